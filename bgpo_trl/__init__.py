@@ -1,0 +1,1 @@
+"""Behavior-Guided Policy Optimization (Hafez & Wermter, 2021) for TorchRL."""

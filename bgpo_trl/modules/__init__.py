@@ -1,0 +1,1 @@
+"""Neural modules: VAE, sequence autoencoder, GWR-B, actor and critic."""

@@ -1,0 +1,90 @@
+"""LSTM autoencoder over latent sequences: one demonstration to a 32-number embedding phi."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+
+class SequenceAutoencoder(nn.Module):
+    """The paper's LAE (Sec. III-A, Fig. "LSTM Autoencoder"): LSTM encoder, LSTM decoder.
+
+    The embedding phi is the encoder's hidden state after the last valid latent. The decoder is
+    fed phi at every step and reconstructs the sequence in reverse order.
+
+    Args:
+        latent_size: dimensions of one latent (paper: 64).
+        embedding_size: LSTM units of encoder and decoder, so dimensions of phi (paper: 32).
+
+    Example:
+        >>> import torch
+        >>> lae = SequenceAutoencoder()
+        >>> z, length = torch.randn(5, 51, 64), torch.tensor([51, 30, 1, 2, 40])
+        >>> lae.encode(z, length).shape
+        torch.Size([5, 32])
+    """
+
+    def __init__(self, latent_size: int = 64, embedding_size: int = 32) -> None:
+        super().__init__()
+        self.latent_size = latent_size
+        self.embedding_size = embedding_size
+        self.encoder = nn.LSTM(latent_size, embedding_size, batch_first=True)
+        self.decoder = nn.LSTM(embedding_size, embedding_size, batch_first=True)
+        self.readout = nn.Linear(embedding_size, latent_size)
+
+    def encode(self, z: Tensor, length: Tensor) -> Tensor:
+        """Embeds whole sequences.
+
+        Args:
+            z: ``[..., T, latent_size]``; what lies at or beyond ``length`` has no influence.
+            length: int64 ``[...]``, valid latents of each sequence, in 1..T.
+
+        Returns:
+            phi, float32 ``[..., embedding_size]`` in (-1, 1).
+
+        Raises:
+            ValueError: if shapes disagree or a length is outside 1..T.
+        """
+        if length.shape != z.shape[:-2]:
+            raise ValueError(
+                f"length must be {tuple(z.shape[:-2])} for latents {tuple(z.shape)}, "
+                f"got {tuple(length.shape)}"
+            )
+        steps = z.shape[-2]
+        if length.numel() and not (length.min() >= 1 and length.max() <= steps):
+            raise ValueError(f"every length must be in 1..{steps}: drop empty sequences")
+        # An LSTM is causal: reading its output at the last valid step masks the padding exactly.
+        hidden, _ = self.encoder(z.reshape(-1, steps, self.latent_size))
+        last = (length.reshape(-1, 1, 1) - 1).expand(-1, 1, self.embedding_size)
+        return hidden.gather(1, last).reshape(*length.shape, self.embedding_size)
+
+    def step(self, z: Tensor, h: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
+        """Advances the encoder by one latent; after the last one, ``h`` is phi.
+
+        Args:
+            z: ``[..., latent_size]``.
+            h: ``[..., embedding_size]``, zeros at the start of a sequence.
+            c: ``[..., embedding_size]``, zeros at the start of a sequence.
+
+        Returns:
+            The new ``h`` and ``c``, ``[..., embedding_size]`` each.
+        """
+        shape = h.shape
+        state = (h.reshape(-1, self.embedding_size), c.reshape(-1, self.embedding_size))
+        z = z.reshape(-1, self.latent_size)
+        h, c = torch.lstm_cell(z, state, *self.encoder.all_weights[0])
+        return h.reshape(shape), c.reshape(shape)
+
+    def decode(self, phi: Tensor, n_steps: int) -> Tensor:
+        """Reconstructs the last ``n_steps`` latents in reverse order (the last one first).
+
+        Args:
+            phi: ``[..., embedding_size]``.
+            n_steps: how many latents to produce.
+
+        Returns:
+            float32 ``[..., n_steps, latent_size]``.
+        """
+        fed = phi.reshape(-1, 1, self.embedding_size).expand(-1, n_steps, -1)
+        hidden, _ = self.decoder(fed)
+        return self.readout(hidden).reshape(*phi.shape[:-1], n_steps, self.latent_size)

@@ -1,0 +1,1 @@
+"""LossModules, each usable on its own with any TorchRL training loop."""

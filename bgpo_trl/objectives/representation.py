@@ -1,0 +1,186 @@
+"""Losses of the two representation networks (paper Sec. III-A), as TorchRL LossModules."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import NestedKey
+from torchrl.objectives import LossModule
+
+from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
+from bgpo_trl.modules.vae import VAE
+
+
+class VAEInverseLoss(LossModule):
+    """Joint loss of the VAE and its inverse model, on windows of consecutive frames.
+
+    What happens to a batch of windows ``[*B, K]``:
+
+    1. Every frame is encoded once and z is sampled from N(mu, sigma^2).
+    2. Reconstruction: squared error, summed over the 6144 numbers of a frame, mean over frames.
+    3. KL(N(mu, sigma^2) || N(0, 1)): summed over dimensions, mean over frames.
+    4. Inverse: ``1/2 ||a_hat_t - a_t||^2`` from the sampled ``[z_t, z_t+1]``, mean over the
+       ``K - 1`` transitions of every window.
+
+    Reconstruction is summed, not averaged, over pixels: a mean would divide what a small object
+    is worth by 6144 and the KL term would then switch off the dimensions that encode it.
+    The entries ``loss_*`` are weighted, so their sum is the objective; ``reconstruction``, ``kl``
+    and ``inverse`` are the same terms unweighted and detached, for logging.
+
+    Reads ``pixels`` uint8 ``[*B, K, 32, 64, 3]`` and ``action`` ``[*B, K, A]``, where
+    ``action[..., t, :]`` leads from frame ``t`` to ``t + 1`` (the last one is not used). Writes
+    scalars.
+
+    Args:
+        vae: the network to train; its parameters are this module's parameters.
+        reconstruction_weight: factor of the reconstruction.
+        kl_weight: factor of the KL divergence.
+        inverse_weight: factor of the inverse model's loss.
+        generator: source of the sampling noise; PyTorch's global one if not given.
+
+    Raises:
+        ValueError: from ``forward``, if windows are shorter than 2 frames.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> loss = VAEInverseLoss(VAE(), generator=torch.Generator().manual_seed(0))
+        >>> windows = TensorDict({
+        ...     "pixels": torch.zeros(3, 4, 32, 64, 3, dtype=torch.uint8),
+        ...     "action": torch.zeros(3, 4, 4),
+        ... }, [3, 4])
+        >>> sorted(key for key in loss(windows).keys() if key.startswith("loss_"))
+        ['loss_inverse', 'loss_kl', 'loss_reconstruction']
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Keys that ``set_keys`` can change."""
+
+        pixels: NestedKey = "pixels"
+        action: NestedKey = "action"
+
+    default_keys = _AcceptedKeys
+    tensor_keys: _AcceptedKeys
+
+    def __init__(
+        self,
+        vae: VAE,
+        *,
+        reconstruction_weight: float = 1.0,
+        kl_weight: float = 0.01,
+        inverse_weight: float = 1.0,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        super().__init__()
+        self.vae = vae
+        self.weights = {
+            "reconstruction": reconstruction_weight,
+            "kl": kl_weight,
+            "inverse": inverse_weight,
+        }
+        self.generator = generator
+
+    @property
+    def functional(self) -> bool:
+        """False: the parameters stay in the network."""
+        return False
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """The keys that ``forward`` reads."""
+        return [self.tensor_keys.pixels, self.tensor_keys.action]
+
+    @property
+    def out_keys(self) -> list[NestedKey]:
+        """The keys that ``forward`` writes."""
+        return [*(f"loss_{name}" for name in self.weights), *self.weights]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """Returns the three losses for a batch of windows; see the class."""
+        pixels = tensordict.get(self.tensor_keys.pixels)
+        action = tensordict.get(self.tensor_keys.action)
+        if pixels.ndim < 5 or pixels.shape[-4] < 2:
+            raise ValueError(f"windows need at least 2 frames, got pixels {tuple(pixels.shape)}")
+        mu, log_variance = self.vae.encode(pixels)
+        noise = torch.randn(mu.shape, generator=self.generator).to(mu.device)
+        z = mu + noise * (log_variance / 2).exp()
+        residual = self.vae.decode(z) - pixels / 255
+        predicted = self.vae.inverse(z[..., :-1, :], z[..., 1:, :])
+        terms = {
+            "reconstruction": residual.square().sum((-3, -2, -1)).mean(),
+            "kl": (mu.square() + log_variance.exp() - 1 - log_variance).sum(-1).mean() / 2,
+            "inverse": (predicted - action[..., :-1, :]).square().sum(-1).mean() / 2,
+        }
+        weighted = {f"loss_{name}": self.weights[name] * term for name, term in terms.items()}
+        return TensorDict({**weighted, **{name: term.detach() for name, term in terms.items()}}, [])
+
+
+class SequenceReconstructionLoss(LossModule):
+    """Masked mean squared error of the sequence autoencoder (paper Sec. III-A).
+
+    Every sequence is embedded, reconstructed in reverse order, and compared with its own valid
+    latents read backwards. Steps at or beyond ``length`` count for nothing; every valid step of
+    the batch counts the same.
+
+    Reads ``latent`` ``[*B, T, latent_size]`` and ``length`` int64 ``[*B]``. Writes the scalar
+    ``loss_reconstruction``.
+
+    Args:
+        lae: the network to train; its parameters are this module's parameters.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> loss = SequenceReconstructionLoss(SequenceAutoencoder())
+        >>> length = torch.tensor([51, 9])
+        >>> data = TensorDict({"latent": torch.randn(2, 51, 64), "length": length}, [2])
+        >>> loss(data)["loss_reconstruction"].shape
+        torch.Size([])
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Keys that ``set_keys`` can change."""
+
+        latent: NestedKey = "latent"
+        length: NestedKey = "length"
+
+    default_keys = _AcceptedKeys
+    tensor_keys: _AcceptedKeys
+
+    def __init__(self, lae: SequenceAutoencoder) -> None:
+        super().__init__()
+        self.lae = lae
+
+    @property
+    def functional(self) -> bool:
+        """False: nn.LSTM caches its weights, so they cannot be swapped for functional calls."""
+        return False
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """The keys that ``forward`` reads."""
+        return [self.tensor_keys.latent, self.tensor_keys.length]
+
+    @property
+    def out_keys(self) -> list[NestedKey]:
+        """The keys that ``forward`` writes."""
+        return ["loss_reconstruction"]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """Returns the loss for a batch of sequences; see the class."""
+        latent = tensordict.get(self.tensor_keys.latent)
+        length = tensordict.get(self.tensor_keys.length)
+        n_steps = int(length.max())
+        reconstructed = self.lae.decode(self.lae.encode(latent, length), n_steps)
+        back = length.unsqueeze(-1) - 1 - torch.arange(n_steps, device=length.device)
+        valid = (back >= 0).unsqueeze(-1)
+        target = latent.gather(-2, back.clamp_min(0).unsqueeze(-1).expand_as(reconstructed))
+        error = torch.where(valid, reconstructed - target, 0.0).square().sum()
+        return TensorDict(
+            {"loss_reconstruction": error / (valid.sum() * latent.shape[-1])},
+            [],
+        )

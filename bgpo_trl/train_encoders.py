@@ -1,0 +1,102 @@
+"""Command line of stage 1: ``python -m bgpo_trl.train_encoders --dataset data/nico``."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import tyro
+from tensordict import TensorDict, TensorDictBase
+
+from bgpo_trl.configs import RepresentationConfig
+from bgpo_trl.csv_file import CsvFile
+from bgpo_trl.probes import probe
+from bgpo_trl.representation import (
+    Representation,
+    default_weights,
+    save_representation,
+    train_representation,
+)
+from suites.nico import scene_version
+
+_COLUMNS = (
+    "stage",
+    "step",
+    "learning_rate",
+    "loss_reconstruction",
+    "loss_kl",
+    "loss_inverse",
+    "reconstruction",
+    "kl",
+    "inverse",
+)
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Trains both encoders on recorded demonstrations, then probes them."""
+
+    dataset: Path
+    """Folder of the recorded demonstrations (a memory-mapped TensorDict)."""
+    weights: Path = field(default_factory=default_weights)
+    """The file to write; by default the weights that come with the package."""
+    folder: Path = Path("runs/encoders")
+    """Where checkpoints, log and probes go. The same folder continues an interrupted training."""
+    config: RepresentationConfig = field(default_factory=RepresentationConfig)
+    """Hyperparameters."""
+
+
+def train_encoders(
+    dataset: TensorDictBase,
+    weights: Path,
+    folder: Path,
+    config: RepresentationConfig,
+    command: str = "",
+) -> Representation:
+    """Trains, saves and probes both encoders.
+
+    Args:
+        dataset: demonstrations as in :mod:`bgpo_trl.representation`, with ``state`` and ``task``.
+        weights: the safetensors file to write.
+        folder: receives ``train.csv``, ``checkpoint/``, ``probes.json``, ``reconstructions.png``.
+        config: hyperparameters.
+        command: stored with the weights.
+
+    Returns:
+        The trained encoders.
+
+    Raises:
+        ValueError: as :func:`bgpo_trl.representation.train_representation`.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with CsvFile(folder / "train.csv", _COLUMNS) as file:
+        representation = train_representation(
+            dataset,
+            config,
+            scene_version=str(scene_version()),
+            command=command,
+            checkpoint=folder / "checkpoint",
+            log=file.write,
+        )
+    save_representation(representation, weights)
+    probe(representation, dataset, folder)
+    return representation
+
+
+def main(arguments: Arguments) -> None:
+    """Runs the command line; see ``--help``."""
+    try:
+        dataset = TensorDict.load_memmap(arguments.dataset)
+    except Exception as error:
+        raise ValueError(f"{arguments.dataset} holds no demonstrations: record some") from error
+    command = shlex.join(["python", "-m", "bgpo_trl.train_encoders", *sys.argv[1:]])
+    train_encoders(dataset, arguments.weights, arguments.folder, arguments.config, command)
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Arguments, description=Arguments.__doc__))
+    except ValueError as error:
+        sys.exit(f"error: {error}")
