@@ -1,0 +1,1 @@
+"""Simulation suites: dm_control domains that know nothing of torch or of ``bgpo_trl``."""

@@ -1,0 +1,150 @@
+"""What NICO's three tasks share: the action, the start of an episode, observation and reward."""
+
+from collections import OrderedDict
+from typing import Literal
+
+import numpy as np
+from dm_control.rl import control
+from dm_env import TimeStep, specs
+
+from suites.nico import kinematics
+from suites.nico.physics import OBJECT_HALF_HEIGHT, OBJECTS, TABLE_HEIGHT, Physics
+from suites.nico.rendering import FRAME_HEIGHT, FRAME_WIDTH, FrameRenderer
+
+Observation = Literal["pixels", "state", "both"]
+
+CONTROL_TIMESTEP = 0.2  # (s)
+TIME_LIMIT = 10.0  # (s), the paper's 50 steps
+STATE_SIZE = 16
+
+# Change of the joint targets at |action| = 1 (rad): three arm joints, then the hand.
+ACTION_SCALE = np.array([0.2, 0.2, 0.2, 0.4])
+
+# The arc on which the objects stand, about the shoulder's yaw axis; left is positive.
+ARC_RADIUS = 0.42  # (m)
+ARC_ANGLES = np.radians([23.0, 0.0, -23.0])  # glass, green box, white box
+ANGLE_JITTER = np.radians(3.0)
+RADIUS_JITTER = 0.012  # (m)
+
+# Where the palm starts: in view, among or above the objects.
+START_ANGLE = np.radians(32.0)  # to either side of the middle of the arc
+START_RADIUS = (0.36, 0.42)  # (m)
+START_HEIGHT = (0.04, 0.12)  # (m) above the table
+
+
+class Environment(control.Environment):
+    """``control.Environment`` whose success on the very last step still has discount 0."""
+
+    def step(self, action: np.ndarray) -> TimeStep:
+        """Advances one control step of 0.2 s."""
+        timestep = super().step(action)
+        if timestep.last() and timestep.reward:
+            return timestep._replace(discount=0.0)
+        return timestep
+
+
+class NicoTask(control.Task):
+    """Base of the tasks: subclasses say only when they have succeeded.
+
+    The action ``[4]`` in [-1, 1] moves the targets of shoulder yaw, shoulder pitch and elbow by up
+    to 0.2 rad and of the hand by up to 0.4 rad a step. A target never runs further ahead of its
+    joint than one full step, so that what the robot sees is nearly all it needs to know.
+
+    Args:
+        random: Source of the starts.
+        observation: ``"pixels"`` (uint8 ``[32, 64, 3]``), ``"state"`` (float64 ``[16]``) or both.
+        renderer: Shared by environments that are stepped in one thread; made on demand if None.
+    """
+
+    def __init__(
+        self,
+        *,
+        random: np.random.RandomState,
+        observation: Observation = "pixels",
+        renderer: FrameRenderer | None = None,
+    ) -> None:
+        if observation not in ("pixels", "state", "both"):
+            raise ValueError(
+                f"observation is {observation!r}; choose one of 'pixels', 'state', 'both'"
+            )
+        self.random = random
+        self._observation = observation
+        self._renderer = renderer
+
+    def succeeded(self, physics: Physics) -> bool:
+        """Returns whether the task is done."""
+        raise NotImplementedError
+
+    def initialize_episode(self, physics: Physics) -> None:
+        """Places the objects with jitter on their arc and the arm somewhere above them."""
+        for name, angle in zip(OBJECTS, ARC_ANGLES, strict=True):
+            place = kinematics.polar(
+                ARC_RADIUS + self.random.uniform(-RADIUS_JITTER, RADIUS_JITTER),
+                angle + self.random.uniform(-ANGLE_JITTER, ANGLE_JITTER),
+            )
+            turn = self.random.uniform(-np.pi / 9, np.pi / 9) / 2
+            height = TABLE_HEIGHT + OBJECT_HALF_HEIGHT[name]
+            physics.named.data.qpos[name] = [*place, height, np.cos(turn), 0, 0, np.sin(turn)]
+        # Resample a hand that would touch something.
+        touching = True
+        while touching:
+            self._place_arm(physics)
+            physics.forward()
+            touching = physics.robot_touches()
+
+    def _place_arm(self, physics: Physics) -> None:
+        palm = kinematics.polar(
+            self.random.uniform(*START_RADIUS), self.random.uniform(-START_ANGLE, START_ANGLE)
+        )
+        height = TABLE_HEIGHT + self.random.uniform(*START_HEIGHT)
+        arm = kinematics.inverse(np.append(palm, height), kinematics.PALM)
+        curl = self.random.uniform(0.0, physics.named.model.jnt_range["thumb_1"][1])
+        physics.data.qpos[:12] = [*arm, *[curl] * 9]
+        physics.data.ctrl[:] = [*arm, curl, curl, curl]
+
+    def before_step(self, action: np.ndarray, physics: Physics) -> None:
+        """Moves the joint targets by the action."""
+        action = np.asarray(action, dtype=float)
+        if action.shape != (4,) or not np.isfinite(action).all():
+            raise ValueError(f"an action is 4 finite numbers in [-1, 1], not {action}")
+        step = ACTION_SCALE[[0, 1, 2, 3, 3, 3]]
+        joints = np.concatenate([physics.arm_angles(), physics.digit_curls()])
+        target = np.clip(physics.data.ctrl, joints - step, joints + step)
+        target = target + step * np.clip(action, -1.0, 1.0)[[0, 1, 2, 3, 3, 3]]
+        limits = physics.model.jnt_range[physics.model.actuator_trnid[:, 0]]
+        physics.set_control(np.clip(target, limits[:, 0], limits[:, 1]))
+
+    def action_spec(self, physics: Physics) -> specs.BoundedArray:
+        """Returns the spec of the action: float64 ``[4]`` in [-1, 1]."""
+        del physics
+        return specs.BoundedArray((4,), float, minimum=-1.0, maximum=1.0, name="action")
+
+    def observation_spec(self, physics: Physics) -> OrderedDict[str, specs.Array]:
+        """Returns the specs of ``pixels`` and ``state``, as chosen, without rendering."""
+        del physics
+        observation: OrderedDict[str, specs.Array] = OrderedDict()
+        if self._observation != "state":
+            shape = (FRAME_HEIGHT, FRAME_WIDTH, 3)
+            observation["pixels"] = specs.BoundedArray(shape, np.uint8, 0, 255, name="pixels")
+        if self._observation != "pixels":
+            observation["state"] = specs.Array((STATE_SIZE,), float, name="state")
+        return observation
+
+    def get_observation(self, physics: Physics) -> OrderedDict[str, np.ndarray]:
+        """Returns new arrays ``pixels`` (uint8 ``[32, 64, 3]``) and ``state`` (``[16]``), as chosen."""
+        observation: OrderedDict[str, np.ndarray] = OrderedDict()
+        if self._observation != "state":
+            if self._renderer is None:
+                self._renderer = FrameRenderer(physics.model.ptr)
+            observation["pixels"] = self._renderer.render(physics.data.ptr)
+        if self._observation != "pixels":
+            observation["state"] = physics.privileged_state()
+        return observation
+
+    def get_reward(self, physics: Physics) -> float:
+        """Returns 1 on success, else 0."""
+        return float(self.succeeded(physics))
+
+    def get_termination(self, physics: Physics) -> float | None:
+        """Returns discount 0 on success, else None."""
+        return 0.0 if self.succeeded(physics) else None

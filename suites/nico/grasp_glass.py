@@ -1,0 +1,12 @@
+"""Grasp the red glass (Task 1 of the paper)."""
+
+from suites.nico.base import NicoTask
+from suites.nico.physics import Physics
+
+
+class GraspGlass(NicoTask):
+    """Done when the glass is held between thumb and fingers with the hand closing on it."""
+
+    def succeeded(self, physics: Physics) -> bool:
+        """Returns whether the task is done."""
+        return physics.glass_held()

@@ -1,0 +1,94 @@
+"""The suite's front: ``load``, ``register`` and ``ALL_TASKS``."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from dm_control import suite
+from dm_control.utils import containers
+
+from suites.nico.base import CONTROL_TIMESTEP, TIME_LIMIT, Environment, NicoTask, Observation
+from suites.nico.grasp_glass import GraspGlass
+from suites.nico.physics import Physics, scene_xml
+from suites.nico.push_green_to_glass import PushGreenToGlass
+from suites.nico.push_green_to_white import PushGreenToWhite
+from suites.nico.rendering import FrameRenderer
+
+TASKS: Mapping[str, type[NicoTask]] = {
+    "grasp_glass": GraspGlass,
+    "push_green_to_glass": PushGreenToGlass,
+    "push_green_to_white": PushGreenToWhite,
+}
+ALL_TASKS = tuple(TASKS)
+
+
+def load(
+    task: str,
+    *,
+    seed: int | np.random.RandomState | None = None,
+    observation: Observation = "pixels",
+    time_limit: float = TIME_LIMIT,
+    physics: Physics | None = None,
+    renderer: FrameRenderer | None = None,
+    environment_kwargs: Mapping[str, Any] | None = None,
+) -> Environment:
+    """Returns an environment of NICO at the table.
+
+    Args:
+        task: One of ``ALL_TASKS``.
+        seed: Seed or source of the starts; None draws one from the system.
+        observation: ``"pixels"`` (uint8 ``[32, 64, 3]``), ``"state"`` (privileged ground truth,
+            float64 ``[16]``: joints (rad), grip and object positions (m)) or ``"both"``.
+        time_limit: Length of an episode (s); a step takes 0.2 s.
+        physics: A simulation to share with other tasks that are not run at the same time.
+        renderer: A renderer to share with other environments of the same thread.
+        environment_kwargs: Further arguments of ``dm_control.rl.control.Environment``.
+
+    Raises:
+        ValueError: If the task or the observation is unknown.
+
+    Example:
+        >>> from suites import nico
+        >>> env = nico.load("grasp_glass", seed=0)
+        >>> env.reset().observation["pixels"].shape
+        (32, 64, 3)
+    """
+    if task not in TASKS:
+        raise ValueError(f"no NICO task {task!r}; choose one of {', '.join(ALL_TASKS)}")
+    random = seed if isinstance(seed, np.random.RandomState) else np.random.RandomState(seed)
+    return Environment(
+        physics or Physics.from_xml_string(scene_xml()),
+        TASKS[task](random=random, observation=observation, renderer=renderer),
+        time_limit=time_limit,
+        control_timestep=CONTROL_TIMESTEP,
+        **(environment_kwargs or {}),
+    )
+
+
+def register() -> None:
+    """Makes the tasks known to ``dm_control.suite`` as domain ``nico``, and so to all that wraps it.
+
+    Example:
+        >>> from dm_control import suite
+        >>> from suites import nico
+        >>> nico.register()
+        >>> suite.load("nico", "grasp_glass", task_kwargs={"random": 0}).action_spec().shape
+        (4,)
+    """
+    domain = type(suite)("nico")
+    tasks = containers.TaggedTasks()
+    for name in ALL_TASKS:
+
+        def factory(
+            random: int | np.random.RandomState | None = None,
+            environment_kwargs: Mapping[str, Any] | None = None,
+            *,
+            name: str = name,
+            **kwargs: Any,
+        ) -> Environment:
+            return load(name, seed=random, environment_kwargs=environment_kwargs, **kwargs)
+
+        factory.__name__ = name
+        tasks.add("nico")(factory)
+    domain.SUITE = tasks  # pyright: ignore[reportAttributeAccessIssue]
+    suite._DOMAINS["nico"] = domain

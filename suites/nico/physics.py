@@ -1,0 +1,101 @@
+"""Simulation of NICO at the table, with named geometric queries."""
+
+import hashlib
+from importlib import resources
+from typing import Final
+
+import mujoco
+import numpy as np
+from dm_control import mujoco as dm_mujoco
+
+OBJECTS: Final = ("glass", "green_box", "white_box")
+ARM_JOINTS: Final = ("shoulder_yaw", "shoulder_pitch", "elbow")
+DIGITS: Final = ("thumb", "upper_finger", "lower_finger")
+TABLE_HEIGHT: Final = 0.62  # (m)
+OBJECT_HALF_HEIGHT: Final = {"glass": 0.035, "green_box": 0.025, "white_box": 0.025}  # (m)
+
+_TOUCH_GAP = 0.002  # (m) two objects closer than this touch
+_PRESSING = 0.02  # (rad) a hand whose target lies this far beyond its curl is closing
+
+
+def scene_xml() -> str:
+    """Returns the MJCF of the scene."""
+    return resources.files("suites.nico").joinpath("nico.xml").read_text()
+
+
+def scene_version() -> str:
+    """Returns the version of the scene; datasets and encoder weights are valid for one version only."""
+    return "nico-1-" + hashlib.sha256(scene_xml().encode()).hexdigest()[:8]
+
+
+class Physics(dm_mujoco.Physics):
+    """MuJoCo simulation with the queries that NICO's tasks, demonstrator and probes need."""
+
+    def arm_angles(self) -> np.ndarray:
+        """Returns shoulder yaw, shoulder pitch and elbow (rad), ``[3]``."""
+        return np.array(self.named.data.qpos[list(ARM_JOINTS)])
+
+    def digit_curls(self) -> np.ndarray:
+        """Returns the angle (rad) of each segment of thumb, upper and lower finger, ``[3]``."""
+        return np.array(self.named.data.qpos[[f"{digit}_1" for digit in DIGITS]])
+
+    def joint_angles(self) -> np.ndarray:
+        """Returns the controlled joints: the arm's three angles and the hand's mean curl (rad), ``[4]``."""
+        return np.append(self.arm_angles(), self.digit_curls().mean())
+
+    def grip_position(self) -> np.ndarray:
+        """Returns where the centre of a held glass would be (m), ``[3]``."""
+        return np.array(self.named.data.site_xpos["grip"])
+
+    def palm_position(self) -> np.ndarray:
+        """Returns the centre of the palm (m), ``[3]``."""
+        return np.array(self.named.data.site_xpos["palm"])
+
+    def object_position(self, name: str) -> np.ndarray:
+        """Returns the centre of an object (m), ``[3]``."""
+        return np.array(self.named.data.xpos[name])
+
+    def privileged_state(self) -> np.ndarray:
+        """Returns joint angles (rad) ``[4]``, grip position (m) ``[3]`` and three object positions (m) ``[9]``."""
+        objects = [self.object_position(name) for name in OBJECTS]
+        return np.concatenate([self.joint_angles(), self.grip_position(), *objects])
+
+    def gap(self, first: str, second: str) -> float:
+        """Returns the smallest distance between two geoms (m); negative where they overlap."""
+        model = self.model.ptr
+        ids = [self.model.name2id(name, "geom") for name in (first, second)]
+        return mujoco.mj_geomDistance(model, self.data.ptr, ids[0], ids[1], 1.0, None)
+
+    def touching(self, first: str, second: str) -> bool:
+        """Returns whether two geoms touch."""
+        return self.gap(first, second) < _TOUCH_GAP
+
+    def robot_touches(self) -> bool:
+        """Returns whether any part of the robot touches the table or an object."""
+        bodies = self.model.body_rootid[self.model.geom_bodyid]
+        robot = self.model.name2id("torso", "body")
+        geoms = self.data.contact.geom
+        return bool((bodies[geoms] == robot).any())
+
+    def hand_closing(self) -> bool:
+        """Returns whether the hand is being closed: its target lies beyond its mean curl."""
+        targets = self.data.ctrl[len(ARM_JOINTS) :]
+        return bool((targets - self.digit_curls()).mean() > _PRESSING)
+
+    def glass_held(self) -> bool:
+        """Returns whether the glass is between thumb side and finger side with the hand closing on it.
+
+        A finger touches it, the thumb or the palm touches it, and the hand is being closed.
+        Whether the glass stands or has been knocked over does not matter.
+        """
+        if not self.hand_closing():
+            return False
+        glass = self.model.name2id("glass", "geom")
+        touched = set()
+        for contact in self.data.contact:
+            pair = (contact.geom1, contact.geom2)
+            if glass in pair:
+                touched.add(self.model.id2name(pair[0] if pair[1] == glass else pair[1], "geom"))
+        finger_side = any("finger" in name for name in touched)
+        thumb_side = any(name == "palm" or name.startswith("thumb") for name in touched)
+        return finger_side and thumb_side

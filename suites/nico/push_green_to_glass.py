@@ -1,0 +1,12 @@
+"""Push the green box towards the red glass (Task 2 of the paper)."""
+
+from suites.nico.base import NicoTask
+from suites.nico.physics import Physics
+
+
+class PushGreenToGlass(NicoTask):
+    """Done when the green box touches the glass, standing or knocked over."""
+
+    def succeeded(self, physics: Physics) -> bool:
+        """Returns whether the task is done."""
+        return physics.touching("green_box", "glass")
