@@ -1,0 +1,182 @@
+"""Checkpoints that are there when a run needs them: complete, verified, and never only one.
+
+A checkpoint is a file ``checkpoint-{number}-{digest}.pt``; ``digest`` is the start of its SHA-256,
+as in ``torch.hub``'s file names, since ``torch.load`` does not notice damaged bytes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import warnings
+from collections import OrderedDict
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import torch
+from torch import Tensor, nn
+
+_NAME = re.compile(r"checkpoint-(\d+)-([0-9a-f]{16})\.pt")
+_PLAIN_TYPES = (bool, int, float, str, type(None), Tensor, nn.Parameter)
+
+
+def save_checkpoint(directory: str | os.PathLike[str], state: dict[str, Any]) -> Path:
+    """Writes a checkpoint; the newest intact one before it is kept, older ones are removed.
+
+    The file appears under its name only when all of it is on the disk, so that neither a kill nor a
+    power cut at any moment leaves less than the checkpoint before.
+
+    Args:
+        directory: Where the run keeps its checkpoints; made if it does not exist.
+        state: Dicts, lists and tuples of tensors, numbers, strings, booleans and None, nested as
+            ``state_dict`` methods return them. Random generators go in as their state:
+            ``generator.get_state()`` or NumPy's ``generator.bit_generator.state``.
+
+    Returns:
+        The file.
+
+    Raises:
+        ValueError: If the state holds anything else, which loading would refuse.
+        OSError: If the file cannot be written, such as on a full disk; earlier ones stay.
+
+    Example:
+        >>> import tempfile
+        >>> directory = tempfile.mkdtemp()
+        >>> _ = save_checkpoint(directory, {"episode": 7, "weight": torch.ones(2)})
+        >>> load_checkpoint(directory)
+        {'episode': 7, 'weight': tensor([1., 1.])}
+    """
+    _check_state(state, "state")
+    directory = Path(directory)
+    temporary = directory / "checkpoint.tmp"
+    earlier = _checkpoints(directory)
+    number = _parse(earlier[0])[0] + 1 if earlier else 1
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        with open(temporary, "wb") as file:
+            digest = _write(state, file)
+        path = directory / f"checkpoint-{number:06d}-{digest}.pt"
+        temporary.replace(path)
+        _sync_directory(directory)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise OSError(
+            error.errno,
+            f"cannot save a checkpoint in {directory} ({error.strerror}), earlier ones are kept: "
+            "make room, then resume the run",
+        ) from error
+    # A damaged one must not take the place of the one that a run has just fallen back to.
+    kept = next((candidate for candidate in earlier if _is_intact(candidate)), None)
+    for old in earlier:
+        if old != kept:
+            old.unlink()
+    return path
+
+
+def load_checkpoint(
+    directory: str | os.PathLike[str], *, map_location: str | torch.device = "cpu"
+) -> dict[str, Any]:
+    """Reads the newest intact checkpoint, with a warning for each newer one that is damaged.
+
+    Args:
+        directory: Where the run keeps its checkpoints.
+        map_location: Device of the tensors.
+
+    Returns:
+        The state as it was saved.
+
+    Raises:
+        ValueError: If there is no intact checkpoint.
+    """
+    directory = Path(directory)
+    for path in _checkpoints(directory):
+        if _is_intact(path):
+            return torch.load(path, map_location=map_location, weights_only=True)
+        warnings.warn(f"{path} is damaged: going on from the checkpoint before it.", stacklevel=2)
+    raise ValueError(
+        f"{directory} holds no intact checkpoint to resume from: start a new run in another "
+        "directory."
+    )
+
+
+def has_checkpoint(directory: str | os.PathLike[str]) -> bool:
+    """Returns whether a run got as far as its first checkpoint, intact or not."""
+    return bool(_checkpoints(Path(directory)))
+
+
+class _HashingFile:
+    """Hashes what passes through, and keeps the error that ``torch.save`` would hide."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self.sha256 = hashlib.sha256()
+        self.error: OSError | None = None
+
+    def write(self, data: Any) -> int:
+        try:
+            written = self._file.write(data)
+        except OSError as error:
+            self.error = error
+            raise
+        self.sha256.update(data)
+        return written
+
+    def flush(self) -> None:
+        self._file.flush()
+
+
+def _write(state: dict[str, Any], file: BinaryIO) -> str:
+    hashing_file = _HashingFile(file)
+    try:
+        torch.save(state, hashing_file)  # pyright: ignore[reportArgumentType]
+    except RuntimeError:
+        if hashing_file.error is not None:
+            raise hashing_file.error from None
+        raise
+    file.flush()
+    os.fsync(file.fileno())
+    return hashing_file.sha256.hexdigest()[:16]
+
+
+def _sync_directory(directory: Path) -> None:
+    descriptor = os.open(directory, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _parse(path: Path) -> tuple[int, str]:
+    match = _NAME.fullmatch(path.name)
+    assert match is not None
+    return int(match[1]), match[2]
+
+
+def _checkpoints(directory: Path) -> list[Path]:
+    """Returns the checkpoints of a run, newest first."""
+    found = [path for path in directory.glob("checkpoint-*.pt") if _NAME.fullmatch(path.name)]
+    return sorted(found, key=_parse, reverse=True)
+
+
+def _is_intact(path: Path) -> bool:
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest().startswith(_parse(path)[1])
+
+
+def _check_state(value: Any, where: str) -> None:
+    # Exact types: subclasses such as numpy.float64 or a memory-mapped tensor are pickled with
+    # their class, which torch.load(weights_only=True) refuses.
+    if type(value) in (dict, OrderedDict):
+        for key, item in value.items():
+            if type(key) not in (str, int):
+                raise ValueError(f"{where} has the key {key!r}: a checkpoint takes str and int.")
+            _check_state(item, f"{where}[{key!r}]")
+    elif type(value) in (list, tuple):
+        for index, item in enumerate(value):
+            _check_state(item, f"{where}[{index}]")
+    elif type(value) not in _PLAIN_TYPES:
+        raise ValueError(
+            f"{where} is a {type(value).__name__}, which a checkpoint cannot hold: turn it into "
+            "tensors, numbers, strings, lists or dicts."
+        )
