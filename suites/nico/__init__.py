@@ -3,6 +3,6 @@
 # First, because it chooses the OpenGL backend before anything imports MuJoCo.
 from suites.nico import rendering  # isort: skip
 from suites.nico.nico import ALL_TASKS, load, register
-from suites.nico.physics import OBJECTS, Physics, scene_version
+from suites.nico.physics import OBJECTS, Physics, scene_version, scene_xml
 
-__all__ = ["ALL_TASKS", "OBJECTS", "Physics", "load", "register", "rendering", "scene_version"]
+__all__ = ["ALL_TASKS", "OBJECTS", "Physics", "load", "register", "rendering", "scene_version", "scene_xml"]

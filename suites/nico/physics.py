@@ -14,6 +14,7 @@ DIGITS: Final = ("thumb", "upper_finger", "lower_finger")
 TABLE_HEIGHT: Final = 0.62  # (m)
 OBJECT_HALF_HEIGHT: Final = {"glass": 0.035, "green_box": 0.025, "white_box": 0.025}  # (m)
 
+_FULL_STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 _TOUCH_GAP = 0.002  # (m) two objects closer than this touch
 _PRESSING = 0.02  # (rad) a hand whose target lies this far beyond its curl is closing
 
@@ -59,6 +60,19 @@ class Physics(dm_mujoco.Physics):
         """Returns joint angles (rad) ``[4]``, grip position (m) ``[3]`` and three object positions (m) ``[9]``."""
         objects = [self.object_position(name) for name in OBJECTS]
         return np.concatenate([self.joint_angles(), self.grip_position(), *objects])
+
+    def full_state(self) -> np.ndarray:
+        """Returns all that the simulation's future depends on, as one vector."""
+        state = np.empty(mujoco.mj_stateSize(self.model.ptr, _FULL_STATE))
+        mujoco.mj_getState(self.model.ptr, self.data.ptr, state, _FULL_STATE)
+        return state
+
+    def set_full_state(self, state: np.ndarray) -> None:
+        """Continues from what ``full_state`` returned, bit for bit."""
+        mujoco.mj_setState(self.model.ptr, self.data.ptr, state, _FULL_STATE)
+        mujoco.mj_forward(self.model.ptr, self.data.ptr)
+        # Forward dynamics has moved the solver's warm start on: set it back.
+        mujoco.mj_setState(self.model.ptr, self.data.ptr, state, _FULL_STATE)
 
     def gap(self, first: str, second: str) -> float:
         """Returns the smallest distance between two geoms (m); negative where they overlap."""

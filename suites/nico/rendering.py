@@ -5,8 +5,10 @@ first imported: on Linux EGL if its library can be loaded, else OSMesa. A value 
 ``LP_NUM_THREADS=0`` where unset: llvmpipe's worker threads cost more than they give on a 64x32 frame.
 """
 
+import atexit
 import ctypes
 import ctypes.util
+import importlib
 import os
 import platform
 import sys
@@ -60,21 +62,28 @@ def choose_backend(loadable: Callable[[str], bool] = _loadable) -> str | None:
 
 def _configure() -> None:
     os.environ.setdefault("LP_NUM_THREADS", "0")
-    if "mujoco" in sys.modules:
-        return
     try:
         backend = choose_backend()
     except RuntimeError:
         # Physics works without OpenGL; the error belongs to whoever asks for a frame.
         backend = None
-    if backend is not None:
+    if backend is not None and backend != os.environ.get("MUJOCO_GL"):
         os.environ["MUJOCO_GL"] = backend
+        context = sys.modules.get("mujoco.rendering.classic.gl_context")
+        if context is not None:  # Somebody imported MuJoCo first: have it choose again.
+            importlib.reload(context)
 
 
 _configure()
 
 import mujoco  # noqa: E402
 import numpy as np  # noqa: E402
+
+
+def _close(reference: weakref.ref[mujoco.Renderer]) -> None:
+    renderer = reference()
+    if renderer is not None:
+        renderer.close()
 
 
 class FrameRenderer:
@@ -118,8 +127,8 @@ class FrameRenderer:
         self._camera = mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED  # pyright: ignore[reportAttributeAccessIssue]
         self._camera.fixedcamid = camera_id
-        # Also runs at exit, while the OpenGL library can still be called.
-        self._finalizer = weakref.finalize(self, self._renderer.close)
+        # Registered after the OpenGL library's own exit handler, so that it runs before that one.
+        atexit.register(_close, weakref.ref(self._renderer))
 
     def render(self, data: mujoco.MjData, out: np.ndarray | None = None) -> np.ndarray:
         """Returns the frame that the camera sees.
@@ -136,4 +145,4 @@ class FrameRenderer:
 
     def close(self) -> None:
         """Frees the OpenGL context."""
-        self._finalizer()
+        self._renderer.close()

@@ -1,0 +1,220 @@
+"""NICO's tasks as one TorchRL environment, batched over seeds and switching task at each reset."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Bounded, Categorical, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from suites import nico
+from suites.nico.base import STATE_SIZE, Environment, Observation
+from suites.nico.rendering import FRAME_HEIGHT, FRAME_WIDTH, FrameRenderer
+
+
+class NicoEnv(EnvBase):
+    """NICO at the table, one simulation for each element of the batch.
+
+    All simulations run in this process and share one renderer. The task of an episode is chosen
+    at reset, by the entry ``"task"`` of the reset's tensordict. Episodes end on success only:
+    append ``StepCounter(50)`` for the paper's time limit.
+
+    Writes at reset and step: ``"pixels"`` uint8 ``[*B, 32, 64, 3]`` and/or ``"state"`` float32
+    ``[*B, 16]`` (joints (rad), grip and object positions (m)); ``"task"`` int64 ``[*B]``, an index
+    into ``tasks``. Reads ``"action"`` float32 ``[*B, 4]`` in [-1, 1]. ``"reward"`` is 1 on success,
+    else 0; ``"terminated"`` and ``"done"`` are success, ``"truncated"`` is never set here.
+
+    An optional boolean entry ``"_step"`` ``[*B]`` says which simulations advance; the others repeat
+    what they showed last.
+
+    Args:
+        tasks: Names of the tasks, in the order of their presentation.
+        batch_size: Shape of the batch.
+        seed: Seed of each simulation's starts; an int counts up from there.
+        observation: ``"pixels"``, ``"state"`` or ``"both"``.
+
+    Raises:
+        ValueError: If a task is unknown or there are not as many seeds as simulations.
+
+    Example:
+        >>> env = NicoEnv(batch_size=[2], seed=0)
+        >>> env.rollout(3)["pixels"].shape
+        torch.Size([2, 3, 32, 64, 3])
+    """
+
+    def __init__(
+        self,
+        tasks: Sequence[str] = nico.ALL_TASKS,
+        *,
+        batch_size: Sequence[int] = (),
+        seed: int | Sequence[int] = 0,
+        observation: Observation = "pixels",
+    ) -> None:
+        super().__init__(batch_size=torch.Size(batch_size))
+        self.tasks = tuple(tasks)
+        self.observation = observation
+        count = self.batch_size.numel()
+        seeds = [seed + i for i in range(count)] if isinstance(seed, int) else list(seed)
+        if len(seeds) != count:
+            raise ValueError(f"{len(seeds)} seeds for {count} simulations: give one each")
+        renderer = None
+        self._environments: list[list[Environment]] = []
+        for row_seed in seeds:
+            physics = nico.Physics.from_xml_string(nico.scene_xml())
+            if observation != "state" and renderer is None:
+                renderer = FrameRenderer(physics.model.ptr)
+            random = np.random.RandomState(row_seed)
+            self._environments.append(
+                [
+                    nico.load(
+                        task,
+                        seed=random,
+                        observation=observation,
+                        time_limit=float("inf"),
+                        physics=physics,
+                        renderer=renderer,
+                    )
+                    for task in self.tasks
+                ]
+            )
+        self._task = np.zeros(count, dtype=np.int64)
+        self._current: dict[str, np.ndarray] = {}
+        self._done = np.zeros(count, dtype=bool)
+        self._make_specs()
+
+    def _make_specs(self) -> None:
+        batch = self.batch_size
+        observation: dict[str, Any] = {
+            "task": Categorical(len(self.tasks), shape=batch, dtype=torch.int64)
+        }
+        count = batch.numel()
+        if self.observation != "state":
+            shape = (FRAME_HEIGHT, FRAME_WIDTH, 3)
+            observation["pixels"] = Bounded(0, 255, shape=(*batch, *shape), dtype=torch.uint8)
+            self._current["pixels"] = np.zeros((count, *shape), np.uint8)
+        if self.observation != "pixels":
+            observation["state"] = Unbounded(shape=(*batch, STATE_SIZE))
+            self._current["state"] = np.zeros((count, STATE_SIZE), np.float32)
+        self.observation_spec = Composite(observation, shape=batch)
+        self.action_spec = Bounded(-1.0, 1.0, shape=(*batch, 4))
+        self.reward_spec = Bounded(0.0, 1.0, shape=(*batch, 1))
+        self.done_spec = Composite(
+            {
+                key: Categorical(2, shape=(*batch, 1), dtype=torch.bool)
+                for key in ("done", "terminated", "truncated")
+            },
+            shape=batch,
+        )
+
+    def _observe(self) -> dict[str, torch.Tensor]:
+        # Fresh memory each time: what was handed out before must not change.
+        out = {
+            key: torch.from_numpy(value.copy()).unflatten(0, self.batch_size)
+            if self.batch_size
+            else torch.from_numpy(value[0].copy())
+            for key, value in self._current.items()
+        }
+        out["task"] = torch.from_numpy(self._task.copy()).reshape(self.batch_size)
+        return out
+
+    def _dones(self) -> dict[str, torch.Tensor]:
+        done = torch.from_numpy(self._done.copy()).reshape(*self.batch_size, 1)
+        return {"done": done, "terminated": done.clone(), "truncated": torch.zeros_like(done)}
+
+    def _record(self, row: int, observation: dict[str, np.ndarray]) -> None:
+        for key, value in self._current.items():
+            value[row] = observation[key]
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        del kwargs
+        rows = np.ones(len(self._task), dtype=bool)
+        if tensordict is not None:
+            if "_reset" in tensordict.keys():
+                rows = tensordict["_reset"].reshape(-1).numpy()
+            task = tensordict.get("task", None)
+            if task is not None:
+                chosen = task.reshape(-1).numpy()
+                if ((chosen < 0) | (chosen >= len(self.tasks)))[rows].any():
+                    raise ValueError(f"task must lie in 0..{len(self.tasks) - 1}, got {task}")
+                self._task[rows] = chosen[rows]
+        for row in np.flatnonzero(rows):
+            timestep = self._environments[row][self._task[row]].reset()
+            self._record(row, timestep.observation)
+        self._done[rows] = False
+        return TensorDict({**self._observe(), **self._dones()}, self.batch_size)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        rows = ~self._done
+        steps = tensordict.get("_step", None)
+        if steps is not None:
+            rows = steps.reshape(-1).numpy()
+        actions = tensordict["action"].reshape(-1, 4).double().numpy()
+        rewards = np.zeros((len(rows), 1), np.float32)
+        for row in np.flatnonzero(rows):
+            timestep = self._environments[row][self._task[row]].step(actions[row])
+            self._record(row, timestep.observation)
+            rewards[row] = timestep.reward
+            self._done[row] = timestep.last()
+        reward = torch.from_numpy(rewards).reshape(*self.batch_size, 1)
+        return TensorDict({**self._observe(), "reward": reward, **self._dones()}, self.batch_size)
+
+    def _set_seed(self, seed: int | None) -> None:
+        for row, environments in enumerate(self._environments):
+            # All tasks of a simulation draw from one source.
+            environments[0].task.random.seed(None if seed is None else seed + row)
+
+    def simulation_state(self) -> dict[str, Any]:
+        """Returns all that the future depends on, as tensors: physics, task, random numbers."""
+        physics, random = [], []
+        for environments in self._environments:
+            physics.append(torch.from_numpy(environments[0].physics.full_state()))
+            _, key, position, has_gauss, gauss = environments[0].task.random.get_state()
+            random.append(
+                {
+                    "key": torch.from_numpy(key.astype(np.int64)),
+                    "position": int(position),
+                    "has_gauss": int(has_gauss),
+                    "gauss": float(gauss),
+                }
+            )
+        return {
+            "physics": torch.stack(physics),
+            "random": random,
+            "task": torch.from_numpy(self._task.copy()),
+            "done": torch.from_numpy(self._done.copy()),
+            "current": {key: torch.from_numpy(v.copy()) for key, v in self._current.items()},
+        }
+
+    def load_simulation_state(self, state: dict[str, Any]) -> None:
+        """Continues from what `simulation_state` returned.
+
+        Raises:
+            ValueError: If it belongs to another number of simulations.
+        """
+        if len(state["physics"]) != len(self._environments):
+            raise ValueError(
+                f"the state holds {len(state['physics'])} simulations, this environment has "
+                f"{len(self._environments)}: use the same number of seeds"
+            )
+        for row, environments in enumerate(self._environments):
+            environments[0].physics.set_full_state(state["physics"][row].numpy())
+            random = state["random"][row]
+            environments[0].task.random.set_state(
+                (
+                    "MT19937",
+                    random["key"].numpy().astype(np.uint32),
+                    random["position"],
+                    random["has_gauss"],
+                    random["gauss"],
+                )
+            )
+            for environment in environments:
+                environment._reset_next_step = False
+        self._task[:] = state["task"].numpy()
+        self._done[:] = state["done"].numpy()
+        for key, value in self._current.items():
+            value[:] = state["current"][key].numpy()
