@@ -1,0 +1,353 @@
+"""GWR-B: the self-organizing network whose nodes are behavior embeddings (paper, section III-B)."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterable, Sequence
+from typing import Any, Literal
+
+import torch
+from tensordict import TensorClass
+from torch import Tensor, nn
+
+from bgpo_trl.modules.gwr_topology import BehaviorGraph, LearningRule, Topology
+
+
+class BehaviorMatch(TensorClass):
+    """The best-matching node of each input.
+
+    Attributes:
+        embedding: weight vector w_c of the node, the behavior b; a copy, `[*batch, d]`.
+        node: identity of the node within its network, int64 `[*batch]`. Identities count up from 0
+            in order of creation; none is reused or renumbered when a node is removed.
+        activity: exp(-||phi - w_c||) in [0, 1] (Eq. 2), `[*batch]`.
+    """
+
+    embedding: Tensor
+    node: Tensor
+    activity: Tensor
+
+
+class GWRB(nn.Module):
+    """Grow-When-Required network of behaviors (GWR-B), or a batch of independent ones.
+
+    It learns from one input phi (an embedded demonstration) at a time:
+
+    1. A network starts as two connected nodes with random weights, or as its first two inputs.
+    2. c and c' are the nearest and the second nearest node (Eq. 1); the older one wins a tie.
+    3. The edge c-c' is created, or its age set to 0. The activity is a = exp(-||phi - w_c||).
+    4. If a < a_T and h_c < h_T, a node v is inserted: w_v = (w_c + phi) / 2, h_v = h_0, edges v-c
+       and v-c'; the edge c-c' is removed. Otherwise c and its neighbors k learn,
+       w_c += eps_c h_c (phi - w_c) and w_k += eps_n h_k (phi - w_k) (Eqs. 3, 4), and habituate,
+       h <- h_inf + (h - h_inf) exp(-alpha / tau) with h_inf = h_0 - 1 / alpha. (Eqs. 5, 6, i read
+       as the node's own firing count: the global iteration would soon habituate every node.)
+    5. All edges of c age by 1. Those older than kappa are removed, then nodes without edges.
+
+    Time and memory are linear in nodes and edges. `state_dict` carries networks of any size.
+
+    Reference: Hafez & Wermter, "Behavior Self-Organization Supports Task Inference for Continual
+    Robot Learning", 2021, section III-B; the defaults are its Table 1.
+
+    Args:
+        n_features: size d of an input.
+        batch_size: shape of the batch of networks (the seeds); `()` is a single network.
+        activity_threshold: a_T.
+        habituation_threshold: h_T.
+        lr_best: eps_c, at most 1.
+        lr_neighbor: eps_n, at most eps_c.
+        initial_habituation: h_0, in (0, 1].
+        alpha_best: alpha of c; at least 1 / h_0, lest h fall below 0.
+        alpha_neighbor: alpha of the neighbors, likewise.
+        tau_best: tau of c; the larger, the slower it habituates.
+        tau_neighbor: tau of the neighbors.
+        max_age: kappa, at least 1.
+        max_nodes: at this many nodes a network adapts where it would insert. None: no limit.
+        init: `"random"` draws both weights uniformly from (-1, 1), the range of an LSTM's hidden
+            state. `"data"` leaves networks empty: the first input becomes a node and matches that
+            node; the second becomes another, joined to it by an edge of age 0; the third is the
+            first to be learned from.
+        generator: draws the random weights, network after network; a sequence holds one for each
+            network, which then starts as it would alone. None: torch's default generator.
+
+    Raises:
+        ValueError: for an argument out of range.
+
+    Examples:
+        >>> gwr = GWRB(2, batch_size=[3], init="data")
+        >>> phi = torch.tensor([[0.0, 0.0], [0.5, 0.0], [0.0, 0.5]])
+        >>> gwr.adapt(phi).activity
+        tensor([1., 1., 1.])
+        >>> gwr.adapt(-phi, mask=torch.tensor([False, False, True])).node
+        tensor([-1, -1,  0])
+        >>> gwr.num_nodes
+        tensor([1, 1, 2])
+        >>> gwr.graph(2).edges
+        tensor([[0, 1]])
+        >>> gwr.lookup(torch.zeros(3, 100, 2)).embedding.shape
+        torch.Size([3, 100, 2])
+    """
+
+    _weights: Tensor  # [networks, capacity, d]; spare rows are inf, hence never the nearest
+
+    def __init__(
+        self,
+        n_features: int,
+        *,
+        batch_size: Sequence[int] = (),
+        activity_threshold: float = 0.8,
+        habituation_threshold: float = 0.15,
+        lr_best: float = 0.1,
+        lr_neighbor: float = 0.01,
+        initial_habituation: float = 1.0,
+        alpha_best: float = 1.05,
+        alpha_neighbor: float = 1.05,
+        tau_best: float = 3.3,
+        tau_neighbor: float = 14.3,
+        max_age: int = 80,
+        max_nodes: int | None = None,
+        init: Literal["random", "data"] = "random",
+        generator: torch.Generator | Sequence[torch.Generator] | None = None,
+    ) -> None:
+        super().__init__()
+        self.n_features = n_features
+        self.batch_size = torch.Size(batch_size)
+        self.rule = LearningRule(
+            activity_threshold=activity_threshold,
+            habituation_threshold=habituation_threshold,
+            lr_best=lr_best,
+            lr_neighbor=lr_neighbor,
+            initial_habituation=initial_habituation,
+            alpha_best=alpha_best,
+            alpha_neighbor=alpha_neighbor,
+            tau_best=tau_best,
+            tau_neighbor=tau_neighbor,
+            max_age=max_age,
+            max_nodes=max_nodes,
+        )
+        networks = self.batch_size.numel()
+        if n_features < 1 or networks < 1:
+            raise ValueError("n_features and every dimension of batch_size must be at least 1")
+        if init not in ("random", "data"):
+            raise ValueError(f"init must be 'random' or 'data'; got {init!r}")
+        generators = generator if isinstance(generator, Sequence) else [generator] * networks
+        if len(generators) != networks:
+            raise ValueError(f"generator must be one, or a sequence of {networks}, one a network")
+
+        self._topologies = [Topology() for _ in range(networks)]
+        spare = torch.full((networks, 16, n_features), torch.inf)
+        self.register_buffer("_weights", spare, persistent=False)
+        if init == "random":
+            for i, source in enumerate(generators):
+                device = None if source is None else source.device
+                for weights in torch.rand(2, n_features, generator=source, device=device):
+                    self._start(i, 2 * weights - 1)
+
+    @property
+    def num_nodes(self) -> Tensor:
+        """Number of nodes of each network, int64 `[*batch_size]`."""
+        counts = [len(topology.nodes) for topology in self._topologies]
+        return torch.tensor(counts, device=self._weights.device).view(self.batch_size)
+
+    def graph(self, index: int | tuple[int, ...] = ()) -> BehaviorGraph:
+        """Copies the network at `index` of `batch_size`."""
+        network = int(torch.arange(len(self._topologies)).view(self.batch_size)[index])
+        topology = self._topologies[network]
+        return topology.to_graph(self._weights[network, : len(topology.nodes)].clone())
+
+    def forward(self, phi: Tensor) -> BehaviorMatch:
+        """The same as `lookup`."""
+        return self.lookup(phi)
+
+    @torch.no_grad()
+    def lookup(self, phi: Tensor) -> BehaviorMatch:
+        """Finds the best match of each input (step 2); changes nothing.
+
+        Args:
+            phi: `[*batch_size, *extra, d]`; each network matches all of its `extra` inputs.
+
+        Returns:
+            Matches `[*batch_size, *extra]`.
+
+        Raises:
+            ValueError: if phi has the wrong shape or holds NaN or Inf, or if a network is still
+                empty (`init="data"` before the first input).
+        """
+        batch, networks = phi.shape[:-1], len(self._topologies)
+        if (*batch[: len(self.batch_size)], *phi.shape[-1:]) != (*self.batch_size, self.n_features):
+            raise ValueError(
+                f"phi must begin with dimensions {[*self.batch_size]} and end with "
+                f"{self.n_features}; got {[*phi.shape]}"
+            )
+        if not all(topology.nodes for topology in self._topologies):
+            raise ValueError("an empty network matches nothing: adapt() it to an input first")
+        phi = self._checked(phi.reshape(networks, batch.numel() // networks, self.n_features))
+        distance, row = self._distances(phi).min(-1)
+        network = torch.arange(networks, device=row.device).unsqueeze(-1)
+        return BehaviorMatch(
+            embedding=self._weights[network, row].view(*batch, self.n_features),
+            node=self._nodes(range(networks), row).view(batch),
+            activity=distance.neg_().exp_().view(batch),
+            batch_size=batch,
+        )
+
+    @torch.no_grad()
+    def adapt(self, phi: Tensor, mask: Tensor | None = None) -> BehaviorMatch:
+        """Finds the best match of one input for each network and learns from it (steps 2 to 5).
+
+        Args:
+            phi: `[*batch_size, d]`.
+            mask: bool `[*batch_size]`, the networks that take part. The others stay as they are,
+                whatever phi holds for them. None: all.
+
+        Returns:
+            Matches `[*batch_size]` from before learning, which `lookup` would have returned; where
+            `mask` is False, embedding and activity are NaN and the node is -1.
+
+        Raises:
+            ValueError: if phi or mask has the wrong shape, or phi holds NaN or Inf for a network
+                that takes part; no network has changed then.
+        """
+        if phi.shape != (*self.batch_size, self.n_features):
+            raise ValueError(
+                f"phi must be {[*self.batch_size, self.n_features]}; got {[*phi.shape]}"
+            )
+        if mask is not None and (mask.shape != self.batch_size or mask.dtype != torch.bool):
+            raise ValueError(
+                f"mask must be bool {[*self.batch_size]}; got {mask.dtype} {[*mask.shape]}"
+            )
+        active = slice(None) if mask is None else mask.flatten()
+        phi = self._checked(phi.reshape(-1, self.n_features)[active])
+        network = torch.arange(len(self._topologies), device=phi.device)[active]
+        networks = network.tolist()
+        n_before = [len(self._topologies[i].nodes) for i in networks]
+        for i, n, first_input in zip(networks, n_before, phi, strict=True):
+            if n == 0:
+                self._start(i, first_input)
+
+        distances = self._distances(phi.unsqueeze(1), active).squeeze(1)
+        distance, best = distances.min(-1)
+        second = distances.scatter_(-1, best.unsqueeze(-1), torch.inf).min(-1).indices
+        embedding, activity = self._weights[network, best], distance.neg_().exp_()
+        node = self._nodes(networks, best.unsqueeze(-1)).squeeze(-1)
+        nearest = zip(best.tolist(), second.tolist(), activity.tolist(), strict=True)
+        self._learn(phi, (embedding + phi) / 2, zip(networks, n_before, nearest, strict=True))
+
+        if mask is not None:
+            embedding = self._spread(embedding, network, torch.nan)
+            node = self._spread(node, network, -1)
+            activity = self._spread(activity, network, torch.nan)
+        return BehaviorMatch(
+            embedding=embedding.view(*self.batch_size, self.n_features),
+            node=node.view(self.batch_size),
+            activity=activity.view(self.batch_size),
+            batch_size=self.batch_size,
+        )
+
+    def get_extra_state(self) -> list[dict[str, Any]]:
+        """Returns what `state_dict` carries: each network's `graph` and the identity due next."""
+        indices = itertools.product(*map(range, self.batch_size))
+        return [
+            {**self.graph(index)._asdict(), "next_node": topology.next_node}
+            for index, topology in zip(indices, self._topologies, strict=True)
+        ]
+
+    def set_extra_state(self, state: list[dict[str, Any]]) -> None:
+        """Replaces the networks by those that `get_extra_state` returned.
+
+        Raises:
+            ValueError: if there are more or fewer of them, or of other features, than here.
+        """
+        found = [network["weights"].shape[1] for network in state]
+        if found != [self.n_features] * len(self._topologies):
+            raise ValueError(
+                f"the state has {len(found)} networks of {set(found)} features, this GWRB "
+                f"{len(self._topologies)} of {self.n_features}: build it with the same sizes"
+            )
+        graphs = [BehaviorGraph(*(network[x] for x in BehaviorGraph._fields)) for network in state]
+        capacity = max(2, *(len(graph.node) for graph in graphs))
+        weights = self._weights.new_full((len(graphs), capacity, self.n_features), torch.inf)
+        for rows, graph in zip(weights, graphs, strict=True):
+            rows[: len(graph.node)] = graph.weights
+        self._topologies = [
+            Topology.from_graph(graph, network["next_node"])
+            for graph, network in zip(graphs, state, strict=True)
+        ]
+        self._weights = weights
+
+    def _checked(self, phi: Tensor) -> Tensor:
+        """Returns phi in the type and on the device of the weights, if it can be matched."""
+        phi = phi.to(self._weights)
+        # Farther out a squared distance could overflow, and every node would be equally near.
+        limit = math.sqrt(torch.finfo(phi.dtype).max / self.n_features) / 4
+        if not (phi.abs() <= limit).all():
+            raise ValueError(f"phi must be free of NaN, Inf and values beyond +-{limit:.0e}")
+        return phi
+
+    def _distances(self, phi: Tensor, active: slice | Tensor = slice(None)) -> Tensor:
+        """Distances `[A, M, N]` of inputs `[A, M, d]` to the nodes of the A active networks."""
+        n_nodes = max(2, *(len(topology.nodes) for topology in self._topologies))
+        # By matrix product, the default of cdist, distances near 0 would be off by 1e-3.
+        exact = "donot_use_mm_for_euclid_dist"
+        return torch.cdist(phi, self._weights[active, :n_nodes], compute_mode=exact)
+
+    def _nodes(self, networks: Iterable[int], rows: Tensor) -> Tensor:
+        """Identities of the nodes with those `rows`, `[A, M]`."""
+        nodes = [
+            [self._topologies[i].nodes[row] for row in rows_i]
+            for i, rows_i in zip(networks, rows.tolist(), strict=True)
+        ]
+        return torch.tensor(nodes, dtype=torch.int64, device=rows.device).view(rows.shape)
+
+    def _spread(self, x: Tensor, network: Tensor, fill: float) -> Tensor:
+        """Places results of active networks among those of all, which are `fill` elsewhere."""
+        return x.new_full((len(self._topologies), *x.shape[1:]), fill).index_copy(0, network, x)
+
+    def _start(self, network: int, weights: Tensor) -> None:
+        """Creates the first node, or the second and its edge to the first (step 1)."""
+        topology = self._topologies[network]
+        node = topology.add(self.rule.initial_habituation)
+        self._set_weights(network, node, weights)
+        if node > 0:
+            topology.connect(0, node)
+
+    def _learn(
+        self,
+        phi: Tensor,
+        midpoint: Tensor,
+        matches: Iterable[tuple[int, int, tuple[int, int, float]]],
+    ) -> None:
+        """Takes steps 3 to 5.
+
+        Args:
+            phi: inputs `[A, d]`.
+            midpoint: of phi and w_c, `[A, d]`.
+            matches: of each input its network, the number of nodes that has had before, and the
+                rows of its two nearest nodes with its activity.
+        """
+        steps: list[tuple[int, int, int, float]] = []  # input, network, row, size
+        deleted: list[tuple[int, int]] = []  # network, row
+        for k, (i, n_nodes, nearest) in enumerate(matches):
+            if n_nodes == 1:
+                self._start(i, phi[k])
+            if n_nodes < 2:
+                continue
+            update = self._topologies[i].learn(*nearest, self.rule)
+            if update.insert:
+                self._set_weights(i, n_nodes, midpoint[k])
+            steps += [(k, i, row, size) for row, size in update.steps]
+            deleted += [(i, row) for row in update.delete]
+        if steps:
+            inputs, networks, rows, sizes = zip(*steps, strict=True)
+            k, i, row = torch.tensor([inputs, networks, rows], device=phi.device)
+            size = torch.tensor(sizes, dtype=phi.dtype, device=phi.device).unsqueeze(-1)
+            self._weights[i, row] = self._weights[i, row].lerp(phi[k], size)
+        for i, row in deleted:
+            self._weights[i, row] = torch.inf
+            self._weights[i, row:] = self._weights[i, row:].roll(-1, dims=0)
+
+    def _set_weights(self, network: int, row: int, weights: Tensor) -> None:
+        capacity = self._weights.shape[1]
+        if row == capacity:
+            self._weights = nn.functional.pad(self._weights, (0, 0, 0, capacity), value=torch.inf)
+        self._weights[network, row] = weights
