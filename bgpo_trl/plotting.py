@@ -1,0 +1,293 @@
+"""Figures of a run: learning curves (Figs. 6, 8, 9 of the paper) and the GWR-B graph (Fig. 7).
+
+Figures are built without pyplot, so that drawing one changes nothing for whoever imports this, and
+the same data always gives the same file. Colors are Okabe and Ito's, which color-blind people can
+tell apart; line styles and markers differ as well.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import os
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import ArrayLike, NDArray
+
+_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+_LINES = ("-", "--", "-.", (0, (3, 1, 1, 1, 1, 1)))
+_MARKERS = ("o", "s", "^", "D", "v", "P")
+_GRID_POINTS = 400
+_OVERALL = "All presented tasks"
+
+_Tests = dict[str, dict[int, list[tuple[int, str, float]]]]
+"""By algorithm and seed: training episode, task and success of each test episode."""
+
+
+def plot_success_curves(
+    eval_csv: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
+    *,
+    presented: Mapping[str, int] | None = None,
+    random_success: Mapping[str, float] | None = None,
+    window: int | None = None,
+) -> Figure:
+    """Plots success over training episodes, one panel for all tasks and one for each.
+
+    Each test episode succeeds or fails, so a seed's curve at episode e is its share of successes in
+    the test episodes after training episodes (e - window, e]: a trailing mean, which never shows
+    success before it was there. Lines are the mean over seeds, shaded by one standard deviation
+    over seeds (``ddof=0``), as in the paper. A seed counts where its window holds a test episode.
+
+    Args:
+        eval_csv: One or more ``eval.csv`` files, which may hold several algorithms and seeds.
+        presented: Training episode from which each task is presented, by its name. Episodes after
+            the first are marked with dashed lines; also gives the order of the panels.
+        random_success: Success rate of a random policy by task, marked with dotted lines.
+        window: Length of the trailing mean in training episodes; 5 % of the training if None.
+
+    Returns:
+        The figure.
+
+    Raises:
+        ValueError: If a file is no ``eval.csv``, there are no test episodes, or the window is not
+            positive.
+    """
+    tests = _read_tests([eval_csv] if isinstance(eval_csv, str | os.PathLike) else eval_csv)
+    presented = presented or {}
+    random_success = random_success or {}
+    found = {task for seeds in tests.values() for rows in seeds.values() for _, task, _ in rows}
+    tasks = [*presented, *sorted(found - set(presented))]
+    last = max(row[0] for seeds in tests.values() for rows in seeds.values() for row in rows)
+    window = max(1, round(last / 20)) if window is None else window
+    if window < 1:
+        raise ValueError(f"window must be at least 1 episode, not {window}.")
+
+    n_columns = 2 if len(tasks) in (1, 2, 3) else 3
+    n_rows = math.ceil((len(tasks) + 1) / n_columns)
+    width = 3.5 * n_columns
+    figure = Figure(figsize=(width, 2.4 * n_rows + 0.5))
+    # Side by side, the last tick label of a panel must not run into the first of the next.
+    figure.set_layout_engine("constrained", w_pad=0.1)
+    panels = figure.subplots(n_rows, n_columns, sharex=True, sharey=True, squeeze=False).ravel()
+    grid = np.unique(np.linspace(0, last, _GRID_POINTS).round().astype(int))
+
+    for panel, task in zip(panels, [None, *tasks], strict=False):
+        for index, (algorithm, seeds) in enumerate(tests.items()):
+            curves = [_trailing_mean(rows, task, grid, window) for rows in seeds.values()]
+            _draw_curve(panel, grid, np.array(curves), algorithm, index)
+        starts = {name: episode for name, episode in presented.items() if task in (None, name)}
+        _mark_starts(panel, starts, tasks, last)
+        if task is not None and task in random_success:
+            panel.axhline(random_success[task], color="0.35", linestyle=":", linewidth=1.2)
+        panel.set_title(
+            _OVERALL if task is None else f"Task {tasks.index(task) + 1}: {_readable(task)}",
+            fontsize=9,
+        )
+        _style(panel)
+        # Room above 1, where no curve can be, for the labels of the dashed lines.
+        panel.set(xlim=(0, last), ylim=(0, 1.1), yticks=np.linspace(0, 1, 6))
+        panel.xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10], integer=True))
+        panel.xaxis.set_major_formatter("{x:,.0f}")
+    for panel in panels[len(tasks) + 1 :]:
+        panel.remove()
+    for position, panel in enumerate(panels[: len(tasks) + 1]):
+        # The lowest panel of its column, which has no panel below that could carry the ticks.
+        if position + n_columns > len(tasks):
+            panel.tick_params(labelbottom=True)
+
+    figure.supxlabel(f"Training episode (success: mean over the last {window:,})", fontsize=9)
+    figure.supylabel("Success rate", fontsize=9)
+    handles, labels = panels[0].get_legend_handles_labels()
+    if random_success:
+        handles += [panels[0].plot([], [], color="0.35", linestyle=":", linewidth=1.2)[0]]
+        labels += ["random policy"]
+    _legend(figure, handles, labels, width)
+    return figure
+
+
+def plot_gwr_pca(weights: ArrayLike, node_task: ArrayLike, task_names: Sequence[str]) -> Figure:
+    """Plots the nodes of a GWR-B on their first two principal components (Fig. 7 of the paper).
+
+    Args:
+        weights: Weights of the nodes ``[N, d]``, N and d at least 2.
+        node_task: For each node, the position in ``task_names`` of the task with the most
+            demonstrations for which the node is the best match, or -1 if it is for none; ``[N]``.
+        task_names: Names of the tasks.
+
+    Returns:
+        The figure.
+
+    Raises:
+        ValueError: If the shapes do not fit, a weight is not finite, or a task does not exist.
+    """
+    weights = np.asarray(weights, dtype=np.float64)
+    node_task = np.asarray(node_task)
+    if weights.ndim != 2 or min(weights.shape) < 2 or not np.isfinite(weights).all():
+        raise ValueError(
+            f"weights must be finite and [N, d] with N, d >= 2, not {list(weights.shape)}."
+        )
+    if node_task.shape != weights.shape[:1]:
+        raise ValueError(
+            f"node_task must have one task for each of the {len(weights)} nodes, "
+            f"not the shape {list(node_task.shape)}."
+        )
+    if not np.isin(node_task, np.arange(-1, len(task_names))).all():
+        raise ValueError(
+            f"node_task must be -1 or a position in the {len(task_names)} task_names, "
+            f"not {node_task.min()} to {node_task.max()}."
+        )
+
+    points, share = _principal_components(weights)
+    width = 4.8
+    figure = Figure(figsize=(width, 4.6), layout="constrained")
+    axes = figure.add_subplot()
+    groups = [*_task_markers(task_names), (-1, "no demonstration", "0.6", "x")]
+    for task, name, color, marker in groups:
+        chosen = points[node_task == task]
+        if len(chosen) == 0:
+            continue
+        axes.scatter(
+            *chosen.T,
+            s=22,
+            c=color,
+            marker=marker,
+            linewidths=0.9 if marker == "x" else 0.4,
+            edgecolors=None if marker == "x" else "white",
+            alpha=0.9,
+            zorder=2 if task < 0 else 3,
+            label=f"{name} ({len(chosen)})",
+        )
+    axes.set_xlabel(f"Principal component 1 ({share[0]:.0%} of variance)", fontsize=9)
+    axes.set_ylabel(f"Principal component 2 ({share[1]:.0%} of variance)", fontsize=9)
+    axes.set_aspect("equal", adjustable="datalim")
+    _style(axes)
+    _legend(figure, *axes.get_legend_handles_labels(), width)
+    return figure
+
+
+def save_figure(figure: Figure, path: str | os.PathLike[str]) -> None:
+    """Saves a figure at print quality, 300 dpi; the same figure always gives the same bytes.
+
+    Args:
+        figure: The figure.
+        path: Where to, ending in ``.png``; its folder is made if it does not exist.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, format="png", dpi=300, metadata={"Software": None})
+
+
+def _read_tests(paths: Iterable[str | os.PathLike[str]]) -> _Tests:
+    tests: _Tests = defaultdict(lambda: defaultdict(list))
+    for path in paths:
+        with open(path, newline="") as file:
+            reader = csv.DictReader(file)
+            missing = {"algorithm", "seed", "episode", "task", "success"} - set(
+                reader.fieldnames or ()
+            )
+            if missing:
+                raise ValueError(
+                    f"{path} is no eval.csv of a run: it lacks {', '.join(sorted(missing))}."
+                )
+            for row in reader:
+                test = (int(row["episode"]), row["task"], float(row["success"]))
+                tests[row["algorithm"]][int(row["seed"])].append(test)
+    if not tests:
+        raise ValueError("there are no test episodes to plot: let the run evaluate first.")
+    return tests
+
+
+def _trailing_mean(
+    rows: list[tuple[int, str, float]], task: str | None, grid: NDArray, window: int
+) -> NDArray:
+    """Returns a seed's share of successes at each grid point; NaN where it has no test episode."""
+    chosen = sorted((episode, success) for episode, name, success in rows if task in (None, name))
+    episodes = np.array([episode for episode, _ in chosen])
+    successes = np.cumsum([0.0, *(success for _, success in chosen)])
+    stop = np.searchsorted(episodes, grid, side="right")
+    start = np.searchsorted(episodes, grid - window, side="right")
+    count = stop - start
+    return np.where(count > 0, (successes[stop] - successes[start]) / np.maximum(count, 1), np.nan)
+
+
+def _draw_curve(axes: Axes, grid: NDArray, curves: NDArray, name: str, index: int) -> None:
+    seeds = np.ma.masked_invalid(curves)
+    mean, spread = seeds.mean(axis=0).filled(np.nan), seeds.std(axis=0).filled(np.nan)
+    color = _COLORS[index % len(_COLORS)]
+    label = f"{name} ({len(curves)} seed{'s' if len(curves) > 1 else ''})"
+    axes.plot(
+        grid, mean, color=color, linestyle=_LINES[index % len(_LINES)], linewidth=1.6, label=label
+    )
+    low, high = np.clip(mean - spread, 0, 1), np.clip(mean + spread, 0, 1)
+    axes.fill_between(grid, low, high, color=color, alpha=0.18, linewidth=0)
+
+
+def _mark_starts(axes: Axes, starts: Mapping[str, int], tasks: Sequence[str], last: int) -> None:
+    for task, episode in starts.items():
+        if not 0 < episode < last:
+            continue
+        axes.axvline(episode, color="0.35", linestyle=(0, (4, 3)), linewidth=0.9)
+        axes.annotate(
+            f"task {tasks.index(task) + 1}",
+            (episode, 1.05),
+            xytext=(3, 0),
+            textcoords="offset points",
+            va="center",
+            fontsize=7.5,
+            color="0.25",
+        )
+
+
+def _task_markers(task_names: Sequence[str]) -> list[tuple[int, str, str, str]]:
+    return [
+        (
+            task,
+            f"task {task + 1}: {_readable(name)}",
+            _COLORS[task % len(_COLORS)],
+            _MARKERS[task % len(_MARKERS)],
+        )
+        for task, name in enumerate(task_names)
+    ]
+
+
+def _principal_components(values: NDArray) -> tuple[NDArray, NDArray]:
+    """Returns the values on their first two principal components, and each one's variance share."""
+    _, scales, directions = np.linalg.svd(values - values.mean(axis=0), full_matrices=False)
+    # The sign of a direction is the solver's whim: let its largest part be positive.
+    largest = np.abs(directions).argmax(axis=1, keepdims=True)
+    directions = directions * np.sign(np.take_along_axis(directions, largest, axis=1))
+    variance = scales**2
+    share = variance[:2] / max(variance.sum(), np.finfo(float).tiny)
+    return (values - values.mean(axis=0)) @ directions[:2].T, share
+
+
+def _readable(name: str) -> str:
+    return name.replace("_", " ")
+
+
+def _style(axes: Axes) -> None:
+    axes.tick_params(labelsize=8, length=3)
+    axes.grid(color="0.9", linewidth=0.6)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def _legend(figure: Figure, handles: list[Any], labels: list[str], width: float) -> None:
+    # Inches: a letter of this size is about 0.065 wide, a handle with its gaps 0.55.
+    sizes = [0.065 * len(label) + 0.55 for label in labels]
+    columns = len(labels) if sum(sizes) <= width else max(1, int(width / max(sizes)))
+    figure.legend(
+        handles,
+        labels,
+        loc="outside upper center",
+        ncols=columns,
+        fontsize=8.5,
+        frameon=False,
+    )
