@@ -93,18 +93,18 @@ class NicoEnv(EnvBase):
         }
         count = batch.numel()
         if self.observation != "state":
-            shape = (FRAME_HEIGHT, FRAME_WIDTH, 3)
-            observation["pixels"] = Bounded(0, 255, shape=(*batch, *shape), dtype=torch.uint8)
+            shape = torch.Size([FRAME_HEIGHT, FRAME_WIDTH, 3])
+            observation["pixels"] = Bounded(0, 255, shape=batch + shape, dtype=torch.uint8)
             self._current["pixels"] = np.zeros((count, *shape), np.uint8)
         if self.observation != "pixels":
-            observation["state"] = Unbounded(shape=(*batch, STATE_SIZE))
+            observation["state"] = Unbounded(shape=torch.Size([*batch, STATE_SIZE]))
             self._current["state"] = np.zeros((count, STATE_SIZE), np.float32)
         self.observation_spec = Composite(observation, shape=batch)
-        self.action_spec = Bounded(-1.0, 1.0, shape=(*batch, 4))
-        self.reward_spec = Bounded(0.0, 1.0, shape=(*batch, 1))
+        self.action_spec = Bounded(-1.0, 1.0, shape=torch.Size([*batch, 4]))
+        self.reward_spec = Bounded(0.0, 1.0, shape=torch.Size([*batch, 1]))
         self.done_spec = Composite(
             {
-                key: Categorical(2, shape=(*batch, 1), dtype=torch.bool)
+                key: Categorical(2, shape=torch.Size([*batch, 1]), dtype=torch.bool)
                 for key in ("done", "terminated", "truncated")
             },
             shape=batch,
@@ -125,7 +125,7 @@ class NicoEnv(EnvBase):
         done = torch.from_numpy(self._done.copy()).reshape(*self.batch_size, 1)
         return {"done": done, "terminated": done.clone(), "truncated": torch.zeros_like(done)}
 
-    def _record(self, row: int, observation: dict[str, np.ndarray]) -> None:
+    def _record(self, row: int | np.intp, observation: dict[str, np.ndarray]) -> None:
         for key, value in self._current.items():
             value[row] = observation[key]
 
@@ -133,13 +133,16 @@ class NicoEnv(EnvBase):
         del kwargs
         rows = np.ones(len(self._task), dtype=bool)
         if tensordict is not None:
-            if "_reset" in tensordict.keys():
-                rows = tensordict["_reset"].reshape(-1).numpy()
+            reset = tensordict.get("_reset", None)
+            if reset is not None:
+                rows = reset.reshape(-1).numpy()
             task = tensordict.get("task", None)
             if task is not None:
                 chosen = task.reshape(-1).numpy()
                 if ((chosen < 0) | (chosen >= len(self.tasks)))[rows].any():
-                    raise ValueError(f"task must lie in 0..{len(self.tasks) - 1}, got {task}")
+                    raise ValueError(
+                        f"task must lie in 0..{len(self.tasks) - 1}, got {chosen.tolist()}"
+                    )
                 self._task[rows] = chosen[rows]
         for row in np.flatnonzero(rows):
             timestep = self._environments[row][self._task[row]].reset()
@@ -151,8 +154,11 @@ class NicoEnv(EnvBase):
         rows = ~self._done
         steps = tensordict.get("_step", None)
         if steps is not None:
-            rows = steps.reshape(-1).numpy()
+            rows = rows & steps.reshape(-1).numpy()
         actions = tensordict["action"].reshape(-1, 4).double().numpy()
+        # Checked for all before any of them moves.
+        if not np.isfinite(actions[rows]).all():
+            raise ValueError(f"an action is 4 finite numbers in [-1, 1], got {actions.tolist()}")
         rewards = np.zeros((len(rows), 1), np.float32)
         for row in np.flatnonzero(rows):
             timestep = self._environments[row][self._task[row]].step(actions[row])
@@ -193,12 +199,17 @@ class NicoEnv(EnvBase):
         """Continues from what `simulation_state` returned.
 
         Raises:
-            ValueError: If it belongs to another number of simulations.
+            ValueError: If it belongs to another number of simulations or kind of observation.
         """
         if len(state["physics"]) != len(self._environments):
             raise ValueError(
                 f"the state holds {len(state['physics'])} simulations, this environment has "
                 f"{len(self._environments)}: use the same number of seeds"
+            )
+        if state["current"].keys() != self._current.keys():
+            raise ValueError(
+                f"the state was saved with the observations {sorted(state['current'])}, this "
+                f"environment has {sorted(self._current)}: use the same observation"
             )
         for row, environments in enumerate(self._environments):
             environments[0].physics.set_full_state(state["physics"][row].numpy())

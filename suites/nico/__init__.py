@@ -5,4 +5,13 @@ from suites.nico import rendering  # isort: skip
 from suites.nico.nico import ALL_TASKS, load, register
 from suites.nico.physics import OBJECTS, Physics, scene_version, scene_xml
 
-__all__ = ["ALL_TASKS", "OBJECTS", "Physics", "load", "register", "rendering", "scene_version", "scene_xml"]
+__all__ = [
+    "ALL_TASKS",
+    "OBJECTS",
+    "Physics",
+    "load",
+    "register",
+    "rendering",
+    "scene_version",
+    "scene_xml",
+]

@@ -106,7 +106,7 @@ class NicoTask(control.Task):
         """Moves the joint targets by the action."""
         action = np.asarray(action, dtype=float)
         if action.shape != (4,) or not np.isfinite(action).all():
-            raise ValueError(f"an action is 4 finite numbers in [-1, 1], not {action}")
+            raise ValueError(f"an action is 4 finite numbers in [-1, 1], not {action.tolist()}")
         step = ACTION_SCALE[[0, 1, 2, 3, 3, 3]]
         joints = np.concatenate([physics.arm_angles(), physics.digit_curls()])
         target = np.clip(physics.data.ctrl, joints - step, joints + step)
@@ -131,7 +131,7 @@ class NicoTask(control.Task):
         return observation
 
     def get_observation(self, physics: Physics) -> OrderedDict[str, np.ndarray]:
-        """Returns new arrays ``pixels`` (uint8 ``[32, 64, 3]``) and ``state`` (``[16]``), as chosen."""
+        """Returns new arrays: ``pixels`` (uint8 ``[32, 64, 3]``) and/or ``state`` (``[16]``)."""
         observation: OrderedDict[str, np.ndarray] = OrderedDict()
         if self._observation != "state":
             if self._renderer is None:

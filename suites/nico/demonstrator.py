@@ -1,7 +1,8 @@
 """Scripted demonstrations of NICO's tasks, in the policy's own action space.
 
-A demonstrator moves the hand through a few noisy waypoints by inverse kinematics: above the place from which to sweep,
-down to the table, sideways into the object, and for grasping closes the hand. It follows the objects as they move.
+A demonstrator moves the hand through a few noisy waypoints by inverse kinematics: above the place
+from which to sweep, down to the table, sideways into the object, and for grasping closes the hand.
+It follows the objects as they move.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,8 +24,8 @@ _CLEAR_HEIGHT = TABLE_HEIGHT + 0.125  # (m) of the palm while it travels over th
 _SWEEP_HEIGHT = TABLE_HEIGHT + 0.045  # (m) of the palm while it sweeps
 _OPEN, _FIST = 0.05, 0.85  # (rad) curl of a segment
 
-# Where a pushed box lies, as (left of the arm's plane, beyond the wrist) (m): against the fist's knuckles when pushed
-# left, against the back of the hand when pushed right.
+# Where a pushed box lies, as (left of the arm's plane, beyond the wrist) (m): against the fist's
+# knuckles when pushed left, against the back of the hand when pushed right.
 _BEFORE_KNUCKLES, _BEHIND_BACK = (0.078, 0.105), (-0.043, 0.075)
 _SPEED = (0.041, 0.06)  # (rad a step) range of an episode's speed
 _HAND_SPEED = 0.08  # (rad a step)
@@ -120,7 +121,7 @@ class Demonstrator:
         return np.clip(action, -1.0, 1.0)
 
     def _grasp_glass(self) -> list[_Phase]:
-        """Sweep the open hand left until the glass stands between thumb and fingers, then close it."""
+        """Sweep the open hand left until the glass is between thumb and fingers, then close it."""
         noise = self._random.normal(0.0, _NOISE, 3)
         right = self._random.uniform(0.065, 0.085)
 
@@ -155,7 +156,8 @@ class Demonstrator:
             )
 
         def through(physics: Physics) -> np.ndarray:
-            # A box pushed along the arc drifts outwards along the hand, and off it unless the hand follows.
+            # A box pushed along the arc drifts outwards along the hand, and off it unless the hand
+            # follows.
             radius, angle = kinematics.to_polar(physics.object_position(box))
             radius = (radius + kinematics.to_polar(physics.object_position(target))[0]) / 2
             place = kinematics.polar(radius + _OUTWARD, angle - side * _LEAD / radius)
@@ -176,7 +178,7 @@ class Demonstrator:
         point: tuple[float, float],
         noise: np.ndarray | float = 0.0,
     ) -> np.ndarray:
-        """Returns the arm angles that put a point of the hand left (m, along the arc) of an object."""
+        """Returns the arm angles that put a point of the hand left (m, on the arc) of an object."""
         radius, angle = kinematics.to_polar(physics.object_position(name))
         place = kinematics.polar(radius, angle + left / radius) + noise
         return kinematics.inverse(np.append(place, height), point)

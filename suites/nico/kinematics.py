@@ -17,12 +17,12 @@ PALM = (0.0, 0.075)  # (m) centre of the palm
 
 
 def polar(radius: float, angle: float) -> np.ndarray:
-    """Returns the point ``[x, y]`` (m) at a radius (m) and angle (rad, left positive) from the yaw axis."""
+    """Returns ``[x, y]`` (m) at a radius (m) and angle (rad, left +) about the yaw axis."""
     return YAW_AXIS + radius * np.array([np.cos(angle), np.sin(angle)])
 
 
 def to_polar(position: np.ndarray) -> tuple[float, float]:
-    """Returns radius (m) and angle (rad, left positive) of a point ``[x, y, ...]`` about the yaw axis."""
+    """Returns radius (m) and angle (rad, left +) of a point ``[x, y, ...]`` about the yaw axis."""
     x, y = np.asarray(position)[:2] - YAW_AXIS
     return float(np.hypot(x, y)), float(np.arctan2(y, x))
 

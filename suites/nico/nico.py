@@ -66,7 +66,7 @@ def load(
 
 
 def register() -> None:
-    """Makes the tasks known to ``dm_control.suite`` as domain ``nico``, and so to all that wraps it.
+    """Makes the tasks known to ``dm_control.suite``, and so to its wrappers, as domain ``nico``.
 
     Example:
         >>> from dm_control import suite

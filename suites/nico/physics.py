@@ -1,5 +1,8 @@
 """Simulation of NICO at the table, with named geometric queries."""
 
+# MuJoCo's bindings come without stubs.
+# pyright: reportAttributeAccessIssue=false
+
 import hashlib
 from importlib import resources
 from typing import Final
@@ -25,7 +28,7 @@ def scene_xml() -> str:
 
 
 def scene_version() -> str:
-    """Returns the version of the scene; datasets and encoder weights are valid for one version only."""
+    """Returns the version of the scene; datasets and encoder weights are valid for one only."""
     return "nico-1-" + hashlib.sha256(scene_xml().encode()).hexdigest()[:8]
 
 
@@ -41,7 +44,7 @@ class Physics(dm_mujoco.Physics):
         return np.array(self.named.data.qpos[[f"{digit}_1" for digit in DIGITS]])
 
     def joint_angles(self) -> np.ndarray:
-        """Returns the controlled joints: the arm's three angles and the hand's mean curl (rad), ``[4]``."""
+        """Returns the arm's three angles and the hand's mean curl (rad), ``[4]``."""
         return np.append(self.arm_angles(), self.digit_curls().mean())
 
     def grip_position(self) -> np.ndarray:
@@ -57,22 +60,20 @@ class Physics(dm_mujoco.Physics):
         return np.array(self.named.data.xpos[name])
 
     def privileged_state(self) -> np.ndarray:
-        """Returns joint angles (rad) ``[4]``, grip position (m) ``[3]`` and three object positions (m) ``[9]``."""
+        """Returns joint angles (rad) ``[4]``, grip (m) ``[3]`` and object positions (m) ``[9]``."""
         objects = [self.object_position(name) for name in OBJECTS]
         return np.concatenate([self.joint_angles(), self.grip_position(), *objects])
 
     def full_state(self) -> np.ndarray:
         """Returns all that the simulation's future depends on, as one vector."""
-        state = np.empty(mujoco.mj_stateSize(self.model.ptr, _FULL_STATE))
-        mujoco.mj_getState(self.model.ptr, self.data.ptr, state, _FULL_STATE)
-        return state
+        return self.get_state(_FULL_STATE)
 
     def set_full_state(self, state: np.ndarray) -> None:
         """Continues from what ``full_state`` returned, bit for bit."""
-        mujoco.mj_setState(self.model.ptr, self.data.ptr, state, _FULL_STATE)
+        self.set_state(state, _FULL_STATE)
         mujoco.mj_forward(self.model.ptr, self.data.ptr)
         # Forward dynamics has moved the solver's warm start on: set it back.
-        mujoco.mj_setState(self.model.ptr, self.data.ptr, state, _FULL_STATE)
+        self.set_state(state, _FULL_STATE)
 
     def gap(self, first: str, second: str) -> float:
         """Returns the smallest distance between two geoms (m); negative where they overlap."""
@@ -97,7 +98,7 @@ class Physics(dm_mujoco.Physics):
         return bool((targets - self.digit_curls()).mean() > _PRESSING)
 
     def glass_held(self) -> bool:
-        """Returns whether the glass is between thumb side and finger side with the hand closing on it.
+        """Returns whether the glass is between thumb and finger side of a hand that is closing.
 
         A finger touches it, the thumb or the palm touches it, and the hand is being closed.
         Whether the glass stands or has been knocked over does not matter.

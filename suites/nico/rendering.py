@@ -1,9 +1,13 @@
 """Rendering of NICO's first-person frames at the speed the hardware allows.
 
-Importing this module chooses the OpenGL backend, because MuJoCo and dm_control read ``MUJOCO_GL`` once, when they are
-first imported: on Linux EGL if its library can be loaded, else OSMesa. A value the user has set is kept. It also sets
-``LP_NUM_THREADS=0`` where unset: llvmpipe's worker threads cost more than they give on a 64x32 frame.
+Importing this module chooses the OpenGL backend, because MuJoCo and dm_control read ``MUJOCO_GL``
+once, when they are first imported: on Linux EGL if its library can be loaded, else OSMesa. A value
+the user has set is kept. It also sets ``LP_NUM_THREADS=0`` where unset: llvmpipe's worker threads
+cost more than they give on a 64x32 frame.
 """
+
+# MuJoCo's bindings come without stubs.
+# pyright: reportAttributeAccessIssue=false
 
 import atexit
 import ctypes
@@ -125,7 +129,7 @@ class FrameRenderer:
                 "or set MUJOCO_GL to one of egl, osmesa, glfw"
             ) from error
         self._camera = mujoco.MjvCamera()
-        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED  # pyright: ignore[reportAttributeAccessIssue]
+        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
         self._camera.fixedcamid = camera_id
         # Registered after the OpenGL library's own exit handler, so that it runs before that one.
         atexit.register(_close, weakref.ref(self._renderer))

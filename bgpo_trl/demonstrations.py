@@ -1,0 +1,320 @@
+"""Demonstrations: record, store, load; and the bank of their embeddings."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import sys
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import tyro
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from tensordict import TensorDict
+from torch import Tensor
+from tqdm import tqdm
+
+from suites import nico
+from suites.nico.base import STATE_SIZE, Environment
+from suites.nico.demonstrator import Demonstrator
+from suites.nico.rendering import FRAME_HEIGHT, FRAME_WIDTH, FrameRenderer
+
+MAX_STEPS = 50
+_META = "dataset.json"
+_REMEDY = "record it anew with `python -m bgpo_trl.demonstrations PATH`"
+
+
+def _empty(n: int) -> TensorDict:
+    frames = MAX_STEPS + 1
+    return TensorDict(
+        {
+            "pixels": torch.zeros((), dtype=torch.uint8).expand(
+                n, frames, FRAME_HEIGHT, FRAME_WIDTH, 3
+            ),
+            "state": torch.zeros(()).expand(n, frames, STATE_SIZE),
+            "action": torch.zeros(()).expand(n, MAX_STEPS, 4),
+            "length": torch.zeros((), dtype=torch.int64).expand(n),
+            "task": torch.zeros((), dtype=torch.int64).expand(n),
+            "train": torch.zeros((), dtype=torch.bool).expand(n),
+            "seed": torch.zeros((), dtype=torch.int64).expand(n),
+        },
+        [n],
+    )
+
+
+def _checksum(dataset: TensorDict) -> str:
+    digest = hashlib.sha256()
+    for _, tensor in sorted(dataset.items()):
+        for rows in tensor.split(256):
+            digest.update(rows.numpy().data)
+    return digest.hexdigest()
+
+
+def record_demonstrations(
+    path: str | Path,
+    *,
+    tasks: Sequence[str] = nico.ALL_TASKS,
+    per_task: int = 1_200,
+    held_out_per_task: int = 200,
+    seed: int = 0,
+    progress: bool = True,
+) -> TensorDict:
+    """Records successful demonstrations of each task; continues a recording that was interrupted.
+
+    Row ``i`` is determined by ``seed`` and ``i`` alone, so an interrupted recording ends the same.
+
+    Args:
+        path: Folder of the dataset; made if missing.
+        tasks: Tasks to demonstrate, in the order of their labels.
+        per_task: Demonstrations of each task (1,200 in Sec. IV-B).
+        held_out_per_task: How many of those are held out for test episodes.
+        seed: Seed of starts and of the demonstrator's noise.
+        progress: Whether to show a progress bar.
+
+    Returns:
+        A memory-mapped TensorDict ``[N]`` with ``pixels`` uint8 ``[N, 51, 32, 64, 3]``, ``state``
+        ``[N, 51, 16]``, ``action`` ``[N, 50, 4]``, ``length`` int64 ``[N]`` (frames, one more than
+        actions), ``task`` int64 ``[N]``, ``train`` bool ``[N]`` (False: held out) and ``seed``
+        int64 ``[N]``. What lies beyond the length is zero.
+
+    Raises:
+        ValueError: If an argument is wrong, or there is another recording at that path.
+        OSError: If the disk has no room for it.
+        RuntimeError: If there is no OpenGL to render with.
+    """
+    unknown = [task for task in tasks if task not in nico.ALL_TASKS]
+    if unknown:
+        raise ValueError(f"no NICO task {unknown[0]!r}; choose from {', '.join(nico.ALL_TASKS)}")
+    if not 0 <= held_out_per_task < per_task:
+        raise ValueError(
+            f"held_out_per_task is {held_out_per_task}: it must be less than per_task, {per_task}"
+        )
+    path = Path(path)
+    wanted = {
+        "scene_version": nico.scene_version(),
+        "tasks": list(tasks),
+        "per_task": per_task,
+        "held_out_per_task": held_out_per_task,
+        "seed": seed,
+    }
+    if (path / _META).exists():
+        meta = _read_meta(path)
+        found = {key: meta.get(key) for key in wanted}
+        if found != wanted:
+            raise ValueError(
+                f"{path} holds another recording ({found}); choose another folder or remove it"
+            )
+        if meta.get("checksum"):
+            return load_demonstrations(path)
+        dataset = _open(path, per_task * len(tasks))
+    else:
+        dataset = _make(path, per_task * len(tasks))
+        _write_meta(path, wanted)
+    physics = nico.Physics.from_xml_string(nico.scene_xml())
+    shared = {"physics": physics, "renderer": FrameRenderer(physics.model.ptr)}
+    environments = [nico.load(task, observation="both", **shared) for task in tasks]
+    missing = torch.nonzero(dataset["length"] == 0).flatten().tolist()
+    for row in tqdm(missing, desc="record demonstrations", disable=not progress):
+        task = row // per_task
+        episode = _demonstrate(environments[task], seed, row)
+        n_frames = len(episode["pixels"])
+        for key in ("pixels", "state", "action"):
+            dataset[key][row, : len(episode[key])] = torch.from_numpy(episode[key])
+        dataset["task"][row] = task
+        dataset["seed"][row] = seed
+        dataset["train"][row] = row % per_task < per_task - held_out_per_task
+        # Written last: a row without a length is recorded again.
+        dataset["length"][row] = n_frames
+    _write_meta(path, {**wanted, "checksum": _checksum(dataset)})
+    return dataset
+
+
+def _demonstrate(env: Environment, seed: int, row: int) -> dict[str, np.ndarray]:
+    """Returns the first success among attempts whose seeds follow from seed and row."""
+    sequence = np.random.SeedSequence([seed, row])
+    while True:
+        start, noise = (int(child.generate_state(1)[0]) for child in sequence.spawn(2))
+        env.task.random.seed(start)
+        demonstrator = Demonstrator(env, seed=noise)
+        timestep = env.reset()
+        demonstrator.reset()
+        observations, actions = [timestep.observation], []
+        while not timestep.last():
+            actions.append(demonstrator(timestep))
+            timestep = env.step(actions[-1])
+            observations.append(timestep.observation)
+        if timestep.reward:
+            episode = {key: np.stack([o[key] for o in observations]) for key in observations[0]}
+            return {**episode, "action": np.stack(actions)}
+
+
+def _write_meta(path: Path, meta: dict) -> None:
+    temporary = path / (_META + ".tmp")
+    temporary.write_text(json.dumps(meta, indent=2))
+    temporary.replace(path / _META)
+
+
+def _read_meta(path: Path) -> dict:
+    try:
+        meta = json.loads((path / _META).read_text())
+    except FileNotFoundError:
+        raise ValueError(f"{path} is no dataset of demonstrations; {_REMEDY}") from None
+    except (json.JSONDecodeError, UnicodeDecodeError):
+        meta = None
+    if not isinstance(meta, dict) or not {"per_task", "tasks"} <= meta.keys():
+        raise ValueError(f"{path / _META} is damaged; remove {path} and {_REMEDY}")
+    return meta
+
+
+def _make(path: Path, n: int) -> TensorDict:
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OSError(f"cannot make the folder {path} ({error.strerror}); choose another") from None
+    dataset = _empty(n)
+    size = sum(value.numel() * value.element_size() for _, value in dataset.items())
+    free = shutil.disk_usage(path).free
+    if size > free:  # Writing to a memory map on a full disk kills the process.
+        raise OSError(
+            f"the dataset takes {size / 1e9:.1f} GB, {path} has {free / 1e9:.1f} GB left: "
+            "make room or choose another folder"
+        )
+    return dataset.memmap_like(str(path))
+
+
+def _open(path: Path, n: int) -> TensorDict:
+    expected = _empty(n)
+    for key, value in expected.items():
+        file = path / f"{key}.memmap"
+        size = value.numel() * value.element_size()
+        if not file.exists() or file.stat().st_size != size:
+            raise ValueError(f"{file} is missing or truncated; remove {path} and {_REMEDY}")
+    try:
+        return TensorDict.load_memmap(path)
+    except Exception as error:
+        raise ValueError(f"{path} cannot be read ({error}); remove it and {_REMEDY}") from error
+
+
+def load_demonstrations(path: str | Path, *, verify: bool = True) -> TensorDict:
+    """Opens a recorded dataset, memory-mapped.
+
+    Args:
+        path: Folder of the dataset.
+        verify: Whether to compare the checksum, which reads all of it.
+
+    Returns:
+        What `record_demonstrations` returned.
+
+    Raises:
+        ValueError: If it is missing, incomplete, damaged or of another scene version.
+    """
+    path = Path(path)
+    meta = _read_meta(path)
+    version = nico.scene_version()
+    if meta.get("scene_version") != version:
+        raise ValueError(
+            f"{path} was recorded in scene {meta.get('scene_version')}, this is {version}; "
+            f"{_REMEDY}"
+        )
+    if not meta.get("checksum"):
+        raise ValueError(
+            f"the recording at {path} is not complete; resume it with the same command"
+        )
+    dataset = _open(path, meta["per_task"] * len(meta["tasks"]))
+    if verify and _checksum(dataset) != meta["checksum"]:
+        raise ValueError(f"{path} is damaged (checksum differs); remove it and {_REMEDY}")
+    return dataset
+
+
+@dataclass(frozen=True)
+class DemonstrationBank:
+    """Embedded demonstrations: all that BGPO needs of them once the encoders are trained.
+
+    Attributes:
+        embedding: phi, float32 ``[N, 32]``.
+        task: Labels, int64 ``[N]``; for the draw of an episode's task and for evaluation.
+        train: Bool ``[N]``; False for demonstrations held out for test episodes.
+    """
+
+    embedding: Tensor
+    task: Tensor
+    train: Tensor
+
+    def seen(self) -> DemonstrationBank:
+        """Returns the demonstrations for training episodes."""
+        return self._select(self.train)
+
+    def held_out(self) -> DemonstrationBank:
+        """Returns the demonstrations for test episodes."""
+        return self._select(~self.train)
+
+    def _select(self, rows: Tensor) -> DemonstrationBank:
+        return DemonstrationBank(self.embedding[rows], self.task[rows], self.train[rows])
+
+    def save(self, path: str | Path, *, encoder_id: str) -> None:
+        """Writes the bank as safetensors, with the scene version and the encoders' identity."""
+        tensors = {"embedding": self.embedding, "task": self.task, "train": self.train}
+        meta = {"scene_version": nico.scene_version(), "encoder_id": encoder_id}
+        save_file({k: v.contiguous() for k, v in tensors.items()}, str(path), metadata=meta)
+
+    @classmethod
+    def load(cls, path: str | Path, *, encoder_id: str) -> DemonstrationBank:
+        """Reads a bank.
+
+        Raises:
+            ValueError: If it is missing, damaged, or made in another scene or by other encoders.
+        """
+        wanted = {"scene_version": nico.scene_version(), "encoder_id": encoder_id}
+        remedy = "make it anew with `--train-encoders`"
+        try:
+            with safe_open(str(path), framework="pt") as file:
+                meta = file.metadata() or {}
+                tensors = {k: file.get_tensor(k) for k in ("embedding", "task", "train")}
+        except FileNotFoundError:
+            raise ValueError(f"there is no demonstration bank at {path}; {remedy}") from None
+        except (SafetensorError, OSError) as error:
+            raise ValueError(f"{path} is damaged ({error}); {remedy}") from None
+        found = {key: meta.get(key) for key in wanted}
+        if found != wanted:
+            raise ValueError(f"{path} belongs to {found}, but needed is {wanted}; {remedy}")
+        return cls(**tensors)
+
+
+def encoder_id(parameters: dict[str, Tensor]) -> str:
+    """Returns a short identity of trained encoders, to match a bank with them."""
+    value = 0
+    for name in sorted(parameters):
+        value = zlib.crc32(parameters[name].detach().contiguous().numpy().tobytes(), value)
+    return f"{value:08x}"
+
+
+def main(
+    path: tyro.conf.Positional[Path],
+    per_task: int = 1_200,
+    held_out_per_task: int = 200,
+    seed: int = 0,
+) -> None:
+    """Records the dataset of demonstrations; the same command continues an interrupted one.
+
+    Args:
+        path: Folder of the dataset.
+        per_task: Demonstrations of each task.
+        held_out_per_task: How many of those are held out for test episodes.
+        seed: Seed of starts and noise.
+    """
+    record_demonstrations(path, per_task=per_task, held_out_per_task=held_out_per_task, seed=seed)
+
+
+if __name__ == "__main__":
+    try:
+        tyro.cli(main)
+    except (ValueError, OSError, RuntimeError) as error:
+        sys.exit(f"error: {error}")
+    except KeyboardInterrupt:
+        sys.exit("interrupted: the same command continues the recording")
