@@ -1,0 +1,253 @@
+"""Experience replay for one seed, or for a stack of seeds that step together."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from torch import Tensor
+
+__all__ = ["ReplayBuffer"]
+
+
+class ReplayBuffer:
+    """Ring buffer of transitions, sampled uniformly with replacement, each seed from its own.
+
+    The methods are named as in :class:`torchrl.data.ReplayBuffer`, which is not used because its
+    sampling by an index pair (row, seed) takes 3.6 ms for 10 seeds and 256 transitions, half as
+    long as the update itself; here it takes 0.66 ms, nearly all of it cache misses (adding: 0.16 ms
+    there, 0.07 ms here).
+
+    Address space is reserved for the whole capacity at the first transition, but the operating
+    system commits memory only as it is filled: 662 bytes a transition and seed for a latent of 64,
+    a behavior of 32, 4 actions, the next latent, reward and two flags; 6.6 GB for 10 full seeds of
+    10^6.
+
+    Args:
+        capacity: transitions kept for each seed, 10^6 in the paper; then the oldest are replaced.
+        batch_size: transitions ``B`` drawn for each seed by :meth:`sample`. 256 in the paper.
+        generator: source of the sampled indices. One generator makes a plain buffer; a sequence of
+            ``S`` generators makes a stack of ``S`` buffers, and buffer ``i`` draws the indices that
+            a plain one with generator ``i`` would draw.
+        keys: entries to store; ``None`` stores all that the first transition has.
+
+    Raises:
+        ValueError: if ``capacity``, ``batch_size`` or the number of generators is not positive.
+
+    Examples:
+        >>> generators = [torch.Generator().manual_seed(seed) for seed in range(10)]
+        >>> replay = ReplayBuffer(1000, batch_size=256, generator=generators)
+        >>> replay.add(TensorDict({"state": torch.zeros(10, 3), "action": torch.zeros(10, 2)}, 10))
+        >>> len(replay), replay.sample().shape
+        (1, torch.Size([10, 256]))
+    """
+
+    def __init__(
+        self,
+        capacity: int,
+        *,
+        batch_size: int = 256,
+        generator: torch.Generator | Sequence[torch.Generator],
+        keys: Sequence[NestedKey] | None = None,
+    ) -> None:
+        stacked = not isinstance(generator, torch.Generator)
+        self.generators = list(generator) if stacked else [generator]
+        if capacity < 1 or batch_size < 1 or not self.generators:
+            raise ValueError(
+                "capacity, batch_size and the number of generators must be at least 1, got "
+                f"{capacity}, {batch_size} and {len(self.generators)}"
+            )
+        self.capacity = capacity
+        self.batch_size = batch_size
+        self.keys = None if keys is None else list(keys)
+        n_seeds = len(self.generators)
+        self._shape = torch.Size([n_seeds] if stacked else [])
+        self._seed = torch.arange(n_seeds)
+        self._n_added = torch.zeros(n_seeds, dtype=torch.int64)
+        # Transition t of seed i is row (t % capacity) * n_seeds + i: a step of all seeds is one
+        # block, and a row is found by a single index, for which torch has its fastest kernels.
+        self._rows: dict[NestedKey, Tensor] = {}
+
+    @property
+    def sizes(self) -> Tensor:
+        """Number of transitions held for each seed, int64 ``[*S]``."""
+        return self._n_added.clamp(max=self.capacity).view(self._shape)
+
+    def __len__(self) -> int:
+        """Returns the number of transitions that every seed holds at least."""
+        return int(self.sizes.min())
+
+    def add(self, transition: TensorDictBase, mask: Tensor | None = None) -> None:
+        """Stores one transition of each seed.
+
+        Args:
+            transition: batch size ``[*S]``, with the entries to store.
+            mask: bool ``[*S]``, which seeds store theirs; ``None`` for all.
+
+        Raises:
+            ValueError: if an entry is missing or has another shape or dtype than those stored.
+        """
+        if transition.batch_size != self._shape:
+            raise ValueError(
+                f"the transition must have batch size {[*self._shape]}, one for each seed, got "
+                f"{[*transition.batch_size]}"
+            )
+        self._write(transition, 1, mask)
+
+    def extend(self, transitions: TensorDictBase, mask: Tensor | None = None) -> None:
+        """Stores ``T`` successive transitions of each seed.
+
+        Args:
+            transitions: batch size ``[T, *S]``, ``T`` at most the capacity.
+            mask: bool ``[T, *S]``, which of them to store; ``None`` for all.
+
+        Raises:
+            ValueError: if an entry is missing or has another shape or dtype than those stored.
+        """
+        n_steps, *shape = transitions.batch_size or [0]
+        if not 1 <= n_steps <= self.capacity or shape != [*self._shape]:
+            raise ValueError(
+                f"transitions must have batch size [T, *{[*self._shape]}] with 1 <= T <= "
+                f"{self.capacity}, got {[*transitions.batch_size]}"
+            )
+        self._write(transitions, n_steps, mask)
+
+    def sample(self, batch_size: int | None = None) -> TensorDict:
+        """Draws transitions of each seed, uniformly and with replacement.
+
+        Args:
+            batch_size: transitions a seed, by default the ``batch_size`` of the buffer.
+
+        Returns:
+            A new tensordict of batch size ``[*S, B]`` that shares no memory with the buffer.
+
+        Raises:
+            ValueError: if a seed holds no transition.
+        """
+        batch_size = self.batch_size if batch_size is None else batch_size
+        sizes = self.sizes.view(-1).tolist()
+        if not all(sizes):
+            raise ValueError(f"every seed needs a transition before the first sample, got {sizes}")
+        steps = torch.stack(
+            [
+                torch.randint(size, (batch_size,), generator=generator)
+                for size, generator in zip(sizes, self.generators, strict=True)
+            ]
+        )
+        rows = (steps * len(sizes) + self._seed.unsqueeze(-1)).view(-1)
+        batch = TensorDict(batch_size=[*self._shape, batch_size])
+        for key, stored in self._rows.items():
+            drawn = stored.index_select(0, rows)
+            batch.set(key, drawn.view(*batch.batch_size, *stored.shape[1:]))
+        return batch
+
+    def state_dict(self) -> dict[str, Any]:
+        """Returns the filled part of the buffer (a copy) and the states of the generators."""
+        return self._state().clone().to_dict()
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Restores what :meth:`state_dict` returned, so that the same samples follow.
+
+        Args:
+            state_dict: from a buffer of the same capacity and number of seeds.
+
+        Raises:
+            ValueError: if it comes from a buffer of another capacity or number of seeds.
+        """
+        n_added, capacity = state_dict["n_added"], int(state_dict["capacity"])
+        if capacity != self.capacity or len(n_added) != len(self._n_added):
+            raise ValueError(
+                f"the saved replay has capacity {capacity} and {len(n_added)} seeds, this one "
+                f"{self.capacity} and {len(self._n_added)}: build it with the saved sizes"
+            )
+        self._rows = {}
+        for key, saved in TensorDict(dict(state_dict.get("rows", {}))).items(True, True):
+            self._rows[key] = self._allocate(saved.shape[1:], saved.dtype)
+            self._rows[key][: len(saved)] = saved
+        self._n_added = n_added.clone()
+        for generator, state in zip(self.generators, state_dict["generators"], strict=True):
+            generator.set_state(state.clone())
+
+    def dumps(self, path: str | Path) -> None:
+        """Writes the filled part and the generators to a directory, without a copy in memory.
+
+        Args:
+            path: directory, created if missing.
+        """
+        self._state().memmap(str(path), copy_existing=True)
+
+    def loads(self, path: str | Path) -> None:
+        """Restores what :meth:`dumps` wrote.
+
+        Args:
+            path: directory given to :meth:`dumps`.
+
+        Raises:
+            ValueError: if it comes from a buffer of another capacity or number of seeds.
+        """
+        self.load_state_dict(TensorDict.load_memmap(str(path)))
+
+    def _state(self) -> TensorDict:
+        state = TensorDict(
+            {
+                "capacity": torch.tensor(self.capacity),
+                "n_added": self._n_added,
+                "generators": torch.stack([g.get_state() for g in self.generators]),
+            }
+        )
+        filled = int(self.sizes.max()) * len(self.generators)
+        for key, stored in self._rows.items():
+            state.set(("rows", *key) if isinstance(key, tuple) else ("rows", key), stored[:filled])
+        return state
+
+    @torch.no_grad()
+    def _write(self, transitions: TensorDictBase, n_steps: int, mask: Tensor | None) -> None:
+        shape, n_seeds = transitions.batch_size, len(self.generators)
+        if mask is not None and (mask.shape != shape or mask.dtype != torch.bool):
+            raise ValueError(f"mask must be bool {[*shape]}, got {mask.dtype} {[*mask.shape]}")
+        entries = self._checked_entries(transitions)
+        if not self._rows:
+            self._rows = {
+                key: self._allocate(entry.shape[len(shape) :], entry.dtype)
+                for key, entry in entries.items()
+            }
+
+        if mask is None:
+            step = self._n_added + torch.arange(n_steps).unsqueeze(-1)
+        else:
+            mask = mask.view(n_steps, n_seeds)
+            step = self._n_added + mask.cumsum(0) - 1
+        rows = step % self.capacity * n_seeds + self._seed
+        rows = rows.view(-1) if mask is None else rows[mask]
+        for key, stored in self._rows.items():
+            entry = entries[key].reshape(-1, *stored.shape[1:])
+            stored.index_copy_(0, rows, entry if mask is None else entry[mask.view(-1)])
+        self._n_added += n_steps if mask is None else mask.sum(0)
+
+    def _checked_entries(self, transitions: TensorDictBase) -> dict[NestedKey, Tensor]:
+        if not self._rows:
+            if self.keys is not None:
+                missing = [key for key in self.keys if key not in transitions.keys(True)]
+                if missing:
+                    raise ValueError(f"the transition lacks {missing}, which are to be stored")
+                transitions = transitions.select(*self.keys)
+            return dict(transitions.items(True, True))
+
+        entries, n_dims = {}, len(transitions.batch_size)
+        for key, stored in self._rows.items():
+            entry = entries[key] = transitions.get(key, None)
+            if entry is None:
+                raise ValueError(f"the transition lacks {key!r}, which was stored before")
+            if entry.shape[n_dims:] != stored.shape[1:] or entry.dtype != stored.dtype:
+                raise ValueError(
+                    f"{key!r} must be {stored.dtype} {[*stored.shape[1:]]} as stored before, got "
+                    f"{entry.dtype} {[*entry.shape[n_dims:]]}"
+                )
+        return entries
+
+    def _allocate(self, shape: torch.Size, dtype: torch.dtype) -> Tensor:
+        # Not zeros: writing them would commit the memory of the whole capacity at once.
+        return torch.empty(self.capacity * len(self.generators), *shape, dtype=dtype)

@@ -1,0 +1,128 @@
+"""The perceptrons compute what plain ones compute, and a seed in a stack is that seed alone."""
+
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+
+from bgpo_trl.modules.actor_critic import Actor, Critic, StackedLinear, StackedMLP
+
+
+def generators(n: int) -> list[torch.Generator]:
+    return [torch.Generator().manual_seed(seed) for seed in range(n)]
+
+
+def test_single_layer_is_nn_linear():
+    layer, reference = StackedLinear(3, 5), nn.Linear(3, 5)
+    with torch.no_grad():
+        reference.weight.copy_(layer.weight.T)
+        reference.bias.copy_(layer.bias)
+    x = torch.randn(4, 7, 3)
+    torch.testing.assert_close(layer(x), reference(x))
+
+
+@pytest.mark.parametrize("batch_size", [(4,), (2, 3)])
+@pytest.mark.parametrize("batch", [(), (7,), (5, 7)])
+def test_stacked_layer_applies_each_matrix_to_its_own_slice(batch_size, batch):
+    layer = StackedLinear(3, 5, batch_size)
+    x = torch.randn(*batch_size, *batch, 3)
+    y = layer(x)
+    assert y.shape == (*batch_size, *batch, 5)
+    for index in torch.cartesian_prod(*map(torch.arange, batch_size)).view(-1, len(batch_size)):
+        i = tuple(index.tolist())
+        torch.testing.assert_close(y[i], x[i] @ layer.weight[i] + layer.bias[i])
+
+
+def test_initial_weights_are_those_of_each_generator_alone():
+    stacked = StackedMLP(6, 2, hidden_sizes=(8, 4), batch_size=(3,), generator=generators(3))
+    for i, generator in enumerate(generators(3)):
+        alone = StackedMLP(6, 2, hidden_sizes=(8, 4), generator=generator)
+        for mine, theirs in zip(stacked.parameters(), alone.parameters(), strict=True):
+            assert torch.equal(mine[i], theirs)
+
+
+def test_initial_weights_are_uniform_within_one_over_root_of_inputs():
+    layer = StackedLinear(100, 300, (3,), torch.Generator().manual_seed(0))
+    for values in (layer.weight, layer.bias):
+        assert values.abs().max() <= 0.1
+        assert values.std().item() == pytest.approx(0.1 / math.sqrt(3), rel=0.05)
+        assert values.mean().item() == pytest.approx(0, abs=0.01)
+    assert not torch.equal(layer.weight[0], layer.weight[1])
+
+
+def test_seeds_do_not_share_gradients():
+    mlp = StackedMLP(3, 2, batch_size=(4,))
+    mlp(torch.randn(4, 5, 3))[2].sum().backward()
+    for parameter in mlp.parameters():
+        assert parameter.grad is not None
+        assert parameter.grad[2].abs().sum() > 0
+        assert parameter.grad[[0, 1, 3]].abs().sum() == 0
+
+
+def test_bad_sizes_are_refused():
+    with pytest.raises(ValueError, match="needs 3, got 2"):
+        StackedLinear(2, 2, (3,), generators(2))
+    with pytest.raises(ValueError, match="at least 1"):
+        StackedLinear(0, 2)
+    with pytest.raises(ValueError, match="one leading index per layer"):
+        StackedLinear(2, 2, (3,))(torch.zeros(5, 3, 2))
+
+
+def test_actor_is_the_network_of_the_paper():
+    actor = Actor()
+    weights = [tuple(parameter.shape) for parameter in actor.parameters()]
+    assert weights == [(96, 64), (64,), (64, 4), (4,)]
+    latent, behavior = torch.randn(5, 64), torch.randn(5, 32)
+    data = actor(TensorDict({"latent": latent, "behavior": behavior}, [5]))
+    w1, b1, w2, b2 = actor.parameters()
+    pre_tanh = (torch.cat([latent, behavior], -1) @ w1 + b1).clamp(min=0) @ w2 + b2
+    torch.testing.assert_close(data["pre_tanh_action"], pre_tanh)
+    torch.testing.assert_close(data["action"], pre_tanh.tanh())
+
+
+def test_critic_is_the_network_of_the_paper():
+    critic = Critic()
+    weights = [tuple(parameter.shape) for parameter in critic.parameters()]
+    assert weights == [(100, 64), (64,), (64, 1), (1,)]
+    parts = {"latent": torch.randn(5, 64), "behavior": torch.randn(5, 32)}
+    parts["action"] = torch.rand(5, 4)
+    data = critic(TensorDict(parts, [5]))
+    w1, b1, w2, b2 = critic.parameters()
+    value = (torch.cat(list(parts.values()), -1) @ w1 + b1).clamp(min=0) @ w2 + b2
+    torch.testing.assert_close(data["state_action_value"], value)
+
+
+def test_other_inputs_widths_and_depths_are_configuration():
+    keys = [("observation", "state"), "task_one_hot"]
+    options = {"in_keys": keys, "hidden_sizes": (16, 8), "batch_size": (3,)}
+    actor, critic = Actor(9, 2, **options), Critic(9, 2, **options)
+    data = TensorDict(
+        {"observation": {"state": torch.randn(3, 5, 6)}, "task_one_hot": torch.randn(3, 5, 3)},
+        [3, 5],
+    )
+    critic(actor(data))
+    assert data["action"].shape == (3, 5, 2)
+    assert data["state_action_value"].shape == (3, 5, 1)
+    assert [p.shape[-1] for p in actor.parameters() if p.ndim == 3] == [16, 8, 2]
+
+
+def test_stacked_actor_is_each_actor_alone_also_while_acting():
+    actor = Actor(batch_size=(3,), generator=generators(3))
+    latent, behavior = torch.randn(3, 64), torch.randn(3, 32)
+    action = actor(TensorDict({"latent": latent, "behavior": behavior}, [3]))["action"]
+    for i, generator in enumerate(generators(3)):
+        data = TensorDict({"latent": latent[i], "behavior": behavior[i]}, [])
+        torch.testing.assert_close(action[i], Actor(generator=generator)(data)["action"])
+
+
+def test_works_without_tensordict_and_names_a_missing_entry():
+    actor = Actor(3, 2, in_keys=["state"])
+    state = torch.randn(5, 3)
+    expected = actor(TensorDict({"state": state}, [5]))
+    pre_tanh, action = actor(state=state)
+    assert torch.equal(action, expected["action"])
+    assert torch.equal(pre_tanh, expected["pre_tanh_action"])
+    with pytest.raises(KeyError, match="state"):
+        actor(TensorDict({"latent": state}, [5]))
