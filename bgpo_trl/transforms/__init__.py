@@ -1,0 +1,14 @@
+"""TorchRL transforms: what an environment becomes for BGPO, one part a file."""
+
+from bgpo_trl.transforms.behavior_lookup import BehaviorLookup
+from bgpo_trl.transforms.behavior_matching import BehaviorMatchingReward
+from bgpo_trl.transforms.demonstration_source import DemonstrationSource, TaskSchedule
+from bgpo_trl.transforms.frame_encoder import FrameEncoder
+
+__all__ = [
+    "BehaviorLookup",
+    "BehaviorMatchingReward",
+    "DemonstrationSource",
+    "FrameEncoder",
+    "TaskSchedule",
+]

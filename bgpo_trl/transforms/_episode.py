@@ -1,0 +1,109 @@
+"""What the transforms share that write at the start of an episode and act at its end."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import cast
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from tensordict.utils import unravel_key
+from torch import Tensor, nn
+from torchrl.data import Composite, TensorSpec, Unbounded
+from torchrl.envs import Compose, EnvBase, StepCounter, Transform, TransformedEnv
+
+
+def starting(tensordict: TensorDictBase, done_key: NestedKey = "done") -> Tensor:
+    """Rows whose episode starts with this reset, bool `[*B]`: all without a `_reset` entry."""
+    reset_key = "_reset" if isinstance(done_key, str) else (*done_key[:-1], "_reset")
+    reset = tensordict.get(reset_key, None)
+    if reset is None:
+        return torch.ones(tensordict.batch_size, dtype=torch.bool, device=tensordict.device)
+    return _one_a_row(reset, tensordict)
+
+
+def ending(
+    tensordict: TensorDictBase, next_tensordict: TensorDictBase, done_key: NestedKey = "done"
+) -> Tensor:
+    """Rows whose episode ends with this step, bool `[*B]`.
+
+    A row that is stepped on after its end, or skipped by a partial step, does not end again.
+    """
+    done = next_tensordict.get(done_key)
+    was_done = tensordict.get(done_key, None)
+    return _one_a_row(done if was_done is None else done & ~was_done, next_tensordict)
+
+
+def _one_a_row(mask: Tensor, tensordict: TensorDictBase) -> Tensor:
+    ndim = tensordict.batch_dims
+    return mask.flatten(ndim).any(-1) if mask.ndim > ndim else mask
+
+
+class EpisodeTransform(Transform):
+    """Base of the transforms with entries that are set at reset and handed on from step to step.
+
+    Such entries are part of the observation, which must keep them: the next step reads them. What
+    happens at the end of an episode depends on `done`, so that a `StepCounter`, which sets it on
+    time-out, must come before.
+
+    Args:
+        in_keys: entries read.
+        out_keys: entries written.
+        done_key: the entry that says where an episode has ended; its sibling `_reset` says where
+            one starts.
+    """
+
+    def __init__(
+        self, in_keys: Sequence[NestedKey], out_keys: Sequence[NestedKey], done_key: NestedKey
+    ) -> None:
+        super().__init__(in_keys=list(in_keys), out_keys=list(out_keys))
+        self.done_key = unravel_key(done_key)
+
+    def _entries(self, observation_spec: Composite) -> dict[NestedKey, TensorSpec]:
+        """Specs of the entries handed on, given the observation so far."""
+        raise NotImplementedError
+
+    def _read_spec(self, observation_spec: Composite, key: NestedKey, source: str) -> TensorSpec:
+        if key not in observation_spec.keys(True, True):
+            raise ValueError(
+                f"{type(self).__name__} found no {key!r}: put {source} before it, or name another "
+                "entry in in_keys"
+            )
+        return observation_spec[key]
+
+    def _reset_env_preprocess(self, tensordict: TensorDictBase | None) -> TensorDictBase | None:
+        # Specs are only made when they are asked for. Making them now, before anything is reset,
+        # lets a wrong composition be refused for what it is.
+        cast(EnvBase, self.container).observation_spec  # noqa: B018
+        return tensordict
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Adds the entries of this transform."""
+        self._check_order()
+        for key, spec in self._entries(observation_spec).items():
+            observation_spec[key] = spec
+        return observation_spec
+
+    def _check_order(self) -> None:
+        env = self.container
+        if not isinstance(env, TransformedEnv):
+            return
+        transforms = list(_flat(env.transform))
+        if any(isinstance(t, StepCounter) for t in transforms[transforms.index(self) :]):
+            raise ValueError(
+                f"put StepCounter before {type(self).__name__}: it has to see where episodes end"
+            )
+
+
+def _flat(transform: nn.Module) -> Iterator[nn.Module]:
+    if isinstance(transform, Compose):
+        for part in transform.transforms:
+            yield from _flat(part)
+    else:
+        yield transform
+
+
+def unbounded(observation_spec: Composite, *shape: int, dtype: torch.dtype) -> Unbounded:
+    """Spec of an entry of shape `[*B, *shape]`."""
+    size = torch.Size((*observation_spec.shape, *shape))
+    return Unbounded(size, device=observation_spec.device, dtype=dtype)

@@ -1,0 +1,116 @@
+"""Frames of the environment to latent vectors (paper, section III-A)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+from torchrl.data import Composite
+from torchrl.envs import Transform
+
+from bgpo_trl.modules.vae import VAE
+from bgpo_trl.transforms._episode import starting, unbounded
+
+
+class FrameEncoder(Transform):
+    """Encodes every frame with a frozen encoder, `z = f_V(s)` (Alg. 1).
+
+    1. At reset, the frames of the rows that are being reset are encoded, and no others: with one
+       environment a seed, episodes end one at a time and the encoder is what costs most.
+    2. At every step, all new frames are encoded, the last ones of an episode included.
+    3. With `del_keys`, the frames are then dropped, so that neither a replay buffer nor a rollout
+       stores them.
+
+    No gradient is recorded; the encoder's parameters are left as they are. It also works on its own
+    or in a replay buffer, on any TensorDict with frames.
+
+    Reads the `in_keys`, uint8 `[*B, 32, 64, 3]`; writes the `out_keys`, float32 `[*B, 64]`.
+
+    Args:
+        vae: the encoder, with `latent(frames [..., 32, 64, 3]) -> latents [..., 64]`.
+        in_keys: the frames.
+        out_keys: their latents, one for each of the `in_keys`.
+        del_keys: drop the frames once they are encoded.
+        done_key: the `done` whose sibling `_reset` tells which rows are being reset.
+
+    Raises:
+        ValueError: if `in_keys` and `out_keys` differ in number, or the environment has no such
+            frames.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> encoder = FrameEncoder(VAE(), del_keys=True)
+        >>> frames = torch.zeros(5, 32, 64, 3, dtype=torch.uint8)
+        >>> data = encoder(TensorDict({"pixels": frames}, batch_size=[5]))
+        >>> print({key: value.shape for key, value in data.items()})
+        {'latent': torch.Size([5, 64])}
+    """
+
+    def __init__(
+        self,
+        vae: VAE,
+        in_keys: Sequence[NestedKey] = ("pixels",),
+        out_keys: Sequence[NestedKey] = ("latent",),
+        *,
+        del_keys: bool = False,
+        done_key: NestedKey = "done",
+    ) -> None:
+        if len(in_keys) != len(out_keys):
+            raise ValueError(
+                f"FrameEncoder needs one of out_keys for each of in_keys, got {len(out_keys)} for "
+                f"{len(in_keys)}"
+            )
+        super().__init__(in_keys=list(in_keys), out_keys=list(out_keys))
+        self.vae = vae
+        self.del_keys = del_keys
+        self.done_key = done_key
+
+    @torch.no_grad()
+    def _apply_transform(self, obs: Tensor) -> Tensor:
+        return self.vae.latent(obs)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Encodes the frames of any TensorDict."""
+        for in_key, out_key in zip(self.in_keys, self.out_keys, strict=True):
+            tensordict.set(out_key, self._apply_transform(tensordict[in_key]))
+        return self._drop(tensordict)
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        return self.forward(next_tensordict)
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        rows = starting(tensordict, self.done_key)
+        if rows.all():
+            return self.forward(tensordict_reset)
+        for in_key, out_key in zip(self.in_keys, self.out_keys, strict=True):
+            latent = self._apply_transform(tensordict_reset[in_key][rows])
+            # What is in the other rows does not matter: the environment keeps theirs.
+            every = latent.new_zeros(*rows.shape, latent.shape[-1])
+            every[rows] = latent
+            tensordict_reset.set(out_key, every)
+        return self._drop(tensordict_reset)
+
+    def _drop(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if self.del_keys:
+            tensordict.exclude(*self.in_keys, inplace=True)
+        return tensordict
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Adds the latents and, with `del_keys`, drops the frames."""
+        for in_key, out_key in zip(self.in_keys, self.out_keys, strict=True):
+            if in_key not in observation_spec.keys(True, True):
+                raise ValueError(
+                    f"FrameEncoder found no {in_key!r} in the environment: have it render, or name "
+                    "its frames in in_keys"
+                )
+            batch_dims = observation_spec.ndim
+            frame = observation_spec[in_key].zero()[(0,) * batch_dims]
+            n_latent = self._apply_transform(frame).shape[-1]
+            observation_spec[out_key] = unbounded(observation_spec, n_latent, dtype=torch.float32)
+            if self.del_keys:
+                del observation_spec[in_key]
+        return observation_spec

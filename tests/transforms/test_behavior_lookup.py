@@ -1,0 +1,136 @@
+"""BehaviorLookup: the behavior of an episode, and when GWR-B learns from it."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.collectors import Collector
+from torchrl.envs import Compose, RenameTransform, StepCounter, TransformedEnv, check_env_specs
+
+from bgpo_trl.transforms import BehaviorLookup, DemonstrationSource, TaskSchedule
+
+
+@pytest.fixture
+def make(MockEnv, make_bank, make_modules, generators):
+    def make(seeds=None, lengths=3, learn=True, behavior=None):
+        gwr = make_modules(seeds)[2]
+        source = DemonstrationSource(
+            make_bank(),
+            TaskSchedule((0, 0, 0)),
+            batch_size=gwr.batch_size,
+            generator=generators(seeds or [0]),
+        )
+        behavior = behavior or BehaviorLookup(gwr, learn=learn)
+        env = MockEnv(seeds, lengths)
+        return TransformedEnv(env, Compose(StepCounter(50), source, behavior)), gwr
+
+    return make
+
+
+def snapshot(gwr):
+    indices = range(gwr.batch_size.numel()) if gwr.batch_size else [()]
+    return [[t.clone() for t in gwr.graph(index)] for index in indices]
+
+
+def unchanged(gwr, before):
+    return [
+        all(torch.equal(a, b) for a, b in zip(now, then, strict=True))
+        for now, then in zip(snapshot(gwr), before, strict=True)
+    ]
+
+
+@pytest.mark.parametrize("seeds", [None, [4, 2, 3]])
+@pytest.mark.parametrize("learn", [True, False])
+def test_behavior_is_there_at_reset_and_stays_for_the_episode(make, play, seeds, learn):
+    env, gwr = make(seeds, learn=learn)
+    check_env_specs(env)
+    start = env.reset()
+    expected = gwr.lookup(start["demo_embedding"])
+    assert start["behavior"].equal(expected.embedding)
+    assert start["behavior_node"].equal(expected.node)
+    steps, _ = play(env, 3, start)  # one episode
+    for key in ("behavior", "behavior_node"):
+        for data in (steps, steps["next"]):
+            dim = len(env.batch_size)
+            assert data[key].equal(start[key].unsqueeze(dim).expand_as(data[key]))
+
+
+def test_behaviors_are_those_of_algorithm_1(make, make_modules, play):
+    seeds, lengths, n_steps = [4, 2, 3], [1, 2, 5], 120
+    env, gwr = make(seeds, lengths)
+    steps, _ = play(env, n_steps)
+    for row, (seed, length) in enumerate(zip(seeds, lengths, strict=True)):
+        reference = make_modules([seed])[2]
+        for start in range(0, n_steps, length):
+            phi = steps["demo_embedding"][row, start].unsqueeze(0)
+            match = reference.adapt(phi)  # b is from before adapting
+            torch.testing.assert_close(steps["behavior"][row, start], match.embedding[0])
+            assert steps["behavior_node"][row, start] == match.node[0]
+        torch.testing.assert_close(gwr.graph(row).weights, reference.graph(0).weights)
+    assert gwr.num_nodes[0] > 5  # it has grown; fixed points would agree in any order
+
+
+def test_learns_from_the_episodes_that_end_and_leaves_other_rows_alone(make, play):
+    env, gwr = make([0, 1, 2], [2, 3, 4])
+    before, data = snapshot(gwr), env.reset()
+    for ended in ([], [0], [1], [0, 2]):
+        _, data = play(env, 1, data)
+        assert unchanged(gwr, before) == [row not in ended for row in range(3)]
+        before = snapshot(gwr)
+
+
+def test_learns_nothing_while_being_made_or_checked_or_told_not_to(make, play):
+    env, gwr = make([0, 1], lengths=4)
+    before = snapshot(gwr)
+    check_env_specs(env, break_when_any_done="both")
+    Collector(env, frames_per_batch=4, total_frames=4).shutdown(close_env=False)
+    for _ in range(3):
+        env.reset()
+    assert all(unchanged(gwr, before))
+    env.transform[2].learn = False
+    env.train()  # has no influence
+    play(env, 12)
+    assert all(unchanged(gwr, before))
+    env.transform[2].learn = True
+    env.eval()  # nor has this
+    play(env, 12)
+    assert not any(unchanged(gwr, before))
+
+
+def test_the_same_network_tests_many_episodes_a_seed(MockEnv, make_bank, make_modules, play):
+    gwr = make_modules([0, 1])[2]
+    source = DemonstrationSource(make_bank(), TaskSchedule((0, 0, 0)), batch_size=[2, 4])
+    lookup = BehaviorLookup(gwr, learn=False)
+    env = TransformedEnv(MockEnv([[0] * 4, [1] * 4]), Compose(StepCounter(50), source, lookup))
+    data = env.reset()
+    assert data["behavior"].equal(gwr.lookup(data["demo_embedding"]).embedding)
+
+
+def test_ablation_takes_the_demonstration_for_the_behavior(make, play):
+    rename = RenameTransform(["demo_embedding"], ["behavior"], create_copy=True)
+    env, _ = make([0, 1], behavior=rename)
+    check_env_specs(env)
+    steps, _ = play(env, 12, env.reset())
+    assert steps["behavior"].equal(steps["demo_embedding"])
+    assert steps["next", "behavior"].equal(steps["demo_embedding"])
+
+
+def test_on_its_own_it_only_looks_up(make_modules):
+    gwr = make_modules([0, 1])[2]
+    before, phi = snapshot(gwr), torch.rand(2, 5, 32)
+    data = BehaviorLookup(gwr, learn=True)(TensorDict({"demo_embedding": phi}, [2, 5]))
+    assert data["behavior"].equal(gwr.lookup(phi).embedding)
+    assert all(unchanged(gwr, before))
+
+
+def test_refuses_what_cannot_work(MockEnv, make_bank, make_modules):
+    gwr = make_modules([0, 1])[2]
+    source = DemonstrationSource(make_bank(), TaskSchedule((0, 0, 0)), batch_size=[3])
+    lookup = BehaviorLookup(gwr, learn=True)
+    with pytest.raises(ValueError, match=r"batch_size=\(2,\), but the environment .* \(3,\)"):
+        TransformedEnv(MockEnv([0, 1, 2]), Compose(source, lookup)).reset()
+    with pytest.raises(ValueError, match="no 'demo_embedding': put DemonstrationSource before it"):
+        TransformedEnv(MockEnv([0, 1]), BehaviorLookup(gwr, learn=True)).reset()
+    with pytest.raises(ValueError, match="put StepCounter before"):
+        source = DemonstrationSource(make_bank(), TaskSchedule((0, 0, 0)), batch_size=[2])
+        lookup = BehaviorLookup(gwr, learn=True)
+        TransformedEnv(MockEnv([0, 1]), Compose(source, lookup, StepCounter(5))).reset()

@@ -1,0 +1,131 @@
+"""BehaviorMatchingReward: the trajectory's embedding as it grows, and what its end is worth."""
+
+import pytest
+import torch
+from torchrl.data import Unbounded
+from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv, check_env_specs
+
+from bgpo_trl.transforms import BehaviorMatchingReward, FrameEncoder
+
+
+def spans(n_steps, length):
+    """First and last step of every episode that ends within n_steps."""
+    return [(start, start + length - 1) for start in range(0, n_steps - length + 1, length)]
+
+
+@pytest.mark.parametrize("seeds", [None, [4, 2, 3]])
+def test_streams_the_embedding_of_the_trajectory(make_env, make_modules, play, seeds):
+    lengths = 4 if seeds is None else [2, 4, 9]  # the last one is cut off after 5
+    env = make_env(seeds, lengths)
+    check_env_specs(env)
+    steps, _ = play(env, 20)
+    lae = make_modules()[1]
+    rows = [(steps, 4)] if seeds is None else list(zip(steps, [2, 4, 5], strict=True))
+    for row, length in rows:
+        for start, end in spans(20, length):
+            first, later = row["latent"][start : start + 1], row["next", "latent"][start : end + 1]
+            trajectory = torch.cat([first, later])  # z_0 ... z_T, the last one included
+            phi = lae.encode(trajectory, torch.tensor(length + 1))
+            torch.testing.assert_close(row["next", "lae_h"][end], phi)
+            at_start = lae.encode(trajectory[:1], torch.tensor(1))
+            torch.testing.assert_close(row["lae_h"][start], at_start)
+
+
+def test_reward_by_hand_at_success_and_at_time_out(make_env, play):
+    env = make_env([0, 1], lengths=[3, 9], max_steps=5, beta=0.1)
+    steps, _ = play(env, 15)
+    after = steps["next"]
+    for row, length, success in ((0, 3, 1.0), (1, 5, 0.0)):
+        for t in range(15):
+            data = after[row, t]
+            last = (t + 1) % length == 0
+            error = sum((b - p) ** 2 for b, p in zip(data["behavior"], data["lae_h"], strict=True))
+            intrinsic = torch.exp(-(error**0.5)) if last else torch.tensor(0.0)
+            assert data["done"].item() is last
+            assert data["extrinsic_reward"].item() == (success if last else 0.0)
+            torch.testing.assert_close(data["intrinsic_reward"], intrinsic.unsqueeze(0))
+            torch.testing.assert_close(
+                data["reward"], data["extrinsic_reward"] + 0.1 * data["intrinsic_reward"]
+            )
+    assert after["terminated"][1].sum() == 0  # row 1 never succeeds, and is paid all the same
+    assert (after["intrinsic_reward"][1, 4::5] > 1e-4).all()
+
+
+def test_reward_sum_behind_it_sums_all_three(make_env, play):
+    env = make_env([0, 1], lengths=[3, 9], max_steps=5)
+    after = play(env, 15)[0]["next"]
+    for part in ("reward", "extrinsic_reward", "intrinsic_reward"):
+        for row, length in ((0, 3), (1, 5)):
+            for start, end in spans(15, length):
+                total = after[part][row, start : end + 1].sum(0)
+                torch.testing.assert_close(after[f"episode_{part}"][row, end], total)
+
+
+def test_without_beta_the_match_is_still_measured(make_env, play):
+    plain, weighted = (play(make_env(beta=beta), 8)[0]["next"] for beta in (0.0, 0.5))
+    assert plain["reward"].equal(plain["extrinsic_reward"])
+    assert plain["intrinsic_reward"].equal(weighted["intrinsic_reward"])
+    assert (weighted["reward"] > plain["reward"]).sum() == 2  # the two ends
+
+
+def test_an_end_is_paid_once(make_env):
+    env = make_env([0, 1], [2, 4])
+    data = env.reset()
+    paid = torch.zeros(2, 1)
+    for _ in range(7):  # stepping on without a reset
+        data = env.step(data.set("action", torch.zeros(2, 4)))
+        paid += data["next", "intrinsic_reward"] > 0
+        data = env.step_mdp(data)
+    assert paid.tolist() == [[1], [1]]
+
+
+def test_nested_keys_and_rewards_of_float64(MockEnv, make_modules, play):
+    vae, lae, _ = make_modules()
+    behavior = torch.linspace(-0.5, 0.5, 32)
+
+    class WithBehavior(MockEnv):
+        def __init__(self):
+            super().__init__([0, 1], 3, ("agent", "pixels"))
+            self.observation_spec["agent", "b"] = Unbounded((2, 32))
+            self.reward_spec = Unbounded((2, 1), dtype=torch.float64)
+
+        def _observe(self, action):
+            return super()._observe(action).set(("agent", "b"), behavior.expand(2, 32).clone())
+
+        def _step(self, tensordict):
+            data = super()._step(tensordict)
+            return data.set("reward", data["reward"].double())
+
+    h, c = ("agent", "h"), ("agent", "c")
+    env = TransformedEnv(
+        WithBehavior(),
+        Compose(
+            FrameEncoder(vae, [("agent", "pixels")], [("agent", "z")]),
+            StepCounter(5),
+            BehaviorMatchingReward(
+                lae,
+                in_keys=[("agent", "z"), ("agent", "b"), "reward"],
+                out_keys=[h, c, "extrinsic_reward", "intrinsic_reward"],
+            ),
+            RewardSum(),
+        ),
+    )
+    check_env_specs(env)
+    after = play(env, 6)[0]["next"]
+    match = torch.exp(-(after[h][:, 2] - behavior).norm(dim=-1))
+    torch.testing.assert_close(after["reward"][:, 2, 0], 1 + 0.1 * match.double())
+    assert after["intrinsic_reward"].dtype == torch.float64
+
+
+def test_refuses_what_cannot_work(MockEnv, make_env, make_modules):
+    vae, lae, _ = make_modules()
+    with pytest.raises(ValueError, match=r"beta must not be negative, got -0\.1"):
+        BehaviorMatchingReward(lae, -0.1)
+    with pytest.raises(ValueError, match="no 'latent': put FrameEncoder before it"):
+        TransformedEnv(MockEnv(), BehaviorMatchingReward(lae)).reset()
+    with pytest.raises(ValueError, match="no 'behavior': put BehaviorLookup before it"):
+        TransformedEnv(MockEnv(), Compose(FrameEncoder(vae), BehaviorMatchingReward(lae))).reset()
+    env = make_env()
+    env.append_transform(StepCounter(3, step_count_key="later"))
+    with pytest.raises(ValueError, match="put StepCounter before"):
+        env.reset()

@@ -1,0 +1,124 @@
+"""All transforms together, as a training run composes them."""
+
+import copy
+
+import pytest
+import torch
+from tensordict.nn import TensorDictModule
+from torchrl.envs import SerialEnv, check_env_specs
+
+AT_START = {
+    "latent",
+    "lae_h",
+    "lae_c",
+    "task",
+    "demo_embedding",
+    "demo_index",
+    "behavior",
+    "behavior_node",
+    "step_count",
+    "episode_reward",
+    "episode_extrinsic_reward",
+    "episode_intrinsic_reward",
+}
+
+
+@pytest.mark.parametrize("seeds", [None, [0], [0, 1, 2]])
+def test_all_keys_are_there_from_the_start(make_env, make_modules, seeds):
+    env = make_env(seeds, vae=make_modules()[0], del_keys=True)
+    check_env_specs(env, break_when_any_done="both")
+    start = env.reset()
+    assert AT_START | {"done", "terminated", "truncated"} == set(start.keys())
+    after = env.rand_step(start.clone())["next"]
+    rewards = {"reward", "extrinsic_reward", "intrinsic_reward"}
+    assert set(start.keys()) | rewards == set(after.keys())
+    for key in (*AT_START, *rewards):
+        assert env.full_observation_spec.get(key, env.full_reward_spec.get(key)).is_in(after[key])
+
+
+def test_partial_reset_changes_the_rows_it_resets_only(make_env):
+    env = make_env([0, 1, 2], lengths=9)
+    running = env.step_mdp(env.rand_step(env.reset()))
+    before = running.clone()
+    mask = torch.tensor([[False], [True], [False]])
+    after = env.reset(running.set("_reset", mask))
+    fresh = make_env([0, 1, 2], lengths=9).reset()
+    for key in AT_START:
+        assert after[key][[0, 2]].equal(before[key][[0, 2]])
+        torch.testing.assert_close(after[key][1], fresh[key][1])
+    assert not before["lae_h"][1].equal(fresh["lae_h"][1])
+
+
+@pytest.mark.parametrize(("real", "n_steps"), [(False, 40), (True, 10)])
+def test_a_row_of_a_batch_is_that_seed_alone(make_env, make_modules, play, real, n_steps):
+    vae = make_modules()[0] if real else None
+    seeds, lengths = [4, 2, 3], [1, 3, 9]
+    together, _ = play(make_env(seeds, lengths, vae=vae), n_steps)
+    for row, (seed, length) in enumerate(zip(seeds, lengths, strict=True)):
+        alone, _ = play(make_env([seed], [length], vae=vae), n_steps)
+        for key, value in alone[0].items(True, True):
+            torch.testing.assert_close(together[row][key], value)
+
+
+@pytest.mark.parametrize("use_buffers", [True, False])
+def test_each_worker_can_have_a_composition_of_its_own(make_env, play, use_buffers):
+    workers = [lambda: make_env(lengths=9), lambda: make_env(lengths=4)]
+    env = SerialEnv(2, workers, use_buffers=use_buffers)
+    check_env_specs(env)
+    together, _ = play(env, 12)
+    alone, _ = play(make_env(lengths=4), 12)
+    for key, value in together[1].items(True, True):
+        torch.testing.assert_close(alone[key], value)
+
+
+def test_rollout_and_step_and_maybe_reset_agree(make_env, play):
+    stepped, _ = play(make_env([0, 1], [2, 4]), 20)
+    policy = TensorDictModule(lambda z: torch.full((len(z), 4), 0.5), ["latent"], ["action"])
+    rolled = make_env([0, 1], [2, 4]).rollout(20, policy, break_when_any_done=False)
+    for key, value in stepped.items(True, True):
+        torch.testing.assert_close(rolled[key], value)
+
+
+def test_what_was_collected_is_not_overwritten(make_env):
+    env = make_env([0, 1], [2, 4])
+    data, kept, copies = env.reset(), [], []
+    for _ in range(9):
+        data["action"] = torch.full((2, 4), 0.5)
+        step, data = env.step_and_maybe_reset(data)
+        kept.append(step)
+        copies.append(step.clone())
+    assert (torch.stack(kept) == torch.stack(copies)).all()
+
+
+def test_single_environment_played_by_rollouts(make_env):
+    env = make_env(lengths=3)
+    source, gwr = env.transform[2], env.transform[3].gwr
+    before = gwr.graph().weights
+    drawn = [env.rollout(50)["demo_index"].unique().item() for _ in range(6)]
+    assert source.episode == 6
+    assert len(set(drawn)) > 2
+    assert not gwr.graph().weights.equal(before)
+
+
+@pytest.mark.parametrize("n_steps", [6, 7])  # at the start and in the midst of an episode
+def test_resumes_from_a_state_dict(make_env, play, n_steps):
+    env = make_env([0, 1], [2, 3])
+    _, data = play(env, n_steps)
+    saved, state, base = data.clone(), copy.deepcopy(env.state_dict()), copy.copy(env.base_env)
+    expected, _ = play(env, 12, data)
+    resumed = make_env([8, 9], [2, 3])
+    resumed.base_env.seeds, resumed.base_env.steps = base.seeds, base.steps
+    resumed.base_env.task = base.task
+    resumed.load_state_dict(state)
+    steps, _ = play(resumed, 12, saved)
+    for key, value in expected.items(True, True):
+        torch.testing.assert_close(steps[key], value)
+
+
+def test_a_reset_of_no_row_changes_nothing(make_env, make_modules):
+    env = make_env([0, 1], vae=make_modules()[0])
+    before = env.reset()
+    data = before.clone().set("_reset", torch.zeros(2, 1, dtype=torch.bool))
+    after = env.reset(data)
+    for key, value in before.items():
+        assert after[key].equal(value)

@@ -1,0 +1,232 @@
+"""DemonstrationSource and TaskSchedule: which task and demonstration an episode starts with."""
+
+import copy
+from types import SimpleNamespace
+
+import pytest
+import torch
+from torchrl.collectors import Collector
+from torchrl.envs import Compose, RewardSum, SerialEnv, StepCounter, TransformedEnv, check_env_specs
+
+from bgpo_trl.transforms import DemonstrationSource, TaskSchedule
+
+CONCURRENT = TaskSchedule((0, 0, 0))
+
+
+def episodes_of(steps, row=None):
+    """Index of the demonstration of each episode played, by where step_count starts anew."""
+    steps = steps if row is None else steps[row]
+    return steps["demo_index"][steps["step_count"].squeeze(-1) == 0].tolist()
+
+
+@pytest.fixture
+def make(MockEnv, make_bank, generators):
+    def make(seeds=None, lengths=3, schedule=CONCURRENT, base=None, **kwargs):
+        batch_size = [] if seeds is None else [len(seeds)]
+        kwargs.setdefault("generator", generators(seeds or [0]))
+        source = DemonstrationSource(make_bank(), schedule, batch_size=batch_size, **kwargs)
+        base = base or MockEnv(seeds, lengths)
+        return TransformedEnv(base, Compose(StepCounter(50), source)), source
+
+    return make
+
+
+@pytest.mark.parametrize("cumulative", [True, False])
+def test_schedule_presents_a_task_after_exactly_that_many_episodes(cumulative):
+    schedule = TaskSchedule(cumulative=cumulative)
+    episode = torch.tensor([[0, 6_999], [7_000, 12_999], [13_000, 20_000]])
+    first, second, third = [1, 0, 0], [int(cumulative), 1, 0], [int(cumulative)] * 2 + [1]
+    expected = torch.tensor([[first, first], [second, second], [third, third]]).bool()
+    assert schedule.available(episode).equal(expected)
+    assert schedule.available(episode[1, 0]).equal(expected[1, 0])
+
+
+@pytest.mark.parametrize("cumulative", [True, False])
+def test_tasks_presented_together_are_all_available(cumulative):
+    schedule = TaskSchedule((0, 0, 5), cumulative)
+    assert schedule.available(torch.tensor(4)).tolist() == [True, True, False]
+    assert CONCURRENT.available(torch.tensor(0)).all()
+
+
+@pytest.mark.parametrize("starts", [(), (1, 2), (0, -1)])
+def test_schedule_refuses_to_start_with_no_task(starts):
+    with pytest.raises(ValueError, match="starts must hold a 0"):
+        TaskSchedule(starts)
+
+
+@pytest.mark.parametrize("seeds", [None, [5, 6, 7]])
+def test_the_demonstration_is_of_the_task_that_the_environment_does(make, make_bank, play, seeds):
+    env, _ = make(seeds)
+    check_env_specs(env)
+    start = env.reset()
+    assert {"task", "demo_embedding", "demo_index"} <= set(start.keys())
+    steps, _ = play(env, 40, start)
+    bank = make_bank()
+    # The environment reports its task itself; that it agrees means that it was told in time.
+    for data in (steps, steps["next"]):
+        assert data["task"].equal(bank.task[data["demo_index"]])
+        assert data["demo_embedding"].equal(bank.embedding[data["demo_index"]])
+    assert steps["task"].unique().tolist() == [0, 1, 2]
+    assert steps["demo_index"].equal(steps["next", "demo_index"])  # the same up to the end
+
+
+def test_draws_tasks_uniformly_then_their_demonstrations(make, MockEnv):
+    bank = SimpleNamespace(  # task 0 has 8 demonstrations, task 1 has 2, task 2 is not presented
+        embedding=torch.zeros(12, 32), task=torch.tensor([0] * 8 + [1] * 2 + [2] * 2)
+    )
+    n = 2000
+    source = DemonstrationSource(
+        bank,
+        TaskSchedule((0, 0, 1)),
+        batch_size=[n],
+        generator=torch.Generator().manual_seed(0),
+    )
+    drawn = TransformedEnv(MockEnv([0] * n), source).reset()["demo_index"]
+    counts = torch.bincount(drawn, minlength=12)
+    expected = torch.tensor([n / 16] * 8 + [n / 4] * 2)
+    deviation = (counts[:10] - expected) / expected.sqrt()
+    assert counts[10:].sum() == 0
+    assert deviation.abs().max() < 3.5
+
+
+def test_every_row_follows_the_schedule_by_its_own_count(make, play):
+    env, source = make([0, 1], [2, 6], TaskSchedule((0, 3, 5), cumulative=False))
+    steps, _ = play(env, 36)
+    assert source.episode.tolist() == [18, 6]
+    for row, length in ((0, 2), (1, 6)):
+        episode = torch.arange(36) // length
+        assert steps["task"][row].equal((episode >= 3).long() + (episode >= 5).long())
+
+
+def test_partial_reset_draws_for_the_rows_it_resets(make, play, monkeypatch):
+    env, source = make([0, 1, 2], [2, 3, 4])
+    asked = []
+    draw = source._draw
+    monkeypatch.setattr(source, "_draw", lambda rows: (asked.append(rows.tolist()), draw(rows)))
+    steps, _ = play(env, 4)
+    assert asked == [
+        [True, True, True],
+        [True, False, False],
+        [False, True, False],
+        [True, False, True],
+    ]
+    # The running episodes keep theirs, the base environment included.
+    length = torch.tensor([2, 3, 4])
+    for t in range(1, 4):
+        running = t % length != 0
+        for key in ("demo_index", "task"):
+            assert steps[key][running, t].equal(steps[key][running, t - 1])
+    assert env.base_env.task_resets[1].tolist()[1:] == steps["task"][1:, 0].tolist()
+
+
+def test_a_row_of_a_batch_is_that_row_alone(make, play):
+    together, _ = play(make([3, 8, 5], [2, 3, 7])[0], 30)
+    for row, (seed, length) in enumerate([(3, 2), (8, 3), (5, 7)]):
+        alone, _ = play(make([seed], [length])[0], 30)
+        single, _ = play(make(None, length, generator=torch.Generator().manual_seed(seed))[0], 30)
+        assert episodes_of(together, row) == episodes_of(alone, 0) == episodes_of(single)
+        assert len(set(episodes_of(together, row))) > 3
+
+
+def test_continues_from_a_state_dict(make, play):
+    env, source = make([0, 1], [2, 3])
+    _, data = play(env, 6)  # both rows have just started an episode
+    state = copy.deepcopy(source.state_dict())
+    expected, _ = play(env, 12, data)
+    resumed, other = make([0, 1], [2, 3], generator=torch.Generator().manual_seed(99))
+    play(resumed, 5)  # whatever it did before
+    other.load_state_dict(state)
+    assert other.episode.tolist() == [3, 2]
+    steps, _ = play(resumed, 12)
+    for row in range(2):
+        assert episodes_of(steps, row) == episodes_of(expected, row)
+
+
+def test_an_episode_that_is_not_played_to_its_end_is_started_again(make, play):
+    env, source = make([0, 1], lengths=4)
+    first = env.reset()["demo_index"]
+    check_env_specs(env)
+    collector = Collector(env, frames_per_batch=4, total_frames=4)
+    assert source.episode.tolist() == [0, 0]
+    assert env.reset()["demo_index"].equal(first)
+    steps, _ = play(env, 3)
+    assert env.reset()["demo_index"].equal(first)
+    steps, data = play(env, 4)
+    assert source.episode.tolist() == [1, 1]
+    assert steps["demo_index"][:, 0].equal(first)
+    assert not data["demo_index"].equal(first)
+    collector.shutdown(close_env=False)
+
+
+def test_an_episode_ends_once(make):
+    env, source = make([0, 1], [2, 4])
+    env.rollout(4, break_when_any_done=False, break_when_all_done=True)  # row 0 waits for row 1
+    assert source.episode.tolist() == [1, 1]
+    data = env.reset()
+    for _ in range(6):  # stepping on without a reset
+        data = env.step_mdp(env.step(data.set("action", torch.zeros(2, 4))))
+    assert source.episode.tolist() == [2, 2]
+
+
+def test_follows_what_training_has_presented(make, make_bank, MockEnv, play):
+    training, source = make([0, 1], [2, 50], TaskSchedule((0, 3), cumulative=False))
+    testing = DemonstrationSource(
+        make_bank(), source.schedule, batch_size=[2, 4], generator=None, follow=source
+    )
+    env = TransformedEnv(MockEnv([[0] * 4, [1] * 4], 2), Compose(StepCounter(50), testing))
+    seen = []
+    for _ in range(3):
+        play(training, 4)
+        seen.append(play(env, 2)[0]["task"])
+    assert seen[0].unique().tolist() == [0]
+    assert seen[-1][0].unique().tolist() == [1]  # seed 0 has played six episodes ...
+    assert seen[-1][1].unique().tolist() == [0]  # ... and seed 1 none to its end
+    assert testing.episode.tolist() == [[3] * 4] * 2
+    assert not [key for key in testing.state_dict() if "follow" in key]
+
+
+@pytest.mark.parametrize("wrapped", [False, True])
+def test_reaches_environments_inside_a_serial_env(make, make_bank, MockEnv, play, wrapped):
+    def single(length):
+        return (
+            TransformedEnv(MockEnv(None, length), RewardSum()) if wrapped else MockEnv(None, length)
+        )
+
+    base = SerialEnv(2, [lambda: single(4), lambda: single(6)])
+    env, source = make([0, 1], base=base)
+    check_env_specs(env)
+    steps, _ = play(env, 24)
+    assert steps["task"].equal(make_bank().task[steps["demo_index"]])
+    assert source.episode.tolist() == [6, 4]
+
+
+def test_tells_when_the_environment_does_not_take_the_task(make, MockEnv):
+    class Stubborn(MockEnv):
+        def _reset(self, tensordict, **kwargs):
+            return super()._reset(tensordict.exclude("task"), **kwargs)
+
+    env, _ = make(list(range(9)), base=Stubborn([0] * 9))
+    with pytest.raises(ValueError, match="did not take the task drawn for it: it must read 'task'"):
+        env.reset()
+
+
+def test_refuses_what_cannot_work(make_bank, MockEnv, generators, make):
+    bank = make_bank(n_tasks=2)
+    with pytest.raises(ValueError, match="no demonstration of task 2"):
+        DemonstrationSource(bank, CONCURRENT)
+    with pytest.raises(ValueError, match=r"task \[N\], got shapes \(40, 32\) and \(39,\)"):
+        DemonstrationSource(
+            SimpleNamespace(embedding=bank.embedding, task=bank.task[1:]), TaskSchedule((0, 0))
+        )
+    with pytest.raises(ValueError, match="one or 3, one a row; got 2"):
+        DemonstrationSource(
+            bank, TaskSchedule((0, 0)), batch_size=[3], generator=generators([0, 1])
+        )
+    _, source = make([0, 1])
+    with pytest.raises(ValueError, match="must start with that of the source to follow"):
+        DemonstrationSource(bank, TaskSchedule((0, 0)), batch_size=[3], follow=source)
+    with pytest.raises(ValueError, match=r"batch_size=\(2,\), but the environment has \(3,\)"):
+        make([0, 1], base=MockEnv([0, 1, 2]))[0].reset()
+    with pytest.raises(ValueError, match="put StepCounter before DemonstrationSource"):
+        source = DemonstrationSource(make_bank(), CONCURRENT)
+        TransformedEnv(MockEnv(), Compose(source, StepCounter(50))).reset()

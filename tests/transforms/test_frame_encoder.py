@@ -1,0 +1,67 @@
+"""FrameEncoder: frames to latents, at reset and at every step, for no more rows than needed."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs import TransformedEnv, check_env_specs
+
+from bgpo_trl.transforms import FrameEncoder
+
+
+@pytest.mark.parametrize("seeds", [None, [4, 2, 3]])
+@pytest.mark.parametrize("keys", [("pixels", "latent"), (("agent", "pixels"), ("agent", "latent"))])
+@pytest.mark.parametrize("del_keys", [False, True])
+def test_latents_of_all_frames_from_the_reset_on(
+    MockEnv, make_modules, play, seeds, keys, del_keys
+):
+    vae, in_key, out_key = make_modules()[0], *keys
+    encoder = FrameEncoder(vae, [in_key], [out_key], del_keys=del_keys)
+    env = TransformedEnv(MockEnv(seeds, 3, in_key), encoder)
+    frames, _ = play(TransformedEnv(MockEnv(seeds, 3, in_key)), 8)
+    check_env_specs(env)
+    steps, _ = play(env, 8)
+    assert (in_key in steps.keys(True)) is not del_keys
+    for data, expected in ((steps, frames), (steps["next"], frames["next"])):
+        torch.testing.assert_close(data[out_key], vae.latent(expected[in_key]))
+    assert frames[in_key].float().std() > 5  # frames that show nothing would prove nothing
+
+
+def test_partial_reset_encodes_the_rows_that_are_reset_only(MockEnv, TopRow, play):
+    vae = TopRow()
+    env = TransformedEnv(MockEnv([0, 1, 2], [2, 3, 3]), FrameEncoder(vae))
+    data = env.reset()
+    del vae.n_frames[:]
+    steps, data = play(env, 3, data)
+    assert vae.n_frames == [3, 3, 1, 3, 2]
+    assert data["latent"].equal(vae.latent(data["pixels"]))
+    assert steps["latent"].equal(vae.latent(steps["pixels"]))
+
+
+def test_records_no_gradient_and_leaves_the_encoder_trainable(MockEnv):
+    class Trainable(torch.nn.Linear):
+        def latent(self, pixels):
+            return self(pixels[..., 0, :, 0].float())
+
+    encoder = Trainable(64, 64)
+    env = TransformedEnv(MockEnv(), FrameEncoder(encoder))
+    start = env.reset()
+    with torch.enable_grad():
+        steps = [start, env.rand_step(start)["next"]]
+    assert not any(step["latent"].requires_grad for step in steps)
+    assert encoder.weight.requires_grad
+
+
+def test_encodes_stored_frames_of_any_shape(make_modules):
+    vae = make_modules()[0]
+    frames = torch.randint(256, (2, 3, 32, 64, 3), dtype=torch.uint8)
+    data = FrameEncoder(vae, del_keys=True)(TensorDict({"pixels": frames}, [2, 3]))
+    assert set(data.keys()) == {"latent"}
+    assert data["latent"].equal(vae.latent(frames))
+
+
+def test_refuses_what_it_cannot_encode(MockEnv, make_modules):
+    vae = make_modules()[0]
+    with pytest.raises(ValueError, match="one of out_keys for each of in_keys"):
+        FrameEncoder(vae, ["left", "right"])
+    with pytest.raises(ValueError, match=r"found no 'left'.*in_keys"):
+        _ = TransformedEnv(MockEnv(), FrameEncoder(vae, ["left"])).observation_spec
