@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 
 @dataclass(frozen=True)
@@ -60,3 +61,88 @@ class RepresentationConfig:
     """Steps between checkpoints (about a minute each). Ours."""
     log_every: int = 20
     """Steps between rows of the log. Ours."""
+
+
+@dataclass(frozen=True)
+class DDPGConfig:
+    """The RL algorithm f_RL of Alg. 1."""
+
+    hidden_sizes: tuple[int, ...] = (64,)
+    """Hidden layers of actor and critic (Sec. IV-A: a 2-layer MLP of 64 hidden units)."""
+    learning_rate: float = 1e-3
+    """Rate of Adam (Sec. IV-A)."""
+    batch_size: int = 256
+    """Transitions an update (Sec. IV-A)."""
+    replay_size: int = 1_000_000
+    """Transitions kept for each seed (Sec. IV-A)."""
+    gamma: float = 0.95
+    """Discount. Ours: the paper does not say; an episode has about 20 steps."""
+    tau: float = 0.005
+    """Share of the weights that the target networks take over each update. Ours."""
+    noise: float = 0.3
+    """Standard deviation of the Gaussian exploration noise on the action. Ours."""
+    pre_tanh_penalty: float = 0.01
+    """Weight of the squared pre-tanh actions. Ours: without it all actions saturate."""
+    clip_targets: bool = True
+    """Clip bootstrapped targets to the attainable returns [0, 1 + beta]. Ours: without it Q grows
+    to hundreds."""
+    warmup_steps: int = 256
+    """Environment steps of each seed before the first update. Ours: one batch."""
+
+
+@dataclass(frozen=True)
+class BGPOConfig:
+    """Behavior-guided policy optimization (Alg. 1)."""
+
+    state: Literal["latent", "state"] = "latent"
+    """What the policy sees of the world: z of a frame, or (for the ladder) the ground truth."""
+    context: Literal["behavior", "demo_embedding", "task_one_hot"] = "behavior"
+    """What the policy is told to do: b of GWR-B; phi of the demonstration (the ablation without
+    GWR-B); or (for the ladder and the reference with labels) the task's label."""
+    beta: float = 0.1
+    """Weight of the intrinsic reward (Sec. IV-A); 0 is the ablation without it."""
+    max_steps: int = 50
+    """Steps of an episode (Sec. IV-B)."""
+    ddpg: DDPGConfig = field(default_factory=DDPGConfig)
+    """The RL algorithm."""
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """One run of an experiment: which seeds, how long, which tasks when."""
+
+    seeds: tuple[int, ...] = tuple(range(10))
+    """Seeds, run as one batch (Sec. IV: 10)."""
+    episodes: int = 20_000
+    """Training episodes of each seed (Figs. 6 and 8)."""
+    task_starts: tuple[int, ...] = (0, 7_000, 13_000)
+    """Episode from which each task is presented (Sec. IV-C); all 0 is the concurrent setting."""
+    eval_every: int = 1
+    """Training episodes between evaluations (1 in the paper)."""
+    eval_episodes: int = 1
+    """Test episodes of each task presented so far, each evaluation. The paper has one episode of
+    one random task; testing every task costs more and says more."""
+    checkpoint_minutes: float = 10.0
+    """Minutes between checkpoints. Ours."""
+    bgpo: BGPOConfig = field(default_factory=BGPOConfig)
+    """The algorithm."""
+
+
+PRESETS: dict[str, RunConfig] = {
+    "smoke": RunConfig(
+        seeds=(0, 1), episodes=12, task_starts=(0, 4, 8), eval_every=6, eval_episodes=1
+    ),
+    "quick": RunConfig(
+        seeds=(0, 1, 2), episodes=1_200, task_starts=(0, 420, 780), eval_every=60, eval_episodes=4
+    ),
+    "desk": RunConfig(
+        seeds=(0, 1, 2, 3, 4),
+        episodes=6_000,
+        task_starts=(0, 2_100, 3_900),
+        eval_every=100,
+        eval_episodes=5,
+    ),
+    "paper": RunConfig(),
+}
+"""What ``--preset`` names: every stage in minutes; learning to look at; five seeds overnight at
+most; the paper's scale."""

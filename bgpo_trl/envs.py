@@ -173,6 +173,12 @@ class NicoEnv(EnvBase):
             # All tasks of a simulation draw from one source.
             environments[0].task.random.seed(None if seed is None else seed + row)
 
+    def seed_rows(self, seeds: Sequence[int]) -> None:
+        """Sets the seed of each simulation's next starts, in ``[0, 2**32)``."""
+        for environments, seed in zip(self._environments, seeds, strict=True):
+            # All tasks of a simulation draw from one source.
+            environments[0].task.random.seed(seed)
+
     def simulation_state(self) -> dict[str, Any]:
         """Returns all that the future depends on, as tensors: physics, task, random numbers."""
         physics, random = [], []

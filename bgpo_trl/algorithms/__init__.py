@@ -1,0 +1,1 @@
+"""The algorithms: each file says, top to bottom, how its parts compose."""

@@ -1,0 +1,235 @@
+"""Behavior-Guided Policy Optimization (Alg. 1): GWR-B tells the task, DDPG learns to do it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torch.nn.functional import one_hot
+from torchrl.envs import (
+    Compose,
+    ObservationNorm,
+    RenameTransform,
+    RewardSum,
+    StepCounter,
+    Transform,
+    TransformedEnv,
+    UnaryTransform,
+)
+
+from bgpo_trl.configs import BGPOConfig
+from bgpo_trl.demonstrations import DemonstrationBank
+from bgpo_trl.envs import NicoEnv
+from bgpo_trl.modules.actor_critic import Actor, Critic
+from bgpo_trl.modules.gwr import GWRB
+from bgpo_trl.objectives.ddpg import DDPGLoss, ForeachSoftUpdate
+from bgpo_trl.replay import ReplayBuffer
+from bgpo_trl.representation import Representation
+from bgpo_trl.seeding import generators, stream_seed
+from bgpo_trl.transforms import (
+    BehaviorLookup,
+    BehaviorMatchingReward,
+    DemonstrationSource,
+    FrameEncoder,
+    TaskSchedule,
+)
+from suites.nico.base import STATE_SIZE
+
+# Middle and spread of joints (rad), grip and object positions (m) in demonstrations, so that the
+# ground truth comes to the policy in the scale that latents have.
+_STATE_LOC = (0.3, 0.9, 0.9, 0.45, 0.36, 0, 0.68, 0.4, 0.12, 0.655, 0.45, -0.05, 0.645)
+_STATE_LOC += (0.41, -0.21, 0.645)
+_STATE_SCALE = (0.35, 0.25, 0.35, 0.3, 0.06, 0.15, 0.05, *(0.03, 0.05, 0.02) * 3)
+
+
+def observe(config: BGPOConfig, encoders: Representation | None, n_tasks: int) -> list[Transform]:
+    """Returns the transforms from what the simulation shows to what the policy sees.
+
+    Args:
+        config: Says whether the policy sees latents or the ground truth, and a label or not.
+        encoders: The trained encoders; needed for latents.
+        n_tasks: Length of a label's one-hot vector.
+    """
+    transforms: list[Transform] = []
+    if config.state == "latent":
+        if encoders is None:
+            raise ValueError("state='latent' needs trained encoders")
+        transforms.append(FrameEncoder(encoders.vae, del_keys=True))
+    else:
+        loc, scale = torch.tensor(_STATE_LOC), torch.tensor(_STATE_SCALE)
+        transforms.append(ObservationNorm(loc, scale, in_keys=["state"], standard_normal=True))
+    if config.context == "task_one_hot":
+        transforms.append(
+            UnaryTransform(["task"], ["task_one_hot"], lambda t: one_hot(t, n_tasks).float())
+        )
+    return transforms
+
+
+class BGPO:
+    """BGPO, its ablations and its references with labels, for a batch of seeds.
+
+    Args:
+        config: Hyperparameters; ``state`` and ``context`` say what the policy sees.
+        seeds: One for each element of the batch; they share nothing but the encoders.
+        schedule: Which tasks are presented when.
+        bank: Embedded demonstrations for training episodes.
+        encoders: The trained encoders; None where neither latents nor embeddings are used.
+
+    Attributes:
+        env: The composition of transforms.
+        gwr: GWR-B, or None in the variants without it.
+        actor: The policy, ``[S]`` stacked.
+    """
+
+    name = "bgpo"
+
+    def __init__(
+        self,
+        config: BGPOConfig,
+        *,
+        seeds: Sequence[int],
+        schedule: TaskSchedule,
+        bank: DemonstrationBank,
+        encoders: Representation | None = None,
+    ) -> None:
+        self.config = config
+        batch = torch.Size([len(seeds)])
+        self.source = DemonstrationSource(
+            bank, schedule, batch_size=batch, generator=generators(seeds, "demonstrations")
+        )
+        self.gwr: GWRB | None = None
+        infer: list[Transform] = []
+        reward: list[Transform] = []
+        rewards = ["reward"]
+        embedding_size = bank.embedding.shape[-1]
+        if config.context == "behavior":
+            self.gwr = GWRB(embedding_size, batch_size=batch, generator=generators(seeds, "gwr"))
+            infer.append(BehaviorLookup(self.gwr, learn=True))
+        elif config.context == "demo_embedding":
+            infer.append(RenameTransform(["demo_embedding"], ["behavior"], create_copy=True))
+        if config.context != "task_one_hot":
+            if encoders is None:
+                raise ValueError(f"context={config.context!r} needs trained encoders")
+            reward.append(BehaviorMatchingReward(encoders.lae, beta=config.beta))
+            rewards += ["extrinsic_reward", "intrinsic_reward"]
+        self.env = TransformedEnv(
+            NicoEnv(
+                batch_size=batch,
+                seed=[stream_seed(seed, "env") for seed in seeds],
+                observation="pixels" if config.state == "latent" else "state",
+            ),
+            Compose(
+                *observe(config, encoders, schedule.n_tasks),
+                StepCounter(config.max_steps),
+                self.source,
+                *infer,
+                *reward,
+                RewardSum(in_keys=rewards, out_keys=[f"episode_{key}" for key in rewards]),
+            ),
+        )
+        context_key = "task_one_hot" if config.context == "task_one_hot" else "behavior"
+        context_size = schedule.n_tasks if context_key == "task_one_hot" else embedding_size
+        state_size = STATE_SIZE if encoders is None else encoders.vae.latent_size
+        self.in_keys = (config.state, context_key)
+        self._make_learner(seeds, state_size + context_size)
+
+    def _make_learner(self, seeds: Sequence[int], in_features: int) -> None:
+        ddpg, keys = self.config.ddpg, self.in_keys
+        network = {
+            "in_keys": keys,
+            "hidden_sizes": ddpg.hidden_sizes,
+            "batch_size": [len(seeds)],
+        }
+        self.actor = Actor(in_features, generator=generators(seeds, "actor"), **network)
+        critic = Critic(in_features, generator=generators(seeds, "critic"), **network)
+        highest = 1.0 + (self.config.beta if keys[1] == "behavior" else 0.0)
+        self.loss = DDPGLoss(
+            self.actor,
+            critic,
+            return_bounds=(0.0, highest) if ddpg.clip_targets else None,
+            pre_tanh_penalty=ddpg.pre_tanh_penalty,
+            constant_keys=[keys[1]],
+        )
+        self.loss.make_value_estimator(gamma=ddpg.gamma)
+        self.target_update = ForeachSoftUpdate(self.loss, tau=ddpg.tau)
+        self.optimizer = torch.optim.Adam(
+            list(self.loss.parameters()), lr=ddpg.learning_rate, fused=True
+        )
+        self.replay = ReplayBuffer(
+            ddpg.replay_size,
+            batch_size=ddpg.batch_size,
+            generator=generators(seeds, "replay"),
+            keys=[
+                *keys,
+                "action",
+                *(("next", key) for key in (keys[0], "reward", "terminated")),
+            ],
+        )
+        self._noise = generators(seeds, "exploration")
+
+    @torch.no_grad()
+    def act(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the ``action`` ``[S, 4]`` of the policy with exploration noise."""
+        action = self.actor(tensordict)["action"]
+        noise = [torch.randn(action.shape[-1:], generator=g) for g in self._noise]
+        action = action + self.config.ddpg.noise * torch.stack(noise)
+        return tensordict.set("action", action.clamp(-1.0, 1.0))
+
+    def learn(self, transition: TensorDictBase) -> dict[str, Tensor]:
+        """Stores a transition of each seed and makes one update of each.
+
+        Returns:
+            Losses, means over the seeds ``[]``; empty before the first update.
+        """
+        self.replay.add(transition)
+        if len(self.replay) < self.config.ddpg.warmup_steps:
+            return {}
+        losses = self.loss(self.replay.sample())
+        self.optimizer.zero_grad()
+        (losses["loss_actor"] + losses["loss_value"]).backward()
+        self.optimizer.step()
+        self.target_update.step()
+        n_seeds = self.source.episode.numel()
+        return {key: losses[key].detach() / n_seeds for key in ("loss_actor", "loss_value")}
+
+    @torch.no_grad()
+    def infer(self, embedding: Tensor, task: Tensor) -> Tensor:
+        """Returns what the policy is told for demonstrations, without learning from them.
+
+        Args:
+            embedding: phi of the demonstrations, ``[S, M, 32]``.
+            task: Their labels, int64 ``[S, M]``; read only by the variants that need a label.
+
+        Returns:
+            The policy's second input, ``[S, M, context]``.
+        """
+        if self.in_keys[1] == "task_one_hot":
+            return one_hot(task, self.source.schedule.n_tasks).float()
+        return embedding if self.gwr is None else self.gwr.lookup(embedding).embedding
+
+    def state_dict(self) -> dict[str, Any]:
+        """Returns all that the future of the run depends on but the tensordict in flight."""
+        return {
+            "loss": dict(self.loss.state_dict()),
+            "optimizer": self.optimizer.state_dict(),
+            "replay": self.replay.state_dict(),
+            "source": dict(self.source.state_dict()),
+            "gwr": None if self.gwr is None else dict(self.gwr.state_dict()),
+            "simulation": self.env.base_env.simulation_state(),
+            "noise": [generator.get_state() for generator in self._noise],
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continues from what `state_dict` returned."""
+        self.loss.load_state_dict(state["loss"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.replay.load_state_dict(state["replay"])
+        self.source.load_state_dict(state["source"])
+        if self.gwr is not None:
+            self.gwr.load_state_dict(state["gwr"])
+        self.env.base_env.load_simulation_state(state["simulation"])
+        for generator, saved in zip(self._noise, state["noise"], strict=True):
+            generator.set_state(saved)

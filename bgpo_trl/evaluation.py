@@ -1,0 +1,182 @@
+"""Test episodes: frozen weights, frozen GWR-B, no noise, held-out demonstrations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+from torchrl.envs import Compose, TransformedEnv
+
+from bgpo_trl.algorithms.bgpo import BGPO, observe
+from bgpo_trl.configs import BGPOConfig
+from bgpo_trl.demonstrations import DemonstrationBank
+from bgpo_trl.envs import NicoEnv
+from bgpo_trl.modules.actor_critic import Actor
+from bgpo_trl.representation import Representation
+from bgpo_trl.seeding import stream_seed
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """What a seed's evaluation depends on, taken at one moment of its training.
+
+    Attributes:
+        episode: Training episodes before it.
+        env_steps: Environment steps before it.
+        n_tasks: Tasks presented so far.
+        actor: The policy's weights, without the seed dimension.
+        context: The policy's second input for each test episode, ``[T * M, context]``.
+    """
+
+    episode: int
+    env_steps: int
+    n_tasks: int
+    actor: dict[str, Tensor]
+    context: Tensor
+
+
+@dataclass(frozen=True)
+class TestResult:
+    """Outcome of the test episodes of one evaluation of each seed.
+
+    Attributes:
+        success: Bool ``[S, T, M]``: seeds, tasks, episodes of a task; it is also the extrinsic return.
+        steps: Length of the episodes, int64 ``[S, T, M]``.
+    """
+
+    __test__ = False  # Not a test case of pytest's.
+
+    success: Tensor
+    steps: Tensor
+
+
+class Evaluator:
+    """Tests snapshots of all seeds as one batch.
+
+    Seeds reach an evaluation at different times. Each leaves a `Snapshot`; when all have, their
+    test episodes run side by side. Starts and demonstrations of an evaluation follow from the seed
+    and its number alone.
+
+    Args:
+        config: The algorithm's hyperparameters.
+        seeds: As in training.
+        n_tasks: Number of tasks, presented or not.
+        episodes: Test episodes ``M`` of each task.
+        bank: Held-out demonstrations.
+        encoders: As in training.
+    """
+
+    def __init__(
+        self,
+        config: BGPOConfig,
+        *,
+        seeds: Sequence[int],
+        n_tasks: int,
+        episodes: int,
+        bank: DemonstrationBank,
+        encoders: Representation | None,
+    ) -> None:
+        self.max_steps = config.max_steps
+        self.seeds = tuple(seeds)
+        self.shape = (len(seeds), n_tasks, episodes)
+        self._rows_of = [torch.nonzero(bank.task == task).flatten() for task in range(n_tasks)]
+        self._bank = bank
+        self.env = TransformedEnv(
+            NicoEnv(
+                batch_size=self.shape,
+                observation="pixels" if config.state == "latent" else "state",
+            ),
+            Compose(*observe(config, encoders, n_tasks)),
+        )
+        self._task = torch.arange(n_tasks)[:, None].expand(self.shape).contiguous()
+
+    def _rng(self, seed: int, number: int) -> np.random.Generator:
+        return np.random.default_rng([stream_seed(seed, "evaluation"), number])
+
+    @torch.no_grad()
+    def take(self, algorithm: BGPO, index: int, number: int, env_steps: int) -> Snapshot:
+        """Returns a snapshot of one seed.
+
+        Args:
+            algorithm: In training.
+            index: Position of the seed in the batch.
+            number: How many evaluations of this seed were before.
+            env_steps: The seed's environment steps so far.
+        """
+        rng = self._rng(self.seeds[index], number)
+        drawn = torch.cat(
+            [rows[torch.from_numpy(rng.integers(len(rows), size=self.shape[2]))] for rows in self._rows_of]
+        )
+        # All seeds look the same demonstrations up: GWR-B knows only whole batches.
+        embedding = self._bank.embedding[drawn].expand(len(self.seeds), -1, -1)
+        task = self._bank.task[drawn].expand(len(self.seeds), -1)
+        episode = algorithm.source.episode
+        return Snapshot(
+            episode=int(episode[index]),
+            env_steps=env_steps,
+            n_tasks=int(algorithm.source.schedule.available(episode - 1)[index].sum()),
+            actor={k: v[index].clone() for k, v in algorithm.actor.state_dict().items()},
+            context=algorithm.infer(embedding, task)[index].clone(),
+        )
+
+    @torch.no_grad()
+    def run(self, snapshots: Sequence[Snapshot], number: int, actor: Actor) -> TestResult:
+        """Plays the test episodes of all tasks presented to each seed.
+
+        Args:
+            snapshots: One of each seed.
+            number: How many evaluations were before.
+            actor: A policy of the right shape; its own weights are not used.
+
+        Returns:
+            Success and length; both 0 where a task was not yet presented.
+        """
+        weights = {key: torch.stack([s.actor[key] for s in snapshots]) for key in snapshots[0].actor}
+        context = torch.stack([s.context for s in snapshots]).unflatten(1, self.shape[1:])
+        starts = [
+            self._rng(seed, number).integers(2**32, size=self.shape[1:]) for seed in self.seeds
+        ]
+        self.env.base_env.seed_rows(np.stack(starts).ravel().tolist())
+        presented = torch.tensor([s.n_tasks for s in snapshots])
+        active = torch.arange(self.shape[1]) < presented[:, None]
+        active = active[:, :, None].expand(self.shape).clone()
+        success, steps = torch.zeros(self.shape, dtype=torch.bool), torch.zeros(self.shape).long()
+        state = self.env.reset(TensorDict({"task": self._task}, self.shape))
+        for _ in range(self.max_steps):
+            flat = state.flatten(1, 2).set(actor.in_keys[1], context.flatten(1, 2))
+            torch.func.functional_call(actor, weights, (flat,))
+            state.set("action", flat["action"].unflatten(1, self.shape[1:]))
+            state.set("_step", active)
+            state = self.env.step(state)["next"]
+            steps += active
+            success |= state["terminated"].squeeze(-1) & active
+            active = active & ~success
+            if not active.any():
+                break
+        return TestResult(success, steps)
+
+
+@torch.no_grad()
+def evaluate_random_policy(
+    *, n_tasks: int, episodes: int, seed: int = 0, max_steps: int = 50
+) -> Tensor:
+    """Returns the success rate of uniformly random actions on each task, float32 ``[n_tasks]``."""
+    shape = (n_tasks, episodes)
+    env = NicoEnv(batch_size=shape, seed=stream_seed(seed, "random policy") // 2, observation="state")
+    generator = torch.Generator().manual_seed(seed)
+    task = torch.arange(n_tasks)[:, None].expand(shape).contiguous()
+    state = env.reset(TensorDict({"task": task}, shape))
+    for _ in range(max_steps):
+        state.set("action", torch.rand(*shape, 4, generator=generator) * 2 - 1)
+        state = env.step(state)["next"]
+    return state["terminated"].squeeze(-1).float().mean(-1)
+
+
+def snapshot_to_dict(snapshot: Snapshot) -> dict[str, Any]:
+    """Returns the snapshot as plain containers, for a checkpoint."""
+    return dict(vars(snapshot))

@@ -1,0 +1,32 @@
+"""Independent streams of random numbers, each named, all from one seed."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+
+def stream_seed(seed: int, name: str) -> int:
+    """Returns the seed of a named stream, below 2**32, independent of all other names' and seeds'.
+
+    Args:
+        seed: Seed of the run.
+        name: What the stream is for, such as ``"exploration"``.
+    """
+    sequence = np.random.SeedSequence([seed, zlib.crc32(name.encode())])
+    return int(sequence.generate_state(1)[0])
+
+
+def generators(seeds: Sequence[int], name: str) -> list[torch.Generator]:
+    """Returns one generator for each seed, for one purpose; seed by seed the same in any batch.
+
+    Example:
+        >>> alone, = generators([7], "exploration")
+        >>> _, in_batch = generators([3, 7], "exploration")
+        >>> bool((torch.rand(4, generator=alone) == torch.rand(4, generator=in_batch)).all())
+        True
+    """
+    return [torch.Generator().manual_seed(stream_seed(seed, name)) for seed in seeds]

@@ -1,0 +1,202 @@
+"""The training loop: step all seeds, learn, test, log, save; continue what was interrupted."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tqdm import tqdm
+
+from bgpo_trl.algorithms.bgpo import BGPO
+from bgpo_trl.checkpoint import has_checkpoint, load_checkpoint, save_checkpoint
+from bgpo_trl.configs import RunConfig
+from bgpo_trl.demonstrations import DemonstrationBank
+from bgpo_trl.evaluation import Evaluator, Snapshot, snapshot_to_dict
+from bgpo_trl.logging import RunLogger
+from bgpo_trl.representation import Representation
+from bgpo_trl.transforms import TaskSchedule
+from suites import nico
+
+
+class Trainer:
+    """One run: an algorithm, its test episodes, its files.
+
+    Each seed of the batch plays ``config.episodes`` training episodes. Seeds that are done early go
+    on, unlogged, until the last one is; everything that is logged is what the seed alone would have
+    logged.
+
+    Args:
+        config: The run.
+        directory: The run's directory: ``config.json``, ``train.csv``, ``eval.csv``,
+            ``checkpoint/``.
+        bank: Embedded demonstrations, seen and held out.
+        encoders: Trained encoders; None for a run that does not use them.
+        resume: Continue the run in the directory, from its last checkpoint.
+        wandb: None, ``"online"`` or ``"offline"``: mirror the CSV there.
+        progress: Whether to show a progress bar.
+
+    Raises:
+        ValueError: If the directory holds another run, or one and ``resume`` is False.
+    """
+
+    def __init__(
+        self,
+        config: RunConfig,
+        directory: str | Path,
+        *,
+        bank: DemonstrationBank,
+        encoders: Representation | None = None,
+        resume: bool = False,
+        wandb: str | None = None,
+        progress: bool = True,
+    ) -> None:
+        self.config = config
+        self.directory = Path(directory)
+        self.progress = progress
+        schedule = TaskSchedule(starts=config.task_starts)
+        seeds = config.seeds
+        self.algorithm = BGPO(
+            config.bgpo, seeds=seeds, schedule=schedule, bank=bank.seen(), encoders=encoders
+        )
+        self.evaluator = Evaluator(
+            config.bgpo,
+            seeds=seeds,
+            n_tasks=schedule.n_tasks,
+            episodes=config.eval_episodes,
+            bank=bank.held_out(),
+            encoders=encoders,
+        )
+        self.env_steps = 0
+        # Snapshots of each seed that wait for the other seeds, and how many were evaluated.
+        self._waiting: list[list[Snapshot]] = [[] for _ in seeds]
+        self._evaluated = 0
+        self.logger = RunLogger(
+            self.directory, config=asdict(config), wandb=wandb, resume=resume
+        )
+        self._state: TensorDictBase | None = None
+        if resume:
+            self._resume()
+
+    def run(self) -> None:
+        """Trains to the end. An interrupt (Ctrl-C) leaves a checkpoint behind."""
+        algorithm, n_episodes = self.algorithm, self.config.episodes
+        state = algorithm.env.reset() if self._state is None else self._state
+        saved = time.monotonic()
+        episodes = algorithm.source.episode
+        bar = tqdm(
+            total=n_episodes * len(self.config.seeds),
+            initial=int(episodes.clamp(max=n_episodes).sum()),
+            desc="train",
+            unit="episode",
+            disable=not self.progress,
+        )
+        losses: dict[str, torch.Tensor] = {}
+        try:
+            while int(episodes.min()) < n_episodes:
+                before = episodes.clone()
+                state = algorithm.act(state)
+                transition, state = algorithm.env.step_and_maybe_reset(state)
+                losses = algorithm.learn(transition) or losses
+                self.env_steps += 1
+                self._state = state
+                for index in torch.nonzero(episodes > before).flatten().tolist():
+                    if before[index] < n_episodes:
+                        self._end_of_episode(index, transition, losses)
+                        bar.update()
+                self._evaluate(bar)
+                if time.monotonic() - saved > 60 * self.config.checkpoint_minutes:
+                    self.save()
+                    saved = time.monotonic()
+        finally:
+            bar.close()
+            if self._state is not None:
+                self.save()
+            self.logger.close()
+
+    def _end_of_episode(
+        self, index: int, transition: TensorDictBase, losses: dict[str, torch.Tensor]
+    ) -> None:
+        algorithm, end = self.algorithm, transition["next"][index]
+        episode = int(algorithm.source.episode[index])
+        has_intrinsic = "episode_extrinsic_reward" in end.keys()
+        extrinsic = end["episode_extrinsic_reward" if has_intrinsic else "episode_reward"]
+        nodes = 0 if algorithm.gwr is None else int(algorithm.gwr.num_nodes[index])
+        self.logger.log_train(
+            {
+                "algorithm": algorithm.name,
+                "seed": self.config.seeds[index],
+                "episode": episode,
+                "env_steps": self.env_steps,
+                "task": nico.ALL_TASKS[int(end["task"])],
+                "success": int(end["terminated"]),
+                "return": float(extrinsic),
+                "steps": int(end["step_count"]),
+                "intrinsic_return": float(end["episode_intrinsic_reward"]) if has_intrinsic else 0.0,
+                "num_nodes": nodes,
+                "loss_actor": float(losses.get("loss_actor", 0.0)),
+                "loss_value": float(losses.get("loss_value", 0.0)),
+            }
+        )
+        if episode % self.config.eval_every == 0:
+            number = self._evaluated + len(self._waiting[index])
+            self._waiting[index].append(
+                self.evaluator.take(algorithm, index, number, self.env_steps)
+            )
+
+    def _evaluate(self, bar: tqdm) -> None:
+        while all(self._waiting):
+            snapshots = [waiting.pop(0) for waiting in self._waiting]
+            result = self.evaluator.run(snapshots, self._evaluated, self.algorithm.actor)
+            self._evaluated += 1
+            for index, snapshot in enumerate(snapshots):
+                for task in range(snapshot.n_tasks):
+                    for success, steps in zip(
+                        result.success[index, task].tolist(),
+                        result.steps[index, task].tolist(),
+                        strict=True,
+                    ):
+                        self.logger.log_eval(
+                            {
+                                "algorithm": self.algorithm.name,
+                                "seed": self.config.seeds[index],
+                                "episode": snapshot.episode,
+                                "env_steps": snapshot.env_steps,
+                                "task": nico.ALL_TASKS[task],
+                                "success": int(success),
+                                "return": float(success),
+                                "steps": steps,
+                            }
+                        )
+            shown = result.success.float().mean((0, 2)).tolist()
+            bar.set_postfix_str("test success " + " ".join(f"{s:.2f}" for s in shown))
+
+    def save(self) -> None:
+        """Writes a checkpoint from which `resume` continues to the same curve."""
+        assert self._state is not None
+        state: dict[str, Any] = {
+            "algorithm": self.algorithm.state_dict(),
+            "state": self._state.clone().to_dict(),
+            "env_steps": self.env_steps,
+            "waiting": [[snapshot_to_dict(s) for s in waiting] for waiting in self._waiting],
+            "evaluated": self._evaluated,
+            "position": self.logger.position(),
+        }
+        save_checkpoint(self.directory / "checkpoint", state)
+
+    def _resume(self) -> None:
+        folder = self.directory / "checkpoint"
+        if not has_checkpoint(folder):
+            self.logger.truncate_to({})
+            return
+        state = load_checkpoint(folder)
+        self.algorithm.env.reset()  # Transforms make their caches at the first reset.
+        self.algorithm.load_state_dict(state["algorithm"])
+        self._state = TensorDict(state["state"], self.algorithm.env.batch_size)
+        self.env_steps = state["env_steps"]
+        self._waiting = [[Snapshot(**s) for s in waiting] for waiting in state["waiting"]]
+        self._evaluated = state["evaluated"]
+        self.logger.truncate_to(state["position"])
