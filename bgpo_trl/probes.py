@@ -19,7 +19,14 @@ from torch import Tensor
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
 from bgpo_trl.objectives.representation import SequenceReconstructionLoss
-from bgpo_trl.representation import Representation, encode_frames, split, valid_frames, valid_steps
+from bgpo_trl.representation import (
+    Representation,
+    encode_frames,
+    mean_frame,
+    split,
+    valid_frames,
+    valid_steps,
+)
 
 JOINTS = ("yaw", "pitch", "elbow", "hand")
 OBJECTS = ("glass", "green", "white")
@@ -213,7 +220,7 @@ def _probe_reconstruction(
     vae: VAE, train: TensorDictBase, held_out: TensorDictBase
 ) -> dict[str, float]:
     frames, frames_held_out = valid_frames(train), valid_frames(held_out)
-    mean = frames.sum(0, dtype=torch.int64) / (255 * len(frames))
+    mean = mean_frame(frames)
 
     def error(chunk: Tensor, guess: Tensor) -> Tensor:
         return (chunk / 255 - guess).square().sum((-3, -2, -1))

@@ -225,6 +225,11 @@ def valid_frames(dataset: TensorDictBase) -> Tensor:
     return pixels[valid_steps(dataset.get("length"), pixels.shape[1])]
 
 
+def mean_frame(frames: Tensor) -> Tensor:
+    """Returns the mean of uint8 ``[F, 32, 64, 3]`` as float32 ``[32, 64, 3]`` in [0, 1]."""
+    return frames.sum(0, dtype=torch.int64) / (255 * len(frames))
+
+
 def _train_vae(train: TensorDictBase, config: VAEConfig, fit: Fit, seed: int) -> VAE:
     if config.window < 2 or config.batch_size % config.window:
         raise ValueError(
@@ -256,6 +261,7 @@ def _train_vae(train: TensorDictBase, config: VAEConfig, fit: Fit, seed: int) ->
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         vae = VAE(config.latent_size, action.shape[-1])
+    vae.mean_frame.copy_(mean_frame(frames))
     loss = VAEInverseLoss(
         vae,
         reconstruction_weight=config.reconstruction_weight,

@@ -1,4 +1,4 @@
-"""Command line of stage 1: ``python -m bgpo_trl.train_encoders --dataset data/nico``."""
+"""Command line of stage 1: ``python -m bgpo_trl.train_encoders data/nico``."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import tyro
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 
 from bgpo_trl.configs import RepresentationConfig
 from bgpo_trl.csv_file import CsvFile
+from bgpo_trl.demonstrations import load_demonstrations
 from bgpo_trl.probes import probe
 from bgpo_trl.representation import (
     Representation,
@@ -19,7 +20,7 @@ from bgpo_trl.representation import (
     save_representation,
     train_representation,
 )
-from suites.nico import scene_version
+from suites import nico
 
 _COLUMNS = (
     "stage",
@@ -38,8 +39,8 @@ _COLUMNS = (
 class Arguments:
     """Trains both encoders on recorded demonstrations, then probes them."""
 
-    dataset: Path
-    """Folder of the recorded demonstrations (a memory-mapped TensorDict)."""
+    dataset: tyro.conf.Positional[Path]
+    """Folder of the recorded demonstrations."""
     weights: Path = field(default_factory=default_weights)
     """The file to write; by default the weights that come with the package."""
     folder: Path = Path("runs/encoders")
@@ -75,7 +76,7 @@ def train_encoders(
         representation = train_representation(
             dataset,
             config,
-            scene_version=str(scene_version()),
+            scene_version=nico.scene_version(),
             command=command,
             checkpoint=folder / "checkpoint",
             log=file.write,
@@ -87,10 +88,7 @@ def train_encoders(
 
 def main(arguments: Arguments) -> None:
     """Runs the command line; see ``--help``."""
-    try:
-        dataset = TensorDict.load_memmap(arguments.dataset)
-    except Exception as error:
-        raise ValueError(f"{arguments.dataset} holds no demonstrations: record some") from error
+    dataset = load_demonstrations(arguments.dataset)
     command = shlex.join(["python", "-m", "bgpo_trl.train_encoders", *sys.argv[1:]])
     train_encoders(dataset, arguments.weights, arguments.folder, arguments.config, command)
 
@@ -98,5 +96,7 @@ def main(arguments: Arguments) -> None:
 if __name__ == "__main__":
     try:
         main(tyro.cli(Arguments, description=Arguments.__doc__))
-    except ValueError as error:
+    except (ValueError, OSError) as error:
         sys.exit(f"error: {error}")
+    except KeyboardInterrupt:
+        sys.exit("interrupted: the same command continues the training")

@@ -26,14 +26,20 @@ class VAE(nn.Module):
     The encoder has three 3x3 convolutions of 32, 64 and 128 channels, each followed by ReLU and
     2x2 max-pooling, then two parallel dense layers for mean and log-variance. The decoder mirrors
     it with three transposed convolutions (kernel 4, stride 2: every "upsample by 2, then 3x3
-    convolution" is one of these, at a third less compute) and a sigmoid output. Everything runs
+    convolution" is one of these, at half the compute) and a sigmoid output. Everything runs
     channels-last, which is the layout the frames already have.
+
+    A fixed camera shows mostly the same table. So both ends work relative to a mean frame: it is
+    subtracted from what the encoder reads, and it is what the decoder shows when its last layer
+    says nothing. This is input normalisation and an output bias, nothing else, but it spares the
+    network hundreds of steps of learning the background before it turns to the objects.
 
     Args:
         latent_size: dimensions of z (paper: 64).
         action_size: dimensions of an action (paper: 4).
 
     Attributes:
+        mean_frame: ``[32, 64, 3]`` buffer in [0, 1], set before training; grey until then.
         latent_mean: ``[latent_size]`` buffer, subtracted from mu by :meth:`latent`.
         latent_std: ``[latent_size]`` buffer, divides mu in :meth:`latent`.
 
@@ -45,6 +51,7 @@ class VAE(nn.Module):
         torch.Size([10, 64])
     """
 
+    mean_frame: Tensor
     latent_mean: Tensor
     latent_std: Tensor
 
@@ -55,12 +62,17 @@ class VAE(nn.Module):
         self.encoder = nn.ModuleList(nn.Conv2d(a, b, 3, padding=1) for a, b in pairwise(_CHANNELS))
         self.mean_head = nn.Linear(_COARSE_SIZE, latent_size)
         self.log_variance_head = nn.Linear(_COARSE_SIZE, latent_size)
+        # Starts with little noise (sigma .14): as loud as the signal, it would first teach the
+        # decoder to ignore z.
+        nn.init.zeros_(self.log_variance_head.weight)
+        nn.init.constant_(self.log_variance_head.bias, -4.0)
         self.decoder_dense = nn.Linear(latent_size, _COARSE_SIZE)
         self.decoder = nn.ModuleList(
             nn.ConvTranspose2d(b, a, 4, stride=2, padding=1)
             for b, a in pairwise(reversed(_CHANNELS))
         )
         self.inverse_head = nn.Linear(2 * latent_size, action_size)
+        self.register_buffer("mean_frame", torch.full(FRAME_SHAPE, 0.5))
         self.register_buffer("latent_mean", torch.zeros(latent_size))
         self.register_buffer("latent_std", torch.ones(latent_size))
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -93,8 +105,9 @@ class VAE(nn.Module):
         x = x.unflatten(-1, _COARSE_SHAPE).contiguous(memory_format=torch.channels_last)
         for convolution in self.decoder[:-1]:
             x = F.relu(convolution(x))
-        x = torch.sigmoid(self.decoder[-1](x)).permute(0, 2, 3, 1)
-        return x.reshape(*z.shape[:-1], *FRAME_SHAPE)
+        # The bound keeps pixels that are nearly always black or white able to change.
+        x = self.decoder[-1](x).permute(0, 2, 3, 1) + torch.logit(self.mean_frame, eps=0.02)
+        return torch.sigmoid(x).reshape(*z.shape[:-1], *FRAME_SHAPE)
 
     def inverse(self, z: Tensor, z_next: Tensor) -> Tensor:
         """Predicts the action taken between two consecutive latents.
@@ -155,8 +168,7 @@ class VAE(nn.Module):
             raise ValueError(
                 f"pixels must be uint8 [..., 32, 64, 3], got {pixels.dtype} {tuple(pixels.shape)}"
             )
-        x = pixels.reshape(-1, *FRAME_SHAPE).permute(0, 3, 1, 2).to(self.mean_head.weight.dtype)
-        x = x / 255
+        x = (pixels.reshape(-1, *FRAME_SHAPE) / 255 - self.mean_frame).permute(0, 3, 1, 2)
         for convolution in self.encoder:
             # Pooling before ReLU gives the same result (both are monotone) on a quarter the data.
             x = F.relu(F.max_pool2d(convolution(x), 2))

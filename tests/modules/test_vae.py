@@ -1,0 +1,130 @@
+import pytest
+import torch
+import torch.nn.functional as F
+
+from bgpo_trl.modules.vae import VAE
+
+
+@pytest.fixture
+def vae() -> VAE:
+    torch.manual_seed(0)
+    vae = VAE()
+    vae.mean_frame.uniform_(0.1, 0.9)
+    return vae
+
+
+def frames(*batch: int, seed: int = 0) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randint(0, 256, (*batch, 32, 64, 3), dtype=torch.uint8, generator=generator)
+
+
+def test_encoder_is_the_papers(vae: VAE) -> None:
+    """Plain reference: NCHW, three times convolution, ReLU, pooling, in the paper's order."""
+    pixels = frames(5)
+    x = (pixels.float() / 255 - vae.mean_frame).permute(0, 3, 1, 2).contiguous()
+    for layer, channels in zip(vae.encoder, (32, 64, 128), strict=True):
+        assert layer.weight.shape[0] == channels
+        x = F.max_pool2d(F.relu(F.conv2d(x, layer.weight.contiguous(), layer.bias, padding=1)), 2)
+    assert x.shape[1:] == (128, 4, 8)
+    mu, log_variance = vae.encode(pixels)
+    torch.testing.assert_close(mu, vae.mean_head(x.flatten(1)))
+    torch.testing.assert_close(log_variance, vae.log_variance_head(x.flatten(1)))
+    assert mu.shape == log_variance.shape == (5, 64)
+
+
+def test_decoder_layer_can_be_upsampling_and_convolution(vae: VAE) -> None:
+    """A 3x3 kernel smeared over 2x2 is the 4x4 kernel that does both, at the borders too."""
+    x, kernel = torch.randn(2, 128, 4, 8), torch.randn(64, 128, 3, 3)
+    expected = F.conv2d(F.interpolate(x, scale_factor=2), kernel, padding=1)
+    smeared = F.conv2d(kernel.flatten(0, 1).unsqueeze(1), torch.ones(1, 1, 2, 2), padding=1)
+    layer = vae.decoder[0]
+    with torch.no_grad():
+        layer.weight.copy_(smeared.reshape(64, 128, 4, 4).flip(-1, -2).transpose(0, 1))
+        layer.bias.zero_()
+    torch.testing.assert_close(layer(x), expected, rtol=1e-4, atol=1e-3)
+
+
+@pytest.mark.parametrize("batch", [(), (3,), (2, 3), (0,), (2, 1, 3)])
+def test_leading_dimensions(vae: VAE, batch: tuple[int, ...]) -> None:
+    pixels = frames(*batch)
+    mu, log_variance = vae.encode(pixels)
+    assert mu.shape == log_variance.shape == vae.latent(pixels).shape == (*batch, 64)
+    decoded = vae.decode(mu)
+    assert decoded.shape == pixels.shape
+    assert ((decoded >= 0) & (decoded <= 1)).all()
+    action = vae.inverse(mu, mu)
+    assert action.shape == (*batch, 4)
+    assert (action.abs() <= 1).all()
+
+
+def test_a_frame_is_encoded_alike_alone_and_in_a_batch(vae: VAE) -> None:
+    pixels = frames(2, 7)
+    batch = vae.latent(pixels)
+    torch.testing.assert_close(vae.latent(pixels[1, 3]), batch[1, 3], rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(vae.latent(pixels[:, ::2]), batch[:, ::2], rtol=1e-4, atol=1e-6)
+
+
+def test_decoder_shows_the_mean_frame_when_its_last_layer_says_nothing(vae: VAE) -> None:
+    with torch.no_grad():
+        vae.decoder[-1].weight.zero_()
+        vae.decoder[-1].bias.zero_()
+    torch.testing.assert_close(vae.decode(torch.randn(2, 64))[1], vae.mean_frame)
+
+
+def test_inverse_reads_both_latents_in_order(vae: VAE) -> None:
+    z, z_next = torch.randn(3, 64), torch.randn(3, 64)
+    weight, bias = vae.inverse_head.weight, vae.inverse_head.bias
+    expected = (z @ weight[:, :64].T + z_next @ weight[:, 64:].T + bias).tanh()
+    torch.testing.assert_close(vae.inverse(z, z_next), expected)
+
+
+def test_latent_is_standardised_mu_without_gradient(vae: VAE) -> None:
+    pixels = frames(40)
+    mu, _ = vae.encode(pixels)
+    torch.testing.assert_close(vae.latent(pixels), mu, msg="unscaled before training")
+    vae.set_latent_scale(mu, floor=0.0)
+    latent = vae.latent(pixels)
+    assert not latent.requires_grad
+    torch.testing.assert_close(latent.mean(0), torch.zeros(64), atol=1e-4, rtol=0)
+    torch.testing.assert_close(latent.std(0), torch.ones(64), atol=1e-4, rtol=0)
+
+
+def test_collapsed_dimensions_are_not_amplified(vae: VAE) -> None:
+    """Spreads of 2 and 0.001 with a floor of 0.1: the second is divided by 0.2."""
+    mu = torch.zeros(2, 64)
+    mu[:, 0] = torch.tensor([3.0, 3 + 2 * 2**0.5])
+    mu[:, 1] = torch.tensor([0.0, 0.001 * 2**0.5])
+    vae.set_latent_scale(mu, floor=0.1)
+    torch.testing.assert_close(vae.latent_std, torch.tensor([2.0] + 63 * [0.2]))
+    torch.testing.assert_close(vae.latent_mean[0], torch.tensor(3 + 2**0.5))
+
+
+@pytest.mark.parametrize(
+    "mu",
+    [torch.ones(5, 64), torch.full((5, 64), torch.nan), torch.randn(1, 64), torch.randn(3, 2, 64)],
+    ids=["constant", "nan", "one-row", "shape"],
+)
+def test_refuses_a_useless_scale_and_stays_as_it_was(vae: VAE, mu: torch.Tensor) -> None:
+    with pytest.raises(ValueError, match="mu"):
+        vae.set_latent_scale(mu)
+    assert (vae.latent_mean == 0).all()
+    assert (vae.latent_std == 1).all()
+
+
+def test_state_dict_carries_the_scale(vae: VAE) -> None:
+    pixels = frames(4)
+    vae.set_latent_scale(vae.encode(pixels)[0])
+    other = VAE()
+    other.load_state_dict(vae.state_dict())
+    assert torch.equal(other.latent(pixels), vae.latent(pixels))
+
+
+@pytest.mark.parametrize(
+    "pixels",
+    [torch.zeros(2, 32, 64, 3), frames(2).permute(0, 3, 1, 2), frames(2)[:, :16]],
+    ids=["float", "channels-first", "too-small"],
+)
+def test_refuses_what_is_no_frame(vae: VAE, pixels: torch.Tensor) -> None:
+    for function in (vae.encode, vae.latent):
+        with pytest.raises(ValueError, match="uint8"):
+            function(pixels)

@@ -1,0 +1,176 @@
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import Tensor, nn
+
+from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
+from bgpo_trl.modules.vae import VAE
+from bgpo_trl.objectives.representation import SequenceReconstructionLoss, VAEInverseLoss
+
+
+class HandVAE(nn.Module):
+    """Two latents with known posterior; decodes to a constant; the action is ``z_next - z``."""
+
+    def __init__(self, mu: Tensor, log_variance: Tensor, grey: float = 0.0) -> None:
+        super().__init__()
+        self.mu, self.log_variance, self.grey = mu, log_variance, grey
+
+    def encode(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+        return self.mu, self.log_variance
+
+    def decode(self, z: Tensor) -> Tensor:
+        return torch.full((*z.shape[:-1], 32, 64, 3), self.grey)
+
+    def inverse(self, z: Tensor, z_next: Tensor) -> Tensor:
+        return z_next - z
+
+
+def windows(n: int = 2, k: int = 3, n_actions: int = 4, seed: int = 0) -> TensorDict:
+    generator = torch.Generator().manual_seed(seed)
+    pixels = torch.randint(0, 256, (n, k, 32, 64, 3), dtype=torch.uint8, generator=generator)
+    action = torch.rand(n, k, n_actions, generator=generator) * 2 - 1
+    return TensorDict({"pixels": pixels, "action": action}, [n, k])
+
+
+def test_hand_computed_numbers() -> None:
+    mu = torch.tensor([[[1.0, 0.0], [1.0, 2.0], [3.0, 2.0]]])
+    log_variance = torch.full_like(mu, -80.0)  # so that z is mu to float precision
+    data = windows(1, 3, 2)
+    data["pixels"] = torch.full_like(data["pixels"], 51)  # 0.2
+    data["action"] = torch.tensor([[[0.0, 1.0], [2.0, 1.0], [torch.nan, torch.nan]]])
+    loss = VAEInverseLoss(
+        HandVAE(mu, log_variance, grey=0.3),  # type: ignore[arg-type]
+        reconstruction_weight=2.0,
+        kl_weight=0.5,
+        inverse_weight=3.0,
+    )
+    result = loss(data)
+    # Transitions [0, 2] against [0, 1], and [2, 0] against [2, 1]; the last action is not read.
+    assert result["inverse"].item() == pytest.approx(0.5)
+    assert result["reconstruction"].item() == pytest.approx(6144 * 0.1**2, rel=1e-4)
+    # Squares 1, 5, 13 of three frames; each of two dimensions adds 80 - 1.
+    assert result["kl"].item() == pytest.approx(((1 + 5 + 13) / 3 + 2 * 79) / 2)
+    assert result["loss_inverse"].item() == pytest.approx(1.5)
+    assert result["loss_reconstruction"].item() == pytest.approx(2 * 61.44, rel=1e-4)
+    assert result["loss_kl"].item() == pytest.approx(result["kl"].item() / 2)
+    assert set(result.keys()) == set(loss.out_keys)
+
+
+def test_kl_of_the_prior_is_zero() -> None:
+    loss = VAEInverseLoss(HandVAE(torch.zeros(1, 3, 4), torch.zeros(1, 3, 4)))  # type: ignore[arg-type]
+    assert loss(windows(1))["kl"].item() == 0
+
+
+def test_z_is_sampled_with_the_posteriors_width() -> None:
+    """With actions zero the inverse loss is half the variance of z_next - z: sigma^2 a number."""
+    mu, log_variance = torch.zeros(4, 3, 1000), torch.full((4, 3, 1000), 2 * math.log(0.3))
+    generator = torch.Generator().manual_seed(0)
+    loss = VAEInverseLoss(HandVAE(mu, log_variance), generator=generator)  # type: ignore[arg-type]
+    data = windows(4, 3, 1000)
+    data["action"].zero_()
+    assert loss(data)["inverse"].item() == pytest.approx(1000 * 0.3**2, rel=0.05)
+
+
+def test_noise_comes_from_the_generator_alone() -> None:
+    torch.manual_seed(0)
+    vae = VAE()
+    results = []
+    for global_seed in (1, 2):
+        torch.manual_seed(global_seed)
+        loss = VAEInverseLoss(vae, generator=torch.Generator().manual_seed(5))
+        results.append(loss(windows())["reconstruction"])
+    assert torch.equal(*results)
+
+
+@pytest.mark.parametrize("term", ["reconstruction", "kl", "inverse"])
+def test_every_term_trains_the_encoder(term: str) -> None:
+    torch.manual_seed(0)
+    loss = VAEInverseLoss(VAE(), generator=torch.Generator().manual_seed(0))
+    loss(windows())[f"loss_{term}"].backward()
+    gradient = loss.vae.encoder[0].weight.grad
+    assert gradient is not None
+    assert gradient.abs().sum() > 0
+
+
+def test_parameters_are_the_networks_own() -> None:
+    vae = VAE()
+    assert {id(p) for p in VAEInverseLoss(vae).parameters()} == {id(p) for p in vae.parameters()}
+
+
+def test_leading_dimensions_and_other_keys() -> None:
+    torch.manual_seed(0)
+    vae, data = VAE(), windows(4)
+    expected = VAEInverseLoss(vae, generator=torch.Generator().manual_seed(0))(data)
+    loss = VAEInverseLoss(vae, generator=torch.Generator().manual_seed(0))
+    loss.set_keys(pixels="image", action=("agents", "action"))
+    renamed = TensorDict({"image": data["pixels"], "agents": {"action": data["action"]}}, [4, 3])
+    result = loss(renamed.reshape(2, 2, 3))
+    for key in list(expected.keys()):
+        torch.testing.assert_close(result[key], expected[key])
+
+
+def test_refuses_windows_without_a_transition() -> None:
+    with pytest.raises(ValueError, match="2 frames"):
+        VAEInverseLoss(VAE())(windows(2, 1))
+
+
+class Parrot(nn.Module):
+    """Reconstructs what it is told to."""
+
+    def __init__(self, reversed_latent: Tensor) -> None:
+        super().__init__()
+        self.reversed_latent = reversed_latent
+
+    def encode(self, z: Tensor, length: Tensor) -> Tensor:
+        return z[..., 0, :]
+
+    def decode(self, phi: Tensor, n_steps: int) -> Tensor:
+        return self.reversed_latent[..., :n_steps, :]
+
+
+def test_sequence_loss_by_hand() -> None:
+    latent = torch.tensor([[[1.0, 2.0], [3.0, 4.0], [9.0, 9.0]], [[5.0, 6.0], [9.0, 9.0], [9, 9]]])
+    data = TensorDict({"latent": latent, "length": torch.tensor([2, 1])}, [2])
+    backwards = torch.tensor([[[3.0, 4.0], [1.0, 2.0]], [[5.0, 6.0], [-7.0, 7.0]]])
+    key = "loss_reconstruction"
+    assert SequenceReconstructionLoss(Parrot(backwards))(data)[key] == 0  # type: ignore[arg-type]
+    backwards[0, 1] += torch.tensor([3.0, 0.0])
+    backwards[1, 0] += torch.tensor([0.0, 1.0])
+    # Squares 9 and 1 over three valid steps of two numbers.
+    loss = SequenceReconstructionLoss(Parrot(backwards))  # type: ignore[arg-type]
+    assert loss(data)[key].item() == pytest.approx(10 / 6)
+    loss = SequenceReconstructionLoss(Parrot(backwards[:1]))  # type: ignore[arg-type]
+    assert loss(data[:1])[key].item() == pytest.approx(9 / 4)
+
+
+@pytest.mark.parametrize("filler", [0.0, 100.0])
+def test_sequence_loss_and_gradient_ignore_padding(filler: float) -> None:
+    torch.manual_seed(0)
+    loss = SequenceReconstructionLoss(SequenceAutoencoder())
+    length = torch.tensor([7, 1, 51])
+    latent = torch.randn(3, 51, 64)
+    beyond = (torch.arange(51) >= length.unsqueeze(-1)).unsqueeze(-1)
+    gradients = []
+    for z in (latent, latent.masked_fill(beyond, filler)):
+        loss.zero_grad()
+        value = loss(TensorDict({"latent": z, "length": length}, [3]))["loss_reconstruction"]
+        value.backward()
+        gradients.append([value.detach(), *(p.grad.clone() for p in loss.parameters())])
+    torch.testing.assert_close(*gradients)
+
+
+def test_sequence_loss_learns_sequences() -> None:
+    torch.manual_seed(0)
+    loss = SequenceReconstructionLoss(SequenceAutoencoder(latent_size=4))
+    phase = torch.rand(64, 1, 1) * 6.28
+    latent = torch.sin(phase + torch.arange(12).reshape(1, 12, 1) / 3 + torch.arange(4.0))
+    data = TensorDict({"latent": latent, "length": torch.randint(6, 13, (64,))}, [64])
+    optimizer = torch.optim.Adam(loss.parameters(), 0.02)
+    for _ in range(150):
+        value = loss(data)["loss_reconstruction"]
+        optimizer.zero_grad()
+        value.backward()
+        optimizer.step()
+    assert value.item() < 0.1 * latent.var().item()
