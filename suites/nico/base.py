@@ -47,8 +47,9 @@ class NicoTask(control.Task):
     """Base of the tasks: subclasses say only when they have succeeded.
 
     The action ``[4]`` in [-1, 1] moves the targets of shoulder yaw, shoulder pitch and elbow by up
-    to 0.2 rad and of the hand by up to 0.4 rad a step. A target never runs further ahead of its
-    joint than one full step, so that what the robot sees is nearly all it needs to know.
+    to 0.2 rad and of the hand by up to 0.4 rad a step. A target that has run further ahead of its
+    joint than one full step is brought back to that before, so that what the robot sees is nearly
+    all it needs to know.
 
     Args:
         random: Source of the starts.

@@ -10,6 +10,7 @@ cost more than they give on a 64x32 frame.
 # pyright: reportAttributeAccessIssue=false
 
 import atexit
+import contextlib
 import ctypes
 import ctypes.util
 import importlib
@@ -83,11 +84,18 @@ _configure()
 import mujoco  # noqa: E402
 import numpy as np  # noqa: E402
 
+# What the garbage collector would free at any moment, between the calls that draw another frame.
+_abandoned: list[mujoco.Renderer] = []
 
-def _close(reference: weakref.ref[mujoco.Renderer]) -> None:
-    renderer = reference()
-    if renderer is not None:
-        renderer.close()
+
+def _close(renderer: mujoco.Renderer | None) -> None:
+    if renderer is None:
+        return
+    # MuJoCo frees buffers by number in whichever context is current, be it another renderer's,
+    # whose frames would be garbage from then on. Rendering makes the own context current.
+    with contextlib.suppress(RuntimeError):  # It was closed before.
+        renderer.render()
+    renderer.close()
 
 
 class FrameRenderer:
@@ -120,6 +128,8 @@ class FrameRenderer:
             names = [model.camera(i).name for i in range(model.ncam)]
             raise ValueError(f"no camera {camera!r} in the scene; choose one of {names}")
         choose_backend()
+        while _abandoned:
+            _close(_abandoned.pop())
         try:
             self._renderer = mujoco.Renderer(model, height, width, max_geom=200)
         except Exception as error:  # MuJoCo's backends raise errors of many kinds.
@@ -131,8 +141,10 @@ class FrameRenderer:
         self._camera = mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
         self._camera.fixedcamid = camera_id
+        weakref.finalize(self, _abandoned.append, self._renderer).atexit = False
         # Registered after the OpenGL library's own exit handler, so that it runs before that one.
-        atexit.register(_close, weakref.ref(self._renderer))
+        reference = weakref.ref(self._renderer)
+        atexit.register(lambda: _close(reference()))
 
     def render(self, data: mujoco.MjData, out: np.ndarray | None = None) -> np.ndarray:
         """Returns the frame that the camera sees.
@@ -149,4 +161,4 @@ class FrameRenderer:
 
     def close(self) -> None:
         """Frees the OpenGL context."""
-        self._renderer.close()
+        _close(self._renderer)

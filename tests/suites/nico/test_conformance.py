@@ -1,0 +1,403 @@
+"""What every task of the suite must keep to; modelled on ``dm_control.suite.tests.suite_test``."""
+
+import itertools
+
+import mujoco
+import numpy as np
+import pytest
+from dm_control import suite
+from torchrl.envs import DMControlWrapper, check_env_specs
+
+from suites import nico
+from suites.nico import kinematics
+from suites.nico.base import ACTION_SCALE, Environment
+from suites.nico.demonstrator import Demonstrator
+from suites.nico.physics import OBJECT_HALF_HEIGHT, OBJECTS, TABLE_HEIGHT, Physics
+
+all_tasks = pytest.mark.parametrize("task", nico.ALL_TASKS)
+
+
+@pytest.fixture
+def load(physics, renderer):
+    """Loads environments that share a simulation, so use one at a time."""
+    return lambda task, **kwargs: nico.load(task, physics=physics, renderer=renderer, **kwargs)
+
+
+def random_actions(count: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(-1.0, 1.0, (count, 4))
+
+
+def test_all_tasks_are_the_three_of_the_paper():
+    assert nico.ALL_TASKS == ("grasp_glass", "push_green_to_glass", "push_green_to_white")
+
+
+@all_tasks
+def test_what_is_emitted_matches_the_specs(load, task):
+    env = load(task, seed=0, observation="both")
+    specs = env.observation_spec()
+    assert (specs["pixels"].shape, specs["pixels"].dtype) == ((32, 64, 3), np.uint8)
+    assert (specs["state"].shape, specs["state"].dtype) == ((16,), np.float64)
+    assert (env.action_spec().shape, env.action_spec().dtype) == ((4,), np.float64)
+    assert (env.action_spec().minimum.item(), env.action_spec().maximum.item()) == (-1.0, 1.0)
+
+    timesteps = [env.reset(), *(env.step(action) for action in random_actions(12))]
+
+    for timestep in timesteps:
+        assert timestep.observation.keys() == specs.keys()
+        for key, value in timestep.observation.items():
+            specs[key].validate(value)
+        if not timestep.first():
+            env.reward_spec().validate(timestep.reward)
+            env.discount_spec().validate(timestep.discount)
+            assert timestep.reward in (0.0, 1.0)
+
+
+@all_tasks
+@pytest.mark.parametrize(("observation", "keys"), [("pixels", ["pixels"]), ("state", ["state"])])
+def test_only_what_was_asked_for_is_observed(load, task, observation, keys):
+    env = load(task, seed=0, observation=observation)
+
+    assert list(env.observation_spec()) == keys
+    assert list(env.reset().observation) == keys
+
+
+@all_tasks
+def test_frames_show_the_scene(load, task):
+    pixels = load(task, seed=0).reset().observation["pixels"].reshape(-1, 3).astype(int)
+    red, green, blue = pixels.T
+
+    assert ((red > 2 * green) & (red > 2 * blue)).sum() >= 8
+    assert ((green > 2 * red) & (green > 2 * blue)).sum() >= 8
+    assert (pixels.min(axis=1) > 150).sum() >= 8
+    assert pixels.std() > 20
+
+
+@all_tasks
+def test_state_is_joints_grip_and_objects(load, task):
+    env = load(task, seed=0, observation="state")
+    state = env.reset().observation["state"]
+
+    angles, positions = env.physics.named.data.qpos, env.physics.named.data
+    hand = [angles["thumb_1"], angles["upper_finger_1"], angles["lower_finger_1"]]
+    arm = [angles["shoulder_yaw"], angles["shoulder_pitch"], angles["elbow"]]
+    expected = [*np.ravel(arm), np.mean(hand), *positions.site_xpos["grip"]]
+    expected += [x for name in ("glass", "green_box", "white_box") for x in positions.xpos[name]]
+    np.testing.assert_array_equal(state, expected)
+
+
+@all_tasks
+def test_time_out_is_after_50_steps_and_keeps_the_discount(load, task):
+    env = load(task, seed=0, observation="state")
+    env.reset()
+
+    timesteps = [env.step(np.zeros(4)) for _ in range(50)]
+
+    assert [timestep.last() for timestep in timesteps] == [False] * 49 + [True]
+    assert {timestep.reward for timestep in timesteps} == {0.0}
+    assert {timestep.discount for timestep in timesteps} == {1.0}
+    assert env.step(np.zeros(4)).first()
+
+
+@all_tasks
+@pytest.mark.parametrize("steps", [1, 2])
+def test_success_has_discount_0_even_on_the_last_step(load, monkeypatch, task, steps):
+    env = load(task, seed=0, observation="state", time_limit=0.4)
+    monkeypatch.setattr(env.task, "succeeded", lambda _: False)
+    env.reset()
+    for _ in range(steps - 1):
+        env.step(np.zeros(4))
+
+    monkeypatch.setattr(env.task, "succeeded", lambda _: True)
+    timestep = env.step(np.zeros(4))
+
+    assert timestep.last()
+    assert (timestep.reward, timestep.discount) == (1.0, 0.0)
+
+
+@all_tasks
+def test_same_seed_same_pixels_and_trajectory(load, task):
+    def run() -> tuple[np.ndarray, np.ndarray]:
+        env = load(task, seed=np.random.RandomState(7), observation="both")
+        pixels, states = [], []
+        for episode in range(2):
+            timesteps = [env.reset(), *map(env.step, random_actions(6, seed=episode))]
+            pixels += [timestep.observation["pixels"] for timestep in timesteps]
+            states += [timestep.observation["state"] for timestep in timesteps]
+        return np.stack(pixels), np.stack(states)
+
+    for first, second in zip(run(), run(), strict=True):
+        np.testing.assert_array_equal(first, second)
+
+
+@all_tasks
+def test_starts_differ_between_episodes_and_seeds(load, task):
+    env, other = load(task, seed=0, observation="both"), load(task, seed=1, observation="both")
+    starts = [env.reset().observation for _ in range(5)] + [other.reset().observation]
+
+    for first, second in itertools.combinations(starts, 2):
+        difference = np.abs(first["state"] - second["state"])
+        table_heights = [9, 12, 15]
+        assert (np.delete(difference, table_heights) > 0).all()
+        assert (first["pixels"] != second["pixels"]).any()
+
+
+@all_tasks
+def test_observations_share_no_memory(load, task):
+    env = load(task, seed=0, observation="both")
+    observations = [env.reset().observation]
+    observations += [env.step(action).observation for action in random_actions(3)]
+    kept = [{key: value.copy() for key, value in o.items()} for o in observations]
+
+    for first, second in itertools.combinations(observations, 2):
+        assert not np.shares_memory(first["pixels"], second["pixels"])
+        assert not np.shares_memory(first["state"], second["state"])
+    before = env.physics.full_state()
+    observations[-1]["state"][:] = 0
+    np.testing.assert_array_equal(env.physics.full_state(), before)
+    for observation, copy in zip(observations[:-1], kept[:-1], strict=True):
+        np.testing.assert_array_equal(observation["pixels"], copy["pixels"])
+        np.testing.assert_array_equal(observation["state"], copy["state"])
+
+
+@all_tasks
+def test_starts_are_as_promised(load, task):
+    env = load(task, seed=0, observation="state")
+    physics = env.physics
+    for _ in range(100):
+        env.reset()
+        angles = {}
+        for name in OBJECTS:
+            position = physics.object_position(name)
+            bottom = position[2] - OBJECT_HALF_HEIGHT[name]
+            assert bottom == pytest.approx(TABLE_HEIGHT, abs=1e-3)
+            assert 0.25 < position[0] < 0.85 and abs(position[1]) < 0.55  # on the table
+            assert physics.named.data.xmat[name, "zz"] > 0.999  # upright
+            angles[name] = kinematics.to_polar(position)[1]
+        assert angles["glass"] > angles["green_box"] > angles["white_box"]  # left to right
+        assert not physics.robot_touches()
+        for first, second in itertools.combinations(OBJECTS, 2):
+            assert physics.gap(first, second) > 0.05
+        assert not env.task.succeeded(physics)
+        low, high = physics.model.jnt_range[:12].T
+        assert (physics.data.qpos[:12] >= low).all() and (physics.data.qpos[:12] <= high).all()
+
+
+@all_tasks
+def test_starts_are_at_rest(load, task):
+    env = load(task, seed=3, observation="state")
+    for _ in range(5):
+        start = env.reset().observation["state"]
+        for _ in range(5):
+            end = env.step(np.zeros(4)).observation["state"]
+        np.testing.assert_allclose(end[:4], start[:4], atol=0.02)  # (rad)
+        np.testing.assert_allclose(end[4:], start[4:], atol=0.002)  # (m)
+
+
+@all_tasks
+def test_objects_are_within_reach(load, task):
+    env = load(task, seed=0, observation="state")
+    physics = env.physics
+    limits = np.radians([100, 100, 85])
+    for _ in range(10):
+        env.reset()
+        for name in OBJECTS:
+            target = physics.object_position(name) + np.array([0.0, 0.0, 0.02])
+            arm = kinematics.inverse(target)
+            assert (np.abs(arm) < limits).all()
+            set_arm(physics, arm)
+            np.testing.assert_allclose(physics.grip_position(), target, atol=1e-3)
+
+
+def set_arm(physics: Physics, arm: np.ndarray) -> None:
+    physics.data.qpos[:3] = arm
+    physics.forward()
+
+
+def targets(env: Environment) -> np.ndarray:
+    return np.array(env.physics.data.ctrl)
+
+
+@all_tasks
+def test_actions_move_the_joint_targets(load, task):
+    env = load(task, seed=0, observation="state")
+    env.reset()
+    # In the middle of all ranges, with targets where the joints are.
+    env.physics.data.qpos[:12] = [0.1, -1.0, 0.5, *[0.45] * 9]
+    env.physics.data.ctrl[:] = [0.1, -1.0, 0.5, *[0.45] * 3]
+
+    env.task.before_step(np.array([0.5, -1.0, 0.25, -0.5]), env.physics)
+    np.testing.assert_allclose(targets(env), [0.2, -1.2, 0.55, *[0.25] * 3])
+
+    # From the targets of before, not from the joints, which have not moved.
+    env.task.before_step(np.array([0.5, 0.0, -0.25, 0.5]), env.physics)
+    np.testing.assert_allclose(targets(env), [0.3, -1.2, 0.5, *[0.45] * 3])
+
+
+@all_tasks
+def test_targets_do_not_run_away_from_the_joints(load, task):
+    env = load(task, seed=0, observation="state")
+    env.reset()
+    joints = np.array([0.1, -1.0, 0.5, 0.45, 0.45, 0.45])
+    env.physics.data.qpos[:12] = [*joints[:3], *[0.45] * 9]
+    # Targets two steps ahead of joints that something holds back: brought back to one step.
+    ahead = ACTION_SCALE[[0, 1, 2, 3, 3, 3]] * [1, -1, 1, -1, -1, -1]
+    env.physics.data.ctrl[:] = joints + 2 * ahead
+
+    env.task.before_step(np.zeros(4), env.physics)
+
+    np.testing.assert_allclose(targets(env), joints + ahead)
+
+
+@all_tasks
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_targets_stay_within_the_range_of_the_joints(load, task, sign):
+    env = load(task, seed=0, observation="state")
+    env.reset()
+    # The arm raised behind the robot, where nothing is in its way.
+    env.physics.data.qpos[1] = env.physics.data.ctrl[1] = -1.5
+    env.physics.forward()
+
+    reached = []
+    for _ in range(20):
+        env.step(np.array([sign, -1.0, sign, sign]))
+        reached.append(targets(env))
+
+    degrees = np.array([100, -100, 85, 160 / 3]) * [sign, 1, sign, sign > 0]
+    np.testing.assert_allclose(reached[-1], np.radians(degrees)[[0, 1, 2, 3, 3, 3]], atol=1e-3)
+
+
+@all_tasks
+def test_actions_beyond_the_range_count_as_its_ends(load, task):
+    env = load(task, seed=0, observation="state")
+
+    def target(action: list[float]) -> np.ndarray:
+        env.task.random.seed(0)
+        env.reset()
+        env.task.before_step(np.array(action), env.physics)
+        return targets(env)
+
+    np.testing.assert_array_equal(target([9.0, -3.0, 1.5, -7.0]), target([1.0, -1.0, 1.0, -1.0]))
+
+
+@all_tasks
+@pytest.mark.parametrize(
+    "action",
+    [np.zeros(3), np.zeros((1, 4)), [0, np.nan, 0, 0], [0, 0, np.inf, 0]],
+    ids=["three", "two dimensions", "nan", "inf"],
+)
+def test_bad_actions_are_refused_before_anything_moves(load, task, action):
+    env = load(task, seed=0, observation="state")
+    env.reset()
+    before = env.physics.full_state()
+
+    with pytest.raises(ValueError, match=r"^an action is 4 finite numbers in \[-1, 1\], not .*$"):
+        env.step(action)
+
+    np.testing.assert_array_equal(env.physics.full_state(), before)
+
+
+@pytest.fixture(scope="module")
+def segmentation(physics):
+    """Simulation -> name of the body that each pixel of the frame shows, or None."""
+    renderer = mujoco.Renderer(physics.model.ptr, 32, 64)
+    renderer.enable_segmentation_rendering()
+    names = np.array([physics.model.id2name(b, "body") for b in physics.model.geom_bodyid] + [""])
+
+    def segment() -> np.ndarray:
+        renderer.update_scene(physics.data.ptr, "eyes")
+        ids, types = np.moveaxis(renderer.render(), -1, 0)
+        return names[np.where(types == mujoco.mjtObj.mjOBJ_GEOM, ids, -1)]
+
+    yield segment
+    renderer.render()  # Makes its context current, or closing would free buffers of another one.
+    renderer.close()
+
+
+def hand_bodies() -> list[str]:
+    digits = ("thumb", "upper_finger", "lower_finger")
+    return ["hand", *(f"{digit}_{segment}" for digit in digits for segment in (1, 2, 3))]
+
+
+@all_tasks
+def test_the_hand_stays_in_view_in_demonstrations(load, segmentation, task):
+    env = load(task, seed=0, observation="state")
+    demonstrator = Demonstrator(env, seed=0)
+    in_view = []
+    for _ in range(6):
+        timestep = env.reset()
+        demonstrator.reset()
+        in_view.append(np.isin(segmentation(), hand_bodies()).sum() >= 4)
+        while not timestep.last():
+            timestep = env.step(demonstrator(timestep))
+            in_view.append(np.isin(segmentation(), hand_bodies()).sum() >= 4)
+    assert len(in_view) > 100
+    assert np.mean(in_view) >= 0.98
+
+
+@all_tasks
+def test_objects_are_at_least_4_pixels_wide(load, segmentation, task):
+    env = load(task, seed=0, observation="state")
+    for _ in range(20):
+        env.reset()
+        set_arm(env.physics, np.array([0.0, -1.5, 0.0]))  # out of the way
+        shown = segmentation()
+        for name in OBJECTS:
+            assert (shown == name).any(axis=0).sum() >= 4
+
+
+def test_a_simulation_continues_bit_for_bit_from_its_full_state(load):
+    env = load("push_green_to_glass", seed=0, observation="state")
+    other = nico.load("push_green_to_glass", seed=1, observation="state")
+    env.reset(), other.reset()
+    actions = random_actions(20)
+    for action in actions[:10]:
+        env.step(action)
+
+    other.physics.set_full_state(env.physics.full_state())
+
+    for action in actions[10:]:
+        env.step(action), other.step(action)
+        np.testing.assert_array_equal(env.physics.full_state(), other.physics.full_state())
+
+
+@pytest.fixture
+def registered(monkeypatch):
+    monkeypatch.setattr(suite, "_DOMAINS", dict(suite._DOMAINS))
+    nico.register()
+
+
+@all_tasks
+def test_registered_tasks_load_by_dm_control(registered, task):
+    env = suite.load(
+        "nico", task, {"random": 5, "observation": "state"}, {"flat_observation": True}
+    )
+    direct = nico.load(task, seed=5, observation="state")
+
+    np.testing.assert_array_equal(
+        env.reset().observation["observations"], direct.reset().observation["state"]
+    )
+    assert env.control_timestep() == pytest.approx(0.2)
+
+
+@all_tasks
+def test_torchrl_wraps_registered_tasks(registered, renderer, task):
+    env = DMControlWrapper(suite.load("nico", task, {"random": 0, "renderer": renderer}))
+
+    check_env_specs(env)
+    rollout = env.rollout(3)
+
+    assert rollout["pixels"].shape == (3, 32, 64, 3)
+    assert rollout["pixels"].dtype == env.observation_spec["pixels"].dtype
+    assert rollout["next", "reward"].shape == (3, 1)
+
+
+def test_unknown_names_are_refused_in_one_line():
+    with pytest.raises(ValueError, match=r"^no NICO task 'juggle'; choose one of grasp_glass, .*$"):
+        nico.load("juggle")
+    with pytest.raises(ValueError, match=r"^observation is 'sound'; choose one of 'pixels', .*$"):
+        nico.load("grasp_glass", observation="sound")
+
+
+def test_scene_version_names_the_scene():
+    assert nico.scene_version().startswith("nico-1-")
+    assert len(nico.scene_version()) == len("nico-1-") + 8

@@ -1,0 +1,107 @@
+"""The demonstrator: it succeeds, in the policy's own action space, as long as the paper's."""
+
+import sys
+
+import numpy as np
+import pytest
+
+from suites import nico
+from suites.nico.demonstrator import Demonstrator
+from suites.nico.grasp_glass import GraspGlass
+
+all_tasks = pytest.mark.parametrize("task", nico.ALL_TASKS)
+
+
+def demonstrate(env, demonstrator) -> tuple[np.ndarray, bool]:
+    """Returns the actions ``[T, 4]`` of an episode and whether it succeeded."""
+    timestep, actions = env.reset(), []
+    demonstrator.reset()
+    while not timestep.last():
+        actions.append(demonstrator(timestep))
+        timestep = env.step(actions[-1])
+    return np.stack(actions), bool(timestep.reward)
+
+
+@all_tasks
+def test_it_succeeds_with_actions_in_range(physics, task):
+    env = nico.load(task, seed=0, observation="state", physics=physics)
+    demonstrator = Demonstrator(env, seed=0)
+
+    episodes = [demonstrate(env, demonstrator) for _ in range(6)]
+
+    assert all(success for _, success in episodes)
+    for actions, _ in episodes:
+        assert actions.shape[1:] == (4,)
+        assert (np.abs(actions) <= 1).all()
+        assert 10 < len(actions) < 50
+
+
+@all_tasks
+def test_equal_seeds_give_equal_demonstrations(physics, task):
+    def actions(start: int, noise: int) -> np.ndarray:
+        env = nico.load(task, seed=start, observation="state", physics=physics)
+        return demonstrate(env, Demonstrator(env, seed=noise))[0]
+
+    first = actions(0, 0)
+    np.testing.assert_array_equal(actions(0, 0), first)
+    for other in (actions(0, 1), actions(1, 0)):
+        assert len(other) != len(first) or (other != first).any()
+
+
+def test_it_must_be_reset_first(physics):
+    env = nico.load("grasp_glass", seed=0, observation="state", physics=physics)
+    timestep = env.reset()
+
+    with pytest.raises(RuntimeError, match=r"^call the demonstrator's reset\(\) after .*$"):
+        Demonstrator(env)(timestep)
+
+
+def test_a_task_it_does_not_know_is_refused(physics):
+    class Juggle(GraspGlass):
+        pass
+
+    env = nico.load("grasp_glass", seed=0, observation="state", physics=physics)
+    env._task = Juggle(random=np.random.RandomState(0))
+
+    with pytest.raises(ValueError, match=r"^no demonstration is known for the task Juggle$"):
+        Demonstrator(env)
+
+
+@pytest.mark.slow
+def test_95_percent_succeed_in_25_to_35_steps(physics, capsys):
+    table = [f"{'task':<20} {'success':>8} {'steps':>6} {'std':>5}  (200 random starts)"]
+    passed = True
+    for task in nico.ALL_TASKS:
+        env = nico.load(task, seed=1, observation="state", physics=physics)
+        demonstrator = Demonstrator(env, seed=1)
+        episodes = [demonstrate(env, demonstrator) for _ in range(200)]
+        success = np.mean([success for _, success in episodes])
+        steps = [len(actions) for actions, success in episodes if success]
+        table.append(f"{task:<20} {success:>8.1%} {np.mean(steps):>6.1f} {np.std(steps):>5.1f}")
+        passed &= bool(success >= 0.95 and 25 <= np.mean(steps) <= 35)
+    with capsys.disabled():
+        sys.stdout.write("\n" + "\n".join(table) + "\n")
+    assert passed
+
+
+@pytest.mark.slow
+def test_100_000_random_steps_without_a_warning(physics):
+    random = np.random.default_rng(0)
+    environments = [
+        nico.load(task, seed=0, observation="state", physics=physics) for task in nico.ALL_TASKS
+    ]
+    steps = episode = 0
+    while steps < 100_000:
+        env = environments[episode % len(environments)]
+        timestep = env.reset()
+        # Held for some steps and often at the ends of the range, actions drive the arm further.
+        hold, decimals = random.integers(1, 20), int(random.integers(0, 3))
+        actions = np.repeat(random.uniform(-1.0, 1.0, (50, 4)).round(decimals), hold, axis=0)
+        for action in actions[:50]:
+            timestep = env.step(action)
+            steps += 1
+            if timestep.last():
+                break
+        # Before the next reset, which clears the counts.
+        assert not any(warning.number for warning in physics.data.warning)
+        episode += 1

@@ -1,0 +1,148 @@
+"""Choice of the OpenGL backend, and frames."""
+
+import gc
+import os
+import platform
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from suites import nico
+from suites.nico.rendering import FrameRenderer, choose_backend
+
+
+@pytest.fixture
+def on_linux(monkeypatch):
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    monkeypatch.setattr(platform, "system", lambda: "Linux")
+
+
+@pytest.mark.parametrize(
+    ("libraries", "backend"),
+    [({"EGL", "OSMesa"}, "egl"), ({"EGL"}, "egl"), ({"OSMesa"}, "osmesa")],
+)
+def test_backend_is_the_first_that_can_be_loaded(on_linux, libraries, backend):
+    assert choose_backend(libraries.__contains__) == backend
+
+
+def test_without_any_library_one_line_says_what_to_install(on_linux):
+    with pytest.raises(RuntimeError, match=r"^no OpenGL .*apt-get install libegl1.*libosmesa6.*$"):
+        choose_backend(lambda _: False)
+
+
+@pytest.mark.parametrize("chosen", ["egl", "osmesa", "glfw", "disabled"])
+def test_the_choice_of_the_user_is_kept(on_linux, monkeypatch, chosen):
+    monkeypatch.setenv("MUJOCO_GL", chosen)
+
+    assert choose_backend(lambda _: False) == chosen
+
+
+def test_other_systems_bring_a_backend_of_their_own(on_linux, monkeypatch):
+    monkeypatch.setattr(platform, "system", lambda: "Darwin")
+
+    assert choose_backend(lambda _: False) is None
+
+
+def run_python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    clean = {key: value for key, value in os.environ.items() if key != "MUJOCO_GL"}
+    return subprocess.run(
+        [sys.executable, "-W", "error::UserWarning", "-c", code],
+        env={**clean, **environment},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+
+
+RENDER = """
+nico.load("grasp_glass", seed=1).reset()  # dropped at once
+env = nico.load("grasp_glass", seed=0)
+print(env.reset().observation["pixels"].std() > 20)
+"""
+
+
+@pytest.mark.parametrize(
+    "imports",
+    ["from suites import nico", "import mujoco\nfrom suites import nico"],
+    ids=["suite first", "mujoco first"],
+)
+def test_a_fresh_process_renders_and_exits_cleanly(imports):
+    process = run_python(imports + RENDER)
+
+    assert (process.stdout, process.stderr, process.returncode) == ("True\n", "", 0)
+
+
+def test_a_backend_that_cannot_render_is_one_line_that_says_what_to_do():
+    code = f"""
+from suites import nico
+try:{RENDER.replace(chr(10), chr(10) + "    ")}
+except RuntimeError as error:
+    print(error)
+"""
+    process = run_python(code, MUJOCO_GL="disabled")
+
+    line, *others = process.stdout.splitlines()
+    assert not others
+    assert line.startswith("no OpenGL context from the disabled backend")
+    assert "set MUJOCO_GL" in line
+
+
+def test_frames_of_simulations_that_share_a_renderer_do_not_mix(physics, renderer):
+    other = nico.Physics.from_xml_string(nico.scene_xml())
+    with other.reset_context():
+        other.named.data.qpos["green_box"][:2] = [0.45, 0.1]
+    with physics.reset_context():
+        pass
+
+    first, second = renderer.render(physics.data.ptr), renderer.render(other.data.ptr)
+
+    assert (first != second).any()
+    np.testing.assert_array_equal(renderer.render(physics.data.ptr), first)
+
+
+@pytest.mark.parametrize("how", ["close", "drop", "drop in a cycle"])
+def test_the_end_of_a_renderer_leaves_frames_of_others_alone(physics, renderer, how):
+    before = renderer.render(physics.data.ptr)
+    other = FrameRenderer(physics.model.ptr, "room")
+    other.render(physics.data.ptr)
+    renderer.render(physics.data.ptr)  # Its context is current now.
+
+    if how == "close":
+        other.close()
+    elif how == "drop in a cycle":
+        other.cycle = other
+    del other
+    gc.collect()
+    np.testing.assert_array_equal(renderer.render(physics.data.ptr), before)
+    FrameRenderer(physics.model.ptr).close()  # Frees what was dropped.
+    np.testing.assert_array_equal(renderer.render(physics.data.ptr), before)
+
+
+def test_a_renderer_can_be_closed_twice(physics):
+    renderer = FrameRenderer(physics.model.ptr)
+    renderer.close()
+    renderer.close()
+
+
+def test_frames_are_written_where_asked(physics, renderer):
+    out = np.zeros((32, 64, 3), np.uint8)
+
+    assert renderer.render(physics.data.ptr, out=out) is out
+    np.testing.assert_array_equal(out, renderer.render(physics.data.ptr))
+
+
+def test_size_and_camera_can_be_chosen(physics, renderer):
+    room = FrameRenderer(physics.model.ptr, "room", height=48, width=80)
+
+    frame = room.render(physics.data.ptr)
+    room.close()
+
+    assert frame.shape == (48, 80, 3)
+    assert frame.std() > 10
+
+
+def test_an_unknown_camera_is_refused(physics):
+    with pytest.raises(ValueError, match=r"^no camera 'nose' in the scene; choose one of .*'eyes'"):
+        FrameRenderer(physics.model.ptr, "nose")

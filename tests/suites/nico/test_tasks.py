@@ -1,0 +1,147 @@
+"""Each task's success, in states made for it."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from suites import nico
+from suites.nico import kinematics
+from suites.nico.nico import TASKS
+from suites.nico.physics import OBJECT_HALF_HEIGHT, TABLE_HEIGHT, Physics
+
+STANDING = (1.0, 0.0, 0.0, 0.0)
+LYING = (np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0)  # about x, so that the axis of the glass is along y
+AWAY = {"glass": (0.45, 0.4), "green_box": (0.45, 0.1), "white_box": (0.45, -0.4)}
+
+
+def succeeded(task: str, physics: Physics) -> bool:
+    instance = TASKS[task](random=np.random.RandomState(0))
+    success = instance.succeeded(physics)
+    assert instance.get_reward(physics) == float(success)
+    assert instance.get_termination(physics) == (0.0 if success else None)
+    return success
+
+
+def place(
+    physics: Physics,
+    objects: dict[str, Sequence[float]] | None = None,
+    *,
+    arm: Sequence[float] | np.ndarray = (0.0, -1.5, 0.0),  # stretched out backwards
+    curls: Sequence[float] = (0.0, 0.0, 0.0),
+    closing: float = 0.0,
+) -> None:
+    """Puts objects at ``[x, y]`` or ``[x, y, z, *quaternion]``, the others apart from each other.
+
+    Thumb, upper and lower finger take their curls (rad); targets lie ``closing`` (rad) beyond.
+    """
+    with physics.reset_context():
+        for name, (x, y) in AWAY.items():
+            height = TABLE_HEIGHT + OBJECT_HALF_HEIGHT[name]
+            physics.named.data.qpos[name] = [x, y, height, *STANDING]
+        for name, pose in (objects or {}).items():
+            physics.named.data.qpos[name][: len(pose)] = pose
+        physics.data.qpos[:12] = [*arm, *np.repeat(curls, 3)]
+        physics.data.ctrl[:] = [*arm, *(np.array(curls) + closing)]
+
+
+@pytest.mark.parametrize("target", ["glass", "white_box"])
+@pytest.mark.parametrize(("gap", "touches"), [(-0.001, True), (0.001, True), (0.003, False)])
+def test_push_is_done_when_the_green_box_touches_the_target(physics, target, gap, touches):
+    # Half the box and the radius of the glass, or half the other box.
+    place(physics, {"green_box": (0.40, 0.0), target: (0.40 + 0.05 + gap, 0.0)})
+
+    done = {task for task in nico.ALL_TASKS if succeeded(task, physics)}
+
+    task = {"glass": "push_green_to_glass", "white_box": "push_green_to_white"}[target]
+    assert done == ({task} if touches else set())
+
+
+@pytest.mark.parametrize("turn", [0.0, np.pi / 4])
+def test_push_to_white_measures_from_surface_to_surface(physics, turn):
+    # A box turned by 45 degrees reaches half its diagonal, 0.0354 m.
+    reach = 0.025 * (np.cos(turn) + np.sin(turn))
+    rotation = (np.cos(turn / 2), 0.0, 0.0, np.sin(turn / 2))
+    for gap, touches in ((0.001, True), (0.004, False)):
+        white = (0.40 + reach + 0.025 + gap, 0.0, TABLE_HEIGHT + 0.025, *rotation)
+        place(physics, {"green_box": (0.40, 0.0), "white_box": white})
+        assert succeeded("push_green_to_white", physics) is touches
+
+
+def test_push_to_glass_counts_when_the_glass_was_knocked_over(physics):
+    # Along x a lying glass is as wide as a standing one; along y it is 0.07 m long.
+    lying = (TABLE_HEIGHT + 0.025, *LYING)
+    place(physics, {"green_box": (0.40, 0.0), "glass": (0.451, 0.0, *lying)})
+    assert succeeded("push_green_to_glass", physics)
+    place(physics, {"green_box": (0.40, 0.0), "glass": (0.40, 0.061, *lying)})
+    assert succeeded("push_green_to_glass", physics)
+    place(physics, {"green_box": (0.40, 0.0), "glass": (0.40, 0.064, *lying)})
+    assert not succeeded("push_green_to_glass", physics)
+
+
+def test_no_push_is_done_when_only_glass_and_white_box_touch(physics):
+    place(physics, {"glass": (0.40, 0.3), "white_box": (0.45, 0.3)})
+
+    assert not any(succeeded(task, physics) for task in nico.ALL_TASKS)
+
+
+GRIP = np.array([0.42, 0.05, TABLE_HEIGHT + 0.045])
+ARM = kinematics.inverse(GRIP)
+GLASS = (GRIP[0], GRIP[1], TABLE_HEIGHT + 0.035, *STANDING)
+CLOSED, OPEN = 0.7, 0.0
+
+
+@pytest.mark.parametrize(
+    ("thumb", "fingers", "closing", "held"),
+    [
+        pytest.param(CLOSED, CLOSED, 0.1, True, id="held"),
+        pytest.param(OPEN, OPEN, 0.1, False, id="open"),
+        pytest.param(CLOSED, OPEN, 0.1, False, id="thumb only"),
+        pytest.param(OPEN, CLOSED, 0.1, False, id="fingers only"),
+        pytest.param(CLOSED, CLOSED, 0.025, True, id="just closing"),
+        pytest.param(CLOSED, CLOSED, 0.015, False, id="hardly closing"),
+        pytest.param(CLOSED, CLOSED, 0.0, False, id="not closing"),
+        pytest.param(CLOSED, CLOSED, -0.1, False, id="opening"),
+    ],
+)
+def test_grasp_needs_both_sides_of_a_closing_hand(physics, thumb, fingers, closing, held):
+    place(physics, {"glass": GLASS}, arm=ARM, curls=(thumb, fingers, fingers), closing=closing)
+
+    assert succeeded("grasp_glass", physics) is held
+
+
+@pytest.mark.parametrize(("upper", "lower"), [(CLOSED, OPEN), (OPEN, CLOSED)])
+def test_one_finger_is_enough(physics, upper, lower):
+    place(physics, {"glass": GLASS}, arm=ARM, curls=(CLOSED, upper, lower), closing=0.1)
+
+    assert succeeded("grasp_glass", physics)
+
+
+def test_the_palm_counts_as_the_thumb_side(physics):
+    # Moved right, along the normal of the palm, until it overlaps the palm by half a millimetre.
+    shift = (0.043 - 0.018 - 0.025 + 0.0005) * np.array([np.sin(ARM[0]), -np.cos(ARM[0])])
+    glass = (*(GRIP[:2] + shift), *GLASS[2:])
+    place(physics, {"glass": glass}, arm=ARM, curls=(OPEN, OPEN, OPEN), closing=0.1)
+    assert not succeeded("grasp_glass", physics)
+    place(physics, {"glass": glass}, arm=ARM, curls=(OPEN, 1.2 * CLOSED, 1.2 * CLOSED), closing=0.1)
+    assert succeeded("grasp_glass", physics)
+
+
+def test_a_closing_hand_elsewhere_holds_nothing(physics):
+    place(physics, arm=ARM, curls=(CLOSED,) * 3, closing=0.1)
+
+    assert not succeeded("grasp_glass", physics)
+
+
+def test_holding_a_box_is_no_success(physics):
+    box = (GRIP[0], GRIP[1], TABLE_HEIGHT + 0.025)
+    place(physics, {"green_box": box}, arm=ARM, curls=(CLOSED,) * 3, closing=0.1)
+
+    assert not succeeded("grasp_glass", physics)
+
+
+def test_a_glass_that_was_knocked_over_can_be_held(physics):
+    glass = (GRIP[0], GRIP[1], TABLE_HEIGHT + 0.025, *LYING)
+    place(physics, {"glass": glass}, arm=ARM, curls=(CLOSED,) * 3, closing=0.1)
+
+    assert succeeded("grasp_glass", physics)
