@@ -146,3 +146,28 @@ PRESETS: dict[str, RunConfig] = {
 }
 """What ``--preset`` names: every stage in minutes; learning to look at; five seeds overnight at
 most; the paper's scale."""
+
+
+@dataclass(frozen=True)
+class StageConfig:
+    """Stage 1 of a preset that makes its own encoders."""
+
+    per_task: int
+    """Demonstrations of each task."""
+    held_out_per_task: int
+    """How many of those are held out."""
+    config: RepresentationConfig
+    """Training of the encoders."""
+
+
+STAGE_PRESETS: dict[str, StageConfig] = {
+    "smoke": StageConfig(
+        per_task=12,
+        held_out_per_task=4,
+        config=RepresentationConfig(
+            vae=VAEConfig(steps=20, batch_size=64),
+            lae=SequenceAutoencoderConfig(steps=50, batch_size=32),
+        ),
+    )
+}
+"""Presets that go through every stage from nothing instead of using the shipped encoders."""

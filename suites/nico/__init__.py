@@ -2,8 +2,9 @@
 
 # First, because it chooses the OpenGL backend before anything imports MuJoCo.
 from suites.nico import rendering  # isort: skip
+from suites.nico.base import scene_version
 from suites.nico.nico import ALL_TASKS, load, register
-from suites.nico.physics import OBJECTS, Physics, scene_version, scene_xml
+from suites.nico.physics import OBJECTS, Physics, scene_xml
 
 __all__ = [
     "ALL_TASKS",

@@ -1,5 +1,6 @@
 """What NICO's three tasks share: the action, the start of an episode, observation and reward."""
 
+import hashlib
 from collections import OrderedDict
 from typing import Literal
 
@@ -8,7 +9,7 @@ from dm_control.rl import control
 from dm_env import TimeStep, specs
 
 from suites.nico import kinematics
-from suites.nico.physics import OBJECT_HALF_HEIGHT, OBJECTS, TABLE_HEIGHT, Physics
+from suites.nico.physics import OBJECT_HALF_HEIGHT, OBJECTS, TABLE_HEIGHT, Physics, scene_xml
 from suites.nico.rendering import FRAME_HEIGHT, FRAME_WIDTH, FrameRenderer
 
 Observation = Literal["pixels", "state", "both"]
@@ -22,14 +23,22 @@ ACTION_SCALE = np.array([0.2, 0.2, 0.2, 0.4])
 
 # The arc on which the objects stand, about the shoulder's yaw axis; left is positive.
 ARC_RADIUS = 0.42  # (m)
-ARC_ANGLES = np.radians([23.0, 0.0, -23.0])  # glass, green box, white box
-ANGLE_JITTER = np.radians(3.0)
+ARC_ANGLES = np.radians([22.0, 0.0, -22.0])  # glass, green box, white box
+ANGLE_JITTER = np.radians(2.5)
 RADIUS_JITTER = 0.012  # (m)
 
 # Where the palm starts: in view, among or above the objects.
-START_ANGLE = np.radians(32.0)  # to either side of the middle of the arc
+START_ANGLE = np.radians(18.0)  # to either side of the middle of the arc
 START_RADIUS = (0.36, 0.42)  # (m)
-START_HEIGHT = (0.04, 0.12)  # (m) above the table
+START_HEIGHT = (0.05, 0.12)  # (m) above the table
+
+
+def scene_version() -> str:
+    """Returns the version of scene, starts and action; datasets and encoders are valid for one."""
+    layout = (ACTION_SCALE.tolist(), ARC_RADIUS, ARC_ANGLES.tolist(), ANGLE_JITTER, RADIUS_JITTER)
+    starts = (START_ANGLE, START_RADIUS, START_HEIGHT)
+    described = f"{scene_xml()}{layout}{starts}".encode()
+    return "nico-1-" + hashlib.sha256(described).hexdigest()[:8]
 
 
 class Environment(control.Environment):

@@ -3,7 +3,6 @@
 # MuJoCo's bindings come without stubs.
 # pyright: reportAttributeAccessIssue=false
 
-import hashlib
 from importlib import resources
 from typing import Final
 
@@ -25,11 +24,6 @@ _PRESSING = 0.02  # (rad) a hand whose target lies this far beyond its curl is c
 def scene_xml() -> str:
     """Returns the MJCF of the scene."""
     return resources.files("suites.nico").joinpath("nico.xml").read_text()
-
-
-def scene_version() -> str:
-    """Returns the version of the scene; datasets and encoder weights are valid for one only."""
-    return "nico-1-" + hashlib.sha256(scene_xml().encode()).hexdigest()[:8]
 
 
 class Physics(dm_mujoco.Physics):

@@ -1,0 +1,93 @@
+"""The trained encoders and the bank of embedded demonstrations: load the shipped ones or make new."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from bgpo_trl.configs import RepresentationConfig
+from bgpo_trl.demonstrations import DemonstrationBank, encoder_id, record_demonstrations
+from bgpo_trl.representation import (
+    Representation,
+    default_weights,
+    embed_demonstrations,
+    load_representation,
+)
+from bgpo_trl.train_encoders import train_encoders
+from suites import nico
+
+BANK_NAME = "nico_bank.safetensors"
+
+
+def _identity(encoders: Representation) -> str:
+    parameters = {f"vae.{k}": v for k, v in encoders.vae.state_dict().items()}
+    parameters |= {f"lae.{k}": v for k, v in encoders.lae.state_dict().items()}
+    return encoder_id(parameters)
+
+
+def load_pretrained(
+    weights: str | Path | None = None,
+) -> tuple[Representation, DemonstrationBank]:
+    """Loads encoders and the bank that lies beside them.
+
+    Args:
+        weights: Encoder weights; those that come with the package if None.
+
+    Raises:
+        ValueError: If either is missing, damaged or made for another scene.
+    """
+    weights = default_weights() if weights is None else Path(weights)
+    encoders = load_representation(weights, scene_version=nico.scene_version())
+    bank = DemonstrationBank.load(weights.with_name(BANK_NAME), encoder_id=_identity(encoders))
+    return encoders, bank
+
+
+def make_pretrained(
+    weights: str | Path,
+    dataset: str | Path,
+    *,
+    folder: str | Path,
+    config: RepresentationConfig | None = None,
+    per_task: int = 1_200,
+    held_out_per_task: int = 200,
+    seed: int = 0,
+    command: str = "",
+    progress: bool = True,
+) -> tuple[Representation, DemonstrationBank]:
+    """Records demonstrations, trains both encoders on them, and embeds all.
+
+    Each stage continues where it was interrupted.
+
+    Args:
+        weights: Where to write the encoders; the bank goes beside them.
+        dataset: Folder of the demonstrations; recorded if not there yet.
+        folder: Folder for the log, checkpoints and probes of the training.
+        config: Hyperparameters of the encoders.
+        per_task: Demonstrations of each task.
+        held_out_per_task: How many of those are held out.
+        seed: Seed of the recording.
+        command: Stored with the weights.
+        progress: Whether to show progress bars.
+
+    Raises:
+        ValueError: If the dataset is damaged or of another scene.
+    """
+    demonstrations = record_demonstrations(
+        dataset,
+        per_task=per_task,
+        held_out_per_task=held_out_per_task,
+        seed=seed,
+        progress=progress,
+    )
+    weights = Path(weights)
+    weights.parent.mkdir(parents=True, exist_ok=True)
+    train_encoders(
+        demonstrations, weights, Path(folder), config or RepresentationConfig(), command
+    )
+    encoders = load_representation(weights, scene_version=nico.scene_version())
+    bank = DemonstrationBank(
+        embed_demonstrations(encoders, demonstrations),
+        demonstrations["task"].clone(),
+        demonstrations["train"].clone(),
+    )
+    bank.save(weights.with_name(BANK_NAME), encoder_id=_identity(encoders))
+    return encoders, bank
