@@ -1,6 +1,7 @@
 """What every task of the suite must keep to; modelled on ``dm_control.suite.tests.suite_test``."""
 
 import itertools
+import re
 
 import mujoco
 import numpy as np
@@ -9,7 +10,7 @@ from dm_control import suite
 from torchrl.envs import DMControlWrapper, check_env_specs
 
 from suites import nico
-from suites.nico import kinematics
+from suites.nico import base, kinematics
 from suites.nico.base import ACTION_SCALE, Environment
 from suites.nico.demonstrator import Demonstrator
 from suites.nico.physics import OBJECT_HALF_HEIGHT, OBJECTS, TABLE_HEIGHT, Physics
@@ -398,6 +399,12 @@ def test_unknown_names_are_refused_in_one_line():
         nico.load("grasp_glass", observation="sound")
 
 
-def test_scene_version_names_the_scene():
-    assert nico.scene_version().startswith("nico-1-")
-    assert len(nico.scene_version()) == len("nico-1-") + 8
+@pytest.mark.parametrize("name", ["ACTION_SCALE", "ARC_ANGLES", "ANGLE_JITTER", "START_ANGLE"])
+def test_scene_version_follows_what_frames_depend_on(monkeypatch, name):
+    version = nico.scene_version()
+    assert re.fullmatch(r"nico-1-[0-9a-f]{8}", version)
+    assert nico.scene_version() == version
+
+    monkeypatch.setattr(base, name, getattr(base, name) * 1.01)
+
+    assert nico.scene_version() != version

@@ -1,0 +1,333 @@
+"""NicoEnv against single environments of the suite, and its promises to TorchRL."""
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.envs import StepCounter, TransformedEnv, check_env_specs, step_mdp
+
+from bgpo_trl.checkpoint import load_checkpoint, save_checkpoint
+from bgpo_trl.envs import NicoEnv
+from suites import nico
+from suites.nico.demonstrator import Demonstrator
+
+batch_sizes = pytest.mark.parametrize("batch_size", [(), (3,), (2, 2)])
+observations = pytest.mark.parametrize("observation", ["pixels", "state", "both"])
+
+
+def actions(env: NicoEnv, steps: int, seed: int = 0) -> torch.Tensor:
+    """Returns actions ``[steps, *B, 4]``."""
+    generator = torch.Generator().manual_seed(seed)
+    return torch.rand(steps, *env.batch_size, 4, generator=generator) * 2 - 1
+
+
+def run(env: NicoEnv, td: TensorDictBase, actions: torch.Tensor) -> TensorDict:
+    """Returns what the steps give, stacked along the first dimension."""
+    steps = []
+    for action in actions:
+        td = env.step(td.set("action", action))
+        steps.append(td["next"].clone())
+        td = step_mdp(td)
+    return torch.stack(steps)
+
+
+def assert_equal(first: TensorDictBase, second: TensorDictBase) -> None:
+    assert set(first.keys()) == set(second.keys())
+    for key in first.keys():  # noqa: SIM118
+        torch.testing.assert_close(first[key], second[key], rtol=0, atol=0)
+
+
+def task_td(*task: int) -> TensorDict:
+    return TensorDict({"task": torch.tensor(task)}, [len(task)])
+
+
+@batch_sizes
+@observations
+def test_torchrl_finds_the_specs_kept(batch_size, observation):
+    check_env_specs(NicoEnv(batch_size=batch_size, observation=observation))
+
+
+@batch_sizes
+def test_shapes_and_types(batch_size):
+    env = NicoEnv(batch_size=batch_size, observation="both")
+    start = env.reset()
+    end = env.rand_step(start.clone())["next"]
+
+    for td in (start, end):
+        assert (td["pixels"].shape, td["pixels"].dtype) == ((*batch_size, 32, 64, 3), torch.uint8)
+        assert (td["state"].shape, td["state"].dtype) == ((*batch_size, 16), torch.float32)
+        assert (td["task"].shape, td["task"].dtype) == (batch_size, torch.int64)
+        for key in ("done", "terminated", "truncated"):
+            assert (td[key].shape, td[key].dtype) == ((*batch_size, 1), torch.bool)
+    assert (end["reward"].shape, end["reward"].dtype) == ((*batch_size, 1), torch.float32)
+
+
+@pytest.mark.parametrize("task", range(3))
+def test_it_shows_what_the_suite_shows(task):
+    env = NicoEnv(seed=5, observation="both")
+    td = env.reset(TensorDict({"task": torch.tensor(task)}))
+    plain = nico.load(nico.ALL_TASKS[task], seed=5, observation="both")
+    timestep = plain.reset()
+
+    for action in actions(env, 6):
+        np.testing.assert_array_equal(td["pixels"], timestep.observation["pixels"])
+        np.testing.assert_array_equal(td["state"], timestep.observation["state"].astype(np.float32))
+        td = env.step(td.set("action", action))["next"]
+        timestep = plain.step(action.double().numpy())
+
+
+def test_each_row_of_a_batch_is_as_it_is_alone():
+    batch = NicoEnv(batch_size=[2, 2], seed=4, observation="both")
+    steps = actions(batch, 5)
+    tasks = torch.tensor([[0, 1], [2, 1]])
+    start = batch.reset(TensorDict({"task": tasks}, [2, 2]))
+    rollout = run(batch, start.clone(), steps)
+
+    for row, index in enumerate(itertools.product(range(2), range(2))):
+        alone = NicoEnv(seed=4 + row, observation="both")
+        alone_start = alone.reset(TensorDict({"task": tasks[index]}))
+        assert_equal(alone_start, start[index])
+        assert_equal(run(alone, alone_start, steps[:, *index]), rollout[:, *index])
+
+
+def test_seeds_can_be_given_one_by_one_and_set_again():
+    env = NicoEnv(batch_size=[2], seed=[8, 3], observation="state")
+    first = env.reset()
+    env.set_seed(8)
+    second = env.reset()
+
+    torch.testing.assert_close(first["state"][0], second["state"][0], rtol=0, atol=0)
+    other = NicoEnv(batch_size=[2], seed=8, observation="state").reset()
+    assert_equal(other, second)
+    assert (first["state"][1] != second["state"][1]).any()
+
+
+def test_a_partial_reset_leaves_other_rows_alone():
+    env = NicoEnv(batch_size=[3], observation="both")
+    undisturbed = NicoEnv(batch_size=[3], observation="both")
+    steps = actions(env, 6)
+    before = run(env, env.reset(), steps[:3])[-1].exclude("reward")
+    run(undisturbed, undisturbed.reset(), steps[:3])
+
+    reset = torch.tensor([[False], [True], [False]])
+    task = torch.tensor([2, 1, 2])  # counts only where there is a reset
+    after = env.reset(before.clone().update({"_reset": reset, "task": task}))
+
+    assert_equal(after[[0, 2]].exclude("task"), before[[0, 2]].exclude("task"))
+    assert (after["state"][1] != before["state"][1]).any()
+    assert (after["pixels"][1] != before["pixels"][1]).any()
+    rollout = run(env, after, steps[3:])
+    assert rollout["task"].tolist() == [[0, 1, 0]] * 3
+    expected = run(undisturbed, before, steps[3:])
+    assert_equal(rollout[:, [0, 2]], expected[:, [0, 2]])
+
+
+def test_rows_masked_out_of_a_step_stay_where_they_are():
+    env = NicoEnv(batch_size=[3], observation="both")
+    undisturbed = NicoEnv(batch_size=[3], observation="both")
+    start = env.reset()
+    undisturbed.reset()
+    first, second = actions(env, 2)
+
+    mask = torch.tensor([True, False, True])
+    masked = env.step(start.clone().update({"action": first, "_step": mask}))["next"]
+
+    assert_equal(masked[[1]].exclude("reward"), start[[1]])
+    assert masked["reward"][1] == 0
+    expected = undisturbed.step(start.clone().set("action", first))["next"]
+    assert_equal(masked[[0, 2]], expected[[0, 2]])
+    # The masked row goes on as if that step had not been.
+    late = env.step(step_mdp(TensorDict({"next": masked}, [3])).set("action", second))["next"]
+    alone = NicoEnv(seed=1, observation="both")
+    expected = alone.step(alone.reset().set("action", second[1]))["next"]
+    assert_equal(late[1], expected)
+
+
+def test_no_row_at_all_may_step():
+    env = NicoEnv(batch_size=[2], observation="state")
+    start = env.reset()
+
+    mask = torch.zeros(2, dtype=torch.bool)
+    after = env.step(start.clone().update({"action": torch.ones(2, 4), "_step": mask}))["next"]
+
+    assert_equal(after.select("state", "task", "done"), start.select("state", "task", "done"))
+
+
+def test_the_task_is_chosen_at_reset_and_kept_until_another_is():
+    env = NicoEnv(batch_size=[3], observation="state")
+    assert env.reset()["task"].tolist() == [0, 0, 0]
+    td = env.reset(task_td(2, 0, 1))
+    assert td["task"].tolist() == [2, 0, 1]
+    assert run(env, td, actions(env, 2))["task"].tolist() == [[2, 0, 1]] * 2
+    assert env.reset()["task"].tolist() == [2, 0, 1]
+    assert env.reset(task_td(1, 1, 1))["task"].tolist() == [1, 1, 1]
+
+
+def succeed(env: NicoEnv, row: int, td: TensorDictBase) -> TensorDictBase:
+    """Demonstrates in one row, while others rest, until it succeeds; returns the last step."""
+    simulation = env._environments[row][int(env._task[row])]
+    demonstrator = Demonstrator(simulation, seed=0)
+    demonstrator.reset()
+    for _ in range(60):
+        action = torch.zeros(*env.batch_size, 4)
+        action[row] = torch.from_numpy(demonstrator(None))
+        td = env.step(td.set("action", action))["next"]
+        if td["done"].any():
+            return td
+        td = td.exclude("reward")
+    raise AssertionError("the demonstration failed")
+
+
+@pytest.mark.parametrize("task", range(3))
+def test_success_terminates_its_row_only(task):
+    env = NicoEnv(batch_size=[2], seed=2, observation="state")
+    last = succeed(env, 1, env.reset(task_td(task, task)))
+
+    assert last["reward"].tolist() == [[0.0], [1.0]]
+    assert last["terminated"].tolist() == last["done"].tolist() == [[False], [True]]
+    assert not last["truncated"].any()
+
+
+def test_a_done_row_waits_for_its_reset():
+    env = NicoEnv(batch_size=[2], seed=2, observation="both")
+    last = succeed(env, 1, env.reset(task_td(0, 0)))
+
+    for mask in ({}, {"_step": torch.ones(2, dtype=torch.bool)}):
+        td = last.exclude("reward").update({"action": torch.full((2, 4), 0.5), **mask})
+        after = env.step(td)["next"]
+        assert after["reward"].tolist() == [[0.0], [0.0]]
+        assert after["done"].tolist() == [[False], [True]]
+        torch.testing.assert_close(after["pixels"][1], last["pixels"][1], rtol=0, atol=0)
+        assert (after["state"][0] != last["state"][0]).any()
+    fresh = env.reset(TensorDict({"_reset": last["done"]}, [2]))
+    assert not fresh["done"].any()
+    assert (fresh["state"][1] != last["state"][1]).any()
+
+
+def test_it_never_ends_an_episode_by_time():
+    env = NicoEnv(observation="state")
+    rollout = run(env, env.reset(), torch.zeros(60, 4))
+    assert not rollout["done"].any()
+    limited = TransformedEnv(env, StepCounter(50))
+    last = limited.rollout(60, policy=lambda td: td.set("action", torch.zeros(4)))[-1]["next"]
+    assert (last["truncated"].item(), last["terminated"].item()) == (True, False)
+    assert last["step_count"] == 50
+
+
+@batch_sizes
+def test_it_continues_bit_for_bit_from_its_state(tmp_path, batch_size):
+    env = NicoEnv(batch_size=batch_size, observation="both")
+    steps = actions(env, 9)
+    task = torch.arange(env.batch_size.numel()).reshape(batch_size) % 3
+    td = run(env, env.reset(TensorDict({"task": task}, batch_size)), steps[:4])[-1]
+    save_checkpoint(tmp_path, env.simulation_state())
+
+    def go_on(env: NicoEnv) -> list[TensorDictBase]:
+        first = run(env, td.exclude("reward"), steps[4:])
+        start = env.reset()  # draws random numbers
+        return [first, start.clone(), run(env, start, steps[:3])]
+
+    expected = go_on(env)
+    env.load_simulation_state(load_checkpoint(tmp_path))
+    fresh = NicoEnv(batch_size=batch_size, seed=99, observation="both")
+    fresh.load_simulation_state(load_checkpoint(tmp_path))
+
+    for actual in (go_on(env), go_on(fresh)):
+        for first, second in zip(actual, expected, strict=True):
+            assert_equal(first, second)
+
+
+def test_a_row_that_was_done_is_done_after_loading():
+    env = NicoEnv(batch_size=[2], seed=2, observation="state")
+    last = succeed(env, 1, env.reset(task_td(0, 0)))
+    fresh = NicoEnv(batch_size=[2], observation="state")
+    fresh.load_simulation_state(env.simulation_state())
+
+    after = fresh.step(last.exclude("reward").set("action", torch.zeros(2, 4)))["next"]
+
+    assert after["done"].tolist() == [[False], [True]]
+    torch.testing.assert_close(after["state"][1], last["state"][1], rtol=0, atol=0)
+
+
+def test_a_state_is_a_copy():
+    env = NicoEnv(batch_size=[2], observation="both")
+    td = env.reset(task_td(1, 2))
+    state = env.simulation_state()
+    physics, pixels = state["physics"].clone(), state["current"]["pixels"].clone()
+
+    run(env, td, actions(env, 2))
+    env.reset(task_td(0, 0))
+
+    torch.testing.assert_close(state["physics"], physics, rtol=0, atol=0)
+    torch.testing.assert_close(state["current"]["pixels"], pixels, rtol=0, atol=0)
+    assert state["task"].tolist() == [1, 2]
+
+
+@batch_sizes
+def test_what_was_handed_out_never_changes(batch_size):
+    env = NicoEnv(batch_size=batch_size, observation="both")
+    kept, copies = [], []
+    td = env.reset()
+    for action in actions(env, 4):
+        kept.append(td)
+        copies.append(td.clone())
+        td = env.step(td.clone().set("action", action))["next"]
+    env.reset(TensorDict({"task": torch.ones(batch_size, dtype=torch.int64)}, batch_size))
+
+    for td, copy in zip(kept, copies, strict=True):
+        assert_equal(td, copy)
+    td["pixels"].zero_()
+    td["state"].zero_()
+    td["done"].fill_(True)
+    td["task"].fill_(2)
+    after = env.step(TensorDict({"action": torch.zeros(*batch_size, 4)}, batch_size))["next"]
+    assert after["pixels"].any()
+    assert not after["done"].any()
+    assert (after["task"] == 1).all()
+
+
+@pytest.mark.parametrize("wrong", [-1, 3])
+def test_a_task_out_of_range_is_refused_before_anything_changes(wrong):
+    env = NicoEnv(batch_size=[2], observation="state")
+    env.reset(task_td(2, 0))
+    before = env.simulation_state()
+
+    with pytest.raises(ValueError, match=rf"^task must lie in 0\.\.2, got \[1, {wrong}\]$"):
+        env.reset(task_td(1, wrong))
+
+    after = env.simulation_state()
+    assert after["task"].tolist() == [2, 0]
+    torch.testing.assert_close(after["physics"], before["physics"], rtol=0, atol=0)
+
+
+def test_a_bad_action_is_refused_before_any_row_moves():
+    env = NicoEnv(batch_size=[2], observation="state")
+    td = env.reset()
+    before = env.simulation_state()["physics"]
+    action = torch.zeros(2, 4)
+    action[1, 2] = torch.nan
+
+    with pytest.raises(ValueError, match=r"^an action is 4 finite numbers in \[-1, 1\], got .*$"):
+        env.step(td.set("action", action))
+
+    torch.testing.assert_close(env.simulation_state()["physics"], before, rtol=0, atol=0)
+
+
+def test_wrong_arguments_are_refused_in_one_line():
+    with pytest.raises(ValueError, match=r"^3 seeds for 2 simulations: give one each$"):
+        NicoEnv(batch_size=[2], seed=[1, 2, 3])
+    with pytest.raises(ValueError, match=r"^no NICO task 'juggle'; choose one of .*$"):
+        NicoEnv(["juggle"])
+    with pytest.raises(ValueError, match=r"^observation is 'sound'; choose one of .*$"):
+        NicoEnv(observation="sound")
+
+
+def test_a_state_of_another_environment_is_refused():
+    state = NicoEnv(batch_size=[2], observation="state").simulation_state()
+
+    with pytest.raises(ValueError, match=r"^the state holds 2 simulations, .* has 3: use .*$"):
+        NicoEnv(batch_size=[3], observation="state").load_simulation_state(state)
+    with pytest.raises(ValueError, match=r"observations \['state'\], .* has \['pixels'\]: use"):
+        NicoEnv(batch_size=[2], observation="pixels").load_simulation_state(state)
