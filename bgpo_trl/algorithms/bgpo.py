@@ -63,7 +63,9 @@ def observe(config: BGPOConfig, encoders: Representation | None, n_tasks: int) -
         transforms.append(ObservationNorm(loc, scale, in_keys=["state"], standard_normal=True))
     if config.context == "task_one_hot":
         transforms.append(
-            UnaryTransform(["task"], ["task_one_hot"], lambda t: one_hot(t, n_tasks).float())
+            UnaryTransform(
+                ["task"], ["task_one_hot"], fn=lambda t: one_hot(t, n_tasks).float()
+            )
         )
     return transforms
 
@@ -132,7 +134,9 @@ class BGPO:
         )
         context_key = "task_one_hot" if config.context == "task_one_hot" else "behavior"
         context_size = schedule.n_tasks if context_key == "task_one_hot" else embedding_size
-        state_size = STATE_SIZE if encoders is None else encoders.vae.latent_size
+        state_size = STATE_SIZE
+        if config.state == "latent" and encoders is not None:
+            state_size = encoders.vae.latent_size
         self.in_keys = (config.state, context_key)
         self._make_learner(seeds, state_size + context_size)
 

@@ -1,0 +1,107 @@
+"""Which part limits learning: the same learner, fed with less and less that is given to it.
+
+    python benchmarks/ladder.py --rungs a b c d --episodes 2000
+
+All three tasks at once (the paper's concurrent setting). Rung (a) sees ground-truth state and the
+task's label; (b) latents and the label; (c) latents and the demonstration's embedding phi; (d) is
+BGPO: latents and the behavior b of GWR-B. A drop from one rung to the next names the part that is
+short: encoder, sequence encoder, self-organization.
+"""
+
+from __future__ import annotations
+
+import csv
+import sys
+from collections import defaultdict
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+import torch
+import tyro
+
+from bgpo_trl.configs import PRESETS, BGPOConfig
+from bgpo_trl.plotting import plot_success_curves, save_figure
+from bgpo_trl.pretrained import load_pretrained
+from bgpo_trl.training import Trainer
+from suites import nico
+
+Rung = Literal["a", "b", "c", "d"]
+
+RUNGS: dict[str, tuple[str, BGPOConfig]] = {
+    "a": ("ground truth + label", BGPOConfig(state="state", context="task_one_hot")),
+    "b": ("latent + label", BGPOConfig(context="task_one_hot")),
+    "c": ("latent + phi", BGPOConfig(context="demo_embedding")),
+    "d": ("latent + b (BGPO)", BGPOConfig(context="behavior")),
+}
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Runs the rungs one after the other and prints a table."""
+
+    rungs: tuple[Rung, ...] = ("a", "b", "c", "d")
+    """Which to run."""
+    episodes: int = 2_000
+    """Training episodes of each seed."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Seeds, run as one batch."""
+    out: Path = Path("runs/ladder")
+    """One run directory a rung goes in here."""
+    resume: bool = False
+    """Continue interrupted rungs; finished ones are only read."""
+    threads: int = 1
+    """Threads of PyTorch."""
+
+
+def summarize(path: Path, episodes: int) -> dict[str, float]:
+    """Returns success over the last 10 % of training, by task and overall, and episodes to 80 %."""
+    rows = list(csv.DictReader(path.open()))
+    late: dict[str, list[float]] = defaultdict(list)
+    curve: dict[int, list[float]] = defaultdict(list)
+    for row in rows:
+        curve[int(row["episode"])].append(float(row["success"]))
+        if int(row["episode"]) > 0.9 * episodes:
+            late[row["task"]].append(float(row["success"]))
+    table = {task: sum(late[task]) / len(late[task]) for task in nico.ALL_TASKS}
+    table["overall"] = sum(table[task] for task in nico.ALL_TASKS) / len(nico.ALL_TASKS)
+    reached = (episode for episode, s in sorted(curve.items()) if sum(s) / len(s) >= 0.8)
+    table["episodes to 80 %"] = next(reached, float("nan"))
+    return table
+
+
+def main(arguments: Arguments) -> None:
+    """Runs the ladder."""
+    torch.set_num_threads(arguments.threads)
+    encoders, bank = load_pretrained()
+    base = replace(
+        PRESETS["desk"],
+        seeds=arguments.seeds,
+        episodes=arguments.episodes,
+        task_starts=(0, 0, 0),
+        eval_every=100,
+        eval_episodes=5,
+    )
+    tables = {}
+    for rung in arguments.rungs:
+        _, bgpo = RUNGS[rung]
+        out = arguments.out / rung
+        config = replace(base, bgpo=bgpo)
+        Trainer(config, out, bank=bank, encoders=encoders, resume=arguments.resume).run()
+        save_figure(plot_success_curves(out / "eval.csv"), out / "figures" / "success.png")
+        tables[rung] = summarize(out / "eval.csv", arguments.episodes)
+    columns = list(next(iter(tables.values())))
+    print("| rung | " + " | ".join(columns) + " |")
+    print("|---|" + "---|" * len(columns))
+    for rung, table in tables.items():
+        cells = [f"{v:.0f}" if k.startswith("episodes") else f"{v:.2f}" for k, v in table.items()]
+        print(f"| ({rung}) {RUNGS[rung][0]} | " + " | ".join(cells) + " |")
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Annotated[Arguments, tyro.conf.OmitArgPrefixes], description=__doc__))
+    except (ValueError, OSError) as error:
+        sys.exit(f"error: {error}")
+    except KeyboardInterrupt:
+        sys.exit("interrupted: the same command with --resume continues")
