@@ -3,12 +3,23 @@
 from __future__ import annotations
 
 import math
-from bisect import bisect_left
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
+
+
+class Firing(NamedTuple):
+    """A node of habituation h moves by `lr * h` of its way to the input, then habituates.
+
+    Each firing leaves `decay = exp(-alpha / tau)` of what h has above `floor = h_0 - 1 / alpha`.
+    """
+
+    lr: float
+    floor: float
+    decay: float
 
 
 @dataclass(frozen=True)
@@ -46,10 +57,17 @@ class LearningRule:
             if not holds:
                 raise ValueError(f"GWR-B needs {need}; got {self}")
 
-    def habituate(self, h: float, alpha: float, tau: float) -> float:
-        """Habituation after one more firing (Eqs. 5, 6)."""
-        floor = self.initial_habituation - 1 / alpha
-        return floor + (h - floor) * math.exp(-alpha / tau)
+    @cached_property
+    def best(self) -> Firing:
+        """What firing does to the best match (Eqs. 3, 5)."""
+        floor = self.initial_habituation - 1 / self.alpha_best
+        return Firing(self.lr_best, floor, math.exp(-self.alpha_best / self.tau_best))
+
+    @cached_property
+    def neighbor(self) -> Firing:
+        """What firing does to its neighbors (Eqs. 4, 6)."""
+        floor = self.initial_habituation - 1 / self.alpha_neighbor
+        return Firing(self.lr_neighbor, floor, math.exp(-self.alpha_neighbor / self.tau_neighbor))
 
 
 class BehaviorGraph(NamedTuple):
@@ -71,117 +89,139 @@ class BehaviorGraph(NamedTuple):
 
 
 class WeightUpdate(NamedTuple):
-    """What learning from phi asks of the weights, to be done in this order.
+    """What learning from phi asks of the weights, in this order.
 
     Attributes:
-        insert: whether to append the row (w_c + phi) / 2.
-        steps: (row, size): move the weights of that row by `size` of their way to phi.
-        delete: rows to delete, one after the other.
+        insert: whether the next row becomes (w_c + phi) / 2.
+        moved: rows to move to phi ...
+        steps: ... by this much of their way.
+        removed: rows to erase.
     """
 
     insert: bool
-    steps: list[tuple[int, float]]
-    delete: list[int]
+    moved: list[int]
+    steps: list[float]
+    removed: list[int]
 
 
 @dataclass(slots=True)
 class Topology:
-    """Nodes, edges and habituation of one network; `nodes[i]` has row i of the weights.
+    """Nodes, edges and habituation of one network; a node is known by its row of the weights.
 
     Plain Python on the host: an input touches the few edges of one node, which takes dictionaries
-    less time than the call of a single tensor operation. A node is named by its identity: counted
-    up from 0, neither reused nor renumbered when a node is removed.
+    less time than the call of a single tensor operation. Rows are in order of creation. The row of
+    a removed node stays behind, out of use, until `compact`.
     """
 
-    nodes: list[int] = field(default_factory=list)  # ascending, as they are in order of creation
-    habituation: list[float] = field(default_factory=list)  # of each of `nodes`
-    neighbors: dict[int, dict[int, int]] = field(default_factory=dict)  # node -> {neighbor: age}
-    next_node: int = 0
+    identity: list[int] = field(default_factory=list)  # of the node in each row, ascending
+    habituation: list[float] = field(default_factory=list)  # of the node in each row
+    wins: list[int] = field(default_factory=list)  # how often it has been the best match
+    # Node -> {neighbor: reset}. An edge ages when either end wins, so its age is the wins of both
+    # less what they were at age 0. That `reset` is all to be kept, and a win touches no edge.
+    edges: dict[int, dict[int, int]] = field(default_factory=dict)
+    next_identity: int = 0
 
     @classmethod
-    def from_graph(cls, graph: BehaviorGraph, next_node: int) -> Topology:
+    def from_graph(cls, graph: BehaviorGraph, next_identity: int) -> Topology:
         """Rebuilds the topology that `to_graph` has copied."""
-        nodes = graph.node.tolist()
-        topology = cls(nodes, graph.habituation.tolist(), {node: {} for node in nodes}, next_node)
-        for (i, j), age in zip(graph.edges.tolist(), graph.ages.tolist(), strict=True):
-            topology.connect(nodes[i], nodes[j], age)
+        identity, habituation = graph.node.tolist(), graph.habituation.tolist()
+        edges = {row: {} for row in range(len(identity))}
+        topology = cls(identity, habituation, [0] * len(identity), edges, next_identity)
+        for (a, b), age in zip(graph.edges.tolist(), graph.ages.tolist(), strict=True):
+            topology.connect(a, b, age)
         return topology
 
     def to_graph(self, weights: Tensor) -> BehaviorGraph:
-        """Copies the topology to tensors on the device of `weights`, which it goes with."""
+        """Copies the network, given the weights of all rows."""
+        rows = list(self.edges)
+        position = {row: i for i, row in enumerate(rows)}
         edges = sorted(
-            (a, b, age) for a, ages in self.neighbors.items() for b, age in ages.items() if a < b
+            (position[a], position[b], self.wins[a] + self.wins[b] - reset)
+            for a, resets in self.edges.items()
+            for b, reset in resets.items()
+            if a < b
         )
-        table = torch.tensor(edges, dtype=torch.int64, device=weights.device).view(-1, 3)
-        node = torch.tensor(self.nodes, dtype=torch.int64, device=weights.device)
+        device = weights.device
+        table = torch.tensor(edges, dtype=torch.int64, device=device).view(-1, 3)
+        habituation = [self.habituation[row] for row in rows]
+        identity = [self.identity[row] for row in rows]
         return BehaviorGraph(
-            weights=weights,
-            habituation=torch.tensor(self.habituation, dtype=torch.float64, device=weights.device),
-            edges=torch.searchsorted(node, table[:, :2].contiguous()),
+            weights=weights[torch.tensor(rows, dtype=torch.int64, device=device)],
+            habituation=torch.tensor(habituation, dtype=torch.float64, device=device),
+            edges=table[:, :2].clone(),
             ages=table[:, 2].clone(),
-            node=node,
+            node=torch.tensor(identity, dtype=torch.int64, device=device),
         )
+
+    def compact(self) -> list[int]:
+        """Closes the gaps that removed nodes have left; returns the former row of each node."""
+        rows = list(self.edges)
+        position = {row: i for i, row in enumerate(rows)}
+        self.identity = [self.identity[row] for row in rows]
+        self.habituation = [self.habituation[row] for row in rows]
+        self.wins = [self.wins[row] for row in rows]
+        self.edges = {
+            position[a]: {position[b]: reset for b, reset in resets.items()}
+            for a, resets in self.edges.items()
+        }
+        return rows
 
     def add(self, habituation: float) -> int:
         """Creates a node without edges."""
-        node = self.next_node
-        self.next_node += 1
-        self.nodes.append(node)
+        row = len(self.identity)
+        self.identity.append(self.next_identity)
         self.habituation.append(habituation)
-        self.neighbors[node] = {}
-        return node
+        self.wins.append(0)
+        self.edges[row] = {}
+        self.next_identity += 1
+        return row
 
     def connect(self, a: int, b: int, age: int = 0) -> None:
         """Creates the edge a-b, or sets its age."""
-        self.neighbors[a][b] = self.neighbors[b][a] = age
+        self.edges[a][b] = self.edges[b][a] = self.wins[a] + self.wins[b] - age
 
     def disconnect(self, a: int, b: int) -> None:
         """Removes the edge a-b."""
-        del self.neighbors[a][b], self.neighbors[b][a]
+        del self.edges[a][b], self.edges[b][a]
 
-    def learn(self, best: int, second: int, activity: float, rule: LearningRule) -> WeightUpdate:
-        """Takes steps 3 to 5 of `GWRB`, given the rows of the two nearest nodes."""
-        c, c_second = self.nodes[best], self.nodes[second]
-        self.connect(c, c_second)
+    def learn(self, c: int, second: int, activity: float, rule: LearningRule) -> WeightUpdate:
+        """Takes steps 3 to 5 of `GWRB`, given the two nearest nodes."""
+        self.connect(c, second)
         insert = (
             activity < rule.activity_threshold
-            and self.habituation[best] < rule.habituation_threshold
-            and (rule.max_nodes is None or len(self.nodes) < rule.max_nodes)
+            and self.habituation[c] < rule.habituation_threshold
+            and (rule.max_nodes is None or len(self.edges) < rule.max_nodes)
         )
         if insert:
             v = self.add(rule.initial_habituation)
             self.connect(v, c)
-            self.connect(v, c_second)
-            self.disconnect(c, c_second)
-        steps = [] if insert else self._fire(c, rule)
-        return WeightUpdate(insert, steps, self._age_edges(c, rule.max_age))
+            self.connect(v, second)
+            self.disconnect(c, second)
+        moved = [] if insert else [c, *self.edges[c]]
+        steps = self._fire(moved, rule)
+        return WeightUpdate(insert, moved, steps, self._age_edges(c, rule.max_age))
 
-    def _fire(self, c: int, rule: LearningRule) -> list[tuple[int, float]]:
-        """Habituates c and its neighbors; returns row and step size of each (Eqs. 3-6)."""
-        best = (c, rule.lr_best, rule.alpha_best, rule.tau_best)
-        others = [
-            (k, rule.lr_neighbor, rule.alpha_neighbor, rule.tau_neighbor) for k in self.neighbors[c]
-        ]
-        steps = []
-        for node, lr, alpha, tau in [best, *others]:
-            row = self._row(node)
-            steps.append((row, lr * self.habituation[row]))
-            self.habituation[row] = rule.habituate(self.habituation[row], alpha, tau)
+    def _fire(self, nodes: list[int], rule: LearningRule) -> list[float]:
+        """Habituates nodes, the first as the best match; returns the step of each."""
+        steps, habituation = [], self.habituation
+        lr, floor, decay = rule.best
+        for node in nodes:
+            h = habituation[node]
+            steps.append(lr * h)
+            habituation[node] = floor + (h - floor) * decay
+            lr, floor, decay = rule.neighbor
         return steps
 
     def _age_edges(self, c: int, max_age: int) -> list[int]:
-        """Ages the edges of c; those too old go, then nodes without edges; returns the rows."""
-        rows = []
-        for k, age in list(self.neighbors[c].items()):
-            if age < max_age:
-                self.connect(c, k, age + 1)
-                continue
+        """Ages the edges of c; those too old go, then nodes without edges, which it returns."""
+        wins = self.wins
+        wins[c] += 1
+        oldest = wins[c] - max_age
+        expired = [k for k, reset in self.edges[c].items() if wins[k] + oldest > reset]
+        removed = []
+        for k in expired:
             self.disconnect(c, k)
-            if not self.neighbors[k]:
-                row = self._row(k)
-                del self.neighbors[k], self.nodes[row], self.habituation[row]
-                rows.append(row)
-        return rows
-
-    def _row(self, node: int) -> int:
-        return bisect_left(self.nodes, node)
+            if not self.edges[k]:
+                del self.edges[k]
+                removed.append(k)
+        return removed
