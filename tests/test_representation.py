@@ -1,5 +1,6 @@
 """Stage 1 on a small world: two squares on grey, moved by the four numbers of the action."""
 
+import csv
 import json
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -21,9 +22,19 @@ from bgpo_trl.representation import (
     split,
     train_representation,
 )
+from bgpo_trl.train_encoders import train_encoders
+from suites import nico
 
 CONFIG = RepresentationConfig(
-    vae=VAEConfig(batch_size=32, window=2, steps=90, learning_rate=2e-3, warmup_steps=10),
+    vae=VAEConfig(
+        batch_size=32,
+        window=2,
+        steps=90,
+        learning_rate=2e-3,
+        warmup_steps=10,
+        kl_weight=0.01,
+        inverse_weight=10.0,
+    ),
     lae=SequenceAutoencoderConfig(batch_size=64, steps=150, learning_rate=1e-2, warmup_steps=10),
     checkpoint_every=50,
 )
@@ -212,6 +223,18 @@ def test_log_has_the_losses_of_both_stages(tmp_path: Path) -> None:
     ]
     assert {"loss_reconstruction", "loss_kl", "loss_inverse", "kl", "inverse"} <= rows[0].keys()
     assert rows[0]["loss_kl"] == pytest.approx(TINY.vae.kl_weight * rows[0]["kl"])
+
+
+def test_command_writes_weights_log_and_probes(tiny: Representation, tmp_path: Path) -> None:
+    folder, weights = tmp_path / "run", tmp_path / "weights.safetensors"
+    train_encoders(squares(8), weights, folder, TINY, "make weights")
+    loaded = load_representation(weights, scene_version=nico.scene_version())
+    assert same(tiny, loaded)
+    assert loaded.metadata["command"] == "make weights"
+    rows = list(csv.DictReader((folder / "train.csv").open()))
+    assert [row["stage"] for row in rows] == ["vae", "vae", "lae", "lae"]
+    assert json.loads((folder / "probes.json").read_text()) == probe(loaded, squares(8))
+    assert (folder / "reconstructions.png").exists()
 
 
 @pytest.mark.parametrize(
