@@ -206,6 +206,17 @@ def test_a_done_row_waits_for_its_reset():
     assert (fresh["state"][1] != last["state"][1]).any()
 
 
+def test_a_reset_elsewhere_leaves_a_row_done():
+    env = NicoEnv(batch_size=[2], seed=2, observation="state")
+    last = succeed(env, 1, env.reset(task_td(0, 0))).exclude("reward")
+
+    env.reset(last.clone().set("_reset", torch.tensor([[True], [False]])))
+
+    after = env.step(last.clone().set("action", torch.zeros(2, 4)))["next"]
+    assert after["done"].tolist() == [[False], [True]]
+    torch.testing.assert_close(after["state"][1], last["state"][1], rtol=0, atol=0)
+
+
 def test_it_never_ends_an_episode_by_time():
     env = NicoEnv(observation="state")
     rollout = run(env, env.reset(), torch.zeros(60, 4))

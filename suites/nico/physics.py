@@ -66,8 +66,6 @@ class Physics(dm_mujoco.Physics):
         """Continues from what ``full_state`` returned, bit for bit."""
         self.set_state(state, _FULL_STATE)
         mujoco.mj_forward(self.model.ptr, self.data.ptr)
-        # Forward dynamics has moved the solver's warm start on: set it back.
-        self.set_state(state, _FULL_STATE)
 
     def gap(self, first: str, second: str) -> float:
         """Returns the smallest distance between two geoms (m); negative where they overlap."""
