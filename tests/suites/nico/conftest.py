@@ -1,6 +1,9 @@
+from collections.abc import Callable
+
 import pytest
 
 from suites import nico
+from suites.nico.base import Environment
 from suites.nico.rendering import FrameRenderer
 
 
@@ -14,3 +17,9 @@ def physics() -> nico.Physics:
 def renderer(physics: nico.Physics) -> FrameRenderer:
     """One OpenGL context for all tests, since making it costs more than most tests."""
     return FrameRenderer(physics.model.ptr)
+
+
+@pytest.fixture
+def load(physics: nico.Physics, renderer: FrameRenderer) -> Callable[..., Environment]:
+    """Loads environments that share a simulation, so use one at a time."""
+    return lambda task, **kwargs: nico.load(task, physics=physics, renderer=renderer, **kwargs)
