@@ -107,6 +107,13 @@ class BGPOConfig:
     ddpg: DDPGConfig = field(default_factory=DDPGConfig)
     """The RL algorithm."""
 
+    def __post_init__(self) -> None:
+        if self.state != "latent" and self.context != "task_one_hot":
+            raise ValueError(
+                f"state={self.state!r} goes with context='task_one_hot' only: behaviors are "
+                "matched with what latents become"
+            )
+
 
 @dataclass(frozen=True)
 class RunConfig:
@@ -127,6 +134,13 @@ class RunConfig:
     """Minutes between checkpoints. Ours."""
     bgpo: BGPOConfig = field(default_factory=BGPOConfig)
     """The algorithm."""
+
+    def __post_init__(self) -> None:
+        if not self.seeds or len(set(self.seeds)) < len(self.seeds) or min(self.seeds) < 0:
+            raise ValueError(f"a run needs seeds, all different and none negative: {self.seeds}")
+        for name in ("episodes", "eval_every", "eval_episodes"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
 
 
 PRESETS: dict[str, RunConfig] = {

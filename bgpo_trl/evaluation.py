@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -28,14 +27,14 @@ class Snapshot:
     Attributes:
         episode: Training episodes before it.
         env_steps: Environment steps before it.
-        n_tasks: Tasks presented so far.
+        presented: Which tasks were presented so far, bool ``[T]``.
         actor: The policy's weights, without the seed dimension.
         context: The policy's second input for each test episode, ``[T * M, context]``.
     """
 
     episode: int
     env_steps: int
-    n_tasks: int
+    presented: Tensor
     actor: dict[str, Tensor]
     context: Tensor
 
@@ -45,7 +44,7 @@ class TestResult:
     """Outcome of the test episodes of one evaluation of each seed.
 
     Attributes:
-        success: Bool ``[S, T, M]``: seeds, tasks, episodes of a task; it is also the extrinsic return.
+        success: Bool ``[S, T, M]``: seeds, tasks, episodes of a task; also the extrinsic return.
         steps: Length of the episodes, int64 ``[S, T, M]``.
     """
 
@@ -69,6 +68,9 @@ class Evaluator:
         episodes: Test episodes ``M`` of each task.
         bank: Held-out demonstrations.
         encoders: As in training.
+
+    Raises:
+        ValueError: If there is no demonstration of one of the tasks.
     """
 
     def __init__(
@@ -85,14 +87,18 @@ class Evaluator:
         self.seeds = tuple(seeds)
         self.shape = (len(seeds), n_tasks, episodes)
         self._rows_of = [torch.nonzero(bank.task == task).flatten() for task in range(n_tasks)]
+        missing = [task for task, rows in enumerate(self._rows_of) if not len(rows)]
+        if missing:
+            raise ValueError(
+                f"the bank has no held-out demonstration of task {missing[0]}: hold some out of "
+                "each task"
+            )
         self._bank = bank
-        self.env = TransformedEnv(
-            NicoEnv(
-                batch_size=self.shape,
-                observation="pixels" if config.state == "latent" else "state",
-            ),
-            Compose(*observe(config, encoders, n_tasks)),
+        self.simulation = NicoEnv(
+            batch_size=self.shape,
+            observation="pixels" if config.state == "latent" else "state",
         )
+        self.env = TransformedEnv(self.simulation, Compose(observe(config, encoders, n_tasks)))
         self._task = torch.arange(n_tasks)[:, None].expand(self.shape).contiguous()
 
     def _rng(self, seed: int, number: int) -> np.random.Generator:
@@ -110,16 +116,20 @@ class Evaluator:
         """
         rng = self._rng(self.seeds[index], number)
         drawn = torch.cat(
-            [rows[torch.from_numpy(rng.integers(len(rows), size=self.shape[2]))] for rows in self._rows_of]
+            [
+                rows[torch.from_numpy(rng.integers(len(rows), size=self.shape[2]))]
+                for rows in self._rows_of
+            ]
         )
         # All seeds look the same demonstrations up: GWR-B knows only whole batches.
         embedding = self._bank.embedding[drawn].expand(len(self.seeds), -1, -1)
         task = self._bank.task[drawn].expand(len(self.seeds), -1)
-        episode = algorithm.source.episode
+        episode = int(algorithm.source.episode[index])
         return Snapshot(
-            episode=int(episode[index]),
+            episode=episode,
             env_steps=env_steps,
-            n_tasks=int(algorithm.source.schedule.available(episode - 1)[index].sum()),
+            # The last of those episodes could be about tasks that start with fewer before it.
+            presented=torch.tensor(algorithm.source.schedule.starts) < episode,
             actor={k: v[index].clone() for k, v in algorithm.actor.state_dict().items()},
             context=algorithm.infer(embedding, task)[index].clone(),
         )
@@ -136,15 +146,16 @@ class Evaluator:
         Returns:
             Success and length; both 0 where a task was not yet presented.
         """
-        weights = {key: torch.stack([s.actor[key] for s in snapshots]) for key in snapshots[0].actor}
+        weights = {
+            key: torch.stack([s.actor[key] for s in snapshots]) for key in snapshots[0].actor
+        }
         context = torch.stack([s.context for s in snapshots]).unflatten(1, self.shape[1:])
         starts = [
             self._rng(seed, number).integers(2**32, size=self.shape[1:]) for seed in self.seeds
         ]
-        self.env.base_env.seed_rows(np.stack(starts).ravel().tolist())
-        presented = torch.tensor([s.n_tasks for s in snapshots])
-        active = torch.arange(self.shape[1]) < presented[:, None]
-        active = active[:, :, None].expand(self.shape).clone()
+        self.simulation.seed_rows(np.stack(starts).ravel().tolist())
+        presented = torch.stack([s.presented for s in snapshots])
+        active = presented[:, :, None].expand(self.shape).clone()
         success, steps = torch.zeros(self.shape, dtype=torch.bool), torch.zeros(self.shape).long()
         state = self.env.reset(TensorDict({"task": self._task}, self.shape))
         for _ in range(self.max_steps):
@@ -167,7 +178,9 @@ def evaluate_random_policy(
 ) -> Tensor:
     """Returns the success rate of uniformly random actions on each task, float32 ``[n_tasks]``."""
     shape = (n_tasks, episodes)
-    env = NicoEnv(batch_size=shape, seed=stream_seed(seed, "random policy") // 2, observation="state")
+    env = NicoEnv(
+        batch_size=shape, seed=stream_seed(seed, "random policy") // 2, observation="state"
+    )
     generator = torch.Generator().manual_seed(seed)
     task = torch.arange(n_tasks)[:, None].expand(shape).contiguous()
     state = env.reset(TensorDict({"task": task}, shape))
@@ -175,8 +188,3 @@ def evaluate_random_policy(
         state.set("action", torch.rand(*shape, 4, generator=generator) * 2 - 1)
         state = env.step(state)["next"]
     return state["terminated"].squeeze(-1).float().mean(-1)
-
-
-def snapshot_to_dict(snapshot: Snapshot) -> dict[str, Any]:
-    """Returns the snapshot as plain containers, for a checkpoint."""
-    return dict(vars(snapshot))

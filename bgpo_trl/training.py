@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import signal
+import threading
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -15,7 +19,7 @@ from bgpo_trl.algorithms.bgpo import BGPO
 from bgpo_trl.checkpoint import has_checkpoint, load_checkpoint, save_checkpoint
 from bgpo_trl.configs import RunConfig
 from bgpo_trl.demonstrations import DemonstrationBank
-from bgpo_trl.evaluation import Evaluator, Snapshot, snapshot_to_dict
+from bgpo_trl.evaluation import Evaluator, Snapshot
 from bgpo_trl.logging import RunLogger
 from bgpo_trl.representation import Representation
 from bgpo_trl.transforms import TaskSchedule
@@ -27,7 +31,11 @@ class Trainer:
 
     Each seed of the batch plays ``config.episodes`` training episodes. Seeds that are done early go
     on, unlogged, until the last one is; everything that is logged is what the seed alone would have
-    logged.
+    logged, but for the losses, which are means over the seeds.
+
+    Checkpoints are written between steps only, and an interrupt (Ctrl-C) waits for the end of its
+    step, so that each checkpoint is a state that the run has been in. Whatever else ends a run
+    costs it what came after its last checkpoint, and no row: a resumed run writes them again.
 
     Args:
         config: The run.
@@ -51,7 +59,7 @@ class Trainer:
         bank: DemonstrationBank,
         encoders: Representation | None = None,
         resume: bool = False,
-        wandb: str | None = None,
+        wandb: Literal["online", "offline"] | None = None,
         progress: bool = True,
     ) -> None:
         self.config = config
@@ -74,15 +82,19 @@ class Trainer:
         # Snapshots of each seed that wait for the other seeds, and how many were evaluated.
         self._waiting: list[list[Snapshot]] = [[] for _ in seeds]
         self._evaluated = 0
-        self.logger = RunLogger(
-            self.directory, config=asdict(config), wandb=wandb, resume=resume
-        )
+        self.logger = RunLogger(self.directory, config=asdict(config), wandb=wandb, resume=resume)
         self._state: TensorDictBase | None = None
         if resume:
             self._resume()
 
     def run(self) -> None:
-        """Trains to the end. An interrupt (Ctrl-C) leaves a checkpoint behind."""
+        """Trains to the end; does nothing where a resumed run is there already.
+
+        Raises:
+            KeyboardInterrupt: At the first Ctrl-C, when the step is over and saved; at a second one
+                at once.
+            OSError: If the disk is full.
+        """
         algorithm, n_episodes = self.algorithm, self.config.episodes
         state = algorithm.env.reset() if self._state is None else self._state
         saved = time.monotonic()
@@ -96,34 +108,37 @@ class Trainer:
         )
         losses: dict[str, torch.Tensor] = {}
         try:
-            while int(episodes.min()) < n_episodes:
-                before = episodes.clone()
-                state = algorithm.act(state)
-                transition, state = algorithm.env.step_and_maybe_reset(state)
-                losses = algorithm.learn(transition) or losses
-                self.env_steps += 1
-                self._state = state
-                for index in torch.nonzero(episodes > before).flatten().tolist():
-                    if before[index] < n_episodes:
-                        self._end_of_episode(index, transition, losses)
-                        bar.update()
-                self._evaluate(bar)
-                if time.monotonic() - saved > 60 * self.config.checkpoint_minutes:
-                    self.save()
-                    saved = time.monotonic()
+            with _interrupts_wait() as interrupted:
+                while int(episodes.min()) < n_episodes:
+                    before = episodes.clone()
+                    state = algorithm.act(state)
+                    transition, state = algorithm.env.step_and_maybe_reset(state)
+                    losses = algorithm.learn(transition) or losses
+                    self.env_steps += 1
+                    self._state = state
+                    for index in torch.nonzero(episodes > before).flatten().tolist():
+                        if before[index] < n_episodes:
+                            self._end_of_episode(index, transition, losses)
+                            bar.update()
+                    self._evaluate(bar)
+                    due = time.monotonic() - saved > 60 * self.config.checkpoint_minutes
+                    stop = interrupted()
+                    if due or stop or int(episodes.min()) >= n_episodes:
+                        self.save()
+                        saved = time.monotonic()
+                    if stop:
+                        break
         finally:
             bar.close()
-            if self._state is not None:
-                self.save()
             self.logger.close()
 
     def _end_of_episode(
         self, index: int, transition: TensorDictBase, losses: dict[str, torch.Tensor]
     ) -> None:
-        algorithm, end = self.algorithm, transition["next"][index]
+        algorithm, end = self.algorithm, transition.get("next")[index]
         episode = int(algorithm.source.episode[index])
-        has_intrinsic = "episode_extrinsic_reward" in end.keys()
-        extrinsic = end["episode_extrinsic_reward" if has_intrinsic else "episode_reward"]
+        intrinsic = end.get("episode_intrinsic_reward", 0.0)  # not measured where a label is given
+        extrinsic = end.get("episode_extrinsic_reward", end["episode_reward"])
         nodes = 0 if algorithm.gwr is None else int(algorithm.gwr.num_nodes[index])
         self.logger.log_train(
             {
@@ -135,7 +150,7 @@ class Trainer:
                 "success": int(end["terminated"]),
                 "return": float(extrinsic),
                 "steps": int(end["step_count"]),
-                "intrinsic_return": float(end["episode_intrinsic_reward"]) if has_intrinsic else 0.0,
+                "intrinsic_return": float(intrinsic),
                 "num_nodes": nodes,
                 "loss_actor": float(losses.get("loss_actor", 0.0)),
                 "loss_value": float(losses.get("loss_value", 0.0)),
@@ -153,7 +168,7 @@ class Trainer:
             result = self.evaluator.run(snapshots, self._evaluated, self.algorithm.actor)
             self._evaluated += 1
             for index, snapshot in enumerate(snapshots):
-                for task in range(snapshot.n_tasks):
+                for task in torch.nonzero(snapshot.presented).flatten().tolist():
                     for success, steps in zip(
                         result.success[index, task].tolist(),
                         result.steps[index, task].tolist(),
@@ -181,7 +196,7 @@ class Trainer:
             "algorithm": self.algorithm.state_dict(),
             "state": self._state.clone().to_dict(),
             "env_steps": self.env_steps,
-            "waiting": [[snapshot_to_dict(s) for s in waiting] for waiting in self._waiting],
+            "waiting": [[vars(s) for s in waiting] for waiting in self._waiting],
             "evaluated": self._evaluated,
             "position": self.logger.position(),
         }
@@ -200,3 +215,33 @@ class Trainer:
         self._waiting = [[Snapshot(**s) for s in waiting] for waiting in state["waiting"]]
         self._evaluated = state["evaluated"]
         self.logger.truncate_to(state["position"])
+
+
+@contextmanager
+def _interrupts_wait() -> Iterator[Callable[[], bool]]:
+    """Makes the first Ctrl-C wait for the end of the block, which is told by what it is given.
+
+    Where Ctrl-C is ignored (in the background of a shell), handled by someone else, or meant for
+    another thread, it stays so.
+    """
+    asked = False
+
+    def ask(signum: int, frame: Any) -> None:
+        nonlocal asked
+        if asked:
+            raise KeyboardInterrupt
+        asked = True
+
+    if (
+        threading.current_thread() is not threading.main_thread()
+        or signal.getsignal(signal.SIGINT) is not signal.default_int_handler
+    ):
+        yield lambda: False
+        return
+    signal.signal(signal.SIGINT, ask)
+    try:
+        yield lambda: asked
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    if asked:
+        raise KeyboardInterrupt
