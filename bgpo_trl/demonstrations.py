@@ -6,7 +6,6 @@ import hashlib
 import json
 import shutil
 import sys
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -284,14 +283,6 @@ class DemonstrationBank:
         if found != wanted:
             raise ValueError(f"{path} belongs to {found}, but needed is {wanted}; {remedy}")
         return cls(**tensors)
-
-
-def encoder_id(parameters: dict[str, Tensor]) -> str:
-    """Returns a short identity of trained encoders, to match a bank with them."""
-    value = 0
-    for name in sorted(parameters):
-        value = zlib.crc32(parameters[name].detach().contiguous().numpy().tobytes(), value)
-    return f"{value:08x}"
 
 
 def main(

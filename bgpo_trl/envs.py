@@ -100,6 +100,8 @@ class NicoEnv(EnvBase):
             observation["state"] = Unbounded(shape=torch.Size([*batch, STATE_SIZE]))
             self._current["state"] = np.zeros((count, STATE_SIZE), np.float32)
         self.observation_spec = Composite(observation, shape=batch)
+        # What is not a state is withheld from `_reset` when this is wrapped in a TransformedEnv.
+        self.state_spec = Composite({"task": observation["task"].clone()}, shape=batch)
         self.action_spec = Bounded(-1.0, 1.0, shape=torch.Size([*batch, 4]))
         self.reward_spec = Bounded(0.0, 1.0, shape=torch.Size([*batch, 1]))
         self.done_spec = Composite(

@@ -5,23 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from bgpo_trl.configs import RepresentationConfig
-from bgpo_trl.demonstrations import DemonstrationBank, encoder_id, record_demonstrations
-from bgpo_trl.representation import (
-    Representation,
-    default_weights,
-    embed_demonstrations,
-    load_representation,
-)
-from bgpo_trl.train_encoders import train_encoders
+from bgpo_trl.demonstrations import DemonstrationBank, record_demonstrations
+from bgpo_trl.representation import Representation, default_weights, load_representation
+from bgpo_trl.train_encoders import bank_path, train_encoders
 from suites import nico
-
-BANK_NAME = "nico_bank.safetensors"
-
-
-def _identity(encoders: Representation) -> str:
-    parameters = {f"vae.{k}": v for k, v in encoders.vae.state_dict().items()}
-    parameters |= {f"lae.{k}": v for k, v in encoders.lae.state_dict().items()}
-    return encoder_id(parameters)
 
 
 def load_pretrained(
@@ -37,7 +24,7 @@ def load_pretrained(
     """
     weights = default_weights() if weights is None else Path(weights)
     encoders = load_representation(weights, scene_version=nico.scene_version())
-    bank = DemonstrationBank.load(weights.with_name(BANK_NAME), encoder_id=_identity(encoders))
+    bank = DemonstrationBank.load(bank_path(weights), encoder_id=encoders.identity)
     return encoders, bank
 
 
@@ -78,16 +65,6 @@ def make_pretrained(
         seed=seed,
         progress=progress,
     )
-    weights = Path(weights)
-    weights.parent.mkdir(parents=True, exist_ok=True)
-    train_encoders(
-        demonstrations, weights, Path(folder), config or RepresentationConfig(), command
+    return train_encoders(
+        demonstrations, Path(weights), Path(folder), config or RepresentationConfig(), command
     )
-    encoders = load_representation(weights, scene_version=nico.scene_version())
-    bank = DemonstrationBank(
-        embed_demonstrations(encoders, demonstrations),
-        demonstrations["task"].clone(),
-        demonstrations["train"].clone(),
-    )
-    bank.save(weights.with_name(BANK_NAME), encoder_id=_identity(encoders))
-    return encoders, bank

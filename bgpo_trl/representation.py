@@ -45,6 +45,11 @@ class Representation:
     lae: SequenceAutoencoder
     metadata: dict[str, str]
 
+    @property
+    def identity(self) -> str:
+        """A digest of all weights: what was embedded with other encoders has another."""
+        return _digest(_tensors(self))
+
 
 def train_representation(
     dataset: TensorDictBase,
@@ -138,11 +143,7 @@ def save_representation(representation: Representation, path: str | Path) -> Non
         path: the file to write; missing folders are made.
     """
     path = Path(path)
-    tensors = {
-        f"{name}.{key}": value.contiguous()
-        for name, module in (("vae", representation.vae), ("lae", representation.lae))
-        for key, value in module.state_dict().items()
-    }
+    tensors = _tensors(representation)
     path.parent.mkdir(parents=True, exist_ok=True)
     # Written aside first: an interrupted save must not destroy the weights that were there.
     partial = path.with_suffix(".partial")
@@ -192,6 +193,14 @@ def load_representation(
     return Representation(
         vae.eval().requires_grad_(False), lae.eval().requires_grad_(False), metadata
     )
+
+
+def _tensors(representation: Representation) -> dict[str, Tensor]:
+    return {
+        f"{name}.{key}": value.contiguous()
+        for name, module in (("vae", representation.vae), ("lae", representation.lae))
+        for key, value in module.state_dict().items()
+    }
 
 
 def _digest(tensors: Mapping[str, Tensor]) -> str:

@@ -12,11 +12,12 @@ from tensordict import TensorDictBase
 
 from bgpo_trl.configs import RepresentationConfig
 from bgpo_trl.csv_file import CsvFile
-from bgpo_trl.demonstrations import load_demonstrations
+from bgpo_trl.demonstrations import DemonstrationBank, load_demonstrations
 from bgpo_trl.probes import probe
 from bgpo_trl.representation import (
     Representation,
     default_weights,
+    embed_demonstrations,
     save_representation,
     train_representation,
 )
@@ -49,24 +50,29 @@ class Arguments:
     """Hyperparameters."""
 
 
+def bank_path(weights: Path) -> Path:
+    """Returns where the bank embedded with encoders lies: ``nico_bank`` beside ``nico``."""
+    return weights.with_name(f"{weights.stem}_bank{weights.suffix}")
+
+
 def train_encoders(
     dataset: TensorDictBase,
     weights: Path,
     folder: Path,
     config: RepresentationConfig,
     command: str = "",
-) -> Representation:
-    """Trains, saves and probes both encoders.
+) -> tuple[Representation, DemonstrationBank]:
+    """Trains, saves and probes both encoders, and embeds the demonstrations with them.
 
     Args:
         dataset: demonstrations as in :mod:`bgpo_trl.representation`, with ``state`` and ``task``.
-        weights: the safetensors file to write.
+        weights: the safetensors file to write; the bank goes beside it, see `bank_path`.
         folder: receives ``train.csv``, ``checkpoint/``, ``probes.json``, ``reconstructions.png``.
         config: hyperparameters.
         command: stored with the weights.
 
     Returns:
-        The trained encoders.
+        The trained encoders and the bank of embedded demonstrations.
 
     Raises:
         ValueError: as :func:`bgpo_trl.representation.train_representation`.
@@ -82,8 +88,14 @@ def train_encoders(
             log=file.write,
         )
     save_representation(representation, weights)
+    bank = DemonstrationBank(
+        embed_demonstrations(representation, dataset),
+        dataset["task"].clone(),
+        dataset["train"].clone(),
+    )
+    bank.save(bank_path(weights), encoder_id=representation.identity)
     probe(representation, dataset, folder)
-    return representation
+    return representation, bank
 
 
 def main(arguments: Arguments) -> None:

@@ -10,6 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn.functional import one_hot
 from torchrl.envs import (
+    ClipTransform,
     Compose,
     ObservationNorm,
     RenameTransform,
@@ -61,11 +62,11 @@ def observe(config: BGPOConfig, encoders: Representation | None, n_tasks: int) -
     else:
         loc, scale = torch.tensor(_STATE_LOC), torch.tensor(_STATE_SCALE)
         transforms.append(ObservationNorm(loc, scale, in_keys=["state"], standard_normal=True))
+    # An object knocked off the table is dozens of deviations away and would swamp the rest.
+    transforms.append(ClipTransform(in_keys=[config.state], low=-5.0, high=5.0))
     if config.context == "task_one_hot":
         transforms.append(
-            UnaryTransform(
-                ["task"], ["task_one_hot"], fn=lambda t: one_hot(t, n_tasks).float()
-            )
+            UnaryTransform(["task"], ["task_one_hot"], fn=lambda t: one_hot(t, n_tasks).float())
         )
     return transforms
 
@@ -117,21 +118,20 @@ class BGPO:
                 raise ValueError(f"context={config.context!r} needs trained encoders")
             reward.append(BehaviorMatchingReward(encoders.lae, beta=config.beta))
             rewards += ["extrinsic_reward", "intrinsic_reward"]
-        self.env = TransformedEnv(
-            NicoEnv(
-                batch_size=batch,
-                seed=[stream_seed(seed, "env") for seed in seeds],
-                observation="pixels" if config.state == "latent" else "state",
-            ),
-            Compose(
-                *observe(config, encoders, schedule.n_tasks),
-                StepCounter(config.max_steps),
-                self.source,
-                *infer,
-                *reward,
-                RewardSum(in_keys=rewards, out_keys=[f"episode_{key}" for key in rewards]),
-            ),
+        transforms = [
+            *observe(config, encoders, schedule.n_tasks),
+            StepCounter(config.max_steps),
+            self.source,
+            *infer,
+            *reward,
+            RewardSum(in_keys=rewards, out_keys=[f"episode_{key}" for key in rewards]),
+        ]
+        self.simulation = NicoEnv(
+            batch_size=batch,
+            seed=[stream_seed(seed, "env") for seed in seeds],
+            observation="pixels" if config.state == "latent" else "state",
         )
+        self.env = TransformedEnv(self.simulation, Compose(transforms))
         context_key = "task_one_hot" if config.context == "task_one_hot" else "behavior"
         context_size = schedule.n_tasks if context_key == "task_one_hot" else embedding_size
         state_size = STATE_SIZE
@@ -222,7 +222,7 @@ class BGPO:
             "replay": self.replay.state_dict(),
             "source": dict(self.source.state_dict()),
             "gwr": None if self.gwr is None else dict(self.gwr.state_dict()),
-            "simulation": self.env.base_env.simulation_state(),
+            "simulation": self.simulation.simulation_state(),
             "noise": [generator.get_state() for generator in self._noise],
         }
 
@@ -234,6 +234,6 @@ class BGPO:
         self.source.load_state_dict(state["source"])
         if self.gwr is not None:
             self.gwr.load_state_dict(state["gwr"])
-        self.env.base_env.load_simulation_state(state["simulation"])
+        self.simulation.load_simulation_state(state["simulation"])
         for generator, saved in zip(self._noise, state["noise"], strict=True):
             generator.set_state(saved)

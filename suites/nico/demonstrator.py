@@ -27,7 +27,7 @@ _OPEN, _FIST = 0.05, 0.85  # (rad) curl of a segment
 # Where a pushed box lies, as (left of the arm's plane, beyond the wrist) (m): against the fist's
 # knuckles when pushed left, against the back of the hand when pushed right.
 _BEFORE_KNUCKLES, _BEHIND_BACK = (0.078, 0.105), (-0.043, 0.075)
-_SPEED = (0.041, 0.06)  # (rad a step) range of an episode's speed
+_SPEED = (0.032, 0.048)  # (rad a step) range of an episode's speed
 _HAND_SPEED = 0.08  # (rad a step)
 _LEAD = 0.07  # (m) by which the hand aims ahead of the box it pushes
 _OUTWARD = 0.03  # (m) by which it aims beyond the arc

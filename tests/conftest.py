@@ -1,0 +1,80 @@
+"""What all tests share: settings, and the parts of a run small enough to be played in a second."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import settings
+
+from bgpo_trl.algorithms import bgpo
+from bgpo_trl.configs import BGPOConfig, DDPGConfig, RunConfig
+from bgpo_trl.demonstrations import DemonstrationBank
+from bgpo_trl.envs import NicoEnv
+from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
+from bgpo_trl.modules.vae import VAE
+from bgpo_trl.representation import Representation
+
+# How long an example takes says more about the other processes of the machine than about the code.
+settings.register_profile("bgpo_trl", deadline=None)
+settings.load_profile("bgpo_trl")
+torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="session")
+def encoders():
+    """Untrained encoders: what latents mean does not matter to what is tested with them."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        vae, lae = VAE(), SequenceAutoencoder()
+    return Representation(vae.eval().requires_grad_(False), lae.eval().requires_grad_(False), {})
+
+
+@pytest.fixture(scope="session")
+def bank():
+    """Three tasks, eight seen and four held-out demonstrations of each, all of them different."""
+    generator = torch.Generator().manual_seed(1)
+    task = torch.arange(36) % 3
+    embedding = torch.rand(36, 32, generator=generator) - 0.5 + 0.2 * task.unsqueeze(-1)
+    return DemonstrationBank(embedding, task, torch.arange(36) < 24)
+
+
+@pytest.fixture(scope="session")
+def make_config():
+    """Makes the settings of a run of two seeds and 10 episodes, with some of them changed."""
+
+    def make(state="latent", context="behavior", **changes):
+        ddpg = DDPGConfig(batch_size=16, warmup_steps=8, replay_size=200)
+        algorithm = BGPOConfig(state=state, context=context, max_steps=6, ddpg=ddpg)
+        config = RunConfig(
+            seeds=(3, 8), episodes=10, task_starts=(0, 2, 4), eval_every=2, bgpo=algorithm
+        )
+        return replace(config, **changes)
+
+    return make
+
+
+class EasyNicoEnv(NicoEnv):
+    """Ends episodes with success, too, where the arm is turned far enough to one side."""
+
+    def _step(self, tensordict):
+        moved = ~self._done
+        if "_step" in tensordict:
+            moved &= tensordict["_step"].reshape(-1).numpy()
+        following = super()._step(tensordict)
+        yaw = np.array([tasks[0].physics.arm_angles()[0] for tasks in self._environments])
+        self._done |= moved & (yaw > 0.15)
+        won = torch.from_numpy(moved & self._done).reshape(*self.batch_size, 1)
+        return following.update({"reward": won.float(), **self._dones()})
+
+
+@pytest.fixture(scope="module")
+def easy_world():
+    """A world in which episodes end after 1 to 6 steps, so that seeds are soon out of step.
+
+    It lasts for the module: mark all of it with `pytest.mark.usefixtures("easy_world")`.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(bgpo, "NicoEnv", EasyNicoEnv)
+        patch.setattr("bgpo_trl.evaluation.NicoEnv", EasyNicoEnv)
+        yield EasyNicoEnv

@@ -1,0 +1,241 @@
+"""Test episodes against a plain loop over one environment, and what they must leave alone."""
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+
+from bgpo_trl.algorithms.bgpo import BGPO
+from bgpo_trl.demonstrations import DemonstrationBank
+from bgpo_trl.evaluation import Evaluator, evaluate_random_policy
+from bgpo_trl.modules.actor_critic import Actor
+from bgpo_trl.seeding import stream_seed
+from bgpo_trl.transforms import TaskSchedule
+
+pytestmark = pytest.mark.usefixtures("easy_world")
+SEEDS = (3, 8)
+EPISODES = 4
+
+
+@pytest.fixture
+def make(bank, encoders, make_config):
+    """Makes an algorithm that has played a little, and an evaluator for it."""
+
+    def make(state="latent", context="behavior", seeds=SEEDS, starts=(0, 2, 4), n_steps=20):
+        config = make_config(state, context).bgpo
+        parts = {"seeds": seeds, "encoders": encoders}
+        algorithm = BGPO(config, schedule=TaskSchedule(starts), bank=bank.seen(), **parts)
+        evaluator = Evaluator(
+            config, n_tasks=len(starts), episodes=EPISODES, bank=bank.held_out(), **parts
+        )
+        train(algorithm, n_steps)
+        return algorithm, evaluator
+
+    return make
+
+
+def train(algorithm, n_steps):
+    state = algorithm.env.reset()
+    for _ in range(n_steps):
+        transition, state = algorithm.env.step_and_maybe_reset(algorithm.act(state))
+        algorithm.learn(transition)
+
+
+def take(evaluator, algorithm, number=0):
+    return [
+        evaluator.take(algorithm, index, number, env_steps=0)
+        for index in range(len(evaluator.seeds))
+    ]
+
+
+def assert_same_result(first, second):
+    assert first.success.equal(second.success)
+    assert first.steps.equal(second.steps)
+
+
+@pytest.mark.parametrize(
+    ("state", "context"),
+    [("latent", "behavior"), ("latent", "demo_embedding"), ("state", "task_one_hot")],
+)
+def test_a_test_episode_is_that_of_a_plain_loop_over_one_environment(
+    make, bank, encoders, easy_world, state, context
+):
+    algorithm, evaluator = make(state, context)
+    with torch.no_grad():  # A policy that turns the arm, sooner or later, as it sees and is told.
+        algorithm.actor.mlp.layers[-1].weight.mul_(4)
+        algorithm.actor.mlp.layers[-1].bias.add_(0.2)
+    snapshots = take(evaluator, algorithm, number=5)
+    result = evaluator.run(snapshots, 5, algorithm.actor)
+
+    for index, seed in enumerate(SEEDS):
+        rng = np.random.default_rng([stream_seed(seed, "evaluation"), 5])
+        starts = rng.integers(2**32, size=(3, EPISODES))
+        weights = {key: value[index] for key, value in algorithm.actor.state_dict().items()}
+        actor = Actor(algorithm.actor.mlp.layers[0].in_features, in_keys=algorithm.actor.in_keys)
+        actor.load_state_dict(weights)
+        context_of = snapshots[index].context.unflatten(0, (3, EPISODES))
+        for task in range(3):
+            for episode in range(EPISODES):
+                env = easy_world(
+                    seed=[int(starts[task, episode])],
+                    observation="state" if state == "state" else "pixels",
+                )
+                now = env.reset(TensorDict({"task": torch.tensor(task)}))
+                steps, success = 0, False
+                while steps < 6 and not success:
+                    given = {algorithm.actor.in_keys[1]: context_of[task, episode]}
+                    if state == "latent":
+                        given["latent"] = encoders.vae.latent(now["pixels"]).clamp(-5, 5)
+                    else:
+                        seen = algorithm.env.transform[0].forward(now.clone())["state"]
+                        given["state"] = seen.clamp(-5, 5)
+                    action = actor(TensorDict(given))["action"].detach()
+                    now = env.step(now.set("action", action))["next"]
+                    steps += 1
+                    success = bool(now["terminated"])
+                assert bool(result.success[index, task, episode]) == success
+                assert int(result.steps[index, task, episode]) == steps
+    assert 0 < result.success.float().mean() < 1
+    assert len(result.steps.unique()) > 2
+
+
+def test_what_the_policy_is_told_follows_from_held_out_demonstrations(make, bank):
+    algorithm, evaluator = make()
+    _, by_phi = make("latent", "demo_embedding")
+    raw, _ = make("latent", "demo_embedding", n_steps=1)
+    held_out, seen = bank.held_out(), bank.seen()
+    drawn = set()
+    for number in range(5):
+        shown = [s.context.unflatten(0, (3, EPISODES)) for s in take(by_phi, raw, number)]
+        told = [s.context.unflatten(0, (3, EPISODES)) for s in take(evaluator, algorithm, number)]
+        for index, phi in enumerate(shown):
+            for task in range(3):
+                of_task = held_out.embedding[held_out.task == task]
+                found = (phi[task].unsqueeze(1) == of_task).all(-1)
+                assert found.any(1).all()
+                assert not (phi[task].unsqueeze(1) == seen.embedding).all(-1).any()
+                drawn |= {(task, int(row)) for row in found.nonzero()[:, 1]}
+            matched = algorithm.gwr.lookup(phi.expand(2, 3, EPISODES, 32)).embedding[index]
+            assert told[index].equal(matched)
+    assert len(drawn) == 12  # in time, all of them
+
+
+def test_a_label_tells_the_task(make):
+    algorithm, evaluator = make("state", "task_one_hot")
+    expected = torch.eye(3).repeat_interleave(EPISODES, 0)
+    for snapshot in take(evaluator, algorithm):
+        assert snapshot.context.equal(expected)
+
+
+def flat(state, where=""):
+    """Lists all values in nested containers, tensors copied."""
+    if isinstance(state, dict):
+        return [x for key, value in state.items() for x in flat(value, f"{where}/{key}")]
+    if isinstance(state, list | tuple):
+        return [x for i, value in enumerate(state) for x in flat(value, f"{where}/{i}")]
+    return [(where, state.clone() if isinstance(state, torch.Tensor) else state)]
+
+
+def test_testing_leaves_no_trace_in_training(make):
+    algorithm, evaluator = make()
+    before = flat(algorithm.state_dict())
+    for number in range(2):
+        evaluator.run(take(evaluator, algorithm, number), number, algorithm.actor)
+    after = flat(algorithm.state_dict())
+    assert {"/loss", "/optimizer", "/replay", "/source", "/gwr", "/simulation", "/noise"} == {
+        "/" + where.split("/")[1] for where, _ in before
+    }
+    for (where, first), (_, second) in zip(before, after, strict=True):
+        same = first.equal(second) if isinstance(first, torch.Tensor) else first == second
+        assert same, where
+
+
+def test_a_snapshot_does_not_follow_the_training(make):
+    algorithm, evaluator = make()
+    snapshots = take(evaluator, algorithm)
+    before = evaluator.run(snapshots, 0, algorithm.actor)
+    weights = [value.clone() for value in algorithm.actor.parameters()]
+    nodes = algorithm.gwr.graph(0).weights
+    with torch.no_grad():
+        algorithm.actor.mlp.layers[-1].bias.add_(2)
+    train(algorithm, 20)
+    assert not algorithm.gwr.graph(0).weights.equal(nodes)
+    for value, old in zip(algorithm.actor.parameters(), weights, strict=True):
+        assert not value.equal(old)
+
+    assert_same_result(evaluator.run(snapshots, 0, algorithm.actor), before)
+    later = evaluator.run(take(evaluator, algorithm), 0, algorithm.actor)
+    assert not later.steps.equal(before.steps)
+
+
+def test_an_evaluation_follows_from_seed_and_number(make):
+    algorithm, evaluator = make()
+    results = [
+        evaluator.run(take(evaluator, algorithm, number), number, algorithm.actor)
+        for number in (0, 1, 0)
+    ]
+    assert_same_result(results[0], results[2])
+    assert not results[0].steps.equal(results[1].steps)
+
+    for index, seed in enumerate(SEEDS):
+        alone, evaluator = make(seeds=(seed,))
+        result = evaluator.run(take(evaluator, alone), 0, alone.actor)
+        assert result.success[0].equal(results[0].success[index])
+        assert result.steps[0].equal(results[0].steps[index])
+
+
+@pytest.mark.parametrize("starts", [(0, 2, 99), (99, 0, 99), (1, 99, 0)])
+def test_only_tasks_that_were_presented_are_tested(make, starts):
+    algorithm, evaluator = make(starts=starts)
+    assert (algorithm.source.episode > 2).all()
+    presented = [start < 99 for start in starts]
+    snapshots = take(evaluator, algorithm)
+    result = evaluator.run(snapshots, 0, algorithm.actor)
+    for index, snapshot in enumerate(snapshots):
+        assert snapshot.presented.tolist() == presented
+        assert snapshot.episode == algorithm.source.episode[index]
+        for task, tested in enumerate(presented):
+            assert (result.steps[index, task] > 0).all() == tested
+            assert result.success[index, task].any() <= tested
+
+
+@pytest.mark.parametrize(("episode", "presented"), [(1, 1), (2, 1), (3, 2), (4, 2), (5, 3)])
+def test_a_task_counts_as_presented_once_an_episode_could_be_about_it(make, episode, presented):
+    algorithm, evaluator = make(n_steps=0)
+    algorithm.source.episode.fill_(episode)
+    assert take(evaluator, algorithm)[0].presented.sum() == presented
+
+
+def test_seeds_may_be_at_different_stages(make):
+    algorithm, evaluator = make(n_steps=0)
+    algorithm.source.episode.copy_(torch.tensor([1, 3]))
+    result = evaluator.run(take(evaluator, algorithm), 0, algorithm.actor)
+    assert (result.steps > 0).all(-1).tolist() == [[True, False, False], [True, True, False]]
+
+
+def test_a_bank_without_a_held_out_demonstration_of_a_task_is_refused(bank, encoders, make_config):
+    train = bank.train | (bank.task == 1)
+    partial = DemonstrationBank(bank.embedding, bank.task, train).held_out()
+    with pytest.raises(ValueError, match="no held-out demonstration of task 1"):
+        Evaluator(
+            make_config().bgpo, seeds=SEEDS, n_tasks=3, episodes=1, bank=partial, encoders=encoders
+        )
+
+
+def test_a_random_policy_is_uniform_and_succeeds_by_chance(easy_world):
+    rate = evaluate_random_policy(n_tasks=2, episodes=5, seed=4, max_steps=3)
+
+    generator = torch.Generator().manual_seed(4)
+    actions = [torch.rand(2, 5, 4, generator=generator) * 2 - 1 for _ in range(3)]
+    first_seed = stream_seed(4, "random policy") // 2
+    expected = torch.zeros(2, 5)
+    for task in range(2):
+        for episode in range(5):
+            env = easy_world(seed=first_seed + 5 * task + episode, observation="state")
+            now = env.reset(TensorDict({"task": torch.tensor(task)}))
+            for action in actions:
+                if not now["done"]:
+                    now = env.step(now.set("action", action[task, episode]))["next"]
+            expected[task, episode] = now["done"]
+    assert rate.equal(expected.mean(-1))
+    assert 0 < rate.mean() < 1

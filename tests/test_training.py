@@ -1,0 +1,293 @@
+"""Whole runs, small ones: what they write, and that no interrupt changes it."""
+
+import csv
+import signal
+from collections import Counter, defaultdict
+from dataclasses import replace
+
+import pytest
+import torch
+
+from bgpo_trl.checkpoint import load_checkpoint
+from bgpo_trl.training import Trainer
+
+pytestmark = pytest.mark.usefixtures("easy_world")
+CSV_FILES = ("train.csv", "eval.csv")
+TASKS = ("grasp_glass", "push_green_to_glass", "push_green_to_white")
+LOSSES = ("loss_actor", "loss_value")
+
+
+@pytest.fixture(scope="module")
+def make(bank, encoders, make_config):
+    def make(directory, config=None, **arguments):
+        parts = {"bank": bank, "encoders": encoders, "progress": False, **arguments}
+        return Trainer(config or make_config(), directory, **parts)
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(make, easy_world, tmp_path_factory):
+    directory = tmp_path_factory.mktemp("uninterrupted")
+    make(directory).run()
+    return directory
+
+
+def rows(path):
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def assert_equal(first, second, where="state"):
+    """Compares nested containers bit for bit."""
+    assert type(first) is type(second), where
+    if isinstance(first, dict):
+        assert list(first) == list(second), where
+        for key in first:
+            assert_equal(first[key], second[key], f"{where}[{key!r}]")
+    elif isinstance(first, list | tuple):
+        assert len(first) == len(second), where
+        for index, pair in enumerate(zip(first, second, strict=True)):
+            assert_equal(*pair, f"{where}[{index}]")
+    elif isinstance(first, torch.Tensor):
+        assert first.equal(second), where
+    else:
+        assert first == second, where
+
+
+def assert_same_run(first, second):
+    for name in CSV_FILES:
+        assert (first / name).read_bytes() == (second / name).read_bytes()
+    # Weights, optimizer, replay, GWR-B, simulations, random numbers and the tensordict in flight.
+    assert_equal(load_checkpoint(first / "checkpoint"), load_checkpoint(second / "checkpoint"))
+
+
+def at_step(trainer, n, do):
+    """Calls `do` in the midst of the n-th step: the simulation has moved, learning is to come."""
+    learn, steps = trainer.algorithm.learn, []
+
+    def learn_or_not(transition):
+        steps.append(None)
+        if len(steps) == n:
+            do()
+        return learn(transition)
+
+    trainer.algorithm.learn = learn_or_not
+
+
+def test_every_seed_plays_every_episode_once(uninterrupted, make_config):
+    config, train = make_config(), rows(uninterrupted / "train.csv")
+    seeds = defaultdict(list)
+    for row in train:
+        seeds[int(row["seed"])].append(row)
+    assert set(seeds) == set(config.seeds)
+    for played in seeds.values():
+        assert [int(row["episode"]) for row in played] == list(range(1, config.episodes + 1))
+        total = 0
+        for row in played:
+            total += int(row["steps"])
+            assert int(row["env_steps"]) == total
+            assert 1 <= int(row["steps"]) <= config.bgpo.max_steps
+            assert int(row["success"]) == float(row["return"])
+            assert int(row["success"]) or int(row["steps"]) == config.bgpo.max_steps
+            assert 0 < float(row["intrinsic_return"]) <= 1
+    assert {row["success"] for row in train} == {"0", "1"}
+    assert {row["algorithm"] for row in train} == {"bgpo"}
+    assert int(train[-1]["num_nodes"]) > 2
+    assert (float(train[0]["loss_value"]), float(train[-1]["loss_value"]) > 0) == (0, True)
+
+
+@pytest.mark.parametrize("starts", [(0, 5, 10), (4, 0, 8), (0, 0, 0)])
+def test_a_task_is_presented_from_its_start_on(make, make_config, tmp_path, starts):
+    config = make_config("state", "task_one_hot", seeds=(0, 1, 2), episodes=16, task_starts=starts)
+    make(tmp_path, config).run()
+    first = defaultdict(lambda: 99)
+    for row in rows(tmp_path / "train.csv"):
+        first[row["task"]] = min(first[row["task"]], int(row["episode"]))
+    for task, start in zip(TASKS, starts, strict=True):
+        assert start < first[task] <= start + 3  # three seeds draw: the next episodes have it
+    for row in rows(tmp_path / "eval.csv"):
+        assert int(row["episode"]) > starts[TASKS.index(row["task"])]
+
+
+def test_all_presented_tasks_are_tested_every_few_episodes(make, make_config, tmp_path):
+    config = make_config(episodes=5, task_starts=(0, 2, 4), eval_every=2, eval_episodes=3)
+    make(tmp_path, config).run()
+    tests = rows(tmp_path / "eval.csv")
+    counts = Counter((int(row["seed"]), int(row["episode"]), row["task"]) for row in tests)
+    tasks_at = {2: TASKS[:1], 4: TASKS[:2]}
+    assert counts == {
+        (seed, episode, task): 3
+        for seed in config.seeds
+        for episode, tasks in tasks_at.items()
+        for task in tasks
+    }
+    steps = {
+        (row["seed"], row["episode"]): row["env_steps"] for row in rows(tmp_path / "train.csv")
+    }
+    for row in tests:
+        assert row["env_steps"] == steps[row["seed"], row["episode"]]
+        assert int(row["success"]) == float(row["return"])
+
+
+def test_a_seed_writes_what_it_would_write_alone(uninterrupted, make, make_config, tmp_path):
+    for seed in make_config().seeds:
+        make(tmp_path / str(seed), make_config(seeds=(seed,))).run()
+        for name in CSV_FILES:
+            together = [row for row in rows(uninterrupted / name) if row["seed"] == str(seed)]
+            alone = rows(tmp_path / str(seed) / name)
+            assert len(together) == len(alone) > 0
+            for ours, theirs in zip(together, alone, strict=True):
+                intrinsic = [float(row.pop("intrinsic_return", 0)) for row in (ours, theirs)]
+                assert intrinsic[0] == pytest.approx(intrinsic[1], rel=1e-3)
+                for loss in LOSSES:  # means over the seeds
+                    ours.pop(loss, None), theirs.pop(loss, None)
+                assert ours == theirs
+
+
+def test_a_label_in_place_of_encoders(make, make_config, tmp_path):
+    make(tmp_path, make_config("state", "task_one_hot", episodes=4), encoders=None).run()
+    train = rows(tmp_path / "train.csv")
+    assert {(row["num_nodes"], row["intrinsic_return"]) for row in train} == {("0", "0.0")}
+    assert {row["success"] for row in train} == {"0", "1"}
+    assert all(int(row["success"]) == float(row["return"]) for row in train)
+
+
+@pytest.mark.parametrize("step", [1, 20])
+def test_ctrl_c_waits_for_the_step_and_the_run_goes_on_from_it(uninterrupted, make, tmp_path, step):
+    trainer = make(tmp_path)
+    at_step(trainer, step, lambda: signal.raise_signal(signal.SIGINT))
+    with pytest.raises(KeyboardInterrupt):
+        trainer.run()
+    assert load_checkpoint(tmp_path / "checkpoint")["env_steps"] == step
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+    make(tmp_path, resume=True).run()
+    assert_same_run(tmp_path, uninterrupted)
+
+
+def test_a_run_can_be_interrupted_again_and_again(uninterrupted, make, tmp_path):
+    for step in (3, 1, 9):
+        trainer = make(tmp_path, resume=True)
+        at_step(trainer, step, lambda: signal.raise_signal(signal.SIGINT))
+        with pytest.raises(KeyboardInterrupt):
+            trainer.run()
+    assert load_checkpoint(tmp_path / "checkpoint")["env_steps"] == 13
+    make(tmp_path, resume=True).run()
+    assert_same_run(tmp_path, uninterrupted)
+
+
+def crash(*args, **kwargs):
+    raise RuntimeError("the lights went out")
+
+
+MOMENTS = {
+    "before the simulation moves": ("algorithm", "act"),
+    "before learning": ("algorithm", "learn"),
+    "while an episode is logged": ("logger", "log_train"),
+    "while a snapshot is taken": ("evaluator", "take"),
+    "while a test is played": ("evaluator", "run"),
+    "while a test is logged": ("logger", "log_eval"),
+}
+
+
+@pytest.mark.parametrize(
+    ("moment", "saved"), [*((moment, 11) for moment in MOMENTS), ("before learning", None)]
+)
+def test_a_run_that_dies_goes_on_from_its_last_checkpoint(
+    uninterrupted, make, tmp_path, monkeypatch, moment, saved
+):
+    """It dies some steps after the checkpoint, if there is one, and its rows are written again."""
+    trainer = make(tmp_path)
+    trainer.config = replace(trainer.config, checkpoint_minutes=0.0)
+    part, method = MOMENTS[moment]
+    alive, save = getattr(getattr(trainer, part), method), trainer.save
+
+    def live_or_die(*args):
+        return crash() if trainer.env_steps >= 20 else alive(*args)
+
+    monkeypatch.setattr(getattr(trainer, part), method, live_or_die)
+    monkeypatch.setattr(trainer, "save", lambda: trainer.env_steps == saved and save())
+    with pytest.raises(RuntimeError, match="the lights went out"):
+        trainer.run()
+
+    if saved is None:
+        assert not (tmp_path / "checkpoint").exists()
+    else:
+        state = load_checkpoint(tmp_path / "checkpoint")
+        assert state["env_steps"] == saved
+        assert state["position"]["train.csv"] < (tmp_path / "train.csv").stat().st_size
+    make(tmp_path, resume=True).run()
+    assert_same_run(tmp_path, uninterrupted)
+
+
+def test_a_second_ctrl_c_ends_the_run_at_once(make, tmp_path):
+    trainer = make(tmp_path)
+
+    def impatient():
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+        raise AssertionError("went on after the second interrupt")
+
+    at_step(trainer, 3, impatient)
+    with pytest.raises(KeyboardInterrupt):
+        trainer.run()
+    assert not (tmp_path / "checkpoint").exists()
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_ctrl_c_that_is_ignored_stays_so(make, make_config, tmp_path):
+    trainer = make(tmp_path, make_config(episodes=2))
+    at_step(trainer, 1, lambda: signal.raise_signal(signal.SIGINT))
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        trainer.run()
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert len(rows(tmp_path / "train.csv")) == 4
+
+
+def test_checkpoints_are_written_as_often_as_asked(make, make_config, tmp_path):
+    trainer = make(tmp_path, make_config(episodes=2, checkpoint_minutes=0.0))
+    trainer.run()
+    numbers = [path.name.split("-")[1] for path in (tmp_path / "checkpoint").glob("*.pt")]
+    assert max(int(number) for number in numbers) == trainer.env_steps
+
+
+def test_a_finished_run_is_left_as_it_is(uninterrupted, make):
+    def contents():
+        files = [path for path in uninterrupted.rglob("*") if path.is_file()]
+        return {path: path.read_bytes() for path in files}
+
+    before = contents()
+    trainer = make(uninterrupted, resume=True)
+    trainer.algorithm.act = crash
+    trainer.run()
+    assert contents() == before
+    assert trainer.env_steps == load_checkpoint(uninterrupted / "checkpoint")["env_steps"]
+
+
+def test_a_directory_with_another_run_is_refused(uninterrupted, make, make_config):
+    with pytest.raises(ValueError, match="already holds a run: resume it"):
+        make(uninterrupted)
+    longer = make_config(episodes=11)
+    for config in (longer, replace(longer, episodes=10, seeds=(1, 2))):
+        with pytest.raises(ValueError, match="holds a run with other settings"):
+            make(uninterrupted, config, resume=True)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"seeds": ()}, "needs seeds, all different"),
+        ({"seeds": (1, 1)}, "needs seeds, all different"),
+        ({"seeds": (-1,)}, "none negative"),
+        ({"episodes": 0}, "episodes must be at least 1, got 0"),
+        ({"eval_every": 0}, "eval_every must be at least 1, got 0"),
+        ({"eval_episodes": -2}, "eval_episodes must be at least 1, got -2"),
+    ],
+)
+def test_runs_that_cannot_be_are_refused(make_config, changes, message):
+    with pytest.raises(ValueError, match=message):
+        make_config(**changes)
