@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -14,23 +15,18 @@ def match_counts(gwr: GWRB, bank: DemonstrationBank, n_tasks: int) -> Tensor:
     """Counts for which demonstrations each node of GWR-B is the best match.
 
     Args:
-        gwr: The network(s), ``batch_size`` ``[S]``.
+        gwr: The network(s), ``batch_size`` ``[*S]``.
         bank: Demonstrations to look up.
         n_tasks: Number of tasks.
 
     Returns:
-        Counts ``[S, N, n_tasks]``, int64, nodes in order of creation, ``N`` the largest network's
+        Counts ``[*S, N, n_tasks]``, int64, nodes in order of creation, ``N`` the largest network's
         size; rows beyond a smaller network's size are 0.
     """
-    n_seeds = gwr.batch_size.numel()
-    embedding = bank.embedding.expand(n_seeds, *bank.embedding.shape)
-    behavior = gwr.lookup(embedding).embedding
-    counts = torch.zeros(n_seeds, int(gwr.num_nodes.max()), n_tasks, dtype=torch.int64)
-    for index in range(n_seeds):
-        weights = gwr.graph(index).weights
-        position = torch.cdist(
-            behavior[index], weights, compute_mode="donot_use_mm_for_euclid_dist"
-        ).argmin(-1)
+    node = gwr.lookup(bank.embedding.expand(*gwr.batch_size, *bank.embedding.shape)).node
+    counts = torch.zeros(*gwr.batch_size, int(gwr.num_nodes.max()), n_tasks, dtype=torch.int64)
+    for index in np.ndindex(*gwr.batch_size):
+        position = torch.searchsorted(gwr.graph(index).node, node[index])
         counts[index].index_put_((position, bank.task), torch.tensor(1), accumulate=True)
     return counts
 
@@ -47,10 +43,10 @@ def majority_task(counts: Tensor) -> Tensor:
 def task_inference_accuracy(
     gwr: GWRB, seen: DemonstrationBank, tested: DemonstrationBank, n_tasks: int
 ) -> Tensor:
-    """Returns how often the matched node's majority task is the demonstration's own, ``[S]``.
+    """Returns how often the matched node's majority task is the demonstration's own, ``[*S]``.
 
     Args:
-        gwr: The network(s), ``batch_size`` ``[S]``.
+        gwr: The network(s), ``batch_size`` ``[*S]``.
         seen: Demonstrations that give each node its majority task.
         tested: Demonstrations whose task is inferred.
         n_tasks: Number of tasks.
