@@ -32,7 +32,7 @@ class Arguments:
     """Trains BGPO on tasks that are presented one after the other, and draws its success."""
 
     preset: Literal["smoke", "quick", "desk", "paper"] = "quick"
-    """Size of the run: every stage in minutes; learning to look at; five seeds; the paper's scale."""
+    """Size of the run: every stage in minutes; learning to look at; five seeds; the paper's."""
     out: Path | None = None
     """The run's directory; runs/continual-PRESET if not given."""
     seeds: tuple[int, ...] | None = None
@@ -50,14 +50,23 @@ class Arguments:
 
 
 def run_config(arguments: Arguments) -> RunConfig:
-    """Returns the preset with the changes asked for."""
+    """Returns the preset with the changes asked for.
+
+    Raises:
+        ValueError: If there is no such run.
+    """
     config = PRESETS[arguments.preset]
     if arguments.seeds is not None:
         config = replace(config, seeds=arguments.seeds)
     if arguments.episodes is not None:
         share = arguments.episodes / config.episodes
         starts = tuple(round(start * share) for start in config.task_starts)
-        config = replace(config, episodes=arguments.episodes, task_starts=starts)
+        config = replace(
+            config,
+            episodes=arguments.episodes,
+            task_starts=starts,
+            eval_every=max(1, min(config.eval_every, arguments.episodes)),
+        )
     return config
 
 
@@ -66,6 +75,8 @@ def main(arguments: Arguments) -> None:
     torch.set_num_threads(arguments.threads)
     config = run_config(arguments)
     out = arguments.out or Path("runs") / f"continual-{arguments.preset}"
+    if (out / "config.json").exists() and not arguments.resume:
+        raise ValueError(f"{out} holds a run: --resume continues it, --out names another directory")
     if arguments.train_encoders or arguments.preset in STAGE_PRESETS:
         stage = STAGE_PRESETS.get(arguments.preset)
         encoders, bank = make_pretrained(
@@ -105,7 +116,7 @@ def main(arguments: Arguments) -> None:
 if __name__ == "__main__":
     try:
         main(tyro.cli(Annotated[Arguments, tyro.conf.OmitArgPrefixes], description=__doc__))
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, RuntimeError) as error:
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:
         sys.exit("interrupted: the same command with --resume continues")

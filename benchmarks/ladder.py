@@ -54,14 +54,20 @@ class Arguments:
     """Threads of PyTorch."""
 
 
-def summarize(path: Path, episodes: int) -> dict[str, float]:
-    """Returns success over the last 10 % of training, by task and overall, and episodes to 80 %."""
-    rows = list(csv.DictReader(path.open()))
+def summarize(path: Path) -> dict[str, float]:
+    """Returns success over the last 10 % of training, by task and overall, and episodes to 80 %.
+
+    Args:
+        path: An ``eval.csv`` with test episodes of every task.
+    """
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    last = max(int(row["episode"]) for row in rows)
     late: dict[str, list[float]] = defaultdict(list)
     curve: dict[int, list[float]] = defaultdict(list)
     for row in rows:
         curve[int(row["episode"])].append(float(row["success"]))
-        if int(row["episode"]) > 0.9 * episodes:
+        if int(row["episode"]) > 0.9 * last:
             late[row["task"]].append(float(row["success"]))
     table = {task: sum(late[task]) / len(late[task]) for task in nico.ALL_TASKS}
     table["overall"] = sum(table[task] for task in nico.ALL_TASKS) / len(nico.ALL_TASKS)
@@ -79,7 +85,7 @@ def main(arguments: Arguments) -> None:
         seeds=arguments.seeds,
         episodes=arguments.episodes,
         task_starts=(0, 0, 0),
-        eval_every=100,
+        eval_every=max(1, min(100, arguments.episodes)),
         eval_episodes=5,
     )
     tables = {}
@@ -89,7 +95,7 @@ def main(arguments: Arguments) -> None:
         config = replace(base, bgpo=bgpo)
         Trainer(config, out, bank=bank, encoders=encoders, resume=arguments.resume).run()
         save_figure(plot_success_curves(out / "eval.csv"), out / "figures" / "success.png")
-        tables[rung] = summarize(out / "eval.csv", arguments.episodes)
+        tables[rung] = summarize(out / "eval.csv")
     columns = list(next(iter(tables.values())))
     print("| rung | " + " | ".join(columns) + " |")
     print("|---|" + "---|" * len(columns))
@@ -101,7 +107,7 @@ def main(arguments: Arguments) -> None:
 if __name__ == "__main__":
     try:
         main(tyro.cli(Annotated[Arguments, tyro.conf.OmitArgPrefixes], description=__doc__))
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, RuntimeError) as error:
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:
         sys.exit("interrupted: the same command with --resume continues")

@@ -1,4 +1,4 @@
-"""The trained encoders and the bank of embedded demonstrations: load the shipped ones or make new."""
+"""Trained encoders and the bank of embedded demonstrations: load those shipped, or make new."""
 
 from __future__ import annotations
 

@@ -48,7 +48,8 @@ class Trainer:
         progress: Whether to show a progress bar.
 
     Raises:
-        ValueError: If the directory holds another run, or one and ``resume`` is False.
+        ValueError: If the directory holds another run (other settings, other encoders), or one and
+            ``resume`` is False.
     """
 
     def __init__(
@@ -82,7 +83,8 @@ class Trainer:
         # Snapshots of each seed that wait for the other seeds, and how many were evaluated.
         self._waiting: list[list[Snapshot]] = [[] for _ in seeds]
         self._evaluated = 0
-        self.logger = RunLogger(self.directory, config=asdict(config), wandb=wandb, resume=resume)
+        settings = {**asdict(config), "encoders": None if encoders is None else encoders.identity}
+        self.logger = RunLogger(self.directory, config=settings, wandb=wandb, resume=resume)
         self._state: TensorDictBase | None = None
         if resume:
             self._resume()

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from bgpo_trl.checkpoint import load_checkpoint
+from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.training import Trainer
 
 pytestmark = pytest.mark.usefixtures("easy_world")
@@ -275,6 +276,14 @@ def test_a_directory_with_another_run_is_refused(uninterrupted, make, make_confi
     for config in (longer, replace(longer, episodes=10, seeds=(1, 2))):
         with pytest.raises(ValueError, match="holds a run with other settings"):
             make(uninterrupted, config, resume=True)
+
+
+def test_a_run_with_other_encoders_is_another_run(uninterrupted, make, encoders):
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(1)
+        other = replace(encoders, lae=SequenceAutoencoder())
+    with pytest.raises(ValueError, match=r"other settings \(encoders is [0-9a-f]+ there and"):
+        make(uninterrupted, encoders=other, resume=True)
 
 
 @pytest.mark.parametrize(

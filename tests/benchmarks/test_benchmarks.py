@@ -1,0 +1,244 @@
+"""The benchmarks' command lines: what they run, what they leave behind, and what they refuse."""
+
+import csv
+import json
+import math
+import os
+import re
+import runpy
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from benchmarks import continual, ladder
+from bgpo_trl.checkpoint import load_checkpoint
+from bgpo_trl.configs import PRESETS
+from bgpo_trl.logging import EVAL_COLUMNS
+from suites import nico
+
+ROOT = Path(__file__).parents[2]
+TASKS = nico.ALL_TASKS
+
+
+def files(folder):
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.fixture
+def tiny(monkeypatch, encoders, bank, make_config):
+    """The benchmarks with untrained encoders, and runs of a second."""
+    config = make_config(episodes=6)
+    for module in (continual, ladder):
+        monkeypatch.setattr(module, "load_pretrained", lambda: (encoders, bank))
+        monkeypatch.setattr(module, "PRESETS", {"quick": config, "desk": config})
+    for rung, (name, bgpo) in ladder.RUNGS.items():
+        small = replace(bgpo, max_steps=6, ddpg=config.bgpo.ddpg)
+        monkeypatch.setitem(ladder.RUNGS, rung, (name, small))
+    chance = torch.tensor([0.1, 0.2, 0.3])
+    monkeypatch.setattr(continual, "evaluate_random_policy", lambda **kwargs: chance)
+
+
+def test_a_preset_is_taken_as_it_is():
+    for name, preset in PRESETS.items():
+        assert continual.run_config(continual.Arguments(preset=name)) == preset
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_tasks_of_every_preset_start_when_the_paper_has_them_start(preset):
+    config = PRESETS[preset]
+    shares = [start / config.episodes for start in config.task_starts]
+    assert shares == pytest.approx([0, 7_000 / 20_000, 13_000 / 20_000], abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("preset", "episodes", "starts", "eval_every"),
+    [
+        ("paper", 10_000, (0, 3_500, 6_500), 1),
+        ("quick", 2_400, (0, 840, 1_560), 60),
+        ("quick", 20, (0, 7, 13), 20),  # tested once at least
+    ],
+)
+def test_another_length_keeps_the_proportions(preset, episodes, starts, eval_every):
+    config = continual.run_config(continual.Arguments(preset=preset, episodes=episodes))
+    assert (config.episodes, config.task_starts) == (episodes, starts)
+    assert config.eval_every == eval_every
+    assert config == replace(
+        PRESETS[preset], episodes=episodes, task_starts=starts, eval_every=eval_every
+    )
+
+
+def test_other_seeds_change_nothing_else():
+    config = continual.run_config(continual.Arguments(preset="desk", seeds=(7, 9)))
+    assert config == replace(PRESETS["desk"], seeds=(7, 9))
+
+
+@pytest.mark.parametrize(
+    "arguments", [{"episodes": 0}, {"episodes": -3}, {"seeds": ()}, {"seeds": (2, 2)}]
+)
+def test_lengths_and_seeds_that_cannot_be_are_refused(arguments):
+    with pytest.raises(ValueError, match=r"must be at least 1|needs seeds"):
+        continual.run_config(continual.Arguments(**arguments))
+
+
+def test_continual_leaves_curve_and_figures(tiny, tmp_path, capsys):
+    continual.main(continual.Arguments(out=tmp_path / "run"))
+    run_directory = tmp_path / "run"
+    for name in ("success.png", "gwr.png"):
+        assert (run_directory / "figures" / name).read_bytes().startswith(b"\x89PNG")
+    assert json.loads((run_directory / "config.json").read_text())["episodes"] == 6
+    printed = capsys.readouterr().out
+    assert "GWR-B nodes: [" in printed
+    assert f"curve and figures: {run_directory}" in printed
+
+    before = files(run_directory)
+    with pytest.raises(ValueError, match="holds a run: --resume continues it, --out names another"):
+        continual.main(continual.Arguments(out=run_directory))
+    continual.main(continual.Arguments(out=run_directory, resume=True))
+    assert files(run_directory) == before
+    assert capsys.readouterr().out == printed
+
+
+def test_the_ladder_has_a_row_and_a_run_for_each_rung(tiny, tmp_path, capsys):
+    arguments = ladder.Arguments(episodes=4, seeds=(1,), out=tmp_path)
+    ladder.main(arguments)
+    printed = capsys.readouterr().out
+    lines = printed.splitlines()
+    assert lines[0] == "| rung | " + " | ".join([*TASKS, "overall", "episodes to 80 %"]) + " |"
+    assert [line[:5] for line in lines[2:]] == ["| (a)", "| (b)", "| (c)", "| (d)"]
+    seen = {}
+    for rung in "abcd":
+        config = json.loads((tmp_path / rung / "config.json").read_text())
+        seen[rung] = (config["bgpo"]["state"], config["bgpo"]["context"])
+        assert (config["task_starts"], config["eval_every"]) == ([0, 0, 0], 4)
+        assert (tmp_path / rung / "figures" / "success.png").exists()
+    assert seen == {
+        "a": ("state", "task_one_hot"),
+        "b": ("latent", "task_one_hot"),
+        "c": ("latent", "demo_embedding"),
+        "d": ("latent", "behavior"),
+    }
+
+    before = files(tmp_path)
+    ladder.main(replace(arguments, resume=True))
+    assert files(tmp_path) == before
+    assert capsys.readouterr().out == printed
+    with pytest.raises(ValueError, match="already holds a run"):
+        ladder.main(arguments)
+
+
+def write_tests(path, successes):
+    """Writes an eval.csv from successes by episode and task."""
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, EVAL_COLUMNS)
+        writer.writeheader()
+        for episode, by_task in successes.items():
+            for task, outcomes in zip(TASKS, by_task, strict=True):
+                for seed, success in enumerate(outcomes):
+                    row = {"seed": seed, "episode": episode, "task": task, "success": success}
+                    writer.writerow(row)
+
+
+def test_a_rung_is_summed_up_by_the_last_tenth_and_the_first_80_percent(tmp_path):
+    write_tests(
+        tmp_path / "eval.csv",
+        {
+            1_700: ([0, 0], [0, 0], [1, 1]),
+            1_800: ([1, 1], [1, 1], [1, 0]),  # 5 of 6: reached; not among the last tenth
+            1_900: ([1, 1], [0, 1], [0, 0]),
+            2_000: ([1, 0], [0, 0], [0, 0]),
+        },
+    )
+    assert ladder.summarize(tmp_path / "eval.csv") == pytest.approx(
+        {
+            "grasp_glass": 3 / 4,
+            "push_green_to_glass": 1 / 4,
+            "push_green_to_white": 0,
+            "overall": 1 / 3,
+            "episodes to 80 %": 1_800,
+        }
+    )
+
+
+def test_a_rung_that_never_gets_there(tmp_path):
+    write_tests(tmp_path / "eval.csv", {100: ([1], [1], [0])})
+    table = ladder.summarize(tmp_path / "eval.csv")
+    assert math.isnan(table.pop("episodes to 80 %"))
+    assert table["overall"] == pytest.approx(2 / 3)
+
+
+def ended_with(monkeypatch, script, *arguments):
+    """Runs a script in this process; returns what it hands to the shell."""
+    monkeypatch.setattr(sys, "argv", [script, *arguments])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(str(ROOT / "benchmarks" / script), run_name="__main__")
+    return ended.value.code
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--preset", "smoke", "--out", "here"), "error: here holds a run: --resume continues it"),
+        (("--episodes", "0"), "error: episodes must be at least 1, got 0"),
+        (("--preset", "smoke", "--out", "file"), "error: cannot make the folder file/"),
+    ],
+)
+def test_mistakes_of_a_person_are_one_line(tmp_path, monkeypatch, capsys, arguments, message):
+    (tmp_path / "here").mkdir()
+    (tmp_path / "here" / "config.json").write_text("{}")
+    (tmp_path / "file").touch()
+    monkeypatch.chdir(tmp_path)
+    told = ended_with(monkeypatch, "continual.py", *arguments)
+    assert told.startswith(message)
+    assert "\n" not in told
+    assert capsys.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("script", ["continual.py", "ladder.py"])
+@pytest.mark.parametrize("wrong", [("--presett", "quick"), ("--episodes", "many")])
+def test_a_wrong_flag_is_named_and_nothing_done(tmp_path, monkeypatch, capsys, script, wrong):
+    monkeypatch.chdir(tmp_path)
+    assert ended_with(monkeypatch, script, *wrong) == 2
+    assert wrong[0] in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_unknown_preset_is_answered_with_those_there_are(monkeypatch, capsys):
+    assert ended_with(monkeypatch, "continual.py", "--preset", "huge") == 2
+    told = capsys.readouterr().err
+    assert all(preset in told for preset in PRESETS)
+
+
+@pytest.mark.slow
+def test_smoke_goes_through_every_stage_from_nothing(tmp_path):
+    """Interrupted once on the way, like a person would: the same command goes on."""
+    script = str(ROOT / "benchmarks" / "continual.py")
+    command = [sys.executable, script, "--preset", "smoke", "--out", "run"]
+    options = {"cwd": tmp_path, "env": {**os.environ, "PYTHONPATH": str(ROOT)}, "text": True}
+    with subprocess.Popen(command, stderr=subprocess.PIPE, **options) as process:
+        told = ""
+        while not re.search(r"train: .* ([4-9]|1\d)/24", told):
+            character = process.stderr.read(1)
+            assert character, f"it ended early: {told}"
+            told += character
+        process.send_signal(signal.SIGINT)
+        assert process.stderr.read().endswith("the same command with --resume continues\n")
+    assert process.returncode == 1
+    assert load_checkpoint(tmp_path / "run" / "checkpoint")["evaluated"] < 2
+
+    result = subprocess.run([*command, "--resume"], capture_output=True, **options)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.endswith("curve and figures: run\n")
+    for name in (
+        *("config.json", "train.csv", "eval.csv", "figures/success.png", "figures/gwr.png"),
+        *("encoders/nico.safetensors", "encoders/nico_bank.safetensors", "encoders/probes.json"),
+        "demonstrations/dataset.json",
+    ):
+        assert (tmp_path / "run" / name).stat().st_size > 0
+    with open(tmp_path / "run" / "train.csv", newline="") as file:
+        episodes = [(row["seed"], int(row["episode"])) for row in csv.DictReader(file)]
+    assert sorted(episodes) == [(seed, n) for seed in "01" for n in range(1, 13)]
