@@ -38,9 +38,8 @@ format: $(SETUP)  ## let ruff format and fix what it can
 typecheck: $(SETUP)  ## pyright
 	$(BIN)/pyright
 
-bench: $(SETUP) $(GL)  ## measure the speed of training and of GWR-B
-	$(BIN)/python benchmarks/throughput.py
-	$(BIN)/python benchmarks/gwr.py
+bench: $(SETUP) $(GL)  ## the ladder: which part limits learning
+	$(BIN)/python benchmarks/ladder.py
 
 clean:  ## remove caches and build leftovers, never .venv or runs
 	rm -rf build dist ./*.egg-info .pytest_cache .ruff_cache .hypothesis
