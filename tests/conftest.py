@@ -1,5 +1,7 @@
 """What all tests share: settings, and the parts of a run small enough to be played in a second."""
 
+import signal
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -78,3 +80,11 @@ def easy_world():
         patch.setattr(bgpo, "NicoEnv", EasyNicoEnv)
         patch.setattr("bgpo_trl.evaluation.NicoEnv", EasyNicoEnv)
         yield EasyNicoEnv
+
+
+@pytest.fixture(autouse=True)
+def interruptible() -> Iterator[None]:
+    """Ctrl-C is answered as at a terminal, though a job in the background starts deaf to it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
