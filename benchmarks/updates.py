@@ -1,0 +1,297 @@
+"""One DDPG update: ours, a TorchRL loop, Stable-Baselines3, and the least that torch must do.
+
+An update is a sample of 256 transitions, one gradient step of actor and critic, and one of their
+targets. All contenders have the networks of the paper (96 inputs, 4 actions, 64 hidden units) and
+draw from 50,000 random transitions; those "without sampling" take the same batch every time, which
+stays in the cache. Only ours and the floor step several seeds together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import Tensor, nn
+from torchrl import objectives
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.modules import MLP, TanhModule, ValueOperator
+
+from bgpo_trl.modules.actor_critic import Actor, Critic
+from bgpo_trl.objectives.ddpg import DDPGLoss, ForeachSoftUpdate
+from bgpo_trl.replay import ReplayBuffer
+from bgpo_trl.seeding import generators
+
+Contender = tuple[Callable[[], object], int]
+
+LATENT, BEHAVIOR, ACTION, HIDDEN, BATCH = 64, 32, 4, 64, 256
+LEARNING_RATE, GAMMA, TAU = 1e-3, 0.98, 0.005
+
+
+def contenders(seeds: int = 10, transitions: int = 50_000) -> dict[str, Contender]:
+    """Returns what to time against each other with `bgpo_trl.timing.interleave`.
+
+    Stable-Baselines3 is left out, with a line that says how to install it, if it is missing. The
+    number of threads is the caller's choice: `torch.set_num_threads`.
+
+    Args:
+        seeds: How many seeds ours and the floor step together.
+        transitions: How many each replay buffer holds, for each seed.
+
+    Returns:
+        For each name, a call that takes some milliseconds, and the number of updates it makes, each
+        seed's counted.
+    """
+    stack, single = Ours(seeds, transitions), Ours(1, transitions)
+    fixed, fixed_single = Ours(seeds, BATCH), Ours(1, BATCH)
+    batch, batch_single = fixed.replay.sample(), fixed_single.replay.sample()
+    floor = Floor(fixed.loss)
+    found: dict[str, Contender] = {
+        f"ours, {seeds} seeds": (stack.update, seeds),
+        "ours, 1 seed": (_repeat(single.update, 4), 4),
+        f"ours, {seeds} seeds, without sampling": (lambda: fixed.learn(batch), seeds),
+        "ours, 1 seed, without sampling": (_repeat(lambda: fixed_single.learn(batch_single), 4), 4),
+        f"floor, {seeds} seeds, without sampling": (_on_tensors(floor, batch), seeds),
+        "TorchRL loop": (_repeat(TorchRLLoop(transitions).update, 4), 4),
+    }
+    try:
+        found["Stable-Baselines3"] = stable_baselines3(transitions, updates=4), 4
+    except ImportError:
+        print(
+            "Goes on without Stable-Baselines3; to have it: pip install -c constraints.txt "
+            "-e '.[bench]'"
+        )
+    return found
+
+
+def random_transitions(*shape: int, generator: torch.Generator) -> TensorDict:
+    """Returns transitions as BGPO stores them, of random numbers, one in ten a success."""
+
+    def normal(size: int) -> Tensor:
+        return torch.randn(*shape, size, generator=generator)
+
+    success = torch.rand(*shape, 1, generator=generator) < 0.1
+    next_data = {"latent": normal(LATENT), "reward": success.float(), "terminated": success}
+    action = torch.rand(*shape, ACTION, generator=generator) * 2 - 1
+    root = {"latent": normal(LATENT), "behavior": normal(BEHAVIOR), "action": action}
+    return TensorDict({**root, "next": next_data}, shape)
+
+
+class Ours:
+    """The learner of `bgpo_trl.algorithms.bgpo.BGPO`, without an environment.
+
+    Args:
+        seeds: Size of the batch of seeds.
+        transitions: How many random transitions to fill the replay buffer with.
+        **options: For the loss, as in `DDPGLoss`.
+    """
+
+    def __init__(self, seeds: int, transitions: int, **options) -> None:
+        numbers, size = range(seeds), LATENT + BEHAVIOR
+        self.loss = DDPGLoss(
+            Actor(size, ACTION, batch_size=[seeds], generator=generators(numbers, "actor")),
+            Critic(size, ACTION, batch_size=[seeds], generator=generators(numbers, "critic")),
+            constant_keys=["behavior"],
+            **options,
+        )
+        self.loss.make_value_estimator(gamma=GAMMA)
+        self.target_update = ForeachSoftUpdate(self.loss, tau=TAU)
+        self.optimizer = torch.optim.Adam(
+            list(self.loss.parameters()), lr=LEARNING_RATE, fused=True
+        )
+        self.replay = ReplayBuffer(
+            transitions, batch_size=BATCH, generator=generators(numbers, "replay")
+        )
+        generator = torch.Generator().manual_seed(0)
+        for start in range(0, transitions, 1000):
+            steps = min(1000, transitions - start)
+            self.replay.extend(random_transitions(steps, seeds, generator=generator))
+
+    def update(self) -> None:
+        """Makes one update of every seed."""
+        self.learn(self.replay.sample())
+
+    def learn(self, batch: TensorDict) -> None:
+        """Makes one update of every seed from a batch ``[S, B]``."""
+        losses = self.loss(batch)
+        self.optimizer.zero_grad()
+        (losses["loss_actor"] + losses["loss_value"]).backward()
+        self.optimizer.step()
+        self.target_update.step()
+
+
+class Floor:
+    """DDPG of stacked seeds in bare torch: only what must be computed, nothing of it by name.
+
+    No clipped targets, no penalty, no diagnostics, no TensorDict; the rest of the arithmetic is
+    that of `DDPGLoss` with these off.
+
+    Args:
+        loss: Where the initial weights are copied from.
+    """
+
+    def __init__(self, loss: DDPGLoss) -> None:
+        def copy(params) -> list[Tensor]:
+            return [tensor.detach().clone() for tensor in params.values(True, True)]
+
+        # Each a list of weight and bias of the first layer, then of the second.
+        self.actor = [nn.Parameter(t) for t in copy(loss.actor_network_params)]
+        self.critic = [nn.Parameter(t) for t in copy(loss.value_network_params)]
+        self.target_actor = copy(loss.target_actor_network_params)
+        self.target_critic = copy(loss.target_value_network_params)
+        self.optimizer = torch.optim.Adam([*self.actor, *self.critic], lr=LEARNING_RATE, fused=True)
+
+    def learn(
+        self, state: Tensor, action: Tensor, next_state: Tensor, reward: Tensor, goes_on: Tensor
+    ) -> None:
+        """Makes one update of every seed.
+
+        Args:
+            state: Latent and behavior, ``[S, B, 96]``.
+            action: ``[S, B, 4]``.
+            next_state: As ``state``.
+            reward: ``[S, B, 1]``.
+            goes_on: 0 where the transition ended in a terminal state, else 1, ``[S, B, 1]``.
+        """
+        with torch.no_grad():
+            next_action = _mlp(self.target_actor, next_state).tanh()
+            next_value = _mlp(self.target_critic, torch.cat([next_state, next_action], -1))
+            target = reward + GAMMA * goes_on * next_value
+        value = _mlp(self.critic, torch.cat([state, action], -1))
+        loss_value = (value - target).square().mean((1, 2)).sum()
+        frozen = [tensor.detach() for tensor in self.critic]
+        policy_action = _mlp(self.actor, state).tanh()
+        loss_actor = -_mlp(frozen, torch.cat([state, policy_action], -1)).mean((1, 2)).sum()
+        self.optimizer.zero_grad()
+        (loss_actor + loss_value).backward()
+        self.optimizer.step()
+        with torch.no_grad():
+            torch._foreach_lerp_(
+                self.target_actor + self.target_critic, self.actor + self.critic, TAU
+            )
+
+
+def _mlp(weights: list[Tensor], x: Tensor) -> Tensor:
+    w1, b1, w2, b2 = weights
+    hidden = torch.baddbmm(b1.unsqueeze(1), x, w1).relu()
+    return torch.baddbmm(b2.unsqueeze(1), hidden, w2)
+
+
+def floor_batch(batch: TensorDict) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Returns a batch of `Ours` as the arguments of `Floor.learn`."""
+    successor = batch["next"]
+    return (
+        torch.cat([batch["latent"], batch["behavior"]], -1),
+        batch["action"].contiguous(),
+        torch.cat([successor["latent"], batch["behavior"]], -1),
+        successor["reward"].contiguous(),
+        1 - successor["terminated"].float(),
+    )
+
+
+class TorchRLLoop:
+    """DDPG as TorchRL's own example (sota-implementations/ddpg) writes it, with our sizes.
+
+    Args:
+        transitions: How many random transitions to fill the replay buffer with.
+    """
+
+    def __init__(self, transitions: int) -> None:
+        size = LATENT + BEHAVIOR
+        network = {"num_cells": [HIDDEN], "activation_class": nn.ReLU}
+        policy = MLP(in_features=size, out_features=ACTION, **network)
+        actor = TensorDictSequential(
+            TensorDictModule(policy, in_keys=["observation"], out_keys=["param"]),
+            TanhModule(in_keys=["param"], out_keys=["action"]),
+        )
+        critic = ValueOperator(
+            MLP(in_features=size + ACTION, out_features=1, **network),
+            in_keys=["action", "observation"],
+        )
+        self.loss = objectives.DDPGLoss(
+            actor, critic, loss_function="l2", delay_actor=True, delay_value=True
+        )
+        self.loss.make_value_estimator(gamma=GAMMA)
+        self.target_update = objectives.SoftUpdate(self.loss, tau=TAU)
+        self.actor_optimizer, self.critic_optimizer = (
+            torch.optim.Adam(list(params.flatten_keys().values()), lr=LEARNING_RATE)
+            for params in (self.loss.actor_network_params, self.loss.value_network_params)
+        )
+        self.replay = TensorDictReplayBuffer(
+            storage=LazyTensorStorage(transitions), batch_size=BATCH
+        )
+        data = random_transitions(transitions, generator=torch.Generator().manual_seed(0))
+        successor = data["next"]
+        successor["done"] = successor["terminated"]
+        for part in (data, successor):
+            part["observation"] = torch.cat([part.pop("latent"), data["behavior"]], -1)
+        self.replay.extend(data.exclude("behavior"))
+
+    def update(self) -> None:
+        """Makes one update."""
+        batch = self.replay.sample()
+        loss_value, _ = self.loss.loss_value(batch)
+        loss_value.backward()
+        self.critic_optimizer.step()
+        self.critic_optimizer.zero_grad()
+        loss_actor, _ = self.loss.loss_actor(batch)
+        loss_actor.backward()
+        self.actor_optimizer.step()
+        self.actor_optimizer.zero_grad()
+        self.target_update.step()
+
+
+def stable_baselines3(transitions: int, updates: int) -> Callable[[], object]:
+    """Returns a call that makes some updates with the DDPG of Stable-Baselines3.
+
+    Args:
+        transitions: How many random transitions to fill the replay buffer with.
+        updates: How many updates a call makes.
+
+    Raises:
+        ImportError: If Stable-Baselines3 is not installed.
+    """
+    import gymnasium
+    from stable_baselines3 import DDPG
+    from stable_baselines3.common.logger import Logger
+
+    class Nowhere(gymnasium.Env):
+        """Says what shape observations and actions have; never stepped."""
+
+        observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (LATENT + BEHAVIOR,))
+        action_space = gymnasium.spaces.Box(-1.0, 1.0, (ACTION,))
+
+    model = DDPG(
+        "MlpPolicy",
+        Nowhere(),
+        policy_kwargs={"net_arch": [HIDDEN]},
+        learning_rate=LEARNING_RATE,
+        batch_size=BATCH,
+        buffer_size=transitions,
+        gamma=GAMMA,
+        tau=TAU,
+        device="cpu",
+    )
+    model.set_logger(Logger(None, []))
+    rng, replay = np.random.default_rng(0), model.replay_buffer
+    for array in (replay.observations, replay.next_observations):
+        rng.standard_normal(out=array, dtype=np.float32)
+    replay.actions[:] = rng.uniform(-1, 1, replay.actions.shape)
+    replay.dones[:] = replay.rewards[:] = rng.random(replay.dones.shape) < 0.1
+    replay.full = True
+    return lambda: model.train(gradient_steps=updates, batch_size=BATCH)
+
+
+def _repeat(call: Callable[[], object], times: int) -> Callable[[], object]:
+    def repeated() -> None:
+        for _ in range(times):
+            call()
+
+    return repeated
+
+
+def _on_tensors(floor: Floor, batch: TensorDict) -> Callable[[], object]:
+    tensors = floor_batch(batch)
+    return lambda: floor.learn(*tensors)
