@@ -2,26 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
 from typing import Any
 
 import numpy as np
 import torch
+from dm_env import TimeStep
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from bgpo_trl.machine import usable_cores
 from suites import nico
-from suites.nico.base import STATE_SIZE, Environment, Observation
+from suites.nico.base import STATE_SIZE, Environment, Observation, check_observation
 from suites.nico.rendering import FRAME_HEIGHT, FRAME_WIDTH, FrameRenderer
 
 
 class NicoEnv(EnvBase):
     """NICO at the table, one simulation for each element of the batch.
 
-    All simulations run in this process and share one renderer. The task of an episode is chosen
-    at reset, by the entry ``"task"`` of the reset's tensordict. Episodes end on success only:
-    append ``StepCounter(50)`` for the paper's time limit.
+    All simulations run in this process and share one renderer. Physics is stepped in threads, and
+    each frame is drawn by the caller's thread as soon as its simulation is there; results do not
+    depend on the number of threads. The task of an episode is chosen at reset, by the entry
+    ``"task"`` of the reset's tensordict. Episodes end on success only: append ``StepCounter(50)``
+    for the paper's time limit.
 
     Writes at reset and step: ``"pixels"`` uint8 ``[*B, 32, 64, 3]`` and/or ``"state"`` float32
     ``[*B, 16]`` (joints (rad), grip and object positions (m)); ``"task"`` int64 ``[*B]``, an index
@@ -36,9 +41,11 @@ class NicoEnv(EnvBase):
         batch_size: Shape of the batch.
         seed: Seed of each simulation's starts; an int counts up from there.
         observation: ``"pixels"``, ``"state"`` or ``"both"``.
+        threads: Threads for physics; None takes one for each core, 1 the caller's own.
 
     Raises:
-        ValueError: If a task is unknown or there are not as many seeds as simulations.
+        ValueError: If a task is unknown, there are not as many seeds as simulations, or there is
+            to be no thread.
 
     Example:
         >>> env = NicoEnv(batch_size=[2], seed=0)
@@ -53,34 +60,39 @@ class NicoEnv(EnvBase):
         batch_size: Sequence[int] = (),
         seed: int | Sequence[int] = 0,
         observation: Observation = "pixels",
+        threads: int | None = None,
     ) -> None:
         super().__init__(batch_size=torch.Size(batch_size))
+        check_observation(observation)
+        if threads is not None and threads < 1:
+            raise ValueError(f"threads must be at least 1, or None for all cores, got {threads}")
         self.tasks = tuple(tasks)
         self.observation = observation
         count = self.batch_size.numel()
         seeds = [seed + i for i in range(count)] if isinstance(seed, int) else list(seed)
         if len(seeds) != count:
             raise ValueError(f"{len(seeds)} seeds for {count} simulations: give one each")
-        renderer = None
         self._environments: list[list[Environment]] = []
         for row_seed in seeds:
             physics = nico.Physics.from_xml_string(nico.scene_xml())
-            if observation != "state" and renderer is None:
-                renderer = FrameRenderer(physics.model.ptr)
             random = np.random.RandomState(row_seed)
             self._environments.append(
                 [
                     nico.load(
                         task,
                         seed=random,
-                        observation=observation,
+                        observation="state",  # Frames are drawn here, in one thread.
                         time_limit=float("inf"),
                         physics=physics,
-                        renderer=renderer,
                     )
                     for task in self.tasks
                 ]
             )
+        self._renderer: FrameRenderer | None = None
+        if observation != "state":
+            self._renderer = FrameRenderer(self._environments[0][0].physics.model.ptr)
+        threads = min(count, usable_cores() if threads is None else threads)
+        self._pool = ThreadPoolExecutor(threads, "physics") if threads > 1 else None
         self._task = np.zeros(count, dtype=np.int64)
         self._current: dict[str, np.ndarray] = {}
         self._done = np.zeros(count, dtype=bool)
@@ -127,9 +139,28 @@ class NicoEnv(EnvBase):
         done = torch.from_numpy(self._done.copy()).reshape(*self.batch_size, 1)
         return {"done": done, "terminated": done.clone(), "truncated": torch.zeros_like(done)}
 
-    def _record(self, row: int | np.intp, observation: dict[str, np.ndarray]) -> None:
-        for key, value in self._current.items():
-            value[row] = observation[key]
+    def _environment(self, row: int) -> Environment:
+        return self._environments[row][self._task[row]]
+
+    def _record(self, row: int, timestep: TimeStep) -> None:
+        if self._renderer is not None:
+            data = self._environment(row).physics.data.ptr
+            self._renderer.render(data, out=self._current["pixels"][row])
+        if "state" in self._current:
+            self._current["state"][row] = timestep.observation["state"]
+
+    def _advance(self, rows: Sequence[int], actions: np.ndarray) -> Iterator[TimeStep]:
+        """Steps simulations; yields what each has come to, in order, as soon as it has."""
+        if self._pool is None:
+            for row in rows:
+                yield self._environment(row).step(actions[row])
+            return
+        pending = [self._pool.submit(self._environment(row).step, actions[row]) for row in rows]
+        try:
+            for step in pending:
+                yield step.result()
+        finally:
+            wait(pending)  # Whatever happens, nothing moves behind the caller's back.
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         del kwargs
@@ -146,9 +177,8 @@ class NicoEnv(EnvBase):
                         f"task must lie in 0..{len(self.tasks) - 1}, got {chosen.tolist()}"
                     )
                 self._task[rows] = chosen[rows]
-        for row in np.flatnonzero(rows):
-            timestep = self._environments[row][self._task[row]].reset()
-            self._record(row, timestep.observation)
+        for row in np.flatnonzero(rows).tolist():
+            self._record(row, self._environment(row).reset())
         self._done[rows] = False
         return TensorDict({**self._observe(), **self._dones()}, self.batch_size)
 
@@ -162,13 +192,21 @@ class NicoEnv(EnvBase):
         if not np.isfinite(actions[rows]).all():
             raise ValueError(f"an action is 4 finite numbers in [-1, 1], got {actions.tolist()}")
         rewards = np.zeros((len(rows), 1), np.float32)
-        for row in np.flatnonzero(rows):
-            timestep = self._environments[row][self._task[row]].step(actions[row])
-            self._record(row, timestep.observation)
+        moving = np.flatnonzero(rows).tolist()
+        for row, timestep in zip(moving, self._advance(moving, actions), strict=True):
+            self._record(row, timestep)
             rewards[row] = timestep.reward
             self._done[row] = timestep.last()
         reward = torch.from_numpy(rewards).reshape(*self.batch_size, 1)
         return TensorDict({**self._observe(), "reward": reward, **self._dones()}, self.batch_size)
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Ends the threads and frees the renderer."""
+        if self._pool is not None:
+            self._pool.shutdown()
+        if self._renderer is not None:
+            self._renderer.close()
+        super().close(raise_if_closed=raise_if_closed)
 
     def _set_seed(self, seed: int | None) -> None:
         for row, environments in enumerate(self._environments):

@@ -1,6 +1,8 @@
 """NicoEnv against single environments of the suite, and its promises to TorchRL."""
 
 import itertools
+import threading
+import time
 
 import numpy as np
 import pytest
@@ -342,3 +344,55 @@ def test_a_state_of_another_environment_is_refused():
         NicoEnv(batch_size=[3], observation="state").load_simulation_state(state)
     with pytest.raises(ValueError, match=r"observations \['state'\], .* has \['pixels'\]: use"):
         NicoEnv(batch_size=[2], observation="pixels").load_simulation_state(state)
+
+
+def test_results_do_not_depend_on_the_number_of_threads():
+    def play(threads):
+        env = NicoEnv(batch_size=[3], seed=5, observation="both", threads=threads)
+        generator = torch.Generator().manual_seed(0)
+        td, seen = env.reset(), []
+        for step in range(12):
+            td["action"] = torch.rand(3, 4, generator=generator) * 2 - 1
+            td["_step"] = torch.tensor([True, step % 3 > 0, True])
+            td = env.step(td)["next"]
+            seen.append(td.clone())
+        return torch.stack(seen)
+
+    alone = play(1)
+    for threads in (2, 5):
+        together = play(threads)
+        assert (together == alone).all()
+
+
+def test_an_error_in_a_thread_reaches_the_caller_when_all_others_have_stopped(monkeypatch):
+    env = NicoEnv(batch_size=[3], seed=0, observation="state", threads=2)
+    td = env.reset()
+    first, last = env._environments[0][0], env._environments[2][0]
+    finished = []
+
+    def fail(action):
+        raise RuntimeError("physics exploded")
+
+    def slow(action, step=last.step):
+        time.sleep(0.05)
+        finished.append(timestep := step(action))
+        return timestep
+
+    monkeypatch.setattr(first, "step", fail)
+    monkeypatch.setattr(last, "step", slow)
+    with pytest.raises(RuntimeError, match="physics exploded"):
+        env.step(td.set("action", torch.zeros(3, 4)))
+    assert len(finished) == 1
+
+
+def test_without_a_thread_there_is_nothing_to_step_in():
+    with pytest.raises(ValueError, match=r"^threads must be at least 1, or None for all cores.*$"):
+        NicoEnv(threads=0)
+
+
+def test_closing_ends_the_threads():
+    env = NicoEnv(batch_size=[2], seed=0, threads=2)
+    env.rollout(2)
+    before = threading.active_count()
+    env.close()
+    assert threading.active_count() == before - 2

@@ -2,7 +2,7 @@
 
 import hashlib
 from collections import OrderedDict
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from dm_control.rl import control
@@ -41,6 +41,13 @@ def scene_version() -> str:
     return "nico-1-" + hashlib.sha256(described).hexdigest()[:8]
 
 
+def check_observation(observation: str) -> None:
+    """Raises ValueError if there is no such observation."""
+    if observation not in get_args(Observation):
+        choices = ", ".join(map(repr, get_args(Observation)))
+        raise ValueError(f"observation is {observation!r}; choose one of {choices}")
+
+
 class Environment(control.Environment):
     """``control.Environment`` whose success on the very last step still has discount 0."""
 
@@ -73,10 +80,7 @@ class NicoTask(control.Task):
         observation: Observation = "pixels",
         renderer: FrameRenderer | None = None,
     ) -> None:
-        if observation not in ("pixels", "state", "both"):
-            raise ValueError(
-                f"observation is {observation!r}; choose one of 'pixels', 'state', 'both'"
-            )
+        check_observation(observation)
         self.random = random
         self._observation = observation
         self._renderer = renderer

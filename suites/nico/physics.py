@@ -3,6 +3,7 @@
 # MuJoCo's bindings come without stubs.
 # pyright: reportAttributeAccessIssue=false
 
+from functools import cached_property
 from importlib import resources
 from typing import Final
 
@@ -29,13 +30,32 @@ def scene_xml() -> str:
 class Physics(dm_mujoco.Physics):
     """MuJoCo simulation with the queries that NICO's tasks, demonstrator and probes need."""
 
+    # Names are looked up once: `named` takes many times as long as what it is read for.
+
+    @cached_property
+    def _arm(self) -> list[int]:
+        return [self.model.joint(name).qposadr[0] for name in ARM_JOINTS]
+
+    @cached_property
+    def _curls(self) -> list[int]:
+        return [self.model.joint(f"{digit}_1").qposadr[0] for digit in DIGITS]
+
+    @cached_property
+    def _ids(self) -> dict[tuple[str, str], int]:
+        return {}
+
+    def _id(self, kind: str, name: str) -> int:
+        if (kind, name) not in self._ids:
+            self._ids[kind, name] = self.model.name2id(name, kind)
+        return self._ids[kind, name]
+
     def arm_angles(self) -> np.ndarray:
         """Returns shoulder yaw, shoulder pitch and elbow (rad), ``[3]``."""
-        return np.array(self.named.data.qpos[list(ARM_JOINTS)])
+        return self.data.qpos[self._arm]
 
     def digit_curls(self) -> np.ndarray:
         """Returns the angle (rad) of each segment of thumb, upper and lower finger, ``[3]``."""
-        return np.array(self.named.data.qpos[[f"{digit}_1" for digit in DIGITS]])
+        return self.data.qpos[self._curls]
 
     def joint_angles(self) -> np.ndarray:
         """Returns the arm's three angles and the hand's mean curl (rad), ``[4]``."""
@@ -43,15 +63,15 @@ class Physics(dm_mujoco.Physics):
 
     def grip_position(self) -> np.ndarray:
         """Returns where the centre of a held glass would be (m), ``[3]``."""
-        return np.array(self.named.data.site_xpos["grip"])
+        return self.data.site_xpos[self._id("site", "grip")].copy()
 
     def palm_position(self) -> np.ndarray:
         """Returns the centre of the palm (m), ``[3]``."""
-        return np.array(self.named.data.site_xpos["palm"])
+        return self.data.site_xpos[self._id("site", "palm")].copy()
 
     def object_position(self, name: str) -> np.ndarray:
         """Returns the centre of an object (m), ``[3]``."""
-        return np.array(self.named.data.xpos[name])
+        return self.data.xpos[self._id("body", name)].copy()
 
     def privileged_state(self) -> np.ndarray:
         """Returns joint angles (rad) ``[4]``, grip (m) ``[3]`` and object positions (m) ``[9]``."""
@@ -69,9 +89,8 @@ class Physics(dm_mujoco.Physics):
 
     def gap(self, first: str, second: str) -> float:
         """Returns the smallest distance between two geoms (m); negative where they overlap."""
-        model = self.model.ptr
-        ids = [self.model.name2id(name, "geom") for name in (first, second)]
-        return mujoco.mj_geomDistance(model, self.data.ptr, ids[0], ids[1], 1.0, None)
+        ids = [self._id("geom", name) for name in (first, second)]
+        return mujoco.mj_geomDistance(self.model.ptr, self.data.ptr, *ids, 1.0, None)
 
     def touching(self, first: str, second: str) -> bool:
         """Returns whether two geoms touch."""
@@ -80,7 +99,7 @@ class Physics(dm_mujoco.Physics):
     def robot_touches(self) -> bool:
         """Returns whether any part of the robot touches the table or an object."""
         bodies = self.model.body_rootid[self.model.geom_bodyid]
-        robot = self.model.name2id("torso", "body")
+        robot = self._id("body", "torso")
         geoms = self.data.contact.geom
         return bool((bodies[geoms] == robot).any())
 
@@ -97,7 +116,7 @@ class Physics(dm_mujoco.Physics):
         """
         if not self.hand_closing():
             return False
-        glass = self.model.name2id("glass", "geom")
+        glass = self._id("geom", "glass")
         touched = set()
         for contact in self.data.contact:
             pair = (contact.geom1, contact.geom2)

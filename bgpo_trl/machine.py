@@ -1,0 +1,49 @@
+"""What this machine offers: cores that may be used, and a device for the networks."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import torch
+
+
+def usable_cores(quota: str | Path = "/sys/fs/cgroup/cpu.max") -> int:
+    """Returns how many cores this process may use, at least 1.
+
+    Heeds the process's affinity (``taskset``, Slurm) and a container's quota.
+
+    Args:
+        quota: Where Linux tells the quota and its period (us), as ``"200000 100000"`` or
+            ``"max 100000"``.
+    """
+    if hasattr(os, "sched_getaffinity"):
+        cores = len(os.sched_getaffinity(0))
+    else:
+        cores = os.cpu_count() or 1
+    try:
+        allowed, period = Path(quota).read_text().split()
+        cores = min(cores, round(int(allowed) / int(period)))
+    except (OSError, ValueError):  # No Linux, no control group, or no quota.
+        pass
+    return max(1, cores)
+
+
+def choose_device(name: str = "auto") -> torch.device:
+    """Returns the device for networks and replay; the simulation is always on the CPU.
+
+    Args:
+        name: ``"auto"`` (a CUDA GPU if there is one, else the CPU) or a device of PyTorch's.
+
+    Raises:
+        ValueError: If there is no such device.
+    """
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:  # A PyTorch without CUDA asserts.
+        reason = str(error).splitlines()[0]
+        raise ValueError(f"no device {name!r} here ({reason}): use auto or cpu") from error
+    return device
