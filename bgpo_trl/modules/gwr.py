@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any, Literal
 
@@ -89,6 +88,7 @@ class GWRB(nn.Module):
     """
 
     _weights: Tensor  # [networks, capacity, d]; spare rows are inf, hence never the nearest
+    _network: Tensor  # 0, 1, ..., one a network
 
     def __init__(
         self,
@@ -137,6 +137,7 @@ class GWRB(nn.Module):
         self._topologies = [Topology() for _ in range(networks)]
         spare = torch.full((networks, 16, n_features), torch.inf)
         self.register_buffer("_weights", spare, persistent=False)
+        self.register_buffer("_network", torch.arange(networks), persistent=False)
         if init == "random":
             for i, source in enumerate(generators):
                 device = None if source is None else source.device
@@ -171,7 +172,7 @@ class GWRB(nn.Module):
             ValueError: if phi has the wrong shape or holds NaN or Inf, or if a network is still
                 empty (`init="data"` before the first input).
         """
-        batch, networks = phi.shape[:-1], len(self._topologies)
+        batch, networks, weights = phi.shape[:-1], len(self._topologies), self._weights
         if (*batch[: len(self.batch_size)], *phi.shape[-1:]) != (*self.batch_size, self.n_features):
             raise ValueError(
                 f"phi must begin with dimensions {[*self.batch_size]} and end with "
@@ -179,16 +180,15 @@ class GWRB(nn.Module):
             )
         if not all(topology.edges for topology in self._topologies):
             raise ValueError("an empty network matches nothing: adapt() it to an input first")
-        phi = self._checked(phi.reshape(networks, batch.numel() // networks, self.n_features))
-        distance, row = self._distances(phi).min(-1)
-        network = torch.arange(networks, device=row.device).unsqueeze(-1)
+        phi = _checked(phi.reshape(networks, batch.numel() // networks, self.n_features), weights)
+        distance, row = _distances(phi, weights).min(-1)
         node = [
             [topology.identity[i] for i in rows]
             for topology, rows in zip(self._topologies, row.tolist(), strict=True)
         ]
         return BehaviorMatch(
-            embedding=self._weights[network, row].view(*batch, self.n_features),
-            node=torch.tensor(node, dtype=torch.int64, device=row.device).view(batch),
+            embedding=weights[self._network.unsqueeze(-1), row].view(*batch, self.n_features),
+            node=_to_tensor(node, row.dtype, row.device).view(batch),
             activity=distance.neg_().exp_().view(batch),
             batch_size=batch,
         )
@@ -217,36 +217,35 @@ class GWRB(nn.Module):
             raise ValueError(
                 f"mask must be bool {[*self.batch_size]}; got {mask.dtype} {[*mask.shape]}"
             )
-        active = slice(None) if mask is None else mask.flatten()
-        phi = self._checked(phi.reshape(-1, self.n_features)[active])
-        network = torch.arange(len(self._topologies), device=phi.device)[active]
+        phi, network = phi.reshape(-1, self.n_features), self._network
+        if mask is not None:
+            phi, network = phi[mask.flatten()], network[mask.flatten()]
+        phi = _checked(phi, self._weights)
         networks = network.tolist()
         self._make_room(networks)
-        n_before = [len(self._topologies[i].edges) for i in networks]
-        for k, (i, n) in enumerate(zip(networks, n_before, strict=True)):
-            if n == 0:
-                self._start(i, phi[k])
+        topologies = [self._topologies[i] for i in networks]
+        n_before = [len(topology.edges) for topology in topologies]
+        for k in [k for k, n in enumerate(n_before) if n == 0]:
+            self._start(networks[k], phi[k])
 
-        distances = self._distances(phi.unsqueeze(1), active).squeeze(1)
+        weights = self._weights
+        searched = weights if mask is None else weights[network]
+        distances = _distances(phi.unsqueeze(1), searched).squeeze(1)
         distance, best = distances.min(-1)
         second = distances.scatter_(-1, best.unsqueeze(-1), torch.inf).min(-1).indices
-        embedding, activity = self._weights[network, best], distance.neg_().exp_()
+        embedding, activity = weights[network, best], distance.neg_().exp_()
         nearest = list(zip(best.tolist(), second.tolist(), activity.tolist(), strict=True))
-        identities = [
-            self._topologies[i].identity[c] for i, (c, _, _) in zip(networks, nearest, strict=True)
-        ]
-        node = torch.tensor(identities, dtype=torch.int64, device=phi.device)
+        identities = [t.identity[match[0]] for t, match in zip(topologies, nearest, strict=True)]
+        node = _to_tensor(identities, best.dtype, best.device)
         self._learn(phi, embedding, networks, n_before, nearest)
 
         if mask is not None:
             embedding = self._spread(embedding, network, torch.nan)
             node = self._spread(node, network, -1)
             activity = self._spread(activity, network, torch.nan)
+        batch = self.batch_size
         return BehaviorMatch(
-            embedding=embedding.view(*self.batch_size, self.n_features),
-            node=node.view(self.batch_size),
-            activity=activity.view(self.batch_size),
-            batch_size=self.batch_size,
+            embedding.view(*batch, -1), node.view(batch), activity.view(batch), batch_size=batch
         )
 
     def get_extra_state(self) -> list[dict[str, Any]]:
@@ -279,21 +278,6 @@ class GWRB(nn.Module):
         ]
         self._weights = weights
 
-    def _checked(self, phi: Tensor) -> Tensor:
-        """Returns phi in the type and on the device of the weights, if it can be matched."""
-        phi = phi.detach().to(self._weights)
-        # Farther out a squared distance could overflow, and every node would be equally near.
-        limit = math.sqrt(torch.finfo(phi.dtype).max) / 2
-        if not torch.linalg.vector_norm(phi).item() <= limit:
-            raise ValueError(f"phi must be free of NaN, Inf and values beyond +-{limit:.0e}")
-        return phi
-
-    def _distances(self, phi: Tensor, active: slice | Tensor = slice(None)) -> Tensor:
-        """Distances `[A, M, N]` of inputs `[A, M, d]` to the nodes of the A active networks."""
-        # By matrix product, the default of cdist, distances near 0 would be off by 1e-3.
-        exact = "donot_use_mm_for_euclid_dist"
-        return torch.cdist(phi, self._weights[active], compute_mode=exact)
-
     def _spread(self, x: Tensor, network: Tensor, fill: float) -> Tensor:
         """Places results of active networks among those of all, which are `fill` elsewhere."""
         return x.new_full((len(self._topologies), *x.shape[1:]), fill).index_copy(0, network, x)
@@ -316,40 +300,35 @@ class GWRB(nn.Module):
     ) -> None:
         """Takes steps 3 to 5 for inputs `[A, d]`, one for each of A `networks`.
 
-        Args:
-            phi: the inputs.
-            embedding: weights w_c of their best matches, `[A, d]`.
-            networks: what each input is for.
-            n_before: how many nodes those networks had before.
-            nearest: rows of the two nearest nodes, and the activity.
+        These had `n_before` nodes; `nearest` holds the rows of the two nearest nodes and the
+        activity, and `embedding` `[A, d]` the weights w_c of the best match.
         """
-        weights = self._weights.view(-1, self.n_features)
-        capacity = self._weights.shape[1]
+        weights = self._weights
         inputs: list[int] = []
-        rows: list[int] = []  # of the flat weights
+        rows: list[int] = []  # of the weights of all networks, one after the other
         steps: list[float] = []
-        removed: list[tuple[int, int]] = []  # network, row
+        erased: list[int] = []
         for k, (i, n, match) in enumerate(zip(networks, n_before, nearest, strict=True)):
-            if n == 1:
-                self._start(i, phi[k])
             if n < 2:
+                if n == 1:
+                    self._start(i, phi[k])
                 continue
             update = self._topologies[i].learn(*match, self.rule)
             if update.insert:
                 new_row = len(self._topologies[i].identity) - 1
-                self._weights[i, new_row] = (embedding[k] + phi[k]) / 2
+                weights[i, new_row] = (embedding[k] + phi[k]) / 2
+            first = i * weights.shape[1]
             inputs += [k] * len(update.moved)
-            rows += [i * capacity + row for row in update.moved]
+            rows += [first + row for row in update.moved]
             steps += update.steps
-            removed += [(i, row) for row in update.removed]
+            erased += [first + row for row in update.removed]
+        flat = weights.view(-1, self.n_features)
         if rows:
-            # By way of numpy, which reads a list of a hundred numbers four times as fast.
-            k, row = (torch.as_tensor(np.array(x), device=phi.device) for x in (inputs, rows))
-            step = torch.as_tensor(np.array(steps)).to(phi).unsqueeze(-1)
-            moved = weights.index_select(0, row).lerp(phi.index_select(0, k), step)
-            weights.index_copy_(0, row, moved)
-        for i, row in removed:
-            self._weights[i, row] = torch.inf
+            row, k = (_to_tensor(x, torch.int64, phi.device) for x in (rows, inputs))
+            step = _to_tensor(steps, phi.dtype, phi.device).unsqueeze(-1)
+            flat.index_copy_(0, row, flat.index_select(0, row).lerp(phi.index_select(0, k), step))
+        if erased:
+            flat[erased] = torch.inf
 
     def _make_room(self, networks: list[int]) -> None:
         """Sees to a spare row in each of the networks.
@@ -367,3 +346,24 @@ class GWRB(nn.Module):
             rows = self._topologies[i].compact()
             self._weights[i, : len(rows)] = self._weights[i, rows]
             self._weights[i, len(rows) :] = torch.inf
+
+
+def _checked(phi: Tensor, weights: Tensor) -> Tensor:
+    """Returns phi in the type and on the device of the weights, if it can be matched."""
+    phi = phi.detach().to(weights)
+    # Farther out a squared distance could overflow, and every node would be equally near.
+    limit = torch.finfo(phi.dtype).max ** 0.5 / 2
+    if not torch.linalg.vector_norm(phi).item() <= limit:
+        raise ValueError(f"phi must be free of NaN, Inf and values beyond +-{limit:.0e}")
+    return phi
+
+
+def _distances(phi: Tensor, weights: Tensor) -> Tensor:
+    """Distances `[A, M, N]` of inputs `[A, M, d]` to nodes `[A, N, d]`."""
+    # By matrix product, the default of cdist, distances near 0 would be off by 1e-3.
+    return torch.cdist(phi, weights, compute_mode="donot_use_mm_for_euclid_dist")
+
+
+def _to_tensor(numbers: list[Any], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """The same as `torch.tensor`, by way of numpy, which reads a list four times as fast."""
+    return torch.as_tensor(np.array(numbers), dtype=dtype, device=device)

@@ -1,0 +1,202 @@
+"""What GWR-B costs: time and memory against the number of nodes, and of the networks of a run.
+
+    python benchmarks/gwr.py --out runs/gwr
+
+prints a table and writes it as ``gwr.json``, with the times against nodes as ``gwr.png``.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import statistics
+import sys
+import tracemalloc
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import torch
+import tyro
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from bgpo_trl.modules.gwr import GWRB
+from bgpo_trl.plotting import save_figure
+from bgpo_trl.timing import Timing, interleave
+
+CALLS = ("lookup", "adapt", "lookup + adapt")
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Measures GWR-B."""
+
+    out: Path = Path("runs/gwr")
+    """Where the results go."""
+    nodes: tuple[int, ...] = (100, 1_000, 10_000, 100_000, 1_000_000)
+    """Sizes of a single network."""
+    networks: int = 10
+    """Networks in the batch."""
+    batch_nodes: int = 500
+    """Nodes of each network in the batch."""
+    features: int = 32
+    """Size of an input."""
+    rounds: int = 30
+    """How often everything is timed."""
+    threads: int = 1
+    """Threads of PyTorch."""
+
+
+def synthetic_network(n_nodes: int, n_features: int, seed: int) -> dict[str, Any]:
+    """Returns the state of a network along a curve; each node is joined to the next three."""
+    generator = torch.Generator().manual_seed(seed)
+    frequency, phase = torch.rand(2, n_features, generator=generator)
+    node = torch.arange(n_nodes)
+    pairs = torch.cat([torch.stack([node[:-k], node[k:]], -1) for k in (1, 2, 3)])
+    return {
+        "weights": (node.unsqueeze(-1) * frequency / 10 + 2 * math.pi * phase).sin(),
+        "habituation": torch.full((n_nodes,), 0.5, dtype=torch.float64),
+        "edges": pairs,
+        "ages": torch.zeros(len(pairs), dtype=torch.int64),
+        "node": node,
+        "next_node": n_nodes,
+    }
+
+
+def make_gwr(n_networks: int, n_nodes: int, n_features: int) -> tuple[GWRB, Tensor, int]:
+    """Returns full networks, their weights `[S, N, d]`, and the bytes that they hold."""
+    gwr = GWRB(n_features, batch_size=[n_networks], max_nodes=n_nodes)
+    state = [synthetic_network(n_nodes, n_features, seed) for seed in range(n_networks)]
+    # It counts what Python holds, the graph; tensors are allocated where it cannot look.
+    tracemalloc.start()
+    gwr.load_state_dict({"_extra_state": state})
+    held = tracemalloc.get_traced_memory()[0]
+    tracemalloc.stop()
+    held += sum(buffer.nbytes for buffer in gwr.buffers())
+    return gwr, torch.stack([network["weights"] for network in state]), held
+
+
+def calls_per_round(gwr: GWRB, weights: Tensor, n_inputs: int) -> dict[str, Callable[[], object]]:
+    """Returns what is timed: each call learns from, or looks up, `n_inputs` inputs in turn."""
+    generator = torch.Generator().manual_seed(0)
+    n_networks, n_nodes, n_features = weights.shape
+
+    def inputs() -> Tensor:
+        row = torch.randint(n_nodes, (n_inputs, n_networks), generator=generator)
+        noise = torch.randn(n_inputs, n_networks, n_features, generator=generator)
+        return weights[torch.arange(n_networks), row] + 0.02 * noise
+
+    fixed = inputs()
+
+    def lookup() -> None:
+        for phi in fixed:
+            gwr.lookup(phi)
+
+    def adapt() -> None:
+        for phi in fixed:
+            gwr.adapt(phi)
+
+    def lookup_adapt() -> None:
+        for phi in fixed:
+            gwr.lookup(phi)
+            gwr.adapt(phi)
+
+    def read() -> None:
+        for _ in fixed:
+            weights.sum()
+
+    return {**dict(zip(CALLS, (lookup, adapt, lookup_adapt), strict=True)), "read": read}
+
+
+def measure(n_networks: int, n_nodes: int, arguments: Arguments) -> dict[str, Any]:
+    """Returns times (ms a network) and memory (bytes a node) of a batch of networks."""
+    gwr, weights, held = make_gwr(n_networks, n_nodes, arguments.features)
+    # A call should take milliseconds, yet all calls of the largest network only a minute.
+    n_inputs = max(1, min(20, 200_000 // (n_networks * n_nodes)))
+    times = interleave(calls_per_round(gwr, weights, n_inputs), rounds=arguments.rounds)
+    scale = 1e3 / (n_inputs * n_networks)
+    return {
+        "networks": n_networks,
+        "nodes": n_nodes,
+        "bytes_per_node": held / (n_networks * n_nodes),
+        **{
+            name: asdict(Timing.of([scale * t for t in seconds])) for name, seconds in times.items()
+        },
+    }
+
+
+def slope(rows: list[dict[str, Any]], call: str) -> float:
+    """Returns the exponent of time in nodes: the slope of a line through the logarithms."""
+    x = [math.log(row["nodes"]) for row in rows]
+    y = [math.log(row[call]["median"]) for row in rows]
+    return statistics.linear_regression(x, y).slope
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Returns the measurements in Markdown."""
+    lines = [
+        "| networks | nodes | lookup | adapt | lookup + adapt | read weights | bytes a node |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        cells = [
+            "{median:.4f} ({low:.4f} to {high:.4f})".format(**row[x]) for x in (*CALLS, "read")
+        ]
+        count = f"| {row['networks']} | {row['nodes']:,} |"
+        lines.append(f"{count} {' | '.join(cells)} | {row['bytes_per_node']:.0f} |")
+    return "\n".join(lines)
+
+
+def plot(rows: list[dict[str, Any]]) -> Figure:
+    """Plots times against nodes of a single network, medians and quartiles."""
+    figure = Figure(figsize=(4.8, 3.6), layout="constrained")
+    axes = figure.add_subplot()
+    nodes = [row["nodes"] for row in rows]
+    for call, style in (("lookup", "o-"), ("adapt", "s--"), ("read", "^:")):
+        median, low, high = ([row[call][x] for row in rows] for x in ("median", "low", "high"))
+        (line,) = axes.loglog(
+            nodes, median, style, label="read weights" if call == "read" else call
+        )
+        axes.fill_between(nodes, low, high, color=line.get_color(), alpha=0.2, linewidth=0)
+    axes.set(xlabel="Nodes", ylabel="Time of a call (ms)")
+    axes.grid(color="0.9")
+    axes.legend(frameon=False)
+    return figure
+
+
+def main(arguments: Arguments) -> None:
+    """Measures, prints and writes."""
+    torch.set_num_threads(arguments.threads)
+    single = [measure(1, n, arguments) for n in arguments.nodes]
+    batch = measure(arguments.networks, arguments.batch_nodes, arguments)
+    large = [row for row in single if row["nodes"] >= 10_000]
+    fitted = large if len(large) > 1 else single
+    exponents = {call: slope(fitted, call) for call in ("lookup", "adapt", "read")}
+    result = {
+        "unit": "ms a network",
+        "features": arguments.features,
+        "threads": arguments.threads,
+        "rounds": arguments.rounds,
+        "torch": torch.__version__,
+        "single": single,
+        "batch": batch,
+        "exponent": {"from": fitted[0]["nodes"], "to": fitted[-1]["nodes"], **exponents},
+    }
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    (arguments.out / "gwr.json").write_text(json.dumps(result, indent=2) + "\n")
+    save_figure(plot(single), arguments.out / "gwr.png")
+    print("Milliseconds a network, medians and quartiles\n")
+    print(table([*single, batch]))
+    shown = ", ".join(f"{call} {value:.2f}" for call, value in exponents.items())
+    print(f"\nexponent from {fitted[0]['nodes']:,} to {fitted[-1]['nodes']:,} nodes: {shown}")
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Annotated[Arguments, tyro.conf.OmitArgPrefixes], description=__doc__))
+    except (ValueError, OSError) as error:
+        sys.exit(f"error: {error}")
+    except KeyboardInterrupt:
+        sys.exit("interrupted")
