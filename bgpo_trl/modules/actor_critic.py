@@ -97,32 +97,42 @@ class StackedLinear(nn.Module):
             weight.uniform_(-bound, bound, generator=stream)
             bias.uniform_(-bound, bound, generator=stream)
 
-    def forward(self, input: Tensor) -> Tensor:
-        """Applies each layer to its own slice of the input.
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """Applies each layer to its own slice of the inputs, side by side along the last dimension.
+
+        Inputs are not concatenated: each is multiplied with its own rows of the weights. That saves
+        the copy, and the gradient of an input that needs none.
 
         Args:
-            input: ``[*S, *B, in_features]``, with any number of further batch dimensions ``B``.
+            *inputs: ``[*S, *B, features]`` each, with any number of further batch dimensions ``B``
+                and ``in_features`` features together.
 
         Returns:
             ``[*S, *B, out_features]``.
 
         Raises:
-            ValueError: if the input does not lead with the ``batch_size`` of the weights.
+            ValueError: if an input does not lead with the ``batch_size`` of the weights, or the
+                inputs do not have ``in_features`` together.
         """
-        if not self.batch_size:
-            return nn.functional.linear(input, self.weight.mT, self.bias)
-        if input.shape[: len(self.batch_size)] != self.batch_size:
+        sizes = [input.shape[-1] for input in inputs]
+        n_stacked = len(self.batch_size)
+        if sum(sizes) != self.in_features or any(
+            input.shape[:n_stacked] != self.batch_size for input in inputs
+        ):
             raise ValueError(
-                f"the input must have one leading index per layer, shape {[*self.batch_size]} + "
-                f"[*B, {self.in_features}], got {[*input.shape]}"
+                f"the inputs must have one leading index per layer and {self.in_features} features "
+                f"together, shape {[*self.batch_size]} + [*B, {self.in_features}], got "
+                f"{' and '.join(str([*input.shape]) for input in inputs)}"
             )
         n_layers = self.batch_size.numel()
-        output = torch.baddbmm(
-            self.bias.reshape(n_layers, 1, self.out_features),
-            input.reshape(n_layers, -1, self.in_features),
-            self.weight.reshape(n_layers, self.in_features, self.out_features),
-        )
-        return output.view(*input.shape[:-1], self.out_features)
+        weight = self.weight.view(n_layers, self.in_features, self.out_features)
+        output = self.bias.view(n_layers, 1, self.out_features)
+        for i, (input, rows) in enumerate(zip(inputs, weight.split(sizes, -2), strict=True)):
+            multiply_add = torch.Tensor.baddbmm_ if i else torch.Tensor.baddbmm
+            output = multiply_add(output, input.reshape(n_layers, -1, input.shape[-1]), rows)
+        shape = torch.Size([*inputs[0].shape[:-1], self.out_features])
+        # Not a view where none is needed: autograd is slow with what is then changed in place.
+        return output if output.shape == shape else output.view(shape)
 
 
 class StackedMLP(nn.Module):
@@ -160,18 +170,18 @@ class StackedMLP(nn.Module):
         )
 
     def forward(self, *inputs: Tensor) -> Tensor:
-        """Concatenates the inputs along their last dimension and maps them to the output.
+        """Maps the inputs, side by side along their last dimension, to the output.
 
         Args:
-            *inputs: ``[*S, *B, features]`` each.
+            *inputs: ``[*S, *B, features]`` each, ``in_features`` together.
 
         Returns:
             ``[*S, *B, out_features]``, without an output nonlinearity.
         """
         first, *others = self.layers
-        x = first(torch.cat(inputs, -1))
+        x = first(*inputs)
         for layer in others:
-            x = layer(x.relu())
+            x = layer(x.relu_())
         return x
 
 

@@ -35,6 +35,25 @@ def test_stacked_layer_applies_each_matrix_to_its_own_slice(batch_size, batch):
         torch.testing.assert_close(y[i], x[i] @ layer.weight[i] + layer.bias[i])
 
 
+@pytest.mark.parametrize("batch_size", [(), (4,), (2, 3)])
+@pytest.mark.parametrize("batch", [(), (7,), (5, 7)])
+def test_several_inputs_count_as_one_side_by_side(batch_size, batch):
+    mlp = StackedMLP(6, 5, batch_size=batch_size)
+    # Columns of one tensor, as a sample from replay has them, beside a tensor of its own.
+    stored = torch.randn(*batch_size, *batch, 9)
+    parts = [stored[..., 2:5], torch.randn(*batch_size, *batch, 1), stored[..., 7:]]
+    results = []
+    for inputs in (parts, [torch.cat(parts, -1)]):
+        inputs = [part.detach().requires_grad_() for part in inputs]
+        output = mlp(*inputs)
+        output.square().sum().backward()
+        grads = torch.cat([part.grad for part in inputs], -1)
+        results.append([output, grads, *(p.grad.clone() for p in mlp.parameters())])
+        mlp.zero_grad()
+    for apart, together in zip(*results, strict=True):
+        torch.testing.assert_close(apart, together, rtol=1e-4, atol=1e-4)
+
+
 def test_initial_weights_are_those_of_each_generator_alone():
     stacked = StackedMLP(6, 2, hidden_sizes=(8, 4), batch_size=(3,), generator=generators(3))
     for i, generator in enumerate(generators(3)):
@@ -68,6 +87,8 @@ def test_bad_sizes_are_refused():
         StackedLinear(0, 2)
     with pytest.raises(ValueError, match="one leading index per layer"):
         StackedLinear(2, 2, (3,))(torch.zeros(5, 3, 2))
+    with pytest.raises(ValueError, match=r"2 features together.*\[4, 1\] and \[4, 2\]"):
+        StackedLinear(2, 2)(torch.zeros(4, 1), torch.zeros(4, 2))
 
 
 def test_actor_is_the_network_of_the_paper():

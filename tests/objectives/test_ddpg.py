@@ -354,6 +354,21 @@ def test_soft_update_is_torchrls_also_after_a_cast():
     torch.testing.assert_close(after - before, torch.full_like(after, 1 - 0.9**3))
 
 
+@pytest.mark.parametrize("change", [copy.deepcopy, lambda loss: loss.double().float()])
+def test_a_copied_or_cast_loss_still_follows_its_parameters(change):
+    loss, batch = make_loss(torch.Generator().manual_seed(0)), make_batch(16)
+    loss(batch)  # what it keeps from a first call must not outlive the change
+    loss = change(loss)
+    fresh = make_loss(torch.Generator().manual_seed(1))
+    fresh(batch)
+    loss.load_state_dict(fresh.state_dict())
+    mine, theirs = loss(batch), fresh(batch)
+    for key in ("loss_actor", "loss_value", "target_value"):
+        torch.testing.assert_close(mine[key], theirs[key])
+    for grad, other in zip(gradients(loss, batch), gradients(fresh, batch), strict=True):
+        torch.testing.assert_close(grad, other)
+
+
 def test_importance_weights_scale_each_transition():
     loss = make_loss()
     batch = make_batch(8)
