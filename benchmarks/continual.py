@@ -20,6 +20,7 @@ import tyro
 
 from bgpo_trl.configs import PRESETS, STAGE_PRESETS, RunConfig
 from bgpo_trl.evaluation import evaluate_random_policy
+from bgpo_trl.machine import choose_device
 from bgpo_trl.metrics import majority_task, match_counts, task_inference_accuracy
 from bgpo_trl.plotting import plot_gwr_pca, plot_success_curves, save_figure
 from bgpo_trl.pretrained import load_pretrained, make_pretrained
@@ -45,8 +46,11 @@ class Arguments:
     """Record demonstrations and train the encoders anew instead of using the shipped ones."""
     wandb: Literal["online", "offline"] | None = None
     """Log to Weights & Biases too."""
+    device: str = "auto"
+    """Where the networks are: cpu, cuda, or auto for a GPU if there is one."""
     threads: int = 1
-    """Threads of PyTorch. On these small networks more than one rarely pays."""
+    """Threads of PyTorch. More than one slows these small networks down; physics takes all cores by
+    itself."""
 
 
 def run_config(arguments: Arguments) -> RunConfig:
@@ -73,6 +77,7 @@ def run_config(arguments: Arguments) -> RunConfig:
 def main(arguments: Arguments) -> None:
     """Runs the experiment."""
     torch.set_num_threads(arguments.threads)
+    device = choose_device(arguments.device)
     config = run_config(arguments)
     out = arguments.out or Path("runs") / f"continual-{arguments.preset}"
     if (out / "config.json").exists() and not arguments.resume:
@@ -84,13 +89,20 @@ def main(arguments: Arguments) -> None:
             out / "demonstrations",
             folder=out / "encoders",
             command=shlex.join(["python", *sys.argv]),
+            device=device,
             **({} if stage is None else vars(stage)),
         )
     else:
         encoders, bank = load_pretrained()
 
     trainer = Trainer(
-        config, out, bank=bank, encoders=encoders, resume=arguments.resume, wandb=arguments.wandb
+        config,
+        out,
+        bank=bank,
+        encoders=encoders,
+        device=device,
+        resume=arguments.resume,
+        wandb=arguments.wandb,
     )
     trainer.run()
 

@@ -21,6 +21,7 @@ import torch
 import tyro
 
 from bgpo_trl.configs import PRESETS, BGPOConfig
+from bgpo_trl.machine import choose_device
 from bgpo_trl.plotting import plot_success_curves, save_figure
 from bgpo_trl.pretrained import load_pretrained
 from bgpo_trl.training import Trainer
@@ -50,8 +51,11 @@ class Arguments:
     """One run directory a rung goes in here."""
     resume: bool = False
     """Continue interrupted rungs; finished ones are only read."""
+    device: str = "auto"
+    """Where the networks are: cpu, cuda, or auto for a GPU if there is one."""
     threads: int = 1
-    """Threads of PyTorch."""
+    """Threads of PyTorch. More than one slows these small networks down; physics takes all cores by
+    itself."""
 
 
 def summarize(path: Path) -> dict[str, float]:
@@ -79,6 +83,7 @@ def summarize(path: Path) -> dict[str, float]:
 def main(arguments: Arguments) -> None:
     """Runs the ladder."""
     torch.set_num_threads(arguments.threads)
+    device = choose_device(arguments.device)
     encoders, bank = load_pretrained()
     base = replace(
         PRESETS["desk"],
@@ -93,7 +98,9 @@ def main(arguments: Arguments) -> None:
         _, bgpo = RUNGS[rung]
         out = arguments.out / rung
         config = replace(base, bgpo=bgpo)
-        Trainer(config, out, bank=bank, encoders=encoders, resume=arguments.resume).run()
+        Trainer(
+            config, out, bank=bank, encoders=encoders, device=device, resume=arguments.resume
+        ).run()
         save_figure(plot_success_curves(out / "eval.csv"), out / "figures" / "success.png")
         tables[rung] = summarize(out / "eval.csv")
     columns = list(next(iter(tables.values())))

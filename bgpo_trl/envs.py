@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections import deque
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from typing import Any
 
@@ -41,7 +42,7 @@ class NicoEnv(EnvBase):
         batch_size: Shape of the batch.
         seed: Seed of each simulation's starts; an int counts up from there.
         observation: ``"pixels"``, ``"state"`` or ``"both"``.
-        threads: Threads for physics; None takes one for each core, 1 the caller's own.
+        threads: Threads for physics, the caller's among them; None takes one for each core.
 
     Raises:
         ValueError: If a task is unknown, there are not as many seeds as simulations, or there is
@@ -91,8 +92,9 @@ class NicoEnv(EnvBase):
         self._renderer: FrameRenderer | None = None
         if observation != "state":
             self._renderer = FrameRenderer(self._environments[0][0].physics.model.ptr)
-        threads = min(count, usable_cores() if threads is None else threads)
-        self._pool = ThreadPoolExecutor(threads, "physics") if threads > 1 else None
+        threads = usable_cores() if threads is None else threads
+        self._helpers = min(count, threads) - 1
+        self._pool = ThreadPoolExecutor(max(1, self._helpers), "physics")
         self._task = np.zeros(count, dtype=np.int64)
         self._current: dict[str, np.ndarray] = {}
         self._done = np.zeros(count, dtype=bool)
@@ -149,18 +151,38 @@ class NicoEnv(EnvBase):
         if "state" in self._current:
             self._current["state"][row] = timestep.observation["state"]
 
-    def _advance(self, rows: Sequence[int], actions: np.ndarray) -> Iterator[TimeStep]:
-        """Steps simulations; yields what each has come to, in order, as soon as it has."""
-        if self._pool is None:
-            for row in rows:
-                yield self._environment(row).step(actions[row])
-            return
-        pending = [self._pool.submit(self._environment(row).step, actions[row]) for row in rows]
+    def _advance(self, rows: Iterable[int], actions: np.ndarray, rewards: np.ndarray) -> None:
+        """Steps simulations, in all threads, and draws what they have come to, in this one."""
+        waiting, arrived = deque(rows), deque[tuple[int, TimeStep]]()
+
+        def step_next() -> bool:
+            try:
+                row = waiting.popleft()
+            except IndexError:
+                return False
+            arrived.append((row, self._environment(row).step(actions[row])))
+            return True
+
+        def step_all() -> None:
+            while step_next():
+                pass
+
+        def record() -> None:
+            while arrived:
+                row, timestep = arrived.popleft()
+                self._record(row, timestep)
+                rewards[row] = timestep.reward
+                self._done[row] = timestep.last()
+
+        helpers = [self._pool.submit(step_all) for _ in range(min(self._helpers, len(waiting) - 1))]
         try:
-            for step in pending:
-                yield step.result()
+            while step_next():
+                record()
         finally:
-            wait(pending)  # Whatever happens, nothing moves behind the caller's back.
+            wait(helpers)  # Whatever happens, nothing moves behind the caller's back.
+        for helper in helpers:
+            helper.result()
+        record()
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         del kwargs
@@ -192,18 +214,13 @@ class NicoEnv(EnvBase):
         if not np.isfinite(actions[rows]).all():
             raise ValueError(f"an action is 4 finite numbers in [-1, 1], got {actions.tolist()}")
         rewards = np.zeros((len(rows), 1), np.float32)
-        moving = np.flatnonzero(rows).tolist()
-        for row, timestep in zip(moving, self._advance(moving, actions), strict=True):
-            self._record(row, timestep)
-            rewards[row] = timestep.reward
-            self._done[row] = timestep.last()
+        self._advance(np.flatnonzero(rows).tolist(), actions, rewards)
         reward = torch.from_numpy(rewards).reshape(*self.batch_size, 1)
         return TensorDict({**self._observe(), "reward": reward, **self._dones()}, self.batch_size)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Ends the threads and frees the renderer."""
-        if self._pool is not None:
-            self._pool.shutdown()
+        self._pool.shutdown()
         if self._renderer is not None:
             self._renderer.close()
         super().close(raise_if_closed=raise_if_closed)

@@ -125,12 +125,13 @@ class Evaluator:
         embedding = self._bank.embedding[drawn].expand(len(self.seeds), -1, -1)
         task = self._bank.task[drawn].expand(len(self.seeds), -1)
         episode = int(algorithm.source.episode[index])
+        weights = algorithm.actor.state_dict()
         return Snapshot(
             episode=episode,
             env_steps=env_steps,
             # The last of those episodes could be about tasks that start with fewer before it.
             presented=torch.tensor(algorithm.source.schedule.starts) < episode,
-            actor={k: v[index].clone() for k, v in algorithm.actor.state_dict().items()},
+            actor={key: stacked[index].to("cpu", copy=True) for key, stacked in weights.items()},
             context=algorithm.infer(embedding, task)[index].clone(),
         )
 
@@ -146,8 +147,10 @@ class Evaluator:
         Returns:
             Success and length; both 0 where a task was not yet presented.
         """
+        device = next(actor.parameters()).device
         weights = {
-            key: torch.stack([s.actor[key] for s in snapshots]) for key in snapshots[0].actor
+            key: torch.stack([s.actor[key] for s in snapshots]).to(device)
+            for key in snapshots[0].actor
         }
         context = torch.stack([s.context for s in snapshots]).unflatten(1, self.shape[1:])
         starts = [
@@ -160,8 +163,9 @@ class Evaluator:
         state = self.env.reset(TensorDict({"task": self._task}, self.shape))
         for _ in range(self.max_steps):
             flat = state.flatten(1, 2).set(actor.in_keys[1], context.flatten(1, 2))
+            flat = flat.select(*actor.in_keys).to(device)
             torch.func.functional_call(actor, weights, (flat,))
-            state.set("action", flat["action"].unflatten(1, self.shape[1:]))
+            state.set("action", flat["action"].unflatten(1, self.shape[1:]).cpu())
             state.set("_step", active)
             state = self.env.step(state)["next"]
             steps += active

@@ -30,12 +30,14 @@ class Fit:
         folder: where each stage's checkpoint ``<stage>.pt`` lies; None for no checkpoints.
         log: receives a row every ``config.log_every`` steps.
         progress: whether to show a progress bar.
+        device: where to train.
     """
 
     config: RepresentationConfig
     folder: Path | None
     log: Log | None
     progress: bool
+    device: torch.device | str = "cpu"
 
     def __call__(
         self,
@@ -45,12 +47,14 @@ class Fit:
         schedule: VAEConfig | SequenceAutoencoderConfig,
         generator: torch.Generator,
     ) -> None:
-        """Trains ``loss.parameters()`` in place, from the last checkpoint if there is one.
+        """Trains ``loss.parameters()``, from the last checkpoint if there is one.
+
+        Moves the loss to the device and leaves it there.
 
         Args:
             stage: names the progress bar, the log rows and the checkpoint.
             loss: maps a batch to a TensorDict whose ``loss_*`` entries are summed.
-            sample: draws a batch.
+            sample: draws a batch, on the CPU.
             schedule: the stage's gradient steps and learning rate.
             generator: the only source of randomness of ``sample`` and ``loss``; kept in the
                 checkpoint, so that an interrupted training continues to the same weights.
@@ -59,6 +63,7 @@ class Fit:
             ValueError: if the loss is no longer finite, or the checkpoint is unreadable or
                 belongs to another configuration.
         """
+        loss.to(self.device)
         optimizer = torch.optim.Adam(loss.parameters(), lr=schedule.learning_rate)
         path = self.folder / f"{stage}.pt" if self.folder else None
         start = self._resume(path, loss, optimizer, generator)
@@ -73,7 +78,7 @@ class Fit:
             rate = schedule.learning_rate * _decay(step, schedule.steps, schedule.warmup_steps)
             for group in optimizer.param_groups:
                 group["lr"] = rate
-            losses = loss(sample(generator))
+            losses = loss(sample(generator).to(self.device))
             objective = [value for key, value in losses.items() if key.startswith("loss_")]
             optimizer.zero_grad()
             torch.stack(objective).sum().backward()

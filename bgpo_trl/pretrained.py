@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import torch
+
 from bgpo_trl.configs import RepresentationConfig
 from bgpo_trl.demonstrations import DemonstrationBank, record_demonstrations
 from bgpo_trl.representation import Representation, default_weights, load_representation
@@ -39,6 +41,7 @@ def make_pretrained(
     seed: int = 0,
     command: str = "",
     progress: bool = True,
+    device: torch.device | str = "cpu",
 ) -> tuple[Representation, DemonstrationBank]:
     """Records demonstrations, trains both encoders on them, and embeds all.
 
@@ -54,6 +57,7 @@ def make_pretrained(
         seed: Seed of the recording.
         command: Stored with the weights.
         progress: Whether to show progress bars.
+        device: Where to train.
 
     Raises:
         ValueError: If the dataset is damaged or of another scene.
@@ -66,5 +70,10 @@ def make_pretrained(
         progress=progress,
     )
     return train_encoders(
-        demonstrations, Path(weights), Path(folder), config or RepresentationConfig(), command
+        demonstrations,
+        Path(weights),
+        Path(folder),
+        config or RepresentationConfig(),
+        command,
+        device,
     )

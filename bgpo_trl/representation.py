@@ -60,6 +60,7 @@ def train_representation(
     checkpoint: str | Path | None = None,
     log: Log | None = None,
     progress: bool = True,
+    device: torch.device | str = "cpu",
 ) -> Representation:
     """Trains both encoders on the training demonstrations.
 
@@ -72,9 +73,10 @@ def train_representation(
             with the same folder continues, to the same weights.
         log: receives a row every ``config.log_every`` steps.
         progress: whether to show a progress bar for each of the two stages.
+        device: where to train.
 
     Returns:
-        The trained encoders, in eval mode, without gradients.
+        The trained encoders, on the CPU, in eval mode, without gradients.
 
     Raises:
         ValueError: if the dataset or the configuration cannot be trained on, or ``checkpoint``
@@ -82,7 +84,8 @@ def train_representation(
     """
     config = config or RepresentationConfig()
     train, _ = split(dataset)
-    fit = Fit(config, Path(checkpoint) if checkpoint else None, log, progress)
+    folder = Path(checkpoint) if checkpoint else None
+    fit = Fit(config, folder, log, progress, device)
     vae = _train_vae(train, config.vae, fit, config.seed)
     latent = encode_frames(vae, train.get("pixels"), train.get("length"))
     lae = _train_lae(latent, train.get("length"), config.lae, fit, config.seed)
@@ -92,7 +95,7 @@ def train_representation(
         "seed": str(config.seed),
         "command": command,
     }
-    return Representation(vae, lae, metadata)
+    return Representation(vae.cpu(), lae.cpu(), metadata)
 
 
 @torch.no_grad()
@@ -111,7 +114,7 @@ def encode_frames(vae: VAE, pixels: Tensor, length: Tensor, batch_size: int = 64
     latent = torch.zeros(*pixels.shape[:2], vae.latent_size)
     demonstration, time = valid_steps(length, pixels.shape[1]).nonzero(as_tuple=True)
     for d, t in zip(demonstration.split(batch_size), time.split(batch_size), strict=True):
-        latent[d, t] = vae.latent(pixels[d, t])
+        latent[d, t] = vae.latent(pixels[d, t].to(vae.mean_frame.device)).cpu()
     return latent
 
 
@@ -280,7 +283,8 @@ def _train_vae(train: TensorDictBase, config: VAEConfig, fit: Fit, seed: int) ->
     )
     fit("vae", loss, sample, config, generator)
     vae.eval().requires_grad_(False)
-    vae.set_latent_scale(torch.cat([vae.encode(chunk)[0] for chunk in frames.split(64)]))
+    chunks = (chunk.to(fit.device) for chunk in frames.split(64))
+    vae.set_latent_scale(torch.cat([vae.encode(chunk)[0] for chunk in chunks]))
     return vae
 
 

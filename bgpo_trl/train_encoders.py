@@ -7,12 +7,14 @@ import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import torch
 import tyro
 from tensordict import TensorDictBase
 
 from bgpo_trl.configs import RepresentationConfig
 from bgpo_trl.csv_file import CsvFile
 from bgpo_trl.demonstrations import DemonstrationBank, load_demonstrations
+from bgpo_trl.machine import choose_device
 from bgpo_trl.probes import probe
 from bgpo_trl.representation import (
     Representation,
@@ -48,6 +50,8 @@ class Arguments:
     """Where checkpoints, log and probes go. The same folder continues an interrupted training."""
     config: RepresentationConfig = field(default_factory=RepresentationConfig)
     """Hyperparameters."""
+    device: str = "auto"
+    """Where to train: cpu, cuda, or auto for a GPU if there is one."""
 
 
 def bank_path(weights: Path) -> Path:
@@ -61,6 +65,7 @@ def train_encoders(
     folder: Path,
     config: RepresentationConfig,
     command: str = "",
+    device: torch.device | str = "cpu",
 ) -> tuple[Representation, DemonstrationBank]:
     """Trains, saves and probes both encoders, and embeds the demonstrations with them.
 
@@ -70,6 +75,7 @@ def train_encoders(
         folder: receives ``train.csv``, ``checkpoint/``, ``probes.json``, ``reconstructions.png``.
         config: hyperparameters.
         command: stored with the weights.
+        device: where to train.
 
     Returns:
         The trained encoders and the bank of embedded demonstrations.
@@ -86,6 +92,7 @@ def train_encoders(
             command=command,
             checkpoint=folder / "checkpoint",
             log=file.write,
+            device=device,
         )
     save_representation(representation, weights)
     bank = DemonstrationBank(
@@ -102,7 +109,14 @@ def main(arguments: Arguments) -> None:
     """Runs the command line; see ``--help``."""
     dataset = load_demonstrations(arguments.dataset)
     command = shlex.join(["python", "-m", "bgpo_trl.train_encoders", *sys.argv[1:]])
-    train_encoders(dataset, arguments.weights, arguments.folder, arguments.config, command)
+    train_encoders(
+        dataset,
+        arguments.weights,
+        arguments.folder,
+        arguments.config,
+        command,
+        choose_device(arguments.device),
+    )
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -33,6 +34,8 @@ class Trainer:
     on, unlogged, until the last one is; everything that is logged is what the seed alone would have
     logged, but for the losses, which are means over the seeds.
 
+    Each update runs while the environment takes a step, and learns from all transitions before it.
+
     Checkpoints are written between steps only, and an interrupt (Ctrl-C) waits for the end of its
     step, so that each checkpoint is a state that the run has been in. Whatever else ends a run
     costs it what came after its last checkpoint, and no row: a resumed run writes them again.
@@ -43,6 +46,7 @@ class Trainer:
             ``checkpoint/``.
         bank: Embedded demonstrations, seen and held out.
         encoders: Trained encoders; None for a run that does not use them.
+        device: Where the networks are; see `BGPO`.
         resume: Continue the run in the directory, from its last checkpoint.
         wandb: None, ``"online"`` or ``"offline"``: mirror the CSV there.
         progress: Whether to show a progress bar.
@@ -59,6 +63,7 @@ class Trainer:
         *,
         bank: DemonstrationBank,
         encoders: Representation | None = None,
+        device: torch.device | str = "cpu",
         resume: bool = False,
         wandb: Literal["online", "offline"] | None = None,
         progress: bool = True,
@@ -69,7 +74,12 @@ class Trainer:
         schedule = TaskSchedule(starts=config.task_starts)
         seeds = config.seeds
         self.algorithm = BGPO(
-            config.bgpo, seeds=seeds, schedule=schedule, bank=bank.seen(), encoders=encoders
+            config.bgpo,
+            seeds=seeds,
+            schedule=schedule,
+            bank=bank.seen(),
+            encoders=encoders,
+            device=device,
         )
         self.evaluator = Evaluator(
             config.bgpo,
@@ -110,12 +120,14 @@ class Trainer:
         )
         losses: dict[str, torch.Tensor] = {}
         try:
-            with _interrupts_wait() as interrupted:
+            with _interrupts_wait() as interrupted, ThreadPoolExecutor(1, "update") as background:
                 while int(episodes.min()) < n_episodes:
                     before = episodes.clone()
                     state = algorithm.act(state)
+                    update = background.submit(algorithm.update)
                     transition, state = algorithm.env.step_and_maybe_reset(state)
-                    losses = algorithm.learn(transition) or losses
+                    losses = update.result() or losses
+                    algorithm.store(transition)
                     self.env_steps += 1
                     self._state = state
                     for index in torch.nonzero(episodes > before).flatten().tolist():

@@ -37,8 +37,9 @@ def make(bank, encoders, make_config):
 def train(algorithm, n_steps):
     state = algorithm.env.reset()
     for _ in range(n_steps):
+        algorithm.update()
         transition, state = algorithm.env.step_and_maybe_reset(algorithm.act(state))
-        algorithm.learn(transition)
+        algorithm.store(transition)
 
 
 def take(evaluator, algorithm, number=0):

@@ -67,16 +67,16 @@ def assert_same_run(first, second):
 
 
 def at_step(trainer, n, do):
-    """Calls `do` in the midst of the n-th step: the simulation has moved, learning is to come."""
-    learn, steps = trainer.algorithm.learn, []
+    """Calls `do` in the midst of the n-th step: the simulation has moved, the replay has not."""
+    store, steps = trainer.algorithm.store, []
 
-    def learn_or_not(transition):
+    def store_or_not(transition):
         steps.append(None)
         if len(steps) == n:
             do()
-        return learn(transition)
+        store(transition)
 
-    trainer.algorithm.learn = learn_or_not
+    trainer.algorithm.store = store_or_not
 
 
 def test_every_seed_plays_every_episode_once(uninterrupted, make_config):
@@ -153,18 +153,18 @@ def test_training_draws_seen_demonstrations_and_tests_held_out_ones(
     make, make_config, bank, tmp_path, monkeypatch
 ):
     trainer = make(tmp_path, make_config(context="demo_embedding", episodes=4))
-    learn, test = trainer.algorithm.learn, trainer.evaluator.run
+    store, test = trainer.algorithm.store, trainer.evaluator.run
     trained_on, tested_on = [], []
 
-    def spy_learn(transition):
+    def spy_store(transition):
         trained_on.append(transition["behavior"])
-        return learn(transition)
+        store(transition)
 
     def spy_test(snapshots, *args):
         tested_on.extend(snapshot.context for snapshot in snapshots)
         return test(snapshots, *args)
 
-    monkeypatch.setattr(trainer.algorithm, "learn", spy_learn)
+    monkeypatch.setattr(trainer.algorithm, "store", spy_store)
     monkeypatch.setattr(trainer.evaluator, "run", spy_test)
     trainer.run()
     for given, allowed in ((trained_on, bank.seen()), (tested_on, bank.held_out())):
@@ -211,7 +211,8 @@ def crash(*args, **kwargs):
 
 MOMENTS = {
     "before the simulation moves": ("algorithm", "act"),
-    "before learning": ("algorithm", "learn"),
+    "while the networks are updated": ("algorithm", "update"),
+    "before the transition is stored": ("algorithm", "store"),
     "while an episode is logged": ("logger", "log_train"),
     "while a snapshot is taken": ("evaluator", "take"),
     "while a test is played": ("evaluator", "run"),
@@ -220,7 +221,8 @@ MOMENTS = {
 
 
 @pytest.mark.parametrize(
-    ("moment", "saved"), [*((moment, 11) for moment in MOMENTS), ("before learning", None)]
+    ("moment", "saved"),
+    [*((moment, 11) for moment in MOMENTS), ("while the networks are updated", None)],
 )
 def test_a_run_that_dies_goes_on_from_its_last_checkpoint(
     uninterrupted, make, tmp_path, monkeypatch, moment, saved

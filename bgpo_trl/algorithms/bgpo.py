@@ -79,7 +79,10 @@ class BGPO:
         seeds: One for each element of the batch; they share nothing but the encoders.
         schedule: Which tasks are presented when.
         bank: Embedded demonstrations for training episodes.
-        encoders: The trained encoders; None where neither latents nor embeddings are used.
+        encoders: The trained encoders; None where neither latents nor embeddings are used. The
+            frame encoder is moved to the device.
+        device: Where frames are encoded, and actor and critic learn. Simulations, GWR-B and the
+            replay stay on the CPU.
 
     Attributes:
         env: The composition of transforms.
@@ -97,8 +100,12 @@ class BGPO:
         schedule: TaskSchedule,
         bank: DemonstrationBank,
         encoders: Representation | None = None,
+        device: torch.device | str = "cpu",
     ) -> None:
         self.config = config
+        self.device = torch.device(device)
+        if encoders is not None:
+            encoders.vae.to(self.device)
         batch = torch.Size([len(seeds)])
         self.source = DemonstrationSource(
             bank, schedule, batch_size=batch, generator=generators(seeds, "demonstrations")
@@ -149,6 +156,8 @@ class BGPO:
         }
         self.actor = Actor(in_features, generator=generators(seeds, "actor"), **network)
         critic = Critic(in_features, generator=generators(seeds, "critic"), **network)
+        self.actor.to(self.device)
+        critic.to(self.device)
         highest = 1.0 + (self.config.beta if keys[1] == "behavior" else 0.0)
         self.loss = DDPGLoss(
             self.actor,
@@ -174,24 +183,34 @@ class BGPO:
         )
         self._noise = generators(seeds, "exploration")
 
+    def _moved(self, batch: TensorDictBase) -> TensorDictBase:
+        return batch if self.device.type == "cpu" else batch.to(self.device)
+
     @torch.no_grad()
     def act(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the ``action`` ``[S, 4]`` of the policy with exploration noise."""
-        action = self.actor(tensordict)["action"]
+        inputs = tensordict.select(*self.in_keys)
+        action = self.actor(self._moved(inputs))["action"].cpu()
         noise = [torch.randn(action.shape[-1:], generator=g) for g in self._noise]
         action = action + self.config.ddpg.noise * torch.stack(noise)
         return tensordict.set("action", action.clamp(-1.0, 1.0))
 
-    def learn(self, transition: TensorDictBase) -> dict[str, Tensor]:
-        """Stores a transition of each seed and makes one update of each.
+    def store(self, transition: TensorDictBase) -> None:
+        """Keeps a transition of each seed for updates to come."""
+        self.replay.add(transition)
+
+    def update(self) -> dict[str, Tensor]:
+        """Makes one update of each seed from the transitions stored so far.
+
+        Touches neither the environment nor what acting changes, so that it may run while the
+        environment takes the step that has been chosen before.
 
         Returns:
             Losses, means over the seeds ``[]``; empty before the first update.
         """
-        self.replay.add(transition)
         if len(self.replay) < self.config.ddpg.warmup_steps:
             return {}
-        losses = self.loss(self.replay.sample())
+        losses = self.loss(self._moved(self.replay.sample()))
         self.optimizer.zero_grad()
         (losses["loss_actor"] + losses["loss_value"]).backward()
         self.optimizer.step()

@@ -69,7 +69,9 @@ class FrameEncoder(Transform):
 
     @torch.no_grad()
     def _apply_transform(self, obs: Tensor) -> Tensor:
-        return self.vae.latent(obs)
+        # Simulations are on the CPU, wherever the encoder is.
+        device = next((weights.device for weights in self.vae.parameters()), obs.device)
+        return self.vae.latent(obs.to(device)).to(obs.device)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Encodes the frames of any TensorDict."""

@@ -38,9 +38,10 @@ def play(algorithm, n_steps, hidden=()):
     state, transitions = algorithm.env.reset(), []
     for _ in range(n_steps):
         state = algorithm.act(state.exclude(*hidden))
+        algorithm.update()
         transition, state = algorithm.env.step_and_maybe_reset(state)
         transitions.append(transition.clone())
-        algorithm.learn(transition.exclude(*hidden, *(("next", key) for key in hidden)))
+        algorithm.store(transition.exclude(*hidden, *(("next", key) for key in hidden)))
     return torch.stack(transitions, dim=1)
 
 
@@ -240,8 +241,8 @@ def test_each_seed_of_a_batch_learns_as_it_would_alone(make, variant):
         if batch.gwr is not None:
             assert_same_graph(batch.gwr.graph(index), alone.gwr.graph(0), rtol=1e-5, atol=1e-5)
             assert len(alone.gwr.graph(0).weights) > 2
-        losses.append(alone.learn(alone.env.step(alone.act(alone.env.reset()))))
-    mean = batch.learn(batch.env.step(batch.act(batch.env.reset())))
+        losses.append(alone.update())
+    mean = batch.update()
     for key, value in mean.items():
         expected = torch.stack([loss[key] for loss in losses]).mean()
         torch.testing.assert_close(value, expected, rtol=1e-3, atol=1e-4)

@@ -1,0 +1,193 @@
+"""Frames a second: the hardware's limit, our layers one by one, and what dm_control does by itself.
+
+All contenders step ten simulations once a call, with the same random actions, and none resets: the
+tasks of ours never end on success here, so that all simulate the same.
+"""
+
+# MuJoCo's bindings come without stubs.
+# pyright: reportAttributeAccessIssue=false
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+
+import mujoco
+import numpy as np
+import torch
+from dm_control.suite.wrappers import pixels
+from mujoco.rendering.classic.gl_context import GLContext
+from torchrl.envs import Compose, DMControlWrapper, EnvBase, TransformedEnv
+
+from bgpo_trl.envs import NicoEnv
+from bgpo_trl.modules.vae import VAE
+from bgpo_trl.transforms import FrameEncoder
+from suites import nico
+from suites.nico.base import Environment
+from suites.nico.rendering import FRAME_CAMERA, FRAME_HEIGHT, FRAME_WIDTH
+
+ROWS = 10
+SUBSTEPS = 20
+TASK = "grasp_glass"
+# An episode is begun anew after the paper's 50 steps, by all contenders.
+EPISODE = 50
+
+
+def contenders(threads: int, encoder: VAE) -> dict[str, Callable[[], object]]:
+    """Returns what to time against each other with `bgpo_trl.timing.interleave`.
+
+    Args:
+        threads: Threads of the bare limit and of our batched environment.
+        encoder: Any trained or untrained frame encoder.
+
+    Returns:
+        For each name, a call that makes ``ROWS`` frames.
+    """
+    task = nico.load(TASK, seed=0, time_limit=float("inf"))
+    found: dict[str, Callable[[], object]] = {
+        f"bare limit, {threads} threads": BareLoop(threads).step,
+        "dm_control task, 1 thread": _stepper(task),
+        f"TorchRL env, {threads} threads": _roller(_env(threads)),
+        f"TorchRL env with encoder, {threads} threads": _roller(
+            TransformedEnv(_env(threads), Compose(FrameEncoder(encoder, del_keys=True)))
+        ),
+        "stock pixels.Wrapper in DMControlWrapper, 1 thread": _roller(stock_env(), calls=ROWS),
+    }
+    return {"bare limit, 1 thread": BareLoop(1).step, **found} if threads > 1 else found
+
+
+def actions(seed: int = 0) -> Callable[[int], np.ndarray]:
+    """Returns a source of random actions: ``draw(n)`` gives ``[n, 4]`` in [-1, 1]."""
+    rng = np.random.default_rng(seed)
+    return lambda n: rng.uniform(-1, 1, (n, 4))
+
+
+class BareLoop:
+    """Twenty `mj_step`, `mjr_render` and the reading of the pixels, for ten simulations: no more.
+
+    Threads that draw at the same time are more than some OpenGL libraries bear, so each "thread" is
+    a process. Targets of the joints are those that random actions gave in a run before, for the
+    arms to move, and meet things, as in ours.
+
+    Args:
+        threads: Processes that share the simulations.
+    """
+
+    def __init__(self, threads: int) -> None:
+        starts, targets = record()
+        spawn = multiprocessing.get_context("spawn")
+        self._number = 0
+        self._pipes = []
+        for rows in np.array_split(np.arange(ROWS), threads):
+            ours, theirs = spawn.Pipe()
+            job = (theirs, starts[rows], targets[:, rows])
+            spawn.Process(target=bare_process, args=job, daemon=True).start()
+            self._pipes.append(ours)
+
+    def step(self) -> None:
+        """Makes a frame of each simulation."""
+        for pipe in self._pipes:
+            pipe.send(self._number)
+        for pipe in self._pipes:
+            pipe.recv()
+        self._number = (self._number + 1) % EPISODE
+
+
+def bare_process(pipe: Connection, starts: np.ndarray, targets: np.ndarray) -> None:
+    """Steps its simulations whenever it is told to.
+
+    Args:
+        pipe: Brings the number of the step, takes None when it is done.
+        starts: Full states to start from, ``[R, N]``.
+        targets: Of the joints, ``[T, R, 6]``.
+    """
+    model = mujoco.MjModel.from_xml_string(nico.scene_xml())
+    datas = [mujoco.MjData(model) for _ in starts]
+    context = GLContext(640, 480)
+    context.make_current()
+    scene, option = mujoco.MjvScene(model, 200), mujoco.MjvOption()
+    renderer = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+    mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, renderer)
+    camera = mujoco.MjvCamera()
+    camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
+    camera.fixedcamid = model.camera(FRAME_CAMERA).id
+    view = mujoco.MjrRect(0, 0, FRAME_WIDTH, FRAME_HEIGHT)
+    frame = np.empty((FRAME_HEIGHT, FRAME_WIDTH, 3), np.uint8)
+    everything = mujoco.mjtCatBit.mjCAT_ALL.value
+    with contextlib.suppress(EOFError):  # The measurement is over.
+        while True:
+            number = pipe.recv()
+            for data, start, target in zip(datas, starts, targets[number], strict=True):
+                if number == 0:
+                    mujoco.mj_setState(model, data, start, mujoco.mjtState.mjSTATE_INTEGRATION)
+                data.ctrl[:] = target
+                mujoco.mj_step(model, data, SUBSTEPS)
+                mujoco.mjv_updateScene(model, data, option, None, camera, everything, scene)
+                mujoco.mjr_render(view, scene, renderer)
+                mujoco.mjr_readPixels(frame, None, view, renderer)
+            pipe.send(None)
+
+
+def record() -> tuple[np.ndarray, np.ndarray]:
+    """Plays an episode of random actions; returns starts ``[R, N]`` and targets ``[T, R, 6]``."""
+    draw, starts, targets = actions(), [], []
+    environments = [
+        nico.load(TASK, seed=i, observation="state", time_limit=float("inf")) for i in range(ROWS)
+    ]
+    for environment in environments:
+        environment.reset()
+        starts.append(environment.physics.full_state())
+    for _ in range(EPISODE):
+        for environment, action in zip(environments, draw(ROWS), strict=True):
+            environment.step(action)
+            environment._reset_next_step = False  # On, past a success.
+        targets.append([np.array(e.physics.data.ctrl) for e in environments])
+    return np.array(starts), np.array(targets)
+
+
+def stock_env() -> EnvBase:
+    """Returns the task as dm_control and TorchRL wrap it, with MuJoCo's own visual settings."""
+    xml = nico.scene_xml()
+    start, end = xml.index("<quality"), xml.index("/>", xml.index("<quality")) + 2
+    xml = (xml[:start] + xml[end:]).replace('castshadow="false"', "")
+    environment = nico.load(
+        TASK, seed=0, observation="state", physics=nico.Physics.from_xml_string(xml)
+    )
+    size = {"height": FRAME_HEIGHT, "width": FRAME_WIDTH, "camera_id": FRAME_CAMERA}
+    return DMControlWrapper(pixels.Wrapper(environment, render_kwargs=size))
+
+
+def _env(threads: int) -> NicoEnv:
+    return NicoEnv([TASK], batch_size=[ROWS], seed=0, threads=threads)
+
+
+def _stepper(task: Environment) -> Callable[[], None]:
+    draw, count = actions(), [0]
+    task.reset()
+
+    def step() -> None:
+        for action in draw(ROWS):
+            if task.step(action).last() or count[0] == EPISODE:
+                task.reset()
+                count[0] = 0
+            count[0] += 1
+
+    return step
+
+
+def _roller(env: EnvBase, calls: int = 1) -> Callable[[], None]:
+    draw, count, state = actions(), [0], [env.reset()]
+    batch = env.batch_size
+
+    def step() -> None:
+        for _ in range(calls):
+            action = torch.from_numpy(draw(batch.numel())).to(env.action_spec.dtype)
+            state[0].set("action", action.view(*batch, 4))
+            _, state[0] = env.step_and_maybe_reset(state[0])
+            count[0] += 1
+            if count[0] == EPISODE:
+                state[0], count[0] = env.reset(), 0
+
+    return step

@@ -1,0 +1,271 @@
+"""How fast it is, each part against what it could be at best and what one would use otherwise.
+
+    python benchmarks/throughput.py
+
+prints tables and writes ``throughput.json``: frames a second, DDPG updates a second, the whole
+training step of BGPO in a batch of seeds against one seed after the other, and memory over a long
+run. Contenders take turns, round by round, since the speed of a machine varies; a ratio is the
+median of the rounds' ratios. Times are medians, with quartiles.
+"""
+
+from __future__ import annotations
+
+import json
+import platform
+import resource
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import frames
+import torch
+import tyro
+import updates
+
+from bgpo_trl.algorithms.bgpo import BGPO
+from bgpo_trl.configs import PRESETS
+from bgpo_trl.machine import usable_cores
+from bgpo_trl.pretrained import load_pretrained
+from bgpo_trl.timing import Timing, interleave, ratio
+from bgpo_trl.transforms import TaskSchedule
+
+Part = Literal["frames", "updates", "step", "memory"]
+Table = dict[str, dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Measures the speed of all parts."""
+
+    parts: tuple[Part, ...] = ("frames", "updates", "step", "memory")
+    """What to measure."""
+    seeds: int = 10
+    """Seeds of the batch."""
+    rounds: int = 100
+    """Rounds of each comparison."""
+    steps: int = 20_000
+    """Training steps of the measurement of memory."""
+    threads: int | None = None
+    """Threads for physics and of PyTorch; one for each core if not given."""
+    out: Path = Path("benchmarks/results/throughput")
+    """Where ``throughput.json`` goes."""
+
+
+def measure_frames(arguments: Arguments, threads: int) -> Table:
+    """Times a frame: the bare limit, our layers above it, and the stock one."""
+    encoders, _ = load_pretrained()
+    contenders = frames.contenders(threads, encoders.vae)
+    times = interleave(contenders, rounds=arguments.rounds)
+    bare, stock = (next(n for n in times if n.startswith(s)) for s in ("bare limit", "stock"))
+    bare = f"bare limit, {threads} threads" if threads > 1 else bare
+    return {
+        name: {
+            "frames a second": frames.ROWS / Timing.of(taken).median,
+            "ms a frame": _milliseconds(taken, frames.ROWS),
+            "share of the bare limit": ratio(times[bare], taken).median,
+            "times stock": ratio(times[stock], taken).median,
+        }
+        for name, taken in times.items()
+    }
+
+
+def measure_updates(arguments: Arguments, threads: int) -> Table:
+    """Times an update of one seed: ours, the floor, TorchRL's loop and Stable-Baselines3."""
+    contenders = updates.contenders(arguments.seeds)
+    counts = {name: count for name, (_, count) in contenders.items()}
+    times = interleave({n: call for n, (call, _) in contenders.items()}, rounds=arguments.rounds)
+    each = {name: [t / counts[name] for t in taken] for name, taken in times.items()}
+    floor = next(name for name in each if name.startswith("floor"))
+    rivals = [name for name in ("TorchRL loop", "Stable-Baselines3") if name in each]
+    return {
+        name: {
+            "updates a second a seed": 1 / Timing.of(taken).median,
+            "ms an update": _milliseconds(taken),
+            "share of the floor": ratio(each[floor], taken).median,
+            **{f"times {rival}": ratio(each[rival], taken).median for rival in rivals},
+        }
+        for name, taken in each.items()
+    }
+
+
+class Training:
+    """BGPO in training, step by step, as `bgpo_trl.training.Trainer` runs it but for the logging.
+
+    Args:
+        seeds: The seeds of the batch.
+    """
+
+    def __init__(self, seeds: range) -> None:
+        encoders, bank = load_pretrained()
+        self.algorithm = BGPO(
+            PRESETS["desk"].bgpo,
+            seeds=seeds,
+            schedule=TaskSchedule((0, 0, 0)),
+            bank=bank.seen(),
+            encoders=encoders,
+        )
+        self._background = ThreadPoolExecutor(1, "update")
+        self._state = self.algorithm.env.reset()
+        while len(self.algorithm.replay) <= self.algorithm.config.ddpg.warmup_steps:
+            self.step()
+
+    def step(self) -> None:
+        """Takes a step in all environments and makes an update of all seeds."""
+        self._state = self.algorithm.act(self._state)
+        update = self._background.submit(self.algorithm.update)
+        transition, self._state = self.algorithm.env.step_and_maybe_reset(self._state)
+        update.result()
+        self.algorithm.store(transition)
+
+    def time_parts(self) -> dict[str, float]:
+        """Makes every part keep its time from now on; returns the seconds by part, as they grow."""
+        seconds: dict[str, float] = defaultdict(float)
+
+        def keep_time(owner: Any, method: str, part: str) -> None:
+            call = getattr(owner, method)
+
+            def timed(*args: Any, **kwargs: Any) -> Any:
+                start = time.perf_counter()
+                try:
+                    return call(*args, **kwargs)
+                finally:
+                    seconds[part] += time.perf_counter() - start
+
+            object.__setattr__(owner, method, timed)
+
+        algorithm = self.algorithm
+        keep_time(algorithm.simulation, "_step", "simulate (physics and render)")
+        keep_time(algorithm.simulation, "_reset", "begin episodes")
+        keep_time(algorithm.simulation._renderer, "render", "of which render")
+        for transform in algorithm.env.transform:
+            keep_time(transform, "_step", type(transform).__name__)
+        keep_time(algorithm.env, "step_and_maybe_reset", "whole environment")
+        for method in ("act", "update", "store"):
+            keep_time(algorithm, method, method)
+        keep_time(algorithm.replay, "sample", "of which sample")
+        return seconds
+
+
+def measure_step(arguments: Arguments) -> Table:
+    """Times a training step of a batch of seeds, and of as many runs of one seed, in turn."""
+    batch = Training(range(arguments.seeds))
+    singles = [Training(range(seed, seed + 1)) for seed in range(arguments.seeds)]
+
+    def one_after_the_other() -> None:
+        for single in singles:
+            single.step()
+
+    names = f"{arguments.seeds} seeds in a batch", f"{arguments.seeds} runs of one seed"
+    times = interleave(
+        dict(zip(names, (batch.step, one_after_the_other), strict=True)), rounds=arguments.rounds
+    )
+    table: Table = {
+        name: {
+            "ms a step of all": _milliseconds(taken),
+            "share of single runs": ratio(taken, times[names[1]]).median,
+        }
+        for name, taken in times.items()
+    }
+    seconds = batch.time_parts()
+    for _ in range(arguments.rounds):
+        batch.step()
+    for part, spent in seconds.items():
+        table[f"{names[0]}: {part}"] = {"ms a step of all": 1e3 * spent / arguments.rounds}
+    return table
+
+
+def measure_memory(arguments: Arguments) -> Table:
+    """Tells the memory of a run at the start, at the end, and what of the growth is replay."""
+    training = Training(range(arguments.seeds))
+    marks: list[tuple[int, float, float]] = []
+    every = max(1, arguments.steps // 4)
+    for step in range(arguments.steps + 1):
+        if step % every == 0:
+            stored = training.algorithm.replay.state_dict()
+            marks.append((len(training.algorithm.replay), _resident(), _size(stored)))
+            del stored
+        training.step()
+    table: Table = {}
+    _, first_resident, first_stored = marks[0]
+    for stored_steps, resident, stored in marks:
+        table[f"{stored_steps} steps stored"] = {
+            "MB resident": resident / 1e6,
+            "MB grown": (resident - first_resident) / 1e6,
+            "MB of it replay": (stored - first_stored) / 1e6,
+        }
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    table["highest of all measurements"] = {"MB resident": peak / 1e6}
+    return table
+
+
+def _milliseconds(seconds: list[float], pieces: int = 1) -> str:
+    timing = Timing.of([1e3 * t / pieces for t in seconds])
+    return f"{timing.median:.3f} ({timing.low:.3f}-{timing.high:.3f})"
+
+
+def _resident() -> float:
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * resource.getpagesize()
+
+
+def _size(state: Any) -> float:
+    if isinstance(state, dict):
+        return sum(_size(value) for value in state.values())
+    return state.nbytes if isinstance(state, torch.Tensor) else 0.0
+
+
+def show(table: Table) -> str:
+    """Returns a table in Markdown."""
+    columns = list(dict.fromkeys(column for row in table.values() for column in row))
+    lines = ["| | " + " | ".join(columns) + " |", "|---|" + "---:|" * len(columns)]
+    for name, row in table.items():
+        cells = [row.get(column, "") for column in columns]
+        shown = [
+            f"{c:.0f}"
+            if isinstance(c, float) and c >= 100
+            else f"{c:.2f}"
+            if isinstance(c, float)
+            else c
+            for c in cells
+        ]
+        lines.append(f"| {name} | " + " | ".join(shown) + " |")
+    return "\n".join(lines)
+
+
+def main(arguments: Arguments) -> None:
+    """Measures what was asked for."""
+    threads = arguments.threads or usable_cores()
+    torch.set_num_threads(threads)
+    measures: dict[Part, Callable[[], Table]] = {
+        "frames": lambda: measure_frames(arguments, threads),
+        "updates": lambda: measure_updates(arguments, threads),
+        "step": lambda: measure_step(arguments),
+        "memory": lambda: measure_memory(arguments),
+    }
+    found: dict[str, Any] = {
+        "machine": {
+            "cores": usable_cores(),
+            "threads": threads,
+            "processor": platform.processor() or platform.machine(),
+            "python": platform.python_version(),
+            "torch": torch.__version__,
+        },
+        "arguments": {**asdict(arguments), "out": None},
+    }
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    for part in arguments.parts:
+        found[part] = measures[part]()
+        print(f"\n{part}\n\n{show(found[part])}", flush=True)
+        (arguments.out / "throughput.json").write_text(json.dumps(found, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Annotated[Arguments, tyro.conf.OmitArgPrefixes], description=__doc__))
+    except (ValueError, OSError, RuntimeError) as error:
+        sys.exit(f"error: {error}")
