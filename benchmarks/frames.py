@@ -1,7 +1,6 @@
 """Frames a second: the hardware's limit, our layers one by one, and what dm_control does by itself.
 
-All contenders step ten simulations once a call, with the same random actions, and none resets: the
-tasks of ours never end on success here, so that all simulate the same.
+Ours step ten simulations a call. All get random actions and begin anew after 50 steps or a success.
 """
 
 # MuJoCo's bindings come without stubs.
@@ -11,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import multiprocessing
+import os
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 
@@ -31,31 +31,33 @@ from suites.nico.rendering import FRAME_CAMERA, FRAME_HEIGHT, FRAME_WIDTH
 ROWS = 10
 SUBSTEPS = 20
 TASK = "grasp_glass"
-# An episode is begun anew after the paper's 50 steps, by all contenders.
 EPISODE = 50
+STOCK_FRAMES = 2
 
 
-def contenders(threads: int, encoder: VAE) -> dict[str, Callable[[], object]]:
+def contenders(threads: int, encoder: VAE) -> dict[str, tuple[Callable[[], object], int]]:
     """Returns what to time against each other with `bgpo_trl.timing.interleave`.
 
     Args:
         threads: Threads of the bare limit and of our batched environment.
-        encoder: Any trained or untrained frame encoder.
+        encoder: Any frame encoder, trained or not.
 
     Returns:
-        For each name, a call that makes ``ROWS`` frames.
+        For each name, a call, and the number of frames it makes.
     """
     task = nico.load(TASK, seed=0, time_limit=float("inf"))
-    found: dict[str, Callable[[], object]] = {
-        f"bare limit, {threads} threads": BareLoop(threads).step,
-        "dm_control task, 1 thread": _stepper(task),
-        f"TorchRL env, {threads} threads": _roller(_env(threads)),
-        f"TorchRL env with encoder, {threads} threads": _roller(
-            TransformedEnv(_env(threads), Compose(FrameEncoder(encoder, del_keys=True)))
+    encode = Compose(FrameEncoder(encoder, del_keys=True))
+    counts = sorted({1, threads})
+    return {
+        **{f"bare limit, {n} threads": (BareLoop(n).step, ROWS) for n in counts},
+        "dm_control task, 1 thread": (_stepper(task), ROWS),
+        **{f"TorchRL env, {n} threads": (_roller(_env(n)), ROWS) for n in counts},
+        f"TorchRL env with encoder, {threads} threads": (
+            _roller(TransformedEnv(_env(threads), encode)),
+            ROWS,
         ),
-        "stock pixels.Wrapper in DMControlWrapper, 1 thread": _roller(stock_env(), calls=ROWS),
+        "stock": (Stock().step, STOCK_FRAMES),
     }
-    return {"bare limit, 1 thread": BareLoop(1).step, **found} if threads > 1 else found
 
 
 def actions(seed: int = 0) -> Callable[[int], np.ndarray]:
@@ -147,8 +149,26 @@ def record() -> tuple[np.ndarray, np.ndarray]:
     return np.array(starts), np.array(targets)
 
 
-def stock_env() -> EnvBase:
-    """Returns the task as dm_control and TorchRL wrap it, with MuJoCo's own visual settings."""
+class Stock:
+    """The same task as dm_control and TorchRL wrap it, with MuJoCo's own visual settings.
+
+    In a process of its own, because we tell Mesa's software renderer not to start threads.
+    """
+
+    def __init__(self) -> None:
+        spawn = multiprocessing.get_context("spawn")
+        self._pipe, theirs = spawn.Pipe()
+        spawn.Process(target=stock_process, args=(theirs,), daemon=True).start()
+
+    def step(self) -> None:
+        """Makes some frames of one simulation."""
+        self._pipe.send(None)
+        self._pipe.recv()
+
+
+def stock_process(pipe: Connection) -> None:
+    """Makes ``STOCK_FRAMES`` frames whenever it is told to."""
+    os.environ.pop("LP_NUM_THREADS", None)
     xml = nico.scene_xml()
     start, end = xml.index("<quality"), xml.index("/>", xml.index("<quality")) + 2
     xml = (xml[:start] + xml[end:]).replace('castshadow="false"', "")
@@ -156,7 +176,13 @@ def stock_env() -> EnvBase:
         TASK, seed=0, observation="state", physics=nico.Physics.from_xml_string(xml)
     )
     size = {"height": FRAME_HEIGHT, "width": FRAME_WIDTH, "camera_id": FRAME_CAMERA}
-    return DMControlWrapper(pixels.Wrapper(environment, render_kwargs=size))
+    roll = _roller(DMControlWrapper(pixels.Wrapper(environment, render_kwargs=size)))
+    with contextlib.suppress(EOFError):
+        while True:
+            pipe.recv()
+            for _ in range(STOCK_FRAMES):
+                roll()
+            pipe.send(None)
 
 
 def _env(threads: int) -> NicoEnv:
@@ -177,17 +203,16 @@ def _stepper(task: Environment) -> Callable[[], None]:
     return step
 
 
-def _roller(env: EnvBase, calls: int = 1) -> Callable[[], None]:
+def _roller(env: EnvBase) -> Callable[[], None]:
     draw, count, state = actions(), [0], [env.reset()]
     batch = env.batch_size
 
     def step() -> None:
-        for _ in range(calls):
-            action = torch.from_numpy(draw(batch.numel())).to(env.action_spec.dtype)
-            state[0].set("action", action.view(*batch, 4))
-            _, state[0] = env.step_and_maybe_reset(state[0])
-            count[0] += 1
-            if count[0] == EPISODE:
-                state[0], count[0] = env.reset(), 0
+        action = torch.from_numpy(draw(batch.numel())).to(env.action_spec.dtype)
+        state[0].set("action", action.view(*batch, 4))
+        _, state[0] = env.step_and_maybe_reset(state[0])
+        count[0] += 1
+        if count[0] == EPISODE:
+            state[0], count[0] = env.reset(), 0
 
     return step

@@ -60,17 +60,22 @@ def measure_frames(arguments: Arguments, threads: int) -> Table:
     """Times a frame: the bare limit, our layers above it, and the stock one."""
     encoders, _ = load_pretrained()
     contenders = frames.contenders(threads, encoders.vae)
-    times = interleave(contenders, rounds=arguments.rounds)
-    bare, stock = (next(n for n in times if n.startswith(s)) for s in ("bare limit", "stock"))
-    bare = f"bare limit, {threads} threads" if threads > 1 else bare
+    counts = {name: count for name, (_, count) in contenders.items()}
+    times = interleave({n: call for n, (call, _) in contenders.items()}, rounds=arguments.rounds)
+    each = {name: [t / counts[name] for t in taken] for name, taken in times.items()}
     return {
         name: {
-            "frames a second": frames.ROWS / Timing.of(taken).median,
-            "ms a frame": _milliseconds(taken, frames.ROWS),
-            "share of the bare limit": ratio(times[bare], taken).median,
-            "times stock": ratio(times[stock], taken).median,
+            "frames a second": 1 / Timing.of(taken).median,
+            "ms a frame": _milliseconds(taken),
+            **{
+                f"share of the bare limit, {n} threads": ratio(
+                    each[f"bare limit, {n} threads"], taken
+                ).median
+                for n in sorted({1, threads})
+            },
+            "times stock": ratio(each["stock"], taken).median,
         }
-        for name, taken in times.items()
+        for name, taken in each.items()
     }
 
 
@@ -203,8 +208,8 @@ def measure_memory(arguments: Arguments) -> Table:
     return table
 
 
-def _milliseconds(seconds: list[float], pieces: int = 1) -> str:
-    timing = Timing.of([1e3 * t / pieces for t in seconds])
+def _milliseconds(seconds: list[float]) -> str:
+    timing = Timing.of([1e3 * t for t in seconds])
     return f"{timing.median:.3f} ({timing.low:.3f}-{timing.high:.3f})"
 
 

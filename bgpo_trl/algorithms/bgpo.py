@@ -184,7 +184,7 @@ class BGPO:
         self._noise = generators(seeds, "exploration")
 
     def _moved(self, batch: TensorDictBase) -> TensorDictBase:
-        return batch if self.device.type == "cpu" else batch.to(self.device)
+        return batch if self.device == torch.device("cpu") else batch.to(self.device)
 
     @torch.no_grad()
     def act(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -1,0 +1,104 @@
+"""Networks on another device than the simulation: the same run, to float tolerance.
+
+``cpu:0`` is the CPU under another name, for PyTorch another device: whatever is compared by name is
+moved there and back. Where there is a GPU, it is tested too.
+"""
+
+import csv
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+
+from bgpo_trl.configs import RepresentationConfig, SequenceAutoencoderConfig, VAEConfig
+from bgpo_trl.representation import (
+    load_representation,
+    save_representation,
+    train_representation,
+)
+from bgpo_trl.training import Trainer
+from bgpo_trl.transforms import FrameEncoder
+
+DEVICES = ["cpu:0", *(["cuda"] if torch.cuda.is_available() else [])]
+
+
+def rows(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.mark.usefixtures("easy_world")
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_run_is_the_same_on_every_device(device, bank, encoders, make_config, tmp_path):
+    parts = {"bank": bank, "encoders": encoders, "progress": False}
+    try:
+        for folder, place in (("here", "cpu"), ("there", device)):
+            Trainer(make_config(), tmp_path / folder, device=place, **parts).run()
+    finally:
+        encoders.vae.cpu()
+    for name in ("train.csv", "eval.csv"):
+        here, there = rows(tmp_path / "here" / name), rows(tmp_path / "there" / name)
+        for ours, theirs in zip(here, there, strict=True):
+            assert ours["steps"] == theirs["steps"]
+            assert ours["success"] == theirs["success"]
+            for key in ("return", "intrinsic_return", "loss_actor", "loss_value"):
+                if key in ours:
+                    assert float(ours[key]) == pytest.approx(float(theirs[key]), abs=1e-3)
+
+
+@pytest.mark.usefixtures("easy_world")
+@pytest.mark.parametrize("device", DEVICES)
+def test_learner_and_encoder_are_where_they_were_told(
+    device, bank, encoders, make_config, tmp_path
+):
+    parts = {"bank": bank, "encoders": encoders, "progress": False}
+    try:
+        algorithm = Trainer(make_config(), tmp_path, device=device, **parts).algorithm
+        for module in (algorithm.actor, algorithm.loss, encoders.vae):
+            for name, weights in module.named_parameters():
+                assert weights.device.type == torch.device(device).type, name
+    finally:
+        encoders.vae.cpu()
+
+
+def test_frames_follow_the_encoder_and_latents_come_back():
+    class Elsewhere(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.weights = nn.Parameter(torch.empty(1, device="meta"))
+
+        def latent(self, frames):
+            assert frames.device.type == "meta"
+            return torch.ones(*frames.shape[:-3], 64)
+
+    latent = FrameEncoder(Elsewhere())._apply_transform(torch.zeros(3, 32, 64, 3).byte())
+    assert latent.device.type == "cpu"
+    assert latent.shape == (3, 64)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_encoders_trained_elsewhere_come_back_to_the_cpu(device, tmp_path):
+    generator = torch.Generator().manual_seed(0)
+    data = TensorDict(
+        {
+            "pixels": torch.randint(0, 256, (4, 3, 32, 64, 3), generator=generator).byte(),
+            "action": torch.rand(4, 2, 4, generator=generator),
+            "length": torch.full((4,), 3),
+            "train": torch.tensor([True, True, True, False]),
+        },
+        [4],
+    )
+    config = RepresentationConfig(
+        vae=VAEConfig(steps=2, batch_size=4), lae=SequenceAutoencoderConfig(steps=2, batch_size=4)
+    )
+    found = []
+    for place in ("cpu", device):
+        trained = train_representation(
+            data, config, scene_version="noise", device=place, progress=False
+        )
+        save_representation(trained, tmp_path / "weights.safetensors")
+        found.append(load_representation(tmp_path / "weights.safetensors"))
+    here, there = found
+    for ours, theirs in zip(here.vae.parameters(), there.vae.parameters(), strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-3, atol=1e-4)
