@@ -48,10 +48,10 @@ class Arguments:
     """Seeds of the batch."""
     rounds: int = 100
     """Rounds of each comparison."""
-    steps: int = 20_000
+    steps: int = 6_000
     """Training steps of the measurement of memory."""
     threads: int | None = None
-    """Threads for physics and of PyTorch; one for each core if not given."""
+    """Threads for physics; one for each core if not given. PyTorch has one, as in training."""
     out: Path = Path("benchmarks/results/throughput")
     """Where ``throughput.json`` goes."""
 
@@ -79,7 +79,7 @@ def measure_frames(arguments: Arguments, threads: int) -> Table:
     }
 
 
-def measure_updates(arguments: Arguments, threads: int) -> Table:
+def measure_updates(arguments: Arguments) -> Table:
     """Times an update of one seed: ours, the floor, TorchRL's loop and Stable-Baselines3."""
     contenders = updates.contenders(arguments.seeds)
     counts = {name: count for name, (_, count) in contenders.items()}
@@ -245,10 +245,10 @@ def show(table: Table) -> str:
 def main(arguments: Arguments) -> None:
     """Measures what was asked for."""
     threads = arguments.threads or usable_cores()
-    torch.set_num_threads(threads)
+    torch.set_num_threads(1)
     measures: dict[Part, Callable[[], Table]] = {
         "frames": lambda: measure_frames(arguments, threads),
-        "updates": lambda: measure_updates(arguments, threads),
+        "updates": lambda: measure_updates(arguments),
         "step": lambda: measure_step(arguments),
         "memory": lambda: measure_memory(arguments),
     }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import signal
 import threading
 import time
@@ -108,6 +109,8 @@ class Trainer:
             OSError: If the disk is full.
         """
         algorithm, n_episodes = self.algorithm, self.config.episodes
+        # What is here now stays to the end: the garbage collector need not look at it again.
+        gc.freeze()
         state = algorithm.env.reset() if self._state is None else self._state
         saved = time.monotonic()
         episodes = algorithm.source.episode
@@ -143,6 +146,7 @@ class Trainer:
                     if stop:
                         break
         finally:
+            gc.unfreeze()
             bar.close()
             self.logger.close()
 

@@ -21,6 +21,9 @@ STATE_SIZE = 16
 # Change of the joint targets at |action| = 1 (rad): three arm joints, then the hand.
 ACTION_SCALE = np.array([0.2, 0.2, 0.2, 0.4])
 
+_PART = [0, 1, 2, 3, 3, 3]  # of the action, for each actuator: the three digits move as one hand
+_STEP = ACTION_SCALE[_PART]
+
 # The arc on which the objects stand, about the shoulder's yaw axis; left is positive.
 ARC_RADIUS = 0.42  # (m)
 ARC_ANGLES = np.radians([22.0, 0.0, -22.0])  # glass, green box, white box
@@ -121,12 +124,10 @@ class NicoTask(control.Task):
         action = np.asarray(action, dtype=float)
         if action.shape != (4,) or not np.isfinite(action).all():
             raise ValueError(f"an action is 4 finite numbers in [-1, 1], not {action.tolist()}")
-        step = ACTION_SCALE[[0, 1, 2, 3, 3, 3]]
-        joints = np.concatenate([physics.arm_angles(), physics.digit_curls()])
-        target = np.clip(physics.data.ctrl, joints - step, joints + step)
-        target = target + step * np.clip(action, -1.0, 1.0)[[0, 1, 2, 3, 3, 3]]
-        limits = physics.model.jnt_range[physics.model.actuator_trnid[:, 0]]
-        physics.set_control(np.clip(target, limits[:, 0], limits[:, 1]))
+        joints, (lowest, highest) = physics.actuated_angles(), physics.actuated_limits
+        target = np.minimum(np.maximum(physics.data.ctrl, joints - _STEP), joints + _STEP)
+        target += _STEP * np.minimum(np.maximum(action, -1.0), 1.0)[_PART]
+        physics.set_control(np.minimum(np.maximum(target, lowest), highest))
 
     def action_spec(self, physics: Physics) -> specs.BoundedArray:
         """Returns the spec of the action: float64 ``[4]`` in [-1, 1]."""

@@ -49,6 +49,16 @@ class Physics(dm_mujoco.Physics):
             self._ids[kind, name] = self.model.name2id(name, kind)
         return self._ids[kind, name]
 
+    @cached_property
+    def actuated_limits(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest angle (rad) of the joint of each actuator, ``[6]`` each."""
+        lowest, highest = self.model.jnt_range[self.model.actuator_trnid[:, 0]].T
+        return lowest, highest
+
+    def actuated_angles(self) -> np.ndarray:
+        """Returns the angle (rad) of the joint of each actuator, ``[6]``."""
+        return self.data.qpos[self._arm + self._curls]
+
     def arm_angles(self) -> np.ndarray:
         """Returns shoulder yaw, shoulder pitch and elbow (rad), ``[3]``."""
         return self.data.qpos[self._arm]
