@@ -187,13 +187,13 @@ def measure_step(arguments: Arguments) -> Table:
 def measure_memory(arguments: Arguments) -> Table:
     """Tells the memory of a run at the start, at the end, and what of the growth is replay."""
     training = Training(range(arguments.seeds))
+    transition_size = training.algorithm.replay.sample(1).bytes() / arguments.seeds
     marks: list[tuple[int, float, float]] = []
     every = max(1, arguments.steps // 4)
     for step in range(arguments.steps + 1):
         if step % every == 0:
-            stored = training.algorithm.replay.state_dict()
-            marks.append((len(training.algorithm.replay), _resident(), _size(stored)))
-            del stored
+            count = len(training.algorithm.replay)
+            marks.append((count, _resident(), count * arguments.seeds * transition_size))
         training.step()
     table: Table = {}
     _, first_resident, first_stored = marks[0]
@@ -216,12 +216,6 @@ def _milliseconds(seconds: list[float]) -> str:
 def _resident() -> float:
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * resource.getpagesize()
-
-
-def _size(state: Any) -> float:
-    if isinstance(state, dict):
-        return sum(_size(value) for value in state.values())
-    return state.nbytes if isinstance(state, torch.Tensor) else 0.0
 
 
 def show(table: Table) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections import deque
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
@@ -174,12 +175,18 @@ class NicoEnv(EnvBase):
                 rewards[row] = timestep.reward
                 self._done[row] = timestep.last()
 
+        interval = sys.getswitchinterval()
+        if self._helpers:
+            # A thread back from MuJoCo waits this long for a turn of Python, by default 5 ms: the
+            # time of several simulations.
+            sys.setswitchinterval(2e-4)
         helpers = [self._pool.submit(step_all) for _ in range(min(self._helpers, len(waiting) - 1))]
         try:
             while step_next():
                 record()
         finally:
             wait(helpers)  # Whatever happens, nothing moves behind the caller's back.
+            sys.setswitchinterval(interval)
         for helper in helpers:
             helper.result()
         record()
