@@ -38,8 +38,10 @@ format: $(SETUP)  ## let ruff format and fix what it can
 typecheck: $(SETUP)  ## pyright
 	$(BIN)/pyright
 
-bench: $(SETUP) $(GL)  ## the ladder: which part limits learning
-	$(BIN)/python benchmarks/ladder.py
+bench: $(SETUP) $(GL)  ## speed: frames, updates, training steps, GWR-B
+	$(BIN)/pip install -q -c constraints.txt -e '.[bench]'
+	$(BIN)/python benchmarks/throughput.py
+	$(BIN)/python benchmarks/gwr.py
 
 clean:  ## remove caches and build leftovers, never .venv or runs
 	rm -rf build dist ./*.egg-info .pytest_cache .ruff_cache .hypothesis

@@ -48,7 +48,7 @@ class Arguments:
     """Seeds of the batch."""
     rounds: int = 100
     """Rounds of each comparison."""
-    steps: int = 6_000
+    steps: int = 3_000
     """Training steps of the measurement of memory."""
     threads: int | None = None
     """Threads for physics; one for each core if not given. PyTorch has one, as in training."""

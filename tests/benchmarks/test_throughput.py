@@ -1,0 +1,113 @@
+"""The throughput benchmark: contenders do what they are timed for; sums and ratios are right."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks import throughput
+from bgpo_trl.configs import PRESETS
+from suites import nico
+from suites.nico.base import Environment
+
+frames = throughput.frames
+
+
+def test_the_bare_loop_simulates_what_our_task_does():
+    """The targets that it replays move the arms to where they were when these were recorded."""
+    import mujoco
+
+    starts, targets = frames.record()
+    draw = frames.actions()
+    environment = nico.load(frames.TASK, seed=0, observation="state", time_limit=float("inf"))
+    environment.reset()
+    model = mujoco.MjModel.from_xml_string(nico.scene_xml())
+    data = mujoco.MjData(model)
+    mujoco.mj_setState(model, data, starts[0], mujoco.mjtState.mjSTATE_INTEGRATION)
+    for step in range(10):
+        environment.step(draw(frames.ROWS)[0])
+        environment._reset_next_step = False
+        data.ctrl[:] = targets[step, 0]
+        mujoco.mj_step(model, data, frames.SUBSTEPS)
+    np.testing.assert_allclose(data.qpos[:12], environment.physics.data.qpos[:12], atol=0.02)
+    assert np.abs(data.qpos[:3] - starts[0][1:4]).max() > 0.05
+
+
+def test_processes_of_the_bare_loop_make_frames_until_it_is_dropped():
+    loop = frames.BareLoop(1)
+    for _ in range(frames.EPISODE + 1):
+        loop.step()
+    assert loop._number == 1
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_contenders_come_with_the_frames_they_make(monkeypatch, threads):
+    class Elsewhere:
+        """In place of processes, which take seconds to start."""
+
+        def __init__(self, *args):
+            pass
+
+        def step(self):
+            pass
+
+    drawn, steps = [], []
+    monkeypatch.setattr(frames, "Stock", Elsewhere)
+    monkeypatch.setattr(frames, "BareLoop", Elsewhere)
+    step = Environment.step
+    monkeypatch.setattr(Environment, "step", lambda *args: steps.append(None) or step(*args))
+    encode = frames.VAE().latent
+    vae = frames.VAE()
+    monkeypatch.setattr(vae, "latent", lambda pixels: drawn.append(pixels) or encode(pixels))
+    contenders = frames.contenders(threads, vae)
+    assert {f"bare limit, {n} threads" for n in (1, threads)} <= contenders.keys()
+    for name, (call, count) in contenders.items():
+        steps.clear(), drawn.clear()
+        call()
+        if not name.startswith(("bare", "stock")):
+            assert len(steps) == count == frames.ROWS, name
+        assert bool(drawn) == ("encoder" in name), name
+
+
+def test_ratios_are_against_the_named_contenders(monkeypatch):
+    seconds = {
+        "bare limit, 1 threads": [10.0, 20.0],
+        "bare limit, 2 threads": [5.0, 10.0],
+        "ours": [20.0, 40.0],
+        "stock": [100.0, 200.0],
+    }
+    monkeypatch.setattr(frames, "contenders", lambda *a: dict.fromkeys(seconds, (None, 10)))
+    monkeypatch.setattr(throughput, "load_pretrained", lambda: (type("E", (), {"vae": None}), None))
+    monkeypatch.setattr(throughput, "interleave", lambda contenders, rounds: seconds)
+    row = throughput.measure_frames(throughput.Arguments(), threads=2)["ours"]
+    assert row["frames a second"] == pytest.approx(10 / 30)
+    assert row["share of the bare limit, 1 threads"] == pytest.approx(0.5)
+    assert row["share of the bare limit, 2 threads"] == pytest.approx(0.25)
+    assert row["times stock"] == pytest.approx(5)
+
+
+def test_results_are_written_and_printed(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(torch, "set_num_threads", lambda n: None)
+    desk = PRESETS["desk"]
+    ddpg = replace(desk.bgpo.ddpg, warmup_steps=3)
+    short = replace(desk, bgpo=replace(desk.bgpo, ddpg=ddpg))
+    monkeypatch.setattr(throughput, "PRESETS", {"desk": short})
+    throughput.main(
+        throughput.Arguments(
+            parts=("step", "memory"), seeds=2, rounds=2, steps=4, threads=1, out=tmp_path
+        )
+    )
+    found = json.loads((tmp_path / "throughput.json").read_text())
+    step = found["step"]
+    assert step["2 runs of one seed"]["share of single runs"] == 1
+    for part in ("simulate (physics and render)", "FrameEncoder", "act", "update", "store"):
+        assert step[f"2 seeds in a batch: {part}"]["ms a step of all"] > 0
+    whole = step["2 seeds in a batch: whole environment"]["ms a step of all"]
+    inside = [step[f"2 seeds in a batch: {part}"] for part in ("FrameEncoder", "RewardSum")]
+    assert sum(row["ms a step of all"] for row in inside) < whole
+    rows = list(found["memory"].values())
+    # 662 bytes a transition, in the units of the table.
+    assert rows[-2]["MB of it replay"] == pytest.approx(4 * 2 * 662e-6, rel=0.01)
+    assert "| 2 seeds in a batch |" in capsys.readouterr().out
