@@ -1,0 +1,93 @@
+"""Whether two runs differ by more than their seeds do.
+
+    python benchmarks/compare.py runs/before runs/after
+
+prints, for each task and part of training, the success of test episodes in both runs and the
+two-sided p of an exact permutation test over seeds: among all ways to deal the seeds out to the two
+runs, the share of those that lie as far apart as the runs do. Small means different; with five
+seeds each, the smallest possible is 2 / 252.
+"""
+
+from __future__ import annotations
+
+import csv
+import sys
+from collections import defaultdict
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Compares the ``eval.csv`` of two runs."""
+
+    first: tyro.conf.Positional[Path]
+    """A run's directory."""
+    second: tyro.conf.Positional[Path]
+    """Another's."""
+    every: int = 1_000
+    """Episodes of training that one row of the table is about."""
+
+
+def success_by_seed(path: Path, every: int) -> dict[tuple[str, int], np.ndarray]:
+    """Returns the mean success ``[S]`` of each seed, by task and part of training.
+
+    Args:
+        path: An ``eval.csv``.
+        every: Length of a part (episodes); the key tells where it ends.
+    """
+    found: dict[tuple[str, int], dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
+    with path.open(newline="") as file:
+        for row in csv.DictReader(file):
+            end = -(-int(row["episode"]) // every) * every
+            found[row["task"], end][row["seed"]].append(float(row["success"]))
+    return {key: np.array([np.mean(s) for s in seeds.values()]) for key, seeds in found.items()}
+
+
+def permutation_p(first: np.ndarray, second: np.ndarray) -> float:
+    """Returns the two-sided p of the difference of two samples' means, by all permutations.
+
+    Args:
+        first: ``[A]``.
+        second: ``[B]``.
+    """
+    everything = np.concatenate([first, second])
+    observed = abs(first.mean() - second.mean())
+    drawn = np.array(
+        [
+            abs(everything[list(own)].mean() - np.delete(everything, own).mean())
+            for own in combinations(range(len(everything)), len(first))
+        ]
+    )
+    return float((drawn >= observed - 1e-12).mean())
+
+
+def main(arguments: Arguments) -> None:
+    """Prints the table."""
+    first, second = (
+        success_by_seed(run / "eval.csv", arguments.every)
+        for run in (arguments.first, arguments.second)
+    )
+    shared = sorted(first.keys() & second.keys())
+    if not shared:
+        raise ValueError("the runs share no task and part of training: nothing to compare")
+    print("| task | episodes up to | first | second | difference | p |")
+    print("|---|---:|---:|---:|---:|---:|")
+    for task, end in shared:
+        a, b = first[task, end], second[task, end]
+        print(
+            f"| {task} | {end} | {a.mean():.2f} | {b.mean():.2f} | {b.mean() - a.mean():+.2f} "
+            f"| {permutation_p(a, b):.2f} |"
+        )
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Annotated[Arguments, tyro.conf.OmitArgPrefixes], description=__doc__))
+    except (ValueError, OSError) as error:
+        sys.exit(f"error: {error}")
