@@ -6,7 +6,10 @@ Ours step ten simulations a call. All get random actions and begin anew after 50
 # MuJoCo's bindings come without stubs.
 # pyright: reportAttributeAccessIssue=false
 
+# ruff: noqa: I001 (the suite chooses an OpenGL backend, which MuJoCo reads when first imported)
 from __future__ import annotations
+
+from suites import nico
 
 import contextlib
 import multiprocessing
@@ -24,7 +27,6 @@ from torchrl.envs import Compose, DMControlWrapper, EnvBase, TransformedEnv
 from bgpo_trl.envs import NicoEnv
 from bgpo_trl.modules.vae import VAE
 from bgpo_trl.transforms import FrameEncoder
-from suites import nico
 from suites.nico.base import Environment
 from suites.nico.rendering import FRAME_CAMERA, FRAME_HEIGHT, FRAME_WIDTH
 
