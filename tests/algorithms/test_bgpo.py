@@ -211,16 +211,16 @@ def test_clipping_can_be_turned_off(make, make_config):
     assert make(ddpg=ddpg).loss.return_bounds is None
 
 
-def test_the_first_update_is_at_the_end_of_the_warm_up(make):
+def test_the_first_update_comes_after_the_warm_up_and_with_the_step_that_follows(make):
     algorithm = make()
     start = [p.detach().clone() for p in algorithm.loss.parameters()]
-    play(algorithm, algorithm.config.ddpg.warmup_steps - 1)
+    play(algorithm, algorithm.config.ddpg.warmup_steps)
     for value, before in zip(algorithm.loss.parameters(), start, strict=True):
         assert value.equal(before)
     play(algorithm, 1)
     for value, before in zip(algorithm.loss.parameters(), start, strict=True):
         assert not value.equal(before)
-    assert len(algorithm.replay) == algorithm.config.ddpg.warmup_steps
+    assert len(algorithm.replay) == algorithm.config.ddpg.warmup_steps + 1
 
 
 @pytest.mark.parametrize("variant", ["ground truth, label", "latent, b"])
