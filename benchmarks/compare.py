@@ -34,16 +34,27 @@ class Arguments:
     """Episodes of training that one row of the table is about."""
 
 
-def success_by_seed(path: Path, every: int) -> dict[tuple[str, int], np.ndarray]:
+def last_episode(path: Path) -> int:
+    """Returns how far an ``eval.csv`` goes."""
+    with path.open(newline="") as file:
+        return max(int(row["episode"]) for row in csv.DictReader(file))
+
+
+def success_by_seed(
+    path: Path, every: int, last: int | None = None
+) -> dict[tuple[str, int], np.ndarray]:
     """Returns the mean success ``[S]`` of each seed, by task and part of training.
 
     Args:
         path: An ``eval.csv``.
         every: Length of a part (episodes); the key tells where it ends.
+        last: Read no further than this episode.
     """
     found: dict[tuple[str, int], dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
     with path.open(newline="") as file:
         for row in csv.DictReader(file):
+            if last is not None and int(row["episode"]) > last:
+                continue
             end = -(-int(row["episode"]) // every) * every
             found[row["task"], end][row["seed"]].append(float(row["success"]))
     return {key: np.array([np.mean(s) for s in seeds.values()]) for key, seeds in found.items()}
@@ -69,10 +80,9 @@ def permutation_p(first: np.ndarray, second: np.ndarray) -> float:
 
 def main(arguments: Arguments) -> None:
     """Prints the table."""
-    first, second = (
-        success_by_seed(run / "eval.csv", arguments.every)
-        for run in (arguments.first, arguments.second)
-    )
+    paths = arguments.first / "eval.csv", arguments.second / "eval.csv"
+    last = min(map(last_episode, paths))  # Of a run cut short, only what both have is compared.
+    first, second = (success_by_seed(path, arguments.every, last) for path in paths)
     shared = sorted(first.keys() & second.keys())
     if not shared:
         raise ValueError("the runs share no task and part of training: nothing to compare")

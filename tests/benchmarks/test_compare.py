@@ -29,7 +29,11 @@ def test_success_is_averaged_within_a_seed_first(tmp_path):
 
 
 def test_the_table_has_what_both_runs_have(tmp_path, capsys):
-    first = write(tmp_path / "a", [(0, 5, "grasp", 0), (1, 5, "grasp", 0), (0, 5, "push", 1)])
+    # The second run was cut short after episode 5: what comes later in the first does not count.
+    first = write(
+        tmp_path / "a",
+        [(0, 5, "grasp", 0), (1, 5, "grasp", 0), (0, 5, "push", 1), (0, 9, "grasp", 1)],
+    )
     second = write(tmp_path / "b", [(0, 5, "grasp", 1), (1, 5, "grasp", 1)])
     compare.main(compare.Arguments(first, second, every=10))
     assert capsys.readouterr().out.splitlines()[2:] == [
