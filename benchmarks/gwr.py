@@ -33,7 +33,7 @@ CALLS = ("lookup", "adapt", "lookup + adapt")
 class Arguments:
     """Measures GWR-B."""
 
-    out: Path = Path("runs/gwr")
+    out: Path = Path("benchmarks/results/gwr")
     """Where the results go."""
     nodes: tuple[int, ...] = (100, 1_000, 10_000, 100_000, 1_000_000)
     """Sizes of a single network."""

@@ -59,10 +59,7 @@ class Arguments:
 def measure_frames(arguments: Arguments, threads: int) -> Table:
     """Times a frame: the bare limit, our layers above it, and the stock one."""
     encoders, _ = load_pretrained()
-    contenders = frames.contenders(threads, encoders.vae)
-    counts = {name: count for name, (_, count) in contenders.items()}
-    times = interleave({n: call for n, (call, _) in contenders.items()}, rounds=arguments.rounds)
-    each = {name: [t / counts[name] for t in taken] for name, taken in times.items()}
+    each = _time_each(frames.contenders(threads, encoders.vae), arguments.rounds)
     return {
         name: {
             "frames a second": 1 / Timing.of(taken).median,
@@ -81,10 +78,7 @@ def measure_frames(arguments: Arguments, threads: int) -> Table:
 
 def measure_updates(arguments: Arguments) -> Table:
     """Times an update of one seed: ours, the floor, TorchRL's loop and Stable-Baselines3."""
-    contenders = updates.contenders(arguments.seeds)
-    counts = {name: count for name, (_, count) in contenders.items()}
-    times = interleave({n: call for n, (call, _) in contenders.items()}, rounds=arguments.rounds)
-    each = {name: [t / counts[name] for t in taken] for name, taken in times.items()}
+    each = _time_each(updates.contenders(arguments.seeds), arguments.rounds)
     floor = next(name for name in each if name.startswith("floor"))
     rivals = [name for name in ("TorchRL loop", "Stable-Baselines3") if name in each]
     return {
@@ -206,6 +200,14 @@ def measure_memory(arguments: Arguments) -> Table:
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     table["highest of all measurements"] = {"MB resident": peak / 1e6}
     return table
+
+
+def _time_each(
+    contenders: dict[str, tuple[Callable[[], object], int]], rounds: int
+) -> dict[str, list[float]]:
+    """Times calls that make several pieces each; returns seconds a piece, round by round."""
+    times = interleave({name: call for name, (call, _) in contenders.items()}, rounds=rounds)
+    return {name: [t / contenders[name][1] for t in taken] for name, taken in times.items()}
 
 
 def _milliseconds(seconds: list[float]) -> str:

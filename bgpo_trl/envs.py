@@ -175,13 +175,13 @@ class NicoEnv(EnvBase):
                 rewards[row] = timestep.reward
                 self._done[row] = timestep.last()
 
-        interval = sys.getswitchinterval()
-        if self._helpers:
-            # A thread back from MuJoCo waits this long for a turn of Python, by default 5 ms: the
-            # time of several simulations.
-            sys.setswitchinterval(2e-4)
         helpers = [self._pool.submit(step_all) for _ in range(min(self._helpers, len(waiting) - 1))]
+        interval = sys.getswitchinterval()
         try:
+            if helpers:
+                # A thread back from MuJoCo waits this long for a turn of Python, by default 5 ms:
+                # the time of several simulations.
+                sys.setswitchinterval(2e-4)
             while step_next():
                 record()
         finally:

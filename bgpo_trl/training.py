@@ -109,8 +109,6 @@ class Trainer:
             OSError: If the disk is full.
         """
         algorithm, n_episodes = self.algorithm, self.config.episodes
-        # What is here now stays to the end: the garbage collector need not look at it again.
-        gc.freeze()
         state = algorithm.env.reset() if self._state is None else self._state
         saved = time.monotonic()
         episodes = algorithm.source.episode
@@ -122,6 +120,8 @@ class Trainer:
             disable=not self.progress,
         )
         losses: dict[str, torch.Tensor] = {}
+        # What is here now stays to the end: the garbage collector need not look at it again.
+        gc.freeze()
         try:
             with _interrupts_wait() as interrupted, ThreadPoolExecutor(1, "update") as background:
                 while int(episodes.min()) < n_episodes:
