@@ -1,6 +1,6 @@
 """What GWR-B costs: time and memory against the number of nodes, and of the networks of a run.
 
-    python benchmarks/gwr.py --out runs/gwr
+    python benchmarks/gwr.py
 
 prints a table and writes it as ``gwr.json``, with the times against nodes as ``gwr.png``.
 """
