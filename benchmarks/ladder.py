@@ -10,22 +10,20 @@ short: encoder, sequence encoder, self-organization.
 
 from __future__ import annotations
 
-import csv
 import sys
-from collections import defaultdict
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
 import torch
 import tyro
+from summary import summarize
 
 from bgpo_trl.configs import PRESETS, BGPOConfig
 from bgpo_trl.machine import choose_device
 from bgpo_trl.plotting import plot_success_curves, save_figure
 from bgpo_trl.pretrained import load_pretrained
 from bgpo_trl.training import Trainer
-from suites import nico
 
 Rung = Literal["a", "b", "c", "d"]
 
@@ -56,28 +54,6 @@ class Arguments:
     threads: int = 1
     """Threads of PyTorch. More than one slows these small networks down; physics takes all cores by
     itself."""
-
-
-def summarize(path: Path) -> dict[str, float]:
-    """Returns success over the last 10 % of training, by task and overall, and episodes to 80 %.
-
-    Args:
-        path: An ``eval.csv`` with test episodes of every task.
-    """
-    with path.open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    last = max(int(row["episode"]) for row in rows)
-    late: dict[str, list[float]] = defaultdict(list)
-    curve: dict[int, list[float]] = defaultdict(list)
-    for row in rows:
-        curve[int(row["episode"])].append(float(row["success"]))
-        if int(row["episode"]) > 0.9 * last:
-            late[row["task"]].append(float(row["success"]))
-    table = {task: sum(late[task]) / len(late[task]) for task in nico.ALL_TASKS}
-    table["overall"] = sum(table[task] for task in nico.ALL_TASKS) / len(nico.ALL_TASKS)
-    reached = (episode for episode, s in sorted(curve.items()) if sum(s) / len(s) >= 0.8)
-    table["episodes to 80 %"] = next(reached, float("nan"))
-    return table
 
 
 def main(arguments: Arguments) -> None:

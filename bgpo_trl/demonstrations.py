@@ -6,13 +6,14 @@ import hashlib
 import json
 import shutil
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 import tyro
+from dm_env import TimeStep
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from tensordict import TensorDict
@@ -61,6 +62,7 @@ def record_demonstrations(
     tasks: Sequence[str] = nico.ALL_TASKS,
     per_task: int = 1_200,
     held_out_per_task: int = 200,
+    play: bool = False,
     seed: int = 0,
     progress: bool = True,
 ) -> TensorDict:
@@ -68,11 +70,17 @@ def record_demonstrations(
 
     Row ``i`` is determined by ``seed`` and ``i`` alone, so an interrupted recording ends the same.
 
+    With ``play`` it records what the robot sees when it plays instead: it follows a demonstration
+    for a while, up to 30 steps, then moves at random until the 50 steps are over. A robot that
+    learns by trial and error sees much that no demonstration shows, and a frame encoder that knows
+    nothing else is off by several centimetres there.
+
     Args:
         path: Folder of the dataset; made if missing.
         tasks: Tasks to demonstrate, in the order of their labels.
         per_task: Demonstrations of each task (1,200 in Sec. IV-B).
         held_out_per_task: How many of those are held out for test episodes.
+        play: Record play in place of demonstrations.
         seed: Seed of starts and of the demonstrator's noise.
         progress: Whether to show a progress bar.
 
@@ -101,10 +109,11 @@ def record_demonstrations(
         "per_task": per_task,
         "held_out_per_task": held_out_per_task,
         "seed": seed,
+        **({"play": True} if play else {}),
     }
     if (path / _META).exists():
         meta = _read_meta(path)
-        found = {key: meta.get(key) for key in wanted}
+        found = {key: meta.get(key) for key in {**wanted, **meta} if key != "checksum"}
         if found != wanted:
             raise ValueError(
                 f"{path} holds another recording ({found}); choose another folder or remove it"
@@ -119,9 +128,11 @@ def record_demonstrations(
     shared = {"physics": physics, "renderer": FrameRenderer(physics.model.ptr)}
     environments = [nico.load(task, observation="both", **shared) for task in tasks]
     missing = torch.nonzero(dataset["length"] == 0).flatten().tolist()
-    for row in tqdm(missing, desc="record demonstrations", disable=not progress):
+    perform = _play if play else _demonstrate
+    described = "record play" if play else "record demonstrations"
+    for row in tqdm(missing, desc=described, disable=not progress):
         task = row // per_task
-        episode = _demonstrate(environments[task], seed, row)
+        episode = perform(environments[task], seed, row)
         n_frames = len(episode["pixels"])
         for key in ("pixels", "state", "action"):
             dataset[key][row, : len(episode[key])] = torch.from_numpy(episode[key])
@@ -139,18 +150,48 @@ def _demonstrate(env: Environment, seed: int, row: int) -> dict[str, np.ndarray]
     sequence = np.random.SeedSequence([seed, row])
     while True:
         start, noise = (int(child.generate_state(1)[0]) for child in sequence.spawn(2))
-        env.task.random.seed(start)
         demonstrator = Demonstrator(env, seed=noise)
-        timestep = env.reset()
-        demonstrator.reset()
-        observations, actions = [timestep.observation], []
-        while not timestep.last():
-            actions.append(demonstrator(timestep))
-            timestep = env.step(actions[-1])
-            observations.append(timestep.observation)
-        if timestep.reward:
-            episode = {key: np.stack([o[key] for o in observations]) for key in observations[0]}
-            return {**episode, "action": np.stack(actions)}
+        episode, reward = _perform(env, start, demonstrator, demonstrator)
+        if reward:
+            return episode
+
+
+def _play(env: Environment, seed: int, row: int) -> dict[str, np.ndarray]:
+    """Returns an episode that leaves its demonstration for random movements, jerky or smooth."""
+    rng = np.random.default_rng([seed, row, 1])
+    start, noise = (int(value) for value in rng.integers(2**32, size=2))
+    demonstrator = Demonstrator(env, seed=noise)
+    n_followed, persistence, spread = rng.integers(31), rng.uniform(0, 0.9), rng.uniform(0.2, 0.8)
+    movement, steps = rng.standard_normal(4), 0
+
+    def act(timestep: TimeStep) -> np.ndarray:
+        nonlocal movement, steps
+        steps += 1
+        if steps <= n_followed:
+            return demonstrator(timestep)
+        movement = persistence * movement + (1 - persistence**2) ** 0.5 * rng.standard_normal(4)
+        return np.clip(spread * movement, -1.0, 1.0)
+
+    return _perform(env, start, demonstrator, act)[0]
+
+
+def _perform(
+    env: Environment,
+    start: int,
+    demonstrator: Demonstrator,
+    policy: Callable[[TimeStep], np.ndarray],
+) -> tuple[dict[str, np.ndarray], float]:
+    """Returns an episode from the start with that seed, and its last reward."""
+    env.task.random.seed(start)
+    timestep = env.reset()
+    demonstrator.reset()
+    observations, actions = [timestep.observation], []
+    while not timestep.last():
+        actions.append(policy(timestep))
+        timestep = env.step(actions[-1])
+        observations.append(timestep.observation)
+    episode = {key: np.stack([o[key] for o in observations]) for key in observations[0]}
+    return {**episode, "action": np.stack(actions)}, float(timestep.reward)
 
 
 def _write_meta(path: Path, meta: dict) -> None:
@@ -253,6 +294,10 @@ class DemonstrationBank:
         """Returns the demonstrations for test episodes."""
         return self._select(~self.train)
 
+    def of_task(self, task: int) -> DemonstrationBank:
+        """Returns the demonstrations of one task."""
+        return self._select(self.task == task)
+
     def _select(self, rows: Tensor) -> DemonstrationBank:
         return DemonstrationBank(self.embedding[rows], self.task[rows], self.train[rows])
 
@@ -289,6 +334,7 @@ def main(
     path: tyro.conf.Positional[Path],
     per_task: int = 1_200,
     held_out_per_task: int = 200,
+    play: bool = False,
     seed: int = 0,
 ) -> None:
     """Records the dataset of demonstrations; the same command continues an interrupted one.
@@ -297,9 +343,12 @@ def main(
         path: Folder of the dataset.
         per_task: Demonstrations of each task.
         held_out_per_task: How many of those are held out for test episodes.
+        play: Record how the robot plays at random in place of demonstrations.
         seed: Seed of starts and noise.
     """
-    record_demonstrations(path, per_task=per_task, held_out_per_task=held_out_per_task, seed=seed)
+    record_demonstrations(
+        path, per_task=per_task, held_out_per_task=held_out_per_task, play=play, seed=seed
+    )
 
 
 if __name__ == "__main__":

@@ -43,13 +43,14 @@ def make_pretrained(
     progress: bool = True,
     device: torch.device | str = "cpu",
 ) -> tuple[Representation, DemonstrationBank]:
-    """Records demonstrations, trains both encoders on them, and embeds all.
+    """Records demonstrations and play, trains both encoders, and embeds the demonstrations.
 
     Each stage continues where it was interrupted.
 
     Args:
         weights: Where to write the encoders; the bank goes beside them.
-        dataset: Folder of the demonstrations; recorded if not there yet.
+        dataset: Folder of the demonstrations; recorded if not there yet. Half as many episodes of
+            play go to the folder of that name with ``-play`` at its end.
         folder: Folder for the log, checkpoints and probes of the training.
         config: Hyperparameters of the encoders.
         per_task: Demonstrations of each task.
@@ -69,8 +70,18 @@ def make_pretrained(
         seed=seed,
         progress=progress,
     )
+    folder_of_play = Path(dataset).with_name(f"{Path(dataset).name}-play")
+    play = record_demonstrations(
+        folder_of_play,
+        per_task=max(2, per_task // 2),
+        held_out_per_task=max(1, held_out_per_task // 4),
+        play=True,
+        seed=seed,
+        progress=progress,
+    )
     return train_encoders(
         demonstrations,
+        play,
         Path(weights),
         Path(folder),
         config or RepresentationConfig(),

@@ -38,6 +38,8 @@ def probe(
     dataset: TensorDictBase,
     folder: str | Path | None = None,
     activity_threshold: float = 0.8,
+    *,
+    play: TensorDictBase | None = None,
 ) -> dict[str, float]:
     """Measures trained encoders.
 
@@ -47,6 +49,8 @@ def probe(
             ``pixels``, ``action``, ``length``, ``train``, ``task`` and ``state`` ``[N, T, 16]``.
         folder: where to write ``probes.json`` and ``reconstructions.png``; None for nowhere.
         activity_threshold: a_T of GWR-B (Table 1), for :func:`embedding_distances`.
+        play: recorded play, in the form of the dataset: adds the joints' and objects' errors there,
+            as ``play_...``, wherever all objects are still on the table.
 
     Returns:
         Flat names to numbers: ``joint_<name>_rmse_rad`` and ``<object>_error_cm`` (linear probe of
@@ -82,6 +86,14 @@ def probe(
         "task_accuracy_nearest": _mean(task[nearest] == task_held_out),
         **embedding_distances(phi, task, activity_threshold),
     }
+    if play is not None:
+        played, played_held_out = split(play)
+        latents = [
+            encode_frames(vae, part.get("pixels"), part.get("length"))
+            for part in (played, played_held_out)
+        ]
+        errors = _probe_state(latents[0], played, latents[1], played_held_out)
+        result |= {f"play_{name}": error for name, error in errors.items()}
     if folder is not None:
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
@@ -186,7 +198,8 @@ def _probe_state(
     latent: Tensor, train: TensorDictBase, latent_held_out: Tensor, held_out: TensorDictBase
 ) -> dict[str, float]:
     valid, valid_held_out = (
-        valid_steps(part.get("length"), latent.shape[1]) for part in (train, held_out)
+        valid_steps(part.get("length"), latent.shape[1]) & _on_table(part.get("state"))
+        for part in (train, held_out)
     )
     state = held_out.get("state")[valid_held_out]
     error = (
@@ -202,6 +215,11 @@ def _probe_state(
         f"{name}_error_cm": 100 * _mean(error[:, i : i + 2].norm(dim=-1))
         for name, i in first.items()
     }
+
+
+def _on_table(state: Tensor) -> Tensor:
+    """Returns where all objects are higher than 0.6 m, bool, of state ``[..., 16]``."""
+    return (state[..., _FIRST_OBJECT + 2 :: 3] > 0.6).all(-1)
 
 
 @torch.no_grad()

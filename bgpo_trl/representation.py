@@ -1,8 +1,8 @@
 """Stage 1: learn to see. Trains, embeds, saves and loads the two frozen encoders.
 
 ``train_representation`` runs the paper's Sec. III-A: first the VAE with its inverse model on the
-frames of the demonstrations, then the LSTM autoencoder on their latents. What the result is worth
-is measured in :mod:`bgpo_trl.probes`.
+frames of the demonstrations and of play, then the LSTM autoencoder on the latents of the
+demonstrations. What the result is worth is measured in :mod:`bgpo_trl.probes`.
 
 A dataset is a TensorDict ``[N]`` with ``pixels`` uint8 ``[N, T, 32, 64, 3]``, ``action``
 ``[N, T - 1, A]``, ``length`` int64 ``[N]`` (frames) and ``train`` bool ``[N]``.
@@ -13,7 +13,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib import resources
 from pathlib import Path
@@ -55,6 +55,7 @@ def train_representation(
     dataset: TensorDictBase,
     config: RepresentationConfig | None = None,
     *,
+    play: TensorDictBase | None = None,
     scene_version: str,
     command: str = "",
     checkpoint: str | Path | None = None,
@@ -67,6 +68,8 @@ def train_representation(
     Args:
         dataset: demonstrations, see the module's head. Held-out ones are not touched.
         config: hyperparameters; ``RepresentationConfig()`` if not given.
+        play: episodes of play, in the form of the dataset, for the frame encoder to see besides the
+            demonstrations what trial and error brings.
         scene_version: version of the scene that made the frames, stored with the weights.
         command: the command line that asked for this, stored with the weights.
         checkpoint: folder to write checkpoints to. An interrupted training that is called again
@@ -86,7 +89,8 @@ def train_representation(
     train, _ = split(dataset)
     folder = Path(checkpoint) if checkpoint else None
     fit = Fit(config, folder, log, progress, device)
-    vae = _train_vae(train, config.vae, fit, config.seed)
+    seen = [train] if play is None else [train, split(play)[0]]
+    vae = _train_vae(seen, config.vae, fit, config.seed)
     latent = encode_frames(vae, train.get("pixels"), train.get("length"))
     lae = _train_lae(latent, train.get("length"), config.lae, fit, config.seed)
     metadata = {
@@ -242,17 +246,18 @@ def mean_frame(frames: Tensor) -> Tensor:
     return frames.sum(0, dtype=torch.int64) / (255 * len(frames))
 
 
-def _train_vae(train: TensorDictBase, config: VAEConfig, fit: Fit, seed: int) -> VAE:
+def _train_vae(datasets: Sequence[TensorDictBase], config: VAEConfig, fit: Fit, seed: int) -> VAE:
     if config.window < 2 or config.batch_size % config.window:
         raise ValueError(
             f"vae.window must be at least 2 and divide vae.batch_size {config.batch_size}, "
             f"got {config.window}"
         )
-    if train.get("length").max() < config.window:
+    length = torch.cat([dataset.get("length") for dataset in datasets])
+    if length.max() < config.window:
         raise ValueError(f"the dataset has no training demonstration of {config.window} frames")
-    length, action = train.get("length"), train.get("action")
-    frames = valid_frames(train)
+    frames = torch.cat([valid_frames(dataset) for dataset in datasets])
     # The last frame of a demonstration leads nowhere; its action is never read.
+    action = torch.cat([dataset.get("action") for dataset in datasets])
     padded = torch.nn.functional.pad(action, (0, 0, 0, 1))
     action = padded[valid_steps(length, padded.shape[1])]
     first = length.cumsum(0) - length
@@ -298,6 +303,6 @@ def _train_lae(
     generator = torch.Generator().manual_seed(seed)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        lae = SequenceAutoencoder(latent.shape[-1], config.embedding_size)
+        lae = SequenceAutoencoder(latent.shape[-1], config.embedding_size, config.embedding_scale)
     fit("lae", SequenceReconstructionLoss(lae), sample, config, generator)
     return lae.eval().requires_grad_(False)

@@ -1,4 +1,4 @@
-"""Command line of stage 1: ``python -m bgpo_trl.train_encoders data/nico``."""
+"""Command line of stage 1: ``python -m bgpo_trl.train_encoders data/nico data/nico-play``."""
 
 from __future__ import annotations
 
@@ -40,10 +40,12 @@ _COLUMNS = (
 
 @dataclass(frozen=True)
 class Arguments:
-    """Trains both encoders on recorded demonstrations, then probes them."""
+    """Trains both encoders on recorded demonstrations and play, then probes them."""
 
     dataset: tyro.conf.Positional[Path]
     """Folder of the recorded demonstrations."""
+    play: tyro.conf.Positional[Path]
+    """Folder of the recorded play."""
     weights: Path = field(default_factory=default_weights)
     """The file to write; by default the weights that come with the package."""
     folder: Path = Path("runs/encoders")
@@ -61,6 +63,7 @@ def bank_path(weights: Path) -> Path:
 
 def train_encoders(
     dataset: TensorDictBase,
+    play: TensorDictBase,
     weights: Path,
     folder: Path,
     config: RepresentationConfig,
@@ -71,6 +74,7 @@ def train_encoders(
 
     Args:
         dataset: demonstrations as in :mod:`bgpo_trl.representation`, with ``state`` and ``task``.
+        play: recorded play, in the same form.
         weights: the safetensors file to write; the bank goes beside it, see `bank_path`.
         folder: receives ``train.csv``, ``checkpoint/``, ``probes.json``, ``reconstructions.png``.
         config: hyperparameters.
@@ -88,6 +92,7 @@ def train_encoders(
         representation = train_representation(
             dataset,
             config,
+            play=play,
             scene_version=nico.scene_version(),
             command=command,
             checkpoint=folder / "checkpoint",
@@ -101,16 +106,17 @@ def train_encoders(
         dataset["train"].clone(),
     )
     bank.save(bank_path(weights), encoder_id=representation.identity)
-    probe(representation, dataset, folder)
+    probe(representation, dataset, folder, play=play)
     return representation, bank
 
 
 def main(arguments: Arguments) -> None:
     """Runs the command line; see ``--help``."""
-    dataset = load_demonstrations(arguments.dataset)
+    dataset, play = load_demonstrations(arguments.dataset), load_demonstrations(arguments.play)
     command = shlex.join(["python", "-m", "bgpo_trl.train_encoders", *sys.argv[1:]])
     train_encoders(
         dataset,
+        play,
         arguments.weights,
         arguments.folder,
         arguments.config,

@@ -72,6 +72,7 @@ class Trainer:
         self.config = config
         self.directory = Path(directory)
         self.progress = progress
+        self.encoders = encoders
         schedule = TaskSchedule(starts=config.task_starts)
         seeds = config.seeds
         self.algorithm = BGPO(

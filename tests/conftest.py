@@ -28,7 +28,7 @@ def encoders():
     """Untrained encoders: what latents mean does not matter to what is tested with them."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        vae, lae = VAE(), SequenceAutoencoder()
+        vae, lae = VAE(), SequenceAutoencoder(embedding_scale=0.5)
     return Representation(vae.eval().requires_grad_(False), lae.eval().requires_grad_(False), {})
 
 
@@ -46,7 +46,7 @@ def make_config():
     """Makes the settings of a run of two seeds and 10 episodes, with some of them changed."""
 
     def make(state="latent", context="behavior", **changes):
-        ddpg = DDPGConfig(batch_size=16, warmup_steps=8, replay_size=200)
+        ddpg = DDPGConfig(hidden_sizes=(64,), batch_size=16, warmup_steps=8, replay_size=200)
         algorithm = BGPOConfig(state=state, context=context, max_steps=6, ddpg=ddpg)
         config = RunConfig(
             seeds=(3, 8), episodes=10, task_starts=(0, 2, 4), eval_every=2, bgpo=algorithm

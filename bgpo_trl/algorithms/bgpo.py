@@ -115,6 +115,18 @@ class BGPO:
         reward: list[Transform] = []
         rewards = ["reward"]
         embedding_size = bank.embedding.shape[-1]
+        # The distances that GWR-B needs are not those that a network learns well from.
+        self._behavior_loc, self._behavior_scale = (
+            bank.embedding.mean(0),
+            bank.embedding.std(0).clamp_min(1e-6),
+        )
+        normalize = ObservationNorm(
+            self._behavior_loc,
+            self._behavior_scale,
+            in_keys=["behavior"],
+            out_keys=["normalized_behavior"],
+            standard_normal=True,
+        )
         if config.context == "behavior":
             self.gwr = GWRB(embedding_size, batch_size=batch, generator=generators(seeds, "gwr"))
             infer.append(BehaviorLookup(self.gwr, learn=True))
@@ -123,7 +135,7 @@ class BGPO:
         if config.context != "task_one_hot":
             if encoders is None:
                 raise ValueError(f"context={config.context!r} needs trained encoders")
-            reward.append(BehaviorMatchingReward(encoders.lae, beta=config.beta))
+            reward = [normalize, BehaviorMatchingReward(encoders.lae, beta=config.beta)]
             rewards += ["extrinsic_reward", "intrinsic_reward"]
         transforms = [
             *observe(config, encoders, schedule.n_tasks),
@@ -139,8 +151,9 @@ class BGPO:
             observation="pixels" if config.state == "latent" else "state",
         )
         self.env = TransformedEnv(self.simulation, Compose(transforms))
-        context_key = "task_one_hot" if config.context == "task_one_hot" else "behavior"
-        context_size = schedule.n_tasks if context_key == "task_one_hot" else embedding_size
+        labeled = config.context == "task_one_hot"
+        context_key = "task_one_hot" if labeled else "normalized_behavior"
+        context_size = schedule.n_tasks if labeled else embedding_size
         state_size = STATE_SIZE
         if config.state == "latent" and encoders is not None:
             state_size = encoders.vae.latent_size
@@ -155,10 +168,15 @@ class BGPO:
             "batch_size": [len(seeds)],
         }
         self.actor = Actor(in_features, generator=generators(seeds, "actor"), **network)
-        critic = Critic(in_features, generator=generators(seeds, "critic"), **network)
+        critic = Critic(
+            in_features,
+            layer_norm=ddpg.critic_layer_norm,
+            generator=generators(seeds, "critic"),
+            **network,
+        )
         self.actor.to(self.device)
         critic.to(self.device)
-        highest = 1.0 + (self.config.beta if keys[1] == "behavior" else 0.0)
+        highest = 1.0 + (0.0 if keys[1] == "task_one_hot" else self.config.beta)
         self.loss = DDPGLoss(
             self.actor,
             critic,
@@ -231,7 +249,8 @@ class BGPO:
         """
         if self.in_keys[1] == "task_one_hot":
             return one_hot(task, self.source.schedule.n_tasks).float()
-        return embedding if self.gwr is None else self.gwr.lookup(embedding).embedding
+        behavior = embedding if self.gwr is None else self.gwr.lookup(embedding).embedding
+        return (behavior - self._behavior_loc) / self._behavior_scale
 
     def state_dict(self) -> dict[str, Any]:
         """Returns all that the future of the run depends on but the tensordict in flight."""

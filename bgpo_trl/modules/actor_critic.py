@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 import torch
+import torch.nn.functional as F
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor, nn
@@ -138,10 +139,16 @@ class StackedLinear(nn.Module):
 class StackedMLP(nn.Module):
     """A perceptron of :class:`StackedLinear` layers with ReLU between them.
 
+    With ``layer_norm``, each hidden layer's output is normalized over its units (Ba et al., 2016,
+    without gain and bias) before the ReLU. In a Q-function this bounds what it can say about
+    actions it has never seen (Ball et al., 2023, "Efficient Online Reinforcement Learning with
+    Offline Data").
+
     Args:
         in_features: size of the last dimension of all inputs together.
         out_features: size of the last output dimension.
         hidden_sizes: width of each hidden layer.
+        layer_norm: whether to normalize the hidden layers.
         batch_size: leading dimensions ``S`` of the weights.
         generator: as in :class:`StackedLinear`.
 
@@ -160,10 +167,12 @@ class StackedMLP(nn.Module):
         out_features: int,
         *,
         hidden_sizes: Sequence[int] = (64,),
+        layer_norm: bool = False,
         batch_size: Sequence[int] = (),
         generator: torch.Generator | Sequence[torch.Generator] | None = None,
     ) -> None:
         super().__init__()
+        self.layer_norm = layer_norm
         sizes = [in_features, *hidden_sizes, out_features]
         self.layers = nn.ModuleList(
             StackedLinear(n_in, n_out, batch_size, generator) for n_in, n_out in pairwise(sizes)
@@ -181,6 +190,8 @@ class StackedMLP(nn.Module):
         first, *others = self.layers
         x = first(*inputs)
         for layer in others:
+            if self.layer_norm:
+                x = F.layer_norm(x, x.shape[-1:])
             x = layer(x.relu_())
         return x
 
@@ -265,6 +276,7 @@ class Critic(TensorDictModuleBase):
         action_dim: number of action components.
         in_keys: entries to read, concatenated in this order; the action comes last.
         hidden_sizes: width of each hidden layer.
+        layer_norm: whether to normalize the hidden layers, see :class:`StackedMLP`.
         batch_size: leading dimensions ``S`` of the weights, one independent Q-function per index.
         generator: source of the initial weights, as in :class:`StackedLinear`.
 
@@ -288,6 +300,7 @@ class Critic(TensorDictModuleBase):
         *,
         in_keys: Sequence[NestedKey] = ("latent", "behavior"),
         hidden_sizes: Sequence[int] = (64,),
+        layer_norm: bool = False,
         batch_size: Sequence[int] = (),
         generator: torch.Generator | Sequence[torch.Generator] | None = None,
     ) -> None:
@@ -299,6 +312,7 @@ class Critic(TensorDictModuleBase):
             in_features + action_dim,
             1,
             hidden_sizes=hidden_sizes,
+            layer_norm=layer_norm,
             batch_size=batch_size,
             generator=generator,
         )

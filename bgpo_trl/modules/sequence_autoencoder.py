@@ -9,12 +9,18 @@ from torch import Tensor, nn
 class SequenceAutoencoder(nn.Module):
     """The paper's LAE (Sec. III-A, Fig. "LSTM Autoencoder"): LSTM encoder, LSTM decoder.
 
-    The embedding phi is the encoder's hidden state after the last valid latent. The decoder is
-    fed phi at every step and reconstructs the sequence in reverse order.
+    The embedding phi is the encoder's hidden state after the last valid latent, times
+    ``embedding_scale``. The decoder is fed that hidden state at every step and reconstructs the
+    sequence in reverse order; so the scale changes nothing of what is learned, only the distances
+    that GWR-B (whose activity is ``exp(-distance)``) and the intrinsic reward see.
 
     Args:
         latent_size: dimensions of one latent (paper: 64).
         embedding_size: LSTM units of encoder and decoder, so dimensions of phi (paper: 32).
+        embedding_scale: length of phi in units of the hidden state (paper: 1).
+
+    Raises:
+        ValueError: if the scale is not positive.
 
     Example:
         >>> import torch
@@ -24,10 +30,17 @@ class SequenceAutoencoder(nn.Module):
         torch.Size([5, 32])
     """
 
-    def __init__(self, latent_size: int = 64, embedding_size: int = 32) -> None:
+    def __init__(
+        self, latent_size: int = 64, embedding_size: int = 32, embedding_scale: float = 1.0
+    ) -> None:
+        if not embedding_scale > 0:
+            raise ValueError(f"embedding_scale must be positive, got {embedding_scale}")
         super().__init__()
         self.latent_size = latent_size
         self.embedding_size = embedding_size
+        # Kept with the weights: embeddings of one scale are worth nothing beside those of another.
+        self.register_buffer("embedding_scale", torch.tensor(embedding_scale))
+        self.embedding_scale: Tensor
         self.encoder = nn.LSTM(latent_size, embedding_size, batch_first=True)
         self.decoder = nn.LSTM(embedding_size, embedding_size, batch_first=True)
         self.readout = nn.Linear(embedding_size, latent_size)
@@ -40,7 +53,7 @@ class SequenceAutoencoder(nn.Module):
             length: int64 ``[...]``, valid latents of each sequence, in 1..T.
 
         Returns:
-            phi, float32 ``[..., embedding_size]`` in (-1, 1).
+            phi, float32 ``[..., embedding_size]`` in (-1, 1) times the scale.
 
         Raises:
             ValueError: if shapes disagree or a length is outside 1..T.
@@ -56,10 +69,14 @@ class SequenceAutoencoder(nn.Module):
         # An LSTM is causal: reading its output at the last valid step masks the padding exactly.
         hidden, _ = self.encoder(z.reshape(-1, steps, self.latent_size))
         last = (length.reshape(-1, 1, 1) - 1).expand(-1, 1, self.embedding_size)
-        return hidden.gather(1, last).reshape(*length.shape, self.embedding_size)
+        return self.embed(hidden.gather(1, last).reshape(*length.shape, self.embedding_size))
+
+    def embed(self, h: Tensor) -> Tensor:
+        """Returns phi of the sequence that the encoder has read when its hidden state is ``h``."""
+        return self.embedding_scale * h
 
     def step(self, z: Tensor, h: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
-        """Advances the encoder by one latent; after the last one, ``h`` is phi.
+        """Advances the encoder by one latent; after the last one, ``embed(h)`` is phi.
 
         Args:
             z: ``[..., latent_size]``.
@@ -85,6 +102,6 @@ class SequenceAutoencoder(nn.Module):
         Returns:
             float32 ``[..., n_steps, latent_size]``.
         """
-        fed = phi.reshape(-1, 1, self.embedding_size).expand(-1, n_steps, -1)
+        fed = phi.reshape(-1, 1, self.embedding_size).expand(-1, n_steps, -1) / self.embedding_scale
         hidden, _ = self.decoder(fed)
         return self.readout(hidden).reshape(*phi.shape[:-1], n_steps, self.latent_size)

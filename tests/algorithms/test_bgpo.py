@@ -62,7 +62,7 @@ def test_each_variant_is_an_environment_with_the_input_it_is_named_after(make, v
 
     state, context = VARIANTS[variant]
     sizes = {"state": 16, "latent": 64, "task_one_hot": n_tasks}
-    key = "task_one_hot" if context == "task_one_hot" else "behavior"
+    key = "task_one_hot" if context == "task_one_hot" else "normalized_behavior"
     start = algorithm.act(algorithm.env.reset())
     assert algorithm.actor.in_keys == [state, key]
     assert algorithm.actor.mlp.layers[0].in_features == sizes[state] + sizes.get(context, 32)
@@ -125,7 +125,7 @@ def test_only_a_variant_with_a_label_acts_by_it(make, variant):
     other = algorithm.infer(embedding, torch.ones(2, 1, dtype=torch.int64))
     key = algorithm.in_keys[1]
     actions = [algorithm.actor(state.clone().set(key, b[:, 0]))["action"] for b in (first, other)]
-    assert actions[0].equal(actions[1]) == (key == "behavior")
+    assert actions[0].equal(actions[1]) == (key == "normalized_behavior")
 
 
 def test_inference_is_the_lookup_of_the_algorithm_and_learns_nothing(make, bank):
@@ -134,7 +134,11 @@ def test_inference_is_the_lookup_of_the_algorithm_and_learns_nothing(make, bank)
     before = [algorithm.gwr.graph(i) for i in range(2)]
     state = algorithm.env.reset()
     inferred = algorithm.infer(state["demo_embedding"].unsqueeze(1), state["task"].unsqueeze(1))
-    assert inferred.squeeze(1).equal(state["behavior"])
+    assert inferred.squeeze(1).equal(state["normalized_behavior"])
+    seen = bank.seen().embedding
+    torch.testing.assert_close(
+        state["normalized_behavior"] * seen.std(0) + seen.mean(0), state["behavior"]
+    )
     for index, graph in enumerate(before):
         assert_same_graph(algorithm.gwr.graph(index), graph, rtol=0, atol=0)
 

@@ -115,6 +115,30 @@ def test_critic_is_the_network_of_the_paper():
     torch.testing.assert_close(data["state_action_value"], value)
 
 
+def test_layer_norm_is_the_textbook_one_before_each_relu():
+    mlp = StackedMLP(5, 2, hidden_sizes=(16, 8), layer_norm=True, batch_size=(3,))
+    x = torch.randn(3, 7, 5)
+    output = mlp(x)
+    for layer in mlp.layers[:-1]:
+        x = x @ layer.weight + layer.bias.unsqueeze(1)
+        mean = x.mean(-1, keepdim=True)
+        variance = (x - mean).square().mean(-1, keepdim=True)
+        x = ((x - mean) / (variance + 1e-5).sqrt()).clamp(min=0)
+    last = mlp.layers[-1]
+    torch.testing.assert_close(output, x @ last.weight + last.bias.unsqueeze(1))
+
+
+def test_normalized_critic_does_not_see_the_scale_of_its_input():
+    critic = Critic(6, 2, in_keys=["state"], layer_norm=True)
+    with torch.no_grad():
+        critic.mlp.layers[0].bias.zero_()
+    state, action = torch.randn(9, 6), torch.randn(9, 2)
+    value = critic(state=state, action=action)
+    torch.testing.assert_close(
+        critic(state=100 * state, action=100 * action), value, rtol=1e-3, atol=1e-3
+    )
+
+
 def test_other_inputs_widths_and_depths_are_configuration():
     keys = [("observation", "state"), "task_one_hot"]
     options = {"in_keys": keys, "hidden_sizes": (16, 8), "batch_size": (3,)}

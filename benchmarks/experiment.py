@@ -1,0 +1,209 @@
+"""What the paper's experiments share: command line, run, and what is measured at its end."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shlex
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+import torch
+import tyro
+
+from bgpo_trl.configs import PRESETS, STAGE_PRESETS, RunConfig
+from bgpo_trl.demonstrations import DemonstrationBank
+from bgpo_trl.evaluation import Evaluator, evaluate_random_policy
+from bgpo_trl.machine import choose_device
+from bgpo_trl.metrics import majority_task, match_counts, task_inference_accuracy
+from bgpo_trl.plotting import plot_gwr_pca, plot_success_curves, save_figure
+from bgpo_trl.pretrained import load_pretrained, make_pretrained
+from bgpo_trl.training import Trainer
+from suites import nico
+
+# Number of the evaluation after training, which no evaluation in training has: other starts.
+_LAST = 2**31
+FINAL_COLUMNS = ("seed", "demonstrations", "task", "episodes", "success", "task_inference")
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Trains BGPO and draws its success."""
+
+    preset: Literal["smoke", "quick", "desk", "paper"] = "quick"
+    """Size of the run: every stage in minutes; learning to look at; five seeds; the paper's."""
+    out: Path | None = None
+    """The run's directory; runs/EXPERIMENT-PRESET if not given."""
+    seeds: tuple[int, ...] | None = None
+    """Other seeds than the preset's."""
+    episodes: int | None = None
+    """Another length than the preset's; the tasks' starts keep their proportions."""
+    resume: bool = False
+    """Continue the run in the directory."""
+    train_encoders: bool = False
+    """Record demonstrations and train the encoders anew instead of using the shipped ones."""
+    wandb: Literal["online", "offline"] | None = None
+    """Log to Weights & Biases too."""
+    device: str = "auto"
+    """Where the networks are: cpu, cuda, or auto for a GPU if there is one."""
+    threads: int = 1
+    """Threads of PyTorch. More than one slows these small networks down; physics takes all cores by
+    itself."""
+
+
+def run_config(arguments: Arguments) -> RunConfig:
+    """Returns the preset, for tasks one after the other, with the changes asked for.
+
+    Raises:
+        ValueError: If there is no such run.
+    """
+    config = PRESETS[arguments.preset]
+    if arguments.seeds is not None:
+        config = replace(config, seeds=arguments.seeds)
+    if arguments.episodes is not None:
+        share = arguments.episodes / config.episodes
+        starts = tuple(round(start * share) for start in config.task_starts)
+        config = replace(
+            config,
+            episodes=arguments.episodes,
+            task_starts=starts,
+            eval_every=max(1, min(config.eval_every, arguments.episodes)),
+        )
+    return config
+
+
+def run_experiment(arguments: Arguments, name: str, config: RunConfig) -> None:
+    """Trains to the end, then measures and draws.
+
+    The run's directory then holds, besides what `Trainer` writes, ``final.csv`` (success of the
+    trained policies with demonstrations seen in training and with held-out ones, and task
+    inference), ``summary.json`` (commit, command, nodes of GWR-B) and ``figures/``.
+
+    Args:
+        arguments: From the command line.
+        name: The experiment's, for the run's directory.
+        config: The run.
+
+    Raises:
+        ValueError: If the directory holds another run.
+    """
+    torch.set_num_threads(arguments.threads)
+    device = choose_device(arguments.device)
+    out = arguments.out or Path("runs") / f"{name}-{arguments.preset}"
+    if (out / "config.json").exists() and not arguments.resume:
+        raise ValueError(f"{out} holds a run: --resume continues it, --out names another directory")
+    if arguments.train_encoders or arguments.preset in STAGE_PRESETS:
+        stage = STAGE_PRESETS.get(arguments.preset)
+        encoders, bank = make_pretrained(
+            out / "encoders" / "nico.safetensors",
+            out / "demonstrations",
+            folder=out / "encoders",
+            command=shlex.join(["python", *sys.argv]),
+            device=device,
+            **({} if stage is None else vars(stage)),
+        )
+    else:
+        encoders, bank = load_pretrained()
+
+    trainer = Trainer(
+        config,
+        out,
+        bank=bank,
+        encoders=encoders,
+        device=device,
+        resume=arguments.resume,
+        wandb=arguments.wandb,
+    )
+    trainer.run()
+    measure(trainer, bank, out)
+
+    random_success = evaluate_random_policy(n_tasks=3, episodes=100)
+    figure = plot_success_curves(
+        out / "eval.csv",
+        presented=dict(zip(nico.ALL_TASKS, config.task_starts, strict=True)),
+        random_success=dict(zip(nico.ALL_TASKS, random_success.tolist(), strict=True)),
+    )
+    save_figure(figure, out / "figures" / "success.png")
+    gwr = trainer.algorithm.gwr
+    assert gwr is not None
+    tasks = majority_task(match_counts(gwr, bank.seen(), 3)[0])
+    graph = gwr.graph(0)
+    figure = plot_gwr_pca(graph.weights, tasks[: len(graph.weights)], nico.ALL_TASKS)
+    save_figure(figure, out / "figures" / "gwr.png")
+    accuracy = task_inference_accuracy(gwr, bank.seen(), bank.held_out(), 3)
+    print(f"GWR-B nodes: {gwr.num_nodes.tolist()}")
+    print(f"task inference on held-out demonstrations: {accuracy.mean():.1%}")
+    print(f"curve and figures: {out}; in numbers: python benchmarks/summary.py {out}")
+
+
+def measure(trainer: Trainer, bank: DemonstrationBank, out: Path, episodes: int = 20) -> None:
+    """Tests the trained policies with seen and with held-out demonstrations.
+
+    Args:
+        trainer: At the end of its run.
+        bank: Demonstrations of both kinds.
+        out: Where ``final.csv`` and ``summary.json`` go.
+        episodes: Test episodes of each seed, task and kind.
+    """
+    algorithm, config, seen = trainer.algorithm, trainer.config, bank.seen()
+    gwr = algorithm.gwr
+    assert gwr is not None
+    rows = []
+    for kind, tested in (("seen", seen), ("held-out", bank.held_out())):
+        evaluator = Evaluator(
+            config.bgpo,
+            seeds=config.seeds,
+            n_tasks=len(nico.ALL_TASKS),
+            episodes=episodes,
+            bank=tested,
+            encoders=trainer.encoders,
+        )
+        snapshots = [
+            evaluator.take(algorithm, index, _LAST, 0) for index in range(len(config.seeds))
+        ]
+        success = evaluator.run(snapshots, _LAST, algorithm.actor).success
+        for task, name in enumerate(nico.ALL_TASKS):
+            of_task = tested.of_task(task)
+            accuracy = task_inference_accuracy(gwr, seen, of_task, len(nico.ALL_TASKS))
+            for index, seed in enumerate(config.seeds):
+                share = success[index, task].float().mean().item()
+                rows.append((seed, kind, name, episodes, share, round(accuracy[index].item(), 4)))
+    with (out / "final.csv").open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(FINAL_COLUMNS)
+        writer.writerows(rows)
+    summary = {
+        "commit": _commit(),
+        "command": shlex.join(["python", *sys.argv]),
+        "nodes": gwr.num_nodes.tolist(),
+    }
+    (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+
+
+def _commit() -> str:
+    """Returns the commit of this code, with ``-dirty`` where it was changed; "" where unknown."""
+    command = ["git", "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
+    try:
+        told = subprocess.run(
+            command, cwd=Path(__file__).parent, capture_output=True, text=True, check=True
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return ""
+    return told.stdout.strip()
+
+
+def command_line(main: Callable[[Arguments], None], description: str | None) -> None:
+    """Runs an experiment's ``main`` with the arguments of the command line.
+
+    What a person can mend is told in one line.
+    """
+    try:
+        main(tyro.cli(Annotated[Arguments, tyro.conf.OmitArgPrefixes], description=description))
+    except (ValueError, OSError, RuntimeError) as error:
+        sys.exit(f"error: {error}")
+    except KeyboardInterrupt:
+        sys.exit("interrupted: the same command with --resume continues")

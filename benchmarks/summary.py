@@ -1,0 +1,149 @@
+"""What runs have come to, in numbers and figures.
+
+    python benchmarks/summary.py benchmarks/results/c*-desk
+
+prints for each run a table of its success by task and draws ``success.png`` anew from its files.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import sys
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+
+from bgpo_trl.plotting import plot_success_curves, save_figure
+from suites import nico
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Sums up the directories of runs."""
+
+    runs: tyro.conf.Positional[tuple[Path, ...]]
+    """Directories with ``config.json``, ``eval.csv`` and ``final.csv``."""
+
+
+def read_rows(path: Path) -> list[dict[str, str]]:
+    """Returns the rows of a CSV file.
+
+    Raises:
+        ValueError: If there is no such file.
+    """
+    try:
+        with path.open(newline="") as file:
+            return list(csv.DictReader(file))
+    except FileNotFoundError:
+        raise ValueError(f"{path} is missing: let the run in {path.parent} finish") from None
+
+
+def summarize(path: Path) -> dict[str, float]:
+    """Returns success over the last 10 % of training, by task and overall, and episodes to 80 %.
+
+    Args:
+        path: An ``eval.csv`` with test episodes of every task.
+
+    Returns:
+        By task; ``overall``, the mean over tasks; and ``episodes to 80 %``, the first evaluation at
+        which the mean over seeds and all presented tasks is that high; NaN if none is.
+    """
+    rows = read_rows(path)
+    last = max(int(row["episode"]) for row in rows)
+    late, curve = defaultdict(list), defaultdict(list)
+    for row in rows:
+        curve[int(row["episode"])].append(float(row["success"]))
+        if int(row["episode"]) > 0.9 * last:
+            late[row["task"]].append(float(row["success"]))
+    table = {task: float(np.mean(late[task])) for task in nico.ALL_TASKS}
+    table["overall"] = sum(table.values()) / len(table)
+    reached = (episode for episode, success in sorted(curve.items()) if np.mean(success) >= 0.8)
+    table["episodes to 80 %"] = next(reached, float("nan"))
+    return table
+
+
+def best(path: Path) -> dict[str, float]:
+    """Returns, by task, the highest success over any 10 % of training, in the mean over seeds.
+
+    Args:
+        path: An ``eval.csv``.
+    """
+    rows = read_rows(path)
+    window = max(int(row["episode"]) for row in rows) / 10
+    found = {}
+    for task in nico.ALL_TASKS:
+        tests = [(int(r["episode"]), float(r["success"])) for r in rows if r["task"] == task]
+        episode, success = np.array(tests).T
+        ends = [end for end in np.unique(episode) if end >= episode.min() + window - 1]
+        found[task] = max(
+            success[(episode > end - window) & (episode <= end)].mean() for end in ends or [np.inf]
+        )
+    return found
+
+
+def describe(run: Path) -> str:
+    """Returns the table of a run, in Markdown."""
+    late, highest = summarize(run / "eval.csv"), best(run / "eval.csv")
+    final = read_rows(run / "final.csv")
+
+    def trained(task: str | None, kind: str, column: str) -> float:
+        of_task = [r for r in final if r["task"] == (task or r["task"])]
+        return float(np.mean([float(r[column]) for r in of_task if r["demonstrations"] == kind]))
+
+    lines = [
+        "| task | last 10 % | best 10 % | by seed | trained, seen | trained, held-out | inferred |",
+        "|---|---:|---:|---|---:|---:|---:|",
+    ]
+    by_seed = _late_by_seed(run / "eval.csv")
+    for task in (*nico.ALL_TASKS, None):
+        numbers = [late[task or "overall"], *([highest[task]] if task else [])]
+        cells = [f"{100 * number:.1f}" for number in numbers] + ([] if task else [""])
+        cells.append(" ".join(f"{100 * success:.0f}" for success in by_seed[task]))
+        cells += [f"{100 * trained(task, kind, 'success'):.1f}" for kind in ("seen", "held-out")]
+        cells.append(f"{100 * trained(task, 'held-out', 'task_inference'):.2f}")
+        lines.append(f"| {task or 'all'} | " + " | ".join(cells) + " |")
+    told = json.loads((run / "summary.json").read_text())
+    lines += [
+        "",
+        f"Episodes to 80 %: {late['episodes to 80 %']:.0f}. GWR-B nodes: {told['nodes']}. "
+        f"Commit {told['commit']}: `{told['command']}`.",
+    ]
+    return "\n".join(lines)
+
+
+def _late_by_seed(path: Path) -> dict[str | None, list[float]]:
+    rows = read_rows(path)
+    last = max(int(row["episode"]) for row in rows)
+    late = [row for row in rows if int(row["episode"]) > 0.9 * last]
+    seeds = sorted({int(row["seed"]) for row in rows})
+    found: dict[str | None, list[float]] = {}
+    for task in nico.ALL_TASKS:
+        found[task] = [
+            float(np.mean([float(r["success"]) for r in late if (r["seed"], r["task"]) == key]))
+            for key in ((str(seed), task) for seed in seeds)
+        ]
+    found[None] = np.mean(list(found.values()), 0).tolist()
+    return found
+
+
+def main(arguments: Arguments) -> None:
+    """Prints the tables and draws the figures."""
+    if not arguments.runs:
+        raise ValueError("name the directory of a run")
+    for run in arguments.runs:
+        print(f"{run}\n\n{describe(run)}\n")
+        starts = json.loads((run / "config.json").read_text())["task_starts"]
+        presented = dict(zip(nico.ALL_TASKS, starts, strict=True))
+        save_figure(plot_success_curves(run / "eval.csv", presented=presented), run / "success.png")
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Annotated[Arguments, tyro.conf.OmitArgPrefixes], description=__doc__))
+    except (ValueError, OSError) as error:
+        sys.exit(f"error: {error}")
