@@ -91,6 +91,7 @@ def run_experiment(arguments: Arguments, name: str, config: RunConfig) -> None:
     Raises:
         ValueError: If the directory holds another run.
     """
+    commit = _commit()  # of the code that runs, whatever is committed meanwhile
     torch.set_num_threads(arguments.threads)
     device = choose_device(arguments.device)
     out = arguments.out or Path("runs") / f"{name}-{arguments.preset}"
@@ -119,7 +120,7 @@ def run_experiment(arguments: Arguments, name: str, config: RunConfig) -> None:
         wandb=arguments.wandb,
     )
     trainer.run()
-    measure(trainer, bank, out)
+    measure(trainer, bank, out, commit)
 
     random_success = evaluate_random_policy(n_tasks=3, episodes=100)
     figure = plot_success_curves(
@@ -140,13 +141,16 @@ def run_experiment(arguments: Arguments, name: str, config: RunConfig) -> None:
     print(f"curve and figures: {out}; in numbers: python benchmarks/summary.py {out}")
 
 
-def measure(trainer: Trainer, bank: DemonstrationBank, out: Path, episodes: int = 20) -> None:
+def measure(
+    trainer: Trainer, bank: DemonstrationBank, out: Path, commit: str, episodes: int = 20
+) -> None:
     """Tests the trained policies with seen and with held-out demonstrations.
 
     Args:
         trainer: At the end of its run.
         bank: Demonstrations of both kinds.
         out: Where ``final.csv`` and ``summary.json`` go.
+        commit: Of the code that ran.
         episodes: Test episodes of each seed, task and kind.
     """
     algorithm, config, seen = trainer.algorithm, trainer.config, bank.seen()
@@ -177,7 +181,7 @@ def measure(trainer: Trainer, bank: DemonstrationBank, out: Path, episodes: int 
         writer.writerow(FINAL_COLUMNS)
         writer.writerows(rows)
     summary = {
-        "commit": _commit(),
+        "commit": commit,
         "command": shlex.join(["python", *sys.argv]),
         "nodes": gwr.num_nodes.tolist(),
     }

@@ -5,13 +5,16 @@
 All three tasks at once (the paper's concurrent setting). Rung (a) sees ground-truth state and the
 task's label; (b) latents and the label; (c) latents and the demonstration's embedding phi; (d) is
 BGPO: latents and the behavior b of GWR-B. A drop from one rung to the next names the part that is
-short: encoder, sequence encoder, self-organization.
+short: encoder, sequence encoder, self-organization. What the learner itself gains by a setting is
+seen on one rung:
+
+    python benchmarks/ladder.py --rungs a --ddpg.hidden-sizes 64 --out runs/ladder-64
 """
 
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -19,7 +22,7 @@ import torch
 import tyro
 from summary import summarize
 
-from bgpo_trl.configs import PRESETS, BGPOConfig
+from bgpo_trl.configs import PRESETS, BGPOConfig, DDPGConfig
 from bgpo_trl.machine import choose_device
 from bgpo_trl.plotting import plot_success_curves, save_figure
 from bgpo_trl.pretrained import load_pretrained
@@ -47,6 +50,8 @@ class Arguments:
     """Seeds, run as one batch."""
     out: Path = Path("runs/ladder")
     """One run directory a rung goes in here."""
+    ddpg: DDPGConfig = field(default_factory=DDPGConfig)
+    """The learner."""
     resume: bool = False
     """Continue interrupted rungs; finished ones are only read."""
     device: str = "auto"
@@ -73,7 +78,7 @@ def main(arguments: Arguments) -> None:
     for rung in arguments.rungs:
         _, bgpo = RUNGS[rung]
         out = arguments.out / rung
-        config = replace(base, bgpo=bgpo)
+        config = replace(base, bgpo=replace(bgpo, ddpg=arguments.ddpg))
         Trainer(
             config, out, bank=bank, encoders=encoders, device=device, resume=arguments.resume
         ).run()

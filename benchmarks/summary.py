@@ -81,7 +81,8 @@ def best(path: Path) -> dict[str, float]:
         episode, success = np.array(tests).T
         ends = [end for end in np.unique(episode) if end >= episode.min() + window - 1]
         found[task] = max(
-            success[(episode > end - window) & (episode <= end)].mean() for end in ends or [np.inf]
+            float(success[(episode > end - window) & (episode <= end)].mean())
+            for end in ends or [episode.max()]
         )
     return found
 

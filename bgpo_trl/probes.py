@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import matplotlib.image
@@ -92,7 +93,9 @@ def probe(
             encode_frames(vae, part.get("pixels"), part.get("length"))
             for part in (played, played_held_out)
         ]
-        errors = _probe_state(latents[0], played, latents[1], played_held_out)
+        errors = _probe_state(
+            latents[0], played, latents[1], played_held_out, only=_objects_on_table
+        )
         result |= {f"play_{name}": error for name, error in errors.items()}
     if folder is not None:
         folder = Path(folder)
@@ -195,12 +198,18 @@ def reconstruction_picture(vae: VAE, demonstrations: TensorDictBase, columns: in
 
 
 def _probe_state(
-    latent: Tensor, train: TensorDictBase, latent_held_out: Tensor, held_out: TensorDictBase
+    latent: Tensor,
+    train: TensorDictBase,
+    latent_held_out: Tensor,
+    held_out: TensorDictBase,
+    only: Callable[[Tensor], Tensor] | None = None,
 ) -> dict[str, float]:
     valid, valid_held_out = (
-        valid_steps(part.get("length"), latent.shape[1]) & _on_table(part.get("state"))
-        for part in (train, held_out)
+        valid_steps(part.get("length"), latent.shape[1]) for part in (train, held_out)
     )
+    if only is not None:
+        valid = valid & only(train.get("state"))
+        valid_held_out = valid_held_out & only(held_out.get("state"))
     state = held_out.get("state")[valid_held_out]
     error = (
         ridge_predict(latent[valid], train.get("state")[valid], latent_held_out[valid_held_out])
@@ -217,7 +226,7 @@ def _probe_state(
     }
 
 
-def _on_table(state: Tensor) -> Tensor:
+def _objects_on_table(state: Tensor) -> Tensor:
     """Returns where all objects are higher than 0.6 m, bool, of state ``[..., 16]``."""
     return (state[..., _FIRST_OBJECT + 2 :: 3] > 0.6).all(-1)
 

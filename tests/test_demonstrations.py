@@ -93,6 +93,30 @@ def test_tasks_and_held_out_ones_are_marked(recorded):
     assert dataset["seed"].tolist() == [0] * 9
 
 
+def test_play_follows_a_demonstration_and_then_moves_at_random(tmp_path):
+    options = {"per_task": 6, "held_out_per_task": 1, "progress": False}
+    play = record_demonstrations(tmp_path / "play", play=True, **options)
+
+    whole = play["length"] == 51
+    assert whole.float().mean() > 0.8  # chance success ends the rest
+    assert len(play["state"][:, 0].unique(dim=0)) == 18
+    action = play["action"][whole]
+    early, late = action[:, :2].std(), action[:, -15:].std()
+    assert late > 0.25  # a demonstrator moves by less
+    assert early < late
+    reach = play["state"][whole][:, :, 4:7]
+    assert (reach[:, -1] - reach[:, 0]).norm(dim=-1).mean() > 0.1
+    # Nothing of it passes as demonstrations, and the other way round.
+    for wrong in (False, True):
+        with pytest.raises(ValueError, match="holds another recording"):
+            record_demonstrations(
+                tmp_path / "play", play=wrong, **(options | {"per_task": 6 + wrong})
+            )
+    again = record_demonstrations(tmp_path / "again", play=True, **options)
+    for key in KEYS:
+        assert again[key].equal(play[key])
+
+
 def test_demonstrations_differ_from_each_other_and_between_seeds(recorded, tmp_path):
     starts = load_demonstrations(recorded)["state"][:, 0]
     other = record_demonstrations(

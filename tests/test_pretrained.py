@@ -72,7 +72,10 @@ def test_the_same_command_finds_all_of_it_made(made, folder, monkeypatch):
     def refuse(*arguments):
         raise AssertionError("recorded again")
 
-    monkeypatch.setattr("bgpo_trl.demonstrations._demonstrate", refuse)
+    for name in ("_demonstrate", "_play"):
+        monkeypatch.setattr(f"bgpo_trl.demonstrations.{name}", refuse)
+    play = load_demonstrations(folder / "demonstrations-play")
+    assert (len(play), int((~play["train"]).sum())) == (6, 3)
     encoders, bank = make_pretrained(
         folder / "encoders" / "some.safetensors",
         folder / "demonstrations",

@@ -107,3 +107,25 @@ def test_frames_beyond_the_length_do_not_count(untrained: Representation) -> Non
     data["state"][beyond] = 1e6
     data["action"][beyond[:, 1:]] = 1e6
     assert probe(untrained, data) == pytest.approx(expected)
+
+
+def test_play_is_measured_where_all_objects_are_on_the_table(untrained: Representation) -> None:
+    play = demonstrations(9)
+    play["state"][..., 7:] = 0.7
+    play["state"][:, 1, 15] = 0.1  # the white box has just fallen
+    play["state"][:, 1, 0] = 1e6
+    result = probe(untrained, demonstrations(), play=play)
+    assert result.items() >= probe(untrained, demonstrations()).items()
+    assert 0.01 < result["play_joint_yaw_rmse_rad"] < 10
+    assert result["play_white_error_cm"] == pytest.approx(0, abs=1e-2)
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.25])
+def test_distances_are_those_of_the_scaled_embedding(scale: float) -> None:
+    torch.manual_seed(0)
+    representation = Representation(VAE(), SequenceAutoencoder(embedding_scale=scale), {})
+    torch.manual_seed(0)
+    plain = Representation(VAE(), SequenceAutoencoder(), {})
+    ours, theirs = (probe(r, demonstrations()) for r in (representation, plain))
+    name = "phi_distance_other_task"
+    assert ours[name] == pytest.approx(scale * theirs[name])

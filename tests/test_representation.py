@@ -18,9 +18,11 @@ from bgpo_trl.representation import (
     embed_demonstrations,
     encode_frames,
     load_representation,
+    mean_frame,
     save_representation,
     split,
     train_representation,
+    valid_frames,
 )
 from bgpo_trl.train_encoders import train_encoders
 from suites import nico
@@ -225,15 +227,34 @@ def test_log_has_the_losses_of_both_stages(tmp_path: Path) -> None:
     assert rows[0]["loss_kl"] == pytest.approx(TINY.vae.kl_weight * rows[0]["kl"])
 
 
-def test_command_writes_weights_log_and_probes(tiny: Representation, tmp_path: Path) -> None:
+def test_frame_encoder_sees_the_training_part_of_play_besides_the_demonstrations(
+    tiny: Representation,
+) -> None:
+    def train(play: TensorDict) -> Representation:
+        return train_representation(
+            squares(8), TINY, play=play, scene_version="squares", progress=False
+        )
+
+    play = squares(10)
+    trained, held_out_changed = train(play), play.clone()
+    assert not trained.vae.mean_frame.equal(tiny.vae.mean_frame)
+    together = torch.cat([valid_frames(d[d["train"]]) for d in (squares(8), play)])
+    torch.testing.assert_close(trained.vae.mean_frame, mean_frame(together))
+    held_out_changed["pixels"][~play["train"]] = 0
+    assert same(trained, train(held_out_changed))
+
+
+def test_command_writes_weights_log_and_probes(tmp_path: Path) -> None:
     folder, weights = tmp_path / "run", tmp_path / "weights.safetensors"
-    train_encoders(squares(8), weights, folder, TINY, "make weights")
+    play = squares(10)
+    play["state"][..., 7:] = 1.0  # on the table
+    trained, _ = train_encoders(squares(8), play, weights, folder, TINY, "make weights")
     loaded = load_representation(weights, scene_version=nico.scene_version())
-    assert same(tiny, loaded)
+    assert same(trained, loaded)
     assert loaded.metadata["command"] == "make weights"
     rows = list(csv.DictReader((folder / "train.csv").open()))
     assert [row["stage"] for row in rows] == ["vae", "vae", "lae", "lae"]
-    assert json.loads((folder / "probes.json").read_text()) == probe(loaded, squares(8))
+    assert json.loads((folder / "probes.json").read_text()) == probe(loaded, squares(8), play=play)
     assert (folder / "reconstructions.png").exists()
 
 

@@ -13,12 +13,13 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import experiment
 import pytest
 import torch
 
-from benchmarks import continual, ladder
+from benchmarks import concurrent, continual, ladder, summary
 from bgpo_trl.checkpoint import load_checkpoint
-from bgpo_trl.configs import PRESETS
+from bgpo_trl.configs import PRESETS, DDPGConfig
 from bgpo_trl.logging import EVAL_COLUMNS
 from suites import nico
 
@@ -35,19 +36,19 @@ def files(folder):
 def tiny(monkeypatch, encoders, bank, make_config):
     """The benchmarks with untrained encoders, and runs of a second."""
     config = make_config(episodes=6)
-    for module in (continual, ladder):
+    for module in (experiment, ladder):
         monkeypatch.setattr(module, "load_pretrained", lambda: (encoders, bank))
         monkeypatch.setattr(module, "PRESETS", {"quick": config, "desk": config})
     for rung, (name, bgpo) in ladder.RUNGS.items():
-        small = replace(bgpo, max_steps=6, ddpg=config.bgpo.ddpg)
+        small = replace(bgpo, max_steps=6)
         monkeypatch.setitem(ladder.RUNGS, rung, (name, small))
     chance = torch.tensor([0.1, 0.2, 0.3])
-    monkeypatch.setattr(continual, "evaluate_random_policy", lambda **kwargs: chance)
+    monkeypatch.setattr(experiment, "evaluate_random_policy", lambda **kwargs: chance)
 
 
 def test_a_preset_is_taken_as_it_is():
     for name, preset in PRESETS.items():
-        assert continual.run_config(continual.Arguments(preset=name)) == preset
+        assert experiment.run_config(experiment.Arguments(preset=name)) == preset
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -66,7 +67,7 @@ def test_tasks_of_every_preset_start_when_the_paper_has_them_start(preset):
     ],
 )
 def test_another_length_keeps_the_proportions(preset, episodes, starts, eval_every):
-    config = continual.run_config(continual.Arguments(preset=preset, episodes=episodes))
+    config = experiment.run_config(experiment.Arguments(preset=preset, episodes=episodes))
     assert (config.episodes, config.task_starts) == (episodes, starts)
     assert config.eval_every == eval_every
     assert config == replace(
@@ -75,7 +76,7 @@ def test_another_length_keeps_the_proportions(preset, episodes, starts, eval_eve
 
 
 def test_other_seeds_change_nothing_else():
-    config = continual.run_config(continual.Arguments(preset="desk", seeds=(7, 9)))
+    config = experiment.run_config(experiment.Arguments(preset="desk", seeds=(7, 9)))
     assert config == replace(PRESETS["desk"], seeds=(7, 9))
 
 
@@ -84,11 +85,11 @@ def test_other_seeds_change_nothing_else():
 )
 def test_lengths_and_seeds_that_cannot_be_are_refused(arguments):
     with pytest.raises(ValueError, match=r"must be at least 1|needs seeds"):
-        continual.run_config(continual.Arguments(**arguments))
+        experiment.run_config(experiment.Arguments(**arguments))
 
 
 def test_continual_leaves_curve_and_figures(tiny, tmp_path, capsys):
-    continual.main(continual.Arguments(out=tmp_path / "run"))
+    continual.main(experiment.Arguments(out=tmp_path / "run"))
     run_directory = tmp_path / "run"
     for name in ("success.png", "gwr.png"):
         assert (run_directory / "figures" / name).read_bytes().startswith(b"\x89PNG")
@@ -99,14 +100,82 @@ def test_continual_leaves_curve_and_figures(tiny, tmp_path, capsys):
 
     before = files(run_directory)
     with pytest.raises(ValueError, match="holds a run: --resume continues it, --out names another"):
-        continual.main(continual.Arguments(out=run_directory))
-    continual.main(continual.Arguments(out=run_directory, resume=True))
+        continual.main(experiment.Arguments(out=run_directory))
+    continual.main(experiment.Arguments(out=run_directory, resume=True))
     assert files(run_directory) == before
     assert capsys.readouterr().out == printed
 
 
+def test_concurrent_presents_all_tasks_from_the_start(tiny, tmp_path, capsys):
+    run = tmp_path / "run"
+    concurrent.main(experiment.Arguments(out=run))
+    assert json.loads((run / "config.json").read_text())["task_starts"] == [0, 0, 0]
+    assert {row["task"] for row in summary.read_rows(run / "eval.csv")} == set(TASKS)
+
+    rows = summary.read_rows(run / "final.csv")
+    assert sorted((int(r["seed"]), r["demonstrations"], r["task"]) for r in rows) == sorted(
+        (seed, kind, task) for seed in (3, 8) for kind in ("seen", "held-out") for task in TASKS
+    )
+    for row in rows:
+        assert row["episodes"] == "20"
+        assert (20 * float(row["success"])) % 1 == 0
+        assert 0 <= float(row["task_inference"]) <= 1
+    told = json.loads((run / "summary.json").read_text())
+    assert re.fullmatch(r"|[0-9a-f]{7,}(-dirty)?", told["commit"])
+    assert len(told["nodes"]) == 2
+
+    capsys.readouterr()
+    summary.main(summary.Arguments((run,)))
+    printed = capsys.readouterr().out
+    late = summary.summarize(run / "eval.csv")
+    for task in TASKS:
+        assert f"| {task} | {100 * late[task]:.1f} |" in printed
+    assert (run / "success.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("script", ["concurrent.py", "continual.py"])
+def test_scripts_find_the_standard_library_beside_concurrent(tmp_path, script):
+    code = (
+        "import sys, runpy; sys.path.insert(0, sys.argv[1]); "
+        "from concurrent.futures import ThreadPoolExecutor; import concurrent; "
+        "assert concurrent.__file__.startswith(sys.argv[1]); "
+        "assert ThreadPoolExecutor(1).submit(int, '7').result() == 7"
+    )
+    folder = str(ROOT / "benchmarks")
+    subprocess.run([sys.executable, "-S", "-c", code, folder], check=True, cwd=tmp_path)
+    told = subprocess.run(
+        [sys.executable, str(ROOT / "benchmarks" / script), "--help"],
+        check=True,
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+    ).stdout
+    assert "--preset" in told
+
+
+def test_the_best_part_of_a_run_is_the_best_mean_over_a_tenth(tmp_path):
+    def outcomes(success):
+        return [success], [success], [success]
+
+    successes = {100 * (i + 1): outcomes(float(8 <= i < 12)) for i in range(40)}
+    write_tests(tmp_path / "eval.csv", successes)  # a tenth is 400 episodes, four tests
+    assert set(summary.best(tmp_path / "eval.csv").values()) == {1.0}
+    successes = {100 * (i + 1): outcomes(float(8 <= i < 10)) for i in range(40)}
+    write_tests(tmp_path / "eval.csv", successes)
+    assert set(summary.best(tmp_path / "eval.csv").values()) == {0.5}
+
+
+def test_a_run_that_is_not_finished_cannot_be_summed_up(tmp_path):
+    write_tests(tmp_path / "eval.csv", {100: ([1], [1], [0])})
+    with pytest.raises(ValueError, match=r"final\.csv is missing: let the run in .* finish"):
+        summary.main(summary.Arguments((tmp_path,)))
+    with pytest.raises(ValueError, match="name the directory of a run"):
+        summary.main(summary.Arguments(()))
+
+
 def test_the_ladder_has_a_row_and_a_run_for_each_rung(tiny, tmp_path, capsys):
-    arguments = ladder.Arguments(episodes=4, seeds=(1,), out=tmp_path)
+    ddpg = DDPGConfig(hidden_sizes=(7,), batch_size=16, warmup_steps=8, replay_size=200)
+    arguments = ladder.Arguments(episodes=4, seeds=(1,), out=tmp_path, ddpg=ddpg)
     ladder.main(arguments)
     printed = capsys.readouterr().out
     lines = printed.splitlines()
@@ -117,6 +186,7 @@ def test_the_ladder_has_a_row_and_a_run_for_each_rung(tiny, tmp_path, capsys):
         config = json.loads((tmp_path / rung / "config.json").read_text())
         seen[rung] = (config["bgpo"]["state"], config["bgpo"]["context"])
         assert (config["task_starts"], config["eval_every"]) == ([0, 0, 0], 4)
+        assert config["bgpo"]["ddpg"]["hidden_sizes"] == [7]
         assert (tmp_path / rung / "figures" / "success.png").exists()
     assert seen == {
         "a": ("state", "task_one_hot"),
@@ -155,7 +225,7 @@ def test_a_rung_is_summed_up_by_the_last_tenth_and_the_first_80_percent(tmp_path
             2_000: ([1, 0], [0, 0], [0, 0]),
         },
     )
-    assert ladder.summarize(tmp_path / "eval.csv") == pytest.approx(
+    assert summary.summarize(tmp_path / "eval.csv") == pytest.approx(
         {
             "grasp_glass": 3 / 4,
             "push_green_to_glass": 1 / 4,
@@ -168,7 +238,7 @@ def test_a_rung_is_summed_up_by_the_last_tenth_and_the_first_80_percent(tmp_path
 
 def test_a_rung_that_never_gets_there(tmp_path):
     write_tests(tmp_path / "eval.csv", {100: ([1], [1], [0])})
-    table = ladder.summarize(tmp_path / "eval.csv")
+    table = summary.summarize(tmp_path / "eval.csv")
     assert math.isnan(table.pop("episodes to 80 %"))
     assert table["overall"] == pytest.approx(2 / 3)
 
