@@ -174,7 +174,7 @@ def measure(
             of_task = tested.of_task(task)
             accuracy = task_inference_accuracy(gwr, seen, of_task, len(nico.ALL_TASKS))
             for index, seed in enumerate(config.seeds):
-                share = success[index, task].float().mean().item()
+                share = round(success[index, task].float().mean().item(), 4)
                 rows.append((seed, kind, name, episodes, share, round(accuracy[index].item(), 4)))
     with (out / "final.csv").open("w", newline="") as file:
         writer = csv.writer(file)

@@ -1,5 +1,7 @@
 """What the representation is worth: linear probes and distances, all on held-out demonstrations.
 
+    python -m bgpo_trl.probes data/nico data/nico-play
+
 A policy sees nothing but latents and behaviors, so what cannot be read from them here cannot be
 learned later. Every probe is fitted on training demonstrations and measured on held-out ones.
 The ground-truth ``state`` is read here and nowhere else in stage 1.
@@ -9,25 +11,32 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import matplotlib.image
 import torch
+import tyro
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from bgpo_trl.demonstrations import load_demonstrations
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
 from bgpo_trl.objectives.representation import SequenceReconstructionLoss
 from bgpo_trl.representation import (
     Representation,
+    default_weights,
     encode_frames,
+    load_representation,
     mean_frame,
     split,
     valid_frames,
     valid_steps,
 )
+from suites import nico
 
 JOINTS = ("yaw", "pitch", "elbow", "hand")
 OBJECTS = ("glass", "green", "white")
@@ -277,3 +286,31 @@ def _mean(values: Tensor) -> float:
 def _median(values: Tensor) -> float:
     values = values[values.isfinite()]
     return values.median().item() if values.numel() else math.nan
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Measures trained encoders."""
+
+    dataset: tyro.conf.Positional[Path]
+    """Folder of the recorded demonstrations."""
+    play: tyro.conf.Positional[Path | None] = None
+    """Folder of recorded play."""
+    weights: Path = field(default_factory=default_weights)
+    """The encoders; by default those that come with the package."""
+    out: Path = Path("runs/probes")
+    """Where ``probes.json`` and ``reconstructions.png`` go."""
+
+
+def main(arguments: Arguments) -> None:
+    """Runs the command line; see ``--help``."""
+    representation = load_representation(arguments.weights, scene_version=nico.scene_version())
+    play = None if arguments.play is None else load_demonstrations(arguments.play)
+    probe(representation, load_demonstrations(arguments.dataset), arguments.out, play=play)
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Arguments, description=Arguments.__doc__))
+    except (ValueError, OSError) as error:
+        sys.exit(f"error: {error}")

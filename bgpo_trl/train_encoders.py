@@ -44,8 +44,8 @@ class Arguments:
 
     dataset: tyro.conf.Positional[Path]
     """Folder of the recorded demonstrations."""
-    play: tyro.conf.Positional[Path]
-    """Folder of the recorded play."""
+    play: tyro.conf.Positional[Path | None] = None
+    """Folder of recorded play. Without it, the frame encoder sees demonstrations only."""
     weights: Path = field(default_factory=default_weights)
     """The file to write; by default the weights that come with the package."""
     folder: Path = Path("runs/encoders")
@@ -63,7 +63,7 @@ def bank_path(weights: Path) -> Path:
 
 def train_encoders(
     dataset: TensorDictBase,
-    play: TensorDictBase,
+    play: TensorDictBase | None,
     weights: Path,
     folder: Path,
     config: RepresentationConfig,
@@ -74,7 +74,7 @@ def train_encoders(
 
     Args:
         dataset: demonstrations as in :mod:`bgpo_trl.representation`, with ``state`` and ``task``.
-        play: recorded play, in the same form.
+        play: recorded play, in the same form, or None.
         weights: the safetensors file to write; the bank goes beside it, see `bank_path`.
         folder: receives ``train.csv``, ``checkpoint/``, ``probes.json``, ``reconstructions.png``.
         config: hyperparameters.
@@ -112,7 +112,8 @@ def train_encoders(
 
 def main(arguments: Arguments) -> None:
     """Runs the command line; see ``--help``."""
-    dataset, play = load_demonstrations(arguments.dataset), load_demonstrations(arguments.play)
+    dataset = load_demonstrations(arguments.dataset)
+    play = None if arguments.play is None else load_demonstrations(arguments.play)
     command = shlex.join(["python", "-m", "bgpo_trl.train_encoders", *sys.argv[1:]])
     train_encoders(
         dataset,

@@ -98,7 +98,7 @@ def test_play_follows_a_demonstration_and_then_moves_at_random(tmp_path):
     play = record_demonstrations(tmp_path / "play", play=True, **options)
 
     whole = play["length"] == 51
-    assert whole.float().mean() > 0.8  # chance success ends the rest
+    assert whole.float().mean() > 0.5  # the rest have come far enough to succeed
     assert len(play["state"][:, 0].unique(dim=0)) == 18
     action = play["action"][whole]
     early, late = action[:, :2].std(), action[:, -15:].std()

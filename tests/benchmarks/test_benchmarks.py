@@ -118,7 +118,7 @@ def test_concurrent_presents_all_tasks_from_the_start(tiny, tmp_path, capsys):
     )
     for row in rows:
         assert row["episodes"] == "20"
-        assert (20 * float(row["success"])) % 1 == 0
+        assert 20 * float(row["success"]) in range(21)
         assert 0 <= float(row["task_inference"]) <= 1
     told = json.loads((run / "summary.json").read_text())
     assert re.fullmatch(r"|[0-9a-f]{7,}(-dirty)?", told["commit"])
