@@ -89,6 +89,12 @@ class DDPGConfig:
     """Share of the weights that the target networks take over each update. Ours."""
     noise: float = 0.3
     """Standard deviation of the Gaussian exploration noise on the action. Ours."""
+    exploratory_share: float = 0.5
+    """Share of episodes that act by noise alone where the critic expects nothing. Ours: a policy
+    that has learned one task well hardly ever meets the reward of the next one."""
+    promising_value: float = 0.25
+    """Value of an episode's start from which on none is exploratory; in between, the share falls
+    linearly. Ours: success after 27 steps at gamma 0.95."""
     pre_tanh_penalty: float = 0.01
     """Weight of the squared pre-tanh actions. Ours: without it all actions saturate."""
     clip_targets: bool = True

@@ -88,6 +88,7 @@ class BGPO:
         env: The composition of transforms.
         gwr: GWR-B, or None in the variants without it.
         actor: The policy, ``[S]`` stacked.
+        critic: The Q-function, ``[S]`` stacked.
     """
 
     name = "bgpo"
@@ -168,18 +169,18 @@ class BGPO:
             "batch_size": [len(seeds)],
         }
         self.actor = Actor(in_features, generator=generators(seeds, "actor"), **network)
-        critic = Critic(
+        self.critic = Critic(
             in_features,
             layer_norm=ddpg.critic_layer_norm,
             generator=generators(seeds, "critic"),
             **network,
         )
         self.actor.to(self.device)
-        critic.to(self.device)
+        self.critic.to(self.device)
         highest = 1.0 + (0.0 if keys[1] == "task_one_hot" else self.config.beta)
         self.loss = DDPGLoss(
             self.actor,
-            critic,
+            self.critic,
             return_bounds=(0.0, highest) if ddpg.clip_targets else None,
             pre_tanh_penalty=ddpg.pre_tanh_penalty,
             constant_keys=[keys[1]],
@@ -200,18 +201,35 @@ class BGPO:
             ],
         )
         self._noise = generators(seeds, "exploration")
+        self._exploratory = torch.zeros(len(seeds), dtype=torch.bool)
 
     def _moved(self, batch: TensorDictBase) -> TensorDictBase:
         return batch if self.device == torch.device("cpu") else batch.to(self.device)
 
     @torch.no_grad()
     def act(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the ``action`` ``[S, 4]`` of the policy with exploration noise."""
-        inputs = tensordict.select(*self.in_keys)
-        action = self.actor(self._moved(inputs))["action"].cpu()
+        """Writes the ``action`` ``[S, 4]`` of the policy with exploration noise.
+
+        An exploratory episode consists of the noise alone. At each start of an episode it is drawn
+        whether it is one, with a chance that falls as the critic expects more of the policy there.
+        """
+        chosen = self.actor(self._moved(tensordict.select(*self.in_keys)))
+        starting = tensordict["step_count"].squeeze(-1) == 0
+        if starting.any():
+            self._draw_exploratory(starting, chosen)
+        action = chosen["action"].cpu()
+        action = torch.where(self._exploratory.unsqueeze(-1), 0.0, action)
         noise = [torch.randn(action.shape[-1:], generator=g) for g in self._noise]
         action = action + self.config.ddpg.noise * torch.stack(noise)
         return tensordict.set("action", action.clamp(-1.0, 1.0))
+
+    def _draw_exploratory(self, starting: Tensor, chosen: TensorDictBase) -> None:
+        ddpg = self.config.ddpg
+        value = self.critic(chosen)["state_action_value"].squeeze(-1).cpu()
+        chance = ddpg.exploratory_share * (1 - value / ddpg.promising_value).clamp(0.0, 1.0)
+        for index in starting.nonzero().flatten().tolist():
+            drawn = torch.rand((), generator=self._noise[index])
+            self._exploratory[index] = drawn < chance[index]
 
     def store(self, transition: TensorDictBase) -> None:
         """Keeps a transition of each seed for updates to come."""
@@ -262,6 +280,7 @@ class BGPO:
             "gwr": None if self.gwr is None else dict(self.gwr.state_dict()),
             "simulation": self.simulation.simulation_state(),
             "noise": [generator.get_state() for generator in self._noise],
+            "exploratory": self._exploratory.clone(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -273,5 +292,6 @@ class BGPO:
         if self.gwr is not None:
             self.gwr.load_state_dict(state["gwr"])
         self.simulation.load_simulation_state(state["simulation"])
+        self._exploratory.copy_(state["exploratory"])
         for generator, saved in zip(self._noise, state["noise"], strict=True):
             generator.set_state(saved)
