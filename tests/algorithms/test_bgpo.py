@@ -1,6 +1,7 @@
 """BGPO as a whole: what it sees, what it learns from, and that seeds share nothing."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import pytest
 import torch
@@ -168,18 +169,55 @@ def test_episodes_follow_algorithm_1(make, bank, encoders):
         assert len(gwr.graph().weights) > 2
 
 
-def test_exploration_is_noise_of_each_seed_on_the_policy(make):
-    algorithm = make()
+def expect(algorithm, value):
+    """Has the critic expect the same of whatever is done."""
+    with torch.no_grad():
+        algorithm.critic.mlp.layers[-1].weight.zero_()
+        algorithm.critic.mlp.layers[-1].bias.fill_(value)
+
+
+@pytest.mark.parametrize(("value", "policy"), [(0.0, 0.0), (-1.0, 0.0), (0.25, 1.0), (0.9, 1.0)])
+def test_exploration_is_noise_of_each_seed_on_the_policy_or_alone(make, value, policy):
+    config = make().config
+    algorithm = make(ddpg=replace(config.ddpg, exploratory_share=1.0))
+    expect(algorithm, value)
     state = algorithm.env.reset()
     action = algorithm.actor(state.clone())["action"]
-    sigma = algorithm.config.ddpg.noise
     explored = algorithm.act(state)["action"]
     for index, source in enumerate(generators((3, 8), "exploration")):
-        expected = (action[index] + sigma * torch.randn(4, generator=source)).clamp(-1, 1)
-        torch.testing.assert_close(explored[index], expected)
+        torch.rand((), generator=source)
+        noise = config.ddpg.noise * torch.randn(4, generator=source)
+        torch.testing.assert_close(explored[index], (policy * action[index] + noise).clamp(-1, 1))
     with torch.no_grad():
         algorithm.actor.mlp.layers[-1].bias.fill_(9)
-    assert algorithm.act(algorithm.env.reset())["action"].max() == 1
+    assert (algorithm.act(algorithm.env.reset())["action"].max() == 1) == bool(policy)
+
+
+@pytest.mark.parametrize(("value", "share"), [(0.0, 0.5), (0.125, 0.25), (0.3, 0.0)])
+def test_the_less_is_expected_the_more_episodes_explore(make, value, share):
+    algorithm = make()
+    expect(algorithm, value)
+    with torch.no_grad():
+        algorithm.actor.mlp.layers[-1].bias.fill_(9)  # tells policy from noise
+    start = algorithm.env.reset()
+    drawn = torch.stack([(algorithm.act(start)["action"] < 0.1).any(-1) for _ in range(300)])
+    assert drawn.float().mean().item() == pytest.approx(share, abs=0.07)
+
+
+def test_what_an_episode_does_is_drawn_at_its_start_only(make):
+    algorithm = make(max_steps=50)
+    expect(algorithm, 0.0)
+    with torch.no_grad():
+        algorithm.actor.mlp.layers[-1].bias.fill_(9)
+    data = play(algorithm, 120)
+    by_policy = data["action"].mean(-1) > 0.5  # of four parts around 0.9, or around 0
+    kinds = set()
+    for row in range(2):
+        firsts = (data["step_count"][row, :, 0] == 0).nonzero().flatten().tolist()
+        for first, end in pairwise([*firsts, 120]):
+            assert by_policy[row, first:end].unique().numel() == 1
+            kinds.add(by_policy[row, first].item())
+    assert kinds == {True, False}
 
 
 @pytest.mark.parametrize(
