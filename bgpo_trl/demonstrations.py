@@ -72,8 +72,7 @@ def record_demonstrations(
 
     With ``play`` it records what the robot sees when it plays instead: it follows a demonstration
     for a while, up to 30 steps, then moves at random until the 50 steps are over. A robot that
-    learns by trial and error sees much that no demonstration shows, and a frame encoder that knows
-    nothing else is off by several centimetres there.
+    learns by trial and error sees much that no demonstration shows.
 
     Args:
         path: Folder of the dataset; made if missing.
