@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 import tyro
@@ -200,13 +200,15 @@ def _commit() -> str:
     return told.stdout.strip()
 
 
-def command_line(main: Callable[[Arguments], None], description: str | None) -> None:
-    """Runs an experiment's ``main`` with the arguments of the command line.
+def command_line(
+    main: Callable[[Any], None], description: str | None, arguments: type = Arguments
+) -> None:
+    """Runs ``main`` with the arguments of the command line.
 
     What a person can mend is told in one line.
     """
     try:
-        main(tyro.cli(Annotated[Arguments, tyro.conf.OmitArgPrefixes], description=description))
+        main(tyro.cli(Annotated[arguments, tyro.conf.OmitArgPrefixes], description=description))
     except (ValueError, OSError, RuntimeError) as error:
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:

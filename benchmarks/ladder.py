@@ -13,13 +13,12 @@ seen on one rung:
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import torch
-import tyro
+from experiment import command_line
 from summary import summarize
 
 from bgpo_trl.configs import PRESETS, BGPOConfig, DDPGConfig
@@ -93,9 +92,4 @@ def main(arguments: Arguments) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Annotated[Arguments, tyro.conf.OmitArgPrefixes], description=__doc__))
-    except (ValueError, OSError, RuntimeError) as error:
-        sys.exit(f"error: {error}")
-    except KeyboardInterrupt:
-        sys.exit("interrupted: the same command with --resume continues")
+    command_line(main, __doc__, Arguments)
