@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal
 import torch
 import tyro
 
+from bgpo_trl.algorithms import ALGORITHMS, Algorithm
 from bgpo_trl.configs import PRESETS, STAGE_PRESETS, RunConfig
 from bgpo_trl.demonstrations import DemonstrationBank
 from bgpo_trl.evaluation import Evaluator, evaluate_random_policy
@@ -32,12 +33,14 @@ FINAL_COLUMNS = ("seed", "demonstrations", "task", "episodes", "success", "task_
 
 @dataclass(frozen=True)
 class Arguments:
-    """Trains BGPO and draws its success."""
+    """Trains an algorithm and draws its success."""
 
+    algorithm: Literal["bgpo", "oracle", "ddpg"] = "bgpo"
+    """BGPO; DDPG that is told the task's label (oracle); or DDPG that is told nothing."""
     preset: Literal["smoke", "quick", "desk", "paper"] = "quick"
     """Size of the run: every stage in minutes; learning to look at; five seeds; the paper's."""
     out: Path | None = None
-    """The run's directory; runs/EXPERIMENT-PRESET if not given."""
+    """The run's directory; runs/EXPERIMENT-ALGORITHM-PRESET if not given."""
     seeds: tuple[int, ...] | None = None
     """Other seeds than the preset's."""
     episodes: int | None = None
@@ -61,7 +64,8 @@ def run_config(arguments: Arguments) -> RunConfig:
     Raises:
         ValueError: If there is no such run.
     """
-    config = PRESETS[arguments.preset]
+    algorithm = ALGORITHMS[arguments.algorithm].config
+    config = replace(PRESETS[arguments.preset], name=arguments.algorithm, algorithm=algorithm)
     if arguments.seeds is not None:
         config = replace(config, seeds=arguments.seeds)
     if arguments.episodes is not None:
@@ -76,7 +80,12 @@ def run_config(arguments: Arguments) -> RunConfig:
     return config
 
 
-def run_experiment(arguments: Arguments, name: str, config: RunConfig) -> None:
+def run_experiment(
+    arguments: Arguments,
+    name: str,
+    config: RunConfig,
+    make: Callable[..., Algorithm] | None = None,
+) -> None:
     """Trains to the end, then measures and draws.
 
     The run's directory then holds, besides what `Trainer` writes, ``final.csv`` (success of the
@@ -87,6 +96,7 @@ def run_experiment(arguments: Arguments, name: str, config: RunConfig) -> None:
         arguments: From the command line.
         name: The experiment's, for the run's directory.
         config: The run.
+        make: Makes the algorithm, where ``config.name`` does not say it.
 
     Raises:
         ValueError: If the directory holds another run.
@@ -94,7 +104,7 @@ def run_experiment(arguments: Arguments, name: str, config: RunConfig) -> None:
     commit = _commit()  # of the code that runs, whatever is committed meanwhile
     torch.set_num_threads(arguments.threads)
     device = choose_device(arguments.device)
-    out = arguments.out or Path("runs") / f"{name}-{arguments.preset}"
+    out = arguments.out or Path("runs") / f"{name}-{config.name}-{arguments.preset}"
     if (out / "config.json").exists() and not arguments.resume:
         raise ValueError(f"{out} holds a run: --resume continues it, --out names another directory")
     if arguments.train_encoders or arguments.preset in STAGE_PRESETS:
@@ -115,6 +125,7 @@ def run_experiment(arguments: Arguments, name: str, config: RunConfig) -> None:
         out,
         bank=bank,
         encoders=encoders,
+        make=make,
         device=device,
         resume=arguments.resume,
         wandb=arguments.wandb,
@@ -130,14 +141,14 @@ def run_experiment(arguments: Arguments, name: str, config: RunConfig) -> None:
     )
     save_figure(figure, out / "figures" / "success.png")
     gwr = trainer.algorithm.gwr
-    assert gwr is not None
-    tasks = majority_task(match_counts(gwr, bank.seen(), 3)[0])
-    graph = gwr.graph(0)
-    figure = plot_gwr_pca(graph.weights, tasks[: len(graph.weights)], nico.ALL_TASKS)
-    save_figure(figure, out / "figures" / "gwr.png")
-    accuracy = task_inference_accuracy(gwr, bank.seen(), bank.held_out(), 3)
-    print(f"GWR-B nodes: {gwr.num_nodes.tolist()}")
-    print(f"task inference on held-out demonstrations: {accuracy.mean():.1%}")
+    if gwr is not None:
+        tasks = majority_task(match_counts(gwr, bank.seen(), 3)[0])
+        graph = gwr.graph(0)
+        figure = plot_gwr_pca(graph.weights, tasks[: len(graph.weights)], nico.ALL_TASKS)
+        save_figure(figure, out / "figures" / "gwr.png")
+        accuracy = task_inference_accuracy(gwr, bank.seen(), bank.held_out(), 3)
+        print(f"GWR-B nodes: {gwr.num_nodes.tolist()}")
+        print(f"task inference on held-out demonstrations: {accuracy.mean():.1%}")
     print(f"curve and figures: {out}; in numbers: python benchmarks/summary.py {out}")
 
 
@@ -155,11 +166,10 @@ def measure(
     """
     algorithm, config, seen = trainer.algorithm, trainer.config, bank.seen()
     gwr = algorithm.gwr
-    assert gwr is not None
     rows = []
     for kind, tested in (("seen", seen), ("held-out", bank.held_out())):
         evaluator = Evaluator(
-            config.bgpo,
+            config.algorithm,
             seeds=config.seeds,
             n_tasks=len(nico.ALL_TASKS),
             episodes=episodes,
@@ -169,13 +179,16 @@ def measure(
         snapshots = [
             evaluator.take(algorithm, index, _LAST, 0) for index in range(len(config.seeds))
         ]
-        success = evaluator.run(snapshots, _LAST, algorithm.actor).success
+        success = evaluator.run(snapshots, _LAST, algorithm).success
         for task, name in enumerate(nico.ALL_TASKS):
             of_task = tested.of_task(task)
-            accuracy = task_inference_accuracy(gwr, seen, of_task, len(nico.ALL_TASKS))
+            inferred: list[float | str] = [""] * len(config.seeds)
+            if gwr is not None:
+                accuracy = task_inference_accuracy(gwr, seen, of_task, len(nico.ALL_TASKS))
+                inferred = [round(share, 4) for share in accuracy.tolist()]
             for index, seed in enumerate(config.seeds):
                 share = round(success[index, task].float().mean().item(), 4)
-                rows.append((seed, kind, name, episodes, share, round(accuracy[index].item(), 4)))
+                rows.append((seed, kind, name, episodes, share, inferred[index]))
     with (out / "final.csv").open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(FINAL_COLUMNS)
@@ -183,7 +196,7 @@ def measure(
     summary = {
         "commit": commit,
         "command": shlex.join(["python", *sys.argv]),
-        "nodes": gwr.num_nodes.tolist(),
+        "nodes": None if gwr is None else gwr.num_nodes.tolist(),
     }
     (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
 

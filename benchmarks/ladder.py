@@ -13,14 +13,18 @@ seen on one rung:
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
 import torch
+from ablation import VARIANTS
 from experiment import command_line
 from summary import summarize
 
+from bgpo_trl.algorithms.bgpo import BGPO, Composition, Parts, labeled
 from bgpo_trl.configs import PRESETS, BGPOConfig, DDPGConfig
 from bgpo_trl.machine import choose_device
 from bgpo_trl.plotting import plot_success_curves, save_figure
@@ -29,11 +33,11 @@ from bgpo_trl.training import Trainer
 
 Rung = Literal["a", "b", "c", "d"]
 
-RUNGS: dict[str, tuple[str, BGPOConfig]] = {
-    "a": ("ground truth + label", BGPOConfig(state="state", context="task_one_hot")),
-    "b": ("latent + label", BGPOConfig(context="task_one_hot")),
-    "c": ("latent + phi", BGPOConfig(context="demo_embedding")),
-    "d": ("latent + b (BGPO)", BGPOConfig(context="behavior")),
+RUNGS: dict[str, tuple[str, BGPOConfig, Callable[[Parts], Composition]]] = {
+    "a": ("ground truth + label", BGPOConfig(state="state"), labeled),
+    "b": ("latent + label", BGPOConfig(), labeled),
+    "c": ("latent + phi", BGPOConfig(), VARIANTS["r_int"]),
+    "d": ("latent + b (BGPO)", BGPOConfig(), VARIANTS["gwr+r_int"]),
 }
 
 
@@ -75,11 +79,17 @@ def main(arguments: Arguments) -> None:
     )
     tables = {}
     for rung in arguments.rungs:
-        _, bgpo = RUNGS[rung]
+        _, bgpo, compose = RUNGS[rung]
         out = arguments.out / rung
-        config = replace(base, bgpo=replace(bgpo, ddpg=arguments.ddpg))
+        algorithm = replace(bgpo, ddpg=arguments.ddpg)
         Trainer(
-            config, out, bank=bank, encoders=encoders, device=device, resume=arguments.resume
+            replace(base, name=f"rung {rung}", algorithm=algorithm),
+            out,
+            bank=bank,
+            encoders=encoders,
+            make=partial(BGPO, compose=compose),
+            device=device,
+            resume=arguments.resume,
         ).run()
         save_figure(plot_success_curves(out / "eval.csv"), out / "figures" / "success.png")
         tables[rung] = summarize(out / "eval.csv")

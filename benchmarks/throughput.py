@@ -28,7 +28,7 @@ import tyro
 import updates
 
 from bgpo_trl.algorithms.bgpo import BGPO
-from bgpo_trl.configs import PRESETS
+from bgpo_trl.configs import BGPOConfig
 from bgpo_trl.machine import usable_cores
 from bgpo_trl.pretrained import load_pretrained
 from bgpo_trl.timing import Timing, interleave, ratio
@@ -102,7 +102,7 @@ class Training:
     def __init__(self, seeds: range) -> None:
         encoders, bank = load_pretrained()
         self.algorithm = BGPO(
-            PRESETS["desk"].bgpo,
+            BGPOConfig(),
             seeds=seeds,
             schedule=TaskSchedule((0, 0, 0)),
             bank=bank.seen(),

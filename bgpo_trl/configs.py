@@ -89,12 +89,6 @@ class DDPGConfig:
     """Share of the weights that the target networks take over each update. Ours."""
     noise: float = 0.3
     """Standard deviation of the Gaussian exploration noise on the action. Ours."""
-    exploratory_share: float = 0.5
-    """Share of episodes that act by noise alone where the critic expects nothing. Ours: a policy
-    that has learned one task well hardly ever meets the reward of the next one."""
-    promising_value: float = 0.25
-    """Value of an episode's start from which on none is exploratory; in between, the share falls
-    linearly. Ours: success after 27 steps at gamma 0.95."""
     pre_tanh_penalty: float = 0.01
     """Weight of the squared pre-tanh actions. Ours: without it all actions saturate."""
     clip_targets: bool = True
@@ -105,26 +99,67 @@ class DDPGConfig:
 
 
 @dataclass(frozen=True)
-class BGPOConfig:
-    """Behavior-guided policy optimization (Alg. 1)."""
+class AlgorithmConfig:
+    """What all algorithms have in common, so that they are compared on equal terms."""
 
     state: Literal["latent", "state"] = "latent"
     """What the policy sees of the world: z of a frame, or (for the ladder) the ground truth."""
-    context: Literal["behavior", "demo_embedding", "task_one_hot"] = "behavior"
-    """What the policy is told to do: b of GWR-B; phi of the demonstration (the ablation without
-    GWR-B); or (for the ladder and the reference with labels) the task's label."""
-    beta: float = 0.1
-    """Weight of the intrinsic reward (Sec. IV-A); 0 is the ablation without it."""
     max_steps: int = 50
     """Steps of an episode (Sec. IV-B)."""
     ddpg: DDPGConfig = field(default_factory=DDPGConfig)
     """The RL algorithm."""
 
+
+@dataclass(frozen=True)
+class BGPOConfig(AlgorithmConfig):
+    """Behavior-guided policy optimization (Alg. 1)."""
+
+    beta: float = 0.1
+    """Weight of the intrinsic reward (Sec. IV-A)."""
+
+
+@dataclass(frozen=True)
+class MAMLConfig(AlgorithmConfig):
+    """Model-agnostic meta-learning over DDPG (Sec. IV-B; Finn et al., 2017)."""
+
+    inner_learning_rate: float = 0.1
+    """Length of the one gradient step by which the policy adapts to a task. Ours."""
+    task_batch_size: int = 64
+    """Transitions of each task in an update to adapt to, and as many to judge the adapted policy
+    by. Ours: three tasks together see more than the 128 of the other algorithms."""
+    adaptation_size: int = 256
+    """Transitions of the test task that the policy adapts to before its test episodes. Sec. IV-B
+    has "256 adaptation trajectories", about 50 times as much."""
+
     def __post_init__(self) -> None:
-        if self.state != "latent" and self.context != "task_one_hot":
+        if self.inner_learning_rate < 0 or self.task_batch_size < 1 or self.adaptation_size < 1:
             raise ValueError(
-                f"state={self.state!r} goes with context='task_one_hot' only: behaviors are "
-                "matched with what latents become"
+                "MAML needs inner_learning_rate >= 0, task_batch_size >= 1 and adaptation_size "
+                f">= 1, got {self.inner_learning_rate}, {self.task_batch_size} and "
+                f"{self.adaptation_size}"
+            )
+
+
+@dataclass(frozen=True)
+class DistNLLConfig(AlgorithmConfig):
+    """Policy distillation with a negative log-likelihood (Sec. IV-B; Rusu et al., 2016)."""
+
+    task_batch_size: int = 64
+    """Transitions of each task in an update of its teacher. Ours: three teachers together see more
+    than the 128 of the other algorithms."""
+    samples: int = 1_000
+    """States of each task that its head learns from at the end of an episode (Sec. IV-B)."""
+    distillation_batch_size: int = 125
+    """States of each task a gradient step, so eight steps an episode. Ours: the paper does not
+    say."""
+    learning_rate: float = 1e-3
+    """Rate of Adam for the multi-task policy. Ours: the teachers' own."""
+
+    def __post_init__(self) -> None:
+        if self.distillation_batch_size < 1 or self.samples % self.distillation_batch_size:
+            raise ValueError(
+                f"samples ({self.samples}) must be a multiple of distillation_batch_size "
+                f"({self.distillation_batch_size})"
             )
 
 
@@ -145,8 +180,10 @@ class RunConfig:
     one random task; testing every task costs more and says more."""
     checkpoint_minutes: float = 10.0
     """Minutes between checkpoints. Ours."""
-    bgpo: BGPOConfig = field(default_factory=BGPOConfig)
-    """The algorithm."""
+    name: str = "bgpo"
+    """The algorithm, or the variant of it, as the CSV files call it."""
+    algorithm: AlgorithmConfig = field(default_factory=BGPOConfig)
+    """The algorithm's hyperparameters."""
 
     def __post_init__(self) -> None:
         if not self.seeds or len(set(self.seeds)) < len(self.seeds) or min(self.seeds) < 0:

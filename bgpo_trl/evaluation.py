@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,11 +12,10 @@ from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs import Compose, TransformedEnv
 
-from bgpo_trl.algorithms.bgpo import BGPO, observe
-from bgpo_trl.configs import BGPOConfig
+from bgpo_trl.algorithms.algorithm import Algorithm, observe
+from bgpo_trl.configs import AlgorithmConfig
 from bgpo_trl.demonstrations import DemonstrationBank
 from bgpo_trl.envs import NicoEnv
-from bgpo_trl.modules.actor_critic import Actor
 from bgpo_trl.representation import Representation
 from bgpo_trl.seeding import stream_seed
 
@@ -28,15 +28,13 @@ class Snapshot:
         episode: Training episodes before it.
         env_steps: Environment steps before it.
         presented: Which tasks were presented so far, bool ``[T]``.
-        actor: The policy's weights, without the seed dimension.
-        context: The policy's second input for each test episode, ``[T * M, context]``.
+        policy: What the policy depends on, from `Algorithm.freeze`.
     """
 
     episode: int
     env_steps: int
     presented: Tensor
-    actor: dict[str, Tensor]
-    context: Tensor
+    policy: dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -75,7 +73,7 @@ class Evaluator:
 
     def __init__(
         self,
-        config: BGPOConfig,
+        config: AlgorithmConfig,
         *,
         seeds: Sequence[int],
         n_tasks: int,
@@ -84,6 +82,7 @@ class Evaluator:
         encoders: Representation | None,
     ) -> None:
         self.max_steps = config.max_steps
+        self._state_key = config.state
         self.seeds = tuple(seeds)
         self.shape = (len(seeds), n_tasks, episodes)
         self._rows_of = [torch.nonzero(bank.task == task).flatten() for task in range(n_tasks)]
@@ -98,14 +97,13 @@ class Evaluator:
             batch_size=self.shape,
             observation="pixels" if config.state == "latent" else "state",
         )
-        self.env = TransformedEnv(self.simulation, Compose(observe(config, encoders, n_tasks)))
+        self.env = TransformedEnv(self.simulation, Compose(observe(config, encoders)))
         self._task = torch.arange(n_tasks)[:, None].expand(self.shape).contiguous()
 
     def _rng(self, seed: int, number: int) -> np.random.Generator:
         return np.random.default_rng([stream_seed(seed, "evaluation"), number])
 
-    @torch.no_grad()
-    def take(self, algorithm: BGPO, index: int, number: int, env_steps: int) -> Snapshot:
+    def take(self, algorithm: Algorithm, index: int, number: int, env_steps: int) -> Snapshot:
         """Returns a snapshot of one seed.
 
         Args:
@@ -115,44 +113,40 @@ class Evaluator:
             env_steps: The seed's environment steps so far.
         """
         rng = self._rng(self.seeds[index], number)
-        drawn = torch.cat(
+        drawn = torch.stack(
             [
                 rows[torch.from_numpy(rng.integers(len(rows), size=self.shape[2]))]
                 for rows in self._rows_of
             ]
         )
-        # All seeds look the same demonstrations up: GWR-B knows only whole batches.
-        embedding = self._bank.embedding[drawn].expand(len(self.seeds), -1, -1)
-        task = self._bank.task[drawn].expand(len(self.seeds), -1)
         episode = int(algorithm.source.episode[index])
-        weights = algorithm.actor.state_dict()
         return Snapshot(
             episode=episode,
             env_steps=env_steps,
             # The last of those episodes could be about tasks that start with fewer before it.
             presented=torch.tensor(algorithm.source.schedule.starts) < episode,
-            actor={key: stacked[index].to("cpu", copy=True) for key, stacked in weights.items()},
-            context=algorithm.infer(embedding, task)[index].clone(),
+            policy=algorithm.freeze(
+                index,
+                self._bank.embedding[drawn],
+                self._bank.task[drawn],
+                torch.Generator().manual_seed(int(rng.integers(2**63 - 1))),
+            ),
         )
 
     @torch.no_grad()
-    def run(self, snapshots: Sequence[Snapshot], number: int, actor: Actor) -> TestResult:
+    def run(self, snapshots: Sequence[Snapshot], number: int, algorithm: Algorithm) -> TestResult:
         """Plays the test episodes of all tasks presented to each seed.
 
         Args:
             snapshots: One of each seed.
             number: How many evaluations were before.
-            actor: A policy of the right shape; its own weights are not used.
+            algorithm: The one that left them; what it has learned since makes no difference.
 
         Returns:
             Success and length; both 0 where a task was not yet presented.
         """
-        device = next(actor.parameters()).device
-        weights = {
-            key: torch.stack([s.actor[key] for s in snapshots]).to(device)
-            for key in snapshots[0].actor
-        }
-        context = torch.stack([s.context for s in snapshots]).unflatten(1, self.shape[1:])
+        device = algorithm.device
+        policy = TensorDict.maybe_dense_stack([TensorDict(s.policy) for s in snapshots]).to(device)
         starts = [
             self._rng(seed, number).integers(2**32, size=self.shape[1:]) for seed in self.seeds
         ]
@@ -162,10 +156,8 @@ class Evaluator:
         success, steps = torch.zeros(self.shape, dtype=torch.bool), torch.zeros(self.shape).long()
         state = self.env.reset(TensorDict({"task": self._task}, self.shape))
         for _ in range(self.max_steps):
-            flat = state.flatten(1, 2).set(actor.in_keys[1], context.flatten(1, 2))
-            flat = flat.select(*actor.in_keys).to(device)
-            torch.func.functional_call(actor, weights, (flat,))
-            state.set("action", flat["action"].unflatten(1, self.shape[1:]).cpu())
+            seen = state[self._state_key].to(device)
+            state.set("action", algorithm.act_frozen(policy, seen).cpu())
             state.set("_step", active)
             state = self.env.step(state)["next"]
             steps += active

@@ -17,7 +17,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tqdm import tqdm
 
-from bgpo_trl.algorithms.bgpo import BGPO
+from bgpo_trl.algorithms import ALGORITHMS, Algorithm
 from bgpo_trl.checkpoint import has_checkpoint, load_checkpoint, save_checkpoint
 from bgpo_trl.configs import RunConfig
 from bgpo_trl.demonstrations import DemonstrationBank
@@ -47,7 +47,8 @@ class Trainer:
             ``checkpoint/``.
         bank: Embedded demonstrations, seen and held out.
         encoders: Trained encoders; None for a run that does not use them.
-        device: Where the networks are; see `BGPO`.
+        make: Makes the algorithm; by default the one that `ALGORITHMS` has under ``config.name``.
+        device: Where the networks are; see `Algorithm`.
         resume: Continue the run in the directory, from its last checkpoint.
         wandb: None, ``"online"`` or ``"offline"``: mirror the CSV there.
         progress: Whether to show a progress bar.
@@ -64,6 +65,7 @@ class Trainer:
         *,
         bank: DemonstrationBank,
         encoders: Representation | None = None,
+        make: Callable[..., Algorithm] | None = None,
         device: torch.device | str = "cpu",
         resume: bool = False,
         wandb: Literal["online", "offline"] | None = None,
@@ -75,8 +77,9 @@ class Trainer:
         self.encoders = encoders
         schedule = TaskSchedule(starts=config.task_starts)
         seeds = config.seeds
-        self.algorithm = BGPO(
-            config.bgpo,
+        make = ALGORITHMS[config.name].make if make is None else make
+        self.algorithm = make(
+            config.algorithm,
             seeds=seeds,
             schedule=schedule,
             bank=bank.seen(),
@@ -84,7 +87,7 @@ class Trainer:
             device=device,
         )
         self.evaluator = Evaluator(
-            config.bgpo,
+            config.algorithm,
             seeds=seeds,
             n_tasks=schedule.n_tasks,
             episodes=config.eval_episodes,
@@ -156,12 +159,12 @@ class Trainer:
     ) -> None:
         algorithm, end = self.algorithm, transition.get("next")[index]
         episode = int(algorithm.source.episode[index])
-        intrinsic = end.get("episode_intrinsic_reward", 0.0)  # not measured where a label is given
+        intrinsic = end.get("episode_intrinsic_reward", 0.0)  # not measured in every variant
         extrinsic = end.get("episode_extrinsic_reward", end["episode_reward"])
         nodes = 0 if algorithm.gwr is None else int(algorithm.gwr.num_nodes[index])
         self.logger.log_train(
             {
-                "algorithm": algorithm.name,
+                "algorithm": self.config.name,
                 "seed": self.config.seeds[index],
                 "episode": episode,
                 "env_steps": self.env_steps,
@@ -184,7 +187,7 @@ class Trainer:
     def _evaluate(self, bar: tqdm) -> None:
         while all(self._waiting):
             snapshots = [waiting.pop(0) for waiting in self._waiting]
-            result = self.evaluator.run(snapshots, self._evaluated, self.algorithm.actor)
+            result = self.evaluator.run(snapshots, self._evaluated, self.algorithm)
             self._evaluated += 1
             for index, snapshot in enumerate(snapshots):
                 for task in torch.nonzero(snapshot.presented).flatten().tolist():
@@ -195,7 +198,7 @@ class Trainer:
                     ):
                         self.logger.log_eval(
                             {
-                                "algorithm": self.algorithm.name,
+                                "algorithm": self.config.name,
                                 "seed": self.config.seeds[index],
                                 "episode": snapshot.episode,
                                 "env_steps": snapshot.env_steps,

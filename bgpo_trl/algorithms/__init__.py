@@ -1,1 +1,31 @@
-"""The algorithms: each file says, top to bottom, how its parts compose."""
+"""Algorithms that learn several tasks, by the names that command lines and CSV files give them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+from bgpo_trl.algorithms.algorithm import Algorithm
+from bgpo_trl.algorithms.bgpo import BGPO, labeled, untold
+from bgpo_trl.configs import AlgorithmConfig, BGPOConfig
+
+__all__ = ["ALGORITHMS", "Algorithm", "Entry"]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """How to make an algorithm."""
+
+    make: Callable[..., Algorithm]
+    """Called with a config and the arguments of `Algorithm`."""
+    config: AlgorithmConfig
+    """Its default hyperparameters."""
+
+
+ALGORITHMS: dict[str, Entry] = {
+    "bgpo": Entry(BGPO, BGPOConfig()),
+    "oracle": Entry(partial(BGPO, compose=labeled), BGPOConfig()),
+    "ddpg": Entry(partial(BGPO, compose=untold), BGPOConfig()),
+}
+"""BGPO; the baselines of the paper; DDPG that is told the task's label, and DDPG told nothing."""

@@ -1,0 +1,185 @@
+"""What all algorithms share, and what training and test episodes ask of them."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import ClipTransform, ObservationNorm, Transform, TransformedEnv
+
+from bgpo_trl.configs import AlgorithmConfig
+from bgpo_trl.demonstrations import DemonstrationBank
+from bgpo_trl.envs import NicoEnv
+from bgpo_trl.modules.gwr import GWRB
+from bgpo_trl.representation import Representation
+from bgpo_trl.seeding import generators, stream_seed
+from bgpo_trl.transforms import DemonstrationSource, FrameEncoder, TaskSchedule
+from suites.nico.base import STATE_SIZE
+
+# Middle and spread of joints (rad), grip and object positions (m) in demonstrations, so that the
+# ground truth comes to the policy in the scale that latents have.
+_STATE_LOC = (0.3, 0.9, 0.9, 0.45, 0.36, 0, 0.68, 0.4, 0.12, 0.655, 0.45, -0.05, 0.645)
+_STATE_LOC += (0.41, -0.21, 0.645)
+_STATE_SCALE = (0.35, 0.25, 0.35, 0.3, 0.06, 0.15, 0.05, *(0.03, 0.05, 0.02) * 3)
+
+
+def observe(config: AlgorithmConfig, encoders: Representation | None) -> list[Transform]:
+    """Returns the transforms from what the simulation shows to the state that the policy sees.
+
+    Args:
+        config: Says whether that is latents or the ground truth.
+        encoders: The trained encoders; needed for latents.
+
+    Raises:
+        ValueError: If latents are asked for without encoders.
+    """
+    transforms: list[Transform] = []
+    if config.state == "latent":
+        if encoders is None:
+            raise ValueError("state='latent' needs trained encoders")
+        transforms.append(FrameEncoder(encoders.vae, del_keys=True))
+    else:
+        loc, scale = torch.tensor(_STATE_LOC), torch.tensor(_STATE_SCALE)
+        transforms.append(ObservationNorm(loc, scale, in_keys=["state"], standard_normal=True))
+    # An object knocked off the table is dozens of deviations away and would swamp the rest.
+    transforms.append(ClipTransform(in_keys=[config.state], low=-5.0, high=5.0))
+    return transforms
+
+
+class Algorithm(ABC):
+    """A learner of several tasks, for a batch of seeds that share nothing but the encoders.
+
+    This class holds the world: simulations, draws of tasks and demonstrations, exploration noise.
+    What is learned, and how, is each algorithm's own.
+
+    A step of training is ``act``, the environment's step, ``store``; an ``update`` may run while
+    the environment takes its step. For test episodes `freeze` copies what the policy of one seed
+    depends on, and `act_frozen` acts by such copies.
+
+    Args:
+        config: Hyperparameters.
+        seeds: One for each element of the batch.
+        schedule: Which tasks are presented when.
+        bank: Embedded demonstrations for training episodes.
+        encoders: The trained encoders; None where they are not used. The frame encoder is moved to
+            the device.
+        device: Where frames are encoded and networks learn. Simulations, GWR-B and replay stay on
+            the CPU.
+
+    Attributes:
+        env: The world as the algorithm sees it, a composition of transforms.
+        source: The transform that draws task and demonstration of each episode.
+        simulation: The environment without its transforms.
+        gwr: GWR-B, or None in an algorithm without it.
+        state_size: Number of features of the state.
+    """
+
+    env: TransformedEnv
+    gwr: GWRB | None = None
+
+    def __init__(
+        self,
+        config: AlgorithmConfig,
+        *,
+        seeds: Sequence[int],
+        schedule: TaskSchedule,
+        bank: DemonstrationBank,
+        encoders: Representation | None = None,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        self.device = torch.device(device)
+        self.n_seeds, self.n_tasks = len(seeds), schedule.n_tasks
+        self.state_size = STATE_SIZE
+        if encoders is not None:
+            encoders.vae.to(self.device)
+            if config.state == "latent":
+                self.state_size = encoders.vae.latent_size
+        batch = torch.Size([self.n_seeds])
+        self.source = DemonstrationSource(
+            bank, schedule, batch_size=batch, generator=generators(seeds, "demonstrations")
+        )
+        self.simulation = NicoEnv(
+            batch_size=batch,
+            seed=[stream_seed(seed, "env") for seed in seeds],
+            observation="pixels" if config.state == "latent" else "state",
+        )
+        self._noise = generators(seeds, "exploration")
+        self._noise_scale = config.ddpg.noise
+
+    @abstractmethod
+    def act(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the ``action`` ``[S, 4]`` of the policy with exploration noise."""
+
+    @abstractmethod
+    def store(self, transition: TensorDictBase) -> None:
+        """Keeps a transition of each seed, ``[S]``, for updates to come."""
+
+    @abstractmethod
+    def update(self) -> dict[str, Tensor]:
+        """Makes one update of each seed from the transitions stored so far.
+
+        Touches neither the environment nor what acting changes, so that it may run while the
+        environment takes the step that has been chosen before.
+
+        Returns:
+            ``loss_actor`` and ``loss_value``, means over the seeds ``[]``; empty before the first
+            update.
+        """
+
+    @abstractmethod
+    def freeze(
+        self, index: int, embedding: Tensor, task: Tensor, generator: torch.Generator
+    ) -> dict[str, Any]:
+        """Returns copies, on the CPU, of what the policy of one seed depends on in test episodes.
+
+        Nothing is learned from the demonstrations, and nothing of the training changes.
+
+        Args:
+            index: Position of the seed in the batch.
+            embedding: phi of the demonstration of each test episode, ``[T, M, 32]``.
+            task: Their labels, int64 ``[T, M]``. BGPO does not read them.
+            generator: For what the algorithm draws to prepare itself.
+
+        Returns:
+            Nested tensors, of the same shapes for all seeds of a run.
+        """
+
+    @abstractmethod
+    def act_frozen(self, frozen: TensorDictBase, state: Tensor) -> Tensor:
+        """Returns the actions of test episodes, without noise.
+
+        Args:
+            frozen: What `freeze` returned, of all seeds, stacked ``[S]``, on the device.
+            state: What the policy sees, ``[S, T, M, features]``, on the device.
+
+        Returns:
+            ``[S, T, M, 4]``.
+        """
+
+    def explore(self, action: Tensor) -> Tensor:
+        """Returns actions ``[S, 4]`` with each seed's Gaussian noise, within [-1, 1]."""
+        noise = [torch.randn(action.shape[-1:], generator=g) for g in self._noise]
+        return (action.cpu() + self._noise_scale * torch.stack(noise)).clamp(-1.0, 1.0)
+
+    def moved(self, batch: TensorDictBase) -> TensorDictBase:
+        """Returns a batch where the networks are."""
+        return batch if self.device == torch.device("cpu") else batch.to(self.device)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Returns all that the future of the run depends on but the tensordict in flight."""
+        return {
+            "source": dict(self.source.state_dict()),
+            "simulation": self.simulation.simulation_state(),
+            "noise": [generator.get_state() for generator in self._noise],
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continues from what `state_dict` returned."""
+        self.source.load_state_dict(state["source"])
+        self.simulation.load_simulation_state(state["simulation"])
+        for generator, saved in zip(self._noise, state["noise"], strict=True):
+            generator.set_state(saved)
