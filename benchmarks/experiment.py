@@ -35,8 +35,8 @@ FINAL_COLUMNS = ("seed", "demonstrations", "task", "episodes", "success", "task_
 class Arguments:
     """Trains an algorithm and draws its success."""
 
-    algorithm: Literal["bgpo", "oracle", "ddpg"] = "bgpo"
-    """BGPO; DDPG that is told the task's label (oracle); or DDPG that is told nothing."""
+    algorithm: Literal["bgpo", "maml", "dist-nll", "oracle", "ddpg"] = "bgpo"
+    """BGPO; a baseline; or a reference: DDPG that is told the task's label (oracle) or nothing."""
     preset: Literal["smoke", "quick", "desk", "paper"] = "quick"
     """Size of the run: every stage in minutes; learning to look at; five seeds; the paper's."""
     out: Path | None = None

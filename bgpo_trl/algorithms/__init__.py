@@ -8,7 +8,9 @@ from functools import partial
 
 from bgpo_trl.algorithms.algorithm import Algorithm
 from bgpo_trl.algorithms.bgpo import BGPO, labeled, untold
-from bgpo_trl.configs import AlgorithmConfig, BGPOConfig
+from bgpo_trl.algorithms.dist_nll import DistNLL
+from bgpo_trl.algorithms.maml import MAML
+from bgpo_trl.configs import AlgorithmConfig, BGPOConfig, DistNLLConfig, MAMLConfig
 
 __all__ = ["ALGORITHMS", "Algorithm", "Entry"]
 
@@ -25,6 +27,8 @@ class Entry:
 
 ALGORITHMS: dict[str, Entry] = {
     "bgpo": Entry(BGPO, BGPOConfig()),
+    "maml": Entry(MAML, MAMLConfig()),
+    "dist-nll": Entry(DistNLL, DistNLLConfig()),
     "oracle": Entry(partial(BGPO, compose=labeled), BGPOConfig()),
     "ddpg": Entry(partial(BGPO, compose=untold), BGPOConfig()),
 }

@@ -183,3 +183,18 @@ class Algorithm(ABC):
         self.simulation.load_simulation_state(state["simulation"])
         for generator, saved in zip(self._noise, state["noise"], strict=True):
             generator.set_state(saved)
+
+
+def networks_of(parameters: TensorDictBase, seed: Tensor, task: Tensor) -> dict[str, Tensor]:
+    """Returns some of the networks that there are for each task of each seed.
+
+    Args:
+        parameters: ``[S, T, ...]``.
+        seed: Positions of the seeds, int64, of any shape that goes with that of ``task``.
+        task: The tasks, int64.
+
+    Returns:
+        Parameters of that shape, by the names that `torch.func.functional_call` takes.
+    """
+    flat = parameters.flatten_keys(".")
+    return {str(key): value[seed, task] for key, value in flat.items()}

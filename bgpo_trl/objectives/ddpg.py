@@ -200,10 +200,13 @@ class DDPGLoss(objectives.DDPGLoss):
                     "it, name it with set_keys(pre_tanh_action=...), or pass pre_tanh_penalty=0"
                 )
             return loss.sum(), {}
-        mean_square = self._flatten_batch(pre_tanh.square()).mean(-1)
+        square = pre_tanh.square()
         if self.pre_tanh_penalty:
-            loss = loss + self.pre_tanh_penalty * mean_square
-        return loss.sum(), {"pre_tanh_magnitude": mean_square.detach().sqrt()}
+            weights = self._maybe_get_priority_weight(tensordict)
+            weighted = square if weights is None else square * weights.unsqueeze(-1)
+            loss = loss + self.pre_tanh_penalty * self._flatten_batch(weighted).mean(-1)
+        magnitude = self._flatten_batch(square.detach()).mean(-1).sqrt()
+        return loss.sum(), {"pre_tanh_magnitude": magnitude}
 
     def _target(self, tensordict: TensorDictBase) -> Tensor:
         successor = tensordict.get("next")

@@ -1,0 +1,258 @@
+"""Dist-NLL (section IV-B): one policy with a head a task, distilled from one DDPG teacher a task.
+
+Unlike BGPO it is told the task, in training and in tests: by its label.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torch.func import functional_call
+from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv
+
+from bgpo_trl.algorithms.algorithm import Algorithm, networks_of, observe
+from bgpo_trl.configs import DistNLLConfig
+from bgpo_trl.demonstrations import DemonstrationBank
+from bgpo_trl.modules.actor_critic import Actor, Critic
+from bgpo_trl.modules.multi_head_actor import MultiHeadActor
+from bgpo_trl.objectives.ddpg import DDPGLoss, ForeachSoftUpdate
+from bgpo_trl.objectives.distillation import DistillationLoss
+from bgpo_trl.replay import TaskReplay
+from bgpo_trl.representation import Representation
+from bgpo_trl.seeding import generators
+from bgpo_trl.transforms import TaskSchedule
+
+
+class DistNLL(Algorithm):
+    """Policy distillation from teachers that are still learning; the policies read the state only.
+
+    1. Training episodes are played by the teacher of their task, with noise.
+    2. Each update is one of all teachers, each from its own replay with its own critic.
+    3. At the end of an episode of a seed, its multi-task policy learns from ``samples`` states of
+       each task, with the actions that the teacher of that task takes there now. A task's head is
+       added when there is data of it; the trunk and the other heads are kept.
+    4. Test episodes are played by the multi-task policy with the head of the true label.
+
+    Args:
+        config: Hyperparameters.
+        seeds: One for each element of the batch; they share nothing but the encoders.
+        schedule: Which tasks are presented when.
+        bank: Demonstrations for training episodes; only their tasks matter here.
+        encoders: The trained encoders; None where latents are not used.
+        device: As in `Algorithm`.
+
+    Attributes:
+        teacher: The tasks' policies, ``[S, T]`` stacked.
+        critic: Their Q-functions, ``[S, T]`` stacked.
+        replay: One for each task.
+        students: The multi-task policy of each seed. They are not stacked: seeds end their
+            episodes at different times.
+    """
+
+    def __init__(
+        self,
+        config: DistNLLConfig,
+        *,
+        seeds: Sequence[int],
+        schedule: TaskSchedule,
+        bank: DemonstrationBank,
+        encoders: Representation | None = None,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        super().__init__(
+            config, seeds=seeds, schedule=schedule, bank=bank, encoders=encoders, device=device
+        )
+        self.config, ddpg = config, config.ddpg
+        self.env = TransformedEnv(
+            self.simulation,
+            Compose(
+                [
+                    *observe(config, encoders),
+                    StepCounter(config.max_steps),
+                    self.source,
+                    RewardSum(in_keys=["reward"], out_keys=["episode_reward"]),
+                ]
+            ),
+        )
+        self._network = {"in_keys": [config.state], "hidden_sizes": ddpg.hidden_sizes}
+        every = [self.n_seeds, self.n_tasks]
+        self.teacher = Actor(
+            self.state_size,
+            batch_size=every,
+            generator=self._streams(seeds, "actor"),
+            **self._network,
+        )
+        self.critic = Critic(
+            self.state_size,
+            layer_norm=ddpg.critic_layer_norm,
+            batch_size=every,
+            generator=self._streams(seeds, "critic"),
+            **self._network,
+        )
+        self.loss = DDPGLoss(
+            self.teacher.to(self.device),
+            self.critic.to(self.device),
+            return_bounds=(0.0, 1.0) if ddpg.clip_targets else None,
+            pre_tanh_penalty=ddpg.pre_tanh_penalty,
+        )
+        self.loss.make_value_estimator(gamma=ddpg.gamma)
+        self.target_update = ForeachSoftUpdate(self.loss, tau=ddpg.tau)
+        self.optimizer = torch.optim.Adam(
+            list(self.loss.parameters()), lr=ddpg.learning_rate, fused=True
+        )
+        # Called with the parameters of some of the teachers: of one a seed, of some of one seed's.
+        self._acting, *self._teaching = (
+            Actor(self.state_size, batch_size=[n], **self._network).to(self.device)
+            for n in (self.n_seeds, *range(1, self.n_tasks + 1))
+        )
+        streams = self._streams(seeds, "replay")
+        self.replay = TaskReplay(
+            ddpg.replay_size,
+            batch_size=config.task_batch_size,
+            generator=[streams[i : i + self.n_tasks] for i in range(0, len(streams), self.n_tasks)],
+            keys=[
+                *(config.state, "action"),
+                *(("next", key) for key in (config.state, "reward", "terminated")),
+            ],
+        )
+        self._make_students(seeds)
+
+    def _streams(self, seeds: Sequence[int], name: str) -> list[torch.Generator]:
+        tasks = range(self.n_tasks)
+        return [generators([seed], f"{name} {task}")[0] for seed in seeds for task in tasks]
+
+    def _make_students(self, seeds: Sequence[int]) -> None:
+        streams = generators(seeds, "student")
+        self.students = [
+            MultiHeadActor(self.state_size, generator=stream, **self._network).to(self.device)
+            for stream in streams
+        ]
+        # The task of each head, in order of appearance.
+        self._tasks: list[list[int]] = [[] for _ in seeds]
+        self._heads = generators(seeds, "heads")
+        self._distillation = [DistillationLoss(student) for student in self.students]
+        self._student_optimizers = [
+            torch.optim.Adam(student.parameters(), lr=self.config.learning_rate, fused=True)
+            for student in self.students
+        ]
+        self._ended = torch.zeros(self.n_seeds, dtype=torch.bool)
+        # Called with the weights that `freeze` returns.
+        self._frozen = MultiHeadActor(
+            self.state_size, batch_size=[self.n_seeds], **self._network
+        ).to(self.device)
+        for _ in range(self.n_tasks):
+            self._frozen.add_head()
+
+    @torch.no_grad()
+    def act(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the ``action`` ``[S, 4]`` of the tasks' teachers with exploration noise."""
+        seen = self.moved(tensordict.select(self.config.state))
+        teachers = networks_of(
+            self.loss.actor_network_params, torch.arange(self.n_seeds), tensordict["task"]
+        )
+        functional_call(self._acting, teachers, (seen,))
+        return tensordict.set("action", self.explore(seen["action"]))
+
+    def store(self, transition: TensorDictBase) -> None:
+        """Keeps a transition of each seed with its task for updates to come."""
+        self.replay.add(transition)
+        self._ended = transition.get(("next", "done")).flatten().clone()
+
+    def update(self) -> dict[str, Tensor]:
+        """Makes one update of each seed's teachers; see `Algorithm.update`.
+
+        The multi-task policies of seeds whose episode has just ended learn from them after it.
+        """
+        if len(self.replay) < self.config.ddpg.warmup_steps or not self.replay.ready.any():
+            return {}
+        losses = self.loss(self.moved(self.replay.sample()))
+        self.optimizer.zero_grad()
+        (losses["loss_actor"] + losses["loss_value"]).backward()
+        self.optimizer.step()
+        self.target_update.step()
+        for index in self._ended.nonzero().flatten().tolist():
+            self._distill(index)
+        return {key: losses[key].detach() / self.n_seeds for key in ("loss_actor", "loss_value")}
+
+    def _distill(self, index: int) -> None:
+        """Has the multi-task policy of a seed learn what its teachers do now."""
+        tasks, student = self._tasks[index], self.students[index]
+        optimizer = self._student_optimizers[index]
+        for task in self.replay.ready[index].nonzero().flatten().tolist():
+            if task not in tasks:
+                tasks.append(task)
+                head = student.add_head(self._heads[index])
+                optimizer.add_param_group({"params": list(head.parameters())})
+        if not tasks:
+            return
+        drawn = self.replay.sample_seed(index, tasks, self.config.samples)
+        batch = self.moved(drawn.select(self.config.state))
+        teachers = networks_of(
+            self.loss.actor_network_params, torch.tensor(index), torch.tensor(tasks)
+        )
+        with torch.no_grad():
+            shown = batch.copy()
+            functional_call(self._teaching[len(tasks) - 1], teachers, (shown,))
+        batch.set("teacher_action", shown["action"])
+        for part in batch.split(self.config.distillation_batch_size, dim=1):
+            loss = self._distillation[index](part)["loss_distillation"]
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+
+    def freeze(
+        self, index: int, embedding: Tensor, task: Tensor, generator: torch.Generator
+    ) -> dict[str, Any]:
+        """Returns the multi-task policy's weights, heads in the order of the tasks.
+
+        See `Algorithm.freeze`. The head of a task of which nothing is known yet is zero. The
+        demonstrations are not read.
+        """
+        del embedding, task, generator
+        like = self._frozen.state_dict()
+        weights = {key: torch.zeros_like(value[0]).cpu() for key, value in like.items()}
+        for key, value in self.students[index].state_dict().items():
+            if key.startswith("heads."):
+                _, head, name = key.split(".")
+                key = f"heads.{self._tasks[index][int(head)]}.{name}"
+            weights[key] = value.to("cpu", copy=True)
+        return {"actor": weights}
+
+    def act_frozen(self, frozen: TensorDictBase, state: Tensor) -> Tensor:
+        """Returns the actions of test episodes; see `Algorithm.act_frozen`."""
+        inputs = TensorDict({self.config.state: state}, state.shape[:-1])
+        functional_call(self._frozen, dict(frozen.get("actor").items()), (inputs,))
+        return inputs["action"]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Returns all that the future of the run depends on but the tensordict in flight."""
+        return {
+            **super().state_dict(),
+            "loss": dict(self.loss.state_dict()),
+            "optimizer": self.optimizer.state_dict(),
+            "replay": self.replay.state_dict(),
+            "tasks": self._tasks,
+            "heads": [generator.get_state() for generator in self._heads],
+            "students": [dict(student.state_dict()) for student in self.students],
+            "student_optimizers": [o.state_dict() for o in self._student_optimizers],
+            "ended": self._ended,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continues from what `state_dict` returned."""
+        super().load_state_dict(state)
+        for name in ("loss", "optimizer", "replay"):
+            getattr(self, name).load_state_dict(state[name])
+        self._ended = state["ended"].clone()
+        for index, tasks in enumerate(state["tasks"]):
+            student, optimizer = self.students[index], self._student_optimizers[index]
+            for _ in tasks[len(self._tasks[index]) :]:
+                optimizer.add_param_group({"params": list(student.add_head().parameters())})
+            self._tasks[index] = list(tasks)
+            student.load_state_dict(state["students"][index])
+            optimizer.load_state_dict(state["student_optimizers"][index])
+            self._heads[index].set_state(state["heads"][index])

@@ -1,0 +1,188 @@
+"""MAML over DDPG (section IV-B): one policy that adapts to a task by one gradient step.
+
+Unlike BGPO it is told the task, in training and in tests: by the data that it adapts to.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torch.func import functional_call
+from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv
+
+from bgpo_trl.algorithms.algorithm import Algorithm, networks_of, observe
+from bgpo_trl.configs import MAMLConfig
+from bgpo_trl.demonstrations import DemonstrationBank
+from bgpo_trl.modules.actor_critic import Actor, Critic
+from bgpo_trl.objectives.ddpg import ForeachSoftUpdate
+from bgpo_trl.objectives.maml import MAMLLoss
+from bgpo_trl.replay import TaskReplay
+from bgpo_trl.representation import Representation
+from bgpo_trl.seeding import generators
+from bgpo_trl.transforms import TaskSchedule
+
+
+class MAML(Algorithm):
+    """MAML with one critic and one replay for each task; the policy reads the state only.
+
+    1. Training episodes are played by the policy as last adapted to their task, with noise.
+    2. Each update adapts the policy to some transitions of each task, judges the adapted policies
+       by the tasks' critics on others, and improves what they were adapted from (`MAMLLoss`).
+       Tasks that have not yet been presented, or hardly, take no part.
+    3. Before the test episodes of a task, the policy makes one gradient step on
+       ``adaptation_size`` transitions of its replay, and plays them with the result.
+
+    Args:
+        config: Hyperparameters.
+        seeds: One for each element of the batch; they share nothing but the encoders.
+        schedule: Which tasks are presented when.
+        bank: Demonstrations for training episodes; only their tasks matter here.
+        encoders: The trained encoders; None where latents are not used.
+        device: As in `Algorithm`.
+
+    Attributes:
+        meta_actor: The policy that adapts, ``[S]`` stacked.
+        critic: The Q-functions, ``[S, T]`` stacked.
+        replay: One for each task.
+    """
+
+    def __init__(
+        self,
+        config: MAMLConfig,
+        *,
+        seeds: Sequence[int],
+        schedule: TaskSchedule,
+        bank: DemonstrationBank,
+        encoders: Representation | None = None,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        super().__init__(
+            config, seeds=seeds, schedule=schedule, bank=bank, encoders=encoders, device=device
+        )
+        self.config, ddpg = config, config.ddpg
+        self.env = TransformedEnv(
+            self.simulation,
+            Compose(
+                [
+                    *observe(config, encoders),
+                    StepCounter(config.max_steps),
+                    self.source,
+                    RewardSum(in_keys=["reward"], out_keys=["episode_reward"]),
+                ]
+            ),
+        )
+        network = {"in_keys": [config.state], "hidden_sizes": ddpg.hidden_sizes}
+        each, every = [self.n_seeds], [self.n_seeds, self.n_tasks]
+        streams = [generators([seed] * self.n_tasks, "critic") for seed in seeds]
+        self.meta_actor = Actor(
+            self.state_size, batch_size=each, generator=generators(seeds, "actor"), **network
+        )
+        self.critic = Critic(
+            self.state_size,
+            layer_norm=ddpg.critic_layer_norm,
+            batch_size=every,
+            generator=[stream for of_seed in streams for stream in of_seed],
+            **network,
+        )
+        # Called with the parameters of policies that were adapted.
+        self._acting = Actor(self.state_size, batch_size=each, **network).to(self.device)
+        self._adapted = Actor(self.state_size, batch_size=every, **network).to(self.device)
+        self.loss = MAMLLoss(
+            self.meta_actor.to(self.device),
+            self._adapted,
+            self.critic.to(self.device),
+            inner_learning_rate=config.inner_learning_rate,
+            return_bounds=(0.0, 1.0) if ddpg.clip_targets else None,
+            pre_tanh_penalty=ddpg.pre_tanh_penalty,
+        )
+        self.loss.make_value_estimator(gamma=ddpg.gamma)
+        self.target_update = ForeachSoftUpdate(self.loss, tau=ddpg.tau)
+        learned = [p for p in self.loss.parameters() if p.requires_grad]
+        self.optimizer = torch.optim.Adam(learned, lr=ddpg.learning_rate, fused=True)
+        self.replay = TaskReplay(
+            ddpg.replay_size,
+            batch_size=config.task_batch_size,
+            generator=[
+                [generators([seed], f"replay {task}")[0] for task in range(self.n_tasks)]
+                for seed in seeds
+            ],
+            keys=[
+                *(config.state, "action"),
+                *(("next", key) for key in (config.state, "reward", "terminated")),
+            ],
+        )
+
+    @torch.no_grad()
+    def act(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the ``action`` ``[S, 4]`` of the adapted policies with exploration noise."""
+        seen = self.moved(tensordict.select(self.config.state))
+        adapted = networks_of(
+            self.loss.actor_network_params, torch.arange(self.n_seeds), tensordict["task"]
+        )
+        functional_call(self._acting, adapted, (seen,))
+        return tensordict.set("action", self.explore(seen["action"]))
+
+    def store(self, transition: TensorDictBase) -> None:
+        """Keeps a transition of each seed with its task for updates to come."""
+        self.replay.add(transition)
+
+    def update(self) -> dict[str, Tensor]:
+        """Makes one update of each seed; see `Algorithm.update`."""
+        if len(self.replay) < self.config.ddpg.warmup_steps or not self.replay.ready.any():
+            return {}
+        losses = self.loss(self.moved(self.replay.sample()))
+        self.optimizer.zero_grad()
+        (losses["loss_actor"] + losses["loss_value"]).backward()
+        self.optimizer.step()
+        self.target_update.step()
+        return {key: losses[key].detach() / self.n_seeds for key in ("loss_actor", "loss_value")}
+
+    def freeze(
+        self, index: int, embedding: Tensor, task: Tensor, generator: torch.Generator
+    ) -> dict[str, Any]:
+        """Returns the weights of the policy adapted to each task, ``[T, ...]``.
+
+        See `Algorithm.freeze`. Without enough data of a task it does not adapt to it. The
+        demonstrations are not read.
+        """
+        del embedding, task
+        meta = dict(self.meta_actor.named_parameters())
+        adapted = {
+            key: value.detach().unsqueeze(1).expand(-1, self.n_tasks, *value.shape[1:])
+            for key, value in meta.items()
+        }
+        if self.replay.ready.any():
+            draws = torch.randint(2**63 - 1, (self.n_tasks,), generator=generator).tolist()
+            streams = [torch.Generator().manual_seed(n) for _ in range(self.n_seeds) for n in draws]
+            data = self.replay.sample(self.config.adaptation_size, generator=streams)
+            adapted = self.loss.adapt(self.moved(data))
+        return {
+            "actor": {
+                key: value[index].detach().to("cpu", copy=True) for key, value in adapted.items()
+            }
+        }
+
+    def act_frozen(self, frozen: TensorDictBase, state: Tensor) -> Tensor:
+        """Returns the actions of test episodes; see `Algorithm.act_frozen`."""
+        inputs = TensorDict({self.config.state: state}, state.shape[:-1])
+        functional_call(self._adapted, dict(frozen.get("actor").items()), (inputs,))
+        return inputs["action"]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Returns all that the future of the run depends on but the tensordict in flight."""
+        return {
+            **super().state_dict(),
+            "loss": dict(self.loss.state_dict()),
+            "optimizer": self.optimizer.state_dict(),
+            "replay": self.replay.state_dict(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continues from what `state_dict` returned."""
+        super().load_state_dict(state)
+        for name in ("loss", "optimizer", "replay"):
+            getattr(self, name).load_state_dict(state[name])

@@ -1,0 +1,146 @@
+"""MAML over DDPG: a policy that solves each task after one gradient step on that task's critic."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torch.func import functional_call, grad
+
+from bgpo_trl.objectives.ddpg import DDPGLoss
+
+__all__ = ["MAMLLoss"]
+
+Parameters = dict[str, Tensor]
+
+
+class MAMLLoss(DDPGLoss):
+    """Loss of a policy by what it is worth after adapting to each task (Finn et al., 2017, Alg. 3).
+
+    With the DDPG loss of task i's critic, ``L_i(theta) = -mean Q_i(s, pi_theta(s))`` (plus the
+    penalty on the actor's output before its tanh, as in `DDPGLoss`), it
+
+    1. adapts the policy to each task, ``theta_i = theta - inner_learning_rate * grad L_i(theta)``,
+       on the first half of the task's transitions;
+    2. judges the adapted policies by ``sum_i L_i(theta_i)`` on the second halves: the gradient with
+       respect to ``theta`` goes through step 1, second derivatives included;
+    3. trains each task's critic on all its transitions as `DDPGLoss` does. Its target action is
+       that of the adapted policy's slow copy, since it is the adapted policy whose value is asked.
+
+    ``theta`` are the parameters of ``meta_network``. Those of ``actor_network`` are the latest
+    ``theta_i``: they are written here, have no gradient, and target networks follow them.
+
+    Reads what `DDPGLoss` reads, with the batch size ``[*S, T, B]``, ``B`` even; and ``"_weight"``
+    ``[*S, T, B]``, 0 for tasks of which nothing is known yet. Returns what `DDPGLoss` returns, per
+    task.
+
+    Args:
+        meta_network: policy with a ``batch_size`` ``[*S]``.
+        actor_network: the same policy with a ``batch_size`` ``[*S, T]``; its parameters are
+            overwritten.
+        value_network: Q-functions with a ``batch_size`` ``[*S, T]``.
+        inner_learning_rate: length of the step of adaptation.
+        **ddpg: other arguments of `DDPGLoss`.
+
+    Raises:
+        ValueError: if ``inner_learning_rate`` is negative, or the batch sizes do not fit.
+    """
+
+    def __init__(
+        self,
+        meta_network: TensorDictModuleBase,
+        actor_network: TensorDictModuleBase,
+        value_network: TensorDictModuleBase,
+        *,
+        inner_learning_rate: float = 0.1,
+        **ddpg: Any,
+    ) -> None:
+        networks: list[Any] = [meta_network, actor_network, value_network]
+        shapes = [torch.Size(network.batch_size) for network in networks]
+        if shapes[1][:-1] != shapes[0] or shapes[2] != shapes[1]:
+            raise ValueError(
+                "meta_network, actor_network and value_network must have the batch sizes [*S], "
+                f"[*S, T] and [*S, T], got {', '.join(str([*shape]) for shape in shapes)}"
+            )
+        if inner_learning_rate < 0:
+            raise ValueError(f"inner_learning_rate must be >= 0, got {inner_learning_rate}")
+        # It is only called with parameters from elsewhere; a list keeps its own out of this module.
+        self._template = [deepcopy(actor_network).requires_grad_(False)]
+        actor_network = deepcopy(actor_network).requires_grad_(False)
+        super().__init__(actor_network, value_network, **ddpg)
+        self.meta_network = meta_network
+        self.inner_learning_rate = inner_learning_rate
+        with torch.no_grad():
+            self._keep(self._each_task())
+            self.target_actor_network_params.data.copy_(self.actor_network_params.data)
+
+    def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """Computes the loss of the adapted policies, and keeps them in ``actor_network``.
+
+        Args:
+            tensordict: a batch of transitions ``[*S, T, B]``.
+
+        Returns:
+            The loss ``[]`` and no diagnostics.
+
+        Raises:
+            ValueError: if the batch cannot be cut in halves.
+        """
+        if tensordict.batch_size[-1] % 2:
+            raise ValueError(
+                f"an even number of transitions is needed, to adapt and to judge, got "
+                f"{tensordict.batch_size[-1]}"
+            )
+        support, query = tensordict.chunk(2, dim=-1)
+        adapted = self.adapt(support)
+        loss = self.policy_loss(adapted, query).sum()
+        self._keep(adapted)
+        return loss, {}
+
+    def adapt(self, tensordict: TensorDictBase) -> Parameters:
+        """Returns the parameters of the policy after one gradient step on each task.
+
+        Args:
+            tensordict: transitions of each task ``[*S, T, B]``.
+
+        Returns:
+            Tensors ``[*S, T, ...]``, differentiable with respect to ``meta_network``.
+        """
+        start = self._each_task()
+        step = grad(lambda parameters: self.policy_loss(parameters, tensordict).sum())(start)
+        return {key: value - self.inner_learning_rate * step[key] for key, value in start.items()}
+
+    def policy_loss(self, parameters: Parameters, tensordict: TensorDictBase) -> Tensor:
+        """Returns ``L_i`` of policies with these parameters, ``[*S, T]``.
+
+        Args:
+            parameters: of one policy a task, ``[*S, T, ...]``.
+            tensordict: transitions of each task ``[*S, T, B]``.
+        """
+        data = tensordict.select(*self.actor_in_keys, *self.value_exclusive_keys).detach()
+        functional_call(self._template[0], parameters, (data,))
+        value = self._frozen_critic(data)[self.tensor_keys.state_action_value].squeeze(-1)
+        loss = -value
+        if self.pre_tanh_penalty:
+            square = data[self.tensor_keys.pre_tanh_action].square().mean(-1)
+            loss = loss + self.pre_tanh_penalty * square
+        return self._mean_per_seed(loss, tensordict)
+
+    def _each_task(self) -> Parameters:
+        n_stacked = len(self.batch_size) - 1
+        return {
+            key: value.unsqueeze(n_stacked)
+            .expand(*self.batch_size, *value.shape[n_stacked:])
+            .contiguous()
+            for key, value in self.meta_network.named_parameters()
+        }
+
+    @torch.no_grad()
+    def _keep(self, adapted: Parameters) -> None:
+        kept = self.actor_network_params.flatten_keys(".")
+        for key, value in adapted.items():
+            kept[key].copy_(value)
