@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 import torch
 import tyro
 
@@ -21,7 +22,7 @@ from bgpo_trl.demonstrations import DemonstrationBank
 from bgpo_trl.evaluation import Evaluator, evaluate_random_policy
 from bgpo_trl.machine import choose_device
 from bgpo_trl.metrics import majority_task, match_counts, task_inference_accuracy
-from bgpo_trl.plotting import plot_gwr_pca, plot_success_curves, save_figure
+from bgpo_trl.plotting import plot_frame_strips, plot_gwr_pca, plot_success_curves, save_figure
 from bgpo_trl.pretrained import load_pretrained, make_pretrained
 from bgpo_trl.training import Trainer
 from suites import nico
@@ -90,7 +91,8 @@ def run_experiment(
 
     The run's directory then holds, besides what `Trainer` writes, ``final.csv`` (success of the
     trained policies with demonstrations seen in training and with held-out ones, and task
-    inference), ``summary.json`` (commit, command, nodes of GWR-B) and ``figures/``.
+    inference), ``summary.json`` (commit, command, success of a random policy, nodes of GWR-B),
+    ``gwr.csv`` (nodes of the first seed's GWR-B) and ``figures/``.
 
     Args:
         arguments: From the command line.
@@ -133,19 +135,22 @@ def run_experiment(
     trainer.run()
     measure(trainer, bank, out, commit)
 
-    random_success = evaluate_random_policy(n_tasks=3, episodes=100)
+    summary = json.loads((out / "summary.json").read_text())
     figure = plot_success_curves(
         out / "eval.csv",
         presented=dict(zip(nico.ALL_TASKS, config.task_starts, strict=True)),
-        random_success=dict(zip(nico.ALL_TASKS, random_success.tolist(), strict=True)),
+        random_success=summary["random_success"],
     )
     save_figure(figure, out / "figures" / "success.png")
+    figure = plot_frame_strips(record_episodes(trainer, bank))
+    save_figure(figure, out / "figures" / "episodes.png")
     gwr = trainer.algorithm.gwr
     if gwr is not None:
         tasks = majority_task(match_counts(gwr, bank.seen(), 3)[0])
-        graph = gwr.graph(0)
-        figure = plot_gwr_pca(graph.weights, tasks[: len(graph.weights)], nico.ALL_TASKS)
-        save_figure(figure, out / "figures" / "gwr.png")
+        weights = gwr.graph(0).weights
+        tasks = tasks[: len(weights)]
+        write_nodes(out / "gwr.csv", weights, tasks)
+        save_figure(plot_gwr_pca(weights, tasks, nico.ALL_TASKS), out / "figures" / "gwr.png")
         accuracy = task_inference_accuracy(gwr, bank.seen(), bank.held_out(), 3)
         print(f"GWR-B nodes: {gwr.num_nodes.tolist()}")
         print(f"task inference on held-out demonstrations: {accuracy.mean():.1%}")
@@ -193,12 +198,64 @@ def measure(
         writer = csv.writer(file)
         writer.writerow(FINAL_COLUMNS)
         writer.writerows(rows)
+    random_success = evaluate_random_policy(n_tasks=len(nico.ALL_TASKS), episodes=100)
     summary = {
         "commit": commit,
         "command": shlex.join(["python", *sys.argv]),
+        "random_success": dict(zip(nico.ALL_TASKS, random_success.tolist(), strict=True)),
         "nodes": None if gwr is None else gwr.num_nodes.tolist(),
     }
     (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+
+
+def record_episodes(trainer: Trainer, bank: DemonstrationBank) -> dict[str, np.ndarray]:
+    """Returns the frames of a test episode of each task by the first seed's trained policy.
+
+    Args:
+        trainer: At the end of its run.
+        bank: Demonstrations; held-out ones are shown.
+
+    Returns:
+        Frames uint8 ``[N, 32, 64, 3]``, by task and outcome; none where frames are not observed.
+    """
+    config, frames = trainer.config, []
+    evaluator = Evaluator(
+        config.algorithm,
+        seeds=config.seeds,
+        n_tasks=len(nico.ALL_TASKS),
+        episodes=1,
+        bank=bank.held_out(),
+        encoders=trainer.encoders,
+    )
+    algorithm = trainer.algorithm
+    snapshots = [evaluator.take(algorithm, i, _LAST, 0) for i in range(len(config.seeds))]
+    result = evaluator.run(
+        snapshots,
+        _LAST,
+        algorithm,
+        watch=lambda: frames.append(evaluator.simulation.frames()[0, :, 0]),
+    )
+    return {
+        f"{name} ({'success' if result.success[0, task, 0] else 'no success'})": np.stack(
+            [frame[task] for frame in frames[: int(result.steps[0, task, 0]) + 1]]
+        )
+        for task, name in enumerate(nico.ALL_TASKS)
+    }
+
+
+def write_nodes(path: Path, weights: torch.Tensor, tasks: torch.Tensor) -> None:
+    """Writes the nodes of a GWR-B, one row each: its majority task (-1: none) and its weights.
+
+    Args:
+        path: Of the CSV file.
+        weights: ``[N, d]``.
+        tasks: ``[N]``.
+    """
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(("task", *(f"w{i}" for i in range(weights.shape[1]))))
+        for task, row in zip(tasks.tolist(), weights.tolist(), strict=True):
+            writer.writerow((task, *(f"{value:.6g}" for value in row)))
 
 
 def _commit() -> str:

@@ -225,6 +225,17 @@ class NicoEnv(EnvBase):
         reward = torch.from_numpy(rewards).reshape(*self.batch_size, 1)
         return TensorDict({**self._observe(), "reward": reward, **self._dones()}, self.batch_size)
 
+    def frames(self) -> np.ndarray:
+        """Returns a copy of the frames that were drawn last, uint8 ``[*B, 32, 64, 3]``.
+
+        Raises:
+            ValueError: If frames are not observed.
+        """
+        if "pixels" not in self._current:
+            raise ValueError("there are no frames with observation='state': observe 'both'")
+        pixels = self._current["pixels"].copy()
+        return pixels.reshape(*self.batch_size, *pixels.shape[1:])
+
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Ends the threads and frees the renderer."""
         self._pool.shutdown()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -134,13 +134,20 @@ class Evaluator:
         )
 
     @torch.no_grad()
-    def run(self, snapshots: Sequence[Snapshot], number: int, algorithm: Algorithm) -> TestResult:
+    def run(
+        self,
+        snapshots: Sequence[Snapshot],
+        number: int,
+        algorithm: Algorithm,
+        watch: Callable[[], object] = lambda: None,
+    ) -> TestResult:
         """Plays the test episodes of all tasks presented to each seed.
 
         Args:
             snapshots: One of each seed.
             number: How many evaluations were before.
             algorithm: The one that left them; what it has learned since makes no difference.
+            watch: Called at the start and after each step, with `simulation` there to be looked at.
 
         Returns:
             Success and length; both 0 where a task was not yet presented.
@@ -155,11 +162,13 @@ class Evaluator:
         active = presented[:, :, None].expand(self.shape).clone()
         success, steps = torch.zeros(self.shape, dtype=torch.bool), torch.zeros(self.shape).long()
         state = self.env.reset(TensorDict({"task": self._task}, self.shape))
+        watch()
         for _ in range(self.max_steps):
             seen = state[self._state_key].to(device)
             state.set("action", algorithm.act_frozen(policy, seen).cpu())
             state.set("_step", active)
             state = self.env.step(state)["next"]
+            watch()
             steps += active
             success |= state["terminated"].squeeze(-1) & active
             active = active & ~success

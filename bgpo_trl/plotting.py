@@ -172,6 +172,34 @@ def plot_gwr_pca(weights: ArrayLike, node_task: ArrayLike, task_names: Sequence[
     return figure
 
 
+def plot_frame_strips(episodes: Mapping[str, NDArray], n_frames: int = 8) -> Figure:
+    """Shows episodes as rows of frames, from the first to the last.
+
+    Args:
+        episodes: Frames uint8 ``[N, 32, 64, 3]`` by the title of their row.
+        n_frames: Frames a row at most, evenly spaced in time.
+
+    Returns:
+        The figure.
+
+    Raises:
+        ValueError: If there is no episode, or one without frames.
+    """
+    if not episodes or any(len(frames) == 0 for frames in episodes.values()):
+        raise ValueError("there is nothing to show: give episodes of at least one frame.")
+    figure = Figure(figsize=(1.3 * n_frames, 0.95 * len(episodes)), layout="constrained")
+    panels = figure.subplots(len(episodes), n_frames, squeeze=False)
+    for row, (title, frames) in zip(panels, episodes.items(), strict=True):
+        shown = np.unique(np.linspace(0, len(frames) - 1, n_frames).round().astype(int))
+        for panel in row:
+            panel.set_axis_off()
+        for panel, index in zip(row, shown, strict=False):
+            panel.imshow(frames[index], interpolation="nearest")
+            panel.set_title(f"step {index}", fontsize=6, pad=2)
+        row[0].set_title(f"{title}: step 0", fontsize=6, pad=2, loc="left")
+    return figure
+
+
 def save_figure(figure: Figure, path: str | os.PathLike[str]) -> None:
     """Saves a figure at print quality, 300 dpi; the same figure always gives the same bytes.
 
