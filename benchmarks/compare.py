@@ -10,7 +10,6 @@ seeds each, the smallest possible is 2 / 252.
 
 from __future__ import annotations
 
-import csv
 import sys
 from collections import defaultdict
 from dataclasses import dataclass
@@ -20,6 +19,8 @@ from typing import Annotated
 
 import numpy as np
 import tyro
+
+from bgpo_trl.runs import read_rows
 
 
 @dataclass(frozen=True)
@@ -34,12 +35,6 @@ class Arguments:
     """Episodes of training that one row of the table is about."""
 
 
-def last_episode(path: Path) -> int:
-    """Returns how far an ``eval.csv`` goes."""
-    with path.open(newline="") as file:
-        return max(int(row["episode"]) for row in csv.DictReader(file))
-
-
 def success_by_seed(
     path: Path, every: int, last: int | None = None
 ) -> dict[tuple[str, int], np.ndarray]:
@@ -51,12 +46,11 @@ def success_by_seed(
         last: Read no further than this episode.
     """
     found: dict[tuple[str, int], dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
-    with path.open(newline="") as file:
-        for row in csv.DictReader(file):
-            if last is not None and int(row["episode"]) > last:
-                continue
-            end = -(-int(row["episode"]) // every) * every
-            found[row["task"], end][row["seed"]].append(float(row["success"]))
+    for row in read_rows(path):
+        if last is not None and int(row["episode"]) > last:
+            continue
+        end = -(-int(row["episode"]) // every) * every
+        found[row["task"], end][row["seed"]].append(float(row["success"]))
     return {key: np.array([np.mean(s) for s in seeds.values()]) for key, seeds in found.items()}
 
 
@@ -81,7 +75,8 @@ def permutation_p(first: np.ndarray, second: np.ndarray) -> float:
 def main(arguments: Arguments) -> None:
     """Prints the table."""
     paths = arguments.first / "eval.csv", arguments.second / "eval.csv"
-    last = min(map(last_episode, paths))  # Of a run cut short, only what both have is compared.
+    # Of a run cut short, only what both have is compared.
+    last = min(max(int(row["episode"]) for row in read_rows(path)) for path in paths)
     first, second = (success_by_seed(path, arguments.every, last) for path in paths)
     shared = sorted(first.keys() & second.keys())
     if not shared:

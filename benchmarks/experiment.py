@@ -21,9 +21,9 @@ from bgpo_trl.configs import PRESETS, STAGE_PRESETS, RunConfig
 from bgpo_trl.demonstrations import DemonstrationBank
 from bgpo_trl.evaluation import Evaluator, evaluate_random_policy
 from bgpo_trl.machine import choose_device
-from bgpo_trl.metrics import majority_task, match_counts, task_inference_accuracy
 from bgpo_trl.plotting import plot_frame_strips, plot_gwr_pca, plot_success_curves, save_figure
 from bgpo_trl.pretrained import load_pretrained, make_pretrained
+from bgpo_trl.task_inference import majority_task, match_counts, task_inference_accuracy
 from bgpo_trl.training import Trainer
 from suites import nico
 

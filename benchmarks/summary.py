@@ -7,7 +7,6 @@ prints for each run a table of its success by task and draws ``success.png`` ane
 
 from __future__ import annotations
 
-import csv
 import json
 import sys
 from collections import defaultdict
@@ -19,6 +18,7 @@ import numpy as np
 import tyro
 
 from bgpo_trl.plotting import plot_success_curves, save_figure
+from bgpo_trl.runs import read_rows
 from suites import nico
 
 
@@ -28,19 +28,6 @@ class Arguments:
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
     """Directories with ``config.json``, ``eval.csv`` and ``final.csv``."""
-
-
-def read_rows(path: Path) -> list[dict[str, str]]:
-    """Returns the rows of a CSV file.
-
-    Raises:
-        ValueError: If there is no such file.
-    """
-    try:
-        with path.open(newline="") as file:
-            return list(csv.DictReader(file))
-    except FileNotFoundError:
-        raise ValueError(f"{path} is missing: let the run in {path.parent} finish") from None
 
 
 def summarize(path: Path) -> dict[str, float]:

@@ -1,58 +1,262 @@
-"""What is measured of a trained run beyond its success."""
+"""Measures of learning several tasks, and how sure they are: from success rates to one number.
+
+All work on plain arrays. ``success`` ``[..., E, T]`` is the share of successes on each of ``T``
+tasks at each of ``E`` evaluations (`bgpo_trl.runs.Curves` has it with a leading seed dimension); a
+success rate of 0 counts as 0, and NaN means that there was no test, as of a task that has not been
+presented yet.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
-import torch
-from torch import Tensor
+from numpy.typing import ArrayLike, NDArray
 
-from bgpo_trl.demonstrations import DemonstrationBank
-from bgpo_trl.modules.gwr import GWRB
+Array = NDArray[np.float64]
 
 
-@torch.no_grad()
-def match_counts(gwr: GWRB, bank: DemonstrationBank, n_tasks: int) -> Tensor:
-    """Counts for which demonstrations each node of GWR-B is the best match.
+def evaluation_matrix(
+    success: ArrayLike, episodes: ArrayLike, ends: ArrayLike, *, window: int
+) -> Array:
+    """Returns ``R[i, j]``: success on task j at the end of phase i.
 
     Args:
-        gwr: The network(s), ``batch_size`` ``[*S]``.
-        bank: Demonstrations to look up.
-        n_tasks: Number of tasks.
+        success: ``[..., E, T]``.
+        episodes: Training episodes before each evaluation, ``[E]``.
+        ends: Episode with which each phase ends, ``[P]``: the starts of the later tasks, and the
+            end of training.
+        window: Evaluations after at most so many episodes before the end of a phase are averaged.
 
     Returns:
-        Counts ``[*S, N, n_tasks]``, int64, nodes in order of creation, ``N`` the largest network's
-        size; rows beyond a smaller network's size are 0.
+        ``[..., P, T]``; NaN for tasks without a test in the window.
+
+    Raises:
+        ValueError: If a phase has no evaluation in its window.
     """
-    node = gwr.lookup(bank.embedding.expand(*gwr.batch_size, *bank.embedding.shape)).node
-    counts = torch.zeros(*gwr.batch_size, int(gwr.num_nodes.max()), n_tasks, dtype=torch.int64)
-    for index in np.ndindex(*gwr.batch_size):
-        position = torch.searchsorted(gwr.graph(index).node, node[index])
-        counts[index].index_put_((position, bank.task), torch.tensor(1), accumulate=True)
-    return counts
+    success, episodes = np.asarray(success, float), np.asarray(episodes)
+    phases = []
+    for end in np.asarray(ends).tolist():
+        chosen = (episodes > end - window) & (episodes <= end)
+        if not chosen.any():
+            raise ValueError(
+                f"there is no evaluation in the {window} episodes before episode {end}: evaluate "
+                "more often or take a larger window"
+            )
+        phases.append(_mean(success[..., chosen, :], axis=-2))
+    return np.stack(phases, axis=-2)
 
 
-def majority_task(counts: Tensor) -> Tensor:
-    """Returns the task with the most matches of each node, int64 ``[..., N]``; -1 without a match.
+def average_performance(matrix: ArrayLike) -> Array:
+    """Returns the mean over tasks of success at the end of training, ``[...]``.
 
     Args:
-        counts: From `match_counts`, ``[..., N, n_tasks]``.
+        matrix: From `evaluation_matrix`, ``[..., P, T]``.
     """
-    return torch.where(counts.sum(-1) > 0, counts.argmax(-1), -1)
+    return _mean(np.asarray(matrix, float)[..., -1, :], axis=-1)
 
 
-def task_inference_accuracy(
-    gwr: GWRB, seen: DemonstrationBank, tested: DemonstrationBank, n_tasks: int
-) -> Tensor:
-    """Returns how often the matched node's majority task is the demonstration's own, ``[*S]``.
+def forgetting_since_learned(matrix: ArrayLike) -> Array:
+    """Returns how much was lost since the end of each task's own phase, ``[...]``.
+
+    The mean over all tasks but the last of ``R[j, j] - R[T - 1, j]``: phase j is that with which
+    task j comes in. Negative where a task has become better since; the negative of
+    `backward_transfer`.
 
     Args:
-        gwr: The network(s), ``batch_size`` ``[*S]``.
-        seen: Demonstrations that give each node its majority task.
-        tested: Demonstrations whose task is inferred.
-        n_tasks: Number of tasks.
+        matrix: From `evaluation_matrix`, as many phases as tasks, ``[..., T, T]``.
+
+    Raises:
+        ValueError: If the numbers of phases and tasks differ.
     """
-    task_of_node = majority_task(match_counts(gwr, seen, n_tasks))
-    matched = match_counts(gwr, tested, n_tasks)
-    right = matched.gather(-1, task_of_node.clamp(min=0).unsqueeze(-1)).squeeze(-1)
-    right = torch.where(task_of_node >= 0, right, 0)
-    return right.sum(-1) / matched.sum((-1, -2))
+    return -backward_transfer(matrix)
+
+
+def forgetting_since_best(success: ArrayLike) -> Array:
+    """Returns how much was lost since each task was done best, ``[...]``.
+
+    The mean over tasks of the highest success at any evaluation minus that at the last one; never
+    negative (Chaudhry et al., 2018, "Riemannian Walk for Incremental Learning", but over all
+    evaluations and tasks). Noise of single evaluations counts as forgetting: average them first,
+    with `trailing_mean`.
+
+    Args:
+        success: ``[..., E, T]``.
+    """
+    success = np.asarray(success, float)
+    return _mean(_max(success, axis=-2) - success[..., -1, :], axis=-1)
+
+
+def backward_transfer(matrix: ArrayLike) -> Array:
+    """Returns how much earlier tasks have gained by learning later ones, ``[...]``.
+
+    The mean over all tasks but the last of ``R[T - 1, j] - R[j, j]`` (Lopez-Paz & Ranzato, 2017,
+    "Gradient Episodic Memory for Continual Learning").
+
+    Args:
+        matrix: From `evaluation_matrix`, as many phases as tasks, ``[..., T, T]``.
+
+    Raises:
+        ValueError: If the numbers of phases and tasks differ.
+    """
+    matrix = np.asarray(matrix, float)
+    if matrix.shape[-1] != matrix.shape[-2]:
+        raise ValueError(f"one phase a task is needed, got {list(matrix.shape[-2:])}")
+    learned = np.diagonal(matrix, axis1=-2, axis2=-1)
+    return _mean((matrix[..., -1, :] - learned)[..., :-1], axis=-1)
+
+
+def forward_transfer(area: ArrayLike, reference: ArrayLike) -> Array:
+    """Returns how much faster a task is learned than without what was learned before it.
+
+    ``(area - reference) / (1 - reference)``: 1 where it succeeds from the start, 0 where nothing is
+    gained, negative where it takes longer (Wolczyk et al., 2021, "Continual World").
+
+    Args:
+        area: `area_under_curve` of a task from its presentation on.
+        reference: The same over as many episodes of a learner that has learned no task before.
+    """
+    area, reference = np.asarray(area, float), np.asarray(reference, float)
+    return (area - reference) / (1 - reference)
+
+
+def area_under_curve(success: ArrayLike, episodes: ArrayLike) -> Array:
+    """Returns the mean height of curves over training, between 0 and 1, ``[...]``.
+
+    Trapezoids between evaluations; before the first one, the curve rises from 0 at episode 0. Only
+    for curves without NaN.
+
+    Args:
+        success: ``[..., E]``.
+        episodes: Training episodes before each evaluation, ``[E]``.
+    """
+    success, episodes = np.asarray(success, float), np.asarray(episodes, float)
+    start = np.zeros((*success.shape[:-1], 1))
+    heights = np.concatenate([start, success], axis=-1)
+    return np.trapezoid(heights, np.concatenate([[0.0], episodes]), axis=-1) / episodes[-1]
+
+
+def episodes_to(success: ArrayLike, episodes: ArrayLike, threshold: float = 0.8) -> Array:
+    """Returns the training episodes before the first evaluation that reaches a success rate.
+
+    Args:
+        success: ``[..., E]``.
+        episodes: Training episodes before each evaluation, ``[E]``.
+        threshold: The success rate.
+
+    Returns:
+        ``[...]``; infinite where it is never reached.
+    """
+    reached = np.asarray(success, float) >= threshold
+    first = np.asarray(episodes, float)[reached.argmax(axis=-1)]
+    return np.where(reached.any(axis=-1), first, np.inf)
+
+
+def trailing_mean(success: ArrayLike, n: int) -> Array:
+    """Returns the mean of each evaluation and up to ``n - 1`` before it.
+
+    Args:
+        success: ``[..., E, T]``.
+        n: Number of evaluations, at least 1.
+    """
+    success = np.asarray(success, float)
+    n_evaluations = success.shape[-2]
+    return np.stack(
+        [
+            _mean(success[..., max(0, end - n) : end, :], axis=-2)
+            for end in range(1, n_evaluations + 1)
+        ],
+        axis=-2,
+    )
+
+
+def presented_mean(success: ArrayLike) -> Array:
+    """Returns the mean over the tasks presented by each evaluation, ``[..., E]``.
+
+    Args:
+        success: ``[..., E, T]``.
+    """
+    return _mean(np.asarray(success, float), axis=-1)
+
+
+def interquartile_mean(scores: ArrayLike) -> float:
+    """Returns the mean of the middle half of all scores (Agarwal et al., 2021, "rliable").
+
+    Args:
+        scores: Of any shape, such as ``[S, T]``: seeds and tasks.
+    """
+    ordered = np.sort(np.asarray(scores, float), axis=None)
+    cut = ordered.size // 4
+    return float(ordered[cut : ordered.size - cut].mean())
+
+
+def stratified_bootstrap(
+    scores: ArrayLike,
+    statistic: Callable[[Array], float] = interquartile_mean,
+    *,
+    n_resamples: int = 2_000,
+    rng: np.random.Generator,
+) -> Array:
+    """Returns a statistic of resampled scores, from which intervals and differences are taken.
+
+    Seeds are drawn anew, with replacement, for each task by itself (Agarwal et al., 2021, "Deep
+    Reinforcement Learning at the Edge of the Statistical Precipice", section 4.1).
+
+    Args:
+        scores: One of each seed on each task, ``[S, T]``.
+        statistic: Of an array of that shape.
+        n_resamples: Number of resamples ``N``.
+        rng: Source of the draws.
+
+    Returns:
+        ``[N]``.
+
+    Raises:
+        ValueError: If scores are not finite, or not ``[S, T]``.
+
+    Example:
+        >>> rng = np.random.default_rng(0)
+        >>> ours, theirs = [[0.9, 0.8], [0.7, 0.8]], [[0.5, 0.1], [0.3, 0.2]]
+        >>> gain = stratified_bootstrap(ours, rng=rng) - stratified_bootstrap(theirs, rng=rng)
+        >>> percentile_interval(gain)[0] > 0
+        True
+    """
+    scores = _checked(scores)
+    n_seeds, n_tasks = scores.shape
+    drawn = rng.integers(n_seeds, size=(n_resamples, n_seeds, n_tasks))
+    return np.array([statistic(scores[seeds, np.arange(n_tasks)]) for seeds in drawn])
+
+
+def percentile_interval(values: ArrayLike, confidence: float = 0.95) -> tuple[float, float]:
+    """Returns the interval that holds the middle share of resampled values.
+
+    Args:
+        values: From `stratified_bootstrap`, or sums and differences of such.
+        confidence: The share.
+    """
+    tail = 100 * (1 - confidence) / 2
+    low, high = np.percentile(np.asarray(values, float), [tail, 100 - tail])
+    return float(low), float(high)
+
+
+def _checked(scores: ArrayLike) -> Array:
+    scores = np.asarray(scores, float)
+    if scores.ndim != 2 or not scores.size or not np.isfinite(scores).all():
+        raise ValueError(
+            f"scores must be finite and [seeds, tasks], at least one of each, not of shape "
+            f"{list(scores.shape)}{'' if np.isfinite(scores).all() else ' with NaN or Inf'}"
+        )
+    return scores
+
+
+def _mean(values: Array, axis: int) -> Array:
+    """The mean of what is not NaN; NaN where nothing is."""
+    there = ~np.isnan(values)
+    count = there.sum(axis)
+    total = np.where(there, values, 0.0).sum(axis)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+def _max(values: Array, axis: int) -> Array:
+    highest = np.where(np.isnan(values), -np.inf, values).max(axis)
+    return np.where(np.isfinite(highest), highest, np.nan)

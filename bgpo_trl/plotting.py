@@ -22,7 +22,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike, NDArray
 
 _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-_LINES = ("-", "--", "-.", (0, (3, 1, 1, 1, 1, 1)))
+_LINES = ("-", "--", "-.", (0, (3, 1, 1, 1, 1, 1)), (0, (1, 1)), (0, (6, 2)))
 _MARKERS = ("o", "s", "^", "D", "v", "P")
 _GRID_POINTS = 400
 _OVERALL = "All presented tasks"
@@ -37,6 +37,8 @@ def plot_success_curves(
     presented: Mapping[str, int] | None = None,
     random_success: Mapping[str, float] | None = None,
     window: int | None = None,
+    last: int | None = None,
+    names: Mapping[str, str] | None = None,
 ) -> Figure:
     """Plots success over training episodes, one panel for all tasks and one for each.
 
@@ -51,6 +53,8 @@ def plot_success_curves(
             the first are marked with dashed lines; also gives the order of the panels.
         random_success: Success rate of a random policy by task, marked with dotted lines.
         window: Length of the trailing mean in training episodes; 5 % of the training if None.
+        last: Training episode at which the curves end; that of the longest if None.
+        names: What the legend calls algorithms, in its order; others follow under their own names.
 
     Returns:
         The figure.
@@ -60,11 +64,15 @@ def plot_success_curves(
             positive.
     """
     tests = _read_tests([eval_csv] if isinstance(eval_csv, str | os.PathLike) else eval_csv)
+    names = names or {}
+    order = [*(name for name in names if name in tests), *(n for n in tests if n not in names)]
+    tests = {name: tests[name] for name in order}
     presented = presented or {}
     random_success = random_success or {}
     found = {task for seeds in tests.values() for rows in seeds.values() for _, task, _ in rows}
     tasks = [*presented, *sorted(found - set(presented))]
-    last = max(row[0] for seeds in tests.values() for rows in seeds.values() for row in rows)
+    if last is None:
+        last = max(row[0] for seeds in tests.values() for rows in seeds.values() for row in rows)
     window = max(1, round(last / 20)) if window is None else window
     if window < 1:
         raise ValueError(f"window must be at least 1 episode, not {window}.")
@@ -76,12 +84,15 @@ def plot_success_curves(
     # Side by side, the last tick label of a panel must not run into the first of the next.
     figure.set_layout_engine("constrained", w_pad=0.1)
     panels = figure.subplots(n_rows, n_columns, sharex=True, sharey=True, squeeze=False).ravel()
-    grid = np.unique(np.linspace(0, last, _GRID_POINTS).round().astype(int))
+    tested = {row[0] for seeds in tests.values() for rows in seeds.values() for row in rows}
+    grid = np.array(sorted(episode for episode in tested if episode <= last))
+    if len(grid) > _GRID_POINTS:
+        grid = np.unique(np.linspace(0, last, _GRID_POINTS).round().astype(int))
 
     for panel, task in zip(panels, [None, *tasks], strict=False):
         for index, (algorithm, seeds) in enumerate(tests.items()):
             curves = [_trailing_mean(rows, task, grid, window) for rows in seeds.values()]
-            _draw_curve(panel, grid, np.array(curves), algorithm, index)
+            _draw_curve(panel, grid, np.array(curves), names.get(algorithm, algorithm), index)
         starts = {name: episode for name, episode in presented.items() if task in (None, name)}
         _mark_starts(panel, starts, tasks, last)
         if task is not None and task in random_success:
@@ -187,7 +198,7 @@ def plot_frame_strips(episodes: Mapping[str, NDArray], n_frames: int = 8) -> Fig
     """
     if not episodes or any(len(frames) == 0 for frames in episodes.values()):
         raise ValueError("there is nothing to show: give episodes of at least one frame.")
-    figure = Figure(figsize=(1.3 * n_frames, 0.95 * len(episodes)), layout="constrained")
+    figure = Figure(figsize=(1.3 * n_frames, 1.05 * len(episodes)), layout="constrained")
     panels = figure.subplots(len(episodes), n_frames, squeeze=False)
     for row, (title, frames) in zip(panels, episodes.items(), strict=True):
         shown = np.unique(np.linspace(0, len(frames) - 1, n_frames).round().astype(int))
@@ -196,7 +207,7 @@ def plot_frame_strips(episodes: Mapping[str, NDArray], n_frames: int = 8) -> Fig
         for panel, index in zip(row, shown, strict=False):
             panel.imshow(frames[index], interpolation="nearest")
             panel.set_title(f"step {index}", fontsize=6, pad=2)
-        row[0].set_title(f"{title}: step 0", fontsize=6, pad=2, loc="left")
+        row[0].text(0, 1.2, title, fontsize=7, transform=row[0].transAxes)
     return figure
 
 

@@ -280,7 +280,7 @@ class TaskReplay:
         >>> played = {"state": torch.ones(10, 5), "task": torch.arange(10) % 2}
         >>> for _ in range(4):
         ...     replay.add(TensorDict(played, [10]))
-        >>> replay.sizes[0].tolist(), replay.sample()["_weight"][0].tolist()
+        >>> replay.sizes[0].tolist(), replay.sample()["priority_weight"][0].tolist()
         ([4, 0, 0], [[1.0, 1.0], [0.0, 0.0], [0.0, 0.0]])
     """
 
@@ -312,6 +312,15 @@ class TaskReplay:
         """Which tasks of each seed fill a batch without repetition, bool ``[S, T]``."""
         return self.sizes >= self.batch_size
 
+    @property
+    def enough(self) -> int:
+        """Transitions that fill a batch of some task, whichever tasks they are of.
+
+        Learning that waits for them begins with the same step for all seeds, so that none begins
+        earlier, or counts more steps in its optimizer, than it would alone.
+        """
+        return self._shape[1] * (self.batch_size - 1) + 1
+
     def __len__(self) -> int:
         """Returns the number of transitions that every seed holds at least, of all tasks."""
         return int(self.sizes.sum(-1).min())
@@ -340,8 +349,8 @@ class TaskReplay:
             generator: sources of the indices in place of the replay's own, ``S * T``.
 
         Returns:
-            Batch size ``[S, T, B]``, with ``"_weight"``, by which losses of TorchRL weight a
-            transition: 1, or 0 for tasks that are not `ready`; those have zeros in all entries.
+            Batch size ``[S, T, B]``, with ``"priority_weight"``, by which losses of TorchRL weight
+            a transition: 1, or 0 for tasks that are not `ready`; those have zeros in all entries.
         """
         batch_size = self.batch_size if batch_size is None else batch_size
         ready = self.ready.view(-1)
@@ -350,7 +359,7 @@ class TaskReplay:
             raise ValueError("no task fills a batch yet")
         sources = None if generator is None else [generator[row] for row in rows]
         drawn = self._buffer.sample(batch_size, seeds=rows, generator=sources)
-        drawn.set("_weight", torch.ones(drawn.batch_size))
+        drawn.set("priority_weight", torch.ones(drawn.batch_size))
         every = TensorDict(batch_size=[len(ready), batch_size])
         for key, value in drawn.items(True, True):
             padded = value.new_zeros(len(ready), *value.shape[1:])

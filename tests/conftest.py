@@ -9,8 +9,8 @@ import pytest
 import torch
 from hypothesis import settings
 
-from bgpo_trl.algorithms import bgpo
-from bgpo_trl.configs import BGPOConfig, DDPGConfig, RunConfig
+from bgpo_trl.algorithms import ALGORITHMS
+from bgpo_trl.configs import DDPGConfig, RunConfig
 from bgpo_trl.demonstrations import DemonstrationBank
 from bgpo_trl.envs import NicoEnv
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
@@ -21,6 +21,12 @@ from bgpo_trl.representation import Representation
 settings.register_profile("bgpo_trl", deadline=None)
 settings.load_profile("bgpo_trl")
 torch.set_num_threads(1)
+
+# Of the algorithms that learn each task from data of its own.
+SMALL = {
+    "maml": {"task_batch_size": 8, "adaptation_size": 12},
+    "dist-nll": {"task_batch_size": 8, "samples": 24, "distillation_batch_size": 12},
+}
 
 
 @pytest.fixture(scope="session")
@@ -45,11 +51,18 @@ def bank():
 def make_config():
     """Makes the settings of a run of two seeds and 10 episodes, with some of them changed."""
 
-    def make(state="latent", context="behavior", **changes):
+    def make(state="latent", name="bgpo", **changes):
         ddpg = DDPGConfig(hidden_sizes=(64,), batch_size=16, warmup_steps=8, replay_size=200)
-        algorithm = BGPOConfig(state=state, context=context, max_steps=6, ddpg=ddpg)
+        algorithm = replace(
+            ALGORITHMS[name].config, state=state, max_steps=6, ddpg=ddpg, **SMALL.get(name, {})
+        )
         config = RunConfig(
-            seeds=(3, 8), episodes=10, task_starts=(0, 2, 4), eval_every=2, bgpo=algorithm
+            seeds=(3, 8),
+            episodes=10,
+            task_starts=(0, 2, 4),
+            eval_every=2,
+            name=name,
+            algorithm=algorithm,
         )
         return replace(config, **changes)
 
@@ -77,7 +90,7 @@ def easy_world():
     It lasts for the module: mark all of it with `pytest.mark.usefixtures("easy_world")`.
     """
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(bgpo, "NicoEnv", EasyNicoEnv)
+        patch.setattr("bgpo_trl.algorithms.algorithm.NicoEnv", EasyNicoEnv)
         patch.setattr("bgpo_trl.evaluation.NicoEnv", EasyNicoEnv)
         yield EasyNicoEnv
 

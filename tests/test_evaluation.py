@@ -1,30 +1,39 @@
 """Test episodes against a plain loop over one environment, and what they must leave alone."""
 
+import copy
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
 
+from benchmarks import ablation
+from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.bgpo import BGPO
 from bgpo_trl.demonstrations import DemonstrationBank
 from bgpo_trl.evaluation import Evaluator, evaluate_random_policy
 from bgpo_trl.modules.actor_critic import Actor
+from bgpo_trl.modules.multi_head_actor import MultiHeadActor
 from bgpo_trl.seeding import stream_seed
 from bgpo_trl.transforms import TaskSchedule
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 SEEDS = (3, 8)
 EPISODES = 4
+WITHOUT_GWR = partial(BGPO, compose=ablation.VARIANTS["r_int"])
+every_algorithm = pytest.mark.parametrize("name", ALGORITHMS)
 
 
 @pytest.fixture
 def make(bank, encoders, make_config):
     """Makes an algorithm that has played a little, and an evaluator for it."""
 
-    def make(state="latent", context="behavior", seeds=SEEDS, starts=(0, 2, 4), n_steps=20):
-        config = make_config(state, context).bgpo
+    def make(state="latent", name="bgpo", make=None, seeds=SEEDS, starts=(0, 2, 4), n_steps=20):
+        config = make_config(state, name).algorithm
         parts = {"seeds": seeds, "encoders": encoders}
-        algorithm = BGPO(config, schedule=TaskSchedule(starts), bank=bank.seen(), **parts)
+        make = make or ALGORITHMS[name].make
+        algorithm = make(config, schedule=TaskSchedule(starts), bank=bank.seen(), **parts)
         evaluator = Evaluator(
             config, n_tasks=len(starts), episodes=EPISODES, bank=bank.held_out(), **parts
         )
@@ -42,6 +51,22 @@ def train(algorithm, n_steps):
         algorithm.store(transition)
 
 
+def last_layers(algorithm):
+    """The last layers of the policies that play test episodes."""
+    if hasattr(algorithm, "students"):
+        return [head for student in algorithm.students for head in student.heads]
+    actor = getattr(algorithm, "meta_actor", None) or algorithm.actor
+    return [actor.mlp.layers[-1]]
+
+
+@torch.no_grad()
+def turn(algorithm):
+    """Makes a policy turn the arm, sooner or later, as it sees and is told."""
+    for layer in last_layers(algorithm):
+        layer.weight.mul_(4)
+        layer.bias.add_(0.2)
+
+
 def take(evaluator, algorithm, number=0):
     return [
         evaluator.take(algorithm, index, number, env_steps=0)
@@ -54,29 +79,60 @@ def assert_same_result(first, second):
     assert first.steps.equal(second.steps)
 
 
+def plain_policy(algorithm, snapshot, index, task, episode):
+    """The policy that is to play a test episode, with a single set of weights."""
+    frozen, state = snapshot.policy["actor"], algorithm.config.state
+    size = {"in_keys": [state], "hidden_sizes": (64,)}
+    if hasattr(algorithm, "students"):  # one head for each task
+        policy = MultiHeadActor(algorithm.state_size, **size)
+        policy.add_head()
+        head = f"heads.{task}."
+        policy.load_state_dict(
+            {
+                key.replace(head, "heads.0."): value
+                for key, value in frozen.items()
+                if key.startswith(("trunk.", head))
+            }
+        )
+        return lambda seen: policy(TensorDict({state: seen[None]}, [1]))["action"][0].detach()
+    if hasattr(algorithm, "meta_actor"):  # weights for each task
+        policy = Actor(algorithm.state_size, **size)
+        policy.load_state_dict({key: value[task] for key, value in frozen.items()})
+        return lambda seen: policy(TensorDict({state: seen}))["action"].detach()
+    n_features = algorithm.actor.mlp.layers[0].in_features
+    policy = Actor(n_features, **{**size, "in_keys": algorithm.in_keys})
+    policy.load_state_dict(
+        {key: value[index] for key, value in algorithm.actor.state_dict().items()}
+    )
+    told = {key: snapshot.policy["told"][task, episode] for key in algorithm.in_keys[1:]}
+    return lambda seen: policy(TensorDict({state: seen, **told}))["action"].detach()
+
+
 @pytest.mark.parametrize(
-    ("state", "context"),
-    [("latent", "behavior"), ("latent", "demo_embedding"), ("state", "task_one_hot")],
+    ("state", "name", "kind"),
+    [
+        ("latent", "bgpo", None),
+        ("latent", "bgpo", WITHOUT_GWR),
+        ("state", "oracle", None),
+        ("latent", "ddpg", None),
+        ("latent", "maml", None),
+        ("state", "dist-nll", None),
+    ],
 )
 def test_a_test_episode_is_that_of_a_plain_loop_over_one_environment(
-    make, bank, encoders, easy_world, state, context
+    make, encoders, easy_world, state, name, kind
 ):
-    algorithm, evaluator = make(state, context)
-    with torch.no_grad():  # A policy that turns the arm, sooner or later, as it sees and is told.
-        algorithm.actor.mlp.layers[-1].weight.mul_(4)
-        algorithm.actor.mlp.layers[-1].bias.add_(0.2)
+    algorithm, evaluator = make(state, name, kind)
+    turn(algorithm)
     snapshots = take(evaluator, algorithm, number=5)
-    result = evaluator.run(snapshots, 5, algorithm.actor)
+    result = evaluator.run(snapshots, 5, algorithm)
 
     for index, seed in enumerate(SEEDS):
         rng = np.random.default_rng([stream_seed(seed, "evaluation"), 5])
         starts = rng.integers(2**32, size=(3, EPISODES))
-        weights = {key: value[index] for key, value in algorithm.actor.state_dict().items()}
-        actor = Actor(algorithm.actor.mlp.layers[0].in_features, in_keys=algorithm.actor.in_keys)
-        actor.load_state_dict(weights)
-        context_of = snapshots[index].context.unflatten(0, (3, EPISODES))
         for task in range(3):
             for episode in range(EPISODES):
+                policy = plain_policy(algorithm, snapshots[index], index, task, episode)
                 env = easy_world(
                     seed=[int(starts[task, episode])],
                     observation="state" if state == "state" else "pixels",
@@ -84,14 +140,11 @@ def test_a_test_episode_is_that_of_a_plain_loop_over_one_environment(
                 now = env.reset(TensorDict({"task": torch.tensor(task)}))
                 steps, success = 0, False
                 while steps < 6 and not success:
-                    given = {algorithm.actor.in_keys[1]: context_of[task, episode]}
                     if state == "latent":
-                        given["latent"] = encoders.vae.latent(now["pixels"]).clamp(-5, 5)
+                        seen = encoders.vae.latent(now["pixels"])
                     else:
                         seen = algorithm.env.transform[0].forward(now.clone())["state"]
-                        given["state"] = seen.clamp(-5, 5)
-                    action = actor(TensorDict(given))["action"].detach()
-                    now = env.step(now.set("action", action))["next"]
+                    now = env.step(now.set("action", policy(seen.clamp(-5, 5))))["next"]
                     steps += 1
                     success = bool(now["terminated"])
                 assert bool(result.success[index, task, episode]) == success
@@ -102,14 +155,14 @@ def test_a_test_episode_is_that_of_a_plain_loop_over_one_environment(
 
 def test_what_the_policy_is_told_follows_from_held_out_demonstrations(make, bank):
     algorithm, evaluator = make()
-    _, by_phi = make("latent", "demo_embedding")
-    raw, _ = make("latent", "demo_embedding", n_steps=1)
+    _, by_phi = make(make=WITHOUT_GWR)
+    raw, _ = make(make=WITHOUT_GWR, n_steps=1)
     held_out, seen = bank.held_out(), bank.seen()
     center, spread = seen.embedding.mean(0), seen.embedding.std(0)
     drawn = set()
     for number in range(5):
-        shown = [s.context.unflatten(0, (3, EPISODES)) for s in take(by_phi, raw, number)]
-        told = [s.context.unflatten(0, (3, EPISODES)) for s in take(evaluator, algorithm, number)]
+        shown = [s.policy["told"] for s in take(by_phi, raw, number)]
+        told = [s.policy["told"] for s in take(evaluator, algorithm, number)]
         for index, phi in enumerate(shown):
             for task in range(3):
                 of_task = (held_out.embedding[held_out.task == task] - center) / spread
@@ -123,10 +176,17 @@ def test_what_the_policy_is_told_follows_from_held_out_demonstrations(make, bank
 
 
 def test_a_label_tells_the_task(make):
-    algorithm, evaluator = make("state", "task_one_hot")
-    expected = torch.eye(3).repeat_interleave(EPISODES, 0)
+    algorithm, evaluator = make("state", "oracle")
+    expected = torch.eye(3).repeat_interleave(EPISODES, 0).view(3, EPISODES, 3)
     for snapshot in take(evaluator, algorithm):
-        assert snapshot.context.equal(expected)
+        assert snapshot.policy["told"].equal(expected)
+
+
+@pytest.mark.parametrize("name", ["ddpg", "maml", "dist-nll"])
+def test_all_but_weights_is_told_by_bgpo_and_oracle_only(make, name):
+    algorithm, evaluator = make("state", name)
+    for snapshot in take(evaluator, algorithm):
+        assert set(snapshot.policy) == {"actor"}
 
 
 def flat(state, where=""):
@@ -138,51 +198,67 @@ def flat(state, where=""):
     return [(where, state.clone() if isinstance(state, torch.Tensor) else state)]
 
 
-def test_testing_leaves_no_trace_in_training(make):
-    algorithm, evaluator = make()
-    before = flat(algorithm.state_dict())
-    for number in range(2):
-        evaluator.run(take(evaluator, algorithm, number), number, algorithm.actor)
-    after = flat(algorithm.state_dict())
-    assert {"/" + where.split("/")[1] for where, _ in before} == {
-        *("/loss", "/optimizer", "/replay", "/source", "/gwr", "/simulation", "/noise"),
-        "/exploratory",
-    }
-    for (where, first), (_, second) in zip(before, after, strict=True):
-        same = first.equal(second) if isinstance(first, torch.Tensor) else first == second
+def assert_same_values(first, second):
+    for (where, ours), (_, theirs) in zip(flat(first), flat(second), strict=True):
+        same = ours.equal(theirs) if isinstance(ours, torch.Tensor) else ours == theirs
         assert same, where
 
 
-def test_a_snapshot_does_not_follow_the_training(make):
-    algorithm, evaluator = make()
-    snapshots = take(evaluator, algorithm)
-    before = evaluator.run(snapshots, 0, algorithm.actor)
-    weights = [value.clone() for value in algorithm.actor.parameters()]
-    nodes = algorithm.gwr.graph(0).weights
-    with torch.no_grad():
-        algorithm.actor.mlp.layers[-1].bias.add_(2)
-    train(algorithm, 20)
-    assert not algorithm.gwr.graph(0).weights.equal(nodes)
-    for value, old in zip(algorithm.actor.parameters(), weights, strict=True):
-        assert not value.equal(old)
+@every_algorithm
+def test_testing_leaves_no_trace_in_training(make, name):
+    algorithm, evaluator = make(name=name)
+    before, chance = copy.deepcopy(algorithm.state_dict()), torch.random.get_rng_state()
+    for number in range(2):
+        evaluator.run(take(evaluator, algorithm, number), number, algorithm)
+    own = {
+        "maml": set(),
+        "dist-nll": {"tasks", "heads", "students", "student_optimizers", "ended"},
+    }
+    assert set(before) == {
+        *("loss", "optimizer", "replay", "source", "simulation", "noise"),
+        *own.get(name, {"gwr"}),
+    }
+    assert_same_values(algorithm.state_dict(), before)
+    assert torch.random.get_rng_state().equal(chance)
 
-    assert_same_result(evaluator.run(snapshots, 0, algorithm.actor), before)
-    later = evaluator.run(take(evaluator, algorithm), 0, algorithm.actor)
+
+@every_algorithm
+def test_a_snapshot_does_not_follow_the_training(make, name):
+    algorithm, evaluator = make(name=name)
+    snapshots = take(evaluator, algorithm)
+    before = evaluator.run(snapshots, 0, algorithm)
+    policies = copy.deepcopy([snapshot.policy for snapshot in snapshots])
+    nodes = None if algorithm.gwr is None else algorithm.gwr.graph(0).weights
+    with torch.no_grad():
+        for layer in last_layers(algorithm):
+            layer.bias.add_(2)
+    train(algorithm, 20)
+    if nodes is not None:
+        assert not algorithm.gwr.graph(0).weights.equal(nodes)
+    for snapshot, policy in zip(take(evaluator, algorithm), policies, strict=True):
+        for key, value in policy["actor"].items():
+            assert not snapshot.policy["actor"][key].equal(value), key
+
+    assert_same_values([snapshot.policy for snapshot in snapshots], policies)
+    assert_same_result(evaluator.run(snapshots, 0, algorithm), before)
+    later = evaluator.run(take(evaluator, algorithm), 0, algorithm)
     assert not later.steps.equal(before.steps)
 
 
-def test_an_evaluation_follows_from_seed_and_number(make):
-    algorithm, evaluator = make()
+@every_algorithm
+def test_an_evaluation_follows_from_seed_and_number(make, name):
+    algorithm, evaluator = make(name=name)
+    turn(algorithm)
     results = [
-        evaluator.run(take(evaluator, algorithm, number), number, algorithm.actor)
-        for number in (0, 1, 0)
+        evaluator.run(take(evaluator, algorithm, number), number, algorithm) for number in (0, 1, 0)
     ]
     assert_same_result(results[0], results[2])
     assert not results[0].steps.equal(results[1].steps)
 
     for index, seed in enumerate(SEEDS):
-        alone, evaluator = make(seeds=(seed,))
-        result = evaluator.run(take(evaluator, alone), 0, alone.actor)
+        alone, evaluator = make(name=name, seeds=(seed,))
+        turn(alone)
+        result = evaluator.run(take(evaluator, alone), 0, alone)
         assert result.success[0].equal(results[0].success[index])
         assert result.steps[0].equal(results[0].steps[index])
 
@@ -193,7 +269,7 @@ def test_only_tasks_that_were_presented_are_tested(make, starts):
     assert (algorithm.source.episode > 2).all()
     presented = [start < 99 for start in starts]
     snapshots = take(evaluator, algorithm)
-    result = evaluator.run(snapshots, 0, algorithm.actor)
+    result = evaluator.run(snapshots, 0, algorithm)
     for index, snapshot in enumerate(snapshots):
         assert snapshot.presented.tolist() == presented
         assert snapshot.episode == algorithm.source.episode[index]
@@ -212,16 +288,21 @@ def test_a_task_counts_as_presented_once_an_episode_could_be_about_it(make, epis
 def test_seeds_may_be_at_different_stages(make):
     algorithm, evaluator = make(n_steps=0)
     algorithm.source.episode.copy_(torch.tensor([1, 3]))
-    result = evaluator.run(take(evaluator, algorithm), 0, algorithm.actor)
+    result = evaluator.run(take(evaluator, algorithm), 0, algorithm)
     assert (result.steps > 0).all(-1).tolist() == [[True, False, False], [True, True, False]]
 
 
 def test_a_bank_without_a_held_out_demonstration_of_a_task_is_refused(bank, encoders, make_config):
     train = bank.train | (bank.task == 1)
-    partial = DemonstrationBank(bank.embedding, bank.task, train).held_out()
+    incomplete = DemonstrationBank(bank.embedding, bank.task, train).held_out()
     with pytest.raises(ValueError, match="no held-out demonstration of task 1"):
         Evaluator(
-            make_config().bgpo, seeds=SEEDS, n_tasks=3, episodes=1, bank=partial, encoders=encoders
+            make_config().algorithm,
+            seeds=SEEDS,
+            n_tasks=3,
+            episodes=1,
+            bank=incomplete,
+            encoders=encoders,
         )
 
 

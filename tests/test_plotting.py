@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from bgpo_trl.logging import RunLogger
-from bgpo_trl.plotting import plot_gwr_pca, plot_success_curves, save_figure
+from bgpo_trl.plotting import plot_frame_strips, plot_gwr_pca, plot_success_curves, save_figure
 
 TASKS = ["grasp_glass", "push_green_to_glass", "push_green_to_white"]
 
@@ -83,10 +83,37 @@ def test_each_panel_shows_its_task_and_the_window_never_looks_ahead(tmp_path):
         "Task 1: a",
         "Task 2: b",
     ]
-    assert curve(overall) == pytest.approx({1: 1, 2: 1 / 2, 3: 1 / 3, 4: 0, 5: 0, 6: 1 / 2})
-    assert curve(a) == {1: 1, 2: 1, 3: 1 / 2, 4: 0, 5: 0}
+    # A point for each evaluation: nothing is known of episodes 4 and 5.
+    assert curve(overall) == pytest.approx({1: 1, 2: 1 / 2, 3: 1 / 3, 6: 1 / 2})
+    assert curve(a) == {1: 1, 2: 1, 3: 1 / 2}
     # At 6, the second seed has its first test episode: mean of 1 and 0.
-    assert curve(b) == {2: 0, 3: 0, 4: 0, 6: 1 / 2}
+    assert curve(b) == {2: 0, 3: 0, 6: 1 / 2}
+
+
+def test_curves_may_end_early_and_be_called_otherwise(run):
+    names = {"MAML": "the second", "BGPO": "the first"}
+    whole, cut = plot_success_curves(run), plot_success_curves(run, last=50, window=5, names=names)
+    labels = [text.get_text() for text in cut.legends[0].get_texts()]
+    assert labels == ["the second (2 seeds)", "the first (2 seeds)", "Dist-NLL (2 seeds)"]
+    for index, before in ((0, 1), (1, 0), (2, 2)):
+        expected = {x: y for x, y in curve(whole.axes[0], before).items() if x <= 50}
+        assert curve(cut.axes[0], index) == expected != {}
+
+
+def test_frame_strips_go_from_the_first_to_the_last_frame():
+    short = np.arange(3, dtype=np.uint8)[:, None, None, None].repeat(3, -1) * 9
+    long = np.arange(40, dtype=np.uint8)[:, None, None, None].repeat(3, -1)
+    figure = plot_frame_strips({"short": short, "long": long}, n_frames=4)
+    shown = [[int(np.asarray(i.get_array())[0, 0, 0]) for i in a.images] for a in figure.axes]
+    assert shown == [[0], [9], [18], [], [0], [13], [26], [39]]
+    assert [a.get_title() for a in figure.axes[4:]] == ["step 0", "step 13", "step 26", "step 39"]
+    assert figure.axes[0].texts[0].get_text() == "short"
+
+
+@pytest.mark.parametrize("episodes", [{}, {"none": np.zeros((0, 2, 2, 3), np.uint8)}])
+def test_nothing_to_show_is_refused(episodes):
+    with pytest.raises(ValueError, match="nothing to show"):
+        plot_frame_strips(episodes)
 
 
 def test_runs_may_be_spread_over_files_with_rows_in_any_order(run, tmp_path):

@@ -167,7 +167,7 @@ class DistNLL(Algorithm):
 
         The multi-task policies of seeds whose episode has just ended learn from them after it.
         """
-        if len(self.replay) < self.config.ddpg.warmup_steps or not self.replay.ready.any():
+        if len(self.replay) < max(self.config.ddpg.warmup_steps, self.replay.enough):
             return {}
         losses = self.loss(self.moved(self.replay.sample()))
         self.optimizer.zero_grad()
@@ -187,8 +187,6 @@ class DistNLL(Algorithm):
                 tasks.append(task)
                 head = student.add_head(self._heads[index])
                 optimizer.add_param_group({"params": list(head.parameters())})
-        if not tasks:
-            return
         drawn = self.replay.sample_seed(index, tasks, self.config.samples)
         batch = self.moved(drawn.select(self.config.state))
         teachers = networks_of(

@@ -132,7 +132,7 @@ class MAML(Algorithm):
 
     def update(self) -> dict[str, Tensor]:
         """Makes one update of each seed; see `Algorithm.update`."""
-        if len(self.replay) < self.config.ddpg.warmup_steps or not self.replay.ready.any():
+        if len(self.replay) < max(self.config.ddpg.warmup_steps, self.replay.enough):
             return {}
         losses = self.loss(self.moved(self.replay.sample()))
         self.optimizer.zero_grad()

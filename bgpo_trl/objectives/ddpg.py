@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -272,10 +272,21 @@ def _bind(network: TensorDictModuleBase, params: TensorDictBase) -> TensorDictMo
     return network
 
 
+def _float_pairs(
+    targets: TensorDictBase, sources: TensorDictBase
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """Yields each target with its source, where they are tensors of their own."""
+    for key, target in targets.items(True, True):
+        source = sources[key]
+        if target.is_floating_point() and not target.is_set_to(source.data):
+            yield target, source
+
+
 class ForeachSoftUpdate(objectives.SoftUpdate):
     """TorchRL's :class:`~torchrl.objectives.SoftUpdate` of target networks, in one kernel call.
 
-    Takes 0.02 ms an update in place of 0.33 ms for one actor and critic of 64 hidden units.
+    Takes 0.02 ms an update in place of 0.33 ms for one actor and critic of 64 hidden units. Targets
+    also follow what needs no gradient, which TorchRL's do not: in `MAMLLoss` the adapted policies.
 
     Args:
         loss_module: loss with target networks.
@@ -288,8 +299,11 @@ class ForeachSoftUpdate(objectives.SoftUpdate):
     ) -> None:
         super().__init__(loss_module, eps=eps, tau=tau)
         pairs = [
-            (target, self._sources[key[0].removeprefix("target_"), *key[1:]])
-            for key, target in self._targets.items(True, True)
+            (target, source)
+            for name in self._target_names
+            for target, source in _float_pairs(
+                getattr(loss_module, name), getattr(loss_module, name.removeprefix("target_"))
+            )
         ]
         self._target_tensors, self._source_tensors = map(list, zip(*pairs, strict=True))
 

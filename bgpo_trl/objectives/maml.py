@@ -34,9 +34,10 @@ class MAMLLoss(DDPGLoss):
     ``theta`` are the parameters of ``meta_network``. Those of ``actor_network`` are the latest
     ``theta_i``: they are written here, have no gradient, and target networks follow them.
 
-    Reads what `DDPGLoss` reads, with the batch size ``[*S, T, B]``, ``B`` even; and ``"_weight"``
-    ``[*S, T, B]``, 0 for tasks of which nothing is known yet. Returns what `DDPGLoss` returns, per
-    task.
+    Reads what `DDPGLoss` reads, with the batch size ``[*S, T, B]``, ``B`` even; and
+    ``"priority_weight"`` ``[*S, T, B]``, 0 for tasks of which nothing is known yet. Returns what
+    `DDPGLoss` returns, per task. Its targets are to be moved by `ForeachSoftUpdate`: TorchRL's own
+    `SoftUpdate` passes over what needs no gradient, as the parameters of ``actor_network`` do not.
 
     Args:
         meta_network: policy with a ``batch_size`` ``[*S]``.
@@ -71,12 +72,13 @@ class MAMLLoss(DDPGLoss):
         # It is only called with parameters from elsewhere; a list keeps its own out of this module.
         self._template = [deepcopy(actor_network).requires_grad_(False)]
         actor_network = deepcopy(actor_network).requires_grad_(False)
+        start = dict(meta_network.named_parameters())
+        with torch.no_grad():
+            for name, parameter in actor_network.named_parameters():
+                parameter.copy_(start[name].unsqueeze(len(shapes[0])))
         super().__init__(actor_network, value_network, **ddpg)
         self.meta_network = meta_network
         self.inner_learning_rate = inner_learning_rate
-        with torch.no_grad():
-            self._keep(self._each_task())
-            self.target_actor_network_params.data.copy_(self.actor_network_params.data)
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Computes the loss of the adapted policies, and keeps them in ``actor_network``.

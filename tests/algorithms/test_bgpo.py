@@ -1,23 +1,27 @@
 """BGPO as a whole: what it sees, what it learns from, and that seeds share nothing."""
 
 from dataclasses import replace
-from itertools import pairwise
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torchrl.envs import check_env_specs
 
-from bgpo_trl.algorithms.bgpo import BGPO, observe
-from bgpo_trl.configs import BGPOConfig
+from benchmarks import ablation
+from bgpo_trl.algorithms.algorithm import observe
+from bgpo_trl.algorithms.bgpo import BGPO, labeled, self_organized, untold
+from bgpo_trl.demonstrations import DemonstrationBank
 from bgpo_trl.modules.gwr import GWRB
 from bgpo_trl.seeding import generators
 from bgpo_trl.transforms import BehaviorLookup, TaskSchedule
 
+# What the policy sees, what it is told, and the composition that tells it.
 VARIANTS = {
-    "ground truth, label": ("state", "task_one_hot"),
-    "latent, label": ("latent", "task_one_hot"),
-    "latent, phi": ("latent", "demo_embedding"),
-    "latent, b": ("latent", "behavior"),
+    "ground truth, label": ("state", "label", labeled),
+    "latent, label": ("latent", "label", labeled),
+    "latent, nothing": ("latent", "nothing", untold),
+    "latent, phi": ("latent", "phi", ablation.VARIANTS["r_int"]),
+    "latent, b": ("latent", "b", self_organized),
 }
 pytestmark = pytest.mark.usefixtures("easy_world")
 variants = pytest.mark.parametrize("variant", VARIANTS)
@@ -26,10 +30,11 @@ SCHEDULE = TaskSchedule((0, 2, 4))
 
 @pytest.fixture
 def make(bank, encoders, make_config):
-    def make(variant="latent, b", seeds=(3, 8), schedule=SCHEDULE, **changes):
-        state, context = VARIANTS[variant]
-        config = replace(make_config(state, context).bgpo, **changes)
-        return BGPO(config, seeds=seeds, schedule=schedule, bank=bank.seen(), encoders=encoders)
+    def make(variant="latent, b", seeds=(3, 8), schedule=SCHEDULE, bank=bank, **changes):
+        state, _, compose = VARIANTS[variant]
+        config = replace(make_config(state).algorithm, **changes)
+        parts = {"bank": bank.seen(), "encoders": encoders, "compose": compose}
+        return BGPO(config, seeds=seeds, schedule=schedule, **parts)
 
     return make
 
@@ -61,18 +66,24 @@ def test_each_variant_is_an_environment_with_the_input_it_is_named_after(make, v
             transform.learn = False
     check_env_specs(algorithm.env)
 
-    state, context = VARIANTS[variant]
-    sizes = {"state": 16, "latent": 64, "task_one_hot": n_tasks}
-    key = "task_one_hot" if context == "task_one_hot" else "normalized_behavior"
+    state, told, _ = VARIANTS[variant]
+    sizes = {"state": 16, "latent": 64, "task_one_hot": n_tasks, "normalized_behavior": 32}
+    keys = {"label": ["task_one_hot"], "nothing": []}.get(told, ["normalized_behavior"])
     start = algorithm.act(algorithm.env.reset())
-    assert algorithm.actor.in_keys == [state, key]
-    assert algorithm.actor.mlp.layers[0].in_features == sizes[state] + sizes.get(context, 32)
-    assert start[state].shape == (2, sizes[state])
-    assert start[key].shape == (2, sizes.get(context, 32))
+    assert algorithm.actor.in_keys == [state, *keys]
+    assert algorithm.critic.in_keys == [state, *keys, "action"]
+    n_features = sum(sizes[key] for key in (state, *keys))
+    assert algorithm.actor.mlp.layers[0].in_features == n_features
+    assert algorithm.critic.mlp.layers[0].in_features == n_features + 4
+    for key in (state, *keys):
+        assert start[key].shape == (2, sizes[key])
     assert start["action"].shape == (2, 4)
-    assert ("behavior_node" in start) == (context == "behavior")
-    assert ("lae_h" in start) == (context != "task_one_hot")
+    assert ("task_one_hot" in start) == (told == "label")
+    assert ("normalized_behavior" in start) == ("behavior" in start) == (told in ("phi", "b"))
+    assert ("behavior_node" in start) == (told == "b")
+    assert ("lae_h" in start) == (told in ("phi", "b"))
     assert "pixels" not in start
+    assert (before is not None) == (told == "b")
     if before is not None:
         assert_same_graph(algorithm.gwr.graph(0), before, rtol=0, atol=0)
 
@@ -97,7 +108,7 @@ def test_a_label_is_the_task_of_the_episode(make):
     assert data["task"].unique().tolist() == [0, 1, 2]
 
 
-@pytest.mark.parametrize("variant", ["latent, phi", "latent, b"])
+@pytest.mark.parametrize("variant", ["latent, nothing", "latent, phi", "latent, b"])
 def test_bgpo_never_reads_the_label(make, variant):
     label = ("task", "task_one_hot")
     algorithm, blind = make(variant), make(variant)
@@ -105,37 +116,96 @@ def test_bgpo_never_reads_the_label(make, variant):
         names = {name for key in keys for name in ([key] if isinstance(key, str) else key)}
         assert names.isdisjoint(label)
 
-    told = play(algorithm, 40)
-    untold = play(blind, 40, hidden=["task"])
+    seeing = play(algorithm, 40)
+    not_seeing = play(blind, 40, hidden=["task"])
 
-    assert told["task"].unique().tolist() == [0, 1, 2]
-    for key in ("action", "latent", "behavior", "demo_index", ("next", "reward")):
-        assert told[key].equal(untold[key]), key
+    assert seeing["task"].unique().tolist() == [0, 1, 2]
+    behavior = [] if variant == "latent, nothing" else ["behavior"]
+    for key in ("action", "latent", *behavior, "demo_index", ("next", "reward")):
+        assert seeing[key].equal(not_seeing[key]), key
     for ours, theirs in zip(algorithm.loss.parameters(), blind.loss.parameters(), strict=True):
         assert ours.equal(theirs)
     if algorithm.gwr is not None:
         assert_same_graph(algorithm.gwr.graph(0), blind.gwr.graph(0), rtol=0, atol=0)
 
 
-@variants
-def test_only_a_variant_with_a_label_acts_by_it(make, variant):
-    algorithm = make(variant, schedule=TaskSchedule((0, 0, 0)))
+@pytest.mark.parametrize("variant", ["ground truth, label", "latent, nothing"])
+def test_a_reference_learns_the_same_from_whatever_demonstrations(make, bank, variant):
+    other = DemonstrationBank(-3 * bank.embedding.flip(0), bank.task, bank.train)
+    algorithm, elsewhere = make(variant), make(variant, bank=other)
+    data, changed = play(algorithm, 30), play(elsewhere, 30)
+    assert not data["demo_embedding"].equal(changed["demo_embedding"])
+    for key in (*algorithm.in_keys, "action", "task", ("next", "reward")):
+        assert data[key].equal(changed[key]), key
+    for ours, theirs in zip(algorithm.loss.parameters(), elsewhere.loss.parameters(), strict=True):
+        assert ours.equal(theirs)
+
+
+def test_plain_ddpg_acts_and_learns_by_the_state_and_nothing_else(make):
+    algorithm, blind = make("latent, nothing"), make("latent, nothing")
+    states = [learner.env.reset() for learner in (algorithm, blind)]
+    kept = ["latent", "action", *(("next", key) for key in ("latent", "reward", "terminated"))]
+    for _ in range(20):
+        actions = [algorithm.act(states[0]), blind.act(states[1].select("latent"))]
+        assert set(actions[1].keys()) == {"latent", "action"}
+        for index, learner in enumerate((algorithm, blind)):
+            losses = learner.update()
+            chosen = states[index].set("action", actions[index]["action"])
+            transition, states[index] = learner.env.step_and_maybe_reset(chosen)
+            learner.store(transition.select(*kept) if learner is blind else transition)
+        assert actions[0]["action"].equal(actions[1]["action"])
+    assert losses
+    assert set(algorithm.replay.sample().keys(True, True)) == set(kept)
+    for ours, theirs in zip(algorithm.loss.parameters(), blind.loss.parameters(), strict=True):
+        assert ours.equal(theirs)
+
+
+def test_what_is_said_of_a_labeled_task_is_its_place(make):
+    """The first layer adds the row of weights that belongs to the label."""
+    algorithm = make("latent, label", schedule=TaskSchedule((0, 0, 0)))
     state = algorithm.env.reset()
-    embedding = state["demo_embedding"].unsqueeze(1)
-    first = algorithm.infer(embedding, torch.zeros(2, 1, dtype=torch.int64))
-    other = algorithm.infer(embedding, torch.ones(2, 1, dtype=torch.int64))
-    key = algorithm.in_keys[1]
-    actions = [algorithm.actor(state.clone().set(key, b[:, 0]))["action"] for b in (first, other)]
-    assert actions[0].equal(actions[1]) == (key == "normalized_behavior")
+    first, second = algorithm.actor.mlp.layers
+    for index in range(2):
+        weight = first.weight[index]
+        hidden = state["latent"][index] @ weight[:64] + weight[64 + state["task"][index]]
+        hidden = (hidden + first.bias[index]).relu()
+        action = (hidden @ second.weight[index] + second.bias[index]).tanh()
+        torch.testing.assert_close(algorithm.actor(state.clone())["action"][index], action)
 
 
-def test_inference_is_the_lookup_of_the_algorithm_and_learns_nothing(make, bank):
+def act_in_tests(algorithm, state, embedding, task):
+    frozen = [
+        TensorDict(algorithm.freeze(index, embedding, task, torch.Generator()))
+        for index in range(algorithm.n_seeds)
+    ]
+    return algorithm.act_frozen(TensorDict.maybe_dense_stack(frozen), state)
+
+
+@variants
+def test_only_a_variant_with_a_label_acts_by_it(make, bank, variant):
+    algorithm = make(variant, schedule=TaskSchedule((0, 0, 0)))
+    embedding = bank.held_out().embedding.view(3, 4, 32)
+    state = torch.randn(2, 3, 4, algorithm.state_size, generator=torch.Generator().manual_seed(0))
+    actions = [
+        act_in_tests(algorithm, state, embedding, torch.full((3, 4), task)) for task in (0, 1)
+    ]
+    assert actions[0].shape == (2, 3, 4, 4)
+    assert actions[0].equal(actions[1]) == (VARIANTS[variant][1] != "label")
+    other = act_in_tests(algorithm, state, 5 - embedding.flip(0), torch.zeros(3, 4).long())
+    assert actions[0].equal(other) == (VARIANTS[variant][1] in ("label", "nothing"))
+
+
+def test_frozen_policies_are_told_what_training_would_tell_and_learn_nothing(make, bank):
     algorithm = make()
     play(algorithm, 13)
     before = [algorithm.gwr.graph(i) for i in range(2)]
     state = algorithm.env.reset()
-    inferred = algorithm.infer(state["demo_embedding"].unsqueeze(1), state["task"].unsqueeze(1))
-    assert inferred.squeeze(1).equal(state["normalized_behavior"])
+    shown = (state["demo_embedding"].unsqueeze(1), state["task"].unsqueeze(1))
+    for index in range(2):
+        frozen = algorithm.freeze(index, *shown, torch.Generator())
+        assert frozen["told"][index, 0].equal(state["normalized_behavior"][index])
+        for key, value in algorithm.actor.state_dict().items():
+            assert frozen["actor"][key].equal(value[index])
     seen = bank.seen().embedding
     torch.testing.assert_close(
         state["normalized_behavior"] * seen.std(0) + seen.mean(0), state["behavior"]
@@ -169,55 +239,23 @@ def test_episodes_follow_algorithm_1(make, bank, encoders):
         assert len(gwr.graph().weights) > 2
 
 
-def expect(algorithm, value):
-    """Has the critic expect the same of whatever is done."""
-    with torch.no_grad():
-        algorithm.critic.mlp.layers[-1].weight.zero_()
-        algorithm.critic.mlp.layers[-1].bias.fill_(value)
-
-
-@pytest.mark.parametrize(("value", "policy"), [(0.0, 0.0), (-1.0, 0.0), (0.25, 1.0), (0.9, 1.0)])
-def test_exploration_is_noise_of_each_seed_on_the_policy_or_alone(make, value, policy):
-    config = make().config
-    algorithm = make(ddpg=replace(config.ddpg, exploratory_share=1.0))
-    expect(algorithm, value)
-    state = algorithm.env.reset()
-    action = algorithm.actor(state.clone())["action"]
-    explored = algorithm.act(state)["action"]
-    for index, source in enumerate(generators((3, 8), "exploration")):
-        torch.rand((), generator=source)
-        noise = config.ddpg.noise * torch.randn(4, generator=source)
-        torch.testing.assert_close(explored[index], (policy * action[index] + noise).clamp(-1, 1))
-    with torch.no_grad():
-        algorithm.actor.mlp.layers[-1].bias.fill_(9)
-    assert (algorithm.act(algorithm.env.reset())["action"].max() == 1) == bool(policy)
-
-
-@pytest.mark.parametrize(("value", "share"), [(0.0, 0.5), (0.125, 0.25), (0.3, 0.0)])
-def test_the_less_is_expected_the_more_episodes_explore(make, value, share):
-    algorithm = make()
-    expect(algorithm, value)
-    with torch.no_grad():
-        algorithm.actor.mlp.layers[-1].bias.fill_(9)  # tells policy from noise
-    start = algorithm.env.reset()
-    drawn = torch.stack([(algorithm.act(start)["action"] < 0.1).any(-1) for _ in range(300)])
-    assert drawn.float().mean().item() == pytest.approx(share, abs=0.07)
-
-
-def test_what_an_episode_does_is_drawn_at_its_start_only(make):
-    algorithm = make(max_steps=50)
-    expect(algorithm, 0.0)
-    with torch.no_grad():
-        algorithm.actor.mlp.layers[-1].bias.fill_(9)
-    data = play(algorithm, 120)
-    by_policy = data["action"].mean(-1) > 0.5  # of four parts around 0.9, or around 0
-    kinds = set()
-    for row in range(2):
-        firsts = (data["step_count"][row, :, 0] == 0).nonzero().flatten().tolist()
-        for first, end in pairwise([*firsts, 120]):
-            assert by_policy[row, first:end].unique().numel() == 1
-            kinds.add(by_policy[row, first].item())
-    assert kinds == {True, False}
+@variants
+@pytest.mark.parametrize("scale", [0.0, 0.7])
+def test_exploration_is_noise_of_each_seed_on_the_policys_action(make, make_config, variant, scale):
+    ddpg = replace(make_config().algorithm.ddpg, noise=scale)
+    algorithm, sources = make(variant, ddpg=ddpg), generators((3, 8), "exploration")
+    with torch.no_grad():  # so that some actions are cut off, and some are not
+        algorithm.actor.mlp.layers[-1].bias.copy_(torch.tensor([[0.0, 1.0, -1.0, 0.0]]))
+    state, n_cut = algorithm.env.reset(), 0
+    for _ in range(8):
+        action = algorithm.actor(state.clone())["action"]
+        state = algorithm.act(state)
+        for index, source in enumerate(sources):
+            expected = action[index] + scale * torch.randn(4, generator=source)
+            n_cut += int((expected.abs() > 1).sum())
+            torch.testing.assert_close(state["action"][index], expected.clamp(-1, 1))
+        _, state = algorithm.env.step_and_maybe_reset(state)
+    assert (0 < n_cut < 64) == (scale > 0)
 
 
 @pytest.mark.parametrize(
@@ -227,6 +265,7 @@ def test_what_an_episode_does_is_drawn_at_its_start_only(make):
         ("latent, phi", {"beta": 0.3}, 1.3),
         ("latent, b", {"beta": 0.0}, 1.0),
         ("latent, label", {}, 1.0),
+        ("latent, nothing", {"beta": 0.3}, 1.0),
     ],
 )
 def test_targets_are_clipped_to_the_attainable_returns(make, variant, changes, highest):
@@ -249,7 +288,7 @@ def test_targets_are_clipped_to_the_attainable_returns(make, variant, changes, h
 
 
 def test_clipping_can_be_turned_off(make, make_config):
-    ddpg = replace(make_config().bgpo.ddpg, clip_targets=False)
+    ddpg = replace(make_config().algorithm.ddpg, clip_targets=False)
     assert make(ddpg=ddpg).loss.return_bounds is None
 
 
@@ -265,9 +304,9 @@ def test_the_first_update_comes_after_the_warm_up_and_with_the_step_that_follows
     assert len(algorithm.replay) == algorithm.config.ddpg.warmup_steps + 1
 
 
-@pytest.mark.parametrize("variant", ["ground truth, label", "latent, b"])
+@pytest.mark.parametrize("variant", ["ground truth, label", "latent, nothing", "latent, b"])
 def test_each_seed_of_a_batch_learns_as_it_would_alone(make, variant):
-    seeds = (3, 8)
+    seeds = (1, 2)  # no pixel of theirs is so near an edge that rounding moves it across
     batch = make(variant, seeds=seeds)
     together = play(batch, 60)
     losses = []
@@ -276,7 +315,7 @@ def test_each_seed_of_a_batch_learns_as_it_would_alone(make, variant):
         data = play(alone, 60)[0]
         for key in ("task", "demo_index", "step_count", ("next", "terminated")):
             assert together[index][key].equal(data[key]), key
-        for key in ("action", alone.in_keys[0], alone.in_keys[1], ("next", "reward")):
+        for key in ("action", *alone.in_keys, ("next", "reward")):
             torch.testing.assert_close(together[index][key], data[key], rtol=1e-4, atol=1e-4)
         for ours, theirs in zip(batch.loss.parameters(), alone.loss.parameters(), strict=True):
             torch.testing.assert_close(ours[index], theirs[0], rtol=1e-4, atol=1e-4)
@@ -292,18 +331,23 @@ def test_each_seed_of_a_batch_learns_as_it_would_alone(make, variant):
 
 @variants
 def test_missing_encoders_are_refused(make_config, bank, variant):
-    state, context = VARIANTS[variant]
-    config = make_config(state, context).bgpo
-    parts = {"seeds": (0,), "schedule": SCHEDULE, "bank": bank.seen()}
+    state, _, compose = VARIANTS[variant]
+    config = make_config(state).algorithm
+    parts = {"seeds": (0,), "schedule": SCHEDULE, "bank": bank.seen(), "compose": compose}
     if state == "state":
         BGPO(config, **parts)
-        assert observe(config, None, 3)
+        assert observe(config, None)
     else:
         with pytest.raises(ValueError, match="needs trained encoders"):
             BGPO(config, **parts)
 
 
-@pytest.mark.parametrize("context", ["behavior", "demo_embedding"])
-def test_ground_truth_without_a_label_is_refused(context):
-    with pytest.raises(ValueError, match="goes with context='task_one_hot' only"):
-        BGPOConfig(state="state", context=context)
+@pytest.mark.parametrize("told", ["phi", "b"])
+def test_matching_behaviors_on_ground_truth_is_refused(make_config, bank, encoders, told):
+    compose = VARIANTS[f"latent, {told}"][-1]
+    config = make_config("state").algorithm
+    parts = {"seeds": (0,), "schedule": SCHEDULE, "bank": bank.seen(), "compose": compose}
+    with pytest.raises(ValueError, match="matching behaviors needs trained encoders"):
+        BGPO(config, **parts)
+    with pytest.raises(ValueError, match="found no 'latent'"):
+        BGPO(config, encoders=encoders, **parts).env.reset()

@@ -5,8 +5,10 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
+from torch.nn.functional import layer_norm
 
-from bgpo_trl.objectives.ddpg import ForeachSoftUpdate
+from bgpo_trl.modules.actor_critic import Actor, Critic
+from bgpo_trl.objectives.ddpg import DDPGLoss, ForeachSoftUpdate
 from bgpo_trl.objectives.maml import MAMLLoss
 
 TARGETS = torch.tensor([[0.5, -0.2], [-0.7, 0.9], [0.1, 0.4]]).double()
@@ -102,3 +104,294 @@ def test_the_outer_gradient_is_that_of_finite_differences(rate, penalty):
             up, down = (plain_loss(start + s * nudge, batch, rate, penalty) for s in (1, -1))
             numeric[row, column] = (up - down) / (2 * step)
     torch.testing.assert_close(meta.grad, numeric, rtol=1e-6, atol=1e-8)
+
+
+# Real policies and Q-functions from here on, against plain ones of one seed and one task each.
+
+N_STATES, N_ACTIONS, TASKS = 3, 2, 3
+
+
+def stack_loss(n_seeds=2, **arguments):
+    """A loss of stacked networks in which all tasks' Q-functions differ, in double precision."""
+    stack = [] if n_seeds is None else [n_seeds]
+    network = {"in_keys": ["state"], "hidden_sizes": (8,)}
+    generator = torch.Generator().manual_seed(1)
+    loss = MAMLLoss(
+        Actor(N_STATES, N_ACTIONS, batch_size=stack, generator=generator, **network),
+        Actor(N_STATES, N_ACTIONS, batch_size=[*stack, TASKS], generator=generator, **network),
+        Critic(
+            *(N_STATES, N_ACTIONS),
+            layer_norm=True,
+            batch_size=[*stack, TASKS],
+            generator=generator,
+            **network,
+        ),
+        **arguments,
+    ).double()
+    loss.make_value_estimator(gamma=0.9)
+    ForeachSoftUpdate(loss, tau=0.1)
+    return loss
+
+
+def plain_policy(weights, state):
+    first, first_bias, second, second_bias = weights
+    return (state @ first + first_bias).relu() @ second + second_bias
+
+
+def plain_critic(weights, state, action):
+    first, first_bias, second, second_bias = weights
+    hidden = torch.cat([state, action], -1) @ first + first_bias
+    return layer_norm(hidden, hidden.shape[-1:]).relu() @ second + second_bias
+
+
+def plain_policy_loss(policy, critic, state, penalty):
+    pre_tanh = plain_policy(policy, state)
+    value = plain_critic(critic, state, pre_tanh.tanh())
+    return penalty * pre_tanh.square().mean() - value.mean()
+
+
+def plain_adapted(policy, critic, state, rate, penalty):
+    loss = plain_policy_loss(policy, critic, state, penalty)
+    gradients = torch.autograd.grad(loss, policy, create_graph=True)
+    return [w - rate * gradient for w, gradient in zip(policy, gradients, strict=True)]
+
+
+def one_of(parameters, *index):
+    """The weights of one network of a stack, layer by layer, each matrix before its bias."""
+    return [p[index].detach().clone().requires_grad_() for p in parameters]
+
+
+def ordered(parameters):
+    """The values of a tensordict of parameters or of a dict of them, as `one_of` wants them."""
+    flat = parameters if isinstance(parameters, dict) else parameters.flatten_keys(".")
+    return [flat[f"mlp.layers.{i}.{name}"] for i in range(2) for name in ("weight", "bias")]
+
+
+SEEDS_AND_TASKS = [(seed, task) for seed in range(2) for task in range(TASKS)]
+
+
+@pytest.mark.parametrize("penalty", [0.0, 0.2])
+def test_adapting_is_a_plain_gradient_step_on_each_task_of_each_seed(penalty):
+    loss = stack_loss(inner_learning_rate=0.3, pre_tanh_penalty=penalty)
+    batch = transitions(2, TASKS, 8)
+    adapted = ordered(loss.adapt(batch))
+    for seed, task in SEEDS_AND_TASKS:
+        start = one_of(loss.meta_network.parameters(), seed)
+        critic = one_of(loss.value_network_params.parameters(), seed, task)
+        assert [w.shape for w in critic] == [(5, 8), (8,), (8, 1), (1,)]
+        expected = plain_adapted(start, critic, batch["state"][seed, task], 0.3, penalty)
+        for ours, theirs, before in zip(adapted, expected, start, strict=True):
+            torch.testing.assert_close(ours[seed, task], theirs)
+            assert not torch.allclose(theirs, before, rtol=1e-3)
+
+
+def test_the_outer_loss_and_gradient_of_real_networks_are_those_of_plain_autograd():
+    """Second derivatives through tanh and layer normalization included."""
+    loss = stack_loss(inner_learning_rate=0.5, pre_tanh_penalty=0.1)
+    batch = transitions(2, TASKS, 8)
+    value, _ = loss.loss_actor(batch)
+    value.backward()
+    total = 0.0
+    for seed in range(2):
+        start = one_of(loss.meta_network.parameters(), seed)
+        of_seed = 0.0
+        for task in range(TASKS):
+            critic = one_of(loss.value_network_params.parameters(), seed, task)
+            support, query = batch["state"][seed, task].chunk(2)
+            adapted = plain_adapted(start, critic, support, 0.5, 0.1)
+            of_seed = of_seed + plain_policy_loss(adapted, critic, query, 0.1)
+        gradients = torch.autograd.grad(of_seed, start)
+        for ours, theirs in zip(loss.meta_network.parameters(), gradients, strict=True):
+            torch.testing.assert_close(ours.grad[seed], theirs)
+        total += of_seed.detach()
+    torch.testing.assert_close(value.detach(), total)
+
+
+def test_target_actions_are_those_of_a_slow_copy_of_the_adapted_policies():
+    loss = stack_loss(inner_learning_rate=0.5)
+    target_update = ForeachSoftUpdate(loss, tau=0.25)
+    slow = [
+        w.detach().unsqueeze(1).expand(2, TASKS, *w.shape[1:]).clone()
+        for w in loss.meta_network.parameters()
+    ]
+    for seed in range(3):
+        batch = transitions(2, TASKS, 8, seed=seed)
+        adapted = ordered(loss.adapt(batch[..., :4]))
+        loss.loss_actor(batch)
+        target_update.step()
+        slow = [0.75 * w + 0.25 * a.detach() for w, a in zip(slow, adapted, strict=True)]
+        with torch.no_grad():
+            for w in [*loss.meta_network.parameters(), *loss.value_network_params.parameters()]:
+                w += 0.1  # as a step of the optimizer
+    for ours, theirs in zip(ordered(loss.target_actor_network_params), slow, strict=True):
+        torch.testing.assert_close(ours, theirs)
+
+    network = {"in_keys": ["state"], "hidden_sizes": (8,), "batch_size": [2, TASKS]}
+    plain = DDPGLoss(
+        Actor(N_STATES, N_ACTIONS, **network),
+        Critic(N_STATES, N_ACTIONS, layer_norm=True, **network),
+    ).double()
+    plain.make_value_estimator(gamma=0.9)
+    ForeachSoftUpdate(plain, tau=0.1)
+    plain.value_network_params.data.copy_(loss.value_network_params.data)
+    plain.target_value_network_params.data.copy_(loss.target_value_network_params.data)
+    for ours, theirs in zip(ordered(plain.target_actor_network_params), slow, strict=True):
+        ours.data.copy_(theirs)
+    batch = transitions(2, TASKS, 8, seed=9)
+    batch.set("priority_weight", torch.tensor([1.0, 0.0, 1.0]).double().view(3, 1).expand(2, 3, 8))
+    value, told = loss.loss_value(batch)
+    expected, told_by_plain = plain.loss_value(batch)
+    torch.testing.assert_close(value, expected)
+    torch.testing.assert_close(told["target_value"], told_by_plain["target_value"])
+    assert told["target_value"].std() > 0.01
+    # The meta policy itself would aim elsewhere.
+    for ours, meta in zip(
+        ordered(plain.target_actor_network_params), loss.meta_network.parameters(), strict=True
+    ):
+        ours.data.copy_(meta.data.unsqueeze(1))
+    assert not torch.allclose(plain.loss_value(batch)[0], value)
+
+
+def test_the_policies_start_as_the_one_that_adapts():
+    loss = stack_loss()
+    for params in (loss.actor_network_params, loss.target_actor_network_params):
+        for ours, meta in zip(ordered(params), loss.meta_network.parameters(), strict=True):
+            assert ours.equal(meta.unsqueeze(1).expand_as(ours))
+
+
+def test_the_actors_loss_leaves_the_adapted_policies_and_no_gradient_but_of_the_meta_policy():
+    loss = stack_loss(inner_learning_rate=0.5)
+    batch = transitions(2, TASKS, 8)
+    expected = ordered(loss.adapt(batch[..., :4]))
+    loss.loss_actor(batch)[0].backward()
+    for ours, theirs in zip(ordered(loss.actor_network_params), expected, strict=True):
+        torch.testing.assert_close(ours.detach(), theirs.detach())
+        assert not ours.requires_grad
+        assert ours.grad is None
+    assert all(w.grad is None for w in loss.value_network_params.parameters())
+    assert all(w.grad.abs().sum() > 0 for w in loss.meta_network.parameters())
+
+    learned = [w for w in loss.parameters() if w.requires_grad]
+    meant = [*loss.meta_network.parameters(), *loss.value_network_params.parameters()]
+    assert {id(w) for w in learned} == {id(w) for w in meant}
+    assert len(learned) == 8
+    loss.zero_grad()
+    loss.loss_value(batch)[0].backward()
+    assert all(w.grad.abs().sum() > 0 for w in loss.value_network_params.parameters())
+    assert all(w.grad is None for w in loss.meta_network.parameters())
+
+
+def total(losses):
+    return losses["loss_actor"] + losses["loss_value"]
+
+
+def gradients(loss):
+    return [w.grad.clone() for w in loss.parameters() if w.requires_grad]
+
+
+def weighted(batch, *weights):
+    """Gives each task of all seeds one weight."""
+    weight = torch.tensor(weights).double().view(len(weights), 1)
+    return batch.clone().set("priority_weight", weight.expand(batch.batch_size).contiguous())
+
+
+def test_a_task_of_weight_zero_counts_for_nothing_and_is_not_adapted_to():
+    loss = stack_loss(inner_learning_rate=0.5)
+    batch = weighted(transitions(2, TASKS, 8), 1.0, 0.0, 1.0)
+    result = total(loss(batch))
+    result.backward()
+    first = gradients(loss)
+    for adapted, meta in zip(
+        ordered(loss.actor_network_params), loss.meta_network.parameters(), strict=True
+    ):
+        assert adapted[:, 1].equal(meta)
+        assert not torch.isclose(adapted[:, [0, 2]], meta.unsqueeze(1), rtol=1e-3).all()
+    for w in loss.value_network_params.parameters():
+        assert not w.grad[:, 1].any()
+        assert w.grad[:, 0].any()
+        assert w.grad[:, 2].any()
+
+    # Whatever the task holds: other transitions, another Q-function.
+    batch[:, 1] = weighted(transitions(2, TASKS, 8, seed=5), 1.0, 0.0, 1.0)[:, 1]
+    with torch.no_grad():
+        for w in loss.value_network_params.parameters():
+            w[:, 1] += 1
+    loss.zero_grad()
+    again = total(loss(batch))
+    again.backward()
+    assert again.equal(result)
+    for ours, theirs in zip(gradients(loss), first, strict=True):
+        assert ours.equal(theirs)
+
+    # What is left is what the other tasks give.
+    expected = 0.0
+    for task in (0, 2):
+        loss.zero_grad()
+        alone = total(loss(weighted(batch, *(float(i == task) for i in range(3)))))
+        expected = expected + alone.detach()
+    torch.testing.assert_close(result.detach(), expected)
+
+
+def test_a_weight_scales_what_a_task_contributes():
+    """The inner step as well: of half the weight it is half as long."""
+    batch = transitions(2, TASKS, 8)
+    loss, other = (stack_loss(inner_learning_rate=rate) for rate in (0.4, 0.2))
+    half, full = loss.adapt(weighted(batch, 0.5, 0.5, 0.5)), other.adapt(batch)
+    for ours, theirs in zip(half.values(), full.values(), strict=True):
+        torch.testing.assert_close(ours, theirs)
+
+
+def test_each_seed_has_the_gradient_it_would_have_alone():
+    together = stack_loss(3, inner_learning_rate=0.5)
+    # Targets that are no copies of what is learned, and a task that is known to one seed only.
+    for params in (together.target_actor_network_params, together.target_value_network_params):
+        for w in params.parameters():
+            w.data.mul_(1.5)
+    batch = weighted(transitions(3, TASKS, 8), 1.0, 1.0, 1.0)
+    batch["priority_weight"][1:, 2] = 0
+    whole = total(together(batch))
+    whole.backward()
+    values = 0.0
+    for seed in range(3):
+        alone = stack_loss(None, inner_learning_rate=0.5)
+        mine, theirs = dict(alone.named_parameters()), dict(together.named_parameters())
+        mine |= dict(alone.named_buffers())
+        theirs |= dict(together.named_buffers())
+        for name, w in mine.items():
+            if w.ndim:  # not the discount
+                w.data.copy_(theirs[name].data[seed])
+        value = total(alone(batch[seed].clone()))
+        value.backward()
+        values = values + value.detach()
+        for ours, of_all in zip(gradients(alone), gradients(together), strict=True):
+            torch.testing.assert_close(of_all[seed], ours)
+            assert ours.abs().sum() > 0
+    torch.testing.assert_close(whole.detach(), values)
+
+
+def test_what_is_told_is_told_of_each_task():
+    losses = stack_loss()(transitions(2, TASKS, 8))
+    assert losses["loss_actor"].shape == losses["loss_value"].shape == ()
+    assert losses["pred_value"].shape == (2, TASKS, 8)
+    assert losses["pred_value_max"].equal(losses["pred_value"].amax(-1))
+
+
+def test_an_odd_number_of_transitions_is_refused():
+    loss = stack_loss()
+    with pytest.raises(ValueError, match=r"even number of transitions.*got 7"):
+        loss.loss_actor(transitions(2, TASKS, 7))
+
+
+@pytest.mark.parametrize(
+    "shapes", [([2], [3, 2], [3, 2]), ([2], [2], [2]), ([], [3], [2]), ([2], [2, 3], [2])]
+)
+def test_batch_sizes_that_do_not_fit_are_refused(shapes):
+    meta, adapted, value = shapes
+    with pytest.raises(ValueError, match="must have the batch sizes"):
+        policies = [Actor(3, batch_size=shape) for shape in (meta, adapted)]
+        MAMLLoss(*policies, Critic(3, batch_size=value))
+
+
+def test_a_negative_rate_is_refused():
+    with pytest.raises(ValueError, match=r"must be >= 0, got -0\.1"):
+        quadratic_loss(inner_learning_rate=-0.1)

@@ -1,0 +1,343 @@
+"""MAML as a whole: by what it acts, what it adapts to, and that seeds share nothing."""
+
+from copy import deepcopy
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from torch.nn.functional import layer_norm
+
+from bgpo_trl.algorithms.maml import MAML
+from bgpo_trl.checkpoint import load_checkpoint, save_checkpoint
+from bgpo_trl.configs import MAMLConfig
+from bgpo_trl.modules.actor_critic import Actor
+from bgpo_trl.seeding import generators
+from bgpo_trl.transforms import TaskSchedule
+
+pytestmark = pytest.mark.usefixtures("easy_world")
+SEEDS = (3, 8)
+SCHEDULE = TaskSchedule((0, 2, 4))
+SIZE, N_TASKS = 16, 3  # of the ground truth, and tasks
+
+
+@pytest.fixture
+def make(bank, encoders, make_config):
+    def make(seeds=SEEDS, schedule=SCHEDULE, state="state", **changes):
+        config = replace(make_config(state, "maml").algorithm, **changes)
+        return MAML(config, seeds=seeds, schedule=schedule, bank=bank.seen(), encoders=encoders)
+
+    return make
+
+
+def play(algorithm, n_steps, state=None, hidden=(), watch=lambda chosen: None):
+    """Trains for some steps; the algorithm gets none of the `hidden` entries.
+
+    Returns transitions ``[S, T]`` and the tensordict in flight.
+    """
+    state, transitions = algorithm.env.reset() if state is None else state, []
+    for _ in range(n_steps):
+        state["action"] = algorithm.act(state.exclude(*hidden))["action"]
+        watch(state)
+        algorithm.update()
+        transition, state = algorithm.env.step_and_maybe_reset(state)
+        transitions.append(transition.clone())
+        algorithm.store(transition.exclude(*hidden, *(("next", key) for key in hidden)))
+    return torch.stack(transitions, dim=1), state
+
+
+def kept(algorithm):
+    """A copy of its state, without the memory that its replay has not filled yet."""
+    state = deepcopy(algorithm.state_dict())
+    added, rows = state["replay"]["n_added"].tolist(), TensorDict(state["replay"].pop("rows"))
+    for key, value in rows.items(True, True):
+        value = value.unflatten(0, (-1, len(added)))
+        state[key] = [value[:count, column] for column, count in enumerate(added)]
+    return state
+
+
+def assert_same(first, second):
+    """Two nested states, bit for bit."""
+    if isinstance(first, dict):
+        assert first.keys() == second.keys()
+        first, second = list(first.values()), list(second.values())
+    if isinstance(first, (list, tuple)):
+        for ours, theirs in zip(first, second, strict=True):
+            assert_same(ours, theirs)
+    elif isinstance(first, torch.Tensor):
+        assert first.equal(second)
+    else:
+        np.testing.assert_equal(first, second)
+
+
+def perceptron(weights, state, normalize=False):
+    """The output of one network with the weights that its ``state_dict`` has."""
+    first, first_bias, second, second_bias = (
+        weights[f"mlp.layers.{i}.{name}"] for i in range(2) for name in ("weight", "bias")
+    )
+    hidden = state @ first + first_bias
+    hidden = layer_norm(hidden, hidden.shape[-1:]) if normalize else hidden
+    return hidden.relu() @ second + second_bias
+
+
+def weights_of(parameters, *index):
+    """Copies of the weights of one network of a stack, by name."""
+    flat = dict(parameters.flatten_keys(".").items())
+    return {key: value.detach()[index].clone() for key, value in flat.items()}
+
+
+def meta_weights(algorithm, seed):
+    weights = dict(algorithm.meta_actor.named_parameters())
+    return {key: value.detach()[seed].clone() for key, value in weights.items()}
+
+
+def by_task(data):
+    """The states of each task of one seed, in the order in which they were seen."""
+    return [data["state"][data["task"] == task] for task in range(N_TASKS)]
+
+
+def freeze(algorithm, index, embedding=0.0, generator_seed=0):
+    shape = (algorithm.n_tasks, 2)
+    task = torch.arange(algorithm.n_tasks).unsqueeze(1).expand(shape)
+    generator = torch.Generator().manual_seed(generator_seed)
+    return algorithm.freeze(index, torch.full((*shape, 32), embedding), task, generator)
+
+
+@pytest.mark.parametrize("schedule", [SCHEDULE, TaskSchedule((0, 0, 0))])
+def test_a_seed_learns_in_a_batch_as_it_does_alone(make, schedule):
+    batch = make(schedule=schedule)
+    together, _ = play(batch, 60)
+    losses = []
+    for index, seed in enumerate(SEEDS):
+        alone = make(seeds=(seed,), schedule=schedule)
+        data = play(alone, 60)[0][0]
+        for key in ("task", "demo_index", "step_count", ("next", "terminated")):
+            assert together[index][key].equal(data[key]), key
+        for key in ("action", "state", ("next", "reward")):
+            torch.testing.assert_close(together[index][key], data[key], rtol=1e-4, atol=1e-4)
+        for (key, ours), theirs in zip(
+            batch.loss.state_dict().items(), alone.loss.state_dict().values(), strict=True
+        ):
+            if ours.ndim:  # not the discount
+                torch.testing.assert_close(ours[index], theirs[0], rtol=1e-4, atol=1e-4, msg=key)
+        frozen, frozen_alone = freeze(batch, index)["actor"], freeze(alone, 0)["actor"]
+        for key, value in frozen.items():
+            torch.testing.assert_close(value, frozen_alone[key], rtol=1e-4, atol=1e-4)
+        losses.append(alone.update())
+    assert together["task"].unique().tolist() == [0, 1, 2]
+    for key, value in batch.update().items():
+        expected = torch.stack([loss[key] for loss in losses]).mean()
+        torch.testing.assert_close(value, expected, rtol=1e-3, atol=1e-4)
+
+
+def test_latents_are_played_and_learned_from_too(make):
+    algorithm = make(state="latent")
+    start = [p.detach().clone() for p in algorithm.meta_actor.parameters()]
+    data, _ = play(algorithm, 12)
+    assert data["latent"].shape == (2, 12, 64)
+    assert "pixels" not in data.keys()
+    assert freeze(algorithm, 1)["actor"]["mlp.layers.0.weight"].shape == (3, 64, 64)
+    assert not any(
+        p.equal(q) for p, q in zip(algorithm.meta_actor.parameters(), start, strict=True)
+    )
+
+
+def test_training_episodes_are_played_by_the_policy_adapted_to_their_task_with_noise(make):
+    algorithm = make()
+    noise = generators(SEEDS, "exploration")
+    clamped, adapted_to = [], set()
+
+    def watch(chosen):
+        for index, source in enumerate(noise):
+            task = int(chosen["task"][index])
+            weights = weights_of(algorithm.loss.actor_network_params, index, task)
+            action = perceptron(weights, chosen["state"][index]).tanh()
+            noisy = action + 0.3 * torch.randn(4, generator=source)
+            torch.testing.assert_close(chosen["action"][index], noisy.clamp(-1, 1))
+            clamped.append(bool((noisy.abs() > 1).any()))
+            meta = perceptron(meta_weights(algorithm, index), chosen["state"][index]).tanh()
+            if (meta - action).abs().max() > 1e-4:
+                adapted_to.add(task)
+
+    play(algorithm, 60, watch=watch)
+    assert set(clamped) == {True, False}
+    assert adapted_to == {0, 1, 2}
+
+
+@pytest.mark.parametrize(("warmup", "n_tasks", "expected"), [(8, 3, 10), (8, 1, 8), (15, 3, 15)])
+def test_the_first_update_comes_after_the_warm_up_when_some_task_fills_a_batch_for_sure(
+    make, warmup, n_tasks, expected
+):
+    """Three tasks can have three transitions each without four of any."""
+    ddpg = replace(make().config.ddpg, warmup_steps=warmup)
+    algorithm = make(schedule=TaskSchedule((0,) * n_tasks), task_batch_size=4, ddpg=ddpg)
+    start = deepcopy(dict(algorithm.loss.state_dict()))
+    _, state = play(algorithm, expected)  # with an update before each step
+    assert_same(dict(algorithm.loss.state_dict()), start)
+    play(algorithm, 1, state)
+    for key, value in algorithm.loss.state_dict().items():
+        if "target" not in key and "gamma" not in key:
+            assert not value.equal(start[key]), key
+
+
+def test_tasks_that_are_never_presented_make_no_difference(make):
+    three, one = make(schedule=TaskSchedule((0, 99, 99))), make(schedule=TaskSchedule((0,)))
+    ours, theirs = play(three, 50)[0], play(one, 50)[0]
+    assert ours["demo_index"].equal(theirs["demo_index"])
+    torch.testing.assert_close(ours["action"], theirs["action"], rtol=1e-4, atol=1e-5)
+    for index in range(2):
+        meta, meta_alone = meta_weights(three, index), meta_weights(one, index)
+        for key, value in meta.items():
+            torch.testing.assert_close(value, meta_alone[key], rtol=1e-4, atol=1e-5)
+        frozen, frozen_alone = freeze(three, index)["actor"], freeze(one, index)["actor"]
+        for key, value in frozen.items():
+            assert value[1].equal(meta[key])
+            assert value[2].equal(meta[key])
+            assert frozen_alone[key].shape[0] == 1
+    critics = zip(three.critic.parameters(), one.critic.parameters(), strict=True)
+    for value, alone in critics:
+        torch.testing.assert_close(value[:, 0], alone[:, 0], rtol=1e-4, atol=1e-5)
+
+
+def test_a_critic_stays_as_it_was_until_there_is_data_of_its_task(make):
+    algorithm = make()
+    names = ("value_network_params", "target_value_network_params")
+    critics = [p for name in names for p in getattr(algorithm.loss, name).values(True, True)]
+    start = [p.detach().clone() for p in critics]
+    counts, learned = torch.zeros(2, N_TASKS).long(), torch.zeros(2, N_TASKS).bool()
+    stages = []
+    state = algorithm.env.reset()
+    for _ in range(60):
+        state = algorithm.act(state)
+        if algorithm.update():
+            learned |= counts >= algorithm.config.task_batch_size
+        for now, before in zip(critics, start, strict=True):
+            changed = (now != before).flatten(2).any(-1)
+            assert changed.equal(learned)
+        stages.append(tuple(learned.flatten().tolist()))
+        transition, state = algorithm.env.step_and_maybe_reset(state)
+        algorithm.store(transition)
+        counts[torch.arange(2), transition["task"]] += 1
+        assert algorithm.replay.sizes.equal(counts)
+    assert not any(stages[0])
+    assert all(stages[-1])
+    assert len(set(stages)) > 3
+
+
+def test_testing_adapts_by_one_plain_step_on_transitions_of_the_task(make):
+    algorithm = make(schedule=TaskSchedule((0, 2, 99)), adaptation_size=20)
+    data, _ = play(algorithm, 60)
+    for index in range(2):
+        frozen = freeze(algorithm, index, generator_seed=5)["actor"]
+        draws = torch.randint(
+            2**63 - 1, (N_TASKS,), generator=torch.Generator().manual_seed(5)
+        ).tolist()
+        start = meta_weights(algorithm, index)
+        seen = by_task(data[index])
+        assert [len(states) >= 8 for states in seen] == [True, True, False]
+        for task in (0, 1):
+            stream = torch.Generator().manual_seed(draws[task])
+            states = seen[task][torch.randint(len(seen[task]), (20,), generator=stream)]
+            policy = {key: value.clone().requires_grad_() for key, value in start.items()}
+            pre_tanh = perceptron(policy, states)
+            critic = weights_of(algorithm.loss.value_network_params, index, task)
+            value = perceptron(critic, torch.cat([states, pre_tanh.tanh()], -1), normalize=True)
+            loss = 0.01 * pre_tanh.square().mean() - value.mean()
+            gradients = torch.autograd.grad(loss, list(policy.values()))
+            for (key, before), gradient in zip(start.items(), gradients, strict=True):
+                step = -0.1 * gradient
+                torch.testing.assert_close(
+                    frozen[key][task] - before, step, rtol=1e-3, atol=1e-6, msg=key
+                )
+                assert step.abs().max() > 1e-4
+        for key, before in start.items():
+            assert frozen[key][2].equal(before)
+
+
+def test_each_test_draws_its_own_transitions(make):
+    algorithm = make()
+    play(algorithm, 60)
+    first, same, other = (freeze(algorithm, 0, generator_seed=seed)["actor"] for seed in (5, 5, 6))
+    for key, value in first.items():
+        assert value.equal(same[key])
+        assert not value.equal(other[key])
+
+
+def test_before_there_is_data_a_test_is_of_the_policy_as_it_starts(make):
+    algorithm = make()
+    for index in range(2):
+        frozen, meta = freeze(algorithm, index)["actor"], meta_weights(algorithm, index)
+        assert frozen.keys() == meta.keys()
+        for key, value in frozen.items():
+            assert value.equal(meta[key].expand_as(value))
+
+
+def test_preparing_a_test_leaves_no_trace(make):
+    algorithm = make()
+    _, state = play(algorithm, 40)
+    before = kept(algorithm)
+    gradients = [deepcopy(p.grad) for p in algorithm.loss.parameters()]
+    frozen = freeze(algorithm, 1)["actor"]
+    assert_same(kept(algorithm), before)
+    assert_same([p.grad for p in algorithm.loss.parameters()], gradients)
+    copied = deepcopy(frozen)
+    play(algorithm, 10, state)
+    for key, value in frozen.items():
+        assert not value.requires_grad
+        assert value.equal(copied[key])
+        assert not value.equal(freeze(algorithm, 1)["actor"][key])
+
+
+def test_frozen_policies_act_as_plain_ones_with_these_weights(make):
+    algorithm = make()
+    play(algorithm, 40)
+    frozen = [freeze(algorithm, index) for index in range(2)]
+    stacked = TensorDict.maybe_dense_stack([TensorDict(one) for one in frozen])
+    state = torch.randn(2, N_TASKS, 5, SIZE, generator=torch.Generator().manual_seed(0))
+    actions = algorithm.act_frozen(stacked, state)
+    assert actions.shape == (2, N_TASKS, 5, 4)
+    for index in range(2):
+        for task in range(N_TASKS):
+            alone = Actor(SIZE, in_keys=["state"])
+            weights = {key: value[task] for key, value in frozen[index]["actor"].items()}
+            alone.load_state_dict(weights)
+            expected = alone(TensorDict({"state": state[index, task]}, [5]))["action"]
+            torch.testing.assert_close(actions[index, task], expected)
+    # What is learned since makes no difference.
+    play(algorithm, 10)
+    assert algorithm.act_frozen(stacked, state).equal(actions)
+
+
+def test_demonstrations_are_never_read(make):
+    told, untold = make(), make()
+    ours, _ = play(told, 40)
+    theirs, _ = play(untold, 40, hidden=["demo_embedding"])
+    assert ours["task"].unique().tolist() == [0, 1, 2]
+    for key in ("action", "state", "demo_index", ("next", "reward")):
+        assert ours[key].equal(theirs[key]), key
+    assert_same(dict(told.loss.state_dict()), dict(untold.loss.state_dict()))
+    for index in range(2):
+        assert_same(freeze(told, index), freeze(untold, index, embedding=float("nan")))
+
+
+def test_a_restored_run_continues_as_the_saved_one(make, tmp_path):
+    algorithm = make()
+    _, state = play(algorithm, 20)
+    save_checkpoint(tmp_path, {"algorithm": algorithm.state_dict(), "state": state.to_dict()})
+    other = make(seeds=(5, 6))  # other weights, streams and simulations
+    play(other, 15)
+    saved = load_checkpoint(tmp_path)
+    other.env.reset()
+    other.load_state_dict(saved["algorithm"])
+    ours, _ = play(algorithm, 30, state)
+    theirs, _ = play(other, 30, TensorDict(saved["state"], [2]))
+    assert (ours == theirs).all()
+    assert_same(kept(algorithm), kept(other))
+    assert_same(freeze(algorithm, 1), freeze(other, 1))
+
+
+@pytest.mark.parametrize("name", ["inner_learning_rate", "task_batch_size", "adaptation_size"])
+def test_settings_without_a_meaning_are_refused(name):
+    with pytest.raises(ValueError, match="MAML needs inner_learning_rate >= 0"):
+        MAMLConfig(**{name: -1})

@@ -1,0 +1,141 @@
+"""The distillation loss against the closed form, and that it teaches what the teachers do."""
+
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
+
+from bgpo_trl.modules.multi_head_actor import MultiHeadActor
+from bgpo_trl.objectives.distillation import DistillationLoss
+
+# Two tasks, three states of each, two action components.
+MEAN = [[[0.0, 0.5], [-0.25, 1.0], [0.1, 0.2]], [[0.0, 0.0], [0.75, -0.5], [-1.0, 0.3]]]
+SCALE = [[[0.1, 0.2], [1.0, 0.5], [0.3, 0.3]], [[0.25, 1.0], [0.4, 0.1], [0.15, 0.9]]]
+ACTION = [[[0.2, 0.5], [0.25, 0.0], [-0.4, 0.8]], [[0.0, 1.0], [0.7, -0.4], [-1.0, -0.6]]]
+
+
+class Told(TensorDictModuleBase):
+    """A policy that is told the distributions of actions: states are parameters here."""
+
+    def __init__(self, names=("loc", "scale")):
+        super().__init__()
+        self.names = names
+        self.in_keys, self.out_keys = ["told"], list(names)
+
+    def forward(self, tensordict):
+        for name, value in zip(self.names, tensordict["told"].unbind(-1), strict=True):
+            tensordict.set(name, value)
+        return tensordict
+
+
+def told_batch(teacher_action="teacher_action"):
+    told = torch.stack([torch.tensor(MEAN), torch.tensor(SCALE)], -1)
+    batch = {"told": told.requires_grad_(), teacher_action: torch.tensor(ACTION).requires_grad_()}
+    return TensorDict(batch, [2, 3])
+
+
+def expected_loss():
+    total = 0.0
+    for of_task in zip(MEAN, SCALE, ACTION, strict=True):
+        for m, s, a in zip(*of_task, strict=True):
+            for mean, scale, action in zip(m, s, a, strict=True):
+                nll = 0.5 * math.log(2 * math.pi * scale**2)
+                nll += (action - mean) ** 2 / (2 * scale**2)
+                total += nll / 3  # a mean over the states, a sum over the rest
+    return total
+
+
+def test_the_loss_is_the_negative_log_likelihood_of_the_teachers_actions():
+    batch = told_batch()
+    losses = DistillationLoss(Told())(batch)
+    assert losses["loss_distillation"].shape == ()
+    assert losses["loss_distillation"].item() == pytest.approx(expected_loss(), rel=1e-5)
+    assert set(batch.keys()) == {"told", "teacher_action"}
+
+
+def test_the_loss_of_one_standard_normal_action_is_known():
+    batch = told_batch()[:1, :1, ...]
+    batch["told"] = torch.tensor([0.0, 1.0]).expand(1, 1, 4, 2)
+    batch["teacher_action"] = torch.zeros(1, 1, 4)
+    loss = DistillationLoss(Told())(batch)["loss_distillation"]
+    assert loss.item() == pytest.approx(4 * 0.9189385, rel=1e-6)
+    batch["teacher_action"] = torch.ones(1, 1, 4)
+    loss = DistillationLoss(Told())(batch)["loss_distillation"]
+    assert loss.item() == pytest.approx(4 * (0.9189385 + 0.5), rel=1e-6)
+
+
+def test_gradients_are_those_of_the_student_and_the_teacher_has_none():
+    batch = told_batch()
+    DistillationLoss(Told())(batch)["loss_distillation"].backward()
+    mean, scale, action = (torch.tensor(values) for values in (MEAN, SCALE, ACTION))
+    error = mean - action
+    expected = torch.stack([error / scale**2, 1 / scale - error**2 / scale**3], -1) / 3
+    torch.testing.assert_close(batch["told"].grad, expected)
+    assert batch["teacher_action"].grad is None
+
+
+def test_entries_can_have_other_names():
+    loss = DistillationLoss(Told(("mu", "sigma")))
+    loss.set_keys(loc="mu", scale="sigma", teacher_action="shown")
+    assert loss.in_keys == ["told", "shown"]
+    value = loss(told_batch("shown"))["loss_distillation"]
+    assert value.item() == pytest.approx(expected_loss(), rel=1e-5)
+
+
+def student(n_heads=2):
+    actor = MultiHeadActor(3, 2, in_keys=["state"], generator=torch.Generator().manual_seed(0))
+    for head in range(n_heads):
+        actor.add_head(torch.Generator().manual_seed(head))
+    return actor
+
+
+def test_what_is_read_is_what_the_student_sees_and_what_the_teachers_did():
+    actor = student()
+    loss = DistillationLoss(actor)
+    assert loss.in_keys == ["state", "teacher_action"]
+    assert loss.out_keys == ["loss_distillation"]
+    assert [id(p) for p in loss.parameters()] == [id(p) for p in actor.parameters()]
+    actor.add_head()  # what comes later is learned, too
+    assert len(list(loss.parameters())) == 8
+
+
+def test_a_student_learns_what_each_teacher_does():
+    """Two teachers that do opposite things in the same states; what it was sure of, it gets."""
+    actor = student()
+    loss = DistillationLoss(actor)
+    optimizer = torch.optim.Adam(actor.parameters(), lr=1e-2)
+    state = torch.randn(1, 128, 3, generator=torch.Generator().manual_seed(1)).expand(2, -1, -1)
+    shown = (2 * state[..., :2]).tanh() * torch.tensor([1.0, -1.0]).view(2, 1, 1)
+    batch = TensorDict({"state": state, "teacher_action": shown}, [2, 128])
+    errors, losses = [], []
+    for _ in range(200):
+        error = actor(batch.select("state"))["loc"] - shown
+        errors.append(error.detach().abs().mean((1, 2)))
+        value = loss(batch)["loss_distillation"]
+        losses.append(value.item())
+        optimizer.zero_grad()
+        value.backward()
+        optimizer.step()
+    assert (errors[0] > 0.4).all()
+    assert (errors[-1] < 0.05).all()
+    assert losses[-1] < losses[20] < losses[0]
+    assert actor(batch.select("state"))["scale"].mean() < 0.15
+
+
+def test_tasks_share_nothing_but_the_trunk():
+    actor = student()
+    batch = TensorDict(
+        {"state": torch.randn(2, 8, 3), "teacher_action": torch.rand(2, 8, 2)}, [2, 8]
+    )
+    loss = DistillationLoss(actor)
+    loss(batch)["loss_distillation"].backward()
+    together = [p.grad.clone() for p in actor.heads.parameters()]
+    actor.zero_grad()
+    batch["teacher_action"][1] = -1
+    loss(batch)["loss_distillation"].backward()
+    apart = [p.grad for p in actor.heads.parameters()]
+    for head in (0, 1):
+        for before, after in zip(together[2 * head :][:2], apart[2 * head :][:2], strict=True):
+            assert before.equal(after) == (head == 0)
