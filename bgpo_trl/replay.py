@@ -210,8 +210,13 @@ class ReplayBuffer:
                 "generators": torch.stack([g.get_state() for g in self.generators]),
             }
         )
-        filled = int(self.sizes.max()) * len(self.generators)
+        longest = int(self.sizes.max())
+        filled = longest * len(self.generators)
+        # What seeds with fewer transitions have not written is whatever was there in memory.
+        empty = (torch.arange(longest).unsqueeze(-1) >= self.sizes.view(-1)).view(-1)
         for key, stored in self._rows.items():
+            if empty.any():
+                stored[:filled][empty] = 0
             state.set(("rows", *key) if isinstance(key, tuple) else ("rows", key), stored[:filled])
         return state
 

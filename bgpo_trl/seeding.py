@@ -30,3 +30,8 @@ def generators(seeds: Sequence[int], name: str) -> list[torch.Generator]:
         True
     """
     return [torch.Generator().manual_seed(stream_seed(seed, name)) for seed in seeds]
+
+
+def task_generators(seeds: Sequence[int], n_tasks: int, name: str) -> list[list[torch.Generator]]:
+    """Returns one generator for each task of each seed, for one purpose."""
+    return [[generators([seed], f"{name} {task}")[0] for task in range(n_tasks)] for seed in seeds]

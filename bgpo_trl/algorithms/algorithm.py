@@ -9,12 +9,22 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.envs import ClipTransform, ObservationNorm, Transform, TransformedEnv
+from torchrl.envs import (
+    ClipTransform,
+    Compose,
+    ObservationNorm,
+    RewardSum,
+    StepCounter,
+    Transform,
+    TransformedEnv,
+)
 
 from bgpo_trl.configs import AlgorithmConfig
 from bgpo_trl.demonstrations import DemonstrationBank
 from bgpo_trl.envs import NicoEnv
 from bgpo_trl.modules.gwr import GWRB
+from bgpo_trl.objectives.ddpg import DDPGLoss, ForeachSoftUpdate
+from bgpo_trl.replay import ReplayBuffer, TaskReplay
 from bgpo_trl.representation import Representation
 from bgpo_trl.seeding import generators, stream_seed
 from bgpo_trl.transforms import DemonstrationSource, FrameEncoder, TaskSchedule
@@ -53,8 +63,8 @@ def observe(config: AlgorithmConfig, encoders: Representation | None) -> list[Tr
 class Algorithm(ABC):
     """A learner of several tasks, for a batch of seeds that share nothing but the encoders.
 
-    This class holds the world: simulations, draws of tasks and demonstrations, exploration noise.
-    What is learned, and how, is each algorithm's own.
+    This class holds the world: simulations, draws of tasks and demonstrations, exploration noise;
+    and the gradient step. What is learned from what is each algorithm's own.
 
     A step of training is ``act``, the environment's step, ``store``; an ``update`` may run while
     the environment takes its step. For test episodes `freeze` copies what the policy of one seed
@@ -76,10 +86,18 @@ class Algorithm(ABC):
         simulation: The environment without its transforms.
         gwr: GWR-B, or None in an algorithm without it.
         state_size: Number of features of the state.
+        loss: The losses of actor and critic, with their target networks.
+        optimizer: Of both.
+        target_update: Of both.
+        replay: What was experienced.
     """
 
     env: TransformedEnv
     gwr: GWRB | None = None
+    loss: DDPGLoss
+    optimizer: torch.optim.Optimizer
+    target_update: ForeachSoftUpdate
+    replay: ReplayBuffer | TaskReplay
 
     def __init__(
         self,
@@ -160,6 +178,48 @@ class Algorithm(ABC):
             ``[S, T, M, 4]``.
         """
 
+    def compose(
+        self,
+        config: AlgorithmConfig,
+        encoders: Representation | None,
+        transforms: Sequence[Transform] = (),
+        *,
+        rewards: Sequence[str] = ("reward",),
+    ) -> TransformedEnv:
+        """Returns the world as the algorithm sees it.
+
+        Args:
+            config: Its hyperparameters.
+            encoders: The trained encoders.
+            transforms: What it adds, behind the draw of task and demonstration.
+            rewards: What is summed over each episode, as ``episode_...``.
+        """
+        return TransformedEnv(
+            self.simulation,
+            Compose(
+                [
+                    *observe(config, encoders),
+                    StepCounter(config.max_steps),
+                    self.source,
+                    *transforms,
+                    RewardSum(in_keys=list(rewards), out_keys=[f"episode_{r}" for r in rewards]),
+                ]
+            ),
+        )
+
+    def learn(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        """Takes a gradient step on a batch, and one of the target networks towards the others.
+
+        Returns:
+            What `update` returns.
+        """
+        losses = self.loss(self.moved(batch))
+        self.optimizer.zero_grad()
+        (losses["loss_actor"] + losses["loss_value"]).backward()
+        self.optimizer.step()
+        self.target_update.step()
+        return {key: losses[key].detach() / self.n_seeds for key in ("loss_actor", "loss_value")}
+
     def explore(self, action: Tensor) -> Tensor:
         """Returns actions ``[S, 4]`` with each seed's Gaussian noise, within [-1, 1]."""
         noise = [torch.randn(action.shape[-1:], generator=g) for g in self._noise]
@@ -175,12 +235,18 @@ class Algorithm(ABC):
             "source": dict(self.source.state_dict()),
             "simulation": self.simulation.simulation_state(),
             "noise": [generator.get_state() for generator in self._noise],
+            "loss": dict(self.loss.state_dict()),
+            "optimizer": self.optimizer.state_dict(),
+            "replay": self.replay.state_dict(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continues from what `state_dict` returned."""
         self.source.load_state_dict(state["source"])
         self.simulation.load_simulation_state(state["simulation"])
+        self.loss.load_state_dict(state["loss"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.replay.load_state_dict(state["replay"])
         for generator, saved in zip(self._noise, state["noise"], strict=True):
             generator.set_state(saved)
 

@@ -12,16 +12,12 @@ from torch import Tensor
 from torch.func import functional_call
 from torch.nn.functional import one_hot
 from torchrl.envs import (
-    Compose,
     ObservationNorm,
-    RewardSum,
-    StepCounter,
     Transform,
-    TransformedEnv,
     UnaryTransform,
 )
 
-from bgpo_trl.algorithms.algorithm import Algorithm, observe
+from bgpo_trl.algorithms.algorithm import Algorithm
 from bgpo_trl.configs import BGPOConfig
 from bgpo_trl.demonstrations import DemonstrationBank
 from bgpo_trl.modules.actor_critic import Actor, Critic
@@ -151,18 +147,8 @@ class BGPO(Algorithm):
             self.told = "normalized_behavior"
         bonuses = [t for t in composition.reward if isinstance(t, BehaviorMatchingReward)]
         rewards = ["reward", *(["extrinsic_reward", "intrinsic_reward"] if bonuses else [])]
-        self.env = TransformedEnv(
-            self.simulation,
-            Compose(
-                [
-                    *observe(config, encoders),
-                    StepCounter(config.max_steps),
-                    self.source,
-                    *self.infer,
-                    *composition.reward,
-                    RewardSum(in_keys=rewards, out_keys=[f"episode_{key}" for key in rewards]),
-                ]
-            ),
+        self.env = self.compose(
+            config, encoders, [*self.infer, *composition.reward], rewards=rewards
         )
         lookups = [t for t in composition.infer if isinstance(t, BehaviorLookup)]
         self.gwr = lookups[0].gwr if lookups else None
@@ -219,12 +205,7 @@ class BGPO(Algorithm):
         """Makes one update of each seed; see `Algorithm.update`."""
         if len(self.replay) < self.config.ddpg.warmup_steps:
             return {}
-        losses = self.loss(self.moved(self.replay.sample()))
-        self.optimizer.zero_grad()
-        (losses["loss_actor"] + losses["loss_value"]).backward()
-        self.optimizer.step()
-        self.target_update.step()
-        return {key: losses[key].detach() / self.n_seeds for key in ("loss_actor", "loss_value")}
+        return self.learn(self.replay.sample())
 
     @torch.no_grad()
     def freeze(
@@ -260,17 +241,11 @@ class BGPO(Algorithm):
         """Returns all that the future of the run depends on but the tensordict in flight."""
         return {
             **super().state_dict(),
-            "loss": dict(self.loss.state_dict()),
-            "optimizer": self.optimizer.state_dict(),
-            "replay": self.replay.state_dict(),
             "gwr": None if self.gwr is None else dict(self.gwr.state_dict()),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continues from what `state_dict` returned."""
         super().load_state_dict(state)
-        self.loss.load_state_dict(state["loss"])
-        self.optimizer.load_state_dict(state["optimizer"])
-        self.replay.load_state_dict(state["replay"])
         if self.gwr is not None:
             self.gwr.load_state_dict(state["gwr"])

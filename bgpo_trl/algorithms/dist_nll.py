@@ -6,15 +6,15 @@ Unlike BGPO it is told the task, in training and in tests: by its label.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import chain
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.func import functional_call
-from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv
 
-from bgpo_trl.algorithms.algorithm import Algorithm, networks_of, observe
+from bgpo_trl.algorithms.algorithm import Algorithm, networks_of
 from bgpo_trl.configs import DistNLLConfig
 from bgpo_trl.demonstrations import DemonstrationBank
 from bgpo_trl.modules.actor_critic import Actor, Critic
@@ -23,7 +23,7 @@ from bgpo_trl.objectives.ddpg import DDPGLoss, ForeachSoftUpdate
 from bgpo_trl.objectives.distillation import DistillationLoss
 from bgpo_trl.replay import TaskReplay
 from bgpo_trl.representation import Representation
-from bgpo_trl.seeding import generators
+from bgpo_trl.seeding import generators, task_generators
 from bgpo_trl.transforms import TaskSchedule
 
 
@@ -53,6 +53,8 @@ class DistNLL(Algorithm):
             episodes at different times.
     """
 
+    replay: TaskReplay
+
     def __init__(
         self,
         config: DistNLLConfig,
@@ -67,30 +69,20 @@ class DistNLL(Algorithm):
             config, seeds=seeds, schedule=schedule, bank=bank, encoders=encoders, device=device
         )
         self.config, ddpg = config, config.ddpg
-        self.env = TransformedEnv(
-            self.simulation,
-            Compose(
-                [
-                    *observe(config, encoders),
-                    StepCounter(config.max_steps),
-                    self.source,
-                    RewardSum(in_keys=["reward"], out_keys=["episode_reward"]),
-                ]
-            ),
-        )
+        self.env = self.compose(config, encoders)
         self._network = {"in_keys": [config.state], "hidden_sizes": ddpg.hidden_sizes}
         every = [self.n_seeds, self.n_tasks]
         self.teacher = Actor(
             self.state_size,
             batch_size=every,
-            generator=self._streams(seeds, "actor"),
+            generator=[*chain(*task_generators(seeds, self.n_tasks, "actor"))],
             **self._network,
         )
         self.critic = Critic(
             self.state_size,
             layer_norm=ddpg.critic_layer_norm,
             batch_size=every,
-            generator=self._streams(seeds, "critic"),
+            generator=[*chain(*task_generators(seeds, self.n_tasks, "critic"))],
             **self._network,
         )
         self.loss = DDPGLoss(
@@ -109,21 +101,16 @@ class DistNLL(Algorithm):
             Actor(self.state_size, batch_size=[n], **self._network).to(self.device)
             for n in (self.n_seeds, *range(1, self.n_tasks + 1))
         )
-        streams = self._streams(seeds, "replay")
         self.replay = TaskReplay(
             ddpg.replay_size,
             batch_size=config.task_batch_size,
-            generator=[streams[i : i + self.n_tasks] for i in range(0, len(streams), self.n_tasks)],
+            generator=task_generators(seeds, self.n_tasks, "replay"),
             keys=[
                 *(config.state, "action"),
                 *(("next", key) for key in (config.state, "reward", "terminated")),
             ],
         )
         self._make_students(seeds)
-
-    def _streams(self, seeds: Sequence[int], name: str) -> list[torch.Generator]:
-        tasks = range(self.n_tasks)
-        return [generators([seed], f"{name} {task}")[0] for seed in seeds for task in tasks]
 
     def _make_students(self, seeds: Sequence[int]) -> None:
         streams = generators(seeds, "student")
@@ -169,14 +156,10 @@ class DistNLL(Algorithm):
         """
         if len(self.replay) < max(self.config.ddpg.warmup_steps, self.replay.enough):
             return {}
-        losses = self.loss(self.moved(self.replay.sample()))
-        self.optimizer.zero_grad()
-        (losses["loss_actor"] + losses["loss_value"]).backward()
-        self.optimizer.step()
-        self.target_update.step()
+        losses = self.learn(self.replay.sample())
         for index in self._ended.nonzero().flatten().tolist():
             self._distill(index)
-        return {key: losses[key].detach() / self.n_seeds for key in ("loss_actor", "loss_value")}
+        return losses
 
     def _distill(self, index: int) -> None:
         """Has the multi-task policy of a seed learn what its teachers do now."""
@@ -230,9 +213,6 @@ class DistNLL(Algorithm):
         """Returns all that the future of the run depends on but the tensordict in flight."""
         return {
             **super().state_dict(),
-            "loss": dict(self.loss.state_dict()),
-            "optimizer": self.optimizer.state_dict(),
-            "replay": self.replay.state_dict(),
             "tasks": self._tasks,
             "heads": [generator.get_state() for generator in self._heads],
             "students": [dict(student.state_dict()) for student in self.students],
@@ -243,8 +223,6 @@ class DistNLL(Algorithm):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continues from what `state_dict` returned."""
         super().load_state_dict(state)
-        for name in ("loss", "optimizer", "replay"):
-            getattr(self, name).load_state_dict(state[name])
         self._ended = state["ended"].clone()
         for index, tasks in enumerate(state["tasks"]):
             student, optimizer = self.students[index], self._student_optimizers[index]

@@ -6,15 +6,15 @@ Unlike BGPO it is told the task, in training and in tests: by the data that it a
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import chain
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.func import functional_call
-from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv
 
-from bgpo_trl.algorithms.algorithm import Algorithm, networks_of, observe
+from bgpo_trl.algorithms.algorithm import Algorithm, networks_of
 from bgpo_trl.configs import MAMLConfig
 from bgpo_trl.demonstrations import DemonstrationBank
 from bgpo_trl.modules.actor_critic import Actor, Critic
@@ -22,7 +22,7 @@ from bgpo_trl.objectives.ddpg import ForeachSoftUpdate
 from bgpo_trl.objectives.maml import MAMLLoss
 from bgpo_trl.replay import TaskReplay
 from bgpo_trl.representation import Representation
-from bgpo_trl.seeding import generators
+from bgpo_trl.seeding import generators, task_generators
 from bgpo_trl.transforms import TaskSchedule
 
 
@@ -50,6 +50,9 @@ class MAML(Algorithm):
         replay: One for each task.
     """
 
+    loss: MAMLLoss
+    replay: TaskReplay
+
     def __init__(
         self,
         config: MAMLConfig,
@@ -64,20 +67,9 @@ class MAML(Algorithm):
             config, seeds=seeds, schedule=schedule, bank=bank, encoders=encoders, device=device
         )
         self.config, ddpg = config, config.ddpg
-        self.env = TransformedEnv(
-            self.simulation,
-            Compose(
-                [
-                    *observe(config, encoders),
-                    StepCounter(config.max_steps),
-                    self.source,
-                    RewardSum(in_keys=["reward"], out_keys=["episode_reward"]),
-                ]
-            ),
-        )
+        self.env = self.compose(config, encoders)
         network = {"in_keys": [config.state], "hidden_sizes": ddpg.hidden_sizes}
         each, every = [self.n_seeds], [self.n_seeds, self.n_tasks]
-        streams = [generators([seed] * self.n_tasks, "critic") for seed in seeds]
         self.meta_actor = Actor(
             self.state_size, batch_size=each, generator=generators(seeds, "actor"), **network
         )
@@ -85,7 +77,7 @@ class MAML(Algorithm):
             self.state_size,
             layer_norm=ddpg.critic_layer_norm,
             batch_size=every,
-            generator=[stream for of_seed in streams for stream in of_seed],
+            generator=[*chain(*task_generators(seeds, self.n_tasks, "critic"))],
             **network,
         )
         # Called with the parameters of policies that were adapted.
@@ -106,10 +98,7 @@ class MAML(Algorithm):
         self.replay = TaskReplay(
             ddpg.replay_size,
             batch_size=config.task_batch_size,
-            generator=[
-                [generators([seed], f"replay {task}")[0] for task in range(self.n_tasks)]
-                for seed in seeds
-            ],
+            generator=task_generators(seeds, self.n_tasks, "replay"),
             keys=[
                 *(config.state, "action"),
                 *(("next", key) for key in (config.state, "reward", "terminated")),
@@ -134,12 +123,7 @@ class MAML(Algorithm):
         """Makes one update of each seed; see `Algorithm.update`."""
         if len(self.replay) < max(self.config.ddpg.warmup_steps, self.replay.enough):
             return {}
-        losses = self.loss(self.moved(self.replay.sample()))
-        self.optimizer.zero_grad()
-        (losses["loss_actor"] + losses["loss_value"]).backward()
-        self.optimizer.step()
-        self.target_update.step()
-        return {key: losses[key].detach() / self.n_seeds for key in ("loss_actor", "loss_value")}
+        return self.learn(self.replay.sample())
 
     def freeze(
         self, index: int, embedding: Tensor, task: Tensor, generator: torch.Generator
@@ -171,18 +155,3 @@ class MAML(Algorithm):
         inputs = TensorDict({self.config.state: state}, state.shape[:-1])
         functional_call(self._adapted, dict(frozen.get("actor").items()), (inputs,))
         return inputs["action"]
-
-    def state_dict(self) -> dict[str, Any]:
-        """Returns all that the future of the run depends on but the tensordict in flight."""
-        return {
-            **super().state_dict(),
-            "loss": dict(self.loss.state_dict()),
-            "optimizer": self.optimizer.state_dict(),
-            "replay": self.replay.state_dict(),
-        }
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continues from what `state_dict` returned."""
-        super().load_state_dict(state)
-        for name in ("loss", "optimizer", "replay"):
-            getattr(self, name).load_state_dict(state[name])
