@@ -79,9 +79,15 @@ def describe(run: Path) -> str:
     late, highest = summarize(run / "eval.csv"), best(run / "eval.csv")
     final = read_rows(run / "final.csv")
 
-    def trained(task: str | None, kind: str, column: str) -> float:
-        of_task = [r for r in final if r["task"] == (task or r["task"])]
-        return float(np.mean([float(r[column]) for r in of_task if r["demonstrations"] == kind]))
+    def trained(task: str | None, kind: str, column: str, digits: int) -> str:
+        cells = [
+            row[column]
+            for row in final
+            if row["task"] == (task or row["task"]) and row["demonstrations"] == kind
+        ]
+        if "" in cells:  # task inference where there is no GWR-B
+            return ""
+        return f"{100 * np.mean([float(cell) for cell in cells]):.{digits}f}"
 
     lines = [
         "| task | last 10 % | best 10 % | by seed | trained, seen | trained, held-out | inferred |",
@@ -92,13 +98,14 @@ def describe(run: Path) -> str:
         numbers = [late[task or "overall"], *([highest[task]] if task else [])]
         cells = [f"{100 * number:.1f}" for number in numbers] + ([] if task else [""])
         cells.append(" ".join(f"{100 * success:.0f}" for success in by_seed[task]))
-        cells += [f"{100 * trained(task, kind, 'success'):.1f}" for kind in ("seen", "held-out")]
-        cells.append(f"{100 * trained(task, 'held-out', 'task_inference'):.2f}")
+        cells += [trained(task, kind, "success", 1) for kind in ("seen", "held-out")]
+        cells.append(trained(task, "held-out", "task_inference", 2))
         lines.append(f"| {task or 'all'} | " + " | ".join(cells) + " |")
     told = json.loads((run / "summary.json").read_text())
+    nodes = "" if told["nodes"] is None else f"GWR-B nodes: {told['nodes']}. "
     lines += [
         "",
-        f"Episodes to 80 %: {late['episodes to 80 %']:.0f}. GWR-B nodes: {told['nodes']}. "
+        f"Episodes to 80 %: {late['episodes to 80 %']:.0f}. {nodes}"
         f"Commit {told['commit']}: `{told['command']}`.",
     ]
     return "\n".join(lines)

@@ -123,8 +123,8 @@ class MAMLConfig(AlgorithmConfig):
     """Model-agnostic meta-learning over DDPG (Sec. IV-B; Finn et al., 2017)."""
 
     inner_learning_rate: float = 1.0
-    """Length of the one gradient step by which the policy adapts to a task. Ours: with 0.1, actions
-    for different tasks differed by 0.02 after 230 episodes, with 1 by 0.18."""
+    """Length of the one gradient step by which the policy adapts to a task. Ours: long enough to
+    change what the policy does."""
     task_batch_size: int = 64
     """Transitions of each task in an update to adapt to, and as many to judge the adapted policy
     by. Ours: three tasks together see more than the 128 of the other algorithms."""

@@ -397,3 +397,15 @@ def test_closing_ends_the_threads():
     assert before < threading.active_count() <= before + 2  # and the caller's own
     env.close()
     assert threading.active_count() == before
+
+
+def test_the_frames_last_drawn_can_be_looked_at():
+    env = NicoEnv(batch_size=[2, 1], seed=3)
+    start = env.reset()
+    shown = env.frames()
+    assert (shown == start["pixels"].numpy()).all()
+    after = env.rand_step(start)["next"]
+    assert (shown == start["pixels"].numpy()).all()  # what was shown stays as it was
+    assert (env.frames() == after["pixels"].numpy()).all()
+    with pytest.raises(ValueError, match="observe 'both'"):
+        NicoEnv(seed=3, observation="state").frames()

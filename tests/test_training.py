@@ -5,10 +5,14 @@ import hashlib
 import signal
 from collections import Counter, defaultdict
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
 
+from benchmarks import ablation
+from bgpo_trl.algorithms import ALGORITHMS
+from bgpo_trl.algorithms.bgpo import BGPO
 from bgpo_trl.checkpoint import load_checkpoint
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.training import Trainer
@@ -17,6 +21,9 @@ pytestmark = pytest.mark.usefixtures("easy_world")
 CSV_FILES = ("train.csv", "eval.csv")
 TASKS = ("grasp_glass", "push_green_to_glass", "push_green_to_white")
 LOSSES = ("loss_actor", "loss_value")
+every_algorithm = pytest.mark.parametrize("name", ALGORITHMS)
+# Those whose tasks each need data of their own begin to learn later, and are given more.
+LONGER = {"maml": {"episodes": 16}, "dist-nll": {"episodes": 16}}
 
 
 @pytest.fixture(scope="module")
@@ -29,10 +36,22 @@ def make(bank, encoders, make_config):
 
 
 @pytest.fixture(scope="module")
-def uninterrupted(make, easy_world, tmp_path_factory):
-    directory = tmp_path_factory.mktemp("uninterrupted")
-    make(directory).run()
-    return directory
+def run_of(make, make_config, easy_world, tmp_path_factory):
+    """Plays a run of an algorithm to its end, once."""
+    directories = {}
+
+    def run_of(name):
+        if name not in directories:
+            directories[name] = tmp_path_factory.mktemp(name)
+            make(directories[name], make_config(name=name, **LONGER.get(name, {}))).run()
+        return directories[name]
+
+    return run_of
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(run_of):
+    return run_of("bgpo")
 
 
 def rows(path):
@@ -79,8 +98,10 @@ def at_step(trainer, n, do):
     trainer.algorithm.store = store_or_not
 
 
-def test_every_seed_plays_every_episode_once(uninterrupted, make_config):
-    config, train = make_config(), rows(uninterrupted / "train.csv")
+@every_algorithm
+def test_every_seed_plays_every_episode_once(run_of, make_config, name):
+    config = make_config(name=name, **LONGER.get(name, {}))
+    train = rows(run_of(name) / "train.csv")
     seeds = defaultdict(list)
     for row in train:
         seeds[int(row["seed"])].append(row)
@@ -91,19 +112,23 @@ def test_every_seed_plays_every_episode_once(uninterrupted, make_config):
         for row in played:
             total += int(row["steps"])
             assert int(row["env_steps"]) == total
-            assert 1 <= int(row["steps"]) <= config.bgpo.max_steps
+            assert 1 <= int(row["steps"]) <= config.algorithm.max_steps
             assert int(row["success"]) == float(row["return"])
-            assert int(row["success"]) or int(row["steps"]) == config.bgpo.max_steps
-            assert 0 < float(row["intrinsic_return"]) <= 1
+            assert int(row["success"]) or int(row["steps"]) == config.algorithm.max_steps
+            assert 0 <= float(row["intrinsic_return"]) <= 1
+            assert (float(row["intrinsic_return"]) > 0) == (name == "bgpo")
+            assert (int(row["num_nodes"]) > 0) == (name == "bgpo")
     assert {row["success"] for row in train} == {"0", "1"}
-    assert {row["algorithm"] for row in train} == {"bgpo"}
-    assert int(train[-1]["num_nodes"]) > 2
+    for file in CSV_FILES:
+        assert {row["algorithm"] for row in rows(run_of(name) / file)} == {name}
+    if name == "bgpo":
+        assert int(train[-1]["num_nodes"]) > 2
     assert (float(train[0]["loss_value"]), float(train[-1]["loss_value"]) > 0) == (0, True)
 
 
 @pytest.mark.parametrize("starts", [(0, 5, 10), (4, 0, 8), (0, 0, 0)])
 def test_a_task_is_presented_from_its_start_on(make, make_config, tmp_path, starts):
-    config = make_config("state", "task_one_hot", seeds=(0, 1, 2), episodes=16, task_starts=starts)
+    config = make_config("state", "oracle", seeds=(0, 1, 2), episodes=16, task_starts=starts)
     make(tmp_path, config).run()
     first = defaultdict(lambda: 99)
     for row in rows(tmp_path / "train.csv"):
@@ -134,12 +159,14 @@ def test_all_presented_tasks_are_tested_every_few_episodes(make, make_config, tm
         assert int(row["success"]) == float(row["return"])
 
 
-def test_a_seed_writes_what_it_would_write_alone(uninterrupted, make, make_config, tmp_path):
+@every_algorithm
+def test_a_seed_writes_what_it_would_write_alone(run_of, make, make_config, tmp_path, name):
     for seed in make_config().seeds:
-        make(tmp_path / str(seed), make_config(seeds=(seed,))).run()
-        for name in CSV_FILES:
-            together = [row for row in rows(uninterrupted / name) if row["seed"] == str(seed)]
-            alone = rows(tmp_path / str(seed) / name)
+        config = make_config(name=name, seeds=(seed,), **LONGER.get(name, {}))
+        make(tmp_path / str(seed), config).run()
+        for file in CSV_FILES:
+            together = [row for row in rows(run_of(name) / file) if row["seed"] == str(seed)]
+            alone = rows(tmp_path / str(seed) / file)
             assert len(together) == len(alone) > 0
             for ours, theirs in zip(together, alone, strict=True):
                 intrinsic = [float(row.pop("intrinsic_return", 0)) for row in (ours, theirs)]
@@ -152,7 +179,8 @@ def test_a_seed_writes_what_it_would_write_alone(uninterrupted, make, make_confi
 def test_training_draws_seen_demonstrations_and_tests_held_out_ones(
     make, make_config, bank, tmp_path, monkeypatch
 ):
-    trainer = make(tmp_path, make_config(context="demo_embedding", episodes=4))
+    without_gwr = partial(BGPO, compose=ablation.VARIANTS["r_int"])
+    trainer = make(tmp_path, make_config(episodes=4), make=without_gwr)
     store, test = trainer.algorithm.store, trainer.evaluator.run
     trained_on, tested_on = [], []
 
@@ -161,7 +189,7 @@ def test_training_draws_seen_demonstrations_and_tests_held_out_ones(
         store(transition)
 
     def spy_test(snapshots, *args):
-        tested_on.extend(snapshot.context for snapshot in snapshots)
+        tested_on.extend(snapshot.policy["told"].flatten(0, 1) for snapshot in snapshots)
         return test(snapshots, *args)
 
     monkeypatch.setattr(trainer.algorithm, "store", spy_store)
@@ -174,12 +202,33 @@ def test_training_draws_seen_demonstrations_and_tests_held_out_ones(
         assert ((rows.unsqueeze(1) - allowed.embedding).abs().amax(-1) < 1e-5).any(1).all()
 
 
-def test_a_label_in_place_of_encoders(make, make_config, tmp_path):
-    make(tmp_path, make_config("state", "task_one_hot", episodes=4), encoders=None).run()
+@pytest.mark.parametrize("name", [name for name in ALGORITHMS if name != "bgpo"])
+def test_ground_truth_in_place_of_encoders(make, make_config, tmp_path, name):
+    make(tmp_path, make_config("state", name, episodes=6), encoders=None).run()
     train = rows(tmp_path / "train.csv")
     assert {(row["num_nodes"], row["intrinsic_return"]) for row in train} == {("0", "0.0")}
     assert {row["success"] for row in train} == {"0", "1"}
     assert all(int(row["success"]) == float(row["return"]) for row in train)
+
+
+def test_an_algorithm_may_be_made_under_another_name(make, make_config, tmp_path):
+    made = []
+
+    def make_it(*args, **kwargs):
+        made.append((args, kwargs))
+        return ALGORITHMS["ddpg"].make(*args, **kwargs)
+
+    config = make_config("state", "ddpg", episodes=2)
+    trainer = make(tmp_path, replace(config, name="no such algorithm"), make=make_it)
+    trainer.run()
+    ((args, kwargs),) = made
+    assert args == (config.algorithm,)
+    assert kwargs["seeds"] == config.seeds
+    assert trainer.algorithm.told is None
+    for file in CSV_FILES:
+        assert {row["algorithm"] for row in rows(tmp_path / file)} == {"no such algorithm"}
+    with pytest.raises(KeyError, match="no such algorithm"):
+        make(tmp_path / "other", trainer.config)
 
 
 @pytest.mark.parametrize("step", [1, 20])
@@ -195,15 +244,23 @@ def test_ctrl_c_waits_for_the_step_and_the_run_goes_on_from_it(uninterrupted, ma
     assert_same_run(tmp_path, uninterrupted)
 
 
-def test_a_run_can_be_interrupted_again_and_again(uninterrupted, make, tmp_path):
-    for step in (3, 1, 9):
-        trainer = make(tmp_path, resume=True)
+@every_algorithm
+def test_a_run_can_be_interrupted_again_and_again(run_of, make, make_config, tmp_path, name):
+    config = make_config(name=name, **LONGER.get(name, {}))
+    steps = (3, 1, 9, 19) if name in LONGER else (3, 1, 9)
+    for step in steps:
+        trainer = make(tmp_path, config, resume=True)
         at_step(trainer, step, lambda: signal.raise_signal(signal.SIGINT))
         with pytest.raises(KeyboardInterrupt):
             trainer.run()
-    assert load_checkpoint(tmp_path / "checkpoint")["env_steps"] == 13
-    make(tmp_path, resume=True).run()
-    assert_same_run(tmp_path, uninterrupted)
+    saved = load_checkpoint(tmp_path / "checkpoint")
+    assert saved["env_steps"] == sum(steps)
+    assert any(saved["waiting"])  # snapshots of one seed, for an evaluation of both
+    assert saved["algorithm"]["optimizer"]["state"]  # it has begun to learn
+    if name == "dist-nll":
+        assert all(saved["algorithm"]["tasks"])
+    make(tmp_path, config, resume=True).run()
+    assert_same_run(tmp_path, run_of(name))
 
 
 def crash(*args, **kwargs):
@@ -303,7 +360,8 @@ def test_a_directory_with_another_run_is_refused(uninterrupted, make, make_confi
     with pytest.raises(ValueError, match="already holds a run: resume it"):
         make(uninterrupted)
     longer = make_config(episodes=11)
-    for config in (longer, replace(longer, episodes=10, seeds=(1, 2))):
+    other = make_config(name="ddpg")
+    for config in (longer, replace(longer, episodes=10, seeds=(1, 2)), other):
         with pytest.raises(ValueError, match="holds a run with other settings"):
             make(uninterrupted, config, resume=True)
 

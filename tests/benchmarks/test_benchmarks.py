@@ -12,12 +12,13 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args, get_type_hints
 
 import experiment
 import pytest
-import torch
 
 from benchmarks import concurrent, continual, ladder, summary
+from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.checkpoint import load_checkpoint
 from bgpo_trl.configs import PRESETS, DDPGConfig
 from bgpo_trl.logging import EVAL_COLUMNS
@@ -32,23 +33,24 @@ def files(folder):
     return {path: hashlib.sha256(path.read_bytes()).hexdigest() for path in found}
 
 
-@pytest.fixture
-def tiny(monkeypatch, encoders, bank, make_config):
-    """The benchmarks with untrained encoders, and runs of a second."""
-    config = make_config(episodes=6)
-    for module in (experiment, ladder):
-        monkeypatch.setattr(module, "load_pretrained", lambda: (encoders, bank))
-        monkeypatch.setattr(module, "PRESETS", {"quick": config, "desk": config})
-    for rung, (name, bgpo) in ladder.RUNGS.items():
-        small = replace(bgpo, max_steps=6)
-        monkeypatch.setitem(ladder.RUNGS, rung, (name, small))
-    chance = torch.tensor([0.1, 0.2, 0.3])
-    monkeypatch.setattr(experiment, "evaluate_random_policy", lambda **kwargs: chance)
-
-
 def test_a_preset_is_taken_as_it_is():
     for name, preset in PRESETS.items():
         assert experiment.run_config(experiment.Arguments(preset=name)) == preset
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_another_algorithm_changes_nothing_else(name):
+    for preset, config in PRESETS.items():
+        arguments = experiment.Arguments(algorithm=name, preset=preset)
+        entry = ALGORITHMS[name]
+        expected = replace(config, name=name, algorithm=entry.config)
+        assert experiment.run_config(arguments) == expected
+        assert entry.config.ddpg == DDPGConfig()  # the same learner for all
+
+
+def test_the_command_line_knows_every_algorithm():
+    choices = get_type_hints(experiment.Arguments)["algorithm"]
+    assert get_args(choices) == tuple(ALGORITHMS)
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -104,6 +106,46 @@ def test_continual_leaves_curve_and_figures(tiny, tmp_path, capsys):
     continual.main(experiment.Arguments(out=run_directory, resume=True))
     assert files(run_directory) == before
     assert capsys.readouterr().out == printed
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_the_command_line_runs_every_algorithm_and_says_its_name(
+    tiny, monkeypatch, tmp_path, capsys, name
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["concurrent.py", "--algorithm", name])
+    runpy.run_path(str(ROOT / "benchmarks" / "concurrent.py"), run_name="__main__")
+    run = Path("runs") / f"concurrent-{name}-quick"
+    printed = capsys.readouterr().out
+    assert f"curve and figures: {run}" in printed
+    config = json.loads((run / "config.json").read_text())
+    assert config["name"] == name
+    assert config["algorithm"].get("beta") == (None if name in ("maml", "dist-nll") else 0.1)
+    for file in ("train.csv", "eval.csv"):
+        rows = summary.read_rows(run / file)
+        assert {row["algorithm"] for row in rows} == {name}
+        assert {row["task"] for row in rows} == set(TASKS)
+
+    # What is said of GWR-B is said where there is one.
+    with_gwr = name == "bgpo"
+    told = json.loads((run / "summary.json").read_text())
+    assert (told["nodes"] is not None) == with_gwr
+    for file in ("gwr.csv", "figures/gwr.png"):
+        assert (run / file).exists() == with_gwr
+    assert ("GWR-B" in printed) == ("task inference" in printed) == with_gwr
+    rows = summary.read_rows(run / "final.csv")
+    assert len(rows) == 2 * 2 * 3
+    assert all((row["task_inference"] != "") == with_gwr for row in rows)
+    summary.main(summary.Arguments((run,)))
+    printed = capsys.readouterr().out
+    assert ("GWR-B nodes: [" in printed) == with_gwr
+    table = [line.split("|") for line in printed.splitlines() if line.startswith("|")]
+    assert [row[1].strip() for row in table[2:]] == [*TASKS, "all"]
+    assert all((row[-2].strip() != "") == with_gwr for row in table[2:])
+    for task, row in zip(TASKS, table[2:], strict=False):
+        shares = [float(r["success"]) for r in rows if r["task"] == task]
+        for cell, of_kind in zip(row[5:7], (shares[:2], shares[2:]), strict=True):
+            assert float(cell) == pytest.approx(100 * sum(of_kind) / 2, abs=0.05)
 
 
 def test_concurrent_presents_all_tasks_from_the_start(tiny, tmp_path, capsys):
@@ -184,15 +226,20 @@ def test_the_ladder_has_a_row_and_a_run_for_each_rung(tiny, tmp_path, capsys):
     seen = {}
     for rung in "abcd":
         config = json.loads((tmp_path / rung / "config.json").read_text())
-        seen[rung] = (config["bgpo"]["state"], config["bgpo"]["context"])
+        learner = load_checkpoint(tmp_path / rung / "checkpoint")["algorithm"]
+        inputs = set(learner["replay"]["rows"]) - {"action", "next"}
+        seen[rung] = (config["algorithm"]["state"], inputs, learner["gwr"] is not None)
         assert (config["task_starts"], config["eval_every"]) == ([0, 0, 0], 4)
-        assert config["bgpo"]["ddpg"]["hidden_sizes"] == [7]
+        assert config["algorithm"]["ddpg"]["hidden_sizes"] == [7]
         assert (tmp_path / rung / "figures" / "success.png").exists()
+        train = summary.read_rows(tmp_path / rung / "train.csv")
+        assert {row["algorithm"] for row in train} == {config["name"]} == {f"rung {rung}"}
+        assert all((float(row["intrinsic_return"]) > 0) == (rung in "cd") for row in train)
     assert seen == {
-        "a": ("state", "task_one_hot"),
-        "b": ("latent", "task_one_hot"),
-        "c": ("latent", "demo_embedding"),
-        "d": ("latent", "behavior"),
+        "a": ("state", {"state", "task_one_hot"}, False),
+        "b": ("latent", {"latent", "task_one_hot"}, False),
+        "c": ("latent", {"latent", "normalized_behavior"}, False),
+        "d": ("latent", {"latent", "normalized_behavior"}, True),
     }
 
     before = files(tmp_path)

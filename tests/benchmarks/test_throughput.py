@@ -1,14 +1,13 @@
 """The throughput benchmark: contenders do what they are timed for; sums and ratios are right."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 from benchmarks import throughput
-from bgpo_trl.configs import PRESETS
+from bgpo_trl.configs import BGPOConfig, DDPGConfig
 from suites import nico
 from suites.nico.base import Environment
 
@@ -90,10 +89,8 @@ def test_ratios_are_against_the_named_contenders(monkeypatch):
 
 def test_results_are_written_and_printed(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(torch, "set_num_threads", lambda n: None)
-    desk = PRESETS["desk"]
-    ddpg = replace(desk.bgpo.ddpg, warmup_steps=3)
-    short = replace(desk, bgpo=replace(desk.bgpo, ddpg=ddpg))
-    monkeypatch.setattr(throughput, "PRESETS", {"desk": short})
+    short = BGPOConfig(ddpg=DDPGConfig(warmup_steps=3))
+    monkeypatch.setattr(throughput, "BGPOConfig", lambda: short)
     throughput.main(
         throughput.Arguments(
             parts=("step", "memory"), seeds=2, rounds=2, steps=4, threads=1, out=tmp_path

@@ -379,6 +379,68 @@ def test_importance_weights_scale_each_transition():
     torch.testing.assert_close(weighted, (weights * distance).mean())
 
 
+def stack_with_weights(n_seeds: int, weights: Tensor | None, n_rows: int = 32, **critic):
+    """Gradients of a stack of seeds, one tensor for each layer, and what the loss tells."""
+    streams = [torch.Generator().manual_seed(seed) for seed in range(n_seeds)]
+    networks = {"in_keys": ["state"], "batch_size": (n_seeds,), "generator": streams}
+    loss = DDPGLoss(Actor(STATE, ACTION, **networks), Critic(STATE, ACTION, **networks, **critic))
+    loss.make_value_estimator()
+    ForeachSoftUpdate(loss, tau=0.005)
+    batch = make_batch(n_seeds, n_rows)
+    if weights is not None:
+        batch["priority_weight"] = weights.unsqueeze(-1).expand(n_seeds, n_rows).clone()
+    return gradients(loss, batch), loss(batch)
+
+
+@pytest.mark.parametrize("layer_norm", [False, True])
+def test_seeds_of_weight_zero_have_no_gradient_and_change_no_others(layer_norm):
+    everything, _ = stack_with_weights(4, None, layer_norm=layer_norm)
+    weights = torch.tensor([1.0, 0.0, 1.0, 0.0])
+    weighted, told = stack_with_weights(4, weights, layer_norm=layer_norm)
+    assert len(weighted) == 8  # weight and bias of two layers of both networks
+    for grad, unweighted in zip(weighted, everything, strict=True):
+        assert not grad[[1, 3]].any()
+        assert grad[[0, 2]].equal(unweighted[[0, 2]])
+        assert unweighted[[1, 3]].abs().flatten(1).amax(-1).min() > 0
+    ones, told_of_ones = stack_with_weights(4, torch.ones(4), layer_norm=layer_norm)
+    for grad, unweighted in zip(ones, everything, strict=True):
+        assert grad.equal(unweighted)
+    assert told["pre_tanh_magnitude"].equal(told_of_ones["pre_tanh_magnitude"])
+
+
+def test_weights_count_in_the_actors_loss_and_in_its_penalty():
+    loss, batch = make_loss(pre_tanh_penalty=0.5), make_batch(8)
+    weights = torch.linspace(0, 2, 8)
+    data = loss.actor_network(batch.select("state"))
+    value = loss.value_network(data)["state_action_value"].squeeze(-1)
+    penalty = 0.5 * data["pre_tanh_action"].square().mean(-1)
+    result = loss(batch.set("priority_weight", weights))
+    torch.testing.assert_close(result["loss_actor"], (weights * (penalty - value)).mean())
+    # A flat critic leaves the penalty alone.
+    constant_critic(loss, online=0.3, target=0.3)
+    loss.zero_grad()
+    loss(batch)["loss_actor"].backward()
+    pre_tanh = data["pre_tanh_action"].detach()
+    expected = (weights.unsqueeze(-1) * 2 * 0.5 * pre_tanh / pre_tanh.numel()).sum(0)
+    bias = loss.actor_network_params["mlp", "layers", "1", "bias"]
+    torch.testing.assert_close(bias.grad, expected)
+
+
+def test_rows_of_zeros_and_weight_zero_learn_nothing_under_layer_norm():
+    """As `TaskReplay` gives them for tasks without data: no NaN may come of them."""
+    networks = {"in_keys": ["state"], "batch_size": (2,)}
+    loss = DDPGLoss(
+        Actor(STATE, ACTION, **networks), Critic(STATE, ACTION, layer_norm=True, **networks)
+    )
+    ForeachSoftUpdate(loss, tau=0.005)
+    batch = make_batch(2, 16).set("priority_weight", torch.ones(2, 16))
+    batch[1] = batch[1].apply(torch.zeros_like)
+    for grad in gradients(loss, batch):
+        assert torch.isfinite(grad).all()
+        assert grad[0].any()
+        assert not grad[1].any()
+
+
 def test_an_actor_of_another_kind():
     network = TensorDictModule(nn.Linear(STATE, ACTION), in_keys=["state"], out_keys=["action"])
     loss = DDPGLoss(network, Critic(STATE, ACTION, in_keys=["state"]))

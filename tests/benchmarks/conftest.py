@@ -1,0 +1,27 @@
+"""Benchmarks made small enough to be run in a second."""
+
+from dataclasses import replace
+
+import experiment
+import pytest
+import torch
+
+from benchmarks import ladder
+from bgpo_trl.algorithms import ALGORITHMS
+
+
+@pytest.fixture
+def tiny(monkeypatch, encoders, bank, make_config):
+    """The benchmarks with untrained encoders, and runs of a second."""
+    config = make_config(episodes=6)
+    for module in (experiment, ladder):
+        monkeypatch.setattr(module, "load_pretrained", lambda: (encoders, bank))
+        monkeypatch.setattr(module, "PRESETS", {"quick": config, "desk": config})
+    for name, entry in ALGORITHMS.items():
+        small = replace(entry, config=make_config(name=name).algorithm)
+        monkeypatch.setitem(ALGORITHMS, name, small)
+    for rung, (name, bgpo, compose) in ladder.RUNGS.items():
+        small = replace(bgpo, max_steps=6)
+        monkeypatch.setitem(ladder.RUNGS, rung, (name, small, compose))
+    chance = torch.tensor([0.1, 0.2, 0.3])
+    monkeypatch.setattr(experiment, "evaluate_random_policy", lambda **kwargs: chance)

@@ -1,0 +1,232 @@
+"""The ablation: variants of BGPO that differ by what their transforms write and nothing else."""
+
+import json
+import sys
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import get_args, get_type_hints
+
+import pytest
+import torch
+from torchrl.envs import check_env_specs
+
+from benchmarks import ablation, experiment, summary
+from benchmarks.ablation import VARIANTS
+from bgpo_trl.algorithms.bgpo import BGPO
+from bgpo_trl.checkpoint import load_checkpoint
+from bgpo_trl.transforms import BehaviorLookup, TaskSchedule
+
+pytestmark = pytest.mark.usefixtures("easy_world")
+variants = pytest.mark.parametrize("variant", VARIANTS)
+
+
+@pytest.fixture
+def make(bank, encoders, make_config):
+    def make(variant, **changes):
+        config = replace(make_config().algorithm, **changes)
+        parts = {"seeds": (3, 8), "schedule": TaskSchedule((0, 2, 4)), "encoders": encoders}
+        compose = {} if variant is None else {"compose": VARIANTS[variant]}
+        return BGPO(config, bank=bank.seen(), **parts, **compose)
+
+    return make
+
+
+def play(algorithm, n_steps):
+    """Trains for some steps; returns transitions [S, T]."""
+    state, transitions = algorithm.env.reset(), []
+    for _ in range(n_steps):
+        state = algorithm.act(state)
+        algorithm.update()
+        transition, state = algorithm.env.step_and_maybe_reset(state)
+        transitions.append(transition.clone())
+        algorithm.store(transition)
+    return torch.stack(transitions, dim=1)
+
+
+def assert_same(first, second, where):
+    """Compares nested containers bit for bit."""
+    if isinstance(first, dict):
+        assert list(first) == list(second), where
+        for key in first:
+            assert_same(first[key], second[key], f"{where}/{key}")
+    elif isinstance(first, list | tuple):
+        for index, pair in enumerate(zip(first, second, strict=True)):
+            assert_same(*pair, f"{where}/{index}")
+    elif isinstance(first, torch.Tensor):
+        assert first.equal(second), where
+    else:
+        assert first == second, where
+
+
+def has_gwr(variant):
+    return variant in ("gwr+r_int", "gwr")
+
+
+def has_reward(variant):
+    return variant in ("gwr+r_int", "r_int")
+
+
+COMMON = {
+    *("latent", "step_count", "task", "demo_embedding", "demo_index", "behavior"),
+    *("normalized_behavior", "episode_reward", "done", "terminated", "truncated"),
+}
+FROM_GWR = {"behavior_node"}
+FROM_REWARD = {"lae_h", "lae_c", "episode_extrinsic_reward", "episode_intrinsic_reward"}
+
+
+@variants
+def test_a_variant_writes_the_entries_of_its_transforms_and_no_others(make, variant):
+    algorithm = make(variant)
+    for transform in algorithm.env.transform:
+        if isinstance(transform, BehaviorLookup):
+            transform.learn = False
+    check_env_specs(algorithm.env)
+    start = algorithm.act(algorithm.env.reset())
+    expected = COMMON | (FROM_GWR if has_gwr(variant) else set())
+    expected |= FROM_REWARD if has_reward(variant) else set()
+    assert set(start.keys()) == expected | {"action"}
+    following = algorithm.env.step(start)["next"]
+    rewards = {"extrinsic_reward", "intrinsic_reward"} if has_reward(variant) else set()
+    assert set(following.keys()) == expected | {"reward"} | rewards
+
+
+@variants
+def test_the_behavior_is_that_of_gwr_or_the_demonstration_itself(make, bank, variant):
+    algorithm, seen, held_out = make(variant), bank.seen().embedding, bank.held_out()
+    data = play(algorithm, 20)
+    phi = data["demo_embedding"]
+    assert phi.equal(seen[data["demo_index"]])
+    torch.testing.assert_close(
+        data["normalized_behavior"] * seen.std(0) + seen.mean(0), data["behavior"]
+    )
+    assert data["behavior"].equal(phi) == (not has_gwr(variant))
+
+    shown = held_out.embedding.view(3, 4, 32)
+    for index in range(2):
+        told = algorithm.freeze(index, shown, held_out.task.view(3, 4), torch.Generator())["told"]
+        known = shown
+        if has_gwr(variant):
+            looked_up = algorithm.gwr.lookup(shown.expand(2, 3, 4, 32)).embedding
+            known = looked_up[index]
+            nodes = algorithm.gwr.graph(index).weights
+            distances = (shown.reshape(-1, 1, 32) - nodes).norm(dim=-1)
+            assert known.reshape(-1, 32).equal(nodes[distances.argmin(-1)])
+        torch.testing.assert_close(told * seen.std(0) + seen.mean(0), known)
+    if has_gwr(variant):
+        assert (algorithm.gwr.num_nodes > 2).all()
+    else:
+        assert algorithm.gwr is None
+
+
+@variants
+def test_only_what_is_paid_for_is_in_the_reward(make, encoders, variant):
+    data = play(make(variant, beta=0.3), 30)
+    ended, reward = data["next", "done"], data["next", "reward"]
+    extrinsic = data["next", "terminated"].float()
+    if not has_reward(variant):
+        assert reward.equal(extrinsic)
+        return
+    assert data["next", "extrinsic_reward"].equal(extrinsic)
+    n_ended = 0
+    for row in data:
+        trajectory = []
+        for step in row:
+            trajectory.append(step["latent"])
+            expected = step["next", "terminated"].float()
+            if step["next", "done"]:
+                trajectory.append(step["next", "latent"])
+                length = torch.tensor([len(trajectory)])
+                phi_g = encoders.lae.encode(torch.stack(trajectory)[None], length)[0]
+                expected = expected + 0.3 * torch.exp(-(step["behavior"] - phi_g).norm())
+                trajectory, n_ended = [], n_ended + 1
+            torch.testing.assert_close(step["next", "reward"], expected)
+    assert n_ended == ended.sum() > 4
+
+
+@pytest.mark.parametrize("beta", [0.1, 0.3])
+@variants
+def test_targets_are_bounded_by_what_can_be_earned(make, variant, beta):
+    highest = 1 + beta if has_reward(variant) else 1.0
+    assert make(variant, beta=beta).loss.return_bounds == (0.0, highest)
+
+
+def test_the_variant_with_both_is_bgpo_bit_for_bit(make):
+    bgpo, variant = make(None), make("gwr+r_int")
+    ours, theirs = play(bgpo, 30), play(variant, 30)
+    assert set(ours.keys(True, True)) == set(theirs.keys(True, True))
+    assert (ours == theirs).all()
+    start = make(None).loss.state_dict()
+    for key, value in bgpo.loss.state_dict().items():
+        assert value.equal(variant.loss.state_dict()[key]), key
+        if "target_" not in key and key.endswith("weight"):
+            assert not value.equal(start[key]), key
+    for index in range(2):
+        for mine, other in zip(bgpo.gwr.graph(index), variant.gwr.graph(index), strict=True):
+            assert mine.equal(other)
+
+
+def test_variants_differ_by_transforms_only(make):
+    algorithms = {variant: make(variant) for variant in VARIANTS}
+    starts = {variant: algorithm.env.reset() for variant, algorithm in algorithms.items()}
+    reference, start = algorithms["none"], starts["none"]
+    transforms = [type(transform).__name__ for transform in reference.env.transform]
+    assert transforms == [
+        *("FrameEncoder", "ClipTransform", "StepCounter", "DemonstrationSource"),
+        *("RenameTransform", "ObservationNorm", "RewardSum"),
+    ]
+    for variant, algorithm in algorithms.items():
+        assert algorithm.config == reference.config
+        assert algorithm.in_keys == ["latent", "normalized_behavior"]
+        assert algorithm.replay.keys == reference.replay.keys
+        for key, value in algorithm.loss.state_dict().items():
+            assert value.equal(reference.loss.state_dict()[key]), key
+        for kind in ("optimizer", "source", "simulation", "noise"):
+            assert_same(algorithm.state_dict()[kind], reference.state_dict()[kind], kind)
+        for key in ("latent", "task", "demo_index", "demo_embedding"):
+            assert starts[variant][key].equal(start[key])
+
+        expected = list(transforms)
+        if has_gwr(variant):
+            expected[expected.index("RenameTransform")] = "BehaviorLookup"
+        if has_reward(variant):
+            expected.insert(-1, "BehaviorMatchingReward")
+        assert [type(transform).__name__ for transform in algorithm.env.transform] == expected
+
+
+def test_the_command_line_knows_every_variant():
+    choices = get_type_hints(ablation.Arguments)["variant"]
+    assert set(get_args(choices)) == set(VARIANTS)
+    own = {field.name for field in fields(ablation.Arguments)}
+    assert own - {field.name for field in fields(experiment.Arguments)} == {"variant"}
+
+
+@pytest.mark.parametrize("variant", [*VARIANTS, None])
+def test_the_command_line_runs_a_variant_under_its_name(
+    tiny, monkeypatch, tmp_path, capsys, variant
+):
+    monkeypatch.chdir(tmp_path)
+    chosen = [] if variant is None else ["--variant", variant]
+    monkeypatch.setattr(sys, "argv", ["ablation.py", *chosen])
+    experiment.command_line(ablation.main, "", ablation.Arguments)
+    variant = variant or "gwr+r_int"
+    run = Path("runs") / f"ablation-{variant}-quick"
+    assert f"curve and figures: {run}" in capsys.readouterr().out
+    config = json.loads((run / "config.json").read_text())
+    assert (config["name"], config["task_starts"]) == (variant, [0, 0, 0])
+    for file in ("train.csv", "eval.csv"):
+        assert {row["algorithm"] for row in summary.read_rows(run / file)} == {variant}
+    for row in summary.read_rows(run / "train.csv"):
+        assert (int(row["num_nodes"]) > 1) == has_gwr(variant)
+        assert (float(row["intrinsic_return"]) > 0) == has_reward(variant)
+    learner = load_checkpoint(run / "checkpoint")["algorithm"]
+    assert (learner["gwr"] is not None) == has_gwr(variant)
+    assert (run / "figures" / "gwr.png").exists() == has_gwr(variant)
+
+
+def test_another_algorithm_has_no_variants(monkeypatch, tmp_path, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["ablation.py", "--algorithm", "maml"])
+    with pytest.raises(SystemExit) as ended:
+        experiment.command_line(ablation.main, "", ablation.Arguments)
+    assert ended.value.code == "error: --algorithm: the variants are BGPO's"
+    assert not list(tmp_path.iterdir())
