@@ -265,7 +265,7 @@ def claims(groups: dict[str, dict[str, Run]], statistics: Statistics) -> Table:
         rows.append(_gap_claim(groups, rival, statistics))
     ablation = groups["ablation"]
     order = ["concurrent-bgpo", "ablation-gwr", "ablation-r_int", "ablation-none"]
-    for better, worse in pairwise(order):
+    for better, worse in [*pairwise(order), (order[0], order[-1])]:
         names = GROUPS["ablation"].runs
         compare(
             f"{names[better]} converges faster than {names[worse]}",

@@ -62,12 +62,23 @@ def draw(group: Group, runs: dict[str, Run], path: Path) -> None:
     )
 
 
-def draw_nodes(path: Path, to: Path) -> None:
-    """Draws Fig. 7 from a run's ``gwr.csv``."""
+def draw_nodes(path: Path, to: Path) -> Table:
+    """Draws Fig. 7 from a run's ``gwr.csv``.
+
+    Returns:
+        A table of the distances between the mean nodes of the tasks.
+    """
     rows = read_rows(path)
     tasks = np.array([int(row["task"]) for row in rows])
     weights = np.array([[float(v) for k, v in row.items() if k != "task"] for row in rows])
     save_figure(plot_gwr_pca(weights, tasks, nico.ALL_TASKS), to)
+    numbers = range(len(nico.ALL_TASKS))
+    means = [weights[tasks == task].mean(0) for task in numbers]
+    table: Table = [["distance of mean nodes", *(f"task {task + 1}" for task in numbers)]]
+    for task in numbers:
+        apart = [float(np.linalg.norm(means[task] - means[other])) for other in numbers]
+        table.append([f"task {task + 1}", *(f"{distance:.2f}" for distance in apart)])
+    return table
 
 
 def markdown(rows: Sequence[Sequence[str]]) -> str:
@@ -101,8 +112,8 @@ def main(arguments: Arguments) -> None:
         sections.append(("Forgetting and transfer, continual (points)", None, table, []))
     nodes = arguments.runs / "concurrent-bgpo" / "gwr.csv"
     if nodes.exists():
-        draw_nodes(nodes, out / "fig7.png")
-        sections.append(("Fig. 7: nodes of one GWR-B", out / "fig7.png", [], []))
+        table = draw_nodes(nodes, out / "fig7.png")
+        sections.append(("Fig. 7: nodes of one GWR-B", out / "fig7.png", table, []))
     else:
         missing = [f"missing ({nodes.relative_to(arguments.runs)} is not there)"]
         sections.append(("Fig. 7: nodes of one GWR-B", None, [], missing))

@@ -126,17 +126,18 @@ class MAMLConfig(AlgorithmConfig):
     """Length of the one gradient step by which the policy adapts to a task. Ours: long enough to
     change what the policy does."""
     task_batch_size: int = 64
-    """Transitions of each task in an update to adapt to, and as many to judge the adapted policy
-    by. Ours: three tasks together see more than the 128 of the other algorithms."""
+    """Transitions of each task in an update: half of them to adapt to, half to judge the adapted
+    policy by. Ours: three tasks together see more than the 128 of the other algorithms."""
     adaptation_size: int = 256
     """Transitions of the test task that the policy adapts to before its test episodes. Sec. IV-B
     has "256 adaptation trajectories", about 50 times as much."""
 
     def __post_init__(self) -> None:
-        if self.inner_learning_rate < 0 or self.task_batch_size < 1 or self.adaptation_size < 1:
+        halves = self.task_batch_size >= 2 and self.task_batch_size % 2 == 0
+        if self.inner_learning_rate < 0 or not halves or self.adaptation_size < 1:
             raise ValueError(
-                "MAML needs inner_learning_rate >= 0, task_batch_size >= 1 and adaptation_size "
-                f">= 1, got {self.inner_learning_rate}, {self.task_batch_size} and "
+                "MAML needs inner_learning_rate >= 0, an even task_batch_size >= 2 and "
+                f"adaptation_size >= 1, got {self.inner_learning_rate}, {self.task_batch_size} and "
                 f"{self.adaptation_size}"
             )
 

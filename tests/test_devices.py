@@ -30,11 +30,14 @@ def rows(path):
 
 @pytest.mark.usefixtures("easy_world")
 @pytest.mark.parametrize("device", DEVICES)
-def test_a_run_is_the_same_on_every_device(device, bank, encoders, make_config, tmp_path):
+@pytest.mark.parametrize("name", ["bgpo", "maml", "dist-nll", "ddpg"])
+def test_a_run_is_the_same_on_every_device(device, name, bank, encoders, make_config, tmp_path):
+    longer = {"episodes": 16} if name in ("maml", "dist-nll") else {}
+    config = make_config(name=name, **longer)
     parts = {"bank": bank, "encoders": encoders, "progress": False}
     try:
         for folder, place in (("here", "cpu"), ("there", device)):
-            Trainer(make_config(), tmp_path / folder, device=place, **parts).run()
+            Trainer(config, tmp_path / folder, device=place, **parts).run()
     finally:
         encoders.vae.cpu()
     for name in ("train.csv", "eval.csv"):
@@ -47,17 +50,24 @@ def test_a_run_is_the_same_on_every_device(device, bank, encoders, make_config, 
                     assert float(ours[key]) == pytest.approx(float(theirs[key]), abs=1e-3)
 
 
+POLICIES = {"bgpo": ("actor",), "maml": ("meta_actor",), "dist-nll": ("teacher", "students")}
+
+
 @pytest.mark.usefixtures("easy_world")
 @pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("name", POLICIES)
 def test_learner_and_encoder_are_where_they_were_told(
-    device, bank, encoders, make_config, tmp_path
+    device, name, bank, encoders, make_config, tmp_path
 ):
     parts = {"bank": bank, "encoders": encoders, "progress": False}
     try:
-        algorithm = Trainer(make_config(), tmp_path, device=device, **parts).algorithm
-        for module in (algorithm.actor, algorithm.loss, encoders.vae):
-            for name, weights in module.named_parameters():
-                assert weights.device.type == torch.device(device).type, name
+        config = make_config(name=name)
+        algorithm = Trainer(config, tmp_path, device=device, **parts).algorithm
+        modules = [getattr(algorithm, part) for part in (*POLICIES[name], "critic", "loss")]
+        for part in (*modules, encoders.vae):
+            for module in part if isinstance(part, list) else [part]:
+                for where, weights in module.named_parameters():
+                    assert weights.device.type == torch.device(device).type, where
     finally:
         encoders.vae.cpu()
 

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from bgpo_trl.demonstrations import DemonstrationBank
-from bgpo_trl.task_inference import majority_task, match_counts, task_inference_accuracy
 from bgpo_trl.modules.gwr import GWRB
+from bgpo_trl.task_inference import majority_task, match_counts, task_inference_accuracy
 
 PLACES = torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 9.0]])
 

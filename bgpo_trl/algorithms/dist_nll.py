@@ -213,11 +213,11 @@ class DistNLL(Algorithm):
         """Returns all that the future of the run depends on but the tensordict in flight."""
         return {
             **super().state_dict(),
-            "tasks": self._tasks,
+            "tasks": [list(tasks) for tasks in self._tasks],
             "heads": [generator.get_state() for generator in self._heads],
             "students": [dict(student.state_dict()) for student in self.students],
             "student_optimizers": [o.state_dict() for o in self._student_optimizers],
-            "ended": self._ended,
+            "ended": self._ended.clone(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:

@@ -227,7 +227,7 @@ def test_a_critic_stays_as_it_was_until_there_is_data_of_its_task(make):
 
 
 def test_testing_adapts_by_one_plain_step_on_transitions_of_the_task(make):
-    algorithm = make(schedule=TaskSchedule((0, 2, 99)), adaptation_size=20)
+    algorithm = make(schedule=TaskSchedule((0, 2, 99)), adaptation_size=20, inner_learning_rate=0.5)
     data, _ = play(algorithm, 40)
     for index in range(2):
         frozen = freeze(algorithm, index, generator_seed=5)["actor"]
@@ -247,7 +247,7 @@ def test_testing_adapts_by_one_plain_step_on_transitions_of_the_task(make):
             loss = 0.01 * pre_tanh.square().mean() - value.mean()
             gradients = torch.autograd.grad(loss, list(policy.values()))
             for (key, before), gradient in zip(start.items(), gradients, strict=True):
-                step = -0.1 * gradient
+                step = -0.5 * gradient
                 torch.testing.assert_close(
                     frozen[key][task] - before, step, rtol=1e-3, atol=1e-6, msg=key
                 )
@@ -338,7 +338,15 @@ def test_a_restored_run_continues_as_the_saved_one(make, tmp_path):
     assert_same(freeze(algorithm, 1), freeze(other, 1))
 
 
-@pytest.mark.parametrize("name", ["inner_learning_rate", "task_batch_size", "adaptation_size"])
-def test_settings_without_a_meaning_are_refused(name):
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("inner_learning_rate", -0.1),
+        ("task_batch_size", 0),
+        ("task_batch_size", 7),  # one half is to adapt to, the other to judge by
+        ("adaptation_size", 0),
+    ],
+)
+def test_settings_without_a_meaning_are_refused(name, value):
     with pytest.raises(ValueError, match="MAML needs inner_learning_rate >= 0"):
-        MAMLConfig(**{name: -1})
+        MAMLConfig(**{name: value})

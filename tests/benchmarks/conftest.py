@@ -1,6 +1,7 @@
 """Benchmarks made small enough to be run in a second."""
 
 from dataclasses import replace
+from functools import partial
 
 import experiment
 import pytest
@@ -25,3 +26,15 @@ def tiny(monkeypatch, encoders, bank, make_config):
         monkeypatch.setitem(ladder.RUNGS, rung, (name, small, compose))
     chance = torch.tensor([0.1, 0.2, 0.3])
     monkeypatch.setattr(experiment, "evaluate_random_policy", lambda **kwargs: chance)
+
+
+@pytest.fixture
+def tiniest(tiny, monkeypatch):
+    """Of what comes after training, less: few test episodes, and figures that are not drawn."""
+
+    def touch(figure, path):
+        path.parent.mkdir(exist_ok=True)
+        path.touch()
+
+    monkeypatch.setattr(experiment, "measure", partial(experiment.measure, episodes=2))
+    monkeypatch.setattr(experiment, "save_figure", touch)

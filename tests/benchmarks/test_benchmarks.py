@@ -110,7 +110,7 @@ def test_continual_leaves_curve_and_figures(tiny, tmp_path, capsys):
 
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_the_command_line_runs_every_algorithm_and_says_its_name(
-    tiny, monkeypatch, tmp_path, capsys, name
+    tiniest, monkeypatch, tmp_path, capsys, name
 ):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["concurrent.py", "--algorithm", name])
@@ -136,10 +136,9 @@ def test_the_command_line_runs_every_algorithm_and_says_its_name(
     rows = summary.read_rows(run / "final.csv")
     assert len(rows) == 2 * 2 * 3
     assert all((row["task_inference"] != "") == with_gwr for row in rows)
-    summary.main(summary.Arguments((run,)))
-    printed = capsys.readouterr().out
-    assert ("GWR-B nodes: [" in printed) == with_gwr
-    table = [line.split("|") for line in printed.splitlines() if line.startswith("|")]
+    summed_up = summary.describe(run)
+    assert ("GWR-B nodes: [" in summed_up) == with_gwr
+    table = [line.split("|") for line in summed_up.splitlines() if line.startswith("|")]
     assert [row[1].strip() for row in table[2:]] == [*TASKS, "all"]
     assert all((row[-2].strip() != "") == with_gwr for row in table[2:])
     for task, row in zip(TASKS, table[2:], strict=False):

@@ -87,6 +87,14 @@ def test_tables_hold_what_the_runs_did(reported):
     assert list(late) == list(comparison.ALGORITHMS.values())
 
 
+def test_how_far_the_tasks_lie_apart_in_behavior_space(reported):
+    nodes = np.loadtxt(reported / "concurrent-bgpo" / "gwr.csv", delimiter=",", skiprows=1)
+    means = [nodes[nodes[:, 0] == task, 1:].mean(0) for task in range(3)]
+    table = rows_of((reported / "tables.md").read_text(), "Fig. 7")
+    assert table["task 1"][0] == table["task 3"][2] == "0.00"
+    assert table["task 3"][1] == table["task 2"][2] == f"{np.linalg.norm(means[1] - means[2]):.2f}"
+
+
 def test_claims_are_judged_by_their_intervals(reported):
     text = (reported / "tables.md").read_text().split("## The paper's claims")[1]
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines()]
@@ -100,6 +108,7 @@ def test_claims_are_judged_by_their_intervals(reported):
     assert found["GWR-B + r_int converges faster than GWR-B", "area"][1] == "reproduced"
     assert found["GWR-B converges faster than r_int", "area"][1] == "not decided"
     assert found["r_int converges faster than none", "area"][1] == "the opposite"
+    assert found["GWR-B + r_int converges faster than none", "area"][1] == "not decided"
 
 
 def test_a_claim_may_turn_out_the_other_way(runs):
