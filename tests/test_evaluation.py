@@ -332,3 +332,20 @@ def test_a_random_policy_is_uniform_and_succeeds_by_chance(easy_world):
             expected[task, episode] = now["done"]
     assert rate.equal(expected.mean(-1))
     assert 0 < rate.mean() < 1
+
+
+def test_test_episodes_can_be_watched(make):
+    algorithm, evaluator = make()
+    shown = []
+    result = evaluator.run(
+        take(evaluator, algorithm),
+        0,
+        algorithm,
+        watch=lambda: shown.append(evaluator.simulation.frames()),
+    )
+    assert len(shown) == int(result.steps.max()) + 1
+    for index in np.ndindex(*result.steps.shape):
+        frames = np.stack([frame[index] for frame in shown])
+        changed = (frames[1:] != frames[:-1]).any((1, 2, 3))
+        assert not changed[int(result.steps[index]) :].any()  # it stands still when it is over
+    assert_same_result(result, evaluator.run(take(evaluator, algorithm), 0, algorithm))

@@ -36,8 +36,8 @@ class MultiHeadActor(TensorDictModuleBase):
     Examples:
         >>> from tensordict import TensorDict
         >>> actor = MultiHeadActor(64)
-        >>> actor.add_head()
-        >>> actor.add_head()
+        >>> _ = actor.add_head()
+        >>> _ = actor.add_head()
         >>> actor(TensorDict({"latent": torch.zeros(2, 5, 64)}, [2, 5]))["action"].shape
         torch.Size([2, 5, 4])
     """

@@ -164,6 +164,12 @@ def test_concurrent_presents_all_tasks_from_the_start(tiny, tmp_path, capsys):
     told = json.loads((run / "summary.json").read_text())
     assert re.fullmatch(r"|[0-9a-f]{7,}(-dirty)?", told["commit"])
     assert len(told["nodes"]) == 2
+    assert told["random_success"] == pytest.approx(dict(zip(TASKS, [0.1, 0.2, 0.3], strict=True)))
+    nodes = summary.read_rows(run / "gwr.csv")
+    assert len(nodes) == told["nodes"][0]
+    assert {node["task"] for node in nodes} <= {"-1", "0", "1", "2"}
+    assert [len(node) for node in nodes] == [33] * len(nodes)
+    assert (run / "figures" / "episodes.png").read_bytes().startswith(b"\x89PNG")
 
     capsys.readouterr()
     summary.main(summary.Arguments((run,)))
