@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import zlib
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -159,21 +160,22 @@ def episodes_to_80(run: Run) -> float:
 
 
 class Statistics:
-    """Statistics with intervals, each pair of scores resampled once.
+    """Statistics with intervals; those of a run do not depend on which others are there.
 
     Args:
         seed: Of the resampling.
     """
 
     def __init__(self, seed: int = 0) -> None:
-        self._rng = np.random.default_rng(seed)
+        self._seed = seed
         self._drawn: dict[bytes, Values] = {}
 
     def resampled(self, scores: Values) -> Values:
         """Returns the interquartile mean of resampled scores."""
         key = scores.tobytes()
         if key not in self._drawn:
-            self._drawn[key] = metrics.stratified_bootstrap(scores, rng=self._rng)
+            rng = np.random.default_rng([self._seed, zlib.crc32(key)])
+            self._drawn[key] = metrics.stratified_bootstrap(scores, rng=rng)
         return self._drawn[key]
 
     def cell(self, scores: Values) -> str:
