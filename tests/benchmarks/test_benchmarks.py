@@ -356,7 +356,8 @@ def test_smoke_goes_through_every_stage_from_nothing(tmp_path):
 
     result = subprocess.run([*command, "--resume"], capture_output=True, **options)
     assert result.returncode == 0, result.stderr
-    assert result.stdout.endswith("curve and figures: run\n")
+    told = "curve and figures: run; in numbers: python benchmarks/summary.py run\n"
+    assert result.stdout.endswith(told)
     for name in (
         *("config.json", "train.csv", "eval.csv", "figures/success.png", "figures/gwr.png"),
         *("encoders/nico.safetensors", "encoders/nico_bank.safetensors", "encoders/probes.json"),
