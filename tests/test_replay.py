@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
-from bgpo_trl.replay import ReplayBuffer, TaskReplay
+from bgpo_trl.replay import ReplayBuffer
+from bgpo_trl.task_replay import TaskReplay
 
 
 def generators(n: int) -> list[torch.Generator]:

@@ -24,9 +24,10 @@ from bgpo_trl.demonstrations import DemonstrationBank
 from bgpo_trl.envs import NicoEnv
 from bgpo_trl.modules.gwr import GWRB
 from bgpo_trl.objectives.ddpg import DDPGLoss, ForeachSoftUpdate
-from bgpo_trl.replay import ReplayBuffer, TaskReplay
+from bgpo_trl.replay import ReplayBuffer
 from bgpo_trl.representation import Representation
 from bgpo_trl.seeding import generators, stream_seed
+from bgpo_trl.task_replay import TaskReplay
 from bgpo_trl.transforms import DemonstrationSource, FrameEncoder, TaskSchedule
 from suites.nico.base import STATE_SIZE
 

@@ -21,9 +21,9 @@ from bgpo_trl.modules.actor_critic import Actor, Critic
 from bgpo_trl.modules.multi_head_actor import MultiHeadActor
 from bgpo_trl.objectives.ddpg import DDPGLoss, ForeachSoftUpdate
 from bgpo_trl.objectives.distillation import DistillationLoss
-from bgpo_trl.replay import TaskReplay
 from bgpo_trl.representation import Representation
 from bgpo_trl.seeding import generators, task_generators
+from bgpo_trl.task_replay import TaskReplay
 from bgpo_trl.transforms import TaskSchedule
 
 

@@ -20,9 +20,9 @@ from bgpo_trl.demonstrations import DemonstrationBank
 from bgpo_trl.modules.actor_critic import Actor, Critic
 from bgpo_trl.objectives.ddpg import ForeachSoftUpdate
 from bgpo_trl.objectives.maml import MAMLLoss
-from bgpo_trl.replay import TaskReplay
 from bgpo_trl.representation import Representation
 from bgpo_trl.seeding import generators, task_generators
+from bgpo_trl.task_replay import TaskReplay
 from bgpo_trl.transforms import TaskSchedule
 
 
