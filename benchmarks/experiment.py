@@ -216,7 +216,10 @@ def record_episodes(trainer: Trainer, bank: DemonstrationBank) -> dict[str, np.n
         bank: Demonstrations; held-out ones are shown.
 
     Returns:
-        Frames uint8 ``[N, 32, 64, 3]``, by task and outcome; none where frames are not observed.
+        Frames uint8 ``[N, 32, 64, 3]``, by task and outcome.
+
+    Raises:
+        ValueError: If the run is one from ground truth, without frames.
     """
     config, frames = trainer.config, []
     evaluator = Evaluator(
