@@ -23,8 +23,10 @@ from bgpo_trl.evaluation import Evaluator, evaluate_random_policy
 from bgpo_trl.machine import choose_device
 from bgpo_trl.plotting import plot_frame_strips, plot_gwr_pca, plot_success_curves, save_figure
 from bgpo_trl.pretrained import load_pretrained, make_pretrained
+from bgpo_trl.progress import progress_bar
 from bgpo_trl.task_inference import majority_task, match_counts, task_inference_accuracy
 from bgpo_trl.training import Trainer
+from bgpo_trl.video import save_gif
 from suites import nico
 
 # Number of the evaluation after training, which no evaluation in training has: other starts.
@@ -92,7 +94,8 @@ def run_experiment(
     The run's directory then holds, besides what `Trainer` writes, ``final.csv`` (success of the
     trained policies with demonstrations seen in training and with held-out ones, and task
     inference), ``summary.json`` (commit, command, success of a random policy, nodes of GWR-B),
-    ``gwr.csv`` (nodes of the first seed's GWR-B) and ``figures/``.
+    ``gwr.csv`` (nodes of the first seed's GWR-B) and ``figures/`` (among them a video of a test
+    episode of each task). Weights & Biases gets what is in ``figures/`` too.
 
     Args:
         arguments: From the command line.
@@ -132,9 +135,24 @@ def run_experiment(
         resume=arguments.resume,
         wandb=arguments.wandb,
     )
-    trainer.run()
-    measure(trainer, bank, out, commit)
+    with trainer:
+        trainer.run()
+        measure(trainer, bank, out, commit)
+        draw(trainer, bank, out)
+        for path in sorted((out / "figures").iterdir()):
+            trainer.logger.log_media(f"figures/{path.stem}", path)
+    print(f"curve and figures: {out}; in numbers: python benchmarks/summary.py {out}")
 
+
+def draw(trainer: Trainer, bank: DemonstrationBank, out: Path) -> None:
+    """Draws the run, and says what GWR-B has become.
+
+    Args:
+        trainer: At the end of its run, which has been measured.
+        bank: Demonstrations of both kinds.
+        out: Where ``figures/`` and ``gwr.csv`` go.
+    """
+    config = trainer.config
     summary = json.loads((out / "summary.json").read_text())
     figure = plot_success_curves(
         out / "eval.csv",
@@ -142,8 +160,10 @@ def run_experiment(
         random_success=summary["random_success"],
     )
     save_figure(figure, out / "figures" / "success.png")
-    figure = plot_frame_strips(record_episodes(trainer, bank))
-    save_figure(figure, out / "figures" / "episodes.png")
+    episodes = record_episodes(trainer, bank)
+    save_figure(plot_frame_strips(episodes), out / "figures" / "episodes.png")
+    for title, frames in episodes.items():
+        save_gif(frames, out / "figures" / f"{title.split()[0]}.gif")
     gwr = trainer.algorithm.gwr
     if gwr is not None:
         tasks = majority_task(match_counts(gwr, bank.seen(), 3)[0])
@@ -154,7 +174,6 @@ def run_experiment(
         accuracy = task_inference_accuracy(gwr, bank.seen(), bank.held_out(), 3)
         print(f"GWR-B nodes: {gwr.num_nodes.tolist()}")
         print(f"task inference on held-out demonstrations: {accuracy.mean():.1%}")
-    print(f"curve and figures: {out}; in numbers: python benchmarks/summary.py {out}")
 
 
 def measure(
@@ -172,7 +191,9 @@ def measure(
     algorithm, config, seen = trainer.algorithm, trainer.config, bank.seen()
     gwr = algorithm.gwr
     rows = []
-    for kind, tested in (("seen", seen), ("held-out", bank.held_out())):
+    n_steps = config.algorithm.max_steps + 1
+    bar = progress_bar("final tests", shown=trainer.progress, total=2 * n_steps, unit="step")
+    for half, (kind, tested) in enumerate((("seen", seen), ("held-out", bank.held_out())), 1):
         evaluator = Evaluator(
             config.algorithm,
             seeds=config.seeds,
@@ -184,7 +205,9 @@ def measure(
         snapshots = [
             evaluator.take(algorithm, index, _LAST, 0) for index in range(len(config.seeds))
         ]
-        success = evaluator.run(snapshots, _LAST, algorithm).success
+        success = evaluator.run(snapshots, _LAST, algorithm, watch=bar.update).success
+        bar.set_postfix_str(f"success {success.float().mean():.2f}, {kind}", refresh=False)
+        bar.update(half * n_steps - bar.n)  # episodes may all end earlier
         for task, name in enumerate(nico.ALL_TASKS):
             of_task = tested.of_task(task)
             inferred: list[float | str] = [""] * len(config.seeds)
@@ -194,6 +217,7 @@ def measure(
             for index, seed in enumerate(config.seeds):
                 share = round(success[index, task].float().mean().item(), 4)
                 rows.append((seed, kind, name, episodes, share, inferred[index]))
+    bar.close()
     with (out / "final.csv").open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(FINAL_COLUMNS)

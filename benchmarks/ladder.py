@@ -82,7 +82,7 @@ def main(arguments: Arguments) -> None:
         _, bgpo, compose = RUNGS[rung]
         out = arguments.out / rung
         algorithm = replace(bgpo, ddpg=arguments.ddpg)
-        Trainer(
+        with Trainer(
             replace(base, name=f"rung {rung}", algorithm=algorithm),
             out,
             bank=bank,
@@ -90,7 +90,8 @@ def main(arguments: Arguments) -> None:
             make=partial(BGPO, compose=compose),
             device=device,
             resume=arguments.resume,
-        ).run()
+        ) as trainer:
+            trainer.run()
         save_figure(plot_success_curves(out / "eval.csv"), out / "figures" / "success.png")
         tables[rung] = summarize(out / "eval.csv")
     columns = list(next(iter(tables.values())))

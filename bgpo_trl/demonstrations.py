@@ -18,8 +18,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from tensordict import TensorDict
 from torch import Tensor
-from tqdm import tqdm
 
+from bgpo_trl.progress import progress_bar
 from suites import nico
 from suites.nico.base import STATE_SIZE, Environment
 from suites.nico.demonstrator import Demonstrator
@@ -129,7 +129,10 @@ def record_demonstrations(
     missing = torch.nonzero(dataset["length"] == 0).flatten().tolist()
     perform = _play if play else _demonstrate
     described = "record play" if play else "record demonstrations"
-    for row in tqdm(missing, desc=described, disable=not progress):
+    n = len(dataset)
+    for row in progress_bar(
+        described, missing, shown=progress, total=n, initial=n - len(missing), unit="episode"
+    ):
         task = row // per_task
         episode = perform(environments[task], seed, row)
         n_frames = len(episode["pixels"])

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -13,9 +12,10 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 from torchrl.objectives import LossModule
-from tqdm import tqdm
 
+from bgpo_trl.checkpoint import has_checkpoint, load_checkpoint, save_checkpoint
 from bgpo_trl.configs import RepresentationConfig, SequenceAutoencoderConfig, VAEConfig
+from bgpo_trl.progress import progress_bar
 
 Log = Callable[[dict[str, Any]], None]
 """Receives one row of a training log: stage, step, learning_rate and the losses."""
@@ -27,7 +27,7 @@ class Fit:
 
     Attributes:
         config: what is trained; its seed and intervals apply to every stage.
-        folder: where each stage's checkpoint ``<stage>.pt`` lies; None for no checkpoints.
+        folder: where each stage has a folder of checkpoints; None for no checkpoints.
         log: receives a row every ``config.log_every`` steps.
         progress: whether to show a progress bar.
         device: where to train.
@@ -60,19 +60,20 @@ class Fit:
                 checkpoint, so that an interrupted training continues to the same weights.
 
         Raises:
-            ValueError: if the loss is no longer finite, or the checkpoint is unreadable or
-                belongs to another configuration.
+            ValueError: if the loss is no longer finite, or the checkpoints are damaged or belong to
+                another configuration.
+            OSError: if a checkpoint cannot be written.
         """
         loss.to(self.device)
         optimizer = torch.optim.Adam(loss.parameters(), lr=schedule.learning_rate)
-        path = self.folder / f"{stage}.pt" if self.folder else None
+        path = self.folder / stage if self.folder else None
         start = self._resume(path, loss, optimizer, generator)
-        bar = tqdm(
+        bar = progress_bar(
+            f"train {stage}",
             range(start, schedule.steps),
-            desc=stage,
+            shown=self.progress,
             initial=start,
             total=schedule.steps,
-            disable=not self.progress,
         )
         for step in bar:
             rate = schedule.learning_rate * _decay(step, schedule.steps, schedule.warmup_steps)
@@ -88,7 +89,8 @@ class Fit:
                 parts = {key: value.item() for key, value in losses.items()}
                 if not all(math.isfinite(value) for value in parts.values()):
                     raise ValueError(f"{stage} diverged at step {done}: lower its learning_rate")
-                bar.set_postfix({k.removeprefix("loss_"): f"{v:.3g}" for k, v in parts.items()})
+                shown = {k.removeprefix("loss_"): f"{v:.3g}" for k, v in parts.items()}
+                bar.set_postfix(shown, refresh=False)
                 if self.log:
                     self.log({"stage": stage, "step": done, "learning_rate": rate, **parts})
             if path and (done % self.config.checkpoint_every == 0 or done == schedule.steps):
@@ -102,19 +104,14 @@ class Fit:
         optimizer: torch.optim.Optimizer,
         generator: torch.Generator,
     ) -> None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_suffix(".partial")
-        torch.save(
-            {
-                "config": json.dumps(asdict(self.config)),
-                "step": step,
-                "loss": loss.state_dict(),
-                "optimizer": optimizer.state_dict(),
-                "generator": generator.get_state(),
-            },
-            partial,
-        )
-        os.replace(partial, path)
+        state = {
+            "config": json.dumps(asdict(self.config)),
+            "step": step,
+            "loss": loss.state_dict(),
+            "optimizer": optimizer.state_dict(),
+            "generator": generator.get_state(),
+        }
+        save_checkpoint(path, state)
 
     def _resume(
         self,
@@ -123,12 +120,9 @@ class Fit:
         optimizer: torch.optim.Optimizer,
         generator: torch.Generator,
     ) -> int:
-        if not path or not path.exists():
+        if not path or not has_checkpoint(path):
             return 0
-        try:
-            saved: Mapping[str, Any] = torch.load(path, weights_only=True)
-        except Exception as error:
-            raise ValueError(f"{path} is not a readable checkpoint: remove it") from error
+        saved = load_checkpoint(path)
         if saved["config"] != json.dumps(asdict(self.config)):
             raise ValueError(
                 f"{path} belongs to a training with another configuration: "

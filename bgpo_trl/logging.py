@@ -13,7 +13,8 @@ import json
 import os
 import uuid
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
@@ -53,7 +54,8 @@ class RunLogger:
 
     A row reaches a mirror as one ``log_metrics`` call with the row's numbers, named
     ``{train,eval}/{task}/seed_{seed}/{column}``, at the step ``episode``. A mirror that fails is
-    left out for the rest of the run, with one warning: no dashboard ever ends a run.
+    left out for the rest of the run, with one warning: no dashboard ever ends a run. Rows that a
+    resumed run writes again reach it twice, with the same values at the same steps.
 
     Raises:
         ValueError: If the directory holds a run with other settings or columns, or any run at all
@@ -118,6 +120,17 @@ class RunLogger:
         self._eval.write(row)
         self._mirror("eval", row)
 
+    def log_media(self, name: str, path: str | os.PathLike[str]) -> None:
+        """Shows a finished figure or video on the dashboards that take files: Weights & Biases.
+
+        Args:
+            name: What it is shown under.
+            path: A picture, or a video as GIF or MP4.
+        """
+        for mirror in list(self._mirrors):
+            if isinstance(mirror, WandbLogger):
+                self._try(mirror, partial(_log_wandb_media, mirror, name, Path(path)))
+
     def position(self) -> dict[str, int]:
         """Returns where the CSV files end, for the checkpoint; all up to there is on the disk."""
         return {file.path.name: file.position() for file in (self._train, self._eval)}
@@ -139,12 +152,9 @@ class RunLogger:
         """Closes the CSV files and the mirrors."""
         self._train.close()
         self._eval.close()
-        while self._mirrors:
-            mirror = self._mirrors.pop()
-            try:
-                mirror.shutdown()
-            except Exception as error:
-                _warn_dropped(mirror, error)
+        for mirror in list(self._mirrors):
+            self._try(mirror, mirror.shutdown)
+        self._mirrors.clear()
 
     def __enter__(self) -> Self:
         return self
@@ -167,11 +177,18 @@ class RunLogger:
             if isinstance(value, int | float)
         }
         for mirror in list(self._mirrors):
-            try:
-                mirror.log_metrics(numbers, step=step)
-            except Exception as error:
-                self._mirrors.remove(mirror)
-                _warn_dropped(mirror, error)
+            self._try(mirror, partial(mirror.log_metrics, numbers, step=step))
+
+    def _try(self, mirror: Logger, report: Callable[[], object]) -> None:
+        try:
+            report()
+        except Exception as error:
+            self._mirrors.remove(mirror)
+            warnings.warn(
+                f"{type(mirror).__name__} failed ({_reason(error)}) and gets no more of this run: "
+                "the CSV files have all of it.",
+                stacklevel=4,
+            )
 
 
 def _plain(config: Any) -> Any:
@@ -220,7 +237,7 @@ def _wandb_logger(directory: Path, settings: Any, mode: str) -> list[Logger]:
     for attempt in dict.fromkeys((mode, "offline")):
         try:
             identity.parent.mkdir(exist_ok=True)
-            if not identity.exists():
+            if not identity.exists() or not identity.read_text():  # killed before it was written
                 identity.write_text(uuid.uuid4().hex)
             return [
                 WandbLogger(
@@ -231,7 +248,12 @@ def _wandb_logger(directory: Path, settings: Any, mode: str) -> list[Logger]:
                     log_env_packages=False,  # they would tell paths of this machine
                     config=settings,
                     mode=attempt,  # not `offline=`, which changes os.environ for good
-                    settings={"init_timeout": 30, "finish_timeout": 60},
+                    settings={
+                        "init_timeout": 30,
+                        "finish_timeout": 60,
+                        "console": "off",  # a progress bar is no log
+                        "x_disable_meta": True,  # command, program and folders of this machine
+                    },
                 )
             ]
         except ImportError:
@@ -251,12 +273,12 @@ def _wandb_logger(directory: Path, settings: Any, mode: str) -> list[Logger]:
     return []
 
 
-def _warn_dropped(mirror: Logger, error: Exception) -> None:
-    warnings.warn(
-        f"{type(mirror).__name__} failed ({_reason(error)}) and gets no more of this run: "
-        "the CSV files have all of it.",
-        stacklevel=4,
-    )
+def _log_wandb_media(mirror: WandbLogger, name: str, path: Path) -> None:
+    import wandb  # an extra; the mirror is there only if this is
+
+    # A video by its path: wandb wants moviepy for the frames themselves, as TorchRL's log_video.
+    media = wandb.Video if path.suffix in (".gif", ".mp4") else wandb.Image
+    mirror.experiment.log({name: media(str(path))})
 
 
 def _reason(error: Exception) -> str:

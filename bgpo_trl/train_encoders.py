@@ -6,6 +6,7 @@ import shlex
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import torch
 import tyro
@@ -14,6 +15,7 @@ from tensordict import TensorDictBase
 from bgpo_trl.configs import RepresentationConfig
 from bgpo_trl.csv_file import CsvFile
 from bgpo_trl.demonstrations import DemonstrationBank, load_demonstrations
+from bgpo_trl.fitting import Log
 from bgpo_trl.machine import choose_device
 from bgpo_trl.probes import probe
 from bgpo_trl.representation import (
@@ -69,6 +71,7 @@ def train_encoders(
     config: RepresentationConfig,
     command: str = "",
     device: torch.device | str = "cpu",
+    progress: bool = True,
 ) -> tuple[Representation, DemonstrationBank]:
     """Trains, saves and probes both encoders, and embeds the demonstrations with them.
 
@@ -80,12 +83,14 @@ def train_encoders(
         config: hyperparameters.
         command: stored with the weights.
         device: where to train.
+        progress: whether to show progress bars.
 
     Returns:
         The trained encoders and the bank of embedded demonstrations.
 
     Raises:
         ValueError: as :func:`bgpo_trl.representation.train_representation`.
+        OSError: if the disk is full.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with CsvFile(folder / "train.csv", _COLUMNS) as file:
@@ -96,7 +101,8 @@ def train_encoders(
             scene_version=nico.scene_version(),
             command=command,
             checkpoint=folder / "checkpoint",
-            log=file.write,
+            log=_log_of(file),
+            progress=progress,
             device=device,
         )
     save_representation(representation, weights)
@@ -108,6 +114,18 @@ def train_encoders(
     bank.save(bank_path(weights), encoder_id=representation.identity)
     probe(representation, dataset, folder, play=play)
     return representation, bank
+
+
+def _log_of(file: CsvFile) -> Log:
+    """Returns a log that drops what an interrupted training wrote of the steps made again."""
+
+    def log(row: dict[str, Any]) -> None:
+        again = file.path.read_bytes().find(f"\n{row['stage']},{row['step']},".encode())
+        if again >= 0:
+            file.truncate_to(again + 1)
+        file.write(row)
+
+    return log
 
 
 def main(arguments: Arguments) -> None:

@@ -6,16 +6,17 @@ import gc
 import signal
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Literal
+from types import TracebackType
+from typing import Any, Literal, Self
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tqdm import tqdm
 
 from bgpo_trl.algorithms import ALGORITHMS, Algorithm
 from bgpo_trl.checkpoint import has_checkpoint, load_checkpoint, save_checkpoint
@@ -23,6 +24,7 @@ from bgpo_trl.configs import RunConfig
 from bgpo_trl.demonstrations import DemonstrationBank
 from bgpo_trl.evaluation import Evaluator, Snapshot
 from bgpo_trl.logging import RunLogger
+from bgpo_trl.progress import progress_bar
 from bgpo_trl.representation import Representation
 from bgpo_trl.transforms import TaskSchedule
 from suites import nico
@@ -40,6 +42,9 @@ class Trainer:
     Checkpoints are written between steps only, and an interrupt (Ctrl-C) waits for the end of its
     step, so that each checkpoint is a state that the run has been in. Whatever else ends a run
     costs it what came after its last checkpoint, and no row: a resumed run writes them again.
+
+    Rows are in their files at once. Mirrors such as Weights & Biases hear that it is over when the
+    trainer is closed, so that figures can still reach them after `run`: use it in a ``with`` block.
 
     Args:
         config: The run.
@@ -98,6 +103,9 @@ class Trainer:
         # Snapshots of each seed that wait for the other seeds, and how many were evaluated.
         self._waiting: list[list[Snapshot]] = [[] for _ in seeds]
         self._evaluated = 0
+        # For the progress bar: the latest episodes, and the latest test.
+        self._successes: deque[int] = deque(maxlen=100)
+        self._tested = ""
         settings = {**asdict(config), "encoders": None if encoders is None else encoders.identity}
         self.logger = RunLogger(self.directory, config=settings, wandb=wandb, resume=resume)
         self._state: TensorDictBase | None = None
@@ -116,12 +124,12 @@ class Trainer:
         state = algorithm.env.reset() if self._state is None else self._state
         saved = time.monotonic()
         episodes = algorithm.source.episode
-        bar = tqdm(
+        bar = progress_bar(
+            "train",
+            shown=self.progress,
             total=n_episodes * len(self.config.seeds),
             initial=int(episodes.clamp(max=n_episodes).sum()),
-            desc="train",
             unit="episode",
-            disable=not self.progress,
         )
         losses: dict[str, torch.Tensor] = {}
         # What is here now stays to the end: the garbage collector need not look at it again.
@@ -140,8 +148,9 @@ class Trainer:
                     for index in torch.nonzero(episodes > before).flatten().tolist():
                         if before[index] < n_episodes:
                             self._end_of_episode(index, transition, losses)
+                            bar.set_postfix_str(self._success_so_far(), refresh=False)
                             bar.update()
-                    self._evaluate(bar)
+                    self._evaluate()
                     due = time.monotonic() - saved > 60 * self.config.checkpoint_minutes
                     stop = interrupted()
                     if due or stop or int(episodes.min()) >= n_episodes:
@@ -152,7 +161,25 @@ class Trainer:
         finally:
             gc.unfreeze()
             bar.close()
-            self.logger.close()
+
+    def close(self) -> None:
+        """Closes the run's files and mirrors."""
+        self.logger.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc_value: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _success_so_far(self) -> str:
+        rate = sum(self._successes) / len(self._successes)
+        return f"success {rate:.2f}{self._tested}"
 
     def _end_of_episode(
         self, index: int, transition: TensorDictBase, losses: dict[str, torch.Tensor]
@@ -162,6 +189,7 @@ class Trainer:
         intrinsic = end.get("episode_intrinsic_reward", 0.0)  # not measured in every variant
         extrinsic = end.get("episode_extrinsic_reward", end["episode_reward"])
         nodes = 0 if algorithm.gwr is None else int(algorithm.gwr.num_nodes[index])
+        self._successes.append(int(end["terminated"]))
         self.logger.log_train(
             {
                 "algorithm": self.config.name,
@@ -184,7 +212,7 @@ class Trainer:
                 self.evaluator.take(algorithm, index, number, self.env_steps)
             )
 
-    def _evaluate(self, bar: tqdm) -> None:
+    def _evaluate(self) -> None:
         while all(self._waiting):
             snapshots = [waiting.pop(0) for waiting in self._waiting]
             result = self.evaluator.run(snapshots, self._evaluated, self.algorithm)
@@ -209,7 +237,7 @@ class Trainer:
                             }
                         )
             shown = result.success.float().mean((0, 2)).tolist()
-            bar.set_postfix_str("test success " + " ".join(f"{s:.2f}" for s in shown))
+            self._tested = ", in tests " + " ".join(f"{rate:.2f}" for rate in shown)
 
     def save(self) -> None:
         """Writes a checkpoint from which `resume` continues to the same curve."""
