@@ -2,6 +2,7 @@
 
 import csv
 import hashlib
+import re
 import signal
 from collections import Counter, defaultdict
 from dataclasses import replace
@@ -342,6 +343,17 @@ def test_checkpoints_are_written_as_often_as_asked(make, make_config, tmp_path):
     trainer.run()
     numbers = [path.name.split("-")[1] for path in (tmp_path / "checkpoint").glob("*.pt")]
     assert max(int(number) for number in numbers) == trainer.env_steps
+
+
+@pytest.mark.parametrize(("eval_every", "tests"), [(99, ""), (2, r", in tests( [01]\.\d\d){3}")])
+def test_the_progress_bar_tells_the_success_so_far(
+    make, make_config, tmp_path, capsys, eval_every, tests
+):
+    make(tmp_path, make_config(eval_every=eval_every), progress=True).run()
+    won = [int(row["success"]) for row in rows(tmp_path / "train.csv")]
+    last = capsys.readouterr().err.split("\r")[-1]
+    expected = rf"train: 100%\|.*\| 20/20 .*, success {sum(won) / len(won):.2f}{tests}\]\n"
+    assert re.fullmatch(expected, last)
 
 
 def test_a_finished_run_is_left_as_it_is(uninterrupted, make):

@@ -1,0 +1,39 @@
+"""What `test_resume` runs in processes of its own, to kill them; imports no more than it needs."""
+
+import pytest
+import torch
+
+from bgpo_trl.configs import RepresentationConfig, SequenceAutoencoderConfig, VAEConfig
+from bgpo_trl.demonstrations import record_demonstrations
+from bgpo_trl.train_encoders import train_encoders
+from bgpo_trl.training import Trainer
+from tests.conftest import EasyNicoEnv
+
+RECORDING = {"per_task": 2, "held_out_per_task": 1, "progress": False}
+ENCODERS = RepresentationConfig(
+    vae=VAEConfig(batch_size=4, window=2, steps=20, warmup_steps=1),
+    lae=SequenceAutoencoderConfig(batch_size=4, steps=20, warmup_steps=1),
+    checkpoint_every=3,
+    log_every=1,
+)
+
+
+def play(directory, parts):
+    """Begins or continues a run; in a process of its own."""
+    torch.set_num_threads(1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("bgpo_trl.algorithms.algorithm.NicoEnv", EasyNicoEnv)
+        patch.setattr("bgpo_trl.evaluation.NicoEnv", EasyNicoEnv)
+        config, bank, encoders = torch.load(parts, weights_only=False)
+        with Trainer(
+            config, directory, bank=bank, encoders=encoders, resume=True, progress=False
+        ) as trainer:
+            trainer.run()
+
+
+def learn_to_see(directory):
+    """Begins or continues stage 1; in a process of its own."""
+    torch.set_num_threads(1)
+    dataset = record_demonstrations(directory / "demonstrations", **RECORDING)
+    weights = directory / "encoders.safetensors"
+    train_encoders(dataset, None, weights, directory / "log", ENCODERS, progress=False)

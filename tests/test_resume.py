@@ -1,0 +1,185 @@
+"""Runs that are killed, run out of disk or lose a checkpoint end as if nothing had happened."""
+
+import errno
+import multiprocessing
+import signal
+import time
+from contextlib import ExitStack
+
+import numpy as np
+import pytest
+import torch
+
+from bgpo_trl.checkpoint import load_checkpoint
+from bgpo_trl.demonstrations import load_demonstrations
+from bgpo_trl.pretrained import load_pretrained
+from bgpo_trl.training import Trainer
+from tests.resumable import learn_to_see, play
+from tests.test_checkpoint import largest_file
+from tests.test_training import assert_same_run, at_step
+
+pytestmark = pytest.mark.usefixtures("easy_world")
+
+
+def kill_again_and_again(target, arguments, progress, times=10, seed=0):
+    """Kills `target` at random moments, then lets it end.
+
+    Each time it is killed when it has come some way, and a random moment later: as far on a slow
+    machine as on a fast one. The processes are forks of one that has imported everything, and that
+    has no window to the GPU or to the screen.
+
+    Args:
+        target: Begins or continues something.
+        arguments: Its arguments.
+        progress: Returns how far it has come, a number that grows.
+        times: How often it is killed.
+        seed: Of the moments.
+    """
+    rng = np.random.default_rng(seed)
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["tests.resumable"])
+    came = []
+    for _ in range(times):
+        process = context.Process(target=target, args=arguments)
+        process.start()
+        enough = progress() + int(rng.integers(3))
+        while process.is_alive() and progress() < enough:
+            time.sleep(0.002)
+        time.sleep(rng.uniform(0, 0.03))
+        process.kill()
+        process.join()
+        assert process.exitcode == -9, "it ended before it was killed"
+        came.append(progress())
+    assert came[0] < came[-1]
+    process = context.Process(target=target, args=arguments)
+    process.start()
+    process.join()
+    assert process.exitcode == 0
+
+
+def assert_same_encoders(first, second):
+    """Compares what stage 1 left in two folders bit for bit."""
+    made = [load_pretrained(folder / "encoders.safetensors") for folder in (first, second)]
+    assert made[0][0].identity == made[1][0].identity
+    assert made[0][1].embedding.equal(made[1][1].embedding)
+    logs = [(folder / "log" / "train.csv").read_text().splitlines() for folder in (first, second)]
+    assert logs[0] == logs[1]
+
+
+@pytest.fixture
+def make(bank, encoders, make_config):
+    def make(directory, config=None, **arguments):
+        config = config or make_config(checkpoint_minutes=0.0)
+        return Trainer(config, directory, bank=bank, encoders=encoders, progress=False, **arguments)
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(easy_world, bank, encoders, make_config, tmp_path_factory):
+    directory = tmp_path_factory.mktemp("uninterrupted")
+    config = make_config(checkpoint_minutes=0.0)
+    Trainer(config, directory, bank=bank, encoders=encoders, progress=False).run()
+    return directory
+
+
+def test_a_run_killed_ten_times_is_the_run_that_never_was(
+    make, make_config, bank, encoders, tmp_path
+):
+    config = make_config(episodes=20, checkpoint_minutes=0.0)
+    make(tmp_path / "straight", config).run()
+    torch.save((config, bank, encoders), tmp_path / "parts.pt")
+    run = tmp_path / "killed"
+
+    def steps():
+        names = [path.name for path in run.glob("checkpoint/checkpoint-*.pt")]
+        return max((int(name.split("-")[1]) for name in names), default=0)
+
+    kill_again_and_again(play, (run, tmp_path / "parts.pt"), steps)
+    assert_same_run(run, tmp_path / "straight")
+
+
+def test_stage_1_killed_ten_times_gives_the_same_encoders(tmp_path):
+    for name in ("straight", "killed"):
+        (tmp_path / name).mkdir()
+    learn_to_see(tmp_path / "straight")
+    killed = tmp_path / "killed"
+
+    def progress():
+        recorded = killed / "demonstrations" / "length.memmap"
+        steps = killed / "log" / "train.csv"
+        return (int((np.fromfile(recorded, np.int64) > 0).sum()) if recorded.exists() else 0) + (
+            steps.read_bytes().count(b"\n") if steps.exists() else 0
+        )
+
+    kill_again_and_again(learn_to_see, (killed,), progress)
+    assert_same_encoders(killed, tmp_path / "straight")
+    for name in ("demonstrations/dataset.json", "log/probes.json"):
+        assert (killed / name).read_text() == (tmp_path / "straight" / name).read_text()
+    load_demonstrations(killed / "demonstrations")  # compares the checksum
+
+
+@pytest.mark.parametrize(
+    ("full", "message"),
+    [
+        ("checkpoint", r"cannot save a checkpoint in .* earlier ones are kept: make room, then"),
+        ("train.csv", r"cannot write to .*train\.csv .*: make room, then resume the run"),
+    ],
+)
+def test_a_full_disk_ends_a_run_that_can_go_on(uninterrupted, make, tmp_path, full, message):
+    trainer = make(tmp_path)
+    with ExitStack() as stack:
+
+        def fill_the_disk():
+            if full == "checkpoint":
+                room = 10_000
+            else:
+                room = (tmp_path / full).stat().st_size + 9
+                trainer.save = lambda: None  # none is due before the next row
+            stack.enter_context(largest_file(room))
+
+        at_step(trainer, 9, fill_the_disk)
+        with pytest.raises(OSError, match=message) as error:
+            trainer.run()
+    assert error.value.errno in (errno.EFBIG, errno.ENOSPC)
+    assert "\n" not in str(error.value)
+    assert load_checkpoint(tmp_path / "checkpoint")["env_steps"] == 8
+    assert (tmp_path / "train.csv").read_bytes().endswith(b"\n")
+    make(tmp_path, resume=True).run()
+    assert_same_run(tmp_path, uninterrupted)
+
+
+def test_a_run_whose_newest_checkpoint_is_cut_goes_on_from_the_one_before(
+    uninterrupted, make, tmp_path
+):
+    trainer = make(tmp_path)
+    at_step(trainer, 20, lambda: signal.raise_signal(signal.SIGINT))
+    with pytest.raises(KeyboardInterrupt):
+        trainer.run()
+    _, newest = sorted((tmp_path / "checkpoint").iterdir())
+    newest.write_bytes(newest.read_bytes()[: newest.stat().st_size // 2])
+    with pytest.warns(UserWarning, match=f"{newest.name} is damaged: going on from the"):
+        resumed = make(tmp_path, resume=True)
+    assert resumed.env_steps == 19
+    resumed.run()
+    assert_same_run(tmp_path, uninterrupted)
+
+    for path in (tmp_path / "checkpoint").iterdir():
+        path.write_bytes(b"")
+    with (
+        pytest.warns(UserWarning, match="is damaged"),
+        pytest.raises(ValueError, match="no intact checkpoint to resume from: start a new run"),
+    ):
+        make(tmp_path, resume=True)
+
+
+def test_stage_1_goes_on_from_the_checkpoint_before_a_cut_one(tmp_path):
+    straight, cut = tmp_path / "straight", tmp_path / "cut"
+    for folder in (straight, cut):
+        folder.mkdir()
+        learn_to_see(folder)
+    newest = max((cut / "log" / "checkpoint" / "vae").iterdir())
+    newest.write_bytes(newest.read_bytes()[:-1])
+    with pytest.warns(UserWarning, match=f"{newest.name} is damaged: going on from the"):
+        learn_to_see(cut)
+    assert_same_encoders(cut, straight)
