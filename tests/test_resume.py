@@ -2,6 +2,7 @@
 
 import errno
 import multiprocessing
+import shutil
 import signal
 import time
 from contextlib import ExitStack
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from bgpo_trl import fitting
 from bgpo_trl.checkpoint import load_checkpoint
 from bgpo_trl.demonstrations import load_demonstrations
 from bgpo_trl.pretrained import load_pretrained
@@ -19,9 +21,10 @@ from tests.test_checkpoint import largest_file
 from tests.test_training import assert_same_run, at_step
 
 pytestmark = pytest.mark.usefixtures("easy_world")
+often = pytest.mark.parametrize("times", [2, pytest.param(10, marks=pytest.mark.slow)])
 
 
-def kill_again_and_again(target, arguments, progress, times=10, seed=0):
+def kill_again_and_again(target, arguments, progress, times, seed=0):
     """Kills `target` at random moments, then lets it end.
 
     Each time it is killed when it has come some way, and a random moment later: as far on a slow
@@ -83,10 +86,18 @@ def uninterrupted(easy_world, bank, encoders, make_config, tmp_path_factory):
     return directory
 
 
-def test_a_run_killed_ten_times_is_the_run_that_never_was(
-    make, make_config, bank, encoders, tmp_path
+@pytest.fixture(scope="module")
+def learned(tmp_path_factory):
+    directory = tmp_path_factory.mktemp("learned")
+    learn_to_see(directory)
+    return directory
+
+
+@often
+def test_a_run_that_is_killed_again_and_again_is_the_run_that_never_was(
+    make, make_config, bank, encoders, tmp_path, times
 ):
-    config = make_config(episodes=20, checkpoint_minutes=0.0)
+    config = make_config(episodes=2 * times + 4, checkpoint_minutes=0.0)
     make(tmp_path / "straight", config).run()
     torch.save((config, bank, encoders), tmp_path / "parts.pt")
     run = tmp_path / "killed"
@@ -95,28 +106,22 @@ def test_a_run_killed_ten_times_is_the_run_that_never_was(
         names = [path.name for path in run.glob("checkpoint/checkpoint-*.pt")]
         return max((int(name.split("-")[1]) for name in names), default=0)
 
-    kill_again_and_again(play, (run, tmp_path / "parts.pt"), steps)
+    kill_again_and_again(play, (run, tmp_path / "parts.pt"), steps, times)
     assert_same_run(run, tmp_path / "straight")
 
 
-def test_stage_1_killed_ten_times_gives_the_same_encoders(tmp_path):
-    for name in ("straight", "killed"):
-        (tmp_path / name).mkdir()
-    learn_to_see(tmp_path / "straight")
-    killed = tmp_path / "killed"
-
+@often
+def test_stage_1_that_is_killed_again_and_again_gives_the_same_encoders(learned, tmp_path, times):
     def progress():
-        recorded = killed / "demonstrations" / "length.memmap"
-        steps = killed / "log" / "train.csv"
-        return (int((np.fromfile(recorded, np.int64) > 0).sum()) if recorded.exists() else 0) + (
-            steps.read_bytes().count(b"\n") if steps.exists() else 0
-        )
+        recorded, log = tmp_path / "demonstrations" / "length.memmap", tmp_path / "log/train.csv"
+        episodes = (np.fromfile(recorded, np.int64) > 0).sum() if recorded.exists() else 0
+        return int(episodes) + (log.read_bytes().count(b"\n") if log.exists() else 0)
 
-    kill_again_and_again(learn_to_see, (killed,), progress)
-    assert_same_encoders(killed, tmp_path / "straight")
+    kill_again_and_again(learn_to_see, (tmp_path,), progress, times)
+    assert_same_encoders(tmp_path, learned)
     for name in ("demonstrations/dataset.json", "log/probes.json"):
-        assert (killed / name).read_text() == (tmp_path / "straight" / name).read_text()
-    load_demonstrations(killed / "demonstrations")  # compares the checksum
+        assert (tmp_path / name).read_text() == (learned / name).read_text()
+    load_demonstrations(tmp_path / "demonstrations")  # compares the checksum
 
 
 @pytest.mark.parametrize(
@@ -173,13 +178,19 @@ def test_a_run_whose_newest_checkpoint_is_cut_goes_on_from_the_one_before(
         make(tmp_path, resume=True)
 
 
-def test_stage_1_goes_on_from_the_checkpoint_before_a_cut_one(tmp_path):
-    straight, cut = tmp_path / "straight", tmp_path / "cut"
-    for folder in (straight, cut):
-        folder.mkdir()
-        learn_to_see(folder)
-    newest = max((cut / "log" / "checkpoint" / "vae").iterdir())
-    newest.write_bytes(newest.read_bytes()[:-1])
-    with pytest.warns(UserWarning, match=f"{newest.name} is damaged: going on from the"):
-        learn_to_see(cut)
-    assert_same_encoders(cut, straight)
+def test_stage_1_goes_on_from_the_checkpoint_before_a_cut_one(learned, tmp_path, monkeypatch):
+    shutil.copytree(learned / "demonstrations", tmp_path / "demonstrations")
+    save, saved = fitting.save_checkpoint, []
+
+    def save_or_die(*arguments):
+        if len(saved) == 3:
+            raise KeyboardInterrupt
+        saved.append(save(*arguments))
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(fitting, "save_checkpoint", save_or_die)
+        learn_to_see(tmp_path)
+    saved[-1].write_bytes(saved[-1].read_bytes()[:-1])
+    with pytest.warns(UserWarning, match=f"{saved[-1].name} is damaged: going on from the"):
+        learn_to_see(tmp_path)
+    assert_same_encoders(tmp_path, learned)
