@@ -87,5 +87,5 @@ def make_pretrained(
         config or RepresentationConfig(),
         command,
         device,
-        progress,
+        progress=progress,
     )
