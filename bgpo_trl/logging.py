@@ -206,11 +206,19 @@ def _flatten(settings: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
         yield prefix, settings
 
 
-def _claim_directory(directory: Path, settings: Any, resume: bool) -> None:
-    """Writes ``config.json``, unless the directory holds a run that this one may not continue."""
-    path = directory / "config.json"
+def check_settings(directory: str | os.PathLike[str], config: Any) -> None:
+    """Makes sure that a directory holds no run, or one with these settings.
+
+    Args:
+        directory: A run directory, there or not.
+        config: Settings of a run, a dataclass instance or a mapping.
+
+    Raises:
+        ValueError: If it holds a run with other settings.
+    """
+    path = Path(directory) / "config.json"
     if path.exists():
-        there, here = dict(_flatten(json.loads(path.read_text()))), dict(_flatten(settings))
+        there, here = dict(_flatten(json.loads(path.read_text()))), dict(_flatten(_plain(config)))
         differences = [
             f"{name} is {there.get(name, 'absent')} there and {here.get(name, 'absent')} here"
             for name in {**there, **here}
@@ -221,6 +229,12 @@ def _claim_directory(directory: Path, settings: Any, resume: bool) -> None:
                 f"{directory} holds a run with other settings ({'; '.join(differences)}): "
                 "choose another run directory, or the same settings."
             )
+
+
+def _claim_directory(directory: Path, settings: Any, resume: bool) -> None:
+    """Writes ``config.json``, unless the directory holds a run that this one may not continue."""
+    check_settings(directory, settings)
+    path = directory / "config.json"
     if not resume and any((directory / name).exists() for name in (path.name, "train.csv")):
         raise ValueError(
             f"{directory} already holds a run: resume it, or choose another run directory."

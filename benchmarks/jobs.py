@@ -1,0 +1,185 @@
+"""Jobs on Ray: each is played to its end once, whatever becomes of the workers that play it."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import logging
+import os
+import socket
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from bgpo_trl.configs import RunConfig
+
+try:
+    import ray
+except ImportError:
+    sys.exit("error: sweeps run on Ray, which is not installed: pip install 'bgpo_trl[ray]'")
+
+# A job that takes its worker down each time must come to an end.
+RETRIES = 10
+
+
+@dataclass(frozen=True)
+class Job:
+    """A run of some seeds, and its directory."""
+
+    directory: Path
+    config: RunConfig
+
+    def __str__(self) -> str:
+        return f"{self.directory.parent.name}/{self.directory.name}"
+
+    @property
+    def finished(self) -> bool:
+        """Whether it was played to its end."""
+        return (self.directory / "finished").exists()
+
+
+@contextlib.contextmanager
+def connected(address: str, cpus: float, gpus: float) -> Iterator[None]:
+    """Connects to a Ray cluster, or starts Ray on this machine, until the end of the block.
+
+    Args:
+        address: Of the cluster, or ``"local"``.
+        cpus: Cores of a job.
+        gpus: GPUs of a job.
+
+    Raises:
+        ValueError: If this machine is too small for a job.
+        ConnectionError: If there is no such cluster.
+    """
+    # Ray would report its use to its makers, and give workers what other processes leave of a core.
+    os.environ.update(RAY_USAGE_STATS_ENABLED="0", RAY_worker_niceness="0")
+    options: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR}
+    if address == "local":
+        # Jobs hand over nothing, so that the smallest store will do.
+        options |= {"include_dashboard": False, "object_store_memory": 80_000_000}
+    try:
+        ray.init(address, **options)
+        for name, wanted in (("cpu", cpus), ("gpu", gpus)):
+            there = ray.cluster_resources().get(name.upper(), 0)
+            if address == "local" and wanted > there:
+                raise ValueError(f"--{name}s-per-run {wanted:g}: Ray finds {there:g} here")
+        yield
+    finally:
+        ray.shutdown()
+
+
+@contextlib.contextmanager
+def locked(directory: Path) -> Iterator[None]:
+    """Waits until no other process holds the directory, and holds it until the end of the block.
+
+    The kernel takes the lock back from a process that ends, however it does.
+
+    Args:
+        directory: Made if it does not exist.
+    """
+    directory.mkdir(parents=True, exist_ok=True)
+    with (directory / "lock").open("a") as lock:
+        while True:
+            with contextlib.suppress(BlockingIOError):
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            time.sleep(0.5)
+        yield
+
+
+def work(job: Job, play: Callable[[Job], None], command: Sequence[str]) -> None:
+    """Plays a job in a worker, unless it is finished; what is printed goes to its ``log.txt``.
+
+    Args:
+        job: What to play.
+        play: How.
+        command: Becomes ``sys.argv``, which in a worker is Ray's.
+    """
+    sys.argv = list(command)
+    with (
+        locked(job.directory),  # Ray may believe a worker dead that still writes
+        (job.directory / "log.txt").open("a", buffering=1) as log,
+        contextlib.redirect_stdout(log),
+        contextlib.redirect_stderr(log),
+    ):
+        if job.finished:
+            return
+        print(f"{time.strftime('%F %T')} process {os.getpid()} on {socket.gethostname()}")
+        try:
+            play(job)
+        except BaseException:
+            traceback.print_exc()
+            raise
+        (job.directory / "finished").touch()
+
+
+def play_jobs(
+    jobs: Sequence[Job], play: Callable[[Job], None], *, cpus: float = 1, gpus: float = 0
+) -> dict[Job, str]:
+    """Plays jobs on the Ray that this process is connected to, and shows how far they are.
+
+    Args:
+        jobs: What to play.
+        play: Called in a worker; goes on with what there is of a job, and returns at its end.
+        cpus: Cores of a job.
+        gpus: GPUs of a job.
+
+    Returns:
+        The jobs that failed, and why in one line: ``play`` raised, or lost its worker again and
+        again.
+
+    Raises:
+        KeyboardInterrupt: At Ctrl-C; it is passed on to ``play``, which has a minute to save.
+    """
+    here = Path(__file__).resolve().parent
+    path = [str(here), str(here.parent), os.environ.get("PYTHONPATH", "")]
+    environment = {
+        "PYTHONPATH": os.pathsep.join(filter(None, path)),
+        "OMP_NUM_THREADS": "1",
+        "TQDM_MININTERVAL": "60",  # for the sake of log.txt
+    }
+    task = ray.remote(
+        num_cpus=cpus,
+        num_gpus=gpus,
+        max_retries=RETRIES,  # of jobs whose worker or machine is lost, not of those that raise
+        max_calls=1,  # a process for each job
+        runtime_env={"env_vars": environment},
+    )(work)
+    pending = {task.remote(job, play, sys.argv): job for job in jobs}
+    failed: dict[Job, str] = {}
+    total = sum(len(job.config.seeds) * job.config.episodes for job in jobs)
+    with tqdm(total=total, initial=_episodes(jobs), unit="episode") as bar:
+        try:
+            while pending:
+                for ended in ray.wait(list(pending), timeout=10)[0]:
+                    job = pending.pop(ended)
+                    try:
+                        ray.get(ended)
+                    except ray.exceptions.RayError as error:
+                        failed[job] = _reason(error)
+                    bar.write(f"{job}: {'failed' if job in failed else 'finished'}")
+                bar.n = _episodes(jobs)
+                bar.refresh()
+        except KeyboardInterrupt:
+            for reference in pending:
+                ray.cancel(reference)
+            ray.wait(list(pending), num_returns=len(pending), timeout=60)
+            raise
+    return failed
+
+
+def _episodes(jobs: Iterable[Job]) -> int:
+    """Returns how many training episodes are on record."""
+    files = (job.directory / "train.csv" for job in jobs)
+    return sum(max(0, path.read_bytes().count(b"\n") - 1) for path in files if path.exists())
+
+
+def _reason(error: ray.exceptions.RayError) -> str:
+    cause = getattr(error, "cause", None) or error
+    return f"{type(cause).__name__}: {(str(cause).splitlines() or [''])[0]}"
