@@ -1,0 +1,208 @@
+"""Jobs on a Ray of this machine, and on two machines of which one is lost."""
+
+import csv
+import os
+import signal
+import tempfile
+import threading
+import time
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import jobs
+import pytest
+from jobs import Job
+
+from bgpo_trl.configs import RunConfig
+from bgpo_trl.training import Trainer
+
+# What Ray starts here, it starts in vain on every core otherwise.
+SMALL = {"include_dashboard": False, "object_store_memory": 80_000_000}
+
+
+def rows(path):
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def processes_of(folder):
+    """Ids of the processes that Ray has started with this folder."""
+    found = []
+    for process in Path("/proc").glob("[0-9]*"):
+        try:
+            environment = (process / "environ").read_bytes()
+            command = (process / "cmdline").read_bytes()
+            running = (process / "stat").read_text().rpartition(")")[2].split()[0] != "Z"
+        except OSError:  # gone, or another user's
+            continue
+        if f"RAY_TMPDIR={folder}".encode() in environment.split(b"\0") and running:
+            if b"ray::" in command or b"/ray/" in command:
+                found.append(int(process.name))
+    return found
+
+
+@pytest.fixture(scope="module")
+def folder():
+    """Of all that Ray writes: short, for its sockets; nothing of Ray's is left at the end."""
+    with (
+        tempfile.TemporaryDirectory(prefix="ray", dir="/tmp") as folder,
+        pytest.MonkeyPatch.context() as patch,
+    ):
+        patch.setenv("RAY_TMPDIR", folder)
+        yield folder
+        end = time.monotonic() + 60
+        while processes_of(folder) and time.monotonic() < end:
+            time.sleep(0.1)
+        left = processes_of(folder)
+        for pid in left:
+            os.kill(pid, signal.SIGKILL)
+        assert not left
+
+
+@pytest.fixture(scope="module")
+def ray(folder):
+    """Ray as sweeps start it."""
+    with jobs.connected("local", 1, 0):
+        yield
+
+
+def make_jobs(folder, names, episodes=6):
+    return [
+        Job(folder / name, RunConfig(seeds=(seed,), episodes=episodes))
+        for seed, name in enumerate(names)
+    ]
+
+
+def make_play():
+    """Made here, it goes to the workers as it is, though they cannot import this module."""
+
+    def play(job):
+        import os
+        import signal
+        import time
+
+        path, name = job.directory / "train.csv", job.directory.name
+        if not path.exists():
+            path.write_text("seed,episode,pid\n")
+        there = path.read_text().count("\n")  # which is where a checkpoint would have it go on
+        for episode in range(there, job.config.episodes + 1):
+            with path.open("a") as file:
+                file.write(f"{job.config.seeds[0]},{episode},{os.getpid()}\n")
+            if name == "dies always" or (name == "dies" and there == 1 and episode == 3):
+                os.kill(os.getpid(), signal.SIGKILL)
+            if name == "fails" and episode == 2:
+                raise ValueError("a mistake\nof two lines")
+        while name == "waits":
+            try:
+                time.sleep(0.1)
+            except KeyboardInterrupt:
+                (job.directory / "saved").touch()
+                raise
+
+    return play
+
+
+def test_jobs_outlive_their_workers_but_not_their_mistakes(ray, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(jobs, "RETRIES", 1)
+    todo = make_jobs(tmp_path, ["dies", "lives", "fails", "dies always"])
+    failed = jobs.play_jobs(todo, make_play(), cpus=0.5)
+    told = {job.directory.name: reason for job, reason in failed.items()}
+    assert told.pop("fails") == "ValueError: a mistake"
+    assert told.pop("dies always").startswith("WorkerCrashedError: ")
+    assert not told
+    printed = capsys.readouterr().out.splitlines()  # among what Ray says of workers that died
+    for job in todo:
+        state = "finished" if job.finished else "failed"
+        assert printed.count(f"{tmp_path.name}/{job.directory.name}: {state}") == 1
+    starts = {"dies": 2, "lives": 1, "fails": 1, "dies always": 2}
+    for job in todo:
+        name = job.directory.name
+        assert job.finished == (name in ("dies", "lives"))
+        assert (job.directory / "log.txt").read_text().count(" process ") == starts[name]
+        played = rows(job.directory / "train.csv")
+        if job.finished:
+            assert [int(row["episode"]) for row in played] == [1, 2, 3, 4, 5, 6]
+        assert len({row["pid"] for row in played}) == starts[name]
+    assert "ValueError: a mistake\nof two lines" in (tmp_path / "fails" / "log.txt").read_text()
+
+
+def test_ctrl_c_reaches_the_runs(ray, tmp_path):
+    todo = make_jobs(tmp_path, ["waits"])
+
+    def interrupt():
+        while not (tmp_path / "waits" / "train.csv").exists():
+            time.sleep(0.1)
+        signal.raise_signal(signal.SIGINT)
+
+    threading.Thread(target=interrupt, daemon=True).start()
+    with pytest.raises(KeyboardInterrupt):
+        jobs.play_jobs(todo, make_play())
+    assert (tmp_path / "waits" / "saved").exists()
+    assert not todo[0].finished
+
+
+@pytest.fixture
+def cluster(folder):
+    """Makes a cluster of a machine that only leads and two that play; yields it and those two."""
+    import ray
+    from ray.cluster_utils import Cluster
+
+    settings = {"health_check_initial_delay_ms": 0, "health_check_failure_threshold": 3}
+    settings["health_check_period_ms"] = 1_000
+    made = Cluster()
+    try:
+        made.add_node(num_cpus=0, _system_config=settings, **SMALL)
+        yield made, [made.add_node(num_cpus=1, **SMALL) for _ in range(2)]
+    finally:
+        ray.shutdown()
+        made.shutdown()
+
+
+@pytest.mark.slow
+def test_a_lost_machine_costs_nothing(cluster, bank, make_config, tmp_path):
+    """It is lost half-way through its run, and the other machine plays what is left."""
+    config = make_config(state="state", episodes=60, checkpoint_minutes=0.0)
+    todo = [
+        Job(tmp_path / f"seeds-{a}-{b}", replace(config, seeds=(a, b)))
+        for a, b in ((3, 8), (1, 2), (5, 4))
+    ]
+
+    def play(job):
+        job.directory.joinpath("node").open("a").write(f"{ray_node()}\n")
+        Trainer(job.config, job.directory, bank=bank, resume=True, progress=False).run()
+
+    def ray_node():
+        import ray
+
+        return ray.get_runtime_context().get_node_id()
+
+    made, machines = cluster
+    lost = []
+
+    def lose():
+        """Takes the machine away that has played a third of the first job."""
+        path = todo[0].directory / "train.csv"
+        while not path.exists() or path.read_text().count("\n") < 40:
+            time.sleep(0.05)
+        node = (todo[0].directory / "node").read_text().strip()
+        (machine,) = (machine for machine in machines if machine.node_id == node)
+        made.remove_node(machine, allow_graceful=False)
+        lost.append(node)
+
+    with jobs.connected(made.address, 1, 0):
+        thread = threading.Thread(target=lose)
+        thread.start()
+        assert jobs.play_jobs(todo, play) == {}
+        thread.join(60)
+    played_on = (todo[0].directory / "node").read_text().split()
+    assert len(played_on) == 2
+    assert played_on[0] == lost[0] != played_on[1]
+    for job in todo:
+        reference = tmp_path / "reference" / job.directory.name
+        Trainer(job.config, reference, bank=bank, progress=False).run()
+        for name in ("train.csv", "eval.csv"):
+            assert (job.directory / name).read_bytes() == (reference / name).read_bytes()
+        episodes = Counter((r["seed"], r["episode"]) for r in rows(reference / "train.csv"))
+        assert len(episodes) == 120
+        assert set(episodes.values()) == {1}

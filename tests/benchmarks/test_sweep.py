@@ -1,0 +1,348 @@
+"""The grid of a sweep, and what comes of its blocks of seeds; without Ray."""
+
+import contextlib
+import csv
+import json
+import os
+import sys
+import threading
+from dataclasses import asdict, replace
+from itertools import product
+from types import SimpleNamespace
+
+import jobs
+import merge
+import pytest
+import sweep
+from comparison import GROUPS, Statistics, main_table, read_group
+from jobs import Job
+
+from benchmarks import report, summary
+from benchmarks.report import markdown
+from bgpo_trl.configs import PRESETS
+from bgpo_trl.training import Trainer
+from suites import nico
+
+HEAD = "algorithm,seed,episode,env_steps,task,success,return,steps"
+
+
+def contents(folder):
+    files = (path for path in folder.rglob("*") if path.is_file())
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+
+
+def rows(path):
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def write_run(job):
+    """What a run of a job leaves behind, of results that follow from seed and episode."""
+    config, folder = job.config, job.directory
+    folder.mkdir(parents=True, exist_ok=True)
+    settings = {**asdict(config), "encoders": "some"}
+    (folder / "config.json").write_text(json.dumps(settings))
+    told = {"commit": f"c{config.seeds[0] // 2}", "command": "a", "random_success": {"x": 0.5}}
+    told["nodes"] = [100 + seed for seed in config.seeds] if config.name == "bgpo" else None
+    (folder / "summary.json").write_text(json.dumps(told))
+    (folder / "gwr.csv").write_text(f"task,w0,w1\n0,1,2\n1,2,5\n2,0,{config.seeds[0]}\n")
+    train, tests, final = [HEAD + ",loss_actor"], [HEAD], ["seed,demonstrations,task,success"]
+    final[0] += ",task_inference"
+    for episode, seed in product(range(1, config.episodes + 1), config.seeds):
+        row = f"{config.name},{seed},{episode},{7 * episode},{{}},{(seed + episode) % 2},0.1,5"
+        train.append(row.format(nico.ALL_TASKS[episode % 3]) + f",{sum(config.seeds)}.25")
+        if episode % config.eval_every == 0:
+            tests += [row.format(task) for task in nico.ALL_TASKS] * 2
+    for kind, task, seed in product(("seen", "held-out"), nico.ALL_TASKS, config.seeds):
+        final.append(f"{seed},{kind},{task},0.{seed},1.0")
+    for name, lines in (("train.csv", train), ("eval.csv", tests), ("final.csv", final)):
+        (folder / name).write_text("\n".join(lines) + "\n")
+
+
+@pytest.fixture
+def few():
+    """Four jobs: two algorithms, two blocks of seeds."""
+    return {"algorithms": ("bgpo", "maml"), "seeds": (4, 0, 2), "block": 2, "preset": "quick"}
+
+
+def test_a_job_is_a_block_of_seeds_of_an_algorithm_in_a_setting(tmp_path):
+    arguments = sweep.Arguments(
+        algorithms=("bgpo", "dist-nll"),
+        settings=("continual", "concurrent", "ablation"),
+        seeds=(0, 1, 2, 5, 9),
+        block=2,
+        out=tmp_path,
+    )
+    grid = sweep.make_jobs(arguments)
+    assert [merged.relative_to(tmp_path).as_posix() for merged in grid] == [
+        *("continual-bgpo", "continual-dist-nll", "concurrent-bgpo", "concurrent-dist-nll"),
+        *("ablation-gwr", "ablation-r_int", "ablation-none"),
+    ]
+    known = {name for group in GROUPS.values() for name in group.runs}
+    assert known >= {merged.name for merged in grid}
+    for merged, group in grid.items():
+        assert [job.config.seeds for job in group] == [(0, 1), (2, 5), (9,)]
+        assert [job.directory.name for job in group] == ["seeds-0-1", "seeds-2-5", "seeds-9"]
+        setting, name = merged.name.split("-", 1)
+        starts = PRESETS["desk"].task_starts if setting == "continual" else (0, 0, 0)
+        for job in group:
+            assert job.directory.parent == merged
+            assert job.config.name == name
+            assert job.config.task_starts == starts
+            algorithm = job.config.algorithm
+            assert replace(PRESETS["desk"], algorithm=algorithm) == replace(
+                job.config,
+                seeds=PRESETS["desk"].seeds,
+                task_starts=PRESETS["desk"].task_starts,
+                name="bgpo",
+            )
+            assert hasattr(algorithm, "beta") == (name != "dist-nll")
+
+
+def test_blocks_are_of_the_presets_seeds_and_length_unless_told():
+    (group,) = sweep.make_jobs(sweep.Arguments(preset="paper")).values()
+    assert [job.config.seeds for job in group] == [(0, 1, 2, 3, 4), (5, 6, 7, 8, 9)]
+    assert group[0].config.episodes == 20_000
+    arguments = sweep.Arguments(preset="paper", episodes=2_000, settings=("continual",))
+    (group,) = sweep.make_jobs(arguments).values()
+    assert group[0].config.task_starts == (0, 700, 1_300)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"block": 0}, "block must be at least 1, got 0"),
+        ({"seeds": (1, 2, 1)}, "seeds, all different"),
+        ({"seeds": ()}, "needs seeds"),
+        ({"episodes": 0}, "episodes must be at least 1"),
+        ({"algorithms": ()}, "name at least one of --algorithms"),
+        ({"settings": ()}, "one of --settings"),
+        ({"cpus_per_run": 0}, "--cpus-per-run must be above 0"),
+        ({"gpus_per_run": -1}, "--gpus-per-run not below"),
+    ],
+)
+def test_grids_that_cannot_be_are_refused(tmp_path, wrong, message):
+    with pytest.raises(ValueError, match=message):
+        sweep.main(sweep.Arguments(out=tmp_path / "out", **wrong))
+    assert not (tmp_path / "out").exists()
+
+
+def test_directories_with_something_else_are_refused(few, tmp_path):
+    grid = sweep.make_jobs(sweep.Arguments(out=tmp_path, **few))
+    sweep.check_directories(grid, "some")  # there is nothing yet
+    for group in grid.values():
+        write_run(group[1])
+    sweep.check_directories(grid, "some")
+    with pytest.raises(ValueError, match="encoders is some there and others here"):
+        sweep.check_directories(grid, "others")
+    longer = sweep.make_jobs(sweep.Arguments(out=tmp_path, episodes=7, **few))
+    with pytest.raises(ValueError, match=r"seeds-2 holds a run with other settings .*episodes is"):
+        sweep.check_directories(longer, "some")
+
+    # Other blocks would be merged over what is there.
+    folder = tmp_path / "concurrent-maml"
+    config = json.loads((folder / "seeds-2" / "config.json").read_text())
+    (folder / "config.json").write_text(json.dumps({**config, "seeds": [7, 8, 9]}))
+    sweep.check_directories(grid, "some")
+    others = sweep.make_jobs(
+        sweep.Arguments(out=tmp_path, episodes=7, **{**few, "algorithms": ("maml",), "block": 3})
+    )
+    with pytest.raises(ValueError, match="concurrent-maml holds a run with other settings"):
+        sweep.check_directories(others, "some")
+
+    alone = sweep.make_jobs(sweep.Arguments(out=tmp_path / "alone", **few))
+    write_run(Job(tmp_path / "alone" / "concurrent-maml", alone.popitem()[1][0].config))
+    before = contents(tmp_path)
+    with pytest.raises(ValueError, match="concurrent-maml is a run of its own"):
+        sweep.main(sweep.Arguments(out=tmp_path / "alone", **few))
+    assert contents(tmp_path) == before
+
+
+def test_merged_blocks_are_what_one_run_of_all_seeds_would_be(few, tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["benchmarks/sweep.py", "--block", "2"])
+    arguments = sweep.Arguments(out=tmp_path / "blocks", episodes=6, **few)
+    for merged, group in sweep.make_jobs(arguments).items():
+        whole = Job(tmp_path / "whole" / merged.name, replace(group[0].config, seeds=(4, 0, 2)))
+        for job in (*group, whole):
+            write_run(job)
+        merge.merge([job.directory for job in group], merged)
+        for name in ("train.csv", "eval.csv", "final.csv"):
+            ours, theirs = rows(merged / name), rows(whole.directory / name)
+            assert len(ours) == len(theirs) > 0
+            for row in (*ours, *theirs):
+                row.pop("loss_actor", None)
+            theirs.sort(key=lambda row: (int(row["seed"]), int(row.get("episode", 0))))
+            assert ours == theirs
+        losses = {(row["seed"], row["loss_actor"]) for row in rows(merged / "train.csv")}
+        assert losses == {("0", "4.25"), ("2", "2.25"), ("4", "4.25")}  # by block
+        config = json.loads((merged / "config.json").read_text())
+        assert config == json.loads((whole.directory / "config.json").read_text())
+        told = json.loads((merged / "summary.json").read_text())
+        assert told == {
+            "commit": "c2 c1",
+            "command": "python benchmarks/sweep.py --block 2",
+            "random_success": {"x": 0.5},
+            "nodes": [104, 100, 102] if merged.name.endswith("bgpo") else None,
+        }
+        assert (merged / "gwr.csv").read_text() == "task,w0,w1\n0,1,2\n1,2,5\n2,0,4\n"
+        described = summary.describe(whole.directory).split("\n\n")[0]
+        assert summary.describe(merged).split("\n\n")[0] == described
+    tables = []
+    for folder in ("blocks", "whole"):
+        found, _ = read_group(tmp_path / folder, GROUPS["concurrent"])
+        assert list(found) == ["concurrent-bgpo", "concurrent-maml"]
+        tables.append(main_table(found, Statistics()))
+    assert tables[0] == tables[1]
+    report.main(report.Arguments(tmp_path / "blocks"))
+    assert markdown(tables[1]) in (tmp_path / "blocks" / "tables.md").read_text()
+
+
+def test_merging_again_changes_nothing_and_a_gap_is_not_merged(few, tmp_path):
+    merged, group = sweep.make_jobs(sweep.Arguments(out=tmp_path, episodes=4, **few)).popitem()
+    for job in group:
+        write_run(job)
+    blocks = [job.directory for job in group]
+    merge.merge(blocks, merged)
+    before = contents(tmp_path)
+    merge.merge(blocks, merged)
+    assert contents(tmp_path) == before
+    train = blocks[1] / "train.csv"
+    lines = train.read_text().splitlines(keepends=True)
+    for broken in (lines[:-1], [*lines, lines[-1]], [*lines[:-1], lines[1]]):
+        train.write_text("".join(broken))
+        with pytest.raises(ValueError, match="do not have each episode of each seed once"):
+            merge.merge(blocks, merged)
+        train.write_text("".join(lines))
+        assert contents(tmp_path) == before
+    (blocks[0] / "final.csv").unlink()
+    with pytest.raises(ValueError, match=r"final\.csv is missing"):
+        merge.merge(blocks, merged)
+
+
+@pytest.mark.usefixtures("easy_world")
+def test_blocks_of_real_runs_are_a_run_of_all_seeds(encoders, bank, make_config, tmp_path):
+    def train(folder, seeds):
+        job = Job(tmp_path / folder, make_config(seeds=seeds, episodes=6))
+        write_run(job)
+        for name in ("config.json", "train.csv", "eval.csv"):
+            (job.directory / name).unlink()
+        Trainer(job.config, job.directory, bank=bank, encoders=encoders, progress=False).run()
+        return job.directory
+
+    whole = train("whole", (8, 3))
+    merge.merge([train("first", (8,)), train("second", (3,))], tmp_path / "merged")
+    config = (tmp_path / "merged" / "config.json").read_text()
+    assert config == (whole / "config.json").read_text()
+    for name in ("train.csv", "eval.csv"):
+        ours, theirs = rows(tmp_path / "merged" / name), rows(whole / name)
+        theirs.sort(key=lambda row: (int(row["seed"]), int(row["episode"])))
+        intrinsic = [[float(r.pop("intrinsic_return", 0)) for r in r] for r in (ours, theirs)]
+        assert intrinsic[0] == pytest.approx(intrinsic[1], rel=1e-3)
+        for row in (*ours, *theirs):
+            row.pop("loss_actor", None), row.pop("loss_value", None)
+        assert ours == theirs
+        assert len(ours) > 0
+
+
+@pytest.fixture
+def without_ray(monkeypatch):
+    """The sweep in this process: `played` lists its jobs, `broken` names those that fail."""
+    played, broken = [], set()
+
+    def play(job):
+        played.append(str(job))
+        if str(job) in broken:
+            raise OSError("no space left")
+        write_run(job)
+
+    def play_jobs(todo, play, *, cpus, gpus):
+        failed = {}
+        for job in todo:
+            try:
+                jobs.work(job, play, sys.argv)
+            except OSError as error:
+                failed[job] = str(error)
+        return failed
+
+    monkeypatch.setattr(sweep, "connected", lambda *_, **__: contextlib.nullcontext())
+    monkeypatch.setattr(sweep, "play_jobs", play_jobs)
+    monkeypatch.setattr(sweep, "play", play)
+    some = (SimpleNamespace(identity="some"), None)
+    monkeypatch.setattr(sweep, "load_pretrained", lambda: some)
+    return SimpleNamespace(played=played, broken=broken)
+
+
+def test_a_sweep_plays_what_is_missing_and_nothing_twice(without_ray, few, tmp_path, capsys):
+    played, broken = without_ray.played, without_ray.broken
+    arguments = sweep.Arguments(out=tmp_path, episodes=4, **few)
+    bgpo = ["concurrent-bgpo/seeds-4-0", "concurrent-bgpo/seeds-2"]
+    maml = ["concurrent-maml/seeds-4-0", "concurrent-maml/seeds-2"]
+    broken.add(bgpo[0])
+    with pytest.raises(SystemExit) as ended:
+        sweep.main(arguments)
+    assert ended.value.code == f"error: {bgpo[0]} failed: no space left"
+    assert played == bgpo + maml
+    assert not (tmp_path / "concurrent-bgpo" / "eval.csv").exists()
+    assert (tmp_path / "concurrent-maml" / "eval.csv").exists()
+    assert "OSError: no space left" in (tmp_path / bgpo[0] / "log.txt").read_text()
+
+    broken.clear(), played.clear()
+    sweep.main(arguments)
+    assert played == bgpo[:1]
+    told = json.loads((tmp_path / "concurrent-bgpo" / "config.json").read_text())
+    assert told["seeds"] == [4, 0, 2]
+
+    played.clear(), capsys.readouterr()
+    before = contents(tmp_path)
+    sweep.main(arguments)
+    assert contents(tmp_path) == before
+    assert not played
+    assert capsys.readouterr().out.startswith("4 jobs, 0 of them to play\n")
+
+    sweep.main(replace(arguments, algorithms=("maml",), seeds=(4, 0, 2, 5, 3, 1), block=2))
+    assert played == [f"concurrent-maml/seeds-{block}" for block in ("2-5", "3-1")]
+    seeds = [row["seed"] for row in rows(tmp_path / "concurrent-maml" / "train.csv")]
+    assert seeds == sorted(4 * "012345")
+
+
+def test_a_run_is_played_when_nobody_else_holds_it(make_config, tmp_path, monkeypatch):
+    """It goes on once the other process is gone, and does not play again what that one ended."""
+    job = Job(tmp_path / "run", make_config())
+    waiting, events = threading.Event(), []
+    monkeypatch.setattr(jobs.time, "sleep", lambda _: waiting.set())
+    for finished in (False, True):
+        waiting.clear()
+        thread = threading.Thread(
+            target=jobs.work, args=(job, lambda _: events.append("played"), sys.argv)
+        )
+        with jobs.locked(job.directory):
+            thread.start()
+            assert waiting.wait(20)
+            events.append("the other ends")
+            assert job.finished == finished
+        thread.join(20)
+    assert events == ["the other ends", "played", "the other ends"]
+    assert (job.directory / "log.txt").read_text().count(f"process {os.getpid()} on") == 1
+
+
+def test_a_machine_that_is_too_small_is_told(monkeypatch):
+    ended = []
+    stub = SimpleNamespace(
+        init=lambda *_, **__: None,
+        cluster_resources=lambda: {"CPU": 2.0},
+        shutdown=lambda: ended.append(1),
+    )
+    monkeypatch.setattr(jobs, "ray", stub)
+    for cpus, gpus, told in ((3, 0, "--cpus-per-run 3: Ray finds 2"), (2, 0.5, "--gpus-per-run")):
+        with pytest.raises(ValueError, match=told), jobs.connected("local", cpus, gpus):
+            raise AssertionError("went on")
+    with jobs.connected("auto", 8, 1):  # a cluster may grow
+        assert len(ended) == 2
+    assert len(ended) == 3
+
+
+def test_a_missing_ray_is_told_with_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    monkeypatch.delitem(sys.modules, "jobs")
+    with pytest.raises(SystemExit, match=r"pip install 'bgpo_trl\[ray\]'"):
+        __import__("jobs")
