@@ -36,9 +36,9 @@ def processes_of(folder):
             running = (process / "stat").read_text().rpartition(")")[2].split()[0] != "Z"
         except OSError:  # gone, or another user's
             continue
-        if f"RAY_TMPDIR={folder}".encode() in environment.split(b"\0") and running:
-            if b"ray::" in command or b"/ray/" in command:
-                found.append(int(process.name))
+        ours = f"RAY_TMPDIR={folder}".encode() in environment.split(b"\0")
+        if running and ours and (b"ray::" in command or b"/ray/" in command):
+            found.append(int(process.name))
     return found
 
 
@@ -50,6 +50,7 @@ def folder():
         pytest.MonkeyPatch.context() as patch,
     ):
         patch.setenv("RAY_TMPDIR", folder)
+        patch.setenv("RAY_worker_niceness", "0")
         yield folder
         end = time.monotonic() + 60
         while processes_of(folder) and time.monotonic() < end:
@@ -105,7 +106,7 @@ def make_play():
 
 def test_jobs_outlive_their_workers_but_not_their_mistakes(ray, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(jobs, "RETRIES", 1)
-    todo = make_jobs(tmp_path, ["dies", "lives", "fails", "dies always"])
+    todo = make_jobs(tmp_path, ["dies", "fails", "dies always"])
     failed = jobs.play_jobs(todo, make_play(), cpus=0.5)
     told = {job.directory.name: reason for job, reason in failed.items()}
     assert told.pop("fails") == "ValueError: a mistake"
@@ -115,10 +116,10 @@ def test_jobs_outlive_their_workers_but_not_their_mistakes(ray, tmp_path, monkey
     for job in todo:
         state = "finished" if job.finished else "failed"
         assert printed.count(f"{tmp_path.name}/{job.directory.name}: {state}") == 1
-    starts = {"dies": 2, "lives": 1, "fails": 1, "dies always": 2}
+    starts = {"dies": 2, "fails": 1, "dies always": 2}
     for job in todo:
         name = job.directory.name
-        assert job.finished == (name in ("dies", "lives"))
+        assert job.finished == (name == "dies")
         assert (job.directory / "log.txt").read_text().count(" process ") == starts[name]
         played = rows(job.directory / "train.csv")
         if job.finished:
@@ -150,6 +151,7 @@ def cluster(folder):
 
     settings = {"health_check_initial_delay_ms": 0, "health_check_failure_threshold": 3}
     settings["health_check_period_ms"] = 1_000
+    ray.shutdown()  # the one of other tests
     made = Cluster()
     try:
         made.add_node(num_cpus=0, _system_config=settings, **SMALL)
@@ -162,20 +164,18 @@ def cluster(folder):
 @pytest.mark.slow
 def test_a_lost_machine_costs_nothing(cluster, bank, make_config, tmp_path):
     """It is lost half-way through its run, and the other machine plays what is left."""
-    config = make_config(state="state", episodes=60, checkpoint_minutes=0.0)
+    config = make_config(state="state", name="ddpg", episodes=60, checkpoint_minutes=0.0)
     todo = [
         Job(tmp_path / f"seeds-{a}-{b}", replace(config, seeds=(a, b)))
         for a, b in ((3, 8), (1, 2), (5, 4))
     ]
 
     def play(job):
-        job.directory.joinpath("node").open("a").write(f"{ray_node()}\n")
-        Trainer(job.config, job.directory, bank=bank, resume=True, progress=False).run()
-
-    def ray_node():
         import ray
 
-        return ray.get_runtime_context().get_node_id()
+        with (job.directory / "node").open("a") as file:
+            file.write(f"{ray.get_runtime_context().get_node_id()}\n")
+        Trainer(job.config, job.directory, bank=bank, resume=True, progress=False).run()
 
     made, machines = cluster
     lost = []
@@ -191,7 +191,7 @@ def test_a_lost_machine_costs_nothing(cluster, bank, make_config, tmp_path):
         lost.append(node)
 
     with jobs.connected(made.address, 1, 0):
-        thread = threading.Thread(target=lose)
+        thread = threading.Thread(target=lose, daemon=True)
         thread.start()
         assert jobs.play_jobs(todo, play) == {}
         thread.join(60)
