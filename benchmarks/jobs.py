@@ -15,9 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
 from bgpo_trl.configs import RunConfig
+from bgpo_trl.progress import progress_bar
 
 try:
     import ray
@@ -139,11 +138,7 @@ def play_jobs(
     """
     here = Path(__file__).resolve().parent
     path = [str(here), str(here.parent), os.environ.get("PYTHONPATH", "")]
-    environment = {
-        "PYTHONPATH": os.pathsep.join(filter(None, path)),
-        "OMP_NUM_THREADS": "1",
-        "TQDM_MININTERVAL": "60",  # for the sake of log.txt
-    }
+    environment = {"PYTHONPATH": os.pathsep.join(filter(None, path)), "OMP_NUM_THREADS": "1"}
     task = ray.remote(
         num_cpus=cpus,
         num_gpus=gpus,
@@ -154,7 +149,7 @@ def play_jobs(
     pending = {task.remote(job, play, sys.argv): job for job in jobs}
     failed: dict[Job, str] = {}
     total = sum(len(job.config.seeds) * job.config.episodes for job in jobs)
-    with tqdm(total=total, initial=_episodes(jobs), unit="episode") as bar:
+    with progress_bar("sweep", total=total, initial=_episodes(jobs), unit="episode") as bar:
         try:
             while pending:
                 for ended in ray.wait(list(pending), timeout=10)[0]:
@@ -164,8 +159,7 @@ def play_jobs(
                     except ray.exceptions.RayError as error:
                         failed[job] = _reason(error)
                     bar.write(f"{job}: {'failed' if job in failed else 'finished'}")
-                bar.n = _episodes(jobs)
-                bar.refresh()
+                bar.update(_episodes(jobs) - bar.n)
         except KeyboardInterrupt:
             for reference in pending:
                 ray.cancel(reference)

@@ -18,8 +18,9 @@ from bgpo_trl.runs import read_rows
 def merge(blocks: Sequence[Path], directory: Path) -> None:
     """Writes what one run of all seeds would have, each file whole or not at all.
 
-    Rows are sorted by seed and episode. Losses stay means over the seeds of a block; ``gwr.csv``
-    and ``figures/episodes.png`` are the first block's, so of the first seed.
+    Rows are sorted by seed and episode. Losses stay means over the seeds of a block. What is of the
+    first seed alone, ``gwr.csv`` and figures, is the first block's; ``success.png`` is left to
+    ``summary.py``.
 
     Args:
         blocks: Run directories, which differ by their seeds alone.
@@ -56,9 +57,9 @@ def merge(blocks: Sequence[Path], directory: Path) -> None:
         writer.writeheader()
         writer.writerows(rows)
         _write(directory / name, text.getvalue().encode())
-    for name in ("gwr.csv", "figures/episodes.png"):
-        if (blocks[0] / name).exists():
-            _write(directory / name, (blocks[0] / name).read_bytes())
+    for path in (*blocks[0].glob("gwr.csv"), *blocks[0].glob("figures/*")):
+        if path.name != "success.png":
+            _write(directory / path.relative_to(blocks[0]), path.read_bytes())
     nodes = [block["nodes"] for block in told]
     summary = {
         **told[0],

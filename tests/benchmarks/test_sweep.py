@@ -46,6 +46,9 @@ def write_run(job):
     told["nodes"] = [100 + seed for seed in config.seeds] if config.name == "bgpo" else None
     (folder / "summary.json").write_text(json.dumps(told))
     (folder / "gwr.csv").write_text(f"task,w0,w1\n0,1,2\n1,2,5\n2,0,{config.seeds[0]}\n")
+    (folder / "figures").mkdir(exist_ok=True)
+    for name in ("episodes.png", "success.png"):
+        (folder / "figures" / name).write_text(str(config.seeds[0]))
     train, tests, final = [HEAD + ",loss_actor"], [HEAD], ["seed,demonstrations,task,success"]
     final[0] += ",task_inference"
     for episode, seed in product(range(1, config.episodes + 1), config.seeds):
@@ -184,6 +187,8 @@ def test_merged_blocks_are_what_one_run_of_all_seeds_would_be(few, tmp_path, mon
             "random_success": {"x": 0.5},
             "nodes": [104, 100, 102] if merged.name.endswith("bgpo") else None,
         }
+        assert {path.name for path in (merged / "figures").iterdir()} == {"episodes.png"}
+        assert (merged / "figures" / "episodes.png").read_text() == "4"
         assert (merged / "gwr.csv").read_text() == "task,w0,w1\n0,1,2\n1,2,5\n2,0,4\n"
         described = summary.describe(whole.directory).split("\n\n")[0]
         assert summary.describe(merged).split("\n\n")[0] == described
