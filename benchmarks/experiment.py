@@ -27,7 +27,6 @@ from bgpo_trl.progress import progress_bar
 from bgpo_trl.task_inference import majority_task, match_counts, task_inference_accuracy
 from bgpo_trl.training import Trainer
 from bgpo_trl.video import save_gif
-from suites import nico
 
 # Number of the evaluation after training, which no evaluation in training has: other starts.
 _LAST = 2**31
@@ -125,6 +124,7 @@ def run_experiment(
     else:
         encoders, bank = load_pretrained()
 
+    bank = bank.for_tasks(config.tasks)
     trainer = Trainer(
         config,
         out,
@@ -156,7 +156,7 @@ def draw(trainer: Trainer, bank: DemonstrationBank, out: Path) -> None:
     summary = json.loads((out / "summary.json").read_text())
     figure = plot_success_curves(
         out / "eval.csv",
-        presented=dict(zip(nico.ALL_TASKS, config.task_starts, strict=True)),
+        presented=dict(zip(config.tasks, config.task_starts, strict=True)),
         random_success=summary["random_success"],
     )
     save_figure(figure, out / "figures" / "success.png")
@@ -166,12 +166,12 @@ def draw(trainer: Trainer, bank: DemonstrationBank, out: Path) -> None:
         save_gif(frames, out / "figures" / f"{title.split()[0]}.gif")
     gwr = trainer.algorithm.gwr
     if gwr is not None:
-        tasks = majority_task(match_counts(gwr, bank.seen(), 3)[0])
+        tasks = majority_task(match_counts(gwr, bank.seen(), len(config.tasks))[0])
         weights = gwr.graph(0).weights
         tasks = tasks[: len(weights)]
         write_nodes(out / "gwr.csv", weights, tasks)
-        save_figure(plot_gwr_pca(weights, tasks, nico.ALL_TASKS), out / "figures" / "gwr.png")
-        accuracy = task_inference_accuracy(gwr, bank.seen(), bank.held_out(), 3)
+        save_figure(plot_gwr_pca(weights, tasks, config.tasks), out / "figures" / "gwr.png")
+        accuracy = task_inference_accuracy(gwr, bank.seen(), bank.held_out(), len(config.tasks))
         print(f"GWR-B nodes: {gwr.num_nodes.tolist()}")
         print(f"task inference on held-out demonstrations: {accuracy.mean():.1%}")
 
@@ -197,7 +197,7 @@ def measure(
         evaluator = Evaluator(
             config.algorithm,
             seeds=config.seeds,
-            n_tasks=len(nico.ALL_TASKS),
+            n_tasks=len(config.tasks),
             episodes=episodes,
             bank=tested,
             encoders=trainer.encoders,
@@ -208,11 +208,11 @@ def measure(
         success = evaluator.run(snapshots, _LAST, algorithm, watch=bar.update).success
         bar.set_postfix_str(f"success {success.float().mean():.2f}, {kind}", refresh=False)
         bar.update(half * n_steps - bar.n)  # episodes may all end earlier
-        for task, name in enumerate(nico.ALL_TASKS):
+        for task, name in enumerate(config.tasks):
             of_task = tested.of_task(task)
             inferred: list[float | str] = [""] * len(config.seeds)
             if gwr is not None:
-                accuracy = task_inference_accuracy(gwr, seen, of_task, len(nico.ALL_TASKS))
+                accuracy = task_inference_accuracy(gwr, seen, of_task, len(config.tasks))
                 inferred = [round(share, 4) for share in accuracy.tolist()]
             for index, seed in enumerate(config.seeds):
                 share = round(success[index, task].float().mean().item(), 4)
@@ -222,11 +222,11 @@ def measure(
         writer = csv.writer(file)
         writer.writerow(FINAL_COLUMNS)
         writer.writerows(rows)
-    random_success = evaluate_random_policy(n_tasks=len(nico.ALL_TASKS), episodes=100)
+    random_success = evaluate_random_policy(tasks=config.tasks, episodes=100)
     summary = {
         "commit": commit,
         "command": shlex.join(["python", *sys.argv]),
-        "random_success": dict(zip(nico.ALL_TASKS, random_success.tolist(), strict=True)),
+        "random_success": dict(zip(config.tasks, random_success.tolist(), strict=True)),
         "nodes": None if gwr is None else gwr.num_nodes.tolist(),
     }
     (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
@@ -249,7 +249,7 @@ def record_episodes(trainer: Trainer, bank: DemonstrationBank) -> dict[str, np.n
     evaluator = Evaluator(
         config.algorithm,
         seeds=config.seeds,
-        n_tasks=len(nico.ALL_TASKS),
+        n_tasks=len(config.tasks),
         episodes=1,
         bank=bank.held_out(),
         encoders=trainer.encoders,
@@ -266,7 +266,7 @@ def record_episodes(trainer: Trainer, bank: DemonstrationBank) -> dict[str, np.n
         f"{name} ({'success' if result.success[0, task, 0] else 'no success'})": np.stack(
             [frame[task] for frame in frames[: int(result.steps[0, task, 0]) + 1]]
         )
-        for task, name in enumerate(nico.ALL_TASKS)
+        for task, name in enumerate(config.tasks)
     }
 
 

@@ -47,7 +47,7 @@ def summarize(path: Path) -> dict[str, float]:
         curve[int(row["episode"])].append(float(row["success"]))
         if int(row["episode"]) > 0.9 * last:
             late[row["task"]].append(float(row["success"]))
-    table = {task: float(np.mean(late[task])) for task in nico.ALL_TASKS}
+    table = {task: float(np.mean(late[task])) for task in _tasks(rows)}
     table["overall"] = sum(table.values()) / len(table)
     reached = (episode for episode, success in sorted(curve.items()) if np.mean(success) >= 0.8)
     table["episodes to 80 %"] = next(reached, float("nan"))
@@ -63,7 +63,7 @@ def best(path: Path) -> dict[str, float]:
     rows = read_rows(path)
     window = max(int(row["episode"]) for row in rows) / 10
     found = {}
-    for task in nico.ALL_TASKS:
+    for task in _tasks(rows):
         tests = [(int(r["episode"]), float(r["success"])) for r in rows if r["task"] == task]
         episode, success = np.array(tests).T
         ends = [end for end in np.unique(episode) if end >= episode.min() + window - 1]
@@ -94,7 +94,7 @@ def describe(run: Path) -> str:
         "|---|---:|---:|---|---:|---:|---:|",
     ]
     by_seed = _late_by_seed(run / "eval.csv")
-    for task in (*nico.ALL_TASKS, None):
+    for task in by_seed:
         numbers = [late[task or "overall"], *([highest[task]] if task else [])]
         cells = [f"{100 * number:.1f}" for number in numbers] + ([] if task else [""])
         cells.append(" ".join(f"{100 * success:.0f}" for success in by_seed[task]))
@@ -111,13 +111,18 @@ def describe(run: Path) -> str:
     return "\n".join(lines)
 
 
+def _tasks(rows: list[dict[str, str]]) -> list[str]:
+    """Returns the tasks that were tested, in the order of their first test."""
+    return list(dict.fromkeys(row["task"] for row in rows))
+
+
 def _late_by_seed(path: Path) -> dict[str | None, list[float]]:
     rows = read_rows(path)
     last = max(int(row["episode"]) for row in rows)
     late = [row for row in rows if int(row["episode"]) > 0.9 * last]
     seeds = sorted({int(row["seed"]) for row in rows})
     found: dict[str | None, list[float]] = {}
-    for task in nico.ALL_TASKS:
+    for task in _tasks(rows):
         found[task] = [
             float(np.mean([float(r["success"]) for r in late if (r["seed"], r["task"]) == key]))
             for key in ((str(seed), task) for seed in seeds)
@@ -132,8 +137,10 @@ def main(arguments: Arguments) -> None:
         raise ValueError("name the directory of a run")
     for run in arguments.runs:
         print(f"{run}\n\n{describe(run)}\n")
-        starts = json.loads((run / "config.json").read_text())["task_starts"]
-        presented = dict(zip(nico.ALL_TASKS, starts, strict=True))
+        config = json.loads((run / "config.json").read_text())
+        # Runs did not always say their tasks; then they had the paper's.
+        tasks = config.get("tasks", nico.ALL_TASKS)
+        presented = dict(zip(tasks, config["task_starts"], strict=True))
         save_figure(plot_success_curves(run / "eval.csv", presented=presented), run / "success.png")
 
 

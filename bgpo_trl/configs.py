@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+from suites import nico
+
 
 @dataclass(frozen=True)
 class VAEConfig:
@@ -173,6 +175,8 @@ class RunConfig:
     """Seeds, run as one batch (Sec. IV: 10)."""
     episodes: int = 20_000
     """Training episodes of each seed (Figs. 6 and 8)."""
+    tasks: tuple[str, ...] = nico.ALL_TASKS
+    """The tasks, by the names that the suite and the CSV files give them."""
     task_starts: tuple[int, ...] = (0, 7_000, 13_000)
     """Episode from which each task is presented (Sec. IV-C); all 0 is the concurrent setting."""
     eval_every: int = 1
@@ -193,6 +197,12 @@ class RunConfig:
         for name in ("episodes", "eval_every", "eval_episodes"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        nico.check_tasks(self.tasks)
+        if len(self.task_starts) != len(self.tasks):
+            raise ValueError(
+                f"task_starts {self.task_starts} must have one episode for each of the tasks "
+                f"{', '.join(self.tasks)}"
+            )
 
 
 PRESETS: dict[str, RunConfig] = {

@@ -7,7 +7,7 @@ import json
 import shutil
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -94,9 +94,7 @@ def record_demonstrations(
         OSError: If the disk has no room for it.
         RuntimeError: If there is no OpenGL to render with.
     """
-    unknown = [task for task in tasks if task not in nico.ALL_TASKS]
-    if unknown:
-        raise ValueError(f"no NICO task {unknown[0]!r}; choose from {', '.join(nico.ALL_TASKS)}")
+    nico.check_tasks(tasks)
     if not 0 <= held_out_per_task < per_task:
         raise ValueError(
             f"held_out_per_task is {held_out_per_task}: it must be less than per_task, {per_task}"
@@ -282,11 +280,24 @@ class DemonstrationBank:
         embedding: phi, float32 ``[N, 32]``.
         task: Labels, int64 ``[N]``; for the draw of an episode's task and for evaluation.
         train: Bool ``[N]``; False for demonstrations held out for test episodes.
+        tasks: Names of the tasks, in the order of their labels.
+
+    Raises:
+        ValueError: If a label has no name.
     """
 
     embedding: Tensor
     task: Tensor
     train: Tensor
+    tasks: tuple[str, ...] = nico.ALL_TASKS
+
+    def __post_init__(self) -> None:
+        unknown = self.task[(self.task < 0) | (self.task >= len(self.tasks))]
+        if len(unknown):
+            raise ValueError(
+                f"there is a demonstration of task {int(unknown[0])}, but tasks names only "
+                f"{len(self.tasks)}: {', '.join(self.tasks)}"
+            )
 
     def seen(self) -> DemonstrationBank:
         """Returns the demonstrations for training episodes."""
@@ -300,13 +311,49 @@ class DemonstrationBank:
         """Returns the demonstrations of one task."""
         return self._select(self.task == task)
 
+    def for_tasks(self, tasks: Sequence[str]) -> DemonstrationBank:
+        """Returns the demonstrations of some tasks, labeled by their places among these.
+
+        Args:
+            tasks: Names, in the order of the labels wanted.
+
+        Raises:
+            ValueError: If there is no demonstration of one of them.
+        """
+        missing = [name for name in tasks if name not in self.tasks]
+        if missing:
+            raise ValueError(
+                f"the bank has no demonstration of {missing[0]!r}, only of "
+                f"{', '.join(self.tasks)}: record and embed some (docs/extending.md)"
+            )
+        label = torch.tensor([tasks.index(n) if n in tasks else -1 for n in self.tasks])
+        kept = self._select(label[self.task] >= 0)
+        return replace(kept, task=label[kept.task], tasks=tuple(tasks))
+
+    def __add__(self, other: DemonstrationBank) -> DemonstrationBank:
+        """Returns the demonstrations of both; tasks that only the other has come last."""
+        tasks = tuple(dict.fromkeys((*self.tasks, *other.tasks)))
+        label = torch.tensor([tasks.index(name) for name in other.tasks])
+        return DemonstrationBank(
+            torch.cat([self.embedding, other.embedding]),
+            torch.cat([self.task, label[other.task]]),
+            torch.cat([self.train, other.train]),
+            tasks,
+        )
+
     def _select(self, rows: Tensor) -> DemonstrationBank:
-        return DemonstrationBank(self.embedding[rows], self.task[rows], self.train[rows])
+        return replace(
+            self, embedding=self.embedding[rows], task=self.task[rows], train=self.train[rows]
+        )
 
     def save(self, path: str | Path, *, encoder_id: str) -> None:
         """Writes the bank as safetensors, with the scene version and the encoders' identity."""
         tensors = {"embedding": self.embedding, "task": self.task, "train": self.train}
-        meta = {"scene_version": nico.scene_version(), "encoder_id": encoder_id}
+        meta = {
+            "scene_version": nico.scene_version(),
+            "encoder_id": encoder_id,
+            "tasks": ",".join(self.tasks),
+        }
         save_file({k: v.contiguous() for k, v in tensors.items()}, str(path), metadata=meta)
 
     @classmethod
@@ -329,7 +376,9 @@ class DemonstrationBank:
         found = {key: meta.get(key) for key in wanted}
         if found != wanted:
             raise ValueError(f"{path} belongs to {found}, but needed is {wanted}; {remedy}")
-        return cls(**tensors)
+        if not meta.get("tasks"):
+            raise ValueError(f"{path} does not say which tasks it is about; {remedy}")
+        return cls(**tensors, tasks=tuple(meta["tasks"].split(",")))
 
 
 def main(

@@ -94,6 +94,7 @@ class Evaluator:
             )
         self._bank = bank
         self.simulation = NicoEnv(
+            bank.tasks,
             batch_size=self.shape,
             observation="pixels" if config.state == "latent" else "state",
         )
@@ -179,15 +180,15 @@ class Evaluator:
 
 @torch.no_grad()
 def evaluate_random_policy(
-    *, n_tasks: int, episodes: int, seed: int = 0, max_steps: int = 50
+    *, tasks: Sequence[str], episodes: int, seed: int = 0, max_steps: int = 50
 ) -> Tensor:
-    """Returns the success rate of uniformly random actions on each task, float32 ``[n_tasks]``."""
-    shape = (n_tasks, episodes)
+    """Returns the success rate of uniformly random actions on each task, float32 ``[T]``."""
+    shape = (len(tasks), episodes)
     env = NicoEnv(
-        batch_size=shape, seed=stream_seed(seed, "random policy") // 2, observation="state"
+        tasks, batch_size=shape, seed=stream_seed(seed, "random policy") // 2, observation="state"
     )
     generator = torch.Generator().manual_seed(seed)
-    task = torch.arange(n_tasks)[:, None].expand(shape).contiguous()
+    task = torch.arange(len(tasks))[:, None].expand(shape).contiguous()
     state = env.reset(TensorDict({"task": task}, shape))
     for _ in range(max_steps):
         state.set("action", torch.rand(*shape, 4, generator=generator) * 2 - 1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -42,6 +43,7 @@ def make_pretrained(
     command: str = "",
     progress: bool = True,
     device: torch.device | str = "cpu",
+    tasks: Sequence[str] = nico.ALL_TASKS,
 ) -> tuple[Representation, DemonstrationBank]:
     """Records demonstrations and play, trains both encoders, and embeds the demonstrations.
 
@@ -59,12 +61,14 @@ def make_pretrained(
         command: Stored with the weights.
         progress: Whether to show progress bars.
         device: Where to train.
+        tasks: Tasks to demonstrate.
 
     Raises:
         ValueError: If the dataset is damaged or of another scene.
     """
     demonstrations = record_demonstrations(
         dataset,
+        tasks=tasks,
         per_task=per_task,
         held_out_per_task=held_out_per_task,
         seed=seed,
@@ -73,6 +77,7 @@ def make_pretrained(
     folder_of_play = Path(dataset).with_name(f"{Path(dataset).name}-play")
     play = record_demonstrations(
         folder_of_play,
+        tasks=tasks,
         per_task=max(2, per_task // 2),
         held_out_per_task=max(1, held_out_per_task // 4),
         play=True,
@@ -88,4 +93,5 @@ def make_pretrained(
         command,
         device,
         progress=progress,
+        tasks=tasks,
     )

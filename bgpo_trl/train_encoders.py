@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -72,6 +73,7 @@ def train_encoders(
     command: str = "",
     device: torch.device | str = "cpu",
     progress: bool = True,
+    tasks: Sequence[str] = nico.ALL_TASKS,
 ) -> tuple[Representation, DemonstrationBank]:
     """Trains, saves and probes both encoders, and embeds the demonstrations with them.
 
@@ -84,6 +86,7 @@ def train_encoders(
         command: stored with the weights.
         device: where to train.
         progress: whether to show progress bars.
+        tasks: what the demonstrations are of, in the order of their labels.
 
     Returns:
         The trained encoders and the bank of embedded demonstrations.
@@ -110,6 +113,7 @@ def train_encoders(
         embed_demonstrations(representation, dataset),
         dataset["task"].clone(),
         dataset["train"].clone(),
+        tuple(tasks),
     )
     bank.save(bank_path(weights), encoder_id=representation.identity)
     probe(representation, dataset, folder, play=play)

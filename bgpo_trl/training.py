@@ -27,7 +27,6 @@ from bgpo_trl.logging import RunLogger
 from bgpo_trl.progress import progress_bar
 from bgpo_trl.representation import Representation
 from bgpo_trl.transforms import TaskSchedule
-from suites import nico
 
 
 class Trainer:
@@ -50,7 +49,7 @@ class Trainer:
         config: The run.
         directory: The run's directory: ``config.json``, ``train.csv``, ``eval.csv``,
             ``checkpoint/``.
-        bank: Embedded demonstrations, seen and held out.
+        bank: Embedded demonstrations, seen and held out; those of ``config.tasks`` are used.
         encoders: Trained encoders; None for a run that does not use them.
         make: Makes the algorithm; by default the one that `ALGORITHMS` has under ``config.name``.
         device: Where the networks are; see `Algorithm`.
@@ -60,7 +59,7 @@ class Trainer:
 
     Raises:
         ValueError: If the directory holds another run (other settings, other encoders), or one and
-            ``resume`` is False.
+            ``resume`` is False; or if the bank has no demonstration of one of the tasks.
     """
 
     def __init__(
@@ -80,6 +79,7 @@ class Trainer:
         self.directory = Path(directory)
         self.progress = progress
         self.encoders = encoders
+        bank = bank.for_tasks(config.tasks)
         schedule = TaskSchedule(starts=config.task_starts)
         seeds = config.seeds
         make = ALGORITHMS[config.name].make if make is None else make
@@ -196,7 +196,7 @@ class Trainer:
                 "seed": self.config.seeds[index],
                 "episode": episode,
                 "env_steps": self.env_steps,
-                "task": nico.ALL_TASKS[int(end["task"])],
+                "task": self.config.tasks[int(end["task"])],
                 "success": int(end["terminated"]),
                 "return": float(extrinsic),
                 "steps": int(end["step_count"]),
@@ -230,7 +230,7 @@ class Trainer:
                                 "seed": self.config.seeds[index],
                                 "episode": snapshot.episode,
                                 "env_steps": snapshot.env_steps,
-                                "task": nico.ALL_TASKS[task],
+                                "task": self.config.tasks[task],
                                 "success": int(success),
                                 "return": float(success),
                                 "steps": steps,

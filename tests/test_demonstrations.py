@@ -248,7 +248,7 @@ def test_another_recording_is_not_continued(copy, wrong, complete):
         ({"held_out_per_task": 3}, r"^held_out_per_task is 3: it must be less than per_task, 3$"),
         ({"held_out_per_task": -1}, r"^held_out_per_task is -1: .*$"),
         ({"per_task": 0}, r"^held_out_per_task is 1: it must be less than per_task, 0$"),
-        ({"tasks": ["juggle"]}, r"^no NICO task 'juggle'; choose from grasp_glass, .*$"),
+        ({"tasks": ["juggle"]}, r"^no NICO task 'juggle'; choose one of grasp_glass, .*$"),
     ],
 )
 def test_wrong_arguments_are_refused_before_anything_is_written(tmp_path, wrong, message):

@@ -17,6 +17,7 @@ from bgpo_trl.modules.actor_critic import Actor
 from bgpo_trl.modules.multi_head_actor import MultiHeadActor
 from bgpo_trl.seeding import stream_seed
 from bgpo_trl.transforms import TaskSchedule
+from suites import nico
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 SEEDS = (3, 8)
@@ -319,7 +320,7 @@ def test_a_bank_without_a_held_out_demonstration_of_a_task_is_refused(bank, enco
 
 
 def test_a_random_policy_is_uniform_and_succeeds_by_chance(easy_world):
-    rate = evaluate_random_policy(n_tasks=2, episodes=5, seed=4, max_steps=3)
+    rate = evaluate_random_policy(tasks=nico.ALL_TASKS[:2], episodes=5, seed=4, max_steps=3)
 
     generator = torch.Generator().manual_seed(4)
     actions = [torch.rand(2, 5, 4, generator=generator) * 2 - 1 for _ in range(3)]

@@ -122,6 +122,7 @@ class Algorithm(ABC):
             bank, schedule, batch_size=batch, generator=generators(seeds, "demonstrations")
         )
         self.simulation = NicoEnv(
+            bank.tasks,
             batch_size=batch,
             seed=[stream_seed(seed, "env") for seed in seeds],
             observation="pixels" if config.state == "latent" else "state",

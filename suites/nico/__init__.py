@@ -1,15 +1,19 @@
-"""NICO at a table: a dm_control suite of three sparse-reward visuomotor tasks."""
+"""NICO at a table: a dm_control suite of sparse-reward visuomotor tasks."""
 
 # First, because it chooses the OpenGL backend before anything imports MuJoCo.
 from suites.nico import rendering  # isort: skip
-from suites.nico.base import scene_version
-from suites.nico.nico import ALL_TASKS, load, register
+from suites.nico.base import NicoTask, scene_version
+from suites.nico.nico import ALL_TASKS, TASKS, add_task, check_tasks, load, register
 from suites.nico.physics import OBJECTS, Physics, scene_xml
 
 __all__ = [
     "ALL_TASKS",
     "OBJECTS",
+    "TASKS",
+    "NicoTask",
     "Physics",
+    "add_task",
+    "check_tasks",
     "load",
     "register",
     "rendering",

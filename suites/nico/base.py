@@ -1,7 +1,8 @@
-"""What NICO's three tasks share: the action, the start of an episode, observation and reward."""
+"""What NICO's tasks share: the action, the start of an episode, observation and reward."""
 
 import hashlib
 from collections import OrderedDict
+from collections.abc import Sequence
 from typing import Literal, get_args
 
 import numpy as np
@@ -9,6 +10,7 @@ from dm_control.rl import control
 from dm_env import TimeStep, specs
 
 from suites.nico import kinematics
+from suites.nico.moves import Phase
 from suites.nico.physics import OBJECT_HALF_HEIGHT, OBJECTS, TABLE_HEIGHT, Physics, scene_xml
 from suites.nico.rendering import FRAME_HEIGHT, FRAME_WIDTH, FrameRenderer
 
@@ -63,7 +65,7 @@ class Environment(control.Environment):
 
 
 class NicoTask(control.Task):
-    """Base of the tasks: subclasses say only when they have succeeded.
+    """Base of the tasks: subclasses say when they have succeeded, and how they are demonstrated.
 
     The action ``[4]`` in [-1, 1] moves the targets of shoulder yaw, shoulder pitch and elbow by up
     to 0.2 rad and of the hand by up to 0.4 rad a step. A target that has run further ahead of its
@@ -90,6 +92,17 @@ class NicoTask(control.Task):
 
     def succeeded(self, physics: Physics) -> bool:
         """Returns whether the task is done."""
+        raise NotImplementedError
+
+    def demonstration(self, physics: Physics, random: np.random.Generator) -> Sequence[Phase]:
+        """Returns the movement that does the task, planned at the start of an episode.
+
+        The hand is lifted above the objects before its first phase.
+
+        Args:
+            physics: The simulation at the start of the episode.
+            random: Source of all that differs between demonstrations.
+        """
         raise NotImplementedError
 
     def initialize_episode(self, physics: Physics) -> None:

@@ -1,5 +1,10 @@
 """Grasp the red glass (Task 1 of the paper)."""
 
+from collections.abc import Sequence
+
+import numpy as np
+
+from suites.nico import moves
 from suites.nico.base import NicoTask
 from suites.nico.physics import Physics
 
@@ -10,3 +15,7 @@ class GraspGlass(NicoTask):
     def succeeded(self, physics: Physics) -> bool:
         """Returns whether the task is done."""
         return physics.glass_held()
+
+    def demonstration(self, physics: Physics, random: np.random.Generator) -> Sequence[moves.Phase]:
+        """Returns the movement that does the task."""
+        return moves.grasp(physics, random, "glass")

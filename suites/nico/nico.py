@@ -1,6 +1,7 @@
-"""The suite's front: ``load``, ``register`` and ``ALL_TASKS``."""
+"""The suite's front: ``load``, ``add_task``, ``register`` and ``ALL_TASKS``."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -14,12 +15,58 @@ from suites.nico.push_green_to_glass import PushGreenToGlass
 from suites.nico.push_green_to_white import PushGreenToWhite
 from suites.nico.rendering import FrameRenderer
 
-TASKS: Mapping[str, type[NicoTask]] = {
+_TASKS: dict[str, type[NicoTask]] = {
     "grasp_glass": GraspGlass,
     "push_green_to_glass": PushGreenToGlass,
     "push_green_to_white": PushGreenToWhite,
 }
-ALL_TASKS = tuple(TASKS)
+ALL_TASKS = tuple(_TASKS)
+"""The paper's tasks, in its order."""
+TASKS: Mapping[str, type[NicoTask]] = MappingProxyType(_TASKS)
+"""Those and the tasks that were added, by name."""
+
+
+def add_task(name: str, task: type[NicoTask]) -> None:
+    """Makes a task of one's own known by name, in this process, to all that asks for tasks so.
+
+    Added again, as when a notebook's cell runs twice, an own task replaces its earlier self.
+    ``ALL_TASKS``, the default of everything, stays the paper's tasks.
+
+    Args:
+        name: What ``load``, datasets, settings and CSV files call it.
+        task: Says when it has succeeded and, to be recorded, how it is demonstrated.
+
+    Raises:
+        ValueError: If the name is one of the paper's tasks' or no name, or the class is no task.
+
+    Example:
+        >>> from suites import nico
+        >>> class TouchWhiteWithGlass(nico.NicoTask):
+        ...     def succeeded(self, physics):
+        ...         return physics.touching("glass", "white_box")
+        >>> nico.add_task("touch_white_with_glass", TouchWhiteWithGlass)
+        >>> nico.load("touch_white_with_glass", seed=0, observation="state").step([0] * 4).reward
+    """
+    if name in ALL_TASKS or not name.isidentifier():
+        raise ValueError(
+            f"a task cannot be called {name!r}: take letters, digits and underscores, and none of "
+            f"{', '.join(ALL_TASKS)}"
+        )
+    if not (isinstance(task, type) and issubclass(task, NicoTask)):
+        raise ValueError(f"{name} must be a subclass of NicoTask, got {task!r}")
+    _TASKS[name] = task
+
+
+def check_tasks(names: Sequence[str]) -> None:
+    """Raises ValueError if there is no such task, or one is named twice."""
+    for position, name in enumerate(names):
+        if name not in TASKS:
+            raise ValueError(
+                f"no NICO task {name!r}; choose one of {', '.join(TASKS)}, or make it known with "
+                "nico.add_task"
+            )
+        if name in names[:position]:
+            raise ValueError(f"the task {name!r} is named twice")
 
 
 def load(
@@ -35,7 +82,7 @@ def load(
     """Returns an environment of NICO at the table.
 
     Args:
-        task: One of ``ALL_TASKS``.
+        task: One of ``TASKS``.
         seed: Seed or source of the starts; None draws one from the system.
         observation: ``"pixels"`` (uint8 ``[32, 64, 3]``), ``"state"`` (privileged ground truth,
             float64 ``[16]``: joints (rad), grip and object positions (m)) or ``"both"``.
@@ -53,8 +100,7 @@ def load(
         >>> env.reset().observation["pixels"].shape
         (32, 64, 3)
     """
-    if task not in TASKS:
-        raise ValueError(f"no NICO task {task!r}; choose one of {', '.join(ALL_TASKS)}")
+    check_tasks([task])
     random = seed if isinstance(seed, np.random.RandomState) else np.random.RandomState(seed)
     return Environment(
         physics or Physics.from_xml_string(scene_xml()),
@@ -68,6 +114,8 @@ def load(
 def register() -> None:
     """Makes the tasks known to ``dm_control.suite``, and so to its wrappers, as domain ``nico``.
 
+    A task that is added later takes another call.
+
     Example:
         >>> from dm_control import suite
         >>> from suites import nico
@@ -77,7 +125,7 @@ def register() -> None:
     """
     domain = type(suite)("nico")
     tasks = containers.TaggedTasks()
-    for name in ALL_TASKS:
+    for name in TASKS:
 
         def factory(
             random: int | np.random.RandomState | None = None,

@@ -1,5 +1,10 @@
 """Push the green box towards the red glass (Task 2 of the paper)."""
 
+from collections.abc import Sequence
+
+import numpy as np
+
+from suites.nico import moves
 from suites.nico.base import NicoTask
 from suites.nico.physics import Physics
 
@@ -10,3 +15,7 @@ class PushGreenToGlass(NicoTask):
     def succeeded(self, physics: Physics) -> bool:
         """Returns whether the task is done."""
         return physics.touching("green_box", "glass")
+
+    def demonstration(self, physics: Physics, random: np.random.Generator) -> Sequence[moves.Phase]:
+        """Returns the movement that does the task."""
+        return moves.push(physics, random, "green_box", "glass")
