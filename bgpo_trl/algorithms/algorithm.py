@@ -237,20 +237,22 @@ class Algorithm(ABC):
             "source": dict(self.source.state_dict()),
             "simulation": self.simulation.simulation_state(),
             "noise": [generator.get_state() for generator in self._noise],
-            "loss": dict(self.loss.state_dict()),
-            "optimizer": self.optimizer.state_dict(),
-            "replay": self.replay.state_dict(),
+            **{name: dict(part.state_dict()) for name, part in self._learned().items()},
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continues from what `state_dict` returned."""
         self.source.load_state_dict(state["source"])
         self.simulation.load_simulation_state(state["simulation"])
-        self.loss.load_state_dict(state["loss"])
-        self.optimizer.load_state_dict(state["optimizer"])
-        self.replay.load_state_dict(state["replay"])
+        for name, part in self._learned().items():
+            part.load_state_dict(state[name])
         for generator, saved in zip(self._noise, state["noise"], strict=True):
             generator.set_state(saved)
+
+    def _learned(self) -> dict[str, Any]:
+        """Returns what changes by learning, which an algorithm need not have all of."""
+        parts = ("loss", "optimizer", "replay")
+        return {name: getattr(self, name) for name in parts if hasattr(self, name)}
 
 
 def networks_of(parameters: TensorDictBase, seed: Tensor, task: Tensor) -> dict[str, Tensor]:

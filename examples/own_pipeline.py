@@ -1,0 +1,59 @@
+"""A pipeline of one's own in plain TorchRL: python examples/own_pipeline.py.
+
+A second GWR-B learns the latents that the robot sees, and pays it for those that are new.
+"""
+
+import torch
+from tensordict.nn import TensorDictSequential as Seq
+from torchrl.collectors import Collector
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs import Compose, StepCounter, Transform, TransformedEnv
+from torchrl.modules import AdditiveGaussianModule
+
+from bgpo_trl.envs import NicoEnv
+from bgpo_trl.modules.actor_critic import Actor, Critic
+from bgpo_trl.modules.gwr import GWRB
+from bgpo_trl.objectives.ddpg import DDPGLoss, ForeachSoftUpdate
+from bgpo_trl.pretrained import load_pretrained
+from bgpo_trl.transforms import BehaviorLookup, DemonstrationSource, FrameEncoder, TaskSchedule
+
+
+class NoveltyReward(Transform):
+    """Adds weight * (1 - activity) of a GWR-B that learns every latent."""
+
+    def __init__(self, gwr: GWRB, weight: float) -> None:
+        super().__init__(in_keys=["latent", "reward"], out_keys=["reward"])
+        self.gwr, self.weight = gwr, weight
+
+    def _step(self, tensordict, next_tensordict):
+        latent = next_tensordict["latent"] / 8  # 64 standardised features: now about as long as 1
+        bonus = self.weight * (1 - self.gwr.adapt(latent).activity.unsqueeze(-1))
+        return next_tensordict.set("reward", next_tensordict["reward"] + bonus)
+
+
+if __name__ == "__main__":
+    torch.manual_seed(0)
+    encoders, bank = load_pretrained()
+    behaviors, places = GWRB(32), GWRB(64, init="data", activity_threshold=0.6)
+    encode = FrameEncoder(encoders.vae, del_keys=True)  # pixels -> latent
+    source = DemonstrationSource(bank.seen(), TaskSchedule(starts=(0, 2, 4)))
+    infer = BehaviorLookup(behaviors, learn=True)  # demo_embedding -> behavior
+    reward = NoveltyReward(places, weight=0.01)
+    env = TransformedEnv(NicoEnv(seed=0), Compose(encode, StepCounter(50), source, infer, reward))
+    actor, critic = Actor(64 + 32, hidden_sizes=(256,)), Critic(64 + 32, hidden_sizes=(256,))
+    loss = DDPGLoss(actor, critic, return_bounds=(0.0, 1.5))  # success, and 50 x 0.01 x novelty
+    target_update = ForeachSoftUpdate(loss, tau=0.005)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
+    replay = TensorDictReplayBuffer(storage=LazyTensorStorage(10_000), batch_size=128)
+    explore = AdditiveGaussianModule(env.action_spec, sigma_init=0.3, sigma_end=0.3)
+    how = {"frames_per_batch": 100, "total_frames": 500, "auto_register_policy_transforms": False}
+    for data in Collector(env, Seq(actor, explore), **how):
+        replay.extend(data)
+        for _ in range(50):
+            losses = loss(replay.sample())
+            optimizer.zero_grad()
+            (losses["loss_actor"] + losses["loss_value"]).backward()
+            optimizer.step()
+            target_update.step()
+        print(f"reward {data['next', 'reward'].mean():.4f} a step, {places.num_nodes} places")
+    print(f"{source.episode} episodes, {behaviors.num_nodes} behaviors")

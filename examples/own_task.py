@@ -1,0 +1,52 @@
+"""A task of one's own, from its success test to its curve: python examples/own_task.py.
+
+Run again, it continues where it was. To see it learn rather than begin, raise `episodes`.
+"""
+
+from pathlib import Path
+
+from bgpo_trl.configs import RunConfig
+from bgpo_trl.demonstrations import DemonstrationBank, record_demonstrations
+from bgpo_trl.pretrained import load_pretrained
+from bgpo_trl.representation import embed_demonstrations
+from bgpo_trl.runs import read_rows
+from bgpo_trl.task_inference import task_inference_accuracy
+from bgpo_trl.training import Trainer
+from suites import nico
+from suites.nico import moves
+
+OWN, OUT = "push_white_to_green", Path("runs/own-task")
+
+
+class PushWhiteToGreen(nico.NicoTask):
+    """Done when the white box touches the green box."""
+
+    def succeeded(self, physics):
+        return physics.touching("white_box", "green_box")
+
+    def demonstration(self, physics, random):
+        return moves.push(physics, random, "white_box", "green_box")
+
+
+if __name__ == "__main__":
+    nico.add_task(OWN, PushWhiteToGreen)
+    folder = OUT / "demonstrations"
+    shown = record_demonstrations(folder, tasks=[OWN], per_task=12, held_out_per_task=4)
+    encoders, bank = load_pretrained()
+    phi = embed_demonstrations(encoders, shown)
+    bank += DemonstrationBank(phi, shown["task"].clone(), shown["train"].clone(), (OWN,))
+    print(f"{len(phi)} demonstrations, {shown['length'].float().mean():.0f} frames each")
+
+    tasks, starts = (OWN, *nico.ALL_TASKS), (0, 4, 6, 8)
+    config = RunConfig(seeds=(0,), episodes=12, tasks=tasks, task_starts=starts, eval_every=6)
+    trainer = Trainer(config, OUT / "run", bank=bank, encoders=encoders, resume=True)
+    trainer.run()
+    for task in tasks:
+        train, test = (
+            [int(row["success"]) for row in read_rows(OUT / "run" / file) if row["task"] == task]
+            for file in ("train.csv", "eval.csv")
+        )
+        print(f"{task}: {sum(train)} of {len(train)} in training, {sum(test)} of {len(test)} tests")
+    gwr = trainer.algorithm.gwr
+    inferred = task_inference_accuracy(gwr, bank.seen(), bank.held_out(), len(bank.tasks))
+    print(f"GWR-B, {gwr.num_nodes.item()} nodes: task inferred for {inferred.item():.0%}, held out")
