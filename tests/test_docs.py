@@ -1,0 +1,164 @@
+"""What README, CONTRIBUTING and the pages of docs/ show works as it stands."""
+
+import functools
+import importlib.util
+import inspect
+import re
+import runpy
+import shlex
+import sys
+from pathlib import Path
+
+import pytest
+import tyro
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+# Commands that take a second: they are not only parsed but run.
+CHEAP = {"benchmarks/compare.py"}
+
+every_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+
+
+def blocks(page, language):
+    """Returns the fenced blocks of a language."""
+    return re.findall(rf"^```{language}\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE)
+
+
+def commands(page):
+    """Returns the commands shown in blocks and in running text, without comments, in one line."""
+    text = page.read_text()
+    indented = re.findall(r"^    ((?:python|make) (?:.*\\\n)*.*)$", text, re.MULTILINE)
+    fenced = "\n".join(blocks(page, "bash")).replace("\\\n", " ").splitlines()
+    text = re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
+    inline = re.findall(r"`((?:python|make|pytest) [^`]+)`", text)
+    shown = [*(block.replace("\\\n", " ") for block in indented), *fenced, *inline]
+    return [shlex.join(shlex.split(line, comments=True)) for line in shown]
+
+
+COMMANDS = sorted({command for page in PAGES for command in commands(page) if command})
+OF_PYTHON = [command for command in COMMANDS if command.startswith("python ")]
+
+
+class Parsed(BaseException):
+    """Raised in place of doing what a command asks for."""
+
+
+@pytest.fixture
+def parse_only(monkeypatch):
+    """Commands end as soon as their arguments are understood."""
+    parse = tyro.cli
+
+    def cli(f, *args, **kwargs):
+        if inspect.isfunction(f):  # which tyro would call
+            f = functools.wraps(f)(lambda *_, **__: None)
+        parse(f, *args, **kwargs)
+        raise Parsed
+
+    monkeypatch.setattr(tyro, "cli", cli)
+
+
+def script_of(command):
+    """Returns what a `python` command runs, file or module, and its arguments."""
+    _, *words = shlex.split(command)
+    if words[0] == "-m":
+        return words[1], words[2:]
+    return words[0], words[1:]
+
+
+def run(script, arguments, monkeypatch):
+    """Runs a script as `python script arguments` would."""
+    monkeypatch.setattr(sys, "argv", [script, *arguments])
+    if script.endswith(".py"):
+        runpy.run_path(str(ROOT / script), run_name="__main__")
+    else:
+        runpy.run_module(script, run_name="__main__")
+
+
+def test_there_is_something_to_run():
+    assert blocks(PAGES[0], "python")
+    assert {"make run", "make test"} <= {*COMMANDS}
+    assert len(OF_PYTHON) > 5
+
+
+@every_page
+def test_the_python_of_a_page_runs_from_top_to_bottom(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    namespace = {}
+    for number, block in enumerate(blocks(page, "python"), 1):
+        exec(compile(block, f"{page.name}, python block {number}", "exec"), namespace)
+
+
+@every_page
+def test_no_block_is_of_a_kind_that_is_not_tested(page):
+    fences = re.findall(r"^```(.*)$", page.read_text(), re.MULTILINE)
+    assert {*fences[::2]} <= {"python", "bash", "text"}
+    assert {*fences[1::2]} <= {""}
+
+
+@pytest.mark.parametrize("command", OF_PYTHON)
+def test_a_command_is_understood(command, monkeypatch, parse_only):
+    script, arguments = script_of(command)
+    if script == "pytest":
+        return check_pytest(arguments)
+    if script.endswith(".py"):
+        assert (ROOT / script).is_file()
+    else:
+        assert importlib.util.find_spec(script)
+    if script.startswith("examples/"):
+        assert not arguments  # and what they do is tested in test_examples.py
+    elif arguments:  # without, it may be the program's name rather than a command
+        with pytest.raises(Parsed):
+            run(script, arguments, monkeypatch)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "python benchmarks/continual.py --presett quick",
+        "python benchmarks/concurrent.py --preset huge",
+        "python -m suites.nico.explore --tasks grasp_glass",
+        "python -m bgpo_trl.demonstrations --per-task 3",
+    ],
+)
+def test_a_command_that_is_wrong_is_not_understood(command, monkeypatch, parse_only):
+    with pytest.raises(SystemExit):
+        run(*script_of(command), monkeypatch)
+
+
+@pytest.mark.parametrize("command", [c for c in OF_PYTHON if script_of(c)[0] in CHEAP])
+def test_a_cheap_command_runs(command, monkeypatch, capsys):
+    script, arguments = script_of(command)
+    paths = [word for word in arguments if "/" in word]
+    if not paths:  # words that stand for paths
+        return
+    monkeypatch.chdir(ROOT)
+    run(script, arguments, monkeypatch)
+    assert capsys.readouterr().out.count("\n") >= 3
+
+
+@pytest.mark.parametrize("command", sorted({*COMMANDS} - {*OF_PYTHON}))
+def test_a_verb_or_tool_is_there(command):
+    tool, *words = shlex.split(command)
+    if tool == "pytest":
+        return check_pytest(words)
+    assert tool == "make"
+    verbs = re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    asked = [word for word in words if "=" not in word]
+    assert [verb for verb in asked if verb not in verbs] == []
+
+
+def check_pytest(words):
+    assert [word for word in words if "/" in word and not (ROOT / word).exists()] == []
+
+
+@every_page
+def test_the_files_it_names_exist(page):
+    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
+    named = re.findall(
+        r"`((?:suites|bgpo_trl|benchmarks|examples|tests|docs|scripts)/[\w/.-]*)`", text
+    )
+    linked = re.findall(r"\]\(([\w/.-]+)\)", text)
+    missing = [name for name in named if not (ROOT / name).exists()]
+    missing += [name for name in linked if not (page.parent / name).exists()]
+    assert missing == []
