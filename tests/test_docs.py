@@ -72,7 +72,7 @@ def run(script, arguments, monkeypatch):
     if script.endswith(".py"):
         runpy.run_path(str(ROOT / script), run_name="__main__")
     else:
-        runpy.run_module(script, run_name="__main__")
+        runpy.run_module(script, run_name="__main__", alter_sys=True)
 
 
 def test_there_is_something_to_run():

@@ -1,0 +1,121 @@
+"""Examples do what they say, in the folder they are called in."""
+
+import csv
+import json
+import re
+import runpy
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from bgpo_trl.demonstrations import load_demonstrations
+from suites import nico
+from suites.nico import nico as registry
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch, capsys):
+    """Runs an example as `python examples/NAME.py` in an empty folder; returns what it printed."""
+    before = dict(registry._TASKS)
+    monkeypatch.chdir(tmp_path)
+
+    def run(name):
+        monkeypatch.setattr(sys, "argv", [name])
+        with torch.random.fork_rng(devices=[]):
+            runpy.run_path(str(EXAMPLES / name), run_name="__main__")
+        return capsys.readouterr().out
+
+    yield run
+    registry._TASKS.clear()
+    registry._TASKS.update(before)
+
+
+def rows(path):
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.mark.parametrize("example", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.name)
+def test_an_example_is_short(example):
+    assert len(example.read_text().splitlines()) < 60
+
+
+def test_own_task_is_recorded_learned_and_counted_under_its_name(run):
+    out = run("own_task.py")
+
+    name, old = "push_white_to_green", nico.ALL_TASKS
+    recorded = load_demonstrations("runs/own-task/demonstrations")
+    green, white = recorded["state"][..., 10:12], recorded["state"][..., 13:15]
+    apart = torch.linalg.vector_norm(green - white, dim=-1)
+    assert (apart[:, 0] > 0.1).all()
+    assert (apart[range(12), recorded["length"] - 1] < 0.08).all()  # boxes of 5 cm, turned
+    frames = recorded["length"].float().mean()
+    assert f"12 demonstrations, {frames:.0f} frames each\n" in out
+
+    settings = json.loads(Path("runs/own-task/run/config.json").read_text())
+    assert settings["tasks"] == [name, *old]
+    train, tests = (rows(f"runs/own-task/run/{file}.csv") for file in ("train", "eval"))
+    assert [int(row["episode"]) for row in train] == list(range(1, 13))
+    assert {row["task"] for row in train[:4]} == {name}
+    assert [row["task"] for row in tests] == [name, old[0], name, *old]
+    for task in (name, *old):
+        counts = [
+            (sum(row["success"] == "1" for row in played), len(played))
+            for played in ([r for r in file if r["task"] == task] for file in (train, tests))
+        ]
+        (won, n), (passed, m) = counts
+        assert f"{task}: {won} of {n} in training, {passed} of {m} tests\n" in out
+    for row in [*train, *tests]:
+        assert row["success"] == "1" or row["steps"] == "50"
+    assert re.search(r"GWR-B, \d+ nodes: task inferred for \d+%, held out\n$", out)
+
+    assert run("own_task.py") == out  # a run that is over is only told of again
+
+
+def test_own_pipeline_pays_for_what_is_new_and_plays_episodes(run):
+    out = run("own_pipeline.py")
+
+    told = re.findall(r"reward ([\d.]+) a step, (\d+) places\n", out)
+    assert len(told) == 5
+    places = [int(n) for _, n in told]
+    assert places == sorted(places)
+    assert places[0] > 2
+    # Less than 0.01 is novelty alone: never nothing, and never all that there could be.
+    rewards = np.array([float(reward) for reward, _ in told])
+    assert ((rewards > 0.0005) & (rewards < 0.1)).all()
+    episodes, behaviors = re.search(r"(\d+) episodes, (\d+) behaviors\n$", out).groups()
+    assert int(episodes) >= 10  # 500 steps, at most 50 an episode
+    assert int(behaviors) > 2  # two that GWR-B starts with
+
+
+def test_own_baseline_acts_as_shown_and_is_tested_under_its_name(run):
+    out = run("own_baseline.py")
+
+    tests = rows("runs/own-baseline/run/eval.csv")
+    assert {row["algorithm"] for row in tests} == {"knn"}
+    success = {
+        task: float(np.mean([int(row["success"]) for row in tests if row["task"] == task]))
+        for task in nico.ALL_TASKS
+    }
+    assert len(tests) == 15
+    assert out == f"knn {success}\n"
+    # Random actions succeed in 7 to 10 % of such episodes.
+    assert np.mean([*success.values()]) > 0.3
+
+
+def test_gwr_alone_finds_as_many_clusters_as_there_are(run):
+    out = run("gwr_alone.py")
+
+    nodes, edges, clusters = map(int, re.match(r"(\d+) nodes, (\d+) edges, (\d+) cl", out).groups())
+    assert clusters == 2
+    assert 20 < nodes < 200
+    assert edges >= nodes - clusters
+    right = float(re.search(r"cluster of their own kind: ([\d.]+)%\n", out).group(1))
+    assert right > 99
+    assert np.asarray(Image.open("runs/gwr-alone.png").convert("RGB")).std() > 5
