@@ -8,7 +8,7 @@ from functools import partial
 import torch
 
 from bgpo_trl.algorithms import Algorithm
-from bgpo_trl.configs import AlgorithmConfig, RunConfig
+from bgpo_trl.configs import RunConfig
 from bgpo_trl.demonstrations import record_demonstrations
 from bgpo_trl.pretrained import load_pretrained
 from bgpo_trl.representation import encode_frames, valid_steps
@@ -22,8 +22,7 @@ class NearestNeighbors(Algorithm):
     def __init__(self, config, *, states, actions, encoders, **world):
         super().__init__(config, encoders=encoders, **world)
         self.env = self.compose(config, encoders)  # pixels -> latent, and the demonstrations
-        self.scale = states.std(0)
-        self.states, self.actions = states / self.scale, actions
+        self.scale, self.states, self.actions = states.std(0), states / states.std(0), actions
 
     def choose(self, *seen):
         nearness, row = (-torch.cdist(torch.cat(seen, -1) / self.scale, self.states)).topk(5)
@@ -53,8 +52,7 @@ if __name__ == "__main__":
     phi = encoders.lae.encode(latent, shown["length"]).unsqueeze(1).expand(-1, 50, -1)
     taken = valid_steps(shown["length"] - 1, 50)  # one action fewer than frames
     states, actions = torch.cat([latent[:, :-1], phi], -1)[taken], shown["action"][taken]
-    plan = {"episodes": 3, "task_starts": (0, 0, 0), "eval_every": 3, "eval_episodes": 5}
-    config = RunConfig(name="nearest neighbors", seeds=(0,), algorithm=AlgorithmConfig(), **plan)
+    config = RunConfig(name="knn", seeds=(0,), episodes=1, task_starts=(0, 0, 0), eval_episodes=5)
     make = partial(NearestNeighbors, states=states, actions=actions)
     Trainer(config, f"{out}/run", bank=bank, encoders=encoders, make=make, resume=True).run()
     success = read_curves(f"{out}/run/eval.csv", config.tasks).success[0, -1]

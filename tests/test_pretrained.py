@@ -1,5 +1,6 @@
 """Encoders and bank belong together: made in one go, loaded together or not at all."""
 
+import json
 import shutil
 from dataclasses import replace
 
@@ -17,7 +18,14 @@ TINY = RepresentationConfig(
     vae=VAEConfig(steps=2, batch_size=4, warmup_steps=1),
     lae=SequenceAutoencoderConfig(steps=2, batch_size=4, warmup_steps=1),
 )
-ARGUMENTS = {"config": TINY, "per_task": 3, "held_out_per_task": 1, "progress": False}
+TASKS = nico.ALL_TASKS[::-1]
+ARGUMENTS = {
+    "config": TINY,
+    "tasks": TASKS,
+    "per_task": 3,
+    "held_out_per_task": 1,
+    "progress": False,
+}
 
 
 @pytest.fixture(scope="module")
@@ -48,6 +56,9 @@ def test_what_was_made_is_loaded(made, folder):
     loaded_encoders, loaded_bank = load_pretrained(folder / "encoders" / "some.safetensors")
     assert loaded_encoders.identity == encoders.identity
     assert loaded_encoders.metadata["command"] == "a command"
+    assert loaded_bank.tasks == bank.tasks == TASKS
+    for recorded in ("demonstrations", "demonstrations-play"):
+        assert json.loads((folder / recorded / "dataset.json").read_text())["tasks"] == [*TASKS]
     for name in ("embedding", "task", "train"):
         assert getattr(loaded_bank, name).equal(getattr(bank, name))
     for module in (loaded_encoders.vae, loaded_encoders.lae):
