@@ -1,7 +1,4 @@
-"""A baseline of one's own, trained and tested like all others: python examples/own_baseline.py.
-
-k nearest neighbors (Pari et al., 2021): what was done in the most similar of demonstrated states.
-"""
+"""A baseline of one's own, trained and tested like all others: python examples/own_baseline.py."""
 
 from functools import partial
 
@@ -17,7 +14,7 @@ from bgpo_trl.training import Trainer
 
 
 class NearestNeighbors(Algorithm):
-    """Acts by states [M, 96] (latent, then demo_embedding) and the actions [M, 4] taken there."""
+    """k nearest neighbors (Pari et al., 2021) of states [M, 96], and the actions [M, 4] there."""
 
     def __init__(self, config, *, states, actions, encoders, **world):
         super().__init__(config, encoders=encoders, **world)
@@ -54,6 +51,9 @@ if __name__ == "__main__":
     states, actions = torch.cat([latent[:, :-1], phi], -1)[taken], shown["action"][taken]
     config = RunConfig(name="knn", seeds=(0,), episodes=1, task_starts=(0, 0, 0), eval_episodes=5)
     make = partial(NearestNeighbors, states=states, actions=actions)
-    Trainer(config, f"{out}/run", bank=bank, encoders=encoders, make=make, resume=True).run()
+    with Trainer(
+        config, f"{out}/run", bank=bank, encoders=encoders, make=make, resume=True
+    ) as trainer:
+        trainer.run()
     success = read_curves(f"{out}/run/eval.csv", config.tasks).success[0, -1]
     print(config.name, dict(zip(config.tasks, success.tolist(), strict=True)))

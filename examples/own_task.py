@@ -39,8 +39,8 @@ if __name__ == "__main__":
 
     tasks, starts = (OWN, *nico.ALL_TASKS), (0, 4, 6, 8)
     config = RunConfig(seeds=(0,), episodes=12, tasks=tasks, task_starts=starts, eval_every=6)
-    trainer = Trainer(config, OUT / "run", bank=bank, encoders=encoders, resume=True)
-    trainer.run()
+    with Trainer(config, OUT / "run", bank=bank, encoders=encoders, resume=True) as trainer:
+        trainer.run()
     for task in tasks:
         train, test = (
             [int(row["success"]) for row in read_rows(OUT / "run" / file) if row["task"] == task]
