@@ -17,6 +17,7 @@ import torch
 import tyro
 
 from bgpo_trl.algorithms import ALGORITHMS, Algorithm
+from bgpo_trl.algorithms.rl import RL
 from bgpo_trl.configs import PRESETS, STAGE_PRESETS, RunConfig
 from bgpo_trl.demonstrations import DemonstrationBank
 from bgpo_trl.evaluation import Evaluator, evaluate_random_policy
@@ -39,10 +40,12 @@ class Arguments:
 
     algorithm: Literal["bgpo", "maml", "dist-nll", "oracle", "ddpg"] = "bgpo"
     """BGPO; a baseline; or a reference: DDPG that is told the task's label (oracle) or nothing."""
+    rl: Literal["ddpg", "td3", "sac"] = "ddpg"
+    """The RL algorithm of BGPO, its ablations and the references."""
     preset: Literal["smoke", "quick", "desk", "paper"] = "quick"
     """Size of the run: every stage in minutes; learning to look at; five seeds; the paper's."""
     out: Path | None = None
-    """The run's directory; runs/EXPERIMENT-ALGORITHM-PRESET if not given."""
+    """The run's directory; runs/EXPERIMENT-ALGORITHM[-RL]-PRESET if not given."""
     seeds: tuple[int, ...] | None = None
     """Other seeds than the preset's."""
     episodes: int | None = None
@@ -67,6 +70,8 @@ def run_config(arguments: Arguments) -> RunConfig:
         ValueError: If there is no such run.
     """
     algorithm = ALGORITHMS[arguments.algorithm].config
+    if arguments.rl != algorithm.rl.name:
+        algorithm = replace(algorithm, rl=RL[arguments.rl].config)
     config = replace(PRESETS[arguments.preset], name=arguments.algorithm, algorithm=algorithm)
     if arguments.seeds is not None:
         config = replace(config, seeds=arguments.seeds)
@@ -108,7 +113,8 @@ def run_experiment(
     commit = _commit()  # of the code that runs, whatever is committed meanwhile
     torch.set_num_threads(arguments.threads)
     device = choose_device(arguments.device)
-    out = arguments.out or Path("runs") / f"{name}-{config.name}-{arguments.preset}"
+    rl = "" if arguments.rl == "ddpg" else f"-{arguments.rl}"
+    out = arguments.out or Path("runs") / f"{name}-{config.name}{rl}-{arguments.preset}"
     if (out / "config.json").exists() and not arguments.resume:
         raise ValueError(f"{out} holds a run: --resume continues it, --out names another directory")
     if arguments.train_encoders or arguments.preset in STAGE_PRESETS:

@@ -8,7 +8,8 @@ BGPO: latents and the behavior b of GWR-B. A drop from one rung to the next name
 short: encoder, sequence encoder, self-organization. What the learner itself gains by a setting is
 seen on one rung:
 
-    python benchmarks/ladder.py --rungs a --ddpg.hidden-sizes 64 --out runs/ladder-64
+    python benchmarks/ladder.py --rungs a --out runs/ladder-64 rl:ddpg --rl.hidden-sizes 64
+    python benchmarks/ladder.py --rungs a --out runs/ladder-td3 rl:td3
 """
 
 from __future__ import annotations
@@ -17,15 +18,16 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from ablation import VARIANTS
 from experiment import command_line
 from summary import summarize
+from tyro.conf import subcommand
 
 from bgpo_trl.algorithms.bgpo import BGPO, Composition, Parts, labeled
-from bgpo_trl.configs import PRESETS, BGPOConfig, DDPGConfig
+from bgpo_trl.configs import PRESETS, BGPOConfig, DDPGConfig, SACConfig, TD3Config
 from bgpo_trl.machine import choose_device
 from bgpo_trl.plotting import plot_success_curves, save_figure
 from bgpo_trl.pretrained import load_pretrained
@@ -53,8 +55,12 @@ class Arguments:
     """Seeds, run as one batch."""
     out: Path = Path("runs/ladder")
     """One run directory a rung goes in here."""
-    ddpg: DDPGConfig = field(default_factory=DDPGConfig)
-    """The learner."""
+    rl: (
+        Annotated[DDPGConfig, subcommand("ddpg")]
+        | Annotated[TD3Config, subcommand("td3")]
+        | Annotated[SACConfig, subcommand("sac")]
+    ) = field(default_factory=DDPGConfig)
+    """The RL algorithm."""
     resume: bool = False
     """Continue interrupted rungs; finished ones are only read."""
     device: str = "auto"
@@ -81,7 +87,7 @@ def main(arguments: Arguments) -> None:
     for rung in arguments.rungs:
         _, bgpo, compose = RUNGS[rung]
         out = arguments.out / rung
-        algorithm = replace(bgpo, ddpg=arguments.ddpg)
+        algorithm = replace(bgpo, rl=arguments.rl)
         with Trainer(
             replace(base, name=f"rung {rung}", algorithm=algorithm),
             out,

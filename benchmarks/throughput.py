@@ -110,7 +110,7 @@ class Training:
         )
         self._background = ThreadPoolExecutor(1, "update")
         self._state = self.algorithm.env.reset()
-        while len(self.algorithm.replay) <= self.algorithm.config.ddpg.warmup_steps:
+        while len(self.algorithm.replay) <= self.algorithm.config.rl.warmup_steps:
             self.step()
 
     def step(self) -> None:

@@ -71,9 +71,12 @@ class RepresentationConfig:
 
 
 @dataclass(frozen=True)
-class DDPGConfig:
-    """The RL algorithm f_RL of Alg. 1."""
+class RLConfig:
+    """What all RL algorithms f_RL of Alg. 1 have in common."""
 
+    name: str = ""
+    """The algorithm, as `bgpo_trl.algorithms.rl.RL` has it; tells the classes apart in
+    ``config.json``."""
     hidden_sizes: tuple[int, ...] = (256,)
     """Hidden layers of actor and critic. Ours: 64 units in Sec. IV-A, which limit what is learned
     (docs/learning.md)."""
@@ -89,15 +92,56 @@ class DDPGConfig:
     """Discount. Ours: the paper does not say; an episode has about 20 steps."""
     tau: float = 0.005
     """Share of the weights that the target networks take over each update. Ours."""
-    noise: float = 0.3
-    """Standard deviation of the Gaussian exploration noise on the action. Ours."""
-    pre_tanh_penalty: float = 0.01
-    """Weight of the squared pre-tanh actions. Ours: without it all actions saturate."""
     clip_targets: bool = True
     """Clip bootstrapped targets to the attainable returns [0, 1 + beta]. Ours: without it Q grows
     to hundreds."""
     warmup_steps: int = 256
     """Environment steps of each seed before the first update. Ours: one batch."""
+
+
+@dataclass(frozen=True)
+class DDPGConfig(RLConfig):
+    """DDPG (Lillicrap et al., 2016), the paper's f_RL."""
+
+    name: Literal["ddpg"] = "ddpg"
+    """See `RLConfig`."""
+    noise: float = 0.3
+    """Standard deviation of the Gaussian exploration noise on the action. Ours."""
+    pre_tanh_penalty: float = 0.01
+    """Weight of the squared pre-tanh actions. Ours: without it all actions saturate."""
+
+
+@dataclass(frozen=True)
+class TD3Config(RLConfig):
+    """TD3 (Fujimoto et al., 2018): two critics, a slower actor, noise on the target action."""
+
+    name: Literal["td3"] = "td3"
+    """See `RLConfig`."""
+    noise: float = 0.3
+    """Standard deviation of the Gaussian exploration noise on the action. Ours: as in DDPG."""
+    pre_tanh_penalty: float = 0.01
+    """Weight of the squared pre-tanh actions. Ours: as in DDPG."""
+    policy_delay: int = 2
+    """Updates of the critics for each of the actor and the target networks (Fujimoto et al.)."""
+    policy_noise: float = 0.2
+    """Standard deviation of the noise on the target action (Fujimoto et al.)."""
+    noise_clip: float = 0.5
+    """Largest such noise (Fujimoto et al.)."""
+
+
+@dataclass(frozen=True)
+class SACConfig(RLConfig):
+    """SAC (Haarnoja et al., 2018): two critics, a stochastic actor, a learned temperature."""
+
+    name: Literal["sac"] = "sac"
+    """See `RLConfig`."""
+    alpha_init: float = 0.1
+    """First temperature."""
+    target_entropy: float = -4.0
+    """Entropy that the temperature keeps, in nats; minus the number of actions in Haarnoja et
+    al."""
+    entropy_in_target: bool = True
+    """Whether the critics count entropy to come."""
 
 
 @dataclass(frozen=True)
@@ -108,8 +152,16 @@ class AlgorithmConfig:
     """What the policy sees of the world: z of a frame, or (for the ladder) the ground truth."""
     max_steps: int = 50
     """Steps of an episode (Sec. IV-B)."""
-    ddpg: DDPGConfig = field(default_factory=DDPGConfig)
-    """The RL algorithm."""
+    rl: RLConfig = field(default_factory=DDPGConfig)
+    """The RL algorithm f_RL."""
+
+
+def _refuse_all_but_ddpg(who: str, rl: RLConfig) -> None:
+    if not isinstance(rl, DDPGConfig):
+        raise ValueError(
+            f"{who} is defined over DDPG, not {rl.name!r}: leave its rl as it is; BGPO, its "
+            "ablations and the references take any"
+        )
 
 
 @dataclass(frozen=True)
@@ -134,7 +186,11 @@ class MAMLConfig(AlgorithmConfig):
     """Transitions of the test task that the policy adapts to before its test episodes. Sec. IV-B
     has "256 adaptation trajectories", about 50 times as much."""
 
+    rl: DDPGConfig = field(default_factory=DDPGConfig)
+    """Its own steps are DDPG's."""
+
     def __post_init__(self) -> None:
+        _refuse_all_but_ddpg("MAML", self.rl)
         halves = self.task_batch_size >= 2 and self.task_batch_size % 2 == 0
         if self.inner_learning_rate < 0 or not halves or self.adaptation_size < 1:
             raise ValueError(
@@ -159,7 +215,11 @@ class DistNLLConfig(AlgorithmConfig):
     learning_rate: float = 1e-3
     """Rate of Adam for the multi-task policy. Ours: the teachers' own."""
 
+    rl: DDPGConfig = field(default_factory=DDPGConfig)
+    """Its teachers are DDPG's."""
+
     def __post_init__(self) -> None:
+        _refuse_all_but_ddpg("Dist-NLL", self.rl)
         if self.distillation_batch_size < 1 or self.samples % self.distillation_batch_size:
             raise ValueError(
                 f"samples ({self.samples}) must be a multiple of distillation_batch_size "

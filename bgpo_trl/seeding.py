@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
+from torch import Tensor
 
 
 def stream_seed(seed: int, name: str) -> int:
@@ -35,3 +36,8 @@ def generators(seeds: Sequence[int], name: str) -> list[torch.Generator]:
 def task_generators(seeds: Sequence[int], n_tasks: int, name: str) -> list[list[torch.Generator]]:
     """Returns one generator for each task of each seed, for one purpose."""
     return [[generators([seed], f"{name} {task}")[0] for task in range(n_tasks)] for seed in seeds]
+
+
+def normal(generators: Sequence[torch.Generator], shape: Sequence[int]) -> Tensor:
+    """Returns standard normals ``[S, *shape]``, those of each seed from its own generator."""
+    return torch.stack([torch.randn(*shape, generator=generator) for generator in generators])

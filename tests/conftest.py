@@ -10,7 +10,8 @@ import torch
 from hypothesis import settings
 
 from bgpo_trl.algorithms import ALGORITHMS
-from bgpo_trl.configs import DDPGConfig, RunConfig
+from bgpo_trl.algorithms.rl import RL
+from bgpo_trl.configs import RunConfig
 from bgpo_trl.demonstrations import DemonstrationBank
 from bgpo_trl.envs import NicoEnv
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
@@ -51,10 +52,11 @@ def bank():
 def make_config():
     """Makes the settings of a run of two seeds and 10 episodes, with some of them changed."""
 
-    def make(state="latent", name="bgpo", **changes):
-        ddpg = DDPGConfig(hidden_sizes=(64,), batch_size=16, warmup_steps=8, replay_size=200)
+    def make(state="latent", name="bgpo", rl="ddpg", **changes):
+        small = {"hidden_sizes": (64,), "batch_size": 16, "warmup_steps": 8, "replay_size": 200}
+        rl = replace(RL[rl].config, **small)
         algorithm = replace(
-            ALGORITHMS[name].config, state=state, max_steps=6, ddpg=ddpg, **SMALL.get(name, {})
+            ALGORITHMS[name].config, state=state, max_steps=6, rl=rl, **SMALL.get(name, {})
         )
         config = RunConfig(
             seeds=(3, 8),

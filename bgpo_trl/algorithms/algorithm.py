@@ -19,11 +19,11 @@ from torchrl.envs import (
     TransformedEnv,
 )
 
+from bgpo_trl.algorithms.rl import Learner
 from bgpo_trl.configs import AlgorithmConfig
 from bgpo_trl.demonstrations import DemonstrationBank
 from bgpo_trl.envs import NicoEnv
 from bgpo_trl.modules.gwr import GWRB
-from bgpo_trl.objectives.ddpg import DDPGLoss, ForeachSoftUpdate
 from bgpo_trl.replay import ReplayBuffer
 from bgpo_trl.representation import Representation
 from bgpo_trl.seeding import generators, stream_seed
@@ -87,17 +87,13 @@ class Algorithm(ABC):
         simulation: The environment without its transforms.
         gwr: GWR-B, or None in an algorithm without it.
         state_size: Number of features of the state.
-        loss: The losses of actor and critic, with their target networks.
-        optimizer: Of both.
-        target_update: Of both.
+        learner: The RL algorithm: losses of actor and critic, optimizer, target networks.
         replay: What was experienced.
     """
 
     env: TransformedEnv
     gwr: GWRB | None = None
-    loss: DDPGLoss
-    optimizer: torch.optim.Optimizer
-    target_update: ForeachSoftUpdate
+    learner: Learner
     replay: ReplayBuffer | TaskReplay
 
     def __init__(
@@ -128,7 +124,6 @@ class Algorithm(ABC):
             observation="pixels" if config.state == "latent" else "state",
         )
         self._noise = generators(seeds, "exploration")
-        self._noise_scale = config.ddpg.noise
 
     @abstractmethod
     def act(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -215,17 +210,10 @@ class Algorithm(ABC):
         Returns:
             What `update` returns.
         """
-        losses = self.loss(self.moved(batch))
-        self.optimizer.zero_grad()
-        (losses["loss_actor"] + losses["loss_value"]).backward()
-        self.optimizer.step()
-        self.target_update.step()
-        return {key: losses[key].detach() / self.n_seeds for key in ("loss_actor", "loss_value")}
-
-    def explore(self, action: Tensor) -> Tensor:
-        """Returns actions ``[S, 4]`` with each seed's Gaussian noise, within [-1, 1]."""
-        noise = [torch.randn(action.shape[-1:], generator=g) for g in self._noise]
-        return (action.cpu() + self._noise_scale * torch.stack(noise)).clamp(-1.0, 1.0)
+        losses = self.learner.learn(self.moved(batch))
+        # TorchRL's name where there are several critics.
+        losses["loss_value"] = losses.pop("loss_qvalue", losses.get("loss_value"))
+        return {key: losses[key] / self.n_seeds for key in ("loss_actor", "loss_value")}
 
     def moved(self, batch: TensorDictBase) -> TensorDictBase:
         """Returns a batch where the networks are."""
@@ -251,7 +239,7 @@ class Algorithm(ABC):
 
     def _learned(self) -> dict[str, Any]:
         """Returns what changes by learning, which an algorithm need not have all of."""
-        parts = ("loss", "optimizer", "replay")
+        parts = ("learner", "replay")
         return {name: getattr(self, name) for name in parts if hasattr(self, name)}
 
 

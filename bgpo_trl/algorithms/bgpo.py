@@ -1,4 +1,4 @@
-"""Behavior-Guided Policy Optimization (Alg. 1): GWR-B tells the task, DDPG learns to do it."""
+"""Behavior-Guided Policy Optimization (Alg. 1): GWR-B tells the task, f_RL learns to do it."""
 
 from __future__ import annotations
 
@@ -18,12 +18,11 @@ from torchrl.envs import (
 )
 
 from bgpo_trl.algorithms.algorithm import Algorithm
+from bgpo_trl.algorithms.rl import Problem, make_learner
 from bgpo_trl.configs import BGPOConfig
 from bgpo_trl.demonstrations import DemonstrationBank
-from bgpo_trl.modules.actor_critic import Actor, Critic
 from bgpo_trl.modules.gwr import GWRB
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
-from bgpo_trl.objectives.ddpg import DDPGLoss, ForeachSoftUpdate
 from bgpo_trl.replay import ReplayBuffer
 from bgpo_trl.representation import Representation
 from bgpo_trl.seeding import generators
@@ -106,7 +105,7 @@ class BGPO(Algorithm):
         env: The composition of transforms.
         gwr: GWR-B, or None in the variants without it.
         actor: The policy, ``[S]`` stacked.
-        critic: The Q-function, ``[S]`` stacked.
+        loss: The RL algorithm's, with the critics.
     """
 
     def __init__(
@@ -154,48 +153,30 @@ class BGPO(Algorithm):
         self.gwr = lookups[0].gwr if lookups else None
         told_size = {None: 0, "task_one_hot": schedule.n_tasks}.get(self.told, embedding_size)
         self.in_keys = [config.state, *([] if self.told is None else [self.told])]
-        self._make_learner(seeds, self.state_size + told_size, sum(t.beta for t in bonuses))
-
-    def _make_learner(self, seeds: Sequence[int], in_features: int, bonus: float) -> None:
-        ddpg, keys = self.config.ddpg, self.in_keys
-        network = {
-            "in_keys": keys,
-            "hidden_sizes": ddpg.hidden_sizes,
-            "batch_size": [len(seeds)],
-        }
-        self.actor = Actor(in_features, generator=generators(seeds, "actor"), **network)
-        self.critic = Critic(
-            in_features,
-            layer_norm=ddpg.critic_layer_norm,
-            generator=generators(seeds, "critic"),
-            **network,
+        rl, keys = config.rl, self.in_keys
+        self.learner = make_learner(
+            rl,
+            Problem(
+                seeds=seeds,
+                in_keys=keys,
+                in_features=self.state_size + told_size,
+                return_bounds=(0.0, 1.0 + sum(t.beta for t in bonuses)),
+                device=self.device,
+            ),
         )
-        self.actor.to(self.device)
-        self.critic.to(self.device)
-        self.loss = DDPGLoss(
-            self.actor,
-            self.critic,
-            return_bounds=(0.0, 1.0 + bonus) if ddpg.clip_targets else None,
-            pre_tanh_penalty=ddpg.pre_tanh_penalty,
-            constant_keys=keys[1:],
-        )
-        self.loss.make_value_estimator(gamma=ddpg.gamma)
-        self.target_update = ForeachSoftUpdate(self.loss, tau=ddpg.tau)
-        self.optimizer = torch.optim.Adam(
-            list(self.loss.parameters()), lr=ddpg.learning_rate, fused=True
-        )
+        self.actor, self.loss = self.learner.actor, self.learner.loss
         self.replay = ReplayBuffer(
-            ddpg.replay_size,
-            batch_size=ddpg.batch_size,
+            rl.replay_size,
+            batch_size=rl.batch_size,
             generator=generators(seeds, "replay"),
             keys=[*keys, "action", *(("next", key) for key in (keys[0], "reward", "terminated"))],
         )
 
     @torch.no_grad()
     def act(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the ``action`` ``[S, 4]`` of the policy with exploration noise."""
-        chosen = self.actor(self.moved(tensordict.select(*self.in_keys)))
-        return tensordict.set("action", self.explore(chosen["action"]))
+        """Writes the ``action`` ``[S, 4]`` by which the policy explores."""
+        seen = self.moved(tensordict.select(*self.in_keys))
+        return tensordict.set("action", self.learner.act(seen, self._noise))
 
     def store(self, transition: TensorDictBase) -> None:
         """Keeps a transition of each seed for updates to come."""
@@ -203,7 +184,7 @@ class BGPO(Algorithm):
 
     def update(self) -> dict[str, Tensor]:
         """Makes one update of each seed; see `Algorithm.update`."""
-        if len(self.replay) < self.config.ddpg.warmup_steps:
+        if len(self.replay) < self.config.rl.warmup_steps:
             return {}
         return self.learn(self.replay.sample())
 

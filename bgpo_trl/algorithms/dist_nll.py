@@ -15,11 +15,12 @@ from torch import Tensor
 from torch.func import functional_call
 
 from bgpo_trl.algorithms.algorithm import Algorithm, networks_of
+from bgpo_trl.algorithms.rl import Learner
 from bgpo_trl.configs import DistNLLConfig
 from bgpo_trl.demonstrations import DemonstrationBank
 from bgpo_trl.modules.actor_critic import Actor, Critic
 from bgpo_trl.modules.multi_head_actor import MultiHeadActor
-from bgpo_trl.objectives.ddpg import DDPGLoss, ForeachSoftUpdate
+from bgpo_trl.objectives.ddpg import DDPGLoss
 from bgpo_trl.objectives.distillation import DistillationLoss
 from bgpo_trl.representation import Representation
 from bgpo_trl.seeding import generators, task_generators
@@ -68,7 +69,7 @@ class DistNLL(Algorithm):
         super().__init__(
             config, seeds=seeds, schedule=schedule, bank=bank, encoders=encoders, device=device
         )
-        self.config, ddpg = config, config.ddpg
+        self.config, ddpg = config, config.rl
         self.env = self.compose(config, encoders)
         self._network = {"in_keys": [config.state], "hidden_sizes": ddpg.hidden_sizes}
         every = [self.n_seeds, self.n_tasks]
@@ -91,11 +92,7 @@ class DistNLL(Algorithm):
             return_bounds=(0.0, 1.0) if ddpg.clip_targets else None,
             pre_tanh_penalty=ddpg.pre_tanh_penalty,
         )
-        self.loss.make_value_estimator(gamma=ddpg.gamma)
-        self.target_update = ForeachSoftUpdate(self.loss, tau=ddpg.tau)
-        self.optimizer = torch.optim.Adam(
-            list(self.loss.parameters()), lr=ddpg.learning_rate, fused=True
-        )
+        self.learner = Learner(self.teacher, self.loss, ddpg, noise=ddpg.noise)
         # Called with the parameters of some of the teachers: of one a seed, of some of one seed's.
         self._acting, *self._teaching = (
             Actor(self.state_size, batch_size=[n], **self._network).to(self.device)
@@ -142,7 +139,7 @@ class DistNLL(Algorithm):
             self.loss.actor_network_params, torch.arange(self.n_seeds), tensordict["task"]
         )
         functional_call(self._acting, teachers, (seen,))
-        return tensordict.set("action", self.explore(seen["action"]))
+        return tensordict.set("action", self.learner.explore(seen["action"], self._noise))
 
     def store(self, transition: TensorDictBase) -> None:
         """Keeps a transition of each seed with its task for updates to come."""
@@ -154,7 +151,7 @@ class DistNLL(Algorithm):
 
         The multi-task policies of seeds whose episode has just ended learn from them after it.
         """
-        if len(self.replay) < max(self.config.ddpg.warmup_steps, self.replay.enough):
+        if len(self.replay) < max(self.config.rl.warmup_steps, self.replay.enough):
             return {}
         losses = self.learn(self.replay.sample())
         for index in self._ended.nonzero().flatten().tolist():

@@ -15,10 +15,10 @@ from torch import Tensor
 from torch.func import functional_call
 
 from bgpo_trl.algorithms.algorithm import Algorithm, networks_of
+from bgpo_trl.algorithms.rl import Learner
 from bgpo_trl.configs import MAMLConfig
 from bgpo_trl.demonstrations import DemonstrationBank
 from bgpo_trl.modules.actor_critic import Actor, Critic
-from bgpo_trl.objectives.ddpg import ForeachSoftUpdate
 from bgpo_trl.objectives.maml import MAMLLoss
 from bgpo_trl.representation import Representation
 from bgpo_trl.seeding import generators, task_generators
@@ -66,7 +66,7 @@ class MAML(Algorithm):
         super().__init__(
             config, seeds=seeds, schedule=schedule, bank=bank, encoders=encoders, device=device
         )
-        self.config, ddpg = config, config.ddpg
+        self.config, ddpg = config, config.rl
         self.env = self.compose(config, encoders)
         network = {"in_keys": [config.state], "hidden_sizes": ddpg.hidden_sizes}
         each, every = [self.n_seeds], [self.n_seeds, self.n_tasks]
@@ -91,10 +91,7 @@ class MAML(Algorithm):
             return_bounds=(0.0, 1.0) if ddpg.clip_targets else None,
             pre_tanh_penalty=ddpg.pre_tanh_penalty,
         )
-        self.loss.make_value_estimator(gamma=ddpg.gamma)
-        self.target_update = ForeachSoftUpdate(self.loss, tau=ddpg.tau)
-        learned = [p for p in self.loss.parameters() if p.requires_grad]
-        self.optimizer = torch.optim.Adam(learned, lr=ddpg.learning_rate, fused=True)
+        self.learner = Learner(self.meta_actor, self.loss, ddpg, noise=ddpg.noise)
         self.replay = TaskReplay(
             ddpg.replay_size,
             batch_size=config.task_batch_size,
@@ -113,7 +110,7 @@ class MAML(Algorithm):
             self.loss.actor_network_params, torch.arange(self.n_seeds), tensordict["task"]
         )
         functional_call(self._acting, adapted, (seen,))
-        return tensordict.set("action", self.explore(seen["action"]))
+        return tensordict.set("action", self.learner.explore(seen["action"], self._noise))
 
     def store(self, transition: TensorDictBase) -> None:
         """Keeps a transition of each seed with its task for updates to come."""
@@ -121,7 +118,7 @@ class MAML(Algorithm):
 
     def update(self) -> dict[str, Tensor]:
         """Makes one update of each seed; see `Algorithm.update`."""
-        if len(self.replay) < max(self.config.ddpg.warmup_steps, self.replay.enough):
+        if len(self.replay) < max(self.config.rl.warmup_steps, self.replay.enough):
             return {}
         return self.learn(self.replay.sample())
 

@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
-from copy import deepcopy
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl import objectives
-from torchrl.objectives import LossModule, ValueEstimators
-from torchrl.objectives.utils import _cache_values, distance_loss
+from torchrl.objectives import LossModule
+from torchrl.objectives.utils import distance_loss
+
+from bgpo_trl.objectives.stacked import StackedLoss
 
 __all__ = ["DDPGLoss", "ForeachSoftUpdate"]
 
 
-class DDPGLoss(objectives.DDPGLoss):
+class DDPGLoss(StackedLoss, objectives.DDPGLoss):
     """DDPG loss (Lillicrap et al., 2016; Eq. 8 of the paper) for one seed or a stack of seeds.
 
     It differs from :class:`torchrl.objectives.DDPGLoss` in this:
@@ -97,8 +97,6 @@ class DDPGLoss(objectives.DDPGLoss):
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
-    # The other estimators need whole trajectories, and replay serves single transitions.
-    SUPPORTED_VALUE_ESTIMATORS = (ValueEstimators.TD0,)
     out_keys: ClassVar = [
         *("loss_actor", "loss_value", "pred_value", "target_value"),
         *("pred_value_max", "target_value_max", "td_error_max", "pre_tanh_magnitude"),
@@ -116,10 +114,6 @@ class DDPGLoss(objectives.DDPGLoss):
         delay_actor: bool = True,
         delay_value: bool = True,
     ) -> None:
-        if return_bounds is not None and not return_bounds[0] < return_bounds[1]:
-            raise ValueError(f"return_bounds must be (low, high) with low < high: {return_bounds}")
-        if not (pre_tanh_penalty >= 0 and math.isfinite(pre_tanh_penalty)):
-            raise ValueError(f"pre_tanh_penalty must be a number >= 0, got {pre_tanh_penalty}")
         super().__init__(
             actor_network,  # pyright: ignore[reportArgumentType] narrower there than it need be
             value_network,  # pyright: ignore[reportArgumentType]
@@ -127,24 +121,7 @@ class DDPGLoss(objectives.DDPGLoss):
             delay_actor=delay_actor,
             delay_value=delay_value,
         )
-        self.return_bounds = return_bounds
-        self.pre_tanh_penalty = pre_tanh_penalty
-        self.batch_size = torch.Size(getattr(actor_network, "batch_size", ()))
-        input_keys = {*self.actor_in_keys, *self.value_exclusive_keys}
-        self.constant_keys = [key for key in constant_keys if key in input_keys]
-        self.moving_keys = list(input_keys.difference(constant_keys))
-
-    def make_value_estimator(
-        self, value_type: ValueEstimators | None = None, **hyperparams
-    ) -> None:
-        """Sets the estimator of the target.
-
-        Args:
-            value_type: ``ValueEstimators.TD0`` or a value estimator of TorchRL.
-            **hyperparams: such as ``gamma``, 0.98 by default (the paper gives none).
-        """
-        value_type = value_type or self.default_value_estimator
-        super().make_value_estimator(value_type, **{"gamma": 0.98, **hyperparams})
+        self._stack(actor_network, return_bounds, constant_keys, pre_tanh_penalty)
 
     def loss_value(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Computes the critic's loss; reads and writes what the class says.
@@ -190,86 +167,13 @@ class DDPGLoss(objectives.DDPGLoss):
         data = tensordict.select(*self.actor_in_keys, *self.value_exclusive_keys).detach()
         self._frozen_critic(self._actor(data))
         value = data.get(self.tensor_keys.state_action_value).squeeze(-1)
-        loss = -self._mean_per_seed(value, tensordict)
-
-        pre_tanh = data.get(self.tensor_keys.pre_tanh_action, None)
-        if pre_tanh is None:
-            if self.pre_tanh_penalty:
-                raise ValueError(
-                    f"the actor wrote no {self.tensor_keys.pre_tanh_action!r} to penalize: write "
-                    "it, name it with set_keys(pre_tanh_action=...), or pass pre_tanh_penalty=0"
-                )
-            return loss.sum(), {}
-        square = pre_tanh.square()
-        if self.pre_tanh_penalty:
-            weights = self._maybe_get_priority_weight(tensordict)
-            weighted = square if weights is None else square * weights.unsqueeze(-1)
-            loss = loss + self.pre_tanh_penalty * self._flatten_batch(weighted).mean(-1)
-        magnitude = self._flatten_batch(square.detach()).mean(-1).sqrt()
-        return loss.sum(), {"pre_tanh_magnitude": magnitude}
+        return self._penalized(value, data, tensordict)
 
     def _target(self, tensordict: TensorDictBase) -> Tensor:
-        successor = tensordict.get("next")
-        if successor.get(self.tensor_keys.terminated, None) is None:
-            # The estimator would read "done" in its place, and stop at truncation too.
-            raise ValueError(
-                f"the batch lacks ('next', {self.tensor_keys.terminated!r}): store it, since only "
-                "it tells a success from a time-out"
-            )
-        data = successor.select(*self.moving_keys)
-        for key in self.constant_keys:
-            data.set(key, tensordict[key])
+        data = self._successor(tensordict)
         self._target_critic(self._target_actor(data))
         next_value = data.get(self.tensor_keys.state_action_value)
-        target = self.value_estimator.value_estimate(tensordict, next_value=next_value).squeeze(-1)
-        return target if self.return_bounds is None else target.clamp(*self.return_bounds)
-
-    # The networks with parameters in place: TorchRL's way of putting them in for each call takes
-    # 0.14 ms, four times an update. As other cached values, they are made anew after a cast.
-
-    @property
-    @_cache_values
-    def _actor(self) -> TensorDictModuleBase:
-        return _bind(self.actor_network, self.actor_network_params)
-
-    @property
-    @_cache_values
-    def _critic(self) -> TensorDictModuleBase:
-        return _bind(self.value_network, self.value_network_params)
-
-    @property
-    @_cache_values
-    def _frozen_critic(self) -> TensorDictModuleBase:
-        return _bind(self.value_network, self.value_network_params.detach())
-
-    @property
-    @_cache_values
-    def _target_actor(self) -> TensorDictModuleBase:
-        return _bind(self.actor_network, self.target_actor_network_params)
-
-    @property
-    @_cache_values
-    def _target_critic(self) -> TensorDictModuleBase:
-        return _bind(self.value_network, self.target_value_network_params)
-
-    def __getstate__(self) -> dict[str, Any]:
-        # A copy makes its own: copies of detached tensors would no longer follow the parameters.
-        return {**super().__getstate__(), "_cache": {}}
-
-    def _mean_per_seed(self, loss: Tensor, tensordict: TensorDictBase) -> Tensor:
-        weights = self._maybe_get_priority_weight(tensordict)
-        loss = self._reduce_loss(loss, tensordict, reduction="none", weights=weights)
-        return self._flatten_batch(loss).mean(-1)
-
-    def _flatten_batch(self, values: Tensor) -> Tensor:
-        return values.reshape(*self.batch_size, -1)
-
-
-def _bind(network: TensorDictModuleBase, params: TensorDictBase) -> TensorDictModuleBase:
-    """Returns a copy of the network that holds these very parameters."""
-    network = deepcopy(network)
-    params.to_module(network)
-    return network
+        return self._bootstrapped(tensordict, next_value)
 
 
 def _float_pairs(

@@ -242,8 +242,8 @@ def test_episodes_follow_algorithm_1(make, bank, encoders):
 @variants
 @pytest.mark.parametrize("scale", [0.0, 0.7])
 def test_exploration_is_noise_of_each_seed_on_the_policys_action(make, make_config, variant, scale):
-    ddpg = replace(make_config().algorithm.ddpg, noise=scale)
-    algorithm, sources = make(variant, ddpg=ddpg), generators((3, 8), "exploration")
+    ddpg = replace(make_config().algorithm.rl, noise=scale)
+    algorithm, sources = make(variant, rl=ddpg), generators((3, 8), "exploration")
     with torch.no_grad():  # so that some actions are cut off, and some are not
         algorithm.actor.mlp.layers[-1].bias.copy_(torch.tensor([[0.0, 1.0, -1.0, 0.0]]))
     state, n_cut = algorithm.env.reset(), 0
@@ -288,20 +288,20 @@ def test_targets_are_clipped_to_the_attainable_returns(make, variant, changes, h
 
 
 def test_clipping_can_be_turned_off(make, make_config):
-    ddpg = replace(make_config().algorithm.ddpg, clip_targets=False)
-    assert make(ddpg=ddpg).loss.return_bounds is None
+    ddpg = replace(make_config().algorithm.rl, clip_targets=False)
+    assert make(rl=ddpg).loss.return_bounds is None
 
 
 def test_the_first_update_comes_after_the_warm_up_and_with_the_step_that_follows(make):
     algorithm = make()
     start = [p.detach().clone() for p in algorithm.loss.parameters()]
-    play(algorithm, algorithm.config.ddpg.warmup_steps)
+    play(algorithm, algorithm.config.rl.warmup_steps)
     for value, before in zip(algorithm.loss.parameters(), start, strict=True):
         assert value.equal(before)
     play(algorithm, 1)
     for value, before in zip(algorithm.loss.parameters(), start, strict=True):
         assert not value.equal(before)
-    assert len(algorithm.replay) == algorithm.config.ddpg.warmup_steps + 1
+    assert len(algorithm.replay) == algorithm.config.rl.warmup_steps + 1
 
 
 @pytest.mark.parametrize("variant", ["ground truth, label", "latent, nothing", "latent, b"])

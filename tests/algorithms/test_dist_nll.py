@@ -157,8 +157,8 @@ def test_the_first_update_comes_after_the_warm_up_when_some_task_fills_a_batch_f
     make, warmup, n_tasks, expected
 ):
     """Three tasks can have three transitions each without four of any."""
-    ddpg = replace(make().config.ddpg, warmup_steps=warmup)
-    algorithm = make(schedule=TaskSchedule((0,) * n_tasks), ddpg=ddpg)
+    ddpg = replace(make().config.rl, warmup_steps=warmup)
+    algorithm = make(schedule=TaskSchedule((0,) * n_tasks), rl=ddpg)
     start = deepcopy(dict(algorithm.loss.state_dict()))
     _, state = play(algorithm, expected)  # with an update before each step
     assert_same(dict(algorithm.loss.state_dict()), start)
@@ -169,8 +169,8 @@ def test_the_first_update_comes_after_the_warm_up_when_some_task_fills_a_batch_f
 
 
 def test_tasks_that_are_never_presented_make_no_difference(make):
-    ddpg = replace(make().config.ddpg, warmup_steps=10)  # as many as three tasks need
-    three, one = (make(schedule=TaskSchedule(s), ddpg=ddpg) for s in ((0, 99, 99), (0,)))
+    ddpg = replace(make().config.rl, warmup_steps=10)  # as many as three tasks need
+    three, one = (make(schedule=TaskSchedule(s), rl=ddpg) for s in ((0, 99, 99), (0,)))
     start = deepcopy(dict(three.loss.state_dict()))
     ours, theirs = play(three, 30)[0], play(one, 30)[0]
     assert ours["demo_index"].equal(theirs["demo_index"])

@@ -46,7 +46,7 @@ def test_another_algorithm_changes_nothing_else(name):
         entry = ALGORITHMS[name]
         expected = replace(config, name=name, algorithm=entry.config)
         assert experiment.run_config(arguments) == expected
-        assert entry.config.ddpg == DDPGConfig()  # the same learner for all
+        assert entry.config.rl == DDPGConfig()  # the same learner for all
 
 
 def test_the_command_line_knows_every_algorithm():
@@ -254,7 +254,7 @@ def test_a_run_that_is_not_finished_cannot_be_summed_up(tmp_path):
 
 def test_the_ladder_has_a_row_and_a_run_for_each_rung(tiny, tmp_path, capsys):
     ddpg = DDPGConfig(hidden_sizes=(7,), batch_size=16, warmup_steps=8, replay_size=200)
-    arguments = ladder.Arguments(episodes=4, seeds=(1,), out=tmp_path, ddpg=ddpg)
+    arguments = ladder.Arguments(episodes=4, seeds=(1,), out=tmp_path, rl=ddpg)
     ladder.main(arguments)
     printed = capsys.readouterr().out
     lines = printed.splitlines()
@@ -267,7 +267,7 @@ def test_the_ladder_has_a_row_and_a_run_for_each_rung(tiny, tmp_path, capsys):
         inputs = set(learner["replay"]["rows"]) - {"action", "next"}
         seen[rung] = (config["algorithm"]["state"], inputs, learner["gwr"] is not None)
         assert (config["task_starts"], config["eval_every"]) == ([0, 0, 0], 4)
-        assert config["algorithm"]["ddpg"]["hidden_sizes"] == [7]
+        assert config["algorithm"]["rl"]["hidden_sizes"] == [7]
         assert (tmp_path / rung / "figures" / "success.png").exists()
         train = summary.read_rows(tmp_path / rung / "train.csv")
         assert {row["algorithm"] for row in train} == {config["name"]} == {f"rung {rung}"}

@@ -89,7 +89,7 @@ def test_ratios_are_against_the_named_contenders(monkeypatch):
 
 def test_results_are_written_and_printed(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(torch, "set_num_threads", lambda n: None)
-    short = BGPOConfig(ddpg=DDPGConfig(warmup_steps=3))
+    short = BGPOConfig(rl=DDPGConfig(warmup_steps=3))
     monkeypatch.setattr(throughput, "BGPOConfig", lambda: short)
     throughput.main(
         throughput.Arguments(

@@ -1,0 +1,275 @@
+"""The RL algorithm f_RL of Alg. 1: DDPG, TD3, SAC, and the place for one's own.
+
+An own one is an entry of `RL` under the ``name`` of its config, such as the one that
+``examples/own_rl_algorithm.py`` makes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+from torchrl.objectives import LossModule
+
+from bgpo_trl.configs import DDPGConfig, RLConfig, SACConfig, TD3Config
+from bgpo_trl.modules.actor_critic import Actor, Critic
+from bgpo_trl.modules.gaussian_actor import GaussianActor
+from bgpo_trl.objectives.ddpg import DDPGLoss, ForeachSoftUpdate
+from bgpo_trl.objectives.sac import SACLoss
+from bgpo_trl.objectives.td3 import TD3Loss
+from bgpo_trl.seeding import generators, normal
+
+__all__ = ["RL", "Learner", "Problem", "RLEntry", "SACLearner", "TD3Learner", "make_learner"]
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What an RL algorithm is to learn, one policy for each seed."""
+
+    seeds: Sequence[int]
+    """One for each element ``S`` of the batch."""
+    in_keys: Sequence[NestedKey]
+    """What the policy reads; all but the first are constant within an episode."""
+    in_features: int
+    """Size of all these together."""
+    return_bounds: tuple[float, float]
+    """Lowest and highest attainable return."""
+    device: torch.device
+    """Where networks and batches are."""
+
+    def actor(self, network: Callable[..., Any], config: RLConfig) -> Any:
+        """Returns policies ``[S]`` of a class such as `Actor`."""
+        return self._network(network, config, [len(self.seeds)], generators(self.seeds, "actor"))
+
+    def critic(self, config: RLConfig) -> Critic:
+        """Returns Q-functions ``[S]``."""
+        streams = generators(self.seeds, "critic")
+        norm = {"layer_norm": config.critic_layer_norm}
+        return self._network(Critic, config, [len(self.seeds)], streams, **norm)
+
+    def twin_critics(self, config: RLConfig) -> Critic:
+        """Returns Q-functions ``[S, 2]``."""
+        first, second = (generators(self.seeds, name) for name in ("critic", "second critic"))
+        streams = [stream for pair in zip(first, second, strict=True) for stream in pair]
+        norm = {"layer_norm": config.critic_layer_norm}
+        return self._network(Critic, config, [len(self.seeds), 2], streams, **norm)
+
+    def loss_options(self, config: RLConfig) -> dict[str, Any]:
+        """Returns the arguments that the losses of this package have in common."""
+        return {
+            "return_bounds": self.return_bounds if config.clip_targets else None,
+            "constant_keys": self.in_keys[1:],
+        }
+
+    def _network(
+        self,
+        network: Callable[..., Any],
+        config: RLConfig,
+        batch_size: Sequence[int],
+        generator: Sequence[torch.Generator],
+        **options: Any,
+    ) -> Any:
+        return network(
+            self.in_features,
+            in_keys=self.in_keys,
+            hidden_sizes=config.hidden_sizes,
+            batch_size=batch_size,
+            generator=generator,
+            **options,
+        ).to(self.device)
+
+
+class Learner:
+    """The policies of all seeds and how they improve: as they are, DDPG's.
+
+    Its optimizer is Adam on the sum of the loss's parts. Adam treats each weight by itself, so one
+    for all networks is one for each.
+
+    Args:
+        actor: Called with what it reads, writes the ``action`` without noise. Its weights lead with
+            ``[S]``.
+        loss: Reads transitions ``[S, B]`` and returns, among others, entries ``loss_...`` ``[]`` to
+            be minimized, each a sum over the seeds. It has target networks.
+        config: Hyperparameters.
+        noise: Standard deviation of the Gaussian exploration noise.
+
+    Attributes:
+        optimizer: Of all that the loss is to learn.
+        target_update: Of the target networks.
+    """
+
+    def __init__(
+        self, actor: Any, loss: LossModule, config: RLConfig, *, noise: float = 0.0
+    ) -> None:
+        loss.make_value_estimator(gamma=config.gamma)
+        self.actor, self.loss, self.noise = actor, loss, noise
+        self.target_update = ForeachSoftUpdate(loss, tau=config.tau)
+        learned = [p for p in loss.parameters() if p.requires_grad]
+        self.optimizer = torch.optim.Adam(learned, lr=config.learning_rate, fused=True)
+
+    def act(self, tensordict: TensorDictBase, generators: Sequence[torch.Generator]) -> Tensor:
+        """Returns actions of a training step, ``[S, 4]`` in [-1, 1], on the CPU.
+
+        Args:
+            tensordict: What the policies read, ``[S]``.
+            generators: What exploration draws from, one for each seed.
+        """
+        return self.explore(self.actor(tensordict)["action"], generators)
+
+    def explore(self, action: Tensor, generators: Sequence[torch.Generator]) -> Tensor:
+        """Returns actions ``[S, 4]`` with each seed's Gaussian noise, within [-1, 1]."""
+        noise = self.noise * normal(generators, action.shape[1:])
+        return (action.cpu() + noise).clamp(-1.0, 1.0)
+
+    def learn(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        """Takes a gradient step on transitions ``[S, B]``, and one of the target networks.
+
+        Returns:
+            The parts of the loss, sums over the seeds ``[]``.
+        """
+        losses = self.loss(batch)
+        parts = {str(key): losses[key] for key in losses.keys() if str(key).startswith("loss_")}
+        due = self.actor_is_due()
+        self.optimizer.zero_grad()
+        torch.stack([v for k, v in parts.items() if due or k != "loss_actor"]).sum().backward()
+        self.optimizer.step()
+        if due:
+            self.target_update.step()
+        return {key: value.detach() for key, value in parts.items()}
+
+    def actor_is_due(self) -> bool:
+        """Returns whether this update is one of the actor and the target networks too."""
+        return True
+
+    def state_dict(self) -> dict[str, Any]:
+        """Returns all that future updates depend on."""
+        return {"loss": dict(self.loss.state_dict()), "optimizer": self.optimizer.state_dict()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continues from what `state_dict` returned."""
+        self.loss.load_state_dict(state["loss"])
+        self.optimizer.load_state_dict(state["optimizer"])
+
+
+class TD3Learner(Learner):
+    """Updates actor and target networks less often than the critics (Fujimoto et al., 2018).
+
+    Args:
+        actor: As in `Learner`.
+        loss: As in `Learner`; ``loss_actor`` is the part that waits.
+        config: Hyperparameters.
+
+    Raises:
+        ValueError: If ``policy_delay`` is less than 1.
+    """
+
+    def __init__(self, actor: Any, loss: LossModule, config: TD3Config) -> None:
+        if config.policy_delay < 1:
+            raise ValueError(f"policy_delay must be at least 1, got {config.policy_delay}")
+        super().__init__(actor, loss, config, noise=config.noise)
+        self.policy_delay, self.n_updates = config.policy_delay, 0
+
+    def actor_is_due(self) -> bool:
+        """Returns whether this is the last of ``policy_delay`` updates; each call counts one."""
+        self.n_updates += 1
+        return self.n_updates % self.policy_delay == 0
+
+    def state_dict(self) -> dict[str, Any]:
+        """Returns all that future updates depend on."""
+        return {**super().state_dict(), "n_updates": self.n_updates}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continues from what `state_dict` returned."""
+        super().load_state_dict(state)
+        self.n_updates = state["n_updates"]
+
+
+class SACLearner(Learner):
+    """Explores by what its stochastic policy draws (Haarnoja et al., 2018)."""
+
+    actor: GaussianActor
+
+    def act(self, tensordict: TensorDictBase, generators: Sequence[torch.Generator]) -> Tensor:
+        """Returns actions drawn for a training step; see `Learner.act`."""
+        noise = normal(generators, [self.actor.action_dim])
+        device = next(self.actor.parameters()).device
+        return self.actor.sample(tensordict, noise.to(device))["action"].cpu()
+
+
+def make_ddpg(config: DDPGConfig, problem: Problem) -> Learner:
+    """Returns DDPG (Lillicrap et al., 2016), the paper's."""
+    actor = problem.actor(Actor, config)
+    loss = DDPGLoss(
+        actor,
+        problem.critic(config),
+        pre_tanh_penalty=config.pre_tanh_penalty,
+        **problem.loss_options(config),
+    )
+    return Learner(actor, loss, config, noise=config.noise)
+
+
+def make_td3(config: TD3Config, problem: Problem) -> Learner:
+    """Returns TD3 (Fujimoto et al., 2018)."""
+    actor = problem.actor(Actor, config)
+    loss = TD3Loss(
+        actor,
+        problem.twin_critics(config),
+        policy_noise=config.policy_noise,
+        noise_clip=config.noise_clip,
+        pre_tanh_penalty=config.pre_tanh_penalty,
+        generator=generators(problem.seeds, "target noise"),
+        **problem.loss_options(config),
+    )
+    return TD3Learner(actor, loss, config)
+
+
+def make_sac(config: SACConfig, problem: Problem) -> Learner:
+    """Returns SAC with a learned temperature (Haarnoja et al., 2018)."""
+    actor = problem.actor(GaussianActor, config)
+    loss = SACLoss(
+        actor,
+        problem.twin_critics(config),
+        alpha_init=config.alpha_init,
+        target_entropy=config.target_entropy,
+        entropy_in_target=config.entropy_in_target,
+        generator=generators(problem.seeds, "policy samples"),
+        **problem.loss_options(config),
+    )
+    return SACLearner(actor, loss, config)
+
+
+@dataclass(frozen=True)
+class RLEntry:
+    """How to make an RL algorithm."""
+
+    make: Callable[[Any, Problem], Learner]
+    """Called with a config and the problem."""
+    config: RLConfig
+    """Its default hyperparameters; those of a run are of the same class."""
+
+
+RL: dict[str, RLEntry] = {
+    "ddpg": RLEntry(make_ddpg, DDPGConfig()),
+    "td3": RLEntry(make_td3, TD3Config()),
+    "sac": RLEntry(make_sac, SACConfig()),
+}
+"""RL algorithms by the ``name`` of their config."""
+
+
+def make_learner(config: RLConfig, problem: Problem) -> Learner:
+    """Returns the RL algorithm that a config is of.
+
+    Raises:
+        ValueError: If `RL` has none under its name.
+    """
+    entry = RL.get(config.name)
+    if entry is None or not isinstance(config, type(entry.config)):
+        raise ValueError(
+            f"{type(config).__name__} is of no known RL algorithm (its name is {config.name!r}): "
+            "add it to bgpo_trl.algorithms.rl.RL under that name"
+        )
+    return entry.make(config, problem)

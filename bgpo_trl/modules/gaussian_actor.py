@@ -1,0 +1,110 @@
+"""The stochastic policy of SAC, with an optional batch of seeds in its weights."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictModuleBase, dispatch
+from torch import Tensor
+
+from bgpo_trl.modules.actor_critic import StackedMLP
+
+__all__ = ["LOG_SCALE_BOUNDS", "GaussianActor"]
+
+LOG_SCALE_BOUNDS = (-5.0, 2.0)
+"""Lowest and highest logarithm of the scale, as in CleanRL's SAC."""
+
+
+class GaussianActor(TensorDictModuleBase):
+    """Stochastic policy: an MLP for mean and scale of a Gaussian that is squashed by a tanh.
+
+    (Haarnoja et al., 2018.) Called, it acts without noise: it reads ``in_keys``
+    (``[*S, *B, features]`` each) and writes ``"loc"`` and ``"scale"`` ``[*S, *B, action_dim]`` and
+    ``"action"``, ``tanh(loc)``. `sample` draws actions by noise that it is given.
+
+    Args:
+        in_features: size of all ``in_keys`` together.
+        action_dim: number of action components.
+        in_keys: entries to read, concatenated in this order.
+        hidden_sizes: width of each hidden layer.
+        batch_size: leading dimensions ``S`` of the weights, one independent policy for each index.
+        generator: source of the initial weights, as in
+            :class:`~bgpo_trl.modules.actor_critic.StackedLinear`.
+
+    Raises:
+        ValueError: if the number of generators is not the number of policies.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> actor = GaussianActor(3, 2, in_keys=["state"])
+        >>> drawn = actor.sample(TensorDict({"state": torch.zeros(7, 3)}, 7), torch.randn(7, 2))
+        >>> drawn["action"].shape, drawn["action_log_prob"].shape
+        (torch.Size([7, 2]), torch.Size([7]))
+    """
+
+    in_keys: list[NestedKey]
+    # What TorchRL's losses ask of a policy that samples.
+    dist_sample_keys = ("action",)
+    log_prob_keys = ("action_log_prob",)
+
+    def __init__(
+        self,
+        in_features: int = 96,
+        action_dim: int = 4,
+        *,
+        in_keys: Sequence[NestedKey] = ("latent", "behavior"),
+        hidden_sizes: Sequence[int] = (64,),
+        batch_size: Sequence[int] = (),
+        generator: torch.Generator | Sequence[torch.Generator] | None = None,
+    ) -> None:
+        super().__init__()
+        self.in_keys = list(in_keys)
+        self.out_keys = ["loc", "scale", "action"]
+        self.action_dim = action_dim
+        self.batch_size = torch.Size(batch_size)
+        self.mlp = StackedMLP(
+            in_features,
+            2 * action_dim,
+            hidden_sizes=hidden_sizes,
+            batch_size=batch_size,
+            generator=generator,
+        )
+
+    @dispatch(auto_batch_size=False)
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the action without noise for each state.
+
+        Args:
+            tensordict: with ``in_keys``; ``"loc"``, ``"scale"`` and ``"action"`` are set in it.
+
+        Returns:
+            The same tensordict.
+        """
+        loc, log_scale = self.mlp(*[tensordict[key] for key in self.in_keys]).chunk(2, dim=-1)
+        tensordict.set("loc", loc)
+        tensordict.set("scale", log_scale.clamp(*LOG_SCALE_BOUNDS).exp())
+        return tensordict.set("action", loc.tanh())
+
+    def sample(self, tensordict: TensorDictBase, noise: Tensor) -> TensorDictBase:
+        """Writes an action drawn for each state, differentiable with respect to the weights.
+
+        Args:
+            tensordict: with ``in_keys``; besides what `forward` sets, ``"action_log_prob"``
+                ``[*S, *B]`` is set in it, the log density of the action.
+            noise: standard normals ``[*S, *B, action_dim]``.
+
+        Returns:
+            The same tensordict.
+        """
+        self(tensordict)
+        scale = tensordict["scale"]
+        pre_tanh = tensordict["loc"] + scale * noise
+        log_prob = -0.5 * (noise.square() + math.log(2 * math.pi)) - scale.log()
+        # log(1 - tanh(x)^2), in a form that holds for large x.
+        log_prob = log_prob - 2 * (math.log(2) - pre_tanh - F.softplus(-2 * pre_tanh))
+        tensordict.set("action_log_prob", log_prob.sum(-1))
+        return tensordict.set("action", pre_tanh.tanh())
