@@ -8,8 +8,8 @@ BGPO: latents and the behavior b of GWR-B. A drop from one rung to the next name
 short: encoder, sequence encoder, self-organization. What the learner itself gains by a setting is
 seen on one rung:
 
-    python benchmarks/ladder.py --rungs a --out runs/ladder-64 rl:ddpg --rl.hidden-sizes 64
-    python benchmarks/ladder.py --rungs a --out runs/ladder-td3 rl:td3
+    python benchmarks/ladder.py --rungs a --out runs/ladder-64 ddpg --hidden-sizes 64
+    python benchmarks/ladder.py --rungs a --out runs/ladder-td3 td3
 """
 
 from __future__ import annotations

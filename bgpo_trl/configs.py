@@ -103,7 +103,7 @@ class RLConfig:
 class DDPGConfig(RLConfig):
     """DDPG (Lillicrap et al., 2016), the paper's f_RL."""
 
-    name: Literal["ddpg"] = "ddpg"
+    name: str = "ddpg"
     """See `RLConfig`."""
     noise: float = 0.3
     """Standard deviation of the Gaussian exploration noise on the action. Ours."""
@@ -115,7 +115,7 @@ class DDPGConfig(RLConfig):
 class TD3Config(RLConfig):
     """TD3 (Fujimoto et al., 2018): two critics, a slower actor, noise on the target action."""
 
-    name: Literal["td3"] = "td3"
+    name: str = "td3"
     """See `RLConfig`."""
     noise: float = 0.3
     """Standard deviation of the Gaussian exploration noise on the action. Ours: as in DDPG."""
@@ -133,7 +133,7 @@ class TD3Config(RLConfig):
 class SACConfig(RLConfig):
     """SAC (Haarnoja et al., 2018): two critics, a stochastic actor, a learned temperature."""
 
-    name: Literal["sac"] = "sac"
+    name: str = "sac"
     """See `RLConfig`."""
     alpha_init: float = 0.1
     """First temperature."""

@@ -50,11 +50,15 @@ def bank():
 
 @pytest.fixture(scope="session")
 def make_config():
-    """Makes the settings of a run of two seeds and 10 episodes, with some of them changed."""
+    """Makes the settings of a run of two seeds and 10 episodes, with some of them changed.
 
-    def make(state="latent", name="bgpo", rl="ddpg", **changes):
+    ``bgpo+td3`` is BGPO with TD3.
+    """
+
+    def make(state="latent", name="bgpo", **changes):
+        name, _, rl = name.partition("+")
         small = {"hidden_sizes": (64,), "batch_size": 16, "warmup_steps": 8, "replay_size": 200}
-        rl = replace(RL[rl].config, **small)
+        rl = replace(RL[rl or "ddpg"].config, **small)
         algorithm = replace(
             ALGORITHMS[name].config, state=state, max_steps=6, rl=rl, **SMALL.get(name, {})
         )

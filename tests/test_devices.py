@@ -30,7 +30,7 @@ def rows(path):
 
 @pytest.mark.usefixtures("easy_world")
 @pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize("name", ["bgpo", "maml", "dist-nll", "ddpg"])
+@pytest.mark.parametrize("name", ["bgpo", "bgpo+td3", "bgpo+sac", "maml", "dist-nll", "ddpg"])
 def test_a_run_is_the_same_on_every_device(device, name, bank, encoders, make_config, tmp_path):
     longer = {"episodes": 16} if name in ("maml", "dist-nll") else {}
     config = make_config(name=name, **longer)
@@ -50,7 +50,12 @@ def test_a_run_is_the_same_on_every_device(device, name, bank, encoders, make_co
                     assert float(ours[key]) == pytest.approx(float(theirs[key]), abs=1e-3)
 
 
-POLICIES = {"bgpo": ("actor",), "maml": ("meta_actor",), "dist-nll": ("teacher", "students")}
+POLICIES = {
+    "bgpo": ("actor", "loss"),
+    "bgpo+sac": ("actor", "loss"),
+    "maml": ("meta_actor", "critic", "loss"),
+    "dist-nll": ("teacher", "students", "critic", "loss"),
+}
 
 
 @pytest.mark.usefixtures("easy_world")
@@ -63,7 +68,7 @@ def test_learner_and_encoder_are_where_they_were_told(
     try:
         config = make_config(name=name)
         algorithm = Trainer(config, tmp_path, device=device, **parts).algorithm
-        modules = [getattr(algorithm, part) for part in (*POLICIES[name], "critic", "loss")]
+        modules = [getattr(algorithm, part) for part in POLICIES[name]]
         for part in (*modules, encoders.vae):
             for module in part if isinstance(part, list) else [part]:
                 for where, weights in module.named_parameters():

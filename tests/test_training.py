@@ -23,6 +23,7 @@ CSV_FILES = ("train.csv", "eval.csv")
 TASKS = ("grasp_glass", "push_green_to_glass", "push_green_to_white")
 LOSSES = ("loss_actor", "loss_value")
 every_algorithm = pytest.mark.parametrize("name", ALGORITHMS)
+every_learner = pytest.mark.parametrize("name", [*ALGORITHMS, "bgpo+td3", "bgpo+sac"])
 # Those whose tasks each need data of their own begin to learn later, and are given more.
 LONGER = {"maml": {"episodes": 16}, "dist-nll": {"episodes": 16}}
 
@@ -160,7 +161,7 @@ def test_all_presented_tasks_are_tested_every_few_episodes(make, make_config, tm
         assert int(row["success"]) == float(row["return"])
 
 
-@every_algorithm
+@every_learner
 def test_a_seed_writes_what_it_would_write_alone(run_of, make, make_config, tmp_path, name):
     for seed in make_config().seeds:
         config = make_config(name=name, seeds=(seed,), **LONGER.get(name, {}))
@@ -245,7 +246,7 @@ def test_ctrl_c_waits_for_the_step_and_the_run_goes_on_from_it(uninterrupted, ma
     assert_same_run(tmp_path, uninterrupted)
 
 
-@every_algorithm
+@every_learner
 def test_a_run_can_be_interrupted_again_and_again(run_of, make, make_config, tmp_path, name):
     config = make_config(name=name, **LONGER.get(name, {}))
     steps = (3, 1, 9, 22) if name in LONGER else (3, 1, 9)

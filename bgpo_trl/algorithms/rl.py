@@ -106,7 +106,7 @@ class Learner:
         self, actor: Any, loss: LossModule, config: RLConfig, *, noise: float = 0.0
     ) -> None:
         loss.make_value_estimator(gamma=config.gamma)
-        self.actor, self.loss, self.noise = actor, loss, noise
+        self.actor, self.loss, self.config, self.noise = actor, loss, config, noise
         self.target_update = ForeachSoftUpdate(loss, tau=config.tau)
         learned = [p for p in loss.parameters() if p.requires_grad]
         self.optimizer = torch.optim.Adam(learned, lr=config.learning_rate, fused=True)
@@ -132,7 +132,7 @@ class Learner:
             The parts of the loss, sums over the seeds ``[]``.
         """
         losses = self.loss(batch)
-        parts = {str(key): losses[key] for key in losses.keys() if str(key).startswith("loss_")}
+        parts = {str(k): v for k, v in losses.items() if str(k).startswith("loss_")}
         due = self.actor_is_due()
         self.optimizer.zero_grad()
         torch.stack([v for k, v in parts.items() if due or k != "loss_actor"]).sum().backward()

@@ -270,4 +270,4 @@ class TwinCriticLoss(StackedLoss):
         """Continues the generators from what `get_extra_state` returned."""
         streams = [self.generators] if isinstance(self.generators, torch.Generator) else []
         for generator, saved in zip(streams or self.generators or (), state, strict=True):
-            generator.set_state(saved)
+            generator.set_state(saved.clone())  # a row of a tensor would crash it

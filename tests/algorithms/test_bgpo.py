@@ -71,10 +71,11 @@ def test_each_variant_is_an_environment_with_the_input_it_is_named_after(make, v
     keys = {"label": ["task_one_hot"], "nothing": []}.get(told, ["normalized_behavior"])
     start = algorithm.act(algorithm.env.reset())
     assert algorithm.actor.in_keys == [state, *keys]
-    assert algorithm.critic.in_keys == [state, *keys, "action"]
+    critic = algorithm.loss.value_network
+    assert critic.in_keys == [state, *keys, "action"]
     n_features = sum(sizes[key] for key in (state, *keys))
     assert algorithm.actor.mlp.layers[0].in_features == n_features
-    assert algorithm.critic.mlp.layers[0].in_features == n_features + 4
+    assert critic.mlp.layers[0].in_features == n_features + 4
     for key in (state, *keys):
         assert start[key].shape == (2, sizes[key])
     assert start["action"].shape == (2, 4)

@@ -1,0 +1,57 @@
+"""An RL algorithm of one's own in place of DDPG: TD3 that acts wholly at random now and then.
+
+python examples/own_rl_algorithm.py
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from bgpo_trl.algorithms.rl import RL, Problem, RLEntry, TD3Learner, make_td3
+from bgpo_trl.configs import BGPOConfig, RunConfig, TD3Config
+from bgpo_trl.pretrained import load_pretrained
+from bgpo_trl.training import Trainer
+
+
+@dataclass(frozen=True)
+class EpsilonConfig(TD3Config):
+    """What `TD3Config` has, under a name of its own, and one field more."""
+
+    name: str = "td3-epsilon"
+    epsilon: float = 0.2
+
+
+class EpsilonLearner(TD3Learner):
+    """Changes how TD3 explores; `learn` would change how it learns."""
+
+    config: EpsilonConfig
+
+    def act(self, tensordict: TensorDictBase, generators: Sequence[torch.Generator]) -> Tensor:
+        """Returns TD3's actions ``[S, 4]``, some of them replaced."""
+        action = super().act(tensordict, generators)
+        for row, generator in zip(action, generators, strict=True):  # a seed draws from its own
+            if torch.rand((), generator=generator) < self.config.epsilon:
+                row.uniform_(-1, 1, generator=generator)
+        return action
+
+
+def make(config: EpsilonConfig, problem: Problem) -> EpsilonLearner:
+    """Makes the networks and the loss of TD3, and puts them to another use."""
+    td3 = make_td3(config, problem)
+    return EpsilonLearner(td3.actor, td3.loss, config)
+
+
+RL["td3-epsilon"] = RLEntry(make, EpsilonConfig())
+
+if __name__ == "__main__":
+    # A minute's try: ground truth and the task's label. BGPO itself is BGPOConfig(rl=...) alone.
+    algorithm = BGPOConfig(state="state", rl=EpsilonConfig(warmup_steps=64))
+    config = RunConfig((0, 1), 4, (0,), eval_every=2, name="oracle", algorithm=algorithm)
+    with TemporaryDirectory() as folder:
+        Trainer(config, folder, bank=load_pretrained()[1]).run()
+        print((Path(folder) / "eval.csv").read_text())

@@ -1,0 +1,209 @@
+"""RL algorithms in BGPO: how they explore and update, and the place for one's own."""
+
+import copy
+from dataclasses import dataclass, replace
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from bgpo_trl.algorithms import ALGORITHMS
+from bgpo_trl.algorithms.bgpo import BGPO, labeled
+from bgpo_trl.algorithms.rl import RL, Problem, RLEntry, make_ddpg, make_learner
+from bgpo_trl.configs import DDPGConfig, RLConfig, TD3Config
+from bgpo_trl.seeding import generators
+from bgpo_trl.transforms import TaskSchedule
+
+pytestmark = pytest.mark.usefixtures("easy_world")
+every_rl = pytest.mark.parametrize("name", RL)
+SEEDS = (3, 8)
+
+
+def make(name, seeds=SEEDS, **changes):
+    config = replace(RL[name].config, hidden_sizes=(16,), **changes)
+    problem = Problem(seeds, ["state", "label"], 6 + 2, (0.0, 1.3), torch.device("cpu"))
+    return make_learner(config, problem)
+
+
+def make_batch(*shape, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    terminated = torch.rand(*shape, 1, generator=generator) < 0.2
+    successor = {"state": torch.randn(*shape, 6, generator=generator), "terminated": terminated}
+    successor["reward"] = terminated.float()
+    data = {"state": torch.randn(*shape, 6, generator=generator), "next": successor}
+    data["label"] = torch.randn(*shape, 2, generator=generator)
+    data["action"] = torch.rand(*shape, 4, generator=generator) * 2 - 1
+    return TensorDict(data, shape)
+
+
+def weights(learner):
+    return {key: value.clone() for key, value in learner.loss.named_parameters()}
+
+
+def targets(learner):
+    return {key: v.clone() for key, v in learner.loss.state_dict().items() if "target_" in key}
+
+
+def changed(before, after):
+    return {key for key, value in before.items() if not value.equal(after[key])}
+
+
+@every_rl
+def test_every_update_is_one_of_the_critics_and_every_other_one_of_td3s_actor(name):
+    learner = make(name)
+    for update in range(1, 7):
+        before, slow = weights(learner), targets(learner)
+        told = learner.learn(make_batch(2, 16, seed=update))
+        now = changed(before, weights(learner))
+        critics = {key for key in before if "value_network" in key}
+        due = name != "td3" or update % 2 == 0
+        assert critics
+        assert now == (set(before) if due else critics)
+        assert bool(changed(slow, targets(learner))) == due
+        assert "loss_actor" in told  # also where nothing is made of it
+
+
+def test_td3s_delay_is_a_setting():
+    learner, moved = make("td3", policy_delay=3), []
+    for update in range(7):
+        before = weights(learner)
+        learner.learn(make_batch(2, 16, seed=update))
+        moved.append(any("actor" in key for key in changed(before, weights(learner))))
+    assert moved == [False, False, True, False, False, True, False]
+    with pytest.raises(ValueError, match="policy_delay must be at least 1, got 0"):
+        make("td3", policy_delay=0)
+
+
+@every_rl
+@pytest.mark.parametrize("updates", [3, 4])
+def test_a_learner_goes_on_from_its_state_bit_for_bit(name, updates):
+    learner = make(name)
+    for update in range(updates):
+        learner.learn(make_batch(2, 16, seed=update))
+    state = copy.deepcopy(learner.state_dict())
+    again = make(name, seeds=(0, 1))
+    again.load_state_dict(state)
+    for update in range(3):
+        told = [one.learn(make_batch(2, 16, seed=10 + update)) for one in (learner, again)]
+        assert told[0] == told[1]
+    assert not changed(weights(learner), weights(again))
+    assert not changed(targets(learner), targets(again))
+
+
+@every_rl
+def test_each_seed_of_a_batch_learns_as_it_would_alone(name):
+    learners = [make(name), *(make(name, seeds=(seed,)) for seed in SEEDS)]
+    for update in range(6):
+        data = make_batch(2, 16, seed=update)
+        for learner, part in zip(learners, (data, data[:1], data[1:]), strict=True):
+            learner.learn(part.clone())
+    together, *alone = [weights(learner) for learner in learners]
+    for index, ours in enumerate(alone):
+        for key, value in ours.items():
+            torch.testing.assert_close(together[key][index], value[0], rtol=1e-4, atol=1e-4)
+
+
+@every_rl
+@torch.no_grad()
+def test_exploration_is_gaussian_or_what_the_policy_draws(name):
+    learner, sources = make(name), generators(SEEDS, "exploration")
+    data = make_batch(2).select("state", "label")
+    action = learner.act(data.clone(), generators(SEEDS, "exploration"))
+    noise = torch.stack([torch.randn(4, generator=source) for source in sources])
+    told = learner.actor(data.clone())
+    if name == "sac":
+        expected = (told["loc"] + told["scale"] * noise).tanh()
+    else:
+        expected = (told["action"] + 0.3 * noise).clamp(-1, 1)
+    torch.testing.assert_close(action, expected)
+    assert not action.equal(told["action"])
+
+
+@every_rl
+def test_targets_are_clipped_to_the_attainable_returns_unless_told_not_to(name):
+    assert make(name).loss.return_bounds == (0.0, 1.3)
+    assert make(name, clip_targets=False).loss.return_bounds is None
+    learner = make(name, **({"entropy_in_target": False} if name == "sac" else {}))
+    bias = [v for k, v in targets(learner).items() if "value" in k and k.endswith("1.bias")]
+    assert len(bias) == 1
+    for key, value in learner.loss.state_dict().items():
+        if "target_" in key and "value" in key and key.endswith("1.bias"):
+            value.fill_(50.0)
+    batch = make_batch(2, 16)
+    ended = batch["next", "terminated"].squeeze(-1)
+    expected = torch.where(ended, 1.0, 1.3)
+    torch.testing.assert_close(learner.loss(batch)["target_value"], expected)
+
+
+@every_rl
+def test_the_settings_reach_the_loss(name):
+    settings = {"gamma": 0.5, "learning_rate": 0.02, "tau": 0.25, "hidden_sizes": (7, 5)}
+    learner = make_learner(
+        replace(RL[name].config, **settings),
+        Problem(SEEDS, ["state"], 6, (0.0, 1.0), torch.device("cpu")),
+    )
+    assert learner.loss.value_estimator.gamma == 0.5
+    assert [group["lr"] for group in learner.optimizer.param_groups] == [0.02]
+    assert learner.target_update.eps == 0.75
+    assert [layer.out_features for layer in learner.actor.mlp.layers][:2] == [7, 5]
+
+
+@pytest.fixture
+def make_bgpo(bank, make_config):
+    def make_bgpo(rl):
+        config = make_config("state", f"oracle+{rl}").algorithm
+        schedule = TaskSchedule((0, 0, 0))
+        return BGPO(config, seeds=SEEDS, schedule=schedule, bank=bank.seen(), compose=labeled)
+
+    return make_bgpo
+
+
+@every_rl
+def test_test_episodes_are_without_noise(make_bgpo, bank, name):
+    algorithm = make_bgpo(name)
+    embedding, task = bank.held_out().embedding.view(3, 4, 32), torch.zeros(3, 4).long()
+    frozen = TensorDict.maybe_dense_stack(
+        [TensorDict(algorithm.freeze(i, embedding, task, torch.Generator())) for i in range(2)]
+    )
+    state = torch.randn(2, 3, 4, 16)
+    label = torch.tensor([1.0, 0, 0]).expand(2, 3, 4, 3)
+    shown = TensorDict({"state": state, "task_one_hot": label}, [2, 3, 4])
+    expected = algorithm.actor(shown)["action"]
+    for _ in range(2):
+        assert algorithm.act_frozen(frozen, state).equal(expected)
+
+
+@pytest.mark.parametrize("name", ["maml", "dist-nll"])
+def test_what_is_defined_over_ddpg_takes_nothing_else(name):
+    config = ALGORITHMS[name].config
+    assert config.rl == DDPGConfig()
+    with pytest.raises(ValueError, match=r"is defined over DDPG, not 'td3': [^\n]*$"):
+        replace(config, rl=TD3Config())
+
+
+@dataclass(frozen=True)
+class OwnConfig(RLConfig):
+    name: str = "own"
+
+
+def test_an_own_algorithm_is_one_entry(make_bgpo, monkeypatch):
+    made = []
+
+    def make_own(config, problem):
+        made.append((config, problem))
+        return make_ddpg(DDPGConfig(hidden_sizes=(5,)), problem)
+
+    monkeypatch.setitem(RL, "own", RLEntry(make_own, OwnConfig()))
+    algorithm = make_bgpo("own")
+    ((config, problem),) = made
+    assert (config.name, config.batch_size) == ("own", 16)
+    assert (problem.seeds, problem.in_features) == (SEEDS, 16 + 3)
+    assert problem.in_keys == ["state", "task_one_hot"]
+    assert problem.return_bounds == (0.0, 1.0)
+    assert algorithm.actor.mlp.layers[0].out_features == 5
+
+
+def test_a_config_of_no_known_algorithm_is_refused():
+    for config in (OwnConfig(), DDPGConfig(name="td3")):
+        with pytest.raises(ValueError, match=r"is of no known RL algorithm \(its name is"):
+            make_learner(config, Problem(SEEDS, ["state"], 6, (0.0, 1.0), torch.device("cpu")))
