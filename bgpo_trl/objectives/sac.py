@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -92,7 +93,7 @@ class SACLoss(TwinCriticLoss, objectives.SACLoss):
         start = self.log_alpha.detach()
         self.log_alpha = nn.Parameter(start.expand(self.batch_size).clone())
 
-    @dispatch
+    @dispatch()
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Computes all three losses; reads, writes and returns what the class says."""
         loss_qvalue, told = self.qvalue_v2_loss(tensordict)
@@ -142,7 +143,8 @@ class SACLoss(TwinCriticLoss, objectives.SACLoss):
         return self._bootstrapped(tensordict, value.unsqueeze(-1))
 
     def _alpha_loss(self, log_prob: Tensor) -> Tensor:
-        return -self._each(self.log_alpha, log_prob) * (log_prob + self.target_entropy)
+        target: Any = self.target_entropy  # a number, in one type or another
+        return -self._each(self.log_alpha, log_prob) * (log_prob + target)
 
     def _sample(self, data: TensorDictBase) -> tuple[TensorDictBase, Tensor]:
         """Returns the data with actions of the policy, and their log-probabilities ``[*S, *B]``."""

@@ -219,18 +219,21 @@ class TwinCriticLoss(StackedLoss):
                 "qvalue_network must hold two Q-functions for each actor, batch_size "
                 f"{[*self.batch_size, 2]}, got {[*critics]}"
             )
-        single = generator is None or isinstance(generator, torch.Generator)
-        self.generators = generator if single else list(generator)
-        if not single and len(generator) != self.batch_size.numel():
-            raise ValueError(
-                f"pass one generator a seed: {self.batch_size.numel()} are needed, got "
-                f"{len(generator)}"
-            )
+        self.generators: list[torch.Generator] = []
+        if isinstance(generator, torch.Generator):
+            self.generators = [generator]
+        elif generator is not None:
+            self.generators = list(generator)
+            if len(self.generators) != self.batch_size.numel():
+                raise ValueError(
+                    f"pass one generator a seed: {self.batch_size.numel()} are needed, got "
+                    f"{len(self.generators)}"
+                )
 
     def _normal(self, like: Tensor) -> Tensor:
         """Returns standard normals of the shape of ``like``, ``[*S, ...]``."""
-        if self.generators is None or isinstance(self.generators, torch.Generator):
-            drawn = torch.randn(like.shape, generator=self.generators)
+        if len(self.generators) < 2:
+            drawn = torch.randn(like.shape, generator=next(iter(self.generators), None))
         else:
             drawn = normal(self.generators, like.shape[len(self.batch_size) :]).view(like.shape)
         return drawn.to(like)
@@ -262,12 +265,10 @@ class TwinCriticLoss(StackedLoss):
 
     def get_extra_state(self) -> Tensor:
         """Returns the states of the generators, for `state_dict`."""
-        streams = [self.generators] if isinstance(self.generators, torch.Generator) else []
-        states = [g.get_state() for g in streams or self.generators or ()]
+        states = [generator.get_state() for generator in self.generators]
         return torch.stack(states) if states else torch.empty(0, dtype=torch.uint8)
 
     def set_extra_state(self, state: Tensor) -> None:
         """Continues the generators from what `get_extra_state` returned."""
-        streams = [self.generators] if isinstance(self.generators, torch.Generator) else []
-        for generator, saved in zip(streams or self.generators or (), state, strict=True):
+        for generator, saved in zip(self.generators, state, strict=True):
             generator.set_state(saved.clone())  # a row of a tensor would crash it

@@ -103,7 +103,7 @@ class TD3Loss(TwinCriticLoss, objectives.TD3Loss):
             pre_tanh_penalty=pre_tanh_penalty,
         )
 
-    @dispatch
+    @dispatch()
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Computes both losses; reads, writes and returns what the class says."""
         loss_qvalue, told = self.value_loss(tensordict)

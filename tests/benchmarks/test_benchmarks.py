@@ -1,6 +1,7 @@
 """The benchmarks' command lines: what they run, what they leave behind, and what they refuse."""
 
 import csv
+import dataclasses
 import hashlib
 import json
 import math
@@ -13,13 +14,15 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import get_args, get_type_hints
+from typing import Annotated, get_args, get_type_hints
 
 import experiment
 import pytest
+import tyro
 
 from benchmarks import concurrent, continual, ladder, summary
 from bgpo_trl.algorithms import ALGORITHMS
+from bgpo_trl.algorithms.rl import RL
 from bgpo_trl.checkpoint import load_checkpoint
 from bgpo_trl.configs import PRESETS, DDPGConfig
 from bgpo_trl.logging import EVAL_COLUMNS
@@ -50,8 +53,37 @@ def test_another_algorithm_changes_nothing_else(name):
 
 
 def test_the_command_line_knows_every_algorithm():
-    choices = get_type_hints(experiment.Arguments)["algorithm"]
-    assert get_args(choices) == tuple(ALGORITHMS)
+    choices = get_type_hints(experiment.Arguments)
+    assert get_args(choices["algorithm"]) == tuple(ALGORITHMS)
+    assert get_args(choices["rl"]) == tuple(RL)
+
+
+@pytest.mark.parametrize("rl", RL)
+@pytest.mark.parametrize("name", ["bgpo", "oracle", "ddpg"])
+def test_another_rl_algorithm_changes_nothing_else(name, rl):
+    plain = experiment.run_config(experiment.Arguments(algorithm=name))
+    config = experiment.run_config(experiment.Arguments(algorithm=name, rl=rl))
+    assert config == replace(plain, algorithm=replace(plain.algorithm, rl=RL[rl].config))
+    assert dataclasses.asdict(config)["algorithm"]["rl"]["name"] == rl
+
+
+def test_the_ladder_takes_the_settings_of_each_rl_algorithm():
+    for rl, entry in RL.items():
+        line = ["--rungs", "a", "--out", "here", rl, "--learning-rate", "0.5"]
+        arguments = tyro.cli(Annotated[ladder.Arguments, tyro.conf.OmitArgPrefixes], args=line)
+        assert arguments.rl == replace(entry.config, learning_rate=0.5)
+        assert (arguments.rungs, arguments.out) == (("a",), Path("here"))
+
+
+@pytest.mark.parametrize("script", ["continual", "concurrent", "ablation"])
+def test_a_run_with_another_rl_algorithm_has_a_name_of_its_own(tmp_path, monkeypatch, script):
+    monkeypatch.chdir(tmp_path)
+    taken = tmp_path / "runs" / f"{script}-{'gwr' if script == 'ablation' else 'bgpo'}-sac-quick"
+    taken.mkdir(parents=True)
+    (taken / "config.json").touch()
+    line = ["--rl", "sac", *(["--variant", "gwr"] if script == "ablation" else [])]
+    told = ended_with(monkeypatch, f"{script}.py", *line)
+    assert told.startswith(f"error: {taken.relative_to(tmp_path)} holds a run: --resume")
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -340,6 +372,7 @@ def ended_with(monkeypatch, script, *arguments):
     [
         (("--preset", "smoke", "--out", "here"), "error: here holds a run: --resume continues it"),
         (("--episodes", "0"), "error: episodes must be at least 1, got 0"),
+        (("--algorithm", "maml", "--rl", "td3"), "error: MAML is defined over DDPG, not 'td3'"),
         (("--preset", "smoke", "--out", "file"), "error: cannot make the folder file/"),
     ],
 )
