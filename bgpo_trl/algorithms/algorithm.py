@@ -141,8 +141,8 @@ class Algorithm(ABC):
         environment takes the step that has been chosen before.
 
         Returns:
-            ``loss_actor`` and ``loss_value``, means over the seeds ``[]``; empty before the first
-            update.
+            ``loss_actor``, ``loss_value`` and what else the RL algorithm minimizes, means over the
+            seeds ``[]``; empty before the first update.
         """
 
     @abstractmethod
@@ -211,9 +211,8 @@ class Algorithm(ABC):
             What `update` returns.
         """
         losses = self.learner.learn(self.moved(batch))
-        # TorchRL's name where there are several critics.
-        losses["loss_value"] = losses.pop("loss_qvalue", losses.get("loss_value"))
-        return {key: losses[key] / self.n_seeds for key in ("loss_actor", "loss_value")}
+        # "loss_qvalue" is TorchRL's name for it where there are several critics.
+        return {key.replace("qvalue", "value"): v / self.n_seeds for key, v in losses.items()}
 
     def moved(self, batch: TensorDictBase) -> TensorDictBase:
         """Returns a batch where the networks are."""

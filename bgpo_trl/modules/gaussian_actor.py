@@ -101,10 +101,10 @@ class GaussianActor(TensorDictModuleBase):
             The same tensordict.
         """
         self(tensordict)
-        scale = tensordict["scale"]
-        pre_tanh = tensordict["loc"] + scale * noise
+        scale: Tensor = tensordict["scale"]
+        pre_tanh: Tensor = tensordict["loc"] + scale * noise
         log_prob = -0.5 * (noise.square() + math.log(2 * math.pi)) - scale.log()
         # log(1 - tanh(x)^2), in a form that holds for large x.
-        log_prob = log_prob - 2 * (math.log(2) - pre_tanh - F.softplus(-2 * pre_tanh))
+        log_prob = log_prob - 2 * (math.log(2) - pre_tanh - F.softplus(pre_tanh * -2))
         tensordict.set("action_log_prob", log_prob.sum(-1))
         return tensordict.set("action", pre_tanh.tanh())

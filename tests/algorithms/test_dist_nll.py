@@ -362,7 +362,7 @@ def test_each_head_comes_to_do_what_the_teacher_of_its_task_does(make):
     with torch.no_grad():
         params["weight"].mul_(0.01)
         params["bias"].copy_(wanted.atanh().expand(2, 3, 4))
-    for group in algorithm.optimizer.param_groups:
+    for group in algorithm.learner.optimizer.param_groups:
         group["lr"] = 0.0  # they have learned enough
     data["next", "done"][:] = True
     for step in range(90):  # twice over, each step an end
