@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any
 
 import torch
@@ -47,16 +48,14 @@ class Problem:
 
     def critic(self, config: RLConfig) -> Critic:
         """Returns Q-functions ``[S]``."""
-        streams = generators(self.seeds, "critic")
-        norm = {"layer_norm": config.critic_layer_norm}
-        return self._network(Critic, config, [len(self.seeds)], streams, **norm)
+        norm, streams = config.critic_layer_norm, generators(self.seeds, "critic")
+        return self._network(Critic, config, [len(self.seeds)], streams, layer_norm=norm)
 
     def twin_critics(self, config: RLConfig) -> Critic:
         """Returns Q-functions ``[S, 2]``."""
         first, second = (generators(self.seeds, name) for name in ("critic", "second critic"))
-        streams = [stream for pair in zip(first, second, strict=True) for stream in pair]
-        norm = {"layer_norm": config.critic_layer_norm}
-        return self._network(Critic, config, [len(self.seeds), 2], streams, **norm)
+        norm, streams = config.critic_layer_norm, [*chain(*zip(first, second, strict=True))]
+        return self._network(Critic, config, [len(self.seeds), 2], streams, layer_norm=norm)
 
     def loss_options(self, config: RLConfig) -> dict[str, Any]:
         """Returns the arguments that the losses of this package have in common."""
@@ -73,14 +72,15 @@ class Problem:
         generator: Sequence[torch.Generator],
         **options: Any,
     ) -> Any:
-        return network(
+        made = network(
             self.in_features,
             in_keys=self.in_keys,
             hidden_sizes=config.hidden_sizes,
             batch_size=batch_size,
             generator=generator,
             **options,
-        ).to(self.device)
+        )
+        return made.to(self.device)
 
 
 class Learner:
@@ -94,10 +94,11 @@ class Learner:
             ``[S]``.
         loss: Reads transitions ``[S, B]`` and returns, among others, entries ``loss_...`` ``[]`` to
             be minimized, each a sum over the seeds. It has target networks.
-        config: Hyperparameters.
+        config: Its ``gamma``, ``tau`` and ``learning_rate`` are used here.
         noise: Standard deviation of the Gaussian exploration noise.
 
     Attributes:
+        config: The hyperparameters.
         optimizer: Of all that the loss is to learn.
         target_update: Of the target networks.
     """
