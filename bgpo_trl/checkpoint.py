@@ -75,13 +75,17 @@ def save_checkpoint(directory: str | os.PathLike[str], state: dict[str, Any]) ->
 
 
 def load_checkpoint(
-    directory: str | os.PathLike[str], *, map_location: str | torch.device = "cpu"
+    directory: str | os.PathLike[str],
+    *,
+    map_location: str | torch.device = "cpu",
+    mmap: bool = False,
 ) -> dict[str, Any]:
     """Reads the newest intact checkpoint, with a warning for each newer one that is damaged.
 
     Args:
         directory: Where the run keeps its checkpoints.
         map_location: Device of the tensors.
+        mmap: Leave tensors in the file until they are used; for those who need only some of them.
 
     Returns:
         The state as it was saved.
@@ -92,7 +96,7 @@ def load_checkpoint(
     directory = Path(directory)
     for path in _checkpoints(directory):
         if _is_intact(path):
-            return torch.load(path, map_location=map_location, weights_only=True)
+            return torch.load(path, map_location=map_location, weights_only=True, mmap=mmap)
         warnings.warn(f"{path} is damaged: going on from the checkpoint before it.", stacklevel=2)
     raise ValueError(
         f"{directory} holds no intact checkpoint to resume from: start a new run in another "

@@ -180,3 +180,16 @@ def test_what_could_not_be_loaded_is_refused_at_once(state: Any, message: str, t
     with pytest.raises(ValueError, match=message):
         save_checkpoint(directory, state)
     assert not directory.exists()
+
+
+def test_tensors_left_in_the_file_are_the_same_and_do_not_change_it(tmp_path):
+    state = {"weights": torch.arange(5.0), "nested": [{"frames": torch.ones(3, dtype=torch.uint8)}]}
+    path = save_checkpoint(tmp_path, state)
+    before = path.read_bytes()
+    loaded = load_checkpoint(tmp_path, mmap=True)
+    assert loaded["weights"].equal(state["weights"])
+    assert loaded["nested"][0]["frames"].equal(state["nested"][0]["frames"])
+    loaded["weights"].zero_()
+    assert path.read_bytes() == before
+    path.unlink()
+    assert loaded["nested"][0]["frames"].sum() == 3

@@ -89,10 +89,14 @@ class Algorithm(ABC):
         state_size: Number of features of the state.
         learner: The RL algorithm: losses of actor and critic, optimizer, target networks.
         replay: What was experienced.
+        needs_label: Whether `freeze` and `act_frozen` depend on the label of a test episode's task.
+        needs_replay: Whether `freeze` depends on the replay.
     """
 
     env: TransformedEnv
     gwr: GWRB | None = None
+    needs_label: bool = True
+    needs_replay: bool = True
     learner: Learner
     replay: ReplayBuffer | TaskReplay
 

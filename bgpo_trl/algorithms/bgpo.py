@@ -108,6 +108,8 @@ class BGPO(Algorithm):
         loss: The RL algorithm's, with the critics.
     """
 
+    needs_replay = False
+
     def __init__(
         self,
         config: BGPOConfig,
@@ -133,6 +135,7 @@ class BGPO(Algorithm):
         composition = compose(parts)
         self.infer = list(composition.infer)
         self.told = composition.told
+        self.needs_label = self.told == "task_one_hot"
         if self.told == "behavior":
             # The distances that GWR-B needs are not those that a network learns well from.
             normalize = ObservationNorm(

@@ -54,6 +54,7 @@ class DistNLL(Algorithm):
             episodes at different times.
     """
 
+    needs_replay = False
     replay: TaskReplay
 
     def __init__(

@@ -1,0 +1,74 @@
+"""The settings of a run, read back from its ``config.json``."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any, Literal, get_args, get_origin, get_type_hints
+
+from bgpo_trl.algorithms import ALGORITHMS
+from bgpo_trl.configs import AlgorithmConfig, RunConfig
+
+
+def read_config(path: str | Path) -> tuple[RunConfig, str | None]:
+    """Reads what `Trainer` wrote: the inverse of `dataclasses.asdict`.
+
+    Settings that a run of an earlier version lacks have their defaults.
+
+    Args:
+        path: The ``config.json`` of a run.
+
+    Returns:
+        The run, and the identity of the encoders that it used; None if it used none.
+
+    Raises:
+        ValueError: If there is no such file, or it is not one of a run of this version.
+    """
+    path = Path(path)
+    try:
+        settings = json.loads(path.read_text())
+        if not isinstance(settings, dict) or not isinstance(settings.get("algorithm"), dict):
+            raise ValueError("it holds no settings of a run")
+        encoders = settings.pop("encoders", None)
+        if not isinstance(encoders, str | None):
+            raise ValueError(f"encoders is {encoders!r}")
+        values = settings.pop("algorithm")
+        algorithm = _read(_algorithm_config(settings.get("name"), values), values, "algorithm.")
+        return _read(RunConfig, {**settings, "algorithm": algorithm}, ""), encoders
+    except (FileNotFoundError, NotADirectoryError):
+        raise ValueError(f"{path.parent} holds no run: there is no {path.name}") from None
+    except ValueError as error:
+        raise ValueError(
+            f"{path} cannot be read ({error}): use the version of the code that made the run"
+        ) from error
+
+
+def _algorithm_config(name: object, values: dict[str, Any]) -> type[AlgorithmConfig]:
+    """Returns the class of an algorithm's hyperparameters; a variant's is the one that fits."""
+    if isinstance(name, str) and name in ALGORITHMS:
+        return type(ALGORITHMS[name].config)
+    for kind in sorted({type(e.config) for e in ALGORITHMS.values()}, key=lambda k: len(fields(k))):
+        if values.keys() <= {field.name for field in fields(kind)}:
+            return kind
+    raise ValueError(f"the hyperparameters of {name!r} are of no known algorithm")
+
+
+def _read(hint: Any, value: Any, where: str) -> Any:
+    """Returns a value of JSON as what the annotation says; ``where`` names it in errors."""
+    if is_dataclass(hint) and isinstance(value, dict):
+        hints = get_type_hints(hint)
+        unknown = sorted(value.keys() - hints.keys())
+        if unknown:
+            raise ValueError(f"unknown setting {where}{unknown[0]}")
+        read = {key: _read(hints[key], item, f"{where}{key}.") for key, item in value.items()}
+        return hint(**read)  # pyright: ignore[reportCallIssue]
+    if get_origin(hint) is tuple and isinstance(value, list):
+        return tuple(_read(get_args(hint)[0], item, where) for item in value)
+    if get_origin(hint) is Literal and value in get_args(hint):
+        return value
+    if hint is float and type(value) is int:
+        return float(value)
+    if isinstance(hint, type) and (type(value) is hint or is_dataclass(value)):
+        return value
+    raise ValueError(f"{where.rstrip('.')} is {value!r}")
