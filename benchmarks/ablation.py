@@ -44,6 +44,11 @@ VARIANTS: dict[str, Callable[[Parts], Composition]] = {
 }
 
 
+def make_of(name: str) -> Callable[..., BGPO] | None:
+    """Returns what makes the variant of that name; None for what is no variant."""
+    return partial(BGPO, compose=VARIANTS[name]) if name in VARIANTS else None
+
+
 @dataclass(frozen=True)
 class Arguments(Common):
     """Trains a variant of BGPO and draws its success."""
@@ -57,8 +62,7 @@ def main(arguments: Arguments) -> None:
     if arguments.algorithm != "bgpo":
         raise ValueError("--algorithm: the variants are BGPO's")
     config = replace(run_config(arguments), name=arguments.variant, task_starts=(0, 0, 0))
-    make = partial(BGPO, compose=VARIANTS[arguments.variant])
-    run_experiment(arguments, "ablation", config, make)
+    run_experiment(arguments, "ablation", config, make_of(arguments.variant))
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import torch
 import tyro
+from growth import draw_growth
 
 from bgpo_trl.algorithms import ALGORITHMS, Algorithm
 from bgpo_trl.algorithms.rl import RL
@@ -178,6 +179,7 @@ def draw(trainer: Trainer, bank: DemonstrationBank, out: Path) -> None:
         write_nodes(out / "gwr.csv", weights, tasks)
         save_figure(plot_gwr_pca(weights, tasks, config.tasks), out / "figures" / "gwr.png")
         accuracy = task_inference_accuracy(gwr, bank.seen(), bank.held_out(), len(config.tasks))
+        draw_growth(out, config, bank)
         print(f"GWR-B nodes: {gwr.num_nodes.tolist()}")
         print(f"task inference on held-out demonstrations: {accuracy.mean():.1%}")
 

@@ -198,7 +198,8 @@ def plot_frame_strips(episodes: Mapping[str, NDArray], n_frames: int = 8) -> Fig
     """
     if not episodes or any(len(frames) == 0 for frames in episodes.values()):
         raise ValueError("there is nothing to show: give episodes of at least one frame.")
-    figure = Figure(figsize=(1.3 * n_frames, 1.05 * len(episodes)), layout="constrained")
+    figure = Figure(figsize=(1.3 * n_frames, 1.05 * len(episodes)))
+    figure.set_layout_engine("constrained", h_pad=0.16)  # room for the titles of the rows
     panels = figure.subplots(len(episodes), n_frames, squeeze=False)
     for row, (title, frames) in zip(panels, episodes.items(), strict=True):
         shown = np.unique(np.linspace(0, len(frames) - 1, n_frames).round().astype(int))
@@ -207,7 +208,10 @@ def plot_frame_strips(episodes: Mapping[str, NDArray], n_frames: int = 8) -> Fig
         for panel, index in zip(row, shown, strict=False):
             panel.imshow(frames[index], interpolation="nearest")
             panel.set_title(f"step {index}", fontsize=6, pad=2)
-        row[0].text(0, 1.2, title, fontsize=7, transform=row[0].transAxes)
+        label = row[0].annotate(
+            title, (0, 1), xytext=(0, 11), xycoords="axes fraction", textcoords="offset points"
+        )
+        label.set(fontsize=7, in_layout=False)  # or a long one would widen its panel's column
     return figure
 
 
@@ -296,15 +300,19 @@ def _task_markers(task_names: Sequence[str]) -> list[tuple[int, str, str, str]]:
     ]
 
 
-def _principal_components(values: NDArray) -> tuple[NDArray, NDArray]:
-    """Returns the values on their first two principal components, and each one's variance share."""
+def _principal_components(values: NDArray, shown: NDArray | None = None) -> tuple[NDArray, NDArray]:
+    """Returns points on the first two principal components of values, and their variance shares.
+
+    The points are those of ``shown``; of the values themselves if None.
+    """
     _, scales, directions = np.linalg.svd(values - values.mean(axis=0), full_matrices=False)
     # The sign of a direction is the solver's whim: let its largest part be positive.
     largest = np.abs(directions).argmax(axis=1, keepdims=True)
     directions = directions * np.sign(np.take_along_axis(directions, largest, axis=1))
     variance = scales**2
     share = variance[:2] / max(variance.sum(), np.finfo(float).tiny)
-    return (values - values.mean(axis=0)) @ directions[:2].T, share
+    shown = values if shown is None else shown
+    return (shown - values.mean(axis=0)) @ directions[:2].T, share
 
 
 def _readable(name: str) -> str:

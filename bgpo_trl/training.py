@@ -23,6 +23,7 @@ from bgpo_trl.checkpoint import has_checkpoint, load_checkpoint, save_checkpoint
 from bgpo_trl.configs import RunConfig
 from bgpo_trl.demonstrations import DemonstrationBank
 from bgpo_trl.evaluation import Evaluator, Snapshot
+from bgpo_trl.gwr_growth import growth_moments, save_graph
 from bgpo_trl.logging import RunLogger
 from bgpo_trl.progress import progress_bar
 from bgpo_trl.representation import Representation
@@ -48,7 +49,7 @@ class Trainer:
     Args:
         config: The run.
         directory: The run's directory: ``config.json``, ``train.csv``, ``eval.csv``,
-            ``checkpoint/``.
+            ``checkpoint/``, and in ``gwr/`` the graph of the first seed's GWR-B at some moments.
         bank: Embedded demonstrations, seen and held out; those of ``config.tasks`` are used.
         encoders: Trained encoders; None for a run that does not use them.
         make: Makes the algorithm; by default the one that `ALGORITHMS` has under ``config.name``.
@@ -106,6 +107,7 @@ class Trainer:
         # For the progress bar: the latest episodes, and the latest test.
         self._successes: deque[int] = deque(maxlen=100)
         self._tested = ""
+        self._growth_moments = growth_moments(config.episodes)
         settings = {**asdict(config), "encoders": None if encoders is None else encoders.identity}
         self.logger = RunLogger(self.directory, config=settings, wandb=wandb, resume=resume)
         self._state: TensorDictBase | None = None
@@ -206,6 +208,8 @@ class Trainer:
                 "loss_value": float(losses.get("loss_value", 0.0)),
             }
         )
+        if index == 0 and algorithm.gwr is not None and episode in self._growth_moments:
+            save_graph(self.directory / "gwr", episode, algorithm.gwr)
         if episode % self.config.eval_every == 0:
             number = self._evaluated + len(self._waiting[index])
             self._waiting[index].append(

@@ -83,6 +83,8 @@ def assert_same_run(first, second):
         # Line by line: pytest would take minutes to show where long byte strings differ.
         lines = [(run / name).read_text().splitlines() for run in (first, second)]
         assert lines[0] == lines[1]
+    graphs = [{p.name: p.read_bytes() for p in run.glob("gwr/*")} for run in (first, second)]
+    assert graphs[0] == graphs[1]
     # Weights, optimizer, replay, GWR-B, simulations, random numbers and the tensordict in flight.
     assert_equal(load_checkpoint(first / "checkpoint"), load_checkpoint(second / "checkpoint"))
 

@@ -1,0 +1,225 @@
+"""How much of a demonstration a trained policy has to see.
+
+    python benchmarks/one_shot.py runs/concurrent-bgpo-desk
+
+Shows the policies of all seeds of a run new demonstrations, cut short, and tests what they do:
+success and task inference by the share that they saw. Writes `one_shot.csv`, `one_shot.png` and,
+for the record, `one_shot.json` with the commit and the command, into the run's directory.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import shlex
+import sys
+import tempfile
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import tyro
+from ablation import make_of
+from experiment import _commit, command_line
+from matplotlib.figure import Figure
+from matplotlib.ticker import PercentFormatter
+
+from bgpo_trl import TrainedPolicy, load_run
+from bgpo_trl.config_file import read_config
+from bgpo_trl.demonstrations import DemonstrationBank, record_demonstrations
+from bgpo_trl.evaluation import Evaluator, Snapshot
+from bgpo_trl.plotting import save_figure
+from bgpo_trl.representation import embed_demonstrations
+from bgpo_trl.seeding import stream_seed
+from bgpo_trl.task_inference import task_inference_accuracy
+
+COLUMNS = ("share", "seed", "task", "episodes", "success", "task_inference", "activity")
+# Number of the evaluation, which none in training or at its end has: other starts.
+_NUMBER = 2**31 + 1
+_COLORS = (
+    "#222222",
+    "#0072B2",
+    "#D55E00",
+    "#009E73",
+    "#CC79A7",
+    "#E69F00",
+)  # of "all", then of tasks
+
+Row = tuple[float, int, str, int, float, float, float]
+"""A line of the CSV file; the last two are NaN in algorithms without GWR-B."""
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Tests the policies of a run with demonstrations that are cut short."""
+
+    run: tyro.conf.Positional[Path]
+    """The run's directory."""
+    shares: tuple[float, ...] = (0.25, 0.5, 0.75, 1.0)
+    """Shares of a demonstration that are shown, from its start."""
+    episodes: int = 20
+    """Demonstrations, and test episodes, of each task and seed."""
+    seed: int = 1
+    """Seed of the demonstrations; those that the shipped encoders learned from have 0."""
+    out: Path | None = None
+    """Folder to write to; the run's directory if not given."""
+    threads: int = 1
+    """Threads of PyTorch."""
+
+
+def show(
+    policy: TrainedPolicy, embedding: torch.Tensor, task: torch.Tensor, evaluator: Evaluator
+) -> list[tuple[int, int, float, float, float]]:
+    """Tests the policies of all seeds, each with the same demonstrations.
+
+    Args:
+        policy: Of one of the seeds.
+        embedding: phi of the demonstrations, ``[T, M, 32]``.
+        task: Their labels, ``[T, M]``.
+        evaluator: For ``M`` episodes of ``T`` tasks.
+
+    Returns:
+        Seed, task, success, share of demonstrations whose task was inferred, and mean activity.
+    """
+    algorithm, seeds = policy.algorithm, policy.config.seeds
+    n_tasks, n_seeds = len(task), len(seeds)
+    snapshots = [
+        Snapshot(
+            episode=0,
+            env_steps=0,
+            presented=torch.ones(n_tasks, dtype=torch.bool),
+            policy=algorithm.freeze(
+                index,
+                embedding,
+                task,
+                torch.Generator().manual_seed(stream_seed(seed, "one-shot")),
+            ),
+        )
+        for index, seed in enumerate(seeds)
+    ]
+    success = evaluator.run(snapshots, _NUMBER, algorithm).success.double().mean(-1)
+    inferred, activity = torch.full((2, n_seeds, n_tasks), torch.nan, dtype=torch.double)
+    if algorithm.gwr is not None:
+        activity = algorithm.gwr.lookup(embedding.expand(n_seeds, *embedding.shape)).activity
+        activity, seen = activity.mean(-1), policy.bank.seen()
+        for number, (phi, label) in enumerate(zip(embedding, task, strict=True)):
+            tested = DemonstrationBank(phi, label, torch.zeros_like(label, dtype=torch.bool))
+            inferred[:, number] = task_inference_accuracy(algorithm.gwr, seen, tested, n_tasks)
+    return [
+        (seed, number, *(float(x[index, number]) for x in (success, inferred, activity)))
+        for index, seed in enumerate(seeds)
+        for number in range(n_tasks)
+    ]
+
+
+def measure(policy: TrainedPolicy, shares: Sequence[float], episodes: int, seed: int) -> list[Row]:
+    """Returns the rows of the CSV file; see `Arguments`.
+
+    Raises:
+        ValueError: If a share is not in (0, 1], or there are to be no episodes.
+    """
+    if not shares or not all(0 < share <= 1 for share in shares):
+        raise ValueError(f"--shares are in (0, 1], got {', '.join(map(str, shares)) or 'none'}")
+    if episodes < 1:
+        raise ValueError(f"--episodes must be at least 1, got {episodes}")
+    tasks, config = policy.tasks, policy.config
+    evaluator = Evaluator(
+        config.algorithm,
+        seeds=config.seeds,
+        n_tasks=len(tasks),
+        episodes=episodes,
+        bank=policy.bank.held_out(),
+        encoders=policy.encoders,
+    )
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        shown = record_demonstrations(
+            folder, tasks=tasks, per_task=episodes, held_out_per_task=0, seed=seed, progress=False
+        ).to_tensordict()
+    length = shown["length"].clone()
+    for share in shares:
+        shown["length"] = (share * length).round().long().clamp(min=1)
+        embedding = embed_demonstrations(policy.encoders, shown).view(len(tasks), episodes, -1)
+        tested = show(policy, embedding, shown["task"].view(len(tasks), episodes), evaluator)
+        rows += [(share, s, tasks[task], episodes, *found) for s, task, *found in tested]
+    return rows
+
+
+def means(rows: Sequence[Row]) -> dict[str, dict[float, np.ndarray]]:
+    """Returns success, task inference and activity by task ("all": of all) and share, ``[S, 3]``.
+
+    Each row is a seed's mean.
+    """
+    found: dict[str, dict[float, dict[int, list]]] = defaultdict(lambda: defaultdict(dict))
+    for share, seed, task, _, *values in rows:
+        for name in ("all", task):
+            found[name][share].setdefault(seed, []).append(values)
+    return {
+        task: {
+            share: np.array([np.mean(values, axis=0) for values in seeds.values()])
+            for share, seeds in shares.items()
+        }
+        for task, shares in found.items()
+    }
+
+
+def plot(table: Mapping[str, Mapping[float, np.ndarray]]) -> Figure:
+    """Plots success and task inference by the share of the demonstrations that was seen.
+
+    Lines are means over seeds, by task and of all; one standard deviation is shaded for all. There
+    is no task inference in algorithms without GWR-B.
+    """
+    names = ["Success rate", "Task inferred"]
+    if all(np.isnan(seeds[:, 1]).all() for shares in table.values() for seeds in shares.values()):
+        names.pop()
+    figure = Figure(figsize=(7.0, 3.2), layout="constrained")
+    panels = figure.subplots(1, len(names), sharex=True, sharey=True, squeeze=False)[0]
+    for column, (axes, name) in enumerate(zip(panels, names, strict=True)):
+        for (task, shares), color in zip(table.items(), _COLORS, strict=False):
+            shown = sorted(shares)
+            seeds = np.stack([shares[share][:, column] for share in shown])
+            mean, spread = seeds.mean(1), seeds.std(1)
+            axes.plot(shown, mean, "o-", color=color, markersize=4, label=task.replace("_", " "))
+            if task == "all":
+                low, high = np.clip(mean - spread, 0, 1), np.clip(mean + spread, 0, 1)
+                axes.fill_between(shown, low, high, color=color, alpha=0.15, linewidth=0)
+        axes.set(xticks=sorted(next(iter(table.values()))), ylim=(0, 1.02))
+        axes.set_title(name, fontsize=9)
+        axes.xaxis.set_major_formatter(PercentFormatter(1, decimals=0))
+        axes.tick_params(labelsize=8)
+        axes.grid(color="0.9", linewidth=0.6)
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.supxlabel("Share of the demonstration seen", fontsize=9)
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=4, fontsize=8, frameon=False)
+    return figure
+
+
+def main(arguments: Arguments) -> None:
+    """Tests, and writes the files."""
+    commit = _commit()
+    torch.set_num_threads(arguments.threads)
+    run, out = arguments.run, arguments.out or arguments.run
+    make = make_of(read_config(run / "config.json")[0].name)
+    rows = measure(load_run(run, make=make), arguments.shares, arguments.episodes, arguments.seed)
+    out.mkdir(parents=True, exist_ok=True)
+    with (out / "one_shot.csv").open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(COLUMNS)
+        writer.writerows((*row[:4], *(round(value, 4) for value in row[4:])) for row in rows)
+    record = {"commit": commit, "command": shlex.join(["python", *sys.argv])}
+    (out / "one_shot.json").write_text(json.dumps(record, indent=2) + "\n")
+    table = means(rows)
+    save_figure(plot(table), out / "one_shot.png")
+    print("| task | seen | success | inferred | activity |\n|---|---:|---:|---:|---:|")
+    for task, shares in table.items():
+        for share, seeds in shares.items():
+            success, inferred, activity = seeds.mean(0)
+            print(f"| {task} | {share:.0%} | {success:.1%} | {inferred:.1%} | {activity:.2f} |")
+
+
+if __name__ == "__main__":
+    command_line(main, __doc__, Arguments)

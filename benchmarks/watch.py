@@ -1,0 +1,181 @@
+"""Shows what a run has learned: NICO beside the demonstration that it was shown.
+
+    python benchmarks/watch.py runs/continual-bgpo-quick
+
+Writes `nico.gif` and the same as a strip of frames, `nico.png`, into the run's `figures/`: of each
+task the demonstration, what NICO then sees, and what an onlooker sees; green is success, red the
+end of the time. And `gwr_growth.png`, how GWR-B grew, where the run kept its graphs.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+from ablation import make_of
+from experiment import command_line
+from growth import draw_growth
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont, ImageOps
+
+from bgpo_trl import TrainedPolicy, load_run
+from bgpo_trl.config_file import read_config
+from bgpo_trl.demonstrations import record_demonstrations
+from bgpo_trl.plotting import plot_frame_strips, save_figure
+from suites import nico
+from suites.nico.rendering import FrameRenderer
+
+_ROOM = (180, 70, 600, 350)  # Where in the room's 640x480 pixels NICO and the table are.
+_SIZES = ((256, 128), (256, 128), (192, 128))
+_BORDER, _CAPTION, _GAP = 4, 18, 8
+_COLORS = {None: "#999999", True: "#009E73", False: "#D55E00"}
+_MILLISECONDS, _HOLD = 100, 2_000
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Shows what a run has learned, beside what it was shown."""
+
+    run: tyro.conf.Positional[Path]
+    """The run's directory."""
+    policy: int | None = None
+    """Which of the run's seeds acts; the first if not given."""
+    seed: int = 0
+    """Seed of demonstrations and starts."""
+    out: Path | None = None
+    """Folder for the pictures; figures/ of the run if not given."""
+
+
+@dataclass(frozen=True)
+class Episode:
+    """A demonstration and what came of it.
+
+    Attributes:
+        task: Its name.
+        demonstration: uint8 ``[T, 32, 64, 3]``.
+        seen: What NICO saw, uint8 ``[N, 32, 64, 3]``.
+        room: What an onlooker saw, uint8 ``[N, 480, 640, 3]``.
+        success: How it ended.
+    """
+
+    task: str
+    demonstration: NDArray
+    seen: NDArray
+    room: NDArray
+    success: bool
+
+    @property
+    def outcome(self) -> str:
+        """How it ended, in words."""
+        return f"{'success' if self.success else 'no success'} after {len(self.seen) - 1} steps"
+
+
+def demonstrate(tasks: Sequence[str], per_task: int, seed: int) -> dict[str, list[NDArray]]:
+    """Returns new demonstrations by task, uint8 ``[T, 32, 64, 3]`` each, of starts of their own."""
+    with tempfile.TemporaryDirectory() as folder:
+        recorded = record_demonstrations(
+            folder, tasks=tasks, per_task=per_task, held_out_per_task=0, seed=seed, progress=False
+        )
+        frames = [
+            pixels[:length].numpy().copy()
+            for pixels, length in zip(recorded["pixels"], recorded["length"].tolist(), strict=True)
+        ]
+    return {task: frames[i * per_task :][:per_task] for i, task in enumerate(tasks)}
+
+
+def play(policy: TrainedPolicy, task: str, demonstration: NDArray, seed: int) -> Episode:
+    """Shows the policy a demonstration and returns what it does from another start."""
+    policy.watch(demonstration, task=task)
+    steps = policy.config.algorithm.max_steps
+    env = nico.load(task, seed=seed)
+    renderer = FrameRenderer(env.physics.model.ptr, "room", height=480, width=640)
+    timestep = env.reset()
+    seen, room = [timestep.observation["pixels"]], [renderer.render(env.physics.data.ptr)]
+    while not timestep.last() and len(seen) <= steps:
+        timestep = env.step(policy.act(seen[-1]))
+        seen.append(timestep.observation["pixels"])
+        room.append(renderer.render(env.physics.data.ptr))
+    renderer.close()
+    return Episode(task, demonstration, np.stack(seen), np.stack(room), bool(timestep.reward))
+
+
+def compose(episodes: Sequence[Episode]) -> list[Image.Image]:
+    """Returns a picture of each step, the episodes below one another, as long as any goes on."""
+    steps = max(max(len(e.demonstration), len(e.seen)) for e in episodes)
+    height = _CAPTION + _SIZES[0][1] + 2 * _BORDER + _GAP
+    width = sum(width + 2 * _BORDER for width, _ in _SIZES) + 4 * _GAP
+    pictures = []
+    for step in range(steps):
+        picture = Image.new("RGB", (width, height * len(episodes) + _GAP), "white")
+        for row, episode in enumerate(episodes):
+            _draw(picture, episode, step, row * height + _GAP // 2)
+        pictures.append(picture)
+    return pictures
+
+
+def _draw(picture: Image.Image, episode: Episode, step: int, top: int) -> None:
+    draw, font = ImageDraw.Draw(picture), ImageFont.load_default(13)
+    now = min(step, len(episode.seen) - 1)
+    outcome = episode.success if now == len(episode.seen) - 1 else None
+    shown = episode.demonstration[min(step, len(episode.demonstration) - 1)]
+    color = _COLORS[outcome]
+    panels = (
+        (shown, f"shown: {episode.task.replace('_', ' ')}", _COLORS[None]),
+        (episode.seen[now], "what NICO sees", color),
+        (episode.room[now], f"step {now}" if outcome is None else episode.outcome, color),
+    )
+    left = _GAP
+    for (frame, caption, border), size in zip(panels, _SIZES, strict=True):
+        image = Image.fromarray(frame)
+        if frame is panels[-1][0]:
+            image = image.crop(_ROOM).resize(size, Image.Resampling.LANCZOS)
+        image = image.resize(size, Image.Resampling.NEAREST)
+        picture.paste(ImageOps.expand(image, _BORDER, border), (left, top + _CAPTION))
+        told = "black" if border == _COLORS[None] else border
+        draw.text((left + _BORDER, top), caption, fill=told, font=font)
+        left += size[0] + 2 * _BORDER + _GAP
+
+
+def write_gif(path: Path, pictures: Sequence[Image.Image]) -> None:
+    """Writes pictures as an endless animation that rests at its end."""
+    # With one palette, and without dithering, what does not move stays the same and costs nothing.
+    sample = [pictures[i] for i in np.linspace(0, len(pictures) - 1, 4).round().astype(int)]
+    strip = Image.new("RGB", (sample[0].width, sum(picture.height for picture in sample)))
+    for row, picture in enumerate(sample):
+        strip.paste(picture, (0, row * picture.height))
+    palette = strip.quantize(128)
+    first, *others = [p.quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures]
+    first.save(
+        path,
+        save_all=True,
+        append_images=others,
+        duration=[_MILLISECONDS] * len(others) + [_HOLD],
+        loop=0,
+    )
+
+
+def main(arguments: Arguments) -> None:
+    """Plays an episode of each task and writes the pictures."""
+    run, out = arguments.run, arguments.out or arguments.run / "figures"
+    make = make_of(read_config(run / "config.json")[0].name)
+    policy = load_run(run, seed=arguments.policy, make=make)
+    shown = demonstrate(policy.tasks, 1, arguments.seed + 1)
+    episodes = [play(policy, task, frames, arguments.seed + 1) for task, (frames,) in shown.items()]
+    out.mkdir(parents=True, exist_ok=True)
+    write_gif(out / "nico.gif", compose(episodes))
+    strips = {}
+    for episode in episodes:
+        strips[f"{episode.task}: the demonstration"] = episode.demonstration
+        strips[f"{episode.task}: what NICO sees, {episode.outcome}"] = episode.seen
+        print(f"{episode.task}: {episode.outcome}")
+    save_figure(plot_frame_strips(strips), out / "nico.png")
+    draw_growth(run, policy.config, policy.bank, out)
+    print(f"pictures: {out}")
+
+
+if __name__ == "__main__":
+    command_line(main, __doc__, Arguments)
