@@ -209,7 +209,9 @@ def main(arguments: Arguments) -> None:
     with (out / "one_shot.csv").open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(COLUMNS)
-        writer.writerows((*row[:4], *(round(value, 4) for value in row[4:])) for row in rows)
+        for *what, success, inferred, activity in rows:
+            values = ["" if np.isnan(x) else round(x, 4) for x in (success, inferred, activity)]
+            writer.writerow((*what, *values))
     record = {"commit": commit, "command": shlex.join(["python", *sys.argv])}
     (out / "one_shot.json").write_text(json.dumps(record, indent=2) + "\n")
     table = means(rows)

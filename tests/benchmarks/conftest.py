@@ -1,14 +1,17 @@
 """Benchmarks made small enough to be run in a second."""
 
+import shutil
 from dataclasses import replace
 from functools import partial
 
+import ablation
 import experiment
 import pytest
 import torch
 
 from benchmarks import ladder
 from bgpo_trl.algorithms import ALGORITHMS
+from bgpo_trl.training import Trainer
 
 
 @pytest.fixture
@@ -38,3 +41,28 @@ def tiniest(tiny, monkeypatch):
 
     monkeypatch.setattr(experiment, "measure", partial(experiment.measure, episodes=2))
     monkeypatch.setattr(experiment, "save_figure", touch)
+
+
+@pytest.fixture(scope="session")
+def finished_runs(bank, encoders, make_config, tmp_path_factory):
+    """Plays a run of an algorithm or a variant to its end, once."""
+    directories = {}
+
+    def finished(name):
+        if name not in directories:
+            directories[name] = tmp_path_factory.mktemp(name)
+            make, known = ablation.make_of(name), name if name in ALGORITHMS else "bgpo"
+            config = replace(make_config(name=known), name=name)
+            parts = {"bank": bank, "encoders": encoders, "make": make, "progress": False}
+            with Trainer(config, directories[name], **parts) as trainer:
+                trainer.run()
+        return directories[name]
+
+    return finished
+
+
+@pytest.fixture
+def run_of(finished_runs, bank, encoders, monkeypatch, tmp_path):
+    """Returns a copy of a finished run, whose encoders are taken for those of the package."""
+    monkeypatch.setattr("bgpo_trl.trained_policy.load_pretrained", lambda own: (encoders, bank))
+    return lambda name: shutil.copytree(finished_runs(name), tmp_path / "runs" / name)

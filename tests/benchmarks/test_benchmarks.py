@@ -126,7 +126,7 @@ def test_lengths_and_seeds_that_cannot_be_are_refused(arguments):
 def test_continual_leaves_curve_and_figures(tiny, tmp_path, capsys):
     continual.main(experiment.Arguments(out=tmp_path / "run"))
     run_directory = tmp_path / "run"
-    for name in ("success.png", "gwr.png"):
+    for name in ("success.png", "gwr.png", "gwr_growth.png"):
         assert (run_directory / "figures" / name).read_bytes().startswith(b"\x89PNG")
     assert json.loads((run_directory / "config.json").read_text())["episodes"] == 6
     printed = capsys.readouterr().out
