@@ -77,7 +77,7 @@ class TrainedPolicy:
         self.bank = bank
         self.seed = seed
         self.tasks = nico.ALL_TASKS[: algorithm.n_tasks]
-        self._observe = Compose(*observe(config.algorithm, encoders))
+        self._observe = Compose(observe(config.algorithm, encoders))
         self._index = config.seeds.index(seed)
         self._frozen: TensorDictBase | None = None
         self._task = 0
@@ -130,8 +130,9 @@ class TrainedPolicy:
         self._task = 0 if task is None else self.tasks.index(task)
         if algorithm.gwr is None:
             return Recognition(embedding, task=task)
-        match = algorithm.gwr.lookup(embedding.expand(n_seeds, -1))[self._index]
-        return Recognition(embedding, match.embedding, int(match.node), float(match.activity), task)
+        match = algorithm.gwr.lookup(embedding.expand(n_seeds, -1))
+        behavior, activity = match.embedding[self._index], float(match.activity[self._index])
+        return Recognition(embedding, behavior, int(match.node[self._index]), activity, task)
 
     @torch.no_grad()
     def act(self, frame: ArrayLike) -> NDArray[np.float32]:

@@ -6,6 +6,7 @@ from functools import partial
 
 import ablation
 import experiment
+import growth
 import pytest
 import torch
 
@@ -40,7 +41,8 @@ def tiniest(tiny, monkeypatch):
         path.touch()
 
     monkeypatch.setattr(experiment, "measure", partial(experiment.measure, episodes=2))
-    monkeypatch.setattr(experiment, "save_figure", touch)
+    for module in (experiment, growth):
+        monkeypatch.setattr(module, "save_figure", touch)
 
 
 @pytest.fixture(scope="session")

@@ -158,7 +158,8 @@ def test_a_dashboard_gets_the_figures_before_it_is_closed(tiniest, monkeypatch, 
         "bgpo_trl.logging._log_wandb_media", lambda dashboard, *media: events.append(media)
     )
     run = tmp_path / "run"
-    figures = ["episodes.png", "gwr.png", "success.png", *(f"{task}.gif" for task in TASKS)]
+    figures = ["episodes.png", "gwr.png", "gwr_growth.png", "success.png"]
+    figures += [f"{task}.gif" for task in TASKS]
     shown = [(f"figures/{Path(n).stem}", run / "figures" / n) for n in sorted(figures)]
     arguments = experiment.Arguments(out=run, wandb="offline")
     continual.main(arguments)
