@@ -13,7 +13,6 @@ from bgpo_trl.plotting import save_figure
 from bgpo_trl.plotting_growth import plot_gwr_growth
 from bgpo_trl.runs import read_rows
 from bgpo_trl.task_inference import majority_task, match_counts
-from suites import nico
 
 
 def draw_growth(
@@ -47,6 +46,6 @@ def draw_growth(
     counts: dict[str, list[int]] = {str(seed): [] for seed in config.seeds}
     for row in read_rows(run / "train.csv"):
         counts[row["seed"]].append(int(row["num_nodes"]))
-    figure = plot_gwr_growth(graphs, list(counts.values()), nico.ALL_TASKS[:n_tasks])
+    figure = plot_gwr_growth(graphs, list(counts.values()), config.tasks)
     save_figure(figure, (out or run / "figures") / "gwr_growth.png")
     return True

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from bgpo_trl.algorithms import ALGORITHMS
-from bgpo_trl.configs import AlgorithmConfig, RunConfig
+from bgpo_trl.algorithms.rl import RL
+from bgpo_trl.configs import AlgorithmConfig, RLConfig, RunConfig
 
 
 def read_config(path: str | Path) -> tuple[RunConfig, str | None]:
@@ -56,6 +57,11 @@ def _algorithm_config(name: object, values: dict[str, Any]) -> type[AlgorithmCon
 
 def _read(hint: Any, value: Any, where: str) -> Any:
     """Returns a value of JSON as what the annotation says; ``where`` names it in errors."""
+    if hint is RLConfig and isinstance(value, dict):
+        name = value.get("name")
+        if name not in RL:
+            raise ValueError(f"{where}name is {name!r}, of no known RL algorithm")
+        hint = type(RL[name].config)
     if is_dataclass(hint) and isinstance(value, dict):
         hints = get_type_hints(hint)
         unknown = sorted(value.keys() - hints.keys())

@@ -23,7 +23,6 @@ from bgpo_trl.pretrained import load_pretrained
 from bgpo_trl.representation import Representation, embed_demonstrations
 from bgpo_trl.seeding import stream_seed
 from bgpo_trl.transforms import TaskSchedule
-from suites import nico
 from suites.nico.rendering import FRAME_HEIGHT, FRAME_WIDTH
 
 _FRAME = (FRAME_HEIGHT, FRAME_WIDTH, 3)
@@ -76,7 +75,7 @@ class TrainedPolicy:
         self.encoders = encoders
         self.bank = bank
         self.seed = seed
-        self.tasks = nico.ALL_TASKS[: algorithm.n_tasks]
+        self.tasks = config.tasks
         self._observe = Compose(observe(config.algorithm, encoders))
         self._index = config.seeds.index(seed)
         self._frozen: TensorDictBase | None = None
@@ -198,6 +197,7 @@ def load_run(
     if not has_checkpoint(path / "checkpoint"):
         raise ValueError(f"{path} has no checkpoint yet: let the run reach its first one")
     encoders, bank = _encoders(path, identity)
+    bank = bank.for_tasks(config.tasks)
     algorithm = make(
         config.algorithm,
         seeds=config.seeds,

@@ -302,7 +302,7 @@ def rewrite(run, **changes):
 
 def widen(run):
     algorithm = json.loads((run / "config.json").read_text())["algorithm"]
-    rewrite(run, algorithm={**algorithm, "ddpg": {**algorithm["ddpg"], "hidden_sizes": [32]}})
+    rewrite(run, algorithm={**algorithm, "rl": {**algorithm["rl"], "hidden_sizes": [32]}})
 
 
 def see_the_truth(run):
