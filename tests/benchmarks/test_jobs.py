@@ -3,12 +3,14 @@
 import csv
 import os
 import signal
+import sys
 import tempfile
 import threading
 import time
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import jobs
 import merge
@@ -142,6 +144,49 @@ def test_ctrl_c_reaches_the_runs(ray, tmp_path):
         jobs.play_jobs(todo, make_play())
     assert (tmp_path / "waits" / "saved").exists()
     assert not todo[0].finished
+
+
+def test_a_run_is_played_when_nobody_else_holds_it(make_config, tmp_path, monkeypatch):
+    """It goes on once the other process is gone, and does not play again what that one ended."""
+    job = Job(tmp_path / "run", make_config())
+    waiting, events = threading.Event(), []
+    monkeypatch.setattr(jobs.time, "sleep", lambda _: waiting.set())
+    for finished in (False, True):
+        waiting.clear()
+        thread = threading.Thread(
+            target=jobs.work, args=(job, lambda _: events.append("played"), sys.argv)
+        )
+        with jobs.locked(job.directory):
+            thread.start()
+            assert waiting.wait(20)
+            events.append("the other ends")
+            assert job.finished == finished
+        thread.join(20)
+    assert events == ["the other ends", "played", "the other ends"]
+    assert (job.directory / "log.txt").read_text().count(f"process {os.getpid()} on") == 1
+
+
+def test_a_machine_that_is_too_small_is_told(monkeypatch):
+    ended = []
+    stub = SimpleNamespace(
+        init=lambda *_, **__: None,
+        cluster_resources=lambda: {"CPU": 2.0},
+        shutdown=lambda: ended.append(1),
+    )
+    monkeypatch.setattr(jobs, "ray", stub)
+    for cpus, gpus, told in ((3, 0, "--cpus-per-run 3: Ray finds 2"), (2, 0.5, "--gpus-per-run")):
+        with pytest.raises(ValueError, match=told), jobs.connected("local", cpus, gpus):
+            raise AssertionError("went on")
+    with jobs.connected("auto", 8, 1):  # a cluster may grow
+        assert len(ended) == 2
+    assert len(ended) == 3
+
+
+def test_a_missing_ray_is_told_with_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    monkeypatch.delitem(sys.modules, "jobs")
+    with pytest.raises(SystemExit, match=r"pip install 'bgpo_trl\[ray\]'"):
+        __import__("jobs")
 
 
 @pytest.fixture

@@ -3,9 +3,7 @@
 import contextlib
 import csv
 import json
-import os
 import sys
-import threading
 from dataclasses import asdict, replace
 from itertools import product
 from types import SimpleNamespace
@@ -308,46 +306,3 @@ def test_a_sweep_plays_what_is_missing_and_nothing_twice(without_ray, few, tmp_p
     assert played == [f"concurrent-maml/seeds-{block}" for block in ("2-5", "3-1")]
     seeds = [row["seed"] for row in rows(tmp_path / "concurrent-maml" / "train.csv")]
     assert seeds == sorted(4 * "012345")
-
-
-def test_a_run_is_played_when_nobody_else_holds_it(make_config, tmp_path, monkeypatch):
-    """It goes on once the other process is gone, and does not play again what that one ended."""
-    job = Job(tmp_path / "run", make_config())
-    waiting, events = threading.Event(), []
-    monkeypatch.setattr(jobs.time, "sleep", lambda _: waiting.set())
-    for finished in (False, True):
-        waiting.clear()
-        thread = threading.Thread(
-            target=jobs.work, args=(job, lambda _: events.append("played"), sys.argv)
-        )
-        with jobs.locked(job.directory):
-            thread.start()
-            assert waiting.wait(20)
-            events.append("the other ends")
-            assert job.finished == finished
-        thread.join(20)
-    assert events == ["the other ends", "played", "the other ends"]
-    assert (job.directory / "log.txt").read_text().count(f"process {os.getpid()} on") == 1
-
-
-def test_a_machine_that_is_too_small_is_told(monkeypatch):
-    ended = []
-    stub = SimpleNamespace(
-        init=lambda *_, **__: None,
-        cluster_resources=lambda: {"CPU": 2.0},
-        shutdown=lambda: ended.append(1),
-    )
-    monkeypatch.setattr(jobs, "ray", stub)
-    for cpus, gpus, told in ((3, 0, "--cpus-per-run 3: Ray finds 2"), (2, 0.5, "--gpus-per-run")):
-        with pytest.raises(ValueError, match=told), jobs.connected("local", cpus, gpus):
-            raise AssertionError("went on")
-    with jobs.connected("auto", 8, 1):  # a cluster may grow
-        assert len(ended) == 2
-    assert len(ended) == 3
-
-
-def test_a_missing_ray_is_told_with_what_to_install(monkeypatch):
-    monkeypatch.setitem(sys.modules, "ray", None)
-    monkeypatch.delitem(sys.modules, "jobs")
-    with pytest.raises(SystemExit, match=r"pip install 'bgpo_trl\[ray\]'"):
-        __import__("jobs")
