@@ -53,5 +53,6 @@ if __name__ == "__main__":
     algorithm = BGPOConfig(state="state", rl=EpsilonConfig(warmup_steps=64))
     config = RunConfig((0, 1), 4, (0,), eval_every=2, name="oracle", algorithm=algorithm)
     with TemporaryDirectory() as folder:
-        Trainer(config, folder, bank=load_pretrained()[1]).run()
+        with Trainer(config, folder, bank=load_pretrained()[1]) as trainer:
+            trainer.run()
         print((Path(folder) / "eval.csv").read_text())
