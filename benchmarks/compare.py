@@ -20,7 +20,7 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from bgpo_trl.runs import read_rows
+from bgpo_trl.runs import read_tests
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ def success_by_seed(
         last: Read no further than this episode.
     """
     found: dict[tuple[str, int], dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
-    for row in read_rows(path):
+    for row in read_tests(path):
         if last is not None and int(row["episode"]) > last:
             continue
         end = -(-int(row["episode"]) // every) * every
@@ -74,9 +74,11 @@ def permutation_p(first: np.ndarray, second: np.ndarray) -> float:
 
 def main(arguments: Arguments) -> None:
     """Prints the table."""
+    if arguments.every < 1:
+        raise ValueError(f"--every must be at least 1 episode, got {arguments.every}")
     paths = arguments.first / "eval.csv", arguments.second / "eval.csv"
     # Of a run cut short, only what both have is compared.
-    last = min(max(int(row["episode"]) for row in read_rows(path)) for path in paths)
+    last = min(max(int(row["episode"]) for row in read_tests(path)) for path in paths)
     first, second = (success_by_seed(path, arguments.every, last) for path in paths)
     shared = sorted(first.keys() & second.keys())
     if not shared:

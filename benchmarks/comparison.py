@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import zlib
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -13,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bgpo_trl import metrics
-from bgpo_trl.runs import Curves, read_curves, read_rows
+from bgpo_trl.runs import Curves, read_curves, read_json, read_rows
 from suites import nico
 
 Values = NDArray[np.float64]
@@ -91,9 +90,9 @@ def read_group(runs: Path, group: Group) -> tuple[dict[str, Run], list[str]]:
         if not (directory / "eval.csv").exists() or not read_rows(directory / "eval.csv"):
             notes.append(f"{name}: missing ({key}/eval.csv is not there, or empty)")
             continue
-        config = json.loads((directory / "config.json").read_text())
+        config = read_json(directory / "config.json")
         path = directory / "summary.json"
-        summary = json.loads(path.read_text()) if path.exists() else {}
+        summary = read_json(path) if path.exists() else {}
         curves = read_curves(directory / "eval.csv", nico.ALL_TASKS)
         if int(curves.episodes[-1]) < config["episodes"]:
             notes.append(

@@ -22,7 +22,7 @@ from bgpo_trl.algorithms.rl import RL
 from bgpo_trl.configs import PRESETS, STAGE_PRESETS, RunConfig
 from bgpo_trl.demonstrations import DemonstrationBank
 from bgpo_trl.evaluation import Evaluator, evaluate_random_policy
-from bgpo_trl.machine import choose_device
+from bgpo_trl.machine import choose_device, set_threads
 from bgpo_trl.plotting import plot_frame_strips, plot_gwr_pca, plot_success_curves, save_figure
 from bgpo_trl.pretrained import load_pretrained, make_pretrained
 from bgpo_trl.progress import progress_bar
@@ -77,8 +77,8 @@ def run_config(arguments: Arguments) -> RunConfig:
     if arguments.seeds is not None:
         config = replace(config, seeds=arguments.seeds)
     if arguments.episodes is not None:
-        share = arguments.episodes / config.episodes
-        starts = tuple(round(start * share) for start in config.task_starts)
+        share, last = arguments.episodes / config.episodes, arguments.episodes - 1
+        starts = tuple(min(round(start * share), last) for start in config.task_starts)
         config = replace(
             config,
             episodes=arguments.episodes,
@@ -112,7 +112,7 @@ def run_experiment(
         ValueError: If the directory holds another run.
     """
     commit = _commit()  # of the code that runs, whatever is committed meanwhile
-    torch.set_num_threads(arguments.threads)
+    set_threads(arguments.threads)
     device = choose_device(arguments.device)
     rl = "" if arguments.rl == "ddpg" else f"-{arguments.rl}"
     out = arguments.out or Path("runs") / f"{name}-{config.name}{rl}-{arguments.preset}"

@@ -22,6 +22,7 @@ import tyro
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from bgpo_trl.machine import set_threads
 from bgpo_trl.modules.gwr import GWRB
 from bgpo_trl.plotting import save_figure
 from bgpo_trl.timing import Timing, interleave
@@ -168,7 +169,12 @@ def plot(rows: list[dict[str, Any]]) -> Figure:
 
 def main(arguments: Arguments) -> None:
     """Measures, prints and writes."""
-    torch.set_num_threads(arguments.threads)
+    if not arguments.nodes or min(arguments.nodes) < 2:
+        raise ValueError(f"--nodes must be one or more, of at least 2, got {arguments.nodes}")
+    for name in ("features", "networks", "rounds"):
+        if getattr(arguments, name) < 1:
+            raise ValueError(f"--{name} must be at least 1, got {getattr(arguments, name)}")
+    set_threads(arguments.threads)
     single = [measure(1, n, arguments) for n in arguments.nodes]
     batch = measure(arguments.networks, arguments.batch_nodes, arguments)
     large = [row for row in single if row["nodes"] >= 10_000]

@@ -20,7 +20,6 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
-import torch
 from ablation import VARIANTS
 from experiment import command_line
 from summary import summarize
@@ -28,7 +27,7 @@ from tyro.conf import subcommand
 
 from bgpo_trl.algorithms.bgpo import BGPO, Composition, Parts, labeled
 from bgpo_trl.configs import PRESETS, BGPOConfig, DDPGConfig, SACConfig, TD3Config
-from bgpo_trl.machine import choose_device
+from bgpo_trl.machine import choose_device, set_threads
 from bgpo_trl.plotting import plot_success_curves, save_figure
 from bgpo_trl.pretrained import load_pretrained
 from bgpo_trl.training import Trainer
@@ -72,7 +71,9 @@ class Arguments:
 
 def main(arguments: Arguments) -> None:
     """Runs the ladder."""
-    torch.set_num_threads(arguments.threads)
+    if not arguments.rungs:
+        raise ValueError("--rungs names none: name some of a, b, c, d")
+    set_threads(arguments.threads)
     device = choose_device(arguments.device)
     encoders, bank = load_pretrained()
     base = replace(

@@ -7,7 +7,6 @@ prints for each run a table of its success by task and draws ``success.png`` ane
 
 from __future__ import annotations
 
-import json
 import sys
 from collections import defaultdict
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ import numpy as np
 import tyro
 
 from bgpo_trl.plotting import plot_success_curves, save_figure
-from bgpo_trl.runs import read_rows
+from bgpo_trl.runs import read_json, read_rows, read_tests
 from suites import nico
 
 
@@ -40,7 +39,7 @@ def summarize(path: Path) -> dict[str, float]:
         By task; ``overall``, the mean over tasks; and ``episodes to 80 %``, the first evaluation at
         which the mean over seeds and all presented tasks is that high; NaN if none is.
     """
-    rows = read_rows(path)
+    rows = read_tests(path)
     last = max(int(row["episode"]) for row in rows)
     late, curve = defaultdict(list), defaultdict(list)
     for row in rows:
@@ -60,7 +59,7 @@ def best(path: Path) -> dict[str, float]:
     Args:
         path: An ``eval.csv``.
     """
-    rows = read_rows(path)
+    rows = read_tests(path)
     window = max(int(row["episode"]) for row in rows) / 10
     found = {}
     for task in _tasks(rows):
@@ -101,7 +100,7 @@ def describe(run: Path) -> str:
         cells += [trained(task, kind, "success", 1) for kind in ("seen", "held-out")]
         cells.append(trained(task, "held-out", "task_inference", 2))
         lines.append(f"| {task or 'all'} | " + " | ".join(cells) + " |")
-    told = json.loads((run / "summary.json").read_text())
+    told = read_json(run / "summary.json")
     nodes = "" if told["nodes"] is None else f"GWR-B nodes: {told['nodes']}. "
     lines += [
         "",
@@ -117,7 +116,7 @@ def _tasks(rows: list[dict[str, str]]) -> list[str]:
 
 
 def _late_by_seed(path: Path) -> dict[str | None, list[float]]:
-    rows = read_rows(path)
+    rows = read_tests(path)
     last = max(int(row["episode"]) for row in rows)
     late = [row for row in rows if int(row["episode"]) > 0.9 * last]
     seeds = sorted({int(row["seed"]) for row in rows})
@@ -137,7 +136,7 @@ def main(arguments: Arguments) -> None:
         raise ValueError("name the directory of a run")
     for run in arguments.runs:
         print(f"{run}\n\n{describe(run)}\n")
-        config = json.loads((run / "config.json").read_text())
+        config = read_json(run / "config.json")
         # Runs did not always say their tasks; then they had the paper's.
         tasks = config.get("tasks", nico.ALL_TASKS)
         presented = dict(zip(tasks, config["task_starts"], strict=True))

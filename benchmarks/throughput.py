@@ -240,6 +240,12 @@ def show(table: Table) -> str:
 
 def main(arguments: Arguments) -> None:
     """Measures what was asked for."""
+    if not arguments.parts:
+        raise ValueError("--parts names none: name some of frames, updates, step, memory")
+    for name in ("seeds", "rounds", "steps", "threads"):
+        number = getattr(arguments, name)
+        if number is not None and number < 1:
+            raise ValueError(f"--{name} must be at least 1, got {number}")
     threads = arguments.threads or usable_cores()
     torch.set_num_threads(1)
     measures: dict[Part, Callable[[], Table]] = {

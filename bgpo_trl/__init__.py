@@ -2,6 +2,9 @@
 
 from typing import TYPE_CHECKING
 
+# First, because TorchRL imports MuJoCo, which reads once what this chooses.
+from suites import opengl as opengl
+
 if TYPE_CHECKING:
     from bgpo_trl.trained_policy import TrainedPolicy, load_run
 else:

@@ -6,6 +6,7 @@ as in ``torch.hub``'s file names, since ``torch.load`` does not notice damaged b
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import re
@@ -60,7 +61,8 @@ def save_checkpoint(directory: str | os.PathLike[str], state: dict[str, Any]) ->
         temporary.replace(path)
         _sync_directory(directory)
     except OSError as error:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # Where the directory is none, there is nothing either.
+            temporary.unlink()
         raise OSError(
             error.errno,
             f"cannot save a checkpoint in {directory} ({error.strerror}), earlier ones are kept: "

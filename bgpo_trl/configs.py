@@ -3,9 +3,29 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from math import inf
 from typing import Literal
 
 from suites import nico
+
+
+def _check(config: object, *needs: tuple[str, bool, str]) -> None:
+    """Raises ValueError for the first need (field, whether it holds, in words) that does not."""
+    for name, holds, need in needs:
+        if not holds:
+            raise ValueError(f"{name} must be {need}, got {getattr(config, name)}")
+
+
+def _at_least(config: object, least: int, *names: str) -> None:
+    """Raises ValueError for a number that is smaller, or not finite."""
+    for name in names:
+        _check(config, (name, least <= getattr(config, name) < inf, f"at least {least}"))
+
+
+def _positive(config: object, *names: str) -> None:
+    """Raises ValueError for a number that is not positive, or not finite."""
+    for name in names:
+        _check(config, (name, 0 < getattr(config, name) < inf, "a number above 0"))
 
 
 @dataclass(frozen=True)
@@ -33,6 +53,13 @@ class VAEConfig:
     inverse_weight: float = 50.0
     """Factor of the inverse model's ``1/2 ||a_hat - a||^2``."""
 
+    def __post_init__(self) -> None:
+        _at_least(self, 1, "latent_size", "batch_size", "warmup_steps", "steps")
+        _positive(self, "learning_rate")
+        _at_least(self, 0, "reconstruction_weight", "kl_weight", "inverse_weight")
+        divides = self.window >= 2 and self.batch_size % self.window == 0
+        _check(self, ("window", divides, f"at least 2 and divide batch_size {self.batch_size}"))
+
 
 @dataclass(frozen=True)
 class SequenceAutoencoderConfig:
@@ -53,6 +80,10 @@ class SequenceAutoencoderConfig:
     steps: int = 5_000
     """Gradient steps. Ours: the paper does not say."""
 
+    def __post_init__(self) -> None:
+        _at_least(self, 1, "embedding_size", "batch_size", "warmup_steps", "steps")
+        _positive(self, "embedding_scale", "learning_rate")
+
 
 @dataclass(frozen=True)
 class RepresentationConfig:
@@ -68,6 +99,10 @@ class RepresentationConfig:
     """Steps between checkpoints (about a minute each). Ours."""
     log_every: int = 20
     """Steps between rows of the log. Ours."""
+
+    def __post_init__(self) -> None:
+        _at_least(self, 0, "seed")
+        _at_least(self, 1, "checkpoint_every", "log_every")
 
 
 @dataclass(frozen=True)
@@ -98,6 +133,19 @@ class RLConfig:
     warmup_steps: int = 256
     """Environment steps of each seed before the first update. Ours: one batch."""
 
+    def __post_init__(self) -> None:
+        _positive(self, "learning_rate")
+        _at_least(self, 1, "batch_size", "warmup_steps")
+        # With less, learning would never begin.
+        least = max(self.batch_size, self.warmup_steps)
+        _check(
+            self,
+            ("hidden_sizes", min(self.hidden_sizes, default=0) >= 1, "one or more, of at least 1"),
+            ("gamma", 0 <= self.gamma <= 1, "between 0 and 1"),
+            ("tau", 0 < self.tau <= 1, "above 0 and at most 1"),
+            ("replay_size", self.replay_size >= least, f"{least} (batch, warm-up) or more"),
+        )
+
 
 @dataclass(frozen=True)
 class DDPGConfig(RLConfig):
@@ -109,6 +157,10 @@ class DDPGConfig(RLConfig):
     """Standard deviation of the Gaussian exploration noise on the action. Ours."""
     pre_tanh_penalty: float = 0.01
     """Weight of the squared pre-tanh actions. Ours: without it all actions saturate."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _at_least(self, 0, "noise", "pre_tanh_penalty")
 
 
 @dataclass(frozen=True)
@@ -128,6 +180,11 @@ class TD3Config(RLConfig):
     noise_clip: float = 0.5
     """Largest such noise (Fujimoto et al.)."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _at_least(self, 0, "noise", "pre_tanh_penalty", "policy_noise", "noise_clip")
+        _at_least(self, 1, "policy_delay")
+
 
 @dataclass(frozen=True)
 class SACConfig(RLConfig):
@@ -143,6 +200,10 @@ class SACConfig(RLConfig):
     entropy_in_target: bool = True
     """Whether the critics count entropy to come."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _positive(self, "alpha_init")
+
 
 @dataclass(frozen=True)
 class AlgorithmConfig:
@@ -154,6 +215,11 @@ class AlgorithmConfig:
     """Steps of an episode (Sec. IV-B)."""
     rl: RLConfig = field(default_factory=DDPGConfig)
     """The RL algorithm f_RL."""
+
+    def __post_init__(self) -> None:
+        known = self.state in ("latent", "state")
+        _check(self, ("state", known, "latent or state"))
+        _at_least(self, 1, "max_steps")
 
 
 def _refuse_all_but_ddpg(who: str, rl: RLConfig) -> None:
@@ -170,6 +236,10 @@ class BGPOConfig(AlgorithmConfig):
 
     beta: float = 0.1
     """Weight of the intrinsic reward (Sec. IV-A)."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _at_least(self, 0, "beta")
 
 
 @dataclass(frozen=True)
@@ -190,14 +260,12 @@ class MAMLConfig(AlgorithmConfig):
     """Its own steps are DDPG's."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         _refuse_all_but_ddpg("MAML", self.rl)
+        _at_least(self, 0, "inner_learning_rate")
+        _at_least(self, 1, "adaptation_size")
         halves = self.task_batch_size >= 2 and self.task_batch_size % 2 == 0
-        if self.inner_learning_rate < 0 or not halves or self.adaptation_size < 1:
-            raise ValueError(
-                "MAML needs inner_learning_rate >= 0, an even task_batch_size >= 2 and "
-                f"adaptation_size >= 1, got {self.inner_learning_rate}, {self.task_batch_size} and "
-                f"{self.adaptation_size}"
-            )
+        _check(self, ("task_batch_size", halves, "even and at least 2"))
 
 
 @dataclass(frozen=True)
@@ -219,7 +287,10 @@ class DistNLLConfig(AlgorithmConfig):
     """Its teachers are DDPG's."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         _refuse_all_but_ddpg("Dist-NLL", self.rl)
+        _at_least(self, 1, "task_batch_size", "samples")
+        _positive(self, "learning_rate")
         if self.distillation_batch_size < 1 or self.samples % self.distillation_batch_size:
             raise ValueError(
                 f"samples ({self.samples}) must be a multiple of distillation_batch_size "
@@ -254,15 +325,17 @@ class RunConfig:
     def __post_init__(self) -> None:
         if not self.seeds or len(set(self.seeds)) < len(self.seeds) or min(self.seeds) < 0:
             raise ValueError(f"a run needs seeds, all different and none negative: {self.seeds}")
-        for name in ("episodes", "eval_every", "eval_episodes"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        _at_least(self, 1, "episodes", "eval_every", "eval_episodes")
+        _at_least(self, 0, "checkpoint_minutes")
         nico.check_tasks(self.tasks)
-        if len(self.task_starts) != len(self.tasks):
-            raise ValueError(
-                f"task_starts {self.task_starts} must have one episode for each of the tasks "
-                f"{', '.join(self.tasks)}"
-            )
+        starts = self.task_starts
+        _check(
+            self,
+            ("eval_every", self.eval_every <= self.episodes, f"at most episodes, {self.episodes}"),
+            ("task_starts", len(starts) == len(self.tasks), "one episode for each of the tasks"),
+            ("task_starts", min(starts, default=-1) == 0, "at least 0, and one of them 0"),
+            ("task_starts", max(starts, default=0) < self.episodes, f"below {self.episodes}"),
+        )
 
 
 PRESETS: dict[str, RunConfig] = {

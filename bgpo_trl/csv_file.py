@@ -25,7 +25,7 @@ class CsvFile:
         columns: Names of the columns, the first line of the file.
 
     Raises:
-        ValueError: If the file exists with other columns.
+        ValueError: If the file exists with other columns, or two columns have the same name.
         OSError: If the file cannot be written.
 
     Example:
@@ -43,9 +43,16 @@ class CsvFile:
     def __init__(self, path: str | os.PathLike[str], columns: Sequence[str]) -> None:
         self.path = Path(path)
         self.columns = tuple(columns)
+        if not self.columns or len(set(self.columns)) < len(self.columns):
+            raise ValueError(f"{self.path.name} needs columns, all different: got {self.columns}")
         header = _csv_line(self.columns)
         self._header_size = len(header)
-        self._file = open(self.path, "a+b", buffering=0)  # noqa: SIM115 closed by close()
+        try:
+            self._file = open(self.path, "a+b", buffering=0)  # noqa: SIM115 closed by close()
+        except OSError as error:
+            raise OSError(
+                f"cannot write {self.path} ({error.strerror}): choose another run directory"
+            ) from None
         try:
             self._file.seek(0)
             content = self._file.read()

@@ -14,12 +14,12 @@ import numpy as np
 import torch
 import tyro
 from dm_env import TimeStep
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
-from tensordict import TensorDict
+from tensordict import MemoryMappedTensor, TensorDict
 from torch import Tensor
 
+from bgpo_trl.folders import make_folder
 from bgpo_trl.progress import progress_bar
+from bgpo_trl.tensor_file import load_tensors, save_tensors
 from suites import nico
 from suites.nico.base import STATE_SIZE, Environment
 from suites.nico.demonstrator import Demonstrator
@@ -95,6 +95,10 @@ def record_demonstrations(
         RuntimeError: If there is no OpenGL to render with.
     """
     nico.check_tasks(tasks)
+    if not tasks:
+        raise ValueError("name at least one of the tasks")
+    if seed < 0:
+        raise ValueError(f"seed must be at least 0, got {seed}")
     if not 0 <= held_out_per_task < per_task:
         raise ValueError(
             f"held_out_per_task is {held_out_per_task}: it must be less than per_task, {per_task}"
@@ -108,7 +112,8 @@ def record_demonstrations(
         "seed": seed,
         **({"play": True} if play else {}),
     }
-    if (path / _META).exists():
+    started = (path / _META).exists()
+    if started:
         meta = _read_meta(path)
         found = {key: meta.get(key) for key in {**wanted, **meta} if key != "checksum"}
         if found != wanted:
@@ -117,13 +122,15 @@ def record_demonstrations(
             )
         if meta.get("checksum"):
             return load_demonstrations(path)
+    # Before anything is written: without OpenGL there is nothing to record.
+    physics = nico.Physics.from_xml_string(nico.scene_xml())
+    shared = {"physics": physics, "renderer": FrameRenderer(physics.model.ptr)}
+    environments = [nico.load(task, observation="both", **shared) for task in tasks]
+    if started:
         dataset = _open(path, per_task * len(tasks))
     else:
         dataset = _make(path, per_task * len(tasks))
         _write_meta(path, wanted)
-    physics = nico.Physics.from_xml_string(nico.scene_xml())
-    shared = {"physics": physics, "renderer": FrameRenderer(physics.model.ptr)}
-    environments = [nico.load(task, observation="both", **shared) for task in tasks]
     missing = torch.nonzero(dataset["length"] == 0).flatten().tolist()
     perform = _play if play else _demonstrate
     described = "record play" if play else "record demonstrations"
@@ -203,20 +210,21 @@ def _write_meta(path: Path, meta: dict) -> None:
 def _read_meta(path: Path) -> dict:
     try:
         meta = json.loads((path / _META).read_text())
-    except FileNotFoundError:
+    except OSError:
         raise ValueError(f"{path} is no dataset of demonstrations; {_REMEDY}") from None
-    except (json.JSONDecodeError, UnicodeDecodeError):
+    except (ValueError, RecursionError):
         meta = None
-    if not isinstance(meta, dict) or not {"per_task", "tasks"} <= meta.keys():
+    if not isinstance(meta, dict) or not (
+        isinstance(meta.get("tasks"), list)
+        and isinstance(meta.get("per_task"), int)
+        and 0 < meta["per_task"] < 2**31
+    ):
         raise ValueError(f"{path / _META} is damaged; remove {path} and {_REMEDY}")
     return meta
 
 
 def _make(path: Path, n: int) -> TensorDict:
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OSError(f"cannot make the folder {path} ({error.strerror}); choose another") from None
+    make_folder(path)
     dataset = _empty(n)
     size = sum(value.numel() * value.element_size() for _, value in dataset.items())
     free = shutil.disk_usage(path).free
@@ -235,10 +243,15 @@ def _open(path: Path, n: int) -> TensorDict:
         size = value.numel() * value.element_size()
         if not file.exists() or file.stat().st_size != size:
             raise ValueError(f"{file} is missing or truncated; remove {path} and {_REMEDY}")
-    try:
-        return TensorDict.load_memmap(path)
-    except Exception as error:
-        raise ValueError(f"{path} cannot be read ({error}); remove it and {_REMEDY}") from error
+    # Not TensorDict.load_memmap: its meta.json, which the checksum does not cover, could have the
+    # bytes read as something else.
+    tensors = {
+        key: MemoryMappedTensor.from_filename(
+            path / f"{key}.memmap", dtype=value.dtype, shape=value.shape
+        )
+        for key, value in expected.items()
+    }
+    return TensorDict(tensors, [n])
 
 
 def load_demonstrations(path: str | Path, *, verify: bool = True) -> TensorDict:
@@ -259,7 +272,7 @@ def load_demonstrations(path: str | Path, *, verify: bool = True) -> TensorDict:
     version = nico.scene_version()
     if meta.get("scene_version") != version:
         raise ValueError(
-            f"{path} was recorded in scene {meta.get('scene_version')}, this is {version}; "
+            f"{path} was recorded in scene {meta.get('scene_version')!r}, this is {version}; "
             f"{_REMEDY}"
         )
     if not meta.get("checksum"):
@@ -347,14 +360,18 @@ class DemonstrationBank:
         )
 
     def save(self, path: str | Path, *, encoder_id: str) -> None:
-        """Writes the bank as safetensors, with the scene version and the encoders' identity."""
+        """Writes the bank as safetensors, with the scene version and the encoders' identity.
+
+        Raises:
+            OSError: If the file cannot be written; one that was there stays.
+        """
         tensors = {"embedding": self.embedding, "task": self.task, "train": self.train}
         meta = {
             "scene_version": nico.scene_version(),
             "encoder_id": encoder_id,
             "tasks": ",".join(self.tasks),
         }
-        save_file({k: v.contiguous() for k, v in tensors.items()}, str(path), metadata=meta)
+        save_tensors(path, tensors, meta)
 
     @classmethod
     def load(cls, path: str | Path, *, encoder_id: str) -> DemonstrationBank:
@@ -366,19 +383,27 @@ class DemonstrationBank:
         wanted = {"scene_version": nico.scene_version(), "encoder_id": encoder_id}
         remedy = "make it anew with `--train-encoders`"
         try:
-            with safe_open(str(path), framework="pt") as file:
-                meta = file.metadata() or {}
-                tensors = {k: file.get_tensor(k) for k in ("embedding", "task", "train")}
+            tensors, meta = load_tensors(path)
+            if not meta.get("tasks"):
+                raise ValueError("it does not say which tasks it is about")
+            bank = cls(**tensors, tasks=tuple(meta["tasks"].split(",")))
         except FileNotFoundError:
             raise ValueError(f"there is no demonstration bank at {path}; {remedy}") from None
-        except (SafetensorError, OSError) as error:
-            raise ValueError(f"{path} is damaged ({error}); {remedy}") from None
+        except (ValueError, TypeError) as error:
+            raise ValueError(f"{path} is damaged or no bank ({error}); {remedy}") from None
+        embedding, task, train = bank.embedding, bank.task, bank.train
+        if not (
+            embedding.ndim == 2
+            and task.shape == train.shape == embedding.shape[:1]
+            and (embedding.dtype, task.dtype, train.dtype)
+            == (torch.float32, torch.int64, torch.bool)
+            and embedding.isfinite().all()
+        ):
+            raise ValueError(f"{path} is damaged (wrong shapes, or NaN); {remedy}")
         found = {key: meta.get(key) for key in wanted}
         if found != wanted:
             raise ValueError(f"{path} belongs to {found}, but needed is {wanted}; {remedy}")
-        if not meta.get("tasks"):
-            raise ValueError(f"{path} does not say which tasks it is about; {remedy}")
-        return cls(**tensors, tasks=tuple(meta["tasks"].split(",")))
+        return bank
 
 
 def main(

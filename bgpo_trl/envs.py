@@ -16,6 +16,7 @@ from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from bgpo_trl.machine import usable_cores
+from bgpo_trl.modules.entries import lacking
 from suites import nico
 from suites.nico.base import STATE_SIZE, Environment, Observation, check_observation
 from suites.nico.rendering import FRAME_HEIGHT, FRAME_WIDTH, FrameRenderer
@@ -47,7 +48,7 @@ class NicoEnv(EnvBase):
 
     Raises:
         ValueError: If a task is unknown, there are not as many seeds as simulations, or there is
-            to be no thread.
+            to be no task, simulation or thread.
 
     Example:
         >>> env = NicoEnv(batch_size=[2], seed=0)
@@ -68,6 +69,10 @@ class NicoEnv(EnvBase):
         check_observation(observation)
         if threads is not None and threads < 1:
             raise ValueError(f"threads must be at least 1, or None for all cores, got {threads}")
+        if not tasks or isinstance(tasks, str):
+            raise ValueError(f"tasks must be names such as {nico.ALL_TASKS}, got {tasks!r}")
+        if not self.batch_size.numel():
+            raise ValueError(f"batch_size must be of at least 1 simulation, got {batch_size}")
         self.tasks = tuple(tasks)
         self.observation = observation
         count = self.batch_size.numel()
@@ -216,10 +221,18 @@ class NicoEnv(EnvBase):
         steps = tensordict.get("_step", None)
         if steps is not None:
             rows = rows & steps.reshape(-1).numpy()
-        actions = tensordict["action"].reshape(-1, 4).double().numpy()
+        action = tensordict.get("action", None)
+        if action is None:
+            raise lacking("NicoEnv", tensordict, ["action"])
+        if action.shape != (*self.batch_size, 4):
+            raise ValueError(f"actions must be {[*self.batch_size, 4]}, got {[*action.shape]}")
+        actions = action.reshape(-1, 4).double().numpy()
         # Checked for all before any of them moves.
         if not np.isfinite(actions[rows]).all():
-            raise ValueError(f"an action is 4 finite numbers in [-1, 1], got {actions.tolist()}")
+            raise ValueError(
+                f"an action is 4 finite numbers in [-1, 1], got {actions.tolist()}: if a policy "
+                "chose it, learning has diverged, lower its learning rate"
+            )
         rewards = np.zeros((len(rows), 1), np.float32)
         self._advance(np.flatnonzero(rows).tolist(), actions, rewards)
         reward = torch.from_numpy(rewards).reshape(*self.batch_size, 1)

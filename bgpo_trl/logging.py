@@ -8,6 +8,7 @@ such as Weights & Biases, is a mirror that may come and go without harm to the r
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import os
@@ -23,6 +24,8 @@ from torchrl.record.loggers import Logger
 from torchrl.record.loggers.wandb import WandbLogger
 
 from bgpo_trl.csv_file import CsvFile, plain_value
+from bgpo_trl.folders import make_folder
+from bgpo_trl.runs import read_json
 
 EVAL_COLUMNS = (
     "algorithm",
@@ -218,7 +221,7 @@ def check_settings(directory: str | os.PathLike[str], config: Any) -> None:
     """
     path = Path(directory) / "config.json"
     if path.exists():
-        there, here = dict(_flatten(json.loads(path.read_text()))), dict(_flatten(_plain(config)))
+        there, here = dict(_flatten(read_json(path))), dict(_flatten(_plain(config)))
         differences = [
             f"{name} is {there.get(name, 'absent')} there and {here.get(name, 'absent')} here"
             for name in {**there, **here}
@@ -235,14 +238,22 @@ def _claim_directory(directory: Path, settings: Any, resume: bool) -> None:
     """Writes ``config.json``, unless the directory holds a run that this one may not continue."""
     check_settings(directory, settings)
     path = directory / "config.json"
-    if not resume and any((directory / name).exists() for name in (path.name, "train.csv")):
+    files = (path.name, "train.csv", "eval.csv")
+    if not resume and any((directory / name).exists() for name in files):
         raise ValueError(
             f"{directory} already holds a run: resume it, or choose another run directory."
         )
-    directory.mkdir(parents=True, exist_ok=True)
+    make_folder(directory)
     temporary = path.with_suffix(".tmp")
-    temporary.write_text(json.dumps(settings, indent=2) + "\n")
-    temporary.replace(path)
+    try:
+        temporary.write_text(json.dumps(settings, indent=2) + "\n")
+        temporary.replace(path)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+        raise OSError(
+            f"cannot write {path} ({error.strerror}): make room, or choose another run directory"
+        ) from None
 
 
 def _wandb_logger(directory: Path, settings: Any, mode: str) -> list[Logger]:

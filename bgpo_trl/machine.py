@@ -29,6 +29,17 @@ def usable_cores(quota: str | Path = "/sys/fs/cgroup/cpu.max") -> int:
     return max(1, cores)
 
 
+def set_threads(threads: int) -> None:
+    """Sets how many threads PyTorch uses.
+
+    Raises:
+        ValueError: If that is none.
+    """
+    if threads < 1:
+        raise ValueError(f"threads must be at least 1, got {threads}: small networks want just 1")
+    torch.set_num_threads(threads)
+
+
 def choose_device(name: str = "auto") -> torch.device:
     """Returns the device for networks and replay; the simulation is always on the CPU.
 
@@ -43,7 +54,7 @@ def choose_device(name: str = "auto") -> torch.device:
     try:
         device = torch.device(name)
         torch.empty(0, device=device)
-    except (RuntimeError, AssertionError) as error:  # A PyTorch without CUDA asserts.
-        reason = str(error).splitlines()[0]
+    except (RuntimeError, AssertionError, NotImplementedError) as error:  # Without CUDA it asserts.
+        reason = str(error).splitlines()[0].partition(". ")[0]
         raise ValueError(f"no device {name!r} here ({reason}): use auto or cpu") from error
     return device

@@ -32,9 +32,11 @@ def evaluation_matrix(
         ``[..., P, T]``; NaN for tasks without a test in the window.
 
     Raises:
-        ValueError: If a phase has no evaluation in its window.
+        ValueError: If a phase has no evaluation in its window, or there are not as many episodes as
+            evaluations.
     """
     success, episodes = np.asarray(success, float), np.asarray(episodes)
+    _check_episodes(success, episodes, -2)
     phases = []
     for end in np.asarray(ends).tolist():
         chosen = (episodes > end - window) & (episodes <= end)
@@ -82,8 +84,12 @@ def forgetting_since_best(success: ArrayLike) -> Array:
 
     Args:
         success: ``[..., E, T]``.
+
+    Raises:
+        ValueError: If it is not of that shape.
     """
     success = np.asarray(success, float)
+    _check_episodes(success, np.arange(success.shape[-2] if success.ndim > 1 else 0), -2)
     return _mean(_max(success, axis=-2) - success[..., -1, :], axis=-1)
 
 
@@ -129,8 +135,12 @@ def area_under_curve(success: ArrayLike, episodes: ArrayLike) -> Array:
     Args:
         success: ``[..., E]``.
         episodes: Training episodes before each evaluation, ``[E]``.
+
+    Raises:
+        ValueError: If there are not as many episodes as evaluations, or they do not increase.
     """
     success, episodes = np.asarray(success, float), np.asarray(episodes, float)
+    _check_episodes(success, episodes, -1)
     start = np.zeros((*success.shape[:-1], 1))
     heights = np.concatenate([start, success], axis=-1)
     return np.trapezoid(heights, np.concatenate([[0.0], episodes]), axis=-1) / episodes[-1]
@@ -146,7 +156,11 @@ def episodes_to(success: ArrayLike, episodes: ArrayLike, threshold: float = 0.8)
 
     Returns:
         ``[...]``; infinite where it is never reached.
+
+    Raises:
+        ValueError: If there are not as many episodes as evaluations, or they do not increase.
     """
+    _check_episodes(np.asarray(success, float), np.asarray(episodes), -1)
     reached = np.asarray(success, float) >= threshold
     first = np.asarray(episodes, float)[reached.argmax(axis=-1)]
     return np.where(reached.any(axis=-1), first, np.inf)
@@ -158,8 +172,13 @@ def trailing_mean(success: ArrayLike, n: int) -> Array:
     Args:
         success: ``[..., E, T]``.
         n: Number of evaluations, at least 1.
+
+    Raises:
+        ValueError: If it is less.
     """
     success = np.asarray(success, float)
+    if n < 1 or success.ndim < 2:
+        raise ValueError(f"success must be [..., E, T] and n at least 1, got {success.shape}, {n}")
     n_evaluations = success.shape[-2]
     return np.stack(
         [
@@ -184,8 +203,13 @@ def interquartile_mean(scores: ArrayLike) -> float:
 
     Args:
         scores: Of any shape, such as ``[S, T]``: seeds and tasks.
+
+    Raises:
+        ValueError: If there is none, or one is not finite.
     """
     ordered = np.sort(np.asarray(scores, float), axis=None)
+    if not ordered.size or not np.isfinite(ordered).all():
+        raise ValueError("scores must be finite, and at least one: leave out what was not tested")
     cut = ordered.size // 4
     return float(ordered[cut : ordered.size - cut].mean())
 
@@ -212,7 +236,7 @@ def stratified_bootstrap(
         ``[N]``.
 
     Raises:
-        ValueError: If scores are not finite, or not ``[S, T]``.
+        ValueError: If scores are not finite, or not ``[S, T]``, or nothing is to be drawn.
 
     Example:
         >>> rng = np.random.default_rng(0)
@@ -222,6 +246,8 @@ def stratified_bootstrap(
         True
     """
     scores = _checked(scores)
+    if n_resamples < 1:
+        raise ValueError(f"n_resamples must be at least 1, got {n_resamples}")
     n_seeds, n_tasks = scores.shape
     drawn = rng.integers(n_seeds, size=(n_resamples, n_seeds, n_tasks))
     return np.array([statistic(scores[seeds, np.arange(n_tasks)]) for seeds in drawn])
@@ -233,7 +259,15 @@ def percentile_interval(values: ArrayLike, confidence: float = 0.95) -> tuple[fl
     Args:
         values: From `stratified_bootstrap`, or sums and differences of such.
         confidence: The share.
+
+    Raises:
+        ValueError: If there is no value, or the share does not lie in (0, 1).
     """
+    if not np.size(values) or not 0 < confidence < 1:
+        raise ValueError(
+            f"values must be at least one and confidence in (0, 1), got {np.size(values)} values "
+            f"and {confidence}"
+        )
     tail = 100 * (1 - confidence) / 2
     low, high = np.percentile(np.asarray(values, float), [tail, 100 - tail])
     return float(low), float(high)
@@ -247,6 +281,16 @@ def _checked(scores: ArrayLike) -> Array:
             f"{list(scores.shape)}{'' if np.isfinite(scores).all() else ' with NaN or Inf'}"
         )
     return scores
+
+
+def _check_episodes(success: Array, episodes: NDArray, axis: int) -> None:
+    """Raises ValueError unless there is one episode, larger than the last, for each evaluation."""
+    found = success.shape[axis] if success.ndim >= -axis else 0
+    if not found or episodes.shape != (found,) or (np.diff(episodes) <= 0).any():
+        raise ValueError(
+            "one evaluation at least is needed, and for each its training episodes, increasing: "
+            f"got success {[*success.shape]} for episodes {episodes.tolist()}"
+        )
 
 
 def _mean(values: Array, axis: int) -> Array:

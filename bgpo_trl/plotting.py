@@ -7,7 +7,6 @@ tell apart; line styles and markers differ as well.
 
 from __future__ import annotations
 
-import csv
 import math
 import os
 from collections import defaultdict
@@ -20,6 +19,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike, NDArray
+
+from bgpo_trl.folders import make_folder
+from bgpo_trl.runs import read_tests
 
 _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 _LINES = ("-", "--", "-.", (0, (3, 1, 1, 1, 1, 1)), (0, (1, 1)), (0, (6, 2)))
@@ -223,25 +225,16 @@ def save_figure(figure: Figure, path: str | os.PathLike[str]) -> None:
         path: Where to, ending in ``.png``; its folder is made if it does not exist.
     """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     figure.savefig(path, format="png", dpi=300, metadata={"Software": None})
 
 
 def _read_tests(paths: Iterable[str | os.PathLike[str]]) -> _Tests:
     tests: _Tests = defaultdict(lambda: defaultdict(list))
     for path in paths:
-        with open(path, newline="") as file:
-            reader = csv.DictReader(file)
-            missing = {"algorithm", "seed", "episode", "task", "success"} - set(
-                reader.fieldnames or ()
-            )
-            if missing:
-                raise ValueError(
-                    f"{path} is no eval.csv of a run: it lacks {', '.join(sorted(missing))}."
-                )
-            for row in reader:
-                test = (int(row["episode"]), row["task"], float(row["success"]))
-                tests[row["algorithm"]][int(row["seed"])].append(test)
+        for row in read_tests(path):
+            test = (int(row["episode"]), row["task"], float(row["success"]))
+            tests[row["algorithm"]][int(row["seed"])].append(test)
     if not tests:
         raise ValueError("there are no test episodes to plot: let the run evaluate first.")
     return tests

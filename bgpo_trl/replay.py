@@ -133,9 +133,11 @@ class ReplayBuffer:
             A new tensordict of batch size ``[*S, B]`` that shares no memory with the buffer.
 
         Raises:
-            ValueError: if a seed holds no transition.
+            ValueError: if a seed holds no transition, or the batch is to have none.
         """
         batch_size = self.batch_size if batch_size is None else batch_size
+        if batch_size < 1:
+            raise ValueError(f"batch_size must be at least 1, got {batch_size}")
         sizes, own = self.sizes.view(-1).tolist(), self.generators
         shape, columns = self._shape, self._seed
         if seeds is not None:
@@ -198,9 +200,13 @@ class ReplayBuffer:
             path: directory given to :meth:`dumps`.
 
         Raises:
-            ValueError: if it comes from a buffer of another capacity or number of seeds.
+            ValueError: if there is none, or it comes from a buffer of another capacity or number of
+                seeds.
         """
-        self.load_state_dict(TensorDict.load_memmap(str(path)))
+        if not (Path(path) / "meta.json").is_file():
+            raise ValueError(f"{path} holds no replay: give the directory that dumps() wrote")
+        # The default would also run what somebody else has pickled.
+        self.load_state_dict(TensorDict.load_memmap(str(path), allow_pickle=False))
 
     def _state(self) -> TensorDict:
         state = TensorDict(

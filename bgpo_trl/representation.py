@@ -10,17 +10,13 @@ A dataset is a TensorDict ``[N]`` with ``pixels`` uint8 ``[N, T, 32, 64, 3]``, `
 
 from __future__ import annotations
 
-import hashlib
 import json
-import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from importlib import resources
 from pathlib import Path
 
 import torch
-from safetensors import safe_open
-from safetensors.torch import save_file
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
@@ -29,6 +25,7 @@ from bgpo_trl.fitting import Fit, Log
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
 from bgpo_trl.objectives.representation import SequenceReconstructionLoss, VAEInverseLoss
+from bgpo_trl.tensor_file import digest, load_tensors, save_tensors
 
 
 @dataclass
@@ -48,7 +45,7 @@ class Representation:
     @property
     def identity(self) -> str:
         """A digest of all weights: what was embedded with other encoders has another."""
-        return _digest(_tensors(self))
+        return digest(_tensors(self))
 
 
 def train_representation(
@@ -148,14 +145,11 @@ def save_representation(representation: Representation, path: str | Path) -> Non
     Args:
         representation: what to save.
         path: the file to write; missing folders are made.
+
+    Raises:
+        OSError: if it cannot be written; one that was there stays as it was.
     """
-    path = Path(path)
-    tensors = _tensors(representation)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    # Written aside first: an interrupted save must not destroy the weights that were there.
-    partial = path.with_suffix(".partial")
-    save_file(tensors, partial, {**representation.metadata, "sha256": _digest(tensors)})
-    os.replace(partial, path)
+    save_tensors(path, _tensors(representation), representation.metadata)
 
 
 def load_representation(
@@ -175,14 +169,10 @@ def load_representation(
     """
     path = Path(path) if path is not None else default_weights()
     remedy = "train new ones with --train-encoders"
-    if not path.is_file():
-        raise ValueError(f"no encoder weights at {path}: {remedy}")
     try:
-        with safe_open(path, "pt") as file:
-            metadata = dict(file.metadata())
-            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-        if metadata.pop("sha256") != _digest(tensors):
-            raise ValueError("checksum differs")
+        tensors, metadata = load_tensors(path)
+        if any(value.dtype != torch.float32 for value in tensors.values()):
+            raise ValueError("weights are float32")
         config = json.loads(metadata["config"])
         trained_on = metadata["scene_version"]
         vae = VAE(config["vae"]["latent_size"], len(tensors["vae.inverse_head.bias"]))
@@ -191,6 +181,8 @@ def load_representation(
             module.load_state_dict(
                 {k.removeprefix(name): v for k, v in tensors.items() if k.startswith(name)}
             )
+    except FileNotFoundError:
+        raise ValueError(f"no encoder weights at {path}: {remedy}") from None
     except Exception as error:
         raise ValueError(f"{path} is damaged or holds no encoder weights: {remedy}") from error
     if scene_version is not None and trained_on != scene_version:
@@ -204,18 +196,10 @@ def load_representation(
 
 def _tensors(representation: Representation) -> dict[str, Tensor]:
     return {
-        f"{name}.{key}": value.contiguous()
+        f"{name}.{key}": value
         for name, module in (("vae", representation.vae), ("lae", representation.lae))
         for key, value in module.state_dict().items()
     }
-
-
-def _digest(tensors: Mapping[str, Tensor]) -> str:
-    digest = hashlib.sha256()
-    for key in sorted(tensors):
-        digest.update(key.encode())
-        digest.update(tensors[key].contiguous().numpy().tobytes())
-    return digest.hexdigest()
 
 
 def split(dataset: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
@@ -247,11 +231,6 @@ def mean_frame(frames: Tensor) -> Tensor:
 
 
 def _train_vae(datasets: Sequence[TensorDictBase], config: VAEConfig, fit: Fit, seed: int) -> VAE:
-    if config.window < 2 or config.batch_size % config.window:
-        raise ValueError(
-            f"vae.window must be at least 2 and divide vae.batch_size {config.batch_size}, "
-            f"got {config.window}"
-        )
     length = torch.cat([dataset.get("length") for dataset in datasets])
     if length.max() < config.window:
         raise ValueError(f"the dataset has no training demonstration of {config.window} frames")

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import csv
+import json
 import os
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,14 +42,63 @@ def read_rows(path: str | os.PathLike[str]) -> list[dict[str, str]]:
     """Returns the rows of a CSV file of a run.
 
     Raises:
-        ValueError: If there is no such file.
+        ValueError: If there is no such file, or it is no CSV file.
     """
+    return _read_csv(path)[1]
+
+
+def _read_csv(path: str | os.PathLike[str]) -> tuple[Sequence[str], list[dict[str, str]]]:
     path = Path(path)
     try:
         with path.open(newline="") as file:
-            return list(csv.DictReader(file))
-    except FileNotFoundError:
+            reader = csv.DictReader(file)
+            rows = list(reader)
+            return reader.fieldnames or (), rows
+    except (FileNotFoundError, NotADirectoryError):
         raise ValueError(f"{path} is missing: let the run in {path.parent} finish") from None
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise ValueError(f"{path} is no CSV file of a run ({error}): name another run") from None
+
+
+def read_tests(path: str | os.PathLike[str]) -> list[dict[str, str]]:
+    """Returns the rows of an ``eval.csv``, one a test episode.
+
+    Raises:
+        ValueError: If the file is missing or empty, or a row is not of a test episode.
+    """
+    columns, rows = _read_csv(path)
+    missing = sorted({"algorithm", "seed", "episode", "task", "success"}.difference(columns))
+    if columns and missing:
+        raise ValueError(f"{path} is no eval.csv of a run: it lacks {', '.join(missing)}")
+    if not rows:
+        raise ValueError(f"{path} holds no test episode: let the run evaluate first")
+    for number, row in enumerate(rows, 2):
+        try:
+            _ = int(row["seed"]), int(row["episode"]), float(row["success"])
+        except (TypeError, ValueError):
+            raise ValueError(
+                f"{path}, line {number} is damaged: resume the run, which writes it again, or take "
+                "the line out"
+            ) from None
+    return rows
+
+
+def read_json(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Returns what a run keeps in ``config.json`` or ``summary.json``.
+
+    Raises:
+        ValueError: If there is no such file, or it is damaged.
+    """
+    path = Path(path)
+    try:
+        found = json.loads(path.read_text())
+    except (FileNotFoundError, NotADirectoryError):
+        raise ValueError(f"{path} is missing: let the run in {path.parent} finish") from None
+    except (OSError, ValueError, RecursionError):
+        found = None
+    if not isinstance(found, dict):
+        raise ValueError(f"{path} is damaged: put it back as the run left it, or run it again")
+    return found
 
 
 def read_curves(path: str | os.PathLike[str], tasks: Sequence[str]) -> Curves:
@@ -61,11 +112,9 @@ def read_curves(path: str | os.PathLike[str], tasks: Sequence[str]) -> Curves:
         ValueError: If the file is missing or empty, or a test is of another task.
     """
     tests: dict[tuple[int, int, str], list[float]] = defaultdict(list)
-    for row in read_rows(path):
+    for row in read_tests(path):
         key = (int(row["seed"]), int(row["episode"]), row["task"])
         tests[key].append(float(row["success"]))
-    if not tests:
-        raise ValueError(f"{path} holds no test episode: let the run evaluate first")
     unknown = sorted({task for _, _, task in tests} - set(tasks))
     if unknown:
         raise ValueError(f"{path} tests {unknown[0]!r}, which is none of {', '.join(tasks)}")

@@ -9,6 +9,7 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 
+from bgpo_trl.modules.entries import lacking
 from bgpo_trl.replay import ReplayBuffer
 
 __all__ = ["TaskReplay"]
@@ -22,6 +23,9 @@ class TaskReplay:
         batch_size: transitions ``B`` drawn of each by :meth:`sample`.
         generator: source of the sampled indices, ``T`` for each of ``S`` seeds.
         keys: entries to store.
+
+    Raises:
+        ValueError: if there is no task, or no task could ever fill a batch.
 
     Examples:
         >>> streams = [[torch.Generator() for _ in range(3)] for _ in range(10)]
@@ -41,9 +45,13 @@ class TaskReplay:
         generator: Sequence[Sequence[torch.Generator]],
         keys: Sequence[NestedKey],
     ) -> None:
+        if not generator or not generator[0]:
+            raise ValueError("give a generator for each task of each seed, at least one")
         self.batch_size = batch_size
         self._shape = torch.Size([len(generator), len(generator[0])])
         self._keys = list(keys)
+        if capacity < batch_size:
+            raise ValueError(f"capacity must be at least batch_size {batch_size}, got {capacity}")
         self._buffer = ReplayBuffer(
             capacity,
             batch_size=batch_size,
@@ -79,9 +87,17 @@ class TaskReplay:
 
         Args:
             transition: batch size ``[S]``, with the entries to store and ``"task"`` int64 ``[S]``.
+
+        Raises:
+            ValueError: if an entry is missing, or there is no such task.
         """
         n_seeds, n_tasks = self._shape
-        mask = torch.arange(n_tasks) == transition["task"].unsqueeze(-1)
+        task = transition.get("task", None)
+        if task is None:
+            raise lacking("TaskReplay", transition, ["task"])
+        mask = torch.arange(n_tasks) == task.unsqueeze(-1)
+        if not mask.any(-1).all():
+            raise ValueError(f"task must lie in 0..{n_tasks - 1}, got {task.tolist()}")
         kept = transition.select(*self._keys).unsqueeze(1).expand(n_seeds, n_tasks)
         self._buffer.add(kept.reshape(n_seeds * n_tasks), mask.view(-1))
 

@@ -17,6 +17,7 @@ from bgpo_trl.configs import RepresentationConfig
 from bgpo_trl.csv_file import CsvFile
 from bgpo_trl.demonstrations import DemonstrationBank, load_demonstrations
 from bgpo_trl.fitting import Log
+from bgpo_trl.folders import make_folder
 from bgpo_trl.machine import choose_device
 from bgpo_trl.probes import probe
 from bgpo_trl.representation import (
@@ -95,7 +96,7 @@ def train_encoders(
         ValueError: as :func:`bgpo_trl.representation.train_representation`.
         OSError: if the disk is full.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     with CsvFile(folder / "train.csv", _COLUMNS) as file:
         representation = train_representation(
             dataset,

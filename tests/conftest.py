@@ -1,8 +1,10 @@
 """What all tests share: settings, and the parts of a run small enough to be played in a second."""
 
+import hashlib
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from json import JSONDecodeError
 
 import numpy as np
 import pytest
@@ -107,3 +109,28 @@ def interruptible() -> Iterator[None]:
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
+
+
+@pytest.fixture
+def refused(tmp_path) -> Callable[..., None]:
+    """Checks that a call ends in a line with cause and remedy, and leaves no trace on the disk."""
+
+    def check(call: Callable[[], object], cause: str, remedy: str) -> None:
+        before = _files(tmp_path)
+        with pytest.raises((ValueError, OSError, RuntimeError)) as raised:
+            call()
+        message = str(raised.value)
+        assert not isinstance(raised.value, JSONDecodeError | UnicodeDecodeError)
+        assert "\n" not in message
+        assert cause in message
+        assert remedy in message
+        assert _files(tmp_path) == before
+
+    return check
+
+
+def _files(folder) -> dict[str, str]:
+    return {
+        str(path): hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
+        for path in folder.rglob("*")
+    }

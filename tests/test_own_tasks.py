@@ -195,7 +195,7 @@ def test_a_bank_keeps_its_names_on_disk(tmp_path):
         tensors = {key: file.get_tensor(key) for key in ("embedding", "task", "train")}
         told = {key: value for key, value in file.metadata().items() if key != "tasks"}
     save_file(tensors, str(path), told)
-    with pytest.raises(ValueError, match=r"does not say which tasks it is about; make it anew"):
+    with pytest.raises(ValueError, match=r"does not say which tasks it is about\); make it anew"):
         DemonstrationBank.load(path, encoder_id="abc")
 
 
@@ -209,8 +209,11 @@ def test_a_label_without_a_name_is_refused():
     [
         ({"tasks": ("juggle",)}, r"^no NICO task 'juggle'; choose one of .* nico\.add_task$"),
         ({"tasks": ("at_once",) * 3}, r"^the task 'at_once' is named twice$"),
-        ({"tasks": ("at_once",)}, r"^task_starts \(0, 7000, 13000\) must have one episode for"),
-        ({"task_starts": (0,)}, r"^task_starts \(0,\) must have one episode for each of the tasks"),
+        ({"tasks": ("at_once",)}, "^task_starts must be one episode for each of the tasks"),
+        (
+            {"task_starts": (0,)},
+            r"^task_starts must be one episode for each of the tasks, got \(0,\)",
+        ),
     ],
 )
 def test_a_run_of_tasks_that_do_not_fit_is_refused(changes, message):

@@ -173,7 +173,7 @@ def test_reads_what_a_run_logger_writes(tmp_path):
 
 def test_bad_curves_are_refused(tmp_path, run):
     empty = write_eval_csv(tmp_path / "empty.csv", [])
-    with pytest.raises(ValueError, match="no test episodes"):
+    with pytest.raises(ValueError, match=r"empty\.csv holds no test episode: let the run evaluate"):
         plot_success_curves(empty)
     with pytest.raises(ValueError, match="no test episodes"):
         plot_success_curves([])

@@ -17,6 +17,8 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor, nn
 
+from bgpo_trl.modules.entries import read
+
 __all__ = ["Actor", "Critic", "StackedLinear", "StackedMLP"]
 
 
@@ -260,7 +262,7 @@ class Actor(TensorDictModuleBase):
         Returns:
             The same tensordict.
         """
-        pre_tanh = self.mlp(*[tensordict[key] for key in self.in_keys])
+        pre_tanh = self.mlp(*read(self, tensordict))
         tensordict.set("pre_tanh_action", pre_tanh)
         return tensordict.set("action", pre_tanh.tanh())
 
@@ -327,5 +329,5 @@ class Critic(TensorDictModuleBase):
         Returns:
             The same tensordict.
         """
-        value = self.mlp(*[tensordict[key] for key in self.in_keys])
+        value = self.mlp(*read(self, tensordict))
         return tensordict.set("state_action_value", value)

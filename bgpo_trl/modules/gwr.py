@@ -259,8 +259,12 @@ class GWRB(nn.Module):
         """Replaces the networks by those that `get_extra_state` returned.
 
         Raises:
-            ValueError: if there are more or fewer of them, or of other features, than here.
+            ValueError: if there are more or fewer of them, or of other features, than here, or they
+                are damaged; nothing has changed then.
         """
+        wanted = {*BehaviorGraph._fields, "next_node"}
+        if not all(wanted <= network.keys() for network in state):
+            raise ValueError(f"the state of a network needs {sorted(wanted)}: see get_extra_state")
         found = [network["weights"].shape[1] for network in state]
         if found != [self.n_features] * len(self._topologies):
             raise ValueError(
@@ -268,15 +272,15 @@ class GWRB(nn.Module):
                 f"{len(self._topologies)} of {self.n_features}: build it with the same sizes"
             )
         graphs = [BehaviorGraph(*(network[x] for x in BehaviorGraph._fields)) for network in state]
+        topologies = [
+            Topology.from_graph(graph, network["next_node"])
+            for graph, network in zip(graphs, state, strict=True)
+        ]
         capacity = max(2, *(len(graph.node) for graph in graphs))
         weights = self._weights.new_full((len(graphs), capacity, self.n_features), torch.inf)
         for rows, graph in zip(weights, graphs, strict=True):
             rows[: len(graph.node)] = graph.weights
-        self._topologies = [
-            Topology.from_graph(graph, network["next_node"])
-            for graph, network in zip(graphs, state, strict=True)
-        ]
-        self._weights = weights
+        self._topologies, self._weights = topologies, weights
 
     def _spread(self, x: Tensor, network: Tensor, fill: float) -> Tensor:
         """Places results of active networks among those of all, which are `fill` elsewhere."""

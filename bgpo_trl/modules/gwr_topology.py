@@ -45,12 +45,17 @@ class LearningRule:
     def __post_init__(self) -> None:
         least_alpha = 1 / self.initial_habituation if self.initial_habituation > 0 else math.inf
         for holds, need in [
+            (0 <= self.activity_threshold <= 1, "0 <= activity_threshold <= 1"),
+            (0 <= self.habituation_threshold < math.inf, "habituation_threshold >= 0"),
             (0 <= self.lr_neighbor <= self.lr_best <= 1, "0 <= lr_neighbor <= lr_best <= 1"),
             (0 < self.initial_habituation <= 1, "0 < initial_habituation <= 1"),
-            (self.alpha_best >= least_alpha, "alpha_best >= 1 / initial_habituation"),
-            (self.alpha_neighbor >= least_alpha, "alpha_neighbor >= 1 / initial_habituation"),
-            (self.tau_best > 0, "tau_best > 0"),
-            (self.tau_neighbor > 0, "tau_neighbor > 0"),
+            (least_alpha <= self.alpha_best < math.inf, "alpha_best >= 1 / initial_habituation"),
+            (
+                least_alpha <= self.alpha_neighbor < math.inf,
+                "alpha_neighbor >= 1 / initial_habituation",
+            ),
+            (0 < self.tau_best < math.inf, "tau_best > 0"),
+            (0 < self.tau_neighbor < math.inf, "tau_neighbor > 0"),
             (self.max_age >= 1, "max_age >= 1"),
             (self.max_nodes is None or self.max_nodes >= 2, "max_nodes >= 2, or None"),
         ]:
@@ -123,7 +128,23 @@ class Topology:
 
     @classmethod
     def from_graph(cls, graph: BehaviorGraph, next_identity: int) -> Topology:
-        """Rebuilds the topology that `to_graph` has copied."""
+        """Rebuilds the topology that `to_graph` has copied.
+
+        Raises:
+            ValueError: if it is no such graph.
+        """
+        n, ends = len(graph.weights), graph.edges
+        sound = (
+            len(graph.habituation) == len(graph.node) == n
+            and ends.shape == (len(graph.ages), 2)
+            and bool(((ends >= 0) & (ends < n)).all() and (ends[:, 0] != ends[:, 1]).all())
+            and bool((graph.node.diff() > 0).all() and (graph.node < next_identity).all())
+            and bool(graph.weights.isfinite().all() and graph.habituation.isfinite().all())
+        )
+        if not sound:
+            raise ValueError(
+                "the state is no graph of GWR-B, or a damaged one: load what state_dict returned"
+            )
         identity, habituation = graph.node.tolist(), graph.habituation.tolist()
         edges = {row: {} for row in range(len(identity))}
         topology = cls(identity, habituation, [0] * len(identity), edges, next_identity)

@@ -10,6 +10,7 @@ from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor, nn
 
 from bgpo_trl.modules.actor_critic import StackedLinear, StackedMLP
+from bgpo_trl.modules.entries import read
 
 __all__ = ["MultiHeadActor"]
 
@@ -98,9 +99,10 @@ class MultiHeadActor(TensorDictModuleBase):
             The same tensordict.
 
         Raises:
-            ValueError: if the states are not of as many tasks as there are heads.
+            ValueError: if an entry is missing, or the states are not of as many tasks as there are
+                heads.
         """
-        hidden = self.trunk(*[tensordict[key] for key in self.in_keys]).relu()
+        hidden = self.trunk(*read(self, tensordict)).relu()
         task_dim = len(self.batch_size)
         if hidden.shape[task_dim] != len(self.heads):
             raise ValueError(

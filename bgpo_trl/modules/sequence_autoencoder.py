@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor, nn
 
@@ -20,7 +22,7 @@ class SequenceAutoencoder(nn.Module):
         embedding_scale: length of phi in units of the hidden state (paper: 1).
 
     Raises:
-        ValueError: if the scale is not positive.
+        ValueError: if a size or the scale is not positive.
 
     Example:
         >>> import torch
@@ -33,7 +35,12 @@ class SequenceAutoencoder(nn.Module):
     def __init__(
         self, latent_size: int = 64, embedding_size: int = 32, embedding_scale: float = 1.0
     ) -> None:
-        if not embedding_scale > 0:
+        if latent_size < 1 or embedding_size < 1:
+            raise ValueError(
+                f"latent_size and embedding_size must be at least 1, got {latent_size} and "
+                f"{embedding_size}"
+            )
+        if not 0 < embedding_scale < math.inf:
             raise ValueError(f"embedding_scale must be positive, got {embedding_scale}")
         super().__init__()
         self.latent_size = latent_size
@@ -64,6 +71,11 @@ class SequenceAutoencoder(nn.Module):
                 f"got {tuple(length.shape)}"
             )
         steps = z.shape[-2]
+        if z.shape[-1] != self.latent_size or length.dtype != torch.int64:
+            raise ValueError(
+                f"latents must be [..., T, {self.latent_size}] and lengths int64, got "
+                f"{[*z.shape]} and {length.dtype}"
+            )
         if length.numel() and not (length.min() >= 1 and length.max() <= steps):
             raise ValueError(f"every length must be in 1..{steps}: drop empty sequences")
         # An LSTM is causal: reading its output at the last valid step masks the padding exactly.
@@ -85,8 +97,16 @@ class SequenceAutoencoder(nn.Module):
 
         Returns:
             The new ``h`` and ``c``, ``[..., embedding_size]`` each.
+
+        Raises:
+            ValueError: if shapes disagree.
         """
         shape = h.shape
+        if z.shape != (*shape[:-1], self.latent_size) or shape[-1] != self.embedding_size:
+            raise ValueError(
+                f"z must be [..., {self.latent_size}] and h [..., {self.embedding_size}], of the "
+                f"same batch, got {[*z.shape]} and {[*shape]}"
+            )
         state = (h.reshape(-1, self.embedding_size), c.reshape(-1, self.embedding_size))
         z = z.reshape(-1, self.latent_size)
         h, c = torch.lstm_cell(z, state, *self.encoder.all_weights[0])

@@ -38,6 +38,9 @@ class VAE(nn.Module):
         latent_size: dimensions of z (paper: 64).
         action_size: dimensions of an action (paper: 4).
 
+    Raises:
+        ValueError: if a size is not positive.
+
     Attributes:
         mean_frame: ``[32, 64, 3]`` buffer in [0, 1], set before training; grey until then.
         latent_mean: ``[latent_size]`` buffer, subtracted from mu by :meth:`latent`.
@@ -56,6 +59,11 @@ class VAE(nn.Module):
     latent_std: Tensor
 
     def __init__(self, latent_size: int = 64, action_size: int = 4) -> None:
+        if latent_size < 1 or action_size < 1:
+            raise ValueError(
+                f"latent_size and action_size must be at least 1, got {latent_size} and "
+                f"{action_size}"
+            )
         super().__init__()
         self.latent_size = latent_size
         self.action_size = action_size
@@ -100,7 +108,11 @@ class VAE(nn.Module):
 
         Returns:
             float32 ``[..., 32, 64, 3]``.
+
+        Raises:
+            ValueError: if ``z`` has another size.
         """
+        self._check_latent(z)
         x = F.relu(self.decoder_dense(z.reshape(-1, self.latent_size)))
         x = x.unflatten(-1, _COARSE_SHAPE).contiguous(memory_format=torch.channels_last)
         for convolution in self.decoder[:-1]:
@@ -118,7 +130,12 @@ class VAE(nn.Module):
 
         Returns:
             float32 ``[..., action_size]`` in (-1, 1).
+
+        Raises:
+            ValueError: if a latent has another size.
         """
+        self._check_latent(z)
+        self._check_latent(z_next)
         return torch.tanh(self.inverse_head(torch.cat([z, z_next], -1)))
 
     @torch.no_grad()
@@ -162,6 +179,10 @@ class VAE(nn.Module):
             raise ValueError("mu is constant or not finite: train the VAE (again) before scaling")
         self.latent_mean.copy_(mean)
         self.latent_std.copy_(std.clamp_min(floor * std.max()))
+
+    def _check_latent(self, z: Tensor) -> None:
+        if z.shape[-1:] != (self.latent_size,):
+            raise ValueError(f"a latent must be [..., {self.latent_size}], got {[*z.shape]}")
 
     def _coarse(self, pixels: Tensor) -> Tensor:
         if pixels.dtype != torch.uint8 or pixels.shape[-3:] != FRAME_SHAPE:

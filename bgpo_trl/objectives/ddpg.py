@@ -60,7 +60,8 @@ class DDPGLoss(StackedLoss, objectives.DDPGLoss):
         delay_value: whether the target value comes from a target network.
 
     Raises:
-        ValueError: if ``return_bounds`` is not an increasing pair, or the penalty is negative.
+        ValueError: if ``return_bounds`` is not an increasing pair, the penalty is negative, or
+            there is no such ``loss_function``.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -133,9 +134,9 @@ class DDPGLoss(StackedLoss, objectives.DDPGLoss):
             The loss ``[]`` and the diagnostics of the critic.
 
         Raises:
-            ValueError: if the batch has no ``("next", "terminated")``.
+            ValueError: if the batch lacks an entry, or the reward has another shape.
         """
-        data = tensordict.select(*self.value_network.in_keys).detach()
+        data = self._select(tensordict, self.value_network.in_keys)
         self._critic(data)
         prediction = data.get(self.tensor_keys.state_action_value).squeeze(-1)
         with torch.no_grad():
@@ -162,9 +163,10 @@ class DDPGLoss(StackedLoss, objectives.DDPGLoss):
             The loss ``[]`` and the diagnostics of the actor.
 
         Raises:
-            ValueError: if the actor wrote no ``"pre_tanh_action"`` to penalize.
+            ValueError: if the batch lacks an entry, or the actor wrote no ``"pre_tanh_action"`` to
+                penalize.
         """
-        data = tensordict.select(*self.actor_in_keys, *self.value_exclusive_keys).detach()
+        data = self._select(tensordict, [*self.actor_in_keys, *self.value_exclusive_keys])
         self._frozen_critic(self._actor(data))
         value = data.get(self.tensor_keys.state_action_value).squeeze(-1)
         return self._penalized(value, data, tensordict)
@@ -196,11 +198,17 @@ class ForeachSoftUpdate(objectives.SoftUpdate):
         loss_module: loss with target networks.
         eps: share of the target that is kept, ``1 - tau``; exclusive with ``tau``.
         tau: share of the source that is taken over (Polyak averaging).
+
+    Raises:
+        ValueError: if not one of ``eps`` and ``tau`` is given, or targets would never move.
     """
 
     def __init__(
         self, loss_module: LossModule, *, eps: float | None = None, tau: float | None = None
     ) -> None:
+        kept = eps if tau is None else 1 - tau
+        if (eps is not None and tau is not None) or kept is None or not 0 <= kept < 1:
+            raise ValueError(f"give tau in (0, 1], or eps in [0, 1), got tau={tau}, eps={eps}")
         super().__init__(loss_module, eps=eps, tau=tau)
         pairs = [
             (target, source)

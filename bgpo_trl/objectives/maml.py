@@ -67,7 +67,7 @@ class MAMLLoss(DDPGLoss):
                 "meta_network, actor_network and value_network must have the batch sizes [*S], "
                 f"[*S, T] and [*S, T], got {', '.join(str([*shape]) for shape in shapes)}"
             )
-        if inner_learning_rate < 0:
+        if not inner_learning_rate >= 0:
             raise ValueError(f"inner_learning_rate must be >= 0, got {inner_learning_rate}")
         # It is only called with parameters from elsewhere; a list keeps its own out of this module.
         self._template = [deepcopy(actor_network).requires_grad_(False)]
@@ -123,7 +123,7 @@ class MAMLLoss(DDPGLoss):
             parameters: of one policy a task, ``[*S, T, ...]``.
             tensordict: transitions of each task ``[*S, T, B]``.
         """
-        data = tensordict.select(*self.actor_in_keys, *self.value_exclusive_keys).detach()
+        data = self._select(tensordict, [*self.actor_in_keys, *self.value_exclusive_keys])
         functional_call(self._template[0], parameters, (data,))
         value = self._frozen_critic(data)[self.tensor_keys.state_action_value].squeeze(-1)
         loss = -value

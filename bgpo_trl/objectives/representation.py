@@ -9,6 +9,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.objectives import LossModule
 
+from bgpo_trl.modules.entries import lacking
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
 
@@ -41,7 +42,8 @@ class VAEInverseLoss(LossModule):
         generator: source of the sampling noise; PyTorch's global one if not given.
 
     Raises:
-        ValueError: from ``forward``, if windows are shorter than 2 frames.
+        ValueError: from ``forward``, if windows are shorter than 2 frames, an entry is missing, or
+            actions have another shape.
 
     Example:
         >>> import torch
@@ -100,8 +102,10 @@ class VAEInverseLoss(LossModule):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Returns the three losses for a batch of windows; see the class."""
-        pixels = tensordict.get(self.tensor_keys.pixels)
-        action = tensordict.get(self.tensor_keys.action)
+        pixels = tensordict.get(self.tensor_keys.pixels, None)
+        action = tensordict.get(self.tensor_keys.action, None)
+        if pixels is None or action is None:
+            raise lacking("VAEInverseLoss", tensordict, self.in_keys)
         if pixels.ndim < 5 or pixels.shape[-4] < 2:
             raise ValueError(f"windows need at least 2 frames, got pixels {tuple(pixels.shape)}")
         mu, log_variance = self.vae.encode(pixels)
@@ -109,6 +113,11 @@ class VAEInverseLoss(LossModule):
         z = mu + noise * (log_variance / 2).exp()
         residual = self.vae.decode(z) - pixels / 255
         predicted = self.vae.inverse(z[..., :-1, :], z[..., 1:, :])
+        if action.shape != (*pixels.shape[:-3], predicted.shape[-1]):
+            raise ValueError(
+                f"action must be {[*pixels.shape[:-3], predicted.shape[-1]]} for these pixels and "
+                f"this VAE, got {[*action.shape]}"
+            )
         terms = {
             "reconstruction": residual.square().sum((-3, -2, -1)).mean(),
             "kl": (mu.square() + log_variance.exp() - 1 - log_variance).sum(-1).mean() / 2,
@@ -172,8 +181,10 @@ class SequenceReconstructionLoss(LossModule):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Returns the loss for a batch of sequences; see the class."""
-        latent = tensordict.get(self.tensor_keys.latent)
-        length = tensordict.get(self.tensor_keys.length)
+        latent = tensordict.get(self.tensor_keys.latent, None)
+        length = tensordict.get(self.tensor_keys.length, None)
+        if latent is None or length is None:
+            raise lacking("SequenceReconstructionLoss", tensordict, self.in_keys)
         n_steps = int(length.max())
         reconstructed = self.lae.decode(self.lae.encode(latent, length), n_steps)
         back = length.unsqueeze(-1) - 1 - torch.arange(n_steps, device=length.device)

@@ -113,7 +113,7 @@ class SACLoss(TwinCriticLoss, objectives.SACLoss):
         Returns:
             The loss ``[]`` and ``"log_prob"`` ``[*S, *B]`` of the actions drawn.
         """
-        data = tensordict.detach().select(*self.moving_keys, *self.constant_keys)
+        data = self._select(tensordict, [*self.moving_keys, *self.constant_keys])
         data, log_prob = self._sample(data)
         value = self._twin_values(self._frozen_critic, data).amin(len(self.batch_size))
         loss = self._mean_per_seed(self._each(self._alpha, log_prob) * log_prob - value, tensordict)

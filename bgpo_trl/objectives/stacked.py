@@ -14,6 +14,7 @@ from torch import Tensor
 from torchrl.objectives import ValueEstimators
 from torchrl.objectives.utils import _cache_values, distance_loss
 
+from bgpo_trl.modules.entries import lacking
 from bgpo_trl.seeding import normal
 
 __all__ = ["StackedLoss", "TwinCriticLoss"]
@@ -57,13 +58,18 @@ class StackedLoss(LossModule):
         """Takes over what is common to all losses; called at the end of each constructor.
 
         Raises:
-            ValueError: if ``return_bounds`` is not an increasing pair, or the penalty is negative.
+            ValueError: if ``return_bounds`` is not an increasing pair, the penalty is negative, or
+                there is no such ``loss_function``.
         """
         if not (pre_tanh_penalty >= 0 and math.isfinite(pre_tanh_penalty)):
             raise ValueError(f"pre_tanh_penalty must be a number >= 0, got {pre_tanh_penalty}")
         self.pre_tanh_penalty = pre_tanh_penalty
         if return_bounds is not None and not return_bounds[0] < return_bounds[1]:
             raise ValueError(f"return_bounds must be (low, high) with low < high: {return_bounds}")
+        if self.loss_function not in ("l2", "l1", "smooth_l1"):
+            raise ValueError(
+                f"loss_function must be l2, l1 or smooth_l1, got {self.loss_function!r}"
+            )
         self.return_bounds = return_bounds
         self.batch_size = torch.Size(getattr(actor_network, "batch_size", ()))
         critic_keys = set(getattr(self, self._critic_name).in_keys)
@@ -79,7 +85,12 @@ class StackedLoss(LossModule):
         Args:
             value_type: ``ValueEstimators.TD0`` or a value estimator of TorchRL.
             **hyperparams: such as ``gamma``, 0.98 by default (the paper gives none).
+
+        Raises:
+            ValueError: if gamma does not lie in [0, 1].
         """
+        if not 0 <= hyperparams.get("gamma", 0.98) <= 1:
+            raise ValueError(f"gamma must be between 0 and 1, got {hyperparams['gamma']}")
         value_type = value_type or self.default_value_estimator
         super().make_value_estimator(value_type, **{"gamma": 0.98, **hyperparams})
 
@@ -87,22 +98,47 @@ class StackedLoss(LossModule):
         """Returns what the networks read of the next states.
 
         Raises:
-            ValueError: if the batch has no ``("next", "terminated")``.
+            ValueError: if the batch lacks an entry.
         """
-        successor = tensordict.get("next")
+        name = type(self).__name__
+        successor = tensordict.get("next", None)
+        if successor is None or successor.get(self.tensor_keys.reward, None) is None:
+            raise lacking(name, tensordict, [("next", self.tensor_keys.reward)])
         if successor.get(self.tensor_keys.terminated, None) is None:
             # The estimator would read "done" in its place, and stop at truncation too.
             raise ValueError(
                 f"the batch lacks ('next', {self.tensor_keys.terminated!r}): store it, since only "
                 "it tells a success from a time-out"
             )
-        data = successor.select(*self.moving_keys)
+        data = self._select(successor, self.moving_keys, f"{name}, under 'next',")
         for key in self.constant_keys:
             data.set(key, tensordict[key])
         return data
 
+    def _select(
+        self, tensordict: TensorDictBase, keys: Sequence[NestedKey], reader: str | None = None
+    ) -> TensorDictBase:
+        """Returns entries without their gradients.
+
+        Raises:
+            ValueError: if one is missing.
+        """
+        try:
+            return tensordict.select(*keys).detach()
+        except KeyError:
+            raise lacking(reader or type(self).__name__, tensordict, keys) from None
+
     def _bootstrapped(self, tensordict: TensorDictBase, next_value: Tensor) -> Tensor:
-        """Returns the clipped target ``[*S, *B]`` for values ``[*S, *B, 1]`` of the next states."""
+        """Returns the clipped target ``[*S, *B]`` for values ``[*S, *B, 1]`` of the next states.
+
+        Raises:
+            ValueError: if the reward has another shape.
+        """
+        reward = tensordict.get(("next", self.tensor_keys.reward))
+        if reward.shape != next_value.shape:
+            raise ValueError(
+                f"the reward must be {[*next_value.shape]}, as the value is, got {[*reward.shape]}"
+            )
         target = self.value_estimator.value_estimate(tensordict, next_value=next_value).squeeze(-1)
         return target if self.return_bounds is None else target.clamp(*self.return_bounds)
 

@@ -123,7 +123,7 @@ class TD3Loss(TwinCriticLoss, objectives.TD3Loss):
         Raises:
             ValueError: if the actor wrote no ``"pre_tanh_action"`` to penalize.
         """
-        data = self._actor(tensordict.detach().select(*self.moving_keys, *self.constant_keys))
+        data = self._actor(self._select(tensordict, [*self.moving_keys, *self.constant_keys]))
         value = self._twin_values(self._frozen_critic, data).select(len(self.batch_size), 0)
         return self._penalized(value, data, tensordict)
 

@@ -8,6 +8,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torchrl.data import Composite, TensorSpec
 
+from bgpo_trl.modules.entries import lacking
 from bgpo_trl.modules.gwr import GWRB
 from bgpo_trl.transforms._episode import EpisodeTransform, ending, unbounded
 
@@ -73,7 +74,10 @@ class BehaviorLookup(EpisodeTransform):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Looks up the behaviors of the demonstrations of any TensorDict; learns nothing."""
-        match = self.gwr.lookup(tensordict[self.in_keys[0]])
+        embedding = tensordict.get(self.in_keys[0], None)
+        if embedding is None:
+            raise lacking("BehaviorLookup", tensordict, self.in_keys)
+        match = self.gwr.lookup(embedding)
         behavior_key, node_key = self.out_keys
         return tensordict.set(behavior_key, match.embedding).set(node_key, match.node)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -41,7 +42,8 @@ class BehaviorMatchingReward(EpisodeTransform):
         done_key: the `done` that ends an episode.
 
     Raises:
-        ValueError: if beta is negative, or latents, behaviors or rewards are not there.
+        ValueError: if beta is negative, or latents, behaviors or rewards are not there, or of other
+            sizes than the encoder's.
 
     Examples:
         >>> from types import SimpleNamespace
@@ -73,7 +75,7 @@ class BehaviorMatchingReward(EpisodeTransform):
         out_keys: Sequence[NestedKey] = ("lae_h", "lae_c", "extrinsic_reward", "intrinsic_reward"),
         done_key: NestedKey = "done",
     ) -> None:
-        if beta < 0:
+        if not 0 <= beta < math.inf:
             raise ValueError(f"beta must not be negative, got {beta}")
         super().__init__(in_keys, out_keys, done_key)
         self.lae = lae
@@ -108,8 +110,14 @@ class BehaviorMatchingReward(EpisodeTransform):
         return self.lae.embed(h)
 
     def _entries(self, observation_spec: Composite) -> dict[NestedKey, TensorSpec]:
-        self._read_spec(observation_spec, self.in_keys[0], "FrameEncoder")
+        latent = self._read_spec(observation_spec, self.in_keys[0], "FrameEncoder")
         behavior = self._read_spec(observation_spec, self.in_keys[1], "BehaviorLookup")
+        sizes = latent.shape[-1], behavior.shape[-1]
+        if sizes != (self.lae.latent_size, self.lae.embedding_size):
+            raise ValueError(
+                f"latents and behaviors have sizes {sizes}, but the sequence encoder was made for "
+                f"{self.lae.latent_size} and {self.lae.embedding_size}: use those trained together"
+            )
         return {key: behavior.clone() for key in self.out_keys[:2]}
 
     def transform_reward_spec(self, reward_spec: Composite) -> Composite:

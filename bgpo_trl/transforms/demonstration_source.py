@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from numbers import Integral
 from typing import Protocol
 
 import numpy as np
@@ -47,6 +48,8 @@ class TaskSchedule:
             raise ValueError(
                 f"starts must hold a 0, for a task to start with, and nothing below: {self.starts}"
             )
+        if not all(isinstance(start, Integral) for start in self.starts):
+            raise ValueError(f"starts must be whole numbers of episodes: {self.starts}")
 
     @property
     def n_tasks(self) -> int:
@@ -162,11 +165,16 @@ class DemonstrationSource(EpisodeTransform):
                 "a bank needs embedding [N, 32] and task [N], got shapes "
                 f"{tuple(bank.embedding.shape)} and {tuple(bank.task.shape)}"
             )
+        if not bank.embedding.isfinite().all():
+            raise ValueError("the bank holds NaN or Inf: embed the demonstrations anew")
         tasks = bank.task.cpu().numpy()
         self._demonstrations = [np.flatnonzero(tasks == t) for t in range(schedule.n_tasks)]
         missing = [t for t, found in enumerate(self._demonstrations) if not len(found)]
         if missing:
-            raise ValueError(f"the bank has no demonstration of task {missing[0]} of the schedule")
+            raise ValueError(
+                f"the bank has no demonstration of task {missing[0]} of the schedule: record some, "
+                f"or let the schedule have fewer than {schedule.n_tasks} tasks"
+            )
         generators = generator if isinstance(generator, Sequence) else [generator] * n_rows
         if len(generators) != n_rows:
             raise ValueError(f"generator must be one or {n_rows}, one a row; got {len(generators)}")

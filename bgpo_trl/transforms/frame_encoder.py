@@ -76,7 +76,10 @@ class FrameEncoder(Transform):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Encodes the frames of any TensorDict."""
         for in_key, out_key in zip(self.in_keys, self.out_keys, strict=True):
-            tensordict.set(out_key, self._apply_transform(tensordict[in_key]))
+            frames = tensordict.get(in_key, None)
+            if frames is None:
+                raise _no_frames(in_key)
+            tensordict.set(out_key, self._apply_transform(frames))
         return self._drop(tensordict)
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
@@ -105,10 +108,7 @@ class FrameEncoder(Transform):
         """Adds the latents and, with `del_keys`, drops the frames."""
         for in_key, out_key in zip(self.in_keys, self.out_keys, strict=True):
             if in_key not in observation_spec.keys(True, True):
-                raise ValueError(
-                    f"FrameEncoder found no {in_key!r} in the environment: have it render, or name "
-                    "its frames in in_keys"
-                )
+                raise _no_frames(in_key)
             batch_dims = observation_spec.ndim
             frame = observation_spec[in_key].zero()[(0,) * batch_dims]
             n_latent = self._apply_transform(frame).shape[-1]
@@ -116,3 +116,10 @@ class FrameEncoder(Transform):
             if self.del_keys:
                 del observation_spec[in_key]
         return observation_spec
+
+
+def _no_frames(key: NestedKey) -> ValueError:
+    return ValueError(
+        f"FrameEncoder found no {key!r} in the environment: have it render, or name its frames in "
+        "in_keys"
+    )

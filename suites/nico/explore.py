@@ -133,19 +133,26 @@ def write_pictures(path: Path, pictures: Sequence[Image.Image]) -> None:
 
     Raises:
         ValueError: If the file's name ends otherwise.
+        OSError: If it cannot be written.
     """
+    _check_path(path)
     if path.suffix == ".gif":
         first, *others = pictures
         milliseconds = round(1000 * CONTROL_TIMESTEP)
         first.save(path, save_all=True, append_images=others, duration=milliseconds, loop=0)
-    elif path.suffix == ".png":
+    else:
         chosen = np.linspace(0, len(pictures) - 1, _STRIP_LENGTH).round().astype(int)
         strip = Image.new("RGB", (_PANEL_WIDTH * _STRIP_LENGTH, pictures[0].height))
         for column, index in enumerate(chosen):
             strip.paste(pictures[index], (column * _PANEL_WIDTH, 0))
         strip.save(path)
-    else:
+
+
+def _check_path(path: Path) -> None:
+    if path.suffix not in (".png", ".gif"):
         raise ValueError(f"cannot write {path}: give a name that ends in .png or .gif")
+    if not path.parent.is_dir():
+        raise ValueError(f"cannot write {path}: there is no folder {path.parent}, make it first")
 
 
 def view(task: str, *, random: bool = False, seed: int = 0) -> None:
@@ -173,6 +180,7 @@ def main(arguments: Arguments) -> None:
         view(arguments.task, **how)
         return
     out = arguments.out or Path(f"{arguments.task}.png")
+    _check_path(out)
     write_pictures(out, picture_episode(arguments.task, **how))
     sys.stdout.write(f"wrote {out}\n")
 

@@ -92,7 +92,7 @@ def load(
         environment_kwargs: Further arguments of ``dm_control.rl.control.Environment``.
 
     Raises:
-        ValueError: If the task or the observation is unknown.
+        ValueError: If the task or the observation is unknown, or the episode has no length.
 
     Example:
         >>> from suites import nico
@@ -101,6 +101,8 @@ def load(
         (32, 64, 3)
     """
     check_tasks([task])
+    if not time_limit > 0:
+        raise ValueError(f"time_limit must be above 0 s, got {time_limit}: a step takes 0.2 s")
     random = seed if isinstance(seed, np.random.RandomState) else np.random.RandomState(seed)
     return Environment(
         physics or Physics.from_xml_string(scene_xml()),

@@ -1,88 +1,21 @@
-"""Rendering of NICO's first-person frames at the speed the hardware allows.
-
-Importing this module chooses the OpenGL backend, because MuJoCo and dm_control read ``MUJOCO_GL``
-once, when they are first imported: on Linux EGL if its library can be loaded, else OSMesa. A value
-the user has set is kept. It also sets ``LP_NUM_THREADS=0`` where unset: llvmpipe's worker threads
-cost more than they give on a 64x32 frame.
-"""
+"""Rendering of NICO's first-person frames at the speed the hardware allows."""
 
 # MuJoCo's bindings come without stubs.
 # pyright: reportAttributeAccessIssue=false
 
+from suites import opengl  # isort: skip (before MuJoCo, which reads once what this chooses)
+
 import atexit
 import contextlib
-import ctypes
-import ctypes.util
-import importlib
 import os
-import platform
-import sys
 import weakref
-from collections.abc import Callable
+
+import mujoco
+import numpy as np
 
 FRAME_HEIGHT = 32  # (pixels), the paper's "64x32 RGB image"
 FRAME_WIDTH = 64  # (pixels)
 FRAME_CAMERA = "eyes"
-
-_INSTALL_HINT = (
-    "no OpenGL library for off-screen rendering was found: install EGL "
-    "(Debian/Ubuntu: `apt-get install libegl1 libgl1-mesa-dri`) or OSMesa (`libosmesa6`)"
-)
-
-
-def _loadable(library: str) -> bool:
-    name = ctypes.util.find_library(library)
-    if name is None:
-        return False
-    try:
-        ctypes.CDLL(name)
-    except OSError:
-        return False
-    return True
-
-
-def choose_backend(loadable: Callable[[str], bool] = _loadable) -> str | None:
-    """Returns the off-screen OpenGL backend to use, or None to leave MuJoCo's own choice.
-
-    Args:
-        loadable: Tells whether a shared library of that short name can be loaded.
-
-    Returns:
-        The user's ``MUJOCO_GL`` if set; on Linux ``"egl"`` or ``"osmesa"``, whichever library is
-        found first; None on other systems, where MuJoCo brings a backend of its own.
-
-    Raises:
-        RuntimeError: If Linux has neither library; the message names the packages.
-    """
-    chosen = os.environ.get("MUJOCO_GL")
-    if chosen:
-        return chosen
-    if platform.system() != "Linux":
-        return None
-    for backend, library in (("egl", "EGL"), ("osmesa", "OSMesa")):
-        if loadable(library):
-            return backend
-    raise RuntimeError(_INSTALL_HINT)
-
-
-def _configure() -> None:
-    os.environ.setdefault("LP_NUM_THREADS", "0")
-    try:
-        backend = choose_backend()
-    except RuntimeError:
-        # Physics works without OpenGL; the error belongs to whoever asks for a frame.
-        backend = None
-    if backend is not None and backend != os.environ.get("MUJOCO_GL"):
-        os.environ["MUJOCO_GL"] = backend
-        context = sys.modules.get("mujoco.rendering.classic.gl_context")
-        if context is not None:  # Somebody imported MuJoCo first: have it choose again.
-            importlib.reload(context)
-
-
-_configure()
-
-import mujoco  # noqa: E402
-import numpy as np  # noqa: E402
 
 # What the garbage collector would free at any moment, between the calls that draw another frame.
 _abandoned: list[mujoco.Renderer] = []
@@ -127,16 +60,19 @@ class FrameRenderer:
         if camera_id < 0:
             names = [model.camera(i).name for i in range(model.ncam)]
             raise ValueError(f"no camera {camera!r} in the scene; choose one of {names}")
-        choose_backend()
+        if opengl.refusal:
+            raise RuntimeError(opengl.refusal)
         while _abandoned:
             _close(_abandoned.pop())
         try:
             self._renderer = mujoco.Renderer(model, height, width, max_geom=200)
         except Exception as error:  # MuJoCo's backends raise errors of many kinds.
             backend = os.environ.get("MUJOCO_GL", "default")
+            reason = next(iter(str(error).splitlines()), type(error).__name__)
             raise RuntimeError(
-                f"no OpenGL context from the {backend} backend ({error}); {_INSTALL_HINT}, "
-                "or set MUJOCO_GL to one of egl, osmesa, glfw"
+                f"no OpenGL context from the {backend} backend ({reason}): set MUJOCO_GL to egl "
+                "or osmesa, or do not set it, and see that the library is there (Debian/Ubuntu: "
+                "`apt-get install libegl1 libgl1-mesa-dri`, or `libosmesa6`)"
             ) from error
         self._camera = mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED

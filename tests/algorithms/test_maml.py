@@ -348,5 +348,5 @@ def test_a_restored_run_continues_as_the_saved_one(make, tmp_path):
     ],
 )
 def test_settings_without_a_meaning_are_refused(name, value):
-    with pytest.raises(ValueError, match="MAML needs inner_learning_rate >= 0"):
+    with pytest.raises(ValueError, match=f"^{name} must be .*, got {value}$"):
         MAMLConfig(**{name: value})

@@ -169,5 +169,7 @@ def test_works_without_tensordict_and_names_a_missing_entry():
     pre_tanh, action = actor(state=state)
     assert torch.equal(action, expected["action"])
     assert torch.equal(pre_tanh, expected["pre_tanh_action"])
-    with pytest.raises(KeyError, match="state"):
+    with pytest.raises(
+        ValueError, match=r"^Actor found no 'state' in a .* with \['latent'\]: write"
+    ):
         actor(TensorDict({"latent": state}, [5]))

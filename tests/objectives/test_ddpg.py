@@ -328,7 +328,7 @@ def test_constant_entry_is_not_needed_under_next():
         ForeachSoftUpdate(loss, tau=0.005)
     batch = make_batch(16)
     batch["behavior"] = torch.randn(16, 2)
-    with pytest.raises(KeyError, match="behavior"):
+    with pytest.raises(ValueError, match=r"^DDPGLoss, under 'next', found no 'behavior'"):
         plain(batch)
     result = lean(batch)
     batch["next", "behavior"] = batch["behavior"]

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from suites import nico
-from suites.nico.rendering import FrameRenderer, choose_backend
+from suites.nico.rendering import FrameRenderer
+from suites.opengl import choose_backend
 
 
 @pytest.fixture
@@ -36,7 +37,24 @@ def test_without_any_library_one_line_says_what_to_install(on_linux):
 def test_the_choice_of_the_user_is_kept(on_linux, monkeypatch, chosen):
     monkeypatch.setenv("MUJOCO_GL", chosen)
 
-    assert choose_backend(lambda _: False) == chosen
+    assert choose_backend(lambda _: True) == chosen
+
+
+@pytest.mark.parametrize(
+    ("chosen", "message"),
+    [
+        ("osmesa", r"^MUJOCO_GL is 'osmesa', but there is no library OSMesa: do not set it.*$"),
+        ("egl", r"^MUJOCO_GL is 'egl', but there is no library EGL: do not set it, or install .*$"),
+        ("EGL", r"^MUJOCO_GL is 'EGL', which is no OpenGL backend: set it to egl, osmesa or .*$"),
+    ],
+)
+def test_a_choice_that_mujoco_cannot_be_imported_with_is_refused(
+    on_linux, monkeypatch, chosen, message
+):
+    monkeypatch.setenv("MUJOCO_GL", chosen)
+
+    with pytest.raises(RuntimeError, match=message):
+        choose_backend(lambda _: False)
 
 
 def test_other_systems_bring_a_backend_of_their_own(on_linux, monkeypatch):
@@ -65,8 +83,12 @@ print(env.reset().observation["pixels"].std() > 20)
 
 @pytest.mark.parametrize(
     "imports",
-    ["from suites import nico", "import mujoco\nfrom suites import nico"],
-    ids=["suite first", "mujoco first"],
+    [
+        "from suites import nico",
+        "import mujoco\nfrom suites import nico",
+        "import bgpo_trl, torchrl.envs\nfrom suites import nico",
+    ],
+    ids=["suite first", "mujoco first", "torchrl first"],
 )
 def test_a_fresh_process_renders_and_exits_cleanly(imports):
     process = run_python(imports + RENDER)
@@ -87,6 +109,22 @@ except RuntimeError as error:
     assert not others
     assert line.startswith("no OpenGL context from the disabled backend")
     assert "set MUJOCO_GL" in line
+
+
+def test_physics_works_with_a_backend_that_there_is_not_and_frames_say_why():
+    code = """
+from suites import nico
+print(nico.load("grasp_glass", seed=0, observation="state").reset().observation["state"].shape)
+try:
+    nico.load("grasp_glass", seed=0).reset()
+except RuntimeError as error:
+    print(error)
+"""
+    process = run_python(code, MUJOCO_GL="vulkan")
+
+    told = "(16,)\nMUJOCO_GL is 'vulkan', which is no OpenGL backend: set it to egl"
+    assert process.stdout.startswith(told)
+    assert process.stdout.count("\n") == 2
 
 
 def test_frames_of_simulations_that_share_a_renderer_do_not_mix(physics, renderer):

@@ -1,0 +1,190 @@
+"""What people get wrong at the command line: one line, exit status 1, and nothing half-written.
+
+Flags that there are not, and values that are no numbers or no choices, are tyro's own to refuse: a
+box of several lines with exit status 2, which must name the flag and, where there are some, the
+choices. Cases are as in `tests/test_bad_input.py`.
+"""
+
+import hashlib
+import os
+import runpy
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import pytest
+
+from bgpo_trl.logging import EVAL_COLUMNS
+from suites import opengl
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture
+def folder(tiny, tmp_path, monkeypatch):
+    """A folder to be in, with a file, an empty folder, and runs of some kind."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("empty", "run", "damaged", "unevaluated"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "file").touch()
+    (tmp_path / "run" / "config.json").write_text('{"episodes": 5, "name": "bgpo"}')
+    (tmp_path / "damaged" / "config.json").write_text('{"episodes": ')
+    header = ",".join(EVAL_COLUMNS) + "\n"
+    (tmp_path / "damaged" / "eval.csv").write_text(header + "bgpo,0,ten,5,grasp_glass,1,1,5\n")
+    (tmp_path / "unevaluated" / "eval.csv").write_text(header)
+    return tmp_path
+
+
+def contents(folder):
+    return {
+        path: hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
+        for path in folder.rglob("*")
+    }
+
+
+def ended_with(monkeypatch, command):
+    """Runs a script or module in this process; returns what it hands to the shell."""
+    name, *arguments = command.split()
+    monkeypatch.setattr(sys, "argv", [name, *arguments])
+    with pytest.raises(SystemExit) as ended, warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # that a module was imported before
+        if name.endswith(".py"):
+            runpy.run_path(str(ROOT / "benchmarks" / name), run_name="__main__")
+        else:
+            runpy.run_module(name, run_name="__main__", alter_sys=True)
+    return ended.value.code
+
+
+CASES = [
+    # settings of a run
+    ("continual.py --episodes 0", "episodes", "must be at least 1, got 0"),
+    ("continual.py --seeds 1 1", "(1, 1)", "all different"),
+    ("continual.py --seeds -1", "(-1,)", "none negative"),
+    ("continual.py --seeds", "()", "needs seeds"),
+    ("continual.py --threads 0", "threads", "must be at least 1, got 0"),
+    ("continual.py --device cuda:99", "no device 'cuda:99'", "use auto or cpu"),
+    ("concurrent.py --device gpu", "no device 'gpu'", "use auto or cpu"),
+    ("ablation.py --algorithm maml", "--algorithm", "the variants are BGPO's"),
+    ("ladder.py --rungs", "--rungs names none", "name some of a, b, c, d"),
+    ("ladder.py --episodes 0", "episodes", "must be at least 1, got 0"),
+    ("ladder.py --threads 0", "threads", "must be at least 1, got 0"),
+    # where it goes
+    ("continual.py --out file", "cannot make the folder file", "choose another"),
+    ("continual.py --out file/run", "cannot make the folder file/run", "choose another"),
+    ("continual.py --out run", "run holds a run", "--resume continues it, --out names another"),
+    ("continual.py --out run --resume", "other settings (episodes is 5 there", "the same sett"),
+    ("continual.py --out damaged --resume", "config.json is damaged", "put it back as the run"),
+    ("ladder.py --rungs a --out file", "cannot make the folder file/a", "choose another"),
+    # runs that are read
+    ("compare.py empty nowhere", "empty/eval.csv is missing", "let the run in empty finish"),
+    ("compare.py unevaluated unevaluated", "no test episode", "let the run evaluate first"),
+    ("compare.py damaged damaged", "eval.csv, line 2 is damaged", "resume the run"),
+    ("compare.py run run --every 0", "--every", "at least 1 episode, got 0"),
+    ("summary.py", "name the directory", "of a run"),
+    ("summary.py file", "file/eval.csv is missing", "let the run in file finish"),
+    ("summary.py unevaluated", "no test episode", "let the run evaluate first"),
+    ("report.py nowhere", "nowhere is no directory", "name the one that holds the runs"),
+    ("report.py empty", "empty holds none of the runs", "that the figures need"),
+    # measurements
+    ("throughput.py --parts", "--parts names none", "name some of frames"),
+    ("throughput.py --rounds 0", "--rounds", "at least 1, got 0"),
+    ("throughput.py --threads 0", "--threads", "at least 1, got 0"),
+    ("gwr.py --nodes", "--nodes", "one or more, of at least 2"),
+    ("gwr.py --networks 0", "--networks", "at least 1, got 0"),
+    # stage 1
+    ("bgpo_trl.demonstrations file", "cannot make the folder file", "choose another"),
+    ("bgpo_trl.demonstrations new --per-task 0", "held_out_per_task", "less than per_task, 0"),
+    ("bgpo_trl.demonstrations new --seed -1", "seed", "must be at least 0, got -1"),
+    ("bgpo_trl.train_encoders empty", "empty is no dataset", "record it anew with"),
+    ("bgpo_trl.train_encoders empty --device gpu", "empty is no dataset", "record it anew with"),
+    ("bgpo_trl.probes empty --weights file", "file is damaged", "--train-encoders"),
+    ("bgpo_trl.probes file", "file is no dataset", "record it anew with"),
+    ("suites.nico.explore --task juggle --out a.gif", "'juggle'", "choose one of grasp_glass"),
+    ("suites.nico.explore --out a.jpeg", "cannot write a.jpeg", "ends in .png or .gif"),
+    ("suites.nico.explore --out file/a.png", "there is no folder file", "make it first"),
+]
+
+
+@pytest.mark.parametrize(("command", "cause", "remedy"), CASES, ids=[case[0] for case in CASES])
+def test_a_command_that_cannot_be_is_answered_in_one_line(
+    folder, monkeypatch, capsys, command, cause, remedy
+):
+    before = contents(folder)
+    told = ended_with(monkeypatch, command)
+    assert isinstance(told, str), capsys.readouterr().err
+    assert told.startswith("error: ")
+    assert "\n" not in told
+    assert cause in told
+    assert remedy in told
+    assert capsys.readouterr() == ("", "")
+    assert contents(folder) == before
+
+
+@pytest.mark.parametrize(
+    ("command", "named"),
+    [
+        ("continual.py --presett quick", "--presett"),
+        ("continual.py --episodes 1.5", "--episodes"),
+        ("continual.py --seeds a", "--seeds"),
+        ("continual.py --algorithm ppo", "dist-nll"),
+        ("ablation.py --variant all", "gwr+r_int"),
+        ("ladder.py --rungs e", "--rungs"),
+        ("ladder.py --gamma 1.5", "gamma must be between 0 and 1, got 1.5"),
+        ("ladder.py --hidden-sizes 64 0", "hidden_sizes must be one or more"),
+        ("compare.py run", "Another's"),
+        ("bgpo_trl.train_encoders empty --config.vae.batch-size 0", "batch_size must be at least"),
+        ("bgpo_trl.demonstrations", "PATH"),
+        ("suites.nico.explore --random --demonstrate", "--demonstrate"),
+    ],
+)
+def test_a_flag_that_cannot_be_is_named(folder, monkeypatch, capsys, command, named):
+    before = contents(folder)
+    assert ended_with(monkeypatch, command) == 2
+    out, told = capsys.readouterr()
+    assert named in " ".join(told.replace("│", " ").split())
+    assert "Traceback" not in told
+    assert not out
+    assert contents(folder) == before
+
+
+def test_a_folder_that_may_not_be_written_is_told(folder, monkeypatch):
+    def refuse(path, *args, **kwargs):
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "mkdir", refuse)
+    before = contents(folder)
+    told = ended_with(monkeypatch, "continual.py --out elsewhere/run")
+    assert told == "error: cannot make the folder elsewhere/run (Permission denied): choose another"
+    assert contents(folder) == before
+
+
+def test_without_opengl_no_recording_is_begun(folder, monkeypatch):
+    monkeypatch.setattr(opengl, "refusal", "MUJOCO_GL is 'vulkan': do not set it")
+    before = contents(folder)
+    told = ended_with(monkeypatch, "bgpo_trl.demonstrations new --per-task 2 --held-out-per-task 1")
+    assert told == "error: MUJOCO_GL is 'vulkan': do not set it"
+    assert contents(folder) == before
+
+
+@pytest.mark.parametrize(
+    ("backend", "told"),
+    [
+        ("vulkan", "error: MUJOCO_GL is 'vulkan', which is no OpenGL backend: set it to egl"),
+        ("disabled", "error: no OpenGL context from the disabled backend"),
+    ],
+)
+def test_without_opengl_no_run_is_begun(tmp_path, backend, told):
+    process = subprocess.run(
+        [sys.executable, str(ROOT / "benchmarks" / "concurrent.py"), "--out", "run"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "MUJOCO_GL": backend},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert process.returncode == 1
+    assert process.stderr.startswith(told)
+    assert process.stderr.count("\n") == 1
+    assert not process.stdout
+    assert not list(tmp_path.iterdir())

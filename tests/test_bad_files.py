@@ -1,0 +1,163 @@
+"""What people get wrong with files: each is one line, and nothing is left half-written."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from bgpo_trl.checkpoint import load_checkpoint, save_checkpoint
+from bgpo_trl.csv_file import CsvFile
+from bgpo_trl.demonstrations import DemonstrationBank, load_demonstrations, record_demonstrations
+from bgpo_trl.logging import EVAL_COLUMNS, RunLogger
+from bgpo_trl.plotting import plot_frame_strips, plot_success_curves, save_figure
+from bgpo_trl.pretrained import load_pretrained
+from bgpo_trl.replay import ReplayBuffer
+from bgpo_trl.representation import default_weights, load_representation
+from bgpo_trl.runs import read_curves, read_json, read_rows
+from bgpo_trl.tensor_file import save_tensors
+from suites import nico
+
+HEADER = ",".join(EVAL_COLUMNS) + "\n"
+TINY = {"per_task": 2, "held_out_per_task": 1, "progress": False}
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    """A file, an empty folder, and runs that something has happened to."""
+    (tmp_path / "file").write_text("x")
+    for name, content in {
+        "unevaluated": HEADER,
+        "foreign": "date,temperature\nmonday,21\n",
+        "damaged": HEADER + "bgpo,0,ten,5,grasp_glass,1,1.0,5\n",
+        "cut": HEADER + "bgpo,0,10\n",
+        "binary": b"\xff\xfe\x00" * 20,
+        "stranger": HEADER + "bgpo,0,10,5,juggle,1,1.0,5\n",
+    }.items():
+        (tmp_path / name).mkdir()
+        data = content if isinstance(content, bytes) else content.encode()
+        (tmp_path / name / "eval.csv").write_bytes(data)
+        if name != "unevaluated":
+            (tmp_path / name / "config.json").write_text('{"gamma": ')
+    meta = {"scene_version": nico.scene_version(), "encoder_id": "x"}
+    save_tensors(tmp_path / "bank", vars(bank()), meta)
+    return tmp_path
+
+
+def bank() -> DemonstrationBank:
+    task = torch.arange(3)
+    return DemonstrationBank(torch.zeros(3, 32), task, task > 0)
+
+
+def load_bank(path):
+    return DemonstrationBank.load(path, encoder_id="x")
+
+
+def curves(path):
+    return read_curves(path / "eval.csv", nico.ALL_TASKS)
+
+
+def figure():
+    return plot_frame_strips({"a": np.zeros((2, 32, 64, 3), np.uint8)})
+
+
+def log(path, **options):
+    RunLogger(path, **({"config": {}} | options)).close()
+
+
+CASES = {
+    # run directories
+    "run in a file": (
+        lambda f: log(f / "file"), "cannot make the folder", "File exists): choose another"),
+    "run below a file": (
+        lambda f: log(f / "file" / "run"), "Not a directory", "choose another"),
+    "run with damaged settings": (
+        lambda f: log(f / "cut", resume=True), "config.json is damaged", "put it back as"),
+    "run that has only tests": (
+        lambda f: log(f / "unevaluated"), "already holds a run", "resume it, or choose another"),
+    "dashboard misspelt": (
+        lambda f: log(f / "new", wandb="yes"), "not 'yes'", '"online", "offline" or None'),
+    "csv in no folder": (
+        lambda f: CsvFile(f / "nowhere" / "a.csv", ["a"]), "No such file", "choose another run"),
+    "csv that is a folder": (lambda f: CsvFile(f, ["a"]), "Is a directory", "choose another run"),
+    "csv without columns": (lambda f: CsvFile(f / "a.csv", []), "got ()", "needs columns"),
+    "csv with a column twice": (
+        lambda f: CsvFile(f / "a.csv", ["a", "a"]), "('a', 'a')", "all different"),
+    "csv of another run": (
+        lambda f: CsvFile(f / "foreign" / "eval.csv", EVAL_COLUMNS),
+        "has the columns date,temperature", "choose another run directory"),
+    "figure in a file": (
+        lambda f: save_figure(figure(), f / "file" / "a.png"), "cannot make the folder", "another"),
+    # checkpoints
+    "no checkpoint": (
+        lambda f: load_checkpoint(f / "nowhere"), "no intact checkpoint", "start a new run"),
+    "checkpoint of an object": (
+        lambda f: save_checkpoint(f, {"a": object()}), "state['a'] is a object", "turn it into"),
+    "checkpoint in a file": (
+        lambda f: save_checkpoint(f / "file", {"a": 1}), "cannot save a checkpoint", "make room"),
+    "no replay": (
+        lambda f: ReplayBuffer(5, generator=torch.Generator()).loads(f / "nowhere"),
+        "holds no replay", "that dumps() wrote"),
+    # runs that are read
+    "no run": (lambda f: curves(f / "nowhere"), "eval.csv is missing", "let the run in"),
+    "run that is a file": (lambda f: curves(f / "file"), "eval.csv is missing", "let the run in"),
+    "run without a test": (
+        lambda f: curves(f / "unevaluated"), "holds no test episode", "let the run evaluate first"),
+    "table of something else": (
+        lambda f: curves(f / "foreign"), "lacks algorithm, episode", "is no eval.csv of a run"),
+    "row with a word for a number": (
+        lambda f: curves(f / "damaged"), "line 2 is damaged", "resume the run"),
+    "row cut short": (lambda f: curves(f / "cut"), "line 2 is damaged", "resume the run"),
+    "binary table": (lambda f: curves(f / "binary"), "is no CSV file", "name another run"),
+    "table that is a folder": (lambda f: read_rows(f), "is no CSV file", "name another run"),
+    "test of an unknown task": (
+        lambda f: curves(f / "stranger"), "'juggle'", "none of grasp_glass"),
+    "curves of a damaged table": (
+        lambda f: plot_success_curves(f / "damaged" / "eval.csv"), "line 2", "resume the run"),
+    "curves of nothing": (
+        lambda f: plot_success_curves([]), "no test episodes", "let the run evaluate first"),
+    "settings cut short": (
+        lambda f: read_json(f / "cut" / "config.json"), "is damaged", "run it again"),
+    "no settings": (lambda f: read_json(f / "config.json"), "is missing", "let the run in"),
+    # encoders and bank
+    "no encoders": (
+        lambda f: load_pretrained(f / "a.safetensors"), "no encoder weights", "--train-encoders"),
+    "encoders that are a folder": (
+        lambda f: load_representation(f), "no encoder weights", "--train-encoders"),
+    "encoders that are a picture": (
+        lambda f: load_representation(f / "file"), "damaged or holds no", "--train-encoders"),
+    "a bank for encoders": (
+        lambda f: load_representation(f / "bank"), "damaged or holds no", "--train-enc"),
+    "encoders of another scene": (
+        lambda f: load_representation(scene_version="mars"), "is scene mars", "--train-encoders"),
+    "no bank": (lambda f: load_bank(f / "a"), "there is no demonstration bank", "--train-encoders"),
+    "encoders for a bank": (lambda f: load_bank(default_weights()), "no bank", "--train-encoders"),
+    "bank of other encoders": (
+        lambda f: DemonstrationBank.load(f / "bank", encoder_id="y"),
+        "'encoder_id': 'x'", "--train-encoders"),
+    "bank in no folder": (
+        lambda f: bank().save(f / "file" / "b", encoder_id="x"), "cannot make the", "another"),
+    # demonstrations
+    "no dataset": (lambda f: load_demonstrations(f / "nowhere"), "is no dataset", "record it anew"),
+    "dataset that is a file": (
+        lambda f: load_demonstrations(f / "file"), "is no dataset", "record it anew with"),
+    "recording into a file": (
+        lambda f: record_demonstrations(f / "file", **TINY), "cannot make the folder", "another"),
+    "recording of no task": (
+        lambda f: record_demonstrations(f / "d", tasks=[], **TINY), "got []", "one or more"),
+    "recording a task twice": (
+        lambda f: record_demonstrations(f / "d", tasks=["grasp_glass"] * 2, **TINY),
+        "got ['grasp_glass', 'grasp_glass']", "all different"),
+    "recording an unknown task": (
+        lambda f: record_demonstrations(f / "d", tasks=["juggle"], **TINY), "'juggle'", "choose"),
+    "recording with a negative seed": (
+        lambda f: record_demonstrations(f / "d", seed=-1, **TINY), "got -1", "at least 0"),
+    "recording none to learn from": (
+        lambda f: record_demonstrations(f / "d", per_task=1, held_out_per_task=1),
+        "held_out_per_task is 1", "must be less than per_task, 1"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("call", "cause", "remedy"), CASES.values(), ids=CASES.keys())
+def test_files(folder, refused, call, cause, remedy):
+    refused(lambda: call(folder), cause, remedy)

@@ -1,0 +1,313 @@
+"""What people get wrong in Python: each wrong value is one line that says what, and what to do.
+
+A case is what is done, what the message says of the cause, and what of the remedy. Settings are in
+`test_configs.py`, files in `test_bad_files.py`, command lines in
+`benchmarks/test_bad_command_lines.py`. Values of a wrong Python type are not here: the types are
+annotated, and their errors are Python's own.
+"""
+
+import math
+from functools import partial
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs import Compose, StepCounter, TransformedEnv
+
+from bgpo_trl import metrics
+from bgpo_trl.envs import NicoEnv
+from bgpo_trl.machine import choose_device, set_threads
+from bgpo_trl.modules.actor_critic import Actor, Critic
+from bgpo_trl.modules.gwr import GWRB
+from bgpo_trl.modules.multi_head_actor import MultiHeadActor
+from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
+from bgpo_trl.modules.vae import VAE
+from bgpo_trl.objectives.ddpg import DDPGLoss, ForeachSoftUpdate
+from bgpo_trl.objectives.distillation import DistillationLoss
+from bgpo_trl.objectives.representation import SequenceReconstructionLoss, VAEInverseLoss
+from bgpo_trl.replay import ReplayBuffer
+from bgpo_trl.task_replay import TaskReplay
+from bgpo_trl.training import Trainer
+from bgpo_trl.transforms import (
+    BehaviorLookup,
+    BehaviorMatchingReward,
+    DemonstrationSource,
+    FrameEncoder,
+    TaskSchedule,
+)
+from suites import nico
+from suites.nico.demonstrator import Demonstrator
+
+NAN = math.nan
+
+
+def bank(n=6, tasks=3, value=0.1):
+    return SimpleNamespace(embedding=torch.full((n, 32), value), task=torch.arange(n) % tasks)
+
+
+def world(*transforms, observation="state", **options):
+    return TransformedEnv(NicoEnv(observation=observation, **options), Compose(*transforms))
+
+
+def source(**options):
+    return DemonstrationSource(bank(), TaskSchedule(), **options)
+
+
+def step_with(action):
+    env = NicoEnv(observation="state")
+    state = env.reset()
+    return env.step(state if action is None else state.set("action", action))
+
+
+def transitions(without=None, reward=(8, 1)):
+    """A batch for `loss`, without one of its entries."""
+    flags = {key: torch.zeros(8, 1, dtype=torch.bool) for key in ("done", "terminated")}
+    following = {"state": torch.zeros(8, 6), "reward": torch.zeros(reward), **flags}
+    batch = {"state": torch.zeros(8, 6), "action": torch.zeros(8, 4), "next": following}
+    batch = TensorDict(batch, [8])
+    return batch if without is None else batch.exclude(without)
+
+
+def actor(**options):
+    return Actor(6, 4, in_keys=["state"], **options)
+
+
+def loss(**options):
+    return DDPGLoss(actor(), Critic(6, 4, in_keys=["state"]), **options)
+
+
+def windows(*shape, action=4):
+    pixels = torch.zeros(*shape, 32, 64, 3, dtype=torch.uint8)
+    return TensorDict({"pixels": pixels, "action": torch.zeros(*shape, action)}, shape)
+
+
+def replay(capacity=5, **options):
+    return ReplayBuffer(capacity, generator=torch.Generator(), **options)
+
+
+def task_replay(task=None, capacity=5, batch_size=2):
+    streams = [[torch.Generator() for _ in range(3)]]
+    made = TaskReplay(capacity, batch_size=batch_size, generator=streams, keys=["x"])
+    entries = {"x": torch.zeros(1)} | ({} if task is None else {"task": torch.tensor([task])})
+    made.add(TensorDict(entries, [1]))
+
+
+def filled(value):
+    """What a GWR-B keeps, with one thing changed."""
+    gwr = GWRB(2)
+    gwr.load_state_dict({"_extra_state": [{**gwr.get_extra_state()[0], **value}]})
+
+
+row, z = partial(TensorDict, batch_size=[]), torch.zeros(2, 5, 64)
+lae, lengths = SequenceAutoencoder(), torch.tensor([5, 5])
+PARTS = {
+    # GWR-B
+    "gwr of no features": (lambda: GWRB(0), "n_features", "must be at least 1"),
+    "gwr threshold": (lambda: GWRB(2, activity_threshold=3.0), "3.0", "<= activity_threshold <= 1"),
+    "gwr NaN rate": (lambda: GWRB(2, lr_best=NAN), "lr_best=nan", "lr_best <= 1"),
+    "gwr NaN habituation": (
+        lambda: GWRB(2, habituation_threshold=NAN), "nan", "habituation_threshold >= 0"),
+    "gwr endless tau": (lambda: GWRB(2, tau_best=math.inf), "inf", "tau_best > 0"),
+    "gwr NaN input": (lambda: GWRB(2).adapt(torch.tensor([NAN, 0])), "NaN", "must be free of"),
+    "gwr wrong size": (lambda: GWRB(2).lookup(torch.zeros(3)), "got [3]", "end with 2"),
+    "gwr empty": (lambda: GWRB(2, init="data").lookup(torch.zeros(2)), "empty", "adapt() it"),
+    "gwr half a state": (
+        lambda: GWRB(2).set_extra_state([{"weights": torch.zeros(2, 2)}]),
+        "the state of a network needs", "see get_extra_state"),
+    "gwr edge to nowhere": (
+        lambda: filled({"edges": torch.tensor([[0, 7]])}), "damaged", "load what state_dict"),
+    "gwr NaN weights": (
+        lambda: filled({"weights": torch.full((2, 2), NAN)}), "damaged", "load what state_dict"),
+    # networks
+    "vae of nothing": (lambda: VAE(0), "latent_size", "at least 1, got 0"),
+    "vae float frames": (lambda: VAE().latent(torch.zeros(32, 64, 3)), "float32", "must be uint8"),
+    "vae channels first": (
+        lambda: VAE().latent(torch.zeros(3, 32, 64).byte()), "(3, 32, 64)", "[..., 32, 64, 3]"),
+    "vae short latent": (lambda: VAE().decode(torch.zeros(2, 32)), "got [2, 32]", "[..., 64]"),
+    "vae inverse": (lambda: VAE().inverse(z, z[..., :32]), "got [2, 5, 32]", "[..., 64]"),
+    "lae of nothing": (lambda: SequenceAutoencoder(64, 0), "got 64 and 0", "at least 1"),
+    "lae scale": (lambda: SequenceAutoencoder(embedding_scale=NAN), "nan", "must be positive"),
+    "lae short latents": (lambda: lae.encode(z[..., :9], lengths), "[2, 5, 9]", "[..., T, 64]"),
+    "lae lengths as floats": (lambda: lae.encode(z, lengths.float()), "float32", "lengths int64"),
+    "lae empty sequence": (lambda: lae.encode(z, 0 * lengths), "in 1..5", "drop empty sequences"),
+    "lae other state": (
+        lambda: lae.step(z[:, 0], z[:, 0, :16], z[:, 0, :16]), "[2, 16]", "h [..., 32]"),
+    "actor without its state": (
+        lambda: actor()(row({"z": torch.zeros(6)})), "Actor found no 'state'", "write it before"),
+    "actor with a short state": (
+        lambda: actor()(row({"state": torch.zeros(5)})), "got [5]", "6 features together"),
+    "actor of other seeds": (
+        lambda: actor(batch_size=[5])(TensorDict({"state": torch.zeros(3, 6)}, [3])),
+        "got [3, 6]", "one leading index per layer"),
+    "heads without a trunk": (
+        lambda: MultiHeadActor(6, hidden_sizes=()), "hidden_sizes is empty", "at least one layer"),
+    "tasks without heads": (
+        lambda: MultiHeadActor(4, in_keys=["x"])(TensorDict({"x": torch.zeros(2, 5, 4)}, [2, 5])),
+        "2 tasks for 0 heads", "add a head"),
+    # losses
+    "ddpg without action": (lambda: loss()(transitions("action")), "found no 'action'", "write it"),
+    "ddpg without next": (lambda: loss()(transitions("next")), "('next', 'reward')", "write it"),
+    "ddpg without reward": (
+        lambda: loss()(transitions(("next", "reward"))), "('next', 'reward')", "write it"),
+    "ddpg without termination": (
+        lambda: loss()(transitions(("next", "terminated"))), "lacks ('next'", "store it"),
+    "ddpg without next state": (
+        lambda: loss()(transitions(("next", "state"))), "under 'next', found no 'state'", "write"),
+    "ddpg flat reward": (
+        lambda: loss()(transitions(reward=(8,))), "got [8]", "the reward must be [8, 1]"),
+    "ddpg bounds": (lambda: loss(return_bounds=(1, 0)), "(1, 0)", "low < high"),
+    "ddpg penalty": (lambda: loss(pre_tanh_penalty=NAN), "got nan", "a number >= 0"),
+    "ddpg distance": (lambda: loss(loss_function="huber"), "'huber'", "l2, l1 or smooth_l1"),
+    "ddpg gamma": (
+        lambda: loss().make_value_estimator(gamma=95), "gamma must", "between 0 and 1, got 95"),
+    "targets that never move": (lambda: ForeachSoftUpdate(loss(), tau=0.0), "tau=0.0", "(0, 1]"),
+    "targets without a rate": (lambda: ForeachSoftUpdate(loss()), "tau=None", "give tau"),
+    "distillation without teacher": (
+        lambda: DistillationLoss(actor())(transitions()), "no 'teacher_action'", "write it"),
+    "distillation without spread": (
+        lambda: DistillationLoss(actor())(transitions().set("teacher_action", torch.zeros(8, 4))),
+        "from its actor, found no 'loc', 'scale'", "write it"),
+    "windows of one frame": (
+        lambda: VAEInverseLoss(VAE())(windows(2, 1)), "(2, 1, 32", "at least 2 frames"),
+    "windows without actions": (
+        lambda: VAEInverseLoss(VAE())(windows(2, 2).exclude("action")), "no 'action'", "write it"),
+    "actions of another robot": (
+        lambda: VAEInverseLoss(VAE())(windows(2, 2, action=7)), "got [2, 2, 7]", "[2, 2, 4]"),
+    "sequences without lengths": (
+        lambda: SequenceReconstructionLoss(lae)(TensorDict({"latent": z}, [2])),
+        "no 'length'", "write it"),
+    # replay
+    "replay of nothing": (lambda: replay(0), "got 0", "must be at least 1"),
+    "replay without a transition": (lambda: replay().sample(), "got [0]", "needs a transition"),
+    "replay of an empty batch": (lambda: replay().sample(0), "got 0", "batch_size must be"),
+    "replay without an entry": (
+        lambda: replay(keys=["b"]).add(row({"a": torch.zeros(1)})), "['b']", "are to be stored"),
+    "replay smaller than a batch": (
+        lambda: task_replay(0, 5, 20), "got 5", "at least batch_size 20"),
+    "replay of an unknown task": (lambda: task_replay(7), "got [7]", "task must lie in 0..2"),
+    "replay without the task": (lambda: task_replay(), "TaskReplay found no 'task'", "write it"),
+    # the world
+    "unknown task": (
+        lambda: NicoEnv(["juggle"], observation="state"), "'juggle'", "choose one of grasp_glass"),
+    "no task": (lambda: NicoEnv([]), "got []", "must be names such as"),
+    "a name for a list": (lambda: NicoEnv("grasp_glass"), "'grasp_glass'", "must be names such as"),
+    "no simulation": (lambda: NicoEnv(batch_size=[0]), "got [0]", "at least 1 simulation"),
+    "no thread": (lambda: NicoEnv(threads=0), "got 0", "at least 1, or None"),
+    "too few seeds": (lambda: NicoEnv(batch_size=[2], seed=[1]), "1 seeds for 2", "give one each"),
+    "negative seed": (lambda: nico.load("grasp_glass", seed=-1), "Seed", "between 0 and 2**32"),
+    "unknown observation": (
+        lambda: NicoEnv(observation="pixel"), "'pixel'", "choose one of 'pixels'"),
+    "frames that are not drawn": (
+        lambda: NicoEnv(observation="state").frames(), "no frames", "observe 'both'"),
+    "NaN action": (
+        lambda: step_with(torch.full((4,), NAN)), "nan", "diverged, lower its learning rate"),
+    "action of another robot": (lambda: step_with(torch.zeros(7)), "got [7]", "must be [4]"),
+    "no action": (lambda: step_with(None), "NicoEnv found no 'action'", "write it before"),
+    "task out of range": (
+        lambda: NicoEnv(observation="state").reset(row({"task": torch.tensor(9)})),
+        "got [9]", "must lie in 0..2"),
+    "misspelt task": (lambda: nico.load("grasp_glas"), "'grasp_glas'", "choose one of grasp_glass"),
+    "no time": (lambda: nico.load("grasp_glass", time_limit=NAN), "got nan", "above 0 s"),
+    "demonstrator of a stranger": (
+        lambda: Demonstrator(SimpleNamespace(task=None, physics=None)),
+        "NoneType", "no demonstration is known"),
+    "demonstrator in mid-air": (
+        lambda: Demonstrator(nico.load("grasp_glass", observation="state"))(None),
+        "reset()", "call the demonstrator's reset() after"),
+    "no GPU": (lambda: choose_device("cuda:99"), "no device 'cuda:99'", "use auto or cpu"),
+    "no such device": (lambda: choose_device("gpu"), "no device 'gpu'", "use auto or cpu"),
+    "no threads": (lambda: set_threads(0), "threads", "at least 1, got 0"),
+    # transforms
+    "schedule of nothing": (lambda: TaskSchedule(()), "()", "must hold a 0"),
+    "schedule without a start": (lambda: TaskSchedule((5, 9)), "(5, 9)", "must hold a 0"),
+    "schedule in parts": (lambda: TaskSchedule((0, 0.5)), "0.5", "whole numbers"),
+    "task without demonstrations": (
+        lambda: DemonstrationSource(bank(), TaskSchedule((0,) * 4)), "task 3", "record some, or"),
+    "NaN demonstration": (
+        lambda: DemonstrationSource(bank(value=NAN), TaskSchedule()), "NaN", "embed the demo"),
+    "source of other rows": (
+        lambda: world(source(batch_size=[3]), batch_size=[2]).reset(),
+        "batch_size=(3,)", "the environment has (2,)"),
+    "lookup without a source": (
+        lambda: world(BehaviorLookup(GWRB(32), learn=True)).reset(),
+        "found no 'demo_embedding'", "put DemonstrationSource before it"),
+    "lookup in another size": (
+        lambda: world(source(), BehaviorLookup(GWRB(16), learn=True)).reset(),
+        "got [32]", "end with 16"),
+    "lookup of nothing": (
+        lambda: BehaviorLookup(GWRB(32), learn=False)(row({"x": torch.zeros(32)})),
+        "found no 'demo_embedding'", "write it before"),
+    "learning for other rows": (
+        lambda: world(
+            source(batch_size=[2]), BehaviorLookup(GWRB(32), learn=True), batch_size=[2]
+        ).reset(),
+        "batch_size=()", "it is to learn from has (2,)"),
+    "bonus without latents": (
+        lambda: world(
+            source(), BehaviorLookup(GWRB(32), learn=True), BehaviorMatchingReward(lae)
+        ).reset(),
+        "found no 'latent'", "put FrameEncoder before it"),
+    "bonus by another encoder": (
+        lambda: world(
+            FrameEncoder(VAE(16)), source(), BehaviorLookup(GWRB(32), learn=True),
+            BehaviorMatchingReward(lae), observation="pixels",
+        ).reset(),
+        "have sizes (16, 32)", "use those trained together"),
+    "NaN bonus": (lambda: BehaviorMatchingReward(lae, beta=NAN), "got nan", "must not be negative"),
+    "encoder without frames": (
+        lambda: world(FrameEncoder(VAE())).reset(), "no 'pixels'", "have it render"),
+    "keys that do not pair": (
+        lambda: FrameEncoder(VAE(), out_keys=("a", "b")), "got 2 for 1", "one of out_keys for"),
+    "time limit too late": (
+        lambda: world(source(), StepCounter(5)).reset(), "DemonstrationSource", "put StepCounter"),
+    # measures
+    "area of nothing": (lambda: metrics.area_under_curve([], []), "success [0]", "at least"),
+    "area of unequal lists": (
+        lambda: metrics.area_under_curve([0.1, 0.2], [1]), "episodes [1", "for each"),
+    "area back in time": (
+        lambda: metrics.area_under_curve([0.1, 0.2], [2, 1]), "[2.0, 1.0]", "increasing"),
+    "threshold of unequal lists": (
+        lambda: metrics.episodes_to([0.1, 0.9], [1]), "episodes [1]", "for each"),
+    "matrix of unequal lists": (
+        lambda: metrics.evaluation_matrix([[0.1]], [1, 2], [2], window=2), "[1, 2]", "for each"),
+    "matrix without a test": (
+        lambda: metrics.evaluation_matrix([[0.1]], [1], [9], window=2), "no evaluation", "larger"),
+    "mean of no evaluations": (
+        lambda: metrics.trailing_mean([[0.1]], 0), "got (1, 1), 0", "n at least 1"),
+    "best of a single list": (
+        lambda: metrics.forgetting_since_best([0.1, 0.2]), "success [2]", "is needed"),
+    "transfer without phases": (
+        lambda: metrics.backward_transfer([[1, 2]]), "got [1, 2]", "one phase a task"),
+    "quartiles of nothing": (lambda: metrics.interquartile_mean([]), "at least one", "leave out"),
+    "quartiles of NaN": (lambda: metrics.interquartile_mean([NAN]), "finite", "leave out"),
+    "bootstrap of NaN": (
+        lambda: metrics.stratified_bootstrap([[NAN]], rng=np.random.default_rng(0)),
+        "with NaN", "must be finite"),
+    "bootstrap of no draws": (
+        lambda: metrics.stratified_bootstrap([[1]], n_resamples=0, rng=np.random.default_rng(0)),
+        "got 0", "at least 1"),
+    "interval in percent": (
+        lambda: metrics.percentile_interval([1, 2], 95), "and 95", "confidence in (0, 1)"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("call", "cause", "remedy"), PARTS.values(), ids=PARTS.keys())
+def test_parts(refused, call, cause, remedy):
+    refused(call, cause, remedy)
+
+
+def test_a_policy_that_has_diverged_ends_the_run_in_one_line(make_config, bank, tmp_path, encoders):
+    config = make_config(state="state", name="ddpg")
+    trainer = Trainer(config, tmp_path / "run", bank=bank, encoders=encoders, progress=False)
+    for parameter in trainer.algorithm.loss.parameters():
+        parameter.data.fill_(NAN)
+    with pytest.raises(
+        ValueError, match=r"^an action is 4 finite numbers .* diverged, lower its .*$"
+    ):
+        trainer.run()
+    assert not list((tmp_path / "run").glob("checkpoint/*"))
+    # What is there can be read: headers, and not a row.
+    for name in ("train.csv", "eval.csv"):
+        assert (tmp_path / "run" / name).read_bytes().count(b"\n") == 1

@@ -1,0 +1,68 @@
+"""Settings without a meaning are refused where they are made; see `test_bad_input.py`."""
+
+import math
+
+import pytest
+
+from bgpo_trl.configs import (
+    AlgorithmConfig,
+    BGPOConfig,
+    DDPGConfig,
+    DistNLLConfig,
+    MAMLConfig,
+    RepresentationConfig,
+    RunConfig,
+    SequenceAutoencoderConfig,
+    VAEConfig,
+)
+
+NAN = math.nan
+SETTINGS = [
+    (VAEConfig, {"batch_size": 0}, "at least 1"),
+    (VAEConfig, {"window": 1}, "at least 2 and divide batch_size 128"),
+    (VAEConfig, {"window": 3}, "at least 2 and divide batch_size 128"),
+    (VAEConfig, {"learning_rate": -1e-3}, "a number above 0"),
+    (VAEConfig, {"kl_weight": NAN}, "at least 0"),
+    (SequenceAutoencoderConfig, {"steps": 0}, "at least 1"),
+    (SequenceAutoencoderConfig, {"warmup_steps": 0}, "at least 1"),
+    (SequenceAutoencoderConfig, {"embedding_scale": 0.0}, "a number above 0"),
+    (RepresentationConfig, {"seed": -1}, "at least 0"),
+    (RepresentationConfig, {"log_every": 0}, "at least 1"),
+    (DDPGConfig, {"hidden_sizes": ()}, "one or more, of at least 1"),
+    (DDPGConfig, {"hidden_sizes": (64, 0)}, "one or more, of at least 1"),
+    (DDPGConfig, {"learning_rate": 0.0}, "a number above 0"),
+    (DDPGConfig, {"learning_rate": math.inf}, "a number above 0"),
+    (DDPGConfig, {"batch_size": 0}, "at least 1"),
+    (DDPGConfig, {"gamma": 1.5}, "between 0 and 1"),
+    (DDPGConfig, {"gamma": NAN}, "between 0 and 1"),
+    (DDPGConfig, {"tau": 0.0}, "above 0 and at most 1"),
+    (DDPGConfig, {"tau": 5}, "above 0 and at most 1"),
+    (DDPGConfig, {"noise": -0.1}, "at least 0"),
+    (DDPGConfig, {"pre_tanh_penalty": NAN}, "at least 0"),
+    (DDPGConfig, {"warmup_steps": 0}, "at least 1"),
+    (DDPGConfig, {"replay_size": 100}, "256 (batch, warm-up) or more"),
+    (AlgorithmConfig, {"state": "pixels"}, "latent or state"),
+    (AlgorithmConfig, {"max_steps": 0}, "at least 1"),
+    (BGPOConfig, {"beta": -0.1}, "at least 0"),
+    (BGPOConfig, {"beta": NAN}, "at least 0"),
+    (MAMLConfig, {"inner_learning_rate": NAN}, "at least 0"),
+    (MAMLConfig, {"task_batch_size": 7}, "even and at least 2"),
+    (DistNLLConfig, {"learning_rate": NAN}, "a number above 0"),
+    (DistNLLConfig, {"task_batch_size": 0}, "at least 1"),
+    (RunConfig, {"episodes": 0}, "at least 1"),
+    (RunConfig, {"eval_every": 30_000}, "at most episodes, 20000"),
+    (RunConfig, {"eval_episodes": -1}, "at least 1"),
+    (RunConfig, {"checkpoint_minutes": NAN}, "at least 0"),
+    (RunConfig, {"task_starts": ()}, "one episode for each of the tasks"),
+    (RunConfig, {"task_starts": (100, 200, 300)}, "at least 0, and one of them 0"),
+    (RunConfig, {"task_starts": (0, -1, 300)}, "at least 0, and one of them 0"),
+    (RunConfig, {"task_starts": (0, 0, 20_000)}, "below 20000"),
+]
+
+
+@pytest.mark.parametrize(
+    ("config", "values", "remedy"), SETTINGS, ids=[f"{c.__name__}-{v}" for c, v, _ in SETTINGS]
+)
+def test_settings(refused, config, values, remedy):
+    (name, value), *_ = values.items()
+    refused(lambda: config(**values), f"{name} must be {remedy}", f"got {value}")
