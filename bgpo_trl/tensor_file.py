@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -23,6 +24,11 @@ def digest(tensors: Mapping[str, Tensor]) -> str:
     return sha256.hexdigest()
 
 
+def _checksum(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> str:
+    told = json.dumps([digest(tensors), dict(metadata)], sort_keys=True)
+    return hashlib.sha256(told.encode()).hexdigest()
+
+
 def save_tensors(
     path: str | os.PathLike[str], tensors: Mapping[str, Tensor], metadata: Mapping[str, str]
 ) -> None:
@@ -37,7 +43,7 @@ def save_tensors(
     partial = path.with_suffix(".partial")
     contiguous = {key: value.contiguous() for key, value in tensors.items()}
     try:
-        save_file(contiguous, partial, {**metadata, "sha256": digest(contiguous)})
+        save_file(contiguous, partial, {**metadata, "sha256": _checksum(contiguous, metadata)})
         os.replace(partial, path)
     except (SafetensorError, OSError) as error:
         partial.unlink(missing_ok=True)
@@ -60,9 +66,10 @@ def load_tensors(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], dict[
         with safe_open(path, "pt") as file:
             metadata = dict(file.metadata() or {})
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-        found = digest(tensors)
+        written = metadata.pop("sha256", None)
+        found = _checksum(tensors, metadata)
     except Exception as error:  # The library raises errors of many kinds.
         raise ValueError(next(iter(str(error).splitlines()), "unreadable")) from None
-    if metadata.pop("sha256", None) != found:
+    if written != found:
         raise ValueError("checksum differs")
     return tensors, metadata

@@ -15,7 +15,6 @@ from bgpo_trl.pretrained import load_pretrained
 from bgpo_trl.replay import ReplayBuffer
 from bgpo_trl.representation import default_weights, load_representation
 from bgpo_trl.runs import read_curves, read_json, read_rows
-from bgpo_trl.tensor_file import save_tensors
 from suites import nico
 
 HEADER = ",".join(EVAL_COLUMNS) + "\n"
@@ -39,8 +38,7 @@ def folder(tmp_path) -> Path:
         (tmp_path / name / "eval.csv").write_bytes(data)
         if name != "unevaluated":
             (tmp_path / name / "config.json").write_text('{"gamma": ')
-    meta = {"scene_version": nico.scene_version(), "encoder_id": "x"}
-    save_tensors(tmp_path / "bank", vars(bank()), meta)
+    bank().save(tmp_path / "bank", encoder_id="x")
     return tmp_path
 
 
@@ -144,10 +142,10 @@ CASES = {
     "recording into a file": (
         lambda f: record_demonstrations(f / "file", **TINY), "cannot make the folder", "another"),
     "recording of no task": (
-        lambda f: record_demonstrations(f / "d", tasks=[], **TINY), "got []", "one or more"),
+        lambda f: record_demonstrations(f / "d", tasks=[], **TINY), "tasks", "name at least one"),
     "recording a task twice": (
         lambda f: record_demonstrations(f / "d", tasks=["grasp_glass"] * 2, **TINY),
-        "got ['grasp_glass', 'grasp_glass']", "all different"),
+        "'grasp_glass' is named twice", "name each once"),
     "recording an unknown task": (
         lambda f: record_demonstrations(f / "d", tasks=["juggle"], **TINY), "'juggle'", "choose"),
     "recording with a negative seed": (

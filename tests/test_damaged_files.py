@@ -151,7 +151,8 @@ def files(tmp_path_factory) -> Path:
 
 
 def read_bank(path: Path) -> dict[str, torch.Tensor]:
-    return vars(DemonstrationBank.load(path, encoder_id="x"))
+    bank = vars(DemonstrationBank.load(path, encoder_id="x"))
+    return bank | {"tasks": torch.tensor(list(",".join(bank["tasks"]).encode()))}
 
 
 def read_encoders(path: Path) -> dict[str, torch.Tensor]:

@@ -208,7 +208,7 @@ def test_a_label_without_a_name_is_refused():
     ("changes", "message"),
     [
         ({"tasks": ("juggle",)}, r"^no NICO task 'juggle'; choose one of .* nico\.add_task$"),
-        ({"tasks": ("at_once",) * 3}, r"^the task 'at_once' is named twice$"),
+        ({"tasks": ("at_once",) * 3}, r"^the task 'at_once' is named twice: name each once$"),
         ({"tasks": ("at_once",)}, "^task_starts must be one episode for each of the tasks"),
         (
             {"task_starts": (0,)},

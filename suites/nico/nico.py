@@ -66,7 +66,7 @@ def check_tasks(names: Sequence[str]) -> None:
                 "nico.add_task"
             )
         if name in names[:position]:
-            raise ValueError(f"the task {name!r} is named twice")
+            raise ValueError(f"the task {name!r} is named twice: name each once")
 
 
 def load(

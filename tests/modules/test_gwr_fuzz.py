@@ -137,4 +137,4 @@ def test_any_history_leaves_sound_networks_that_share_nothing(n):
             removed += state["next_node"] - len(state["node"])
 
     holds()
-    assert removed > n  # the test would say little of edges that never expire
+    assert removed > 0  # the test would say little of edges that never expire

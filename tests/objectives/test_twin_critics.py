@@ -290,7 +290,7 @@ def test_constant_entries_are_not_needed_under_next(name):
     for made in losses:
         ForeachSoftUpdate(made, tau=0.005)
     batch = make_batch(8).set("behavior", torch.randn(8, 2))
-    with pytest.raises(KeyError, match="behavior"):
+    with pytest.raises(ValueError, match="under 'next', found no 'behavior'"):
         losses[0](batch.clone())
     lean = losses[1](batch.clone())
     batch["next", "behavior"] = batch["behavior"]
