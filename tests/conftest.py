@@ -19,6 +19,7 @@ from bgpo_trl.envs import NicoEnv
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
 from bgpo_trl.representation import Representation
+from suites.nico import nico
 
 # How long an example takes says more about the other processes of the machine than about the code.
 settings.register_profile("bgpo_trl", deadline=None)
@@ -101,6 +102,15 @@ def easy_world():
         patch.setattr("bgpo_trl.algorithms.algorithm.NicoEnv", EasyNicoEnv)
         patch.setattr("bgpo_trl.evaluation.NicoEnv", EasyNicoEnv)
         yield EasyNicoEnv
+
+
+@pytest.fixture(autouse=True)
+def own_tasks_are_forgotten() -> Iterator[None]:
+    """What a test adds to the suite is gone after it."""
+    before = dict(nico._TASKS)
+    yield
+    nico._TASKS.clear()
+    nico._TASKS.update(before)
 
 
 @pytest.fixture(autouse=True)

@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 import tyro
 
 ROOT = Path(__file__).parents[1]
@@ -85,8 +86,10 @@ def test_there_is_something_to_run():
 def test_the_python_of_a_page_runs_from_top_to_bottom(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     namespace = {}
-    for number, block in enumerate(blocks(page, "python"), 1):
-        exec(compile(block, f"{page.name}, python block {number}", "exec"), namespace)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        for number, block in enumerate(blocks(page, "python"), 1):
+            exec(compile(block, f"{page.name}, python block {number}", "exec"), namespace)
 
 
 @every_page

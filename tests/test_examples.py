@@ -14,7 +14,6 @@ from PIL import Image
 
 from bgpo_trl.demonstrations import load_demonstrations
 from suites import nico
-from suites.nico import nico as registry
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
@@ -22,7 +21,6 @@ EXAMPLES = Path(__file__).parents[1] / "examples"
 @pytest.fixture
 def run(tmp_path, monkeypatch, capsys):
     """Runs an example as `python examples/NAME.py` in an empty folder; returns what it printed."""
-    before = dict(registry._TASKS)
     monkeypatch.chdir(tmp_path)
 
     def run(name):
@@ -31,9 +29,7 @@ def run(tmp_path, monkeypatch, capsys):
             runpy.run_path(str(EXAMPLES / name), run_name="__main__")
         return capsys.readouterr().out
 
-    yield run
-    registry._TASKS.clear()
-    registry._TASKS.update(before)
+    return run
 
 
 def rows(path):
