@@ -195,7 +195,8 @@ class SACConfig(RLConfig):
     alpha_init: float = 0.1
     """First temperature. Ours: 1 would outweigh a return of 1 for long."""
     target_entropy: float = -4.0
-    """Entropy that the temperature keeps, in nats: minus the number of actions (Haarnoja et al.)."""
+    """Entropy that the temperature keeps, in nats: minus the number of actions, as in Haarnoja et
+    al."""
     entropy_in_target: bool = False
     """Whether the critics count entropy to come. Ours: Haarnoja et al. do, but then values leave
     the range of returns that targets are clipped to; Ball et al. (2023) leave it out, too."""
