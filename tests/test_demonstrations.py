@@ -207,7 +207,7 @@ def truncate(path: Path) -> None:
         (lambda p: (p / "dataset.json").write_bytes(b"\xff"), r"dataset\.json is damaged; .*"),
         (lambda p: (p / "dataset.json").unlink(), r"copy is no dataset of demonstrations; .*"),
         (lambda p: edit_meta(p, checksum=None), r"is not complete; resume it with .*"),
-        (lambda p: edit_meta(p, scene_version="old"), r"was recorded in scene old, this is nico.*"),
+        (lambda p: edit_meta(p, scene_version="old"), r"was recorded in scene 'old', this is nico"),
     ],
 )
 def test_what_is_not_whole_is_refused_in_one_line(copy, damage, message):
@@ -336,5 +336,7 @@ def test_a_bank_that_is_missing_or_damaged_is_refused(bank, tmp_path):
         DemonstrationBank.load(path, encoder_id="abc")
     bank.save(path, encoder_id="abc")
     path.write_bytes(path.read_bytes()[:-1])
-    with pytest.raises(ValueError, match=r"bank\.safetensors is damaged \(.*\); make it anew with"):
+    with pytest.raises(
+        ValueError, match=r"bank\.safetensors is damaged .*\(.*\); make it anew with"
+    ):
         DemonstrationBank.load(path, encoder_id="abc")

@@ -8,7 +8,8 @@ from benchmarks import compare
 
 def write(path, rows):
     path.mkdir()
-    lines = ["seed,episode,task,success", *(",".join(map(str, row)) for row in rows)]
+    lines = ["algorithm,seed,episode,task,success"]
+    lines += [",".join(map(str, ("bgpo", *row))) for row in rows]
     (path / "eval.csv").write_text("\n".join(lines) + "\n")
     return path
 
