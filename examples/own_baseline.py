@@ -27,7 +27,7 @@ class NearestNeighbors(Algorithm):
 
     def act(self, tensordict):
         action = self.choose(tensordict["latent"], tensordict["demo_embedding"])
-        return tensordict.set("action", self.explore(action))
+        return tensordict.set("action", action)
 
     def store(self, transition): ...  # for updates, of which there are none
 
