@@ -2,6 +2,7 @@
 
 import csv
 import runpy
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -25,7 +26,8 @@ def test_it_runs_and_is_short(registry, capsys):
     runpy.run_path(str(EXAMPLE), run_name="__main__")
     tests = list(csv.DictReader(capsys.readouterr().out.splitlines()))
     played = [(row["algorithm"], row["seed"], row["episode"]) for row in tests if row["seed"]]
-    assert played == [("oracle", seed, episode) for episode in "24" for seed in "01"]
+    # Every task is tested.
+    assert Counter(played) == {("oracle", seed, n): 3 for n in "24" for seed in "01"}
     assert len(EXAMPLE.read_text().splitlines()) < 60
 
 
