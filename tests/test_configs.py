@@ -50,13 +50,11 @@ SETTINGS = [
     (DistNLLConfig, {"learning_rate": NAN}, "a number above 0"),
     (DistNLLConfig, {"task_batch_size": 0}, "at least 1"),
     (RunConfig, {"episodes": 0}, "at least 1"),
-    (RunConfig, {"eval_every": 30_000}, "at most episodes, 20000"),
     (RunConfig, {"eval_episodes": -1}, "at least 1"),
     (RunConfig, {"checkpoint_minutes": NAN}, "at least 0"),
     (RunConfig, {"task_starts": ()}, "one episode for each of the tasks"),
     (RunConfig, {"task_starts": (100, 200, 300)}, "at least 0, and one of them 0"),
     (RunConfig, {"task_starts": (0, -1, 300)}, "at least 0, and one of them 0"),
-    (RunConfig, {"task_starts": (0, 0, 20_000)}, "below 20000"),
 ]
 
 

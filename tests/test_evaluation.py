@@ -222,7 +222,7 @@ def test_testing_leaves_no_trace_in_training(make, name):
         "dist-nll": {"tasks", "heads", "students", "student_optimizers", "ended"},
     }
     assert set(before) == {
-        *("loss", "optimizer", "replay", "source", "simulation", "noise"),
+        *("learner", "replay", "source", "simulation", "noise"),
         *own.get(name, {"gwr"}),
     }
     assert_same_values(algorithm.state_dict(), before)

@@ -180,7 +180,7 @@ def test_variants_differ_by_transforms_only(make):
         assert algorithm.replay.keys == reference.replay.keys
         for key, value in algorithm.loss.state_dict().items():
             assert value.equal(reference.loss.state_dict()[key]), key
-        for kind in ("optimizer", "source", "simulation", "noise"):
+        for kind in ("learner", "source", "simulation", "noise"):
             assert_same(algorithm.state_dict()[kind], reference.state_dict()[kind], kind)
         for key in ("latent", "task", "demo_index", "demo_embedding"):
             assert starts[variant][key].equal(start[key])
