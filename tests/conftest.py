@@ -113,9 +113,12 @@ def own_tasks_are_forgotten() -> Iterator[None]:
     nico._TASKS.update(before)
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture(scope="session", autouse=True)
 def interruptible() -> Iterator[None]:
-    """Ctrl-C is answered as at a terminal, though a job in the background starts deaf to it."""
+    """Ctrl-C is answered as at a terminal, though a job in the background starts deaf to it.
+
+    From the first on, since what fixtures start, such as Ray, would be deaf to it too.
+    """
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
