@@ -111,7 +111,7 @@ def run_experiment(
     Raises:
         ValueError: If the directory holds another run.
     """
-    commit = _commit()  # of the code that runs, whatever is committed meanwhile
+    commit = commit_of_code()  # of the code that runs, whatever is committed meanwhile
     set_threads(arguments.threads)
     device = choose_device(arguments.device)
     rl = "" if arguments.rl == "ddpg" else f"-{arguments.rl}"
@@ -293,7 +293,7 @@ def write_nodes(path: Path, weights: torch.Tensor, tasks: torch.Tensor) -> None:
             writer.writerow((task, *(f"{value:.6g}" for value in row)))
 
 
-def _commit() -> str:
+def commit_of_code() -> str:
     """Returns the commit of this code, with ``-dirty`` where it was changed; "" where unknown."""
     command = ["git", "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
     try:

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
 
-from bgpo_trl.runs import read_rows
+from bgpo_trl.runs import read_json, read_rows
 
 
 def merge(blocks: Sequence[Path], directory: Path) -> None:
@@ -32,8 +32,8 @@ def merge(blocks: Sequence[Path], directory: Path) -> None:
             seed once.
         OSError: If the directory cannot be written.
     """
-    configs = [json.loads((block / "config.json").read_text()) for block in blocks]
-    told = [json.loads((block / "summary.json").read_text()) for block in blocks]
+    configs = [read_json(block / "config.json") for block in blocks]
+    told = [read_json(block / "summary.json") for block in blocks]
     seeds = [seed for config in configs for seed in config["seeds"]]
     tables = {
         name: sorted(

@@ -23,7 +23,7 @@ import numpy as np
 import torch
 import tyro
 from ablation import make_of
-from experiment import _commit, command_line
+from experiment import command_line, commit_of_code
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
@@ -106,7 +106,9 @@ def show(
         activity = algorithm.gwr.lookup(embedding.expand(n_seeds, *embedding.shape)).activity
         activity, seen = activity.mean(-1), policy.bank.seen()
         for number, (phi, label) in enumerate(zip(embedding, task, strict=True)):
-            tested = DemonstrationBank(phi, label, torch.zeros_like(label, dtype=torch.bool))
+            tested = DemonstrationBank(
+                phi, label, torch.zeros_like(label, dtype=torch.bool), policy.tasks
+            )
             inferred[:, number] = task_inference_accuracy(algorithm.gwr, seen, tested, n_tasks)
     return [
         (seed, number, *(float(x[index, number]) for x in (success, inferred, activity)))
@@ -200,7 +202,7 @@ def plot(table: Mapping[str, Mapping[float, np.ndarray]]) -> Figure:
 
 def main(arguments: Arguments) -> None:
     """Tests, and writes the files."""
-    commit = _commit()
+    commit = commit_of_code()
     torch.set_num_threads(arguments.threads)
     run, out = arguments.run, arguments.out or arguments.run
     make = make_of(read_config(run / "config.json")[0].name)

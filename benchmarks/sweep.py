@@ -19,7 +19,6 @@ system that they share. Locks on files must hold across machines, as they do on 
 
 from __future__ import annotations
 
-import json
 import sys
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -34,6 +33,7 @@ from merge import merge
 from bgpo_trl.algorithms.bgpo import BGPO
 from bgpo_trl.logging import check_settings
 from bgpo_trl.pretrained import load_pretrained
+from bgpo_trl.runs import read_json
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ def check_directories(jobs: dict[Path, list[Job]], encoders: str) -> None:
         if path.exists():  # merged before, from the same blocks or others
             if not any(merged.glob("seeds-*")):
                 raise ValueError(f"{merged} is a run of its own: choose another --out")
-            seeds = json.loads(path.read_text())["seeds"]
+            seeds = read_json(path)["seeds"]
             settings = {**asdict(group[0].config), "encoders": encoders, "seeds": seeds}
             check_settings(merged, settings)
 

@@ -12,6 +12,7 @@ from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor
 
 from bgpo_trl.modules.actor_critic import StackedMLP
+from bgpo_trl.modules.entries import read
 
 __all__ = ["LOG_SCALE_BOUNDS", "GaussianActor"]
 
@@ -84,7 +85,7 @@ class GaussianActor(TensorDictModuleBase):
         Returns:
             The same tensordict.
         """
-        loc, log_scale = self.mlp(*[tensordict[key] for key in self.in_keys]).chunk(2, dim=-1)
+        loc, log_scale = self.mlp(*read(self, tensordict)).chunk(2, dim=-1)
         tensordict.set("loc", loc)
         tensordict.set("scale", log_scale.clamp(*LOG_SCALE_BOUNDS).exp())
         return tensordict.set("action", loc.tanh())
