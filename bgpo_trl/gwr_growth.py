@@ -7,10 +7,9 @@ import re
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save
 
 from bgpo_trl.modules.gwr import GWRB
+from bgpo_trl.tensor_file import load_tensors, save_tensors
 
 _NAME = re.compile(r"episode-(\d+)\.safetensors")
 
@@ -39,18 +38,9 @@ def save_graph(directory: str | os.PathLike[str], episode: int, gwr: GWRB) -> Pa
         OSError: If the file cannot be written.
     """
     graph = gwr.get_extra_state()[0]
-    tensors = {key: torch.as_tensor(value).contiguous() for key, value in graph.items()}
+    tensors = {key: torch.as_tensor(value) for key, value in graph.items()}
     path = Path(directory) / f"episode-{episode:06d}.safetensors"
-    partial = path.with_suffix(".partial")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_bytes(save(tensors))
-        partial.replace(path)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise OSError(
-            error.errno, f"cannot write {path} ({error.strerror}): make room, then resume the run"
-        ) from error
+    save_tensors(path, tensors, {})
     return path
 
 
@@ -70,9 +60,9 @@ def load_graphs(directory: str | os.PathLike[str]) -> dict[int, GWRB]:
 
 def _load(path: Path) -> GWRB:
     try:
-        graph = load_file(path)
+        graph, _ = load_tensors(path)
         gwr = GWRB(graph["weights"].shape[1])
         gwr.set_extra_state([{**graph, "next_node": int(graph["next_node"])}])
-    except (SafetensorError, KeyError, IndexError) as error:
+    except (ValueError, KeyError, IndexError) as error:
         raise ValueError(f"{path} is damaged or no graph of GWR-B: remove it") from error
     return gwr

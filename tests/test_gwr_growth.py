@@ -74,7 +74,7 @@ def test_a_full_disk_leaves_the_graph_that_was_there(tmp_path):
     before = save_graph(tmp_path, 5, grown(n=5)).read_bytes()
     with (
         largest_file(100),
-        pytest.raises(OSError, match=r"cannot write .*: make room, then resume the run") as error,
+        pytest.raises(OSError, match=r"cannot write .*: make room, or choose") as error,
     ):
         save_graph(tmp_path, 5, grown(n=30))
     assert "\n" not in str(error.value)
