@@ -20,7 +20,7 @@ class BehaviorMatch(TensorClass["tensor_only"]):
         embedding: weight vector w_c of the node, the behavior b; a copy, `[*batch, d]`.
         node: identity of the node within its network, int64 `[*batch]`. Identities count up from 0
             in order of creation; none is reused or renumbered when a node is removed.
-        activity: exp(-||phi - w_c||) in [0, 1] (Eq. 2), `[*batch]`.
+        activity: exp(-activity_scale ||phi - w_c||) in [0, 1] (Eq. 2), `[*batch]`.
     """
 
     embedding: Tensor
@@ -35,7 +35,8 @@ class GWRB(nn.Module):
 
     1. A network starts as two connected nodes with random weights, or as its first two inputs.
     2. c and c' are the nearest and the second nearest node (Eq. 1); the older one wins a tie.
-    3. The edge c-c' is created, or its age set to 0. The activity is a = exp(-||phi - w_c||).
+    3. The edge c-c' is created, or its age set to 0. The activity is a = exp(-s ||phi - w_c||),
+       with s = 1 in the paper (Eq. 2).
     4. If a < a_T and h_c < h_T, a node v is inserted: w_v = (w_c + phi) / 2, h_v = h_0, edges v-c
        and v-c'; the edge c-c' is removed. Otherwise c and its neighbors k learn,
        w_c += eps_c h_c (phi - w_c) and w_k += eps_n h_k (phi - w_k) (Eqs. 3, 4), and habituate,
@@ -52,6 +53,8 @@ class GWRB(nn.Module):
         n_features: size d of an input.
         batch_size: shape of the batch of networks (the seeds); `()` is a single network.
         activity_threshold: a_T.
+        activity_scale: s, positive. Only here does the scale of inputs matter: a network with s
+            does what one with 1 does with inputs (and random weights) multiplied by s.
         habituation_threshold: h_T.
         lr_best: eps_c, at most 1.
         lr_neighbor: eps_n, at most eps_c.
@@ -96,6 +99,7 @@ class GWRB(nn.Module):
         *,
         batch_size: Sequence[int] = (),
         activity_threshold: float = 0.8,
+        activity_scale: float = 1.0,
         habituation_threshold: float = 0.15,
         lr_best: float = 0.1,
         lr_neighbor: float = 0.01,
@@ -114,6 +118,7 @@ class GWRB(nn.Module):
         self.batch_size = torch.Size(batch_size)
         self.rule = LearningRule(
             activity_threshold=activity_threshold,
+            activity_scale=activity_scale,
             habituation_threshold=habituation_threshold,
             lr_best=lr_best,
             lr_neighbor=lr_neighbor,
@@ -189,7 +194,7 @@ class GWRB(nn.Module):
         return BehaviorMatch(
             embedding=weights[self._network.unsqueeze(-1), row].view(*batch, self.n_features),
             node=_to_tensor(node, row.dtype, row.device).view(batch),
-            activity=distance.neg_().exp_().view(batch),
+            activity=self._activity(distance).view(batch),
             batch_size=batch,
         )
 
@@ -233,7 +238,7 @@ class GWRB(nn.Module):
         distances = _distances(phi.unsqueeze(1), searched).squeeze(1)
         distance, best = distances.min(-1)
         second = distances.scatter_(-1, best.unsqueeze(-1), torch.inf).min(-1).indices
-        embedding, activity = weights[network, best], distance.neg_().exp_()
+        embedding, activity = weights[network, best], self._activity(distance)
         nearest = list(zip(best.tolist(), second.tolist(), activity.tolist(), strict=True))
         identities = [t.identity[match[0]] for t, match in zip(topologies, nearest, strict=True)]
         node = _to_tensor(identities, best.dtype, best.device)
@@ -281,6 +286,10 @@ class GWRB(nn.Module):
         for rows, graph in zip(weights, graphs, strict=True):
             rows[: len(graph.node)] = graph.weights
         self._topologies, self._weights = topologies, weights
+
+    def _activity(self, distance: Tensor) -> Tensor:
+        """Turns distances to the best matches into activities, in place (Eq. 2)."""
+        return distance.mul_(-self.rule.activity_scale).exp_()
 
     def _spread(self, x: Tensor, network: Tensor, fill: float) -> Tensor:
         """Places results of active networks among those of all, which are `fill` elsewhere."""

@@ -31,6 +31,7 @@ class LearningRule:
     """
 
     activity_threshold: float
+    activity_scale: float
     habituation_threshold: float
     lr_best: float
     lr_neighbor: float
@@ -46,6 +47,7 @@ class LearningRule:
         least_alpha = 1 / self.initial_habituation if self.initial_habituation > 0 else math.inf
         for holds, need in [
             (0 <= self.activity_threshold <= 1, "0 <= activity_threshold <= 1"),
+            (0 < self.activity_scale < math.inf, "activity_scale > 0"),
             (0 <= self.habituation_threshold < math.inf, "habituation_threshold >= 0"),
             (0 <= self.lr_neighbor <= self.lr_best <= 1, "0 <= lr_neighbor <= lr_best <= 1"),
             (0 < self.initial_habituation <= 1, "0 < initial_habituation <= 1"),

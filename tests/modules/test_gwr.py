@@ -194,6 +194,36 @@ def test_match_is_the_nearest_node_and_its_activity():
     assert match.activity.tolist() == pytest.approx([0.6065307, 0.7788008])  # exp(-.5), exp(-.25)
 
 
+def test_activity_decays_with_the_scaled_distance():
+    gwr = from_data([[0.0, 0.0], [3.0, 4.0]], activity_scale=2.0)
+    assert gwr.lookup(torch.tensor([3.0, 3.5])).activity.item() == pytest.approx(math.exp(-1))
+    assert gwr.adapt(torch.tensor([0.0, 0.25])).activity.item() == pytest.approx(math.exp(-0.5))
+
+
+@pytest.mark.parametrize("scale", [0.25, 4.0])  # powers of two: nothing is rounded otherwise
+def test_scaled_activity_is_that_of_scaled_inputs(scale):
+    scaled, plain = (
+        GWRB(3, batch_size=[2], init="data", activity_scale=s, **GROWING).double()
+        for s in (scale, 1.0)
+    )
+    inputs = drifting_inputs(500, 2, 3) * 0.5 / scale
+    for phi in inputs:
+        match, expected = scaled.adapt(phi), plain.adapt(scale * phi)
+        assert torch.equal(match.activity, expected.activity)
+        assert torch.equal(match.node, expected.node)
+        assert torch.equal(scale * match.embedding, expected.embedding)
+    for i in range(2):
+        graph, expected = scaled.graph(i), plain.graph(i)
+        torch.testing.assert_close(
+            graph._replace(weights=scale * graph.weights), expected, rtol=0, atol=0
+        )
+        assert graph.node[-1] > len(graph.node) > 5  # nodes were inserted, and some removed
+    unscaled = GWRB(3, batch_size=[2], init="data", **GROWING).double()
+    for phi in inputs:
+        unscaled.adapt(phi)
+    assert not torch.equal(unscaled.num_nodes, plain.num_nodes)  # the scale did matter
+
+
 def test_best_match_and_neighbor_learn_and_habituate():
     gwr = from_data([[0.0, 0.0], [1.0, 0.0]])
     match = gwr.adapt(torch.tensor([0.25, 0.5]))
@@ -382,6 +412,10 @@ def test_wrong_shapes_are_refused():
 @pytest.mark.parametrize(
     "wrong",
     [
+        {"activity_scale": 0.0},
+        {"activity_scale": -1.0},
+        {"activity_scale": math.nan},
+        {"activity_scale": math.inf},
         {"lr_best": 1.5},
         {"lr_neighbor": 0.2},
         {"lr_neighbor": -0.1},
