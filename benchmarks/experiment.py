@@ -20,7 +20,7 @@ from growth import draw_growth
 from bgpo_trl.algorithms import ALGORITHMS, Algorithm
 from bgpo_trl.algorithms.rl import RL
 from bgpo_trl.configs import PRESETS, STAGE_PRESETS, RunConfig
-from bgpo_trl.demonstrations import DemonstrationBank
+from bgpo_trl.demonstration_bank import DemonstrationBank
 from bgpo_trl.evaluation import Evaluator, evaluate_random_policy
 from bgpo_trl.machine import choose_device, set_threads
 from bgpo_trl.plotting import plot_frame_strips, plot_gwr_pca, plot_success_curves, save_figure
@@ -178,7 +178,9 @@ def draw(trainer: Trainer, bank: DemonstrationBank, out: Path) -> None:
         tasks = tasks[: len(weights)]
         write_nodes(out / "gwr.csv", weights, tasks)
         save_figure(plot_gwr_pca(weights, tasks, config.tasks), out / "figures" / "gwr.png")
-        accuracy = task_inference_accuracy(gwr, bank.seen(), bank.held_out(), len(config.tasks))
+        accuracy = task_inference_accuracy(
+            gwr, bank.seen(), bank.held_out(config.held_out), len(config.tasks)
+        )
         draw_growth(out, config, bank)
         print(f"GWR-B nodes: {gwr.num_nodes.tolist()}")
         print(f"task inference on held-out demonstrations: {accuracy.mean():.1%}")
@@ -201,7 +203,9 @@ def measure(
     rows = []
     n_steps = config.algorithm.max_steps + 1
     bar = progress_bar("final tests", shown=trainer.progress, total=2 * n_steps, unit="step")
-    for half, (kind, tested) in enumerate((("seen", seen), ("held-out", bank.held_out())), 1):
+    for half, (kind, tested) in enumerate(
+        (("seen", seen), ("held-out", bank.held_out(config.held_out))), 1
+    ):
         evaluator = Evaluator(
             config.algorithm,
             seeds=config.seeds,
@@ -259,7 +263,7 @@ def record_episodes(trainer: Trainer, bank: DemonstrationBank) -> dict[str, np.n
         seeds=config.seeds,
         n_tasks=len(config.tasks),
         episodes=1,
-        bank=bank.held_out(),
+        bank=bank.held_out(config.held_out),
         encoders=trainer.encoders,
     )
     algorithm = trainer.algorithm

@@ -25,11 +25,15 @@ class Entry:
     """Its default hyperparameters."""
 
 
+_SINGLE = BGPOConfig(experts=False, even_replay=False, demonstration_share=0.0)
+
 ALGORITHMS: dict[str, Entry] = {
     "bgpo": Entry(BGPO, BGPOConfig()),
+    "bgpo-single": Entry(BGPO, _SINGLE),
     "maml": Entry(MAML, MAMLConfig()),
     "dist-nll": Entry(DistNLL, DistNLLConfig()),
-    "oracle": Entry(partial(BGPO, compose=labeled), BGPOConfig()),
-    "ddpg": Entry(partial(BGPO, compose=untold), BGPOConfig()),
+    "oracle": Entry(partial(BGPO, compose=labeled), _SINGLE),
+    "ddpg": Entry(partial(BGPO, compose=untold), _SINGLE),
 }
-"""BGPO; the baselines of the paper; DDPG that is told the task's label, and DDPG told nothing."""
+"""BGPO; BGPO with one actor and critic for all and without demonstrations; the baselines of the
+paper; DDPG that is told the task's label, and DDPG told nothing."""

@@ -164,14 +164,16 @@ class GWRB(nn.Module):
         """The same as `lookup`."""
         return self.lookup(phi)
 
-    def lookup(self, phi: Tensor) -> BehaviorMatch:
+    def lookup(self, phi: Tensor, mask: Tensor | None = None) -> BehaviorMatch:
         """Finds the best match of each input (step 2); changes nothing.
 
         Args:
             phi: `[*batch_size, *extra, d]`; each network matches all of its `extra` inputs.
+            mask: bool `[*batch_size]`, the networks that take part. None: all.
 
         Returns:
-            Matches `[*batch_size, *extra]`.
+            Matches `[*batch_size, *extra]`; where `mask` is False, embedding and activity are NaN
+            and the node is -1.
 
         Raises:
             ValueError: if phi has the wrong shape or holds NaN or Inf, or if a network is still
@@ -183,18 +185,29 @@ class GWRB(nn.Module):
                 f"phi must begin with dimensions {[*self.batch_size]} and end with "
                 f"{self.n_features}; got {[*phi.shape]}"
             )
-        if not all(topology.edges for topology in self._topologies):
+        network = self._network if mask is None else self._network[mask.flatten()]
+        topologies = [self._topologies[i] for i in network.tolist()]
+        if not all(topology.edges for topology in topologies):
             raise ValueError("an empty network matches nothing: adapt() it to an input first")
-        phi = _checked(phi.reshape(networks, batch.numel() // networks, self.n_features), weights)
-        distance, row = _distances(phi, weights).min(-1)
+        phi = phi.reshape(networks, batch.numel() // networks, self.n_features)
+        if mask is not None:
+            phi, weights = phi[mask.flatten()], weights[network]
+        distance, row = _distances(_checked(phi, weights), weights).min(-1)
         node = [
             [topology.identity[i] for i in rows]
-            for topology, rows in zip(self._topologies, row.tolist(), strict=True)
+            for topology, rows in zip(topologies, row.tolist(), strict=True)
         ]
+        embedding = self._weights[network.unsqueeze(-1), row]
+        node = _to_tensor(node, row.dtype, row.device).view(row.shape)
+        activity = self._activity(distance)
+        if mask is not None:
+            embedding = self._spread(embedding, network, torch.nan)
+            node = self._spread(node, network, -1)
+            activity = self._spread(activity, network, torch.nan)
         return BehaviorMatch(
-            embedding=weights[self._network.unsqueeze(-1), row].view(*batch, self.n_features),
-            node=_to_tensor(node, row.dtype, row.device).view(batch),
-            activity=self._activity(distance).view(batch),
+            embedding=embedding.view(*batch, self.n_features),
+            node=node.view(batch),
+            activity=activity.view(batch),
             batch_size=batch,
         )
 

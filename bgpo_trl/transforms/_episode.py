@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import cast
+from typing import Any, cast
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -11,6 +11,8 @@ from tensordict.utils import unravel_key
 from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Compose, EnvBase, StepCounter, Transform, TransformedEnv
+
+from bgpo_trl.modules.entries import lacking
 
 
 def starting(tensordict: TensorDictBase, done_key: NestedKey = "done") -> Tensor:
@@ -93,6 +95,81 @@ class EpisodeTransform(Transform):
             raise ValueError(
                 f"put StepCounter before {type(self).__name__}: it has to see where episodes end"
             )
+
+
+class DemonstrationLookup(EpisodeTransform):
+    """Base of the transforms that look a demonstration up in a network that learns from it.
+
+    1. At reset, what the network says of the episode's demonstration is written; it stays the same
+       until the episode is over.
+    2. When it is over (`done`), and with `learn=True`, the network adapts to the demonstration; the
+       networks of the rows whose episode goes on are left alone.
+
+    Args:
+        network: the network, or one for each row: its `batch_size` is that of the environment, or
+            (if it does not learn here) the first dimensions of it.
+        learn: adapt the network. May be changed at any time; `train()` and `eval()`, which TorchRL
+            calls as it likes, have no influence on it.
+        in_keys: name of the demonstration's embedding.
+        out_keys: entries written.
+        done_key: the `done` that ends an episode.
+    """
+
+    def __init__(
+        self,
+        network: Any,
+        *,
+        learn: bool,
+        in_keys: Sequence[NestedKey],
+        out_keys: Sequence[NestedKey],
+        done_key: NestedKey,
+    ) -> None:
+        super().__init__(in_keys, out_keys, done_key)
+        self.network = network
+        self.learn = learn
+
+    def look_up(self, embedding: Tensor) -> tuple[Tensor, ...]:
+        """Returns the `out_keys` for embeddings `[*B, d]`."""
+        raise NotImplementedError
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Looks up the demonstrations of any TensorDict; learns nothing."""
+        embedding = tensordict.get(self.in_keys[0], None)
+        if embedding is None:
+            raise lacking(type(self).__name__, tensordict, self.in_keys)
+        for key, value in zip(self.out_keys, self.look_up(embedding), strict=True):
+            tensordict.set(key, value)
+        return tensordict
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        return self.forward(tensordict_reset)
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        for key in self.out_keys:
+            next_tensordict.set(key, tensordict[key])
+        if self.learn:
+            ended = ending(tensordict, next_tensordict, self.done_key)
+            if ended.any():
+                self.network.adapt(tensordict[self.in_keys[0]], mask=ended)
+        return next_tensordict
+
+    def _demonstration_spec(self, observation_spec: Composite) -> TensorSpec:
+        """Spec of the demonstration's embedding.
+
+        Raises:
+            ValueError: if there is none, or the network is to learn from an environment of another
+                batch size.
+        """
+        demonstration = self._read_spec(observation_spec, self.in_keys[0], "DemonstrationSource")
+        if self.learn and observation_spec.shape != self.network.batch_size:
+            raise ValueError(
+                f"{type(self.network).__name__} was made for "
+                f"batch_size={tuple(self.network.batch_size)}, but the environment it is to learn "
+                f"from has {tuple(observation_spec.shape)}"
+            )
+        return demonstration
 
 
 def _flat(transform: nn.Module) -> Iterator[nn.Module]:
