@@ -104,7 +104,7 @@ row, z = partial(TensorDict, batch_size=[]), torch.zeros(2, 5, 64)
 lae, lengths = SequenceAutoencoder(), torch.tensor([5, 5])
 PARTS = {
     # GWR-B
-    "gwr of no features": (lambda: GWRB(0), "n_features", "must be at least 1"),
+    "gwr of no features": (lambda: GWRB(0), "n_features", "a whole number, at least 1"),
     "gwr threshold": (lambda: GWRB(2, activity_threshold=3.0), "3.0", "<= activity_threshold <= 1"),
     "gwr scale": (lambda: GWRB(2, activity_scale=0.0), "activity_scale=0.0", "activity_scale > 0"),
     "gwr NaN rate": (lambda: GWRB(2, lr_best=NAN), "lr_best=nan", "lr_best <= 1"),
