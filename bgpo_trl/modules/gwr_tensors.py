@@ -76,19 +76,19 @@ def as_mask(value: Numbers, shape: torch.Size) -> Tensor:
     return mask
 
 
-def checked(phi: Tensor, weights: Tensor) -> Tensor:
-    """Returns phi in the type and on the device of the weights.
+def checked(phi: Tensor, weights: Tensor, name: str = "phi") -> Tensor:
+    """Returns the argument called `name` in the type and on the device of the weights.
 
     Raises:
         ValueError: if it cannot be matched.
     """
     if phi.is_complex():
-        raise ValueError("phi must be real numbers; got complex ones")
+        raise ValueError(f"{name} must be real numbers; got complex ones")
     phi = phi.detach().to(weights)
     # Farther out a squared distance could overflow, and every node would be equally near.
     limit = torch.finfo(phi.dtype).max ** 0.5 / 2
     if not torch.linalg.vector_norm(phi).item() <= limit:
-        raise ValueError(f"phi must be free of NaN, Inf and values beyond +-{limit:.0e}")
+        raise ValueError(f"{name} must be free of NaN, Inf and values beyond +-{limit:.0e}")
     return phi
 
 
