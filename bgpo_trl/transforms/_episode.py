@@ -10,7 +10,7 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.utils import unravel_key
 from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec, Unbounded
-from torchrl.envs import Compose, EnvBase, StepCounter, Transform, TransformedEnv
+from torchrl.envs import Compose, EnvBase, RewardSum, StepCounter, Transform, TransformedEnv
 
 from bgpo_trl.modules.entries import lacking
 
@@ -46,7 +46,12 @@ class EpisodeTransform(Transform):
 
     Such entries are part of the observation, which must keep them: the next step reads them. What
     happens at the end of an episode depends on `done`, so that a `StepCounter`, which sets it on
-    time-out, must come before.
+    time-out, must come before. One that learns then must have one: an episode that is never over
+    teaches nothing. One that changes the reward must come before `RewardSum`.
+
+    Attributes:
+        learn: whether it learns at the end of an episode.
+        pays: whether it changes the reward.
 
     Args:
         in_keys: entries read.
@@ -54,6 +59,9 @@ class EpisodeTransform(Transform):
         done_key: the entry that says where an episode has ended; its sibling `_reset` says where
             one starts.
     """
+
+    learn: bool = False
+    pays: bool = False
 
     def __init__(
         self, in_keys: Sequence[NestedKey], out_keys: Sequence[NestedKey], done_key: NestedKey
@@ -76,7 +84,8 @@ class EpisodeTransform(Transform):
     def _reset_env_preprocess(self, tensordict: TensorDictBase | None) -> TensorDictBase | None:
         # Specs are only made when they are asked for. Making them now, before anything is reset,
         # lets a wrong composition be refused for what it is.
-        cast(EnvBase, self.container).observation_spec  # noqa: B018
+        observation_spec = cast(EnvBase, self.container).observation_spec
+        self._check_limit(observation_spec)  # once more, as `learn` can have changed since
         return tensordict
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
@@ -84,17 +93,40 @@ class EpisodeTransform(Transform):
         self._check_order()
         for key, spec in self._entries(observation_spec).items():
             observation_spec[key] = spec
+        self._check_limit(observation_spec)
         return observation_spec
 
     def _check_order(self) -> None:
-        env = self.container
-        if not isinstance(env, TransformedEnv):
-            return
-        transforms = list(_flat(env.transform))
-        if any(isinstance(t, StepCounter) for t in transforms[transforms.index(self) :]):
+        before, after = self._others()
+        if any(isinstance(t, StepCounter) for t in after):
             raise ValueError(
                 f"put StepCounter before {type(self).__name__}: it has to see where episodes end"
             )
+        if self.pays and any(isinstance(t, RewardSum) for t in before):
+            raise ValueError(
+                f"put RewardSum after {type(self).__name__}: it has to see the reward as paid"
+            )
+
+    def _check_limit(self, observation_spec: Composite) -> None:
+        if not self.learn or not isinstance(self.container, TransformedEnv):
+            return
+        # A StepCounter within the workers of a ParallelEnv shows only in what it counts.
+        entries = [key if isinstance(key, str) else key[-1] for key in observation_spec.keys(True)]
+        if "step_count" in entries or any(isinstance(t, StepCounter) for t in self._others()[0]):
+            return
+        raise ValueError(
+            f"{type(self).__name__} learns when episodes end: put StepCounter(50) before it, or "
+            "StepCounter() if the environment has a time limit of its own"
+        )
+
+    def _others(self) -> tuple[list[nn.Module], list[nn.Module]]:
+        """Returns the transforms before this one, those of wrapped environments too, and after."""
+        env, transforms = self.container, list[nn.Module]()
+        while isinstance(env, TransformedEnv):
+            transforms = [*_flat(env.transform), *transforms]
+            env = env.base_env
+        at = transforms.index(self) if transforms else 0
+        return transforms[:at], transforms[at + 1 :]
 
 
 class DemonstrationLookup(EpisodeTransform):

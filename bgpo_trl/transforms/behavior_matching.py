@@ -66,6 +66,8 @@ class BehaviorMatchingReward(EpisodeTransform):
         True
     """
 
+    pays = True
+
     def __init__(
         self,
         lae: SequenceAutoencoder,
