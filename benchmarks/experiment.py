@@ -35,12 +35,31 @@ _LAST = 2**31
 FINAL_COLUMNS = ("seed", "demonstrations", "task", "episodes", "success", "task_inference")
 
 
+AlgorithmName = Literal[
+    "bgpo",
+    "bgpo-experts",
+    "bgpo-single",
+    "bgpo-paper",
+    "maml",
+    "maml-demonstrations",
+    "maml-paper",
+    "dist-nll",
+    "dist-nll-demonstrations",
+    "dist-nll-paper",
+    "oracle",
+    "ddpg",
+]
+"""The keys of `ALGORITHMS`, as a command line has to be told them."""
+
+
 @dataclass(frozen=True)
 class Arguments:
     """Trains an algorithm and draws its success."""
 
-    algorithm: Literal["bgpo", "maml", "dist-nll", "oracle", "ddpg"] = "bgpo"
-    """BGPO; a baseline; or a reference: DDPG that is told the task's label (oracle) or nothing."""
+    algorithm: AlgorithmName = "bgpo"
+    """BGPO, without demonstrations (-experts), with one actor and critic for all behaviors besides
+    (-single); a baseline, or one that learns from demonstrations too; any of them as published
+    (-paper); or a reference: DDPG that is told the task's label (oracle) or nothing."""
     rl: Literal["ddpg", "td3", "sac"] = "ddpg"
     """The RL algorithm of BGPO, its ablations and the references."""
     preset: Literal["smoke", "quick", "desk", "paper"] = "quick"
@@ -51,6 +70,10 @@ class Arguments:
     """Other seeds than the preset's."""
     episodes: int | None = None
     """Another length than the preset's; the tasks' starts keep their proportions."""
+    eval_every: int | None = None
+    """Other training episodes between tests than the preset's."""
+    held_out: Literal["validation", "test"] = "validation"
+    """The half of the held-out demonstrations to test on: to choose settings by, or to report."""
     resume: bool = False
     """Continue the run in the directory."""
     train_encoders: bool = False
@@ -73,7 +96,12 @@ def run_config(arguments: Arguments) -> RunConfig:
     algorithm = ALGORITHMS[arguments.algorithm].config
     if arguments.rl != algorithm.rl.name:
         algorithm = replace(algorithm, rl=RL[arguments.rl].config)
-    config = replace(PRESETS[arguments.preset], name=arguments.algorithm, algorithm=algorithm)
+    config = replace(
+        PRESETS[arguments.preset],
+        name=arguments.algorithm,
+        algorithm=algorithm,
+        held_out=arguments.held_out,
+    )
     if arguments.seeds is not None:
         config = replace(config, seeds=arguments.seeds)
     if arguments.episodes is not None:
@@ -85,6 +113,8 @@ def run_config(arguments: Arguments) -> RunConfig:
             task_starts=starts,
             eval_every=max(1, min(config.eval_every, arguments.episodes)),
         )
+    if arguments.eval_every is not None:
+        config = replace(config, eval_every=arguments.eval_every)
     return config
 
 

@@ -218,7 +218,7 @@ class BGPO(Algorithm):
             reward = torch.ones(self.n_seeds)
             if self._beta:
                 error = transition["behavior"] - transition["demo_embedding"]
-                reward = reward + self._beta * torch.exp(-error.norm(dim=-1))
+                reward += self._beta * torch.exp(-torch.linalg.vector_norm(error, dim=-1))
             self.shown.add(transition, reward, group, ended)
 
     def update(self) -> dict[str, Tensor]:
