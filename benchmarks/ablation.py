@@ -75,9 +75,9 @@ class Arguments(Common):
     variant: Literal[
         "gwr+r_int", "gwr", "r_int", "none", "even-replay", "experts", "demonstrations", "all"
     ] = "gwr+r_int"
-    """GWR-B and the intrinsic reward as published; one of them; or none. Or both, and besides: replay
-    drawn evenly over groups of behaviors; experts for the groups too; demonstrations as experience;
-    or all of it."""
+    """GWR-B and the intrinsic reward as published; one of them; or none. Or both, and besides:
+    replay drawn evenly over groups of behaviors; experts for the groups too; demonstrations as
+    experience; or all of it."""
     continual: bool = False
     """Tasks one after the other instead of all from the start."""
 

@@ -26,7 +26,12 @@ from bgpo_trl.machine import choose_device, set_threads
 from bgpo_trl.plotting import plot_frame_strips, plot_gwr_pca, plot_success_curves, save_figure
 from bgpo_trl.pretrained import load_pretrained, make_pretrained
 from bgpo_trl.progress import progress_bar
-from bgpo_trl.task_inference import majority_task, match_counts, task_inference_accuracy
+from bgpo_trl.task_inference import (
+    group_purity,
+    majority_task,
+    match_counts,
+    task_inference_accuracy,
+)
 from bgpo_trl.training import Trainer
 from bgpo_trl.video import save_gif
 
@@ -270,7 +275,12 @@ def measure(
         "command": shlex.join(["python", *sys.argv]),
         "random_success": dict(zip(config.tasks, random_success.tolist(), strict=True)),
         "nodes": None if gwr is None else gwr.num_nodes.tolist(),
+        "groups": None,
     }
+    if algorithm.groups is not None:
+        purity = group_purity(algorithm.groups, bank.held_out(config.held_out), len(config.tasks))
+        summary["groups"] = algorithm.groups.num_groups.tolist()
+        summary["group_purity"] = purity.tolist()
     (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
 
 

@@ -39,7 +39,15 @@ EVAL_COLUMNS = (
 )
 """Columns of ``eval.csv``, one row a test episode."""
 
-TRAIN_COLUMNS = (*EVAL_COLUMNS, "intrinsic_return", "num_nodes", "loss_actor", "loss_value")
+TRAIN_COLUMNS = (
+    *EVAL_COLUMNS,
+    "intrinsic_return",
+    "num_nodes",
+    "group",
+    "num_groups",
+    "loss_actor",
+    "loss_value",
+)
 """Default columns of ``train.csv``, one row a training episode."""
 
 

@@ -1,4 +1,4 @@
-"""How well GWR-B tells tasks apart, measured with labels that it never sees."""
+"""How well GWR-B and the groups tell tasks apart, measured with labels that they never see."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from bgpo_trl.demonstration_bank import DemonstrationBank
+from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.modules.gwr import GWRB
 
 
@@ -56,3 +57,20 @@ def task_inference_accuracy(
     right = matched.gather(-1, task_of_node.clamp(min=0).unsqueeze(-1)).squeeze(-1)
     right = torch.where(task_of_node >= 0, right, 0)
     return right.sum(-1) / matched.sum((-1, -2))
+
+
+@torch.no_grad()
+def group_purity(groups: BehaviorGroups, bank: DemonstrationBank, n_tasks: int) -> Tensor:
+    """Returns the share of demonstrations that are of the majority task of their group, ``[*S]``.
+
+    Args:
+        groups: The groups, ``batch_size`` ``[*S]``.
+        bank: Demonstrations, of whose labels the groups know nothing.
+        n_tasks: Number of tasks.
+    """
+    batch = groups.batch_size
+    group = groups.lookup(bank.embedding.expand(*batch, *bank.embedding.shape)).group
+    counts = torch.zeros(*batch, int(groups.num_groups.max()), n_tasks)
+    for index in np.ndindex(*batch):
+        counts[index].index_put_((group[index], bank.task), torch.tensor(1.0), accumulate=True)
+    return counts.amax(-1).sum(-1) / len(bank.task)

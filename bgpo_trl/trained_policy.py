@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -37,7 +38,11 @@ class Recognition:
         behavior: The weights b of the best matching node of GWR-B, ``[32]``. None, as the next two,
             in algorithms without GWR-B.
         node: Its identity.
-        activity: ``exp(-||phi - b||)``: 1 where the demonstration is just like the node.
+        activity: Of the node, in [0, 1]: 1 where the demonstration is just like it.
+        group: The group of behaviors that it belongs to. None, as the next two, in algorithms that
+            do not tell groups apart.
+        group_activity: Of the best match among the groups' nodes, in [0, 1].
+        known: Whether that is high enough for the demonstration to be of a known group.
         task: The label that came with the demonstration.
     """
 
@@ -45,6 +50,9 @@ class Recognition:
     behavior: Tensor | None = field(default=None, repr=False)
     node: int | None = None
     activity: float | None = None
+    group: int | None = None
+    group_activity: float | None = None
+    known: bool | None = None
     task: str | None = None
 
 
@@ -127,11 +135,18 @@ class TrainedPolicy:
         )
         self._frozen = TensorDict.maybe_dense_stack([policy] * n_seeds).to(algorithm.device)
         self._task = 0 if task is None else self.tasks.index(task)
-        if algorithm.gwr is None:
-            return Recognition(embedding, task=task)
-        match = algorithm.gwr.lookup(embedding.expand(n_seeds, -1))
-        behavior, activity = match.embedding[self._index], float(match.activity[self._index])
-        return Recognition(embedding, behavior, int(match.node[self._index]), activity, task)
+        shown, index = embedding.expand(n_seeds, -1), self._index
+        found: dict[str, Any] = {}
+        if algorithm.gwr is not None:
+            match = algorithm.gwr.lookup(shown)
+            found["behavior"], found["node"] = match.embedding[index], int(match.node[index])
+            found["activity"] = float(match.activity[index])
+        if algorithm.groups is not None:
+            member = algorithm.groups.lookup(shown)
+            activity = float(member.activity[index])
+            found["group"], found["group_activity"] = int(member.group[index]), activity
+            found["known"] = activity >= algorithm.groups.activity_threshold
+        return Recognition(embedding, **found, task=task)
 
     @torch.no_grad()
     def act(self, frame: ArrayLike) -> NDArray[np.float32]:

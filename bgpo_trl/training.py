@@ -191,6 +191,7 @@ class Trainer:
         intrinsic = end.get("episode_intrinsic_reward", 0.0)  # not measured in every variant
         extrinsic = end.get("episode_extrinsic_reward", end["episode_reward"])
         nodes = 0 if algorithm.gwr is None else int(algorithm.gwr.num_nodes[index])
+        groups = 1 if algorithm.groups is None else int(algorithm.groups.num_groups[index])
         self._successes.append(int(end["terminated"]))
         self.logger.log_train(
             {
@@ -204,6 +205,8 @@ class Trainer:
                 "steps": int(end["step_count"]),
                 "intrinsic_return": float(intrinsic),
                 "num_nodes": nodes,
+                "group": int(end.get("group", 0)),
+                "num_groups": groups,
                 "loss_actor": float(losses.get("loss_actor", 0.0)),
                 "loss_value": float(losses.get("loss_value", 0.0)),
             }

@@ -164,25 +164,24 @@ class BGPO(Algorithm):
         self.in_keys = [config.state, *([] if self.told is None else [self.told])]
         rl, keys = config.rl, self.in_keys
 
-        def learner_of(seeds: Sequence[int], experts: Sequence[int]) -> Any:
-            problem = Problem(
+        n_slots = config.active_groups if config.grouped else 1
+        n_experts = n_slots if config.experts else 1
+        self.learner = make_learner(
+            rl,
+            Problem(
                 seeds=seeds,
                 in_keys=keys,
                 in_features=self.state_size + told_size,
                 return_bounds=(0.0, self._highest_return()),
                 device=self.device,
-                experts=experts,
-            )
-            return make_learner(rl, problem)
-
-        n_slots = config.active_groups if config.grouped else 1
+                experts=range(n_experts),
+            ),
+        )
         self._active = ActiveGroups(len(seeds), n_slots)
-        n_experts = n_slots if config.experts else 1
-        self.learner = learner_of(seeds, range(n_experts))
         self.experts = Experts(
             self.learner,
             self._active if config.experts else ActiveGroups(len(seeds), 1),
-            lambda seed, group: learner_of([seeds[seed]], [group]),
+            lambda seed, group: 0 if self.groups is None else self.groups.parent(seed, group),
         )
         self.replay = GroupReplay(
             rl.replay_size,
@@ -261,8 +260,7 @@ class BGPO(Algorithm):
             shown = embedding.expand(self.n_seeds, *embedding.shape)
             group = self.groups.lookup(shown).group[index]
         experts = {
-            number: self.experts.actor_weights(index, self._with_networks(index, number))
-            for number in group.unique().tolist()
+            number: self.experts.actor_weights(index, number) for number in group.unique().tolist()
         }
         each = [experts[number] for number in group.flatten().tolist()]
         frozen: dict[str, Any] = {
@@ -280,12 +278,6 @@ class BGPO(Algorithm):
                 batch = transform(batch)
             frozen["told"] = batch[self.told][index].clone()
         return frozen
-
-    def _with_networks(self, seed: int, group: int) -> int:
-        """Returns the group, or the one it parted from if it has not been played yet."""
-        while self.groups is not None and group and not self.experts.knows(seed, group):
-            group = self.groups.parent(seed, group)
-        return group
 
     def act_frozen(self, frozen: TensorDictBase, state: Tensor) -> Tensor:
         """Returns the actions of test episodes; see `Algorithm.act_frozen`."""

@@ -13,6 +13,7 @@ from bgpo_trl.algorithms.rl import Learner
 __all__ = ["ActiveGroups", "Experts"]
 
 State = dict[str, Tensor]
+_MOMENTS = "optimizer."
 
 
 class ActiveGroups:
@@ -77,22 +78,22 @@ class Experts:
     The learner's networks are a stack ``[S, E]``: those of the active groups. A group that becomes
     active takes the place of the one played longest ago, whose networks, targets and moments of
     the optimizer are put aside until it is played again. So an update costs the same however many
-    groups there are, and a group that is not played is not changed.
+    groups there are, and a group that is not played is not changed. A new group starts with the
+    networks of the group that it parted from, and without moments.
 
     Args:
         learner: Learner of a stack ``[S, E]``.
         active: The active groups; only `play` changes them from now on.
-        fresh: Makes the learner of a group that is new: called with the position of the seed and
-            the group, it returns one of a stack ``[1, 1]``.
+        parent: Returns the group that a group parted from, given the position of the seed and the
+            group. Group 0 has none.
     """
 
     def __init__(
-        self, learner: Learner, active: ActiveGroups, fresh: Callable[[int, int], Learner]
+        self, learner: Learner, active: ActiveGroups, parent: Callable[[int, int], int]
     ) -> None:
-        self.learner, self.active, self._fresh = learner, active, fresh
+        self.learner, self.active, self._parent = learner, active, parent
         self._batch = active.group.shape
         self._aside: list[dict[int, State]] = [{} for _ in range(self._batch[0])]
-        self._known: list[set[int]] = [set() for _ in range(self._batch[0])]
 
     def play(self, groups: Sequence[int]) -> Tensor:
         """Makes the group of each seed's episode active.
@@ -105,20 +106,17 @@ class Experts:
         """
         return torch.tensor([self._play(seed, group) for seed, group in enumerate(groups)])
 
-    def knows(self, seed: int, group: int) -> bool:
-        """Returns whether a group has networks of its own: it was played before."""
-        return group in self._known[seed]
-
     def actor_weights(self, seed: int, group: int) -> State:
         """Returns copies of the weights of a group's policy, on the CPU.
 
+        A group that was not played yet acts as the one it parted from.
+
         Args:
             seed: Position of the seed.
-            group: A group that the seed `knows`.
+            group: A group.
         """
         prefix = "actor_network_params."
-        slot = self.active.slot(seed, group)
-        state = self._aside[seed][group] if slot is None else self._read(seed, slot)
+        state = self._state(seed, self._with_networks(seed, group))
         return {
             key.removeprefix(prefix): value.to("cpu", copy=True)
             for key, value in state.items()
@@ -127,37 +125,47 @@ class Experts:
 
     def state_dict(self) -> dict[str, Any]:
         """Returns the networks that are put aside, and which groups are active."""
-        return {
-            "active": self.active.state_dict(),
-            "aside": [{group: dict(s) for group, s in aside.items()} for aside in self._aside],
-            "known": [sorted(known) for known in self._known],
-        }
+        aside = [{group: dict(state) for group, state in row.items()} for row in self._aside]
+        return {"active": self.active.state_dict(), "aside": aside}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continues from what `state_dict` returned; the learner is loaded by itself."""
         self.active.load_state_dict(state["active"])
         device = next(self.learner.loss.parameters()).device
         self._aside = [
-            {group: {k: v.to(device) for k, v in s.items()} for group, s in aside.items()}
-            for aside in state["aside"]
+            {group: {k: v.to(device) for k, v in s.items()} for group, s in row.items()}
+            for row in state["aside"]
         ]
-        self._known = [set(known) for known in state["known"]]
 
     def _play(self, seed: int, group: int) -> int:
+        slot = self.active.slot(seed, group)
+        if slot is not None:
+            return self.active.play(seed, group)
+        aside = self._aside[seed]
+        if group in aside:
+            state = aside.pop(group)
+        else:
+            inherited = self._state(seed, self._with_networks(seed, group)) if group else {}
+            state = {k: v.clone() for k, v in inherited.items() if not k.startswith(_MOMENTS)}
         before = self.active.group[seed].tolist()
         slot = self.active.play(seed, group)
-        left = before[slot]
-        if left == group:
-            return slot
-        if left >= 0:
-            self._aside[seed][left] = {k: v.clone() for k, v in self._read(seed, slot).items()}
-        if group in self._aside[seed]:
-            self._write(seed, slot, self._aside[seed].pop(group))
-        elif group != slot:  # else the slot has been its own since the stack was made
-            fresh = _tensors(self._fresh(seed, group), torch.Size([1, 1]))
-            self._write(seed, slot, {key: value[0, 0] for key, value in fresh.items()})
-        self._known[seed].add(group)
+        if before[slot] >= 0:
+            aside[before[slot]] = {k: v.clone() for k, v in self._read(seed, slot).items()}
+        if group or state:
+            self._write(seed, slot, state)
         return slot
+
+    def _with_networks(self, seed: int, group: int) -> int:
+        """Returns the group, or the nearest of those it descends from that has networks."""
+        while group and group not in self._aside[seed] and self.active.slot(seed, group) is None:
+            group = self._parent(seed, group)
+        return group
+
+    def _state(self, seed: int, group: int) -> State:
+        slot = self.active.slot(seed, group)
+        if slot is None and group in self._aside[seed]:
+            return self._aside[seed][group]
+        return self._read(seed, slot or 0)  # before the first step, group 0 is in no slot yet
 
     def _read(self, seed: int, slot: int) -> State:
         tensors = _tensors(self.learner, self._batch)
@@ -165,11 +173,7 @@ class Experts:
 
     def _write(self, seed: int, slot: int, state: State) -> None:
         for key, value in _tensors(self.learner, self._batch).items():
-            # A learner that has not learned yet has no moments, and a fresh one starts with zeros.
-            if key in state:
-                value[seed, slot] = state[key]
-            else:
-                value[seed, slot] = 0
+            value[seed, slot] = state.get(key, 0.0)
 
 
 def _tensors(learner: Learner, batch: torch.Size) -> State:
@@ -183,5 +187,5 @@ def _tensors(learner: Learner, batch: torch.Size) -> State:
     for number, parameter in enumerate(parameters):
         for key, value in learner.optimizer.state.get(parameter, {}).items():
             if key != "step":
-                tensors[f"optimizer.{number}.{key}"] = value
+                tensors[f"{_MOMENTS}{number}.{key}"] = value
     return tensors
