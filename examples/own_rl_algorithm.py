@@ -50,10 +50,9 @@ RL["td3-epsilon"] = RLEntry(make, EpsilonConfig())
 
 if __name__ == "__main__":
     # A minute's try: ground truth and the task's label. BGPO itself is BGPOConfig(rl=...) alone.
-    rl = EpsilonConfig(warmup_steps=64)
-    algorithm = replace(ALGORITHMS["oracle"].config, state="state", rl=rl)
+    told = replace(ALGORITHMS["oracle"].config, state="state", rl=EpsilonConfig(warmup_steps=64))
     config = RunConfig(
-        (0, 1), 4, task_starts=(0, 0, 0), eval_every=2, name="oracle", algorithm=algorithm
+        (0, 1), 4, task_starts=(0, 0, 0), eval_every=2, name="oracle", algorithm=told
     )
     with TemporaryDirectory() as folder, Trainer(config, folder, bank=load_pretrained()[1]) as run:
         run.run()
