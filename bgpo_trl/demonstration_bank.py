@@ -134,11 +134,15 @@ class DemonstrationBank:
         """Returns the demonstrations for test episodes.
 
         Args:
-            part: Every other one, from the first on to choose settings by, or from the second on
-                to report results on; None for all.
+            part: Every other one of each task, from the first on to choose settings by, or from
+                the second on to report results on; None for all.
         """
         rows = torch.nonzero(~self.train).flatten()
-        return self._select(rows if part is None else rows[part == "test" :: 2])
+        if part is None:
+            return self._select(rows)
+        task = self.task[rows].unsqueeze(-1)
+        place = (task == torch.arange(len(self.tasks))).cumsum(0).gather(-1, task).flatten() - 1
+        return self._select(rows[place % 2 == (part == "test")])
 
     def of_task(self, task: int) -> DemonstrationBank:
         """Returns the demonstrations of one task."""

@@ -141,12 +141,22 @@ def test_steps_go_with_their_demonstrations(with_steps):
 
 
 def test_the_halves_of_the_held_out_ones_take_turns_and_are_all_of_them(bank):
-    every = bank.held_out()
-    halves = [bank.held_out(part) for part in ("validation", "test")]
-    assert [len(half.task) for half in halves] == [6, 6]
-    for first, half in enumerate(halves):
-        assert half.embedding.equal(every.embedding[first::2])
-        assert half.task.bincount().tolist() == [2, 2, 2]
+    """Task by task, in whatever order they are."""
+    sorted_by_task = bank._select(bank.task.argsort(stable=True))
+    for one in (bank, sorted_by_task, bank.for_tasks(bank.tasks[::-1])):
+        halves = [one.held_out(part) for part in ("validation", "test")]
+        assert [len(half.task) for half in halves] == [6, 6]
+        for task in range(3):
+            every = one.of_task(task).held_out().embedding
+            for first, half in enumerate(halves):
+                assert half.of_task(task).embedding.equal(every[first::2])
+
+
+def test_the_only_one_held_out_of_a_task_is_for_validation(bank):
+    kept = torch.cat([torch.nonzero(bank.train).flatten(), torch.arange(24, 27)])
+    few = bank._select(kept)
+    assert few.held_out("validation").task.tolist() == [0, 1, 2]
+    assert few.held_out("test").task.tolist() == []
 
 
 def test_steps_of_other_demonstrations_are_refused(with_steps, tmp_path):
