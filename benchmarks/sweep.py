@@ -27,10 +27,11 @@ from typing import Literal
 
 import experiment
 from ablation import VARIANTS
-from jobs import Job, connected, locked, play_jobs
+from jobs import Job, connected, play_jobs
 from merge import merge
 
 from bgpo_trl.algorithms.bgpo import BGPO
+from bgpo_trl.locking import DirectoryLock
 from bgpo_trl.logging import check_settings
 from bgpo_trl.pretrained import load_pretrained
 from bgpo_trl.runs import read_json
@@ -147,7 +148,7 @@ def main(arguments: Arguments) -> None:
             sys.exit("interrupted: the same command continues")
     for directory, group in jobs.items():
         if failed.keys().isdisjoint(group):
-            with locked(directory):
+            with DirectoryLock(directory, wait=True):
                 merge([job.directory for job in group], directory)
             print(f"{directory}: {len(group)} blocks of seeds")
     if failed:
