@@ -32,8 +32,8 @@ from merge import merge
 
 from bgpo_trl.algorithms.bgpo import BGPO
 from bgpo_trl.locking import DirectoryLock
-from bgpo_trl.logging import check_settings
 from bgpo_trl.pretrained import load_pretrained
+from bgpo_trl.run_directory import check_settings, holds_run
 from bgpo_trl.runs import read_json
 
 
@@ -128,7 +128,7 @@ def play(job: Job) -> None:
     """Plays a job to its end, from its last checkpoint if there is one, and measures."""
     name = job.config.name
     make = partial(BGPO, compose=VARIANTS[name]) if name in VARIANTS else None
-    arguments = experiment.Arguments(out=job.directory, resume=True)
+    arguments = experiment.Arguments(out=job.directory, resume=holds_run(job.directory))
     experiment.run_experiment(arguments, "sweep", job.config, make)
 
 

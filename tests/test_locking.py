@@ -3,53 +3,10 @@
 import os
 import signal
 import socket
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 
 from bgpo_trl.locking import DirectoryLock
-
-ROOT = Path(__file__).parents[1]
-# What the other processes do: each line that they print is something that they have come to.
-HOLD = """
-import sys
-from bgpo_trl import locking
-lock = locking.DirectoryLock(sys.argv[1])
-print("has it", flush=True)
-input()
-"""
-WAIT = """
-import sys
-from bgpo_trl import locking
-sleep = locking.time.sleep
-locking.time.sleep = lambda seconds: (print("waits", flush=True), sleep(0.01))
-locking.DirectoryLock(sys.argv[1], wait=True)
-print("has it", flush=True)
-"""
-
-
-@pytest.fixture
-def other():
-    """Starts processes that take the lock of a directory."""
-    started = []
-
-    def start(code, directory):
-        process = subprocess.Popen(
-            [sys.executable, "-c", code, str(directory)],
-            env={**os.environ, "PYTHONPATH": str(ROOT)},
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        started.append(process)
-        return process
-
-    yield start
-    for process in started:
-        process.kill()
-        process.communicate()
 
 
 def refusal(directory):
@@ -58,9 +15,9 @@ def refusal(directory):
     return str(raised.value)
 
 
-def test_the_second_process_is_told_of_the_first_one(other, tmp_path):
+def test_the_second_process_is_told_of_the_first_one(other_process, tmp_path):
     run = tmp_path / "run"
-    process = other(HOLD, run)
+    process = other_process(run)
     assert process.stdout.readline() == "has it\n"
     told = f"process {process.pid} on {socket.gethostname()}"
     assert refusal(run) == f"{run} is in use by {told}: let it finish, or stop it"
@@ -70,8 +27,8 @@ def test_the_second_process_is_told_of_the_first_one(other, tmp_path):
         pass
 
 
-def test_a_process_that_is_killed_holds_nothing(other, tmp_path):
-    process = other(HOLD, tmp_path)
+def test_a_process_that_is_killed_holds_nothing(other_process, tmp_path):
+    process = other_process(tmp_path)
     assert process.stdout.readline() == "has it\n"
     process.send_signal(signal.SIGKILL)
     process.wait()
@@ -81,20 +38,20 @@ def test_a_process_that_is_killed_holds_nothing(other, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_whoever_waits_has_it_next(other, tmp_path):
+def test_whoever_waits_has_it_next(other_process, tmp_path):
     with DirectoryLock(tmp_path):
-        process = other(WAIT, tmp_path)
+        process = other_process(tmp_path, wait=True)
         assert process.stdout.readline() == "waits\n"
     assert "has it\n" in process.stdout
 
 
-def test_who_holds_it_may_take_it_again(other, tmp_path):
+def test_who_holds_it_may_take_it_again(other_process, tmp_path):
     """It is free when the last one is released, in whatever order."""
     first = DirectoryLock(tmp_path)
     second = DirectoryLock(tmp_path / "." / ".." / tmp_path.name)
     first.release()
     first.release()
-    process = other(WAIT, tmp_path)
+    process = other_process(tmp_path, wait=True)
     assert process.stdout.readline() == "waits\n"
     second.release()
     assert "has it\n" in process.stdout
@@ -137,8 +94,8 @@ def test_a_directory_that_cannot_be_locked_is_told(tmp_path, refused):
     refused(lambda: DirectoryLock(tmp_path / "run"), "Is a directory", "choose another run")
 
 
-def test_what_a_stranger_wrote_into_the_file_is_not_told(tmp_path, other):
-    process = other(HOLD, tmp_path)
+def test_what_a_stranger_wrote_into_the_file_is_not_told(tmp_path, other_process):
+    process = other_process(tmp_path)
     assert process.stdout.readline() == "has it\n"
     (tmp_path / "lock").write_bytes(b"\x1b[31mred\n")
     assert "in use by another process: " in refusal(tmp_path)

@@ -3,7 +3,6 @@
 import csv
 import os
 import signal
-import subprocess
 import sys
 import tempfile
 import threading
@@ -21,7 +20,6 @@ from jobs import Job
 from bgpo_trl.configs import RunConfig
 from bgpo_trl.training import Trainer
 
-ROOT = Path(__file__).parents[2]
 # What Ray starts here, it starts in vain on every core otherwise.
 SMALL = {"include_dashboard": False, "object_store_memory": 80_000_000}
 
@@ -148,38 +146,27 @@ def test_ctrl_c_reaches_the_runs(ray, tmp_path):
     assert not todo[0].finished
 
 
-HOLD = """
-import sys
-from bgpo_trl.locking import DirectoryLock
-with DirectoryLock(sys.argv[1]):
-    print("has it", flush=True)
-    input()
-"""
-
-
-def test_a_run_is_played_when_no_other_process_holds_it(make_config, tmp_path, monkeypatch):
+def test_a_run_is_played_when_no_other_process_holds_it(
+    make_config, tmp_path, monkeypatch, other_process
+):
     """It goes on once the other process is gone, and does not play again what that one ended."""
     job = Job(tmp_path / "run", make_config())
     waiting, played = threading.Event(), []
     monkeypatch.setattr("bgpo_trl.locking.time.sleep", lambda _: waiting.set())
-    options = {"env": {**os.environ, "PYTHONPATH": str(ROOT)}, "text": True}
     for ended_by_other in (False, True):
         waiting.clear(), played.clear()
+        other = other_process(job.directory)
+        assert other.stdout.readline() == "has it\n"
+        (job.directory / "finished").unlink(missing_ok=True)
         thread = threading.Thread(
             target=jobs.work, args=(job, lambda _: played.append(job), sys.argv)
         )
-        command = [sys.executable, "-c", HOLD, str(job.directory)]
-        with subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, **options
-        ) as other:
-            assert other.stdout.readline() == "has it\n"
-            (job.directory / "finished").unlink(missing_ok=True)
-            thread.start()
-            assert waiting.wait(20)
-            assert not played
-            if ended_by_other:
-                (job.directory / "finished").touch()
-            other.communicate("\n")
+        thread.start()
+        assert waiting.wait(20)
+        assert not played
+        if ended_by_other:
+            (job.directory / "finished").touch()
+        other.communicate("\n")
         thread.join(20)
         assert played == ([] if ended_by_other else [job])
         assert job.finished
