@@ -22,6 +22,7 @@ from typing import Annotated, Literal
 
 from ablation import VARIANTS
 from experiment import command_line
+from resuming import check_resumable
 from summary import summarize
 from tyro.conf import subcommand
 
@@ -75,6 +76,8 @@ def main(arguments: Arguments) -> None:
         raise ValueError("--rungs names none: name some of a, b, c, d")
     set_threads(arguments.threads)
     device = choose_device(arguments.device)
+    if arguments.resume:
+        check_resumable([arguments.out / rung for rung in arguments.rungs])
     encoders, bank = load_pretrained()
     base = replace(
         PRESETS["desk"],

@@ -96,6 +96,7 @@ def load_last(directory: Path, config: Any) -> dict[str, Any] | None:
     Raises:
         ValueError: If settings, rows or checkpoint are missing, damaged or of another run.
     """
+    check_settings(directory, config, longer=True)
     folder = directory / "checkpoint"
     remedy = "put it back as the run left it, or begin a new run in another directory"
     if not has_checkpoint(folder):
@@ -104,7 +105,6 @@ def load_last(directory: Path, config: Any) -> dict[str, Any] | None:
         return None
     if not (directory / "config.json").exists():
         raise ValueError(f"{directory} has a checkpoint, but no config.json: {remedy}")
-    check_settings(directory, config, longer=True)
     state = load_checkpoint(folder)
     # Checkpoints did not always say; then config.json alone does.
     _compare(folder, state.get("settings", config), config, longer=True)

@@ -136,9 +136,83 @@ def test_continual_leaves_curve_and_figures(tiny, tmp_path, capsys):
     before = files(run_directory)
     with pytest.raises(ValueError, match="holds a run: --resume continues it, --out names another"):
         continual.main(experiment.Arguments(out=run_directory))
-    continual.main(experiment.Arguments(out=run_directory, resume=True))
     assert files(run_directory) == before
-    assert capsys.readouterr().out == printed
+
+
+def test_a_finished_run_only_says_so_until_it_is_made_longer(
+    tiniest, tmp_path, monkeypatch, capsys
+):
+    run = tmp_path / "run"
+    arguments = experiment.Arguments(out=run)
+    continual.main(arguments)
+    before, played = files(run), (run / "train.csv").read_text()
+    again = replace(arguments, resume=True)
+    with monkeypatch.context() as patch:
+        for name in ("load_pretrained", "make_pretrained", "Trainer", "measure", "draw"):
+            patch.delattr(experiment, name)
+        for same in (again, replace(again, episodes=6), replace(again, train_encoders=True)):
+            capsys.readouterr()
+            continual.main(same)
+            told = f"{run} is finished, all 6 episodes: --episodes makes it longer\n"
+            assert capsys.readouterr() == (told, "")
+    assert files(run) == before
+
+    for wrong in (replace(again, episodes=5), replace(again, seeds=(3,))):
+        with pytest.raises(ValueError, match="holds a run with other settings"):
+            continual.main(wrong)
+    with pytest.raises(ValueError, match=r"with other settings .*task_starts is \[0, 2, 4\] there"):
+        concurrent.main(replace(again, episodes=9))
+    assert files(run) == before
+
+    (run / "final.csv").unlink()  # as if it had been interrupted in its last tests
+    continual.main(again)
+    assert (run / "final.csv").exists()
+    assert (run / "train.csv").read_text() == played
+
+    for _ in range(2):
+        capsys.readouterr()
+        continual.main(replace(again, episodes=9))
+        settings = json.loads((run / "config.json").read_text())
+        assert (settings["episodes"], settings["task_starts"]) == (9, [0, 2, 4])
+        assert settings["eval_every"] == 2
+        assert json.loads((run / "summary.json").read_text())["episodes"] == 9
+        train = (run / "train.csv").read_text()
+        assert train.startswith(played)
+        assert train.count("\n") == 1 + 2 * 9
+    assert capsys.readouterr().out.startswith(f"{run} is finished, all 9 episodes")
+
+
+def test_a_run_that_was_interrupted_before_its_training_is_resumed(
+    tiniest, tmp_path, monkeypatch, encoders, bank
+):
+    monkeypatch.setattr(experiment, "make_pretrained", lambda *_, **__: (encoders, bank))
+    (tmp_path / "demonstrations").mkdir()
+    arguments = experiment.Arguments(out=tmp_path, resume=True, episodes=2)
+    with pytest.raises(ValueError, match="holds no run to resume"):
+        continual.main(arguments)
+    assert [path.name for path in tmp_path.iterdir()] == ["demonstrations"]
+    continual.main(replace(arguments, train_encoders=True))
+    assert (tmp_path / "summary.json").exists()
+
+
+def test_another_process_is_kept_off_all_of_an_experiment(
+    tiniest, tmp_path, monkeypatch, other_process
+):
+    """Also while it makes its encoders, and while it is tested and drawn."""
+    events = []
+    for name in ("load_pretrained", "measure"):
+        function = getattr(experiment, name)
+
+        def do(*args, name=name, function=function, **kwargs):
+            other = other_process(tmp_path / "run")
+            assert f"in use by process {os.getpid()} on" in other.communicate()[1]
+            events.append(name)
+            return function(*args, **kwargs)
+
+        monkeypatch.setattr(experiment, name, do)
+    continual.main(experiment.Arguments(out=tmp_path / "run"))
+    assert events == ["load_pretrained", "measure"]
+    assert not (tmp_path / "run" / "lock").exists()
 
 
 def test_a_dashboard_gets_the_figures_before_it_is_closed(tiniest, monkeypatch, tmp_path):
@@ -169,7 +243,8 @@ def test_a_dashboard_gets_the_figures_before_it_is_closed(tiniest, monkeypatch, 
         assert (run / "figures" / f"{task}.gif").read_bytes().startswith(b"GIF89a")
 
     events.clear()
-    continual.main(replace(arguments, resume=True))  # finished before
+    (run / "summary.json").unlink()  # as if it had been killed when training was over
+    continual.main(replace(arguments, resume=True))
     assert events == [*shown, "shutdown"]
 
 
@@ -374,7 +449,7 @@ def ended_with(monkeypatch, script, *arguments):
         (("--preset", "smoke", "--out", "here"), "error: here holds a run: --resume continues it"),
         (("--episodes", "0"), "error: episodes must be at least 1, got 0"),
         (("--algorithm", "maml", "--rl", "td3"), "error: MAML is defined over DDPG, not 'td3'"),
-        (("--preset", "smoke", "--out", "file"), "error: cannot make the folder file/"),
+        (("--preset", "smoke", "--out", "file"), "error: cannot make the folder file ("),
     ],
 )
 def test_mistakes_of_a_person_are_one_line(tmp_path, monkeypatch, capsys, arguments, message):
