@@ -150,6 +150,8 @@ CASES = {
         lambda f: record_demonstrations(f / "d", tasks=["juggle"], **TINY), "'juggle'", "choose"),
     "recording with a negative seed": (
         lambda f: record_demonstrations(f / "d", seed=-1, **TINY), "got -1", "at least 0"),
+    "recording without an attempt": (
+        lambda f: record_demonstrations(f / "d", attempts=0, **TINY), "got 0", "at least 1"),
     "recording none to learn from": (
         lambda f: record_demonstrations(f / "d", per_task=1, held_out_per_task=1),
         "held_out_per_task is 1", "must be less than per_task, 1"),
