@@ -14,6 +14,7 @@ seen on one rung:
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -108,7 +109,9 @@ def main(arguments: Arguments) -> None:
     print("| rung | " + " | ".join(columns) + " |")
     print("|---|" + "---|" * len(columns))
     for rung, table in tables.items():
-        cells = [f"{v:.0f}" if k.startswith("episodes") else f"{v:.2f}" for k, v in table.items()]
+        reached = table.pop("episodes to 80 %")
+        cells = [f"{success:.2f}" for success in table.values()]
+        cells.append("not reached" if math.isnan(reached) else f"{reached:.0f}")
         print(f"| ({rung}) {RUNGS[rung][0]} | " + " | ".join(cells) + " |")
 
 

@@ -138,7 +138,7 @@ def refused(tmp_path) -> Callable[..., None]:
             call()
         message = str(raised.value)
         assert not isinstance(raised.value, JSONDecodeError | UnicodeDecodeError)
-        assert "\n" not in message
+        assert message.isprintable()  # one line, and nothing that a terminal would act on
         assert cause in message
         assert remedy in message
         assert _files(tmp_path) == before

@@ -26,6 +26,7 @@ from bgpo_trl.algorithms.rl import RL
 from bgpo_trl.checkpoint import load_checkpoint
 from bgpo_trl.configs import PRESETS, DDPGConfig
 from bgpo_trl.logging import EVAL_COLUMNS
+from bgpo_trl.runs import read_rows
 from suites import nico
 
 ROOT = Path(__file__).parents[2]
@@ -237,7 +238,7 @@ def test_a_dashboard_gets_the_figures_before_it_is_closed(tiniest, monkeypatch, 
     shown = [(f"figures/{Path(n).stem}", run / "figures" / n) for n in sorted(figures)]
     arguments = experiment.Arguments(out=run, wandb="offline")
     continual.main(arguments)
-    rows = [summary.read_rows(run / name) for name in ("train.csv", "eval.csv")]
+    rows = [read_rows(run / name) for name in ("train.csv", "eval.csv")]
     assert events == ["row"] * sum(map(len, rows)) + [*shown, "shutdown"]
     for task in TASKS:
         assert (run / "figures" / f"{task}.gif").read_bytes().startswith(b"GIF89a")
@@ -262,7 +263,7 @@ def test_the_command_line_runs_every_algorithm_and_says_its_name(
     assert config["name"] == name
     assert config["algorithm"].get("beta") == (None if name in ("maml", "dist-nll") else 0.1)
     for file in ("train.csv", "eval.csv"):
-        rows = summary.read_rows(run / file)
+        rows = read_rows(run / file)
         assert {row["algorithm"] for row in rows} == {name}
         assert {row["task"] for row in rows} == set(TASKS)
 
@@ -273,7 +274,7 @@ def test_the_command_line_runs_every_algorithm_and_says_its_name(
     for file in ("gwr.csv", "figures/gwr.png"):
         assert (run / file).exists() == with_gwr
     assert ("GWR-B" in printed) == ("task inference" in printed) == with_gwr
-    rows = summary.read_rows(run / "final.csv")
+    rows = read_rows(run / "final.csv")
     assert len(rows) == 2 * 2 * 3
     assert all((row["task_inference"] != "") == with_gwr for row in rows)
     summed_up = summary.describe(run)
@@ -291,9 +292,9 @@ def test_concurrent_presents_all_tasks_from_the_start(tiny, tmp_path, capsys):
     run = tmp_path / "run"
     concurrent.main(experiment.Arguments(out=run))
     assert json.loads((run / "config.json").read_text())["task_starts"] == [0, 0, 0]
-    assert {row["task"] for row in summary.read_rows(run / "eval.csv")} == set(TASKS)
+    assert {row["task"] for row in read_rows(run / "eval.csv")} == set(TASKS)
 
-    rows = summary.read_rows(run / "final.csv")
+    rows = read_rows(run / "final.csv")
     assert sorted((int(r["seed"]), r["demonstrations"], r["task"]) for r in rows) == sorted(
         (seed, kind, task) for seed in (3, 8) for kind in ("seen", "held-out") for task in TASKS
     )
@@ -305,7 +306,7 @@ def test_concurrent_presents_all_tasks_from_the_start(tiny, tmp_path, capsys):
     assert re.fullmatch(r"|[0-9a-f]{7,}(-dirty)?", told["commit"])
     assert len(told["nodes"]) == 2
     assert told["random_success"] == pytest.approx(dict(zip(TASKS, [0.1, 0.2, 0.3], strict=True)))
-    nodes = summary.read_rows(run / "gwr.csv")
+    nodes = read_rows(run / "gwr.csv")
     assert len(nodes) == told["nodes"][0]
     assert {node["task"] for node in nodes} <= {"-1", "0", "1", "2"}
     assert [len(node) for node in nodes] == [33] * len(nodes)
@@ -368,6 +369,7 @@ def test_the_ladder_has_a_row_and_a_run_for_each_rung(tiny, tmp_path, capsys):
     lines = printed.splitlines()
     assert lines[0] == "| rung | " + " | ".join([*TASKS, "overall", "episodes to 80 %"]) + " |"
     assert [line[:5] for line in lines[2:]] == ["| (a)", "| (b)", "| (c)", "| (d)"]
+    assert all(re.search(r"\| (\d+|not reached) \|$", line) for line in lines[2:])
     seen = {}
     for rung in "abcd":
         config = json.loads((tmp_path / rung / "config.json").read_text())
@@ -377,7 +379,7 @@ def test_the_ladder_has_a_row_and_a_run_for_each_rung(tiny, tmp_path, capsys):
         assert (config["task_starts"], config["eval_every"]) == ([0, 0, 0], 4)
         assert config["algorithm"]["rl"]["hidden_sizes"] == [7]
         assert (tmp_path / rung / "figures" / "success.png").exists()
-        train = summary.read_rows(tmp_path / rung / "train.csv")
+        train = read_rows(tmp_path / rung / "train.csv")
         assert {row["algorithm"] for row in train} == {config["name"]} == {f"rung {rung}"}
         assert all((float(row["intrinsic_return"]) > 0) == (rung in "cd") for row in train)
     assert seen == {
