@@ -21,7 +21,7 @@ from resuming import as_begun, check_resumable, is_finished
 from bgpo_trl.algorithms import ALGORITHMS, Algorithm
 from bgpo_trl.algorithms.rl import RL
 from bgpo_trl.configs import PRESETS, STAGE_PRESETS, RunConfig
-from bgpo_trl.demonstrations import DemonstrationBank
+from bgpo_trl.demonstration_bank import DemonstrationBank
 from bgpo_trl.evaluation import Evaluator, evaluate_random_policy
 from bgpo_trl.locking import DirectoryLock
 from bgpo_trl.machine import choose_device, set_threads
@@ -38,12 +38,31 @@ _DATASET, _ENCODERS = "demonstrations", "encoders"  # in the directory of a run 
 FINAL_COLUMNS = ("seed", "demonstrations", "task", "episodes", "success", "task_inference")
 
 
+AlgorithmName = Literal[
+    "bgpo",
+    "bgpo-experts",
+    "bgpo-single",
+    "bgpo-paper",
+    "maml",
+    "maml-demonstrations",
+    "maml-paper",
+    "dist-nll",
+    "dist-nll-demonstrations",
+    "dist-nll-paper",
+    "oracle",
+    "ddpg",
+]
+"""The keys of `ALGORITHMS`, as a command line has to be told them."""
+
+
 @dataclass(frozen=True)
 class Arguments:
     """Trains an algorithm and draws its success."""
 
-    algorithm: Literal["bgpo", "maml", "dist-nll", "oracle", "ddpg"] = "bgpo"
-    """BGPO; a baseline; or a reference: DDPG that is told the task's label (oracle) or nothing."""
+    algorithm: AlgorithmName = "bgpo"
+    """BGPO, without demonstrations (-experts), with one actor and critic for all behaviors besides
+    (-single); a baseline, or one that learns from demonstrations too; any of them as published
+    (-paper); or a reference: DDPG that is told the task's label (oracle) or nothing."""
     rl: Literal["ddpg", "td3", "sac"] = "ddpg"
     """The RL algorithm of BGPO, its ablations and the references."""
     preset: Literal["smoke", "quick", "desk", "paper"] = "quick"
@@ -55,6 +74,10 @@ class Arguments:
     episodes: int | None = None
     """Another length than the preset's; the tasks' starts keep their proportions. With --resume, a
     longer one goes on from where the run ended; the tasks' starts are what they were."""
+    eval_every: int | None = None
+    """Other training episodes between tests than the preset's."""
+    held_out: Literal["validation", "test"] = "validation"
+    """The half of the held-out demonstrations to test on: to choose settings by, or to report."""
     resume: bool = False
     """Continue the run in the directory."""
     train_encoders: bool = False
@@ -77,7 +100,12 @@ def run_config(arguments: Arguments) -> RunConfig:
     algorithm = ALGORITHMS[arguments.algorithm].config
     if arguments.rl != algorithm.rl.name:
         algorithm = replace(algorithm, rl=RL[arguments.rl].config)
-    config = replace(PRESETS[arguments.preset], name=arguments.algorithm, algorithm=algorithm)
+    config = replace(
+        PRESETS[arguments.preset],
+        name=arguments.algorithm,
+        algorithm=algorithm,
+        held_out=arguments.held_out,
+    )
     if arguments.seeds is not None:
         config = replace(config, seeds=arguments.seeds)
     if arguments.episodes is not None:
@@ -89,6 +117,8 @@ def run_config(arguments: Arguments) -> RunConfig:
             task_starts=starts,
             eval_every=max(1, min(config.eval_every, arguments.episodes)),
         )
+    if arguments.eval_every is not None:
+        config = replace(config, eval_every=arguments.eval_every)
     return config
 
 
@@ -126,7 +156,7 @@ def run_experiment(
         begun = makes_encoders and any((out / made).exists() for made in (_DATASET, _ENCODERS))
         if not begun:
             check_resumable([out])
-        config = as_begun(config, out)
+        config = as_begun(config, out, keep_eval_every=arguments.eval_every is not None)
         if is_finished(out, config):
             print(f"{out} is finished, all {config.episodes} episodes: --episodes makes it longer")
             return
@@ -196,7 +226,9 @@ def draw(
         tasks = tasks[: len(weights)]
         write_nodes(out / "gwr.csv", weights, tasks)
         save_figure(plot_gwr_pca(weights, tasks, config.tasks), out / "figures" / "gwr.png")
-        accuracy = task_inference_accuracy(gwr, bank.seen(), bank.held_out(), len(config.tasks))
+        accuracy = task_inference_accuracy(
+            gwr, bank.seen(), bank.held_out(config.held_out), len(config.tasks)
+        )
         draw_growth(out, config, bank)
         print(f"GWR-B nodes: {gwr.num_nodes.tolist()}")
         print(f"task inference on held-out demonstrations: {accuracy.mean():.1%}")
@@ -221,7 +253,9 @@ def measure(
     rows = []
     n_steps = config.algorithm.max_steps + 1
     bar = progress_bar("final tests", shown=trainer.progress, total=2 * n_steps, unit="step")
-    for half, (kind, tested) in enumerate((("seen", seen), ("held-out", bank.held_out())), 1):
+    for half, (kind, tested) in enumerate(
+        (("seen", seen), ("held-out", bank.held_out(config.held_out))), 1
+    ):
         evaluator = Evaluator(
             config.algorithm,
             seeds=config.seeds,
@@ -278,7 +312,7 @@ def record_episodes(trainer: Trainer, bank: DemonstrationBank) -> dict[str, np.n
         seeds=config.seeds,
         n_tasks=len(config.tasks),
         episodes=1,
-        bank=bank.held_out(),
+        bank=bank.held_out(config.held_out),
         encoders=trainer.encoders,
     )
     algorithm = trainer.algorithm

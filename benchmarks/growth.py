@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 
 from bgpo_trl.configs import RunConfig
-from bgpo_trl.demonstrations import DemonstrationBank
+from bgpo_trl.demonstration_bank import DemonstrationBank
 from bgpo_trl.gwr_growth import load_graphs
 from bgpo_trl.plotting import save_figure
 from bgpo_trl.plotting_growth import plot_gwr_growth

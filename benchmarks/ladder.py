@@ -37,10 +37,10 @@ from bgpo_trl.training import Trainer
 Rung = Literal["a", "b", "c", "d"]
 
 RUNGS: dict[str, tuple[str, BGPOConfig, Callable[[Parts], Composition]]] = {
-    "a": ("ground truth + label", BGPOConfig(state="state"), labeled),
-    "b": ("latent + label", BGPOConfig(), labeled),
-    "c": ("latent + phi", BGPOConfig(), VARIANTS["r_int"]),
-    "d": ("latent + b (BGPO)", BGPOConfig(), VARIANTS["gwr+r_int"]),
+    "a": ("ground truth + label", replace(VARIANTS["none"][1], state="state"), labeled),
+    "b": ("latent + label", VARIANTS["none"][1], labeled),
+    "c": ("latent + phi", *reversed(VARIANTS["r_int"])),
+    "d": ("latent + b (BGPO as published)", *reversed(VARIANTS["gwr+r_int"])),
 }
 
 

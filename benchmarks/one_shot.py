@@ -29,7 +29,8 @@ from matplotlib.ticker import PercentFormatter
 
 from bgpo_trl import TrainedPolicy, load_run
 from bgpo_trl.config_file import read_config
-from bgpo_trl.demonstrations import DemonstrationBank, record_demonstrations
+from bgpo_trl.demonstration_bank import DemonstrationBank
+from bgpo_trl.demonstrations import record_demonstrations
 from bgpo_trl.evaluation import Evaluator, Snapshot
 from bgpo_trl.plotting import save_figure
 from bgpo_trl.representation import embed_demonstrations

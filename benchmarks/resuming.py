@@ -12,12 +12,13 @@ from bgpo_trl.run_directory import holds_run
 from bgpo_trl.runs import read_json
 
 
-def as_begun(config: RunConfig, directory: Path) -> RunConfig:
+def as_begun(config: RunConfig, directory: Path, *, keep_eval_every: bool = False) -> RunConfig:
     """Returns a run with the tasks' starts and the evaluations of the shorter one in a directory.
 
     Args:
         config: The run, of which these depend on its length.
         directory: The run's.
+        keep_eval_every: Whether the evaluations are as they are for another reason.
     """
     try:
         there, _ = read_config(directory / "config.json")
@@ -26,7 +27,8 @@ def as_begun(config: RunConfig, directory: Path) -> RunConfig:
     at_once = [[start == 0 for start in run.task_starts] for run in (there, config)]
     if at_once[0] != at_once[1]:  # another experiment
         return config
-    return replace(config, task_starts=there.task_starts, eval_every=there.eval_every)
+    every = config.eval_every if keep_eval_every else there.eval_every
+    return replace(config, task_starts=there.task_starts, eval_every=every)
 
 
 def is_finished(directory: Path, config: RunConfig) -> bool:

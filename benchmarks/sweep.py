@@ -41,7 +41,7 @@ from bgpo_trl.runs import read_json
 class Arguments:
     """Plays a grid of runs on Ray."""
 
-    algorithms: tuple[Literal["bgpo", "maml", "dist-nll", "oracle", "ddpg"], ...] = ("bgpo",)
+    algorithms: tuple[experiment.AlgorithmName, ...] = ("bgpo",)
     """What learns; see concurrent.py."""
     settings: tuple[Literal["concurrent", "continual", "ablation"], ...] = ("concurrent",)
     """All tasks from the start; one after the other; or BGPO without GWR-B, without the intrinsic
@@ -127,7 +127,7 @@ def check_directories(jobs: dict[Path, list[Job]], encoders: str) -> None:
 def play(job: Job) -> None:
     """Plays a job to its end, from its last checkpoint if there is one, and measures."""
     name = job.config.name
-    make = partial(BGPO, compose=VARIANTS[name]) if name in VARIANTS else None
+    make = partial(BGPO, compose=VARIANTS[name][0]) if name in VARIANTS else None
     arguments = experiment.Arguments(out=job.directory, resume=holds_run(job.directory))
     experiment.run_experiment(arguments, "sweep", job.config, make)
 

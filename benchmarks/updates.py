@@ -93,8 +93,7 @@ class Ours:
         self.loss = DDPGLoss(
             Actor(size, ACTION, batch_size=[seeds], generator=generators(numbers, "actor")),
             Critic(size, ACTION, batch_size=[seeds], generator=generators(numbers, "critic")),
-            constant_keys=["behavior"],
-            **options,
+            **{"constant_keys": ["behavior"], "return_bounds": (0.0, 1.1), **options},
         )
         self.loss.make_value_estimator(gamma=GAMMA)
         self.target_update = ForeachSoftUpdate(self.loss, tau=TAU)

@@ -67,10 +67,6 @@ class SequenceAutoencoderConfig:
 
     embedding_size: int = 32
     """LSTM units of encoder and decoder, so dimensions of phi (Sec. IV-A)."""
-    embedding_scale: float = 0.25
-    """Length of phi in units of the LSTM's hidden state. Ours: with 1, as in the paper, each
-    demonstration is so far from the next that GWR-B makes a node of every third; with 0.25 it has
-    the paper's 500 or so nodes after 20,000 episodes."""
     batch_size: int = 256
     """Sequences a step (Sec. IV-A)."""
     learning_rate: float = 1e-3
@@ -82,7 +78,7 @@ class SequenceAutoencoderConfig:
 
     def __post_init__(self) -> None:
         _at_least(self, 1, "embedding_size", "batch_size", "warmup_steps", "steps")
-        _positive(self, "embedding_scale", "learning_rate")
+        _positive(self, "learning_rate")
 
 
 @dataclass(frozen=True)
@@ -216,10 +212,18 @@ class AlgorithmConfig:
     """Steps of an episode (Sec. IV-B)."""
     rl: RLConfig = field(default_factory=DDPGConfig)
     """The RL algorithm f_RL."""
+    demonstration_share: float = 0.0
+    """Share of an update's transitions that are taken from the demonstrations shown in training
+    episodes so far, with actions that the inverse model inferred. The paper has none."""
 
     def __post_init__(self) -> None:
         known = self.state in ("latent", "state")
-        _check(self, ("state", known, "latent or state"))
+        share = self.demonstration_share
+        _check(
+            self,
+            ("state", known, "latent or state"),
+            ("demonstration_share", 0 <= share < 1, "at least 0 and below 1"),
+        )
         _at_least(self, 1, "max_steps")
 
 
@@ -232,15 +236,54 @@ def _refuse_all_but_ddpg(who: str, rl: RLConfig) -> None:
 
 
 @dataclass(frozen=True)
+class GWRBConfig:
+    """Growth of GWR-B; its other settings are those of Table 1 (`GWRB`)."""
+
+    activity_threshold: float = 0.8
+    """Activity below which a node is inserted (Table 1)."""
+    activity_scale: float = 0.25
+    """Factor of distances in the activity. Ours: with 1, as in the paper, each demonstration is so
+    far from the next that a node is made of every third; with 0.25 there are about 300 after 6,000
+    episodes."""
+
+    def __post_init__(self) -> None:
+        _positive(self, "activity_scale")
+        _check(self, ("activity_threshold", 0 < self.activity_threshold < 1, "between 0 and 1"))
+
+
+@dataclass(frozen=True)
 class BGPOConfig(AlgorithmConfig):
     """Behavior-guided policy optimization (Alg. 1)."""
 
     beta: float = 0.1
     """Weight of the intrinsic reward (Sec. IV-A)."""
+    gwr: GWRBConfig = field(default_factory=GWRBConfig)
+    """The network whose nodes are behaviors."""
+    experts: bool = True
+    """An actor and a critic for each group of behaviors. Ours: one of each for all in the paper,
+    which learns a new task slowly (docs/learning.md)."""
+    even_replay: bool = True
+    """Draw an update's transitions in equal parts from the groups played last. Ours: from all alike
+    in the paper."""
+    demonstration_share: float = 0.25
+    """See `AlgorithmConfig`. Ours: triples the success of a task's first hundred episodes."""
+    active_groups: int = 4
+    """Groups that an update learns from at most, those played last. Ours."""
+    groups: GWRBConfig = field(default_factory=lambda: GWRBConfig(activity_threshold=0.5))
+    """The coarse network that finds the groups. Ours: from 0.5 to 0.525 it finds one for each of
+    NICO's tasks."""
+
+    @property
+    def grouped(self) -> bool:
+        """Whether groups of behaviors are told apart."""
+        return self.experts or self.even_replay
 
     def __post_init__(self) -> None:
         super().__post_init__()
         _at_least(self, 0, "beta")
+        _at_least(self, 1, "active_groups")
+        holds = self.even_replay or not self.experts
+        _check(self, ("even_replay", holds, "set where there are experts"))
 
 
 @dataclass(frozen=True)
@@ -316,6 +359,9 @@ class RunConfig:
     eval_episodes: int = 1
     """Test episodes of each task presented so far, each evaluation. The paper has one episode of
     one random task; testing every task costs more and says more."""
+    held_out: Literal["validation", "test"] = "validation"
+    """Which half of the held-out demonstrations test episodes show: the one by which settings are
+    chosen, or the one on which results are reported. Ours."""
     checkpoint_minutes: float = 10.0
     """Minutes between checkpoints. Ours."""
     name: str = "bgpo"
@@ -328,6 +374,7 @@ class RunConfig:
             raise ValueError(f"a run needs seeds, all different and none negative: {self.seeds}")
         _at_least(self, 1, "episodes", "eval_every", "eval_episodes")
         _at_least(self, 0, "checkpoint_minutes")
+        _check(self, ("held_out", self.held_out in ("validation", "test"), "validation or test"))
         nico.check_tasks(self.tasks)
         starts = self.task_starts
         _check(

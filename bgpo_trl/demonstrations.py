@@ -1,4 +1,4 @@
-"""Demonstrations: record, store, load; and the bank of their embeddings."""
+"""Demonstrations as frames and actions: record, store, load."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import json
 import shutil
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +14,9 @@ import torch
 import tyro
 from dm_env import TimeStep
 from tensordict import MemoryMappedTensor, TensorDict
-from torch import Tensor
 
 from bgpo_trl.folders import make_folder
 from bgpo_trl.progress import progress_bar
-from bgpo_trl.tensor_file import load_tensors, save_tensors
 from suites import nico
 from suites.nico.base import STATE_SIZE, Environment
 from suites.nico.demonstrator import Demonstrator
@@ -305,127 +302,6 @@ def load_demonstrations(path: str | Path, *, verify: bool = True) -> TensorDict:
     if verify and _checksum(dataset) != meta["checksum"]:
         raise ValueError(f"{path} is damaged (checksum differs); remove it and {_REMEDY}")
     return dataset
-
-
-@dataclass(frozen=True)
-class DemonstrationBank:
-    """Embedded demonstrations: all that BGPO needs of them once the encoders are trained.
-
-    Attributes:
-        embedding: phi, float32 ``[N, 32]``.
-        task: Labels, int64 ``[N]``; for the draw of an episode's task and for evaluation.
-        train: Bool ``[N]``; False for demonstrations held out for test episodes.
-        tasks: Names of the tasks, in the order of their labels.
-
-    Raises:
-        ValueError: If a label has no name.
-    """
-
-    embedding: Tensor
-    task: Tensor
-    train: Tensor
-    tasks: tuple[str, ...] = nico.ALL_TASKS
-
-    def __post_init__(self) -> None:
-        unknown = self.task[(self.task < 0) | (self.task >= len(self.tasks))]
-        if len(unknown):
-            raise ValueError(
-                f"there is a demonstration of task {int(unknown[0])}, but tasks names only "
-                f"{len(self.tasks)}: {', '.join(self.tasks)}"
-            )
-
-    def seen(self) -> DemonstrationBank:
-        """Returns the demonstrations for training episodes."""
-        return self._select(self.train)
-
-    def held_out(self) -> DemonstrationBank:
-        """Returns the demonstrations for test episodes."""
-        return self._select(~self.train)
-
-    def of_task(self, task: int) -> DemonstrationBank:
-        """Returns the demonstrations of one task."""
-        return self._select(self.task == task)
-
-    def for_tasks(self, tasks: Sequence[str]) -> DemonstrationBank:
-        """Returns the demonstrations of some tasks, labeled by their places among these.
-
-        Args:
-            tasks: Names, in the order of the labels wanted.
-
-        Raises:
-            ValueError: If there is no demonstration of one of them.
-        """
-        missing = [name for name in tasks if name not in self.tasks]
-        if missing:
-            raise ValueError(
-                f"the bank has no demonstration of {missing[0]!r}, only of "
-                f"{', '.join(self.tasks)}: record and embed some (docs/extending.md)"
-            )
-        label = torch.tensor([tasks.index(n) if n in tasks else -1 for n in self.tasks])
-        kept = self._select(label[self.task] >= 0)
-        return replace(kept, task=label[kept.task], tasks=tuple(tasks))
-
-    def __add__(self, other: DemonstrationBank) -> DemonstrationBank:
-        """Returns the demonstrations of both; tasks that only the other has come last."""
-        tasks = tuple(dict.fromkeys((*self.tasks, *other.tasks)))
-        label = torch.tensor([tasks.index(name) for name in other.tasks])
-        return DemonstrationBank(
-            torch.cat([self.embedding, other.embedding]),
-            torch.cat([self.task, label[other.task]]),
-            torch.cat([self.train, other.train]),
-            tasks,
-        )
-
-    def _select(self, rows: Tensor) -> DemonstrationBank:
-        return replace(
-            self, embedding=self.embedding[rows], task=self.task[rows], train=self.train[rows]
-        )
-
-    def save(self, path: str | Path, *, encoder_id: str) -> None:
-        """Writes the bank as safetensors, with the scene version and the encoders' identity.
-
-        Raises:
-            OSError: If the file cannot be written; one that was there stays.
-        """
-        tensors = {"embedding": self.embedding, "task": self.task, "train": self.train}
-        meta = {
-            "scene_version": nico.scene_version(),
-            "encoder_id": encoder_id,
-            "tasks": ",".join(self.tasks),
-        }
-        save_tensors(path, tensors, meta)
-
-    @classmethod
-    def load(cls, path: str | Path, *, encoder_id: str) -> DemonstrationBank:
-        """Reads a bank.
-
-        Raises:
-            ValueError: If it is missing, damaged, or made in another scene or by other encoders.
-        """
-        wanted = {"scene_version": nico.scene_version(), "encoder_id": encoder_id}
-        remedy = "make it anew with `--train-encoders`"
-        try:
-            tensors, meta = load_tensors(path)
-            if not meta.get("tasks"):
-                raise ValueError("it does not say which tasks it is about")
-            bank = cls(**tensors, tasks=tuple(meta["tasks"].split(",")))
-        except FileNotFoundError:
-            raise ValueError(f"there is no demonstration bank at {path}; {remedy}") from None
-        except (ValueError, TypeError) as error:
-            raise ValueError(f"{path} is damaged or no bank ({error}); {remedy}") from None
-        embedding, task, train = bank.embedding, bank.task, bank.train
-        if not (
-            embedding.ndim == 2
-            and task.shape == train.shape == embedding.shape[:1]
-            and (embedding.dtype, task.dtype, train.dtype)
-            == (torch.float32, torch.int64, torch.bool)
-            and embedding.isfinite().all()
-        ):
-            raise ValueError(f"{path} is damaged (wrong shapes, or NaN); {remedy}")
-        found = {key: meta.get(key) for key in wanted}
-        if found != wanted:
-            raise ValueError(f"{path} belongs to {found}, but needed is {wanted}; {remedy}")
-        return bank
 
 
 def main(

@@ -123,7 +123,8 @@ class NicoEnv(EnvBase):
         # What is not a state is withheld from `_reset` when this is wrapped in a TransformedEnv.
         self.state_spec = Composite({"task": observation["task"].clone()}, shape=batch)
         self.action_spec = Bounded(-1.0, 1.0, shape=torch.Size([*batch, 4]))
-        self.reward_spec = Bounded(0.0, 1.0, shape=torch.Size([*batch, 1]))
+        # Not Bounded, which TorchRL's RewardScaling and RewardClipping refuse.
+        self.reward_spec = Unbounded(shape=torch.Size([*batch, 1]))
         self.done_spec = Composite(
             {
                 key: Categorical(2, shape=torch.Size([*batch, 1]), dtype=torch.bool)

@@ -12,9 +12,9 @@ from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs import Compose, TransformedEnv
 
-from bgpo_trl.algorithms.algorithm import Algorithm, observe
+from bgpo_trl.algorithms.algorithm import Algorithm, clip, observe
 from bgpo_trl.configs import AlgorithmConfig
-from bgpo_trl.demonstrations import DemonstrationBank
+from bgpo_trl.demonstration_bank import DemonstrationBank
 from bgpo_trl.envs import NicoEnv
 from bgpo_trl.representation import Representation
 from bgpo_trl.seeding import stream_seed
@@ -98,7 +98,9 @@ class Evaluator:
             batch_size=self.shape,
             observation="pixels" if config.state == "latent" else "state",
         )
-        self.env = TransformedEnv(self.simulation, Compose(observe(config, encoders)))
+        self.env = TransformedEnv(
+            self.simulation, Compose([observe(config, encoders), clip(config)])
+        )
         self._task = torch.arange(n_tasks)[:, None].expand(self.shape).contiguous()
 
     def _rng(self, seed: int, number: int) -> np.random.Generator:

@@ -8,9 +8,15 @@ from pathlib import Path
 import torch
 
 from bgpo_trl.configs import RepresentationConfig
-from bgpo_trl.demonstrations import DemonstrationBank, record_demonstrations
-from bgpo_trl.representation import Representation, default_weights, load_representation
-from bgpo_trl.train_encoders import bank_path, train_encoders
+from bgpo_trl.demonstration_bank import DemonstrationBank
+from bgpo_trl.demonstrations import record_demonstrations
+from bgpo_trl.representation import (
+    Representation,
+    bank_path,
+    default_weights,
+    load_representation,
+)
+from bgpo_trl.train_encoders import train_encoders
 from suites import nico
 
 

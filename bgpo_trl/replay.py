@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -70,6 +69,16 @@ class ReplayBuffer:
         # Transition t of seed i is row (t % capacity) * n_seeds + i: a step of all seeds is one
         # block, and a row is found by a single index, for which torch has its fastest kernels.
         self._rows: dict[NestedKey, Tensor] = {}
+
+    @property
+    def n_added(self) -> Tensor:
+        """Number of transitions added so far for each seed, int64 ``[*S]``."""
+        return self._n_added.view(self._shape).clone()
+
+    @property
+    def oldest(self) -> Tensor:
+        """The first step of each seed that is not overwritten, int64 ``[*S]``; steps count up."""
+        return (self._n_added - self.capacity).clamp(min=0).view(self._shape)
 
     @property
     def sizes(self) -> Tensor:
@@ -152,8 +161,35 @@ class ReplayBuffer:
             ]
         )
         rows = (steps * len(self.generators) + columns.unsqueeze(-1)).view(-1)
-        batch = TensorDict(batch_size=[*shape, batch_size])
-        for key, stored in self._rows.items():
+        return self._read(rows, [*shape, batch_size])
+
+    def take(
+        self,
+        steps: Tensor,
+        keys: Sequence[NestedKey] | None = None,
+        *,
+        seeds: Sequence[int] | None = None,
+    ) -> TensorDict:
+        """Returns the transitions that each seed stored at some of its steps.
+
+        Args:
+            steps: int64 ``[S, R]``, each at least `oldest` and less than `n_added`.
+            keys: entries to return; ``None`` for all.
+            seeds: positions of the seeds, ``S`` of them; ``None`` for all.
+
+        Returns:
+            A new tensordict ``[S, R]`` that shares no memory with the buffer.
+        """
+        columns = self._seed if seeds is None else self._seed[list(seeds)]
+        rows = steps % self.capacity * len(self.generators) + columns.unsqueeze(-1)
+        return self._read(rows.view(-1), steps.shape, keys)
+
+    def _read(
+        self, rows: Tensor, batch_size: Sequence[int], keys: Sequence[NestedKey] | None = None
+    ) -> TensorDict:
+        batch = TensorDict(batch_size=batch_size)
+        for key in self._rows if keys is None else keys:
+            stored = self._rows[key]
             drawn = stored.index_select(0, rows)
             batch.set(key, drawn.view(*batch.batch_size, *stored.shape[1:]))
         return batch
@@ -184,29 +220,6 @@ class ReplayBuffer:
         self._n_added = n_added.clone()
         for generator, state in zip(self.generators, state_dict["generators"], strict=True):
             generator.set_state(state.clone())
-
-    def dumps(self, path: str | Path) -> None:
-        """Writes the filled part and the generators to a directory, without a copy in memory.
-
-        Args:
-            path: directory, created if missing.
-        """
-        self._state().memmap(str(path), copy_existing=True)
-
-    def loads(self, path: str | Path) -> None:
-        """Restores what :meth:`dumps` wrote.
-
-        Args:
-            path: directory given to :meth:`dumps`.
-
-        Raises:
-            ValueError: if there is none, or it comes from a buffer of another capacity or number of
-                seeds.
-        """
-        if not (Path(path) / "meta.json").is_file():
-            raise ValueError(f"{path} holds no replay: give the directory that dumps() wrote")
-        # The default would also run what somebody else has pickled.
-        self.load_state_dict(TensorDict.load_memmap(str(path), allow_pickle=False))
 
     def _state(self) -> TensorDict:
         state = TensorDict(

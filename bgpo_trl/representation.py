@@ -139,6 +139,11 @@ def default_weights() -> Path:
     return Path(str(resources.files("bgpo_trl") / "weights" / "nico.safetensors"))
 
 
+def bank_path(weights: Path) -> Path:
+    """Returns where the bank embedded with encoders lies: ``nico_bank`` beside ``nico``."""
+    return weights.with_name(f"{weights.stem}_bank{weights.suffix}")
+
+
 def save_representation(representation: Representation, path: str | Path) -> None:
     """Writes both encoders and the metadata to one safetensors file.
 
@@ -282,6 +287,6 @@ def _train_lae(
     generator = torch.Generator().manual_seed(seed)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        lae = SequenceAutoencoder(latent.shape[-1], config.embedding_size, config.embedding_scale)
+        lae = SequenceAutoencoder(latent.shape[-1], config.embedding_size)
     fit("lae", SequenceReconstructionLoss(lae), sample, config, generator)
     return lae.eval().requires_grad_(False)

@@ -15,15 +15,17 @@ from tensordict import TensorDictBase
 
 from bgpo_trl.configs import RepresentationConfig
 from bgpo_trl.csv_file import CsvFile
-from bgpo_trl.demonstrations import DemonstrationBank, load_demonstrations
+from bgpo_trl.demonstration_bank import DemonstrationBank
+from bgpo_trl.demonstrations import load_demonstrations
 from bgpo_trl.fitting import Log
 from bgpo_trl.folders import make_folder
 from bgpo_trl.machine import choose_device
+from bgpo_trl.make_bank import make_bank
 from bgpo_trl.probes import probe
 from bgpo_trl.representation import (
     Representation,
+    bank_path,
     default_weights,
-    embed_demonstrations,
     save_representation,
     train_representation,
 )
@@ -58,11 +60,6 @@ class Arguments:
     """Hyperparameters."""
     device: str = "auto"
     """Where to train: cpu, cuda, or auto for a GPU if there is one."""
-
-
-def bank_path(weights: Path) -> Path:
-    """Returns where the bank embedded with encoders lies: ``nico_bank`` beside ``nico``."""
-    return weights.with_name(f"{weights.stem}_bank{weights.suffix}")
 
 
 def train_encoders(
@@ -110,12 +107,7 @@ def train_encoders(
             device=device,
         )
     save_representation(representation, weights)
-    bank = DemonstrationBank(
-        embed_demonstrations(representation, dataset),
-        dataset["task"].clone(),
-        dataset["train"].clone(),
-        tuple(tasks),
-    )
+    bank = make_bank(representation, dataset, tasks=tasks)
     bank.save(bank_path(weights), encoder_id=representation.identity)
     probe(representation, dataset, folder, play=play)
     return representation, bank

@@ -14,11 +14,11 @@ from torch import Tensor
 from torchrl.envs import Compose
 
 from bgpo_trl.algorithms import ALGORITHMS, Algorithm
-from bgpo_trl.algorithms.algorithm import observe
+from bgpo_trl.algorithms.algorithm import clip, observe
 from bgpo_trl.checkpoint import has_checkpoint, load_checkpoint
 from bgpo_trl.config_file import read_config
 from bgpo_trl.configs import RunConfig
-from bgpo_trl.demonstrations import DemonstrationBank
+from bgpo_trl.demonstration_bank import DemonstrationBank
 from bgpo_trl.pretrained import load_pretrained
 from bgpo_trl.representation import Representation, embed_demonstrations
 from bgpo_trl.seeding import stream_seed
@@ -76,7 +76,7 @@ class TrainedPolicy:
         self.bank = bank
         self.seed = seed
         self.tasks = config.tasks
-        self._observe = Compose(observe(config.algorithm, encoders))
+        self._observe = Compose([observe(config.algorithm, encoders), clip(config.algorithm)])
         self._index = config.seeds.index(seed)
         self._frozen: TensorDictBase | None = None
         self._task = 0

@@ -18,7 +18,7 @@ from tensordict import TensorDict, TensorDictBase
 from bgpo_trl.algorithms import ALGORITHMS, Algorithm
 from bgpo_trl.checkpoint import save_checkpoint
 from bgpo_trl.configs import RunConfig
-from bgpo_trl.demonstrations import DemonstrationBank
+from bgpo_trl.demonstration_bank import DemonstrationBank
 from bgpo_trl.evaluation import Evaluator, Snapshot
 from bgpo_trl.gwr_growth import growth_moments, save_graph
 from bgpo_trl.interrupts import interrupts_wait
@@ -103,7 +103,7 @@ class Trainer:
             seeds=seeds,
             n_tasks=schedule.n_tasks,
             episodes=config.eval_episodes,
-            bank=bank.held_out(),
+            bank=bank.held_out(config.held_out),
             encoders=encoders,
         )
         self.env_steps = 0

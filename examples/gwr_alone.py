@@ -5,11 +5,9 @@ python examples/gwr_alone.py
 
 from pathlib import Path
 
-import numpy as np
+import networkx as nx
 import torch
 from matplotlib.figure import Figure
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from bgpo_trl.modules.gwr import GWRB
 from bgpo_trl.plotting import save_figure
@@ -34,21 +32,20 @@ if __name__ == "__main__":
         gwr.adapt(point)
 
     graph = gwr.graph()
-    n = len(graph.weights)
-    edges = coo_array((np.ones(len(graph.edges)), graph.edges.numpy().T), shape=(n, n))
-    n_clusters, cluster_of_node = connected_components(edges, directed=False)
+    clusters = list(nx.connected_components(graph.to_networkx()))
+    cluster_of_node = {node: i for i, nodes in enumerate(clusters) for node in nodes}
     fresh, is_ring = point_cloud(1_000, generator)
-    match = gwr.lookup(fresh)
-    cluster = torch.from_numpy(cluster_of_node)[torch.searchsorted(graph.node, match.node)]
+    cluster = torch.tensor([cluster_of_node[node] for node in gwr.lookup(fresh).node.tolist()])
     right = sum(int(is_ring[cluster == c].long().bincount().max()) for c in cluster.unique())
-    print(f"{n} nodes, {len(graph.edges)} edges, {n_clusters} clusters")
+    print(f"{len(graph.node)} nodes, {len(graph.edges)} edges, {len(clusters)} clusters")
     print(f"fresh points in the cluster of their own kind: {right / len(fresh):.1%}")
 
     figure = Figure(figsize=(4, 4), layout="constrained")
     axes = figure.add_subplot(aspect="equal")
     axes.scatter(*points.T, s=2, c="0.8")
-    for edge in graph.edges:
+    colors = [cluster_of_node[node] for node in graph.node.tolist()]
+    for edge in graph.edges:  # of positions, as weights are
         axes.plot(*graph.weights[edge].T, c="0.4", linewidth=0.8)
-    axes.scatter(*graph.weights.T, s=14, c=cluster_of_node, cmap="tab10", zorder=3)
+    axes.scatter(*graph.weights.T, s=14, c=colors, cmap="tab10", zorder=3)
     save_figure(figure, Path("runs/gwr-alone.png"))
     print("figure: runs/gwr-alone.png")

@@ -6,7 +6,8 @@ Run again, it continues where it was. To see it learn rather than begin, raise `
 from pathlib import Path
 
 from bgpo_trl.configs import RunConfig
-from bgpo_trl.demonstrations import DemonstrationBank, record_demonstrations
+from bgpo_trl.demonstration_bank import DemonstrationBank
+from bgpo_trl.demonstrations import record_demonstrations
 from bgpo_trl.pretrained import load_pretrained
 from bgpo_trl.representation import embed_demonstrations
 from bgpo_trl.runs import read_rows

@@ -18,7 +18,7 @@ from hypothesis import settings
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.rl import RL
 from bgpo_trl.configs import RunConfig
-from bgpo_trl.demonstrations import DemonstrationBank
+from bgpo_trl.demonstration_bank import DemonstrationBank, DemonstrationSteps
 from bgpo_trl.envs import NicoEnv
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
@@ -42,7 +42,7 @@ def encoders():
     """Untrained encoders: what latents mean does not matter to what is tested with them."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        vae, lae = VAE(), SequenceAutoencoder(embedding_scale=0.5)
+        vae, lae = VAE(), SequenceAutoencoder()
     return Representation(vae.eval().requires_grad_(False), lae.eval().requires_grad_(False), {})
 
 
@@ -51,8 +51,12 @@ def bank():
     """Three tasks, eight seen and four held-out demonstrations of each, all of them different."""
     generator = torch.Generator().manual_seed(1)
     task = torch.arange(36) % 3
-    embedding = torch.rand(36, 32, generator=generator) - 0.5 + 0.2 * task.unsqueeze(-1)
-    return DemonstrationBank(embedding, task, torch.arange(36) < 24)
+    embedding = torch.rand(36, 32, generator=generator) - 0.5 + 0.8 * task.unsqueeze(-1)
+    latent = torch.randn(36, 6, 64, generator=generator)
+    action = torch.rand(36, 5, 4, generator=generator) * 2 - 1
+    train = torch.arange(36) < 24
+    steps = DemonstrationSteps.of(latent, action, (3 + torch.arange(36) % 4) * train)
+    return DemonstrationBank(embedding, task, train, steps=steps)
 
 
 @pytest.fixture(scope="session")

@@ -8,7 +8,8 @@ import torch
 
 from bgpo_trl.checkpoint import load_checkpoint, save_checkpoint
 from bgpo_trl.csv_file import CsvFile
-from bgpo_trl.demonstrations import DemonstrationBank, load_demonstrations, record_demonstrations
+from bgpo_trl.demonstration_bank import DemonstrationBank
+from bgpo_trl.demonstrations import load_demonstrations, record_demonstrations
 from bgpo_trl.logging import EVAL_COLUMNS, RunLogger
 from bgpo_trl.plotting import plot_frame_strips, plot_success_curves, save_figure
 from bgpo_trl.pretrained import load_pretrained

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.envs import Compose, StepCounter, TransformedEnv
+from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv
 
 from bgpo_trl import metrics
 from bgpo_trl.checkpoint import load_checkpoint
@@ -49,7 +49,8 @@ def bank(n=6, tasks=3, value=0.1):
 
 
 def world(*transforms, observation="state", **options):
-    return TransformedEnv(NicoEnv(observation=observation, **options), Compose(*transforms))
+    env = NicoEnv(observation=observation, **options)
+    return TransformedEnv(env, Compose(StepCounter(50), *transforms))
 
 
 def source(**options):
@@ -105,8 +106,9 @@ row, z = partial(TensorDict, batch_size=[]), torch.zeros(2, 5, 64)
 lae, lengths = SequenceAutoencoder(), torch.tensor([5, 5])
 PARTS = {
     # GWR-B
-    "gwr of no features": (lambda: GWRB(0), "n_features", "must be at least 1"),
+    "gwr of no features": (lambda: GWRB(0), "n_features", "a whole number, at least 1"),
     "gwr threshold": (lambda: GWRB(2, activity_threshold=3.0), "3.0", "<= activity_threshold <= 1"),
+    "gwr scale": (lambda: GWRB(2, activity_scale=0.0), "activity_scale=0.0", "activity_scale > 0"),
     "gwr NaN rate": (lambda: GWRB(2, lr_best=NAN), "lr_best=nan", "lr_best <= 1"),
     "gwr NaN habituation": (
         lambda: GWRB(2, habituation_threshold=NAN), "nan", "habituation_threshold >= 0"),
@@ -263,6 +265,14 @@ PARTS = {
         lambda: FrameEncoder(VAE(), out_keys=("a", "b")), "got 2 for 1", "one of out_keys for"),
     "time limit too late": (
         lambda: world(source(), StepCounter(5)).reset(), "DemonstrationSource", "put StepCounter"),
+    "learning without an end": (
+        lambda: TransformedEnv(
+            NicoEnv(observation="state"), Compose(source(), BehaviorLookup(GWRB(32), learn=True))
+        ).reset(),
+        "BehaviorLookup learns when episodes end", "put StepCounter(50) before it"),
+    "sum of half the reward": (
+        lambda: world(source(), RewardSum(), BehaviorMatchingReward(lae)).reset(),
+        "BehaviorMatchingReward", "put RewardSum after"),
     # measures
     "area of nothing": (lambda: metrics.area_under_curve([], []), "success [0]", "at least"),
     "area of unequal lists": (

@@ -11,7 +11,8 @@ import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from bgpo_trl.demonstrations import DemonstrationBank, load_demonstrations, record_demonstrations
+from bgpo_trl.demonstration_bank import DemonstrationBank
+from bgpo_trl.demonstrations import load_demonstrations, record_demonstrations
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
 from bgpo_trl.representation import Representation, load_representation, save_representation

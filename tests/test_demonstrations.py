@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from bgpo_trl import demonstrations
+from bgpo_trl.demonstration_bank import DemonstrationBank
 from bgpo_trl.demonstrations import (
-    DemonstrationBank,
     load_demonstrations,
     record_demonstrations,
 )

@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torchrl.envs import StepCounter, TransformedEnv, check_env_specs, step_mdp
+from torchrl.envs import (
+    RewardClipping,
+    RewardScaling,
+    StepCounter,
+    TransformedEnv,
+    check_env_specs,
+    step_mdp,
+)
 
 from bgpo_trl.checkpoint import load_checkpoint, save_checkpoint
 from bgpo_trl.envs import NicoEnv
@@ -227,6 +234,19 @@ def test_it_never_ends_an_episode_by_time():
     last = limited.rollout(60, policy=lambda td: td.set("action", torch.zeros(4)))[-1]["next"]
     assert (last["truncated"].item(), last["terminated"].item()) == (True, False)
     assert last["step_count"] == 50
+
+
+@pytest.mark.parametrize(
+    ("transform", "paid"),
+    [(RewardScaling(loc=-0.5, scale=4.0), (-0.5, 3.5)), (RewardClipping(0.1, 0.7), (0.1, 0.7))],
+    ids=["scaling", "clipping"],
+)
+def test_rewards_can_be_scaled_and_clipped(transform, paid):
+    env = TransformedEnv(NicoEnv(batch_size=[2], seed=2, observation="state"), transform)
+    check_env_specs(env)
+    last = succeed(env, 1, env.reset(task_td(0, 0)))
+    torch.testing.assert_close(last["reward"].flatten(), torch.tensor(paid))
+    assert env.reward_spec.is_in(last["reward"])
 
 
 @batch_sizes

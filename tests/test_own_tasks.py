@@ -11,7 +11,8 @@ from dm_control import suite
 from tensordict import TensorDict
 
 from bgpo_trl.configs import RunConfig
-from bgpo_trl.demonstrations import DemonstrationBank, record_demonstrations
+from bgpo_trl.demonstration_bank import DemonstrationBank
+from bgpo_trl.demonstrations import record_demonstrations
 from bgpo_trl.envs import NicoEnv
 from bgpo_trl.evaluation import evaluate_random_policy
 from bgpo_trl.tensor_file import load_tensors, save_tensors

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from bgpo_trl.demonstrations import DemonstrationBank
+from bgpo_trl.demonstration_bank import DemonstrationBank
 from bgpo_trl.modules.gwr import GWRB
 from bgpo_trl.task_inference import majority_task, match_counts, task_inference_accuracy
 

@@ -20,7 +20,7 @@ from benchmarks import ablation
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.bgpo import BGPO
 from bgpo_trl.configs import RepresentationConfig
-from bgpo_trl.demonstrations import DemonstrationBank
+from bgpo_trl.demonstration_bank import DemonstrationBank
 from bgpo_trl.evaluation import Evaluator
 from bgpo_trl.representation import Representation, save_representation
 from bgpo_trl.train_encoders import bank_path

@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 from bgpo_trl.algorithms.algorithm import Algorithm
 from bgpo_trl.algorithms.bgpo import BGPO, labeled, untold
 from bgpo_trl.algorithms.dist_nll import DistNLL
 from bgpo_trl.algorithms.maml import MAML
-from bgpo_trl.configs import AlgorithmConfig, BGPOConfig, DistNLLConfig, MAMLConfig
+from bgpo_trl.configs import (
+    AlgorithmConfig,
+    BGPOConfig,
+    DDPGConfig,
+    DistNLLConfig,
+    GWRBConfig,
+    MAMLConfig,
+)
 
 __all__ = ["ALGORITHMS", "Algorithm", "Entry"]
 
@@ -25,11 +32,33 @@ class Entry:
     """Its default hyperparameters."""
 
 
+_SINGLE = BGPOConfig(experts=False, even_replay=False, demonstration_share=0.0)
+_PAPER = DDPGConfig(
+    hidden_sizes=(64,),
+    critic_layer_norm=False,
+    batch_size=256,
+    clip_targets=False,
+    pre_tanh_penalty=0.0,
+)
+_SHOWN = 0.25
+
 ALGORITHMS: dict[str, Entry] = {
-    "bgpo": Entry(BGPO, BGPOConfig()),
+    "bgpo": Entry(BGPO, BGPOConfig(demonstration_share=_SHOWN)),
+    "bgpo-experts": Entry(BGPO, BGPOConfig(demonstration_share=0.0)),
+    "bgpo-single": Entry(BGPO, _SINGLE),
+    "bgpo-paper": Entry(BGPO, replace(_SINGLE, rl=_PAPER, gwr=GWRBConfig(activity_scale=1.0))),
     "maml": Entry(MAML, MAMLConfig()),
+    "maml-demonstrations": Entry(MAML, MAMLConfig(demonstration_share=_SHOWN)),
+    "maml-paper": Entry(MAML, MAMLConfig(rl=_PAPER, task_batch_size=256, adaptation_size=256 * 50)),
     "dist-nll": Entry(DistNLL, DistNLLConfig()),
-    "oracle": Entry(partial(BGPO, compose=labeled), BGPOConfig()),
-    "ddpg": Entry(partial(BGPO, compose=untold), BGPOConfig()),
+    "dist-nll-demonstrations": Entry(DistNLL, DistNLLConfig(demonstration_share=_SHOWN)),
+    "dist-nll-paper": Entry(
+        DistNLL, DistNLLConfig(rl=_PAPER, task_batch_size=256, distillation_batch_size=1_000)
+    ),
+    "oracle": Entry(partial(BGPO, compose=labeled), _SINGLE),
+    "ddpg": Entry(partial(BGPO, compose=untold), _SINGLE),
 }
-"""BGPO; the baselines of the paper; DDPG that is told the task's label, and DDPG told nothing."""
+"""Algorithms with their settings: BGPO, without demonstrations, and with one actor and critic for
+all behaviors besides; the baselines of the paper, without demonstrations and with them; as
+references, DDPG that is told the task's label, and DDPG told nothing. Those named ``-paper`` are as
+published: networks of 64 units, batches of 256, no stabilisers."""

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.envs import (
     ClipTransform,
@@ -21,10 +21,12 @@ from torchrl.envs import (
 
 from bgpo_trl.algorithms.rl import Learner
 from bgpo_trl.configs import AlgorithmConfig
-from bgpo_trl.demonstrations import DemonstrationBank
+from bgpo_trl.demonstration_bank import DemonstrationBank
+from bgpo_trl.demonstration_replay import DemonstrationReplay
 from bgpo_trl.envs import NicoEnv
+from bgpo_trl.group_replay import GroupReplay
+from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.modules.gwr import GWRB
-from bgpo_trl.replay import ReplayBuffer
 from bgpo_trl.representation import Representation
 from bgpo_trl.seeding import generators, stream_seed
 from bgpo_trl.task_replay import TaskReplay
@@ -38,8 +40,8 @@ _STATE_LOC += (0.41, -0.21, 0.645)
 _STATE_SCALE = (0.35, 0.25, 0.35, 0.3, 0.06, 0.15, 0.05, *(0.03, 0.05, 0.02) * 3)
 
 
-def observe(config: AlgorithmConfig, encoders: Representation | None) -> list[Transform]:
-    """Returns the transforms from what the simulation shows to the state that the policy sees.
+def observe(config: AlgorithmConfig, encoders: Representation | None) -> Transform:
+    """Returns the transform from what the simulation shows to the state.
 
     Args:
         config: Says whether that is latents or the ground truth.
@@ -48,17 +50,21 @@ def observe(config: AlgorithmConfig, encoders: Representation | None) -> list[Tr
     Raises:
         ValueError: If latents are asked for without encoders.
     """
-    transforms: list[Transform] = []
     if config.state == "latent":
         if encoders is None:
             raise ValueError("state='latent' needs trained encoders")
-        transforms.append(FrameEncoder(encoders.vae, del_keys=True))
-    else:
-        loc, scale = torch.tensor(_STATE_LOC), torch.tensor(_STATE_SCALE)
-        transforms.append(ObservationNorm(loc, scale, in_keys=["state"], standard_normal=True))
-    # An object knocked off the table is dozens of deviations away and would swamp the rest.
-    transforms.append(ClipTransform(in_keys=[config.state], low=-5.0, high=5.0))
-    return transforms
+        return FrameEncoder(encoders.vae, del_keys=True)
+    loc, scale = torch.tensor(_STATE_LOC), torch.tensor(_STATE_SCALE)
+    return ObservationNorm(loc, scale, in_keys=["state"], standard_normal=True)
+
+
+def clip(config: AlgorithmConfig) -> Transform:
+    """Returns the transform that bounds what policies read of the state.
+
+    An object knocked off the table is dozens of deviations away and would swamp the rest. It comes
+    behind whatever else reads the state: trajectories are embedded as demonstrations are.
+    """
+    return ClipTransform(in_keys=[config.state], low=-5.0, high=5.0)
 
 
 class Algorithm(ABC):
@@ -86,6 +92,7 @@ class Algorithm(ABC):
         source: The transform that draws task and demonstration of each episode.
         simulation: The environment without its transforms.
         gwr: GWR-B, or None in an algorithm without it.
+        groups: Groups of behaviors, or None in an algorithm that does not tell them apart.
         state_size: Number of features of the state.
         learner: The RL algorithm: losses of actor and critic, optimizer, target networks.
         replay: What was experienced.
@@ -95,10 +102,11 @@ class Algorithm(ABC):
 
     env: TransformedEnv
     gwr: GWRB | None = None
+    groups: BehaviorGroups | None = None
     needs_label: bool = True
     needs_replay: bool = True
     learner: Learner
-    replay: ReplayBuffer | TaskReplay
+    replay: GroupReplay | TaskReplay
 
     def __init__(
         self,
@@ -199,13 +207,43 @@ class Algorithm(ABC):
             self.simulation,
             Compose(
                 [
-                    *observe(config, encoders),
+                    observe(config, encoders),
                     StepCounter(config.max_steps),
                     self.source,
                     *transforms,
+                    clip(config),
                     RewardSum(in_keys=list(rewards), out_keys=[f"episode_{r}" for r in rewards]),
                 ]
             ),
+        )
+
+    def demonstrations(
+        self,
+        config: AlgorithmConfig,
+        bank: DemonstrationBank,
+        seeds: Sequence[int],
+        constant_keys: Sequence[NestedKey] = (),
+    ) -> DemonstrationReplay | None:
+        """Returns the replay of shown demonstrations; None if the algorithm is not to use them.
+
+        Args:
+            config: Its hyperparameters.
+            bank: The demonstrations of training episodes.
+            seeds: The seeds.
+            constant_keys: What policies read that is constant within an episode.
+
+        Raises:
+            ValueError: If the bank has no steps, or they are not of the state that policies see.
+        """
+        if not config.demonstration_share:
+            return None
+        if config.state != "latent":
+            raise ValueError("demonstrations are latents: set demonstration_share to 0")
+        return DemonstrationReplay(
+            bank,
+            generator=generators(seeds, "demonstration replay"),
+            state_key=config.state,
+            constant_keys=constant_keys,
         )
 
     def learn(self, batch: TensorDictBase) -> dict[str, Tensor]:

@@ -1,32 +1,36 @@
-"""Behavior-Guided Policy Optimization (Alg. 1): GWR-B tells the task, f_RL learns to do it."""
+"""Behavior-Guided Policy Optimization (Alg. 1): GWR-B infers the task, f_RL learns to do it."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import asdict, dataclass
+from typing import Any, cast
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torch.func import functional_call
 from torch.nn.functional import one_hot
-from torchrl.envs import (
-    ObservationNorm,
-    Transform,
-    UnaryTransform,
-)
+from torchrl.envs import Transform, UnaryTransform
 
 from bgpo_trl.algorithms.algorithm import Algorithm
+from bgpo_trl.algorithms.experts import ActiveGroups, Experts
 from bgpo_trl.algorithms.rl import Problem, make_learner
 from bgpo_trl.configs import BGPOConfig
-from bgpo_trl.demonstrations import DemonstrationBank
+from bgpo_trl.demonstration_bank import DemonstrationBank
+from bgpo_trl.demonstration_replay import DemonstrationReplay
+from bgpo_trl.group_replay import GroupReplay
+from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.modules.gwr import GWRB
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
-from bgpo_trl.replay import ReplayBuffer
 from bgpo_trl.representation import Representation
 from bgpo_trl.seeding import generators
-from bgpo_trl.transforms import BehaviorLookup, BehaviorMatchingReward, TaskSchedule
+from bgpo_trl.transforms import (
+    BehaviorLookup,
+    BehaviorMatchingReward,
+    GroupLookup,
+    TaskSchedule,
+)
 
 
 @dataclass(frozen=True)
@@ -62,7 +66,7 @@ class Composition:
     reward: Sequence[Transform] = ()
     """What changes the reward."""
     told: NestedKey | None = "behavior"
-    """The entry that the policy is told; ``behavior`` is standardised for it. None: nothing."""
+    """The entry that the policy is told. None: nothing."""
 
 
 def self_organized(parts: Parts) -> Composition:
@@ -92,6 +96,11 @@ def untold(parts: Parts) -> Composition:
 class BGPO(Algorithm):
     """BGPO, its ablations and the references without GWR-B, which differ by their transforms.
 
+    With ``config.experts``, each group of behaviors has an actor and a critic of its own; with
+    ``config.even_replay``, an update sees as many transitions of each of the groups played last;
+    with a ``config.demonstration_share``, a part of them is taken from demonstrations. Without the
+    three it is the paper's algorithm.
+
     Args:
         config: Hyperparameters.
         seeds: One for each element of the batch; they share nothing but the encoders.
@@ -104,11 +113,13 @@ class BGPO(Algorithm):
     Attributes:
         env: The composition of transforms.
         gwr: GWR-B, or None in the variants without it.
-        actor: The policy, ``[S]`` stacked.
-        loss: The RL algorithm's, with the critics.
+        groups: Groups of behaviors, or None where they are not told apart.
+        experts: The networks, by group; without experts, of one group.
+        shown: Replay of the demonstrations that were shown, or None where they are not used.
     """
 
     needs_replay = False
+    replay: GroupReplay
 
     def __init__(
         self,
@@ -125,83 +136,140 @@ class BGPO(Algorithm):
             config, seeds=seeds, schedule=schedule, bank=bank, encoders=encoders, device=device
         )
         self.config = config
-        embedding_size = bank.embedding.shape[-1]
+        embedding_size, batch = bank.embedding.shape[-1], [len(seeds)]
+        streams = generators(seeds, "gwr")
         parts = Parts(
             beta=config.beta,
             n_tasks=schedule.n_tasks,
-            gwr=GWRB(embedding_size, batch_size=[len(seeds)], generator=generators(seeds, "gwr")),
+            gwr=GWRB(embedding_size, batch_size=batch, generator=streams, **asdict(config.gwr)),
             lae=None if encoders is None else encoders.lae,
         )
         composition = compose(parts)
         self.infer = list(composition.infer)
         self.told = composition.told
         self.needs_label = self.told == "task_one_hot"
-        if self.told == "behavior":
-            # The distances that GWR-B needs are not those that a network learns well from.
-            normalize = ObservationNorm(
-                bank.embedding.mean(0),
-                bank.embedding.std(0).clamp_min(1e-6),
-                in_keys=["behavior"],
-                out_keys=["normalized_behavior"],
-                standard_normal=True,
-            )
-            self.infer.append(normalize)
-            self.told = "normalized_behavior"
+        grouping: list[Transform] = []
+        if config.grouped:
+            self.groups = BehaviorGroups(embedding_size, batch_size=batch, **asdict(config.groups))
+            grouping.append(GroupLookup(self.groups, learn=True))
         bonuses = [t for t in composition.reward if isinstance(t, BehaviorMatchingReward)]
         rewards = ["reward", *(["extrinsic_reward", "intrinsic_reward"] if bonuses else [])]
         self.env = self.compose(
-            config, encoders, [*self.infer, *composition.reward], rewards=rewards
+            config, encoders, [*self.infer, *grouping, *composition.reward], rewards=rewards
         )
+        self._beta = sum(t.beta for t in bonuses)
         lookups = [t for t in composition.infer if isinstance(t, BehaviorLookup)]
         self.gwr = lookups[0].gwr if lookups else None
         told_size = {None: 0, "task_one_hot": schedule.n_tasks}.get(self.told, embedding_size)
         self.in_keys = [config.state, *([] if self.told is None else [self.told])]
         rl, keys = config.rl, self.in_keys
-        self.learner = make_learner(
-            rl,
-            Problem(
+
+        def learner_of(seeds: Sequence[int], experts: Sequence[int]) -> Any:
+            problem = Problem(
                 seeds=seeds,
                 in_keys=keys,
                 in_features=self.state_size + told_size,
-                return_bounds=(0.0, 1.0 + sum(t.beta for t in bonuses)),
+                return_bounds=(0.0, self._highest_return()),
                 device=self.device,
-            ),
+                experts=experts,
+            )
+            return make_learner(rl, problem)
+
+        n_slots = config.active_groups if config.grouped else 1
+        self._active = ActiveGroups(len(seeds), n_slots)
+        n_experts = n_slots if config.experts else 1
+        self.learner = learner_of(seeds, range(n_experts))
+        self.experts = Experts(
+            self.learner,
+            self._active if config.experts else ActiveGroups(len(seeds), 1),
+            lambda seed, group: learner_of([seeds[seed]], [group]),
         )
-        self.actor, self.loss = self.learner.actor, self.learner.loss
-        self.replay = ReplayBuffer(
+        self.replay = GroupReplay(
             rl.replay_size,
-            batch_size=rl.batch_size,
             generator=generators(seeds, "replay"),
             keys=[*keys, "action", *(("next", key) for key in (keys[0], "reward", "terminated"))],
         )
+        self.shown = self.demonstrations(config, bank, seeds, constant_keys=keys[1:])
+
+    def _highest_return(self) -> float:
+        """Returns the highest attainable return: of a success now, or after a time-out's bonus."""
+        success = 1.0 + self._beta
+        return max(success, self._beta + self.config.rl.gamma * success)
+
+    def _groups_of(self, tensordict: TensorDictBase) -> list[int]:
+        return tensordict["group"].tolist() if self.config.grouped else [0] * self.n_seeds
 
     @torch.no_grad()
     def act(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the ``action`` ``[S, 4]`` by which the policy explores."""
+        groups = self._groups_of(tensordict)
+        for seed, group in enumerate(groups if not self.config.experts else []):
+            self._active.play(seed, group)
+        expert = self.experts.play(groups if self.config.experts else [0] * self.n_seeds)
         seen = self.moved(tensordict.select(*self.in_keys))
-        return tensordict.set("action", self.learner.act(seen, self._noise))
+        return tensordict.set("action", self.learner.act(seen, self._noise, expert))
 
     def store(self, transition: TensorDictBase) -> None:
-        """Keeps a transition of each seed for updates to come."""
-        self.replay.add(transition)
+        """Keeps a transition of each seed for updates to come, and the demonstration at its end."""
+        group = torch.tensor(self._groups_of(transition))
+        self.replay.add(transition, group)
+        ended = transition.get(("next", "done")).flatten()
+        if self.shown is not None and ended.any():
+            reward = torch.ones(self.n_seeds)
+            if self._beta:
+                error = transition["behavior"] - transition["demo_embedding"]
+                reward += self._beta * torch.exp(-torch.linalg.vector_norm(error, dim=-1))
+            self.shown.add(transition, reward, group, ended)
 
     def update(self) -> dict[str, Tensor]:
         """Makes one update of each seed; see `Algorithm.update`."""
         if len(self.replay) < self.config.rl.warmup_steps:
             return {}
-        return self.learn(self.replay.sample())
+        return self.learn(self._sample())
+
+    def _sample(self) -> TensorDictBase:
+        """Returns the transitions of an update, ``[S, E, B / E]``."""
+        config, (_, n_experts) = self.config, self.experts.active.group.shape
+        n_rows = config.rl.batch_size // n_experts
+
+        def groups_of(n_rows: int) -> Tensor:
+            if config.experts:
+                return self._active.group.repeat_interleave(n_rows, 1)
+            return self._active.rows(n_rows)
+
+        def draw(replay: GroupReplay | DemonstrationReplay, n_rows: int) -> TensorDict:
+            return replay.sample(groups_of(n_rows)).view(self.n_seeds, n_experts, n_rows)
+
+        if self.shown is None or not len(self.shown):
+            return draw(self.replay, n_rows)
+        n_shown = round(config.demonstration_share * n_rows)
+        played, shown = draw(self.replay, n_rows - n_shown), draw(self.shown, n_shown)
+        return cast(TensorDictBase, torch.cat([played, shown], -1))
 
     @torch.no_grad()
     def freeze(
         self, index: int, embedding: Tensor, task: Tensor, generator: torch.Generator
     ) -> dict[str, Any]:
-        """Returns the actor's weights, and what it is told in each test episode ``[T, M, told]``.
+        """Returns the weights and what is told of the policy of each test episode, ``[T, M, ...]``.
 
-        See `Algorithm.freeze`. The task is only read by the variant that is told the label.
+        See `Algorithm.freeze`. A policy that is the same for all is returned as ``[1, 1, ...]``.
+        The task is only read by the variant that is told the label.
         """
-        weights = self.actor.state_dict()
+        del generator
+        group = torch.zeros(1, 1, dtype=torch.int64)
+        if self.config.experts and self.groups is not None:
+            shown = embedding.expand(self.n_seeds, *embedding.shape)
+            group = self.groups.lookup(shown).group[index]
+        experts = {
+            number: self.experts.actor_weights(index, self._with_networks(index, number))
+            for number in group.unique().tolist()
+        }
+        each = [experts[number] for number in group.flatten().tolist()]
         frozen: dict[str, Any] = {
-            "actor": {key: stacked[index].to("cpu", copy=True) for key, stacked in weights.items()}
+            "actor": {
+                key: torch.stack([weights[key] for weights in each]).unflatten(0, group.shape)
+                for key in each[0]
+            }
         }
         if self.told is not None:
             # All seeds look the same demonstrations up: GWR-B knows only whole batches.
@@ -213,23 +281,37 @@ class BGPO(Algorithm):
             frozen["told"] = batch[self.told][index].clone()
         return frozen
 
+    def _with_networks(self, seed: int, group: int) -> int:
+        """Returns the group, or the one it parted from if it has not been played yet."""
+        while self.groups is not None and group and not self.experts.knows(seed, group):
+            group = self.groups.parent(seed, group)
+        return group
+
     def act_frozen(self, frozen: TensorDictBase, state: Tensor) -> Tensor:
         """Returns the actions of test episodes; see `Algorithm.act_frozen`."""
-        inputs = TensorDict({self.in_keys[0]: state}, state.shape[:-1])
+        batch = state.shape[:-1]
+        inputs = TensorDict({self.in_keys[0]: state}, batch)
         if self.told is not None:
             inputs.set(self.told, frozen["told"])
-        functional_call(self.actor, dict(frozen.get("actor").items()), (inputs,))
+        weights = {
+            key: value.expand(*batch, *value.shape[len(batch) :])
+            for key, value in frozen.get("actor").items()
+        }
+        functional_call(self.learner.actor, weights, (inputs,))
         return inputs["action"]
 
     def state_dict(self) -> dict[str, Any]:
         """Returns all that the future of the run depends on but the tensordict in flight."""
-        return {
-            **super().state_dict(),
-            "gwr": None if self.gwr is None else dict(self.gwr.state_dict()),
-        }
+        state = {**super().state_dict(), "experts": self.experts.state_dict()}
+        state["active"] = self._active.state_dict()
+        return state
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continues from what `state_dict` returned."""
         super().load_state_dict(state)
-        if self.gwr is not None:
-            self.gwr.load_state_dict(state["gwr"])
+        self.experts.load_state_dict(state["experts"])
+        self._active.load_state_dict(state["active"])
+
+    def _learned(self) -> dict[str, Any]:
+        parts = {"gwr": self.gwr, "groups": self.groups, "shown": self.shown}
+        return super()._learned() | {key: part for key, part in parts.items() if part is not None}

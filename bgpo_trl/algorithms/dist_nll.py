@@ -17,7 +17,7 @@ from torch.func import functional_call
 from bgpo_trl.algorithms.algorithm import Algorithm, networks_of
 from bgpo_trl.algorithms.rl import Learner
 from bgpo_trl.configs import DistNLLConfig
-from bgpo_trl.demonstrations import DemonstrationBank
+from bgpo_trl.demonstration_bank import DemonstrationBank
 from bgpo_trl.modules.actor_critic import Actor, Critic
 from bgpo_trl.modules.multi_head_actor import MultiHeadActor
 from bgpo_trl.objectives.ddpg import DDPGLoss
@@ -101,8 +101,11 @@ class DistNLL(Algorithm):
         )
         self.replay = TaskReplay(
             ddpg.replay_size,
+            n_tasks=self.n_tasks,
             batch_size=config.task_batch_size,
-            generator=task_generators(seeds, self.n_tasks, "replay"),
+            generator=generators(seeds, "replay"),
+            demonstrations=self.demonstrations(config, bank, seeds),
+            demonstration_share=config.demonstration_share,
             keys=[
                 *(config.state, "action"),
                 *(("next", key) for key in (config.state, "reward", "terminated")),

@@ -17,7 +17,7 @@ from torch.func import functional_call
 from bgpo_trl.algorithms.algorithm import Algorithm, networks_of
 from bgpo_trl.algorithms.rl import Learner
 from bgpo_trl.configs import MAMLConfig
-from bgpo_trl.demonstrations import DemonstrationBank
+from bgpo_trl.demonstration_bank import DemonstrationBank
 from bgpo_trl.modules.actor_critic import Actor, Critic
 from bgpo_trl.objectives.maml import MAMLLoss
 from bgpo_trl.representation import Representation
@@ -94,8 +94,11 @@ class MAML(Algorithm):
         self.learner = Learner(self.meta_actor, self.loss, ddpg, noise=ddpg.noise)
         self.replay = TaskReplay(
             ddpg.replay_size,
+            n_tasks=self.n_tasks,
             batch_size=config.task_batch_size,
-            generator=task_generators(seeds, self.n_tasks, "replay"),
+            generator=generators(seeds, "replay"),
+            demonstrations=self.demonstrations(config, bank, seeds),
+            demonstration_share=config.demonstration_share,
             keys=[
                 *(config.state, "action"),
                 *(("next", key) for key in (config.state, "reward", "terminated")),
@@ -120,7 +123,10 @@ class MAML(Algorithm):
         """Makes one update of each seed; see `Algorithm.update`."""
         if len(self.replay) < max(self.config.rl.warmup_steps, self.replay.enough):
             return {}
-        return self.learn(self.replay.sample())
+        batch = self.replay.sample()
+        # Demonstrations come last; each half is to have its share of them.
+        order = torch.arange(self.config.task_batch_size).view(-1, 2).T.flatten()
+        return self.learn(batch[..., order])
 
     def freeze(
         self, index: int, embedding: Tensor, task: Tensor, generator: torch.Generator
@@ -137,9 +143,9 @@ class MAML(Algorithm):
             for key, value in meta.items()
         }
         if self.replay.ready.any():
-            draws = torch.randint(2**63 - 1, (self.n_tasks,), generator=generator).tolist()
-            streams = [torch.Generator().manual_seed(n) for _ in range(self.n_seeds) for n in draws]
-            data = self.replay.sample(self.config.adaptation_size, generator=streams)
+            draw = int(torch.randint(2**63 - 1, (), generator=generator))
+            streams = [torch.Generator().manual_seed(draw) for _ in range(self.n_seeds)]
+            data = self.replay.sample_played(self.config.adaptation_size, generator=streams)
             adapted = self.loss.adapt(self.moved(data))
         return {
             "actor": {

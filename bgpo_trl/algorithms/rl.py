@@ -29,7 +29,7 @@ __all__ = ["RL", "Learner", "Problem", "RLEntry", "SACLearner", "TD3Learner", "m
 
 @dataclass(frozen=True)
 class Problem:
-    """What an RL algorithm is to learn, one policy for each seed."""
+    """What an RL algorithm is to learn: policies ``[S, E]``, one for each expert of each seed."""
 
     seeds: Sequence[int]
     """One for each element ``S`` of the batch."""
@@ -41,21 +41,27 @@ class Problem:
     """Lowest and highest attainable return."""
     device: torch.device
     """Where networks and batches are."""
+    experts: Sequence[int] = (0,)
+    """Numbers of the experts ``E``; an expert's random numbers follow from its seed and number."""
+
+    def generators(self, name: str) -> list[torch.Generator]:
+        """Returns one generator for each expert of each seed, for one purpose."""
+        return [generators([s], f"{name} {e}")[0] for s in self.seeds for e in self.experts]
 
     def actor(self, network: Callable[..., Any], config: RLConfig) -> Any:
-        """Returns policies ``[S]`` of a class such as `Actor`."""
-        return self._network(network, config, [len(self.seeds)], generators(self.seeds, "actor"))
+        """Returns policies ``[S, E]`` of a class such as `Actor`."""
+        return self._network(network, config, self._shape, self.generators("actor"))
 
     def critic(self, config: RLConfig) -> Critic:
-        """Returns Q-functions ``[S]``."""
-        norm, streams = config.critic_layer_norm, generators(self.seeds, "critic")
-        return self._network(Critic, config, [len(self.seeds)], streams, layer_norm=norm)
+        """Returns Q-functions ``[S, E]``."""
+        norm, streams = config.critic_layer_norm, self.generators("critic")
+        return self._network(Critic, config, self._shape, streams, layer_norm=norm)
 
     def twin_critics(self, config: RLConfig) -> Critic:
-        """Returns Q-functions ``[S, 2]``."""
-        first, second = (generators(self.seeds, name) for name in ("critic", "second critic"))
+        """Returns Q-functions ``[S, E, 2]``."""
+        first, second = (self.generators(name) for name in ("critic", "second critic"))
         norm, streams = config.critic_layer_norm, [*chain(*zip(first, second, strict=True))]
-        return self._network(Critic, config, [len(self.seeds), 2], streams, layer_norm=norm)
+        return self._network(Critic, config, [*self._shape, 2], streams, layer_norm=norm)
 
     def loss_options(self, config: RLConfig) -> dict[str, Any]:
         """Returns the arguments that the losses of this package have in common."""
@@ -63,6 +69,10 @@ class Problem:
             "return_bounds": self.return_bounds if config.clip_targets else None,
             "constant_keys": self.in_keys[1:],
         }
+
+    @property
+    def _shape(self) -> list[int]:
+        return [len(self.seeds), len(self.experts)]
 
     def _network(
         self,
@@ -112,14 +122,22 @@ class Learner:
         learned = [p for p in loss.parameters() if p.requires_grad]
         self.optimizer = torch.optim.Adam(learned, lr=config.learning_rate, fused=True)
 
-    def act(self, tensordict: TensorDictBase, generators: Sequence[torch.Generator]) -> Tensor:
+    def act(
+        self, tensordict: TensorDictBase, generators: Sequence[torch.Generator], expert: Tensor
+    ) -> Tensor:
         """Returns actions of a training step, ``[S, 4]`` in [-1, 1], on the CPU.
 
         Args:
             tensordict: What the policies read, ``[S]``.
-            generators: What exploration draws from, one for each seed.
+            generators: Sources of exploration, one for each seed.
+            expert: Which expert of each seed acts, int64 ``[S]``.
         """
-        return self.explore(self.actor(tensordict)["action"], generators)
+        action = self.actor(self._for_all(tensordict))["action"]
+        return self.explore(_of_expert(action, expert), generators)
+
+    def _for_all(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Returns what is read ``[S]`` by all experts, ``[S, E]``."""
+        return tensordict.unsqueeze(1).expand(*self.actor.batch_size)
 
     def explore(self, action: Tensor, generators: Sequence[torch.Generator]) -> Tensor:
         """Returns actions ``[S, 4]`` with each seed's Gaussian noise, within [-1, 1]."""
@@ -194,11 +212,20 @@ class SACLearner(Learner):
 
     actor: GaussianActor
 
-    def act(self, tensordict: TensorDictBase, generators: Sequence[torch.Generator]) -> Tensor:
+    def act(
+        self, tensordict: TensorDictBase, generators: Sequence[torch.Generator], expert: Tensor
+    ) -> Tensor:
         """Returns actions drawn for a training step; see `Learner.act`."""
-        noise = normal(generators, [self.actor.action_dim])
+        noise = normal(generators, [self.actor.action_dim]).unsqueeze(1)
+        noise = noise.expand(*self.actor.batch_size, -1)
         device = next(self.actor.parameters()).device
-        return self.actor.sample(tensordict, noise.to(device))["action"].cpu()
+        drawn = self.actor.sample(self._for_all(tensordict), noise.to(device))
+        return _of_expert(drawn["action"], expert).cpu()
+
+
+def _of_expert(values: Tensor, expert: Tensor) -> Tensor:
+    """Returns those of one expert of each seed, ``[S, ...]`` of ``[S, E, ...]``."""
+    return values[torch.arange(len(values)), expert.to(values.device)]
 
 
 def make_ddpg(config: DDPGConfig, problem: Problem) -> Learner:
@@ -222,7 +249,7 @@ def make_td3(config: TD3Config, problem: Problem) -> Learner:
         policy_noise=config.policy_noise,
         noise_clip=config.noise_clip,
         pre_tanh_penalty=config.pre_tanh_penalty,
-        generator=generators(problem.seeds, "target noise"),
+        generator=problem.generators("target noise"),
         **problem.loss_options(config),
     )
     return TD3Learner(actor, loss, config)
@@ -237,7 +264,7 @@ def make_sac(config: SACConfig, problem: Problem) -> Learner:
         alpha_init=config.alpha_init,
         target_entropy=config.target_entropy,
         entropy_in_target=config.entropy_in_target,
-        generator=generators(problem.seeds, "policy samples"),
+        generator=problem.generators("policy samples"),
         **problem.loss_options(config),
     )
     return SACLearner(actor, loss, config)

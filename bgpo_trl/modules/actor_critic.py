@@ -118,18 +118,19 @@ class StackedLinear(nn.Module):
                 inputs do not have ``in_features`` together.
         """
         sizes = [input.shape[-1] for input in inputs]
-        n_stacked = len(self.batch_size)
+        # Not self.batch_size: the layer may be called with weights of another stack.
+        stack = self.weight.shape[:-2]
         if sum(sizes) != self.in_features or any(
-            input.shape[:n_stacked] != self.batch_size for input in inputs
+            input.shape[: len(stack)] != stack for input in inputs
         ):
             raise ValueError(
                 f"the inputs must have one leading index per layer and {self.in_features} features "
-                f"together, shape {[*self.batch_size]} + [*B, {self.in_features}], got "
+                f"together, shape {[*stack]} + [*B, {self.in_features}], got "
                 f"{' and '.join(str([*input.shape]) for input in inputs)}"
             )
-        n_layers = self.batch_size.numel()
-        weight = self.weight.view(n_layers, self.in_features, self.out_features)
-        output = self.bias.view(n_layers, 1, self.out_features)
+        n_layers = stack.numel()
+        weight = self.weight.reshape(n_layers, self.in_features, self.out_features)
+        output = self.bias.reshape(n_layers, 1, self.out_features)
         for i, (input, rows) in enumerate(zip(inputs, weight.split(sizes, -2), strict=True)):
             multiply_add = torch.Tensor.baddbmm_ if i else torch.Tensor.baddbmm
             output = multiply_add(output, input.reshape(n_layers, -1, input.shape[-1]), rows)

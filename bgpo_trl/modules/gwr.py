@@ -5,27 +5,21 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Literal
 
-import numpy as np
 import torch
-from tensordict import TensorClass
 from torch import Tensor, nn
 
-from bgpo_trl.modules.gwr_topology import BehaviorGraph, LearningRule, Topology
-
-
-class BehaviorMatch(TensorClass["tensor_only"]):
-    """The best-matching node of each input.
-
-    Attributes:
-        embedding: weight vector w_c of the node, the behavior b; a copy, `[*batch, d]`.
-        node: identity of the node within its network, int64 `[*batch]`. Identities count up from 0
-            in order of creation; none is reused or renumbered when a node is removed.
-        activity: exp(-||phi - w_c||) in [0, 1] (Eq. 2), `[*batch]`.
-    """
-
-    embedding: Tensor
-    node: Tensor
-    activity: Tensor
+from bgpo_trl.modules.gwr_graph import BehaviorGraph, BehaviorMatch
+from bgpo_trl.modules.gwr_tensors import (
+    Numbers,
+    as_generators,
+    as_mask,
+    as_shape,
+    as_tensor,
+    checked,
+    pairwise_distances,
+    to_tensor,
+)
+from bgpo_trl.modules.gwr_topology import LearningRule, Topology, read_state, with_room
 
 
 class GWRB(nn.Module):
@@ -35,7 +29,8 @@ class GWRB(nn.Module):
 
     1. A network starts as two connected nodes with random weights, or as its first two inputs.
     2. c and c' are the nearest and the second nearest node (Eq. 1); the older one wins a tie.
-    3. The edge c-c' is created, or its age set to 0. The activity is a = exp(-||phi - w_c||).
+    3. The edge c-c' is created, or its age set to 0. The activity is a = exp(-s ||phi - w_c||),
+       with s = 1 in the paper (Eq. 2).
     4. If a < a_T and h_c < h_T, a node v is inserted: w_v = (w_c + phi) / 2, h_v = h_0, edges v-c
        and v-c'; the edge c-c' is removed. Otherwise c and its neighbors k learn,
        w_c += eps_c h_c (phi - w_c) and w_k += eps_n h_k (phi - w_k) (Eqs. 3, 4), and habituate,
@@ -50,8 +45,11 @@ class GWRB(nn.Module):
 
     Args:
         n_features: size d of an input.
-        batch_size: shape of the batch of networks (the seeds); `()` is a single network.
+        batch_size: shape of the batch of networks (the seeds), or how many there are in a row; `()`
+            is a single network.
         activity_threshold: a_T.
+        activity_scale: s, positive. Only here does the scale of inputs matter: a network with s
+            does what one with 1 does with inputs (and random weights) multiplied by s.
         habituation_threshold: h_T.
         lr_best: eps_c, at most 1.
         lr_neighbor: eps_n, at most eps_c.
@@ -94,8 +92,9 @@ class GWRB(nn.Module):
         self,
         n_features: int,
         *,
-        batch_size: Sequence[int] = (),
+        batch_size: int | Sequence[int] = (),
         activity_threshold: float = 0.8,
+        activity_scale: float = 1.0,
         habituation_threshold: float = 0.15,
         lr_best: float = 0.1,
         lr_neighbor: float = 0.01,
@@ -110,10 +109,11 @@ class GWRB(nn.Module):
         generator: torch.Generator | Sequence[torch.Generator] | None = None,
     ) -> None:
         super().__init__()
-        self.n_features = n_features
-        self.batch_size = torch.Size(batch_size)
+        (self.n_features,) = as_shape([n_features], "n_features")
+        self.batch_size = as_shape(batch_size, "batch_size")
         self.rule = LearningRule(
             activity_threshold=activity_threshold,
+            activity_scale=activity_scale,
             habituation_threshold=habituation_threshold,
             lr_best=lr_best,
             lr_neighbor=lr_neighbor,
@@ -126,22 +126,18 @@ class GWRB(nn.Module):
             max_nodes=max_nodes,
         )
         networks = self.batch_size.numel()
-        if n_features < 1 or networks < 1:
-            raise ValueError("n_features and every dimension of batch_size must be at least 1")
         if init not in ("random", "data"):
             raise ValueError(f"init must be 'random' or 'data'; got {init!r}")
-        generators = generator if isinstance(generator, Sequence) else [generator] * networks
-        if len(generators) != networks:
-            raise ValueError(f"generator must be one, or a sequence of {networks}, one a network")
+        generators = as_generators(generator, networks)
 
         self._topologies = [Topology() for _ in range(networks)]
-        spare = torch.full((networks, 16, n_features), torch.inf)
+        spare = torch.full((networks, 16, self.n_features), torch.inf)
         self.register_buffer("_weights", spare, persistent=False)
         self.register_buffer("_network", torch.arange(networks), persistent=False)
         if init == "random":
             for i, source in enumerate(generators):
                 device = None if source is None else source.device
-                for weights in torch.rand(2, n_features, generator=source, device=device):
+                for weights in torch.rand(2, self.n_features, generator=source, device=device):
                     self._start(i, 2 * weights - 1)
 
     @property
@@ -151,53 +147,87 @@ class GWRB(nn.Module):
         return torch.tensor(counts, device=self._weights.device).view(self.batch_size)
 
     def graph(self, index: int | tuple[int, ...] = ()) -> BehaviorGraph:
-        """Copies the network at `index` of `batch_size`."""
-        network = int(torch.arange(len(self._topologies)).view(self.batch_size)[index])
+        """Copies the network at `index` of `batch_size`.
+
+        Raises:
+            IndexError: if that is not a single network.
+        """
+        try:
+            network = int(torch.arange(len(self._topologies)).view(self.batch_size)[index])
+        except (IndexError, RuntimeError, ValueError):
+            raise IndexError(
+                f"index must name one network of batch_size {[*self.batch_size]}; got {index}"
+            ) from None
         return self._topologies[network].to_graph(self._weights[network])
 
-    def forward(self, phi: Tensor) -> BehaviorMatch:
+    def extra_repr(self) -> str:
+        """Tells `repr` how large the networks are and what makes them grow."""
+        nodes = self.num_nodes.flatten()
+        sizes = " to ".join(dict.fromkeys(str(int(n)) for n in nodes.aminmax()))
+        thresholds = ("activity_threshold", "activity_scale", "habituation_threshold")
+        parts = {"batch_size": [*self.batch_size], "num_nodes": sizes}
+        parts |= {name: getattr(self.rule, name) for name in thresholds}
+        return ", ".join([f"{self.n_features}", *(f"{key}={x}" for key, x in parts.items())])
+
+    def forward(self, phi: Numbers) -> BehaviorMatch:
         """The same as `lookup`."""
         return self.lookup(phi)
 
-    def lookup(self, phi: Tensor) -> BehaviorMatch:
+    def lookup(self, phi: Numbers, mask: Numbers | None = None) -> BehaviorMatch:
         """Finds the best match of each input (step 2); changes nothing.
 
         Args:
-            phi: `[*batch_size, *extra, d]`; each network matches all of its `extra` inputs.
+            phi: `[*batch_size, *extra, d]`, a tensor, an array or lists of numbers of any type;
+                each network matches all of its `extra` inputs.
+            mask: bool `[*batch_size]`, the networks that take part. None: all.
 
         Returns:
-            Matches `[*batch_size, *extra]`.
+            Matches `[*batch_size, *extra]`; where `mask` is False, embedding and activity are NaN
+            and the node is -1.
 
         Raises:
             ValueError: if phi has the wrong shape or holds NaN or Inf, or if a network is still
                 empty (`init="data"` before the first input).
         """
+        phi = as_tensor(phi, "phi")
         batch, networks, weights = phi.shape[:-1], len(self._topologies), self._weights
         if (*batch[: len(self.batch_size)], *phi.shape[-1:]) != (*self.batch_size, self.n_features):
             raise ValueError(
                 f"phi must begin with dimensions {[*self.batch_size]} and end with "
                 f"{self.n_features}; got {[*phi.shape]}"
             )
-        if not all(topology.edges for topology in self._topologies):
+        mask = None if mask is None else as_mask(mask, self.batch_size)
+        network = self._network if mask is None else self._network[mask.flatten()]
+        topologies = [self._topologies[i] for i in network.tolist()]
+        if not all(topology.edges for topology in topologies):
             raise ValueError("an empty network matches nothing: adapt() it to an input first")
-        phi = _checked(phi.reshape(networks, batch.numel() // networks, self.n_features), weights)
-        distance, row = _distances(phi, weights).min(-1)
+        phi = phi.reshape(networks, batch.numel() // networks, self.n_features)
+        if mask is not None:
+            phi, weights = phi[mask.flatten()], weights[network]
+        distance, row = pairwise_distances(checked(phi, weights), weights).min(-1)
         node = [
             [topology.identity[i] for i in rows]
-            for topology, rows in zip(self._topologies, row.tolist(), strict=True)
+            for topology, rows in zip(topologies, row.tolist(), strict=True)
         ]
+        embedding = self._weights[network.unsqueeze(-1), row]
+        node = to_tensor(node, row.dtype, row.device).view(row.shape)
+        activity = self._activity(distance)
+        if mask is not None:
+            embedding = self._spread(embedding, network, torch.nan)
+            node = self._spread(node, network, -1)
+            activity = self._spread(activity, network, torch.nan)
         return BehaviorMatch(
-            embedding=weights[self._network.unsqueeze(-1), row].view(*batch, self.n_features),
-            node=_to_tensor(node, row.dtype, row.device).view(batch),
-            activity=distance.neg_().exp_().view(batch),
+            embedding=embedding.view(*batch, self.n_features),
+            node=node.view(batch),
+            activity=activity.view(batch),
             batch_size=batch,
         )
 
-    def adapt(self, phi: Tensor, mask: Tensor | None = None) -> BehaviorMatch:
+    def adapt(self, phi: Numbers, mask: Numbers | None = None) -> BehaviorMatch:
         """Finds the best match of one input for each network and learns from it (steps 2 to 5).
 
         Args:
-            phi: `[*batch_size, d]`.
+            phi: `[*batch_size, d]`, as for `lookup`.
             mask: bool `[*batch_size]`, the networks that take part. The others stay as they are,
                 whatever phi holds for them. None: all.
 
@@ -209,20 +239,18 @@ class GWRB(nn.Module):
             ValueError: if phi or mask has the wrong shape, or phi holds NaN or Inf for a network
                 that takes part; no network has changed then.
         """
+        phi = as_tensor(phi, "phi")
         if phi.shape != (*self.batch_size, self.n_features):
             raise ValueError(
                 f"phi must be {[*self.batch_size, self.n_features]}; got {[*phi.shape]}"
             )
-        if mask is not None and (mask.shape != self.batch_size or mask.dtype != torch.bool):
-            raise ValueError(
-                f"mask must be bool {[*self.batch_size]}; got {mask.dtype} {[*mask.shape]}"
-            )
+        mask = None if mask is None else as_mask(mask, self.batch_size)
         phi, network = phi.reshape(-1, self.n_features), self._network
         if mask is not None:
             phi, network = phi[mask.flatten()], network[mask.flatten()]
-        phi = _checked(phi, self._weights)
+        phi = checked(phi, self._weights)
         networks = network.tolist()
-        self._make_room(networks)
+        self._weights = with_room(self._weights, self._topologies, networks)
         topologies = [self._topologies[i] for i in networks]
         n_before = [len(topology.edges) for topology in topologies]
         for k in [k for k, n in enumerate(n_before) if n == 0]:
@@ -230,13 +258,13 @@ class GWRB(nn.Module):
 
         weights = self._weights
         searched = weights if mask is None else weights[network]
-        distances = _distances(phi.unsqueeze(1), searched).squeeze(1)
+        distances = pairwise_distances(phi.unsqueeze(1), searched).squeeze(1)
         distance, best = distances.min(-1)
         second = distances.scatter_(-1, best.unsqueeze(-1), torch.inf).min(-1).indices
-        embedding, activity = weights[network, best], distance.neg_().exp_()
+        embedding, activity = weights[network, best], self._activity(distance)
         nearest = list(zip(best.tolist(), second.tolist(), activity.tolist(), strict=True))
         identities = [t.identity[match[0]] for t, match in zip(topologies, nearest, strict=True)]
-        node = _to_tensor(identities, best.dtype, best.device)
+        node = to_tensor(identities, best.dtype, best.device)
         self._learn(phi, embedding, networks, n_before, nearest)
 
         if mask is not None:
@@ -262,25 +290,16 @@ class GWRB(nn.Module):
             ValueError: if there are more or fewer of them, or of other features, than here, or they
                 are damaged; nothing has changed then.
         """
-        wanted = {*BehaviorGraph._fields, "next_node"}
-        if not all(wanted <= network.keys() for network in state):
-            raise ValueError(f"the state of a network needs {sorted(wanted)}: see get_extra_state")
-        found = [network["weights"].shape[1] for network in state]
-        if found != [self.n_features] * len(self._topologies):
-            raise ValueError(
-                f"the state has {len(found)} networks of {set(found)} features, this GWRB "
-                f"{len(self._topologies)} of {self.n_features}: build it with the same sizes"
-            )
-        graphs = [BehaviorGraph(*(network[x] for x in BehaviorGraph._fields)) for network in state]
-        topologies = [
-            Topology.from_graph(graph, network["next_node"])
-            for graph, network in zip(graphs, state, strict=True)
-        ]
+        graphs, topologies = read_state(state, len(self._topologies), self.n_features)
         capacity = max(2, *(len(graph.node) for graph in graphs))
         weights = self._weights.new_full((len(graphs), capacity, self.n_features), torch.inf)
         for rows, graph in zip(weights, graphs, strict=True):
             rows[: len(graph.node)] = graph.weights
         self._topologies, self._weights = topologies, weights
+
+    def _activity(self, distance: Tensor) -> Tensor:
+        """Turns distances to the best matches into activities, in place (Eq. 2)."""
+        return distance.mul_(-self.rule.activity_scale).exp_()
 
     def _spread(self, x: Tensor, network: Tensor, fill: float) -> Tensor:
         """Places results of active networks among those of all, which are `fill` elsewhere."""
@@ -328,46 +347,8 @@ class GWRB(nn.Module):
             erased += [first + row for row in update.removed]
         flat = weights.view(-1, self.n_features)
         if rows:
-            row, k = (_to_tensor(x, torch.int64, phi.device) for x in (rows, inputs))
-            step = _to_tensor(steps, phi.dtype, phi.device).unsqueeze(-1)
+            row, k = (to_tensor(x, torch.int64, phi.device) for x in (rows, inputs))
+            step = to_tensor(steps, phi.dtype, phi.device).unsqueeze(-1)
             flat.index_copy_(0, row, flat.index_select(0, row).lerp(phi.index_select(0, k), step))
         if erased:
             flat[erased] = torch.inf
-
-    def _make_room(self, networks: list[int]) -> None:
-        """Sees to a spare row in each of the networks.
-
-        Capacity grows by an eighth: in proportion, so that growth costs little, but by no more, as
-        every row is searched. Where as many rows are out of use, those are put to use instead.
-        """
-        capacity = self._weights.shape[1]
-        share = max(16, capacity // 8)
-        full = [i for i in networks if len(self._topologies[i].identity) == capacity]
-        if any(capacity - len(self._topologies[i].edges) < share for i in full):
-            self._weights = nn.functional.pad(self._weights, (0, 0, 0, share), value=torch.inf)
-            return
-        for i in full:
-            rows = self._topologies[i].compact()
-            self._weights[i, : len(rows)] = self._weights[i, rows]
-            self._weights[i, len(rows) :] = torch.inf
-
-
-def _checked(phi: Tensor, weights: Tensor) -> Tensor:
-    """Returns phi in the type and on the device of the weights, if it can be matched."""
-    phi = phi.detach().to(weights)
-    # Farther out a squared distance could overflow, and every node would be equally near.
-    limit = torch.finfo(phi.dtype).max ** 0.5 / 2
-    if not torch.linalg.vector_norm(phi).item() <= limit:
-        raise ValueError(f"phi must be free of NaN, Inf and values beyond +-{limit:.0e}")
-    return phi
-
-
-def _distances(phi: Tensor, weights: Tensor) -> Tensor:
-    """Distances `[A, M, N]` of inputs `[A, M, d]` to nodes `[A, N, d]`."""
-    # By matrix product, the default of cdist, distances near 0 would be off by 1e-3.
-    return torch.cdist(phi, weights, compute_mode="donot_use_mm_for_euclid_dist")
-
-
-def _to_tensor(numbers: list[Any], dtype: torch.dtype, device: torch.device) -> Tensor:
-    """The same as `torch.tensor`, by way of numpy, which reads a list four times as fast."""
-    return torch.as_tensor(np.array(numbers), dtype=dtype, device=device)

@@ -1,14 +1,17 @@
-"""The graph of a GWR-B network, and the part of its learning rule that needs no weights."""
+"""The nodes and edges of a GWR-B network, and what of its learning rule needs no weights."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
-from typing import NamedTuple
+from numbers import Real
+from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+
+from bgpo_trl.modules.gwr_graph import BehaviorGraph
 
 
 class Firing(NamedTuple):
@@ -31,6 +34,7 @@ class LearningRule:
     """
 
     activity_threshold: float
+    activity_scale: float
     habituation_threshold: float
     lr_best: float
     lr_neighbor: float
@@ -43,9 +47,14 @@ class LearningRule:
     max_nodes: int | None
 
     def __post_init__(self) -> None:
+        constants = asdict(self)
+        for name, value in constants.items():
+            if not isinstance(value, Real) and (name, value) != ("max_nodes", None):
+                raise ValueError(f"{name} must be a number; got {value!r}")
         least_alpha = 1 / self.initial_habituation if self.initial_habituation > 0 else math.inf
         for holds, need in [
             (0 <= self.activity_threshold <= 1, "0 <= activity_threshold <= 1"),
+            (0 < self.activity_scale < math.inf, "activity_scale > 0"),
             (0 <= self.habituation_threshold < math.inf, "habituation_threshold >= 0"),
             (0 <= self.lr_neighbor <= self.lr_best <= 1, "0 <= lr_neighbor <= lr_best <= 1"),
             (0 < self.initial_habituation <= 1, "0 < initial_habituation <= 1"),
@@ -60,7 +69,8 @@ class LearningRule:
             (self.max_nodes is None or self.max_nodes >= 2, "max_nodes >= 2, or None"),
         ]:
             if not holds:
-                raise ValueError(f"GWR-B needs {need}; got {self}")
+                got = ", ".join(f"{x}={constants[x]}" for x in constants if x in need)
+                raise ValueError(f"GWR-B needs {need}; got {got}")
 
     @cached_property
     def best(self) -> Firing:
@@ -73,24 +83,6 @@ class LearningRule:
         """What firing does to its neighbors (Eqs. 4, 6)."""
         floor = self.initial_habituation - 1 / self.alpha_neighbor
         return Firing(self.lr_neighbor, floor, math.exp(-self.alpha_neighbor / self.tau_neighbor))
-
-
-class BehaviorGraph(NamedTuple):
-    """A copy of one network, its nodes in order of creation.
-
-    Attributes:
-        weights: `[N, d]`.
-        habituation: float64 `[N]`.
-        edges: positions (i, j), i < j, of the nodes they join, sorted; int64 `[E, 2]`.
-        ages: of the edges, int64 `[E]`.
-        node: identities of the nodes, as in `BehaviorMatch.node`; int64 `[N]`, ascending.
-    """
-
-    weights: Tensor
-    habituation: Tensor
-    edges: Tensor
-    ages: Tensor
-    node: Tensor
 
 
 class WeightUpdate(NamedTuple):
@@ -246,3 +238,46 @@ class Topology:
                 del self.edges[k]
                 removed.append(k)
         return removed
+
+
+def read_state(
+    state: list[dict[str, Any]], n_networks: int, n_features: int
+) -> tuple[list[BehaviorGraph], list[Topology]]:
+    """Reads the networks of `GWRB.get_extra_state`.
+
+    Raises:
+        ValueError: if there are more or fewer of them, or of other features, or they are damaged.
+    """
+    wanted = {*BehaviorGraph._fields, "next_node"}
+    if not all(wanted <= network.keys() for network in state):
+        raise ValueError(f"the state of a network needs {sorted(wanted)}: see get_extra_state")
+    found = [network["weights"].shape[1] for network in state]
+    if found != [n_features] * n_networks:
+        raise ValueError(
+            f"the state has {len(found)} networks of {set(found)} features, this GWRB "
+            f"{n_networks} of {n_features}: build it with the same sizes"
+        )
+    graphs = [BehaviorGraph(*(network[x] for x in BehaviorGraph._fields)) for network in state]
+    topologies = [
+        Topology.from_graph(graph, network["next_node"])
+        for graph, network in zip(graphs, state, strict=True)
+    ]
+    return graphs, topologies
+
+
+def with_room(weights: Tensor, topologies: list[Topology], networks: list[int]) -> Tensor:
+    """Returns the weights of all networks, with a spare row in each of `networks`.
+
+    Capacity grows by an eighth: in proportion, so that growth costs little, but by no more, as
+    every row is searched. Where as many rows are out of use, those are put to use instead.
+    """
+    capacity = weights.shape[1]
+    share = max(16, capacity // 8)
+    full = [i for i in networks if len(topologies[i].identity) == capacity]
+    if any(capacity - len(topologies[i].edges) < share for i in full):
+        return nn.functional.pad(weights, (0, 0, 0, share), value=torch.inf)
+    for i in full:
+        rows = topologies[i].compact()
+        weights[i, : len(rows)] = weights[i, rows]
+        weights[i, len(rows) :] = torch.inf
+    return weights

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor, nn
 
@@ -11,18 +9,15 @@ from torch import Tensor, nn
 class SequenceAutoencoder(nn.Module):
     """The paper's LAE (Sec. III-A, Fig. "LSTM Autoencoder"): LSTM encoder, LSTM decoder.
 
-    The embedding phi is the encoder's hidden state after the last valid latent, times
-    ``embedding_scale``. The decoder is fed that hidden state at every step and reconstructs the
-    sequence in reverse order; so the scale changes nothing of what is learned, only the distances
-    that GWR-B (whose activity is ``exp(-distance)``) and the intrinsic reward see.
+    The embedding phi is the encoder's hidden state after the last valid latent. The decoder is fed
+    phi at every step and reconstructs the sequence in reverse order.
 
     Args:
         latent_size: dimensions of one latent (paper: 64).
         embedding_size: LSTM units of encoder and decoder, so dimensions of phi (paper: 32).
-        embedding_scale: length of phi in units of the hidden state (paper: 1).
 
     Raises:
-        ValueError: if a size or the scale is not positive.
+        ValueError: if a size is not positive.
 
     Example:
         >>> import torch
@@ -32,22 +27,15 @@ class SequenceAutoencoder(nn.Module):
         torch.Size([5, 32])
     """
 
-    def __init__(
-        self, latent_size: int = 64, embedding_size: int = 32, embedding_scale: float = 1.0
-    ) -> None:
+    def __init__(self, latent_size: int = 64, embedding_size: int = 32) -> None:
         if latent_size < 1 or embedding_size < 1:
             raise ValueError(
                 f"latent_size and embedding_size must be at least 1, got {latent_size} and "
                 f"{embedding_size}"
             )
-        if not 0 < embedding_scale < math.inf:
-            raise ValueError(f"embedding_scale must be positive, got {embedding_scale}")
         super().__init__()
         self.latent_size = latent_size
         self.embedding_size = embedding_size
-        # Kept with the weights: embeddings of one scale are worth nothing beside those of another.
-        self.register_buffer("embedding_scale", torch.tensor(embedding_scale))
-        self.embedding_scale: Tensor
         self.encoder = nn.LSTM(latent_size, embedding_size, batch_first=True)
         self.decoder = nn.LSTM(embedding_size, embedding_size, batch_first=True)
         self.readout = nn.Linear(embedding_size, latent_size)
@@ -60,7 +48,7 @@ class SequenceAutoencoder(nn.Module):
             length: int64 ``[...]``, valid latents of each sequence, in 1..T.
 
         Returns:
-            phi, float32 ``[..., embedding_size]`` in (-1, 1) times the scale.
+            phi, float32 ``[..., embedding_size]`` in (-1, 1).
 
         Raises:
             ValueError: if shapes disagree or a length is outside 1..T.
@@ -81,14 +69,10 @@ class SequenceAutoencoder(nn.Module):
         # An LSTM is causal: reading its output at the last valid step masks the padding exactly.
         hidden, _ = self.encoder(z.reshape(-1, steps, self.latent_size))
         last = (length.reshape(-1, 1, 1) - 1).expand(-1, 1, self.embedding_size)
-        return self.embed(hidden.gather(1, last).reshape(*length.shape, self.embedding_size))
-
-    def embed(self, h: Tensor) -> Tensor:
-        """Returns phi of the sequence that the encoder has read when its hidden state is ``h``."""
-        return self.embedding_scale * h
+        return hidden.gather(1, last).reshape(*length.shape, self.embedding_size)
 
     def step(self, z: Tensor, h: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
-        """Advances the encoder by one latent; after the last one, ``embed(h)`` is phi.
+        """Advances the encoder by one latent; after the last one, ``h`` is phi.
 
         Args:
             z: ``[..., latent_size]``.
@@ -122,6 +106,6 @@ class SequenceAutoencoder(nn.Module):
         Returns:
             float32 ``[..., n_steps, latent_size]``.
         """
-        fed = phi.reshape(-1, 1, self.embedding_size).expand(-1, n_steps, -1) / self.embedding_scale
+        fed = phi.reshape(-1, 1, self.embedding_size).expand(-1, n_steps, -1)
         hidden, _ = self.decoder(fed)
         return self.readout(hidden).reshape(*phi.shape[:-1], n_steps, self.latent_size)

@@ -24,9 +24,9 @@ class DDPGLoss(StackedLoss, objectives.DDPGLoss):
 
     It differs from :class:`torchrl.objectives.DDPGLoss` in this:
 
-    1. The bootstrapped target ``r + gamma * Q'(s', pi'(s'))`` is clipped to ``return_bounds``, the
-       range of attainable returns. With an extrinsic reward of 0 or 1 that ends the episode and an
-       intrinsic reward of at most ``beta`` that range is ``[0, 1 + beta]``.
+    1. The bootstrapped target ``r + gamma * Q'(s', pi'(s'))`` is clipped to ``return_bounds``, if
+       they are given: the range of attainable returns. With an extrinsic reward of 0 or 1 that ends
+       the episode and an intrinsic reward of at most ``beta`` that range is ``[0, 1 + beta]``.
     2. ``pre_tanh_penalty * mean(pre_tanh_action ** 2)``, the mean over batch and action dimensions,
        is added to the actor's loss, so that the tanh does not saturate.
     3. Losses are a mean over the batch and a *sum* over the actor's leading ``batch_size``, so that
@@ -34,8 +34,8 @@ class DDPGLoss(StackedLoss, objectives.DDPGLoss):
     4. Actor and critic have target networks, ``gamma`` is 0.98, and an entry that is constant
        within an episode need not be stored a second time under ``"next"``.
 
-    Without 1 and 2 (both can be turned off) DDPG diverges on these tasks: Q grows to hundreds and
-    every action saturates. Only ``"terminated"`` ends the bootstrap; a truncated episode goes on.
+    Without 1 and 2 DDPG diverges on these tasks: Q grows to hundreds and every action saturates.
+    Only ``"terminated"`` ends the bootstrap; a truncated episode goes on.
 
     Reads the ``in_keys`` of both networks (``"action"`` ``[*S, *B, action_dim]`` among them), those
     of the actor under ``"next"``, and ``("next", "reward")``, ``("next", "terminated")``
@@ -43,7 +43,7 @@ class DDPGLoss(StackedLoss, objectives.DDPGLoss):
     squared error that prioritized replay wants, into the input. Returns, without a batch size,
 
     - ``"loss_actor"``, ``"loss_value"`` ``[]``: to be added and differentiated;
-    - ``"pred_value"``, ``"target_value"`` ``[*S, *B]``: Q and its clipped target;
+    - ``"pred_value"``, ``"target_value"`` ``[*S, *B]``: Q and its target;
     - ``"pred_value_max"``, ``"target_value_max"``, ``"td_error_max"`` ``[*S]``: over the batch;
     - ``"pre_tanh_magnitude"`` ``[*S]``: root mean square of the actor's output before tanh.
 
@@ -51,7 +51,7 @@ class DDPGLoss(StackedLoss, objectives.DDPGLoss):
         actor_network: policy; its ``batch_size``, if it has one, is taken as ``S``. It must write
             ``"pre_tanh_action"`` unless ``pre_tanh_penalty`` is 0.
         value_network: Q-function.
-        return_bounds: lowest and highest attainable return, or ``None`` for no clipping.
+        return_bounds: lowest and highest attainable return; ``None`` for no clipping.
         pre_tanh_penalty: weight of the penalty, 0 for none.
         constant_keys: entries of the networks' input that are constant within an episode: their
             next value is read from the root.
@@ -108,7 +108,7 @@ class DDPGLoss(StackedLoss, objectives.DDPGLoss):
         actor_network: TensorDictModuleBase,
         value_network: TensorDictModuleBase,
         *,
-        return_bounds: tuple[float, float] | None = (0.0, 1.1),
+        return_bounds: tuple[float, float] | None = None,
         pre_tanh_penalty: float = 0.01,
         constant_keys: Sequence[NestedKey] = (),
         loss_function: str = "l2",

@@ -44,7 +44,7 @@ class SACLoss(TwinCriticLoss, objectives.SACLoss):
         alpha_init: first temperature.
         target_entropy: of the policy, in nats over all action dimensions.
         entropy_in_target: whether the Q-functions count entropy to come.
-        return_bounds: lowest and highest attainable return, or ``None`` for no clipping.
+        return_bounds: lowest and highest attainable return; ``None`` for no clipping.
         constant_keys: as in `DDPGLoss`.
         loss_function: ``"l2"``, ``"l1"`` or ``"smooth_l1"``, of prediction and target.
         generator: of the samples, one a seed; ``None`` draws from torch's default generator.
@@ -73,7 +73,7 @@ class SACLoss(TwinCriticLoss, objectives.SACLoss):
         alpha_init: float = 0.1,
         target_entropy: float = -4.0,
         entropy_in_target: bool = True,
-        return_bounds: tuple[float, float] | None = (0.0, 1.1),
+        return_bounds: tuple[float, float] | None = None,
         constant_keys: Sequence[NestedKey] = (),
         loss_function: str = "l2",
         generator: torch.Generator | Sequence[torch.Generator] | None = None,

@@ -32,7 +32,7 @@ class StackedLoss(LossModule):
 
     Goes before TorchRL's loss among the bases of a class. A loss is a mean over the batch and a
     *sum* over the actor's leading ``batch_size``, so that the gradient of each seed is what it
-    would have alone. Bootstrapped targets are clipped to ``return_bounds``, the attainable returns.
+    would have alone. Bootstrapped targets are clipped to ``return_bounds``, if they are given.
     An entry that is constant within an episode need not be stored a second time under ``"next"``.
     Only ``"terminated"`` ends the bootstrap; a truncated episode goes on.
     """

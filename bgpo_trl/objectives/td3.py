@@ -42,7 +42,7 @@ class TD3Loss(TwinCriticLoss, objectives.TD3Loss):
         qvalue_network: both Q-functions, ``batch_size`` ``[*S, 2]``.
         policy_noise: standard deviation of the noise on the target action.
         noise_clip: largest such noise.
-        return_bounds: lowest and highest attainable return, or ``None`` for no clipping.
+        return_bounds: lowest and highest attainable return; ``None`` for no clipping.
         pre_tanh_penalty: weight of the penalty, 0 for none.
         constant_keys: as in `DDPGLoss`.
         loss_function: ``"l2"``, ``"l1"`` or ``"smooth_l1"``, of prediction and target.
@@ -79,7 +79,7 @@ class TD3Loss(TwinCriticLoss, objectives.TD3Loss):
         *,
         policy_noise: float = 0.2,
         noise_clip: float = 0.5,
-        return_bounds: tuple[float, float] | None = (0.0, 1.1),
+        return_bounds: tuple[float, float] | None = None,
         pre_tanh_penalty: float = 0.01,
         constant_keys: Sequence[NestedKey] = (),
         loss_function: str = "l2",

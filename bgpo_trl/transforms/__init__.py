@@ -4,11 +4,13 @@ from bgpo_trl.transforms.behavior_lookup import BehaviorLookup
 from bgpo_trl.transforms.behavior_matching import BehaviorMatchingReward
 from bgpo_trl.transforms.demonstration_source import DemonstrationSource, TaskSchedule
 from bgpo_trl.transforms.frame_encoder import FrameEncoder
+from bgpo_trl.transforms.group_lookup import GroupLookup
 
 __all__ = [
     "BehaviorLookup",
     "BehaviorMatchingReward",
     "DemonstrationSource",
     "FrameEncoder",
+    "GroupLookup",
     "TaskSchedule",
 ]

@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey
+from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 
-from bgpo_trl.modules.entries import lacking
 from bgpo_trl.modules.gwr import GWRB
-from bgpo_trl.transforms._episode import EpisodeTransform, ending, unbounded
+from bgpo_trl.transforms._episode import DemonstrationLookup, unbounded
 
 
-class BehaviorLookup(EpisodeTransform):
+class BehaviorLookup(DemonstrationLookup):
     """Infers the task of an episode with GWR-B: its behavior `b` (Alg. 1).
 
     1. At reset, `b = w_c`, the weights of the node that matches the demonstration best, and the
@@ -68,42 +68,21 @@ class BehaviorLookup(EpisodeTransform):
         out_keys: Sequence[NestedKey] = ("behavior", "behavior_node"),
         done_key: NestedKey = "done",
     ) -> None:
-        super().__init__(in_keys, out_keys, done_key)
-        self.gwr = gwr
-        self.learn = learn
+        super().__init__(gwr, learn=learn, in_keys=in_keys, out_keys=out_keys, done_key=done_key)
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Looks up the behaviors of the demonstrations of any TensorDict; learns nothing."""
-        embedding = tensordict.get(self.in_keys[0], None)
-        if embedding is None:
-            raise lacking("BehaviorLookup", tensordict, self.in_keys)
+    @property
+    def gwr(self) -> GWRB:
+        """The network."""
+        return self.network
+
+    def look_up(self, embedding: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns behavior and node for embeddings `[*B, 32]`."""
         match = self.gwr.lookup(embedding)
-        behavior_key, node_key = self.out_keys
-        return tensordict.set(behavior_key, match.embedding).set(node_key, match.node)
-
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
-        return self.forward(tensordict_reset)
-
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        for key in self.out_keys:
-            next_tensordict.set(key, tensordict[key])
-        if self.learn:
-            ended = ending(tensordict, next_tensordict, self.done_key)
-            if ended.any():
-                self.gwr.adapt(tensordict[self.in_keys[0]], mask=ended)
-        return next_tensordict
+        return match.embedding, match.node
 
     def _entries(self, observation_spec: Composite) -> dict[NestedKey, TensorSpec]:
-        demonstration = self._read_spec(observation_spec, self.in_keys[0], "DemonstrationSource")
-        if self.learn and observation_spec.shape != self.gwr.batch_size:
-            raise ValueError(
-                f"GWR-B was made for batch_size={tuple(self.gwr.batch_size)}, but the environment "
-                f"it is to learn from has {tuple(observation_spec.shape)}"
-            )
         behavior_key, node_key = self.out_keys
         return {
-            behavior_key: demonstration.clone(),
+            behavior_key: self._demonstration_spec(observation_spec).clone(),
             node_key: unbounded(observation_spec, dtype=torch.int64),
         }

@@ -20,8 +20,8 @@ class BehaviorMatchingReward(EpisodeTransform):
     1. At reset, the encoder of the LSTM autoencoder reads the first latent `z_0`, from a state of
        zeros.
     2. At every step it reads the next latent. Its state travels in the TensorDict, so that no
-       trajectory has to be kept: after the last one, `lae.embed(lae_h)` is `phi_g`, the embedding
-       of the generated trajectory.
+       trajectory has to be kept: after the last one, `lae_h` is `phi_g`, the embedding of the
+       generated trajectory.
     3. On the step with which the episode ends, by success or by time-out, the intrinsic reward is
        `exp(-||b - phi_g||)`; on all others it is 0.
     4. The reward becomes extrinsic + beta * intrinsic; the two are also kept by themselves.
@@ -34,8 +34,8 @@ class BehaviorMatchingReward(EpisodeTransform):
     `[*B, 1]`, and `reward` anew. Rewards keep the dtype of `reward`.
 
     Args:
-        lae: the autoencoder, with `step(z [..., 64], h [..., 32], c [..., 32]) -> (h, c)` and
-            `embed(h) -> phi [..., 32]`. No gradient is recorded.
+        lae: the autoencoder, with `step(z [..., 64], h [..., 32], c [..., 32]) -> (h, c)`. No
+            gradient is recorded.
         beta: weight of the intrinsic reward. With 0 it is still measured (the ablation without it).
         in_keys: names of latent, behavior and reward.
         out_keys: names for the two halves of the LSTM's state and the two parts of the reward.
@@ -65,6 +65,8 @@ class BehaviorMatchingReward(EpisodeTransform):
         >>> last["reward"].allclose(last["extrinsic_reward"] + 0.1 * last["intrinsic_reward"])
         True
     """
+
+    pays = True
 
     def __init__(
         self,
@@ -107,7 +109,7 @@ class BehaviorMatchingReward(EpisodeTransform):
     def _read(self, z: Tensor, h: Tensor, c: Tensor, into: TensorDictBase) -> Tensor:
         h, c = self.lae.step(z, h, c)
         into.set(self.out_keys[0], h).set(self.out_keys[1], c)
-        return self.lae.embed(h)
+        return h
 
     def _entries(self, observation_spec: Composite) -> dict[NestedKey, TensorSpec]:
         latent = self._read_spec(observation_spec, self.in_keys[0], "FrameEncoder")

@@ -10,7 +10,7 @@ from torchrl.envs import check_env_specs
 from benchmarks import ablation
 from bgpo_trl.algorithms.algorithm import observe
 from bgpo_trl.algorithms.bgpo import BGPO, labeled, self_organized, untold
-from bgpo_trl.demonstrations import DemonstrationBank
+from bgpo_trl.demonstration_bank import DemonstrationBank
 from bgpo_trl.modules.gwr import GWRB
 from bgpo_trl.seeding import generators
 from bgpo_trl.transforms import BehaviorLookup, TaskSchedule

@@ -3,8 +3,10 @@
 import copy
 import itertools
 import math
+import sys
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -194,6 +196,36 @@ def test_match_is_the_nearest_node_and_its_activity():
     assert match.activity.tolist() == pytest.approx([0.6065307, 0.7788008])  # exp(-.5), exp(-.25)
 
 
+def test_activity_decays_with_the_scaled_distance():
+    gwr = from_data([[0.0, 0.0], [3.0, 4.0]], activity_scale=2.0)
+    assert gwr.lookup(torch.tensor([3.0, 3.5])).activity.item() == pytest.approx(math.exp(-1))
+    assert gwr.adapt(torch.tensor([0.0, 0.25])).activity.item() == pytest.approx(math.exp(-0.5))
+
+
+@pytest.mark.parametrize("scale", [0.25, 4.0])  # powers of two: nothing is rounded otherwise
+def test_scaled_activity_is_that_of_scaled_inputs(scale):
+    scaled, plain = (
+        GWRB(3, batch_size=[2], init="data", activity_scale=s, **GROWING).double()
+        for s in (scale, 1.0)
+    )
+    inputs = drifting_inputs(500, 2, 3) * 0.5 / scale
+    for phi in inputs:
+        match, expected = scaled.adapt(phi), plain.adapt(scale * phi)
+        assert torch.equal(match.activity, expected.activity)
+        assert torch.equal(match.node, expected.node)
+        assert torch.equal(scale * match.embedding, expected.embedding)
+    for i in range(2):
+        graph, expected = scaled.graph(i), plain.graph(i)
+        torch.testing.assert_close(
+            graph._replace(weights=scale * graph.weights), expected, rtol=0, atol=0
+        )
+        assert graph.node[-1] > len(graph.node) > 5  # nodes were inserted, and some removed
+    unscaled = GWRB(3, batch_size=[2], init="data", **GROWING).double()
+    for phi in inputs:
+        unscaled.adapt(phi)
+    assert not torch.equal(unscaled.num_nodes, plain.num_nodes)  # the scale did matter
+
+
 def test_best_match_and_neighbor_learn_and_habituate():
     gwr = from_data([[0.0, 0.0], [1.0, 0.0]])
     match = gwr.adapt(torch.tensor([0.25, 0.5]))
@@ -343,6 +375,116 @@ def test_network_of_a_batch_is_what_its_seed_is_alone():
     assert len({int(n) for n in batch.num_nodes}) > 1
 
 
+# ---- what people bring along
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        lambda phi: phi.float(),
+        lambda phi: phi.numpy(),
+        lambda phi: phi.numpy().astype(np.float32),
+        lambda phi: phi.tolist(),
+        lambda phi: list(phi),
+        lambda phi: phi.numpy()[..., ::-1].copy()[..., ::-1],  # of negative strides
+        lambda phi: np.broadcast_to(phi.numpy(), phi.shape),  # read-only
+    ],
+    ids=["float32", "numpy", "numpy32", "lists", "list of tensors", "strides", "read-only"],
+)
+@pytest.mark.parametrize("batch_size", [(), 2])
+@pytest.mark.filterwarnings("error")
+def test_inputs_of_any_kind_are_the_same_inputs(kind, batch_size):
+    inputs = drifting_inputs(60, *torch.Size([2][: batch_size != ()]), 3)
+    one, other = (GWRB(3, batch_size=batch_size, init="data", **GROWING) for _ in range(2))
+    for phi in inputs:
+        assert_same_state(one.adapt(kind(phi)), other.adapt(phi))
+    assert_same_state(state_of(one), state_of(other))
+    assert one.num_nodes.min() > 2
+    many = inputs.movedim(0, -2)
+    assert_same_state(one.lookup(kind(many)), other.lookup(many))
+
+
+def test_integers_and_a_mask_of_any_kind_are_taken():
+    gwr = GWRB(2, batch_size=np.int64(2), init="data")
+    assert gwr.batch_size == (2,)
+    for mask in ([True, False], np.array([True, False])):
+        gwr.adapt([[1, 2], [3, 4]], mask)
+    assert gwr.num_nodes.tolist() == [2, 0]
+    assert gwr.graph(0).weights.tolist() == [[1.0, 2.0], [1.0, 2.0]]
+    alone = GWRB(np.int64(1))
+    assert alone.adapt(np.array([2], np.int32), mask=False).node == -1
+
+
+@pytest.mark.parametrize(
+    "wrong", [[[1, 2], [3]], object(), "ab", [["a", "b"], ["c", "d"]], np.ones((2, 2), complex)]
+)
+def test_what_is_no_input_is_refused_by_name(wrong):
+    gwr = GWRB(2, batch_size=2)
+    before = state_of(gwr)
+    for call in (gwr.lookup, gwr.adapt, lambda phi: gwr.adapt([[0, 0], [0, 0]], mask=phi)):
+        with pytest.raises(ValueError, match=r"^(phi|mask) must be") as raised:
+            call(wrong)
+        assert "\n" not in str(raised.value)
+    assert_same_state(state_of(gwr), before)
+
+
+def test_repr_tells_nodes_and_thresholds():
+    gwr = GWRB(2, batch_size=2, init="data", activity_threshold=0.7, activity_scale=3.0)
+    gwr.adapt([[0, 0], [0, 0]])
+    gwr.adapt([[0, 0], [1, 0]], [True, False])
+    assert repr(gwr) == (
+        "GWRB(2, batch_size=[2], num_nodes=1 to 2, activity_threshold=0.7, activity_scale=3.0, "
+        "habituation_threshold=0.15)"
+    )
+    assert "num_nodes=2, " in repr(GWRB(5, batch_size=[3]))
+
+
+# ---- the graph
+
+
+def test_edges_have_the_names_of_matches_and_the_positions_of_weights():
+    gwr = GWRB(2, generator=torch.Generator().manual_seed(0), **GROWING)
+    for phi in drifting_inputs(300, 2):
+        gwr.adapt(phi)
+    graph = gwr.graph()
+    assert graph.node.tolist() != list(range(len(graph.node)))  # some were removed
+    assert graph.edge_nodes.tolist() == [
+        [int(graph.node[a]), int(graph.node[b])] for a, b in graph.edges
+    ]
+    for node, weights in zip(graph.node, graph.weights, strict=True):
+        match = gwr.lookup(weights)
+        assert match.node == node
+        assert graph.edge_nodes.eq(match.node).any()  # no node is without an edge
+
+
+def test_networkx_names_nodes_as_matches_do():
+    gwr = GWRB(2, batch_size=[2], generator=torch.Generator().manual_seed(0), **GROWING)
+    for phi in drifting_inputs(300, 2, 2):
+        gwr.adapt(phi)
+    graph = gwr.graph(1)
+    copied = graph.to_networkx()
+    assert [*copied.nodes] == graph.node.tolist() != list(range(len(copied)))
+    ages = [copied.edges[edge]["age"] for edge in graph.edge_nodes.tolist()]
+    assert ages == graph.ages.tolist()
+    assert copied.number_of_edges() == len(ages)
+    weights = {node: w.tolist() for node, w in copied.nodes(data="weights")}
+    assert [*weights.values()] == graph.weights.tolist()
+    habituation = [h for _, h in copied.nodes(data="habituation")]
+    assert habituation == graph.habituation.tolist()
+    point = graph.weights[3]
+    match = gwr.lookup(torch.stack([point, point]))
+    assert weights[int(match.node[1])] == point.tolist()
+    copied.nodes[int(match.node[1])]["weights"][:] = 0  # is a copy
+    assert torch.equal(gwr.graph(1).weights, graph.weights)
+    assert len(GWRB(2, init="data").graph().to_networkx()) == 0
+
+
+def test_without_networkx_one_is_told_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "networkx", None)
+    with pytest.raises(ImportError, match=r"pip install 'bgpo_trl\[networkx\]'"):
+        GWRB(2).graph().to_networkx()
+
+
 # ---- refusals
 
 
@@ -382,6 +524,10 @@ def test_wrong_shapes_are_refused():
 @pytest.mark.parametrize(
     "wrong",
     [
+        {"activity_scale": 0.0},
+        {"activity_scale": -1.0},
+        {"activity_scale": math.nan},
+        {"activity_scale": math.inf},
         {"lr_best": 1.5},
         {"lr_neighbor": 0.2},
         {"lr_neighbor": -0.1},
@@ -394,13 +540,29 @@ def test_wrong_shapes_are_refused():
         {"max_nodes": 1},
         {"init": "zeros"},
         {"batch_size": [0]},
+        {"batch_size": 0},
+        {"batch_size": 2.5},
+        {"batch_size": "2"},
+        {"lr_best": "fast"},
+        {"max_age": None},
+        {"activity_threshold": torch.tensor(0.8)},
+        {"generator": 0},
         {"batch_size": [3], "generator": [torch.Generator()]},
     ],
 )
 def test_arguments_out_of_range_are_refused(wrong):
     name = next(reversed(wrong)) if "init" not in wrong else "init"
-    with pytest.raises(ValueError, match=name):
+    with pytest.raises(ValueError, match=name) as raised:
         GWRB(4, **wrong)
+    assert "\n" not in str(raised.value)
+    others = {"tau_best", "tau_neighbor", "max_age", "max_nodes"} - {name}
+    assert not any(other in str(raised.value) for other in others)
+
+
+@pytest.mark.parametrize("wrong", [0, 2.5, "2", None, [2]])
+def test_a_number_of_features_is_a_whole_number(wrong):
+    with pytest.raises(ValueError, match="n_features"):
+        GWRB(wrong)
 
 
 # ---- state
@@ -459,8 +621,9 @@ def test_graph_is_indexed_like_the_batch():
     assert ages == [[0, 0, 0], [0, 0, 1]]
     assert gwr.graph((-1, -1)).ages.item() == 1
     assert gwr.num_nodes.tolist() == [[2] * 3] * 2
-    with pytest.raises(IndexError):
-        gwr.graph((2, 0))
+    for wrong in ((2, 0), (), 1, (0, slice(2)), (0, 0, 0), 0.5):
+        with pytest.raises(IndexError, match=r"^index must name one network"):
+            gwr.graph(wrong)
 
 
 def test_removed_nodes_cost_no_memory():

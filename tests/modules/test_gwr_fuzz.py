@@ -27,6 +27,7 @@ def rules(draw):
     tau = st.floats(0.05, 50)
     return {
         "activity_threshold": draw(st.floats(0, 1)),
+        "activity_scale": draw(st.floats(1e-3, 1e3)),
         "habituation_threshold": draw(st.floats(0, 2)),
         "lr_best": best,
         "lr_neighbor": draw(st.floats(0, best)),

@@ -99,6 +99,15 @@ def test_target_and_value_loss_by_hand(bounds):
     assert result["pred_value_max"].item() == pytest.approx(0.2)
 
 
+def test_rewards_of_any_range_are_learned_by_default():
+    loss = make_loss()
+    constant_critic(loss, online=0.0, target=-100.0)
+    batch, _ = transitions()
+    batch["next", "reward"].fill_(-16.0)  # as Pendulum's may be
+    target = torch.where(batch["next", "terminated"], -16.0, -16.0 - 0.98 * 100).squeeze(-1)
+    torch.testing.assert_close(loss(batch)["target_value"], target)
+
+
 def test_gamma_is_set_by_the_value_estimator():
     loss = make_loss()
     constant_critic(loss, online=0.0, target=0.5)
@@ -175,7 +184,7 @@ class PlainDDPG:
 
 
 def test_trains_as_a_plain_ddpg_does():
-    loss = make_loss(torch.Generator().manual_seed(1))
+    loss = make_loss(torch.Generator().manual_seed(1), return_bounds=(0.0, 1.1))
     update = ForeachSoftUpdate(loss, tau=0.005)
     plain = PlainDDPG(loss)
     optimizer = torch.optim.Adam(list(loss.parameters()), lr=1e-3)
@@ -287,7 +296,7 @@ def test_targets_stay_attainable_on_data_that_makes_them_diverge():
         return largest
 
     assert largest_target(**UNBOUNDED) > 10
-    assert largest_target() <= torch.tensor(1.1)
+    assert largest_target(return_bounds=(0.0, 1.1)) <= torch.tensor(1.1)
 
 
 def test_learns_a_point_task():

@@ -102,6 +102,16 @@ def test_the_smaller_target_value_is_believed_within_bounds(name, target_values,
     torch.testing.assert_close(result["td_error_max"], torch.maximum(*squares).max())
 
 
+@both
+def test_rewards_of_any_range_are_learned_by_default(name):
+    loss = make_loss(name, **({"entropy_in_target": False} if name == "sac" else {}))
+    constant_critics(loss, (0.0, 0.0), (-100.0, -90.0))
+    batch, _ = transitions()
+    batch["next", "reward"].fill_(-16.0)
+    target = torch.where(batch["next", "terminated"], -16.0, -16.0 - 0.98 * 100).squeeze(-1)
+    torch.testing.assert_close(loss(batch)["target_value"], target)
+
+
 def tanh_normal(loc: Tensor, scale: Tensor):
     normal = torch.distributions.Normal(loc, scale)
     squash = torch.distributions.TanhTransform(cache_size=1)

@@ -4,7 +4,14 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.collectors import Collector
-from torchrl.envs import Compose, RenameTransform, StepCounter, TransformedEnv, check_env_specs
+from torchrl.envs import (
+    Compose,
+    RenameTransform,
+    SerialEnv,
+    StepCounter,
+    TransformedEnv,
+    check_env_specs,
+)
 
 from bgpo_trl.transforms import BehaviorLookup, DemonstrationSource, TaskSchedule
 
@@ -134,3 +141,33 @@ def test_refuses_what_cannot_work(MockEnv, make_bank, make_modules):
         source = DemonstrationSource(make_bank(), TaskSchedule((0, 0, 0)), batch_size=[2])
         lookup = BehaviorLookup(gwr, learn=True)
         TransformedEnv(MockEnv([0, 1]), Compose(source, lookup, StepCounter(5))).reset()
+
+
+def test_learns_only_where_episodes_end(MockEnv, make_bank, make_modules):
+    def make(*transforms, learn=True, base=None):
+        source = DemonstrationSource(make_bank(), TaskSchedule((0, 0, 0)))
+        lookup = BehaviorLookup(make_modules()[2], learn=learn)
+        env = TransformedEnv(
+            base or MockEnv(), Compose(*transforms, source, lookup), auto_unwrap=False
+        )
+        return env, lookup
+
+    refusal = r"learns when episodes end: put StepCounter\(50\) before it"
+    with pytest.raises(ValueError, match=refusal):
+        make()[0].reset()
+    env, lookup = make(learn=False)
+    env.reset()
+    lookup.learn = True
+    with pytest.raises(ValueError, match=refusal):
+        env.reset()
+
+    make(StepCounter())[0].reset()  # the environment has a limit of its own
+    make(StepCounter(50, step_count_key="time"))[0].reset()
+    make(base=TransformedEnv(MockEnv(), StepCounter(50)))[0].reset()
+
+
+def test_a_time_limit_within_workers_will_do(MockEnv, make_bank, make_modules):
+    base = SerialEnv(2, lambda: TransformedEnv(MockEnv(), StepCounter(50)))
+    source = DemonstrationSource(make_bank(), TaskSchedule((0, 0, 0)), batch_size=[2])
+    lookup = BehaviorLookup(make_modules([0, 1])[2], learn=True)
+    assert "behavior" in TransformedEnv(base, Compose(source, lookup)).reset()

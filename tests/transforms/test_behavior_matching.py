@@ -3,8 +3,16 @@
 import pytest
 import torch
 from torchrl.data import Unbounded
-from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv, check_env_specs
+from torchrl.envs import (
+    Compose,
+    RenameTransform,
+    RewardSum,
+    StepCounter,
+    TransformedEnv,
+    check_env_specs,
+)
 
+from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.transforms import BehaviorMatchingReward, FrameEncoder
 
 
@@ -130,3 +138,26 @@ def test_refuses_what_cannot_work(MockEnv, make_env, make_modules):
     env.append_transform(StepCounter(3, step_count_key="later"))
     with pytest.raises(ValueError, match="put StepCounter before"):
         env.reset()
+
+
+def test_refuses_to_come_after_the_sum_of_rewards(MockEnv, make_modules):
+    vae = make_modules()[0]
+
+    def reset(*transforms):
+        env = TransformedEnv(MockEnv(), FrameEncoder(vae))
+        for transform in transforms:  # each around the one before
+            env = TransformedEnv(env, transform, auto_unwrap=False)
+        env.reset()
+
+    def behavior():  # the latent itself: all that matters here is the order
+        return RenameTransform(["latent"], ["behavior"], create_copy=True)
+
+    def bonus():
+        return BehaviorMatchingReward(SequenceAutoencoder(embedding_size=64))
+
+    refusal = "put RewardSum after BehaviorMatchingReward"
+    with pytest.raises(ValueError, match=refusal):
+        reset(behavior(), Compose(RewardSum(), bonus()))
+    with pytest.raises(ValueError, match=refusal):
+        reset(Compose(behavior(), RewardSum()), bonus())
+    reset(behavior(), Compose(bonus(), RewardSum()))

@@ -1,0 +1,183 @@
+"""Groups of behaviors, found without labels by a second, coarser GWR-B over the same embeddings."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorClass
+from torch import Tensor, nn
+
+from bgpo_trl.modules.gwr import GWRB
+
+_NEVER = 2**62  # edges of this age do not occur: groups that are not met again are kept
+
+
+class GroupMatch(TensorClass["tensor_only"]):
+    """The group of each input.
+
+    Attributes:
+        group: number of the group within its network, int64 `[*batch]`. Groups count up from 0 in
+            order of appearance; none is removed or renumbered.
+        activity: activity of the best-matching node in [0, 1], `[*batch]`; 0 where nothing is known
+            yet. Below the activity threshold the input is of no known group.
+    """
+
+    group: Tensor
+    activity: Tensor
+
+
+class BehaviorGroups(nn.Module):
+    """Groups of similar behaviors, or a batch of independent sets of groups.
+
+    A GWR-B with a low activity threshold makes few nodes: one where an input is far from all that
+    came before. Each node belongs to a group:
+
+    1. A node whose input was new (activity below the threshold) opens a group, of which the group
+       of its best match is the parent. It starts half-way between the two and is drawn towards
+       the inputs that it matches.
+    2. Any other node, such as the second of a network that starts with two similar inputs, belongs
+       to the group of its best match.
+
+    Nodes are never removed (edges do not age out), so that a group is still known when its task
+    has not been shown for long. The network starts empty; until the first input all is group 0.
+
+    Args:
+        n_features: size d of an input.
+        batch_size: shape of the batch (the seeds); `()` is a single set of groups.
+        activity_threshold: a_T of the coarse GWR-B, below which an input is new.
+        activity_scale: factor of distances, as in `GWRB`.
+        max_groups: at this many groups a new node joins the group of its best match. None: no
+            limit.
+
+    Examples:
+        >>> groups = BehaviorGroups(1, activity_threshold=0.5)
+        >>> for x in [0.0, 0.1] * 6 + [3.0] * 2:
+        ...     match = groups.adapt(torch.tensor([x]))
+        >>> groups.num_groups, groups.lookup(torch.tensor([[0.2], [2.9]])).group
+        (tensor(2), tensor([0, 1]))
+    """
+
+    def __init__(
+        self,
+        n_features: int,
+        *,
+        batch_size: Sequence[int] = (),
+        activity_threshold: float = 0.55,
+        activity_scale: float = 1.0,
+        max_groups: int | None = None,
+    ) -> None:
+        super().__init__()
+        if max_groups is not None and max_groups < 1:
+            raise ValueError(f"max_groups must be at least 1, or None; got {max_groups}")
+        self.gwr = GWRB(
+            n_features,
+            batch_size=batch_size,
+            activity_threshold=activity_threshold,
+            activity_scale=activity_scale,
+            max_age=_NEVER,
+            init="data",
+        )
+        self.activity_threshold = activity_threshold
+        self.max_groups = max_groups
+        # By network: the group of each node, and the parent of each group.
+        n_networks = self.batch_size.numel()
+        self._group: list[list[int]] = [[] for _ in range(n_networks)]
+        self._parent: list[list[int]] = [[0] for _ in range(n_networks)]
+
+    @property
+    def batch_size(self) -> torch.Size:
+        """Shape of the batch of networks."""
+        return self.gwr.batch_size
+
+    @property
+    def num_groups(self) -> Tensor:
+        """Number of groups of each network, at least 1, int64 `[*batch_size]`."""
+        return torch.tensor([len(parent) for parent in self._parent]).view(self.batch_size)
+
+    def parent(self, network: int, group: int) -> int:
+        """Returns the group that another one parted from; 0 for the first.
+
+        Args:
+            network: position in the flattened batch.
+            group: number of the group.
+        """
+        return self._parent[network][group]
+
+    def forward(self, phi: Tensor) -> GroupMatch:
+        """The same as `lookup`."""
+        return self.lookup(phi)
+
+    def lookup(self, phi: Tensor) -> GroupMatch:
+        """Finds the group of each input; changes nothing.
+
+        Args:
+            phi: `[*batch_size, *extra, d]`.
+
+        Returns:
+            Matches `[*batch_size, *extra]`.
+
+        Raises:
+            ValueError: if phi has the wrong shape or holds NaN or Inf.
+        """
+        match = self.gwr.lookup(phi, mask=self.gwr.num_nodes > 0)
+        n_networks = self.batch_size.numel()
+        node = match.node.reshape(n_networks, -1)
+        group = torch.zeros_like(node)
+        for row, nodes, known in zip(group, node, self._group, strict=True):
+            if known:
+                row.copy_(torch.tensor(known)[nodes])
+        return GroupMatch(
+            group=group.view(match.node.shape),
+            activity=match.activity.nan_to_num(0.0),
+            batch_size=match.batch_size,
+        )
+
+    def adapt(self, phi: Tensor, mask: Tensor | None = None) -> GroupMatch:
+        """Finds the group of one input for each network, and learns from it.
+
+        Args:
+            phi: `[*batch_size, d]`.
+            mask: bool `[*batch_size]`, the networks that take part. None: all.
+
+        Returns:
+            Matches `[*batch_size]` from before learning; -1 and NaN where `mask` is False.
+
+        Raises:
+            ValueError: as `GWRB.adapt`.
+        """
+        before = self.gwr.num_nodes
+        match = self.gwr.adapt(phi, mask)
+        grown = (self.gwr.num_nodes > before).flatten().tolist()
+        nodes, activity = match.node.flatten().tolist(), match.activity.flatten().tolist()
+        found = []
+        for i, (node, grew) in enumerate(zip(nodes, grown, strict=True)):
+            of_node, parent = self._group[i], self._parent[i]
+            group = -1 if node < 0 else of_node[node] if of_node else 0
+            found.append(group)
+            if not grew:
+                continue
+            full = self.max_groups is not None and len(parent) >= self.max_groups
+            if of_node and activity[i] < self.activity_threshold and not full:
+                of_node.append(len(parent))
+                parent.append(group)
+            else:
+                of_node.append(group)
+        return GroupMatch(
+            group=torch.tensor(found).view(self.batch_size),
+            activity=match.activity,
+            batch_size=self.batch_size,
+        )
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Returns what `state_dict` carries beside the coarse GWR-B's own."""
+        return {
+            "group": [list(group) for group in self._group],
+            "parent": [list(parent) for parent in self._parent],
+        }
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Continues from what `get_extra_state` returned."""
+        self._group = [list(group) for group in state["group"]]
+        self._parent = [list(parent) for parent in state["parent"]]

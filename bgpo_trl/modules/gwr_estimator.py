@@ -1,0 +1,146 @@
+"""GWR-B as an estimator of scikit-learn, which comes with the extra `sklearn`."""
+
+from __future__ import annotations
+
+from typing import Any, Self
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from bgpo_trl.modules.gwr import GWRB
+from bgpo_trl.modules.gwr_tensors import checked
+
+try:
+    from sklearn.base import BaseEstimator, ClusterMixin, OneToOneFeatureMixin, TransformerMixin
+    from sklearn.utils import Tags
+    from sklearn.utils.validation import check_is_fitted, validate_data
+except ImportError:
+    raise ImportError("the estimator is scikit-learn's: pip install 'bgpo_trl[sklearn]'") from None
+
+
+class GWRBEstimator(OneToOneFeatureMixin, TransformerMixin, ClusterMixin, BaseEstimator):
+    """A GWR-B network that learns the rows of a table, once and in their order.
+
+    It starts from the first two rows and computes in float64. The arguments are those of `GWRB`.
+    As nodes are created, a row belongs to the nearest: `predict` gives its identity, `transform`
+    its weights. Identities have gaps where nodes were removed or are nearest to no row.
+
+    scikit-learn's `check_estimator` passes; with constants that make nodes come and go quickly its
+    `check_clustering`, which asks for labels without gaps, does not.
+
+    Attributes:
+        gwr_: the network; its `graph()` has the nodes and their edges.
+        labels_: identities of the nodes nearest to the rows learned last, int64 `[n]`.
+        n_features_in_: number d of columns.
+        feature_names_in_: their names, if X had some.
+
+    Examples:
+        >>> from bgpo_trl.modules.gwr_estimator import GWRBEstimator
+        >>> model = GWRBEstimator(activity_scale=4).fit([[0.0, 0.0], [1.0, 1.0]])
+        >>> model.partial_fit([[0.1, 0.0]]).predict([[0.0, 0.2], [0.9, 1.0]])
+        array([0, 1])
+        >>> model.transform([[0.0, 0.2]]).round(2)
+        array([[0.01, 0.  ]])
+    """
+
+    def __init__(
+        self,
+        *,
+        activity_threshold: float = 0.8,
+        activity_scale: float = 1.0,
+        habituation_threshold: float = 0.15,
+        lr_best: float = 0.1,
+        lr_neighbor: float = 0.01,
+        initial_habituation: float = 1.0,
+        alpha_best: float = 1.05,
+        alpha_neighbor: float = 1.05,
+        tau_best: float = 3.3,
+        tau_neighbor: float = 14.3,
+        max_age: int = 80,
+        max_nodes: int | None = None,
+    ) -> None:
+        # scikit-learn reads the names from this signature, and wants values as they were given.
+        self.activity_threshold = activity_threshold
+        self.activity_scale = activity_scale
+        self.habituation_threshold = habituation_threshold
+        self.lr_best = lr_best
+        self.lr_neighbor = lr_neighbor
+        self.initial_habituation = initial_habituation
+        self.alpha_best = alpha_best
+        self.alpha_neighbor = alpha_neighbor
+        self.tau_best = tau_best
+        self.tau_neighbor = tau_neighbor
+        self.max_age = max_age
+        self.max_nodes = max_nodes
+
+    def fit(self, X: npt.ArrayLike, y: object = None) -> Self:
+        """Starts a new network and learns the rows.
+
+        Args:
+            X: numbers `[n, d]`.
+            y: ignored.
+
+        Raises:
+            ValueError: if an argument of the estimator is out of range, or X holds NaN or Inf.
+        """
+        rows = _to_tensor(self._validated(X))
+        gwr = GWRB(rows.shape[1], init="data", **self.get_params(deep=False))
+        return self._learn(gwr.double(), rows)
+
+    def partial_fit(self, X: npt.ArrayLike, y: object = None) -> Self:
+        """Learns further rows; the first call is the same as `fit`.
+
+        Args:
+            X: numbers `[n, d]`.
+            y: ignored.
+
+        Raises:
+            ValueError: as `fit`, and if d has changed; nothing is learned then.
+        """
+        if not hasattr(self, "gwr_"):
+            return self.fit(X)
+        return self._learn(self.gwr_, _to_tensor(self._validated(X, reset=False)))
+
+    def predict(self, X: npt.ArrayLike) -> np.ndarray:
+        """Returns the identity of the node nearest to each row, int64 `[n]`; learns nothing.
+
+        Args:
+            X: numbers `[n, d]`.
+        """
+        rows = self._rows(X)
+        return self.gwr_.lookup(rows).node.numpy()
+
+    def transform(self, X: npt.ArrayLike) -> np.ndarray:
+        """Returns the weights of the node nearest to each row, `[n, d]`; learns nothing.
+
+        Args:
+            X: numbers `[n, d]`; the result is float32 if they are, else float64.
+        """
+        rows = self._rows(X)
+        return self.gwr_.lookup(rows).embedding.numpy().astype(rows.dtype)
+
+    def _rows(self, X: npt.ArrayLike) -> np.ndarray:
+        check_is_fitted(self, "gwr_")
+        return self._validated(X, reset=False, dtype=[np.float64, np.float32])
+
+    def _validated(self, X: Any, **how: Any) -> np.ndarray:  # scikit-learn declares no types
+        return np.asarray(validate_data(self, X, **how))
+
+    def _learn(self, gwr: GWRB, rows: torch.Tensor) -> Self:
+        for row in rows:
+            gwr.adapt(row)
+        self.gwr_ = gwr
+        self.labels_ = gwr.lookup(rows).node.numpy()
+        return self
+
+    def __sklearn_tags__(self) -> Tags:
+        tags = super().__sklearn_tags__()
+        tags.transformer_tags.preserves_dtype = ["float64", "float32"]
+        return tags
+
+
+def _to_tensor(X: npt.ArrayLike) -> torch.Tensor:
+    """Returns all rows, refused together before any of them is learned."""
+    rows = torch.from_numpy(np.array(X, np.float64))
+    return checked(rows, rows, "X")

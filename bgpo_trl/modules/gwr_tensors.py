@@ -1,0 +1,103 @@
+"""What GWR-B is given, as tensors, and how far it is from the nodes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from numbers import Integral
+from reprlib import repr as short_repr
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+Numbers: TypeAlias = Tensor | npt.ArrayLike
+
+
+def as_shape(value: int | Sequence[int], name: str) -> torch.Size:
+    """Returns the argument called `name`, a size or several, as a shape.
+
+    Raises:
+        ValueError: if a size is no whole number of at least 1.
+    """
+    sizes = list(value) if isinstance(value, Sequence) else [value]
+    if not all(isinstance(size, Integral) and size >= 1 for size in sizes):
+        got = ", ".join(map(repr, sizes))
+        raise ValueError(f"{name} must be a whole number, at least 1; got {got}")
+    return torch.Size(sizes)
+
+
+def as_generators(
+    value: torch.Generator | Sequence[torch.Generator] | None, count: int
+) -> Sequence[torch.Generator | None]:
+    """Returns the argument called `generator` as one for each of `count` networks.
+
+    Raises:
+        ValueError: if it is not one, or not so many.
+    """
+    generators = value if isinstance(value, Sequence) else [value] * count
+    if len(generators) != count or not all(
+        generator is None or isinstance(generator, torch.Generator) for generator in generators
+    ):
+        raise ValueError(
+            f"generator must be a torch.Generator, or a sequence of {count}, one a network"
+        )
+    return generators
+
+
+def as_tensor(value: Numbers, name: str) -> Tensor:
+    """Returns the argument called `name` as a tensor, in its own type.
+
+    Raises:
+        ValueError: if it does not consist of numbers.
+    """
+    if isinstance(value, Tensor):
+        return value
+    try:
+        # Copied, as torch takes neither negative strides nor read-only memory.
+        return torch.from_numpy(np.array(value))
+    except (TypeError, ValueError, RuntimeError):
+        raise ValueError(
+            f"{name} must be a tensor, an array, or lists of equal lengths, of numbers; "
+            f"got {short_repr(value)}"
+        ) from None
+
+
+def as_mask(value: Numbers, shape: torch.Size) -> Tensor:
+    """Returns the argument called `mask` as a tensor.
+
+    Raises:
+        ValueError: if it is not bool, or of another shape.
+    """
+    mask = as_tensor(value, "mask")
+    if mask.shape != shape or mask.dtype != torch.bool:
+        raise ValueError(f"mask must be bool {[*shape]}; got {mask.dtype} {[*mask.shape]}")
+    return mask
+
+
+def checked(phi: Tensor, weights: Tensor, name: str = "phi") -> Tensor:
+    """Returns the argument called `name` in the type and on the device of the weights.
+
+    Raises:
+        ValueError: if it cannot be matched.
+    """
+    if phi.is_complex():
+        raise ValueError(f"{name} must be real numbers; got complex ones")
+    phi = phi.detach().to(weights)
+    # Farther out a squared distance could overflow, and every node would be equally near.
+    limit = torch.finfo(phi.dtype).max ** 0.5 / 2
+    if not torch.linalg.vector_norm(phi).item() <= limit:
+        raise ValueError(f"{name} must be free of NaN, Inf and values beyond +-{limit:.0e}")
+    return phi
+
+
+def pairwise_distances(phi: Tensor, weights: Tensor) -> Tensor:
+    """Distances `[A, M, N]` of inputs `[A, M, d]` to nodes `[A, N, d]`."""
+    # By matrix product, the default of cdist, distances near 0 would be off by 1e-3.
+    return torch.cdist(phi, weights, compute_mode="donot_use_mm_for_euclid_dist")
+
+
+def to_tensor(numbers: list[Any], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """The same as `torch.tensor`, by way of numpy, which reads a list four times as fast."""
+    return torch.as_tensor(np.array(numbers), dtype=dtype, device=device)

@@ -1,0 +1,79 @@
+"""The group of behaviors that a demonstration belongs to."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import NestedKey
+from torch import Tensor
+from torchrl.data import Composite, TensorSpec
+
+from bgpo_trl.modules.behavior_groups import BehaviorGroups
+from bgpo_trl.transforms._episode import DemonstrationLookup, unbounded
+
+
+class GroupLookup(DemonstrationLookup):
+    """Finds the group of an episode's demonstration, by which experts and replay are chosen.
+
+    1. At reset, the number of the group, and the activity of the best match; below the activity
+       threshold of the groups, the demonstration is of none that is known. Both stay the same until
+       the episode is over.
+    2. When it is over (`done`), and with `learn=True`, the groups adapt to its demonstration, for
+       the reason that `BehaviorLookup` gives.
+
+    Reads `demo_embedding` float32 `[*B, 32]` and `done`; writes `group` int64 `[*B]` and
+    `group_activity` float32 `[*B]`. Called on its own, it only looks up.
+
+    Args:
+        groups: the groups, or a set of them for each row: its `batch_size` is that of the
+            environment, or (if it does not learn here) the first dimensions of it.
+        learn: adapt the groups; see `DemonstrationLookup`.
+        in_keys: name of the demonstration's embedding.
+        out_keys: names for group and activity.
+        done_key: the `done` that ends an episode.
+
+    Raises:
+        ValueError: if the groups are to learn from an environment of another batch size, or no
+            demonstration is there to be looked up.
+
+    Examples:
+        >>> from types import SimpleNamespace
+        >>> from torchrl.envs import Compose, PendulumEnv, StepCounter, TransformedEnv
+        >>> from bgpo_trl.transforms import DemonstrationSource, TaskSchedule
+        >>> bank = SimpleNamespace(embedding=torch.rand(6, 32), task=torch.arange(6) % 3)
+        >>> source = DemonstrationSource(bank, TaskSchedule())
+        >>> lookup = GroupLookup(BehaviorGroups(32), learn=True)
+        >>> env = TransformedEnv(PendulumEnv(), Compose(StepCounter(50), source, lookup))
+        >>> env.rollout(50)["group"].unique()
+        tensor([0])
+    """
+
+    def __init__(
+        self,
+        groups: BehaviorGroups,
+        *,
+        learn: bool,
+        in_keys: Sequence[NestedKey] = ("demo_embedding",),
+        out_keys: Sequence[NestedKey] = ("group", "group_activity"),
+        done_key: NestedKey = "done",
+    ) -> None:
+        super().__init__(groups, learn=learn, in_keys=in_keys, out_keys=out_keys, done_key=done_key)
+
+    @property
+    def groups(self) -> BehaviorGroups:
+        """The groups."""
+        return self.network
+
+    def look_up(self, embedding: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns group and activity for embeddings `[*B, 32]`."""
+        match = self.groups.lookup(embedding)
+        return match.group, match.activity
+
+    def _entries(self, observation_spec: Composite) -> dict[NestedKey, TensorSpec]:
+        demonstration = self._demonstration_spec(observation_spec)
+        group_key, activity_key = self.out_keys
+        return {
+            group_key: unbounded(observation_spec, dtype=torch.int64),
+            activity_key: unbounded(observation_spec, dtype=demonstration.dtype),
+        }
