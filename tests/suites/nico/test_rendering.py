@@ -5,6 +5,7 @@ import os
 import platform
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -156,6 +157,78 @@ def test_the_end_of_a_renderer_leaves_frames_of_others_alone(physics, renderer, 
     np.testing.assert_array_equal(renderer.render(physics.data.ptr), before)
     FrameRenderer(physics.model.ptr).close()  # Frees what was dropped.
     np.testing.assert_array_equal(renderer.render(physics.data.ptr), before)
+
+
+@pytest.mark.parametrize("ended", [False, True], ids=["living thread", "dead thread"])
+@pytest.mark.parametrize("abandoned", [False, True], ids=["in use", "abandoned"])
+def test_a_renderer_of_one_thread_is_no_obstacle_in_another(physics, renderer, ended, abandoned):
+    before = renderer.render(physics.data.ptr)
+    with ThreadPoolExecutor(1) as pool:
+        elsewhere = pool.submit(FrameRenderer, physics.model.ptr).result()
+        pool.submit(elsewhere.render, physics.data.ptr).result()
+        if ended:
+            pool.shutdown()
+        if abandoned:
+            del elsewhere
+        here = FrameRenderer(physics.model.ptr)
+        np.testing.assert_array_equal(here.render(physics.data.ptr), before)
+        if not abandoned:
+            np.testing.assert_array_equal(elsewhere.render(physics.data.ptr), before)
+            elsewhere.close()
+        here.close()
+    np.testing.assert_array_equal(renderer.render(physics.data.ptr), before)
+
+
+def test_threads_may_draw_at_the_same_time_with_one_renderer_or_their_own(physics, renderer):
+    before = renderer.render(physics.data.ptr)
+
+    def draw(number: int) -> bool:
+        own = renderer if number % 2 else FrameRenderer(physics.model.ptr)
+        return all((own.render(physics.data.ptr) == before).all() for _ in range(20))
+
+    with ThreadPoolExecutor(4) as pool:
+        assert all(pool.map(draw, range(8)))
+
+
+def test_what_draws_has_a_name_in_any_thread(renderer):
+    with ThreadPoolExecutor(1) as pool:
+        assert pool.submit(renderer.driver).result() == renderer.driver() != "unknown"
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        """
+import threading, time
+def draw(kept):
+    env = nico.load("grasp_glass", seed=0)
+    for _ in range(3):
+        env.reset()
+    kept.append(env)
+def draw_on(physics):
+    renderer = nico.rendering.FrameRenderer(physics.model.ptr)
+    while True:
+        renderer.render(physics.data.ptr)
+kept = []
+thread = threading.Thread(target=draw, args=(kept,))
+thread.start()
+thread.join()
+threading.Thread(target=draw_on, args=(kept[0].physics,), daemon=True).start()
+time.sleep(0.5)
+""",
+        """
+stock = nico.load("grasp_glass", seed=0, observation="state")
+stock.physics.render(32, 64)
+env = nico.load("grasp_glass", seed=0)
+env.reset()
+""",
+    ],
+    ids=["threads", "dm_control renders, too"],
+)
+def test_a_process_with_renderers_ends_without_a_word(code):
+    process = run_python("from suites import nico\n" + code)
+
+    assert (process.stdout, process.stderr, process.returncode) == ("", "", 0)
 
 
 def test_a_renderer_can_be_closed_twice(physics):
