@@ -8,10 +8,11 @@ from suites import opengl  # isort: skip (before MuJoCo, which reads once what t
 import atexit
 import contextlib
 import functools
+import operator
 import os
 import threading
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import mujoco
 import numpy as np
@@ -26,6 +27,21 @@ _turn = threading.RLock()
 _all: weakref.WeakSet[mujoco.Renderer] = weakref.WeakSet()
 # What the garbage collector would free at any moment, between the calls that draw another frame.
 _abandoned: list[mujoco.Renderer] = []
+
+
+def check_frame_size(model: mujoco.MjModel, frame_size: Sequence[int]) -> None:
+    """Raises ValueError if a scene has no frames of that height and width (pixels)."""
+    limits = (model.vis.global_.offheight, model.vis.global_.offwidth)
+    try:
+        height, width = map(operator.index, frame_size)
+        possible = 1 <= height <= limits[0] and 1 <= width <= limits[1]
+    except (TypeError, ValueError):
+        possible = False
+    if not possible:
+        raise ValueError(
+            f"frame_size is {frame_size}, but must be a height in 1..{limits[0]} and a width in "
+            f"1..{limits[1]} (pixels)"
+        )
 
 
 @functools.cache
@@ -87,6 +103,9 @@ class FrameRenderer:
     a camera each call, which costs several times the frame itself. Any thread may use it, or close
     it; frames of all renderers are drawn one after the other.
 
+    The robot's own camera shows as much from left to right in narrower frames as in the paper's,
+    and more above and below.
+
     Args:
         model: The compiled scene. Data of every other compilation of the same XML may be rendered.
         camera: Name of the camera.
@@ -95,7 +114,7 @@ class FrameRenderer:
 
     Raises:
         RuntimeError: If no OpenGL context can be made; the message names the packages to install.
-        ValueError: If the scene has no such camera.
+        ValueError: If the scene has no such camera, or no frames of that size.
     """
 
     def __init__(
@@ -110,6 +129,8 @@ class FrameRenderer:
         if camera_id < 0:
             names = [model.camera(i).name for i in range(model.ncam)]
             raise ValueError(f"no camera {camera!r} in the scene; choose one of {names}")
+        self.frame_size = (height, width)
+        check_frame_size(model, self.frame_size)
         if opengl.refusal:
             raise RuntimeError(opengl.refusal)
         try:
@@ -132,6 +153,8 @@ class FrameRenderer:
         self._camera = mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
         self._camera.fixedcamid = camera_id
+        paper = FRAME_WIDTH / FRAME_HEIGHT
+        self._taller = max(1.0, paper * height / width) if camera == FRAME_CAMERA else 1.0
         weakref.finalize(self, _abandoned.append, self._renderer).atexit = False
 
     def render(self, data: mujoco.MjData, out: np.ndarray | None = None) -> np.ndarray:
@@ -146,6 +169,10 @@ class FrameRenderer:
         """
         with _turn:
             self._renderer.update_scene(data, self._camera)
+            if self._taller > 1.0:
+                for camera in self._renderer.scene.camera:
+                    camera.frustum_bottom *= self._taller
+                    camera.frustum_top *= self._taller
             try:
                 return self._renderer.render(out=out)
             finally:
