@@ -216,8 +216,12 @@ def _perform(
         actions.append(policy(timestep))
         timestep = env.step(actions[-1])
         observations.append(timestep.observation)
-    episode = {key: np.stack([o[key] for o in observations]) for key in observations[0]}
-    return {**episode, "action": np.stack(actions)}, float(timestep.reward)
+    episode = {
+        "pixels": np.stack([o["pixels"] for o in observations]),
+        "state": np.stack([o["privileged_state"] for o in observations]),
+        "action": np.stack(actions),
+    }
+    return episode, float(timestep.reward)
 
 
 def _write_meta(path: Path, meta: dict) -> None:
