@@ -281,7 +281,11 @@ class BGPOConfig(AlgorithmConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         _at_least(self, 0, "beta")
-        _at_least(self, 1, "active_groups")
+        most = self.rl.batch_size
+        _check(
+            self,
+            ("active_groups", 1 <= self.active_groups <= most, f"from 1 to batch_size, {most}"),
+        )
         holds = self.even_replay or not self.experts
         _check(self, ("even_replay", holds, "set where there are experts"))
 
