@@ -37,6 +37,11 @@ SMALL = {
 }
 
 
+def of_name(settings, name):
+    """Settings of an algorithm, which those named after it share, such as ``maml-paper``."""
+    return next((s for start, s in settings.items() if name.startswith(start)), {})
+
+
 @pytest.fixture(scope="session")
 def encoders():
     """Untrained encoders: what latents mean does not matter to what is tested with them."""
@@ -70,9 +75,10 @@ def make_config():
         name, _, rl = name.partition("+")
         small = {"hidden_sizes": (64,), "batch_size": 16, "warmup_steps": 8, "replay_size": 200}
         rl = replace(RL[rl or "ddpg"].config, **small)
-        algorithm = replace(
-            ALGORITHMS[name].config, state=state, max_steps=6, rl=rl, **SMALL.get(name, {})
-        )
+        settings = {"state": state, "max_steps": 6, "rl": rl, **of_name(SMALL, name)}
+        if state == "state":  # demonstrations are latents
+            settings["demonstration_share"] = 0.0
+        algorithm = replace(ALGORITHMS[name].config, **settings)
         config = RunConfig(
             seeds=(3, 8),
             episodes=10,

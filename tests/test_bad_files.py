@@ -13,7 +13,6 @@ from bgpo_trl.demonstrations import load_demonstrations, record_demonstrations
 from bgpo_trl.logging import EVAL_COLUMNS, RunLogger
 from bgpo_trl.plotting import plot_frame_strips, plot_success_curves, save_figure
 from bgpo_trl.pretrained import load_pretrained
-from bgpo_trl.replay import ReplayBuffer
 from bgpo_trl.representation import default_weights, load_representation
 from bgpo_trl.runs import read_curves, read_json, read_rows
 from suites import nico
@@ -98,9 +97,6 @@ CASES = {
         lambda f: save_checkpoint(f, {"a": object()}), "state['a'] is a object", "turn it into"),
     "checkpoint in a file": (
         lambda f: save_checkpoint(f / "file", {"a": 1}), "cannot save a checkpoint", "make room"),
-    "no replay": (
-        lambda f: ReplayBuffer(5, generator=torch.Generator()).loads(f / "nowhere"),
-        "holds no replay", "that dumps() wrote"),
     # runs that are read
     "no run": (lambda f: curves(f / "nowhere"), "eval.csv is missing", "let the run in"),
     "run that is a file": (lambda f: curves(f / "file"), "eval.csv is missing", "let the run in"),

@@ -375,8 +375,8 @@ def test_the_ladder_has_a_row_and_a_run_for_each_rung(tiny, tmp_path, capsys):
     for rung in "abcd":
         config = json.loads((tmp_path / rung / "config.json").read_text())
         learner = load_checkpoint(tmp_path / rung / "checkpoint")["algorithm"]
-        inputs = set(learner["replay"]["rows"]) - {"action", "next"}
-        seen[rung] = (config["algorithm"]["state"], inputs, learner["gwr"] is not None)
+        inputs = set(learner["replay"]["rows"]) - {"action", "next", "group"}
+        seen[rung] = (config["algorithm"]["state"], inputs, "gwr" in learner)
         assert (config["task_starts"], config["eval_every"]) == ([0, 0, 0], 4)
         assert config["algorithm"]["rl"]["hidden_sizes"] == [7]
         assert (tmp_path / rung / "figures" / "success.png").exists()
@@ -386,8 +386,8 @@ def test_the_ladder_has_a_row_and_a_run_for_each_rung(tiny, tmp_path, capsys):
     assert seen == {
         "a": ("state", {"state", "task_one_hot"}, False),
         "b": ("latent", {"latent", "task_one_hot"}, False),
-        "c": ("latent", {"latent", "normalized_behavior"}, False),
-        "d": ("latent", {"latent", "normalized_behavior"}, True),
+        "c": ("latent", {"latent", "behavior"}, False),
+        "d": ("latent", {"latent", "behavior"}, True),
     }
 
     before = files(tmp_path)
