@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from pathlib import Path
 
 import torch
@@ -11,7 +12,7 @@ from bgpo_trl.demonstration_bank import DemonstrationBank
 from bgpo_trl.gwr_growth import load_graphs
 from bgpo_trl.plotting import save_figure
 from bgpo_trl.plotting_growth import plot_gwr_growth
-from bgpo_trl.runs import read_rows
+from bgpo_trl.runs import count, read_rows
 from bgpo_trl.task_inference import majority_task, match_counts
 
 
@@ -43,9 +44,11 @@ def draw_growth(
         presented = torch.tensor(config.task_starts) < episode
         tasks = majority_task(match_counts(gwr, bank.seen(), n_tasks) * presented)
         graphs[episode] = (gwr.graph().weights, gwr.graph().edges, tasks)
-    counts: dict[str, list[int]] = {str(seed): [] for seed in config.seeds}
-    for row in read_rows(run / "train.csv"):
-        counts[row["seed"]].append(int(row["num_nodes"]))
-    figure = plot_gwr_growth(graphs, list(counts.values()), config.tasks)
+    path, nodes = run / "train.csv", defaultdict[int, list[int]](list)
+    for row in read_rows(path, {"seed": count, "num_nodes": count}):
+        nodes[int(row["seed"])].append(int(row["num_nodes"]))
+    if nodes.keys() != set(config.seeds):
+        raise ValueError(f"{path} does not have the seeds of the run: resume it, or name another")
+    figure = plot_gwr_growth(graphs, [nodes[seed] for seed in config.seeds], config.tasks)
     save_figure(figure, (out or run / "figures") / "gwr_growth.png")
     return True

@@ -10,10 +10,11 @@ import pytest
 import torch
 from torchrl.envs import check_env_specs
 
-from benchmarks import ablation, experiment, summary
+from benchmarks import ablation, experiment
 from benchmarks.ablation import VARIANTS
 from bgpo_trl.algorithms.bgpo import BGPO
 from bgpo_trl.checkpoint import load_checkpoint
+from bgpo_trl.runs import read_rows
 from bgpo_trl.transforms import BehaviorLookup, GroupLookup, TaskSchedule
 
 pytestmark = pytest.mark.usefixtures("easy_world")
@@ -237,8 +238,8 @@ def test_the_command_line_runs_a_variant_under_its_name(
     config = json.loads((run / "config.json").read_text())
     assert (config["name"], config["task_starts"]) == (variant, [0, 0, 0])
     for file in ("train.csv", "eval.csv"):
-        assert {row["algorithm"] for row in summary.read_rows(run / file)} == {variant}
-    for row in summary.read_rows(run / "train.csv"):
+        assert {row["algorithm"] for row in read_rows(run / file)} == {variant}
+    for row in read_rows(run / "train.csv"):
         assert (int(row["num_nodes"]) > 1) == has_gwr(variant)
         assert (float(row["intrinsic_return"]) > 0) == has_reward(variant)
     learner = load_checkpoint(run / "checkpoint")["algorithm"]
