@@ -5,6 +5,7 @@ moved there and back. Where there is a GPU, it is tested too.
 """
 
 import csv
+from operator import attrgetter
 
 import pytest
 import torch
@@ -51,8 +52,8 @@ def test_a_run_is_the_same_on_every_device(device, name, bank, encoders, make_co
 
 
 POLICIES = {
-    "bgpo": ("actor", "loss"),
-    "bgpo+sac": ("actor", "loss"),
+    "bgpo": ("learner.actor", "learner.loss"),
+    "bgpo+sac": ("learner.actor", "learner.loss"),
     "maml": ("meta_actor", "critic", "loss"),
     "dist-nll": ("teacher", "students", "critic", "loss"),
 }
@@ -68,7 +69,7 @@ def test_learner_and_encoder_are_where_they_were_told(
     try:
         config = make_config(name=name)
         algorithm = Trainer(config, tmp_path, device=device, **parts).algorithm
-        modules = [getattr(algorithm, part) for part in POLICIES[name]]
+        modules = [attrgetter(part)(algorithm) for part in POLICIES[name]]
         for part in (*modules, encoders.vae):
             for module in part if isinstance(part, list) else [part]:
                 for where, weights in module.named_parameters():

@@ -121,13 +121,16 @@ def test_every_seed_plays_every_episode_once(run_of, make_config, name):
             assert int(row["success"]) == float(row["return"])
             assert int(row["success"]) or int(row["steps"]) == config.algorithm.max_steps
             assert 0 <= float(row["intrinsic_return"]) <= 1
-            assert (float(row["intrinsic_return"]) > 0) == (name == "bgpo")
-            assert (int(row["num_nodes"]) > 0) == (name == "bgpo")
+            assert (float(row["intrinsic_return"]) > 0) == name.startswith("bgpo")
+            assert (int(row["num_nodes"]) > 0) == name.startswith("bgpo")
+            assert 0 <= int(row["group"]) < int(row["num_groups"])
     assert {row["success"] for row in train} == {"0", "1"}
     for file in CSV_FILES:
         assert {row["algorithm"] for row in rows(run_of(name) / file)} == {name}
-    if name == "bgpo":
+    if name.startswith("bgpo"):
         assert int(train[-1]["num_nodes"]) > 2
+    grouped = name in ("bgpo", "bgpo-experts")
+    assert (max(int(row["num_groups"]) for row in train) > 1) == grouped
     assert (float(train[0]["loss_value"]), float(train[-1]["loss_value"]) > 0) == (0, True)
 
 

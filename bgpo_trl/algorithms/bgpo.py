@@ -215,8 +215,10 @@ class BGPO(Algorithm):
         """Keeps a transition of each seed for updates to come, and the demonstration at its end."""
         group = torch.tensor(self._groups_of(transition))
         self.replay.add(transition, group)
+        if self.shown is None:
+            return
         ended = transition.get(("next", "done")).flatten()
-        if self.shown is not None and ended.any():
+        if ended.any():
             reward = torch.ones(self.n_seeds)
             if self._beta:
                 error = transition["behavior"] - transition["demo_embedding"]

@@ -218,7 +218,8 @@ def test_plain_ddpg_acts_and_learns_by_the_state_and_nothing_else(make):
             learner.store(transition.select(*kept) if learner is blind else transition)
         assert actions[0]["action"].equal(actions[1]["action"])
     assert losses
-    assert set(algorithm.replay.sample().keys(True, True)) == set(kept)
+    drawn = algorithm.replay.sample(torch.zeros(2, 3, dtype=torch.int64))
+    assert set(drawn.keys(True, True)) == {*kept, "priority_weight"}
     for ours, theirs in zip(weights(algorithm), weights(blind), strict=True):
         assert ours.equal(theirs)
 
