@@ -13,9 +13,8 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-import torch
 import tyro
-from growth import draw_growth
+from growth import draw_groups, draw_growth, draw_nodes
 
 from bgpo_trl.algorithms import ALGORITHMS, Algorithm
 from bgpo_trl.algorithms.rl import RL
@@ -23,15 +22,10 @@ from bgpo_trl.configs import PRESETS, STAGE_PRESETS, RunConfig
 from bgpo_trl.demonstration_bank import DemonstrationBank
 from bgpo_trl.evaluation import Evaluator, evaluate_random_policy
 from bgpo_trl.machine import choose_device, set_threads
-from bgpo_trl.plotting import plot_frame_strips, plot_gwr_pca, plot_success_curves, save_figure
+from bgpo_trl.plotting import plot_frame_strips, plot_success_curves, save_figure
 from bgpo_trl.pretrained import load_pretrained, make_pretrained
 from bgpo_trl.progress import progress_bar
-from bgpo_trl.task_inference import (
-    group_purity,
-    majority_task,
-    match_counts,
-    task_inference_accuracy,
-)
+from bgpo_trl.task_inference import group_purity, task_inference_accuracy
 from bgpo_trl.training import Trainer
 from bgpo_trl.video import save_gif
 
@@ -133,9 +127,9 @@ def run_experiment(
 
     The run's directory then holds, besides what `Trainer` writes, ``final.csv`` (success of the
     trained policies with demonstrations seen in training and with held-out ones, and task
-    inference), ``summary.json`` (commit, command, success of a random policy, nodes of GWR-B),
-    ``gwr.csv`` (nodes of the first seed's GWR-B) and ``figures/`` (among them a video of a test
-    episode of each task). Weights & Biases gets what is in ``figures/`` too.
+    inference), ``summary.json`` (commit, command, success of a random policy, nodes of GWR-B,
+    groups of behaviors), ``gwr.csv`` (nodes of the first seed's GWR-B) and ``figures/`` (among them
+    a video of a test episode of each task). Weights & Biases gets what is in ``figures/`` too.
 
     Args:
         arguments: From the command line.
@@ -196,9 +190,10 @@ def draw(trainer: Trainer, bank: DemonstrationBank, out: Path) -> None:
     """
     config = trainer.config
     summary = json.loads((out / "summary.json").read_text())
+    presented = dict(zip(config.tasks, config.task_starts, strict=True))
     figure = plot_success_curves(
         out / "eval.csv",
-        presented=dict(zip(config.tasks, config.task_starts, strict=True)),
+        presented=presented,
         random_success=summary["random_success"],
     )
     save_figure(figure, out / "figures" / "success.png")
@@ -208,17 +203,16 @@ def draw(trainer: Trainer, bank: DemonstrationBank, out: Path) -> None:
         save_gif(frames, out / "figures" / f"{title.split()[0]}.gif")
     gwr = trainer.algorithm.gwr
     if gwr is not None:
-        tasks = majority_task(match_counts(gwr, bank.seen(), len(config.tasks))[0])
-        weights = gwr.graph(0).weights
-        tasks = tasks[: len(weights)]
-        write_nodes(out / "gwr.csv", weights, tasks)
-        save_figure(plot_gwr_pca(weights, tasks, config.tasks), out / "figures" / "gwr.png")
+        draw_nodes(out, trainer.algorithm, bank, config.tasks)
         accuracy = task_inference_accuracy(
             gwr, bank.seen(), bank.held_out(config.held_out), len(config.tasks)
         )
         draw_growth(out, config, bank)
         print(f"GWR-B nodes: {gwr.num_nodes.tolist()}")
         print(f"task inference on held-out demonstrations: {accuracy.mean():.1%}")
+    if trainer.algorithm.groups is not None:
+        draw_groups(out, presented, out / "figures" / "groups.png")
+        print(f"groups of behaviors: {trainer.algorithm.groups.num_groups.tolist()}")
 
 
 def measure(
@@ -320,21 +314,6 @@ def record_episodes(trainer: Trainer, bank: DemonstrationBank) -> dict[str, np.n
         )
         for task, name in enumerate(config.tasks)
     }
-
-
-def write_nodes(path: Path, weights: torch.Tensor, tasks: torch.Tensor) -> None:
-    """Writes the nodes of a GWR-B, one row each: its majority task (-1: none) and its weights.
-
-    Args:
-        path: Of the CSV file.
-        weights: ``[N, d]``.
-        tasks: ``[N]``.
-    """
-    with path.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(("task", *(f"w{i}" for i in range(weights.shape[1]))))
-        for task, row in zip(tasks.tolist(), weights.tolist(), strict=True):
-            writer.writerow((task, *(f"{value:.6g}" for value in row)))
 
 
 def commit_of_code() -> str:
