@@ -7,7 +7,7 @@ import json
 import shlex
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -15,12 +15,14 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import tyro
 from growth import draw_groups, draw_growth, draw_nodes
+from resuming import as_begun, check_resumable, is_finished
 
 from bgpo_trl.algorithms import ALGORITHMS, Algorithm
 from bgpo_trl.algorithms.rl import RL
 from bgpo_trl.configs import PRESETS, STAGE_PRESETS, RunConfig
 from bgpo_trl.demonstration_bank import DemonstrationBank
 from bgpo_trl.evaluation import Evaluator, evaluate_random_policy
+from bgpo_trl.locking import DirectoryLock
 from bgpo_trl.machine import choose_device, set_threads
 from bgpo_trl.plotting import plot_frame_strips, plot_success_curves, save_figure
 from bgpo_trl.pretrained import load_pretrained, make_pretrained
@@ -31,6 +33,7 @@ from bgpo_trl.video import save_gif
 
 # Number of the evaluation after training, which no evaluation in training has: other starts.
 _LAST = 2**31
+_DATASET, _ENCODERS = "demonstrations", "encoders"  # in the directory of a run that makes its own
 FINAL_COLUMNS = ("seed", "demonstrations", "task", "episodes", "success", "task_inference")
 
 
@@ -68,7 +71,8 @@ class Arguments:
     seeds: tuple[int, ...] | None = None
     """Other seeds than the preset's."""
     episodes: int | None = None
-    """Another length than the preset's; the tasks' starts keep their proportions."""
+    """Another length than the preset's; the tasks' starts keep their proportions. With --resume, a
+    longer one goes on from where the run ended; the tasks' starts are what they were."""
     eval_every: int | None = None
     """Other training episodes between tests than the preset's."""
     held_out: Literal["validation", "test"] = "validation"
@@ -127,9 +131,10 @@ def run_experiment(
 
     The run's directory then holds, besides what `Trainer` writes, ``final.csv`` (success of the
     trained policies with demonstrations seen in training and with held-out ones, and task
-    inference), ``summary.json`` (commit, command, success of a random policy, nodes of GWR-B,
-    groups of behaviors), ``gwr.csv`` (nodes of the first seed's GWR-B) and ``figures/`` (among them
-    a video of a test episode of each task). Weights & Biases gets what is in ``figures/`` too.
+    inference), ``gwr.csv`` (nodes of the first seed's GWR-B), ``figures/`` (among them a video of a
+    test episode of each task) and, when all that is there, ``summary.json`` (commit, command,
+    success of a random policy, nodes of GWR-B, groups of behaviors). Weights & Biases gets what is
+    in ``figures/`` too.
 
     Args:
         arguments: From the command line.
@@ -138,63 +143,75 @@ def run_experiment(
         make: Makes the algorithm, where ``config.name`` does not say it.
 
     Raises:
-        ValueError: If the directory holds another run.
+        ValueError: If the directory holds another run, or none that could be resumed.
+        BlockingIOError: If another process is at work there.
     """
     commit = commit_of_code()  # of the code that runs, whatever is committed meanwhile
     set_threads(arguments.threads)
     device = choose_device(arguments.device)
     rl = "" if arguments.rl == "ddpg" else f"-{arguments.rl}"
     out = arguments.out or Path("runs") / f"{name}-{config.name}{rl}-{arguments.preset}"
-    if (out / "config.json").exists() and not arguments.resume:
+    makes_encoders = arguments.train_encoders or arguments.preset in STAGE_PRESETS
+    if arguments.resume:
+        begun = makes_encoders and any((out / made).exists() for made in (_DATASET, _ENCODERS))
+        if not begun:
+            check_resumable([out])
+        config = as_begun(config, out, keep_eval_every=arguments.eval_every is not None)
+        if is_finished(out, config):
+            print(f"{out} is finished, all {config.episodes} episodes: --episodes makes it longer")
+            return
+    elif (out / "config.json").exists():
         raise ValueError(f"{out} holds a run: --resume continues it, --out names another directory")
-    if arguments.train_encoders or arguments.preset in STAGE_PRESETS:
-        stage = STAGE_PRESETS.get(arguments.preset)
-        encoders, bank = make_pretrained(
-            out / "encoders" / "nico.safetensors",
-            out / "demonstrations",
-            folder=out / "encoders",
-            command=shlex.join(["python", *sys.argv]),
-            device=device,
-            **({} if stage is None else vars(stage)),
-        )
-    else:
-        encoders, bank = load_pretrained()
+    with DirectoryLock(out):
+        if makes_encoders:
+            stage = STAGE_PRESETS.get(arguments.preset)
+            encoders, bank = make_pretrained(
+                out / _ENCODERS / "nico.safetensors",
+                out / _DATASET,
+                folder=out / _ENCODERS,
+                command=shlex.join(["python", *sys.argv]),
+                device=device,
+                **({} if stage is None else vars(stage)),
+            )
+        else:
+            encoders, bank = load_pretrained()
 
-    bank = bank.for_tasks(config.tasks)
-    trainer = Trainer(
-        config,
-        out,
-        bank=bank,
-        encoders=encoders,
-        make=make,
-        device=device,
-        resume=arguments.resume,
-        wandb=arguments.wandb,
-    )
-    with trainer:
-        trainer.run()
-        measure(trainer, bank, out, commit)
-        draw(trainer, bank, out)
-        for path in sorted((out / "figures").iterdir()):
-            trainer.logger.log_media(f"figures/{path.stem}", path)
+        bank = bank.for_tasks(config.tasks)
+        with Trainer(
+            config,
+            out,
+            bank=bank,
+            encoders=encoders,
+            make=make,
+            device=device,
+            resume=arguments.resume,
+            wandb=arguments.wandb,
+        ) as trainer:
+            trainer.run()
+            summary = {"commit": commit, **measure(trainer, bank, out)}
+            draw(trainer, bank, out, summary["random_success"])
+            for path in sorted((out / "figures").iterdir()):
+                trainer.logger.log_media(f"figures/{path.stem}", path)
+            # Last: it says that the rest is there.
+            (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
     print(f"curve and figures: {out}; in numbers: python benchmarks/summary.py {out}")
 
 
-def draw(trainer: Trainer, bank: DemonstrationBank, out: Path) -> None:
+def draw(
+    trainer: Trainer, bank: DemonstrationBank, out: Path, random_success: Mapping[str, float]
+) -> None:
     """Draws the run, and says what GWR-B has become.
 
     Args:
-        trainer: At the end of its run, which has been measured.
+        trainer: At the end of its run.
         bank: Demonstrations of both kinds.
         out: Where ``figures/`` and ``gwr.csv`` go.
+        random_success: Of a random policy, by task.
     """
     config = trainer.config
-    summary = json.loads((out / "summary.json").read_text())
     presented = dict(zip(config.tasks, config.task_starts, strict=True))
     figure = plot_success_curves(
-        out / "eval.csv",
-        presented=presented,
-        random_success=summary["random_success"],
+        out / "eval.csv", presented=presented, random_success=random_success
     )
     save_figure(figure, out / "figures" / "success.png")
     episodes = record_episodes(trainer, bank)
@@ -216,16 +233,18 @@ def draw(trainer: Trainer, bank: DemonstrationBank, out: Path) -> None:
 
 
 def measure(
-    trainer: Trainer, bank: DemonstrationBank, out: Path, commit: str, episodes: int = 20
-) -> None:
+    trainer: Trainer, bank: DemonstrationBank, out: Path, episodes: int = 20
+) -> dict[str, Any]:
     """Tests the trained policies with seen and with held-out demonstrations.
 
     Args:
         trainer: At the end of its run.
         bank: Demonstrations of both kinds.
-        out: Where ``final.csv`` and ``summary.json`` go.
-        commit: Of the code that ran.
+        out: Where ``final.csv`` goes.
         episodes: Test episodes of each seed, task and kind.
+
+    Returns:
+        What ``summary.json`` says of the run.
     """
     algorithm, config, seen = trainer.algorithm, trainer.config, bank.seen()
     gwr = algorithm.gwr
@@ -265,8 +284,8 @@ def measure(
         writer.writerows(rows)
     random_success = evaluate_random_policy(tasks=config.tasks, episodes=100)
     summary = {
-        "commit": commit,
         "command": shlex.join(["python", *sys.argv]),
+        "episodes": config.episodes,
         "random_success": dict(zip(config.tasks, random_success.tolist(), strict=True)),
         "nodes": None if gwr is None else gwr.num_nodes.tolist(),
         "groups": None,
@@ -275,7 +294,7 @@ def measure(
         purity = group_purity(algorithm.groups, bank.held_out(config.held_out), len(config.tasks))
         summary["groups"] = algorithm.groups.num_groups.tolist()
         summary["group_purity"] = purity.tolist()
-    (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+    return summary
 
 
 def record_episodes(trainer: Trainer, bank: DemonstrationBank) -> dict[str, np.ndarray]:

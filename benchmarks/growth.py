@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from bgpo_trl.gwr_growth import load_graphs
 from bgpo_trl.plotting import plot_gwr_pca, save_figure
 from bgpo_trl.plotting_groups import plot_groups, read_groups
 from bgpo_trl.plotting_growth import plot_gwr_growth
-from bgpo_trl.runs import read_rows
+from bgpo_trl.runs import count, read_rows
 from bgpo_trl.task_inference import majority_task, match_counts
 from bgpo_trl.transforms import TaskSchedule
 
@@ -49,10 +50,12 @@ def draw_growth(
         presented = TaskSchedule(config.task_starts).presented(torch.tensor(episode))
         tasks = majority_task(match_counts(gwr, bank.seen(), n_tasks) * presented)
         graphs[episode] = (gwr.graph().weights, gwr.graph().edges, tasks)
-    counts: dict[str, list[int]] = {str(seed): [] for seed in config.seeds}
-    for row in read_rows(run / "train.csv"):
-        counts[row["seed"]].append(int(row["num_nodes"]))
-    figure = plot_gwr_growth(graphs, list(counts.values()), config.tasks)
+    path, nodes = run / "train.csv", defaultdict[int, list[int]](list)
+    for row in read_rows(path, {"seed": count, "num_nodes": count}):
+        nodes[int(row["seed"])].append(int(row["num_nodes"]))
+    if nodes.keys() != set(config.seeds):
+        raise ValueError(f"{path} does not have the seeds of the run: resume it, or name another")
+    figure = plot_gwr_growth(graphs, [nodes[seed] for seed in config.seeds], config.tasks)
     save_figure(figure, (out or run / "figures") / "gwr_growth.png")
     return True
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import logging
 import os
 import socket
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from bgpo_trl.configs import RunConfig
+from bgpo_trl.locking import DirectoryLock
 from bgpo_trl.progress import progress_bar
 
 try:
@@ -73,25 +73,6 @@ def connected(address: str, cpus: float, gpus: float) -> Iterator[None]:
         ray.shutdown()
 
 
-@contextlib.contextmanager
-def locked(directory: Path) -> Iterator[None]:
-    """Waits until no other process holds the directory, and holds it until the end of the block.
-
-    The kernel takes the lock back from a process that ends, however it does.
-
-    Args:
-        directory: Made if it does not exist.
-    """
-    directory.mkdir(parents=True, exist_ok=True)
-    with (directory / "lock").open("a") as lock:
-        while True:
-            with contextlib.suppress(BlockingIOError):
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                break
-            time.sleep(0.5)
-        yield
-
-
 def work(job: Job, play: Callable[[Job], None], command: Sequence[str]) -> None:
     """Plays a job in a worker, unless it is finished; what is printed goes to its ``log.txt``.
 
@@ -102,7 +83,7 @@ def work(job: Job, play: Callable[[Job], None], command: Sequence[str]) -> None:
     """
     sys.argv = list(command)
     with (
-        locked(job.directory),  # Ray may believe a worker dead that still writes
+        DirectoryLock(job.directory, wait=True),  # Ray may believe a worker dead that still writes
         (job.directory / "log.txt").open("a", buffering=1) as log,
         contextlib.redirect_stdout(log),
         contextlib.redirect_stderr(log),

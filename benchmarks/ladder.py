@@ -14,6 +14,7 @@ seen on one rung:
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -22,6 +23,7 @@ from typing import Annotated, Literal
 
 from ablation import VARIANTS
 from experiment import command_line
+from resuming import check_resumable
 from summary import summarize
 from tyro.conf import subcommand
 
@@ -75,6 +77,8 @@ def main(arguments: Arguments) -> None:
         raise ValueError("--rungs names none: name some of a, b, c, d")
     set_threads(arguments.threads)
     device = choose_device(arguments.device)
+    if arguments.resume:
+        check_resumable([arguments.out / rung for rung in arguments.rungs])
     encoders, bank = load_pretrained()
     base = replace(
         PRESETS["desk"],
@@ -105,7 +109,9 @@ def main(arguments: Arguments) -> None:
     print("| rung | " + " | ".join(columns) + " |")
     print("|---|" + "---|" * len(columns))
     for rung, table in tables.items():
-        cells = [f"{v:.0f}" if k.startswith("episodes") else f"{v:.2f}" for k, v in table.items()]
+        reached = table.pop("episodes to 80 %")
+        cells = [f"{success:.2f}" for success in table.values()]
+        cells.append("not reached" if math.isnan(reached) else f"{reached:.0f}")
         print(f"| ({rung}) {RUNGS[rung][0]} | " + " | ".join(cells) + " |")
 
 

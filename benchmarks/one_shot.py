@@ -223,7 +223,9 @@ def main(arguments: Arguments) -> None:
     for task, shares in table.items():
         for share, seeds in shares.items():
             success, inferred, activity = seeds.mean(0)
-            print(f"| {task} | {share:.0%} | {success:.1%} | {inferred:.1%} | {activity:.2f} |")
+            # Nothing is inferred without GWR-B.
+            from_gwr = " | |" if np.isnan(inferred) else f" {inferred:.1%} | {activity:.2f} |"
+            print(f"| {task} | {share:.0%} | {success:.1%} |{from_gwr}")
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ import sys
 from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
+from types import NoneType
 from typing import Annotated
 
 import numpy as np
@@ -20,7 +21,7 @@ from growth import draw_groups
 from report_tables import median_cell, own_episodes, ratio_cells
 
 from bgpo_trl.plotting import plot_success_curves, save_figure
-from bgpo_trl.runs import read_curves, read_json, read_rows, read_tests
+from bgpo_trl.runs import read_curves, read_final_tests, read_json, read_tests
 from suites import nico
 
 
@@ -48,6 +49,9 @@ def summarize(path: Path) -> dict[str, float]:
     for row in rows:
         if int(row["episode"]) > 0.9 * last:
             late[row["task"]].append(float(row["success"]))
+    for task in _tasks(rows):
+        if not late[task]:
+            raise ValueError(f"{path} has no late test of {task!r}: let the run finish")
     table = {task: float(np.mean(late[task])) for task in _tasks(rows)}
     table["overall"] = sum(table.values()) / len(table)
     table["episodes to 80 %"] = read_curves(path, _tasks(rows)).episodes_to(0.8)
@@ -77,7 +81,7 @@ def best(path: Path) -> dict[str, float]:
 def describe(run: Path) -> str:
     """Returns the table of a run, in Markdown."""
     late, highest = summarize(run / "eval.csv"), best(run / "eval.csv")
-    final = read_rows(run / "final.csv")
+    final = read_final_tests(run / "final.csv")
 
     def trained(task: str | None, kind: str, column: str, digits: int) -> str:
         cells = [
@@ -85,6 +89,11 @@ def describe(run: Path) -> str:
             for row in final
             if row["task"] == (task or row["task"]) and row["demonstrations"] == kind
         ]
+        if not cells:
+            named = f"{task!r} with {kind} demonstrations"
+            raise ValueError(
+                f"{run / 'final.csv'} has no test of {named}: remove it and resume the run"
+            )
         if "" in cells:  # task inference where there is no GWR-B
             return ""
         return f"{100 * np.mean([float(cell) for cell in cells]):.{digits}f}"
@@ -105,15 +114,21 @@ def describe(run: Path) -> str:
         cells += [trained(task, kind, "success", 1) for kind in ("seen", "held-out")]
         cells.append(trained(task, "held-out", "task_inference", 2))
         lines.append(f"| {task or 'all'} | " + " | ".join(cells) + " |")
-    told = read_json(run / "summary.json")
+    entries = {"commit": str, "command": str} | dict.fromkeys(
+        ("nodes", "groups", "group_purity"), list | NoneType
+    )
+    told = read_json(run / "summary.json", entries)
+    episodes = read_json(run / "config.json").get("episodes")
+    if told.get("episodes", episodes) != episodes:
+        raise ValueError(f"{run} is being made longer: let the run finish")
     nodes = "" if told["nodes"] is None else f"GWR-B nodes: {told['nodes']}. "
-    if told.get("groups") is not None:
-        purity = " ".join(f"{100 * share:.1f}" for share in told["group_purity"])
+    if told.get("groups"):
+        purity = " ".join(f"{100 * share:.1f}" for share in told.get("group_purity") or ())
         nodes += f"Groups: {told['groups']}, {purity} % pure on held-out demonstrations. "
     reached = late["episodes to 80 %"]
     lines += [
         "",
-        f"Episodes to 80 %: {f'{reached:.0f}' if np.isfinite(reached) else 'not reached'}. {nodes}"
+        f"Episodes to 80 %: {'not reached' if np.isinf(reached) else int(reached)}. {nodes}"
         f"Commit {told['commit']}: `{told['command']}`.",
     ]
     if own is not None and len(tasks) > 1:
@@ -137,12 +152,30 @@ def _late_by_seed(path: Path) -> dict[str | None, list[float]]:
     seeds = sorted({int(row["seed"]) for row in rows})
     found: dict[str | None, list[float]] = {}
     for task in _tasks(rows):
-        found[task] = [
-            float(np.mean([float(r["success"]) for r in late if (r["seed"], r["task"]) == key]))
-            for key in ((str(seed), task) for seed in seeds)
-        ]
+        found[task] = []
+        for seed in seeds:
+            tests = [
+                float(r["success"]) for r in late if (int(r["seed"]), r["task"]) == (seed, task)
+            ]
+            if not tests:
+                raise ValueError(f"{path} has no late test of seed {seed}: let the run finish")
+            found[task].append(float(np.mean(tests)))
     found[None] = np.mean(list(found.values()), 0).tolist()
     return found
+
+
+def _presented(run: Path) -> dict[str, int]:
+    """Returns from which training episode each task of a run is presented."""
+    path = run / "config.json"
+    config = read_json(path, {"task_starts": list, "tasks": list | NoneType})
+    # Runs did not always say their tasks; then they had the paper's.
+    tasks, starts = config.get("tasks") or nico.ALL_TASKS, config["task_starts"]
+    known = all(isinstance(task, str) for task in tasks)
+    if not known or len(tasks) != len(starts) or not all(type(start) is int for start in starts):
+        raise ValueError(
+            f"{path} does not say when each task starts: put it back as the run left it"
+        )
+    return dict(zip(tasks, starts, strict=True))
 
 
 def main(arguments: Arguments) -> None:
@@ -150,13 +183,10 @@ def main(arguments: Arguments) -> None:
     if not arguments.runs:
         raise ValueError("name the directory of a run")
     for run in arguments.runs:
-        print(f"{run}\n\n{describe(run)}\n")
-        config = read_json(run / "config.json")
-        # Runs did not always say their tasks; then they had the paper's.
-        tasks = config.get("tasks", nico.ALL_TASKS)
-        presented = dict(zip(tasks, config["task_starts"], strict=True))
+        described, presented = describe(run), _presented(run)
+        print(f"{run}\n\n{described}\n")
         save_figure(plot_success_curves(run / "eval.csv", presented=presented), run / "success.png")
-        if read_json(run / "summary.json").get("groups") is not None:
+        if read_json(run / "summary.json").get("groups"):
             draw_groups(run, presented, run / "groups.png")
 
 

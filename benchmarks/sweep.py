@@ -27,12 +27,13 @@ from typing import Literal
 
 import experiment
 from ablation import VARIANTS
-from jobs import Job, connected, locked, play_jobs
+from jobs import Job, connected, play_jobs
 from merge import merge
 
 from bgpo_trl.algorithms.bgpo import BGPO
-from bgpo_trl.logging import check_settings
+from bgpo_trl.locking import DirectoryLock
 from bgpo_trl.pretrained import load_pretrained
+from bgpo_trl.run_directory import check_settings, holds_run
 from bgpo_trl.runs import read_json
 
 
@@ -127,7 +128,7 @@ def play(job: Job) -> None:
     """Plays a job to its end, from its last checkpoint if there is one, and measures."""
     name = job.config.name
     make = partial(BGPO, compose=VARIANTS[name][0]) if name in VARIANTS else None
-    arguments = experiment.Arguments(out=job.directory, resume=True)
+    arguments = experiment.Arguments(out=job.directory, resume=holds_run(job.directory))
     experiment.run_experiment(arguments, "sweep", job.config, make)
 
 
@@ -147,7 +148,7 @@ def main(arguments: Arguments) -> None:
             sys.exit("interrupted: the same command continues")
     for directory, group in jobs.items():
         if failed.keys().isdisjoint(group):
-            with locked(directory):
+            with DirectoryLock(directory, wait=True):
                 merge([job.directory for job in group], directory)
             print(f"{directory}: {len(group)} blocks of seeds")
     if failed:

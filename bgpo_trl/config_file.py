@@ -39,7 +39,7 @@ def read_config(path: str | Path) -> tuple[RunConfig, str | None]:
         return _read(RunConfig, {**settings, "algorithm": algorithm}, ""), encoders
     except (FileNotFoundError, NotADirectoryError):
         raise ValueError(f"{path.parent} holds no run: there is no {path.name}") from None
-    except ValueError as error:
+    except (ValueError, OSError, RecursionError) as error:
         raise ValueError(
             f"{path} cannot be read ({error}): use the version of the code that made the run"
         ) from error

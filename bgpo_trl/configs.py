@@ -225,6 +225,12 @@ class AlgorithmConfig:
             ("demonstration_share", 0 <= share < 1, "at least 0 and below 1"),
         )
         _at_least(self, 1, "max_steps")
+        if share and self.rl.warmup_steps < self.max_steps:
+            # Else seeds would learn from demonstrations sooner or later than each would alone.
+            raise ValueError(
+                f"with a demonstration_share, warmup_steps ({self.rl.warmup_steps}) must be at "
+                f"least max_steps ({self.max_steps}), so that every seed was shown one by then"
+            )
 
 
 def _refuse_all_but_ddpg(who: str, rl: RLConfig) -> None:
@@ -284,6 +290,11 @@ class BGPOConfig(AlgorithmConfig):
         _at_least(self, 1, "active_groups")
         holds = self.even_replay or not self.experts
         _check(self, ("even_replay", holds, "set where there are experts"))
+        if self.experts and self.rl.batch_size < self.active_groups:
+            raise ValueError(
+                f"batch_size ({self.rl.batch_size}) must be at least active_groups "
+                f"({self.active_groups}), so that each of them has a transition"
+            )
 
 
 @dataclass(frozen=True)

@@ -57,10 +57,12 @@ class CsvFile:
             self._file.seek(0)
             content = self._file.read()
             if not header.startswith(content[: len(header)]):
-                found = content.partition(b"\n")[0].decode(errors="replace").strip()
+                found = content[:300].partition(b"\n")[0].decode(errors="replace").strip()
+                # What is no text would do to a terminal whatever its bytes mean there.
+                text = found.isascii() and found.isprintable()
                 raise ValueError(
-                    f"{self.path} has the columns {found}, this run writes "
-                    f"{','.join(self.columns)}: choose another run directory."
+                    f"{self.path} {f'has the columns {found}' if text else 'is no CSV file'}, this "
+                    f"run writes {','.join(self.columns)}: choose another run directory."
                 )
             self._file.truncate(content.rfind(b"\n") + 1)
             if len(content) < len(header):
@@ -102,13 +104,7 @@ class CsvFile:
             ValueError: If the file is shorter than that, or the position is not the end of a row.
         """
         position = max(position, self._header_size)
-        size = self._file.seek(0, os.SEEK_END)
-        self._file.seek(min(position, size) - 1)
-        if position > size or self._file.read(1) != b"\n":
-            raise ValueError(
-                f"{self.path} has {size} bytes and no row that ends at byte {position}, where the "
-                "checkpoint was taken: put the file back as the run left it, or start a new run."
-            )
+        check_position(self.path, position)
         self._file.truncate(position)
 
     def close(self) -> None:
@@ -138,6 +134,38 @@ class CsvFile:
                 error.errno,
                 f"cannot write to {self.path} ({error.strerror}): make room, then resume the run",
             ) from error
+
+
+def has_rows(path: str | os.PathLike[str]) -> bool:
+    """Returns whether there is a CSV file with more than its header."""
+    try:
+        with open(path, "rb") as file:
+            return bool(file.readline() and file.read(1))
+    except OSError:
+        return False
+
+
+def check_position(path: str | os.PathLike[str], position: int) -> None:
+    """Makes sure that a file has a row that ends at a position.
+
+    Args:
+        path: The file, there or not.
+        position: In bytes, at least 1.
+
+    Raises:
+        ValueError: If it has none.
+    """
+    path = Path(path)
+    size = path.stat().st_size if path.exists() else 0
+    if position <= size:
+        with path.open("rb") as file:
+            file.seek(position - 1)
+            if file.read(1) == b"\n":
+                return
+    raise ValueError(
+        f"{path} has {size} bytes and no row that ends at byte {position}, where the checkpoint "
+        "was taken: put the file back as the run left it, or start a new run."
+    )
 
 
 def plain_value(value: Any) -> Any:

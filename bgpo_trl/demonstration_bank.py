@@ -104,7 +104,7 @@ class DemonstrationBank:
             without them.
 
     Raises:
-        ValueError: If a label has no name.
+        ValueError: If a label has no name, or the steps are of another number of demonstrations.
     """
 
     embedding: Tensor
@@ -119,6 +119,11 @@ class DemonstrationBank:
             raise ValueError(
                 f"there is a demonstration of task {int(unknown[0])}, but tasks names only "
                 f"{len(self.tasks)}: {', '.join(self.tasks)}"
+            )
+        if self.steps is not None and len(self.steps.first) != len(self.embedding):
+            raise ValueError(
+                f"there are steps of {len(self.steps.first)} demonstrations, but embeddings of "
+                f"{len(self.embedding)}"
             )
 
     def seen(self) -> DemonstrationBank:

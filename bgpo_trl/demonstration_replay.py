@@ -10,7 +10,7 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 
 from bgpo_trl.demonstration_bank import DemonstrationBank
-from bgpo_trl.group_replay import GroupReplay
+from bgpo_trl.group_replay import GroupReplay, draw_shares
 
 __all__ = ["DemonstrationReplay"]
 
@@ -30,7 +30,7 @@ class DemonstrationReplay:
         capacity: Demonstrations remembered for each seed; then the oldest are forgotten.
 
     Raises:
-        ValueError: If the bank has no steps.
+        ValueError: If the bank has no steps, or none of some demonstration.
     """
 
     def __init__(
@@ -45,6 +45,12 @@ class DemonstrationReplay:
         if bank.steps is None:
             raise ValueError(
                 "the bank has no steps of demonstrations to learn from: make it anew with "
+                "`python -m bgpo_trl.make_bank`, or set demonstration_share to 0"
+            )
+        if (bank.steps.length < 2).any():
+            row = int((bank.steps.length < 2).nonzero()[0])
+            raise ValueError(
+                f"the bank has no steps of demonstration {row} to learn from: make it anew with "
                 "`python -m bgpo_trl.make_bank`, or set demonstration_share to 0"
             )
         self._steps = bank.steps
@@ -83,10 +89,7 @@ class DemonstrationReplay:
             ``"terminated"``.
         """
         shown = self._shown.sample(group)
-        n_rows, steps = group.shape[1], self._steps
-        share = torch.stack(
-            [torch.rand(n_rows, generator=g, dtype=torch.float64) for g in self._generators]
-        )
+        steps, share = self._steps, draw_shares(group, self._generators)
         number = shown["demo_index"]
         n_steps = steps.length[number] - 1
         step = (share * n_steps).long()

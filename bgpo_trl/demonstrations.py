@@ -61,6 +61,7 @@ def record_demonstrations(
     held_out_per_task: int = 200,
     play: bool = False,
     seed: int = 0,
+    attempts: int = 100,
     progress: bool = True,
 ) -> TensorDict:
     """Records successful demonstrations of each task; continues a recording that was interrupted.
@@ -78,6 +79,7 @@ def record_demonstrations(
         held_out_per_task: How many of those are held out for test episodes.
         play: Record play in place of demonstrations.
         seed: Seed of starts and of the demonstrator's noise.
+        attempts: How often in a row a task's demonstrator may fail.
         progress: Whether to show a progress bar.
 
     Returns:
@@ -89,13 +91,16 @@ def record_demonstrations(
     Raises:
         ValueError: If an argument is wrong, or there is another recording at that path.
         OSError: If the disk has no room for it.
-        RuntimeError: If there is no OpenGL to render with.
+        RuntimeError: If there is no OpenGL to render with, or a demonstrator fails too often; what
+            was recorded before is kept.
     """
     nico.check_tasks(tasks)
     if not tasks:
         raise ValueError("name at least one of the tasks")
     if seed < 0:
         raise ValueError(f"seed must be at least 0, got {seed}")
+    if attempts < 1:
+        raise ValueError(f"attempts must be at least 1, got {attempts}")
     if not 0 <= held_out_per_task < per_task:
         raise ValueError(
             f"held_out_per_task is {held_out_per_task}: it must be less than per_task, {per_task}"
@@ -129,14 +134,25 @@ def record_demonstrations(
         dataset = _make(path, per_task * len(tasks))
         _write_meta(path, wanted)
     missing = torch.nonzero(dataset["length"] == 0).flatten().tolist()
-    perform = _play if play else _demonstrate
+    tried, done = [0] * len(tasks), [0] * len(tasks)
     described = "record play" if play else "record demonstrations"
     n = len(dataset)
     for row in progress_bar(
         described, missing, shown=progress, total=n, initial=n - len(missing), unit="episode"
     ):
         task = row // per_task
-        episode = perform(environments[task], seed, row)
+        if play:
+            episode = _play(environments[task], seed, row)
+        else:
+            episode, n = _demonstrate(environments[task], seed, row, attempts)
+            tried[task] += n
+            if episode is None:
+                raise RuntimeError(
+                    f"the demonstrator of {tasks[task]!r} failed {attempts} times in a row "
+                    f"({done[task]} of {tried[task]} attempts succeeded, "
+                    f"{done[task] / tried[task]:.0%}): mend its demonstration(), or raise attempts"
+                )
+            done[task] += 1
         n_frames = len(episode["pixels"])
         for key in ("pixels", "state", "action"):
             dataset[key][row, : len(episode[key])] = torch.from_numpy(episode[key])
@@ -149,15 +165,21 @@ def record_demonstrations(
     return dataset
 
 
-def _demonstrate(env: Environment, seed: int, row: int) -> dict[str, np.ndarray]:
-    """Returns the first success among attempts whose seeds follow from seed and row."""
+def _demonstrate(
+    env: Environment, seed: int, row: int, attempts: int
+) -> tuple[dict[str, np.ndarray] | None, int]:
+    """Returns the first success, if any, and how many attempts there were.
+
+    The seeds of the attempts follow from seed and row.
+    """
     sequence = np.random.SeedSequence([seed, row])
-    while True:
+    for attempt in range(1, attempts + 1):
         start, noise = (int(child.generate_state(1)[0]) for child in sequence.spawn(2))
         demonstrator = Demonstrator(env, seed=noise)
         episode, reward = _perform(env, start, demonstrator, demonstrator)
         if reward:
-            return episode
+            return episode, attempt
+    return None, attempts
 
 
 def _play(env: Environment, seed: int, row: int) -> dict[str, np.ndarray]:
@@ -194,8 +216,12 @@ def _perform(
         actions.append(policy(timestep))
         timestep = env.step(actions[-1])
         observations.append(timestep.observation)
-    episode = {key: np.stack([o[key] for o in observations]) for key in observations[0]}
-    return {**episode, "action": np.stack(actions)}, float(timestep.reward)
+    episode = {
+        "pixels": np.stack([o["pixels"] for o in observations]),
+        "state": np.stack([o["privileged_state"] for o in observations]),
+        "action": np.stack(actions),
+    }
+    return episode, float(timestep.reward)
 
 
 def _write_meta(path: Path, meta: dict) -> None:

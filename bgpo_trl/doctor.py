@@ -22,6 +22,8 @@ from typing import TYPE_CHECKING, Literal
 if TYPE_CHECKING:
     import numpy as np
 
+    from suites.nico.rendering import FrameRenderer
+
 CONSTRAINTS = Path(__file__).parents[1] / "constraints.txt"
 """Exact versions known to work together; only there in a checkout."""
 
@@ -168,7 +170,7 @@ def check_frame(path: Path | None = None) -> Iterator[Finding]:
         return
     environment.reset()
     still = renderer.render(physics.data.ptr)
-    drawn_by = _opengl_renderer()
+    drawn_by = _driver(renderer)
     for _ in range(3):
         environment.step(np.array([1.0, 0.0, 0.0, 0.0]))
     moved = renderer.render(physics.data.ptr)
@@ -182,13 +184,9 @@ def check_frame(path: Path | None = None) -> Iterator[Finding]:
         yield Finding("ok", "frame", f"written to {path}")
 
 
-def _opengl_renderer() -> str:
-    """Returns what the current context says that it draws with."""
+def _driver(renderer: FrameRenderer) -> str:
     try:
-        from OpenGL import GL
-
-        name = GL.glGetString(GL.GL_RENDERER)
-        return name.decode() if isinstance(name, bytes) else "renderer unknown"
+        return renderer.driver()
     except Exception as error:  # It is only told; PyOpenGL raises errors of many kinds.
         return f"renderer unknown ({_first_line(error)})"
 

@@ -156,7 +156,7 @@ class NicoEnv(EnvBase):
             data = self._environment(row).physics.data.ptr
             self._renderer.render(data, out=self._current["pixels"][row])
         if "state" in self._current:
-            self._current["state"][row] = timestep.observation["state"]
+            self._current["state"][row] = timestep.observation["privileged_state"]
 
     def _advance(self, rows: Iterable[int], actions: np.ndarray, rewards: np.ndarray) -> None:
         """Steps simulations, in all threads, and draws what they have come to, in this one."""

@@ -14,7 +14,7 @@ from torch import Tensor
 from bgpo_trl.modules.entries import lacking
 from bgpo_trl.replay import ReplayBuffer
 
-__all__ = ["GroupReplay"]
+__all__ = ["GroupReplay", "draw_shares"]
 
 GROUP = "group"
 
@@ -96,7 +96,8 @@ class GroupReplay:
         """Draws a transition for each row, uniformly and with replacement from the row's group.
 
         Args:
-            group: the group of each row, int64 ``[S, R]``; -1 for rows that are to stay empty.
+            group: the group of each row, int64 ``[S, R]``; -1 for rows that are to stay empty,
+                which draw nothing.
             seeds: positions of the seeds to draw for, ``S`` of them; ``None`` for all.
             generator: sources of the draws in place of the replay's own, one for each of those.
 
@@ -112,12 +113,11 @@ class GroupReplay:
             raise ValueError("every seed needs a transition before the first sample")
         seeds = range(len(self._generators)) if seeds is None else seeds
         sources = [self._generators[seed] for seed in seeds] if generator is None else generator
-        n_rows, oldest = group.shape[1], self._buffer.oldest.tolist()
+        oldest = self._buffer.oldest.tolist()
         steps = np.empty(group.shape, np.int64)
         weight = np.ones(group.shape, np.float32)
-        wanted = group.numpy()
-        for i, (seed, source) in enumerate(zip(seeds, sources, strict=True)):
-            shares = torch.rand(n_rows, generator=source, dtype=torch.float64).numpy()
+        wanted, all_shares = group.numpy(), draw_shares(group, sources).numpy()
+        for i, (seed, shares) in enumerate(zip(seeds, all_shares, strict=True)):
             for number in np.unique(wanted[i]).tolist():
                 rows = wanted[i] == number
                 held = self._index[seed].of(number, oldest[seed])
@@ -136,16 +136,33 @@ class GroupReplay:
         """Restores what `state_dict` returned, so that the same samples follow."""
         self._buffer.load_state_dict(state_dict)
         self._index = [_Index() for _ in self._generators]
-        if not len(self._buffer):
-            return
         for seed, (first, end) in enumerate(
             zip(self._buffer.oldest.tolist(), self._buffer.n_added.tolist(), strict=True)
         ):
-            steps = torch.zeros(len(self._index), end - first, dtype=torch.int64)
-            steps[seed] = torch.arange(first, end)
-            groups = self._buffer.take(steps, [GROUP])[GROUP][seed]
+            if first == end:
+                continue
+            steps = torch.arange(first, end).unsqueeze(0)
+            groups = self._buffer.take(steps, [GROUP], seeds=[seed])[GROUP][0]
             for step, group in zip(range(first, end), groups.tolist(), strict=True):
                 self._index[seed].append(group, step)
+
+
+def draw_shares(group: Tensor, generator: Sequence[torch.Generator]) -> Tensor:
+    """Draws a number in [0, 1) for each row that has a group; the others draw nothing.
+
+    So a seed draws the same however many slots it leaves free.
+
+    Args:
+        group: the group of each row, int64 ``[S, R]``; -1 for rows without one.
+        generator: one for each of ``S`` seeds.
+
+    Returns:
+        float64 ``[S, R]``, 0 for rows without a group.
+    """
+    shares = torch.zeros(group.shape, dtype=torch.float64)
+    for row, wanted, source in zip(shares, group >= 0, generator, strict=True):
+        row[wanted] = torch.rand(int(wanted.sum()), generator=source, dtype=torch.float64)
+    return shares
 
 
 class _Index:
@@ -173,7 +190,7 @@ class _Index:
         if group not in self._steps:
             return np.empty(0, np.int64)
         steps, (first, end) = self._steps[group], self._span[group]
-        if steps[first] < oldest:
+        if first < end and steps[first] < oldest:
             first += int(np.searchsorted(steps[first:end], oldest))
             self._span[group] = first, end
         return steps[first:end]

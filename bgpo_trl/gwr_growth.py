@@ -63,6 +63,6 @@ def _load(path: Path) -> GWRB:
         graph, _ = load_tensors(path)
         gwr = GWRB(graph["weights"].shape[1])
         gwr.set_extra_state([{**graph, "next_node": int(graph["next_node"])}])
-    except (ValueError, KeyError, IndexError) as error:
+    except (ValueError, KeyError, IndexError, OSError) as error:
         raise ValueError(f"{path} is damaged or no graph of GWR-B: remove it") from error
     return gwr

@@ -8,13 +8,10 @@ such as Weights & Biases, is a mirror that may come and go without harm to the r
 
 from __future__ import annotations
 
-import contextlib
-import dataclasses
-import json
 import os
 import uuid
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -24,8 +21,7 @@ from torchrl.record.loggers import Logger
 from torchrl.record.loggers.wandb import WandbLogger
 
 from bgpo_trl.csv_file import CsvFile, plain_value
-from bgpo_trl.folders import make_folder
-from bgpo_trl.runs import read_json
+from bgpo_trl.run_directory import claim_directory, plain_settings
 
 EVAL_COLUMNS = (
     "algorithm",
@@ -59,7 +55,8 @@ class RunLogger:
         config: Settings of the run, a dataclass instance or a mapping, written to ``config.json``.
         wandb: Also report to Weights & Biases, ``"online"``, or ``"offline"`` into
             ``directory/wandb`` for a later ``wandb sync``. Needs the extra ``wandb``.
-        resume: Continue the run that the directory holds. Follow with :meth:`truncate_to`.
+        resume: Continue the run that the directory holds, which may have had fewer ``episodes``.
+            Follow with :meth:`truncate_to`.
         mirrors: TorchRL loggers that get every row as well.
         train_columns: Columns of ``train.csv``.
 
@@ -95,8 +92,8 @@ class RunLogger:
         self.directory = Path(directory)
         if wandb not in (None, "online", "offline"):
             raise ValueError(f'wandb must be "online", "offline" or None, not {wandb!r}.')
-        settings = _plain(config)
-        _claim_directory(self.directory, settings, resume)
+        settings = plain_settings(config)
+        claim_directory(self.directory, settings, resume=resume)
         self._train = CsvFile(self.directory / "train.csv", train_columns)
         self._eval = CsvFile(self.directory / "eval.csv", EVAL_COLUMNS)
         self._mirrors = list(mirrors)
@@ -200,68 +197,6 @@ class RunLogger:
                 "the CSV files have all of it.",
                 stacklevel=4,
             )
-
-
-def _plain(config: Any) -> Any:
-    """Returns settings as JSON keeps them, so that they compare equal when read back."""
-    if dataclasses.is_dataclass(config) and not isinstance(config, type):
-        config = dataclasses.asdict(config)
-    return json.loads(json.dumps(config, default=str))
-
-
-def _flatten(settings: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    if isinstance(settings, dict):
-        for name, value in settings.items():
-            yield from _flatten(value, f"{prefix}.{name}" if prefix else name)
-    else:
-        yield prefix, settings
-
-
-def check_settings(directory: str | os.PathLike[str], config: Any) -> None:
-    """Makes sure that a directory holds no run, or one with these settings.
-
-    Args:
-        directory: A run directory, there or not.
-        config: Settings of a run, a dataclass instance or a mapping.
-
-    Raises:
-        ValueError: If it holds a run with other settings.
-    """
-    path = Path(directory) / "config.json"
-    if path.exists():
-        there, here = dict(_flatten(read_json(path))), dict(_flatten(_plain(config)))
-        differences = [
-            f"{name} is {there.get(name, 'absent')} there and {here.get(name, 'absent')} here"
-            for name in {**there, **here}
-            if name not in there or name not in here or there[name] != here[name]
-        ]
-        if differences:
-            raise ValueError(
-                f"{directory} holds a run with other settings ({'; '.join(differences)}): "
-                "choose another run directory, or the same settings."
-            )
-
-
-def _claim_directory(directory: Path, settings: Any, resume: bool) -> None:
-    """Writes ``config.json``, unless the directory holds a run that this one may not continue."""
-    check_settings(directory, settings)
-    path = directory / "config.json"
-    files = (path.name, "train.csv", "eval.csv")
-    if not resume and any((directory / name).exists() for name in files):
-        raise ValueError(
-            f"{directory} already holds a run: resume it, or choose another run directory."
-        )
-    make_folder(directory)
-    temporary = path.with_suffix(".tmp")
-    try:
-        temporary.write_text(json.dumps(settings, indent=2) + "\n")
-        temporary.replace(path)
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
-        raise OSError(
-            f"cannot write {path} ({error.strerror}): make room, or choose another run directory"
-        ) from None
 
 
 def _wandb_logger(directory: Path, settings: Any, mode: str) -> list[Logger]:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +16,7 @@ from matplotlib.ticker import MaxNLocator, MultipleLocator
 from numpy.typing import NDArray
 
 from bgpo_trl.plotting import _legend, _mark_starts, _style, _task_markers
-from bgpo_trl.runs import read_rows
+from bgpo_trl.runs import count, read_rows
 
 
 @dataclass(frozen=True)
@@ -57,17 +58,12 @@ def read_groups(
     Raises:
         ValueError: If the file is missing or damaged, or of a run that did not tell groups.
     """
-    rows: dict[int, list[tuple[int, int, int, int]]] = {}
-    for number, row in enumerate(read_rows(path), 2):
-        try:
-            numbers = (int(row[column]) for column in ("episode", "group", "num_groups"))
-            episode, group, num_groups = numbers
-            entry = episode, task_names.index(row["task"]), group, num_groups
-            rows.setdefault(int(row["seed"]), []).append(entry)
-        except (KeyError, TypeError, ValueError):
-            raise ValueError(
-                f"{path}, line {number} tells no group of these tasks: name another run"
-            ) from None
+    columns: dict[str, Callable[[str], object]] = {"task": task_names.index}
+    columns |= dict.fromkeys(("seed", "episode", "group", "num_groups"), count)
+    rows: dict[int, list[tuple[int, int, int, int]]] = defaultdict(list)
+    for row in read_rows(path, columns):
+        episode, group, num_groups = (int(row[name]) for name in ("episode", "group", "num_groups"))
+        rows[int(row["seed"])].append((episode, task_names.index(row["task"]), group, num_groups))
     return {seed: GroupedEpisodes(*np.array(sorted(rows[seed])).T) for seed in sorted(rows)}
 
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import os
+import re
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bgpo_trl import metrics
+
+_CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f]")
 
 
 @dataclass(frozen=True)
@@ -49,26 +53,47 @@ class Curves:
         return float(metrics.episodes_to(presented.mean(axis=0), self.episodes, threshold))
 
 
-def read_rows(path: str | os.PathLike[str]) -> list[dict[str, str]]:
+def read_rows(
+    path: str | os.PathLike[str],
+    columns: Mapping[str, Callable[[str], object]] | None = None,
+    remedy: str = "resume the run, which writes it again, or take the line out",
+) -> list[dict[str, str]]:
     """Returns the rows of a CSV file of a run.
 
+    Args:
+        path: Of the file.
+        columns: Those that must be there, and what raises `ValueError` for cells that cannot be.
+        remedy: What to do about a damaged line.
+
     Raises:
-        ValueError: If there is no such file, or it is no CSV file.
+        ValueError: If there is no such file, it is no CSV file, or it is not such a one.
     """
-    return _read_csv(path)[1]
-
-
-def _read_csv(path: str | os.PathLike[str]) -> tuple[Sequence[str], list[dict[str, str]]]:
     path = Path(path)
     try:
         with path.open(newline="") as file:
-            reader = csv.DictReader(file)
-            rows = list(reader)
-            return reader.fieldnames or (), rows
+            text = file.read()
+            # A terminal would take these for commands.
+            if _CONTROL.search(text):
+                raise ValueError("control characters")
+            reader = csv.DictReader(io.StringIO(text, newline=""))
+            rows, found = list(reader), reader.fieldnames or ()
     except (FileNotFoundError, NotADirectoryError):
         raise ValueError(f"{path} is missing: let the run in {path.parent} finish") from None
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+    except (OSError, ValueError, csv.Error) as error:
         raise ValueError(f"{path} is no CSV file of a run ({error}): name another run") from None
+    missing = sorted(set(columns or ()).difference(found))
+    if found and missing:
+        lacks = ", ".join(missing)
+        raise ValueError(f"{path} is no such table of a run (it lacks {lacks}): name another run")
+    for number, row in enumerate(rows, 2):
+        try:
+            for name, check in (columns or {}).items():
+                if row[name] is None:  # a line that was cut short
+                    raise ValueError
+                check(row[name])
+        except ValueError:
+            raise ValueError(f"{path}, line {number} is damaged: {remedy}") from None
+    return rows
 
 
 def read_tests(path: str | os.PathLike[str]) -> list[dict[str, str]]:
@@ -77,25 +102,32 @@ def read_tests(path: str | os.PathLike[str]) -> list[dict[str, str]]:
     Raises:
         ValueError: If the file is missing or empty, or a row is not of a test episode.
     """
-    columns, rows = _read_csv(path)
-    missing = sorted({"algorithm", "seed", "episode", "task", "success"}.difference(columns))
-    if columns and missing:
-        raise ValueError(f"{path} is no eval.csv of a run: it lacks {', '.join(missing)}")
+    columns = {"algorithm": str, "seed": count, "episode": count, "task": str, "success": _share}
+    rows = read_rows(path, columns)
     if not rows:
         raise ValueError(f"{path} holds no test episode: let the run evaluate first")
-    for number, row in enumerate(rows, 2):
-        try:
-            _ = int(row["seed"]), int(row["episode"]), float(row["success"])
-        except (TypeError, ValueError):
-            raise ValueError(
-                f"{path}, line {number} is damaged: resume the run, which writes it again, or take "
-                "the line out"
-            ) from None
     return rows
 
 
-def read_json(path: str | os.PathLike[str]) -> dict[str, Any]:
+def read_final_tests(path: str | os.PathLike[str]) -> list[dict[str, str]]:
+    """Returns the rows of a ``final.csv``, one a seed, task and kind of demonstrations.
+
+    Raises:
+        ValueError: If the file is missing, or a row is not of such tests.
+    """
+    columns = {"seed": count, "demonstrations": str, "task": str, "success": _share}
+    columns["task_inference"] = _share_or_nothing  # nothing where there is no GWR-B
+    return read_rows(path, columns, "remove the file and resume the run, which tests again")
+
+
+def read_json(
+    path: str | os.PathLike[str], entries: Mapping[str, Any] | None = None
+) -> dict[str, Any]:
     """Returns what a run keeps in ``config.json`` or ``summary.json``.
+
+    Args:
+        path: Of the file.
+        entries: Types of those that must be there; an entry that may be None may be missing.
 
     Raises:
         ValueError: If there is no such file, or it is damaged.
@@ -107,9 +139,27 @@ def read_json(path: str | os.PathLike[str]) -> dict[str, Any]:
         raise ValueError(f"{path} is missing: let the run in {path.parent} finish") from None
     except (OSError, ValueError, RecursionError):
         found = None
-    if not isinstance(found, dict):
+    if not isinstance(found, dict) or not all(
+        isinstance(found.get(name), kind) for name, kind in (entries or {}).items()
+    ):
         raise ValueError(f"{path} is damaged: put it back as the run left it, or run it again")
     return found
+
+
+def count(cell: str) -> None:
+    """Refuses, with a `ValueError`, what is no number of something."""
+    if not 0 <= int(cell) < 2**53:
+        raise ValueError
+
+
+def _share(cell: str) -> None:
+    if not 0 <= float(cell) <= 1:
+        raise ValueError
+
+
+def _share_or_nothing(cell: str) -> None:
+    if cell:
+        _share(cell)
 
 
 def read_curves(path: str | os.PathLike[str], tasks: Sequence[str]) -> Curves:
@@ -156,14 +206,10 @@ def read_outcomes(
         ValueError: If the file is missing or damaged.
     """
     outcomes: dict[int, dict[str, list[tuple[int, int]]]] = defaultdict(lambda: defaultdict(list))
-    for number, row in enumerate(read_rows(path), 2):
-        try:
-            seed, episode, task = int(row["seed"]), int(row["episode"]), row["task"]
-            outcome = (episode, int(float(row["success"])))
-        except (KeyError, TypeError, ValueError):
-            raise ValueError(f"{path}, line {number} is damaged: take the line out") from None
-        if last is None or episode <= last:
-            outcomes[seed][task].append(outcome)
+    for row in read_rows(path, {"seed": count, "episode": count, "task": str, "success": _share}):
+        if last is None or int(row["episode"]) <= last:
+            outcome = int(row["episode"]), int(float(row["success"]))
+            outcomes[int(row["seed"])][row["task"]].append(outcome)
     return [
         [[success for _, success in sorted(of_seed[task])] for task in tasks]
         for _, of_seed in sorted(outcomes.items())

@@ -220,12 +220,13 @@ def load_run(
         bank=bank.seen(),
         encoders=encoders,
     )
-    state = load_checkpoint(path / "checkpoint", mmap=True)["algorithm"]
-    if not algorithm.needs_replay:
-        state["replay"] = algorithm.replay.state_dict()  # What is left in the file costs nothing.
+    saved = load_checkpoint(path / "checkpoint", mmap=True)
     try:
+        state = saved["algorithm"]
+        if not algorithm.needs_replay:
+            state["replay"] = algorithm.replay.state_dict()  # What is left in the file is free.
         algorithm.load_state_dict(state)
-    except (KeyError, RuntimeError, ValueError) as error:
+    except (KeyError, IndexError, RuntimeError, TypeError, ValueError) as error:
         reason = str(error).splitlines()[-1].strip()
         raise ValueError(
             f"{path / 'checkpoint'} does not fit {path / 'config.json'} ({reason}): use the "

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import gc
-import signal
-import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
@@ -19,14 +16,17 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 
 from bgpo_trl.algorithms import ALGORITHMS, Algorithm
-from bgpo_trl.checkpoint import has_checkpoint, load_checkpoint, save_checkpoint
+from bgpo_trl.checkpoint import save_checkpoint
 from bgpo_trl.configs import RunConfig
 from bgpo_trl.demonstration_bank import DemonstrationBank
 from bgpo_trl.evaluation import Evaluator, Snapshot
 from bgpo_trl.gwr_growth import growth_moments, save_graph
+from bgpo_trl.interrupts import interrupts_wait
+from bgpo_trl.locking import DirectoryLock
 from bgpo_trl.logging import RunLogger
 from bgpo_trl.progress import progress_bar
 from bgpo_trl.representation import Representation
+from bgpo_trl.run_directory import load_last, plain_settings
 from bgpo_trl.transforms import TaskSchedule
 
 
@@ -35,16 +35,19 @@ class Trainer:
 
     Each seed of the batch plays ``config.episodes`` training episodes. Seeds that are done early go
     on, unlogged, until the last one is; everything that is logged is what the seed alone would have
-    logged, but for the losses, which are means over the seeds.
+    logged, but for the losses, which are means over the seeds. A run may be resumed with more
+    ``config.episodes`` than it had: it is then what the longer run would have been.
 
     Each update runs while the environment takes a step, and learns from all transitions before it.
 
     Checkpoints are written between steps only, and an interrupt (Ctrl-C) waits for the end of its
     step, so that each checkpoint is a state that the run has been in. Whatever else ends a run
-    costs it what came after its last checkpoint, and no row: a resumed run writes them again.
+    costs it what came after its last checkpoint, and no row: a resumed run writes them again. The
+    first one is written before the first step.
 
     Rows are in their files at once. Mirrors such as Weights & Biases hear that it is over when the
     trainer is closed, so that figures can still reach them after `run`: use it in a ``with`` block.
+    Until then no other process can write to the directory.
 
     Args:
         config: The run.
@@ -54,13 +57,16 @@ class Trainer:
         encoders: Trained encoders; None for a run that does not use them.
         make: Makes the algorithm; by default the one that `ALGORITHMS` has under ``config.name``.
         device: Where the networks are; see `Algorithm`.
-        resume: Continue the run in the directory, from its last checkpoint.
+        resume: Continue the run in the directory, from its last checkpoint; begin it where there is
+            none.
         wandb: None, ``"online"`` or ``"offline"``: mirror the CSV there.
         progress: Whether to show a progress bar.
 
     Raises:
         ValueError: If the directory holds another run (other settings, other encoders), or one and
-            ``resume`` is False; or if the bank has no demonstration of one of the tasks.
+            ``resume`` is False; if rows, checkpoint or ``config.json`` of a run to continue are
+            missing; or if the bank has no demonstration of one of the tasks.
+        BlockingIOError: If another process is at work in the directory.
     """
 
     def __init__(
@@ -108,11 +114,26 @@ class Trainer:
         self._successes: deque[int] = deque(maxlen=100)
         self._tested = ""
         self._growth_moments = growth_moments(config.episodes)
-        settings = {**asdict(config), "encoders": None if encoders is None else encoders.identity}
-        self.logger = RunLogger(self.directory, config=settings, wandb=wandb, resume=resume)
+        # Rows of seeds that were done early and went on.
+        self._later: list[dict[str, Any]] = []
+        encoders_used = None if encoders is None else encoders.identity
+        self._settings = plain_settings({**asdict(config), "encoders": encoders_used})
         self._state: TensorDictBase | None = None
-        if resume:
-            self._resume()
+        self._lock = DirectoryLock(self.directory)
+        try:
+            saved = load_last(self.directory, self._settings) if resume else None
+            if saved is not None:
+                self._load(saved)
+            self.logger = RunLogger(
+                self.directory, config=self._settings, wandb=wandb, resume=resume
+            )
+            if saved is not None:
+                self.logger.truncate_to(saved["position"])
+                for row in saved.get("later", []):
+                    self._log(row)
+        except BaseException:
+            self._lock.release()
+            raise
 
     def run(self) -> None:
         """Trains to the end; does nothing where a resumed run is there already.
@@ -123,8 +144,10 @@ class Trainer:
             OSError: If the disk is full.
         """
         algorithm, n_episodes = self.algorithm, self.config.episodes
-        state = algorithm.env.reset() if self._state is None else self._state
-        saved = time.monotonic()
+        if self._state is None:
+            self._state = algorithm.env.reset()
+            self.save()  # So that there are never rows without a checkpoint.
+        state, saved = self._state, time.monotonic()
         episodes = algorithm.source.episode
         bar = progress_bar(
             "train",
@@ -137,7 +160,7 @@ class Trainer:
         # What is here now stays to the end: the garbage collector need not look at it again.
         gc.freeze()
         try:
-            with _interrupts_wait() as interrupted, ThreadPoolExecutor(1, "update") as background:
+            with interrupts_wait() as interrupted, ThreadPoolExecutor(1, "update") as background:
                 while int(episodes.min()) < n_episodes:
                     before = episodes.clone()
                     state = algorithm.act(state)
@@ -148,8 +171,8 @@ class Trainer:
                     self.env_steps += 1
                     self._state = state
                     for index in torch.nonzero(episodes > before).flatten().tolist():
+                        self._end_of_episode(index, transition, losses)
                         if before[index] < n_episodes:
-                            self._end_of_episode(index, transition, losses)
                             bar.set_postfix_str(self._success_so_far(), refresh=False)
                             bar.update()
                     self._evaluate()
@@ -165,8 +188,9 @@ class Trainer:
             bar.close()
 
     def close(self) -> None:
-        """Closes the run's files and mirrors."""
+        """Closes the run's files and mirrors, and lets other processes into its directory."""
         self.logger.close()
+        self._lock.release()
 
     def __enter__(self) -> Self:
         return self
@@ -192,25 +216,23 @@ class Trainer:
         extrinsic = end.get("episode_extrinsic_reward", end["episode_reward"])
         nodes = 0 if algorithm.gwr is None else int(algorithm.gwr.num_nodes[index])
         groups = 1 if algorithm.groups is None else int(algorithm.groups.num_groups[index])
-        self._successes.append(int(end["terminated"]))
-        self.logger.log_train(
-            {
-                "algorithm": self.config.name,
-                "seed": self.config.seeds[index],
-                "episode": episode,
-                "env_steps": self.env_steps,
-                "task": self.config.tasks[int(end["task"])],
-                "success": int(end["terminated"]),
-                "return": float(extrinsic),
-                "steps": int(end["step_count"]),
-                "intrinsic_return": float(intrinsic),
-                "num_nodes": nodes,
-                "group": int(end.get("group", 0)),
-                "num_groups": groups,
-                "loss_actor": float(losses.get("loss_actor", 0.0)),
-                "loss_value": float(losses.get("loss_value", 0.0)),
-            }
-        )
+        row = {
+            "algorithm": self.config.name,
+            "seed": self.config.seeds[index],
+            "episode": episode,
+            "env_steps": self.env_steps,
+            "task": self.config.tasks[int(end["task"])],
+            "success": int(end["terminated"]),
+            "return": float(extrinsic),
+            "steps": int(end["step_count"]),
+            "intrinsic_return": float(intrinsic),
+            "num_nodes": nodes,
+            "group": int(end.get("group", 0)),
+            "num_groups": groups,
+            "loss_actor": float(losses.get("loss_actor", 0.0)),
+            "loss_value": float(losses.get("loss_value", 0.0)),
+        }
+        self._log(row)
         if index == 0 and algorithm.gwr is not None and episode in self._growth_moments:
             save_graph(self.directory / "gwr", episode, algorithm.gwr)
         if episode % self.config.eval_every == 0:
@@ -218,6 +240,14 @@ class Trainer:
             self._waiting[index].append(
                 self.evaluator.take(algorithm, index, number, self.env_steps)
             )
+
+    def _log(self, row: dict[str, Any]) -> None:
+        """Logs an episode, or keeps what only a longer run would log."""
+        if row["episode"] <= self.config.episodes:
+            self._successes.append(row["success"])
+            self.logger.log_train(row)
+        else:
+            self._later.append(row)
 
     def _evaluate(self) -> None:
         while all(self._waiting):
@@ -255,50 +285,16 @@ class Trainer:
             "env_steps": self.env_steps,
             "waiting": [[vars(s) for s in waiting] for waiting in self._waiting],
             "evaluated": self._evaluated,
+            "later": self._later,
+            "settings": self._settings,
             "position": self.logger.position(),
         }
         save_checkpoint(self.directory / "checkpoint", state)
 
-    def _resume(self) -> None:
-        folder = self.directory / "checkpoint"
-        if not has_checkpoint(folder):
-            self.logger.truncate_to({})
-            return
-        state = load_checkpoint(folder)
+    def _load(self, state: dict[str, Any]) -> None:
         self.algorithm.env.reset()  # Transforms make their caches at the first reset.
         self.algorithm.load_state_dict(state["algorithm"])
         self._state = TensorDict(state["state"], self.algorithm.env.batch_size)
         self.env_steps = state["env_steps"]
         self._waiting = [[Snapshot(**s) for s in waiting] for waiting in state["waiting"]]
         self._evaluated = state["evaluated"]
-        self.logger.truncate_to(state["position"])
-
-
-@contextmanager
-def _interrupts_wait() -> Iterator[Callable[[], bool]]:
-    """Makes the first Ctrl-C wait for the end of the block, which is told by what it is given.
-
-    Where Ctrl-C is ignored (in the background of a shell), handled by someone else, or meant for
-    another thread, it stays so.
-    """
-    asked = False
-
-    def ask(signum: int, frame: Any) -> None:
-        nonlocal asked
-        if asked:
-            raise KeyboardInterrupt
-        asked = True
-
-    if (
-        threading.current_thread() is not threading.main_thread()
-        or signal.getsignal(signal.SIGINT) is not signal.default_int_handler
-    ):
-        yield lambda: False
-        return
-    signal.signal(signal.SIGINT, ask)
-    try:
-        yield lambda: asked
-    finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-    if asked:
-        raise KeyboardInterrupt

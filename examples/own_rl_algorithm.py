@@ -4,16 +4,16 @@ python examples/own_rl_algorithm.py
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor
 
+from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.rl import RL, Problem, RLEntry, TD3Learner, make_td3
-from bgpo_trl.configs import BGPOConfig, RunConfig, TD3Config
+from bgpo_trl.configs import RunConfig, TD3Config
 from bgpo_trl.pretrained import load_pretrained
 from bgpo_trl.training import Trainer
 
@@ -31,9 +31,9 @@ class EpsilonLearner(TD3Learner):
 
     config: EpsilonConfig
 
-    def act(self, tensordict: TensorDictBase, generators: Sequence[torch.Generator]) -> Tensor:
+    def explore(self, action: Tensor, generators: Sequence[torch.Generator]) -> Tensor:
         """Returns TD3's actions ``[S, 4]``, some of them replaced."""
-        action = super().act(tensordict, generators)
+        action = super().explore(action, generators)
         for row, generator in zip(action, generators, strict=True):  # a seed draws from its own
             if torch.rand((), generator=generator) < self.config.epsilon:
                 row.uniform_(-1, 1, generator=generator)
@@ -50,9 +50,9 @@ RL["td3-epsilon"] = RLEntry(make, EpsilonConfig())
 
 if __name__ == "__main__":
     # A minute's try: ground truth and the task's label. BGPO itself is BGPOConfig(rl=...) alone.
-    algorithm = BGPOConfig(state="state", rl=EpsilonConfig(warmup_steps=64))
+    told = replace(ALGORITHMS["oracle"].config, state="state", rl=EpsilonConfig(warmup_steps=64))
     config = RunConfig(
-        (0, 1), 4, task_starts=(0, 0, 0), eval_every=2, name="oracle", algorithm=algorithm
+        (0, 1), 4, task_starts=(0, 0, 0), eval_every=2, name="oracle", algorithm=told
     )
     with TemporaryDirectory() as folder, Trainer(config, folder, bank=load_pretrained()[1]) as run:
         run.run()

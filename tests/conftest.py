@@ -1,10 +1,14 @@
 """What all tests share: settings, and the parts of a run small enough to be played in a second."""
 
 import hashlib
+import os
 import signal
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from json import JSONDecodeError
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -31,6 +35,11 @@ SMALL = {
     "maml": {"task_batch_size": 8, "adaptation_size": 12},
     "dist-nll": {"task_batch_size": 8, "samples": 24, "distillation_batch_size": 12},
 }
+
+
+def of_name(settings, name):
+    """Settings of an algorithm, which those named after it share, such as ``maml-paper``."""
+    return next((s for start, s in settings.items() if name.startswith(start)), {})
 
 
 @pytest.fixture(scope="session")
@@ -66,9 +75,10 @@ def make_config():
         name, _, rl = name.partition("+")
         small = {"hidden_sizes": (64,), "batch_size": 16, "warmup_steps": 8, "replay_size": 200}
         rl = replace(RL[rl or "ddpg"].config, **small)
-        algorithm = replace(
-            ALGORITHMS[name].config, state=state, max_steps=6, rl=rl, **SMALL.get(name, {})
-        )
+        settings = {"state": state, "max_steps": 6, "rl": rl, **of_name(SMALL, name)}
+        if state == "state":  # demonstrations are latents
+            settings["demonstration_share"] = 0.0
+        algorithm = replace(ALGORITHMS[name].config, **settings)
         config = RunConfig(
             seeds=(3, 8),
             episodes=10,
@@ -138,7 +148,7 @@ def refused(tmp_path) -> Callable[..., None]:
             call()
         message = str(raised.value)
         assert not isinstance(raised.value, JSONDecodeError | UnicodeDecodeError)
-        assert "\n" not in message
+        assert message.isprintable()  # one line, and nothing that a terminal would act on
         assert cause in message
         assert remedy in message
         assert _files(tmp_path) == before
@@ -151,3 +161,44 @@ def _files(folder) -> dict[str, str]:
         str(path): hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
         for path in folder.rglob("*")
     }
+
+
+_OTHER_PROCESS = """
+import sys
+from bgpo_trl import locking
+
+def sleep(seconds, sleep=locking.time.sleep):
+    print("waits", flush=True)
+    sleep(0.01)
+
+locking.time.sleep = sleep
+with locking.DirectoryLock(sys.argv[1], wait=sys.argv[2] == "True"):
+    print("has it", flush=True)
+    input()
+"""
+
+
+@pytest.fixture
+def other_process() -> Iterator[Callable[..., subprocess.Popen[str]]]:
+    """Starts processes that hold a directory until they read a line.
+
+    They print ``has it``, or ``waits`` again and again; or they are refused.
+    """
+    started: list[subprocess.Popen[str]] = []
+
+    def start(directory: Path, *, wait: bool = False) -> subprocess.Popen[str]:
+        process = subprocess.Popen(
+            [sys.executable, "-c", _OTHER_PROCESS, str(directory), str(wait)],
+            env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])},
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        started.append(process)
+        return process
+
+    yield start
+    for process in started:
+        process.kill()
+        process.communicate()

@@ -13,7 +13,6 @@ from bgpo_trl.demonstrations import load_demonstrations, record_demonstrations
 from bgpo_trl.logging import EVAL_COLUMNS, RunLogger
 from bgpo_trl.plotting import plot_frame_strips, plot_success_curves, save_figure
 from bgpo_trl.pretrained import load_pretrained
-from bgpo_trl.replay import ReplayBuffer
 from bgpo_trl.representation import default_weights, load_representation
 from bgpo_trl.runs import read_curves, read_json, read_rows
 from suites import nico
@@ -32,6 +31,7 @@ def folder(tmp_path) -> Path:
         "damaged": HEADER + "bgpo,0,ten,5,grasp_glass,1,1.0,5\n",
         "cut": HEADER + "bgpo,0,10\n",
         "binary": b"\xff\xfe\x00" * 20,
+        "terminal": HEADER + "bgpo,0,10,5,\x1b[31mred,1,1.0,5\n",
         "stranger": HEADER + "bgpo,0,10,5,juggle,1,1.0,5\n",
     }.items():
         (tmp_path / name).mkdir()
@@ -85,6 +85,9 @@ CASES = {
     "csv of another run": (
         lambda f: CsvFile(f / "foreign" / "eval.csv", EVAL_COLUMNS),
         "has the columns date,temperature", "choose another run directory"),
+    "csv of rubbish": (
+        lambda f: CsvFile(f / "binary" / "eval.csv", EVAL_COLUMNS),
+        "is no CSV file, this run writes algorithm", "choose another run directory"),
     "figure in a file": (
         lambda f: save_figure(figure(), f / "file" / "a.png"), "cannot make the folder", "another"),
     # checkpoints
@@ -94,20 +97,19 @@ CASES = {
         lambda f: save_checkpoint(f, {"a": object()}), "state['a'] is a object", "turn it into"),
     "checkpoint in a file": (
         lambda f: save_checkpoint(f / "file", {"a": 1}), "cannot save a checkpoint", "make room"),
-    "no replay": (
-        lambda f: ReplayBuffer(5, generator=torch.Generator()).loads(f / "nowhere"),
-        "holds no replay", "that dumps() wrote"),
     # runs that are read
     "no run": (lambda f: curves(f / "nowhere"), "eval.csv is missing", "let the run in"),
     "run that is a file": (lambda f: curves(f / "file"), "eval.csv is missing", "let the run in"),
     "run without a test": (
         lambda f: curves(f / "unevaluated"), "holds no test episode", "let the run evaluate first"),
     "table of something else": (
-        lambda f: curves(f / "foreign"), "lacks algorithm, episode", "is no eval.csv of a run"),
+        lambda f: curves(f / "foreign"), "lacks algorithm, episode", "name another run"),
     "row with a word for a number": (
         lambda f: curves(f / "damaged"), "line 2 is damaged", "resume the run"),
     "row cut short": (lambda f: curves(f / "cut"), "line 2 is damaged", "resume the run"),
     "binary table": (lambda f: curves(f / "binary"), "is no CSV file", "name another run"),
+    "table that talks to the terminal": (
+        lambda f: curves(f / "terminal"), "is no CSV file of a run (control", "name another run"),
     "table that is a folder": (lambda f: read_rows(f), "is no CSV file", "name another run"),
     "test of an unknown task": (
         lambda f: curves(f / "stranger"), "'juggle'", "none of grasp_glass"),
@@ -151,6 +153,8 @@ CASES = {
         lambda f: record_demonstrations(f / "d", tasks=["juggle"], **TINY), "'juggle'", "choose"),
     "recording with a negative seed": (
         lambda f: record_demonstrations(f / "d", seed=-1, **TINY), "got -1", "at least 0"),
+    "recording without an attempt": (
+        lambda f: record_demonstrations(f / "d", attempts=0, **TINY), "got 0", "at least 1"),
     "recording none to learn from": (
         lambda f: record_demonstrations(f / "d", per_task=1, held_out_per_task=1),
         "held_out_per_task is 1", "must be less than per_task, 1"),

@@ -41,7 +41,7 @@ def test_an_rl_algorithm_is_known_by_its_name(tmp_path, name):
 
 @pytest.mark.parametrize("name", ablation.VARIANTS)
 def test_variants_have_the_settings_that_fit(tmp_path, name):
-    config = RunConfig(name=name, algorithm=BGPOConfig(beta=0.3))
+    config = RunConfig(name=name, algorithm=replace(ablation.VARIANTS[name][1], beta=0.3))
     path = write(tmp_path / "config.json", config, encoders=None)
     assert read_config(path) == (config, None)
 

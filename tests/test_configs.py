@@ -9,6 +9,7 @@ from bgpo_trl.configs import (
     BGPOConfig,
     DDPGConfig,
     DistNLLConfig,
+    GWRBConfig,
     MAMLConfig,
     RepresentationConfig,
     RunConfig,
@@ -25,7 +26,6 @@ SETTINGS = [
     (VAEConfig, {"kl_weight": NAN}, "at least 0"),
     (SequenceAutoencoderConfig, {"steps": 0}, "at least 1"),
     (SequenceAutoencoderConfig, {"warmup_steps": 0}, "at least 1"),
-    (SequenceAutoencoderConfig, {"embedding_scale": 0.0}, "a number above 0"),
     (RepresentationConfig, {"seed": -1}, "at least 0"),
     (RepresentationConfig, {"log_every": 0}, "at least 1"),
     (DDPGConfig, {"hidden_sizes": ()}, "one or more, of at least 1"),
@@ -43,6 +43,13 @@ SETTINGS = [
     (DDPGConfig, {"replay_size": 100}, "256 (batch, warm-up) or more"),
     (AlgorithmConfig, {"state": "pixels"}, "latent or state"),
     (AlgorithmConfig, {"max_steps": 0}, "at least 1"),
+    (AlgorithmConfig, {"demonstration_share": 1.0}, "at least 0 and below 1"),
+    (AlgorithmConfig, {"demonstration_share": NAN}, "at least 0 and below 1"),
+    (GWRBConfig, {"activity_scale": 0.0}, "a number above 0"),
+    (GWRBConfig, {"activity_threshold": 1.0}, "between 0 and 1"),
+    (RunConfig, {"held_out": "training"}, "validation or test"),
+    (BGPOConfig, {"active_groups": 0}, "at least 1"),
+    (BGPOConfig, {"even_replay": False}, "set where there are experts"),
     (BGPOConfig, {"beta": -0.1}, "at least 0"),
     (BGPOConfig, {"beta": NAN}, "at least 0"),
     (MAMLConfig, {"inner_learning_rate": NAN}, "at least 0"),
@@ -64,3 +71,19 @@ SETTINGS = [
 def test_settings(refused, config, values, remedy):
     (name, value), *_ = values.items()
     refused(lambda: config(**values), f"{name} must be {remedy}", f"got {value}")
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (
+            {"rl": DDPGConfig(batch_size=3)},
+            r"batch_size \(3\) must be at least active_groups \(4\)",
+        ),
+        ({"rl": DDPGConfig(warmup_steps=49)}, r"warmup_steps \(49\) must be at least max_steps"),
+    ],
+)
+def test_settings_that_do_not_go_together(settings, message):
+    with pytest.raises(ValueError, match=message):
+        BGPOConfig(**settings)
+    BGPOConfig(**settings, experts=False, demonstration_share=0.0)  # by themselves they do

@@ -11,7 +11,7 @@ import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from bgpo_trl.demonstration_bank import DemonstrationBank
+from bgpo_trl.demonstration_bank import DemonstrationBank, DemonstrationSteps
 from bgpo_trl.demonstrations import load_demonstrations, record_demonstrations
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
@@ -146,13 +146,16 @@ def files(tmp_path_factory) -> Path:
     metadata = {"scene_version": "some", "config": json.dumps(config), "seed": "0", "command": ""}
     small = Representation(VAE(1), SequenceAutoencoder(1, 2), metadata)
     save_representation(small, folder / "encoders")
-    task = torch.arange(3)
-    DemonstrationBank(torch.rand(3, 2), task, task > 0).save(folder / "bank", encoder_id="x")
+    task, length = torch.arange(3), torch.tensor([0, 2, 3])
+    steps = DemonstrationSteps.of(torch.rand(3, 3, 2), torch.rand(3, 2, 4), length)
+    bank = DemonstrationBank(torch.rand(3, 2), task, task > 0, steps=steps)
+    bank.save(folder / "bank", encoder_id="x")
     return folder
 
 
 def read_bank(path: Path) -> dict[str, torch.Tensor]:
-    bank = vars(DemonstrationBank.load(path, encoder_id="x"))
+    bank = dict(vars(DemonstrationBank.load(path, encoder_id="x")))
+    bank |= vars(bank.pop("steps"))
     return bank | {"tasks": torch.tensor(list(",".join(bank["tasks"]).encode()))}
 
 

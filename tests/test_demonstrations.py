@@ -1,4 +1,5 @@
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -146,15 +147,48 @@ def test_a_demonstration_that_fails_is_tried_again(tmp_path, monkeypatch):
     assert dataset["action"].abs().sum() > 1
 
 
+class Fickle(nico.TASKS["push_green_to_white"]):
+    """A task that is solved until it is not, since its success test is broken."""
+
+    times = 4  # Each success is asked for twice: for the reward, and for the end.
+
+    def succeeded(self, physics):
+        if Fickle.times == 0 or not super().succeeded(physics):
+            return False
+        Fickle.times -= 1
+        return True
+
+
+def test_a_demonstrator_that_never_succeeds_is_told_of(tmp_path, monkeypatch):
+    nico.add_task("fickle", Fickle)
+    options = {"tasks": ["grasp_glass", "fickle"], "per_task": 4, "held_out_per_task": 1}
+    with pytest.raises(RuntimeError) as raised:
+        record_demonstrations(tmp_path, attempts=3, progress=False, **options)
+    told = re.fullmatch(
+        r"the demonstrator of 'fickle' failed 3 times in a row \(2 of (\d+) attempts succeeded, "
+        r"(\d+)%\): mend its demonstration\(\), or raise attempts",
+        str(raised.value),
+    )
+    assert int(told[1]) >= 5
+    assert int(told[2]) == round(200 / int(told[1]))
+
+    before = demonstrations._open(tmp_path, 8)["length"].clone()
+    assert (before > 0).tolist() == [True] * 6 + [False] * 2
+    monkeypatch.setattr(Fickle, "times", 99)
+    mended = record_demonstrations(tmp_path, attempts=50, progress=False, **options)
+    assert (mended["length"] > 0).all()
+    assert mended["length"][:6].equal(before[:6])
+
+
 def test_an_interrupted_recording_ends_as_an_uninterrupted_one(recorded, tmp_path, monkeypatch):
     record = demonstrations._demonstrate
     rows = []
 
-    def interrupted(env, seed, row):
+    def interrupted(env, seed, row, attempts):
         rows.append(row)
         if len(rows) == 5:
             raise KeyboardInterrupt
-        return record(env, seed, row)
+        return record(env, seed, row, attempts)
 
     monkeypatch.setattr(demonstrations, "_demonstrate", interrupted)
     with pytest.raises(KeyboardInterrupt):

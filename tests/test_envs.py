@@ -82,7 +82,8 @@ def test_it_shows_what_the_suite_shows(task):
 
     for action in actions(env, 6):
         np.testing.assert_array_equal(td["pixels"], timestep.observation["pixels"])
-        np.testing.assert_array_equal(td["state"], timestep.observation["state"].astype(np.float32))
+        state = timestep.observation["privileged_state"].astype(np.float32)
+        np.testing.assert_array_equal(td["state"], state)
         td = env.step(td.set("action", action))["next"]
         timestep = plain.step(action.double().numpy())
 

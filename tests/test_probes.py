@@ -118,14 +118,3 @@ def test_play_is_measured_where_all_objects_are_on_the_table(untrained: Represen
     assert result.items() >= probe(untrained, demonstrations()).items()
     assert 0.01 < result["play_joint_yaw_rmse_rad"] < 10
     assert result["play_white_error_cm"] == pytest.approx(0, abs=1e-2)
-
-
-@pytest.mark.parametrize("scale", [1.0, 0.25])
-def test_distances_are_those_of_the_scaled_embedding(scale: float) -> None:
-    torch.manual_seed(0)
-    representation = Representation(VAE(), SequenceAutoencoder(embedding_scale=scale), {})
-    torch.manual_seed(0)
-    plain = Representation(VAE(), SequenceAutoencoder(), {})
-    ours, theirs = (probe(r, demonstrations()) for r in (representation, plain))
-    name = "phi_distance_other_task"
-    assert ours[name] == pytest.approx(scale * theirs[name])

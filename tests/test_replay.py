@@ -3,8 +3,6 @@
 import io
 import resource
 import sys
-from itertools import chain
-from pathlib import Path
 
 import pytest
 import torch
@@ -13,7 +11,6 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 
 from bgpo_trl.replay import ReplayBuffer
-from bgpo_trl.task_replay import TaskReplay
 
 
 def generators(n: int) -> list[torch.Generator]:
@@ -170,7 +167,8 @@ def test_only_chosen_entries_are_stored():
     assert set(whole.sample().keys(True, True)) == {("next", "latent"), ("next", "terminated")}
 
 
-def saved_by_torch(replay: ReplayBuffer, restored: ReplayBuffer, path: Path) -> int:
+def restored_by_torch(replay: ReplayBuffer, restored: ReplayBuffer) -> int:
+    """Restores one buffer from another by way of a file; returns its size."""
     file = io.BytesIO()
     torch.save(replay.state_dict(), file)
     file.seek(0)
@@ -178,25 +176,16 @@ def saved_by_torch(replay: ReplayBuffer, restored: ReplayBuffer, path: Path) -> 
     return len(file.getvalue())
 
 
-def saved_to_directory(replay: ReplayBuffer, restored: ReplayBuffer, path: Path) -> int:
-    replay.dumps(path)
-    restored.loads(path)
-    return sum(file.stat().st_size for file in path.rglob("*"))
-
-
-@pytest.mark.parametrize("save", [saved_by_torch, saved_to_directory])
 @pytest.mark.parametrize("capacity", [3, 100_000])
-def test_a_restored_buffer_continues_as_the_saved_one(save, capacity, tmp_path):
+def test_a_restored_buffer_continues_as_the_saved_one(capacity):
     replay = ReplayBuffer(capacity, batch_size=8, generator=generators(2))
-    for n_steps in (2, 3):  # twice into the same directory, the second time more
+    for n_steps in (2, 3):
         for step in range(n_steps):
             replay.add(transition(step, 2))
         replay.sample()
         restored = ReplayBuffer(capacity, batch_size=8, generator=generators(2))
         restored.add(transition(99, 2))
-        assert save(replay, restored, tmp_path) < 100_000
-    for file in tmp_path.rglob("*.memmap"):
-        file.unlink()
+        assert restored_by_torch(replay, restored) < 100_000
     assert restored.sizes.tolist() == replay.sizes.tolist()
     for step in range(3):
         assert (restored.sample() == replay.sample()).all()
@@ -220,11 +209,11 @@ def test_what_was_never_stored_is_saved_as_zeros(monkeypatch):
             assert (rows == 0).all()
 
 
-def test_an_empty_buffer_can_be_saved(tmp_path):
+def test_an_empty_buffer_can_be_saved():
     replay = ReplayBuffer(3, generator=generators(2))
     restored = ReplayBuffer(3, generator=generators(2))
     restored.add(transition(0, 2))
-    saved_to_directory(replay, restored, tmp_path)
+    restored_by_torch(replay, restored)
     assert len(restored) == 0
     restored.add(TensorDict({"other": torch.zeros(2, 1)}, [2]))
 
@@ -260,6 +249,28 @@ def test_bad_transitions_change_nothing(message):
     assert (TensorDict(after) == TensorDict(before)).all()
 
 
+def test_steps_are_taken_as_they_were_stored():
+    """Each seed stores at its own pace: the third stored every second of nine, six are kept."""
+    replay = ReplayBuffer(6, generator=generators(3))
+    stored = [[], [], []]
+    for step in range(9):
+        mask = torch.tensor([True, step < 4, step % 2 == 0])
+        replay.add(transition(step, 3), mask)
+        for seed in mask.nonzero().flatten().tolist():
+            stored[seed].append(step)
+    assert replay.n_added.tolist() == [9, 4, 5]
+    assert replay.oldest.tolist() == [3, 0, 0]
+    steps = torch.tensor([[3, 8, 8, 5], [0, 3, 2, 1], [4, 0, 0, 2]])
+    taken = replay.take(steps)
+    assert taken.batch_size == (3, 4)
+    for seed in range(3):
+        for row, step in enumerate(steps[seed].tolist()):
+            assert (taken[seed, row] == transition(stored[seed][step], 3)[seed]).all()
+    some = replay.take(steps[[2, 0]], ["latent"], seeds=[2, 0])
+    assert list(some.keys()) == ["latent"]
+    assert some["latent"].equal(taken["latent"][[2, 0]])
+
+
 def test_bad_arguments_are_refused():
     with pytest.raises(ValueError, match="at least 1"):
         ReplayBuffer(0, generator=torch.Generator())
@@ -277,162 +288,3 @@ def test_bad_arguments_are_refused():
     with pytest.raises(ValueError, match="capacity 4 and 2 seeds"):
         other.load_state_dict(saved.state_dict())
     assert len(other) == 1
-
-
-N_SEEDS, N_TASKS = 2, 3
-
-
-def task_generators(n_seeds: int = N_SEEDS) -> list[list[torch.Generator]]:
-    return [generators(n_seeds * N_TASKS)[i * N_TASKS : (i + 1) * N_TASKS] for i in range(n_seeds)]
-
-
-def make_task_replay(capacity=5, batch_size=3, generator=None) -> TaskReplay:
-    keys = ["latent", ("next", "terminated")]
-    generator = generator or task_generators()
-    return TaskReplay(capacity, batch_size=batch_size, generator=generator, keys=keys)
-
-
-def of_tasks(value: float, *tasks: int) -> TensorDict:
-    """A transition of each seed with its task."""
-    return transition(value, len(tasks)).set("task", torch.tensor(tasks))
-
-
-@settings(deadline=None, max_examples=40)
-@given(
-    capacity=st.integers(3, 7),
-    played=st.lists(
-        st.tuples(st.integers(0, N_TASKS - 1), st.integers(0, N_TASKS - 1)), max_size=25
-    ),
-    batch_size=st.integers(1, 3),
-    n_drawn=st.sampled_from([None, 1, 9]),
-    given_generators=st.booleans(),
-)
-def test_each_task_of_each_seed_has_a_ring_of_its_own(
-    capacity, played, batch_size, n_drawn, given_generators
-):
-    replay = make_task_replay(capacity, batch_size)
-    rings = [[[] for _ in range(N_TASKS)] for _ in range(N_SEEDS)]
-    for value, tasks in enumerate(played):
-        replay.add(of_tasks(value, *tasks))
-        for seed, task in enumerate(tasks):
-            rings[seed][task].append(value + seed / 100)
-    sizes = torch.tensor([[min(len(ring), capacity) for ring in of_seed] for of_seed in rings])
-    ready = sizes >= batch_size
-    assert replay.sizes.equal(sizes)
-    assert replay.ready.equal(ready)
-    assert len(replay) == sizes.sum(-1).min()
-    if not ready.any():
-        with pytest.raises(ValueError, match="no task fills a batch yet"):
-            replay.sample(n_drawn)
-        return
-
-    given = [torch.Generator().manual_seed(90 + i) for i in range(N_SEEDS * N_TASKS)]
-    batch = replay.sample(n_drawn, generator=given if given_generators else None)
-    n_drawn = n_drawn or batch_size
-    assert batch.batch_size == (N_SEEDS, N_TASKS, n_drawn)
-    assert set(batch.keys(True, True)) == {"latent", ("next", "terminated"), "priority_weight"}
-    expected = ready.float().unsqueeze(-1).expand(-1, -1, n_drawn)
-    assert batch["priority_weight"].equal(expected)
-    for seed in range(N_SEEDS):
-        for task, ring in enumerate(rings[seed]):
-            drawn, position = batch[seed, task], seed * N_TASKS + task
-            if not ready[seed, task]:
-                for value in drawn.values(True, True):
-                    assert not value.any()
-                continue
-            kept: list[float] = []
-            for number, value in enumerate(ring):
-                kept[number % capacity : number % capacity + 1] = [value]
-            seed_of_stream = 90 + position if given_generators else position
-            stream = torch.Generator().manual_seed(seed_of_stream)
-            index = torch.randint(len(kept), (n_drawn,), generator=stream)
-            torch.testing.assert_close(drawn["latent"].squeeze(-1), torch.tensor(kept)[index])
-            assert (drawn["next", "terminated"] == (seed == 1)).all()
-
-
-def fill(*replays: TaskReplay, n_steps: int = 12, first: int = 0) -> None:
-    """Adds transitions of changing tasks; the third task of the second seed has none."""
-    for step in range(first, first + n_steps):
-        for replay in replays:
-            replay.add(of_tasks(step, (0, 1, 0, 2)[step % 4], step % 2))
-
-
-def test_tasks_that_do_not_fill_a_batch_draw_nothing():
-    streams = task_generators()
-    replay = make_task_replay(batch_size=4, generator=streams)
-    fill(replay, n_steps=6)
-    assert replay.sizes.tolist() == [[3, 2, 1], [3, 3, 0]]
-    replay.add(of_tasks(9, 0, 2))
-    replay.sample()
-    drew = [
-        not stream.get_state().equal(untouched.get_state())
-        for stream, untouched in zip(chain(*streams), chain(*task_generators()), strict=True)
-    ]
-    assert drew == [True, False, False, False, False, False]
-
-
-def test_enough_transitions_fill_a_batch_of_a_task_whichever_they_are_of():
-    replay = make_task_replay(capacity=9, batch_size=3)
-    assert replay.enough == 7
-    for step in range(6):  # as evenly as can be
-        replay.add(of_tasks(step, step % 3, 0))
-    assert not replay.ready[0].any()
-    replay.add(of_tasks(6, 1, 0))
-    assert len(replay) == replay.enough
-    assert replay.ready.any(-1).all()
-
-
-def test_a_seed_in_a_batch_of_task_replays_is_that_seed_alone():
-    together = make_task_replay(generator=task_generators(2))
-    alone = [make_task_replay(generator=[streams]) for streams in task_generators(2)]
-    for step in range(20):
-        data = of_tasks(step, (0, 1, 0, 2)[step % 4], step % 2)
-        together.add(data)
-        for seed, replay in enumerate(alone):
-            replay.add(data[seed : seed + 1])
-        for seed, replay in enumerate(alone):
-            assert replay.sizes[0].equal(together.sizes[seed])
-        if all(replay.ready.any() for replay in alone):
-            drawn = together.sample()
-            for seed, replay in enumerate(alone):
-                assert (replay.sample()[0] == drawn[seed]).all()
-    assert together.ready.tolist() == [[True, True, True], [True, True, False]]
-
-
-def test_tasks_of_a_seed_are_drawn_in_the_order_asked_for():
-    asked, reference = make_task_replay(), make_task_replay()
-    fill(asked, reference)
-    drawn = asked.sample_seed(0, [2, 0], 8)
-    assert set(drawn.keys(True, True)) == {"latent", ("next", "terminated")}
-    for row, task in enumerate((2, 0)):
-        expected = reference.sample_seed(0, [task], 8)
-        assert expected.batch_size == (1, 8)
-        assert (drawn[row] == expected[0]).all()
-    steps = drawn["latent"].squeeze(-1).round().long()
-    assert (steps[0] % 4 == 3).all()
-    assert (steps[1] % 4 % 2 == 0).all()
-    other = asked.sample_seed(1, [1], 8)["latent"].squeeze(-1)
-    assert (other.round() % 2 == 1).all()
-    torch.testing.assert_close(other - other.round(), torch.full_like(other, 0.01))
-    with pytest.raises(ValueError, match="every seed needs a transition"):
-        asked.sample_seed(1, [1, 2], 8)
-
-
-@pytest.mark.parametrize("n_steps", [0, 1, 12])
-def test_a_restored_task_replay_continues_as_the_saved_one(n_steps):
-    replay, restored = make_task_replay(), make_task_replay()
-    fill(replay, n_steps=n_steps)
-    fill(restored, first=50)
-    if n_steps > 8:
-        replay.sample()
-    file = io.BytesIO()
-    torch.save(replay.state_dict(), file)
-    file.seek(0)
-    restored.load_state_dict(torch.load(file, weights_only=True))
-    assert restored.sizes.equal(replay.sizes)
-    fill(replay, restored, first=n_steps)
-    for _ in range(2):
-        assert (restored.sample() == replay.sample()).all()
-    assert (restored.sample_seed(0, [1], 9) == replay.sample_seed(0, [1], 9)).all()
-    ours, theirs = TensorDict(replay.state_dict()), TensorDict(restored.state_dict())
-    assert (ours == theirs).all()

@@ -60,6 +60,6 @@ def test_outcomes_of_each_tasks_own_training_episodes(tmp_path):
     path = write(tmp_path / "train.csv", rows)
     assert read_outcomes(path, ["a", "b"]) == [[[1], [1, 0]], [[0, 1], []]]
     assert read_outcomes(path, ["b"], last=2) == [[[1]], [[]]]
-    path.write_text(path.read_text().replace("bgpo,2,3", "bgpo,2,"))
+    path.write_text(path.read_text().replace("bgpo,2,3", "bgpo,2,x"))
     with pytest.raises(ValueError, match=r"train.csv, line 4 is damaged"):
         read_outcomes(path, ["a", "b"])

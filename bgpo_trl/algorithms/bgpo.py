@@ -202,9 +202,12 @@ class BGPO(Algorithm):
     def act(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the ``action`` ``[S, 4]`` by which the policy explores."""
         groups = self._groups_of(tensordict)
-        for seed, group in enumerate(groups if not self.config.experts else []):
-            self._active.play(seed, group)
-        expert = self.experts.play(groups if self.config.experts else [0] * self.n_seeds)
+        if self.config.experts:
+            expert = self.experts.play(groups)
+        else:
+            expert = torch.zeros(self.n_seeds, dtype=torch.int64)
+            for seed, group in enumerate(groups):
+                self._active.play(seed, group)
         seen = self.moved(tensordict.select(*self.in_keys))
         return tensordict.set("action", self.learner.act(seen, self._noise, expert))
 

@@ -225,7 +225,8 @@ class SACLearner(Learner):
 
 def _of_expert(values: Tensor, expert: Tensor) -> Tensor:
     """Returns those of one expert of each seed, ``[S, ...]`` of ``[S, E, ...]``."""
-    return values[torch.arange(len(values)), expert.to(values.device)]
+    seed = torch.arange(len(values), device=values.device)
+    return values[seed, expert.to(values.device)]
 
 
 def make_ddpg(config: DDPGConfig, problem: Problem) -> Learner:

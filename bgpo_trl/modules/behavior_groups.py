@@ -64,7 +64,7 @@ class BehaviorGroups(nn.Module):
         n_features: int,
         *,
         batch_size: Sequence[int] = (),
-        activity_threshold: float = 0.55,
+        activity_threshold: float = 0.5,
         activity_scale: float = 1.0,
         max_groups: int | None = None,
     ) -> None:

@@ -2,7 +2,7 @@
 
 import hashlib
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Literal, get_args
 
 import numpy as np
@@ -56,12 +56,25 @@ def check_observation(observation: str) -> None:
 class Environment(control.Environment):
     """``control.Environment`` whose success on the very last step still has discount 0."""
 
+    def observation_spec(self) -> Mapping[str, specs.Array]:
+        """Returns the specs of the observation, flattened where it is."""
+        spec = super().observation_spec()
+        if not self._flat_observation:
+            return spec
+        values = OrderedDict((key, item.generate_value()) for key, item in spec.items())
+        flat = control.flatten_observation(values)
+        return {key: specs.Array(value.shape, value.dtype, key) for key, value in flat.items()}
+
     def step(self, action: np.ndarray) -> TimeStep:
         """Advances one control step of 0.2 s."""
         timestep = super().step(action)
         if timestep.last() and timestep.reward:
             return timestep._replace(discount=0.0)
         return timestep
+
+    def close(self) -> None:
+        """Frees what it renders with, unless that is shared; a later frame makes it anew."""
+        self.task.close()
 
 
 class NicoTask(control.Task):
@@ -73,22 +86,44 @@ class NicoTask(control.Task):
     all it needs to know.
 
     Args:
-        random: Source of the starts.
-        observation: ``"pixels"`` (uint8 ``[32, 64, 3]``), ``"state"`` (float64 ``[16]``) or both.
-        renderer: Shared by environments that are stepped in one thread; made on demand if None.
+        random: Source of the starts, or its seed; None draws one from the system.
+        observation: ``"pixels"`` (uint8 ``[32, 64, 3]``), ``"state"`` (``privileged_state``,
+            float64 ``[16]``) or ``"both"``.
+        frame_size: Height and width of ``pixels``, where these are to be others.
+        renderer: Shared with other environments; made on demand if None.
+
+    Raises:
+        ValueError: If there is no such observation, or the renderer's frames have another size.
     """
 
     def __init__(
         self,
         *,
-        random: np.random.RandomState,
+        random: int | np.random.RandomState | None = None,
         observation: Observation = "pixels",
+        frame_size: Sequence[int] = (FRAME_HEIGHT, FRAME_WIDTH),
         renderer: FrameRenderer | None = None,
     ) -> None:
         check_observation(observation)
-        self.random = random
+        if renderer is not None and renderer.frame_size != tuple(frame_size):
+            raise ValueError(
+                f"frame_size is {tuple(frame_size)}, but the renderer's frames are "
+                f"{renderer.frame_size}: give both the same"
+            )
+        # Under this name dm_control's wrappers put a source of their own: TorchRL's `set_seed`,
+        # shimmy's `reset(seed=...)`.
+        self._random = (
+            random if isinstance(random, np.random.RandomState) else np.random.RandomState(random)
+        )
         self._observation = observation
+        self._frame_size = tuple(frame_size)
         self._renderer = renderer
+        self._shares_renderer = renderer is not None
+
+    @property
+    def random(self) -> np.random.RandomState:
+        """Source of the starts."""
+        return self._random
 
     def succeeded(self, physics: Physics) -> bool:
         """Returns whether the task is done."""
@@ -145,28 +180,30 @@ class NicoTask(control.Task):
     def action_spec(self, physics: Physics) -> specs.BoundedArray:
         """Returns the spec of the action: float64 ``[4]`` in [-1, 1]."""
         del physics
-        return specs.BoundedArray((4,), float, minimum=-1.0, maximum=1.0, name="action")
+        return specs.BoundedArray((4,), float, [-1.0] * 4, [1.0] * 4, name="action")
 
     def observation_spec(self, physics: Physics) -> OrderedDict[str, specs.Array]:
-        """Returns the specs of ``pixels`` and ``state``, as chosen, without rendering."""
+        """Returns the specs of what `get_observation` does, without rendering."""
         del physics
         observation: OrderedDict[str, specs.Array] = OrderedDict()
         if self._observation != "state":
-            shape = (FRAME_HEIGHT, FRAME_WIDTH, 3)
+            shape = (*self._frame_size, 3)
             observation["pixels"] = specs.BoundedArray(shape, np.uint8, 0, 255, name="pixels")
         if self._observation != "pixels":
-            observation["state"] = specs.Array((STATE_SIZE,), float, name="state")
+            name = "privileged_state"  # TorchRL's wrapper renames a `state`, but not its spec.
+            observation[name] = specs.Array((STATE_SIZE,), float, name=name)
         return observation
 
     def get_observation(self, physics: Physics) -> OrderedDict[str, np.ndarray]:
-        """Returns new arrays: ``pixels`` (uint8 ``[32, 64, 3]``) and/or ``state`` (``[16]``)."""
+        """Returns new arrays: ``pixels`` (uint8 ``[H, W, 3]``), ``privileged_state`` (``[16]``)."""
         observation: OrderedDict[str, np.ndarray] = OrderedDict()
         if self._observation != "state":
             if self._renderer is None:
-                self._renderer = FrameRenderer(physics.model.ptr)
+                height, width = self._frame_size
+                self._renderer = FrameRenderer(physics.model.ptr, height=height, width=width)
             observation["pixels"] = self._renderer.render(physics.data.ptr)
         if self._observation != "pixels":
-            observation["state"] = physics.privileged_state()
+            observation["privileged_state"] = physics.privileged_state()
         return observation
 
     def get_reward(self, physics: Physics) -> float:
@@ -176,3 +213,9 @@ class NicoTask(control.Task):
     def get_termination(self, physics: Physics) -> float | None:
         """Returns discount 0 on success, else None."""
         return 0.0 if self.succeeded(physics) else None
+
+    def close(self) -> None:
+        """Frees the renderer that was made on demand."""
+        if self._renderer is not None and not self._shares_renderer:
+            self._renderer.close()
+            self._renderer = None

@@ -14,7 +14,7 @@ class GraspGlass(NicoTask):
 
     def succeeded(self, physics: Physics) -> bool:
         """Returns whether the task is done."""
-        return physics.glass_held()
+        return physics.held("glass")
 
     def demonstration(self, physics: Physics, random: np.random.Generator) -> Sequence[moves.Phase]:
         """Returns the movement that does the task."""

@@ -1,6 +1,7 @@
 """The suite's front: ``load``, ``add_task``, ``register`` and ``ALL_TASKS``."""
 
 from collections.abc import Mapping, Sequence
+from operator import itemgetter
 from types import MappingProxyType
 from typing import Any
 
@@ -13,7 +14,7 @@ from suites.nico.grasp_glass import GraspGlass
 from suites.nico.physics import Physics, scene_xml
 from suites.nico.push_green_to_glass import PushGreenToGlass
 from suites.nico.push_green_to_white import PushGreenToWhite
-from suites.nico.rendering import FrameRenderer
+from suites.nico.rendering import FRAME_HEIGHT, FRAME_WIDTH, FrameRenderer, check_frame_size
 
 _TASKS: dict[str, type[NicoTask]] = {
     "grasp_glass": GraspGlass,
@@ -74,6 +75,7 @@ def load(
     *,
     seed: int | np.random.RandomState | None = None,
     observation: Observation = "pixels",
+    frame_size: Sequence[int] = (FRAME_HEIGHT, FRAME_WIDTH),
     time_limit: float = TIME_LIMIT,
     physics: Physics | None = None,
     renderer: FrameRenderer | None = None,
@@ -84,15 +86,19 @@ def load(
     Args:
         task: One of ``TASKS``.
         seed: Seed or source of the starts; None draws one from the system.
-        observation: ``"pixels"`` (uint8 ``[32, 64, 3]``), ``"state"`` (privileged ground truth,
-            float64 ``[16]``: joints (rad), grip and object positions (m)) or ``"both"``.
+        observation: ``"pixels"`` (uint8 ``[32, 64, 3]``), ``"state"`` (``privileged_state``, the
+            ground truth, float64 ``[16]``: joints (rad), grip and object positions (m)) or
+            ``"both"``.
+        frame_size: Height and width of ``pixels``, such as ``(84, 84)`` for networks that ask for
+            it. Narrower frames show all that is on the table, too.
         time_limit: Length of an episode (s); a step takes 0.2 s.
         physics: A simulation to share with other tasks that are not run at the same time.
-        renderer: A renderer to share with other environments of the same thread.
+        renderer: A renderer to share with other environments, of the same size of frames.
         environment_kwargs: Further arguments of ``dm_control.rl.control.Environment``.
 
     Raises:
-        ValueError: If the task or the observation is unknown, or the episode has no length.
+        ValueError: If the task or the observation is unknown, there are no frames of that size, or
+            the episode has no length.
 
     Example:
         >>> from suites import nico
@@ -103,10 +109,11 @@ def load(
     check_tasks([task])
     if not time_limit > 0:
         raise ValueError(f"time_limit must be above 0 s, got {time_limit}: a step takes 0.2 s")
-    random = seed if isinstance(seed, np.random.RandomState) else np.random.RandomState(seed)
+    physics = physics or Physics.from_xml_string(scene_xml())
+    check_frame_size(physics.model.ptr, frame_size)
     return Environment(
-        physics or Physics.from_xml_string(scene_xml()),
-        TASKS[task](random=random, observation=observation, renderer=renderer),
+        physics,
+        TASKS[task](random=seed, observation=observation, frame_size=frame_size, renderer=renderer),
         time_limit=time_limit,
         control_timestep=CONTROL_TIMESTEP,
         **(environment_kwargs or {}),
@@ -116,7 +123,9 @@ def load(
 def register() -> None:
     """Makes the tasks known to ``dm_control.suite``, and so to its wrappers, as domain ``nico``.
 
-    A task that is added later takes another call.
+    So ``suite.ALL_TASKS`` and ``TASKS_BY_DOMAIN`` list them, and TorchRL's
+    ``DMControlEnv("nico", "grasp_glass")`` finds them. A task that is added later takes another
+    call.
 
     Example:
         >>> from dm_control import suite
@@ -139,6 +148,11 @@ def register() -> None:
             return load(name, seed=random, environment_kwargs=environment_kwargs, **kwargs)
 
         factory.__name__ = name
-        tasks.add("nico")(factory)
+        tasks.add("no_reward_visualization")(factory)
     domain.SUITE = tasks  # pyright: ignore[reportAttributeAccessIssue]
-    suite._DOMAINS["nico"] = domain
+    suite._DOMAINS["nico"] = domain  # There is no other way into `suite.load`.
+    suite.TASKS_BY_DOMAIN["nico"] = tuple(TASKS)
+    ours = [("nico", name) for name in TASKS]
+    for listed in ("ALL_TASKS", "EXTRA", "NO_REWARD_VIZ"):
+        others = [pair for pair in getattr(suite, listed) if pair[0] != "nico"]
+        setattr(suite, listed, tuple(sorted([*others, *ours], key=itemgetter(0))))

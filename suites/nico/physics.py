@@ -3,6 +3,7 @@
 # MuJoCo's bindings come without stubs.
 # pyright: reportAttributeAccessIssue=false
 
+import itertools
 from functools import cached_property
 from importlib import resources
 from typing import Final
@@ -13,11 +14,12 @@ from dm_control import mujoco as dm_mujoco
 
 OBJECTS: Final = ("glass", "green_box", "white_box")
 ARM_JOINTS: Final = ("shoulder_yaw", "shoulder_pitch", "elbow")
+HAND: Final = "hand"
 DIGITS: Final = ("thumb", "upper_finger", "lower_finger")
 TABLE_HEIGHT: Final = 0.62  # (m)
 OBJECT_HALF_HEIGHT: Final = {"glass": 0.035, "green_box": 0.025, "white_box": 0.025}  # (m)
 
-_FULL_STATE = mujoco.mjtState.mjSTATE_INTEGRATION
+_FULL_STATE = mujoco.mjtState.mjSTATE_INTEGRATION.value
 _TOUCH_GAP = 0.002  # (m) two objects closer than this touch
 _PRESSING = 0.02  # (rad) a hand whose target lies this far beyond its curl is closing
 
@@ -41,13 +43,37 @@ class Physics(dm_mujoco.Physics):
         return [self.model.joint(f"{digit}_1").qposadr[0] for digit in DIGITS]
 
     @cached_property
-    def _ids(self) -> dict[tuple[str, str], int]:
-        return {}
+    def _ids(self) -> dict[str, dict[str, int]]:
+        counts = {"body": self.model.nbody, "geom": self.model.ngeom, "site": self.model.nsite}
+        return {
+            kind: {self.model.id2name(i, kind): i for i in range(count)}
+            for kind, count in counts.items()
+        }
 
     def _id(self, kind: str, name: str) -> int:
-        if (kind, name) not in self._ids:
-            self._ids[kind, name] = self.model.name2id(name, kind)
-        return self._ids[kind, name]
+        return self._ids[kind][name]
+
+    def _object_id(self, kind: str, name: str) -> int:
+        if name not in OBJECTS:
+            raise ValueError(f"no object {name!r} in the scene; choose one of {', '.join(OBJECTS)}")
+        return self._id(kind, name)
+
+    @cached_property
+    def _hand(self) -> list[int]:
+        # Bodies come in the order of the tree: each after its parent.
+        bodies = {self._id("body", HAND)}
+        for body, parent in enumerate(self.model.body_parentid):
+            if parent in bodies:
+                bodies.add(body)
+        return [geom for geom, body in enumerate(self.model.geom_bodyid) if body in bodies]
+
+    def _geoms(self, name: str) -> list[int]:
+        if name == HAND:
+            return self._hand
+        if name not in self._ids["geom"]:
+            names = ", ".join([HAND, *self._ids["geom"]])
+            raise ValueError(f"no {name!r} in the scene; choose one of {names}")
+        return [self._id("geom", name)]
 
     @cached_property
     def actuated_limits(self) -> tuple[np.ndarray, np.ndarray]:
@@ -80,30 +106,69 @@ class Physics(dm_mujoco.Physics):
         return self.data.site_xpos[self._id("site", "palm")].copy()
 
     def object_position(self, name: str) -> np.ndarray:
-        """Returns the centre of an object (m), ``[3]``."""
-        return self.data.xpos[self._id("body", name)].copy()
+        """Returns the centre of one of `OBJECTS` (m), ``[3]``; another name raises ValueError."""
+        return self.data.xpos[self._object_id("body", name)].copy()
 
     def privileged_state(self) -> np.ndarray:
         """Returns joint angles (rad) ``[4]``, grip (m) ``[3]`` and object positions (m) ``[9]``."""
         objects = [self.object_position(name) for name in OBJECTS]
         return np.concatenate([self.joint_angles(), self.grip_position(), *objects])
 
-    def full_state(self) -> np.ndarray:
-        """Returns all that the simulation's future depends on, as one vector."""
-        return self.get_state(_FULL_STATE)
+    def get_state(self, sig: int | None = None) -> np.ndarray:
+        """Returns all that the simulation's future depends on, as one vector.
 
-    def set_full_state(self, state: np.ndarray) -> None:
-        """Continues from what ``full_state`` returned, bit for bit."""
-        self.set_state(state, _FULL_STATE)
+        Joint targets are among it, which dm_control leaves out: here an action moves them, so that
+        positions and velocities alone do not say where the robot is going.
+
+        Args:
+            sig: Parts to return instead, bits of ``mujoco.mjtState``.
+        """
+        return super().get_state(_FULL_STATE if sig is None else sig)
+
+    def set_state(self, physics_state: np.ndarray, sig: int | None = None) -> None:
+        """Continues from what `get_state` returned, bit for bit; no ``forward()`` is needed.
+
+        Args:
+            physics_state: The vector, of this simulation or of another one of the same scene.
+            sig: Parts that it holds, as in `get_state`.
+
+        Raises:
+            ValueError: If it has another length.
+        """
+        sig = _FULL_STATE if sig is None else sig
+        size = mujoco.mj_stateSize(self.model.ptr, sig)
+        if np.shape(physics_state) != (size,):
+            raise ValueError(
+                f"the state is a vector of {size} numbers, got {list(np.shape(physics_state))}: "
+                "take one from get_state()"
+            )
+        super().set_state(physics_state, sig)
         mujoco.mj_forward(self.model.ptr, self.data.ptr)
 
+    def full_state(self) -> np.ndarray:
+        """Returns what `get_state` does."""
+        return self.get_state()
+
+    def set_full_state(self, state: np.ndarray) -> None:
+        """Continues from it."""
+        self.set_state(state)
+
     def gap(self, first: str, second: str) -> float:
-        """Returns the smallest distance between two geoms (m); negative where they overlap."""
-        ids = [self._id("geom", name) for name in (first, second)]
-        return mujoco.mj_geomDistance(self.model.ptr, self.data.ptr, *ids, 1.0, None)
+        """Returns the smallest distance between two things (m); negative where they overlap.
+
+        Args:
+            first: An object, ``"table"``, ``"hand"`` (palm, wrist and digits) or any other geom.
+            second: The same.
+
+        Raises:
+            ValueError: If there is no such thing in the scene.
+        """
+        pairs = itertools.product(self._geoms(first), self._geoms(second))
+        model, data = self.model.ptr, self.data.ptr
+        return min(mujoco.mj_geomDistance(model, data, *pair, 1.0, None) for pair in pairs)
 
     def touching(self, first: str, second: str) -> bool:
-        """Returns whether two geoms touch."""
+        """Returns whether two things touch; they are named as in `gap`."""
         return self.gap(first, second) < _TOUCH_GAP
 
     def robot_touches(self) -> bool:
@@ -118,20 +183,26 @@ class Physics(dm_mujoco.Physics):
         targets = self.data.ctrl[len(ARM_JOINTS) :]
         return bool((targets - self.digit_curls()).mean() > _PRESSING)
 
-    def glass_held(self) -> bool:
-        """Returns whether the glass is between thumb and finger side of a hand that is closing.
+    def held(self, name: str) -> bool:
+        """Returns whether an object is between thumb and finger side of a hand that is closing.
 
         A finger touches it, the thumb or the palm touches it, and the hand is being closed.
-        Whether the glass stands or has been knocked over does not matter.
+        Whether it stands or has been knocked over does not matter.
+
+        Args:
+            name: One of `OBJECTS`.
+
+        Raises:
+            ValueError: If it is not.
         """
+        held = self._object_id("geom", name)
         if not self.hand_closing():
             return False
-        glass = self._id("geom", "glass")
         touched = set()
         for contact in self.data.contact:
             pair = (contact.geom1, contact.geom2)
-            if glass in pair:
-                touched.add(self.model.id2name(pair[0] if pair[1] == glass else pair[1], "geom"))
+            if held in pair:
+                touched.add(self.model.id2name(pair[0] if pair[1] == held else pair[1], "geom"))
         finger_side = any("finger" in name for name in touched)
         thumb_side = any(name == "palm" or name.startswith("thumb") for name in touched)
         return finger_side and thumb_side

@@ -7,35 +7,104 @@ from suites import opengl  # isort: skip (before MuJoCo, which reads once what t
 
 import atexit
 import contextlib
+import functools
+import operator
 import os
+import threading
 import weakref
+from collections.abc import Callable, Sequence
 
 import mujoco
 import numpy as np
+from mujoco.rendering.classic import gl_context
 
 FRAME_HEIGHT = 32  # (pixels), the paper's "64x32 RGB image"
 FRAME_WIDTH = 64  # (pixels)
 FRAME_CAMERA = "eyes"
 
+# Not every OpenGL library bears threads that draw at the same time.
+_turn = threading.RLock()
+_all: weakref.WeakSet[mujoco.Renderer] = weakref.WeakSet()
 # What the garbage collector would free at any moment, between the calls that draw another frame.
 _abandoned: list[mujoco.Renderer] = []
 
 
-def _close(renderer: mujoco.Renderer | None) -> None:
-    if renderer is None:
-        return
+def check_frame_size(model: mujoco.MjModel, frame_size: Sequence[int]) -> None:
+    """Raises ValueError if a scene has no frames of that height and width (pixels)."""
+    limits = (model.vis.global_.offheight, model.vis.global_.offwidth)
+    try:
+        height, width = map(operator.index, frame_size)
+        possible = 1 <= height <= limits[0] and 1 <= width <= limits[1]
+    except (TypeError, ValueError):
+        possible = False
+    if not possible:
+        raise ValueError(
+            f"frame_size is {frame_size}, but must be a height in 1..{limits[0]} and a width in "
+            f"1..{limits[1]} (pixels)"
+        )
+
+
+@functools.cache
+def _release() -> Callable[[], object]:
+    """Returns the call that leaves no context current in a thread, once there is a display.
+
+    A context that is current in one thread is closed to all others.
+    """
+    backend = gl_context.GLContext.__module__
+    if backend == "mujoco.egl":
+        from mujoco import egl
+
+        no_surface, no_context = egl.EGL.EGL_NO_SURFACE, egl.EGL.EGL_NO_CONTEXT
+        nothing = (egl.EGL_DISPLAY, no_surface, no_surface, no_context)
+        return functools.partial(egl.EGL.eglMakeCurrent, *nothing)
+    if backend == "mujoco.osmesa":
+        from mujoco import osmesa
+
+        nothing = (None, None, osmesa.GL.GL_FLOAT, 0, 0)
+        return functools.partial(osmesa.osmesa.OSMesaMakeCurrent, *nothing)
+    if backend == "mujoco.glfw":
+        from mujoco import glfw
+
+        return functools.partial(glfw.glfw.make_context_current, None)  # pyright: ignore[reportArgumentType]
+    return lambda: None
+
+
+def _close(renderer: mujoco.Renderer) -> None:
     # MuJoCo frees buffers by number in whichever context is current, be it another renderer's,
     # whose frames would be garbage from then on. Rendering makes the own context current.
-    with contextlib.suppress(RuntimeError):  # It was closed before.
-        renderer.render()
-    renderer.close()
+    with _turn:
+        with contextlib.suppress(RuntimeError):  # It was closed before.
+            renderer.render()
+        renderer.close()
+
+
+@functools.cache
+def _close_at_exit() -> None:
+    """Has all contexts closed at the end of the process; called when the first has been made."""
+    if gl_context.GLContext.__module__ == "mujoco.egl":
+        from mujoco import egl
+
+        # MuJoCo and dm_control each end the one display, be there contexts of the other or not.
+        # The end of the process ends it, too.
+        atexit.unregister(egl.EGL.eglTerminate)
+    atexit.register(_close_all)
+
+
+def _close_all() -> None:
+    _turn.acquire()  # For good: a thread that still draws waits, as it would fail.
+    for renderer in list(_all):
+        _close(renderer)
 
 
 class FrameRenderer:
     """Renders one fixed camera of a scene, for any number of simulations of that scene.
 
     Keeps one OpenGL context, one scene and one camera. ``dm_control``'s ``physics.render`` builds
-    a camera each call, which costs several times the frame itself. Use from one thread only.
+    a camera each call, which costs several times the frame itself. Any thread may use it, or close
+    it; frames of all renderers are drawn one after the other.
+
+    The robot's own camera shows as much from left to right in narrower frames as in the paper's,
+    and more above and below.
 
     Args:
         model: The compiled scene. Data of every other compilation of the same XML may be rendered.
@@ -45,7 +114,7 @@ class FrameRenderer:
 
     Raises:
         RuntimeError: If no OpenGL context can be made; the message names the packages to install.
-        ValueError: If the scene has no such camera.
+        ValueError: If the scene has no such camera, or no frames of that size.
     """
 
     def __init__(
@@ -60,12 +129,19 @@ class FrameRenderer:
         if camera_id < 0:
             names = [model.camera(i).name for i in range(model.ncam)]
             raise ValueError(f"no camera {camera!r} in the scene; choose one of {names}")
+        self.frame_size = (height, width)
+        check_frame_size(model, self.frame_size)
         if opengl.refusal:
             raise RuntimeError(opengl.refusal)
-        while _abandoned:
-            _close(_abandoned.pop())
         try:
-            self._renderer = mujoco.Renderer(model, height, width, max_geom=200)
+            with _turn:
+                while _abandoned:
+                    _close(_abandoned.pop())
+                self._renderer = mujoco.Renderer(model, height, width, max_geom=200)
+                _all.add(self._renderer)
+                _close_at_exit()
+                self._release = _release()
+                self._release()
         except Exception as error:  # MuJoCo's backends raise errors of many kinds.
             backend = os.environ.get("MUJOCO_GL", "default")
             reason = next(iter(str(error).splitlines()), type(error).__name__)
@@ -77,10 +153,9 @@ class FrameRenderer:
         self._camera = mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
         self._camera.fixedcamid = camera_id
+        paper = FRAME_WIDTH / FRAME_HEIGHT
+        self._taller = max(1.0, paper * height / width) if camera == FRAME_CAMERA else 1.0
         weakref.finalize(self, _abandoned.append, self._renderer).atexit = False
-        # Registered after the OpenGL library's own exit handler, so that it runs before that one.
-        reference = weakref.ref(self._renderer)
-        atexit.register(lambda: _close(reference()))
 
     def render(self, data: mujoco.MjData, out: np.ndarray | None = None) -> np.ndarray:
         """Returns the frame that the camera sees.
@@ -92,8 +167,28 @@ class FrameRenderer:
         Returns:
             RGB frame, uint8 ``[height, width, 3]``.
         """
-        self._renderer.update_scene(data, self._camera)
-        return self._renderer.render(out=out)
+        with _turn:
+            self._renderer.update_scene(data, self._camera)
+            if self._taller > 1.0:
+                for camera in self._renderer.scene.camera:
+                    camera.frustum_bottom *= self._taller
+                    camera.frustum_top *= self._taller
+            try:
+                return self._renderer.render(out=out)
+            finally:
+                self._release()
+
+    def driver(self) -> str:
+        """Returns what OpenGL calls that which draws, such as ``"llvmpipe (LLVM 15.0.6)"``."""
+        from OpenGL import GL
+
+        with _turn:
+            self._renderer.render()  # Makes the context current.
+            try:
+                name = GL.glGetString(GL.GL_RENDERER)
+            finally:
+                self._release()
+        return name.decode() if isinstance(name, bytes) else "unknown"
 
     def close(self) -> None:
         """Frees the OpenGL context."""

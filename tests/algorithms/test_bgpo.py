@@ -1,6 +1,6 @@
 """BGPO as a whole: what it sees, what it learns from, and that seeds share nothing."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import pytest
 import torch
@@ -10,19 +10,28 @@ from torchrl.envs import check_env_specs
 from benchmarks import ablation
 from bgpo_trl.algorithms.algorithm import observe
 from bgpo_trl.algorithms.bgpo import BGPO, labeled, self_organized, untold
+from bgpo_trl.checkpoint import load_checkpoint, save_checkpoint
+from bgpo_trl.configs import BGPOConfig, GWRBConfig
 from bgpo_trl.demonstration_bank import DemonstrationBank
 from bgpo_trl.modules.gwr import GWRB
+from bgpo_trl.pretrained import load_pretrained
 from bgpo_trl.seeding import generators
-from bgpo_trl.transforms import BehaviorLookup, TaskSchedule
+from bgpo_trl.transforms import BehaviorLookup, GroupLookup, TaskSchedule
 
-# What the policy sees, what it is told, and the composition that tells it.
+# What the policy sees, what it is told, the composition that tells it, and whose settings it has.
 VARIANTS = {
-    "ground truth, label": ("state", "label", labeled),
-    "latent, label": ("latent", "label", labeled),
-    "latent, nothing": ("latent", "nothing", untold),
-    "latent, phi": ("latent", "phi", ablation.VARIANTS["r_int"]),
-    "latent, b": ("latent", "b", self_organized),
+    "ground truth, label": ("state", "label", labeled, "oracle"),
+    "latent, label": ("latent", "label", labeled, "oracle"),
+    "latent, nothing": ("latent", "nothing", untold, "ddpg"),
+    "latent, phi": ("latent", "phi", ablation.VARIANTS["r_int"][0], "bgpo-single"),
+    "latent, b": ("latent", "b", self_organized, "bgpo-single"),
+    "even replay": ("latent", "b", self_organized, "bgpo-single"),
+    "experts": ("latent", "b", self_organized, "bgpo-experts"),
+    "all": ("latent", "b", self_organized, "bgpo"),
 }
+# Many groups, and few of them active.
+GROUPS = {"groups": GWRBConfig(activity_threshold=0.9), "active_groups": 2}
+CHANGES = {"even replay": {"even_replay": True, **GROUPS}, "experts": GROUPS, "all": GROUPS}
 pytestmark = pytest.mark.usefixtures("easy_world")
 variants = pytest.mark.parametrize("variant", VARIANTS)
 SCHEDULE = TaskSchedule((0, 2, 4))
@@ -30,9 +39,19 @@ SCHEDULE = TaskSchedule((0, 2, 4))
 
 @pytest.fixture
 def make(bank, encoders, make_config):
-    def make(variant="latent, b", seeds=(3, 8), schedule=SCHEDULE, bank=bank, **changes):
-        state, _, compose = VARIANTS[variant]
-        config = replace(make_config(state).algorithm, **changes)
+    def make(
+        variant="latent, b",
+        seeds=(3, 8),
+        schedule=SCHEDULE,
+        bank=bank,
+        rl=None,
+        config=None,
+        **changes,
+    ):
+        state, _, compose, name = VARIANTS[variant]
+        changes = {**({} if config is None else {"rl": config}), **changes}
+        config = make_config(state, name if rl is None else f"{name}+{rl}").algorithm
+        config = replace(config, **{**CHANGES.get(variant, {}), **changes})
         parts = {"bank": bank.seen(), "encoders": encoders, "compose": compose}
         return BGPO(config, seeds=seeds, schedule=schedule, **parts)
 
@@ -51,6 +70,42 @@ def play(algorithm, n_steps, hidden=()):
     return torch.stack(transitions, dim=1)
 
 
+def weights(algorithm):
+    return list(algorithm.learner.loss.parameters())
+
+
+def groups_of(state, algorithm):
+    """The group whose expert acts, of each seed."""
+    return state["group"].tolist() if algorithm.config.experts else [0] * algorithm.n_seeds
+
+
+def plain_action(algorithm, state):
+    """What the policies do without noise, worked out from the weights that tests are given."""
+    actions = []
+    for seed, group in enumerate(groups_of(state, algorithm)):
+        weight = algorithm.experts.actor_weights(seed, group)
+        x = torch.cat([state[key][seed] for key in algorithm.in_keys])
+        hidden = (x @ weight["mlp.layers.0.weight"] + weight["mlp.layers.0.bias"]).relu()
+        actions.append(
+            (hidden @ weight["mlp.layers.1.weight"] + weight["mlp.layers.1.bias"]).tanh()
+        )
+    return torch.stack(actions)
+
+
+def assert_same_state(first, second):
+    """Two nested states, bit for bit."""
+    if isinstance(first, dict):
+        assert first.keys() == second.keys()
+        first, second = list(first.values()), list(second.values())
+    if isinstance(first, (list, tuple)):
+        for ours, theirs in zip(first, second, strict=True):
+            assert_same_state(ours, theirs)
+    elif isinstance(first, torch.Tensor):
+        assert first.equal(second)
+    else:
+        assert first == second
+
+
 def assert_same_graph(first, second, **tolerance):
     for ours, theirs in zip(first, second, strict=True):
         torch.testing.assert_close(ours, theirs, **tolerance)
@@ -62,25 +117,26 @@ def test_each_variant_is_an_environment_with_the_input_it_is_named_after(make, v
     algorithm = make(variant, schedule=TaskSchedule((0,) * n_tasks))
     before = None if algorithm.gwr is None else algorithm.gwr.graph(0)
     for transform in algorithm.env.transform:
-        if isinstance(transform, BehaviorLookup):
+        if isinstance(transform, BehaviorLookup | GroupLookup):
             transform.learn = False
     check_env_specs(algorithm.env)
 
-    state, told, _ = VARIANTS[variant]
-    sizes = {"state": 16, "latent": 64, "task_one_hot": n_tasks, "normalized_behavior": 32}
-    keys = {"label": ["task_one_hot"], "nothing": []}.get(told, ["normalized_behavior"])
+    state, told, _, _ = VARIANTS[variant]
+    sizes = {"state": 16, "latent": 64, "task_one_hot": n_tasks, "behavior": 32}
+    keys = {"label": ["task_one_hot"], "nothing": []}.get(told, ["behavior"])
     start = algorithm.act(algorithm.env.reset())
-    assert algorithm.actor.in_keys == [state, *keys]
-    critic = algorithm.loss.value_network
+    actor, critic = algorithm.learner.actor, algorithm.learner.loss.value_network
+    assert actor.in_keys == [state, *keys]
     assert critic.in_keys == [state, *keys, "action"]
     n_features = sum(sizes[key] for key in (state, *keys))
-    assert algorithm.actor.mlp.layers[0].in_features == n_features
+    assert actor.mlp.layers[0].in_features == n_features
     assert critic.mlp.layers[0].in_features == n_features + 4
     for key in (state, *keys):
         assert start[key].shape == (2, sizes[key])
     assert start["action"].shape == (2, 4)
     assert ("task_one_hot" in start) == (told == "label")
-    assert ("normalized_behavior" in start) == ("behavior" in start) == (told in ("phi", "b"))
+    assert ("behavior" in start) == (told in ("phi", "b"))
+    assert ("group" in start) == (algorithm.groups is not None) == (variant in CHANGES)
     assert ("behavior_node" in start) == (told == "b")
     assert ("lae_h" in start) == (told in ("phi", "b"))
     assert "pixels" not in start
@@ -109,25 +165,31 @@ def test_a_label_is_the_task_of_the_episode(make):
     assert data["task"].unique().tolist() == [0, 1, 2]
 
 
-@pytest.mark.parametrize("variant", ["latent, nothing", "latent, phi", "latent, b"])
+@pytest.mark.parametrize("variant", [v for v in VARIANTS if VARIANTS[v][1] != "label"])
 def test_bgpo_never_reads_the_label(make, variant):
     label = ("task", "task_one_hot")
     algorithm, blind = make(variant), make(variant)
-    for keys in (algorithm.actor.in_keys, algorithm.loss.in_keys, algorithm.replay.keys):
+    learner = algorithm.learner
+    for keys in (learner.actor.in_keys, learner.loss.in_keys, algorithm.in_keys):
         names = {name for key in keys for name in ([key] if isinstance(key, str) else key)}
         assert names.isdisjoint(label)
 
     seeing = play(algorithm, 40)
     not_seeing = play(blind, 40, hidden=["task"])
+    kept = algorithm.replay.sample(torch.zeros(2, 1, dtype=torch.int64))
+    assert {"task", "task_one_hot"}.isdisjoint(kept.keys(True))
 
     assert seeing["task"].unique().tolist() == [0, 1, 2]
     behavior = [] if variant == "latent, nothing" else ["behavior"]
     for key in ("action", "latent", *behavior, "demo_index", ("next", "reward")):
         assert seeing[key].equal(not_seeing[key]), key
-    for ours, theirs in zip(algorithm.loss.parameters(), blind.loss.parameters(), strict=True):
+    for ours, theirs in zip(weights(algorithm), weights(blind), strict=True):
         assert ours.equal(theirs)
     if algorithm.gwr is not None:
         assert_same_graph(algorithm.gwr.graph(0), blind.gwr.graph(0), rtol=0, atol=0)
+    if algorithm.groups is not None:
+        assert algorithm.groups.num_groups.equal(blind.groups.num_groups)
+        assert algorithm.groups.num_groups.min() > 1
 
 
 @pytest.mark.parametrize("variant", ["ground truth, label", "latent, nothing"])
@@ -138,7 +200,7 @@ def test_a_reference_learns_the_same_from_whatever_demonstrations(make, bank, va
     assert not data["demo_embedding"].equal(changed["demo_embedding"])
     for key in (*algorithm.in_keys, "action", "task", ("next", "reward")):
         assert data[key].equal(changed[key]), key
-    for ours, theirs in zip(algorithm.loss.parameters(), elsewhere.loss.parameters(), strict=True):
+    for ours, theirs in zip(weights(algorithm), weights(elsewhere), strict=True):
         assert ours.equal(theirs)
 
 
@@ -157,7 +219,7 @@ def test_plain_ddpg_acts_and_learns_by_the_state_and_nothing_else(make):
         assert actions[0]["action"].equal(actions[1]["action"])
     assert losses
     assert set(algorithm.replay.sample().keys(True, True)) == set(kept)
-    for ours, theirs in zip(algorithm.loss.parameters(), blind.loss.parameters(), strict=True):
+    for ours, theirs in zip(weights(algorithm), weights(blind), strict=True):
         assert ours.equal(theirs)
 
 
@@ -165,13 +227,14 @@ def test_what_is_said_of_a_labeled_task_is_its_place(make):
     """The first layer adds the row of weights that belongs to the label."""
     algorithm = make("latent, label", schedule=TaskSchedule((0, 0, 0)))
     state = algorithm.env.reset()
-    first, second = algorithm.actor.mlp.layers
+    first, second = algorithm.learner.actor.mlp.layers
     for index in range(2):
-        weight = first.weight[index]
+        weight = first.weight[index, 0]
         hidden = state["latent"][index] @ weight[:64] + weight[64 + state["task"][index]]
-        hidden = (hidden + first.bias[index]).relu()
-        action = (hidden @ second.weight[index] + second.bias[index]).tanh()
-        torch.testing.assert_close(algorithm.actor(state.clone())["action"][index], action)
+        hidden = (hidden + first.bias[index, 0]).relu()
+        action = (hidden @ second.weight[index, 0] + second.bias[index, 0]).tanh()
+        acted = algorithm.learner.actor(state.unsqueeze(1).clone())["action"]
+        torch.testing.assert_close(acted[index, 0], action)
 
 
 def act_in_tests(algorithm, state, embedding, task):
@@ -196,32 +259,55 @@ def test_only_a_variant_with_a_label_acts_by_it(make, bank, variant):
     assert actions[0].equal(other) == (VARIANTS[variant][1] in ("label", "nothing"))
 
 
-def test_frozen_policies_are_told_what_training_would_tell_and_learn_nothing(make, bank):
-    algorithm = make()
-    play(algorithm, 13)
+@pytest.mark.parametrize("variant", ["latent, b", "experts", "all"])
+def test_frozen_policies_are_told_what_training_would_tell_and_learn_nothing(make, variant):
+    algorithm = make(variant)
+    play(algorithm, 33)
     before = [algorithm.gwr.graph(i) for i in range(2)]
+    states = algorithm.state_dict()
     state = algorithm.env.reset()
     shown = (state["demo_embedding"].unsqueeze(1), state["task"].unsqueeze(1))
-    for index in range(2):
+    for index, group in enumerate(groups_of(state, algorithm)):
         frozen = algorithm.freeze(index, *shown, torch.Generator())
-        assert frozen["told"][index, 0].equal(state["normalized_behavior"][index])
-        for key, value in algorithm.actor.state_dict().items():
-            assert frozen["actor"][key].equal(value[index])
-    seen = bank.seen().embedding
-    torch.testing.assert_close(
-        state["normalized_behavior"] * seen.std(0) + seen.mean(0), state["behavior"]
-    )
+        assert frozen["told"][index, 0].equal(state["behavior"][index])
+        row = index if algorithm.config.experts else 0  # else it is the same for all
+        for key, value in algorithm.experts.actor_weights(index, group).items():
+            assert frozen["actor"][key][row, 0].equal(value)
     for index, graph in enumerate(before):
         assert_same_graph(algorithm.gwr.graph(index), graph, rtol=0, atol=0)
+    for part in ("experts", "active", "learner"):
+        assert_same_state(algorithm.state_dict()[part], states[part])
 
 
-def test_episodes_follow_algorithm_1(make, bank, encoders):
+def test_test_episodes_are_played_by_the_expert_of_their_demonstration(make, bank):
+    """By hand: the group of each demonstration, its expert's weights, what they do."""
+    algorithm = make("experts", schedule=TaskSchedule((0, 0, 0)))
+    play(algorithm, 60)
+    assert algorithm.groups.num_groups.min() > 2
+    shown = bank.held_out()
+    embedding, task = shown.embedding.view(3, 4, 32), shown.task.view(3, 4)
+    state = torch.randn(2, 3, 4, 64, generator=torch.Generator().manual_seed(0))
+    actions = act_in_tests(algorithm, state, embedding, task)
+    groups = algorithm.groups.lookup(embedding.expand(2, 3, 4, 32)).group
+    behaviors = algorithm.gwr.lookup(embedding.expand(2, 3, 4, 32)).embedding
+    assert all(len(of_seed.unique()) > 1 for of_seed in groups)
+    for seed, t, m in torch.cartesian_prod(*map(torch.arange, groups.shape)).tolist():
+        weight = algorithm.experts.actor_weights(seed, int(groups[seed, t, m]))
+        x = torch.cat([state[seed, t, m], behaviors[seed, t, m]])
+        hidden = (x @ weight["mlp.layers.0.weight"] + weight["mlp.layers.0.bias"]).relu()
+        action = hidden @ weight["mlp.layers.1.weight"] + weight["mlp.layers.1.bias"]
+        torch.testing.assert_close(actions[seed, t, m], action.tanh())
+
+
+@pytest.mark.parametrize("variant", ["latent, b", "all"])
+def test_episodes_follow_algorithm_1(make, bank, encoders, variant):
     """Behavior, growth of GWR-B and reward, worked out anew from latents and demonstrations."""
     seeds, phi = (3, 8), bank.seen().embedding
-    algorithm = make(seeds=seeds)
+    algorithm = make(variant, seeds=seeds)
+    scale = algorithm.config.gwr.activity_scale
     data = play(algorithm, 90)
     for index, seed in enumerate(seeds):
-        gwr = GWRB(32, generator=generators([seed], "gwr"))
+        gwr = GWRB(32, generator=generators([seed], "gwr"), activity_scale=scale)
         trajectory = []
         for step in data[index]:
             b = gwr.lookup(phi[step["demo_index"]]).embedding
@@ -244,13 +330,13 @@ def test_episodes_follow_algorithm_1(make, bank, encoders):
 @pytest.mark.parametrize("scale", [0.0, 0.7])
 def test_exploration_is_noise_of_each_seed_on_the_policys_action(make, make_config, variant, scale):
     ddpg = replace(make_config().algorithm.rl, noise=scale)
-    algorithm, sources = make(variant, rl=ddpg), generators((3, 8), "exploration")
+    algorithm, sources = make(variant, config=ddpg), generators((3, 8), "exploration")
     with torch.no_grad():  # so that some actions are cut off, and some are not
-        algorithm.actor.mlp.layers[-1].bias.copy_(torch.tensor([[0.0, 1.0, -1.0, 0.0]]))
+        algorithm.learner.actor.mlp.layers[-1].bias.copy_(torch.tensor([0.0, 1.0, -1.0, 0.0]))
     state, n_cut = algorithm.env.reset(), 0
     for _ in range(8):
-        action = algorithm.actor(state.clone())["action"]
         state = algorithm.act(state)
+        action = plain_action(algorithm, state)
         for index, source in enumerate(sources):
             expected = action[index] + scale * torch.randn(4, generator=source)
             n_cut += int((expected.abs() > 1).sum())
@@ -262,8 +348,10 @@ def test_exploration_is_noise_of_each_seed_on_the_policys_action(make, make_conf
 @pytest.mark.parametrize(
     ("variant", "changes", "highest"),
     [
-        ("latent, b", {}, 1.1),
-        ("latent, phi", {"beta": 0.3}, 1.3),
+        # A success now, or a time-out with its bonus and a success after it, 0.95 as much worth.
+        ("latent, b", {}, 0.1 + 0.95 * 1.1),
+        ("all", {}, 0.1 + 0.95 * 1.1),
+        ("latent, phi", {"beta": 0.3}, 0.3 + 0.95 * 1.3),
         ("latent, b", {"beta": 0.0}, 1.0),
         ("latent, label", {}, 1.0),
         ("latent, nothing", {"beta": 0.3}, 1.0),
@@ -274,13 +362,15 @@ def test_targets_are_clipped_to_the_attainable_returns(make, variant, changes, h
     play(algorithm, 7)
     target_bias = [
         value
-        for key, value in algorithm.loss.state_dict().items()
+        for key, value in algorithm.learner.loss.state_dict().items()
         if key.startswith("target_value") and key.endswith("bias")
     ][-1]
+    n_experts = algorithm.learner.actor.batch_size[1]
     for bias, expected in ((50.0, highest), (-50.0, 0.0)):
         target_bias.fill_(bias)
-        batch = algorithm.replay.sample()
-        target = algorithm.loss(batch)["target_value"].unsqueeze(-1)
+        batch = algorithm.replay.sample(torch.zeros(2, 32, dtype=torch.int64))
+        batch = batch.view(2, n_experts, -1)
+        target = algorithm.learner.loss(batch)["target_value"].unsqueeze(-1)
         terminated = batch["next", "terminated"]
         # A success has nothing to come: its return is its reward.
         returns = torch.where(terminated, batch["next", "reward"], expected)
@@ -290,39 +380,51 @@ def test_targets_are_clipped_to_the_attainable_returns(make, variant, changes, h
 
 def test_clipping_can_be_turned_off(make, make_config):
     ddpg = replace(make_config().algorithm.rl, clip_targets=False)
-    assert make(rl=ddpg).loss.return_bounds is None
+    assert make(config=ddpg).learner.loss.return_bounds is None
 
 
 def test_the_first_update_comes_after_the_warm_up_and_with_the_step_that_follows(make):
     algorithm = make()
-    start = [p.detach().clone() for p in algorithm.loss.parameters()]
+    start = [p.detach().clone() for p in weights(algorithm)]
     play(algorithm, algorithm.config.rl.warmup_steps)
-    for value, before in zip(algorithm.loss.parameters(), start, strict=True):
+    for value, before in zip(weights(algorithm), start, strict=True):
         assert value.equal(before)
     play(algorithm, 1)
-    for value, before in zip(algorithm.loss.parameters(), start, strict=True):
+    for value, before in zip(weights(algorithm), start, strict=True):
         assert not value.equal(before)
     assert len(algorithm.replay) == algorithm.config.rl.warmup_steps + 1
 
 
-@pytest.mark.parametrize("variant", ["ground truth, label", "latent, nothing", "latent, b"])
-def test_each_seed_of_a_batch_learns_as_it_would_alone(make, variant):
+ALONE = [("ground truth, label", None), ("latent, nothing", None), ("latent, b", None)]
+ALONE += [("even replay", None), *(("all", rl) for rl in ("ddpg", "td3", "sac"))]
+
+
+@pytest.mark.parametrize(("variant", "rl"), ALONE)
+def test_each_seed_of_a_batch_learns_as_it_would_alone(make, variant, rl):
     seeds = (1, 2)  # no pixel of theirs is so near an edge that rounding moves it across
-    batch = make(variant, seeds=seeds)
+    batch = make(variant, seeds=seeds, rl=rl)
     together = play(batch, 60)
     losses = []
     for index, seed in enumerate(seeds):
-        alone = make(variant, seeds=(seed,))
+        alone = make(variant, seeds=(seed,), rl=rl)
         data = play(alone, 60)[0]
-        for key in ("task", "demo_index", "step_count", ("next", "terminated")):
+        whole = ["task", "demo_index", "step_count", ("next", "terminated")]
+        for key in [*whole, *(["group"] if alone.groups is not None else [])]:
             assert together[index][key].equal(data[key]), key
         for key in ("action", *alone.in_keys, ("next", "reward")):
             torch.testing.assert_close(together[index][key], data[key], rtol=1e-4, atol=1e-4)
-        for ours, theirs in zip(batch.loss.parameters(), alone.loss.parameters(), strict=True):
+        for ours, theirs in zip(weights(batch), weights(alone), strict=True):
             torch.testing.assert_close(ours[index], theirs[0], rtol=1e-4, atol=1e-4)
         if batch.gwr is not None:
             assert_same_graph(batch.gwr.graph(index), alone.gwr.graph(0), rtol=1e-5, atol=1e-5)
             assert len(alone.gwr.graph(0).weights) > 2
+        if batch.groups is not None:
+            n_groups = int(alone.groups.num_groups)
+            assert n_groups == batch.groups.num_groups[index] > 2
+            for group in range(n_groups):
+                ours = batch.experts.actor_weights(index, group)
+                for key, value in alone.experts.actor_weights(0, group).items():
+                    torch.testing.assert_close(ours[key], value, rtol=1e-4, atol=1e-4)
         losses.append(alone.update())
     mean = batch.update()
     for key, value in mean.items():
@@ -332,8 +434,8 @@ def test_each_seed_of_a_batch_learns_as_it_would_alone(make, variant):
 
 @variants
 def test_missing_encoders_are_refused(make_config, bank, variant):
-    state, _, compose = VARIANTS[variant]
-    config = make_config(state).algorithm
+    state, _, compose, name = VARIANTS[variant]
+    config = make_config(state, name).algorithm
     parts = {"seeds": (0,), "schedule": SCHEDULE, "bank": bank.seen(), "compose": compose}
     if state == "state":
         BGPO(config, **parts)
@@ -345,10 +447,231 @@ def test_missing_encoders_are_refused(make_config, bank, variant):
 
 @pytest.mark.parametrize("told", ["phi", "b"])
 def test_matching_behaviors_on_ground_truth_is_refused(make_config, bank, encoders, told):
-    compose = VARIANTS[f"latent, {told}"][-1]
-    config = make_config("state").algorithm
+    compose = VARIANTS[f"latent, {told}"][2]
+    config = make_config("state", "bgpo-single").algorithm
     parts = {"seeds": (0,), "schedule": SCHEDULE, "bank": bank.seen(), "compose": compose}
     with pytest.raises(ValueError, match="matching behaviors needs trained encoders"):
         BGPO(config, **parts)
     with pytest.raises(ValueError, match="found no 'latent'"):
         BGPO(config, encoders=encoders, **parts).env.reset()
+
+
+# ---- groups, experts, demonstrations
+
+
+@pytest.mark.parametrize("rl", ["ddpg", "td3", "sac"])
+def test_a_restored_run_continues_as_the_saved_one(make, tmp_path, rl):
+    algorithm, state = make("all", rl=rl), None
+    _, state = play_on(algorithm, 30)
+    assert algorithm.groups.num_groups.min() > 2  # more than are active
+    save_checkpoint(tmp_path, {"algorithm": algorithm.state_dict(), "state": state.to_dict()})
+    other = make("all", seeds=(5, 7), rl=rl)  # other weights, streams and simulations
+    play_on(other, 12)
+    saved = load_checkpoint(tmp_path)
+    other.env.reset()
+    other.load_state_dict(saved["algorithm"])
+    ours, _ = play_on(algorithm, 25, state)
+    theirs, _ = play_on(other, 25, TensorDict(saved["state"], [2]))
+    assert (ours == theirs).all()
+    assert_same_state(algorithm.learner.state_dict(), other.learner.state_dict())
+    assert_same_state(algorithm.experts.state_dict(), other.experts.state_dict())
+    assert other.groups.num_groups.equal(algorithm.groups.num_groups)
+
+
+def play_on(algorithm, n_steps, state=None):
+    """As `play`, from some state on; returns the tensordict in flight too."""
+    state, transitions = algorithm.env.reset() if state is None else state, []
+    for _ in range(n_steps):
+        state = algorithm.act(state)
+        algorithm.update()
+        transition, state = algorithm.env.step_and_maybe_reset(state)
+        transitions.append(transition.clone())
+        algorithm.store(transition)
+    return torch.stack(transitions, dim=1), state
+
+
+@pytest.mark.parametrize("rl", ["ddpg", "td3", "sac"])
+def test_with_one_group_it_is_the_plain_learner_bit_for_bit(make, rl):
+    lonely = {"groups": GWRBConfig(activity_threshold=1e-6), "active_groups": 1}
+    plain, one = make("latent, b", rl=rl), make("experts", rl=rl, **lonely)
+    ours, theirs = play(plain, 30), play(one, 30)
+    assert one.groups.num_groups.tolist() == [1, 1]
+    for key in ("action", "latent", "behavior", "demo_index", ("next", "reward")):
+        assert ours[key].equal(theirs[key]), key
+    assert_same_state(plain.learner.state_dict(), one.learner.state_dict())
+
+
+def test_slots_that_stay_free_change_nothing(make, make_config):
+    """Four slots with four times the batch, one of them used."""
+    ddpg = make_config().algorithm.rl
+    lonely = {"groups": GWRBConfig(activity_threshold=1e-6)}
+    plain = make("latent, b")
+    four = make("experts", config=replace(ddpg, batch_size=64), **lonely, active_groups=4)
+    ours, theirs = play(plain, 30), play(four, 30)
+    torch.testing.assert_close(ours["action"], theirs["action"], rtol=1e-4, atol=1e-5)
+    start = weights(make("experts", **lonely, active_groups=4))
+    for value, other, begun in zip(weights(plain), weights(four), start, strict=True):
+        torch.testing.assert_close(value[:, 0], other[:, 0], rtol=1e-4, atol=1e-5)
+        assert other[:, 1:].equal(begun[:, 1:])
+
+
+def batches_of(algorithm):
+    """The batches that an algorithm learns from, as they come."""
+    batches, learn = [], algorithm.learn
+
+    def spy(batch):
+        batches.append((algorithm._active.group, batch.clone()))
+        return learn(batch)
+
+    algorithm.learn = spy
+    return batches
+
+
+@pytest.mark.parametrize("variant", ["even replay", "experts", "all"])
+def test_an_update_sees_as_much_of_each_group_played_last(make, bank, variant):
+    algorithm = make(variant, schedule=TaskSchedule((0, 0, 0)))
+    batches = batches_of(algorithm)
+    data = play(algorithm, 60)
+    frames = bank.seen().steps.latents(torch.arange(len(bank.seen().steps.latent)))
+    n_experts, n_shown = (2, 2) if variant == "all" else (1 + (variant == "experts"), 0)
+    n_full = 0
+    for step, (active, batch) in enumerate(batches, 60 - len(batches)):
+        assert batch.shape == (2, n_experts, 16 // n_experts)
+        for seed in range(2):
+            groups = active[seed].tolist()
+            past = data[seed, :step]
+            flat = batch[seed].reshape(-1)
+            n_full += -1 not in groups
+            for row, one in enumerate(flat):
+                if algorithm.config.experts:
+                    group = groups[row // 8]
+                else:
+                    group = [g for g in groups if g >= 0][row % (2 - groups.count(-1))]
+                if not one["priority_weight"]:
+                    assert not (past["group"] == group).any() or row % 8 >= 8 - n_shown
+                    continue
+                if row % 8 >= 8 - n_shown and (one["latent"] == frames).all(-1).any():
+                    continue
+                same = (past["latent"] == one["latent"]).all(-1)
+                assert (past["group"][same] == group).any()
+    assert n_full > 20
+
+
+def test_demonstrations_are_a_quarter_of_each_experts_batch_and_were_shown_before(make, bank):
+    algorithm = make("all", schedule=TaskSchedule((0, 0, 0)))
+    batches = batches_of(algorithm)
+    data, steps = play(algorithm, 60), bank.seen().steps
+    frames = steps.latents(torch.arange(len(steps.latent)))
+    n_seen = 0
+    for step, (_, batch) in enumerate(batches, 60 - len(batches)):
+        past = data[:, :step]
+        for seed in range(2):
+            ended = past["next", "done"][seed].flatten()
+            shown, told = past["demo_index"][seed][ended], past["behavior"][seed][ended]
+            for one in batch[seed].reshape(-1)[batch[seed]["priority_weight"].flatten() > 0]:
+                match = (frames == one["latent"]).all(-1)
+                assert bool(match.any()) != bool(
+                    (past["latent"][seed] == one["latent"]).all(-1).any()
+                )
+                if not match.any():
+                    continue
+                frame = int(match.nonzero())
+                number = int(
+                    ((frame >= steps.first) & (frame < steps.first + steps.length)).nonzero()
+                )
+                known = told[shown == number]
+                assert (known == one["behavior"]).all(-1).any()
+                ends = frame == int(steps.first[number] + steps.length[number]) - 2
+                assert bool(one["next", "terminated"]) == ends
+                phi = bank.seen().embedding[number]
+                reward = 1 + 0.1 * torch.exp(-(one["behavior"] - phi).norm()) if ends else 0.0
+                assert float(one["next", "reward"]) == pytest.approx(float(reward), abs=1e-5)
+                n_seen += 1
+            for expert in batch[seed]:
+                is_shown = (frames == expert["latent"].unsqueeze(1)).all(-1).any(-1)
+                assert not is_shown[:6].any()
+    assert n_seen > 100
+
+
+def test_nothing_is_known_of_tasks_that_have_not_been_presented(make, bank):
+    """All that is in the bank of two of the three tasks is something else in one of two runs."""
+    later = bank.task > 0
+    generator = torch.Generator().manual_seed(9)
+    embedding, latent = bank.embedding.clone(), bank.steps.latent.clone()
+    embedding[later] = torch.randn(int(later.sum()), 32, generator=generator)
+    action = bank.steps.action.clone()
+    for row in later.nonzero().flatten().tolist():
+        first = int(bank.steps.first[row])
+        rows = slice(first, first + int(bank.steps.length[row]))
+        latent[rows], action[rows] = -latent[rows] + 3, -action[rows]
+    steps = replace(bank.steps, latent=latent, action=action)
+    other = replace(bank, embedding=embedding, steps=steps)
+    assert not other.steps.latent.equal(bank.steps.latent)
+
+    for variant in ("latent, b", "all"):
+        schedule = TaskSchedule((0, 99, 99))
+        first = make(variant, schedule=schedule)
+        second = make(variant, schedule=schedule, bank=other)
+        ours, theirs = play(first, 40), play(second, 40)
+        assert (ours == theirs).all()
+        assert_same_state(first.learner.state_dict(), second.learner.state_dict())
+        shown, task = bank.embedding[:6].view(3, 2, 32), torch.zeros(3, 2).long()
+        for index in range(2):
+            policies = [
+                one.freeze(index, shown, task, torch.Generator()) for one in (first, second)
+            ]
+            assert_same_state(*policies)
+
+
+def test_the_bonus_is_for_latents_as_they_are_and_the_policy_sees_them_clipped(
+    make, encoders, bank, monkeypatch
+):
+    """Latents ten times as long as they should be: phi_g is still that of a demonstration."""
+    raw, latent = [], encoders.vae.latent
+
+    def stretched(pixels):
+        raw.append(10 * latent(pixels))
+        return raw[-1]
+
+    monkeypatch.setattr(encoders.vae, "latent", stretched)
+    algorithm = make("all", seeds=(3,))
+    data = play(algorithm, 25)[0]
+    frames, trajectory, n_ended, n_clipped = iter(raw), [], 0, 0
+    trajectory.append(next(frames)[0])
+    for step in data:
+        assert step["latent"].equal(trajectory[-1].clamp(-5, 5))
+        n_clipped += int((trajectory[-1].abs() > 5).sum())
+        trajectory.append(next(frames)[0])
+        assert step["next", "latent"].equal(trajectory[-1].clamp(-5, 5))
+        if step["next", "done"]:
+            length = torch.tensor([len(trajectory)])
+            phi_g = encoders.lae.encode(torch.stack(trajectory)[None], length)[0]
+            bonus = torch.exp(-(step["behavior"] - phi_g).norm())
+            torch.testing.assert_close(step["next", "intrinsic_reward"][0], bonus)
+            trajectory, n_ended = [next(frames)[0]], n_ended + 1
+    assert n_ended > 3
+    assert n_clipped > 100
+
+
+def test_the_bonus_tells_right_from_wrong_on_the_shipped_bank():
+    """For a trajectory just like a demonstration, by what GWR-B says of another one."""
+    bank = load_pretrained()[1]
+    seen, held_out = bank.seen(), bank.held_out()
+    gwr = GWRB(32, generator=torch.Generator().manual_seed(0), **asdict(BGPOConfig().gwr))
+    order = torch.randperm(len(seen.task), generator=torch.Generator().manual_seed(1))[:300]
+    for phi in seen.embedding[order]:
+        gwr.adapt(phi)
+    behavior = gwr.lookup(held_out.embedding).embedding
+    bonus = torch.exp(-torch.cdist(behavior, held_out.embedding))
+    same = held_out.task.unsqueeze(1) == held_out.task
+    assert bonus[same].median() > 0.15
+    assert bonus[~same].median() < 0.05
+
+
+def test_demonstrations_are_refused_where_the_state_is_the_ground_truth(make_config, bank):
+    config = replace(make_config("state", "oracle").algorithm, demonstration_share=0.25)
+    parts = {"seeds": (0,), "schedule": SCHEDULE, "bank": bank.seen(), "compose": labeled}
+    with pytest.raises(
+        ValueError, match="demonstrations are latents: set demonstration_share to 0"
+    ):
+        BGPO(config, **parts)

@@ -21,12 +21,13 @@ SEEDS = (4, 6)
 SCHEDULE = TaskSchedule((0, 2, 4))
 OTHER_SCHEDULE = TaskSchedule((4, 0, 2))  # by which task 1 comes first and task 0 last
 SIZE, N_TASKS = 16, 3  # of the ground truth, and tasks
+DEMONSTRATIONS = {"state": "latent", "name": "dist-nll-demonstrations", "task_batch_size": 8}
 
 
 @pytest.fixture
 def make(bank, encoders, make_config):
-    def make(seeds=SEEDS, schedule=SCHEDULE, state="state", **changes):
-        config = make_config(state, "dist-nll").algorithm
+    def make(seeds=SEEDS, schedule=SCHEDULE, state="state", name="dist-nll", bank=bank, **changes):
+        config = make_config(state, name).algorithm
         config = replace(config, **{"task_batch_size": 4, **changes})
         return DistNLL(config, seeds=seeds, schedule=schedule, bank=bank.seen(), encoders=encoders)
 
@@ -52,7 +53,8 @@ def play(algorithm, n_steps, state=None, hidden=(), watch=lambda chosen: None):
 def kept(algorithm):
     """A copy of its state, without the memory that its replay has not filled yet."""
     state = deepcopy(algorithm.state_dict())
-    added, rows = state["replay"]["n_added"].tolist(), TensorDict(state["replay"].pop("rows"))
+    played = state["replay"]["played"]
+    added, rows = played["n_added"].tolist(), TensorDict(played.pop("rows"))
     for key, value in rows.items(True, True):
         value = value.unflatten(0, (-1, len(added)))
         state[key] = [value[:count, column] for column, count in enumerate(added)]
@@ -93,17 +95,20 @@ def head_weights(student):
     return [{key: p.detach().clone() for key, p in h.named_parameters()} for h in student.heads]
 
 
-@pytest.mark.parametrize("schedule", [SCHEDULE, TaskSchedule((0, 0, 0))])
-def test_a_seed_learns_in_a_batch_as_it_does_alone(make, schedule):
-    batch = make(schedule=schedule)
+@pytest.mark.parametrize(
+    ("schedule", "changes"),
+    [(SCHEDULE, {}), (TaskSchedule((0, 0, 0)), {}), (TaskSchedule((0, 0, 0)), DEMONSTRATIONS)],
+)
+def test_a_seed_learns_in_a_batch_as_it_does_alone(make, schedule, changes):
+    batch = make(schedule=schedule, **changes)
     together, _ = play(batch, 40)
     losses = []
     for index, seed in enumerate(SEEDS):
-        alone = make(seeds=(seed,), schedule=schedule)
+        alone = make(seeds=(seed,), schedule=schedule, **changes)
         data = play(alone, 40)[0][0]
         for key in ("task", "demo_index", "step_count", ("next", "terminated")):
             assert together[index][key].equal(data[key]), key
-        for key in ("action", "state", ("next", "reward")):
+        for key in ("action", batch.config.state, ("next", "reward")):
             torch.testing.assert_close(together[index][key], data[key], rtol=1e-4, atol=1e-4)
         for (key, ours), theirs in zip(
             batch.loss.state_dict().items(), alone.loss.state_dict().values(), strict=True
@@ -250,6 +255,33 @@ def test_a_teacher_learns_from_the_transitions_of_its_own_task_only(make):
     assert compared == 16
 
 
+def test_teachers_learn_from_demonstrations_too_and_students_do_not(make, bank):
+    """All frames of demonstrations are turned round in one of two runs."""
+    steps = bank.seen().steps
+    other = replace(bank, steps=replace(bank.steps, latent=-bank.steps.latent))
+    first, second = make(**DEMONSTRATIONS), make(bank=other, **DEMONSTRATIONS)
+    assert len(steps.latent)
+    batches = []
+    for algorithm in (first, second):
+        learned, learn = [], algorithm.learn
+
+        def spy(batch, learned=learned, learn=learn):
+            learned.append(batch.clone())
+            return learn(batch)
+
+        algorithm.learn = spy
+        play(algorithm, 30)
+        batches.append(learned[0])  # before anything could come of it
+    ready = batches[0]["priority_weight"][..., 0] > 0
+    assert ready.any()
+    ours, theirs = (batch["latent"][ready] for batch in batches)
+    assert ours[:, :6].equal(theirs[:, :6])
+    assert ours[:, 6:].equal(-theirs[:, 6:])
+    sampled = first.replay.sample_seed(0, [0], 200)["latent"]
+    frames = steps.latents(torch.arange(len(steps.latent)))
+    assert not (sampled.view(-1, 1, 64) == frames).all(-1).any()
+
+
 def plain_nll(loc, scale, action):
     nll = scale.log() + 0.5 * math.log(2 * math.pi) + (action - loc).square() / (2 * scale**2)
     return nll.sum(-1).mean(-1).sum()
@@ -260,7 +292,7 @@ def test_students_learn_from_their_teachers_at_the_end_of_each_episode(make, sch
     """Whole runs of plain supervised learners: heads, draws, labels, losses, steps of Adam."""
     algorithm = make(schedule=schedule)
     seen = [[[] for _ in range(N_TASKS)] for _ in SEEDS]
-    draws = [[generators([seed], f"replay {t}")[0] for t in range(N_TASKS)] for seed in SEEDS]
+    draws = generators(SEEDS, "replay")
     students = [
         MultiHeadActor(SIZE, in_keys=["state"], generator=stream)
         for stream in generators(SEEDS, "student")
@@ -269,10 +301,16 @@ def test_students_learn_from_their_teachers_at_the_end_of_each_episode(make, sch
     optimizers = [torch.optim.Adam(student.parameters(), lr=1e-3) for student in students]
     lessons, ended, state = [0, 0], [False, False], algorithm.env.reset()
 
-    def draw(index, task, number):
-        states = seen[index][task]
-        rows = torch.randint(len(states), (number,), generator=draws[index][task])
-        return torch.stack([states[row] for row in rows])
+    def draw(index, tasks, number):
+        shares = torch.rand(len(tasks) * number, generator=draws[index], dtype=torch.float64)
+        return torch.stack(
+            [
+                torch.stack(
+                    [seen[index][task][int(share * len(seen[index][task]))] for share in row]
+                )
+                for task, row in zip(tasks, shares.view(-1, number), strict=True)
+            ]
+        )
 
     def learn(index, ready):
         student, order, optimizer = students[index], orders[index], optimizers[index]
@@ -281,7 +319,7 @@ def test_students_learn_from_their_teachers_at_the_end_of_each_episode(make, sch
                 order.append(task)
                 head = student.add_head(heads[index])
                 optimizer.add_param_group({"params": list(head.parameters())})
-        states = torch.stack([draw(index, task, 24) for task in order])
+        states = draw(index, order, 24)
         actions = [
             teachers_action(algorithm, index, task, of_task)
             for task, of_task in zip(order, states, strict=True)
@@ -301,9 +339,8 @@ def test_students_learn_from_their_teachers_at_the_end_of_each_episode(make, sch
         assert bool(updated) == (step >= 10)  # three times three, and one
         for index, student in enumerate(algorithm.students):
             ready = [task for task in range(N_TASKS) if len(seen[index][task]) >= 4]
-            if updated:
-                for task in ready:
-                    draw(index, task, 4)  # what the teacher learns from
+            if updated and ready:
+                draw(index, ready, 4)  # what the teachers learn from
             if updated and ended[index]:
                 learn(index, ready)
                 assert not student.state_dict()["trunk.layers.0.weight"].equal(
@@ -433,13 +470,15 @@ def test_demonstrations_are_never_read(make):
         assert_same(freeze(told, index), freeze(untold, index, embedding=float("nan")))
 
 
-@pytest.mark.parametrize("n_steps", [5, 20, 40])
-def test_a_restored_run_continues_as_the_saved_one(make, tmp_path, n_steps):
-    algorithm = make(schedule=OTHER_SCHEDULE)
+@pytest.mark.parametrize(
+    ("n_steps", "changes"), [(5, {}), (20, {}), (40, {}), (5, DEMONSTRATIONS), (40, DEMONSTRATIONS)]
+)
+def test_a_restored_run_continues_as_the_saved_one(make, tmp_path, n_steps, changes):
+    algorithm = make(schedule=OTHER_SCHEDULE, **changes)
     _, state = play(algorithm, n_steps)
     n_heads = [len(student.heads) for student in algorithm.students]
     save_checkpoint(tmp_path, {"algorithm": algorithm.state_dict(), "state": state.to_dict()})
-    other = make(seeds=(5, 7), schedule=OTHER_SCHEDULE)  # other weights and streams
+    other = make(seeds=(5, 7), schedule=OTHER_SCHEDULE, **changes)  # other weights and streams
     saved = load_checkpoint(tmp_path)
     other.env.reset()
     other.load_state_dict(saved["algorithm"])

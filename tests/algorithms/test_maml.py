@@ -20,12 +20,13 @@ pytestmark = pytest.mark.usefixtures("easy_world")
 SEEDS = (4, 6)
 SCHEDULE = TaskSchedule((0, 2, 4))
 SIZE, N_TASKS = 16, 3  # of the ground truth, and tasks
+DEMONSTRATIONS = {"state": "latent", "name": "maml-demonstrations", "task_batch_size": 8}
 
 
 @pytest.fixture
 def make(bank, encoders, make_config):
-    def make(seeds=SEEDS, schedule=SCHEDULE, state="state", **changes):
-        config = make_config(state, "maml").algorithm
+    def make(seeds=SEEDS, schedule=SCHEDULE, state="state", name="maml", **changes):
+        config = make_config(state, name).algorithm
         config = replace(config, **{"task_batch_size": 4, **changes})
         return MAML(config, seeds=seeds, schedule=schedule, bank=bank.seen(), encoders=encoders)
 
@@ -51,7 +52,8 @@ def play(algorithm, n_steps, state=None, hidden=(), watch=lambda chosen: None):
 def kept(algorithm):
     """A copy of its state, without the memory that its replay has not filled yet."""
     state = deepcopy(algorithm.state_dict())
-    added, rows = state["replay"]["n_added"].tolist(), TensorDict(state["replay"].pop("rows"))
+    played = state["replay"]["played"]
+    added, rows = played["n_added"].tolist(), TensorDict(played.pop("rows"))
     for key, value in rows.items(True, True):
         value = value.unflatten(0, (-1, len(added)))
         state[key] = [value[:count, column] for column, count in enumerate(added)]
@@ -105,17 +107,20 @@ def freeze(algorithm, index, embedding=0.0, generator_seed=0):
     return algorithm.freeze(index, torch.full((*shape, 32), embedding), task, generator)
 
 
-@pytest.mark.parametrize("schedule", [SCHEDULE, TaskSchedule((0, 0, 0))])
-def test_a_seed_learns_in_a_batch_as_it_does_alone(make, schedule):
-    batch = make(schedule=schedule)
+@pytest.mark.parametrize(
+    ("schedule", "changes"),
+    [(SCHEDULE, {}), (TaskSchedule((0, 0, 0)), {}), (TaskSchedule((0, 0, 0)), DEMONSTRATIONS)],
+)
+def test_a_seed_learns_in_a_batch_as_it_does_alone(make, schedule, changes):
+    batch = make(schedule=schedule, **changes)
     together, _ = play(batch, 40)
     losses = []
     for index, seed in enumerate(SEEDS):
-        alone = make(seeds=(seed,), schedule=schedule)
+        alone = make(seeds=(seed,), schedule=schedule, **changes)
         data = play(alone, 40)[0][0]
         for key in ("task", "demo_index", "step_count", ("next", "terminated")):
             assert together[index][key].equal(data[key]), key
-        for key in ("action", "state", ("next", "reward")):
+        for key in ("action", batch.config.state, ("next", "reward")):
             torch.testing.assert_close(together[index][key], data[key], rtol=1e-4, atol=1e-4)
         for (key, ours), theirs in zip(
             batch.loss.state_dict().items(), alone.loss.state_dict().values(), strict=True
@@ -231,15 +236,14 @@ def test_testing_adapts_by_one_plain_step_on_transitions_of_the_task(make):
     data, _ = play(algorithm, 40)
     for index in range(2):
         frozen = freeze(algorithm, index, generator_seed=5)["actor"]
-        draws = torch.randint(
-            2**63 - 1, (N_TASKS,), generator=torch.Generator().manual_seed(5)
-        ).tolist()
+        draw = torch.randint(2**63 - 1, (), generator=torch.Generator().manual_seed(5))
+        stream = torch.Generator().manual_seed(int(draw))
+        shares = torch.rand(2 * 20, generator=stream, dtype=torch.float64).view(2, 20)
         start = meta_weights(algorithm, index)
         seen = by_task(data[index])
         assert [len(states) >= 4 for states in seen] == [True, True, False]
         for task in (0, 1):
-            stream = torch.Generator().manual_seed(draws[task])
-            states = seen[task][torch.randint(len(seen[task]), (20,), generator=stream)]
+            states = seen[task][(shares[task] * len(seen[task])).long()]
             policy = {key: value.clone().requires_grad_() for key, value in start.items()}
             pre_tanh = perceptron(policy, states)
             critic = weights_of(algorithm.loss.value_network_params, index, task)
@@ -254,6 +258,33 @@ def test_testing_adapts_by_one_plain_step_on_transitions_of_the_task(make):
                 assert step.abs().max() > 1e-4
         for key, before in start.items():
             assert frozen[key][2].equal(before)
+
+
+def test_each_half_of_a_tasks_batch_has_its_share_of_demonstrations(make, bank):
+    """One half is to adapt to, the other to judge the adapted policy by."""
+    algorithm = make(**DEMONSTRATIONS)
+    assert algorithm.config.demonstration_share == 0.25
+    batches, learn = [], algorithm.learn
+    algorithm.learn = lambda batch: (batches.append(batch.clone()), learn(batch))[1]
+    data, _ = play(algorithm, 45)
+    steps = bank.seen().steps
+    n_batches = 0
+    for batch in batches:
+        assert batch.shape == (2, N_TASKS, 8)
+        for seed, task in batch["priority_weight"].all(-1).nonzero().tolist():
+            latents = batch["latent"][seed, task]
+            played = (latents.unsqueeze(1) == data["latent"][seed]).all(-1).any(-1)
+            shown = (latents.unsqueeze(1) == steps.latents(torch.arange(len(steps.latent)))).all(-1)
+            is_shown = shown.any(-1)
+            assert is_shown.equal(~played)
+            assert is_shown.tolist() == 2 * [False, False, False, True]
+            frame = shown[is_shown].long().argmax(-1)
+            of = (frame.unsqueeze(-1) >= steps.first) & (
+                frame.unsqueeze(-1) < steps.first + steps.length
+            )
+            assert (bank.seen().task[of.long().argmax(-1)] == task).all()
+            n_batches += 1
+    assert n_batches > 50
 
 
 def test_each_test_draws_its_own_transitions(make):
@@ -322,11 +353,12 @@ def test_demonstrations_are_never_read(make):
         assert_same(freeze(told, index), freeze(untold, index, embedding=float("nan")))
 
 
-def test_a_restored_run_continues_as_the_saved_one(make, tmp_path):
-    algorithm = make()
+@pytest.mark.parametrize("changes", [{}, DEMONSTRATIONS])
+def test_a_restored_run_continues_as_the_saved_one(make, tmp_path, changes):
+    algorithm = make(**changes)
     _, state = play(algorithm, 20)
     save_checkpoint(tmp_path, {"algorithm": algorithm.state_dict(), "state": state.to_dict()})
-    other = make(seeds=(5, 7))  # other weights, streams and simulations
+    other = make(seeds=(5, 7), **changes)  # other weights, streams and simulations
     play(other, 12)
     saved = load_checkpoint(tmp_path)
     other.env.reset()

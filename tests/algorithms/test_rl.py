@@ -19,9 +19,9 @@ every_rl = pytest.mark.parametrize("name", RL)
 SEEDS = (3, 8)
 
 
-def make(name, seeds=SEEDS, **changes):
+def make(name, seeds=SEEDS, experts=(0,), **changes):
     config = replace(RL[name].config, hidden_sizes=(16,), **changes)
-    problem = Problem(seeds, ["state", "label"], 6 + 2, (0.0, 1.3), torch.device("cpu"))
+    problem = Problem(seeds, ["state", "label"], 6 + 2, (0.0, 1.3), torch.device("cpu"), experts)
     return make_learner(config, problem)
 
 
@@ -53,7 +53,7 @@ def test_every_update_is_one_of_the_critics_and_every_other_one_of_td3s_actor(na
     learner = make(name)
     for update in range(1, 7):
         before, slow = weights(learner), targets(learner)
-        told = learner.learn(make_batch(2, 16, seed=update))
+        told = learner.learn(make_batch(2, 1, 16, seed=update))
         now = changed(before, weights(learner))
         critics = {key for key in before if "value_network" in key}
         due = name != "td3" or update % 2 == 0
@@ -67,7 +67,7 @@ def test_td3s_delay_is_a_setting():
     learner, moved = make("td3", policy_delay=3), []
     for update in range(7):
         before = weights(learner)
-        learner.learn(make_batch(2, 16, seed=update))
+        learner.learn(make_batch(2, 1, 16, seed=update))
         moved.append(any("actor" in key for key in changed(before, weights(learner))))
     assert moved == [False, False, True, False, False, True, False]
     with pytest.raises(ValueError, match="policy_delay must be at least 1, got 0"):
@@ -79,12 +79,12 @@ def test_td3s_delay_is_a_setting():
 def test_a_learner_goes_on_from_its_state_bit_for_bit(name, updates):
     learner = make(name)
     for update in range(updates):
-        learner.learn(make_batch(2, 16, seed=update))
+        learner.learn(make_batch(2, 1, 16, seed=update))
     state = copy.deepcopy(learner.state_dict())
     again = make(name, seeds=(0, 1))
     again.load_state_dict(state)
     for update in range(3):
-        told = [one.learn(make_batch(2, 16, seed=10 + update)) for one in (learner, again)]
+        told = [one.learn(make_batch(2, 1, 16, seed=10 + update)) for one in (learner, again)]
         assert told[0] == told[1]
     assert not changed(weights(learner), weights(again))
     assert not changed(targets(learner), targets(again))
@@ -94,7 +94,7 @@ def test_a_learner_goes_on_from_its_state_bit_for_bit(name, updates):
 def test_each_seed_of_a_batch_learns_as_it_would_alone(name):
     learners = [make(name), *(make(name, seeds=(seed,)) for seed in SEEDS)]
     for update in range(6):
-        data = make_batch(2, 16, seed=update)
+        data = make_batch(2, 1, 16, seed=update)
         for learner, part in zip(learners, (data, data[:1], data[1:]), strict=True):
             learner.learn(part.clone())
     together, *alone = [weights(learner) for learner in learners]
@@ -104,13 +104,44 @@ def test_each_seed_of_a_batch_learns_as_it_would_alone(name):
 
 
 @every_rl
+def test_each_expert_learns_as_it_would_alone_whatever_the_others_see(name):
+    """Of one seed: experts are as independent of each other as seeds are."""
+    learners = [make(name, seeds=(3,), experts=(0, 5, 2))]
+    learners += [make(name, seeds=(3,), experts=(expert,)) for expert in (0, 5, 2)]
+    for update in range(6):
+        data = make_batch(1, 3, 16, seed=update)
+        data[:, 1] = make_batch(1, 16, seed=90 + update)
+        for learner, rows in zip(learners, (slice(None), [0], [1], [2]), strict=True):
+            learner.learn(data[:, rows].clone())
+    together, *alone = [weights(learner) for learner in learners]
+    for index, ours in enumerate(alone):
+        for key, value in ours.items():
+            torch.testing.assert_close(together[key][:, index], value[:, 0], rtol=1e-4, atol=1e-4)
+
+
+@every_rl
+def test_an_expert_without_data_stays_as_it_is(name):
+    learner = make(name, experts=(0, 1))
+    before, slow = weights(learner), targets(learner)
+    weight = torch.tensor([[1.0, 0.0], [0.0, 1.0]])
+    for update in range(4):
+        data = make_batch(2, 2, 16, seed=update)
+        learner.learn(data.set("priority_weight", weight.unsqueeze(-1).expand(2, 2, 16)))
+    now = weights(learner) | targets(learner)
+    for key, value in (before | slow).items():
+        if value.ndim > 1:
+            assert (now[key] != value).view(2, 2, -1).any(-1).equal(weight > 0), key
+
+
+@every_rl
 @torch.no_grad()
 def test_exploration_is_gaussian_or_what_the_policy_draws(name):
-    learner, sources = make(name), generators(SEEDS, "exploration")
-    data = make_batch(2).select("state", "label")
-    action = learner.act(data.clone(), generators(SEEDS, "exploration"))
-    noise = torch.stack([torch.randn(4, generator=source) for source in sources])
-    told = learner.actor(data.clone())
+    """By that of the expert which is asked for, of three."""
+    learner = make(name, experts=(0, 1, 2))
+    data, expert = make_batch(2).select("state", "label"), torch.tensor([2, 0])
+    action = learner.act(data.clone(), generators(SEEDS, "exploration"), expert)
+    noise = torch.stack([torch.randn(4, generator=g) for g in generators(SEEDS, "exploration")])
+    told = learner.actor(data.unsqueeze(1).expand(2, 3).clone())[torch.arange(2), expert]
     if name == "sac":
         expected = (told["loc"] + told["scale"] * noise).tanh()
     else:
@@ -129,7 +160,7 @@ def test_targets_are_clipped_to_the_attainable_returns_unless_told_not_to(name):
     for key, value in learner.loss.state_dict().items():
         if "target_" in key and "value" in key and key.endswith("1.bias"):
             value.fill_(50.0)
-    batch = make_batch(2, 16)
+    batch = make_batch(2, 1, 16)
     ended = batch["next", "terminated"].squeeze(-1)
     expected = torch.where(ended, 1.0, 1.3)
     torch.testing.assert_close(learner.loss(batch)["target_value"], expected)
@@ -168,9 +199,10 @@ def test_test_episodes_are_without_noise(make_bgpo, bank, name):
     state = torch.randn(2, 3, 4, 16)
     label = torch.tensor([1.0, 0, 0]).expand(2, 3, 4, 3)
     shown = TensorDict({"state": state, "task_one_hot": label}, [2, 3, 4])
-    expected = algorithm.actor(shown)["action"]
-    for _ in range(2):
-        assert algorithm.act_frozen(frozen, state).equal(expected)
+    expected = algorithm.learner.actor(shown.view(2, 1, 12))["action"].view(2, 3, 4, 4)
+    first, second = (algorithm.act_frozen(frozen, state) for _ in range(2))
+    assert first.equal(second)
+    torch.testing.assert_close(first, expected)
 
 
 @pytest.mark.parametrize("name", ["maml", "dist-nll"])
@@ -200,7 +232,7 @@ def test_an_own_algorithm_is_one_entry(make_bgpo, monkeypatch):
     assert (problem.seeds, problem.in_features) == (SEEDS, 16 + 3)
     assert problem.in_keys == ["state", "task_one_hot"]
     assert problem.return_bounds == (0.0, 1.0)
-    assert algorithm.actor.mlp.layers[0].out_features == 5
+    assert algorithm.learner.actor.mlp.layers[0].out_features == 5
 
 
 def test_a_config_of_no_known_algorithm_is_refused():

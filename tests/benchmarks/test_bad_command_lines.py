@@ -28,7 +28,7 @@ def folder(tiny, tmp_path, monkeypatch):
     for name in ("empty", "run", "damaged", "unevaluated"):
         (tmp_path / name).mkdir()
     (tmp_path / "file").touch()
-    (tmp_path / "run" / "config.json").write_text('{"episodes": 5, "name": "bgpo"}')
+    (tmp_path / "run" / "config.json").write_text('{"episodes": 50, "name": "bgpo"}')
     (tmp_path / "damaged" / "config.json").write_text('{"episodes": ')
     header = ",".join(EVAL_COLUMNS) + "\n"
     (tmp_path / "damaged" / "eval.csv").write_text(header + "bgpo,0,ten,5,grasp_glass,1,1,5\n")
@@ -73,8 +73,15 @@ CASES = [
     ("continual.py --out file", "cannot make the folder file", "choose another"),
     ("continual.py --out file/run", "cannot make the folder file/run", "choose another"),
     ("continual.py --out run", "run holds a run", "--resume continues it, --out names another"),
-    ("continual.py --out run --resume", "other settings (episodes is 5 there", "the same sett"),
+    ("continual.py --out run --resume", "other settings (episodes is 50 there", "the same sett"),
     ("continual.py --out damaged --resume", "config.json is damaged", "put it back as the run"),
+    ("continual.py --out nowhere --resume", "nowhere holds no run to resume", "check --out, or"),
+    (
+        "concurrent.py --out empty --resume",
+        "empty holds no run to resume",
+        "begin without --resume",
+    ),
+    ("ladder.py --rungs a b --out new --resume", "new/a or new/b holds no run", "check --out, or"),
     ("ladder.py --rungs a --out file", "cannot make the folder file/a", "choose another"),
     # runs that are read
     ("compare.py empty nowhere", "empty/eval.csv is missing", "let the run in empty finish"),

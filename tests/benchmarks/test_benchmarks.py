@@ -26,6 +26,7 @@ from bgpo_trl.algorithms.rl import RL
 from bgpo_trl.checkpoint import load_checkpoint
 from bgpo_trl.configs import PRESETS, DDPGConfig
 from bgpo_trl.logging import EVAL_COLUMNS
+from bgpo_trl.runs import read_rows
 from suites import nico
 
 ROOT = Path(__file__).parents[2]
@@ -136,9 +137,84 @@ def test_continual_leaves_curve_and_figures(tiny, tmp_path, capsys):
     before = files(run_directory)
     with pytest.raises(ValueError, match="holds a run: --resume continues it, --out names another"):
         continual.main(experiment.Arguments(out=run_directory))
-    continual.main(experiment.Arguments(out=run_directory, resume=True))
     assert files(run_directory) == before
-    assert capsys.readouterr().out == printed
+
+
+def test_a_finished_run_only_says_so_until_it_is_made_longer(
+    tiniest, tmp_path, monkeypatch, capsys
+):
+    run = tmp_path / "run"
+    arguments = experiment.Arguments(out=run)
+    continual.main(arguments)
+    before, played = files(run), (run / "train.csv").read_text()
+    again = replace(arguments, resume=True)
+    with monkeypatch.context() as patch:
+        for name in ("load_pretrained", "make_pretrained", "Trainer", "measure", "draw"):
+            patch.delattr(experiment, name)
+        for same in (again, replace(again, episodes=6), replace(again, train_encoders=True)):
+            capsys.readouterr()
+            continual.main(same)
+            told = f"{run} is finished, all 6 episodes: --episodes makes it longer\n"
+            assert capsys.readouterr() == (told, "")
+    assert files(run) == before
+
+    wrong = (replace(again, eval_every=3), replace(again, episodes=9, eval_every=3))
+    for changed in (replace(again, episodes=5), replace(again, seeds=(3,)), *wrong):
+        with pytest.raises(ValueError, match="holds a run with other settings"):
+            continual.main(changed)
+    with pytest.raises(ValueError, match=r"with other settings .*task_starts is \[0, 2, 4\] there"):
+        concurrent.main(replace(again, episodes=9))
+    assert files(run) == before
+
+    (run / "final.csv").unlink()  # as if it had been interrupted in its last tests
+    continual.main(again)
+    assert (run / "final.csv").exists()
+    assert (run / "train.csv").read_text() == played
+
+    for _ in range(2):
+        capsys.readouterr()
+        continual.main(replace(again, episodes=9))
+        settings = json.loads((run / "config.json").read_text())
+        assert (settings["episodes"], settings["task_starts"]) == (9, [0, 2, 4])
+        assert settings["eval_every"] == 2
+        assert json.loads((run / "summary.json").read_text())["episodes"] == 9
+        train = (run / "train.csv").read_text()
+        assert train.startswith(played)
+        assert train.count("\n") == 1 + 2 * 9
+    assert capsys.readouterr().out.startswith(f"{run} is finished, all 9 episodes")
+
+
+def test_a_run_that_was_interrupted_before_its_training_is_resumed(
+    tiniest, tmp_path, monkeypatch, encoders, bank
+):
+    monkeypatch.setattr(experiment, "make_pretrained", lambda *_, **__: (encoders, bank))
+    (tmp_path / "demonstrations").mkdir()
+    arguments = experiment.Arguments(out=tmp_path, resume=True, episodes=2)
+    with pytest.raises(ValueError, match="holds no run to resume"):
+        continual.main(arguments)
+    assert [path.name for path in tmp_path.iterdir()] == ["demonstrations"]
+    continual.main(replace(arguments, train_encoders=True))
+    assert (tmp_path / "summary.json").exists()
+
+
+def test_another_process_is_kept_off_all_of_an_experiment(
+    tiniest, tmp_path, monkeypatch, other_process
+):
+    """Also while it makes its encoders, and while it is tested and drawn."""
+    events = []
+    for name in ("load_pretrained", "measure"):
+        function = getattr(experiment, name)
+
+        def do(*args, name=name, function=function, **kwargs):
+            other = other_process(tmp_path / "run")
+            assert f"in use by process {os.getpid()} on" in other.communicate()[1]
+            events.append(name)
+            return function(*args, **kwargs)
+
+        monkeypatch.setattr(experiment, name, do)
+    continual.main(experiment.Arguments(out=tmp_path / "run"))
+    assert events == ["load_pretrained", "measure"]
+    assert not (tmp_path / "run" / "lock").exists()
 
 
 def test_a_dashboard_gets_the_figures_before_it_is_closed(tiniest, monkeypatch, tmp_path):
@@ -163,13 +239,14 @@ def test_a_dashboard_gets_the_figures_before_it_is_closed(tiniest, monkeypatch, 
     shown = [(f"figures/{Path(n).stem}", run / "figures" / n) for n in sorted(figures)]
     arguments = experiment.Arguments(out=run, wandb="offline")
     continual.main(arguments)
-    rows = [summary.read_rows(run / name) for name in ("train.csv", "eval.csv")]
+    rows = [read_rows(run / name) for name in ("train.csv", "eval.csv")]
     assert events == ["row"] * sum(map(len, rows)) + [*shown, "shutdown"]
     for task in TASKS:
         assert (run / "figures" / f"{task}.gif").read_bytes().startswith(b"GIF89a")
 
     events.clear()
-    continual.main(replace(arguments, resume=True))  # finished before
+    (run / "summary.json").unlink()  # as if it had been killed when training was over
+    continual.main(replace(arguments, resume=True))
     assert events == [*shown, "shutdown"]
 
 
@@ -187,7 +264,7 @@ def test_the_command_line_runs_every_algorithm_and_says_its_name(
     assert config["name"] == name
     assert config["algorithm"].get("beta") == (None if name in ("maml", "dist-nll") else 0.1)
     for file in ("train.csv", "eval.csv"):
-        rows = summary.read_rows(run / file)
+        rows = read_rows(run / file)
         assert {row["algorithm"] for row in rows} == {name}
         assert {row["task"] for row in rows} == set(TASKS)
 
@@ -198,7 +275,7 @@ def test_the_command_line_runs_every_algorithm_and_says_its_name(
     for file in ("gwr.csv", "figures/gwr.png"):
         assert (run / file).exists() == with_gwr
     assert ("GWR-B" in printed) == ("task inference" in printed) == with_gwr
-    rows = summary.read_rows(run / "final.csv")
+    rows = read_rows(run / "final.csv")
     assert len(rows) == 2 * 2 * 3
     assert all((row["task_inference"] != "") == with_gwr for row in rows)
     summed_up = summary.describe(run)
@@ -216,9 +293,9 @@ def test_concurrent_presents_all_tasks_from_the_start(tiny, tmp_path, capsys):
     run = tmp_path / "run"
     concurrent.main(experiment.Arguments(out=run))
     assert json.loads((run / "config.json").read_text())["task_starts"] == [0, 0, 0]
-    assert {row["task"] for row in summary.read_rows(run / "eval.csv")} == set(TASKS)
+    assert {row["task"] for row in read_rows(run / "eval.csv")} == set(TASKS)
 
-    rows = summary.read_rows(run / "final.csv")
+    rows = read_rows(run / "final.csv")
     assert sorted((int(r["seed"]), r["demonstrations"], r["task"]) for r in rows) == sorted(
         (seed, kind, task) for seed in (3, 8) for kind in ("seen", "held-out") for task in TASKS
     )
@@ -230,7 +307,7 @@ def test_concurrent_presents_all_tasks_from_the_start(tiny, tmp_path, capsys):
     assert re.fullmatch(r"|[0-9a-f]{7,}(-dirty)?", told["commit"])
     assert len(told["nodes"]) == 2
     assert told["random_success"] == pytest.approx(dict(zip(TASKS, [0.1, 0.2, 0.3], strict=True)))
-    nodes = summary.read_rows(run / "gwr.csv")
+    nodes = read_rows(run / "gwr.csv")
     assert len(nodes) == told["nodes"][0]
     assert {node["task"] for node in nodes} <= {"-1", "0", "1", "2"}
     assert [len(node) for node in nodes] == [33] * len(nodes)
@@ -293,23 +370,24 @@ def test_the_ladder_has_a_row_and_a_run_for_each_rung(tiny, tmp_path, capsys):
     lines = printed.splitlines()
     assert lines[0] == "| rung | " + " | ".join([*TASKS, "overall", "episodes to 80 %"]) + " |"
     assert [line[:5] for line in lines[2:]] == ["| (a)", "| (b)", "| (c)", "| (d)"]
+    assert all(re.search(r"\| (\d+|not reached) \|$", line) for line in lines[2:])
     seen = {}
     for rung in "abcd":
         config = json.loads((tmp_path / rung / "config.json").read_text())
         learner = load_checkpoint(tmp_path / rung / "checkpoint")["algorithm"]
-        inputs = set(learner["replay"]["rows"]) - {"action", "next"}
-        seen[rung] = (config["algorithm"]["state"], inputs, learner["gwr"] is not None)
+        inputs = set(learner["replay"]["rows"]) - {"action", "next", "group"}
+        seen[rung] = (config["algorithm"]["state"], inputs, "gwr" in learner)
         assert (config["task_starts"], config["eval_every"]) == ([0, 0, 0], 4)
         assert config["algorithm"]["rl"]["hidden_sizes"] == [7]
         assert (tmp_path / rung / "figures" / "success.png").exists()
-        train = summary.read_rows(tmp_path / rung / "train.csv")
+        train = read_rows(tmp_path / rung / "train.csv")
         assert {row["algorithm"] for row in train} == {config["name"]} == {f"rung {rung}"}
         assert all((float(row["intrinsic_return"]) > 0) == (rung in "cd") for row in train)
     assert seen == {
         "a": ("state", {"state", "task_one_hot"}, False),
         "b": ("latent", {"latent", "task_one_hot"}, False),
-        "c": ("latent", {"latent", "normalized_behavior"}, False),
-        "d": ("latent", {"latent", "normalized_behavior"}, True),
+        "c": ("latent", {"latent", "behavior"}, False),
+        "d": ("latent", {"latent", "behavior"}, True),
     }
 
     before = files(tmp_path)
@@ -374,7 +452,7 @@ def ended_with(monkeypatch, script, *arguments):
         (("--preset", "smoke", "--out", "here"), "error: here holds a run: --resume continues it"),
         (("--episodes", "0"), "error: episodes must be at least 1, got 0"),
         (("--algorithm", "maml", "--rl", "td3"), "error: MAML is defined over DDPG, not 'td3'"),
-        (("--preset", "smoke", "--out", "file"), "error: cannot make the folder file/"),
+        (("--preset", "smoke", "--out", "file"), "error: cannot make the folder file ("),
     ],
 )
 def test_mistakes_of_a_person_are_one_line(tmp_path, monkeypatch, capsys, arguments, message):

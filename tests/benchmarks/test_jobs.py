@@ -146,23 +146,30 @@ def test_ctrl_c_reaches_the_runs(ray, tmp_path):
     assert not todo[0].finished
 
 
-def test_a_run_is_played_when_nobody_else_holds_it(make_config, tmp_path, monkeypatch):
+def test_a_run_is_played_when_no_other_process_holds_it(
+    make_config, tmp_path, monkeypatch, other_process
+):
     """It goes on once the other process is gone, and does not play again what that one ended."""
     job = Job(tmp_path / "run", make_config())
-    waiting, events = threading.Event(), []
-    monkeypatch.setattr(jobs.time, "sleep", lambda _: waiting.set())
-    for finished in (False, True):
-        waiting.clear()
+    waiting, played = threading.Event(), []
+    monkeypatch.setattr("bgpo_trl.locking.time.sleep", lambda _: waiting.set())
+    for ended_by_other in (False, True):
+        waiting.clear(), played.clear()
+        other = other_process(job.directory)
+        assert other.stdout.readline() == "has it\n"
+        (job.directory / "finished").unlink(missing_ok=True)
         thread = threading.Thread(
-            target=jobs.work, args=(job, lambda _: events.append("played"), sys.argv)
+            target=jobs.work, args=(job, lambda _: played.append(job), sys.argv)
         )
-        with jobs.locked(job.directory):
-            thread.start()
-            assert waiting.wait(20)
-            events.append("the other ends")
-            assert job.finished == finished
+        thread.start()
+        assert waiting.wait(20)
+        assert not played
+        if ended_by_other:
+            (job.directory / "finished").touch()
+        other.communicate("\n")
         thread.join(20)
-    assert events == ["the other ends", "played", "the other ends"]
+        assert played == ([] if ended_by_other else [job])
+        assert job.finished
     assert (job.directory / "log.txt").read_text().count(f"process {os.getpid()} on") == 1
 
 

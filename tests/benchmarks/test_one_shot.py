@@ -41,12 +41,14 @@ def test_every_seed_is_tested_with_every_share_of_every_task(run_of, tmp_path, c
 
 
 @pytest.mark.parametrize("name", ["oracle", "none"])
-def test_without_gwr_b_there_is_nothing_to_infer(run_of, tmp_path, name):
+def test_without_gwr_b_there_is_nothing_to_infer(run_of, tmp_path, capsys, name):
     one_shot.main(one_shot.Arguments(run_of(name), (1.0,), episodes=1, out=tmp_path))
     with (tmp_path / "one_shot.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 6
     assert {(row["task_inference"], row["activity"]) for row in rows} == {("", "")}
+    for line in capsys.readouterr().out.splitlines()[2:]:
+        assert [cell.strip() for cell in line.split("|")[4:]] == ["", "", ""]
 
 
 def test_policies_are_shown_the_beginning_of_new_demonstrations(run_of, tmp_path, monkeypatch):

@@ -37,8 +37,9 @@ def test_it_acts_at_random_now_and_then(registry):
     learner = make_learner(config, problem)
     data, sources = TensorDict({"state": torch.randn(1, 3)}, [1]), generators([4], "exploration")
     with torch.no_grad():
-        usual = learner.actor(data.clone())["action"]
-        drawn = torch.cat([learner.act(data.clone(), sources) for _ in range(400)])
+        usual = learner.actor(data.unsqueeze(1))["action"].squeeze(1)
+        expert = torch.tensor([0])
+        drawn = torch.cat([learner.act(data, sources, expert) for _ in range(400)])
     random = drawn[(drawn != usual).any(-1)]
     assert 150 < len(random) < 250
     assert random.abs().max() > 0.9 > abs(random.mean()) * 10

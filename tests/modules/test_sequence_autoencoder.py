@@ -96,23 +96,3 @@ def test_refuses_lengths_that_do_not_fit(
 ) -> None:
     with pytest.raises(ValueError, match=message):
         lae.encode(sequences(2), length)
-
-
-def test_scale_changes_the_length_of_phi_and_nothing_of_the_reconstruction() -> None:
-    torch.manual_seed(0)
-    plain, scaled = SequenceAutoencoder(), SequenceAutoencoder(embedding_scale=0.25)
-    scaled.load_state_dict(plain.state_dict() | {"embedding_scale": torch.tensor(0.25)})
-    z = sequences(5)
-    phi, short = plain.encode(z, LENGTH), scaled.encode(z, LENGTH)
-    torch.testing.assert_close(short, 0.25 * phi)
-    torch.testing.assert_close(scaled.decode(short, 9), plain.decode(phi, 9))
-    h, c = torch.rand(5, 32), torch.rand(5, 32)
-    for one, other in zip(plain.step(z[:, 0], h, c), scaled.step(z[:, 0], h, c), strict=True):
-        torch.testing.assert_close(one, other)
-    torch.testing.assert_close(scaled.embed(h), 0.25 * h)
-
-
-@pytest.mark.parametrize("scale", [0.0, -1.0, float("nan")])
-def test_refuses_a_scale_that_is_not_positive(scale: float) -> None:
-    with pytest.raises(ValueError, match="embedding_scale"):
-        SequenceAutoencoder(embedding_scale=scale)

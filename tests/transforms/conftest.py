@@ -97,7 +97,7 @@ def make_modules(seeds=None):
     """The three learned parts; `seeds` of GWR-B's networks, None for a single one of seed 0."""
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        vae, lae = VAE(), SequenceAutoencoder(embedding_scale=0.5)
+        vae, lae = VAE(), SequenceAutoencoder()
     batch_size = [] if seeds is None else [len(seeds)]
     gwr = GWRB(32, batch_size=batch_size, generator=generators(seeds or [0]))
     return vae, lae, gwr

@@ -84,9 +84,9 @@ def test_actions_beyond_the_range_count_as_its_ends(load, task):
 def test_bad_actions_are_refused_before_anything_moves(load, task, action):
     env = load(task, seed=0, observation="state")
     env.reset()
-    before = env.physics.full_state()
+    before = env.physics.get_state()
 
     with pytest.raises(ValueError, match=r"^an action is 4 finite numbers in \[-1, 1\], not .*$"):
         env.step(action)
 
-    np.testing.assert_array_equal(env.physics.full_state(), before)
+    np.testing.assert_array_equal(env.physics.get_state(), before)

@@ -5,6 +5,7 @@ import os
 import platform
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -114,7 +115,7 @@ except RuntimeError as error:
 def test_physics_works_with_a_backend_that_there_is_not_and_frames_say_why():
     code = """
 from suites import nico
-print(nico.load("grasp_glass", seed=0, observation="state").reset().observation["state"].shape)
+print(nico.load("grasp_glass", seed=0, observation="state").reset().observation.keys())
 try:
     nico.load("grasp_glass", seed=0).reset()
 except RuntimeError as error:
@@ -122,9 +123,9 @@ except RuntimeError as error:
 """
     process = run_python(code, MUJOCO_GL="vulkan")
 
-    told = "(16,)\nMUJOCO_GL is 'vulkan', which is no OpenGL backend: set it to egl"
-    assert process.stdout.startswith(told)
-    assert process.stdout.count("\n") == 2
+    observed, told = process.stdout.splitlines()
+    assert "privileged_state" in observed
+    assert told.startswith("MUJOCO_GL is 'vulkan', which is no OpenGL backend: set it to egl")
 
 
 def test_frames_of_simulations_that_share_a_renderer_do_not_mix(physics, renderer):
@@ -158,6 +159,78 @@ def test_the_end_of_a_renderer_leaves_frames_of_others_alone(physics, renderer, 
     np.testing.assert_array_equal(renderer.render(physics.data.ptr), before)
 
 
+@pytest.mark.parametrize("ended", [False, True], ids=["living thread", "dead thread"])
+@pytest.mark.parametrize("abandoned", [False, True], ids=["in use", "abandoned"])
+def test_a_renderer_of_one_thread_is_no_obstacle_in_another(physics, renderer, ended, abandoned):
+    before = renderer.render(physics.data.ptr)
+    with ThreadPoolExecutor(1) as pool:
+        elsewhere = pool.submit(FrameRenderer, physics.model.ptr).result()
+        pool.submit(elsewhere.render, physics.data.ptr).result()
+        if ended:
+            pool.shutdown()
+        if abandoned:
+            del elsewhere
+        here = FrameRenderer(physics.model.ptr)
+        np.testing.assert_array_equal(here.render(physics.data.ptr), before)
+        if not abandoned:
+            np.testing.assert_array_equal(elsewhere.render(physics.data.ptr), before)
+            elsewhere.close()
+        here.close()
+    np.testing.assert_array_equal(renderer.render(physics.data.ptr), before)
+
+
+def test_threads_may_draw_at_the_same_time_with_one_renderer_or_their_own(physics, renderer):
+    before = renderer.render(physics.data.ptr)
+
+    def draw(number: int) -> bool:
+        own = renderer if number % 2 else FrameRenderer(physics.model.ptr)
+        return all((own.render(physics.data.ptr) == before).all() for _ in range(20))
+
+    with ThreadPoolExecutor(4) as pool:
+        assert all(pool.map(draw, range(8)))
+
+
+def test_what_draws_has_a_name_in_any_thread(renderer):
+    with ThreadPoolExecutor(1) as pool:
+        assert pool.submit(renderer.driver).result() == renderer.driver() != "unknown"
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        """
+import threading, time
+def draw(kept):
+    env = nico.load("grasp_glass", seed=0)
+    for _ in range(3):
+        env.reset()
+    kept.append(env)
+def draw_on(physics):
+    renderer = nico.rendering.FrameRenderer(physics.model.ptr)
+    while True:
+        renderer.render(physics.data.ptr)
+kept = []
+thread = threading.Thread(target=draw, args=(kept,))
+thread.start()
+thread.join()
+threading.Thread(target=draw_on, args=(kept[0].physics,), daemon=True).start()
+time.sleep(0.5)
+""",
+        """
+stock = nico.load("grasp_glass", seed=0, observation="state")
+stock.physics.render(32, 64)
+env = nico.load("grasp_glass", seed=0)
+env.reset()
+""",
+    ],
+    ids=["threads", "dm_control renders, too"],
+)
+def test_a_process_with_renderers_ends_without_a_word(code):
+    process = run_python("from suites import nico\n" + code)
+
+    assert (process.stdout, process.stderr, process.returncode) == ("", "", 0)
+
+
 def test_a_renderer_can_be_closed_twice(physics):
     renderer = FrameRenderer(physics.model.ptr)
     renderer.close()
@@ -179,6 +252,19 @@ def test_size_and_camera_can_be_chosen(physics, renderer):
 
     assert frame.shape == (48, 80, 3)
     assert frame.std() > 10
+
+
+def test_an_environment_that_is_closed_leaves_a_shared_renderer_alone(load):
+    env = load("grasp_glass", seed=0)
+    own = nico.load("grasp_glass", seed=0)
+    first = own.reset().observation["pixels"]
+
+    for _ in range(2):
+        env.close()
+        own.close()
+
+    np.testing.assert_array_equal(env.reset().observation["pixels"], first)
+    assert own.reset().first()  # With a renderer anew.
 
 
 def test_an_unknown_camera_is_refused(physics):

@@ -1,0 +1,116 @@
+"""Cost of a training step of each algorithm, interleaved in one process.
+
+    python benchmarks/steps.py bgpo-single bgpo bgpo-experts dist-nll maml
+
+A step is of all seeds: act, simulate, render and encode while the update runs in a thread of its
+own, store. Each algorithm first plays with all tasks until it knows them apart and learns.
+"""
+
+from __future__ import annotations
+
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from typing import Annotated, Literal
+
+import numpy as np
+import tyro
+from experiment import AlgorithmName, command_line
+
+from bgpo_trl.algorithms import ALGORITHMS, Algorithm
+from bgpo_trl.machine import set_threads
+from bgpo_trl.pretrained import load_pretrained
+from bgpo_trl.timing import interleave
+from bgpo_trl.transforms import TaskSchedule
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Times training steps and updates."""
+
+    algorithms: Annotated[tuple[AlgorithmName, ...], tyro.conf.Positional] = (
+        "bgpo-single",
+        "bgpo",
+        "bgpo-experts",
+        "dist-nll",
+        "maml",
+    )
+    """Algorithms to compare; ratios are to the first."""
+    seeds: int = 5
+    """Seeds in a batch."""
+    played: int = 400
+    """Steps before the first that counts."""
+    steps: int = 20
+    """Steps of a round."""
+    rounds: int = 25
+    """Rounds that count."""
+
+
+class Steps:
+    """An algorithm in training.
+
+    Args:
+        algorithm: What learns.
+    """
+
+    def __init__(self, algorithm: Algorithm) -> None:
+        self.algorithm = algorithm
+        self._background = ThreadPoolExecutor(1, "update")
+        self._state = algorithm.env.reset()
+
+    def play(self, steps: int) -> None:
+        """Takes training steps, each with its update."""
+        for _ in range(steps):
+            state = self.algorithm.act(self._state)
+            update = self._background.submit(self.algorithm.update)
+            transition, self._state = self.algorithm.env.step_and_maybe_reset(state)
+            update.result()
+            self.algorithm.store(transition)
+
+    def update(self, count: int) -> None:
+        """Makes updates alone."""
+        for _ in range(count):
+            self.algorithm.update()
+
+
+def main(arguments: Arguments) -> None:
+    """Prints a table."""
+    set_threads(1)
+    encoders, bank = load_pretrained()
+    running: dict[str, Steps] = {}
+    for name in arguments.algorithms:
+        entry = ALGORITHMS[name]
+        running[name] = Steps(
+            entry.make(
+                entry.config,
+                seeds=range(arguments.seeds),
+                schedule=TaskSchedule(starts=(0, 0, 0)),
+                bank=bank.seen(),
+                encoders=encoders,
+            )
+        )
+        running[name].play(arguments.played)
+
+    def table(what: Literal["play", "update"]) -> None:
+        calls = {
+            name: partial(getattr(steps, what), arguments.steps) for name, steps in running.items()
+        }
+        wall = interleave(calls, rounds=arguments.rounds)
+        cpu = interleave(calls, rounds=arguments.rounds, clock=time.process_time)
+        first = arguments.algorithms[0]
+        described = "training step" if what == "play" else "update"
+        for name in running:
+            ms = 1_000 * np.median(wall[name]) / arguments.steps
+            ratios = [np.median(np.divide(times[name], times[first])) for times in (wall, cpu)]
+            cells = [f"{ms:.1f}", *(f"{ratio:.2f}" for ratio in ratios)]
+            print(f"| {described} | {name} | {' | '.join(cells)} |")
+
+    print("| what | algorithm | ms | times the first | CPU time, times the first |")
+    print("|---|---|---:|---:|---:|")
+    table("play")
+    table("update")
+
+
+if __name__ == "__main__":
+    command_line(main, __doc__, Arguments)

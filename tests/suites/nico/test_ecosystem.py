@@ -1,0 +1,198 @@
+"""The tasks in others' hands: dm_env, dm_control's suite, TorchRL, Gymnasium, Stable-Baselines3."""
+
+import importlib
+import sys
+import unittest
+import unittest.mock
+from collections.abc import Callable, Iterator
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from dm_control import suite
+from dm_env import test_utils
+from gymnasium.utils.env_checker import check_env
+from shimmy import DmControlCompatibilityV0
+from stable_baselines3 import PPO
+from torchrl.envs import DMControlEnv, DMControlWrapper, check_env_specs
+
+from suites import nico
+
+all_tasks = pytest.mark.parametrize("task", nico.ALL_TASKS)
+all_observations = pytest.mark.parametrize(
+    ("observation", "keys"),
+    [
+        ("pixels", {"pixels"}),
+        ("state", {"privileged_state"}),
+        ("both", {"pixels", "privileged_state"}),
+    ],
+)
+
+
+def failures(tests: type[unittest.TestCase]) -> list[str]:
+    """Runs the tests of a case; there must be some."""
+    result = unittest.TestResult()
+    unittest.defaultTestLoader.loadTestsFromTestCase(tests).run(result)
+    assert result.testsRun
+    return [trace for _, trace in result.failures + result.errors]
+
+
+@all_tasks
+@all_observations
+@pytest.mark.parametrize("flat", [False, True])
+def test_dm_envs_own_tests_pass(load, task, observation, keys, flat):
+    class Checks(test_utils.EnvironmentTestMixin, unittest.TestCase):
+        def make_object_under_test(self):
+            options = {"time_limit": 1.0, "environment_kwargs": {"flat_observation": flat}}
+            return load(task, seed=0, observation=observation, **options)
+
+        def make_action_sequence(self):  # Long enough to come to the end of two episodes.
+            yield from np.random.default_rng(0).uniform(-1.0, 1.0, (13, 4))
+
+    assert failures(Checks) == []
+    env = load(task, observation=observation, environment_kwargs={"flat_observation": flat})
+    assert set(env.observation_spec()) == ({"observations"} if flat else keys)
+
+
+@pytest.fixture
+def registered(monkeypatch) -> None:
+    for name in ("ALL_TASKS", "EXTRA", "NO_REWARD_VIZ", "TASKS_BY_DOMAIN", "_DOMAINS"):
+        content = getattr(suite, name)
+        monkeypatch.setattr(suite, name, type(content)(content))
+    nico.register()
+
+
+# A frame's corners always show the table, and names are part of the scene, whose version is fixed.
+UNMET = ("test_observations_dont_contain_constant_elements", "test_components_have_names")
+
+
+def test_dm_controls_own_tests_pass(registered, monkeypatch):
+    monkeypatch.setitem(sys.modules, "mock", unittest.mock)
+    # Its cases are the tasks that are there when it is imported.
+    ours = tuple(("nico", task) for task in nico.ALL_TASKS)
+    monkeypatch.setattr(suite, "ALL_TASKS", ours)
+    monkeypatch.setattr(suite, "TASKS_BY_DOMAIN", {"nico": nico.ALL_TASKS})
+    monkeypatch.delitem(sys.modules, "dm_control.suite.suite_test", raising=False)
+    tests = importlib.import_module("dm_control.suite.suite_test").SuiteTest
+    unmet = [name for name in dir(tests) if name.startswith(UNMET)]
+    assert len(unmet) == len(UNMET) * len(ours)
+    for name in (*unmet, *(name for name in dir(tests) if "visualize" in name)):
+        delattr(tests, name)
+
+    assert failures(tests) == []
+
+
+@all_tasks
+def test_registered_tasks_load_by_dm_control(registered, task):
+    env = suite.load(
+        "nico", task, {"random": 5, "observation": "state"}, {"flat_observation": True}
+    )
+    direct = nico.load(task, seed=5, observation="state")
+
+    np.testing.assert_array_equal(
+        env.reset().observation["observations"],
+        direct.reset().observation["privileged_state"],
+    )
+    assert env.control_timestep() == pytest.approx(0.2)
+
+
+def test_registered_tasks_are_listed_once_and_others_stay_as_they_are(registered):
+    def others(name: str) -> list:
+        return [pair for pair in getattr(suite, name) if pair[0] != "nico"]
+
+    lists = ("ALL_TASKS", "EXTRA", "NO_REWARD_VIZ")
+    before = {name: others(name) for name in lists}
+    domains = {name: tasks for name, tasks in suite.TASKS_BY_DOMAIN.items() if name != "nico"}
+
+    nico.add_task("own", type("Own", (nico.NicoTask,), {}))
+    nico.register()
+
+    tasks = tuple(nico.TASKS)
+    assert set(tasks) >= {*nico.ALL_TASKS, "own"}
+    for name in lists:
+        listed = getattr(suite, name)
+        assert [pair for pair in listed if pair[0] == "nico"] == [("nico", task) for task in tasks]
+        assert others(name) == before[name]
+        assert [domain for domain, _ in listed] == sorted(domain for domain, _ in listed)
+    assert {**domains, "nico": tasks} == suite.TASKS_BY_DOMAIN
+
+
+@all_tasks
+@all_observations
+def test_torchrl_wraps_seeds_and_checks(load, task, observation, keys):
+    env = DMControlWrapper(load(task, observation=observation))
+
+    def play(seed: int) -> dict[str, torch.Tensor]:
+        env.set_seed(seed)
+        torch.manual_seed(0)
+        return {key: env.rollout(3)[key] for key in keys}
+
+    check_env_specs(env)
+    first, second, other = play(3), play(3), play(4)
+
+    for key in keys:
+        assert first[key].shape == (3, *env.observation_spec[key].shape)
+        assert first[key].dtype == env.observation_spec[key].dtype
+        assert torch.equal(first[key], second[key])
+        assert not torch.equal(first[key], other[key])
+
+
+@all_tasks
+def test_torchrl_finds_registered_tasks(registered, renderer, task):
+    env = DMControlEnv("nico", task, renderer=renderer)
+    env.set_seed(0)
+
+    rollout = env.rollout(3)
+
+    assert rollout["pixels"].shape == (3, 32, 64, 3)
+    assert rollout["next", "reward"].shape == (3, 1)
+    assert task in dict(DMControlEnv.available_envs)["nico"]
+
+
+@pytest.fixture
+def make_gym(renderer) -> Iterator[Callable[..., gymnasium.Env]]:
+    """Makes tasks as environments of gymnasium's registry, of which it checks more."""
+
+    def make(task: str, **options) -> gymnasium.Env:
+        shared = None if "frame_size" in options else renderer
+        return DmControlCompatibilityV0(nico.load(task, renderer=shared, **options))
+
+    gymnasium.register("nico-v0", make)
+    yield lambda task, **options: gymnasium.make("nico-v0", task=task, **options).unwrapped
+    del gymnasium.registry["nico-v0"]
+
+
+# An unbounded state is no mistake; the windows it would open are not ours.
+@pytest.mark.filterwarnings("ignore:.*A Box observation space m.*imum value is:UserWarning")
+@all_tasks
+@all_observations
+def test_gymnasiums_checks_pass_through_shimmy(make_gym, task, observation, keys):
+    env = make_gym(task, observation=observation)
+
+    check_env(env, skip_render_check=True)
+
+    assert set(env.observation_space) == keys
+
+
+def test_shimmy_seeds_starts(make_gym):
+    env = make_gym("grasp_glass", observation="state")
+    starts = [env.reset(seed=seed)[0]["privileged_state"] for seed in (3, 3, 4)]
+    plain = nico.load("grasp_glass", seed=3, observation="state").reset()
+
+    np.testing.assert_array_equal(starts[0], starts[1])
+    np.testing.assert_array_equal(starts[0], plain.observation["privileged_state"])
+    assert (starts[0] != starts[2]).any()
+
+
+def test_stable_baselines3_learns_from_larger_frames(make_gym):
+    env = make_gym("grasp_glass", frame_size=(84, 84))
+    learner = PPO("MultiInputPolicy", env, n_steps=100, batch_size=50, n_epochs=1, device="cpu")
+    before = [parameter.clone() for parameter in learner.policy.parameters()]
+
+    learner.learn(200)
+
+    assert learner.num_timesteps == 200
+    after = list(learner.policy.parameters())
+    assert any((old != new).any() for old, new in zip(before, after, strict=True))
+    env.close()

@@ -1,0 +1,135 @@
+"""The state of a simulation, and what can be asked of it."""
+
+import itertools
+
+import mujoco
+import numpy as np
+import pytest
+
+from suites import nico
+from suites.nico import kinematics
+from suites.nico.demonstrator import Demonstrator
+from suites.nico.physics import TABLE_HEIGHT, Physics
+
+all_tasks = pytest.mark.parametrize("task", nico.ALL_TASKS)
+
+
+@all_tasks
+def test_a_simulation_continues_bit_for_bit_from_its_state(load, task):
+    env = load(task, seed=0, observation="state")
+    other = nico.load(task, seed=1, observation="state").physics
+    demonstrator = Demonstrator(env, seed=0)
+    timestep = env.reset()
+    demonstrator.reset()
+    contacts = 0
+    # From each state anew, so that those in which the hand touches an object are among them.
+    while not timestep.last():
+        other.set_state(env.physics.get_state())
+        timestep = env.step(demonstrator(timestep))
+        other.set_control(env.physics.data.ctrl)
+        other.step(20)
+        np.testing.assert_array_equal(env.physics.get_state(), other.get_state())
+        contacts += env.physics.robot_touches()
+    assert contacts
+
+
+@pytest.mark.parametrize("within_reset", [False, True])
+def test_a_planner_that_goes_back_meets_the_same_future(load, within_reset):
+    env = load("push_green_to_white", seed=0, observation="state")
+    env.reset()
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (20, 4))
+    for action in actions[10:]:
+        env.step(action)
+    state = env.physics.get_state()
+    seen = [env.step(action).observation["privileged_state"] for action in actions[:10]]
+
+    if within_reset:
+        with env.physics.reset_context():
+            env.physics.set_state(state)
+    else:
+        env.physics.set_state(state)
+    np.testing.assert_array_equal(env.physics.get_state(), state)
+    again = [env.step(action).observation["privileged_state"] for action in actions[:10]]
+
+    np.testing.assert_array_equal(again, seen)
+
+
+def test_parts_of_the_state_can_be_chosen(physics):
+    part = mujoco.mjtState.mjSTATE_QPOS.value
+    with physics.reset_context():
+        pass
+    angles = physics.get_state(part)
+
+    physics.set_state(angles + 0.01, part)
+
+    np.testing.assert_array_equal(physics.data.qpos, angles + 0.01)
+
+
+def test_a_state_of_another_length_is_refused(physics):
+    with pytest.raises(ValueError, match=r"^the state is a vector of 256 numbers, got \[33\]: .*$"):
+        physics.set_state(np.zeros(33))
+
+
+GRIP = np.array([0.42, 0.05, TABLE_HEIGHT + 0.045])
+
+
+def put(physics: Physics, name: str, position: np.ndarray, curl: float) -> None:
+    """Puts an object somewhere, the others out of reach, and the hand at `GRIP`, closing."""
+    with physics.reset_context():
+        for number, other in enumerate(nico.OBJECTS):
+            physics.named.data.qpos[other] = [0.45, 0.3 + 0.1 * number, 0.7, 1, 0, 0, 0]
+        physics.named.data.qpos[name][:3] = position
+        physics.data.qpos[:12] = [*kinematics.inverse(GRIP), *[curl] * 9]
+        physics.data.ctrl[:] = [*physics.data.qpos[:3], *[curl + 0.1] * 3]
+
+
+@pytest.mark.parametrize("name", nico.OBJECTS)
+@pytest.mark.parametrize(
+    ("curl", "left", "touched", "held"),
+    [(0.7, 0.0, True, True), (0.0, 0.0, True, False), (0.7, 0.1, False, False)],
+    ids=["in the fist", "at the palm of the open hand", "beside the fist"],
+)
+def test_only_what_is_in_the_hand_is_touched_and_held(physics, name, curl, left, touched, held):
+    # The palm and an object at the grip point just meet; the boxes are no less wide than the glass.
+    put(physics, name, np.array([GRIP[0], GRIP[1] + left, TABLE_HEIGHT + 0.03]), curl)
+
+    for other in nico.OBJECTS:
+        assert physics.touching("hand", other) is (touched and other == name)
+        assert physics.held(other) is (held and other == name)
+
+
+def test_the_hand_ends_at_the_wrist(physics):
+    put(physics, "white_box", GRIP, 0.0)
+    put(physics, "white_box", physics.named.data.geom_xpos["forearm"].copy(), 0.0)
+
+    assert physics.touching("forearm", "white_box")
+    assert not physics.touching("hand", "white_box")
+
+
+def test_the_gap_to_the_hand_is_that_to_its_nearest_part(physics):
+    put(physics, "green_box", np.array([0.42, -0.07, TABLE_HEIGHT + 0.03]), 0.3)
+    digits = ("thumb", "upper_finger", "lower_finger")
+    parts = [f"{digit}_{n}" for digit, n in itertools.product(digits, (1, 2, 3))]
+    gaps = [physics.gap(part, "green_box") for part in ("palm", "wrist", *parts)]
+
+    assert 0.002 < min(gaps) < max(gaps)
+    assert physics.gap("hand", "green_box") == physics.gap("green_box", "hand") == min(gaps)
+
+
+@pytest.mark.parametrize(
+    ("ask", "refusal"),
+    [
+        (lambda physics: physics.gap("hand", "cup"), "no 'cup' .* one of hand, .*, white_box"),
+        (lambda physics: physics.touching("cup", "hand"), "no 'cup' .* one of hand, .*, white_box"),
+        (lambda physics: physics.held("cup"), "no object 'cup' .* one of glass, .*, white_box"),
+        (lambda physics: physics.held("palm"), "no object 'palm' .* one of glass, .*, white_box"),
+        (
+            lambda physics: physics.object_position("cup"),
+            "no object 'cup' .* one of glass, .*, white_box",
+        ),
+    ],
+    ids=["gap", "touching", "held", "held palm", "position"],
+)
+def test_what_is_not_there_cannot_be_asked_for(physics, ask, refusal):
+    with pytest.raises(ValueError, match=rf"^{refusal}$"):
+        ask(physics)

@@ -1,0 +1,142 @@
+"""GroupLookup: the group of an episode, and when groups learn from it."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs import Compose, StepCounter, TransformedEnv, check_env_specs
+
+from bgpo_trl.modules.behavior_groups import BehaviorGroups
+from bgpo_trl.transforms import BehaviorLookup, DemonstrationSource, GroupLookup, TaskSchedule
+
+
+@pytest.fixture
+def make(MockEnv, make_bank, generators):
+    def make(seeds=None, lengths=3, learn=True):
+        batch_size = [] if seeds is None else [len(seeds)]
+        groups = BehaviorGroups(32, batch_size=batch_size, activity_threshold=0.25)
+        source = DemonstrationSource(
+            make_bank(),
+            TaskSchedule((0, 0, 0)),
+            batch_size=batch_size,
+            generator=generators(seeds or [0]),
+        )
+        lookup = GroupLookup(groups, learn=learn)
+        env = TransformedEnv(MockEnv(seeds, lengths), Compose(StepCounter(50), source, lookup))
+        return env, groups
+
+    return make
+
+
+def copy_of(groups):
+    copy = BehaviorGroups(32, batch_size=groups.batch_size, activity_threshold=0.25)
+    copy.load_state_dict(groups.state_dict())
+    return copy
+
+
+@pytest.mark.parametrize("seeds", [None, [4, 2, 3]])
+@pytest.mark.parametrize("learn", [True, False])
+def test_the_group_is_there_at_reset_and_stays_for_the_episode(make, play, seeds, learn):
+    env, groups = make(seeds, learn=False)
+    check_env_specs(env)
+    env.transform[-1].learn = learn
+    start = env.reset()
+    assert start["group"].equal(torch.zeros(env.batch_size, dtype=torch.int64))
+    assert not start["group_activity"].any()
+    for _ in range(6):
+        expected = groups.lookup(start["demo_embedding"])
+        assert start["group"].equal(expected.group)
+        assert start["group_activity"].equal(expected.activity)
+        steps, following = play(env, 3, start.clone())  # one episode
+        for key in ("group", "group_activity"):
+            for data in (steps, steps["next"]):
+                assert (data[key] == start[key].unsqueeze(-1)).all()
+        start = following
+    assert bool((groups.num_groups > 1).all()) == learn
+    assert bool((groups.gwr.num_nodes > 0).all()) == learn
+
+
+def test_groups_learn_from_the_episodes_that_end_and_from_no_others(make, play):
+    """Seeds whose episodes end at different times, against groups that are shown the same."""
+    env, groups = make([4, 2, 3], lengths=[2, 3, 5])
+    plain = copy_of(groups)
+    state = env.reset()
+    for _ in range(30):
+        steps, following = play(env, 1, state.clone())
+        ended = steps["next", "done"].flatten()
+        if ended.any():
+            plain.adapt(state["demo_embedding"], ended)
+        assert plain.num_groups.equal(groups.num_groups)
+        again = plain.lookup(following["demo_embedding"])
+        assert following["group"][ended].equal(again.group[ended])
+        assert following["group"][~ended].equal(state["group"][~ended])
+        assert following["group_activity"][~ended].equal(state["group_activity"][~ended])
+        state = following
+    for i in range(3):
+        for ours, theirs in zip(groups.gwr.graph(i), plain.gwr.graph(i), strict=True):
+            assert ours.equal(theirs)
+    assert groups.num_groups.min() > 1
+
+
+def test_a_row_of_a_batch_is_that_seed_alone(make, play):
+    seeds, lengths = [4, 2, 3], [2, 3, 5]
+    env, groups = make(seeds, lengths)
+    together, _ = play(env, 30)
+    for i, (seed, length) in enumerate(zip(seeds, lengths, strict=True)):
+        env_alone, groups_alone = make([seed], [length])
+        alone, _ = play(env_alone, 30)
+        for key in ("group", "demo_index"):
+            assert together[key][i].equal(alone[key][0])
+        assert groups.num_groups[i] == groups_alone.num_groups[0]
+
+
+def test_it_goes_with_the_lookup_of_behaviors_in_either_order(make, make_modules, play):
+    seen = []
+    for group_first in (True, False):
+        env, _ = make([4, 2])
+        lookup = BehaviorLookup(make_modules([4, 2])[2], learn=True)
+        if group_first:
+            env.append_transform(lookup)
+        else:
+            env.insert_transform(2, lookup)
+        seen.append(play(env, 20)[0])
+    for key in ("group", "group_activity", "behavior", "behavior_node"):
+        assert seen[0][key].equal(seen[1][key])
+
+
+def test_on_its_own_it_only_looks_up(make):
+    _, groups = make([4, 2])
+    phi = torch.rand(2, 5, 32)
+    groups.adapt(phi[:, 0])
+    lookup = GroupLookup(groups, learn=True)
+    found = lookup(TensorDict({"demo_embedding": phi}, [2, 5]))
+    expected = groups.lookup(phi)
+    assert found["group"].equal(expected.group)
+    assert found["group_activity"].equal(expected.activity)
+    assert groups.gwr.num_nodes.tolist() == [1, 1]
+    assert lookup.groups is groups
+
+
+def test_refuses_what_cannot_work(make, MockEnv):
+    env, _ = make([4, 2])
+    with pytest.raises(ValueError, match=r"BehaviorGroups was made for batch_size=\(3,\)"):
+        env.append_transform(
+            GroupLookup(
+                BehaviorGroups(32, batch_size=[3]), learn=True, out_keys=("other", "activity")
+            )
+        )
+        env.reset()
+    lonely = TransformedEnv(
+        MockEnv(), Compose(StepCounter(5), GroupLookup(BehaviorGroups(32), learn=True))
+    )
+    with pytest.raises(ValueError, match=r"GroupLookup found no 'demo_embedding'"):
+        lonely.reset()
+    with pytest.raises(ValueError, match="GroupLookup found no 'demo_embedding'"):
+        GroupLookup(BehaviorGroups(32), learn=False)(TensorDict(batch_size=[]))
+    source = DemonstrationSource(
+        type("Bank", (), {"embedding": torch.rand(3, 32), "task": torch.arange(3)}), TaskSchedule()
+    )
+    endless = TransformedEnv(
+        MockEnv(), Compose(source, GroupLookup(BehaviorGroups(32), learn=True))
+    )
+    with pytest.raises(ValueError, match="put StepCounter"):
+        endless.reset()
