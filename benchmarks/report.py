@@ -110,8 +110,12 @@ def read_sections(directory: Path, out: Path) -> tuple[list[Section], dict[str, 
     sections: list[Section] = []
     for key, group in GROUPS.items():
         groups[key], notes = read_group(directory, group)
-        table = main_table(groups[key], statistics) if groups[key] else []
-        sections.append(Section(group.title, table, draw(group, groups[key], out), notes))
+        section = Section(group.title, notes=notes)
+        # An ablation without any variant of its own would only repeat other tables.
+        if any(not key.startswith("ablation") or name.startswith(key) for name in groups[key]):
+            table = main_table(groups[key], statistics)
+            section = Section(group.title, table, draw(group, groups[key], out), notes)
+        sections.append(section)
     runs = {name: run for group in groups.values() for name, run in group.items()}
     if not runs:
         raise ValueError(f"{directory} holds none of the runs that the figures need")

@@ -87,11 +87,11 @@ def own_episodes(path: Path, tasks: Sequence[str], last: int | None = None) -> V
         last: Training episode at which counting ends; the last of the run if None.
 
     Returns:
-        Infinite where it was not reached; None if the file is not there.
+        Infinite where it was not reached; None if the file is not there, or holds no episode.
     """
-    if not path.exists():
+    outcomes = read_outcomes(path, tasks, last) if path.exists() else []
+    if not outcomes:
         return None
-    outcomes = read_outcomes(path, tasks, last)
     return np.array([[metrics.trials_to(task) for task in seed] for seed in outcomes])
 
 
