@@ -1,10 +1,9 @@
-"""What runs are compared, on which measures, and what the paper claims about them."""
+"""The runs that are compared, and the measures on which they are."""
 
 from __future__ import annotations
 
 import zlib
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -16,46 +15,118 @@ from bgpo_trl.runs import Curves, read_curves, read_json, read_rows
 from suites import nico
 
 Values = NDArray[np.float64]
-Table = list[list[str]]
-"""Rows of cells, the head first."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure of learning curves."""
+
+    file: str
+    """Name of the file, without its ending."""
+    caption: str
+    """What it shows, after the title of its group."""
+    runs: tuple[str, ...]
+    """Directories of the runs, in the order of the legend."""
 
 
 @dataclass(frozen=True)
 class Group:
-    """Runs that one figure compares."""
+    """Runs on equal terms, which one table compares."""
 
-    figure: str
-    """Number of the figure in the paper."""
     title: str
     runs: dict[str, str]
     """What a run is called, by the name of its directory."""
+    pictures: tuple[Picture, ...]
 
 
 REFERENCES = {"oracle": "DDPG, told the label", "ddpg": "DDPG, told nothing"}
-ALGORITHMS = {"bgpo": "BGPO", "maml": "MAML", "dist-nll": "Dist-NLL", **REFERENCES}
-GROUPS = {
-    "concurrent": Group(
-        "6",
-        "All tasks from the start",
-        {f"concurrent-{key}": name for key, name in ALGORITHMS.items()},
-    ),
-    "continual": Group(
-        "8",
-        "Tasks one after the other",
-        {f"continual-{key}": name for key, name in ALGORITHMS.items()},
-    ),
-    "ablation": Group(
-        "9",
-        "What GWR-B and the intrinsic reward contribute",
-        {
-            "concurrent-bgpo": "GWR-B + r_int",
-            "ablation-gwr": "GWR-B",
-            "ablation-r_int": "r_int",
-            "ablation-none": "none",
-            **{f"concurrent-{key}": name for key, name in REFERENCES.items()},
-        },
-    ),
+ALGORITHMS = {
+    "bgpo": "BGPO",
+    "bgpo-experts": "BGPO without demonstrations",
+    "bgpo-single": "BGPO, one policy",
+    "maml": "MAML",
+    "maml-demonstrations": "MAML + demonstrations",
+    "dist-nll": "Dist-NLL",
+    "dist-nll-demonstrations": "Dist-NLL + demonstrations",
+    **REFERENCES,
 }
+PUBLISHED = {
+    "bgpo-paper": "BGPO as published",
+    "maml-paper": "MAML as published",
+    "dist-nll-paper": "Dist-NLL as published",
+}
+SETTINGS = {
+    "concurrent": ("6", "all tasks from the start"),
+    "continual": ("8", "tasks one after the other"),
+}
+"""Number of the paper's figure and what it is about."""
+# Variants that are algorithms too: run once, under the algorithm's name.
+SAME = {"gwr+r_int": "bgpo-single", "experts": "bgpo-experts", "all": "bgpo"}
+PUBLISHED_VARIANTS = {
+    "gwr+r_int": "GWR-B + r_int",
+    "gwr": "GWR-B",
+    "r_int": "r_int",
+    "none": "none",
+}
+ADDITIONS = {
+    "gwr+r_int": "GWR-B + r_int",
+    "even-replay": "+ even replay",
+    "experts": "+ even replay + experts",
+    "demonstrations": "+ demonstrations",
+    "all": "+ all three",
+}
+
+
+def variant(setting: str, name: str) -> str:
+    """Returns the directory of a variant's run."""
+    if name in SAME:
+        return f"{setting}-{SAME[name]}"
+    return f"ablation-{name}" if setting == "concurrent" else f"ablation-continual-{name}"
+
+
+def _compared(setting: str) -> Group:
+    number, title = SETTINGS[setting]
+    alone = ("bgpo-experts", "maml", "dist-nll", *REFERENCES, "bgpo-single")
+    shown = ("bgpo", "maml-demonstrations", "dist-nll-demonstrations", *REFERENCES)
+
+    def picture(file: str, caption: str, algorithms: tuple[str, ...]) -> Picture:
+        return Picture(file, caption, tuple(f"{setting}-{key}" for key in algorithms))
+
+    return Group(
+        f"Fig. {number}: {title}",
+        {f"{setting}-{key}": name for key, name in ALGORITHMS.items()},
+        (
+            picture(f"fig{number}", "with demonstrations as experience", shown),
+            picture(f"fig{number}-without", "without demonstrations as experience", alone),
+        ),
+    )
+
+
+def _published(setting: str) -> Group:
+    number, title = SETTINGS[setting]
+    runs = {f"{setting}-{key}": name for key, name in PUBLISHED.items()}
+    picture = Picture(f"fig{number}-published", "no stabilisers, small networks", tuple(runs))
+    return Group(f"Fig. {number} as published: {title}", runs, (picture,))
+
+
+def _ablation(setting: str) -> Group:
+    published = {variant(setting, key): name for key, name in PUBLISHED_VARIANTS.items()}
+    added = {variant(setting, key): name for key, name in ADDITIONS.items()}
+    references = {f"{setting}-{key}": name for key, name in REFERENCES.items()}
+    file = "fig9" if setting == "concurrent" else f"fig9-{setting}"
+    return Group(
+        f"Fig. 9: what each part contributes, {SETTINGS[setting][1]}",
+        {**published, **added, **references},
+        (
+            Picture(file, "the paper's four", (*published, *references)),
+            Picture(f"{file}-added", "what is added to them", tuple(added)),
+        ),
+    )
+
+
+GROUPS = {setting: _compared(setting) for setting in SETTINGS}
+GROUPS |= {f"{setting}-paper": _published(setting) for setting in SETTINGS}
+GROUPS |= {"ablation": _ablation("concurrent"), "ablation-continual": _ablation("continual")}
 
 
 @dataclass(frozen=True)
@@ -152,12 +223,6 @@ def task_area(run: Run, task: int, start: int, length: int | None = None) -> Val
     return metrics.area_under_curve(run.curves.success[:, chosen, task], episodes[chosen] - start)
 
 
-def episodes_to_80(run: Run) -> float:
-    """Returns when the mean over seeds and presented tasks first stays at 80 % for 3 tests."""
-    mean = metrics.presented_mean(metrics.trailing_mean(run.curves.success, 3)).mean(0)
-    return float(metrics.episodes_to(mean, run.curves.episodes))
-
-
 class Statistics:
     """Statistics with intervals; those of a run do not depend on which others are there.
 
@@ -182,123 +247,3 @@ class Statistics:
         low, high = metrics.percentile_interval(self.resampled(scores))
         middle = metrics.interquartile_mean(scores)
         return f"{100 * middle:.1f} [{100 * low:.0f}, {100 * high:.0f}]"
-
-
-def main_table(runs: dict[str, Run], statistics: Statistics) -> Table:
-    """Returns the rows of a group's table, its head first."""
-    rows = [["", "last 10 %: IQM", "mean", *(f"task {i + 1}" for i in range(3)), "area: IQM"]]
-    rows[0].append("episodes to 80 %")
-    for run in runs.values():
-        late, reached = late_scores(run), episodes_to_80(run)
-        rows.append(
-            [
-                run.name,
-                statistics.cell(late),
-                f"{100 * late.mean():.1f}",
-                *(f"{100 * share:.0f}" for share in late.mean(0)),
-                statistics.cell(area_scores(run)),
-                f"{reached:.0f}" if np.isfinite(reached) else "not reached",
-            ]
-        )
-    return rows
-
-
-def continual_table(continual: dict[str, Run], concurrent: dict[str, Run]) -> Table:
-    """Returns forgetting and transfer of the continual runs, the table's head first."""
-    rows = [["", "forgotten since learned", "forgotten since best", "backward", "forward"]]
-    for key, run in continual.items():
-        success, episodes = run.curves.success, run.curves.episodes
-        ends = [*starts(run)[1:], int(episodes[-1])]
-        matrix = metrics.evaluation_matrix(
-            success, episodes, ends, window=max(1, round(0.1 * episodes[-1]))
-        )
-        best = metrics.forgetting_since_best(metrics.trailing_mean(success, 3))
-        cells = [
-            _spread(metrics.forgetting_since_learned(matrix)),
-            _spread(best),
-            _spread(metrics.backward_transfer(matrix)),
-        ]
-        beside = concurrent.get(key.replace("continual", "concurrent"))
-        rows.append([run.name, *cells, "" if beside is None else _forward(run, beside)])
-    return rows
-
-
-def _forward(run: Run, beside: Run) -> str:
-    gains = []
-    for task, start in enumerate(starts(run)):
-        if start == 0:
-            continue
-        length = int(min(run.curves.episodes[-1] - start, beside.curves.episodes[-1]))
-        reference = task_area(beside, task, 0, length).mean()
-        gains.append(metrics.forward_transfer(task_area(run, task, start, length), reference))
-    return _spread(np.mean(gains, axis=0))
-
-
-def _spread(values: Values) -> str:
-    return f"{100 * values.mean():.1f} ± {100 * values.std():.1f}"
-
-
-def claims(groups: dict[str, dict[str, Run]], statistics: Statistics) -> Table:
-    """Returns the paper's claims with what was found, the table's head first."""
-    rows = [["the paper's claim", "measured", "difference [95 %]", "found"]]
-
-    def compare(claim: str, what: str, first: Run | None, second: Run | None) -> None:
-        if first is None or second is None:
-            rows.append([claim, what, "", "a run is missing"])
-            return
-        scores = late_scores if what == "last 10 %" else area_scores
-        ours, theirs = scores(first), scores(second)
-        gain = metrics.interquartile_mean(ours) - metrics.interquartile_mean(theirs)
-        drawn = statistics.resampled(ours) - statistics.resampled(theirs)
-        rows.append([claim, what, *_verdict(gain, drawn)])
-
-    for setting in ("concurrent", "continual"):
-        runs = groups[setting]
-        for rival in ("maml", "dist-nll"):
-            for what in ("last 10 %", "area"):
-                compare(
-                    f"BGPO above {ALGORITHMS[rival]}, {setting}",
-                    what,
-                    runs.get(f"{setting}-bgpo"),
-                    runs.get(f"{setting}-{rival}"),
-                )
-    for rival in ("maml", "dist-nll"):
-        rows.append(_gap_claim(groups, rival, statistics))
-    ablation = groups["ablation"]
-    order = ["concurrent-bgpo", "ablation-gwr", "ablation-r_int", "ablation-none"]
-    for better, worse in [*pairwise(order), (order[0], order[-1])]:
-        names = GROUPS["ablation"].runs
-        compare(
-            f"{names[better]} converges faster than {names[worse]}",
-            "area",
-            ablation.get(better),
-            ablation.get(worse),
-        )
-    return rows
-
-
-def _gap_claim(groups: dict[str, dict[str, Run]], rival: str, statistics: Statistics) -> list[str]:
-    claim = f"the gap to {ALGORITHMS[rival]} is larger in the continual setting"
-    needed = [
-        groups[setting].get(f"{setting}-{key}")
-        for setting in ("continual", "concurrent")
-        for key in ("bgpo", rival)
-    ]
-    runs = [run for run in needed if run is not None]
-    if len(runs) < len(needed):
-        return [claim, "last 10 %", "", "a run is missing"]
-    scores = [late_scores(run) for run in runs]
-    middle = [metrics.interquartile_mean(s) for s in scores]
-    drawn = [statistics.resampled(s) for s in scores]
-    gain = (middle[0] - middle[1]) - (middle[2] - middle[3])
-    return [
-        claim,
-        "last 10 %",
-        *_verdict(gain, (drawn[0] - drawn[1]) - (drawn[2] - drawn[3])),
-    ]
-
-
-def _verdict(gain: float, drawn: Values) -> list[str]:
-    low, high = metrics.percentile_interval(drawn)
-    found = "reproduced" if low > 0 else "the opposite" if high < 0 else "not decided"
-    return [f"{100 * gain:+.1f} [{100 * low:+.0f}, {100 * high:+.0f}]", found]

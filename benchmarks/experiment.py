@@ -13,9 +13,8 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-import torch
 import tyro
-from growth import draw_growth
+from growth import draw_groups, draw_growth, draw_nodes
 from resuming import as_begun, check_resumable, is_finished
 
 from bgpo_trl.algorithms import ALGORITHMS, Algorithm
@@ -25,15 +24,10 @@ from bgpo_trl.demonstration_bank import DemonstrationBank
 from bgpo_trl.evaluation import Evaluator, evaluate_random_policy
 from bgpo_trl.locking import DirectoryLock
 from bgpo_trl.machine import choose_device, set_threads
-from bgpo_trl.plotting import plot_frame_strips, plot_gwr_pca, plot_success_curves, save_figure
+from bgpo_trl.plotting import plot_frame_strips, plot_success_curves, save_figure
 from bgpo_trl.pretrained import load_pretrained, make_pretrained
 from bgpo_trl.progress import progress_bar
-from bgpo_trl.task_inference import (
-    group_purity,
-    majority_task,
-    match_counts,
-    task_inference_accuracy,
-)
+from bgpo_trl.task_inference import group_purity, task_inference_accuracy
 from bgpo_trl.training import Trainer
 from bgpo_trl.video import save_gif
 
@@ -139,7 +133,8 @@ def run_experiment(
     trained policies with demonstrations seen in training and with held-out ones, and task
     inference), ``gwr.csv`` (nodes of the first seed's GWR-B), ``figures/`` (among them a video of a
     test episode of each task) and, when all that is there, ``summary.json`` (commit, command,
-    success of a random policy, nodes of GWR-B). Weights & Biases gets what is in ``figures/`` too.
+    success of a random policy, nodes of GWR-B, groups of behaviors). Weights & Biases gets what is
+    in ``figures/`` too.
 
     Args:
         arguments: From the command line.
@@ -214,10 +209,9 @@ def draw(
         random_success: Of a random policy, by task.
     """
     config = trainer.config
+    presented = dict(zip(config.tasks, config.task_starts, strict=True))
     figure = plot_success_curves(
-        out / "eval.csv",
-        presented=dict(zip(config.tasks, config.task_starts, strict=True)),
-        random_success=random_success,
+        out / "eval.csv", presented=presented, random_success=random_success
     )
     save_figure(figure, out / "figures" / "success.png")
     episodes = record_episodes(trainer, bank)
@@ -226,17 +220,16 @@ def draw(
         save_gif(frames, out / "figures" / f"{title.split()[0]}.gif")
     gwr = trainer.algorithm.gwr
     if gwr is not None:
-        tasks = majority_task(match_counts(gwr, bank.seen(), len(config.tasks))[0])
-        weights = gwr.graph(0).weights
-        tasks = tasks[: len(weights)]
-        write_nodes(out / "gwr.csv", weights, tasks)
-        save_figure(plot_gwr_pca(weights, tasks, config.tasks), out / "figures" / "gwr.png")
+        draw_nodes(out, trainer.algorithm, bank, config.tasks)
         accuracy = task_inference_accuracy(
             gwr, bank.seen(), bank.held_out(config.held_out), len(config.tasks)
         )
         draw_growth(out, config, bank)
         print(f"GWR-B nodes: {gwr.num_nodes.tolist()}")
         print(f"task inference on held-out demonstrations: {accuracy.mean():.1%}")
+    if trainer.algorithm.groups is not None:
+        draw_groups(out, presented, out / "figures" / "groups.png")
+        print(f"groups of behaviors: {trainer.algorithm.groups.num_groups.tolist()}")
 
 
 def measure(
@@ -340,21 +333,6 @@ def record_episodes(trainer: Trainer, bank: DemonstrationBank) -> dict[str, np.n
         )
         for task, name in enumerate(config.tasks)
     }
-
-
-def write_nodes(path: Path, weights: torch.Tensor, tasks: torch.Tensor) -> None:
-    """Writes the nodes of a GWR-B, one row each: its majority task (-1: none) and its weights.
-
-    Args:
-        path: Of the CSV file.
-        weights: ``[N, d]``.
-        tasks: ``[N]``.
-    """
-    with path.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(("task", *(f"w{i}" for i in range(weights.shape[1]))))
-        for task, row in zip(tasks.tolist(), weights.tolist(), strict=True):
-            writer.writerow((task, *(f"{value:.6g}" for value in row)))
 
 
 def commit_of_code() -> str:

@@ -1,19 +1,25 @@
-"""How GWR-B grew during a run, from the graphs that the run kept."""
+"""GWR-B and groups of behaviors: how they grew during a run, and what became of them."""
 
 from __future__ import annotations
 
+import csv
 from collections import defaultdict
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
+from bgpo_trl.algorithms import Algorithm
 from bgpo_trl.configs import RunConfig
 from bgpo_trl.demonstration_bank import DemonstrationBank
 from bgpo_trl.gwr_growth import load_graphs
-from bgpo_trl.plotting import save_figure
+from bgpo_trl.plotting import plot_gwr_pca, save_figure
+from bgpo_trl.plotting_groups import plot_groups, read_groups
 from bgpo_trl.plotting_growth import plot_gwr_growth
 from bgpo_trl.runs import count, read_rows
 from bgpo_trl.task_inference import majority_task, match_counts
+from bgpo_trl.transforms import TaskSchedule
 
 
 def draw_growth(
@@ -41,7 +47,7 @@ def draw_growth(
         return False
     graphs = {}
     for episode, gwr in networks.items():
-        presented = torch.tensor(config.task_starts) < episode
+        presented = TaskSchedule(config.task_starts).presented(torch.tensor(episode))
         tasks = majority_task(match_counts(gwr, bank.seen(), n_tasks) * presented)
         graphs[episode] = (gwr.graph().weights, gwr.graph().edges, tasks)
     path, nodes = run / "train.csv", defaultdict[int, list[int]](list)
@@ -52,3 +58,57 @@ def draw_growth(
     figure = plot_gwr_growth(graphs, [nodes[seed] for seed in config.seeds], config.tasks)
     save_figure(figure, (out or run / "figures") / "gwr_growth.png")
     return True
+
+
+def draw_groups(run: Path, presented: Mapping[str, int], out: Path) -> None:
+    """Writes the figure of how many groups there were, and which of them played what.
+
+    Args:
+        run: Directory of the run, of which ``train.csv`` is read.
+        presented: Training episode from which each task is presented, by its name.
+        out: Path of the figure.
+
+    Raises:
+        ValueError: If the file is missing or damaged, or of a run that did not tell groups.
+    """
+    save_figure(plot_groups(read_groups(run / "train.csv", list(presented)), presented), out)
+
+
+def draw_nodes(
+    run: Path, algorithm: Algorithm, bank: DemonstrationBank, tasks: Sequence[str]
+) -> None:
+    """Writes the nodes of the first seed's GWR-B, ``gwr.csv``, and draws them (Fig. 7).
+
+    Args:
+        run: Directory of the run.
+        algorithm: At the end of its run; one without GWR-B has nothing to write.
+        bank: Its demonstrations, by which nodes belong to tasks.
+        tasks: Names of the tasks.
+    """
+    if algorithm.gwr is None:
+        return
+    weights, groups = algorithm.gwr.graph(0).weights, None
+    node_tasks = majority_task(match_counts(algorithm.gwr, bank.seen(), len(tasks))[0])
+    node_tasks = node_tasks[: len(weights)]
+    if algorithm.groups is not None:
+        batch = algorithm.groups.batch_size
+        groups = algorithm.groups.lookup(weights.expand(*batch, *weights.shape)).group[0]
+    write_nodes(run / "gwr.csv", weights, node_tasks, groups)
+    save_figure(plot_gwr_pca(weights, node_tasks, tasks, groups), run / "figures" / "gwr.png")
+
+
+def write_nodes(path: Path, weights: Tensor, tasks: Tensor, groups: Tensor | None = None) -> None:
+    """Writes the nodes of a GWR-B, one row each: its majority task (-1: none) and its weights.
+
+    Args:
+        path: Of the CSV file.
+        weights: ``[N, d]``.
+        tasks: ``[N]``.
+        groups: Number of each node's group, ``[N]``; a column that is left out if None.
+    """
+    columns = {"task": tasks.tolist()} | ({} if groups is None else {"group": groups.tolist()})
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow((*columns, *(f"w{i}" for i in range(weights.shape[1]))))
+        for *numbers, row in zip(*columns.values(), weights.tolist(), strict=True):
+            writer.writerow((*numbers, *(f"{value:.6g}" for value in row)))

@@ -19,8 +19,8 @@ def merge(blocks: Sequence[Path], directory: Path) -> None:
     """Writes what one run of all seeds would have, each file whole or not at all.
 
     Rows are sorted by seed and episode. Losses stay means over the seeds of a block. What is of the
-    first seed alone, ``gwr.csv`` and figures, is the first block's; ``success.png`` is left to
-    ``summary.py``.
+    first seed alone, ``gwr.csv`` and figures, is the first block's; ``success.png`` and
+    ``groups.png`` are left to ``summary.py``.
 
     Args:
         blocks: Run directories, which differ by their seeds alone.
@@ -58,15 +58,16 @@ def merge(blocks: Sequence[Path], directory: Path) -> None:
         writer.writerows(rows)
         _write(directory / name, text.getvalue().encode())
     for path in (*blocks[0].glob("gwr.csv"), *blocks[0].glob("figures/*")):
-        if path.name != "success.png":
+        if path.name not in ("success.png", "groups.png"):
             _write(directory / path.relative_to(blocks[0]), path.read_bytes())
-    nodes = [block["nodes"] for block in told]
     summary = {
         **told[0],
         "commit": " ".join(dict.fromkeys(block["commit"] for block in told)),
         "command": shlex.join(["python", *sys.argv]),
-        "nodes": None if None in nodes else list(chain.from_iterable(nodes)),
     }
+    for key in summary.keys() & {"nodes", "groups", "group_purity"}:  # one of each seed, or none
+        of_blocks = [block[key] for block in told]
+        summary[key] = None if None in of_blocks else list(chain.from_iterable(of_blocks))
     _write_json(directory / "summary.json", summary)
     _write_json(directory / "config.json", {**configs[0], "seeds": seeds})
 

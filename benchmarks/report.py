@@ -6,7 +6,7 @@ reads the runs in ``benchmarks/results/comparison`` (or another directory of the
 them Figs. 6, 7, 8 and 9 (mean over seeds and one standard deviation), ``tables.md`` with confidence
 intervals and the claims, and ``report.html``, which holds all of it with frames of test episodes
 and the runs' settings. A run that is not there is listed as missing; one that is longer than
-another of its figure is cut to the length of the shortest.
+another of its table is cut to the length of the shortest.
 """
 
 from __future__ import annotations
@@ -17,19 +17,11 @@ from pathlib import Path
 
 import numpy as np
 import tyro
-from comparison import (
-    GROUPS,
-    Group,
-    Run,
-    Statistics,
-    Table,
-    claims,
-    continual_table,
-    main_table,
-    read_group,
-)
+from claims import LEVEL, additions, claims
+from comparison import GROUPS, SETTINGS, Group, Run, Statistics, read_group
 from experiment import command_line
 from report_page import Section, write_page
+from report_tables import Table, continual_table, groups_table, main_table, speed_table
 
 from bgpo_trl.plotting import plot_gwr_pca, plot_success_curves, save_figure
 from bgpo_trl.runs import read_rows
@@ -46,34 +38,46 @@ class Arguments:
     """Where the report goes; beside the runs if not given."""
 
 
-def draw(group: Group, runs: dict[str, Run], path: Path) -> None:
-    """Draws a group's learning curves."""
-    first = next(iter(runs.values()))
-    save_figure(
-        plot_success_curves(
-            [run.directory / "eval.csv" for run in runs.values()],
-            presented=dict(zip(nico.ALL_TASKS, first.config["task_starts"], strict=True)),
-            random_success=first.summary.get("random_success"),
-            window=3 * first.config["eval_every"],
-            last=int(first.curves.episodes[-1]),
-            names={run.config["name"]: run.name for run in runs.values()},
-        ),
-        path,
-    )
+def draw(group: Group, runs: dict[str, Run], folder: Path) -> dict[str, Path]:
+    """Draws a group's learning curves.
+
+    Returns:
+        The figures that there are runs for, by their captions.
+    """
+    figures = {}
+    for picture in group.pictures:
+        shown = [runs[key] for key in picture.runs if key in runs]
+        if not shown:
+            continue
+        first, path = shown[0], folder / f"{picture.file}.png"
+        save_figure(
+            plot_success_curves(
+                [run.directory / "eval.csv" for run in shown],
+                presented=dict(zip(nico.ALL_TASKS, first.config["task_starts"], strict=True)),
+                random_success=first.summary.get("random_success"),
+                window=3 * first.config["eval_every"],
+                last=int(first.curves.episodes[-1]),
+                names={run.config["name"]: run.name for run in shown},
+            ),
+            path,
+        )
+        figures[picture.caption] = path
+    return figures
 
 
 def draw_nodes(path: Path, to: Path) -> Table:
-    """Draws Fig. 7 from a run's ``gwr.csv``.
+    """Draws Fig. 7 from a run's ``gwr.csv``, by task and by group if it has groups.
 
     Returns:
         A table of the distances between the mean nodes of the tasks.
     """
     rows = read_rows(path)
     tasks = np.array([int(row["task"]) for row in rows])
-    weights = np.array([[float(v) for k, v in row.items() if k != "task"] for row in rows])
-    save_figure(plot_gwr_pca(weights, tasks, nico.ALL_TASKS), to)
-    numbers = range(len(nico.ALL_TASKS))
-    means = [weights[tasks == task].mean(0) for task in numbers]
+    groups = [int(row["group"]) for row in rows] if "group" in rows[0] else None
+    weights = np.array([[float(v) for k, v in row.items() if k.startswith("w")] for row in rows])
+    save_figure(plot_gwr_pca(weights, tasks, nico.ALL_TASKS, groups), to)
+    numbers = [task for task in range(len(nico.ALL_TASKS)) if (tasks == task).any()]
+    means = {task: weights[tasks == task].mean(0) for task in numbers}
     table: Table = [["distance of mean nodes", *(f"task {task + 1}" for task in numbers)]]
     for task in numbers:
         apart = [float(np.linalg.norm(means[task] - means[other])) for other in numbers]
@@ -88,43 +92,71 @@ def markdown(rows: Sequence[Sequence[str]]) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
+def read_sections(directory: Path, out: Path) -> tuple[list[Section], dict[str, Run]]:
+    """Reads the runs in a directory, draws them and tells what they have come to.
+
+    Args:
+        directory: Holds the runs.
+        out: Folder of the figures.
+
+    Returns:
+        The report, and the runs by the names of their directories.
+
+    Raises:
+        ValueError: If none of the runs is there.
+    """
+    statistics = Statistics()
+    groups: dict[str, dict[str, Run]] = {}
+    sections: list[Section] = []
+    for key, group in GROUPS.items():
+        groups[key], notes = read_group(directory, group)
+        section = Section(group.title, notes=notes)
+        # An ablation without any variant of its own would only repeat other tables.
+        if any(not key.startswith("ablation") or name.startswith(key) for name in groups[key]):
+            table = main_table(groups[key], statistics)
+            section = Section(group.title, table, draw(group, groups[key], out), notes)
+        sections.append(section)
+    runs = {name: run for group in groups.values() for name, run in group.items()}
+    if not runs:
+        raise ValueError(f"{directory} holds none of the runs that the figures need")
+    if groups["continual"]:
+        table = continual_table(groups["continual"], groups["concurrent"])
+        sections.append(Section("Forgetting and transfer, continual (points)", table))
+    for setting, (_, about) in SETTINGS.items():
+        of_setting = groups[setting] | groups[f"{setting}-paper"]
+        if of_setting:
+            title = f"Training episodes of a task until half of its last 20 succeed, {about}"
+            sections.append(Section(title, speed_table(of_setting)))
+    table = groups_table(runs[name] for name in sorted(runs))
+    if table:
+        title = "Groups found and tasks inferred on held-out demonstrations, by seed"
+        sections.append(Section(title, table))
+    title, nodes = "Fig. 7: nodes of one GWR-B", directory / "concurrent-bgpo" / "gwr.csv"
+    if nodes.exists():
+        table = draw_nodes(nodes, out / "fig7.png")
+        figures = {"first two principal components, first seed": out / "fig7.png"}
+        sections.append(Section(title, table, figures))
+    else:
+        missing = f"missing ({nodes.relative_to(directory)} is not there)"
+        sections.append(Section(title, notes=[missing]))
+    sections.append(Section("The paper's claims", claims(groups, statistics), notes=[LEVEL]))
+    table = additions(groups, statistics)
+    if table:
+        sections.append(Section("What is added to the paper's algorithm", table, notes=[LEVEL]))
+    return sections, runs
+
+
 def main(arguments: Arguments) -> None:
     """Writes the report."""
     if not arguments.runs.is_dir():
         raise ValueError(f"{arguments.runs} is no directory: name the one that holds the runs")
     out = arguments.out or arguments.runs
-    statistics = Statistics()
-    groups: dict[str, dict[str, Run]] = {}
-    sections: list[Section] = []
-    for key, group in GROUPS.items():
-        groups[key], notes = read_group(arguments.runs, group)
-        figure = None
-        table: Table = []
-        if groups[key]:
-            figure = out / f"fig{group.figure}.png"
-            draw(group, groups[key], figure)
-            table = main_table(groups[key], statistics)
-        sections.append((f"Fig. {group.figure}: {group.title}", figure, table, notes))
-    if not any(groups.values()):
-        raise ValueError(f"{arguments.runs} holds none of the runs that the figures need")
-    if groups["continual"]:
-        table = continual_table(groups["continual"], groups["concurrent"])
-        sections.append(("Forgetting and transfer, continual (points)", None, table, []))
-    nodes = arguments.runs / "concurrent-bgpo" / "gwr.csv"
-    if nodes.exists():
-        table = draw_nodes(nodes, out / "fig7.png")
-        sections.append(("Fig. 7: nodes of one GWR-B", out / "fig7.png", table, []))
-    else:
-        missing = [f"missing ({nodes.relative_to(arguments.runs)} is not there)"]
-        sections.append(("Fig. 7: nodes of one GWR-B", None, [], missing))
-    sections.append(("The paper's claims", None, claims(groups, statistics), []))
-
+    sections, runs = read_sections(arguments.runs, out)
     text = []
-    for title, _, table, notes in sections:
-        text += [f"## {title}", *([markdown(table)] if table else [])]
-        text += ["\n".join(f"- {note}" for note in notes)] if notes else []
+    for section in sections:
+        text += [f"## {section.title}", *([markdown(section.table)] if section.table else [])]
+        text += ["\n".join(f"- {note}" for note in section.notes)] if section.notes else []
     (out / "tables.md").write_text("\n\n".join(text) + "\n")
-    runs = {key: run for group in groups.values() for key, run in group.items()}
     write_page(
         out / "report.html",
         sections,

@@ -5,12 +5,23 @@ from __future__ import annotations
 import base64
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
 from typing import Any
 
-Section = tuple[str, Path | None, list[list[str]], list[str]]
-"""Title, figure, table (its head first) and notes."""
+
+@dataclass(frozen=True)
+class Section:
+    """A part of the report."""
+
+    title: str
+    table: list[list[str]] = field(default_factory=list)
+    """Its head first; none if empty."""
+    figures: dict[str, Path] = field(default_factory=dict)
+    """By their captions."""
+    notes: list[str] = field(default_factory=list)
+
 
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 64rem; margin: 2rem auto; padding: 0 1rem;
@@ -21,6 +32,7 @@ th, td { padding: .25rem .6rem; border-bottom: 1px solid #ddd; text-align: right
 th:first-child, td:first-child { text-align: left; }
 pre { background: #f6f6f6; padding: .6rem; overflow-x: auto; font-size: 12px; }
 .note { color: #a33; }
+.caption { color: #555; font-size: 13px; margin-top: -.6rem; }
 """
 
 
@@ -41,11 +53,12 @@ def write_page(
         "<p>Curves: mean over seeds, shaded by one standard deviation. Brackets: 95 % stratified "
         "bootstrap intervals over seeds and tasks of the interquartile mean (IQM).</p>"
     )
-    for title, figure, table, notes in sections:
-        parts.append(f"<h2>{escape(title)}</h2>")
-        parts += [f'<p class="note">{escape(note)}</p>' for note in notes]
-        parts += [] if figure is None else [_image(figure, title)]
-        parts += [_table(table)] if table else []
+    for section in sections:
+        parts.append(f"<h2>{escape(section.title)}</h2>")
+        parts += [f'<p class="note">{escape(note)}</p>' for note in section.notes]
+        for caption, figure in section.figures.items():
+            parts += [_image(figure, section.title), f'<p class="caption">{escape(caption)}</p>']
+        parts += [_table(section.table)] if section.table else []
     parts.append("<h2>Test episodes after training, and settings</h2>")
     for name, (directory, config, summary) in runs.items():
         parts.append(f"<h3>{escape(name)}</h3>")

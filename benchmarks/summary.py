@@ -2,7 +2,8 @@
 
     python benchmarks/summary.py benchmarks/results/c*-desk
 
-prints for each run a table of its success by task and draws ``success.png`` anew from its files.
+prints for each run a table of its success by task and draws ``success.png``, and ``groups.png``
+where it has groups of behaviors, anew from its files.
 """
 
 from __future__ import annotations
@@ -16,9 +17,11 @@ from typing import Annotated
 
 import numpy as np
 import tyro
+from growth import draw_groups
+from report_tables import median_cell, own_episodes, ratio_cells
 
 from bgpo_trl.plotting import plot_success_curves, save_figure
-from bgpo_trl.runs import read_final_tests, read_json, read_tests
+from bgpo_trl.runs import read_curves, read_final_tests, read_json, read_tests
 from suites import nico
 
 
@@ -37,14 +40,13 @@ def summarize(path: Path) -> dict[str, float]:
         path: An ``eval.csv`` with test episodes of every task.
 
     Returns:
-        By task; ``overall``, the mean over tasks; and ``episodes to 80 %``, the first evaluation at
-        which the mean over seeds and all presented tasks is that high; NaN if none is.
+        By task; ``overall``, the mean over tasks; and ``episodes to 80 %``, as `Curves.episodes_to`
+        tells it; infinite if that is not reached.
     """
     rows = read_tests(path)
     last = max(int(row["episode"]) for row in rows)
-    late, curve = defaultdict(list), defaultdict(list)
+    late = defaultdict(list)
     for row in rows:
-        curve[int(row["episode"])].append(float(row["success"]))
         if int(row["episode"]) > 0.9 * last:
             late[row["task"]].append(float(row["success"]))
     for task in _tasks(rows):
@@ -52,8 +54,7 @@ def summarize(path: Path) -> dict[str, float]:
             raise ValueError(f"{path} has no late test of {task!r}: let the run finish")
     table = {task: float(np.mean(late[task])) for task in _tasks(rows)}
     table["overall"] = sum(table.values()) / len(table)
-    reached = (episode for episode, success in sorted(curve.items()) if np.mean(success) >= 0.8)
-    table["episodes to 80 %"] = next(reached, float("nan"))
+    table["episodes to 80 %"] = read_curves(path, _tasks(rows)).episodes_to(0.8)
     return table
 
 
@@ -98,30 +99,44 @@ def describe(run: Path) -> str:
         return f"{100 * np.mean([float(cell) for cell in cells]):.{digits}f}"
 
     lines = [
-        "| task | last 10 % | best 10 % | by seed | trained, seen | trained, held-out | inferred |",
-        "|---|---:|---:|---|---:|---:|---:|",
+        "| task | last 10 % | best 10 % | by seed | own episodes to 50 % | trained, seen "
+        "| trained, held-out | inferred |",
+        "|---|---:|---:|---|---:|---:|---:|---:|",
     ]
     by_seed = _late_by_seed(run / "eval.csv")
+    tasks = [task for task in by_seed if task]
+    own = own_episodes(run / "train.csv", tasks)
     for task in by_seed:
         numbers = [late[task or "overall"], *([highest[task]] if task else [])]
         cells = [f"{100 * number:.1f}" for number in numbers] + ([] if task else [""])
         cells.append(" ".join(f"{100 * success:.0f}" for success in by_seed[task]))
+        cells.append("" if own is None or task is None else median_cell(own[:, tasks.index(task)]))
         cells += [trained(task, kind, "success", 1) for kind in ("seen", "held-out")]
         cells.append(trained(task, "held-out", "task_inference", 2))
         lines.append(f"| {task or 'all'} | " + " | ".join(cells) + " |")
-    told = read_json(
-        run / "summary.json", {"commit": str, "command": str, "nodes": list | NoneType}
+    entries = {"commit": str, "command": str} | dict.fromkeys(
+        ("nodes", "groups", "group_purity"), list | NoneType
     )
+    told = read_json(run / "summary.json", entries)
     episodes = read_json(run / "config.json").get("episodes")
     if told.get("episodes", episodes) != episodes:
         raise ValueError(f"{run} is being made longer: let the run finish")
     nodes = "" if told["nodes"] is None else f"GWR-B nodes: {told['nodes']}. "
+    if told.get("groups"):
+        purity = " ".join(f"{100 * share:.1f}" for share in told.get("group_purity") or ())
+        nodes += f"Groups: {told['groups']}, {purity} % pure on held-out demonstrations. "
     reached = late["episodes to 80 %"]
     lines += [
         "",
-        f"Episodes to 80 %: {'not reached' if np.isnan(reached) else int(reached)}. {nodes}"
+        f"Episodes to 80 %: {'not reached' if np.isinf(reached) else int(reached)}. {nodes}"
         f"Commit {told['commit']}: `{told['command']}`.",
     ]
+    if own is not None and len(tasks) > 1:
+        ratios = ", ".join(
+            f"{task} {times or 'unknown'}"
+            for task, times in zip(tasks[1:], ratio_cells(own), strict=True)
+        )
+        lines.append(f"Own episodes to 50 %, as many times those of {tasks[0]}: {ratios}.")
     return "\n".join(lines)
 
 
@@ -171,6 +186,8 @@ def main(arguments: Arguments) -> None:
         described, presented = describe(run), _presented(run)
         print(f"{run}\n\n{described}\n")
         save_figure(plot_success_curves(run / "eval.csv", presented=presented), run / "success.png")
+        if read_json(run / "summary.json").get("groups"):
+            draw_groups(run, presented, run / "groups.png")
 
 
 if __name__ == "__main__":

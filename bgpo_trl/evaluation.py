@@ -126,8 +126,7 @@ class Evaluator:
         return Snapshot(
             episode=episode,
             env_steps=env_steps,
-            # The last of those episodes could be about tasks that start with fewer before it.
-            presented=torch.tensor(algorithm.source.schedule.starts) < episode,
+            presented=algorithm.source.schedule.presented(torch.tensor(episode)),
             policy=algorithm.freeze(
                 index,
                 self._bank.embedding[drawn],

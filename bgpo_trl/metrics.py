@@ -166,6 +166,43 @@ def episodes_to(success: ArrayLike, episodes: ArrayLike, threshold: float = 0.8)
     return np.where(reached.any(axis=-1), first, np.inf)
 
 
+def trials_to(success: ArrayLike, threshold: float = 0.5, *, window: int = 20) -> float:
+    """Returns how many of its own training episodes a task takes to reach a success rate.
+
+    Args:
+        success: Outcomes of the training episodes that were about the task, in order, ``[N]``.
+        threshold: The success rate.
+        window: The rate is that of the last so many of them; of fewer, there is none.
+
+    Returns:
+        The episodes up to the first at which the rate is reached; infinite if it never is.
+
+    Raises:
+        ValueError: If the window holds no episode.
+    """
+    if window < 1:
+        raise ValueError(f"window must be at least 1 episode, not {window}")
+    won = np.concatenate([[0.0], np.cumsum(np.asarray(success, float))])
+    reached = won[window:] - won[:-window] >= threshold * window
+    return float(reached.argmax() + window) if reached.any() else float("inf")
+
+
+def times_the_first(episodes: ArrayLike) -> Array:
+    """Returns how many times as long as the first task each later one takes, ``[T - 1]``.
+
+    The median over seeds; a task that a seed never learns takes it infinitely long. Seeds that
+    never learn the first task say nothing and are left out; NaN if all are.
+
+    Args:
+        episodes: From `trials_to`, ``[S, T]``, the tasks in the order of their presentation.
+    """
+    episodes = np.asarray(episodes, float)
+    told = episodes[np.isfinite(episodes[:, 0])]
+    if not len(told):
+        return np.full(episodes.shape[1] - 1, np.nan)
+    return np.median(told[:, 1:] / told[:, :1], axis=0)
+
+
 def trailing_mean(success: ArrayLike, n: int) -> Array:
     """Returns the mean of each evaluation and up to ``n - 1`` before it.
 

@@ -26,6 +26,8 @@ from bgpo_trl.runs import read_tests
 _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 _LINES = ("-", "--", "-.", (0, (3, 1, 1, 1, 1, 1)), (0, (1, 1)), (0, (6, 2)))
 _MARKERS = ("o", "s", "^", "D", "v", "P")
+# Of groups, which are no tasks: Paul Tol's muted colors.
+_GROUP_COLORS = ("#332288", "#CC6677", "#117733", "#88CCEE", "#882255", "#DDCC77", "#44AA99")
 _GRID_POINTS = 400
 _OVERALL = "All presented tasks"
 
@@ -125,7 +127,12 @@ def plot_success_curves(
     return figure
 
 
-def plot_gwr_pca(weights: ArrayLike, node_task: ArrayLike, task_names: Sequence[str]) -> Figure:
+def plot_gwr_pca(
+    weights: ArrayLike,
+    node_task: ArrayLike,
+    task_names: Sequence[str],
+    node_group: ArrayLike | None = None,
+) -> Figure:
     """Plots the nodes of a GWR-B on their first two principal components (Fig. 7 of the paper).
 
     Args:
@@ -133,6 +140,7 @@ def plot_gwr_pca(weights: ArrayLike, node_task: ArrayLike, task_names: Sequence[
         node_task: For each node, the position in ``task_names`` of the task with the most
             demonstrations for which the node is the best match, or -1 if it is for none; ``[N]``.
         task_names: Names of the tasks.
+        node_group: Number of each node's group, ``[N]``, shown in a second panel; none if None.
 
     Returns:
         The figure.
@@ -141,47 +149,54 @@ def plot_gwr_pca(weights: ArrayLike, node_task: ArrayLike, task_names: Sequence[
         ValueError: If the shapes do not fit, a weight is not finite, or a task does not exist.
     """
     weights = np.asarray(weights, dtype=np.float64)
-    node_task = np.asarray(node_task)
+    kinds = {"task": np.asarray(node_task)}
+    if node_group is not None:
+        kinds["group"] = np.asarray(node_group)
     if weights.ndim != 2 or min(weights.shape) < 2 or not np.isfinite(weights).all():
         raise ValueError(
             f"weights must be finite and [N, d] with N, d >= 2, not {list(weights.shape)}."
         )
-    if node_task.shape != weights.shape[:1]:
-        raise ValueError(
-            f"node_task must have one task for each of the {len(weights)} nodes, "
-            f"not the shape {list(node_task.shape)}."
-        )
-    if not np.isin(node_task, np.arange(-1, len(task_names))).all():
+    for kind, numbers in kinds.items():
+        if numbers.shape != weights.shape[:1]:
+            raise ValueError(
+                f"node_{kind} must have one {kind} for each of the {len(weights)} nodes, "
+                f"not the shape {list(numbers.shape)}."
+            )
+    if not np.isin(tasks := kinds["task"], np.arange(-1, len(task_names))).all():
         raise ValueError(
             f"node_task must be -1 or a position in the {len(task_names)} task_names, "
-            f"not {node_task.min()} to {node_task.max()}."
+            f"not {tasks.min()} to {tasks.max()}."
         )
 
     points, share = _principal_components(weights)
+    marks = {
+        "task": [*_task_markers(task_names), (-1, "no demonstration", "0.6", "x")],
+        "group": [
+            (
+                group,
+                f"group {group}",
+                _GROUP_COLORS[group % len(_GROUP_COLORS)],
+                _MARKERS[group % 6],
+            )
+            for group in np.unique(kinds.get("group", [])).tolist()
+        ],
+    }
     width = 4.8
-    figure = Figure(figsize=(width, 4.6), layout="constrained")
-    axes = figure.add_subplot()
-    groups = [*_task_markers(task_names), (-1, "no demonstration", "0.6", "x")]
-    for task, name, color, marker in groups:
-        chosen = points[node_task == task]
-        if len(chosen) == 0:
-            continue
-        axes.scatter(
-            *chosen.T,
-            s=22,
-            c=color,
-            marker=marker,
-            linewidths=0.9 if marker == "x" else 0.4,
-            edgecolors=None if marker == "x" else "white",
-            alpha=0.9,
-            zorder=2 if task < 0 else 3,
-            label=f"{name} ({len(chosen)})",
-        )
-    axes.set_xlabel(f"Principal component 1 ({share[0]:.0%} of variance)", fontsize=9)
-    axes.set_ylabel(f"Principal component 2 ({share[1]:.0%} of variance)", fontsize=9)
-    axes.set_aspect("equal", adjustable="datalim")
-    _style(axes)
-    _legend(figure, *axes.get_legend_handles_labels(), width)
+    figure = Figure(figsize=(width * len(kinds), 4.6), layout="constrained")
+    panels = figure.subplots(1, len(kinds), squeeze=False)[0]
+    for axes, kind in zip(panels, kinds, strict=True):
+        for number, name, color, marker in marks[kind]:
+            chosen = points[kinds[kind] == number]
+            if len(chosen) == 0:
+                continue
+            thin = {"linewidths": 0.9} if marker == "x" else {"linewidths": 0.4, "edgecolors": "w"}
+            dots = axes.scatter(*chosen.T, s=22, c=color, marker=marker, alpha=0.9, **thin)
+            dots.set(label=f"{name} ({len(chosen)})", zorder=2 if number < 0 else 3)
+        axes.set_xlabel(f"Principal component 1 ({share[0]:.0%} of variance)", fontsize=9)
+        axes.set_ylabel(f"Principal component 2 ({share[1]:.0%} of variance)", fontsize=9)
+        axes.set_aspect("equal", adjustable="datalim")
+        _style(axes)
+        _legend(axes, *axes.get_legend_handles_labels(), width)
     return figure
 
 
@@ -272,7 +287,8 @@ def _mark_starts(axes: Axes, starts: Mapping[str, int], tasks: Sequence[str], la
         axes.axvline(episode, color="0.35", linestyle=(0, (4, 3)), linewidth=0.9)
         axes.annotate(
             f"task {tasks.index(task) + 1}",
-            (episode, 1.05),
+            (episode, 1.05 / 1.1),
+            xycoords=axes.get_xaxis_transform(),
             xytext=(3, 0),
             textcoords="offset points",
             va="center",
@@ -319,15 +335,11 @@ def _style(axes: Axes) -> None:
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def _legend(figure: Figure, handles: list[Any], labels: list[str], width: float) -> None:
+def _legend(above: Figure | Axes, handles: list[Any], labels: list[str], width: float) -> None:
     # Inches: a letter of this size is about 0.065 wide, a handle with its gaps 0.55.
     sizes = [0.065 * len(label) + 0.55 for label in labels]
     columns = len(labels) if sum(sizes) <= width else max(1, int(width / max(sizes)))
-    figure.legend(
-        handles,
-        labels,
-        loc="outside upper center",
-        ncols=columns,
-        fontsize=8.5,
-        frameon=False,
-    )
+    outside: dict[str, Any] = {"loc": "outside upper center"}
+    if isinstance(above, Axes):
+        outside = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0)}
+    above.legend(handles, labels, ncols=columns, fontsize=8.5, frameon=False, **outside)

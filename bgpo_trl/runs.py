@@ -1,4 +1,4 @@
-"""Test success of runs, read back from their CSV files."""
+"""Success of runs, read back from their CSV files."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from bgpo_trl import metrics
 
 _CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f]")
 
@@ -40,6 +42,15 @@ class Curves:
         """Returns the evaluations after at most so many training episodes."""
         kept = self.episodes <= episode
         return replace(self, episodes=self.episodes[kept], success=self.success[:, kept])
+
+    def episodes_to(self, threshold: float = 0.8) -> float:
+        """Returns when success overall first reaches a rate; infinite if it never does.
+
+        That is the mean over seeds and the tasks presented, and over the last three evaluations: a
+        single one has few test episodes.
+        """
+        presented = metrics.presented_mean(metrics.trailing_mean(self.success, 3))
+        return float(metrics.episodes_to(presented.mean(axis=0), self.episodes, threshold))
 
 
 def read_rows(
@@ -175,3 +186,31 @@ def read_curves(path: str | os.PathLike[str], tasks: Sequence[str]) -> Curves:
         where = seeds.index(seed), episodes.index(episode), tasks.index(task)
         success[where] = np.mean(successes)
     return Curves(tuple(seeds), tuple(tasks), np.array(episodes), success)
+
+
+def read_outcomes(
+    path: str | os.PathLike[str], tasks: Sequence[str], last: int | None = None
+) -> list[list[list[int]]]:
+    """Reads from a ``train.csv`` how each task's own training episodes went.
+
+    Args:
+        path: Of the file of one run.
+        tasks: Names of the tasks.
+        last: Training episode after which episodes are left out; none is if None.
+
+    Returns:
+        For each seed, in increasing order, and each task: 1 for an episode that succeeded and 0 for
+        one that did not, in the order of training.
+
+    Raises:
+        ValueError: If the file is missing or damaged.
+    """
+    outcomes: dict[int, dict[str, list[tuple[int, int]]]] = defaultdict(lambda: defaultdict(list))
+    for row in read_rows(path, {"seed": count, "episode": count, "task": str, "success": _share}):
+        if last is None or int(row["episode"]) <= last:
+            outcome = int(row["episode"]), int(float(row["success"]))
+            outcomes[int(row["seed"])][row["task"]].append(outcome)
+    return [
+        [[success for _, success in sorted(of_seed[task])] for task in tasks]
+        for _, of_seed in sorted(outcomes.items())
+    ]

@@ -76,6 +76,36 @@ def test_episodes_to_a_threshold():
     assert metrics.episodes_to(curves, [10, 20, 30], 0.7).tolist() == [20, 10, 20]
 
 
+def test_own_episodes_until_half_of_the_last_twenty_succeed():
+    # The tenth success is the thirteenth episode, but twenty are needed for a rate.
+    early = [0, 0, 0] + [1] * 10 + [0] * 7
+    assert metrics.trials_to(early) == 20
+    # 9 of episodes 1 to 20 succeed and 9 of 2 to 21; of 3 to 22, 10 do.
+    late = [0, 0] + [0, 1] * 9 + [0, 1]
+    assert metrics.trials_to(late) == 22
+    assert metrics.trials_to(late[:-1]) == np.inf
+    assert metrics.trials_to([1] * 19) == metrics.trials_to([]) == np.inf
+
+
+def test_another_rate_over_another_window():
+    outcomes = [1, 0, 1, 0, 1, 1, 1, 1, 0]
+    assert metrics.trials_to(outcomes, 0.8, window=5) == 7  # episodes 3 to 7
+    assert metrics.trials_to(outcomes, 1.0, window=2) == 6
+    assert metrics.trials_to(outcomes, window=1) == 1
+    with pytest.raises(ValueError, match="at least 1 episode, not 0"):
+        metrics.trials_to(outcomes, window=0)
+
+
+def test_later_tasks_are_measured_against_the_first():
+    inf = np.inf
+    seeds = [[100, 50, 300], [40, 40, inf], [50, 100, 100]]
+    # By seed 0.5, 1 and 2; 3, never and 2.
+    assert metrics.times_the_first(seeds).tolist() == [1, 3]
+    # A seed without the first task says nothing; half of the others never learn the third.
+    assert metrics.times_the_first([*seeds[:2], [inf, 20, 20]]).tolist() == [0.75, inf]
+    np.testing.assert_array_equal(metrics.times_the_first([[inf, 20, inf]]), [NAN, NAN])
+
+
 def test_forward_transfer_is_1_where_nothing_is_left_to_learn():
     gained = metrics.forward_transfer([1.0, 0.5, 0.25], 0.5)
     assert gained.tolist() == [1, 0, -0.5]

@@ -38,6 +38,8 @@ class TaskSchedule:
                 [ True,  True,  True]])
         >>> TaskSchedule(cumulative=False).available(torch.tensor(7_000))
         tensor([False,  True, False])
+        >>> TaskSchedule().presented(torch.tensor(7_000))
+        tensor([ True, False, False])
     """
 
     starts: tuple[int, ...] = (0, 7_000, 13_000)
@@ -65,12 +67,23 @@ class TaskSchedule:
         Returns:
             bool `[*B, n_tasks]`.
         """
-        starts = torch.tensor(self.starts, device=episode.device)
-        presented = starts <= episode.unsqueeze(-1)
+        presented = self.presented(episode + 1)
         if self.cumulative:
             return presented
+        starts = torch.tensor(self.starts, device=episode.device)
         newest = torch.where(presented, starts, -1).amax(-1, keepdim=True)
         return starts == newest
+
+    def presented(self, episodes: Tensor) -> Tensor:
+        """Tells which tasks any of the episodes so far could have been about.
+
+        Args:
+            episodes: number of episodes so far, int64 `[*B]`.
+
+        Returns:
+            bool `[*B, n_tasks]`.
+        """
+        return torch.tensor(self.starts, device=episodes.device) < episodes.unsqueeze(-1)
 
 
 class Bank(Protocol):

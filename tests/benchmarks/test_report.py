@@ -1,15 +1,20 @@
 """The report against runs whose success is made up by hand."""
 
+import itertools
 import json
 import re
+import shutil
 
 import numpy as np
 import pytest
 
-from benchmarks import comparison, report
+from benchmarks import ablation, claims, comparison, report, report_tables
+from bgpo_trl.algorithms import ALGORITHMS
 from suites import nico
 
 TASKS = nico.ALL_TASKS
+FIGURES = [f"fig{n}.png" for n in ("6", "6-without", "6-published", "7", "8", "8-without")]
+FIGURES += ["fig9.png", "fig9-added.png"]  # of the continual ablation, there is no run
 HEAD = "algorithm,seed,episode,env_steps,task,success,return,steps\n"
 
 
@@ -36,19 +41,20 @@ def write_run(folder, name, level, *, episodes=40, starts=(0, 0, 0), seeds=(0, 1
 
 
 def write_runs(folder):
-    """Everything that the figures need but one run; BGPO is best."""
-    levels = {"bgpo": 9, "maml": 5, "dist-nll": 7, "oracle": 9, "ddpg": 2}
-    for key, level in levels.items():
+    """Runs of every kind, but not all that the figures need; BGPO is best."""
+    levels = {"bgpo": 9, "bgpo-single": 9, "maml": 5, "maml-demonstrations": 5, "dist-nll": 7}
+    levels |= {"oracle": 9, "ddpg": 2}
+    for key, level in {**levels, "bgpo-paper": 4, "maml-paper": 8}.items():
         write_run(folder, f"concurrent-{key}", level)
     starts = (0, 14, 26)
-    for key, level in {**levels, "bgpo": 9, "maml": 2, "dist-nll": 7}.items():
+    for key, level in {**levels, "maml": 2, "maml-demonstrations": 2}.items():
         if key != "oracle":
             write_run(folder, f"continual-{key}", level, starts=starts)
-    for key, level in {"gwr": 8, "r_int": 8, "none": 9}.items():
+    for key, level in {"gwr": 8, "r_int": 8, "none": 9, "even-replay": 9}.items():
         write_run(folder, f"ablation-{key}", level)
     rng = np.random.default_rng(0)
-    nodes = ["task," + ",".join(f"w{i}" for i in range(4))]
-    nodes += [f"{i % 3}," + ",".join(map(str, rng.random(4))) for i in range(9)]
+    nodes = ["task,group," + ",".join(f"w{i}" for i in range(4))]
+    nodes += [f"{i % 3},{i % 2}," + ",".join(map(str, rng.random(4))) for i in range(9)]
     (folder / "concurrent-bgpo" / "gwr.csv").write_text("\n".join(nodes) + "\n")
     return folder
 
@@ -84,62 +90,111 @@ def test_tables_hold_what_the_runs_did(reported):
     # From 0 to 0.4 in 2 episodes, 0.4 to episode 32, to 0.9 at 34, 0.9 to 40.
     area = (2 * 0.2 + 30 * 0.4 + 2 * 0.65 + 6 * 0.9) / 40
     assert late["BGPO"][5].startswith(f"{100 * area:.1f} [")
-    assert list(late) == list(comparison.ALGORITHMS.values())
+    missing = ["BGPO without demonstrations", "Dist-NLL + demonstrations"]
+    assert list(late) == [n for n in comparison.ALGORITHMS.values() if n not in missing]
+    published = rows_of((reported / "tables.md").read_text(), "Fig. 6 as published")
+    assert {name: row[1] for name, row in published.items()} == {
+        "BGPO as published": "40.0",
+        "MAML as published": "80.0",
+    }
 
 
 def test_how_far_the_tasks_lie_apart_in_behavior_space(reported):
     nodes = np.loadtxt(reported / "concurrent-bgpo" / "gwr.csv", delimiter=",", skiprows=1)
-    means = [nodes[nodes[:, 0] == task, 1:].mean(0) for task in range(3)]
+    means = [nodes[nodes[:, 0] == task, 2:].mean(0) for task in range(3)]
     table = rows_of((reported / "tables.md").read_text(), "Fig. 7")
     assert table["task 1"][0] == table["task 3"][2] == "0.00"
     assert table["task 3"][1] == table["task 2"][2] == f"{np.linalg.norm(means[1] - means[2]):.2f}"
 
 
-def test_claims_are_judged_by_their_intervals(reported):
-    text = (reported / "tables.md").read_text().split("## The paper's claims")[1]
-    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines()]
-    found = {(row[0], row[1]): row[2:] for row in rows if len(row) == 4}
-    above = found["BGPO above MAML, concurrent", "last 10 %"]
-    assert above == ["+40.0 [+40, +40]", "reproduced"]
-    assert found["BGPO above Dist-NLL, continual", "area"][1] == "reproduced"
-    gap = "the gap to {} is larger in the continual setting"
-    assert found[gap.format("MAML"), "last 10 %"] == ["+30.0 [+30, +30]", "reproduced"]
-    assert found[gap.format("Dist-NLL"), "last 10 %"] == ["+0.0 [+0, +0]", "not decided"]
-    assert found["GWR-B + r_int converges faster than GWR-B", "area"][1] == "reproduced"
-    assert found["GWR-B converges faster than r_int", "area"][1] == "not decided"
-    assert found["r_int converges faster than none", "area"][1] == "the opposite"
-    assert found["GWR-B + r_int converges faster than none", "area"][1] == "not decided"
-
-
-def test_a_claim_may_turn_out_the_other_way(runs):
-    for name in ("concurrent-bgpo", "concurrent-maml"):
-        for path in (runs / name).iterdir():
-            path.unlink()
-        (runs / name).rmdir()
-    write_run(runs, "concurrent-bgpo", 4)
-    write_run(runs, "concurrent-maml", 8)
+def claims_of(runs, table=claims.claims):
+    """The rows of the claims, by all but the last two cells."""
     groups = {
         key: comparison.read_group(runs, group)[0] for key, group in comparison.GROUPS.items()
     }
-    table = comparison.claims(groups, comparison.Statistics())
-    assert [row[3] for row in table if row[0] == "BGPO above MAML, concurrent"] == 2 * [
-        "the opposite"
-    ]
+    return {tuple(row[:-2]): row[-2:] for row in table(groups, comparison.Statistics())}
+
+
+def test_claims_are_judged_by_their_intervals(reported):
+    found = claims_of(reported)
+    late = "last 10 %"
+    shown = "BGPO against MAML + demonstrations"
+    assert found["BGPO above MAML, concurrent", shown, late] == ["+40.0 [+40, +40]", "reproduced"]
+    single = "BGPO, one policy against {}"
+    above = found["BGPO above Dist-NLL, continual", single.format("Dist-NLL"), "area"]
+    assert above[1] == "reproduced"
+    published = "BGPO as published against MAML as published"
+    assert found["BGPO above MAML, concurrent", published, late][1] == "the opposite"
+    gap = "the gap to {} is larger in the continual setting"
+    assert found[gap.format("MAML"), shown, late] == ["+30.0 [+30, +30]", "reproduced"]
+    level = found[gap.format("Dist-NLL"), single.format("Dist-NLL"), late]
+    assert level == ["+0.0 [+0, +0]", "level"]
+    variants = ("variants of BGPO, one policy", "area")
+    assert found["GWR-B + r_int converges faster than GWR-B", *variants][1] == "reproduced"
+    assert found["GWR-B converges faster than r_int", *variants][1] == "level"
+    assert found["r_int converges faster than none", *variants][1] == "the opposite"
+    assert found["GWR-B + r_int converges faster than none", *variants][1] == "level"
+
+
+def test_each_bgpo_is_tested_against_baselines_on_its_terms(reported):
+    found = claims_of(reported)
+    tested = {claim[1] for claim in found if claim[0] == "BGPO above Dist-NLL, continual"}
+    assert tested == {
+        "BGPO against Dist-NLL + demonstrations",
+        "BGPO without demonstrations against Dist-NLL",
+        "BGPO, one policy against Dist-NLL",
+        "BGPO as published against Dist-NLL as published",
+    }
+    missing = {claim[:2]: row[1] for claim, row in found.items() if not row[0]}
+    above = ("BGPO above Dist-NLL, concurrent", "BGPO against Dist-NLL + demonstrations")
+    assert missing[above] == "missing: concurrent-dist-nll-demonstrations"
+    gap = ("the gap to MAML is larger in the continual setting", "BGPO as published against MAML ")
+    assert missing[gap[0], gap[1] + "as published"] == (
+        "missing: continual-bgpo-paper, continual-maml-paper"
+    )
+
+
+def test_what_is_added_is_compared_step_by_step(reported):
+    found = claims_of(reported, claims.additions)
+    step = ("+ even replay", "GWR-B + r_int", "concurrent", "area")
+    assert found[step] == ["+0.0 [+0, +0]", "level"]
+    assert found["+ all three", "GWR-B + r_int", "continual", "last 10 %"][1] == "level"
+    unknown = found["+ even replay + experts", "+ even replay", "continual", "area"]
+    assert unknown[1] == "missing: continual-bgpo-experts, ablation-continual-even-replay"
+
+
+def test_variants_that_are_algorithms_are_the_same_in_all():
+    for variant, algorithm in comparison.SAME.items():
+        assert ablation.VARIANTS[variant][1] == ALGORITHMS[algorithm].config
+    variants = {*comparison.PUBLISHED_VARIANTS, *comparison.ADDITIONS}
+    assert variants == set(ablation.VARIANTS)
+    assert {*comparison.ALGORITHMS, *comparison.PUBLISHED} == set(ALGORITHMS)
+
+
+def test_a_claim_may_turn_out_the_other_way(runs):
+    for name in ("concurrent-bgpo", "concurrent-maml-demonstrations"):
+        shutil.rmtree(runs / name)
+    write_run(runs, "concurrent-bgpo", 4)
+    write_run(runs, "concurrent-maml-demonstrations", 8)
+    shown = "BGPO against MAML + demonstrations"
+    found = claims_of(runs)
+    for what in ("last 10 %", "area"):
+        assert found["BGPO above MAML, concurrent", shown, what][1] == "the opposite"
 
 
 def test_a_missing_run_is_listed_and_not_made_up(reported, runs):
     text, page = (reported / "tables.md").read_text(), (reported / "report.html").read_text()
     note = "DDPG, told the label: missing (continual-oracle/eval.csv is not there, or empty)"
-    assert text.count(note) == page.count(note) == 1
+    assert text.count(note) == page.count(note) == 2  # in the ablation, too
     assert "DDPG, told the label" not in rows_of(text, "Fig. 8")
 
     path = runs / "ablation-r_int" / "eval.csv"
     path.write_text(HEAD)  # begun, not yet tested
     read = {key: comparison.read_group(runs, group) for key, group in comparison.GROUPS.items()}
     groups, notes = {key: found for key, (found, _) in read.items()}, read["ablation"][1]
-    assert notes == ["r_int: missing (ablation-r_int/eval.csv is not there, or empty)"]
-    table = comparison.claims(groups, comparison.Statistics())
-    missing = [row[0] for row in table if row[3] == "a run is missing"]
+    assert "r_int: missing (ablation-r_int/eval.csv is not there, or empty)" in notes
+    table = claims.claims(groups, comparison.Statistics())
+    missing = [row[0] for row in table if row[4] == "missing: ablation-r_int"]
     assert missing == ["GWR-B converges faster than r_int", "r_int converges faster than none"]
 
 
@@ -166,7 +221,7 @@ def test_runs_on_other_terms_are_refused(runs, what, value):
 
 
 def test_forgetting_and_transfer_by_hand(runs):
-    table = comparison.continual_table(
+    table = report_tables.continual_table(
         *(
             comparison.read_group(runs, comparison.GROUPS[key])[0]
             for key in ("continual", "concurrent")
@@ -184,11 +239,75 @@ def test_forgetting_and_transfer_by_hand(runs):
     assert cells["BGPO"][3] == f"{100 * gain:.1f} ± 0.0"
 
 
+def write_training(directory, seeds):
+    """Writes a train.csv from outcomes by task, one list a seed; tasks take turns."""
+    lines = [HEAD.strip()]
+    for seed, tasks in enumerate(seeds):
+        turns = [
+            (task, success)
+            for row in itertools.zip_longest(*tasks)
+            for task, success in zip(TASKS, row, strict=True)
+            if success is not None
+        ]
+        for episode, (task, success) in enumerate(turns, 1):
+            lines.append(f"bgpo,{seed},{episode},9,{task},{success},0,5")
+    (directory / "train.csv").write_text("\n".join(lines) + "\n")
+
+
+def test_how_fast_each_task_is_learned(tmp_path):
+    def learned(after):  # half of the last twenty after so many
+        return [0] * (after - 10) + [1] * 10
+
+    never = [0] * 30
+    directory = write_run(tmp_path, "continual-bgpo", 9, episodes=120, seeds=(0, 1, 2))
+    seeds = [[learned(20), learned(30), never], [learned(40), learned(40), learned(30)]]
+    write_training(directory, [*seeds, [never, learned(20), learned(20)]])
+    write_run(tmp_path, "continual-ddpg", 2, episodes=120, seeds=(0, 1, 2))
+    found, _ = comparison.read_group(tmp_path, comparison.GROUPS["continual"])
+    head, bgpo, ddpg = report_tables.speed_table(found)
+    assert head == ["", *(f"task {i}" for i in (1, 2, 3)), "task 2 : task 1", "task 3 : task 1"]
+    one = "(1 of 3 seeds never)"
+    # The first two seeds say how the tasks compare: 1.5 and 1; never and 0.75.
+    ratios = ["1.25 (2 of 3 seeds)", "not reached (2 of 3 seeds)"]
+    assert bgpo == ["BGPO", f"40 {one}", "30", f"30 {one}", *ratios]
+    assert ddpg == ["DDPG, told nothing", *["no train.csv"] * 3, "", ""]
+    # Of the third seed's 20 episodes of tasks 2 and 3 the last are its 59th and 60th.
+    episodes = report_tables.own_episodes(directory / "train.csv", TASKS, last=59)
+    assert episodes[2].tolist() == [np.inf, 20, np.inf]
+
+
+def test_groups_and_inference_by_seed(tmp_path):
+    final = "seed,demonstrations,task,episodes,success,task_inference\n"
+    for name, told in {
+        "continual-bgpo": {"nodes": [90, 80], "groups": [3, 4], "group_purity": [1.0, 0.985]},
+        "continual-bgpo-single": {"nodes": [70, 60], "groups": None},
+        "continual-maml": {"nodes": None, "groups": None},
+    }.items():
+        directory = write_run(tmp_path, name, 9, seeds=(0, 1))
+        (directory / "summary.json").write_text(json.dumps(told))
+        shares = {0: (1.0, 0.9, 1.0), 1: (1.0, 1.0, 0.97)}
+        cells = [
+            f"{seed},{kind},{task},20,0.5,{share if kind == 'held-out' else 0.1}\n"
+            for kind in ("seen", "held-out")
+            for seed, of_seed in shares.items()
+            for task, share in zip(TASKS, of_seed, strict=True)
+        ]
+        (directory / "final.csv").write_text(final + "".join(cells))
+    found, _ = comparison.read_group(tmp_path, comparison.GROUPS["continual"])
+    _, *rows = report_tables.groups_table(found.values())
+    inferred = ["97.83", "96.7 99"]  # 2.9 and 2.97 of 3
+    assert rows == [
+        ["continual-bgpo", "3 4", "100 98.5", *inferred, "90 80"],
+        ["continual-bgpo-single", "one for all", "", *inferred, "70 60"],
+    ]
+    assert report_tables.groups_table([found["continual-maml"]]) == []
+
+
 def test_the_page_needs_nothing_else(reported):
     page = (reported / "report.html").read_text()
-    for figure in ("fig6", "fig7", "fig8", "fig9"):
-        assert (reported / f"{figure}.png").read_bytes().startswith(b"\x89PNG")
-    assert page.count("data:image/png;base64,") == 4
+    for figure in FIGURES:
+        assert (reported / figure).read_bytes().startswith(b"\x89PNG")
+    assert page.count("data:image/png;base64,") == len(FIGURES)
     assert not re.findall(r"(?:src|href)=[\"'](?!data:)", page)
     assert "<script" not in page
     assert "&quot;task_starts&quot;" in page
@@ -197,7 +316,7 @@ def test_the_page_needs_nothing_else(reported):
 def test_the_same_files_make_the_same_report(reported, tmp_path, capsys):
     report.main(report.Arguments(reported, out=tmp_path))
     names = sorted(path.name for path in tmp_path.iterdir())
-    assert names == ["fig6.png", "fig7.png", "fig8.png", "fig9.png", "report.html", "tables.md"]
+    assert names == sorted([*FIGURES, "report.html", "tables.md"])
     for name in names:
         assert (tmp_path / name).read_bytes() == (reported / name).read_bytes()
     assert capsys.readouterr().out.strip() == (tmp_path / "tables.md").read_text().strip()

@@ -12,7 +12,7 @@ import jobs
 import merge
 import pytest
 import sweep
-from comparison import GROUPS, Statistics, main_table, read_group
+from comparison import GROUPS, Statistics, read_group
 from jobs import Job
 
 from benchmarks import report, summary

@@ -1,0 +1,135 @@
+"""What the paper claims about the runs and what was found, and what is added to the paper."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import pairwise
+from typing import Any
+
+from comparison import (
+    ADDITIONS,
+    ALGORITHMS,
+    PUBLISHED,
+    PUBLISHED_VARIANTS,
+    SETTINGS,
+    Run,
+    Statistics,
+    area_scores,
+    late_scores,
+    variant,
+)
+from report_tables import Table
+
+from bgpo_trl import metrics
+
+Groups = Mapping[str, Mapping[str, Run]]
+"""Runs by the names of their directories, by the key of their group."""
+
+LEVEL = (
+    "The interval of the difference decides. Level: it includes 0, which does not prove that the "
+    "two are equal."
+)
+_NAMES = ALGORITHMS | PUBLISHED
+_MEASURES = {"last 10 %": late_scores, "area": area_scores}
+_RIVALS = ("MAML", "Dist-NLL")
+# Each BGPO and those baselines that it meets on equal terms.
+_PAIRS = {
+    "bgpo": ("maml-demonstrations", "dist-nll-demonstrations"),
+    "bgpo-experts": ("maml", "dist-nll"),
+    "bgpo-single": ("maml", "dist-nll"),
+    "bgpo-paper": ("maml-paper", "dist-nll-paper"),
+}
+
+
+def claims(groups: Groups, statistics: Statistics) -> Table:
+    """Returns the paper's claims with what was found, the table's head first."""
+    judge = _Judge(groups, statistics, ("reproduced", "the opposite"))
+    rows = [["the paper's claim", "tested", "measured", "difference [95 %]", "found"]]
+    for setting in SETTINGS:
+        for ours, baselines in _PAIRS.items():
+            for rival, baseline in zip(_RIVALS, baselines, strict=True):
+                pair = [(_group(setting, key), f"{setting}-{key}") for key in (ours, baseline)]
+                tested = f"{_NAMES[ours]} against {_NAMES[baseline]}"
+                rows += [
+                    [f"BGPO above {rival}, {setting}", tested, what, *judge(what, *pair)]
+                    for what in _MEASURES
+                ]
+    for ours, baselines in _PAIRS.items():
+        for rival, baseline in zip(_RIVALS, baselines, strict=True):
+            four = [
+                (_group(setting, key), f"{setting}-{key}")
+                for setting in ("continual", "concurrent")
+                for key in (ours, baseline)
+            ]
+            claim = f"the gap to {rival} is larger in the continual setting"
+            tested = f"{_NAMES[ours]} against {_NAMES[baseline]}"
+            rows.append([claim, tested, "last 10 %", *judge("last 10 %", *four)])
+    order = list(PUBLISHED_VARIANTS)
+    for better, worse in [*pairwise(order), (order[0], order[-1])]:
+        names = PUBLISHED_VARIANTS[better], PUBLISHED_VARIANTS[worse]
+        pair = [("ablation", variant("concurrent", name)) for name in (better, worse)]
+        claim = f"{names[0]} converges faster than {names[1]}"
+        rows.append([claim, "variants of BGPO, one policy", "area", *judge("area", *pair)])
+    return rows
+
+
+def additions(groups: Groups, statistics: Statistics) -> Table:
+    """Returns what is gained by each addition to the paper's algorithm, the table's head first.
+
+    Empty if no run has such an addition.
+    """
+    judge = _Judge(groups, statistics, ("above", "below"))
+    rows = [["added", "compared with", "setting", "measured", "difference [95 %]", "found"]]
+    steps = [("even-replay", "gwr+r_int"), ("experts", "even-replay")]
+    steps += [("demonstrations", "gwr+r_int"), ("all", "experts"), ("all", "gwr+r_int")]
+    there = False
+    for setting, group in (("concurrent", "ablation"), ("continual", "ablation-continual")):
+        for more, fewer in steps:
+            pair = [(group, variant(setting, name)) for name in (more, fewer)]
+            there |= all(key in groups[group] for _, key in pair)
+            rows += [
+                [ADDITIONS[more], ADDITIONS[fewer], setting, what, *judge(what, *pair)]
+                for what in _MEASURES
+            ]
+    return rows if there else []
+
+
+def _group(setting: str, algorithm: str) -> str:
+    return f"{setting}-paper" if algorithm in PUBLISHED else setting
+
+
+class _Judge:
+    """Differences between runs, in words.
+
+    Args:
+        groups: The runs.
+        statistics: Of their scores.
+        words: For a difference above 0, and for one below.
+    """
+
+    def __init__(self, groups: Groups, statistics: Statistics, words: tuple[str, str]) -> None:
+        self._groups, self._statistics, self._words = groups, statistics, words
+
+    def __call__(self, what: str, *keys: tuple[str, str]) -> list[str]:
+        """Returns a difference with its interval, and what it says.
+
+        Args:
+            what: The measure.
+            *keys: Group and directory of two runs, the second to be subtracted from the first; or
+                of four, the difference of the last two to be subtracted from that of the first two.
+        """
+        runs = [self._groups[group].get(key) for group, key in keys]
+        missing = [key for (_, key), run in zip(keys, runs, strict=True) if run is None]
+        if missing:
+            return ["", "missing: " + ", ".join(missing)]
+        scores = [_MEASURES[what](run) for run in runs if run is not None]
+        gain = _difference([metrics.interquartile_mean(of_run) for of_run in scores])
+        drawn = _difference([self._statistics.resampled(of_run) for of_run in scores])
+        low, high = metrics.percentile_interval(drawn)
+        found = self._words[0] if low > 0 else self._words[1] if high < 0 else "level"
+        return [f"{100 * gain:+.1f} [{100 * low:+.0f}, {100 * high:+.0f}]", found]
+
+
+def _difference(values: list[Any]) -> Any:
+    gap = values[0] - values[1]
+    return gap if len(values) == 2 else gap - (values[2] - values[3])

@@ -1,0 +1,171 @@
+"""Tables of the report: success, forgetting, how fast a task is learned, and groups found."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from comparison import (
+    Run,
+    Statistics,
+    Values,
+    area_scores,
+    late_scores,
+    starts,
+    task_area,
+)
+
+from bgpo_trl import metrics
+from bgpo_trl.runs import read_outcomes, read_rows
+from suites import nico
+
+Table = list[list[str]]
+"""Rows of cells, the head first."""
+
+
+def main_table(runs: Mapping[str, Run], statistics: Statistics) -> Table:
+    """Returns success of a group's runs."""
+    rows = [["", "last 10 %: IQM", "mean", *(f"task {i + 1}" for i in range(3)), "area: IQM"]]
+    rows[0].append("episodes to 80 %")
+    for run in runs.values():
+        late, reached = late_scores(run), run.curves.episodes_to(0.8)
+        rows.append(
+            [
+                run.name,
+                statistics.cell(late),
+                f"{100 * late.mean():.1f}",
+                *(f"{100 * share:.0f}" for share in late.mean(0)),
+                statistics.cell(area_scores(run)),
+                f"{reached:.0f}" if np.isfinite(reached) else "not reached",
+            ]
+        )
+    return rows
+
+
+def continual_table(continual: Mapping[str, Run], concurrent: Mapping[str, Run]) -> Table:
+    """Returns forgetting and transfer of the continual runs."""
+    rows = [["", "forgotten since learned", "forgotten since best", "backward", "forward"]]
+    for key, run in continual.items():
+        success, episodes = run.curves.success, run.curves.episodes
+        ends = [*starts(run)[1:], int(episodes[-1])]
+        matrix = metrics.evaluation_matrix(
+            success, episodes, ends, window=max(1, round(0.1 * episodes[-1]))
+        )
+        best = metrics.forgetting_since_best(metrics.trailing_mean(success, 3))
+        cells = [
+            _spread(metrics.forgetting_since_learned(matrix)),
+            _spread(best),
+            _spread(metrics.backward_transfer(matrix)),
+        ]
+        beside = concurrent.get(key.replace("continual", "concurrent"))
+        rows.append([run.name, *cells, "" if beside is None else _forward(run, beside)])
+    return rows
+
+
+def _forward(run: Run, beside: Run) -> str:
+    gains = []
+    for task, start in enumerate(starts(run)):
+        if start == 0:
+            continue
+        length = int(min(run.curves.episodes[-1] - start, beside.curves.episodes[-1]))
+        reference = task_area(beside, task, 0, length).mean()
+        gains.append(metrics.forward_transfer(task_area(run, task, start, length), reference))
+    return _spread(np.mean(gains, axis=0))
+
+
+def _spread(values: Values) -> str:
+    return f"{100 * values.mean():.1f} ± {100 * values.std():.1f}"
+
+
+def own_episodes(path: Path, tasks: Sequence[str], last: int | None = None) -> Values | None:
+    """Returns how many of its own training episodes each task took to 50 % success, ``[S, T]``.
+
+    Args:
+        path: A run's ``train.csv``.
+        tasks: Names of the tasks.
+        last: Training episode at which counting ends; the last of the run if None.
+
+    Returns:
+        Infinite where it was not reached; None if the file is not there, or holds no episode.
+    """
+    outcomes = read_outcomes(path, tasks, last) if path.exists() else []
+    if not outcomes:
+        return None
+    return np.array([[metrics.trials_to(task) for task in seed] for seed in outcomes])
+
+
+def speed_table(runs: Mapping[str, Run]) -> Table:
+    """Returns how many of its own training episodes each task took to 50 % success."""
+    tasks = [f"task {i + 1}" for i in range(3)]
+    rows = [["", *tasks, *(f"{task} : {tasks[0]}" for task in tasks[1:])]]
+    for run in runs.values():
+        last = int(run.curves.episodes[-1])
+        episodes = own_episodes(run.directory / "train.csv", nico.ALL_TASKS, last)
+        if episodes is None:
+            rows.append([run.name, *["no train.csv"] * len(tasks), *[""] * (len(tasks) - 1)])
+        else:
+            rows.append([run.name, *map(median_cell, episodes.T), *ratio_cells(episodes)])
+    return rows
+
+
+def median_cell(episodes: Values) -> str:
+    """Returns the median over seeds, and how many never got there.
+
+    Args:
+        episodes: Of each seed; infinite where it never got there, ``[S]``.
+    """
+    never = int(np.isinf(episodes).sum())
+    median = float(np.median(episodes))
+    cell = f"{median:.0f}" if np.isfinite(median) else "not reached"
+    return f"{cell} ({never} of {len(episodes)} seeds never)" if never else cell
+
+
+def ratio_cells(episodes: Values) -> list[str]:
+    """Returns how many times as long as the first task each later one took, and of how many seeds.
+
+    Args:
+        episodes: Infinite where 50 % was never reached, ``[S, T]``.
+    """
+    told = int(np.isfinite(episodes[:, 0]).sum())
+    note = "" if told == len(episodes) else f" ({told} of {len(episodes)} seeds)"
+    return [
+        "" if np.isnan(times) else ("not reached" if np.isinf(times) else f"{times:.2f}") + note
+        for times in metrics.times_the_first(episodes).tolist()
+    ]
+
+
+def groups_table(runs: Iterable[Run]) -> Table:
+    """Returns what the runs with GWR-B found, by seed; empty if none of them has finished."""
+    rows = [["", "groups", "purity, %", "tasks inferred, %", "by seed", "nodes of GWR-B"]]
+    for run in runs:
+        if run.summary.get("nodes") is None:
+            continue
+        groups, purity = run.summary.get("groups"), run.summary.get("group_purity")
+        inferred = _inferred(run)
+        rows.append(
+            [
+                run.directory.name,
+                "one for all" if groups is None else _numbers(groups),
+                "" if purity is None else _numbers([100 * share for share in purity], 1),
+                f"{100 * np.mean(inferred):.2f}" if inferred else "",
+                _numbers([100 * share for share in inferred], 1),
+                _numbers(run.summary["nodes"]),
+            ]
+        )
+    return rows if len(rows) > 1 else []
+
+
+def _inferred(run: Run) -> list[float]:
+    """Returns the share of held-out demonstrations whose task is inferred, by seed."""
+    path = run.directory / "final.csv"
+    shares: dict[int, list[float]] = {seed: [] for seed in run.config["seeds"]}
+    for row in read_rows(path) if path.exists() else []:
+        if row["demonstrations"] == "held-out" and row["task_inference"]:
+            shares[int(row["seed"])].append(float(row["task_inference"]))
+    return [float(np.mean(of_seed)) for of_seed in shares.values() if of_seed]
+
+
+def _numbers(values: Iterable[float], digits: int = 0) -> str:
+    """Returns numbers in a row, without a decimal where it is 0."""
+    return " ".join(f"{value:.{digits}f}".removesuffix(".0") for value in values)
