@@ -158,10 +158,10 @@ def test_a_finished_run_only_says_so_until_it_is_made_longer(
             assert capsys.readouterr() == (told, "")
     assert files(run) == before
 
-    wrong = (replace(again, eval_every=3), replace(again, episodes=9, eval_every=3))
-    for changed in (replace(again, episodes=5), replace(again, seeds=(3,)), *wrong):
+    others = [{"episodes": 5}, {"seeds": (3,)}, {"eval_every": 3}, {"episodes": 9, "eval_every": 3}]
+    for other in others:
         with pytest.raises(ValueError, match="holds a run with other settings"):
-            continual.main(changed)
+            continual.main(replace(again, **other))
     with pytest.raises(ValueError, match=r"with other settings .*task_starts is \[0, 2, 4\] there"):
         concurrent.main(replace(again, episodes=9))
     assert files(run) == before
