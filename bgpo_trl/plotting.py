@@ -189,10 +189,10 @@ def plot_gwr_pca(
             chosen = points[kinds[kind] == number]
             if len(chosen) == 0:
                 continue
-            thin = {"linewidths": 0.9} if marker == "x" else {"linewidths": 0.4, "edgecolors": "w"}
-            dots = axes.scatter(
-                chosen[:, 0], chosen[:, 1], s=22, c=color, marker=marker, alpha=0.9, **thin
-            )
+            dots = axes.scatter(chosen[:, 0], chosen[:, 1], s=22, c=color, marker=marker, alpha=0.9)
+            dots.set(linewidths=0.9 if marker == "x" else 0.4)
+            if marker != "x":
+                dots.set(edgecolors="w")
             dots.set(label=f"{name} ({len(chosen)})", zorder=2 if number < 0 else 3)
         axes.set_xlabel(f"Principal component 1 ({share[0]:.0%} of variance)", fontsize=9)
         axes.set_ylabel(f"Principal component 2 ({share[1]:.0%} of variance)", fontsize=9)
