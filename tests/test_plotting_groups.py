@@ -86,7 +86,7 @@ def test_many_groups_of_many_seeds_fit_on_a_page(path):
 def test_what_tells_no_groups_is_refused(path, tmp_path):
     with pytest.raises(ValueError, match="no training episode to show"):
         plot_groups({}, PRESENTED)
-    with pytest.raises(ValueError, match=r"line 2 is damaged"):
+    with pytest.raises(ValueError, match=r"line 3 is damaged"):
         read_groups(path, TASKS[:1])
     old = tmp_path / "old.csv"
     old.write_text("seed,episode,task\n0,1,grasp_glass\n")
