@@ -111,7 +111,7 @@ def main(arguments: Arguments) -> None:
     for rung, table in tables.items():
         reached = table.pop("episodes to 80 %")
         cells = [f"{success:.2f}" for success in table.values()]
-        cells.append("not reached" if math.isnan(reached) else f"{reached:.0f}")
+        cells.append("not reached" if math.isinf(reached) else f"{reached:.0f}")
         print(f"| ({rung}) {RUNGS[rung][0]} | " + " | ".join(cells) + " |")
 
 

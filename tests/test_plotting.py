@@ -226,6 +226,28 @@ def test_pca_colors_nodes_by_task():
     assert len({to_hex(group.get_facecolor()[0]) for group in axes.collections}) == 3
 
 
+def test_pca_by_group_stands_beside_the_one_by_task():
+    weights = np.array([[3.0, 0], [-3, 0], [0, 1], [0, -1], [0, 0]])
+    figure = plot_gwr_pca(weights, [1, 0, 1, -1, 0], TASKS[:2], torch.tensor([2, 0, 2, 0, 0]))
+    by_task, by_group = figure.axes
+    nodes = {
+        group.get_label(): np.asarray(group.get_offsets()).round(9).tolist()
+        for group in by_group.collections
+    }
+    assert nodes == {
+        "group 0 (3)": [[-3, 0], [0, -1], [0, 0]],
+        "group 2 (2)": [[3, 0], [0, 1]],
+    }
+    colors = [to_hex(c.get_facecolor()[0]) for a in figure.axes for c in a.collections]
+    assert len(set(colors)) == 5  # groups are no tasks
+    legends = [[text.get_text() for text in a.get_legend().get_texts()] for a in figure.axes]
+    assert legends == [[c.get_label() for c in a.collections] for a in figure.axes]
+    FigureCanvasAgg(figure).draw()
+    heights = [axes.get_position().bounds[1::2] for axes in (by_task, by_group)]
+    assert heights[0] == pytest.approx(heights[1])
+    assert by_task.get_xlim() == by_group.get_xlim()
+
+
 def test_pca_of_equal_nodes_is_a_point():
     (axes,) = plot_gwr_pca(np.ones((3, 4)), [0, 0, 0], ["a"]).axes
     np.testing.assert_array_equal(np.asarray(axes.collections[0].get_offsets()), np.zeros((3, 2)))
@@ -245,6 +267,11 @@ def test_pca_of_equal_nodes_is_a_point():
 def test_bad_pca_input_is_refused(weights, node_task, message):
     with pytest.raises(ValueError, match=message):
         plot_gwr_pca(weights, node_task, ["a", "b"])
+
+
+def test_groups_of_other_nodes_are_refused():
+    with pytest.raises(ValueError, match="one group for each of the 3 nodes, not the shape"):
+        plot_gwr_pca(np.zeros((3, 4)), [0, 0, 1], ["a", "b"], [0, 1])
 
 
 def figures(run: Path) -> list[Figure]:
@@ -301,7 +328,8 @@ def test_no_label_is_cut_off_or_overlaps_another(n_tasks, algorithms, tmp_path):
     curves = plot_success_curves(path, presented=presented, random_success={tasks[0]: 0.1})
     nodes = np.random.default_rng(0).normal(size=(50, 8))
     pca = plot_gwr_pca(nodes, np.arange(50) % (n_tasks + 1) - 1, tasks)
-    for figure in (curves, pca):
+    both = plot_gwr_pca(nodes, np.arange(50) % (n_tasks + 1) - 1, tasks, np.arange(50) % n_tasks)
+    for figure in (curves, pca, both):
         canvas = FigureCanvasAgg(figure)
         canvas.draw()
         texts = visible_texts(figure)

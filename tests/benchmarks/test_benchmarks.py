@@ -127,11 +127,12 @@ def test_lengths_and_seeds_that_cannot_be_are_refused(arguments):
 def test_continual_leaves_curve_and_figures(tiny, tmp_path, capsys):
     continual.main(experiment.Arguments(out=tmp_path / "run"))
     run_directory = tmp_path / "run"
-    for name in ("success.png", "gwr.png", "gwr_growth.png"):
+    for name in ("success.png", "gwr.png", "gwr_growth.png", "groups.png"):
         assert (run_directory / "figures" / name).read_bytes().startswith(b"\x89PNG")
     assert json.loads((run_directory / "config.json").read_text())["episodes"] == 6
     printed = capsys.readouterr().out
     assert "GWR-B nodes: [" in printed
+    assert "groups of behaviors: [" in printed
     assert f"curve and figures: {run_directory}" in printed
 
     before = files(run_directory)
@@ -234,7 +235,7 @@ def test_a_dashboard_gets_the_figures_before_it_is_closed(tiniest, monkeypatch, 
         "bgpo_trl.logging._log_wandb_media", lambda dashboard, *media: events.append(media)
     )
     run = tmp_path / "run"
-    figures = ["episodes.png", "gwr.png", "gwr_growth.png", "success.png"]
+    figures = ["episodes.png", "groups.png", "gwr.png", "gwr_growth.png", "success.png"]
     figures += [f"{task}.gif" for task in TASKS]
     shown = [(f"figures/{Path(n).stem}", run / "figures" / n) for n in sorted(figures)]
     arguments = experiment.Arguments(out=run, wandb="offline")
@@ -262,30 +263,39 @@ def test_the_command_line_runs_every_algorithm_and_says_its_name(
     assert f"curve and figures: {run}" in printed
     config = json.loads((run / "config.json").read_text())
     assert config["name"] == name
-    assert config["algorithm"].get("beta") == (None if name in ("maml", "dist-nll") else 0.1)
+    assert config["algorithm"].get("beta") == (
+        None if name.startswith(("maml", "dist-nll")) else 0.1
+    )
     for file in ("train.csv", "eval.csv"):
         rows = read_rows(run / file)
         assert {row["algorithm"] for row in rows} == {name}
         assert {row["task"] for row in rows} == set(TASKS)
 
     # What is said of GWR-B is said where there is one.
-    with_gwr = name == "bgpo"
+    with_gwr = name.startswith("bgpo")
     told = json.loads((run / "summary.json").read_text())
     assert (told["nodes"] is not None) == with_gwr
     for file in ("gwr.csv", "figures/gwr.png"):
         assert (run / file).exists() == with_gwr
+    # And of groups, where behaviors are told apart.
+    with_groups = name in ("bgpo", "bgpo-experts")
+    assert (told["groups"] is not None) == (run / "figures/groups.png").exists() == with_groups
+    if with_gwr:
+        assert ("group" in read_rows(run / "gwr.csv")[0]) == with_groups
     assert ("GWR-B" in printed) == ("task inference" in printed) == with_gwr
     rows = read_rows(run / "final.csv")
     assert len(rows) == 2 * 2 * 3
     assert all((row["task_inference"] != "") == with_gwr for row in rows)
     summed_up = summary.describe(run)
     assert ("GWR-B nodes: [" in summed_up) == with_gwr
+    assert ("Groups: [" in summed_up) == with_groups
+    assert "Own episodes to 50 %, as many times those of grasp_glass: push" in summed_up
     table = [line.split("|") for line in summed_up.splitlines() if line.startswith("|")]
     assert [row[1].strip() for row in table[2:]] == [*TASKS, "all"]
     assert all((row[-2].strip() != "") == with_gwr for row in table[2:])
     for task, row in zip(TASKS, table[2:], strict=False):
         shares = [float(r["success"]) for r in rows if r["task"] == task]
-        for cell, of_kind in zip(row[5:7], (shares[:2], shares[2:]), strict=True):
+        for cell, of_kind in zip(row[6:8], (shares[:2], shares[2:]), strict=True):
             assert float(cell) == pytest.approx(100 * sum(of_kind) / 2, abs=0.05)
 
 
@@ -310,7 +320,8 @@ def test_concurrent_presents_all_tasks_from_the_start(tiny, tmp_path, capsys):
     nodes = read_rows(run / "gwr.csv")
     assert len(nodes) == told["nodes"][0]
     assert {node["task"] for node in nodes} <= {"-1", "0", "1", "2"}
-    assert [len(node) for node in nodes] == [33] * len(nodes)
+    assert {int(node["group"]) for node in nodes} <= set(range(told["groups"][0]))
+    assert [len(node) for node in nodes] == [34] * len(nodes)
     assert (run / "figures" / "episodes.png").read_bytes().startswith(b"\x89PNG")
 
     capsys.readouterr()
@@ -319,7 +330,8 @@ def test_concurrent_presents_all_tasks_from_the_start(tiny, tmp_path, capsys):
     late = summary.summarize(run / "eval.csv")
     for task in TASKS:
         assert f"| {task} | {100 * late[task]:.1f} |" in printed
-    assert (run / "success.png").read_bytes().startswith(b"\x89PNG")
+    for name in ("success.png", "groups.png"):
+        assert (run / name).read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.parametrize("script", ["concurrent.py", "continual.py"])
@@ -414,9 +426,10 @@ def test_a_rung_is_summed_up_by_the_last_tenth_and_the_first_80_percent(tmp_path
     write_tests(
         tmp_path / "eval.csv",
         {
-            1_700: ([0, 0], [0, 0], [1, 1]),
-            1_800: ([1, 1], [1, 1], [1, 0]),  # 5 of 6: reached; not among the last tenth
-            1_900: ([1, 1], [0, 1], [0, 0]),
+            1_600: ([0, 0], [1, 1], [0, 1]),
+            1_700: ([1, 1], [1, 1], [1, 1]),  # by itself, it would be reached
+            1_800: ([1, 1], [1, 1], [1, 0]),  # not among the last tenth
+            1_900: ([1, 1], [0, 1], [0, 1]),  # of the last three, 15 of 18
             2_000: ([1, 0], [0, 0], [0, 0]),
         },
     )
@@ -424,17 +437,49 @@ def test_a_rung_is_summed_up_by_the_last_tenth_and_the_first_80_percent(tmp_path
         {
             "grasp_glass": 3 / 4,
             "push_green_to_glass": 1 / 4,
-            "push_green_to_white": 0,
-            "overall": 1 / 3,
-            "episodes to 80 %": 1_800,
+            "push_green_to_white": 1 / 4,
+            "overall": 5 / 12,
+            "episodes to 80 %": 1_900,
         }
+    )
+
+
+def test_a_summary_says_how_fast_each_task_was_learned(tmp_path):
+    write_tests(tmp_path / "eval.csv", {100: ([1, 1], [1, 1], [0, 0])})
+    final = ["seed,demonstrations,task,success,task_inference"]
+    final += [f"0,{kind},{task},0.5," for kind in ("seen", "held-out") for task in TASKS]
+    (tmp_path / "final.csv").write_text("\n".join(final) + "\n")
+    told = {"commit": "c", "command": "python x", "nodes": [7, 8]}
+    told |= {"groups": [3, 4], "group_purity": [1.0, 0.985]}
+    (tmp_path / "summary.json").write_text(json.dumps(told))
+    (tmp_path / "config.json").write_text("{}")
+    # The last ten of 20, 30 and 20 episodes succeed; of the other seed, task 3 fails throughout.
+    lengths = [(20, 10), (30, 10), (20, 10)], [(40, 10), (20, 10), (20, 0)]
+    train, episode = ["seed,episode,task,success"], 0
+    for seed, tasks in enumerate(lengths):
+        for task, (length, won) in zip(TASKS, tasks, strict=True):
+            for number in range(length):
+                episode += 1
+                train.append(f"{seed},{episode},{task},{int(number >= length - won)}")
+    (tmp_path / "train.csv").write_text("\n".join(train) + "\n")
+    lines = summary.describe(tmp_path).splitlines()
+    cells = [line.split("|")[5].strip() for line in lines[2:6]]
+    assert cells == ["30", "25", "not reached (1 of 2 seeds never)", ""]
+    assert lines[7].startswith(
+        "Episodes to 80 %: not reached. GWR-B nodes: [7, 8]. "
+        "Groups: [3, 4], 100.0 98.5 % pure on held-out demonstrations. Commit c: "
+    )
+    # 1.5 and 0.5 times; 1 time and never.
+    assert lines[8] == (
+        "Own episodes to 50 %, as many times those of grasp_glass: "
+        "push_green_to_glass 1.00, push_green_to_white not reached."
     )
 
 
 def test_a_rung_that_never_gets_there(tmp_path):
     write_tests(tmp_path / "eval.csv", {100: ([1], [1], [0])})
     table = summary.summarize(tmp_path / "eval.csv")
-    assert math.isnan(table.pop("episodes to 80 %"))
+    assert table.pop("episodes to 80 %") == math.inf
     assert table["overall"] == pytest.approx(2 / 3)
 
 

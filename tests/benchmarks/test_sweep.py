@@ -14,6 +14,7 @@ import pytest
 import sweep
 from comparison import GROUPS, Statistics, read_group
 from jobs import Job
+from report_tables import main_table
 
 from benchmarks import report, summary
 from benchmarks.report import markdown
@@ -42,6 +43,9 @@ def write_run(job):
     (folder / "config.json").write_text(json.dumps(settings))
     told = {"commit": f"c{config.seeds[0] // 2}", "command": "a", "random_success": {"x": 0.5}}
     told["nodes"] = [100 + seed for seed in config.seeds] if config.name == "bgpo" else None
+    told["groups"] = [3 + seed for seed in config.seeds] if config.name == "bgpo" else None
+    if config.name == "bgpo":
+        told["group_purity"] = [1 - seed / 8 for seed in config.seeds]
     (folder / "summary.json").write_text(json.dumps(told))
     (folder / "gwr.csv").write_text(f"task,w0,w1\n0,1,2\n1,2,5\n2,0,{config.seeds[0]}\n")
     (folder / "figures").mkdir(exist_ok=True)
@@ -179,11 +183,14 @@ def test_merged_blocks_are_what_one_run_of_all_seeds_would_be(few, tmp_path, mon
         config = json.loads((merged / "config.json").read_text())
         assert config == json.loads((whole.directory / "config.json").read_text())
         told = json.loads((merged / "summary.json").read_text())
+        found = merged.name.endswith("bgpo")
+        assert told.pop("group_purity", None) == ([0.5, 1.0, 0.75] if found else None)
         assert told == {
             "commit": "c2 c1",
             "command": "python benchmarks/sweep.py --block 2",
             "random_success": {"x": 0.5},
-            "nodes": [104, 100, 102] if merged.name.endswith("bgpo") else None,
+            "nodes": [104, 100, 102] if found else None,
+            "groups": [7, 3, 5] if found else None,
         }
         assert {path.name for path in (merged / "figures").iterdir()} == {"episodes.png"}
         assert (merged / "figures" / "episodes.png").read_text() == "4"
