@@ -462,11 +462,14 @@ def test_matching_behaviors_on_ground_truth_is_refused(make_config, bank, encode
 
 @pytest.mark.parametrize("rl", ["ddpg", "td3", "sac"])
 def test_a_restored_run_continues_as_the_saved_one(make, tmp_path, rl):
-    algorithm, state = make("all", rl=rl), None
-    _, state = play_on(algorithm, 30)
+    schedule = TaskSchedule((0, 0, 0))
+    algorithm = make("all", rl=rl, schedule=schedule)
+    _, state = play_on(algorithm, 60)
     assert algorithm.groups.num_groups.min() > 2  # more than are active
     save_checkpoint(tmp_path, {"algorithm": algorithm.state_dict(), "state": state.to_dict()})
-    other = make("all", seeds=(5, 7), rl=rl)  # other weights, streams and simulations
+    other = make(
+        "all", seeds=(5, 7), rl=rl, schedule=schedule
+    )  # other weights, streams and simulations
     play_on(other, 12)
     saved = load_checkpoint(tmp_path)
     other.env.reset()
@@ -539,22 +542,23 @@ def test_an_update_sees_as_much_of_each_group_played_last(make, bank, variant):
     for step, (active, batch) in enumerate(batches, 60 - len(batches)):
         assert batch.shape == (2, n_experts, 16 // n_experts)
         for seed in range(2):
-            groups = active[seed].tolist()
-            past = data[seed, :step]
-            flat = batch[seed].reshape(-1)
+            groups, past = active[seed].tolist(), data["group"][seed, :step]
             n_full += -1 not in groups
-            for row, one in enumerate(flat):
+            latents = batch["latent"][seed].reshape(16, 1, 64)
+            played = (latents == data["latent"][seed, :step]).all(-1)
+            demonstrated = (latents == frames).all(-1).any(-1).tolist()
+            weight = batch["priority_weight"][seed].flatten().tolist()
+            for row in range(16):
                 if algorithm.config.experts:
                     group = groups[row // 8]
                 else:
                     group = [g for g in groups if g >= 0][row % (2 - groups.count(-1))]
-                if not one["priority_weight"]:
-                    assert not (past["group"] == group).any() or row % 8 >= 8 - n_shown
-                    continue
-                if row % 8 >= 8 - n_shown and (one["latent"] == frames).all(-1).any():
-                    continue
-                same = (past["latent"] == one["latent"]).all(-1)
-                assert (past["group"][same] == group).any()
+                is_shown = row % 8 >= 8 - n_shown
+                if weight[row]:
+                    of_group = bool((past[played[row]] == group).any())
+                    assert (of_group, demonstrated[row]) == (not is_shown, is_shown)
+                else:  # nothing is known of the group, or no demonstration of it was over
+                    assert is_shown or not (past == group).any()
     assert n_full > 20
 
 
@@ -631,25 +635,26 @@ def test_the_bonus_is_for_latents_as_they_are_and_the_policy_sees_them_clipped(
     raw, latent = [], encoders.vae.latent
 
     def stretched(pixels):
-        raw.append(10 * latent(pixels))
-        return raw[-1]
+        stretch = 10 * latent(pixels)
+        raw.append(stretch.flatten())  # of the only seed
+        return stretch
 
     monkeypatch.setattr(encoders.vae, "latent", stretched)
     algorithm = make("all", seeds=(3,))
     data = play(algorithm, 25)[0]
     frames, trajectory, n_ended, n_clipped = iter(raw), [], 0, 0
-    trajectory.append(next(frames)[0])
+    trajectory.append(next(frames))
     for step in data:
         assert step["latent"].equal(trajectory[-1].clamp(-5, 5))
         n_clipped += int((trajectory[-1].abs() > 5).sum())
-        trajectory.append(next(frames)[0])
+        trajectory.append(next(frames))
         assert step["next", "latent"].equal(trajectory[-1].clamp(-5, 5))
         if step["next", "done"]:
             length = torch.tensor([len(trajectory)])
             phi_g = encoders.lae.encode(torch.stack(trajectory)[None], length)[0]
             bonus = torch.exp(-(step["behavior"] - phi_g).norm())
             torch.testing.assert_close(step["next", "intrinsic_reward"][0], bonus)
-            trajectory, n_ended = [next(frames)[0]], n_ended + 1
+            trajectory, n_ended = [next(frames)], n_ended + 1
     assert n_ended > 3
     assert n_clipped > 100
 

@@ -10,6 +10,7 @@ import growth
 import pytest
 import torch
 
+from benchmarks import ablation as packaged_ablation
 from benchmarks import ladder
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.training import Trainer
@@ -28,6 +29,10 @@ def tiny(monkeypatch, encoders, bank, make_config):
     for rung, (name, bgpo, compose) in ladder.RUNGS.items():
         small = replace(bgpo, max_steps=6)
         monkeypatch.setitem(ladder.RUNGS, rung, (name, small, compose))
+    for module in (ablation, packaged_ablation):
+        for variant, (compose, bgpo) in module.VARIANTS.items():
+            small = (compose, replace(bgpo, max_steps=6))
+            monkeypatch.setitem(module.VARIANTS, variant, small)
     chance = torch.tensor([0.1, 0.2, 0.3])
     monkeypatch.setattr(experiment, "evaluate_random_policy", lambda **kwargs: chance)
 
