@@ -76,7 +76,8 @@ def make_jobs(arguments: Arguments) -> dict[Path, list[Job]]:
         raise ValueError("--cpus-per-run must be above 0, and --gpus-per-run not below")
     jobs: dict[Path, list[Job]] = {}
     for setting in arguments.settings:
-        ablation = [variant for variant in VARIANTS if variant != "gwr+r_int"]  # that one is BGPO
+        # Those that are not an algorithm by a name of its own.
+        ablation = [v for v in VARIANTS if v not in ("gwr+r_int", "experts", "all")]
         for name in ablation if setting == "ablation" else arguments.algorithms:
             config = experiment.run_config(
                 experiment.Arguments(
@@ -88,6 +89,8 @@ def make_jobs(arguments: Arguments) -> dict[Path, list[Job]]:
             )
             starts = config.task_starts if setting == "continual" else (0, 0, 0)
             config = replace(config, name=name, task_starts=starts)
+            if setting == "ablation":
+                config = replace(config, algorithm=VARIANTS[name][1])
             merged = arguments.out.absolute() / f"{setting}-{name}"
             blocks = [
                 config.seeds[first : first + arguments.block]

@@ -181,7 +181,7 @@ def measure_step(arguments: Arguments) -> Table:
 def measure_memory(arguments: Arguments) -> Table:
     """Tells the memory of a run at the start, at the end, and what of the growth is replay."""
     training = Training(range(arguments.seeds))
-    transition_size = training.algorithm.replay.sample(1).bytes() / arguments.seeds
+    transition_size = training.algorithm.replay.transition_size
     marks: list[tuple[int, float, float]] = []
     every = max(1, arguments.steps // 4)
     for step in range(arguments.steps + 1):

@@ -54,6 +54,11 @@ class GroupReplay:
         """Returns the number of transitions that every seed holds at least."""
         return len(self._buffer)
 
+    @property
+    def transition_size(self) -> int:
+        """Bytes that a transition takes, its group included; 0 before the first one."""
+        return self._buffer.transition_size
+
     def sizes(self, group: Tensor) -> Tensor:
         """Returns the number of transitions held of each of the groups ``[S, G]``."""
         oldest = self._buffer.oldest.tolist()

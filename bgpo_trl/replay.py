@@ -81,6 +81,11 @@ class ReplayBuffer:
         return (self._n_added - self.capacity).clamp(min=0).view(self._shape)
 
     @property
+    def transition_size(self) -> int:
+        """Bytes that a transition takes; 0 before the first one."""
+        return sum(rows[0].numel() * rows.element_size() for rows in self._rows.values())
+
+    @property
     def sizes(self) -> Tensor:
         """Number of transitions held for each seed, int64 ``[*S]``."""
         return self._n_added.clamp(max=self.capacity).view(self._shape)

@@ -6,10 +6,9 @@ Run again, it continues where it was. To see it learn rather than begin, raise `
 from pathlib import Path
 
 from bgpo_trl.configs import RunConfig
-from bgpo_trl.demonstration_bank import DemonstrationBank
 from bgpo_trl.demonstrations import record_demonstrations
+from bgpo_trl.make_bank import make_bank
 from bgpo_trl.pretrained import load_pretrained
-from bgpo_trl.representation import embed_demonstrations
 from bgpo_trl.runs import read_rows
 from bgpo_trl.task_inference import task_inference_accuracy
 from bgpo_trl.training import Trainer
@@ -34,9 +33,8 @@ if __name__ == "__main__":
     folder = OUT / "demonstrations"
     shown = record_demonstrations(folder, tasks=[OWN], per_task=12, held_out_per_task=4)
     encoders, bank = load_pretrained()
-    phi = embed_demonstrations(encoders, shown)
-    bank += DemonstrationBank(phi, shown["task"].clone(), shown["train"].clone(), (OWN,))
-    print(f"{len(phi)} demonstrations, {shown['length'].float().mean():.0f} frames each")
+    bank += make_bank(encoders, shown, tasks=[OWN])
+    print(f"{len(shown)} demonstrations, {shown['length'].float().mean():.0f} frames each")
 
     tasks, starts = (OWN, *nico.ALL_TASKS), (0, 4, 6, 8)
     config = RunConfig(seeds=(0,), episodes=12, tasks=tasks, task_starts=starts, eval_every=6)

@@ -74,7 +74,7 @@ def test_a_run_leaves_its_settings_and_two_csv_files(tmp_path):
         "network": {"hidden": [64]},
     }
     assert (directory / "train.csv").read_text() == (
-        f"{','.join(TRAIN_COLUMNS)}\nbgpo,2,7,210,grasp_glass,1,1.0,28,0.25,,,\n"
+        f"{','.join(TRAIN_COLUMNS)}\nbgpo,2,7,210,grasp_glass,1,1.0,28,0.25,,,,,\n"
     )
     assert (directory / "eval.csv").read_text() == (
         f"{','.join(EVAL_COLUMNS)}\nbgpo,2,7,210,grasp_glass,1,1.0,28\n"

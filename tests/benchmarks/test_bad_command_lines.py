@@ -135,7 +135,7 @@ def test_a_command_that_cannot_be_is_answered_in_one_line(
         ("continual.py --episodes 1.5", "--episodes"),
         ("continual.py --seeds a", "--seeds"),
         ("continual.py --algorithm ppo", "dist-nll"),
-        ("ablation.py --variant all", "gwr+r_int"),
+        ("ablation.py --variant any", "gwr+r_int"),
         ("ladder.py --rungs e", "--rungs"),
         ("ladder.py ddpg --gamma 1.5", "gamma must be between 0 and 1, got 1.5"),
         ("ladder.py sac --hidden-sizes 64 0", "hidden_sizes must be one or more"),

@@ -17,6 +17,7 @@ from jobs import Job
 from report_tables import main_table
 
 from benchmarks import report, summary
+from benchmarks.ablation import VARIANTS
 from benchmarks.report import markdown
 from bgpo_trl.configs import PRESETS
 from bgpo_trl.training import Trainer
@@ -82,6 +83,7 @@ def test_a_job_is_a_block_of_seeds_of_an_algorithm_in_a_setting(tmp_path):
     assert [merged.relative_to(tmp_path).as_posix() for merged in grid] == [
         *("continual-bgpo", "continual-dist-nll", "concurrent-bgpo", "concurrent-dist-nll"),
         *("ablation-gwr", "ablation-r_int", "ablation-none"),
+        *("ablation-even-replay", "ablation-demonstrations"),
     ]
     known = {name for group in GROUPS.values() for name in group.runs}
     assert known >= {merged.name for merged in grid}
@@ -95,6 +97,8 @@ def test_a_job_is_a_block_of_seeds_of_an_algorithm_in_a_setting(tmp_path):
             assert job.config.name == name
             assert job.config.task_starts == starts
             algorithm = job.config.algorithm
+            if setting == "ablation":
+                assert algorithm == VARIANTS[name][1]
             assert replace(PRESETS["desk"], algorithm=algorithm) == replace(
                 job.config,
                 seeds=PRESETS["desk"].seeds,

@@ -89,7 +89,7 @@ def test_ratios_are_against_the_named_contenders(monkeypatch):
 
 def test_results_are_written_and_printed(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(torch, "set_num_threads", lambda n: None)
-    short = BGPOConfig(rl=DDPGConfig(warmup_steps=3))
+    short = BGPOConfig(max_steps=3, rl=DDPGConfig(warmup_steps=3))
     monkeypatch.setattr(throughput, "BGPOConfig", lambda: short)
     throughput.main(
         throughput.Arguments(
@@ -105,6 +105,7 @@ def test_results_are_written_and_printed(tmp_path, capsys, monkeypatch):
     inside = [step[f"2 seeds in a batch: {part}"] for part in ("FrameEncoder", "RewardSum")]
     assert sum(row["ms a step of all"] for row in inside) < whole
     rows = list(found["memory"].values())
-    # 662 bytes a transition, in the units of the table.
-    assert rows[-2]["MB of it replay"] == pytest.approx(4 * 2 * 662e-6, rel=0.01)
+    # Two latents, behavior, action, reward, a flag and the group, in the units of the table.
+    size = 4 * (2 * 64 + 32 + 4 + 1) + 1 + 8
+    assert rows[-2]["MB of it replay"] == pytest.approx(4 * 2 * size / 1e6)
     assert "| 2 seeds in a batch |" in capsys.readouterr().out
