@@ -171,7 +171,7 @@ def read_group(runs: Path, group: Group) -> tuple[dict[str, Run], list[str]]:
             )
         found[key] = Run(directory, name, config, summary, curves)
     if not found:
-        return found, notes
+        return found, [f"missing: {', '.join(group.runs)}"]
     first = next(iter(found.values()))
     last = min(int(run.curves.episodes[-1]) for run in found.values())
     for key, run in found.items():

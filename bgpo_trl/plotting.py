@@ -198,7 +198,8 @@ def plot_gwr_pca(
         axes.set_ylabel(f"Principal component 2 ({share[1]:.0%} of variance)", fontsize=9)
         axes.set_aspect("equal", adjustable="datalim")
         _style(axes)
-        _legend(axes, *axes.get_legend_handles_labels(), width - 0.9)
+        handles, labels = axes.get_legend_handles_labels()
+        _legend(axes, handles, labels, width - 0.9)
     return figure
 
 

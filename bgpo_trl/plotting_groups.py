@@ -72,7 +72,7 @@ def plot_groups(seeds: Mapping[int, GroupedEpisodes], presented: Mapping[str, in
 
     Each group has a row, shaded from the episode on after which it was known, with a mark for each
     episode that it played in the color of the episode's task. Where a group played several tasks,
-    the rarer ones are drawn over the others.
+    the rarer ones are drawn over the others; how pure that leaves the groups is told above.
 
     Args:
         seeds: The training episodes by seed, from `read_groups`.
@@ -136,7 +136,8 @@ def _draw_rows(axes: Axes, run: GroupedEpisodes, n_tasks: int, last: int, width:
         axes.barh(group, last - known[0], 0.8, known[0], color="0.94", zorder=0)
         episodes = [run.episode[(run.group == group) & (run.task == t)] for t in range(n_tasks)]
         for task in sorted(range(n_tasks), key=lambda task: -len(episodes[task])):
-            axes.vlines(episodes[task], group - 0.4, group + 0.4, colors[task], linewidth=line)
+            marks = axes.vlines(episodes[task], group - 0.4, group + 0.4, colors[task], lw=line)
+            marks.set_snap(False)  # or neighbors of many are drawn with gaps, as pixels fall
     axes.set(ylim=(n_groups - 0.4, -0.6))
     axes.yaxis.set_major_locator(MultipleLocator(math.ceil(n_groups / 10)))
     axes.tick_params(axis="y", length=0)

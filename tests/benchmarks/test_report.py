@@ -188,6 +188,8 @@ def test_a_missing_run_is_listed_and_not_made_up(reported, runs):
     assert text.count(note) == page.count(note) == 2  # in the ablation, too
     assert "DDPG, told the label" not in rows_of(text, "Fig. 8")
 
+    assert "- missing: continual-bgpo-paper, continual-maml-paper, continual-dist-nll-paper" in text
+
     path = runs / "ablation-r_int" / "eval.csv"
     path.write_text(HEAD)  # begun, not yet tested
     read = {key: comparison.read_group(runs, group) for key, group in comparison.GROUPS.items()}
