@@ -631,16 +631,18 @@ def test_nothing_is_known_of_tasks_that_have_not_been_presented(make, bank):
 def test_the_bonus_is_for_latents_as_they_are_and_the_policy_sees_them_clipped(
     make, encoders, bank, monkeypatch
 ):
-    """Latents ten times as long as they should be: phi_g is still that of a demonstration."""
+    """Latents much longer than they should be: phi_g is still that of a demonstration."""
     raw, latent = [], encoders.vae.latent
 
     def stretched(pixels):
-        stretch = 10 * latent(pixels)
+        stretch = 200 * latent(pixels)
         raw.append(stretch.flatten())  # of the only seed
         return stretch
 
     monkeypatch.setattr(encoders.vae, "latent", stretched)
     algorithm = make("all", seeds=(3,))
+    assert algorithm.env.observation_spec["latent"].shape == (1, 64)
+    raw.clear()  # what was seen to make the specs
     data = play(algorithm, 25)[0]
     frames, trajectory, n_ended, n_clipped = iter(raw), [], 0, 0
     trajectory.append(next(frames))
