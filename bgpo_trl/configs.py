@@ -247,6 +247,8 @@ class GWRBConfig:
 
     activity_threshold: float = 0.8
     """Activity below which a node is inserted (Table 1)."""
+    habituation_threshold: float = 0.15
+    """Habituation below which a node may have another inserted beside it (Table 1)."""
     activity_scale: float = 0.25
     """Factor of distances in the activity. Ours: with 1, as in the paper, each demonstration is so
     far from the next that a node is made of every third; with 0.25 there are about 300 after 6,000
@@ -254,7 +256,11 @@ class GWRBConfig:
 
     def __post_init__(self) -> None:
         _positive(self, "activity_scale")
-        _check(self, ("activity_threshold", 0 < self.activity_threshold < 1, "between 0 and 1"))
+        _check(
+            self,
+            ("activity_threshold", 0 < self.activity_threshold < 1, "between 0 and 1"),
+            ("habituation_threshold", 0 < self.habituation_threshold <= 1, "above 0, at most 1"),
+        )
 
 
 @dataclass(frozen=True)
@@ -275,9 +281,11 @@ class BGPOConfig(AlgorithmConfig):
     """See `AlgorithmConfig`. Ours: triples the success of a task's first hundred episodes."""
     active_groups: int = 4
     """Groups that an update learns from at most, those played last. Ours."""
-    groups: GWRBConfig = field(default_factory=lambda: GWRBConfig(activity_threshold=0.5))
-    """The coarse network that finds the groups. Ours: from 0.5 to 0.525 it finds one for each of
-    NICO's tasks."""
+    groups: GWRBConfig = field(
+        default_factory=lambda: GWRBConfig(activity_threshold=0.525, habituation_threshold=0.5)
+    )
+    """The coarse network that finds the groups. Ours: so it finds one group, seldom two, for each
+    of NICO's tasks (docs/learning.md)."""
 
     @property
     def grouped(self) -> bool:

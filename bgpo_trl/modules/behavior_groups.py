@@ -47,6 +47,9 @@ class BehaviorGroups(nn.Module):
         n_features: size d of an input.
         batch_size: shape of the batch (the seeds); `()` is a single set of groups.
         activity_threshold: a_T of the coarse GWR-B, below which an input is new.
+        habituation_threshold: h_T, below which a node that matches best may have another inserted
+            beside it. With the 0.15 of the fine network, tasks that appear together are mixed up
+            before any node can part.
         activity_scale: factor of distances, as in `GWRB`.
         max_groups: at this many groups a new node joins the group of its best match. None: no
             limit.
@@ -64,7 +67,8 @@ class BehaviorGroups(nn.Module):
         n_features: int,
         *,
         batch_size: Sequence[int] = (),
-        activity_threshold: float = 0.5,
+        activity_threshold: float = 0.525,
+        habituation_threshold: float = 0.5,
         activity_scale: float = 1.0,
         max_groups: int | None = None,
     ) -> None:
@@ -75,6 +79,7 @@ class BehaviorGroups(nn.Module):
             n_features,
             batch_size=batch_size,
             activity_threshold=activity_threshold,
+            habituation_threshold=habituation_threshold,
             activity_scale=activity_scale,
             max_age=_NEVER,
             init="data",
