@@ -1,4 +1,4 @@
-"""What the paper claims about the runs and what was found, and what is added to the paper."""
+"""The paper's claims and further ones, each with its verdict from the runs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the paper's experiments share: command line, run, and what is measured at its end."""
+"""Command line, run and final measurements, which the paper's experiments share."""
 
 from __future__ import annotations
 
