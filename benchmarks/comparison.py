@@ -24,7 +24,7 @@ class Picture:
     file: str
     """Name of the file, without its ending."""
     caption: str
-    """What it shows, after the title of its group."""
+    """Subtitle, after the title of its group."""
     runs: tuple[str, ...]
     """Directories of the runs, in the order of the legend."""
 
@@ -35,7 +35,7 @@ class Group:
 
     title: str
     runs: dict[str, str]
-    """What a run is called, by the name of its directory."""
+    """Names of the runs, by their directories."""
     pictures: tuple[Picture, ...]
 
 

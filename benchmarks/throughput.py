@@ -43,7 +43,7 @@ class Arguments:
     """Measures the speed of all parts."""
 
     parts: tuple[Part, ...] = ("frames", "updates", "step", "memory")
-    """What to measure."""
+    """Parts to measure."""
     seeds: int = 10
     """Seeds of the batch."""
     rounds: int = 100

@@ -1,4 +1,4 @@
-"""What all algorithms share, and what training and test episodes ask of them."""
+"""The base of all algorithms, and the interface of training and test episodes to them."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ from bgpo_trl.transforms import (
 
 @dataclass(frozen=True)
 class Parts:
-    """What the transforms of a variant are made of."""
+    """Material for the transforms of a variant."""
 
     beta: float
     """Weight of the intrinsic reward."""
