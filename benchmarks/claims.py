@@ -20,7 +20,7 @@ from comparison import (
 )
 from report_tables import Table
 
-from bgpo_trl import metrics
+from bgpo_trl.analysis import metrics
 
 Groups = Mapping[str, Mapping[str, Run]]
 """Runs by the names of their directories, by the key of their group."""

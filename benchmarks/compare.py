@@ -20,7 +20,7 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from bgpo_trl.runs import read_tests
+from bgpo_trl.runs.results import read_tests
 
 
 @dataclass(frozen=True)

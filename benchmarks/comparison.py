@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bgpo_trl import metrics
-from bgpo_trl.runs import Curves, read_curves, read_json, read_rows
+from bgpo_trl.analysis import metrics
+from bgpo_trl.runs.results import Curves, read_curves, read_json, read_rows
 from suites import nico
 
 Values = NDArray[np.float64]

@@ -19,17 +19,17 @@ from resuming import as_begun, check_resumable, is_finished
 
 from bgpo_trl.algorithms import ALGORITHMS, Algorithm
 from bgpo_trl.algorithms.rl import RL
+from bgpo_trl.analysis.task_inference import group_purity, task_inference_accuracy
 from bgpo_trl.configs import PRESETS, STAGE_PRESETS, RunConfig
-from bgpo_trl.demonstration_bank import DemonstrationBank
+from bgpo_trl.data.bank import DemonstrationBank
+from bgpo_trl.encoders.pretrained import load_pretrained, make_pretrained
 from bgpo_trl.evaluation import Evaluator, evaluate_random_policy
-from bgpo_trl.locking import DirectoryLock
+from bgpo_trl.figures.curves import plot_frame_strips, plot_success_curves, save_figure
+from bgpo_trl.figures.video import save_gif
+from bgpo_trl.files.locking import DirectoryLock
+from bgpo_trl.files.progress import progress_bar
 from bgpo_trl.machine import choose_device, set_threads
-from bgpo_trl.plotting import plot_frame_strips, plot_success_curves, save_figure
-from bgpo_trl.pretrained import load_pretrained, make_pretrained
-from bgpo_trl.progress import progress_bar
-from bgpo_trl.task_inference import group_purity, task_inference_accuracy
 from bgpo_trl.training import Trainer
-from bgpo_trl.video import save_gif
 
 # Number of the evaluation after training, which no evaluation in training has: other starts.
 _LAST = 2**31

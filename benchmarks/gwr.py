@@ -22,9 +22,9 @@ import tyro
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from bgpo_trl.figures.curves import save_figure
 from bgpo_trl.machine import set_threads
 from bgpo_trl.modules.gwr import GWRB
-from bgpo_trl.plotting import save_figure
 from bgpo_trl.timing import Timing, interleave
 
 CALLS = ("lookup", "adapt", "lookup + adapt")

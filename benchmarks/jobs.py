@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from bgpo_trl.configs import RunConfig
-from bgpo_trl.locking import DirectoryLock
-from bgpo_trl.progress import progress_bar
+from bgpo_trl.files.locking import DirectoryLock
+from bgpo_trl.files.progress import progress_bar
 
 try:
     import ray

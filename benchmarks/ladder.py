@@ -29,9 +29,9 @@ from tyro.conf import subcommand
 
 from bgpo_trl.algorithms.bgpo import BGPO, Composition, Parts, labeled
 from bgpo_trl.configs import PRESETS, BGPOConfig, DDPGConfig, SACConfig, TD3Config
+from bgpo_trl.encoders.pretrained import load_pretrained
+from bgpo_trl.figures.curves import plot_success_curves, save_figure
 from bgpo_trl.machine import choose_device, set_threads
-from bgpo_trl.plotting import plot_success_curves, save_figure
-from bgpo_trl.pretrained import load_pretrained
 from bgpo_trl.training import Trainer
 
 Rung = Literal["a", "b", "c", "d"]

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
 
-from bgpo_trl.runs import read_json, read_rows
+from bgpo_trl.runs.results import read_json, read_rows
 
 
 def merge(blocks: Sequence[Path], directory: Path) -> None:

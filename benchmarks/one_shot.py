@@ -28,14 +28,14 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
 from bgpo_trl import TrainedPolicy, load_run
-from bgpo_trl.config_file import read_config
-from bgpo_trl.demonstration_bank import DemonstrationBank
-from bgpo_trl.demonstrations import record_demonstrations
+from bgpo_trl.analysis.task_inference import task_inference_accuracy
+from bgpo_trl.data.bank import DemonstrationBank
+from bgpo_trl.data.recording import record_demonstrations
+from bgpo_trl.encoders.representation import embed_demonstrations
 from bgpo_trl.evaluation import Evaluator, Snapshot
-from bgpo_trl.plotting import save_figure
-from bgpo_trl.representation import embed_demonstrations
+from bgpo_trl.figures.curves import save_figure
+from bgpo_trl.runs.config_file import read_config
 from bgpo_trl.seeding import stream_seed
-from bgpo_trl.task_inference import task_inference_accuracy
 
 COLUMNS = ("share", "seed", "task", "episodes", "success", "task_inference", "activity")
 # Number of the evaluation, which none in training or at its end has: other starts.

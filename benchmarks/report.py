@@ -23,8 +23,8 @@ from experiment import command_line
 from report_page import Section, write_page
 from report_tables import Table, continual_table, groups_table, main_table, speed_table
 
-from bgpo_trl.plotting import plot_gwr_pca, plot_success_curves, save_figure
-from bgpo_trl.runs import read_rows
+from bgpo_trl.figures.curves import plot_gwr_pca, plot_success_curves, save_figure
+from bgpo_trl.runs.results import read_rows
 from suites import nico
 
 

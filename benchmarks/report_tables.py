@@ -16,8 +16,8 @@ from comparison import (
     task_area,
 )
 
-from bgpo_trl import metrics
-from bgpo_trl.runs import read_outcomes, read_rows
+from bgpo_trl.analysis import metrics
+from bgpo_trl.runs.results import read_outcomes, read_rows
 from suites import nico
 
 Table = list[list[str]]

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from bgpo_trl.config_file import read_config
 from bgpo_trl.configs import RunConfig
-from bgpo_trl.run_directory import holds_run
-from bgpo_trl.runs import read_json
+from bgpo_trl.runs.config_file import read_config
+from bgpo_trl.runs.directory import holds_run
+from bgpo_trl.runs.results import read_json
 
 
 def as_begun(config: RunConfig, directory: Path, *, keep_eval_every: bool = False) -> RunConfig:

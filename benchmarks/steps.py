@@ -19,8 +19,8 @@ import tyro
 from experiment import AlgorithmName, command_line
 
 from bgpo_trl.algorithms import ALGORITHMS, Algorithm
+from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.machine import set_threads
-from bgpo_trl.pretrained import load_pretrained
 from bgpo_trl.timing import interleave
 from bgpo_trl.transforms import TaskSchedule
 

@@ -31,10 +31,10 @@ from jobs import Job, connected, play_jobs
 from merge import merge
 
 from bgpo_trl.algorithms.bgpo import BGPO
-from bgpo_trl.locking import DirectoryLock
-from bgpo_trl.pretrained import load_pretrained
-from bgpo_trl.run_directory import check_settings, holds_run
-from bgpo_trl.runs import read_json
+from bgpo_trl.encoders.pretrained import load_pretrained
+from bgpo_trl.files.locking import DirectoryLock
+from bgpo_trl.runs.directory import check_settings, holds_run
+from bgpo_trl.runs.results import read_json
 
 
 @dataclass(frozen=True)

@@ -29,8 +29,8 @@ import updates
 
 from bgpo_trl.algorithms.bgpo import BGPO
 from bgpo_trl.configs import BGPOConfig
+from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.machine import usable_cores
-from bgpo_trl.pretrained import load_pretrained
 from bgpo_trl.timing import Timing, interleave, ratio
 from bgpo_trl.transforms import TaskSchedule
 

@@ -19,9 +19,9 @@ from torchrl import objectives
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.modules import MLP, TanhModule, ValueOperator
 
+from bgpo_trl.data.replay import ReplayBuffer
 from bgpo_trl.modules.actor_critic import Actor, Critic
 from bgpo_trl.objectives.ddpg import DDPGLoss, ForeachSoftUpdate
-from bgpo_trl.replay import ReplayBuffer
 from bgpo_trl.seeding import generators
 
 Contender = tuple[Callable[[], object], int]

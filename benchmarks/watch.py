@@ -24,10 +24,10 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont, ImageOps
 
 from bgpo_trl import TrainedPolicy, load_run
-from bgpo_trl.config_file import read_config
-from bgpo_trl.demonstrations import record_demonstrations
-from bgpo_trl.plotting import plot_frame_strips, save_figure
-from bgpo_trl.video import save_gif
+from bgpo_trl.data.recording import record_demonstrations
+from bgpo_trl.figures.curves import plot_frame_strips, save_figure
+from bgpo_trl.figures.video import save_gif
+from bgpo_trl.runs.config_file import read_config
 from suites import nico
 from suites.nico.rendering import FrameRenderer
 

@@ -234,7 +234,7 @@ def check_update_rate(seconds: float = 0.5) -> Iterator[Finding]:
 
     from bgpo_trl.algorithms.bgpo import BGPO
     from bgpo_trl.configs import BGPOConfig
-    from bgpo_trl.pretrained import load_pretrained
+    from bgpo_trl.encoders.pretrained import load_pretrained
     from bgpo_trl.transforms import TaskSchedule
 
     encoders, bank = load_pretrained()

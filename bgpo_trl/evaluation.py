@@ -14,9 +14,9 @@ from torchrl.envs import Compose, TransformedEnv
 
 from bgpo_trl.algorithms.algorithm import Algorithm, clip, observe
 from bgpo_trl.configs import AlgorithmConfig
-from bgpo_trl.demonstration_bank import DemonstrationBank
+from bgpo_trl.data.bank import DemonstrationBank
+from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.envs import NicoEnv
-from bgpo_trl.representation import Representation
 from bgpo_trl.seeding import stream_seed
 
 

@@ -16,17 +16,17 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 
 from bgpo_trl.algorithms import ALGORITHMS, Algorithm
-from bgpo_trl.checkpoint import save_checkpoint
 from bgpo_trl.configs import RunConfig
-from bgpo_trl.demonstration_bank import DemonstrationBank
+from bgpo_trl.data.bank import DemonstrationBank
+from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.evaluation import Evaluator, Snapshot
-from bgpo_trl.gwr_growth import growth_moments, save_graph
-from bgpo_trl.interrupts import interrupts_wait
-from bgpo_trl.locking import DirectoryLock
-from bgpo_trl.logging import RunLogger
-from bgpo_trl.progress import progress_bar
-from bgpo_trl.representation import Representation
-from bgpo_trl.run_directory import load_last, plain_settings
+from bgpo_trl.files.checkpoint import save_checkpoint
+from bgpo_trl.files.interrupts import interrupts_wait
+from bgpo_trl.files.locking import DirectoryLock
+from bgpo_trl.files.progress import progress_bar
+from bgpo_trl.runs.directory import load_last, plain_settings
+from bgpo_trl.runs.gwr_graphs import growth_moments, save_graph
+from bgpo_trl.runs.logger import RunLogger
 from bgpo_trl.transforms import TaskSchedule
 
 

@@ -9,8 +9,8 @@ import networkx as nx
 import torch
 from matplotlib.figure import Figure
 
+from bgpo_trl.figures.curves import save_figure
 from bgpo_trl.modules.gwr import GWRB
-from bgpo_trl.plotting import save_figure
 
 
 def point_cloud(n: int, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:

@@ -6,10 +6,10 @@ import torch
 
 from bgpo_trl.algorithms import Algorithm
 from bgpo_trl.configs import RunConfig
-from bgpo_trl.demonstrations import record_demonstrations
-from bgpo_trl.pretrained import load_pretrained
-from bgpo_trl.representation import encode_frames, valid_steps
-from bgpo_trl.runs import read_curves
+from bgpo_trl.data.recording import record_demonstrations
+from bgpo_trl.encoders.pretrained import load_pretrained
+from bgpo_trl.encoders.representation import encode_frames, valid_steps
+from bgpo_trl.runs.results import read_curves
 from bgpo_trl.training import Trainer
 
 

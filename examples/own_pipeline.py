@@ -10,11 +10,11 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import Compose, StepCounter, Transform, TransformedEnv
 from torchrl.modules import AdditiveGaussianModule
 
+from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.envs import NicoEnv
 from bgpo_trl.modules.actor_critic import Actor, Critic
 from bgpo_trl.modules.gwr import GWRB
 from bgpo_trl.objectives.ddpg import DDPGLoss, ForeachSoftUpdate
-from bgpo_trl.pretrained import load_pretrained
 from bgpo_trl.transforms import BehaviorLookup, DemonstrationSource, FrameEncoder, TaskSchedule
 
 

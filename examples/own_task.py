@@ -5,12 +5,12 @@ Run again, it continues where it was. To see it learn rather than begin, raise `
 
 from pathlib import Path
 
+from bgpo_trl.analysis.task_inference import task_inference_accuracy
 from bgpo_trl.configs import RunConfig
-from bgpo_trl.demonstrations import record_demonstrations
-from bgpo_trl.make_bank import make_bank
-from bgpo_trl.pretrained import load_pretrained
-from bgpo_trl.runs import read_rows
-from bgpo_trl.task_inference import task_inference_accuracy
+from bgpo_trl.data.recording import record_demonstrations
+from bgpo_trl.encoders.make_bank import make_bank
+from bgpo_trl.encoders.pretrained import load_pretrained
+from bgpo_trl.runs.results import read_rows
 from bgpo_trl.training import Trainer
 from suites import nico
 from suites.nico import moves

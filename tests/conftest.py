@@ -18,11 +18,11 @@ from hypothesis import settings
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.rl import RL
 from bgpo_trl.configs import RunConfig
-from bgpo_trl.demonstration_bank import DemonstrationBank, DemonstrationSteps
+from bgpo_trl.data.bank import DemonstrationBank, DemonstrationSteps
+from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.envs import NicoEnv
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
-from bgpo_trl.representation import Representation
 from suites.nico import nico
 
 # How long an example takes says more about the other processes of the machine than about the code.
@@ -165,7 +165,7 @@ def _files(folder) -> dict[str, str]:
 
 _OTHER_PROCESS = """
 import sys
-from bgpo_trl import locking
+from bgpo_trl.files import locking
 
 def sleep(seconds, sleep=locking.time.sleep):
     print("waits", flush=True)

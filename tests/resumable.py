@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from bgpo_trl.configs import RepresentationConfig, SequenceAutoencoderConfig, VAEConfig
-from bgpo_trl.demonstrations import record_demonstrations
-from bgpo_trl.train_encoders import train_encoders
+from bgpo_trl.data.recording import record_demonstrations
+from bgpo_trl.encoders.train import train_encoders
 from bgpo_trl.training import Trainer
 from tests.conftest import EasyNicoEnv
 

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 import torch
 
-from bgpo_trl.checkpoint import load_checkpoint, save_checkpoint
-from bgpo_trl.csv_file import CsvFile
-from bgpo_trl.demonstration_bank import DemonstrationBank
-from bgpo_trl.demonstrations import load_demonstrations, record_demonstrations
-from bgpo_trl.logging import EVAL_COLUMNS, RunLogger
-from bgpo_trl.plotting import plot_frame_strips, plot_success_curves, save_figure
-from bgpo_trl.pretrained import load_pretrained
-from bgpo_trl.representation import default_weights, load_representation
-from bgpo_trl.runs import read_curves, read_json, read_rows
+from bgpo_trl.data.bank import DemonstrationBank
+from bgpo_trl.data.recording import load_demonstrations, record_demonstrations
+from bgpo_trl.encoders.pretrained import load_pretrained
+from bgpo_trl.encoders.representation import default_weights, load_representation
+from bgpo_trl.figures.curves import plot_frame_strips, plot_success_curves, save_figure
+from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
+from bgpo_trl.files.csv_file import CsvFile
+from bgpo_trl.runs.logger import EVAL_COLUMNS, RunLogger
+from bgpo_trl.runs.results import read_curves, read_json, read_rows
 from suites import nico
 
 HEADER = ",".join(EVAL_COLUMNS) + "\n"

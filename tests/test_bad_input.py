@@ -16,9 +16,11 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv
 
-from bgpo_trl import metrics
-from bgpo_trl.checkpoint import load_checkpoint
+from bgpo_trl.analysis import metrics
+from bgpo_trl.data.replay import ReplayBuffer
+from bgpo_trl.data.task_replay import TaskReplay
 from bgpo_trl.envs import NicoEnv
+from bgpo_trl.files.checkpoint import load_checkpoint
 from bgpo_trl.machine import choose_device, set_threads
 from bgpo_trl.modules.actor_critic import Actor, Critic
 from bgpo_trl.modules.gwr import GWRB
@@ -28,8 +30,6 @@ from bgpo_trl.modules.vae import VAE
 from bgpo_trl.objectives.ddpg import DDPGLoss, ForeachSoftUpdate
 from bgpo_trl.objectives.distillation import DistillationLoss
 from bgpo_trl.objectives.representation import SequenceReconstructionLoss, VAEInverseLoss
-from bgpo_trl.replay import ReplayBuffer
-from bgpo_trl.task_replay import TaskReplay
 from bgpo_trl.training import Trainer
 from bgpo_trl.transforms import (
     BehaviorLookup,

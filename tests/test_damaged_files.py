@@ -11,11 +11,15 @@ import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from bgpo_trl.demonstration_bank import DemonstrationBank, DemonstrationSteps
-from bgpo_trl.demonstrations import load_demonstrations, record_demonstrations
+from bgpo_trl.data.bank import DemonstrationBank, DemonstrationSteps
+from bgpo_trl.data.recording import load_demonstrations, record_demonstrations
+from bgpo_trl.encoders.representation import (
+    Representation,
+    load_representation,
+    save_representation,
+)
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
-from bgpo_trl.representation import Representation, load_representation, save_representation
 
 FILES = [f"{key}.memmap" for key in ("pixels", "state", "action", "length", "task", "train")]
 FILES += ["dataset.json", "meta.json"]

@@ -13,7 +13,7 @@ from tensordict import TensorDict
 from torch import nn
 
 from bgpo_trl.configs import RepresentationConfig, SequenceAutoencoderConfig, VAEConfig
-from bgpo_trl.representation import (
+from bgpo_trl.encoders.representation import (
     load_representation,
     save_representation,
     train_representation,

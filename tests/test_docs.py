@@ -121,7 +121,7 @@ def test_a_command_is_understood(command, monkeypatch, parse_only):
         "python benchmarks/continual.py --presett quick",
         "python benchmarks/concurrent.py --preset huge",
         "python -m suites.nico.explore --tasks grasp_glass",
-        "python -m bgpo_trl.demonstrations --per-task 3",
+        "python -m bgpo_trl.data.recording --per-task 3",
     ],
 )
 def test_a_command_that_is_wrong_is_not_understood(command, monkeypatch, parse_only):

@@ -12,8 +12,9 @@ import pytest
 import torch
 from PIL import Image
 
-from bgpo_trl import doctor, pretrained
+from bgpo_trl import doctor
 from bgpo_trl.doctor import Finding
+from bgpo_trl.encoders import pretrained
 
 ROOT = Path(__file__).parents[1]
 GB = 10**9

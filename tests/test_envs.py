@@ -17,8 +17,8 @@ from torchrl.envs import (
     step_mdp,
 )
 
-from bgpo_trl.checkpoint import load_checkpoint, save_checkpoint
 from bgpo_trl.envs import NicoEnv
+from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
 from suites import nico
 from suites.nico.demonstrator import Demonstrator
 

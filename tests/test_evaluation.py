@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from benchmarks import ablation
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.bgpo import BGPO
-from bgpo_trl.demonstration_bank import DemonstrationBank
+from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.evaluation import Evaluator, evaluate_random_policy
 from bgpo_trl.modules.actor_critic import Actor
 from bgpo_trl.modules.multi_head_actor import MultiHeadActor

@@ -11,11 +11,11 @@ from dm_control import suite
 from tensordict import TensorDict
 
 from bgpo_trl.configs import RunConfig
-from bgpo_trl.demonstration_bank import DemonstrationBank
-from bgpo_trl.demonstrations import record_demonstrations
+from bgpo_trl.data.bank import DemonstrationBank
+from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.envs import NicoEnv
 from bgpo_trl.evaluation import evaluate_random_policy
-from bgpo_trl.tensor_file import load_tensors, save_tensors
+from bgpo_trl.files.tensor_file import load_tensors, save_tensors
 from bgpo_trl.training import Trainer
 from suites import nico
 from suites.nico import moves

@@ -14,7 +14,7 @@ import torch
 from benchmarks import ablation
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.bgpo import BGPO
-from bgpo_trl.checkpoint import load_checkpoint
+from bgpo_trl.files.checkpoint import load_checkpoint
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.training import Trainer
 from tests.conftest import of_name

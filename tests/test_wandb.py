@@ -15,10 +15,10 @@ import wandb
 from PIL import Image
 from wandb.proto.wandb_internal_pb2 import Record
 
-from bgpo_trl.logging import RunLogger
-from bgpo_trl.plotting import plot_success_curves, save_figure
+from bgpo_trl.figures.curves import plot_success_curves, save_figure
+from bgpo_trl.figures.video import save_gif
+from bgpo_trl.runs.logger import RunLogger
 from bgpo_trl.training import Trainer
-from bgpo_trl.video import save_gif
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 NOT_IN_THE_CURVE = {"algorithm", "seed", "task", "episode", ""}

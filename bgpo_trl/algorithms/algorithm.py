@@ -21,15 +21,15 @@ from torchrl.envs import (
 
 from bgpo_trl.algorithms.rl import Learner
 from bgpo_trl.configs import AlgorithmConfig
-from bgpo_trl.demonstration_bank import DemonstrationBank
-from bgpo_trl.demonstration_replay import DemonstrationReplay
+from bgpo_trl.data.bank import DemonstrationBank
+from bgpo_trl.data.demonstration_replay import DemonstrationReplay
+from bgpo_trl.data.group_replay import GroupReplay
+from bgpo_trl.data.task_replay import TaskReplay
+from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.envs import NicoEnv
-from bgpo_trl.group_replay import GroupReplay
 from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.modules.gwr import GWRB
-from bgpo_trl.representation import Representation
 from bgpo_trl.seeding import generators, stream_seed
-from bgpo_trl.task_replay import TaskReplay
 from bgpo_trl.transforms import DemonstrationSource, FrameEncoder, TaskSchedule
 from suites.nico.base import STATE_SIZE
 

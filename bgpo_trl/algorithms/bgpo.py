@@ -17,13 +17,13 @@ from bgpo_trl.algorithms.algorithm import Algorithm
 from bgpo_trl.algorithms.experts import ActiveGroups, Experts
 from bgpo_trl.algorithms.rl import Problem, make_learner
 from bgpo_trl.configs import BGPOConfig
-from bgpo_trl.demonstration_bank import DemonstrationBank
-from bgpo_trl.demonstration_replay import DemonstrationReplay
-from bgpo_trl.group_replay import GroupReplay
+from bgpo_trl.data.bank import DemonstrationBank
+from bgpo_trl.data.demonstration_replay import DemonstrationReplay
+from bgpo_trl.data.group_replay import GroupReplay
+from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.modules.gwr import GWRB
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
-from bgpo_trl.representation import Representation
 from bgpo_trl.seeding import generators
 from bgpo_trl.transforms import (
     BehaviorLookup,

@@ -17,14 +17,14 @@ from torch.func import functional_call
 from bgpo_trl.algorithms.algorithm import Algorithm, networks_of
 from bgpo_trl.algorithms.rl import Learner
 from bgpo_trl.configs import DistNLLConfig
-from bgpo_trl.demonstration_bank import DemonstrationBank
+from bgpo_trl.data.bank import DemonstrationBank
+from bgpo_trl.data.task_replay import TaskReplay
+from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.modules.actor_critic import Actor, Critic
 from bgpo_trl.modules.multi_head_actor import MultiHeadActor
 from bgpo_trl.objectives.ddpg import DDPGLoss
 from bgpo_trl.objectives.distillation import DistillationLoss
-from bgpo_trl.representation import Representation
 from bgpo_trl.seeding import generators, task_generators
-from bgpo_trl.task_replay import TaskReplay
 from bgpo_trl.transforms import TaskSchedule
 
 

@@ -17,12 +17,12 @@ from torch.func import functional_call
 from bgpo_trl.algorithms.algorithm import Algorithm, networks_of
 from bgpo_trl.algorithms.rl import Learner
 from bgpo_trl.configs import MAMLConfig
-from bgpo_trl.demonstration_bank import DemonstrationBank
+from bgpo_trl.data.bank import DemonstrationBank
+from bgpo_trl.data.task_replay import TaskReplay
+from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.modules.actor_critic import Actor, Critic
 from bgpo_trl.objectives.maml import MAMLLoss
-from bgpo_trl.representation import Representation
 from bgpo_trl.seeding import generators, task_generators
-from bgpo_trl.task_replay import TaskReplay
 from bgpo_trl.transforms import TaskSchedule
 
 

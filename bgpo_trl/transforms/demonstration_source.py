@@ -87,7 +87,7 @@ class TaskSchedule:
 
 
 class Bank(Protocol):
-    """Embedded demonstrations, as `bgpo_trl.demonstrations.DemonstrationBank` holds them."""
+    """Embedded demonstrations, as `bgpo_trl.data.recording.DemonstrationBank` holds them."""
 
     @property
     def embedding(self) -> Tensor:

@@ -10,11 +10,11 @@ from torchrl.envs import check_env_specs
 from benchmarks import ablation
 from bgpo_trl.algorithms.algorithm import observe
 from bgpo_trl.algorithms.bgpo import BGPO, labeled, self_organized, untold
-from bgpo_trl.checkpoint import load_checkpoint, save_checkpoint
 from bgpo_trl.configs import BGPOConfig, GWRBConfig
-from bgpo_trl.demonstration_bank import DemonstrationBank
+from bgpo_trl.data.bank import DemonstrationBank
+from bgpo_trl.encoders.pretrained import load_pretrained
+from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
 from bgpo_trl.modules.gwr import GWRB
-from bgpo_trl.pretrained import load_pretrained
 from bgpo_trl.seeding import generators
 from bgpo_trl.transforms import BehaviorLookup, GroupLookup, TaskSchedule
 

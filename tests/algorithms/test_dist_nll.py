@@ -10,8 +10,8 @@ import torch
 from tensordict import TensorDict
 
 from bgpo_trl.algorithms.dist_nll import DistNLL
-from bgpo_trl.checkpoint import load_checkpoint, save_checkpoint
 from bgpo_trl.configs import DistNLLConfig
+from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
 from bgpo_trl.modules.multi_head_actor import MultiHeadActor
 from bgpo_trl.seeding import generators
 from bgpo_trl.transforms import TaskSchedule

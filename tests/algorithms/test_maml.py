@@ -10,8 +10,8 @@ from tensordict import TensorDict
 from torch.nn.functional import layer_norm
 
 from bgpo_trl.algorithms.maml import MAML
-from bgpo_trl.checkpoint import load_checkpoint, save_checkpoint
 from bgpo_trl.configs import MAMLConfig
+from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
 from bgpo_trl.modules.actor_critic import Actor
 from bgpo_trl.seeding import generators
 from bgpo_trl.transforms import TaskSchedule

@@ -71,5 +71,5 @@ def finished_runs(bank, encoders, make_config, tmp_path_factory):
 @pytest.fixture
 def run_of(finished_runs, bank, encoders, monkeypatch, tmp_path):
     """Returns a copy of a finished run, whose encoders are taken for those of the package."""
-    monkeypatch.setattr("bgpo_trl.trained_policy.load_pretrained", lambda own: (encoders, bank))
+    monkeypatch.setattr("bgpo_trl.policy.load_pretrained", lambda own: (encoders, bank))
     return lambda name: shutil.copytree(finished_runs(name), tmp_path / "runs" / name)

@@ -13,8 +13,8 @@ from torchrl.envs import check_env_specs
 from benchmarks import ablation, experiment
 from benchmarks.ablation import VARIANTS
 from bgpo_trl.algorithms.bgpo import BGPO
-from bgpo_trl.checkpoint import load_checkpoint
-from bgpo_trl.runs import read_rows
+from bgpo_trl.files.checkpoint import load_checkpoint
+from bgpo_trl.runs.results import read_rows
 from bgpo_trl.transforms import BehaviorLookup, GroupLookup, TaskSchedule
 
 pytestmark = pytest.mark.usefixtures("easy_world")

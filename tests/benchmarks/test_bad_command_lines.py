@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from bgpo_trl.logging import EVAL_COLUMNS
+from bgpo_trl.runs.logger import EVAL_COLUMNS
 from suites import opengl
 
 ROOT = Path(__file__).parents[2]
@@ -100,13 +100,13 @@ CASES = [
     ("gwr.py --nodes", "--nodes", "one or more, of at least 2"),
     ("gwr.py --networks 0", "--networks", "at least 1, got 0"),
     # stage 1
-    ("bgpo_trl.demonstrations file", "cannot make the folder file", "choose another"),
-    ("bgpo_trl.demonstrations new --per-task 0", "held_out_per_task", "less than per_task, 0"),
-    ("bgpo_trl.demonstrations new --seed -1", "seed", "must be at least 0, got -1"),
-    ("bgpo_trl.train_encoders empty", "empty is no dataset", "record it anew with"),
-    ("bgpo_trl.train_encoders empty --device gpu", "empty is no dataset", "record it anew with"),
-    ("bgpo_trl.probes empty --weights file", "file is damaged", "--train-encoders"),
-    ("bgpo_trl.probes file", "file is no dataset", "record it anew with"),
+    ("bgpo_trl.data.recording file", "cannot make the folder file", "choose another"),
+    ("bgpo_trl.data.recording new --per-task 0", "held_out_per_task", "less than per_task, 0"),
+    ("bgpo_trl.data.recording new --seed -1", "seed", "must be at least 0, got -1"),
+    ("bgpo_trl.encoders.train empty", "empty is no dataset", "record it anew with"),
+    ("bgpo_trl.encoders.train empty --device gpu", "empty is no dataset", "record it anew with"),
+    ("bgpo_trl.encoders.probes empty --weights file", "file is damaged", "--train-encoders"),
+    ("bgpo_trl.encoders.probes file", "file is no dataset", "record it anew with"),
     ("suites.nico.explore --task juggle --out a.gif", "'juggle'", "choose one of grasp_glass"),
     ("suites.nico.explore --out a.jpeg", "cannot write a.jpeg", "ends in .png or .gif"),
     ("suites.nico.explore --out file/a.png", "there is no folder file", "make it first"),
@@ -140,8 +140,8 @@ def test_a_command_that_cannot_be_is_answered_in_one_line(
         ("ladder.py ddpg --gamma 1.5", "gamma must be between 0 and 1, got 1.5"),
         ("ladder.py sac --hidden-sizes 64 0", "hidden_sizes must be one or more"),
         ("compare.py run", "Another's"),
-        ("bgpo_trl.train_encoders empty --config.vae.batch-size 0", "batch_size must be at least"),
-        ("bgpo_trl.demonstrations", "PATH"),
+        ("bgpo_trl.encoders.train empty --config.vae.batch-size 0", "batch_size must be at least"),
+        ("bgpo_trl.data.recording", "PATH"),
         ("suites.nico.explore --random --demonstrate", "--demonstrate"),
     ],
 )
@@ -169,7 +169,7 @@ def test_a_folder_that_may_not_be_written_is_told(folder, monkeypatch):
 def test_without_opengl_no_recording_is_begun(folder, monkeypatch):
     monkeypatch.setattr(opengl, "refusal", "MUJOCO_GL is 'vulkan': do not set it")
     before = contents(folder)
-    told = ended_with(monkeypatch, "bgpo_trl.demonstrations new --per-task 2 --held-out-per-task 1")
+    told = ended_with(monkeypatch, "bgpo_trl.data.recording new --per-task 2 --held-out-per-task 1")
     assert told == "error: MUJOCO_GL is 'vulkan': do not set it"
     assert contents(folder) == before
 

@@ -23,10 +23,10 @@ import tyro
 from benchmarks import concurrent, continual, ladder, summary
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.rl import RL
-from bgpo_trl.checkpoint import load_checkpoint
 from bgpo_trl.configs import PRESETS, DDPGConfig
-from bgpo_trl.logging import EVAL_COLUMNS
-from bgpo_trl.runs import read_rows
+from bgpo_trl.files.checkpoint import load_checkpoint
+from bgpo_trl.runs.logger import EVAL_COLUMNS
+from bgpo_trl.runs.results import read_rows
 from suites import nico
 
 ROOT = Path(__file__).parents[2]
@@ -231,9 +231,9 @@ def test_a_dashboard_gets_the_figures_before_it_is_closed(tiniest, monkeypatch, 
         def shutdown(self):
             events.append("shutdown")
 
-    monkeypatch.setattr("bgpo_trl.logging.WandbLogger", Dashboard)
+    monkeypatch.setattr("bgpo_trl.runs.logger.WandbLogger", Dashboard)
     monkeypatch.setattr(
-        "bgpo_trl.logging._log_wandb_media", lambda dashboard, *media: events.append(media)
+        "bgpo_trl.runs.logger._log_wandb_media", lambda dashboard, *media: events.append(media)
     )
     run = tmp_path / "run"
     figures = ["episodes.png", "groups.png", "gwr.png", "gwr_growth.png", "success.png"]

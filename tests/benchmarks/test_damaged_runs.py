@@ -10,7 +10,7 @@ import pytest
 import summary
 import watch
 
-from bgpo_trl.checkpoint import save_checkpoint
+from bgpo_trl.files.checkpoint import save_checkpoint
 from suites import nico
 
 TASKS = nico.ALL_TASKS

@@ -152,7 +152,7 @@ def test_a_run_is_played_when_no_other_process_holds_it(
     """It goes on once the other process is gone, and does not play again what that one ended."""
     job = Job(tmp_path / "run", make_config())
     waiting, played = threading.Event(), []
-    monkeypatch.setattr("bgpo_trl.locking.time.sleep", lambda _: waiting.set())
+    monkeypatch.setattr("bgpo_trl.files.locking.time.sleep", lambda _: waiting.set())
     for ended_by_other in (False, True):
         waiting.clear(), played.clear()
         other = other_process(job.directory)

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from bgpo_trl import load_run
-from bgpo_trl.demonstrations import record_demonstrations
+from bgpo_trl.data.recording import record_demonstrations
 from suites import nico
 
 TASKS = nico.ALL_TASKS

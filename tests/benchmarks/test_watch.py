@@ -9,7 +9,7 @@ import pytest
 import watch
 from PIL import Image
 
-from bgpo_trl.gwr_growth import load_graphs
+from bgpo_trl.runs.gwr_graphs import load_graphs
 from suites import nico
 from suites.nico.demonstrator import Demonstrator
 

@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bgpo_trl.configs import BGPOConfig
+from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.modules.gwr import GWRB
-from bgpo_trl.pretrained import load_pretrained
 from bgpo_trl.transforms import TaskSchedule
 
 

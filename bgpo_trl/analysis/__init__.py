@@ -1,0 +1,1 @@
+"""Measures of continual learning and of task inference."""

@@ -1,0 +1,343 @@
+"""Measures of learning several tasks, and how sure they are: from success rates to one number.
+
+All work on plain arrays. ``success`` ``[..., E, T]`` is the share of successes on each of ``T``
+tasks at each of ``E`` evaluations (`bgpo_trl.runs.results.Curves` has it with a leading seed
+dimension); a success rate of 0 counts as 0, and NaN means that there was no test, as of a task that has not been
+presented yet.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+def evaluation_matrix(
+    success: ArrayLike, episodes: ArrayLike, ends: ArrayLike, *, window: int
+) -> Array:
+    """Returns ``R[i, j]``: success on task j at the end of phase i.
+
+    Args:
+        success: ``[..., E, T]``.
+        episodes: Training episodes before each evaluation, ``[E]``.
+        ends: Episode with which each phase ends, ``[P]``: the starts of the later tasks, and the
+            end of training.
+        window: Evaluations after at most so many episodes before the end of a phase are averaged.
+
+    Returns:
+        ``[..., P, T]``; NaN for tasks without a test in the window.
+
+    Raises:
+        ValueError: If a phase has no evaluation in its window, or there are not as many episodes as
+            evaluations.
+    """
+    success, episodes = np.asarray(success, float), np.asarray(episodes)
+    _check_episodes(success, episodes, -2)
+    phases = []
+    for end in np.asarray(ends).tolist():
+        chosen = (episodes > end - window) & (episodes <= end)
+        if not chosen.any():
+            raise ValueError(
+                f"there is no evaluation in the {window} episodes before episode {end}: evaluate "
+                "more often or take a larger window"
+            )
+        phases.append(_mean(success[..., chosen, :], axis=-2))
+    return np.stack(phases, axis=-2)
+
+
+def average_performance(matrix: ArrayLike) -> Array:
+    """Returns the mean over tasks of success at the end of training, ``[...]``.
+
+    Args:
+        matrix: From `evaluation_matrix`, ``[..., P, T]``.
+    """
+    return _mean(np.asarray(matrix, float)[..., -1, :], axis=-1)
+
+
+def forgetting_since_learned(matrix: ArrayLike) -> Array:
+    """Returns how much was lost since the end of each task's own phase, ``[...]``.
+
+    The mean over all tasks but the last of ``R[j, j] - R[T - 1, j]``: phase j is that with which
+    task j comes in. Negative where a task has become better since; the negative of
+    `backward_transfer`.
+
+    Args:
+        matrix: From `evaluation_matrix`, as many phases as tasks, ``[..., T, T]``.
+
+    Raises:
+        ValueError: If the numbers of phases and tasks differ.
+    """
+    return -backward_transfer(matrix)
+
+
+def forgetting_since_best(success: ArrayLike) -> Array:
+    """Returns how much was lost since each task was done best, ``[...]``.
+
+    The mean over tasks of the highest success at any evaluation minus that at the last one; never
+    negative (Chaudhry et al., 2018, "Riemannian Walk for Incremental Learning", but over all
+    evaluations and tasks). Noise of single evaluations counts as forgetting: average them first,
+    with `trailing_mean`.
+
+    Args:
+        success: ``[..., E, T]``.
+
+    Raises:
+        ValueError: If it is not of that shape.
+    """
+    success = np.asarray(success, float)
+    _check_episodes(success, np.arange(success.shape[-2] if success.ndim > 1 else 0), -2)
+    return _mean(_max(success, axis=-2) - success[..., -1, :], axis=-1)
+
+
+def backward_transfer(matrix: ArrayLike) -> Array:
+    """Returns how much earlier tasks have gained by learning later ones, ``[...]``.
+
+    The mean over all tasks but the last of ``R[T - 1, j] - R[j, j]`` (Lopez-Paz & Ranzato, 2017,
+    "Gradient Episodic Memory for Continual Learning").
+
+    Args:
+        matrix: From `evaluation_matrix`, as many phases as tasks, ``[..., T, T]``.
+
+    Raises:
+        ValueError: If the numbers of phases and tasks differ.
+    """
+    matrix = np.asarray(matrix, float)
+    if matrix.shape[-1] != matrix.shape[-2]:
+        raise ValueError(f"one phase a task is needed, got {list(matrix.shape[-2:])}")
+    learned = np.diagonal(matrix, axis1=-2, axis2=-1)
+    return _mean((matrix[..., -1, :] - learned)[..., :-1], axis=-1)
+
+
+def forward_transfer(area: ArrayLike, reference: ArrayLike) -> Array:
+    """Returns how much faster a task is learned than without what was learned before it.
+
+    ``(area - reference) / (1 - reference)``: 1 where it succeeds from the start, 0 where nothing is
+    gained, negative where it takes longer (Wolczyk et al., 2021, "Continual World").
+
+    Args:
+        area: `area_under_curve` of a task from its presentation on.
+        reference: The same over as many episodes of a learner that has learned no task before.
+    """
+    area, reference = np.asarray(area, float), np.asarray(reference, float)
+    return (area - reference) / (1 - reference)
+
+
+def area_under_curve(success: ArrayLike, episodes: ArrayLike) -> Array:
+    """Returns the mean height of curves over training, between 0 and 1, ``[...]``.
+
+    Trapezoids between evaluations; before the first one, the curve rises from 0 at episode 0. Only
+    for curves without NaN.
+
+    Args:
+        success: ``[..., E]``.
+        episodes: Training episodes before each evaluation, ``[E]``.
+
+    Raises:
+        ValueError: If there are not as many episodes as evaluations, or they do not increase.
+    """
+    success, episodes = np.asarray(success, float), np.asarray(episodes, float)
+    _check_episodes(success, episodes, -1)
+    start = np.zeros((*success.shape[:-1], 1))
+    heights = np.concatenate([start, success], axis=-1)
+    return np.trapezoid(heights, np.concatenate([[0.0], episodes]), axis=-1) / episodes[-1]
+
+
+def episodes_to(success: ArrayLike, episodes: ArrayLike, threshold: float = 0.8) -> Array:
+    """Returns the training episodes before the first evaluation that reaches a success rate.
+
+    Args:
+        success: ``[..., E]``.
+        episodes: Training episodes before each evaluation, ``[E]``.
+        threshold: The success rate.
+
+    Returns:
+        ``[...]``; infinite where it is never reached.
+
+    Raises:
+        ValueError: If there are not as many episodes as evaluations, or they do not increase.
+    """
+    _check_episodes(np.asarray(success, float), np.asarray(episodes), -1)
+    reached = np.asarray(success, float) >= threshold
+    first = np.asarray(episodes, float)[reached.argmax(axis=-1)]
+    return np.where(reached.any(axis=-1), first, np.inf)
+
+
+def trials_to(success: ArrayLike, threshold: float = 0.5, *, window: int = 20) -> float:
+    """Returns how many of its own training episodes a task takes to reach a success rate.
+
+    Args:
+        success: Outcomes of the training episodes that were about the task, in order, ``[N]``.
+        threshold: The success rate.
+        window: The rate is that of the last so many of them; of fewer, there is none.
+
+    Returns:
+        The episodes up to the first at which the rate is reached; infinite if it never is.
+
+    Raises:
+        ValueError: If the window holds no episode.
+    """
+    if window < 1:
+        raise ValueError(f"window must be at least 1 episode, not {window}")
+    won = np.concatenate([[0.0], np.cumsum(np.asarray(success, float))])
+    reached = won[window:] - won[:-window] >= threshold * window
+    return float(reached.argmax() + window) if reached.any() else float("inf")
+
+
+def times_the_first(episodes: ArrayLike) -> Array:
+    """Returns how many times as long as the first task each later one takes, ``[T - 1]``.
+
+    The median over seeds; a task that a seed never learns takes it infinitely long. Seeds that
+    never learn the first task say nothing and are left out; NaN if all are.
+
+    Args:
+        episodes: From `trials_to`, ``[S, T]``, the tasks in the order of their presentation.
+    """
+    episodes = np.asarray(episodes, float)
+    told = episodes[np.isfinite(episodes[:, 0])]
+    if not len(told):
+        return np.full(episodes.shape[1] - 1, np.nan)
+    return np.median(told[:, 1:] / told[:, :1], axis=0)
+
+
+def trailing_mean(success: ArrayLike, n: int) -> Array:
+    """Returns the mean of each evaluation and up to ``n - 1`` before it.
+
+    Args:
+        success: ``[..., E, T]``.
+        n: Number of evaluations, at least 1.
+
+    Raises:
+        ValueError: If it is less.
+    """
+    success = np.asarray(success, float)
+    if n < 1 or success.ndim < 2:
+        raise ValueError(f"success must be [..., E, T] and n at least 1, got {success.shape}, {n}")
+    n_evaluations = success.shape[-2]
+    return np.stack(
+        [
+            _mean(success[..., max(0, end - n) : end, :], axis=-2)
+            for end in range(1, n_evaluations + 1)
+        ],
+        axis=-2,
+    )
+
+
+def presented_mean(success: ArrayLike) -> Array:
+    """Returns the mean over the tasks presented by each evaluation, ``[..., E]``.
+
+    Args:
+        success: ``[..., E, T]``.
+    """
+    return _mean(np.asarray(success, float), axis=-1)
+
+
+def interquartile_mean(scores: ArrayLike) -> float:
+    """Returns the mean of the middle half of all scores (Agarwal et al., 2021, "rliable").
+
+    Args:
+        scores: Of any shape, such as ``[S, T]``: seeds and tasks.
+
+    Raises:
+        ValueError: If there is none, or one is not finite.
+    """
+    ordered = np.sort(np.asarray(scores, float), axis=None)
+    if not ordered.size or not np.isfinite(ordered).all():
+        raise ValueError("scores must be finite, and at least one: leave out what was not tested")
+    cut = ordered.size // 4
+    return float(ordered[cut : ordered.size - cut].mean())
+
+
+def stratified_bootstrap(
+    scores: ArrayLike,
+    statistic: Callable[[Array], float] = interquartile_mean,
+    *,
+    n_resamples: int = 2_000,
+    rng: np.random.Generator,
+) -> Array:
+    """Returns a statistic of resampled scores, from which intervals and differences are taken.
+
+    Seeds are drawn anew, with replacement, for each task by itself (Agarwal et al., 2021, "Deep
+    Reinforcement Learning at the Edge of the Statistical Precipice", section 4.1).
+
+    Args:
+        scores: One of each seed on each task, ``[S, T]``.
+        statistic: Of an array of that shape.
+        n_resamples: Number of resamples ``N``.
+        rng: Source of the draws.
+
+    Returns:
+        ``[N]``.
+
+    Raises:
+        ValueError: If scores are not finite, or not ``[S, T]``, or nothing is to be drawn.
+
+    Example:
+        >>> rng = np.random.default_rng(0)
+        >>> ours, theirs = [[0.9, 0.8], [0.7, 0.8]], [[0.5, 0.1], [0.3, 0.2]]
+        >>> gain = stratified_bootstrap(ours, rng=rng) - stratified_bootstrap(theirs, rng=rng)
+        >>> percentile_interval(gain)[0] > 0
+        True
+    """
+    scores = _checked(scores)
+    if n_resamples < 1:
+        raise ValueError(f"n_resamples must be at least 1, got {n_resamples}")
+    n_seeds, n_tasks = scores.shape
+    drawn = rng.integers(n_seeds, size=(n_resamples, n_seeds, n_tasks))
+    return np.array([statistic(scores[seeds, np.arange(n_tasks)]) for seeds in drawn])
+
+
+def percentile_interval(values: ArrayLike, confidence: float = 0.95) -> tuple[float, float]:
+    """Returns the interval that holds the middle share of resampled values.
+
+    Args:
+        values: From `stratified_bootstrap`, or sums and differences of such.
+        confidence: The share.
+
+    Raises:
+        ValueError: If there is no value, or the share does not lie in (0, 1).
+    """
+    if not np.size(values) or not 0 < confidence < 1:
+        raise ValueError(
+            f"values must be at least one and confidence in (0, 1), got {np.size(values)} values "
+            f"and {confidence}"
+        )
+    tail = 100 * (1 - confidence) / 2
+    low, high = np.percentile(np.asarray(values, float), [tail, 100 - tail])
+    return float(low), float(high)
+
+
+def _checked(scores: ArrayLike) -> Array:
+    scores = np.asarray(scores, float)
+    if scores.ndim != 2 or not scores.size or not np.isfinite(scores).all():
+        raise ValueError(
+            f"scores must be finite and [seeds, tasks], at least one of each, not of shape "
+            f"{list(scores.shape)}{'' if np.isfinite(scores).all() else ' with NaN or Inf'}"
+        )
+    return scores
+
+
+def _check_episodes(success: Array, episodes: NDArray, axis: int) -> None:
+    """Raises ValueError unless there is one episode, larger than the last, for each evaluation."""
+    found = success.shape[axis] if success.ndim >= -axis else 0
+    if not found or episodes.shape != (found,) or (np.diff(episodes) <= 0).any():
+        raise ValueError(
+            "one evaluation at least is needed, and for each its training episodes, increasing: "
+            f"got success {[*success.shape]} for episodes {episodes.tolist()}"
+        )
+
+
+def _mean(values: Array, axis: int) -> Array:
+    """The mean of what is not NaN; NaN where nothing is."""
+    there = ~np.isnan(values)
+    count = there.sum(axis)
+    total = np.where(there, values, 0.0).sum(axis)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+def _max(values: Array, axis: int) -> Array:
+    highest = np.where(np.isnan(values), -np.inf, values).max(axis)
+    return np.where(np.isfinite(highest), highest, np.nan)

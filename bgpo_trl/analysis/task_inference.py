@@ -1,0 +1,76 @@
+"""How well GWR-B and the groups tell tasks apart, measured with labels that they never see."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bgpo_trl.data.bank import DemonstrationBank
+from bgpo_trl.modules.behavior_groups import BehaviorGroups
+from bgpo_trl.modules.gwr import GWRB
+
+
+@torch.no_grad()
+def match_counts(gwr: GWRB, bank: DemonstrationBank, n_tasks: int) -> Tensor:
+    """Counts for which demonstrations each node of GWR-B is the best match.
+
+    Args:
+        gwr: The network(s), ``batch_size`` ``[*S]``.
+        bank: Demonstrations to look up.
+        n_tasks: Number of tasks.
+
+    Returns:
+        Counts ``[*S, N, n_tasks]``, int64, nodes in order of creation, ``N`` the largest network's
+        size; rows beyond a smaller network's size are 0.
+    """
+    node = gwr.lookup(bank.embedding.expand(*gwr.batch_size, *bank.embedding.shape)).node
+    counts = torch.zeros(*gwr.batch_size, int(gwr.num_nodes.max()), n_tasks, dtype=torch.int64)
+    for index in np.ndindex(*gwr.batch_size):
+        position = torch.searchsorted(gwr.graph(index).node, node[index])
+        counts[index].index_put_((position, bank.task), torch.tensor(1), accumulate=True)
+    return counts
+
+
+def majority_task(counts: Tensor) -> Tensor:
+    """Returns the task with the most matches of each node, int64 ``[..., N]``; -1 without a match.
+
+    Args:
+        counts: From `match_counts`, ``[..., N, n_tasks]``.
+    """
+    return torch.where(counts.sum(-1) > 0, counts.argmax(-1), -1)
+
+
+def task_inference_accuracy(
+    gwr: GWRB, seen: DemonstrationBank, tested: DemonstrationBank, n_tasks: int
+) -> Tensor:
+    """Returns how often the matched node's majority task is the demonstration's own, ``[*S]``.
+
+    Args:
+        gwr: The network(s), ``batch_size`` ``[*S]``.
+        seen: Demonstrations that give each node its majority task.
+        tested: Demonstrations whose task is inferred.
+        n_tasks: Number of tasks.
+    """
+    task_of_node = majority_task(match_counts(gwr, seen, n_tasks))
+    matched = match_counts(gwr, tested, n_tasks)
+    right = matched.gather(-1, task_of_node.clamp(min=0).unsqueeze(-1)).squeeze(-1)
+    right = torch.where(task_of_node >= 0, right, 0)
+    return right.sum(-1) / matched.sum((-1, -2))
+
+
+@torch.no_grad()
+def group_purity(groups: BehaviorGroups, bank: DemonstrationBank, n_tasks: int) -> Tensor:
+    """Returns the share of demonstrations that are of the majority task of their group, ``[*S]``.
+
+    Args:
+        groups: The groups, ``batch_size`` ``[*S]``.
+        bank: Demonstrations, of whose labels the groups know nothing.
+        n_tasks: Number of tasks.
+    """
+    batch = groups.batch_size
+    group = groups.lookup(bank.embedding.expand(*batch, *bank.embedding.shape)).group
+    counts = torch.zeros(*batch, int(groups.num_groups.max()), n_tasks)
+    for index in np.ndindex(*batch):
+        counts[index].index_put_((group[index], bank.task), torch.tensor(1.0), accumulate=True)
+    return counts.amax(-1).sum(-1) / len(bank.task)

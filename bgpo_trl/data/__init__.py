@@ -1,0 +1,1 @@
+"""Demonstrations and experience: recording, embedding bank, replay buffers."""

@@ -1,0 +1,240 @@
+"""The bank of embedded demonstrations, and what a learner can take from their steps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from bgpo_trl.files.tensor_file import load_tensors, save_tensors
+from suites import nico
+
+_LATENT_CODES, _ACTION_CODES = 25.0, 127.0
+"""Codes of an int8 for one standard deviation of a latent (so up to 5.08), for an action of 1."""
+
+
+@dataclass(frozen=True)
+class DemonstrationSteps:
+    """Latents and actions along demonstrations, in eight bits a number.
+
+    Rounding errs by up to 0.02 standard deviations of a latent and by 0.004 of an action.
+
+    Attributes:
+        latent: The frames of all demonstrations one after the other, int8 ``[F, 64]``.
+        action: The action that leads from each frame to the next, int8 ``[F, 4]``; that of the last
+            frame of a demonstration means nothing.
+        first: The first frame of each demonstration, int64 ``[N]``.
+        length: Frames of each demonstration, int64 ``[N]``; 0 where none are kept.
+
+    Raises:
+        ValueError: If shapes or types do not fit together, or a frame is missing.
+    """
+
+    latent: Tensor
+    action: Tensor
+    first: Tensor
+    length: Tensor
+
+    def __post_init__(self) -> None:
+        if not (
+            self.latent.dtype == self.action.dtype == torch.int8
+            and self.first.dtype == self.length.dtype == torch.int64
+            and self.latent.ndim == self.action.ndim == 2
+            and len(self.latent) == len(self.action)
+            and self.first.shape == self.length.shape
+            and bool((self.first >= 0).all() and (self.length >= 0).all())
+            and bool((self.first + self.length <= len(self.latent)).all())
+        ):
+            raise ValueError("its steps do not fit together")
+
+    @classmethod
+    def of(cls, latent: Tensor, action: Tensor, length: Tensor) -> DemonstrationSteps:
+        """Takes in padded demonstrations.
+
+        Args:
+            latent: Standardised latents ``[N, T, 64]``; beyond five deviations they are clipped.
+            action: ``[N, T - 1, 4]`` in [-1, 1].
+            length: Frames of each to be kept, int64 ``[N]``.
+        """
+        valid = torch.arange(latent.shape[1]) < length.unsqueeze(-1)
+        padded = torch.nn.functional.pad(action, (0, 0, 0, 1))
+        return cls(
+            (latent[valid] * _LATENT_CODES).round().clamp(-127, 127).to(torch.int8),
+            (padded[valid] * _ACTION_CODES).round().clamp(-127, 127).to(torch.int8),
+            length.cumsum(0) - length,
+            length.clone(),
+        )
+
+    def latents(self, frame: Tensor) -> Tensor:
+        """Returns the latents of frames int64 ``[...]``, float32 ``[..., 64]``."""
+        return self.latent[frame] / _LATENT_CODES
+
+    def actions(self, frame: Tensor) -> Tensor:
+        """Returns the actions that lead on from frames int64 ``[...]``, float32 ``[..., 4]``."""
+        return self.action[frame] / _ACTION_CODES
+
+    def select(self, rows: Tensor) -> DemonstrationSteps:
+        """Returns the steps of some demonstrations, sharing the frames of all."""
+        return replace(self, first=self.first[rows], length=self.length[rows])
+
+    def __add__(self, other: DemonstrationSteps) -> DemonstrationSteps:
+        """Returns the steps of both."""
+        return DemonstrationSteps(
+            torch.cat([self.latent, other.latent]),
+            torch.cat([self.action, other.action]),
+            torch.cat([self.first, other.first + len(self.latent)]),
+            torch.cat([self.length, other.length]),
+        )
+
+
+@dataclass(frozen=True)
+class DemonstrationBank:
+    """Embedded demonstrations: all that BGPO needs of them once the encoders are trained.
+
+    Attributes:
+        embedding: phi, float32 ``[N, 32]``.
+        task: Labels, int64 ``[N]``; for the draw of an episode's task and for evaluation.
+        train: Bool ``[N]``; False for demonstrations held out for test episodes.
+        tasks: Names of the tasks, in the order of their labels.
+        steps: Latents and actions along the demonstrations, in the same order; None in a bank
+            without them.
+
+    Raises:
+        ValueError: If a label has no name, or the steps are of another number of demonstrations.
+    """
+
+    embedding: Tensor
+    task: Tensor
+    train: Tensor
+    tasks: tuple[str, ...] = nico.ALL_TASKS
+    steps: DemonstrationSteps | None = None
+
+    def __post_init__(self) -> None:
+        unknown = self.task[(self.task < 0) | (self.task >= len(self.tasks))]
+        if len(unknown):
+            raise ValueError(
+                f"there is a demonstration of task {int(unknown[0])}, but tasks names only "
+                f"{len(self.tasks)}: {', '.join(self.tasks)}"
+            )
+        if self.steps is not None and len(self.steps.first) != len(self.embedding):
+            raise ValueError(
+                f"there are steps of {len(self.steps.first)} demonstrations, but embeddings of "
+                f"{len(self.embedding)}"
+            )
+
+    def seen(self) -> DemonstrationBank:
+        """Returns the demonstrations for training episodes."""
+        return self._select(self.train)
+
+    def held_out(self, part: Literal["validation", "test"] | None = None) -> DemonstrationBank:
+        """Returns the demonstrations for test episodes.
+
+        Args:
+            part: Every other one of each task, from the first on to choose settings by, or from
+                the second on to report results on; None for all.
+        """
+        rows = torch.nonzero(~self.train).flatten()
+        if part is None:
+            return self._select(rows)
+        task = self.task[rows].unsqueeze(-1)
+        place = (task == torch.arange(len(self.tasks))).cumsum(0).gather(-1, task).flatten() - 1
+        return self._select(rows[place % 2 == (part == "test")])
+
+    def of_task(self, task: int) -> DemonstrationBank:
+        """Returns the demonstrations of one task."""
+        return self._select(self.task == task)
+
+    def for_tasks(self, tasks: Sequence[str]) -> DemonstrationBank:
+        """Returns the demonstrations of some tasks, labeled by their places among these.
+
+        Args:
+            tasks: Names, in the order of the labels wanted.
+
+        Raises:
+            ValueError: If there is no demonstration of one of them.
+        """
+        missing = [name for name in tasks if name not in self.tasks]
+        if missing:
+            raise ValueError(
+                f"the bank has no demonstration of {missing[0]!r}, only of "
+                f"{', '.join(self.tasks)}: record and embed some (docs/extending.md)"
+            )
+        label = torch.tensor([tasks.index(n) if n in tasks else -1 for n in self.tasks])
+        kept = self._select(label[self.task] >= 0)
+        return replace(kept, task=label[kept.task], tasks=tuple(tasks))
+
+    def __add__(self, other: DemonstrationBank) -> DemonstrationBank:
+        """Returns the demonstrations of both; tasks that only the other has come last."""
+        tasks = tuple(dict.fromkeys((*self.tasks, *other.tasks)))
+        label = torch.tensor([tasks.index(name) for name in other.tasks])
+        return DemonstrationBank(
+            torch.cat([self.embedding, other.embedding]),
+            torch.cat([self.task, label[other.task]]),
+            torch.cat([self.train, other.train]),
+            tasks,
+            None if self.steps is None or other.steps is None else self.steps + other.steps,
+        )
+
+    def _select(self, rows: Tensor) -> DemonstrationBank:
+        return replace(
+            self,
+            embedding=self.embedding[rows],
+            task=self.task[rows],
+            train=self.train[rows],
+            steps=None if self.steps is None else self.steps.select(rows),
+        )
+
+    def save(self, path: str | Path, *, encoder_id: str) -> None:
+        """Writes the bank as safetensors, with the scene version and the encoders' identity.
+
+        Raises:
+            OSError: If the file cannot be written; one that was there stays.
+        """
+        tensors = {"embedding": self.embedding, "task": self.task, "train": self.train}
+        if self.steps is not None:
+            tensors |= {f"steps.{key}": value for key, value in vars(self.steps).items()}
+        meta = {
+            "scene_version": nico.scene_version(),
+            "encoder_id": encoder_id,
+            "tasks": ",".join(self.tasks),
+        }
+        save_tensors(path, tensors, meta)
+
+    @classmethod
+    def load(cls, path: str | Path, *, encoder_id: str) -> DemonstrationBank:
+        """Reads a bank.
+
+        Raises:
+            ValueError: If it is missing, damaged, or made in another scene or by other encoders.
+        """
+        wanted = {"scene_version": nico.scene_version(), "encoder_id": encoder_id}
+        remedy = "make it anew with `--train-encoders`"
+        try:
+            tensors, meta = load_tensors(path)
+            if not meta.get("tasks"):
+                raise ValueError("it does not say which tasks it is about")
+            columns = {k.removeprefix("steps."): t for k, t in tensors.items() if "." in k}
+            rows = {key: tensor for key, tensor in tensors.items() if "." not in key}
+            steps = DemonstrationSteps(**columns) if columns else None
+            bank = cls(**rows, tasks=tuple(meta["tasks"].split(",")), steps=steps)
+        except FileNotFoundError:
+            raise ValueError(f"there is no demonstration bank at {path}; {remedy}") from None
+        except (ValueError, TypeError) as error:
+            raise ValueError(f"{path} is damaged or no bank ({error}); {remedy}") from None
+        embedding, task, train = bank.embedding, bank.task, bank.train
+        if not (
+            embedding.ndim == 2
+            and task.shape == train.shape == embedding.shape[:1]
+            and (embedding.dtype, task.dtype, train.dtype)
+            == (torch.float32, torch.int64, torch.bool)
+            and embedding.isfinite().all()
+        ):
+            raise ValueError(f"{path} is damaged (wrong shapes, or NaN); {remedy}")
+        found = {key: meta.get(key) for key in wanted}
+        if found != wanted:
+            raise ValueError(f"{path} belongs to {found}, but needed is {wanted}; {remedy}")
+        return bank

@@ -1,0 +1,201 @@
+"""Experience replay that is drawn group by group, each seed from its own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from torch import Tensor
+
+from bgpo_trl.data.replay import ReplayBuffer
+from bgpo_trl.modules.entries import lacking
+
+__all__ = ["GroupReplay", "draw_shares"]
+
+GROUP = "group"
+
+
+class GroupReplay:
+    """Ring buffer of transitions that remembers the group of each; a row is drawn from one group.
+
+    All groups of a seed share its capacity, so memory does not depend on how many there are.
+
+    Args:
+        capacity: transitions kept for each seed; then the oldest are replaced.
+        generator: sources of the draws, one for each of ``S`` seeds.
+        keys: entries to store.
+
+    Examples:
+        >>> replay = GroupReplay(100, generator=[torch.Generator()], keys=["state"])
+        >>> for step in range(6):
+        ...     transition = TensorDict({"state": torch.full([1, 1], float(step))}, [1])
+        ...     replay.add(transition, group=torch.tensor([step % 2]))
+        >>> drawn = replay.sample(torch.tensor([[1, 1, 1, 7]]))
+        >>> (drawn["state"][0, :3] % 2 == 1).all(), drawn["priority_weight"][0]
+        (tensor(True), tensor([1., 1., 1., 0.]))
+    """
+
+    def __init__(
+        self,
+        capacity: int,
+        *,
+        generator: Sequence[torch.Generator],
+        keys: Sequence[NestedKey],
+    ) -> None:
+        self._buffer = ReplayBuffer(capacity, generator=list(generator), keys=[*keys, GROUP])
+        self._generators = list(generator)
+        self._index = [_Index() for _ in self._generators]
+
+    def __len__(self) -> int:
+        """Returns the number of transitions that every seed holds at least."""
+        return len(self._buffer)
+
+    @property
+    def transition_size(self) -> int:
+        """Bytes that a transition takes, its group included; 0 before the first one."""
+        return self._buffer.transition_size
+
+    def sizes(self, group: Tensor) -> Tensor:
+        """Returns the number of transitions held of each of the groups ``[S, G]``."""
+        oldest = self._buffer.oldest.tolist()
+        return torch.tensor(
+            [
+                [len(index.of(number, first)) for number in row]
+                for index, first, row in zip(self._index, oldest, group.tolist(), strict=True)
+            ]
+        ).view(group.shape)
+
+    def add(self, transition: TensorDictBase, group: Tensor, mask: Tensor | None = None) -> None:
+        """Stores one transition of each seed.
+
+        Args:
+            transition: batch size ``[S]``, with the entries to store.
+            group: the group of each, int64 ``[S]``, at least 0.
+            mask: bool ``[S]``, which seeds store theirs; ``None`` for all.
+
+        Raises:
+            ValueError: if an entry is missing, or of another shape or dtype than those stored.
+        """
+        steps = self._buffer.n_added.tolist()
+        missing = [key for key in self._buffer.keys or () if key not in transition.keys(True)]
+        if set(missing) - {GROUP}:
+            raise lacking("GroupReplay", transition, missing)
+        kept = transition.select(*(key for key in self._buffer.keys or () if key != GROUP))
+        self._buffer.add(kept.set(GROUP, group), mask)
+        chosen = range(len(steps)) if mask is None else mask.nonzero().flatten().tolist()
+        groups = group.tolist()
+        for seed in chosen:
+            self._index[seed].append(groups[seed], steps[seed])
+
+    def sample(
+        self,
+        group: Tensor,
+        *,
+        seeds: Sequence[int] | None = None,
+        generator: Sequence[torch.Generator] | None = None,
+    ) -> TensorDict:
+        """Draws a transition for each row, uniformly and with replacement from the row's group.
+
+        Args:
+            group: the group of each row, int64 ``[S, R]``; -1 for rows that are to stay empty,
+                which draw nothing.
+            seeds: positions of the seeds to draw for, ``S`` of them; ``None`` for all.
+            generator: sources of the draws in place of the replay's own, one for each of those.
+
+        Returns:
+            Batch size ``[S, R]``, with ``"priority_weight"``, by which losses of TorchRL weight a
+            transition: 1, or 0 for rows without a group or of a group that holds nothing; their
+            other entries mean nothing.
+
+        Raises:
+            ValueError: if a seed holds no transition at all.
+        """
+        if not len(self):
+            raise ValueError("every seed needs a transition before the first sample")
+        seeds = range(len(self._generators)) if seeds is None else seeds
+        sources = [self._generators[seed] for seed in seeds] if generator is None else generator
+        oldest = self._buffer.oldest.tolist()
+        steps = np.empty(group.shape, np.int64)
+        weight = np.ones(group.shape, np.float32)
+        wanted, all_shares = group.numpy(), draw_shares(group, sources).numpy()
+        for i, (seed, shares) in enumerate(zip(seeds, all_shares, strict=True)):
+            for number in np.unique(wanted[i]).tolist():
+                rows = wanted[i] == number
+                held = self._index[seed].of(number, oldest[seed])
+                if len(held):
+                    steps[i, rows] = held[(shares[rows] * len(held)).astype(np.int64)]
+                else:
+                    steps[i, rows], weight[i, rows] = oldest[seed], 0.0
+        drawn = self._buffer.take(torch.from_numpy(steps), seeds=seeds).exclude(GROUP)
+        return drawn.set("priority_weight", torch.from_numpy(weight))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Returns the filled part (a copy) and the states of the generators."""
+        return self._buffer.state_dict()
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Restores what `state_dict` returned, so that the same samples follow."""
+        self._buffer.load_state_dict(state_dict)
+        self._index = [_Index() for _ in self._generators]
+        for seed, (first, end) in enumerate(
+            zip(self._buffer.oldest.tolist(), self._buffer.n_added.tolist(), strict=True)
+        ):
+            if first == end:
+                continue
+            steps = torch.arange(first, end).unsqueeze(0)
+            groups = self._buffer.take(steps, [GROUP], seeds=[seed])[GROUP][0]
+            for step, group in zip(range(first, end), groups.tolist(), strict=True):
+                self._index[seed].append(group, step)
+
+
+def draw_shares(group: Tensor, generator: Sequence[torch.Generator]) -> Tensor:
+    """Draws a number in [0, 1) for each row that has a group; the others draw nothing.
+
+    So a seed draws the same however many slots it leaves free.
+
+    Args:
+        group: the group of each row, int64 ``[S, R]``; -1 for rows without one.
+        generator: one for each of ``S`` seeds.
+
+    Returns:
+        float64 ``[S, R]``, 0 for rows without a group.
+    """
+    shares = torch.zeros(group.shape, dtype=torch.float64)
+    for row, wanted, source in zip(shares, group >= 0, generator, strict=True):
+        row[wanted] = torch.rand(int(wanted.sum()), generator=source, dtype=torch.float64)
+    return shares
+
+
+class _Index:
+    """The steps at which a seed stored transitions of each group, in order of time."""
+
+    def __init__(self) -> None:
+        self._steps: dict[int, NDArray[np.int64]] = {}
+        self._span: dict[int, tuple[int, int]] = {}
+
+    def append(self, group: int, step: int) -> None:
+        steps = self._steps.get(group)
+        first, end = self._span.get(group, (0, 0))
+        if steps is None:
+            steps = self._steps[group] = np.empty(1024, np.int64)
+        elif end == len(steps):
+            held = steps[first:end]
+            steps = self._steps[group] = np.empty(2 * len(held) + 1024, np.int64)
+            steps[: len(held)] = held
+            first, end = 0, len(held)
+        steps[end] = step
+        self._span[group] = first, end + 1
+
+    def of(self, group: int, oldest: int) -> NDArray[np.int64]:
+        """Returns the steps of a group that are not overwritten yet."""
+        if group not in self._steps:
+            return np.empty(0, np.int64)
+        steps, (first, end) = self._steps[group], self._span[group]
+        if first < end and steps[first] < oldest:
+            first += int(np.searchsorted(steps[first:end], oldest))
+            self._span[group] = first, end
+        return steps[first:end]

@@ -1,0 +1,172 @@
+"""Experience of each task, for learners that are told the tasks' labels."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, cast
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from torch import Tensor
+
+from bgpo_trl.data.demonstration_replay import DemonstrationReplay
+from bgpo_trl.data.group_replay import GroupReplay
+from bgpo_trl.modules.entries import lacking
+
+__all__ = ["TaskReplay"]
+
+
+class TaskReplay:
+    """Replay drawn task by task, of each task as much, for learners that are told the labels.
+
+    Args:
+        capacity: transitions kept of each seed, of all tasks.
+        n_tasks: number of tasks ``T``.
+        batch_size: transitions ``B`` drawn of each task by `sample`.
+        generator: sources of the draws, one for each of ``S`` seeds.
+        keys: entries to store.
+        demonstrations: replay of the demonstrations that were shown, for a share of each batch.
+        demonstration_share: that share, at least 0 and below 1.
+
+    Raises:
+        ValueError: if there is no task, or no task could ever fill a batch.
+
+    Examples:
+        >>> streams = [torch.Generator() for _ in range(10)]
+        >>> options = {"n_tasks": 3, "batch_size": 2, "keys": ["state"]}
+        >>> replay = TaskReplay(1000, generator=streams, **options)
+        >>> played = {"state": torch.ones(10, 5), "task": torch.arange(10) % 2}
+        >>> for _ in range(4):
+        ...     replay.add(TensorDict(played, [10]))
+        >>> replay.sizes[0].tolist(), replay.sample()["priority_weight"][0].tolist()
+        ([4, 0, 0], [[1.0, 1.0], [0.0, 0.0], [0.0, 0.0]])
+    """
+
+    def __init__(
+        self,
+        capacity: int,
+        *,
+        n_tasks: int,
+        batch_size: int,
+        generator: Sequence[torch.Generator],
+        keys: Sequence[NestedKey],
+        demonstrations: DemonstrationReplay | None = None,
+        demonstration_share: float = 0.0,
+    ) -> None:
+        if n_tasks < 1 or not generator:
+            raise ValueError("there must be at least one seed and one task")
+        if capacity < batch_size:
+            raise ValueError(f"capacity must be at least batch_size {batch_size}, got {capacity}")
+        self.batch_size, self.n_tasks = batch_size, n_tasks
+        self._replay = GroupReplay(capacity, generator=generator, keys=keys)
+        self._demonstrations = demonstrations
+        self._n_shown = round(demonstration_share * batch_size)
+        self._tasks = torch.arange(n_tasks).expand(len(generator), n_tasks)
+
+    @property
+    def sizes(self) -> Tensor:
+        """Number of transitions held of each task of each seed, int64 ``[S, T]``."""
+        return self._replay.sizes(self._tasks)
+
+    @property
+    def ready(self) -> Tensor:
+        """Which tasks of each seed fill a batch without repetition, bool ``[S, T]``."""
+        return self.sizes >= self.batch_size
+
+    @property
+    def enough(self) -> int:
+        """Transitions that fill a batch of some task, whichever tasks they are of.
+
+        Learning that waits for them begins with the same step for all seeds, so that none begins
+        earlier, or counts more steps in its optimizer, than it would alone.
+        """
+        return self.n_tasks * (self.batch_size - 1) + 1
+
+    def __len__(self) -> int:
+        """Returns the number of transitions that every seed holds at least, of all tasks."""
+        return len(self._replay)
+
+    def add(self, transition: TensorDictBase) -> None:
+        """Stores one transition of each seed with its task, and the demonstration at its end.
+
+        Args:
+            transition: batch size ``[S]``, with the entries to store and ``"task"`` int64 ``[S]``.
+
+        Raises:
+            ValueError: if an entry is missing, or there is no such task.
+        """
+        task = transition.get("task", None)
+        if task is None:
+            raise lacking("TaskReplay", transition, ["task"])
+        if not ((task >= 0) & (task < self.n_tasks)).all():
+            raise ValueError(f"task must lie in 0..{self.n_tasks - 1}, got {task.tolist()}")
+        self._replay.add(transition, task)
+        if self._demonstrations is not None:
+            ended = transition.get(("next", "done")).flatten()
+            self._demonstrations.add(transition, torch.ones(len(task)), task, ended)
+
+    def sample(self) -> TensorDictBase:
+        """Draws transitions of each task of each seed, those of demonstrations last.
+
+        Returns:
+            Batch size ``[S, T, B]``, with ``"priority_weight"``, by which losses of TorchRL weight
+            a transition: 1, or 0 for tasks that are not `ready`.
+
+        Raises:
+            ValueError: if no task is ready.
+        """
+        task = self._ready_tasks()
+        if self._demonstrations is None or not len(self._demonstrations):
+            return self._draw(self._replay, task, self.batch_size)
+        played = self._draw(self._replay, task, self.batch_size - self._n_shown)
+        shown = self._draw(self._demonstrations, task, self._n_shown)
+        return cast(TensorDictBase, torch.cat([played, shown], -1))
+
+    def sample_played(
+        self, batch_size: int, *, generator: Sequence[torch.Generator] | None = None
+    ) -> TensorDict:
+        """Draws transitions that were played, of each task of each seed, as `sample`.
+
+        Args:
+            batch_size: how many of each.
+            generator: sources of the draws in place of the replay's own, one for each seed.
+        """
+        return self._draw(self._replay, self._ready_tasks(), batch_size, generator=generator)
+
+    def sample_seed(self, seed: int, tasks: Sequence[int], batch_size: int) -> TensorDict:
+        """Draws transitions of some tasks of one seed, ``[len(tasks), B]``.
+
+        Args:
+            seed: position of the seed.
+            tasks: which, in this order; each holds a transition at least.
+            batch_size: how many of each.
+        """
+        task = torch.tensor([tasks])
+        return self._draw(self._replay, task, batch_size, seeds=[seed])[0]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Returns all that future samples depend on."""
+        shown = self._demonstrations
+        return {
+            "played": self._replay.state_dict(),
+            "shown": None if shown is None else shown.state_dict(),
+        }
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Restores what `state_dict` returned, so that the same samples follow."""
+        self._replay.load_state_dict(state_dict["played"])
+        if self._demonstrations is not None:
+            self._demonstrations.load_state_dict(state_dict["shown"])
+
+    def _ready_tasks(self) -> Tensor:
+        ready = self.ready
+        if not ready.any():
+            raise ValueError("no task fills a batch yet")
+        return torch.where(ready, self._tasks, -1)
+
+    @staticmethod
+    def _draw(
+        replay: GroupReplay | DemonstrationReplay, task: Tensor, n_rows: int, **options: Any
+    ) -> TensorDict:
+        rows = task.repeat_interleave(n_rows, dim=1)
+        return replay.sample(rows, **options).view(*task.shape, n_rows)

@@ -1,0 +1,138 @@
+"""Supervised training of one network: Adam with warm-up and cosine decay, log and checkpoints."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from torchrl.objectives import LossModule
+
+from bgpo_trl.configs import RepresentationConfig, SequenceAutoencoderConfig, VAEConfig
+from bgpo_trl.files.checkpoint import has_checkpoint, load_checkpoint, save_checkpoint
+from bgpo_trl.files.progress import progress_bar
+
+Log = Callable[[dict[str, Any]], None]
+"""Receives one row of a training log: stage, step, learning_rate and the losses."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """The training loop that both stages of the representation share.
+
+    Attributes:
+        config: what is trained; its seed and intervals apply to every stage.
+        folder: where each stage has a folder of checkpoints; None for no checkpoints.
+        log: receives a row every ``config.log_every`` steps.
+        progress: whether to show a progress bar.
+        device: where to train.
+    """
+
+    config: RepresentationConfig
+    folder: Path | None
+    log: Log | None
+    progress: bool
+    device: torch.device | str = "cpu"
+
+    def __call__(
+        self,
+        stage: str,
+        loss: LossModule,
+        sample: Callable[[torch.Generator], TensorDict],
+        schedule: VAEConfig | SequenceAutoencoderConfig,
+        generator: torch.Generator,
+    ) -> None:
+        """Trains ``loss.parameters()``, from the last checkpoint if there is one.
+
+        Moves the loss to the device and leaves it there.
+
+        Args:
+            stage: names the progress bar, the log rows and the checkpoint.
+            loss: maps a batch to a TensorDict whose ``loss_*`` entries are summed.
+            sample: draws a batch, on the CPU.
+            schedule: the stage's gradient steps and learning rate.
+            generator: the only source of randomness of ``sample`` and ``loss``; kept in the
+                checkpoint, so that an interrupted training continues to the same weights.
+
+        Raises:
+            ValueError: if the loss is no longer finite, or the checkpoints are damaged or belong to
+                another configuration.
+            OSError: if a checkpoint cannot be written.
+        """
+        loss.to(self.device)
+        optimizer = torch.optim.Adam(loss.parameters(), lr=schedule.learning_rate)
+        path = self.folder / stage if self.folder else None
+        start = self._resume(path, loss, optimizer, generator)
+        bar = progress_bar(
+            f"train {stage}",
+            range(start, schedule.steps),
+            shown=self.progress,
+            initial=start,
+            total=schedule.steps,
+        )
+        for step in bar:
+            rate = schedule.learning_rate * _decay(step, schedule.steps, schedule.warmup_steps)
+            for group in optimizer.param_groups:
+                group["lr"] = rate
+            losses = loss(sample(generator).to(self.device))
+            objective = [value for key, value in losses.items() if key.startswith("loss_")]
+            optimizer.zero_grad()
+            torch.stack(objective).sum().backward()
+            optimizer.step()
+            done = step + 1
+            if done % self.config.log_every == 0 or done == schedule.steps:
+                parts = {key: value.item() for key, value in losses.items()}
+                if not all(math.isfinite(value) for value in parts.values()):
+                    raise ValueError(f"{stage} diverged at step {done}: lower its learning_rate")
+                shown = {k.removeprefix("loss_"): f"{v:.3g}" for k, v in parts.items()}
+                bar.set_postfix(shown, refresh=False)
+                if self.log:
+                    self.log({"stage": stage, "step": done, "learning_rate": rate, **parts})
+            if path and (done % self.config.checkpoint_every == 0 or done == schedule.steps):
+                self._save(path, done, loss, optimizer, generator)
+
+    def _save(
+        self,
+        path: Path,
+        step: int,
+        loss: LossModule,
+        optimizer: torch.optim.Optimizer,
+        generator: torch.Generator,
+    ) -> None:
+        state = {
+            "config": json.dumps(asdict(self.config)),
+            "step": step,
+            "loss": loss.state_dict(),
+            "optimizer": optimizer.state_dict(),
+            "generator": generator.get_state(),
+        }
+        save_checkpoint(path, state)
+
+    def _resume(
+        self,
+        path: Path | None,
+        loss: LossModule,
+        optimizer: torch.optim.Optimizer,
+        generator: torch.Generator,
+    ) -> int:
+        if not path or not has_checkpoint(path):
+            return 0
+        saved = load_checkpoint(path)
+        if saved["config"] != json.dumps(asdict(self.config)):
+            raise ValueError(
+                f"{path} belongs to a training with another configuration: "
+                "remove it or choose another checkpoint folder"
+            )
+        loss.load_state_dict(saved["loss"])
+        optimizer.load_state_dict(saved["optimizer"])
+        generator.set_state(saved["generator"])
+        return saved["step"]
+
+
+def _decay(step: int, steps: int, warmup_steps: int) -> float:
+    return min(1.0, (step + 1) / warmup_steps) * (1 + math.cos(math.pi * step / steps)) / 2

@@ -1,0 +1,84 @@
+"""Embed recorded demonstrations: ``python -m bgpo_trl.encoders.make_bank data/nico``."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+import torch
+import tyro
+from tensordict import TensorDictBase
+
+from bgpo_trl.data.bank import DemonstrationBank, DemonstrationSteps
+from bgpo_trl.data.recording import load_demonstrations
+from bgpo_trl.encoders.representation import (
+    Representation,
+    bank_path,
+    default_weights,
+    encode_frames,
+    load_representation,
+)
+from suites import nico
+
+
+@torch.no_grad()
+def make_bank(
+    representation: Representation,
+    dataset: TensorDictBase,
+    *,
+    tasks: Sequence[str] = nico.ALL_TASKS,
+    actions: Literal["inferred", "recorded"] = "inferred",
+) -> DemonstrationBank:
+    """Embeds demonstrations, and keeps the steps of those for training.
+
+    Args:
+        representation: The trained encoders.
+        dataset: Reads ``pixels`` ``[N, T, 32, 64, 3]``, ``length``, ``task`` and ``train`` ``[N]``.
+        tasks: Names of the tasks, in the order of their labels.
+        actions: Whether the steps have the actions that the VAE's inverse model infers from the
+            frames, which is all that an onlooker can know, or those that were recorded (``action``
+            ``[N, T - 1, 4]``), for comparison.
+    """
+    vae, length = representation.vae, dataset["length"]
+    latent = encode_frames(vae, dataset["pixels"], length)
+    action = dataset["action"]
+    if actions == "inferred":
+        mean = latent * vae.latent_std + vae.latent_mean
+        action = vae.inverse(mean[:, :-1], mean[:, 1:])
+    train = dataset["train"].clone()
+    return DemonstrationBank(
+        representation.lae.encode(latent, length),
+        dataset["task"].clone(),
+        train,
+        tuple(tasks),
+        DemonstrationSteps.of(latent, action, length * train),
+    )
+
+
+def main(
+    dataset: tyro.conf.Positional[Path],
+    weights: Path | None = None,
+    out: Path | None = None,
+    actions: Literal["inferred", "recorded"] = "inferred",
+) -> None:
+    """Embeds a recorded dataset with trained encoders.
+
+    Args:
+        dataset: Folder of the recorded demonstrations.
+        weights: The encoders; those that come with the package if not given.
+        out: The bank to write; the one beside the encoders if not given.
+        actions: Actions of the steps that learners take from demonstrations.
+    """
+    weights = default_weights() if weights is None else weights
+    encoders = load_representation(weights, scene_version=nico.scene_version())
+    bank = make_bank(encoders, load_demonstrations(dataset), actions=actions)
+    bank.save(out or bank_path(weights), encoder_id=encoders.identity)
+
+
+if __name__ == "__main__":
+    try:
+        tyro.cli(main)
+    except (ValueError, OSError) as error:
+        sys.exit(f"error: {error}")

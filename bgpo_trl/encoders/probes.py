@@ -1,0 +1,316 @@
+"""What the representation is worth: linear probes and distances, all on held-out demonstrations.
+
+    python -m bgpo_trl.encoders.probes data/nico data/nico-play
+
+A policy sees nothing but latents and behaviors, so what cannot be read from them here cannot be
+learned later. Every probe is fitted on training demonstrations and measured on held-out ones.
+The ground-truth ``state`` is read here and nowhere else in stage 1.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import matplotlib.image
+import torch
+import tyro
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from bgpo_trl.data.recording import load_demonstrations
+from bgpo_trl.encoders.representation import (
+    Representation,
+    default_weights,
+    encode_frames,
+    load_representation,
+    mean_frame,
+    split,
+    valid_frames,
+    valid_steps,
+)
+from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
+from bgpo_trl.modules.vae import VAE
+from bgpo_trl.objectives.representation import SequenceReconstructionLoss
+from suites import nico
+
+JOINTS = ("yaw", "pitch", "elbow", "hand")
+OBJECTS = ("glass", "green", "white")
+_FIRST_OBJECT = 7  # state: 4 joints (rad), grip point (m), three objects (m)
+
+
+def probe(
+    representation: Representation,
+    dataset: TensorDictBase,
+    folder: str | Path | None = None,
+    activity_threshold: float = 0.8,
+    *,
+    play: TensorDictBase | None = None,
+) -> dict[str, float]:
+    """Measures trained encoders.
+
+    Args:
+        representation: the encoders.
+        dataset: the demonstrations they were trained on, with their held-out part; reads
+            ``pixels``, ``action``, ``length``, ``train``, ``task`` and ``state`` ``[N, T, 16]``.
+        folder: where to write ``probes.json`` and ``reconstructions.png``; None for nowhere.
+        activity_threshold: a_T of GWR-B (Table 1), for :func:`embedding_distances`.
+        play: recorded play, in the form of the dataset: adds the joints' and objects' errors there,
+            as ``play_...``, wherever all objects are still on the table.
+
+    Returns:
+        Flat names to numbers: ``joint_<name>_rmse_rad`` and ``<object>_error_cm`` (linear probe of
+        one latent), ``inverse_rmse``, ``inverse_r2``, ``reconstruction`` (squared error a frame),
+        ``mean_frame_reconstruction`` (the same for the mean training frame, what a VAE that
+        learned nothing achieves), ``sequence_mse`` (of standardised latents, so 1 is nothing),
+        ``task_accuracy_linear``, ``task_accuracy_nearest``, ``active_dimensions`` and
+        the entries of :func:`embedding_distances`.
+
+    Raises:
+        ValueError: if the dataset has no training or no held-out demonstration.
+    """
+    vae, lae = representation.vae, representation.lae
+    train, held_out = split(dataset)
+    latent = encode_frames(vae, train.get("pixels"), train.get("length"))
+    latent_held_out = encode_frames(vae, held_out.get("pixels"), held_out.get("length"))
+    result = {
+        **_probe_state(latent, train, latent_held_out, held_out),
+        **_probe_inverse(vae, latent_held_out, held_out),
+        **_probe_reconstruction(vae, train, held_out),
+        **_probe_sequences(lae, latent_held_out, held_out),
+    }
+    spread = (latent * vae.latent_std)[valid_steps(train.get("length"), latent.shape[1])].std(0)
+    result["active_dimensions"] = float((spread > 0.1 * spread.max()).sum())
+
+    length, length_held_out = train.get("length"), held_out.get("length")
+    phi, phi_held_out = lae.encode(latent, length), lae.encode(latent_held_out, length_held_out)
+    task, task_held_out = train.get("task"), held_out.get("task")
+    scores = ridge_predict(phi, torch.nn.functional.one_hot(task).float(), phi_held_out)
+    nearest = torch.cdist(phi_held_out, phi).argmin(-1)
+    result |= {
+        "task_accuracy_linear": _mean(scores.argmax(-1) == task_held_out),
+        "task_accuracy_nearest": _mean(task[nearest] == task_held_out),
+        **embedding_distances(phi, task, activity_threshold),
+    }
+    if play is not None:
+        played, played_held_out = split(play)
+        latents = [
+            encode_frames(vae, part.get("pixels"), part.get("length"))
+            for part in (played, played_held_out)
+        ]
+        errors = _probe_state(
+            latents[0], played, latents[1], played_held_out, only=_objects_on_table
+        )
+        result |= {f"play_{name}": error for name, error in errors.items()}
+    if folder is not None:
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "probes.json").write_text(json.dumps(result, indent=2) + "\n")
+        picture = reconstruction_picture(vae, held_out)
+        matplotlib.image.imsave(folder / "reconstructions.png", picture.numpy())
+    return result
+
+
+def embedding_distances(
+    phi: Tensor, task: Tensor, activity_threshold: float = 0.8
+) -> dict[str, float]:
+    """Describes how embedded demonstrations lie relative to each other.
+
+    GWR-B calls a demonstration known if its activity ``exp(-distance)`` to a node reaches a_T
+    (Eq. 2, Table 1), so ``-ln a_T`` (.223 for .8) is the distance everything is compared with: if
+    all demonstrations are closer together than that, the network never grows; if hardly any
+    are, it grows a node for each of them.
+
+    Args:
+        phi: ``[N, embedding_size]``.
+        task: int64 ``[N]``.
+        activity_threshold: a_T.
+
+    Returns:
+        ``phi_nearest_same_task`` and ``phi_nearest_other_task`` (median over demonstrations of the
+        distance to the nearest one), ``phi_distance_same_task`` and ``phi_distance_other_task``
+        (median over pairs), ``phi_threshold_distance`` (``-ln a_T``) and ``phi_nearest_known``
+        (share of demonstrations whose nearest neighbour is closer than that). NaN where there is
+        no such pair.
+
+    Example:
+        >>> phi = torch.tensor([[0.0], [0.1], [1.0]])
+        >>> distances = embedding_distances(phi, torch.tensor([0, 0, 1]))
+        >>> round(distances["phi_nearest_same_task"], 3)
+        0.1
+    """
+    distance = torch.cdist(phi, phi, compute_mode="donot_use_mm_for_euclid_dist")
+    itself = torch.eye(len(phi), dtype=torch.bool)
+    same = (task.unsqueeze(0) == task.unsqueeze(1)) & ~itself
+    other = task.unsqueeze(0) != task.unsqueeze(1)
+
+    def nearest(mask: Tensor) -> Tensor:
+        return distance.masked_fill(~mask, math.inf).amin(-1)
+
+    threshold = -math.log(activity_threshold)
+    return {
+        "phi_nearest_same_task": _median(nearest(same)),
+        "phi_nearest_other_task": _median(nearest(other)),
+        "phi_distance_same_task": _median(distance[same]),
+        "phi_distance_other_task": _median(distance[other]),
+        "phi_threshold_distance": threshold,
+        "phi_nearest_known": _mean(nearest(~itself) < threshold),
+    }
+
+
+def ridge_predict(x: Tensor, y: Tensor, x_new: Tensor, penalty: float = 1e-4) -> Tensor:
+    """Fits ``y`` linearly (with intercept) on ``x`` and predicts for ``x_new``.
+
+    Args:
+        x: ``[N, d]``.
+        y: ``[N, k]``.
+        x_new: ``[M, d]``.
+        penalty: L2 penalty on the coefficients of standardised ``x``, a row.
+
+    Returns:
+        float32 ``[M, k]``.
+    """
+    scale, center = torch.std_mean(x.double(), 0)
+    scale = scale.clamp_min(1e-8)
+    a, b = (x - center) / scale, (x_new - center) / scale
+    offset = y.double().mean(0)
+    gram = a.T @ a / len(a) + penalty * torch.eye(a.shape[1], dtype=a.dtype)
+    weight = torch.linalg.solve(gram, a.T @ (y - offset) / len(a))
+    return (b @ weight + offset).float()
+
+
+@torch.no_grad()
+def reconstruction_picture(vae: VAE, demonstrations: TensorDictBase, columns: int = 12) -> Tensor:
+    """Returns original frames over their reconstructions, each pixel shown as 4 x 4.
+
+    Args:
+        vae: the encoder and decoder.
+        demonstrations: reads ``pixels`` ``[N, T, 32, 64, 3]`` and ``length`` ``[N]``; frames are
+            taken from all over them.
+        columns: number of frames.
+
+    Returns:
+        uint8 ``[2 * 32 * 4, columns * 64 * 4, 3]``.
+    """
+    share = torch.linspace(0, 1, columns)
+    demonstration = (share * (len(demonstrations) - 1)).round().long()
+    # A stride that is no divisor of 1 shows early, middle and late frames side by side.
+    time = (share * 5 % 1) * (demonstrations.get("length")[demonstration] - 1)
+    frames = demonstrations.get("pixels")[demonstration, time.round().long()]
+    decoded = (vae.decode(vae.encode(frames)[0]) * 255).round().to(torch.uint8)
+    rows = [torch.cat(list(images), 1) for images in (frames, decoded)]
+    return torch.cat(rows).repeat_interleave(4, 0).repeat_interleave(4, 1)
+
+
+def _probe_state(
+    latent: Tensor,
+    train: TensorDictBase,
+    latent_held_out: Tensor,
+    held_out: TensorDictBase,
+    only: Callable[[Tensor], Tensor] | None = None,
+) -> dict[str, float]:
+    valid, valid_held_out = (
+        valid_steps(part.get("length"), latent.shape[1]) for part in (train, held_out)
+    )
+    if only is not None:
+        valid = valid & only(train.get("state"))
+        valid_held_out = valid_held_out & only(held_out.get("state"))
+    state = held_out.get("state")[valid_held_out]
+    error = (
+        ridge_predict(latent[valid], train.get("state")[valid], latent_held_out[valid_held_out])
+        - state
+    )
+    joints = {
+        f"joint_{name}_rmse_rad": _mean(error[:, i].square()) ** 0.5
+        for i, name in enumerate(JOINTS)
+    }
+    first = {name: _FIRST_OBJECT + 3 * i for i, name in enumerate(OBJECTS)}
+    return joints | {
+        f"{name}_error_cm": 100 * _mean(error[:, i : i + 2].norm(dim=-1))
+        for name, i in first.items()
+    }
+
+
+def _objects_on_table(state: Tensor) -> Tensor:
+    """Returns where all objects are higher than 0.6 m, bool, of state ``[..., 16]``."""
+    return (state[..., _FIRST_OBJECT + 2 :: 3] > 0.6).all(-1)
+
+
+@torch.no_grad()
+def _probe_inverse(vae: VAE, latent: Tensor, held_out: TensorDictBase) -> dict[str, float]:
+    mu = latent * vae.latent_std + vae.latent_mean
+    action = held_out.get("action")
+    valid = valid_steps(held_out.get("length") - 1, action.shape[1])
+    action = action[valid]
+    error = vae.inverse(mu[:, :-1], mu[:, 1:])[valid] - action
+    explained = 1 - error.square().sum() / (action - action.mean(0)).square().sum()
+    return {"inverse_rmse": _mean(error.square()) ** 0.5, "inverse_r2": explained.item()}
+
+
+@torch.no_grad()
+def _probe_reconstruction(
+    vae: VAE, train: TensorDictBase, held_out: TensorDictBase
+) -> dict[str, float]:
+    frames, frames_held_out = valid_frames(train), valid_frames(held_out)
+    mean = mean_frame(frames)
+
+    def error(chunk: Tensor, guess: Tensor) -> Tensor:
+        return (chunk / 255 - guess).square().sum((-3, -2, -1))
+
+    chunks = frames_held_out.split(64)
+    decoded = [error(chunk, vae.decode(vae.encode(chunk)[0])) for chunk in chunks]
+    constant = [error(chunk, mean) for chunk in chunks]
+    return {
+        "reconstruction": _mean(torch.cat(decoded)),
+        "mean_frame_reconstruction": _mean(torch.cat(constant)),
+    }
+
+
+@torch.no_grad()
+def _probe_sequences(
+    lae: SequenceAutoencoder, latent: Tensor, held_out: TensorDictBase
+) -> dict[str, float]:
+    loss = SequenceReconstructionLoss(lae)
+    data = TensorDict({"latent": latent, "length": held_out.get("length")}, [len(latent)])
+    return {"sequence_mse": loss(data)["loss_reconstruction"].item()}
+
+
+def _mean(values: Tensor) -> float:
+    return values.double().mean().item()
+
+
+def _median(values: Tensor) -> float:
+    values = values[values.isfinite()]
+    return values.median().item() if values.numel() else math.nan
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Measures trained encoders."""
+
+    dataset: tyro.conf.Positional[Path]
+    """Folder of the recorded demonstrations."""
+    play: tyro.conf.Positional[Path | None] = None
+    """Folder of recorded play."""
+    weights: Path = field(default_factory=default_weights)
+    """The encoders; by default those that come with the package."""
+    out: Path = Path("runs/probes")
+    """Where ``probes.json`` and ``reconstructions.png`` go."""
+
+
+def main(arguments: Arguments) -> None:
+    """Runs the command line; see ``--help``."""
+    representation = load_representation(arguments.weights, scene_version=nico.scene_version())
+    play = None if arguments.play is None else load_demonstrations(arguments.play)
+    probe(representation, load_demonstrations(arguments.dataset), arguments.out, play=play)
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Arguments, description=Arguments.__doc__))
+    except (ValueError, OSError) as error:
+        sys.exit(f"error: {error}")

@@ -1,0 +1,292 @@
+"""Stage 1: learn to see. Trains, embeds, saves and loads the two frozen encoders.
+
+``train_representation`` runs the paper's Sec. III-A: first the VAE with its inverse model on the
+frames of the demonstrations and of play, then the LSTM autoencoder on the latents of the
+demonstrations. What the result is worth is measured in :mod:`bgpo_trl.encoders.probes`.
+
+A dataset is a TensorDict ``[N]`` with ``pixels`` uint8 ``[N, T, 32, 64, 3]``, ``action``
+``[N, T - 1, A]``, ``length`` int64 ``[N]`` (frames) and ``train`` bool ``[N]``.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from importlib import resources
+from pathlib import Path
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from bgpo_trl.configs import RepresentationConfig, SequenceAutoencoderConfig, VAEConfig
+from bgpo_trl.encoders.fitting import Fit, Log
+from bgpo_trl.files.tensor_file import digest, load_tensors, save_tensors
+from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
+from bgpo_trl.modules.vae import VAE
+from bgpo_trl.objectives.representation import SequenceReconstructionLoss, VAEInverseLoss
+
+
+@dataclass
+class Representation:
+    """The two trained encoders and where they come from.
+
+    Attributes:
+        vae: frame encoder; ``vae.latent(pixels)`` is the latent used downstream.
+        lae: sequence encoder; ``lae.encode(latent, length)`` is phi.
+        metadata: ``scene_version``, ``config`` (JSON), ``seed``, ``command``.
+    """
+
+    vae: VAE
+    lae: SequenceAutoencoder
+    metadata: dict[str, str]
+
+    @property
+    def identity(self) -> str:
+        """A digest of all weights: what was embedded with other encoders has another."""
+        return digest(_tensors(self))
+
+
+def train_representation(
+    dataset: TensorDictBase,
+    config: RepresentationConfig | None = None,
+    *,
+    play: TensorDictBase | None = None,
+    scene_version: str,
+    command: str = "",
+    checkpoint: str | Path | None = None,
+    log: Log | None = None,
+    progress: bool = True,
+    device: torch.device | str = "cpu",
+) -> Representation:
+    """Trains both encoders on the training demonstrations.
+
+    Args:
+        dataset: demonstrations, see the module's head. Held-out ones are not touched.
+        config: hyperparameters; ``RepresentationConfig()`` if not given.
+        play: episodes of play, in the form of the dataset, for the frame encoder to see besides the
+            demonstrations what trial and error brings.
+        scene_version: version of the scene that made the frames, stored with the weights.
+        command: the command line that asked for this, stored with the weights.
+        checkpoint: folder to write checkpoints to. An interrupted training that is called again
+            with the same folder continues, to the same weights.
+        log: receives a row every ``config.log_every`` steps.
+        progress: whether to show a progress bar for each of the two stages.
+        device: where to train.
+
+    Returns:
+        The trained encoders, on the CPU, in eval mode, without gradients.
+
+    Raises:
+        ValueError: if the dataset or the configuration cannot be trained on, or ``checkpoint``
+            belongs to a training with another configuration.
+    """
+    config = config or RepresentationConfig()
+    train, _ = split(dataset)
+    folder = Path(checkpoint) if checkpoint else None
+    fit = Fit(config, folder, log, progress, device)
+    seen = [train] if play is None else [train, split(play)[0]]
+    vae = _train_vae(seen, config.vae, fit, config.seed)
+    latent = encode_frames(vae, train.get("pixels"), train.get("length"))
+    lae = _train_lae(latent, train.get("length"), config.lae, fit, config.seed)
+    metadata = {
+        "scene_version": scene_version,
+        "config": json.dumps(asdict(config)),
+        "seed": str(config.seed),
+        "command": command,
+    }
+    return Representation(vae.cpu(), lae.cpu(), metadata)
+
+
+@torch.no_grad()
+def encode_frames(vae: VAE, pixels: Tensor, length: Tensor, batch_size: int = 64) -> Tensor:
+    """Encodes the valid frames of demonstrations, a few demonstrations' worth at a time.
+
+    Args:
+        vae: the trained frame encoder.
+        pixels: uint8 ``[N, T, 32, 64, 3]``.
+        length: int64 ``[N]``, valid frames of each.
+        batch_size: frames in one call of the encoder.
+
+    Returns:
+        Standardised latents, float32 ``[N, T, latent_size]``; zeros at and beyond ``length``.
+    """
+    latent = torch.zeros(*pixels.shape[:2], vae.latent_size)
+    demonstration, time = valid_steps(length, pixels.shape[1]).nonzero(as_tuple=True)
+    for d, t in zip(demonstration.split(batch_size), time.split(batch_size), strict=True):
+        latent[d, t] = vae.latent(pixels[d, t].to(vae.mean_frame.device)).cpu()
+    return latent
+
+
+@torch.no_grad()
+def embed_demonstrations(representation: Representation, dataset: TensorDictBase) -> Tensor:
+    """Embeds whole demonstrations, as Alg. 1 does with a demonstration before an episode.
+
+    Args:
+        representation: the trained encoders.
+        dataset: reads ``pixels`` ``[N, T, 32, 64, 3]`` and ``length`` ``[N]``.
+
+    Returns:
+        phi, float32 ``[N, embedding_size]``.
+    """
+    latent = encode_frames(representation.vae, dataset.get("pixels"), dataset.get("length"))
+    return representation.lae.encode(latent, dataset.get("length"))
+
+
+def default_weights() -> Path:
+    """Returns where the weights that come with the package lie."""
+    return Path(str(resources.files("bgpo_trl") / "weights" / "nico.safetensors"))
+
+
+def bank_path(weights: Path) -> Path:
+    """Returns where the bank embedded with encoders lies: ``nico_bank`` beside ``nico``."""
+    return weights.with_name(f"{weights.stem}_bank{weights.suffix}")
+
+
+def save_representation(representation: Representation, path: str | Path) -> None:
+    """Writes both encoders and the metadata to one safetensors file.
+
+    Args:
+        representation: what to save.
+        path: the file to write; missing folders are made.
+
+    Raises:
+        OSError: if it cannot be written; one that was there stays as it was.
+    """
+    save_tensors(path, _tensors(representation), representation.metadata)
+
+
+def load_representation(
+    path: str | Path | None = None, *, scene_version: str | None = None
+) -> Representation:
+    """Reads encoders that :func:`save_representation` wrote.
+
+    Args:
+        path: the file; the weights that come with the package if not given.
+        scene_version: version of the scene at hand; None to accept any.
+
+    Returns:
+        The encoders, in eval mode, without gradients.
+
+    Raises:
+        ValueError: if the file is missing, damaged, or belongs to another scene.
+    """
+    path = Path(path) if path is not None else default_weights()
+    remedy = "train new ones with --train-encoders"
+    try:
+        tensors, metadata = load_tensors(path)
+        if any(value.dtype != torch.float32 for value in tensors.values()):
+            raise ValueError("weights are float32")
+        config = json.loads(metadata["config"])
+        trained_on = metadata["scene_version"]
+        vae = VAE(config["vae"]["latent_size"], len(tensors["vae.inverse_head.bias"]))
+        lae = SequenceAutoencoder(vae.latent_size, config["lae"]["embedding_size"])
+        for name, module in (("vae.", vae), ("lae.", lae)):
+            module.load_state_dict(
+                {k.removeprefix(name): v for k, v in tensors.items() if k.startswith(name)}
+            )
+    except FileNotFoundError:
+        raise ValueError(f"no encoder weights at {path}: {remedy}") from None
+    except Exception as error:
+        raise ValueError(f"{path} is damaged or holds no encoder weights: {remedy}") from error
+    if scene_version is not None and trained_on != scene_version:
+        raise ValueError(
+            f"{path} was trained on scene {trained_on}, this is scene {scene_version}: {remedy}"
+        )
+    return Representation(
+        vae.eval().requires_grad_(False), lae.eval().requires_grad_(False), metadata
+    )
+
+
+def _tensors(representation: Representation) -> dict[str, Tensor]:
+    return {
+        f"{name}.{key}": value
+        for name, module in (("vae", representation.vae), ("lae", representation.lae))
+        for key, value in module.state_dict().items()
+    }
+
+
+def split(dataset: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+    """Returns the training and the held-out demonstrations, by the key ``train``.
+
+    Raises:
+        ValueError: if there is none of either.
+    """
+    chosen = dataset.get("train").bool()
+    if chosen.all() or not chosen.any():
+        raise ValueError("the dataset needs training and held-out demonstrations (key 'train')")
+    return dataset[chosen], dataset[~chosen]  # pyright: ignore[reportReturnType]
+
+
+def valid_steps(length: Tensor, steps: int) -> Tensor:
+    """Returns the mask of valid steps, bool ``[N, steps]``, of ``length`` ``[N]``."""
+    return torch.arange(steps) < length.unsqueeze(-1)
+
+
+def valid_frames(dataset: TensorDictBase) -> Tensor:
+    """Returns all valid frames one after the other, uint8 ``[sum(length), 32, 64, 3]``."""
+    pixels = dataset.get("pixels")
+    return pixels[valid_steps(dataset.get("length"), pixels.shape[1])]
+
+
+def mean_frame(frames: Tensor) -> Tensor:
+    """Returns the mean of uint8 ``[F, 32, 64, 3]`` as float32 ``[32, 64, 3]`` in [0, 1]."""
+    return frames.sum(0, dtype=torch.int64) / (255 * len(frames))
+
+
+def _train_vae(datasets: Sequence[TensorDictBase], config: VAEConfig, fit: Fit, seed: int) -> VAE:
+    length = torch.cat([dataset.get("length") for dataset in datasets])
+    if length.max() < config.window:
+        raise ValueError(f"the dataset has no training demonstration of {config.window} frames")
+    frames = torch.cat([valid_frames(dataset) for dataset in datasets])
+    # The last frame of a demonstration leads nowhere; its action is never read.
+    action = torch.cat([dataset.get("action") for dataset in datasets])
+    padded = torch.nn.functional.pad(action, (0, 0, 0, 1))
+    action = padded[valid_steps(length, padded.shape[1])]
+    first = length.cumsum(0) - length
+    starts = torch.cat(
+        [
+            torch.arange(int(f), int(f) + int(n) - config.window + 1)
+            for f, n in zip(first, length, strict=True)
+        ]
+    )
+
+    def sample(generator: torch.Generator) -> TensorDict:
+        n_windows = config.batch_size // config.window
+        drawn = starts[torch.randint(len(starts), (n_windows,), generator=generator)]
+        index = drawn.unsqueeze(-1) + torch.arange(config.window)
+        return TensorDict({"pixels": frames[index], "action": action[index]}, index.shape)
+
+    generator = torch.Generator().manual_seed(seed)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        vae = VAE(config.latent_size, action.shape[-1])
+    vae.mean_frame.copy_(mean_frame(frames))
+    loss = VAEInverseLoss(
+        vae,
+        reconstruction_weight=config.reconstruction_weight,
+        kl_weight=config.kl_weight,
+        inverse_weight=config.inverse_weight,
+        generator=generator,
+    )
+    fit("vae", loss, sample, config, generator)
+    vae.eval().requires_grad_(False)
+    chunks = (chunk.to(fit.device) for chunk in frames.split(64))
+    vae.set_latent_scale(torch.cat([vae.encode(chunk)[0] for chunk in chunks]))
+    return vae
+
+
+def _train_lae(
+    latent: Tensor, length: Tensor, config: SequenceAutoencoderConfig, fit: Fit, seed: int
+) -> SequenceAutoencoder:
+    def sample(generator: torch.Generator) -> TensorDict:
+        index = torch.randint(len(latent), (config.batch_size,), generator=generator)
+        return TensorDict({"latent": latent[index], "length": length[index]}, [config.batch_size])
+
+    generator = torch.Generator().manual_seed(seed)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        lae = SequenceAutoencoder(latent.shape[-1], config.embedding_size)
+    fit("lae", SequenceReconstructionLoss(lae), sample, config, generator)
+    return lae.eval().requires_grad_(False)

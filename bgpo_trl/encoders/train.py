@@ -1,0 +1,151 @@
+"""Command line of stage 1: ``python -m bgpo_trl.encoders.train data/nico data/nico-play``."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+import tyro
+from tensordict import TensorDictBase
+
+from bgpo_trl.configs import RepresentationConfig
+from bgpo_trl.data.bank import DemonstrationBank
+from bgpo_trl.data.recording import load_demonstrations
+from bgpo_trl.encoders.fitting import Log
+from bgpo_trl.encoders.make_bank import make_bank
+from bgpo_trl.encoders.probes import probe
+from bgpo_trl.encoders.representation import (
+    Representation,
+    bank_path,
+    default_weights,
+    save_representation,
+    train_representation,
+)
+from bgpo_trl.files.csv_file import CsvFile
+from bgpo_trl.files.folders import make_folder
+from bgpo_trl.machine import choose_device
+from suites import nico
+
+_COLUMNS = (
+    "stage",
+    "step",
+    "learning_rate",
+    "loss_reconstruction",
+    "loss_kl",
+    "loss_inverse",
+    "reconstruction",
+    "kl",
+    "inverse",
+)
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Trains both encoders on recorded demonstrations and play, then probes them."""
+
+    dataset: tyro.conf.Positional[Path]
+    """Folder of the recorded demonstrations."""
+    play: tyro.conf.Positional[Path | None] = None
+    """Folder of recorded play. Without it, the frame encoder sees demonstrations only."""
+    weights: Path = field(default_factory=default_weights)
+    """The file to write; by default the weights that come with the package."""
+    folder: Path = Path("runs/encoders")
+    """Where checkpoints, log and probes go. The same folder continues an interrupted training."""
+    config: RepresentationConfig = field(default_factory=RepresentationConfig)
+    """Hyperparameters."""
+    device: str = "auto"
+    """Where to train: cpu, cuda, or auto for a GPU if there is one."""
+
+
+def train_encoders(
+    dataset: TensorDictBase,
+    play: TensorDictBase | None,
+    weights: Path,
+    folder: Path,
+    config: RepresentationConfig,
+    command: str = "",
+    device: torch.device | str = "cpu",
+    progress: bool = True,
+    tasks: Sequence[str] = nico.ALL_TASKS,
+) -> tuple[Representation, DemonstrationBank]:
+    """Trains, saves and probes both encoders, and embeds the demonstrations with them.
+
+    Args:
+        dataset: demonstrations as in :mod:`bgpo_trl.encoders.representation`, with ``state`` and
+            ``task``.
+        play: recorded play, in the same form, or None.
+        weights: the safetensors file to write; the bank goes beside it, see `bank_path`.
+        folder: receives ``train.csv``, ``checkpoint/``, ``probes.json``, ``reconstructions.png``.
+        config: hyperparameters.
+        command: stored with the weights.
+        device: where to train.
+        progress: whether to show progress bars.
+        tasks: what the demonstrations are of, in the order of their labels.
+
+    Returns:
+        The trained encoders and the bank of embedded demonstrations.
+
+    Raises:
+        ValueError: as :func:`bgpo_trl.encoders.representation.train_representation`.
+        OSError: if the disk is full.
+    """
+    make_folder(folder)
+    with CsvFile(folder / "train.csv", _COLUMNS) as file:
+        representation = train_representation(
+            dataset,
+            config,
+            play=play,
+            scene_version=nico.scene_version(),
+            command=command,
+            checkpoint=folder / "checkpoint",
+            log=_log_of(file),
+            progress=progress,
+            device=device,
+        )
+    save_representation(representation, weights)
+    bank = make_bank(representation, dataset, tasks=tasks)
+    bank.save(bank_path(weights), encoder_id=representation.identity)
+    probe(representation, dataset, folder, play=play)
+    return representation, bank
+
+
+def _log_of(file: CsvFile) -> Log:
+    """Returns a log that drops what an interrupted training wrote of the steps made again."""
+
+    def log(row: dict[str, Any]) -> None:
+        again = file.path.read_bytes().find(f"\n{row['stage']},{row['step']},".encode())
+        if again >= 0:
+            file.truncate_to(again + 1)
+        file.write(row)
+
+    return log
+
+
+def main(arguments: Arguments) -> None:
+    """Runs the command line; see ``--help``."""
+    dataset = load_demonstrations(arguments.dataset)
+    play = None if arguments.play is None else load_demonstrations(arguments.play)
+    command = shlex.join(["python", "-m", "bgpo_trl.encoders.train", *sys.argv[1:]])
+    train_encoders(
+        dataset,
+        play,
+        arguments.weights,
+        arguments.folder,
+        arguments.config,
+        command,
+        choose_device(arguments.device),
+    )
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Arguments, description=Arguments.__doc__))
+    except (ValueError, OSError) as error:
+        sys.exit(f"error: {error}")
+    except KeyboardInterrupt:
+        sys.exit("interrupted: the same command continues the training")

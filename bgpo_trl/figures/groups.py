@@ -1,0 +1,145 @@
+"""Figure of how groups of behaviors appeared during a run, and of which group played what."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator, MultipleLocator
+from numpy.typing import NDArray
+
+from bgpo_trl.figures.curves import _legend, _mark_starts, _style, _task_markers
+from bgpo_trl.runs.results import count, read_rows
+
+
+@dataclass(frozen=True)
+class GroupedEpisodes:
+    """Training episodes of one seed, in order.
+
+    Attributes:
+        episode: Number of each, ``[E]``.
+        task: Position of its task in the names of the tasks, ``[E]``.
+        group: Number of the group that played it, ``[E]``.
+        num_groups: Groups known after it, ``[E]``.
+    """
+
+    episode: NDArray[np.int64]
+    task: NDArray[np.int64]
+    group: NDArray[np.int64]
+    num_groups: NDArray[np.int64]
+
+    @property
+    def purity(self) -> float:
+        """Share of the episodes that are of the task that their group played most."""
+        counts = np.zeros((self.group.max() + 1, self.task.max() + 1))
+        np.add.at(counts, (self.group, self.task), 1)
+        return float(counts.max(axis=1).sum() / len(self.task))
+
+
+def read_groups(
+    path: str | os.PathLike[str], task_names: Sequence[str]
+) -> dict[int, GroupedEpisodes]:
+    """Reads a run's ``train.csv``.
+
+    Args:
+        path: Of the file.
+        task_names: Names of the tasks.
+
+    Returns:
+        The training episodes by seed, in increasing order.
+
+    Raises:
+        ValueError: If the file is missing or damaged, or of a run that did not tell groups.
+    """
+    columns: dict[str, Callable[[str], object]] = {"task": task_names.index}
+    columns |= dict.fromkeys(("seed", "episode", "group", "num_groups"), count)
+    rows: dict[int, list[tuple[int, int, int, int]]] = defaultdict(list)
+    for row in read_rows(path, columns):
+        episode, group, num_groups = (int(row[name]) for name in ("episode", "group", "num_groups"))
+        rows[int(row["seed"])].append((episode, task_names.index(row["task"]), group, num_groups))
+    return {seed: GroupedEpisodes(*np.array(sorted(rows[seed])).T) for seed in sorted(rows)}
+
+
+def plot_groups(seeds: Mapping[int, GroupedEpisodes], presented: Mapping[str, int]) -> Figure:
+    """Plots the number of groups over training, and below for each seed which group played what.
+
+    Each group has a row, shaded from the episode on after which it was known, with a mark for each
+    episode that it played in the color of the episode's task. Where a group played several tasks,
+    the rarer ones are drawn over the others; how pure that leaves the groups is told above.
+
+    Args:
+        seeds: The training episodes by seed, from `read_groups`.
+        presented: Training episode from which each task is presented, by its name.
+
+    Returns:
+        The figure.
+
+    Raises:
+        ValueError: If there is no episode.
+    """
+    if not seeds:
+        raise ValueError("there is no training episode to show: let the run play first.")
+    tasks = list(presented)
+    last = max(int(run.episode[-1]) for run in seeds.values())
+    heights = [int(run.num_groups.max()) for run in seeds.values()]
+    # Inches; many groups of many seeds share what a page has.
+    row = min(0.17, 7.0 / sum(heights))
+    width = 7.0
+    sizes = [1.0, *(row * height for height in heights)]
+    figure = Figure(figsize=(width, sum(sizes) + 0.36 * len(sizes) + 0.7), layout="constrained")
+    panels = figure.subplots(len(sizes), sharex=True, height_ratios=sizes)
+    for axes in panels:
+        _style(axes)
+        axes.grid(visible=False)
+
+    _mark_starts(panels[0], presented, tasks, last)
+    _draw_counts(panels[0], list(seeds.values()))
+    for axes, (seed, run) in zip(panels[1:], seeds.items(), strict=True):
+        _draw_rows(axes, run, len(tasks), last, width)
+        title = f"seed {seed}: {run.num_groups[-1]} groups, {100 * run.purity:.1f} % pure"
+        axes.set_title(title, fontsize=8, loc="left", pad=3)
+    panels[-1].set_xlabel("Training episode", fontsize=9)
+    panels[-1].set_xlim(0, last)
+    panels[-1].xaxis.set_major_formatter("{x:,.0f}")
+    kinds = _task_markers(tasks)
+    handles = [Line2D([], [], color=c, marker="s", linestyle="", ms=6) for _, _, c, _ in kinds]
+    _legend(figure, handles, [name for _, name, _, _ in kinds], width)
+    return figure
+
+
+def _draw_counts(axes: Axes, runs: Sequence[GroupedEpisodes]) -> None:
+    """Draws the number of groups of each seed, the first above the others."""
+    for number, run in reversed(list(enumerate(runs))):
+        color, line = ("0.2", 1.4) if number == 0 else ("0.7", 0.9)
+        axes.step(run.episode, run.num_groups, where="post", color=color, linewidth=line)
+    highest = max(int(run.num_groups.max()) for run in runs)
+    axes.set(ylim=(0, 1.3 * highest))  # room for the labels of the dashed lines
+    axes.yaxis.set_major_locator(MaxNLocator(4, integer=True))
+    axes.set_ylabel("Groups" if len(runs) == 1 else "Groups\n(gray: others)", fontsize=8)
+
+
+def _draw_rows(axes: Axes, run: GroupedEpisodes, n_tasks: int, last: int, width: float) -> None:
+    """Draws a row for each group, and its episodes in it."""
+    n_groups = int(run.num_groups.max())
+    colors = [color for _, _, color, _ in _task_markers([""] * n_tasks)]
+    # Points; an episode is as wide as it is long, and never too thin to be seen.
+    line = max(0.4, 0.85 * 72 * width / last)
+    for group in range(n_groups):
+        known = run.episode[run.num_groups > group]
+        axes.barh(group, last - known[0], 0.8, known[0], color="0.94", zorder=0)
+        episodes = [run.episode[(run.group == group) & (run.task == t)] for t in range(n_tasks)]
+        for task in sorted(range(n_tasks), key=lambda task: -len(episodes[task])):
+            marks = axes.vlines(episodes[task], group - 0.4, group + 0.4, colors[task], lw=line)
+            marks.set_snap(False)  # or neighbors of many are drawn with gaps, as pixels fall
+    axes.set(ylim=(n_groups - 0.4, -0.6))
+    axes.yaxis.set_major_locator(MultipleLocator(math.ceil(n_groups / 10)))
+    axes.tick_params(axis="y", length=0)
+    axes.spines["left"].set_visible(False)
+    axes.set_ylabel("Group", fontsize=8)

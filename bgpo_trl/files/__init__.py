@@ -1,0 +1,1 @@
+"""Files that survive crashes: checkpoints, tables, locks; and progress on the terminal."""

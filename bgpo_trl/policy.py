@@ -1,0 +1,258 @@
+"""One-shot use of a trained run: show its policy a demonstration, and let it act."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.envs import Compose
+
+from bgpo_trl.algorithms import ALGORITHMS, Algorithm
+from bgpo_trl.algorithms.algorithm import clip, observe
+from bgpo_trl.configs import RunConfig
+from bgpo_trl.data.bank import DemonstrationBank
+from bgpo_trl.encoders.pretrained import load_pretrained
+from bgpo_trl.encoders.representation import Representation, embed_demonstrations
+from bgpo_trl.files.checkpoint import has_checkpoint, load_checkpoint
+from bgpo_trl.runs.config_file import read_config
+from bgpo_trl.seeding import stream_seed
+from bgpo_trl.transforms import TaskSchedule
+from suites.nico.rendering import FRAME_HEIGHT, FRAME_WIDTH
+
+_FRAME = (FRAME_HEIGHT, FRAME_WIDTH, 3)
+
+
+@dataclass(frozen=True)
+class Recognition:
+    """What a policy made of a demonstration.
+
+    Attributes:
+        embedding: phi of the demonstration, float32 ``[32]``.
+        behavior: The weights b of the best matching node of GWR-B, ``[32]``. None, as the next two,
+            in algorithms without GWR-B.
+        node: Its identity.
+        activity: Of the node, in [0, 1]: 1 where the demonstration is just like it.
+        group: The group of behaviors that it belongs to. None, as the next two, in algorithms that
+            do not tell groups apart.
+        group_activity: Of the best match among the groups' nodes, in [0, 1].
+        known: Whether that is high enough for the demonstration to be of a known group.
+        task: The label that came with the demonstration.
+    """
+
+    embedding: Tensor = field(repr=False)
+    behavior: Tensor | None = field(default=None, repr=False)
+    node: int | None = None
+    activity: float | None = None
+    group: int | None = None
+    group_activity: float | None = None
+    known: bool | None = None
+    task: str | None = None
+
+
+class TrainedPolicy:
+    """The policy of one seed of a run, as in test episodes: it learns nothing and adds no noise.
+
+    Made by `load_run`.
+
+    Args:
+        config: The run.
+        algorithm: The algorithm as the run left it, of all seeds.
+        encoders: The encoders that the run used.
+        bank: The demonstrations that the run used, embedded.
+        seed: Which of the run's seeds.
+    """
+
+    def __init__(
+        self,
+        config: RunConfig,
+        algorithm: Algorithm,
+        *,
+        encoders: Representation,
+        bank: DemonstrationBank,
+        seed: int,
+    ) -> None:
+        self.config = config
+        self.algorithm = algorithm
+        self.encoders = encoders
+        self.bank = bank
+        self.seed = seed
+        self.tasks = config.tasks
+        self._observe = Compose([observe(config.algorithm, encoders), clip(config.algorithm)])
+        self._index = config.seeds.index(seed)
+        self._frozen: TensorDictBase | None = None
+        self._task = 0
+
+    @torch.no_grad()
+    def watch(
+        self,
+        demonstration: ArrayLike,
+        *,
+        task: str | None = None,
+        generator: torch.Generator | None = None,
+    ) -> Recognition:
+        """Takes up what a demonstration shows, whole or cut short, to do it from now on.
+
+        Args:
+            demonstration: Frames, uint8 ``[T, 32, 64, 3]``, T at least 1.
+            task: The label of its task, for algorithms that are told it; others do not read it.
+            generator: For what MAML draws to adapt itself; of the seed if None.
+
+        Returns:
+            What the policy made of it.
+
+        Raises:
+            ValueError: If these are no such frames, or the label is unknown or missing; the policy
+                then does what it did before.
+        """
+        frames = _frames(demonstration, "a demonstration is uint8 [T, 32, 64, 3], T at least 1", 4)
+        algorithm, n_seeds, n_tasks = self.algorithm, len(self.config.seeds), len(self.tasks)
+        if task is None and algorithm.needs_label:
+            raise ValueError(
+                f"{self.config.name} does not infer the task: name it, task=... as one of "
+                f"{', '.join(self.tasks)}"
+            )
+        if task is not None and task not in self.tasks:
+            raise ValueError(f"no task {task!r} in this run; choose one of {', '.join(self.tasks)}")
+        shown = {"pixels": frames.unsqueeze(0), "length": torch.tensor([len(frames)])}
+        (embedding,) = embed_demonstrations(self.encoders, TensorDict(shown, [1]))
+        if generator is None:
+            generator = torch.Generator().manual_seed(stream_seed(self.seed, "one-shot"))
+        # The interface is that of evaluations: of all seeds, with test episodes of each task.
+        policy = TensorDict(
+            algorithm.freeze(
+                self._index,
+                embedding.expand(n_tasks, 1, -1),
+                torch.arange(n_tasks).unsqueeze(-1),
+                generator,
+            )
+        )
+        self._frozen = TensorDict.maybe_dense_stack([policy] * n_seeds).to(algorithm.device)
+        self._task = 0 if task is None else self.tasks.index(task)
+        shown, index = embedding.expand(n_seeds, -1), self._index
+        found: dict[str, Any] = {}
+        if algorithm.gwr is not None:
+            match = algorithm.gwr.lookup(shown)
+            found["behavior"], found["node"] = match.embedding[index], int(match.node[index])
+            found["activity"] = float(match.activity[index])
+        if algorithm.groups is not None:
+            member = algorithm.groups.lookup(shown)
+            activity = float(member.activity[index])
+            found["group"], found["group_activity"] = int(member.group[index]), activity
+            found["known"] = activity >= algorithm.groups.activity_threshold
+        return Recognition(embedding, **found, task=task)
+
+    @torch.no_grad()
+    def act(self, frame: ArrayLike) -> NDArray[np.float32]:
+        """Returns the action for what the robot sees, float32 ``[4]`` in [-1, 1].
+
+        Args:
+            frame: uint8 ``[32, 64, 3]``.
+
+        Raises:
+            ValueError: If this is no such frame, or no demonstration was shown before.
+        """
+        if self._frozen is None:
+            raise ValueError("the policy has seen no demonstration: show it one with watch()")
+        seen = _frames(frame, "a frame is uint8 [32, 64, 3]", 3)
+        state = self._observe(TensorDict({"pixels": seen}))[self.config.algorithm.state].to(
+            self.algorithm.device
+        )
+        every = state.expand(len(self.config.seeds), len(self.tasks), 1, -1)
+        action = self.algorithm.act_frozen(self._frozen, every)
+        return action[self._index, self._task, 0].cpu().numpy()
+
+
+def load_run(
+    path: str | Path,
+    *,
+    seed: int | None = None,
+    make: Callable[..., Algorithm] | None = None,
+) -> TrainedPolicy:
+    """Loads what a run has learned up to its last checkpoint, finished or not.
+
+    Args:
+        path: The run's directory, of which nothing is changed.
+        seed: Which of the run's seeds; the first if None.
+        make: Makes the algorithm, where the run was one that `ALGORITHMS` does not have, as for
+            `Trainer`.
+
+    Raises:
+        ValueError: If there is no run, no checkpoint yet, no such seed or algorithm; if the run saw
+            the ground truth instead of frames; or its encoders are not at hand.
+        RuntimeError: If there is no OpenGL: an algorithm comes with its simulations.
+
+    Example:
+        >>> import bgpo_trl
+        >>> bgpo_trl.load_run("no-run")
+        Traceback (most recent call last):
+        ...
+        ValueError: no-run holds no run: there is no config.json
+    """
+    path = Path(path)
+    config, identity = read_config(path / "config.json")
+    if seed is not None and seed not in config.seeds:
+        seeds = ", ".join(map(str, config.seeds))
+        raise ValueError(f"{path} has no seed {seed!r}: choose one of {seeds}")
+    if config.algorithm.state != "latent" or identity is None:
+        raise ValueError(f"{path} learned from the ground truth: only runs from frames can watch")
+    if make is None:
+        if config.name not in ALGORITHMS:
+            raise ValueError(
+                f"{path} is a run of {config.name!r}, which is not in ALGORITHMS: give make=, what "
+                "its Trainer was given"
+            )
+        make = ALGORITHMS[config.name].make
+    if not has_checkpoint(path / "checkpoint"):
+        raise ValueError(f"{path} has no checkpoint yet: let the run reach its first one")
+    encoders, bank = _encoders(path, identity)
+    bank = bank.for_tasks(config.tasks)
+    algorithm = make(
+        config.algorithm,
+        seeds=config.seeds,
+        schedule=TaskSchedule(starts=config.task_starts),
+        bank=bank.seen(),
+        encoders=encoders,
+    )
+    saved = load_checkpoint(path / "checkpoint", mmap=True)
+    try:
+        state = saved["algorithm"]
+        if not algorithm.needs_replay:
+            state["replay"] = algorithm.replay.state_dict()  # What is left in the file is free.
+        algorithm.load_state_dict(state)
+    except (KeyError, IndexError, RuntimeError, TypeError, ValueError) as error:
+        reason = str(error).splitlines()[-1].strip()
+        raise ValueError(
+            f"{path / 'checkpoint'} does not fit {path / 'config.json'} ({reason}): use the "
+            "version of the code, and the make, of the run"
+        ) from error
+    seed = config.seeds[0] if seed is None else seed
+    return TrainedPolicy(config, algorithm, encoders=encoders, bank=bank, seed=seed)
+
+
+def _encoders(path: Path, identity: str) -> tuple[Representation, DemonstrationBank]:
+    """Returns the encoders of a run, its own or those that come with the package."""
+    own = path / "encoders" / "nico.safetensors"
+    encoders, bank = load_pretrained(own if own.exists() else None)
+    if encoders.identity != identity:
+        found = own if own.exists() else "those that come with the package"
+        raise ValueError(
+            f"{path} was trained with the encoders {identity[:12]}, not with {found} "
+            f"({encoders.identity[:12]}): put its own at {own}, with their bank"
+        )
+    return encoders, bank
+
+
+def _frames(frames: ArrayLike, wanted: str, ndim: int) -> Tensor:
+    array = np.asarray(frames)
+    shape = array.shape
+    if array.dtype != np.uint8 or array.ndim != ndim or shape[-3:] != _FRAME or not array.size:
+        raise ValueError(f"{wanted}, got {array.dtype} {list(shape)}")
+    # A copy: what was given may be read-only.
+    return torch.tensor(np.ascontiguousarray(array))

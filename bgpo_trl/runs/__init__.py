@@ -1,0 +1,1 @@
+"""Directories of runs: what training writes there, and how it is read back."""

@@ -1,0 +1,253 @@
+"""Run directories: the settings of a run, its CSV files, and an optional mirror to a dashboard.
+
+A run directory holds ``config.json``, ``train.csv`` and ``eval.csv`` (and, by other modules,
+``checkpoint/`` and ``figures/``). The CSV files are the record of a run: they are always written,
+row by row, and a resumed run continues them byte for byte. Anything else that wants the numbers,
+such as Weights & Biases, is a mirror that may come and go without harm to the run.
+"""
+
+from __future__ import annotations
+
+import os
+import uuid
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal, Self
+
+from torchrl.record.loggers import Logger
+from torchrl.record.loggers.wandb import WandbLogger
+
+from bgpo_trl.files.csv_file import CsvFile, plain_value
+from bgpo_trl.runs.directory import claim_directory, plain_settings
+
+EVAL_COLUMNS = (
+    "algorithm",
+    "seed",
+    "episode",
+    "env_steps",
+    "task",
+    "success",
+    "return",
+    "steps",
+)
+"""Columns of ``eval.csv``, one row a test episode."""
+
+TRAIN_COLUMNS = (
+    *EVAL_COLUMNS,
+    "intrinsic_return",
+    "num_nodes",
+    "group",
+    "num_groups",
+    "loss_actor",
+    "loss_value",
+)
+"""Default columns of ``train.csv``, one row a training episode."""
+
+
+class RunLogger:
+    """Writes what a run reports into its directory, and mirrors it to a dashboard where wanted.
+
+    Args:
+        directory: The run directory; made if it does not exist.
+        config: Settings of the run, a dataclass instance or a mapping, written to ``config.json``.
+        wandb: Also report to Weights & Biases, ``"online"``, or ``"offline"`` into
+            ``directory/wandb`` for a later ``wandb sync``. Needs the extra ``wandb``.
+        resume: Continue the run that the directory holds, which may have had fewer ``episodes``.
+            Follow with :meth:`truncate_to`.
+        mirrors: TorchRL loggers that get every row as well.
+        train_columns: Columns of ``train.csv``.
+
+    A row reaches a mirror as one ``log_metrics`` call with the row's numbers, named
+    ``{train,eval}/{task}/seed_{seed}/{column}``, at the step ``episode``. A mirror that fails is
+    left out for the rest of the run, with one warning: no dashboard ever ends a run. Rows that a
+    resumed run writes again reach it twice, with the same values at the same steps.
+
+    Raises:
+        ValueError: If the directory holds a run with other settings or columns, or any run at all
+            without ``resume``.
+        OSError: If the directory cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> directory = Path(tempfile.mkdtemp()) / "run"
+        >>> with RunLogger(directory, config={"gamma": 0.98}) as logger:
+        ...     logger.log_eval({"algorithm": "bgpo", "seed": 0, "episode": 1, "success": True})
+        >>> (directory / "eval.csv").read_text().splitlines()[1]
+        'bgpo,0,1,,,1,,'
+    """
+
+    def __init__(
+        self,
+        directory: str | os.PathLike[str],
+        *,
+        config: Any,
+        wandb: Literal["online", "offline"] | None = None,
+        resume: bool = False,
+        mirrors: Sequence[Logger] = (),
+        train_columns: Sequence[str] = TRAIN_COLUMNS,
+    ) -> None:
+        self.directory = Path(directory)
+        if wandb not in (None, "online", "offline"):
+            raise ValueError(f'wandb must be "online", "offline" or None, not {wandb!r}.')
+        settings = plain_settings(config)
+        claim_directory(self.directory, settings, resume=resume)
+        self._train = CsvFile(self.directory / "train.csv", train_columns)
+        self._eval = CsvFile(self.directory / "eval.csv", EVAL_COLUMNS)
+        self._mirrors = list(mirrors)
+        if wandb is not None:
+            self._mirrors += _wandb_logger(self.directory, settings, wandb)
+
+    def log_train(self, row: Mapping[str, Any]) -> None:
+        """Writes a training episode.
+
+        Args:
+            row: Values by column of ``train.csv``; absent ones stay empty.
+
+        Raises:
+            ValueError: If there is no such column.
+            OSError: If the row cannot be written.
+        """
+        self._train.write(row)
+        self._mirror("train", row)
+
+    def log_eval(self, row: Mapping[str, Any]) -> None:
+        """Writes a test episode.
+
+        Args:
+            row: Values by column of :data:`EVAL_COLUMNS`: the algorithm's and the task's names, the
+                seed, training episodes and environment steps of that seed so far, and the test
+                episode's success, extrinsic return and length in steps.
+
+        Raises:
+            ValueError: If there is no such column.
+            OSError: If the row cannot be written.
+        """
+        self._eval.write(row)
+        self._mirror("eval", row)
+
+    def log_media(self, name: str, path: str | os.PathLike[str]) -> None:
+        """Shows a finished figure or video on the dashboards that take files: Weights & Biases.
+
+        Args:
+            name: What it is shown under.
+            path: A picture, or a video as GIF or MP4.
+        """
+        for mirror in list(self._mirrors):
+            if isinstance(mirror, WandbLogger):
+                self._try(mirror, partial(_log_wandb_media, mirror, name, Path(path)))
+
+    def position(self) -> dict[str, int]:
+        """Returns where the CSV files end, for the checkpoint; all up to there is on the disk."""
+        return {file.path.name: file.position() for file in (self._train, self._eval)}
+
+    def truncate_to(self, position: Mapping[str, int]) -> None:
+        """Drops the rows that a resumed run is going to write again.
+
+        Args:
+            position: What :meth:`position` returned when the checkpoint was taken; empty to start
+                over, for a run that ended before its first checkpoint.
+
+        Raises:
+            ValueError: If a file does not reach that far.
+        """
+        for file in (self._train, self._eval):
+            file.truncate_to(position.get(file.path.name, 0))
+
+    def close(self) -> None:
+        """Closes the CSV files and the mirrors."""
+        self._train.close()
+        self._eval.close()
+        for mirror in list(self._mirrors):
+            self._try(mirror, mirror.shutdown)
+        self._mirrors.clear()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc_value: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _mirror(self, group: str, row: Mapping[str, Any]) -> None:
+        values = {name: plain_value(value) for name, value in row.items()}
+        prefix = f"{group}/{values.pop('task', 'all')}/seed_{values.pop('seed', 0)}"
+        step = values.pop("episode", None)
+        numbers = {
+            f"{prefix}/{name}": value
+            for name, value in values.items()
+            if isinstance(value, int | float)
+        }
+        for mirror in list(self._mirrors):
+            self._try(mirror, partial(mirror.log_metrics, numbers, step=step))
+
+    def _try(self, mirror: Logger, report: Callable[[], object]) -> None:
+        try:
+            report()
+        except Exception as error:
+            self._mirrors.remove(mirror)
+            warnings.warn(
+                f"{type(mirror).__name__} failed ({_reason(error)}) and gets no more of this run: "
+                "the CSV files have all of it.",
+                stacklevel=4,
+            )
+
+
+def _wandb_logger(directory: Path, settings: Any, mode: str) -> list[Logger]:
+    """Returns a Weights & Biases logger, an offline one if there is no way online, or none."""
+    identity = directory / "wandb" / "run_id"
+    for attempt in dict.fromkeys((mode, "offline")):
+        try:
+            identity.parent.mkdir(exist_ok=True)
+            if not identity.exists() or not identity.read_text():  # killed before it was written
+                identity.write_text(uuid.uuid4().hex)
+            return [
+                WandbLogger(
+                    directory.name,
+                    project="bgpo_trl",
+                    save_dir=str(directory),
+                    id=identity.read_text(),  # so that a resumed run continues its curves
+                    log_env_packages=False,  # they would tell paths of this machine
+                    config=settings,
+                    mode=attempt,  # not `offline=`, which changes os.environ for good
+                    settings={
+                        "init_timeout": 30,
+                        "finish_timeout": 60,
+                        "console": "off",  # a progress bar is no log
+                        "x_disable_meta": True,  # command, program and folders of this machine
+                    },
+                )
+            ]
+        except ImportError:
+            warnings.warn(
+                "wandb is not installed, so this run is kept in its CSV files only: "
+                "pip install 'bgpo_trl[wandb]' to have it there too.",
+                stacklevel=3,
+            )
+            break
+        except Exception as error:
+            instead = (
+                f"logging offline, upload it with `wandb sync {identity.parent}/offline-run-*`"
+                if attempt == "online"
+                else "the run is kept in its CSV files only"
+            )
+            warnings.warn(f"wandb does not answer ({_reason(error)}): {instead}.", stacklevel=3)
+    return []
+
+
+def _log_wandb_media(mirror: WandbLogger, name: str, path: Path) -> None:
+    import wandb  # an extra; the mirror is there only if this is
+
+    # A video by its path: wandb wants moviepy for the frames themselves, as TorchRL's log_video.
+    media = wandb.Video if path.suffix in (".gif", ".mp4") else wandb.Image
+    mirror.experiment.log({name: media(str(path))})
+
+
+def _reason(error: Exception) -> str:
+    return (str(error) or type(error).__name__).splitlines()[0]

@@ -1,0 +1,187 @@
+"""Measures against numbers worked out by hand, and their intervals against what they promise."""
+
+import numpy as np
+import pytest
+
+from bgpo_trl.analysis import metrics
+
+NAN = np.nan
+# Two tasks in the order of their presentation, evaluated after 10, 20, 30 and 40 episodes; task 2
+# comes in after 20.
+EPISODES = [10, 20, 30, 40]
+SUCCESS = np.array([[0.0, NAN], [0.8, NAN], [0.6, 0.0], [0.4, 0.5]])
+
+
+def test_evaluation_matrix_by_hand():
+    last_only = metrics.evaluation_matrix(SUCCESS, EPISODES, [20, 40], window=10)
+    np.testing.assert_allclose(last_only, [[0.8, NAN], [0.4, 0.5]])
+    both = metrics.evaluation_matrix(SUCCESS, EPISODES, [20, 40], window=20)
+    np.testing.assert_allclose(both, [[0.4, NAN], [0.5, 0.25]])
+
+
+def test_seeds_are_measured_one_by_one():
+    seeds = np.stack([SUCCESS, 0.5 * SUCCESS, np.nan_to_num(SUCCESS)])
+    matrix = metrics.evaluation_matrix(seeds, EPISODES, [20, 40], window=10)
+    assert matrix.shape == (3, 2, 2)
+    for measure in (metrics.average_performance, metrics.backward_transfer):
+        expected = [measure(of_seed) for of_seed in matrix]
+        np.testing.assert_allclose(measure(matrix), expected)
+    best = [metrics.forgetting_since_best(of_seed) for of_seed in seeds]
+    np.testing.assert_allclose(metrics.forgetting_since_best(seeds), best)
+
+
+def test_a_phase_without_evaluation_is_refused():
+    with pytest.raises(ValueError, match="no evaluation in the 3 episodes before episode 25"):
+        metrics.evaluation_matrix(SUCCESS, EPISODES, [25, 40], window=3)
+
+
+def test_performance_forgetting_and_backward_transfer_by_hand():
+    matrix = [[0.8, NAN, NAN], [0.7, 0.9, NAN], [0.4, 1.0, 0.3]]
+    assert metrics.average_performance(matrix) == pytest.approx((0.4 + 1.0 + 0.3) / 3)
+    # Task 1 has lost 0.4, task 2 has gained 0.1; of task 3 nothing can be said.
+    assert metrics.backward_transfer(matrix) == pytest.approx((-0.4 + 0.1) / 2)
+    assert metrics.forgetting_since_learned(matrix) == pytest.approx(0.15)
+    with pytest.raises(ValueError, match="one phase a task"):
+        metrics.backward_transfer(matrix[1:])
+
+
+def test_forgetting_since_the_best_so_far_by_hand():
+    # Task 1 was at 0.8 and is at 0.4; task 2 is at its best.
+    assert metrics.forgetting_since_best(SUCCESS) == pytest.approx((0.4 + 0) / 2)
+    assert metrics.forgetting_since_best(SUCCESS[:1]) == 0  # a task never tested is left out
+
+
+def test_zero_is_a_score_and_not_a_missing_one():
+    matrix = [[0.8, NAN], [0.0, 0.5]]
+    assert metrics.average_performance(matrix) == 0.25
+    assert metrics.backward_transfer(matrix) == pytest.approx(-0.8)
+    assert metrics.presented_mean([[0.0, NAN], [0.0, 1.0]]).tolist() == [0, 0.5]
+    assert metrics.trailing_mean([[1.0], [0.0]], 2).tolist() == [[1], [0.5]]
+    assert metrics.interquartile_mean([0, 0, 0, 1]) == 0
+    assert metrics.area_under_curve([0.0, 0.0], [10, 20]) == 0
+    assert metrics.forgetting_since_best([[0.6], [0.0]]) == 0.6
+
+
+def test_area_under_curve_by_hand():
+    # Triangle to 10, then two trapezoids; the last interval is twice as long.
+    area = (10 * 0.2 + 10 * (0.4 + 0.8) / 2 + 20 * (0.8 + 0.6) / 2) / 40
+    assert metrics.area_under_curve([0.4, 0.8, 0.6], [10, 20, 40]) == pytest.approx(area)
+    several = metrics.area_under_curve([[0.4, 0.8, 0.6], [1, 1, 1]], [10, 20, 40])
+    assert several.tolist() == pytest.approx([area, 1 - 10 * 0.5 / 40])
+
+
+def test_episodes_to_a_threshold():
+    curves = [[0.1, 0.8, 0.2], [0.9, 0.9, 0.9], [0.0, 0.7, 0.79]]
+    assert metrics.episodes_to(curves, [10, 20, 30]).tolist() == [20, 10, np.inf]
+    assert metrics.episodes_to(curves, [10, 20, 30], 0.7).tolist() == [20, 10, 20]
+
+
+def test_own_episodes_until_half_of_the_last_twenty_succeed():
+    # The tenth success is the thirteenth episode, but twenty are needed for a rate.
+    early = [0, 0, 0] + [1] * 10 + [0] * 7
+    assert metrics.trials_to(early) == 20
+    # 9 of episodes 1 to 20 succeed and 9 of 2 to 21; of 3 to 22, 10 do.
+    late = [0, 0] + [0, 1] * 9 + [0, 1]
+    assert metrics.trials_to(late) == 22
+    assert metrics.trials_to(late[:-1]) == np.inf
+    assert metrics.trials_to([1] * 19) == metrics.trials_to([]) == np.inf
+
+
+def test_another_rate_over_another_window():
+    outcomes = [1, 0, 1, 0, 1, 1, 1, 1, 0]
+    assert metrics.trials_to(outcomes, 0.8, window=5) == 7  # episodes 3 to 7
+    assert metrics.trials_to(outcomes, 1.0, window=2) == 6
+    assert metrics.trials_to(outcomes, window=1) == 1
+    with pytest.raises(ValueError, match="at least 1 episode, not 0"):
+        metrics.trials_to(outcomes, window=0)
+
+
+def test_later_tasks_are_measured_against_the_first():
+    inf = np.inf
+    seeds = [[100, 50, 300], [40, 40, inf], [50, 100, 100]]
+    # By seed 0.5, 1 and 2; 3, never and 2.
+    assert metrics.times_the_first(seeds).tolist() == [1, 3]
+    # A seed without the first task says nothing; half of the others never learn the third.
+    assert metrics.times_the_first([*seeds[:2], [inf, 20, 20]]).tolist() == [0.75, inf]
+    np.testing.assert_array_equal(metrics.times_the_first([[inf, 20, inf]]), [NAN, NAN])
+
+
+def test_forward_transfer_is_1_where_nothing_is_left_to_learn():
+    gained = metrics.forward_transfer([1.0, 0.5, 0.25], 0.5)
+    assert gained.tolist() == [1, 0, -0.5]
+
+
+def test_trailing_mean_by_hand():
+    np.testing.assert_allclose(
+        metrics.trailing_mean(SUCCESS, 3),
+        [[0, NAN], [0.4, NAN], [1.4 / 3, 0], [0.6, 0.25]],
+    )
+    np.testing.assert_array_equal(metrics.trailing_mean(SUCCESS, 1), SUCCESS)
+
+
+def test_interquartile_mean_by_hand():
+    # A quarter of eight is two at each end.
+    assert metrics.interquartile_mean([[9, 3, 1, 2], [8, 0, 100, 4]]) == (3 + 4 + 2 + 8) / 4
+    assert metrics.interquartile_mean([1, 2, 30]) == 11  # three have no quarter to cut
+    assert metrics.interquartile_mean([5, 1, 2, 3, 4, 40]) == (2 + 3 + 4 + 5) / 4
+
+
+def test_resampling_draws_seeds_for_each_task_by_itself():
+    scores = np.array([[0.0, 10.0], [1.0, 11.0]])
+    seen = set()
+
+    def collect(drawn):
+        assert set(drawn[:, 0]) <= {0, 1}
+        assert set(drawn[:, 1]) <= {10, 11}
+        seen.add(tuple(drawn.ravel()))
+        return 0.0
+
+    metrics.stratified_bootstrap(scores, collect, n_resamples=500, rng=np.random.default_rng(0))
+    assert len(seen) == 16  # any seed with any other
+
+
+def test_the_interval_of_a_mean_is_that_of_theory():
+    rng = np.random.default_rng(1)
+    scores = rng.normal(size=(400, 1))
+    drawn = metrics.stratified_bootstrap(scores, np.mean, n_resamples=4_000, rng=rng)
+    low, high = metrics.percentile_interval(drawn)
+    error = scores.std() / np.sqrt(400)
+    assert [low, high] == pytest.approx(
+        [scores.mean() - 1.96 * error, scores.mean() + 1.96 * error], abs=0.15 * error
+    )
+    narrow = metrics.percentile_interval(drawn, confidence=0.5)
+    assert narrow == pytest.approx(
+        (scores.mean() - 0.674 * error, scores.mean() + 0.674 * error), abs=0.15 * error
+    )
+
+
+def test_intervals_follow_from_the_generator():
+    scores = np.random.default_rng(2).random((5, 3))
+    draws = [
+        metrics.stratified_bootstrap(scores, rng=np.random.default_rng(seed)) for seed in (0, 0, 1)
+    ]
+    assert draws[0].tolist() == draws[1].tolist() != draws[2].tolist()
+    assert draws[0].shape == (2_000,)
+
+
+@pytest.mark.parametrize("scores", [[0.5], [[0.5, NAN]], [[0.5, np.inf]], np.zeros((0, 3))])
+def test_scores_that_are_not_there_are_refused(scores):
+    with pytest.raises(ValueError, match=r"finite and \[seeds, tasks\]"):
+        metrics.stratified_bootstrap(scores, rng=np.random.default_rng(0))
+
+
+def test_rliable_agrees():
+    metrics_of_rliable = pytest.importorskip("rliable.metrics", reason="rliable is not needed")
+    library = pytest.importorskip("rliable.library", reason="rliable is not needed")
+    scores = np.random.default_rng(3).random((10, 3))
+    ours = metrics.interquartile_mean(scores)
+    assert ours == pytest.approx(float(metrics_of_rliable.aggregate_iqm(scores)))
+    _, theirs = library.get_interval_estimates(
+        {"x": scores}, lambda x: np.array([metrics_of_rliable.aggregate_iqm(x)]), reps=5_000
+    )
+    rng = np.random.default_rng(4)
+    drawn = metrics.stratified_bootstrap(scores, n_resamples=5_000, rng=rng)
+    width = np.ptp(theirs["x"])
+    assert metrics.percentile_interval(drawn) == pytest.approx(
+        theirs["x"].ravel(), abs=0.06 * width
+    )

@@ -1,0 +1,82 @@
+"""Task inference, counted by hand on networks with nodes at known places."""
+
+import pytest
+import torch
+
+from bgpo_trl.analysis.task_inference import majority_task, match_counts, task_inference_accuracy
+from bgpo_trl.data.bank import DemonstrationBank
+from bgpo_trl.modules.gwr import GWRB
+
+PLACES = torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 9.0]])
+
+
+def network(*nodes, batch_size=()):
+    """Nodes at the given positions of PLACES, in this order."""
+    gwr = GWRB(2, batch_size=batch_size)
+    state = gwr.get_extra_state()
+    for index, positions in enumerate(nodes):
+        n = len(positions)
+        state[index] |= {
+            "weights": PLACES[list(positions)],
+            "habituation": torch.ones(n, dtype=torch.float64),
+            "edges": torch.tensor([[i, i + 1] for i in range(n - 1)]),
+            "ages": torch.zeros(n - 1, dtype=torch.int64),
+            "node": torch.arange(n) * 3 + 1,  # some in between were removed
+            "next_node": 99,
+        }
+    gwr.set_extra_state(state)
+    return gwr
+
+
+def bank(*demonstrations):
+    """Demonstrations as (position in PLACES, task), a little off their place."""
+    place, task = map(torch.tensor, zip(*demonstrations, strict=True))
+    return DemonstrationBank(PLACES[place] + 0.1, task, torch.ones(len(task), dtype=torch.bool))
+
+
+SEEN = bank((0, 0), (0, 0), (0, 1), (1, 1), (1, 1), (1, 0))
+
+
+def test_matches_are_counted_by_node_and_task():
+    assert match_counts(network((0, 1, 2)), SEEN, 2).tolist() == [[2, 1], [1, 2], [0, 0]]
+
+
+def test_networks_of_a_batch_are_counted_each_by_itself():
+    gwr = network((0, 1, 2), (2, 1), batch_size=[2])
+    assert match_counts(gwr, SEEN, 3).tolist() == [
+        [[2, 1, 0], [1, 2, 0], [0, 0, 0]],
+        [[0, 0, 0], [3, 3, 0], [0, 0, 0]],
+    ]
+
+
+def test_counting_learns_nothing():
+    gwr = network((0, 1))
+    before = gwr.graph()
+    match_counts(gwr, SEEN, 2)
+    assert all(a.equal(b) for a, b in zip(gwr.graph(), before, strict=True))
+
+
+def test_the_majority_of_no_match_is_none_and_of_a_tie_the_first():
+    counts = torch.tensor([[[2, 1], [1, 3], [0, 0]], [[2, 2], [0, 1], [4, 0]]])
+    assert majority_task(counts).tolist() == [[0, 1, -1], [0, 1, 0]]
+
+
+@pytest.mark.parametrize(
+    ("tested", "accuracy"),
+    [
+        ([(0, 0), (1, 1)], 1.0),
+        ([(0, 1), (1, 0)], 0.0),
+        ([(0, 0), (0, 0), (0, 1), (1, 1)], 0.75),
+        ([(0, 0), (2, 0)], 0.5),  # a node that nothing seen has matched tells no task
+    ],
+)
+def test_accuracy_is_the_share_of_demonstrations_whose_node_tells_their_task(tested, accuracy):
+    gwr = network((0, 1, 2))
+    assert task_inference_accuracy(gwr, SEEN, bank(*tested), 2).tolist() == accuracy
+
+
+def test_accuracy_of_each_network_of_a_batch():
+    gwr = network((0, 1, 2), (1, 0), batch_size=[2])
+    tested = bank((0, 0), (2, 0), (1, 1))  # the second network takes place 2 for place 0
+    accuracy = task_inference_accuracy(gwr, SEEN, tested, 2)
+    torch.testing.assert_close(accuracy, torch.tensor([2 / 3, 1.0]))

@@ -1,0 +1,221 @@
+"""The steps of demonstrations in eight bits, and the bank that carries them."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from bgpo_trl.data.bank import DemonstrationBank, DemonstrationSteps
+from bgpo_trl.encoders.make_bank import make_bank
+from bgpo_trl.encoders.pretrained import load_pretrained
+from bgpo_trl.files.tensor_file import load_tensors, save_tensors
+
+LENGTH = torch.tensor([4, 0, 2, 6, 0])
+
+
+@pytest.fixture
+def padded():
+    generator = torch.Generator().manual_seed(0)
+    latent = torch.randn(5, 6, 64, generator=generator) * 2
+    return latent, torch.rand(5, 5, 4, generator=generator) * 2 - 1
+
+
+@pytest.fixture
+def steps(padded):
+    return DemonstrationSteps.of(*padded, LENGTH)
+
+
+def frames(steps, row):
+    return torch.arange(int(steps.length[row])) + steps.first[row]
+
+
+def assert_same(ours, theirs):
+    for key, value in vars(ours).items():
+        assert value.equal(vars(theirs)[key]), key
+
+
+def test_no_number_is_off_by_more_than_half_a_code(steps, padded):
+    latent, action = padded
+    assert steps.latent.dtype == steps.action.dtype == torch.int8
+    assert len(steps.latent) == LENGTH.sum()
+    for row, length in enumerate(LENGTH.tolist()):
+        kept, exact = steps.latents(frames(steps, row)), latent[row, :length].clamp(-5.08, 5.08)
+        assert kept.shape == (length, 64)
+        assert ((kept - exact).abs() <= 0.5 / 25 + 1e-6).all()
+        moves = frames(steps, row)[: max(length - 1, 0)]
+        error = steps.actions(moves) - action[row, : len(moves)]
+        assert (error.abs() <= 0.5 / 127 + 1e-6).all()
+    assert latent.abs().max() > 5.08  # so that some are clipped
+
+
+def test_what_is_in_codes_already_is_kept_exactly(steps):
+    again = DemonstrationSteps.of(
+        torch.stack(
+            [
+                torch.nn.functional.pad(steps.latents(frames(steps, row)), (0, 0, 0, 6 - n))
+                for row, n in enumerate(LENGTH.tolist())
+            ]
+        ),
+        torch.stack(
+            [
+                torch.nn.functional.pad(steps.actions(frames(steps, row)), (0, 0, 0, 6 - n))[:5]
+                for row, n in enumerate(LENGTH.tolist())
+            ]
+        ),
+        LENGTH,
+    )
+    assert again.latent.equal(steps.latent)
+    for row in range(5):  # all but the meaningless action of the last frame
+        moves = frames(steps, row)[:-1]
+        assert again.action[moves].equal(steps.action[moves])
+
+
+def test_some_demonstrations_are_those_of_the_rows(steps):
+    some = steps.select(torch.tensor([3, 0]))
+    assert some.length.tolist() == [6, 4]
+    for row, origin in enumerate((3, 0)):
+        assert some.latents(frames(some, row)).equal(steps.latents(frames(steps, origin)))
+    masked = steps.select(torch.tensor([False, False, True, True, False]))
+    assert masked.length.tolist() == [2, 6]
+
+
+def test_the_steps_of_two_are_those_of_one_after_the_other(steps):
+    both = steps.select(torch.tensor([3])) + steps.select(torch.tensor([2, 1, 0]))
+    assert both.length.tolist() == [6, 2, 0, 4]
+    for row, origin in enumerate((3, 2, 1, 0)):
+        assert both.latents(frames(both, row)).equal(steps.latents(frames(steps, origin)))
+        assert both.actions(frames(both, row)).equal(steps.actions(frames(steps, origin)))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"latent": torch.zeros(12, 64)},
+        {"action": torch.zeros(11, 4, dtype=torch.int8)},
+        {"first": torch.zeros(4, dtype=torch.int64)},
+        {"first": torch.tensor([0, 4, 4, 7, 12])},
+        {"first": torch.tensor([0, 4, 4, -1, 12])},
+        {"length": torch.tensor([4, 0, 2, 7, 0])},
+        {"length": torch.tensor([4, -1, 2, 6, 0])},
+        {"length": LENGTH.float()},
+    ],
+)
+def test_steps_that_do_not_fit_together_are_refused(steps, changes):
+    with pytest.raises(ValueError, match="do not fit together"):
+        replace(steps, **changes)
+
+
+# ---- in the bank
+
+
+@pytest.fixture
+def with_steps(steps):
+    embedding = torch.rand(5, 32, generator=torch.Generator().manual_seed(1))
+    task = torch.tensor([0, 1, 2, 0, 1])
+    return DemonstrationBank(embedding, task, LENGTH > 0, steps=steps)
+
+
+def test_a_bank_is_read_with_the_steps_that_were_written(with_steps, tmp_path):
+    with_steps.save(tmp_path / "bank", encoder_id="x")
+    read = DemonstrationBank.load(tmp_path / "bank", encoder_id="x")
+    assert read.steps is not None
+    assert_same(read.steps, with_steps.steps)
+    assert read.embedding.equal(with_steps.embedding)
+    replace(with_steps, steps=None).save(tmp_path / "bank", encoder_id="x")
+    assert DemonstrationBank.load(tmp_path / "bank", encoder_id="x").steps is None
+
+
+def test_steps_go_with_their_demonstrations(with_steps):
+    steps = with_steps.steps
+    for part, rows in (
+        (with_steps.seen(), [0, 2, 3]),
+        (with_steps.held_out(), [1, 4]),
+        (with_steps.of_task(0), [0, 3]),
+        (with_steps.for_tasks(with_steps.tasks[2:]), [2]),
+    ):
+        assert part.steps.first.tolist() == steps.first[rows].tolist()
+        assert part.steps.length.tolist() == steps.length[rows].tolist()
+    both = with_steps + with_steps.seen()
+    assert both.steps.length.tolist() == [*LENGTH.tolist(), 4, 2, 6]
+    assert (with_steps + replace(with_steps, steps=None)).steps is None
+
+
+def test_the_halves_of_the_held_out_ones_take_turns_and_are_all_of_them(bank):
+    """Task by task, in whatever order they are."""
+    sorted_by_task = bank._select(bank.task.argsort(stable=True))
+    for one in (bank, sorted_by_task, bank.for_tasks(bank.tasks[::-1])):
+        halves = [one.held_out(part) for part in ("validation", "test")]
+        assert [len(half.task) for half in halves] == [6, 6]
+        for task in range(3):
+            every = one.of_task(task).held_out().embedding
+            for first, half in enumerate(halves):
+                assert half.of_task(task).embedding.equal(every[first::2])
+
+
+def test_the_only_one_held_out_of_a_task_is_for_validation(bank):
+    kept = torch.cat([torch.nonzero(bank.train).flatten(), torch.arange(24, 27)])
+    few = bank._select(kept)
+    assert few.held_out("validation").task.tolist() == [0, 1, 2]
+    assert few.held_out("test").task.tolist() == []
+
+
+def test_steps_of_other_demonstrations_are_refused(with_steps, tmp_path):
+    with pytest.raises(ValueError, match="steps of 3 demonstrations, but embeddings of 5"):
+        replace(with_steps, steps=with_steps.seen().steps)
+    with_steps.save(tmp_path / "bank", encoder_id="x")
+    tensors, meta = load_tensors(tmp_path / "bank")
+    meta.pop("sha256", None)
+    short = {f"steps.{key}": tensors[f"steps.{key}"][1:].clone() for key in ("first", "length")}
+    for damage in (
+        short,
+        {"steps.latent": tensors["steps.latent"].float()},
+        {"steps.other": torch.zeros(5)},
+    ):
+        save_tensors(tmp_path / "damaged", tensors | damage, meta)
+        with pytest.raises(ValueError, match=r"damaged is damaged or no bank .* make it anew"):
+            DemonstrationBank.load(tmp_path / "damaged", encoder_id="x")
+
+
+def test_a_bank_is_made_of_what_the_encoders_see(encoders):
+    generator = torch.Generator().manual_seed(4)
+    length = torch.tensor([5, 3, 4])
+    dataset = {
+        "pixels": torch.randint(256, (3, 5, 32, 64, 3), generator=generator).to(torch.uint8),
+        "action": torch.rand(3, 4, 4, generator=generator) * 2 - 1,
+        "length": length,
+        "task": torch.tensor([0, 1, 2]),
+        "train": torch.tensor([True, True, False]),
+    }
+    inferred, recorded = (
+        make_bank(encoders, dataset, actions=actions) for actions in ("inferred", "recorded")
+    )
+    assert inferred.steps.length.tolist() == [5, 3, 0]  # nothing of what is held out
+    assert_same(replace(inferred.steps, action=recorded.steps.action), recorded.steps)
+    for row, n in ((0, 5), (1, 3)):
+        pixels = dataset["pixels"][row, :n]
+        latent = encoders.vae.latent(pixels)
+        phi = encoders.lae.encode(latent[None], length[row : row + 1])[0]
+        torch.testing.assert_close(inferred.embedding[row], phi, rtol=1e-4, atol=1e-5)
+        kept = inferred.steps.latents(frames(inferred.steps, row))
+        torch.testing.assert_close(kept, latent.clamp(-5.08, 5.08), rtol=0, atol=0.021)
+        moves = frames(inferred.steps, row)[:-1]
+        mean = latent * encoders.vae.latent_std + encoders.vae.latent_mean
+        action = encoders.vae.inverse(mean[:-1], mean[1:]).clamp(-1, 1)
+        torch.testing.assert_close(inferred.steps.actions(moves), action, rtol=0, atol=0.005)
+        exact = dataset["action"][row, : n - 1]
+        torch.testing.assert_close(recorded.steps.actions(moves), exact, rtol=0, atol=0.005)
+
+
+def test_the_banks_steps_are_those_of_its_embeddings():
+    """phi anew from the latents of the shipped bank: rounding moves it hardly."""
+    encoders, bank = load_pretrained()
+    seen = bank.seen()
+    assert bool((seen.steps.length >= 2).all())
+    assert not bank.held_out().steps.length.any()
+    rows = torch.arange(0, len(seen.task), 61)
+    length = seen.steps.length[rows]
+    inside = torch.arange(51) < length.unsqueeze(-1)
+    frame = (seen.steps.first[rows].unsqueeze(-1) + torch.arange(51)).where(inside, 0)
+    phi = encoders.lae.encode(seen.steps.latents(frame), length)
+    distance = (phi - seen.embedding[rows]).norm(dim=-1)
+    assert distance.max() < 0.03  # of about 3 between two demonstrations

@@ -1,0 +1,191 @@
+"""Transitions of shown demonstrations, against the bank's own steps."""
+
+import io
+from dataclasses import replace
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from bgpo_trl.data.bank import DemonstrationSteps
+from bgpo_trl.data.demonstration_replay import DemonstrationReplay
+
+CONSTANT = ["behavior", "label"]
+
+
+def generators(n, first=0):
+    return [torch.Generator().manual_seed(first + seed) for seed in range(n)]
+
+
+def make(bank, n_seeds=2, first=0, **options):
+    return DemonstrationReplay(
+        bank, generator=generators(n_seeds, first), constant_keys=CONSTANT, **options
+    )
+
+
+def episode(*index):
+    """An episode of each seed, which was told the number of its demonstration and of its seed."""
+    number, seed = torch.tensor(index), torch.arange(len(index))
+    behavior = torch.stack([number, seed], -1).float()
+    return TensorDict({"demo_index": number, "behavior": behavior, "label": seed}, [len(index)])
+
+
+def show(replay, *shown):
+    """Adds for each of the tuples (index, reward, group) one to each of the seeds."""
+    for one in shown:
+        index, reward, group = zip(*one, strict=True)
+        replay.add(episode(*index), torch.tensor(reward), torch.tensor(group))
+
+
+@pytest.fixture
+def shown(bank):
+    replay = make(bank.seen())
+    show(
+        replay,
+        [(3, 1.0, 0), (5, 1.02, 0)],
+        [(7, 1.05, 1), (9, 1.0, 0)],
+        [(3, 1.07, 0), (11, 1.1, 2)],
+    )
+    return replay
+
+
+GROUP = torch.tensor([[0, 0, 1, -1, 2], [0, 2, 2, 0, 1]])
+
+
+def transitions(steps, index):
+    """All of a demonstration's, from its frames: latent, action, next latent, whether it ends."""
+    frames = torch.arange(int(steps.length[index])) + steps.first[index]
+    latents, actions = steps.latents(frames), steps.actions(frames)
+    n = len(frames) - 1
+    return [(latents[t], actions[t], latents[t + 1], t == n - 1) for t in range(n)]
+
+
+def test_transitions_are_the_steps_of_what_was_shown_in_the_rows_group(shown, bank):
+    steps = bank.seen().steps
+    told = {  # seed and group: demonstrations with their rewards
+        (0, 0): {3: {1.0, 1.07}},
+        (0, 1): {7: {1.05}},
+        (1, 0): {5: {1.02}, 9: {1.0}},
+        (1, 2): {11: {1.1}},
+    }
+    found = {key: set() for key in told}
+    for _ in range(60):
+        drawn = shown.sample(GROUP)
+        assert drawn["priority_weight"].tolist() == [[1, 1, 1, 0, 0], [1, 1, 1, 1, 0]]
+        for (seed, row), group in zip(
+            torch.cartesian_prod(torch.arange(2), torch.arange(5)).tolist(),
+            GROUP.flatten().tolist(),
+            strict=True,
+        ):
+            if (seed, group) not in told:
+                continue
+            one = drawn[seed, row]
+            index = int(one["behavior"][0])
+            assert one["behavior"][1] == one["label"] == seed
+            rewards = told[seed, group][index]
+            (place,) = (
+                t
+                for t, (latent, _, _, _) in enumerate(transitions(steps, index))
+                if latent.equal(one["latent"])
+            )
+            _, action, following, ends = transitions(steps, index)[place]
+            assert one["action"].equal(action)
+            assert one["next", "latent"].equal(following)
+            assert one["next", "terminated"].tolist() == [ends]
+            reward = float(one["next", "reward"])
+            assert min(abs(reward - r) for r in (rewards if ends else {0.0})) < 1e-6
+            found[seed, group].add((index, place))
+    for key, of_group in told.items():
+        every = {(i, t) for i in of_group for t in range(int(steps.length[i]) - 1)}
+        assert found[key] == every
+
+
+def test_entries_have_the_shapes_and_types_of_played_transitions(shown):
+    drawn = shown.sample(GROUP)
+    assert drawn.batch_size == (2, 5)
+    expected = {
+        "latent": ((64,), torch.float32),
+        "action": ((4,), torch.float32),
+        "behavior": ((2,), torch.float32),
+        "label": ((), torch.int64),
+        "priority_weight": ((), torch.float32),
+        ("next", "latent"): ((64,), torch.float32),
+        ("next", "reward"): ((1,), torch.float32),
+        ("next", "terminated"): ((1,), torch.bool),
+    }
+    found = {key: (v.shape[2:], v.dtype) for key, v in drawn.items(True, True)}
+    assert found == expected
+
+
+def test_demonstrations_and_their_steps_are_drawn_equally_often(bank):
+    """A long demonstration is drawn no more often than a short one."""
+    replay = make(bank.seen(), n_seeds=1)
+    lengths = bank.seen().steps.length
+    short, long = int(lengths.argmin()), int(lengths.argmax())
+    assert (int(lengths[short]), int(lengths[long])) == (3, 6)
+    show(replay, [(short, 1.0, 0)], [(long, 1.0, 0)])
+    drawn = replay.sample(torch.zeros(1, 20_000, dtype=torch.int64))[0]
+    is_long = drawn["behavior"][:, 0] == long
+    assert abs(int(is_long.sum()) - 10_000) < 5 * 5_000**0.5
+    for rows, n_steps in ((is_long, 5), (~is_long, 2)):
+        ends = drawn["next", "terminated"][rows].float().mean()
+        assert float(ends) == pytest.approx(1 / n_steps, abs=0.03)
+
+
+def test_a_seed_of_a_stack_is_that_seed_alone(bank):
+    together = make(bank.seen(), n_seeds=3)
+    alone = [
+        DemonstrationReplay(bank.seen(), generator=[stream], constant_keys=["behavior"])
+        for stream in generators(3)
+    ]
+    asked = torch.tensor([[0, 1, 0, -1]])
+    for step in range(8):
+        data, group = episode(step, 2 * step, step + 3), torch.tensor([step % 2, 0, 1])
+        reward, mask = torch.full([3], 1.0 + step / 100), torch.tensor([True, step % 3 == 0, True])
+        together.add(data, reward, group, mask)
+        for seed, replay in enumerate(alone):
+            rows = slice(seed, seed + 1)
+            replay.add(data[rows], reward[rows], group[rows], mask[rows])
+        assert len(together) == min(len(replay) for replay in alone)
+        drawn = together.sample(asked.expand(3, -1))
+        for seed, replay in enumerate(alone):
+            other, has = replay.sample(asked)[0], drawn["priority_weight"][seed] > 0
+            assert other["priority_weight"].equal(drawn["priority_weight"][seed])
+            for key in ("latent", "action", ("next", "latent"), ("next", "reward")):
+                assert other[key][has].equal(drawn[seed][key][has])
+
+
+def test_only_so_many_are_remembered(bank):
+    replay = make(bank.seen(), n_seeds=1, capacity=3)
+    show(replay, *([(index, 1.0, 0)] for index in range(6)))
+    drawn = replay.sample(torch.zeros(1, 200, dtype=torch.int64))
+    assert drawn["behavior"][0, :, 0].unique().tolist() == [3, 4, 5]
+
+
+def test_a_restored_replay_continues_as_the_saved_one(shown, bank):
+    shown.sample(GROUP)
+    file = io.BytesIO()
+    torch.save(shown.state_dict(), file)
+    file.seek(0)
+    restored = make(bank.seen(), first=30)
+    restored.load_state_dict(torch.load(file, weights_only=True))
+    for step in range(3):
+        assert (restored.sample(GROUP) == shown.sample(GROUP)).all()
+        for replay in (restored, shown):
+            show(replay, [(step, 1.0, 1), (2 + step, 1.0, 1)])
+
+
+def test_a_bank_without_steps_is_refused(bank):
+    with pytest.raises(ValueError, match="has no steps of demonstrations to learn from"):
+        make(replace(bank.seen(), steps=None))
+    # Those of held-out demonstrations are not kept.
+    with pytest.raises(ValueError, match="has no steps of demonstration 24 to learn from"):
+        make(bank)
+
+
+def test_a_demonstration_of_one_frame_is_refused(bank):
+    steps = DemonstrationSteps.of(
+        torch.zeros(24, 3, 64), torch.zeros(24, 2, 4), 3 - 2 * (torch.arange(24) == 4).long()
+    )
+    with pytest.raises(ValueError, match="has no steps of demonstration 4 to learn from"):
+        make(replace(bank.seen(), steps=steps))

@@ -1,0 +1,207 @@
+"""Replay by group against plain lists: what is drawn, how often, and what is forgotten."""
+
+import io
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict
+
+from bgpo_trl.data.group_replay import GroupReplay, draw_shares
+
+KEYS = ["latent", ("next", "terminated")]
+
+
+def generators(n, first=0):
+    return [torch.Generator().manual_seed(first + seed) for seed in range(n)]
+
+
+def transition(value, n_seeds):
+    """Says in its entries when it was stored (before the point) and by which seed (behind it)."""
+    seed = torch.arange(n_seeds)
+    number = (value + seed / 100).unsqueeze(-1)
+    ends = seed.unsqueeze(-1) % 2 == 1
+    return TensorDict({"latent": number, "other": seed, "next": {"terminated": ends}}, [n_seeds])
+
+
+def make(capacity=100, n_seeds=2, first=0):
+    return GroupReplay(capacity, generator=generators(n_seeds, first), keys=KEYS)
+
+
+def fill(replay, groups):
+    """Stores a transition of each seed a step, of these groups."""
+    for step, of_step in enumerate(groups):
+        replay.add(transition(step, len(of_step)), torch.tensor(of_step))
+
+
+def through_a_file(state):
+    file = io.BytesIO()
+    torch.save(state, file)
+    file.seek(0)
+    return torch.load(file, weights_only=True)
+
+
+@settings(max_examples=60)
+@given(
+    capacity=st.integers(1, 9),
+    stored=st.lists(
+        st.tuples(st.integers(0, 3), st.integers(0, 3), st.booleans()), min_size=1, max_size=30
+    ),
+    asked=st.lists(st.integers(-1, 5), min_size=1, max_size=12),
+    given_generators=st.booleans(),
+    restored=st.booleans(),
+)
+def test_a_row_is_drawn_from_what_is_left_of_its_group(
+    capacity, stored, asked, given_generators, restored
+):
+    replay, kept = make(capacity), [[], []]
+    for step, (first, second, both) in enumerate(stored):
+        both = both or step == 0  # so that each seed has something
+        replay.add(transition(step, 2), torch.tensor([first, second]), torch.tensor([True, both]))
+        kept[0] = [*kept[0], (first, step)][-capacity:]
+        if both:
+            kept[1] = [*kept[1], (second, step + 0.01)][-capacity:]
+    if restored:
+        state, replay = through_a_file(replay.state_dict()), make(capacity, first=7)
+        replay.load_state_dict(state)
+    group = torch.tensor([asked, asked[::-1]])
+    held = [[[value for g, value in kept[s] if g == n] for n in group[s].tolist()] for s in (0, 1)]
+    assert replay.sizes(group).tolist() == [[len(values) for values in rows] for rows in held]
+    assert len(replay) == min(len(kept[0]), len(kept[1]))
+
+    source = generators(2, 40) if given_generators else None
+    drawn = replay.sample(group, generator=source)
+    assert set(drawn.keys(True, True)) == {*KEYS, "priority_weight"}
+    for seed, stream in enumerate(generators(2, 40 if given_generators else 0)):
+        wanted = [number >= 0 for number in group[seed].tolist()]
+        shares = iter(torch.rand(sum(wanted), generator=stream, dtype=torch.float64).tolist())
+        for row, values in enumerate(held[seed]):
+            share = next(shares) if wanted[row] else 0.0
+            assert float(drawn["priority_weight"][seed, row]) == bool(values)
+            if values:
+                expected = values[int(share * len(values))]
+                assert float(drawn["latent"][seed, row]) == pytest.approx(expected, abs=1e-5)
+                assert bool(drawn["next", "terminated"][seed, row]) == (seed == 1)
+
+
+def test_all_that_a_group_holds_is_drawn_equally_often():
+    replay = make(20)
+    fill(replay, [(step % 3, 0) for step in range(30)])
+    drawn = replay.sample(torch.tensor([[2] * 30_000, [0] * 30_000]))["latent"].squeeze(-1)
+    count = drawn[0].round().long().bincount(minlength=30)
+    held = torch.arange(11, 30, 3)  # of the last 20 steps, every third
+    assert count.nonzero().flatten().equal(held)
+    expected = 30_000 / len(held)
+    assert ((count[held] - expected).abs() < 5 * expected**0.5).all()
+    assert drawn[1].round().long().unique().equal(torch.arange(10, 30))
+
+
+def test_a_seed_of_a_stack_is_that_seed_alone():
+    together = make(7, n_seeds=3)
+    alone = [GroupReplay(7, generator=[stream], keys=KEYS) for stream in generators(3)]
+    groups = torch.randint(3, (20, 3), generator=torch.Generator().manual_seed(5))
+    asked = torch.tensor([[0, 1, 2, 0, -1]])
+    for step, group in enumerate(groups):
+        data, mask = transition(step, 3), torch.tensor([True, step % 2 == 0, True])
+        together.add(data, group, mask)
+        for seed, replay in enumerate(alone):
+            rows = slice(seed, seed + 1)
+            replay.add(data[rows], group[rows], mask[rows])
+        drawn = together.sample(asked.expand(3, -1))
+        for seed, replay in enumerate(alone):
+            assert (replay.sample(asked)[0] == drawn[seed]).all()
+
+
+def test_some_seeds_draw_what_they_would_draw_with_all():
+    some, every = make(n_seeds=3), make(n_seeds=3)
+    for replay in (some, every):
+        fill(replay, [(step % 2, 1, 0) for step in range(9)])
+    asked = torch.tensor([[0, 1, 1, 0]])
+    whole = every.sample(asked.expand(3, -1))
+    drawn = some.sample(asked.expand(2, -1), seeds=[2, 0])
+    has = whole["priority_weight"][[2, 0]] > 0
+    assert drawn["priority_weight"].equal(whole["priority_weight"][[2, 0]])
+    assert drawn["latent"][has].equal(whole["latent"][[2, 0]][has])
+    # They alone have drawn, so that the other draws now what it did then.
+    assert (some.sample(asked, seeds=[1])[0] == whole[1]).all()
+
+
+def test_rows_without_a_group_draw_nothing():
+    asked = torch.tensor([[0, -1, 1, -1], [-1, -1, -1, -1]])
+    ours, theirs = generators(2), generators(2)
+    shares = draw_shares(asked, ours)
+    assert shares[0, [0, 2]].equal(torch.rand(2, generator=theirs[0], dtype=torch.float64))
+    assert not shares[0, [1, 3]].any()
+    assert not shares[1].any()
+    for one, other in zip(ours, theirs, strict=True):
+        assert one.get_state().equal(other.get_state())
+
+
+@pytest.mark.parametrize("n_first", [5, 1024, 2500])
+def test_a_group_of_long_ago_is_forgotten_as_it_is_overwritten_and_can_come_back(n_first):
+    """However many there were of it: the room for them comes in pieces."""
+    replay = GroupReplay(3000, generator=generators(1), keys=["latent"])
+
+    def store(group, n, first):
+        for step in range(n):
+            replay.add(TensorDict({"latent": torch.full([1, 1], first + step)}, [1]), group)
+
+    old, new = torch.tensor([0]), torch.tensor([1])
+    store(old, n_first, 0.0)
+    store(new, 3000 - n_first // 2, 10_000.0)
+    assert replay.sizes(torch.tensor([[0, 1]])).tolist() == [[n_first // 2, 3000 - n_first // 2]]
+    drawn = replay.sample(torch.zeros(1, 500, dtype=torch.int64))["latent"]
+    assert drawn.min() >= n_first - n_first // 2
+    assert drawn.max() < n_first
+    store(new, 3000, 20_000.0)
+    for _ in range(2):  # the second time there is nothing to be forgotten any more
+        assert replay.sizes(torch.tensor([[0, 1]])).tolist() == [[0, 3000]]
+        assert not replay.sample(torch.zeros(1, 9, dtype=torch.int64))["priority_weight"].any()
+    store(old, 2, 30_000.0)
+    drawn = replay.sample(torch.zeros(1, 99, dtype=torch.int64))
+    assert drawn["latent"].unique().tolist() == [30_000.0, 30_001.0]
+    assert (drawn["priority_weight"] == 1).all()
+
+
+@pytest.mark.parametrize("n_steps", [0, 1, 6, 25])
+def test_a_restored_replay_continues_as_the_saved_one(n_steps):
+    replay, restored = make(10), make(10, first=9)
+    groups = [(step % 3, step % 2) for step in range(n_steps)]
+    fill(replay, groups)
+    fill(restored, [(4, 4)] * 3)
+    asked = torch.tensor([[0, 1, 2, 1], [1, 0, 1, -1]])
+    if n_steps:
+        replay.sample(asked)
+    restored.load_state_dict(through_a_file(replay.state_dict()))
+    for step in range(4):
+        for one in (replay, restored):
+            one.add(transition(50 + step, 2), torch.tensor([step % 2, 1]))
+        assert restored.sizes(asked).equal(replay.sizes(asked))
+        assert (restored.sample(asked) == replay.sample(asked)).all()
+
+
+def test_a_seed_is_restored_though_another_has_stored_nothing_yet():
+    replay, restored = make(10), make(10)
+    only_first = torch.tensor([True, False])
+    replay.add(transition(4, 2), torch.tensor([3, 3]), only_first)
+    restored.load_state_dict(through_a_file(replay.state_dict()))
+    asked = torch.tensor([[3], [3]])
+    assert restored.sizes(asked).tolist() == [[1], [0]]
+    with pytest.raises(ValueError, match="every seed needs a transition"):
+        restored.sample(asked)
+    restored.add(transition(5, 2), torch.tensor([0, 0]), ~only_first)
+    drawn = restored.sample(asked)
+    assert drawn["priority_weight"].tolist() == [[1.0], [0.0]]
+    assert drawn["latent"][0].item() == 4
+
+
+def test_a_transition_without_an_entry_changes_nothing():
+    replay = make(10)
+    fill(replay, [(0, 1)] * 2)
+    before = replay.state_dict()
+    bad = transition(9, 2).exclude("latent")
+    with pytest.raises(ValueError, match="GroupReplay found no 'latent'"):
+        replay.add(bad, torch.tensor([0, 1]))
+    assert (TensorDict(replay.state_dict()) == TensorDict(before)).all()
+    assert replay.sizes(torch.tensor([[0, 1], [0, 1]])).tolist() == [[2, 0], [0, 2]]

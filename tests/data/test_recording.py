@@ -1,0 +1,376 @@
+import json
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from bgpo_trl.data import recording as demonstrations
+from bgpo_trl.data.bank import DemonstrationBank
+from bgpo_trl.data.recording import (
+    load_demonstrations,
+    record_demonstrations,
+)
+from suites import nico
+from suites.nico.demonstrator import Demonstrator
+
+TINY = {"per_task": 3, "held_out_per_task": 1, "progress": False}
+KEYS = {"pixels", "state", "action", "length", "task", "train", "seed"}
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("recorded") / "made" / "by" / "recording"
+    record_demonstrations(path, **TINY)
+    return path
+
+
+@pytest.fixture
+def copy(recorded, tmp_path) -> Path:
+    return Path(shutil.copytree(recorded, tmp_path / "copy"))
+
+
+def contents(path: Path) -> dict[str, bytes]:
+    return {file.name: file.read_bytes() for file in path.iterdir()}
+
+
+def edit_meta(path: Path, **changes: object) -> None:
+    file = path / "dataset.json"
+    meta = {**json.loads(file.read_text()), **changes}
+    file.write_text(json.dumps({k: v for k, v in meta.items() if v is not None}))
+
+
+def test_recording_returns_what_loading_does(recorded):
+    dataset = load_demonstrations(recorded)
+
+    assert set(dataset.keys()) == KEYS
+    shapes = {"pixels": (51, 32, 64, 3), "state": (51, 16), "action": (50, 4)}
+    for key in KEYS:
+        assert dataset[key].shape == (9, *shapes.get(key, ()))
+    assert dataset["pixels"].dtype == torch.uint8
+    assert dataset["length"].dtype == dataset["task"].dtype == torch.int64
+    again = record_demonstrations(recorded, **TINY)  # complete: only opened
+    for key in KEYS:
+        torch.testing.assert_close(again[key], dataset[key], rtol=0, atol=0)
+
+
+def test_padding_is_zero_and_the_rest_is_not(recorded):
+    for row in load_demonstrations(recorded):
+        length = int(row["length"])
+        assert 10 < length <= 51
+        assert (row["pixels"][:length].float().std(dim=(1, 2, 3)) > 10).all()
+        assert row["state"][:length].abs().sum(-1).min() > 0
+        assert row["action"][: length - 1].abs().sum(-1).min() > 0
+        assert row["action"].abs().max() <= 1
+        assert not row["pixels"][length:].any()
+        assert not row["state"][length:].any()
+        assert not row["action"][length - 1 :].any()
+
+
+def test_each_demonstration_does_its_task(recorded):
+    dataset = load_demonstrations(recorded)
+    glass, green, white = dataset["state"][:, :, 7:].unflatten(-1, (3, 3)).unbind(2)
+    last = torch.arange(9), dataset["length"] - 1
+    for row, task in enumerate(dataset["task"].tolist()):
+        frame = last[0][row], last[1][row]
+        if task == 0:
+            assert (dataset["state"][frame][4:7] - glass[frame]).norm() < 0.04
+        else:
+            target = (glass, white)[task - 1]
+            # Not further than a standing glass or a box turned by 45 degrees allows.
+            assert (green[frame] - target[frame])[:2].norm() < 0.08
+            assert (green[row, 0] - target[row, 0])[:2].norm() > 0.1
+
+
+def test_tasks_and_held_out_ones_are_marked(recorded):
+    dataset = load_demonstrations(recorded)
+
+    assert dataset["task"].tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 2]
+    assert dataset["train"].tolist() == [True, True, False] * 3
+    assert dataset["seed"].tolist() == [0] * 9
+
+
+def test_play_follows_a_demonstration_and_then_moves_at_random(tmp_path):
+    options = {"per_task": 6, "held_out_per_task": 1, "progress": False}
+    play = record_demonstrations(tmp_path / "play", play=True, **options)
+
+    whole = play["length"] == 51
+    assert whole.float().mean() > 0.5  # the rest have come far enough to succeed
+    assert len(play["state"][:, 0].unique(dim=0)) == 18
+    action = play["action"][whole]
+    early, late = action[:, :2].std(), action[:, -15:].std()
+    assert late > 0.25  # a demonstrator moves by less
+    assert early < late
+    reach = play["state"][whole][:, :, 4:7]
+    assert (reach[:, -1] - reach[:, 0]).norm(dim=-1).mean() > 0.1
+    # Nothing of it passes as demonstrations, and the other way round.
+    for wrong in (False, True):
+        with pytest.raises(ValueError, match="holds another recording"):
+            record_demonstrations(
+                tmp_path / "play", play=wrong, **(options | {"per_task": 6 + wrong})
+            )
+    again = record_demonstrations(tmp_path / "again", play=True, **options)
+    for key in KEYS:
+        assert again[key].equal(play[key])
+
+
+def test_demonstrations_differ_from_each_other_and_between_seeds(recorded, tmp_path):
+    starts = load_demonstrations(recorded)["state"][:, 0]
+    other = record_demonstrations(
+        tmp_path, tasks=["grasp_glass"], per_task=1, held_out_per_task=0, seed=1, progress=False
+    )
+
+    assert len(torch.cat([starts, other["state"][:, 0]]).unique(dim=0)) == 10
+
+
+def test_a_demonstration_that_fails_is_tried_again(tmp_path, monkeypatch):
+    attempts = []
+
+    class ClumsyAtFirst(Demonstrator):
+        def reset(self):
+            super().reset()
+            attempts.append(self)
+
+        def __call__(self, timestep):
+            return super().__call__(timestep) if len(attempts) > 2 else np.zeros(4)
+
+    monkeypatch.setattr(demonstrations, "Demonstrator", ClumsyAtFirst)
+    dataset = record_demonstrations(
+        tmp_path, tasks=["grasp_glass"], per_task=1, held_out_per_task=0, progress=False
+    )
+
+    assert len(attempts) >= 3
+    assert dataset["action"].abs().sum() > 1
+
+
+class Fickle(nico.TASKS["push_green_to_white"]):
+    """A task that is solved until it is not, since its success test is broken."""
+
+    times = 4  # Each success is asked for twice: for the reward, and for the end.
+
+    def succeeded(self, physics):
+        if Fickle.times == 0 or not super().succeeded(physics):
+            return False
+        Fickle.times -= 1
+        return True
+
+
+def test_a_demonstrator_that_never_succeeds_is_told_of(tmp_path, monkeypatch):
+    nico.add_task("fickle", Fickle)
+    options = {"tasks": ["grasp_glass", "fickle"], "per_task": 4, "held_out_per_task": 1}
+    with pytest.raises(RuntimeError) as raised:
+        record_demonstrations(tmp_path, attempts=3, progress=False, **options)
+    told = re.fullmatch(
+        r"the demonstrator of 'fickle' failed 3 times in a row \(2 of (\d+) attempts succeeded, "
+        r"(\d+)%\): mend its demonstration\(\), or raise attempts",
+        str(raised.value),
+    )
+    assert int(told[1]) >= 5
+    assert int(told[2]) == round(200 / int(told[1]))
+
+    before = demonstrations._open(tmp_path, 8)["length"].clone()
+    assert (before > 0).tolist() == [True] * 6 + [False] * 2
+    monkeypatch.setattr(Fickle, "times", 99)
+    mended = record_demonstrations(tmp_path, attempts=50, progress=False, **options)
+    assert (mended["length"] > 0).all()
+    assert mended["length"][:6].equal(before[:6])
+
+
+def test_an_interrupted_recording_ends_as_an_uninterrupted_one(recorded, tmp_path, monkeypatch):
+    record = demonstrations._demonstrate
+    rows = []
+
+    def interrupted(env, seed, row, attempts):
+        rows.append(row)
+        if len(rows) == 5:
+            raise KeyboardInterrupt
+        return record(env, seed, row, attempts)
+
+    monkeypatch.setattr(demonstrations, "_demonstrate", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        record_demonstrations(tmp_path, **TINY)
+    with pytest.raises(ValueError, match=r"is not complete; resume it with the same command$"):
+        load_demonstrations(tmp_path)
+    record_demonstrations(tmp_path, **TINY)
+
+    assert rows == [0, 1, 2, 3, 4, 4, 5, 6, 7, 8]  # none twice but the one it was at
+    assert contents(tmp_path) == contents(recorded)
+
+
+def test_missing_rows_are_recorded_again(recorded, copy):
+    length = np.memmap(copy / "length.memmap", np.int64, "r+")
+    length[[1, 8]] = 0
+    length.flush()
+    pixels = np.memmap(copy / "pixels.memmap", np.uint8, "r+").reshape(9, -1)
+    pixels[8, :1000] = 7  # as after a kill in the middle of a row
+    pixels.flush()
+    edit_meta(copy, checksum=None)
+
+    record_demonstrations(copy, **TINY)
+
+    assert contents(copy) == contents(recorded)
+
+
+@pytest.mark.parametrize("key", sorted(KEYS))
+def test_a_flipped_byte_is_noticed(copy, key):
+    values = np.memmap(copy / f"{key}.memmap", np.uint8, "r+")
+    values[len(values) // 2] ^= 1
+    values.flush()
+
+    with pytest.raises(ValueError, match=r"is damaged \(checksum differs\); remove it and .*$"):
+        load_demonstrations(copy)
+    assert len(load_demonstrations(copy, verify=False)) == 9
+
+
+def truncate(path: Path) -> None:
+    with open(path / "pixels.memmap", "r+b") as file:
+        file.truncate(1000)
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (truncate, r"pixels\.memmap is missing or truncated; remove .*"),
+        (lambda p: (p / "action.memmap").unlink(), r"action\.memmap is missing or truncated; .*"),
+        (lambda p: (p / "dataset.json").write_text("{"), r"dataset\.json is damaged; remove .*"),
+        (lambda p: (p / "dataset.json").write_text("{}"), r"dataset\.json is damaged; remove .*"),
+        (lambda p: (p / "dataset.json").write_bytes(b"\xff"), r"dataset\.json is damaged; .*"),
+        (lambda p: (p / "dataset.json").unlink(), r"copy is no dataset of demonstrations; .*"),
+        (lambda p: edit_meta(p, checksum=None), r"is not complete; resume it with .*"),
+        (lambda p: edit_meta(p, scene_version="old"), r"was recorded in scene 'old', this is nico"),
+    ],
+)
+def test_what_is_not_whole_is_refused_in_one_line(copy, damage, message):
+    damage(copy)
+
+    with pytest.raises(ValueError, match=message) as error:
+        load_demonstrations(copy)
+
+    assert "\n" not in str(error.value)
+    if "resume" not in message:
+        assert "record it anew with `python -m bgpo_trl.data.recording PATH`" in str(error.value)
+
+
+@pytest.mark.parametrize("meta", ["{", '{"_type": "os.system"}', None])
+def test_what_says_how_to_read_the_tensors_is_not_believed(recorded, copy, meta):
+    """TensorDict's own file is not under the checksum, and may name what to unpickle."""
+    (copy / "meta.json").unlink() if meta is None else (copy / "meta.json").write_text(meta)
+    found, expected = load_demonstrations(copy), load_demonstrations(recorded)
+    assert set(found.keys()) == KEYS
+    for key in KEYS:
+        torch.testing.assert_close(found[key], expected[key], rtol=0, atol=0)
+
+
+def test_a_folder_that_is_missing_is_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"is no dataset of demonstrations; record it anew with"):
+        load_demonstrations(tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"seed": 1}, {"per_task": 4}, {"held_out_per_task": 2}, {"tasks": ["grasp_glass"]}]
+)
+@pytest.mark.parametrize("complete", [True, False])
+def test_another_recording_is_not_continued(copy, wrong, complete):
+    if not complete:
+        edit_meta(copy, checksum=None)
+    before = contents(copy)
+
+    with pytest.raises(ValueError, match=r"holds another recording .*; choose another folder or"):
+        record_demonstrations(copy, **{**TINY, **wrong})
+
+    assert contents(copy) == before
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"held_out_per_task": 3}, r"^held_out_per_task is 3: it must be less than per_task, 3$"),
+        ({"held_out_per_task": -1}, r"^held_out_per_task is -1: .*$"),
+        ({"per_task": 0}, r"^held_out_per_task is 1: it must be less than per_task, 0$"),
+        ({"tasks": ["juggle"]}, r"^no NICO task 'juggle'; choose one of grasp_glass, .*$"),
+    ],
+)
+def test_wrong_arguments_are_refused_before_anything_is_written(tmp_path, wrong, message):
+    with pytest.raises(ValueError, match=message):
+        record_demonstrations(tmp_path / "new", **{**TINY, **wrong})
+
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_full_disk_is_noticed_before_recording(tmp_path, monkeypatch):
+    usage = shutil.disk_usage(tmp_path)._replace(free=10**6)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
+
+    with pytest.raises(OSError, match=r"^the dataset takes 0\.0 GB, .* has 0\.0 GB left: make ro"):
+        record_demonstrations(tmp_path, **TINY)
+
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_command_ends_user_errors_in_one_line(recorded):
+    size = ["--per-task", "3", "--held-out-per-task", "1"]
+    process = subprocess.run(
+        [sys.executable, "-m", "bgpo_trl.data.recording", str(recorded), *size, "--seed", "1"],
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+
+    assert process.returncode == 1
+    assert process.stderr.startswith(f"error: {recorded} holds another recording")
+    assert process.stderr.count("\n") == 1
+
+
+@pytest.fixture
+def bank() -> DemonstrationBank:
+    generator = torch.Generator().manual_seed(0)
+    return DemonstrationBank(
+        embedding=torch.randn(6, 32, generator=generator),
+        task=torch.tensor([0, 0, 1, 1, 2, 2]),
+        train=torch.tensor([True, False] * 3),
+    )
+
+
+def test_a_bank_is_split_into_seen_and_held_out(bank):
+    torch.testing.assert_close(bank.seen().embedding, bank.embedding[[0, 2, 4]])
+    torch.testing.assert_close(bank.held_out().embedding, bank.embedding[[1, 3, 5]])
+    assert bank.seen().task.tolist() == bank.held_out().task.tolist() == [0, 1, 2]
+    assert bank.seen().train.all()
+    assert not bank.held_out().train.any()
+
+
+def test_a_bank_is_read_as_it_was_written(bank, tmp_path):
+    bank.save(tmp_path / "bank.safetensors", encoder_id="abc")
+
+    loaded = DemonstrationBank.load(tmp_path / "bank.safetensors", encoder_id="abc")
+
+    for name in ("embedding", "task", "train"):
+        torch.testing.assert_close(getattr(loaded, name), getattr(bank, name), rtol=0, atol=0)
+        assert getattr(loaded, name).dtype == getattr(bank, name).dtype
+
+
+def test_a_bank_of_other_encoders_or_another_scene_is_refused(bank, tmp_path, monkeypatch):
+    path = tmp_path / "bank.safetensors"
+    bank.save(path, encoder_id="abc")
+
+    with pytest.raises(ValueError, match=r"belongs to .*'abc'.*, but needed is .*'xyz'.*; make it"):
+        DemonstrationBank.load(path, encoder_id="xyz")
+    monkeypatch.setattr(nico, "scene_version", lambda: "nico-2-00000000")
+    with pytest.raises(ValueError, match=r"but needed is .*nico-2-00000000.*; make it anew with"):
+        DemonstrationBank.load(path, encoder_id="abc")
+
+
+def test_a_bank_that_is_missing_or_damaged_is_refused(bank, tmp_path):
+    path = tmp_path / "bank.safetensors"
+    with pytest.raises(ValueError, match=r"^there is no demonstration bank at .*; make it anew"):
+        DemonstrationBank.load(path, encoder_id="abc")
+    bank.save(path, encoder_id="abc")
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(
+        ValueError, match=r"bank\.safetensors is damaged .*\(.*\); make it anew with"
+    ):
+        DemonstrationBank.load(path, encoder_id="abc")

@@ -1,0 +1,131 @@
+"""Encoders and bank belong together: made in one go, loaded together or not at all."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import pytest
+import torch
+
+from bgpo_trl.configs import RepresentationConfig, SequenceAutoencoderConfig, VAEConfig
+from bgpo_trl.data.recording import load_demonstrations
+from bgpo_trl.encoders.pretrained import load_pretrained, make_pretrained
+from bgpo_trl.encoders.representation import save_representation
+from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
+from suites import nico
+
+TINY = RepresentationConfig(
+    vae=VAEConfig(steps=2, batch_size=4, warmup_steps=1),
+    lae=SequenceAutoencoderConfig(steps=2, batch_size=4, warmup_steps=1),
+)
+TASKS = nico.ALL_TASKS[::-1]
+ARGUMENTS = {
+    "config": TINY,
+    "tasks": TASKS,
+    "per_task": 3,
+    "held_out_per_task": 1,
+    "progress": False,
+}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("pretrained")
+
+
+@pytest.fixture(scope="module")
+def made(folder):
+    return make_pretrained(
+        folder / "encoders" / "some.safetensors",
+        folder / "demonstrations",
+        folder=folder / "log",
+        command="a command",
+        **ARGUMENTS,
+    )
+
+
+@pytest.fixture
+def copy(made, folder, tmp_path):
+    """The files, to be tampered with."""
+    shutil.copytree(folder / "encoders", tmp_path, dirs_exist_ok=True)
+    return tmp_path / "some.safetensors"
+
+
+def test_what_was_made_is_loaded(made, folder):
+    encoders, bank = made
+    loaded_encoders, loaded_bank = load_pretrained(folder / "encoders" / "some.safetensors")
+    assert loaded_encoders.identity == encoders.identity
+    assert loaded_encoders.metadata["command"] == "a command"
+    assert loaded_bank.tasks == bank.tasks == TASKS
+    for recorded in ("demonstrations", "demonstrations-play"):
+        assert json.loads((folder / recorded / "dataset.json").read_text())["tasks"] == [*TASKS]
+    for name in ("embedding", "task", "train"):
+        assert getattr(loaded_bank, name).equal(getattr(bank, name))
+    for module in (loaded_encoders.vae, loaded_encoders.lae):
+        assert not module.training
+        assert not any(parameter.requires_grad for parameter in module.parameters())
+
+
+def test_the_bank_holds_what_the_encoders_make_of_each_demonstration(made, folder):
+    encoders, bank = made
+    demonstrations = load_demonstrations(folder / "demonstrations")
+    assert bank.task.tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 2]
+    assert bank.train.tolist() == [True, True, False] * 3
+    for row, demonstration in enumerate(demonstrations):
+        length = int(demonstration["length"])
+        latent = encoders.vae.latent(demonstration["pixels"][:length])
+        phi = encoders.lae.encode(latent[None], torch.tensor([length]))[0]
+        torch.testing.assert_close(bank.embedding[row], phi, rtol=1e-4, atol=1e-5)
+    assert len(bank.embedding.unique(dim=0)) == 9
+
+
+def test_the_same_command_finds_all_of_it_made(made, folder, monkeypatch):
+    def refuse(*arguments):
+        raise AssertionError("recorded again")
+
+    for name in ("_demonstrate", "_play"):
+        monkeypatch.setattr(f"bgpo_trl.data.recording.{name}", refuse)
+    play = load_demonstrations(folder / "demonstrations-play")
+    assert (len(play), int((~play["train"]).sum())) == (6, 3)
+    encoders, bank = make_pretrained(
+        folder / "encoders" / "some.safetensors",
+        folder / "demonstrations",
+        folder=folder / "log",
+        **ARGUMENTS,
+    )
+    assert encoders.identity == made[0].identity
+    assert bank.embedding.equal(made[1].embedding)
+
+
+def test_other_demonstrations_at_that_place_are_refused(made, folder):
+    with pytest.raises(ValueError, match="holds another recording"):
+        make_pretrained(
+            folder / "encoders" / "some.safetensors",
+            folder / "demonstrations",
+            folder=folder / "log",
+            **{**ARGUMENTS, "per_task": 4},
+        )
+
+
+def test_encoders_of_another_scene_are_refused(copy, monkeypatch):
+    monkeypatch.setattr(nico, "scene_version", lambda: "another")
+    with pytest.raises(ValueError, match="this is scene another: train new ones with"):
+        load_pretrained(copy)
+
+
+def test_a_bank_that_other_encoders_made_is_refused(made, copy):
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(5)
+        other = replace(made[0], lae=SequenceAutoencoder())
+    save_representation(other, copy)
+    with pytest.raises(ValueError, match=r"some_bank\.safetensors belongs to .*make it anew with"):
+        load_pretrained(copy)
+
+
+def test_a_missing_bank_or_missing_encoders_are_named(copy):
+    copy.with_name("some_bank.safetensors").unlink()
+    with pytest.raises(ValueError, match="there is no demonstration bank at"):
+        load_pretrained(copy)
+    copy.unlink()
+    with pytest.raises(ValueError, match="no encoder weights at"):
+        load_pretrained(copy)

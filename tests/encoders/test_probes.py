@@ -1,0 +1,125 @@
+import json
+import math
+from pathlib import Path
+
+import matplotlib.image
+import pytest
+import torch
+from tensordict import TensorDict
+
+from bgpo_trl.encoders.probes import (
+    embedding_distances,
+    probe,
+    reconstruction_picture,
+    ridge_predict,
+)
+from bgpo_trl.encoders.representation import Representation
+from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
+from bgpo_trl.modules.vae import VAE
+
+
+def demonstrations(n: int = 6) -> TensorDict:
+    generator = torch.Generator().manual_seed(0)
+    shape = (n, 51, 32, 64, 3)
+    return TensorDict(
+        {
+            "pixels": torch.randint(0, 256, shape, dtype=torch.uint8, generator=generator),
+            "action": torch.rand(n, 50, 4, generator=generator),
+            "length": torch.arange(n) + 2,
+            "state": torch.rand(n, 51, 16, generator=generator),
+            "task": torch.arange(n) % 3,
+            "train": torch.arange(n) < n - 2,
+        },
+        [n],
+    )
+
+
+@pytest.fixture
+def untrained() -> Representation:
+    torch.manual_seed(0)
+    return Representation(VAE(), SequenceAutoencoder(), {})
+
+
+def test_ridge_finds_a_linear_map_whatever_the_scale() -> None:
+    x, x_new = torch.randn(500, 5), torch.randn(40, 5)
+    scale, weight = torch.tensor([1e-3, 1.0, 1e3, 1.0, 0.0]), torch.randn(5, 3)
+
+    def truth(x: torch.Tensor) -> torch.Tensor:
+        return x[:, :4] @ weight[:4] + 7
+
+    predicted = ridge_predict(x * scale, truth(x), x_new * scale, penalty=1e-8)
+    torch.testing.assert_close(predicted, truth(x_new), rtol=1e-3, atol=1e-3)
+
+
+def test_ridge_finds_nothing_in_noise() -> None:
+    y = torch.randn(5000, 1) + 3
+    predicted = ridge_predict(torch.randn(5000, 2), y, torch.randn(100, 2))
+    assert (predicted - 3).abs().max() < 0.3
+
+
+def test_embedding_distances_by_hand() -> None:
+    phi = torch.tensor([[0.0, 0.0], [0.1, 0.0], [0.0, 1.0], [0.0, 1.4]])
+    result = embedding_distances(phi, torch.tensor([0, 0, 1, 1]), activity_threshold=0.8)
+    assert result["phi_threshold_distance"] == pytest.approx(0.2231, abs=1e-4)
+    # Nearest of the same task: .1 .1 .4 .4; of the other: 1, 1.005, 1, 1.4. Medians are lower.
+    assert result["phi_nearest_same_task"] == pytest.approx(0.1)
+    assert result["phi_nearest_other_task"] == pytest.approx(1.0)
+    assert result["phi_distance_same_task"] == pytest.approx(0.1)
+    assert result["phi_distance_other_task"] == pytest.approx(math.hypot(0.1, 1.0))
+    assert result["phi_nearest_known"] == 0.5
+
+
+def test_one_task_has_no_other(untrained: Representation) -> None:
+    result = embedding_distances(torch.randn(3, 32), torch.zeros(3, dtype=torch.int64))
+    assert math.isnan(result["phi_nearest_other_task"])
+    assert result["phi_nearest_same_task"] > 0
+
+
+def test_picture_shows_frames_over_reconstructions(untrained: Representation) -> None:
+    data = demonstrations()
+    picture = reconstruction_picture(untrained.vae, data, columns=5)
+    assert picture.shape == (2 * 32 * 4, 5 * 64 * 4, 3)
+    assert torch.equal(picture[:128:4, :256:4], data["pixels"][0, 0])
+    decoded = untrained.vae.decode(untrained.vae.encode(data["pixels"][0, 0])[0])
+    assert (picture[128::4, :256:4] / 255 - decoded).abs().max() < 0.51 / 255
+    last = picture[:128:4, -256::4]
+    assert (last == data["pixels"][5, :7]).flatten(1).all(-1).any(), "of a valid step"
+
+
+def test_writes_numbers_and_picture(untrained: Representation, tmp_path: Path) -> None:
+    result = probe(untrained, demonstrations(), tmp_path / "new")
+    assert json.loads((tmp_path / "new" / "probes.json").read_text()) == result
+    picture = matplotlib.image.imread(tmp_path / "new" / "reconstructions.png")
+    assert picture.shape[:2] == (256, 3072)
+
+
+def test_probes_read_held_out_demonstrations_only_to_measure(untrained: Representation) -> None:
+    """Two held-out demonstrations of three: measuring on one alone is fitting on the same four."""
+    data = demonstrations()
+    data["state"][data["train"]] = 0.5
+    result = probe(untrained, data)
+    error = data["state"][4:, :, 0] - 0.5
+    valid = torch.arange(51) < data["length"][4:].unsqueeze(-1)
+    expected = error[valid].square().mean().sqrt().item()
+    assert result["joint_yaw_rmse_rad"] == pytest.approx(expected, rel=1e-3)
+
+
+def test_frames_beyond_the_length_do_not_count(untrained: Representation) -> None:
+    data = demonstrations()
+    expected = probe(untrained, data)
+    beyond = torch.arange(51) >= data["length"].unsqueeze(-1)
+    data["pixels"][beyond] = 7
+    data["state"][beyond] = 1e6
+    data["action"][beyond[:, 1:]] = 1e6
+    assert probe(untrained, data) == pytest.approx(expected)
+
+
+def test_play_is_measured_where_all_objects_are_on_the_table(untrained: Representation) -> None:
+    play = demonstrations(9)
+    play["state"][..., 7:] = 0.7
+    play["state"][:, 1, 15] = 0.1  # the white box has just fallen
+    play["state"][:, 1, 0] = 1e6
+    result = probe(untrained, demonstrations(), play=play)
+    assert result.items() >= probe(untrained, demonstrations()).items()
+    assert 0.01 < result["play_joint_yaw_rmse_rad"] < 10
+    assert result["play_white_error_cm"] == pytest.approx(0, abs=1e-2)

@@ -1,0 +1,311 @@
+"""Stage 1 on a small world: two squares on grey, moved by the four numbers of the action."""
+
+import csv
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+
+from bgpo_trl.configs import RepresentationConfig, SequenceAutoencoderConfig, VAEConfig
+from bgpo_trl.encoders.probes import probe
+from bgpo_trl.encoders.representation import (
+    Representation,
+    default_weights,
+    embed_demonstrations,
+    encode_frames,
+    load_representation,
+    mean_frame,
+    save_representation,
+    split,
+    train_representation,
+    valid_frames,
+)
+from bgpo_trl.encoders.train import train_encoders
+from suites import nico
+
+CONFIG = RepresentationConfig(
+    vae=VAEConfig(
+        batch_size=32,
+        window=2,
+        steps=90,
+        learning_rate=2e-3,
+        warmup_steps=10,
+        kl_weight=0.01,
+        inverse_weight=10.0,
+    ),
+    lae=SequenceAutoencoderConfig(batch_size=64, steps=150, learning_rate=1e-2, warmup_steps=10),
+    checkpoint_every=50,
+)
+TINY = RepresentationConfig(
+    vae=VAEConfig(batch_size=4, window=2, steps=4, warmup_steps=1),
+    lae=SequenceAutoencoderConfig(batch_size=4, steps=4, warmup_steps=1),
+    checkpoint_every=1,
+    log_every=2,
+)
+DIRECTIONS = np.array([[1, 0, 0, 0], [-1, 0, 0, 1], [0, 1, -1, 0]])  # of both squares, by task
+
+
+def squares(n: int, seed: int = 0) -> TensorDict:
+    """Demonstrations of three ways to move a red and a green square of 8 pixels."""
+    rng = np.random.default_rng(seed)
+    pixels = np.zeros((n, 51, 32, 64, 3), np.uint8)
+    action = np.zeros((n, 50, 4), np.float32)
+    state = np.zeros((n, 51, 16), np.float32)
+    task = np.arange(n) % 3
+    length = rng.integers(6, 11, n)
+    for i in range(n):
+        place = rng.uniform([16, 8, 16, 8], [40, 16, 40, 16])  # x, y, x, y of the corners
+        for t in range(length[i]):
+            frame = np.full((32, 64, 3), 60, np.uint8)
+            for corner, color in ((place[:2], (230, 30, 30)), (place[2:], (30, 230, 30))):
+                x, y = np.round(corner).astype(int)
+                frame[y : y + 8, x : x + 8] = color
+            pixels[i, t] = frame
+            state[i, t, :4] = place / 32
+            state[i, t, 7:9], state[i, t, 10:12] = place[:2] / 100, place[2:] / 100
+            if t < length[i] - 1:
+                action[i, t] = 0.6 * DIRECTIONS[task[i]] + rng.uniform(-0.4, 0.4, 4)
+                place = np.clip(place + 4 * action[i, t], 0, [55, 23, 55, 23])
+    return TensorDict(
+        {
+            "pixels": torch.from_numpy(pixels),
+            "action": torch.from_numpy(action),
+            "length": torch.from_numpy(length),
+            "state": torch.from_numpy(state),
+            "task": torch.from_numpy(task),
+            "train": torch.arange(n) < 0.8 * n,
+        },
+        [n],
+    )
+
+
+@pytest.fixture(scope="module")
+def dataset() -> TensorDict:
+    return squares(150)
+
+
+@pytest.fixture(scope="module")
+def trained(dataset: TensorDict) -> Representation:
+    return train_representation(dataset, CONFIG, scene_version="squares", progress=False)
+
+
+@pytest.fixture(scope="module")
+def tiny() -> Representation:
+    return train_representation(
+        squares(8), TINY, scene_version="squares", command="make weights", progress=False
+    )
+
+
+@pytest.fixture(scope="module")
+def probed(trained: Representation, dataset: TensorDict) -> dict[str, float]:
+    return probe(trained, dataset)
+
+
+def same(a: Representation, b: Representation) -> bool:
+    return all(
+        torch.equal(x, y)
+        for m, n in ((a.vae, b.vae), (a.lae, b.lae))
+        for x, y in zip(m.state_dict().values(), n.state_dict().values(), strict=True)
+    )
+
+
+def test_reconstructs_better_than_the_mean_frame(probed: dict[str, float]) -> None:
+    assert probed["reconstruction"] < 0.6 * probed["mean_frame_reconstruction"]
+
+
+def test_latents_tell_where_things_are(probed: dict[str, float], dataset: TensorDict) -> None:
+    """Held-out error of the linear probe, against always guessing the mean of the training set."""
+    train, held_out = split(dataset)
+    positions = [
+        part["state"][torch.arange(51) < part["length"].unsqueeze(-1)] for part in (train, held_out)
+    ]
+    for name, first in (("glass", 7), ("green", 10)):
+        here = slice(first, first + 2)
+        guess = positions[1][:, here] - positions[0][:, here].mean(0)
+        assert probed[f"{name}_error_cm"] < 0.5 * 100 * guess.norm(dim=-1).mean()
+
+
+def test_inverse_model_sees_the_action(probed: dict[str, float]) -> None:
+    assert probed["inverse_r2"] > 0.3
+
+
+def test_embeddings_tell_tasks_apart(probed: dict[str, float]) -> None:
+    assert probed["task_accuracy_linear"] > 0.8
+    assert probed["task_accuracy_nearest"] > 0.8
+    assert probed["phi_distance_same_task"] < probed["phi_distance_other_task"]
+    assert probed["sequence_mse"] < 0.6
+
+
+def test_latents_are_standardised_and_zero_beyond_the_length(
+    trained: Representation, dataset: TensorDict
+) -> None:
+    train, _ = split(dataset)
+    latent = encode_frames(trained.vae, train["pixels"], train["length"], batch_size=50)
+    valid = torch.arange(51) < train["length"].unsqueeze(-1)
+    assert (latent[~valid] == 0).all()
+    torch.testing.assert_close(latent[valid].mean(0), torch.zeros(64), atol=1e-3, rtol=0)
+    assert latent[valid].std(0).max() < 1.001
+    torch.testing.assert_close(latent[3, 2], trained.vae.latent(train["pixels"][3, 2]))
+
+
+def test_embedding_ignores_frames_beyond_the_length(
+    trained: Representation, dataset: TensorDict
+) -> None:
+    part = dataset[:6].clone()
+    phi = embed_demonstrations(trained, part)
+    assert phi.shape == (6, 32)
+    part["pixels"][:, 12:] = 255
+    assert torch.equal(embed_demonstrations(trained, part), phi)
+
+
+def test_result_is_frozen(trained: Representation) -> None:
+    assert not any(p.requires_grad for m in (trained.vae, trained.lae) for p in m.parameters())
+    assert not trained.vae.training
+    assert not trained.lae.training
+
+
+def test_held_out_demonstrations_are_not_learned_from(tiny: Representation) -> None:
+    data = squares(8)
+    data["pixels"][~data["train"]] = 0
+    other = train_representation(data, TINY, scene_version="squares", progress=False)
+    assert same(tiny, other)
+
+
+def test_seed_decides_everything_and_touches_no_global_state(tiny: Representation) -> None:
+    torch.manual_seed(77)
+    state = torch.get_rng_state()
+    again = train_representation(squares(8), TINY, scene_version="squares", progress=False)
+    assert torch.equal(torch.get_rng_state(), state)
+    assert same(tiny, again)
+    other = train_representation(
+        squares(8), replace(TINY, seed=1), scene_version="squares", progress=False
+    )
+    assert not same(tiny, other)
+
+
+@pytest.mark.parametrize("stop", [("vae", 2), ("lae", 2)])
+def test_interrupted_training_continues_to_the_same_weights(
+    tiny: Representation, tmp_path: Path, stop: tuple[str, int]
+) -> None:
+    def interrupt(row: dict) -> None:
+        if (row["stage"], row["step"]) == stop:
+            raise KeyboardInterrupt
+
+    arguments = {"scene_version": "squares", "checkpoint": tmp_path, "progress": False}
+    with pytest.raises(KeyboardInterrupt):
+        train_representation(squares(8), TINY, log=interrupt, **arguments)
+    rows: list[dict] = []
+    resumed = train_representation(squares(8), TINY, log=rows.append, **arguments)
+    assert same(tiny, resumed)
+    assert [row["stage"] for row in rows] == ["vae"] * (2 if stop[0] == "vae" else 0) + ["lae"] * 2
+
+
+def test_checkpoint_of_another_configuration_is_refused(tmp_path: Path) -> None:
+    arguments = {"scene_version": "squares", "checkpoint": tmp_path, "progress": False}
+    train_representation(squares(8), TINY, **arguments)
+    with pytest.raises(ValueError, match="another configuration"):
+        train_representation(squares(8), replace(TINY, seed=3), **arguments)
+
+
+def test_log_has_the_losses_of_both_stages(tmp_path: Path) -> None:
+    rows: list[dict] = []
+    train_representation(squares(8), TINY, scene_version="squares", log=rows.append, progress=False)
+    assert [(row["stage"], row["step"]) for row in rows] == [
+        ("vae", 2),
+        ("vae", 4),
+        ("lae", 2),
+        ("lae", 4),
+    ]
+    assert {"loss_reconstruction", "loss_kl", "loss_inverse", "kl", "inverse"} <= rows[0].keys()
+    assert rows[0]["loss_kl"] == pytest.approx(TINY.vae.kl_weight * rows[0]["kl"])
+
+
+def test_frame_encoder_sees_the_training_part_of_play_besides_the_demonstrations(
+    tiny: Representation,
+) -> None:
+    def train(play: TensorDict) -> Representation:
+        return train_representation(
+            squares(8), TINY, play=play, scene_version="squares", progress=False
+        )
+
+    play = squares(10)
+    trained, held_out_changed = train(play), play.clone()
+    assert not trained.vae.mean_frame.equal(tiny.vae.mean_frame)
+    together = torch.cat([valid_frames(d[d["train"]]) for d in (squares(8), play)])
+    torch.testing.assert_close(trained.vae.mean_frame, mean_frame(together))
+    held_out_changed["pixels"][~play["train"]] = 0
+    assert same(trained, train(held_out_changed))
+
+
+def test_command_writes_weights_log_and_probes(tmp_path: Path) -> None:
+    folder, weights = tmp_path / "run", tmp_path / "weights.safetensors"
+    play = squares(10)
+    play["state"][..., 7:] = 1.0  # on the table
+    trained, _ = train_encoders(squares(8), play, weights, folder, TINY, "make weights")
+    loaded = load_representation(weights, scene_version=nico.scene_version())
+    assert same(trained, loaded)
+    assert loaded.metadata["command"] == "make weights"
+    rows = list(csv.DictReader((folder / "train.csv").open()))
+    assert [row["stage"] for row in rows] == ["vae", "vae", "lae", "lae"]
+    assert json.loads((folder / "probes.json").read_text()) == probe(loaded, squares(8), play=play)
+    assert (folder / "reconstructions.png").exists()
+
+
+@pytest.mark.parametrize("window", [1, 3])
+def test_refuses_windows_that_do_not_make_up_a_batch(window: int) -> None:
+    with pytest.raises(ValueError, match=f"^window must be .* divide batch_size 4, got {window}$"):
+        replace(TINY.vae, window=window)
+
+
+def test_refuses_demonstrations_shorter_than_a_window() -> None:
+    config = replace(TINY, vae=replace(TINY.vae, window=16, batch_size=16))
+    with pytest.raises(ValueError, match="16 frames"):
+        train_representation(squares(8), config, scene_version="squares", progress=False)
+
+
+def test_refuses_a_dataset_without_held_out_part() -> None:
+    with pytest.raises(ValueError, match="held-out"):
+        split(squares(8).set("train", torch.ones(8, dtype=torch.bool)))
+
+
+def test_save_and_load(tiny: Representation, tmp_path: Path) -> None:
+    path = tmp_path / "new" / "weights.safetensors"
+    save_representation(tiny, path)
+    loaded = load_representation(path, scene_version="squares")
+    assert same(tiny, loaded)
+    pixels = squares(2)["pixels"]
+    assert torch.equal(loaded.vae.latent(pixels), tiny.vae.latent(pixels))
+    assert loaded.metadata == tiny.metadata
+    assert loaded.metadata["command"] == "make weights"
+    assert loaded.metadata["seed"] == "0"
+    assert json.loads(loaded.metadata["config"]) == asdict(TINY)
+    assert not any(p.requires_grad for p in loaded.vae.parameters())
+    assert [file.name for file in path.parent.iterdir()] == ["weights.safetensors"]
+
+
+def test_refuses_weights_of_another_scene(tiny: Representation, tmp_path: Path) -> None:
+    save_representation(tiny, tmp_path / "w.safetensors")
+    with pytest.raises(ValueError, match=r"scene squares, this is scene nico-2.*--train-encoders"):
+        load_representation(tmp_path / "w.safetensors", scene_version="nico-2")
+
+
+def test_refuses_missing_and_damaged_weights(tiny: Representation, tmp_path: Path) -> None:
+    path = tmp_path / "w.safetensors"
+    with pytest.raises(ValueError, match=r"no encoder weights.*--train-encoders"):
+        load_representation(path)
+    save_representation(tiny, path)
+    content = path.read_bytes()
+    flipped = bytearray(content)
+    flipped[len(content) // 2] ^= 1
+    for damaged in (b"", b"not weights", content[: len(content) // 2], bytes(flipped)):
+        path.write_bytes(damaged)
+        with pytest.raises(ValueError, match=r"damaged.*--train-encoders"):
+            load_representation(path)
+
+
+def test_default_weights_lie_in_the_package() -> None:
+    assert default_weights().parts[-3:] == ("bgpo_trl", "weights", "nico.safetensors")

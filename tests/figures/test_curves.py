@@ -1,0 +1,346 @@
+import itertools
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+import torch
+from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+
+from bgpo_trl.figures.curves import (
+    plot_frame_strips,
+    plot_gwr_pca,
+    plot_success_curves,
+    save_figure,
+)
+from bgpo_trl.runs.logger import RunLogger
+
+TASKS = ["grasp_glass", "push_green_to_glass", "push_green_to_white"]
+
+
+def write_eval_csv(path: Path, rows: list[tuple[str, int, int, str, int]]) -> Path:
+    lines = [
+        f"{algorithm},{seed},{episode},{30 * episode},{task},{success},{success}.0,30"
+        for algorithm, seed, episode, task, success in rows
+    ]
+    header = "algorithm,seed,episode,env_steps,task,success,return,steps"
+    path.write_text("\n".join([header, *lines]) + "\n")
+    return path
+
+
+@pytest.fixture
+def run(tmp_path) -> Path:
+    """Three algorithms, two seeds, tasks presented from episodes 0, 35 and 65 of 100."""
+    generator = np.random.default_rng(0)
+    starts = np.array([0, 35, 65])
+    rows = [
+        (algorithm, seed, episode, TASKS[generator.integers((starts <= episode).sum())], success)
+        for algorithm in ("BGPO", "MAML", "Dist-NLL")
+        for seed in range(2)
+        for episode in range(1, 101)
+        for success in [int(generator.integers(2))]
+    ]
+    return write_eval_csv(tmp_path / "eval.csv", rows)
+
+
+def curve(axes: Axes, index: int = 0) -> dict[int, float]:
+    """Returns the mean by episode, where there is one."""
+    x, y = axes.lines[index].get_data()
+    return {int(a): float(b) for a, b in zip(x, y, strict=True) if np.isfinite(b)}
+
+
+def band(axes: Axes, episode: int) -> tuple[float, float]:
+    """Returns the lower and upper edge of the shaded region."""
+    vertices = np.concatenate([path.vertices for path in axes.collections[0].get_paths()])
+    values = vertices[vertices[:, 0] == episode, 1]
+    return float(values.min()), float(values.max())
+
+
+def vertical_lines(axes: Axes) -> list[float]:
+    lines = [np.asarray(line.get_xdata()) for line in axes.lines if line.get_linestyle() == "--"]
+    return sorted(float(x[0]) for x in lines if len(x) == 2 and x[0] == x[1])
+
+
+def test_mean_and_spread_over_seeds_by_hand(tmp_path):
+    rows = [("bgpo", 0, episode, "push", success) for episode, success in enumerate([1, 1, 0], 1)]
+    rows += [("bgpo", 1, episode, "push", success) for episode, success in enumerate([0, 1, 0], 1)]
+    figure = plot_success_curves(write_eval_csv(tmp_path / "eval.csv", rows), window=2)
+    overall, push = figure.axes
+    # Seed 0: 1, (1 + 1) / 2, (1 + 0) / 2; seed 1: 0, (0 + 1) / 2, (1 + 0) / 2.
+    assert curve(overall) == curve(push) == {1: 0.5, 2: 0.75, 3: 0.5}
+    assert band(overall, 1) == (0, 1)
+    assert band(overall, 2) == (0.5, 1)
+    assert band(overall, 3) == (0.5, 0.5)
+
+
+def test_each_panel_shows_its_task_and_the_window_never_looks_ahead(tmp_path):
+    rows = [("bgpo", 0, 1, "a", 1), ("bgpo", 0, 2, "b", 0), ("bgpo", 0, 3, "a", 0)]
+    rows += [("bgpo", 0, 6, "b", 1), ("bgpo", 1, 6, "b", 0)]
+    path = write_eval_csv(tmp_path / "eval.csv", rows)
+    overall, a, b = plot_success_curves(path, window=3).axes
+    assert [axes.get_title() for axes in (overall, a, b)] == [
+        "All presented tasks",
+        "Task 1: a",
+        "Task 2: b",
+    ]
+    # A point for each evaluation: nothing is known of episodes 4 and 5.
+    assert curve(overall) == pytest.approx({1: 1, 2: 1 / 2, 3: 1 / 3, 6: 1 / 2})
+    assert curve(a) == {1: 1, 2: 1, 3: 1 / 2}
+    # At 6, the second seed has its first test episode: mean of 1 and 0.
+    assert curve(b) == {2: 0, 3: 0, 6: 1 / 2}
+
+
+def test_curves_may_end_early_and_be_called_otherwise(run):
+    names = {"MAML": "the second", "BGPO": "the first"}
+    whole, cut = plot_success_curves(run), plot_success_curves(run, last=50, window=5, names=names)
+    labels = [text.get_text() for text in cut.legends[0].get_texts()]
+    assert labels == ["the second (2 seeds)", "the first (2 seeds)", "Dist-NLL (2 seeds)"]
+    for index, before in ((0, 1), (1, 0), (2, 2)):
+        expected = {x: y for x, y in curve(whole.axes[0], before).items() if x <= 50}
+        assert curve(cut.axes[0], index) == expected != {}
+
+
+def test_frame_strips_go_from_the_first_to_the_last_frame():
+    short = np.arange(3, dtype=np.uint8)[:, None, None, None].repeat(3, -1) * 9
+    long = np.arange(40, dtype=np.uint8)[:, None, None, None].repeat(3, -1)
+    figure = plot_frame_strips({"short": short, "long " * 20: long}, n_frames=4)
+    shown = [[int(np.asarray(i.get_array())[0, 0, 0]) for i in a.images] for a in figure.axes]
+    assert shown == [[0], [9], [18], [], [0], [13], [26], [39]]
+    assert [a.get_title() for a in figure.axes[4:]] == ["step 0", "step 13", "step 26", "step 39"]
+    assert [a.texts[0].get_text() for a in figure.axes[::4]] == [
+        "short",
+        "long " * 20,
+    ]
+    FigureCanvasAgg(figure).draw()
+    gaps = np.diff([axes.get_position().x0 for axes in figure.axes[4:]])
+    assert np.allclose(gaps, gaps[0])  # However long a title is.
+
+
+@pytest.mark.parametrize("episodes", [{}, {"none": np.zeros((0, 2, 2, 3), np.uint8)}])
+def test_nothing_to_show_is_refused(episodes):
+    with pytest.raises(ValueError, match="nothing to show"):
+        plot_frame_strips(episodes)
+
+
+def test_runs_may_be_spread_over_files_with_rows_in_any_order(run, tmp_path):
+    header, *lines = run.read_text().splitlines()
+    parts = []
+    for algorithm in ("BGPO", "MAML", "Dist-NLL"):
+        rows = [line for line in lines if line.startswith(algorithm)]
+        parts.append(tmp_path / f"{algorithm}.csv")
+        parts[-1].write_text("\n".join([header, *reversed(rows)]) + "\n")
+    whole, spread = plot_success_curves(run), plot_success_curves(parts)
+    for expected, axes in zip(whole.axes, spread.axes, strict=True):
+        for index in range(3):
+            assert curve(axes, index) == curve(expected, index) != {}
+
+
+def test_window_is_a_twentieth_of_the_training_and_is_told(run):
+    figure = plot_success_curves(run)
+    assert figure.get_supxlabel() == "Training episode (success: mean over the last 5)"
+    expected = plot_success_curves(run, window=5)
+    assert curve(figure.axes[0]) == curve(expected.axes[0])
+    assert curve(figure.axes[0]) != curve(plot_success_curves(run, window=6).axes[0])
+
+
+def test_presentation_and_chance_are_marked(run):
+    presented = {TASKS[2]: 0, TASKS[0]: 35, TASKS[1]: 65}
+    figure = plot_success_curves(run, presented=presented, random_success={TASKS[0]: 0.05})
+    assert [vertical_lines(axes) for axes in figure.axes] == [[35, 65], [], [35], [65]]
+    assert [axes.get_title()[:6] for axes in figure.axes[1:]] == ["Task 1", "Task 2", "Task 3"]
+    assert figure.axes[2].get_title() == "Task 2: grasp glass"
+    dotted = [
+        [
+            float(np.asarray(line.get_ydata())[0])
+            for line in axes.lines
+            if len(line.get_xdata()) == 2
+        ]
+        for axes in figure.axes
+    ]
+    assert 0.05 in dotted[2]
+    assert not any(0.05 in values for values in (dotted[0], dotted[1], dotted[3]))
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert labels == ["BGPO (2 seeds)", "MAML (2 seeds)", "Dist-NLL (2 seeds)", "random policy"]
+
+
+def test_reads_what_a_run_logger_writes(tmp_path):
+    with RunLogger(tmp_path, config={}) as logger:
+        for episode, success in enumerate([True, False], 1):
+            row = {"algorithm": "bgpo", "seed": 0, "episode": episode, "task": "a"}
+            logger.log_eval({**row, "success": torch.tensor([success])})
+    assert curve(plot_success_curves(tmp_path / "eval.csv").axes[0]) == {1: 1, 2: 0}
+
+
+def test_bad_curves_are_refused(tmp_path, run):
+    empty = write_eval_csv(tmp_path / "empty.csv", [])
+    with pytest.raises(ValueError, match=r"empty\.csv holds no test episode: let the run evaluate"):
+        plot_success_curves(empty)
+    with pytest.raises(ValueError, match="no test episodes"):
+        plot_success_curves([])
+    (tmp_path / "other.csv").write_text("seed,task,loss\n")
+    with pytest.raises(ValueError, match=r"no such table of a run \(it lacks algorithm, episode"):
+        plot_success_curves(tmp_path / "other.csv")
+    with pytest.raises(ValueError, match="window must be at least 1"):
+        plot_success_curves(run, window=0)
+
+
+def test_pca_keeps_the_distances_of_what_lies_in_a_plane():
+    generator = np.random.default_rng(0)
+    plane = np.linalg.qr(generator.normal(size=(32, 2)))[0].T
+    weights = generator.normal(size=(40, 2)) @ plane + generator.normal(size=32)
+    figure = plot_gwr_pca(torch.from_numpy(weights), torch.zeros(40, dtype=torch.long), ["a"])
+    (axes,) = figure.axes
+    points = np.asarray(axes.collections[0].get_offsets())
+    for i, j in itertools.combinations(range(40), 2):
+        assert np.linalg.norm(points[i] - points[j]) == pytest.approx(
+            np.linalg.norm(weights[i] - weights[j])
+        )
+    assert points.var(axis=0)[0] > points.var(axis=0)[1]
+    np.testing.assert_allclose(points.mean(axis=0), 0, atol=1e-9)
+    np.testing.assert_allclose(np.cov(points.T)[0, 1], 0, atol=1e-9)
+
+
+def test_pca_tells_the_share_of_variance():
+    # Variances 9 and 1 along two axes of three.
+    weights = np.array([[3, 0, 5], [-3, 0, 5], [0, 1, 5], [0, -1, 5]])
+    (axes,) = plot_gwr_pca(weights, np.zeros(4, dtype=int), ["a"]).axes
+    assert axes.get_xlabel() == "Principal component 1 (90% of variance)"
+    assert axes.get_ylabel() == "Principal component 2 (10% of variance)"
+    np.testing.assert_allclose(
+        np.asarray(axes.collections[0].get_offsets()), weights[:, :2], atol=1e-12
+    )
+
+
+def test_pca_colors_nodes_by_task():
+    weights = np.array([[3.0, 0], [-3, 0], [0, 1], [0, -1], [0, 0]])
+    (axes,) = plot_gwr_pca(weights, [1, 0, 1, -1, 0], TASKS[:2]).axes
+    nodes = {
+        group.get_label(): np.asarray(group.get_offsets()).round(9).tolist()
+        for group in axes.collections
+    }
+    assert nodes == {
+        "task 1: grasp glass (2)": [[-3, 0], [0, 0]],
+        "task 2: push green to glass (2)": [[3, 0], [0, 1]],
+        "no demonstration (1)": [[0, -1]],
+    }
+    assert len({to_hex(group.get_facecolor()[0]) for group in axes.collections}) == 3
+
+
+def test_pca_by_group_stands_beside_the_one_by_task():
+    weights = np.array([[3.0, 0], [-3, 0], [0, 1], [0, -1], [0, 0]])
+    figure = plot_gwr_pca(weights, [1, 0, 1, -1, 0], TASKS[:2], torch.tensor([2, 0, 2, 0, 0]))
+    by_task, by_group = figure.axes
+    nodes = {
+        group.get_label(): np.asarray(group.get_offsets()).round(9).tolist()
+        for group in by_group.collections
+    }
+    assert nodes == {
+        "group 0 (3)": [[-3, 0], [0, -1], [0, 0]],
+        "group 2 (2)": [[3, 0], [0, 1]],
+    }
+    colors = [to_hex(c.get_facecolor()[0]) for a in figure.axes for c in a.collections]
+    assert len(set(colors)) == 5  # groups are no tasks
+    legends = [[text.get_text() for text in a.get_legend().get_texts()] for a in figure.axes]
+    assert legends == [[c.get_label() for c in a.collections] for a in figure.axes]
+    FigureCanvasAgg(figure).draw()
+    heights = [axes.get_position().bounds[1::2] for axes in (by_task, by_group)]
+    assert heights[0] == pytest.approx(heights[1])
+    assert by_task.get_xlim() == by_group.get_xlim()
+
+
+def test_pca_of_equal_nodes_is_a_point():
+    (axes,) = plot_gwr_pca(np.ones((3, 4)), [0, 0, 0], ["a"]).axes
+    np.testing.assert_array_equal(np.asarray(axes.collections[0].get_offsets()), np.zeros((3, 2)))
+
+
+@pytest.mark.parametrize(
+    ("weights", "node_task", "message"),
+    [
+        (np.zeros((1, 4)), [0], r"N, d >= 2, not \[1, 4\]"),
+        (np.zeros(4), [0] * 4, "N, d >= 2"),
+        (np.full((3, 4), np.nan), [0] * 3, "must be finite"),
+        (np.zeros((3, 4)), [0] * 2, "one task for each of the 3 nodes"),
+        (np.zeros((3, 4)), [0, 1, 2], "position in the 2 task_names, not 0 to 2"),
+        (np.zeros((3, 4)), [0, 1, -2], "not -2 to 1"),
+    ],
+)
+def test_bad_pca_input_is_refused(weights, node_task, message):
+    with pytest.raises(ValueError, match=message):
+        plot_gwr_pca(weights, node_task, ["a", "b"])
+
+
+def test_groups_of_other_nodes_are_refused():
+    with pytest.raises(ValueError, match="one group for each of the 3 nodes, not the shape"):
+        plot_gwr_pca(np.zeros((3, 4)), [0, 0, 1], ["a", "b"], [0, 1])
+
+
+def figures(run: Path) -> list[Figure]:
+    presented = dict(zip(TASKS, (0, 35, 65), strict=True))
+    generator = np.random.default_rng(0)
+    return [
+        plot_success_curves(run, presented=presented, random_success=dict.fromkeys(TASKS, 0.1)),
+        plot_gwr_pca(generator.normal(size=(50, 32)), generator.integers(-1, 3, 50), TASKS),
+    ]
+
+
+def test_the_same_data_gives_the_same_file_and_leaves_no_trace(run, tmp_path):
+    before = dict(mpl.rcParams)
+    for number, figure in enumerate(figures(run) + figures(run)):
+        save_figure(figure, tmp_path / "figures" / f"{number}.png")
+    content = [(tmp_path / "figures" / f"{number}.png").read_bytes() for number in range(4)]
+    assert content[:2] == content[2:]
+    assert content[0] != content[1]
+    assert all(image.startswith(b"\x89PNG") for image in content)
+    assert dict(mpl.rcParams) == before
+    assert plt.get_fignums() == []
+
+
+def visible_texts(figure: Figure) -> list[Text]:
+    hidden = {
+        id(text)
+        for axes in figure.axes
+        for axis in (axes.xaxis, axes.yaxis)
+        for tick in axis.get_major_ticks()
+        for text in (tick.label1, tick.label2)
+        # Matplotlib keeps spare ticks beyond the ends of an axis, and does not draw them.
+        if not min(axis.get_view_interval()) <= tick.get_loc() <= max(axis.get_view_interval())
+    }
+    return [
+        text
+        for text in figure.findobj(Text)
+        if text.get_visible() and text.get_text() and id(text) not in hidden
+    ]
+
+
+@pytest.mark.parametrize("n_tasks", [1, 3, 5])
+@pytest.mark.parametrize(
+    "algorithms", [("bgpo",), ("GWR-B + intrinsic reward", "GWR-B", "no", "x")]
+)
+def test_no_label_is_cut_off_or_overlaps_another(n_tasks, algorithms, tmp_path):
+    tasks = [f"push_green_to_{number}" for number in range(n_tasks)]
+    rows = [
+        (algorithm, 0, episode, tasks[episode % n_tasks], episode % 2)
+        for algorithm in algorithms
+        for episode in range(0, 20001, 100)
+    ]
+    path = write_eval_csv(tmp_path / "eval.csv", rows)
+    presented = {task: 20000 * index // n_tasks for index, task in enumerate(tasks)}
+    curves = plot_success_curves(path, presented=presented, random_success={tasks[0]: 0.1})
+    nodes = np.random.default_rng(0).normal(size=(50, 8))
+    pca = plot_gwr_pca(nodes, np.arange(50) % (n_tasks + 1) - 1, tasks)
+    both = plot_gwr_pca(nodes, np.arange(50) % (n_tasks + 1) - 1, tasks, np.arange(50) % n_tasks)
+    for figure in (curves, pca, both):
+        canvas = FigureCanvasAgg(figure)
+        canvas.draw()
+        texts = visible_texts(figure)
+        boxes = [text.get_window_extent(canvas.get_renderer()) for text in texts]
+        for text, box in zip(texts, boxes, strict=True):
+            assert figure.bbox.x0 <= box.x0 and box.x1 <= figure.bbox.x1, text
+            assert figure.bbox.y0 <= box.y0 and box.y1 <= figure.bbox.y1, text
+        for (i, one), (j, other) in itertools.combinations(enumerate(boxes), 2):
+            assert not one.overlaps(other), (texts[i], texts[j])

@@ -1,0 +1,140 @@
+import csv
+import errno
+import math
+import resource
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bgpo_trl.files.csv_file import CsvFile
+
+COLUMNS = ("episode", "task", "return")
+
+
+def test_rows_are_there_without_closing_and_continue_after_reopening(tmp_path):
+    path = tmp_path / "eval.csv"
+    first = CsvFile(path, COLUMNS)
+    first.write({"return": 0.1, "episode": 1})
+    assert path.read_bytes() == b"episode,task,return\n1,,0.1\n"
+    # Reopened without a close, as after a kill.
+    second = CsvFile(path, COLUMNS)
+    second.write({"episode": 2, "task": 'push "green", slowly', "return": 1})
+    assert path.read_bytes() == (b'episode,task,return\n1,,0.1\n2,"push ""green"", slowly",1\n')
+
+
+@settings(deadline=None)
+@given(value=st.floats(), number=st.integers())
+def test_numbers_are_read_back_exactly(value, number, tmp_path_factory):
+    path = tmp_path_factory.mktemp("csv") / "eval.csv"
+    with CsvFile(path, COLUMNS) as file:
+        file.write({"episode": number, "return": value})
+    row = next(csv.DictReader(path.open()))
+    assert int(row["episode"]) == number
+    assert float(row["return"]) == value or (math.isnan(value) and row["return"] == "nan")
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (True, "1"),
+        (torch.tensor([False]), "0"),
+        (np.bool_(True), "1"),
+        (torch.tensor(0.5), "0.5"),
+        (np.int64(3), "3"),
+        (None, ""),
+    ],
+)
+def test_values_of_one_element_are_written_as_numbers(value, text, tmp_path):
+    with CsvFile(tmp_path / "eval.csv", COLUMNS) as file:
+        file.write({"return": value})
+    assert (tmp_path / "eval.csv").read_text().splitlines()[1] == f",,{text}"
+
+
+def test_unknown_column_is_refused_before_anything_is_written(tmp_path):
+    with CsvFile(tmp_path / "eval.csv", COLUMNS) as file:
+        with pytest.raises(ValueError, match=r"eval.csv has no column loss, speed"):
+            file.write({"episode": 1, "loss": 2.0, "speed": 1})
+        assert file.position() == len("episode,task,return\n")
+
+
+@pytest.mark.parametrize(
+    "content", ["episode,return\n1,2\n", "no newline", "episode,task,return2\n"]
+)
+def test_a_file_with_other_columns_is_left_alone(content, tmp_path):
+    path = tmp_path / "eval.csv"
+    path.write_text(content)
+    with pytest.raises(ValueError, match=r"has the columns .*, this run writes") as error:
+        CsvFile(path, COLUMNS)
+    assert "\n" not in str(error.value)
+    assert path.read_text() == content
+
+
+@settings(deadline=None)
+@given(cut=st.integers(0, 38))
+def test_a_torn_last_row_is_dropped(cut, tmp_path_factory):
+    path = tmp_path_factory.mktemp("csv") / "eval.csv"
+    whole = b"episode,task,return\n1,grasp,0\n2,push,1\n"
+    path.write_bytes(whole[:cut])
+    with CsvFile(path, COLUMNS) as file:
+        file.write({"episode": 3})
+    rows = [line for line in (b"1,grasp,0\n", b"2,push,1\n") if line in whole[:cut]]
+    assert path.read_bytes() == b"episode,task,return\n" + b"".join(rows) + b"3,,\n"
+
+
+@settings(deadline=None)
+@given(data=st.data())
+def test_cut_back_and_written_again_is_byte_for_byte_the_same(data, tmp_path_factory):
+    directory = tmp_path_factory.mktemp("csv")
+    rows = data.draw(
+        st.lists(st.fixed_dictionaries({"episode": st.integers(), "return": st.floats()}))
+    )
+    kept = data.draw(st.integers(0, len(rows)))
+    with CsvFile(directory / "straight.csv", COLUMNS) as straight:
+        for row in rows:
+            straight.write(row)
+    interrupted = CsvFile(directory / "resumed.csv", COLUMNS)
+    for row in rows[:kept]:
+        interrupted.write(row)
+    position = interrupted.position()
+    for row in rows[kept:]:
+        interrupted.write({**row, "task": "lost"})
+    with CsvFile(directory / "resumed.csv", COLUMNS) as resumed:
+        resumed.truncate_to(position)
+        for row in rows[kept:]:
+            resumed.write(row)
+    assert (directory / "resumed.csv").read_bytes() == (directory / "straight.csv").read_bytes()
+
+
+def test_cannot_cut_where_no_row_ends(tmp_path):
+    path = tmp_path / "eval.csv"
+    with CsvFile(path, COLUMNS) as file:
+        file.write({"episode": 1})
+        end = file.position()
+        for position in (end + 1, end - 1):
+            with pytest.raises(ValueError, match=f"no row that ends at byte {position}"):
+                file.truncate_to(position)
+        assert path.stat().st_size == end
+        file.truncate_to(0)
+    assert path.read_text() == "episode,task,return\n"
+
+
+@pytest.mark.parametrize("room", range(6))
+def test_a_row_without_room_leaves_no_trace(room, tmp_path):
+    path = tmp_path / "eval.csv"
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    with CsvFile(path, COLUMNS) as file:
+        file.write({"episode": 1})
+        before = path.read_bytes()
+        resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) + room, hard))
+        try:
+            with pytest.raises(OSError, match=r"cannot write to .*: make room") as error:
+                file.write({"episode": 2000})  # 7 bytes
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        assert error.value.errno in (errno.ENOSPC, errno.EFBIG)
+        assert path.read_bytes() == before
+        file.write({"episode": 2000})
+    assert path.read_bytes() == before + b"2000,,\n"

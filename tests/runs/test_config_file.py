@@ -1,0 +1,91 @@
+"""Settings read back from config.json."""
+
+import json
+from dataclasses import asdict, replace
+
+import pytest
+
+from benchmarks import ablation
+from bgpo_trl.algorithms import ALGORITHMS
+from bgpo_trl.algorithms.rl import RL
+from bgpo_trl.configs import PRESETS, BGPOConfig, DDPGConfig, RunConfig
+from bgpo_trl.runs.config_file import read_config
+
+
+def write(path, config, **changes):
+    path.write_text(json.dumps({**asdict(config), "encoders": "abc", **changes}))
+    return path
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_what_was_written_is_read(tmp_path, preset, name):
+    algorithm = replace(
+        ALGORITHMS[name].config, state="state", rl=DDPGConfig(hidden_sizes=(5, 7), gamma=0.5)
+    )
+    config = replace(PRESETS[preset], name=name, algorithm=algorithm, checkpoint_minutes=3)
+    read, encoders = read_config(write(tmp_path / "config.json", config))
+    assert (read, encoders) == (config, "abc")
+    assert type(read.algorithm) is type(algorithm)
+    assert isinstance(read.algorithm.rl.hidden_sizes, tuple)
+
+
+@pytest.mark.parametrize("name", RL)
+def test_an_rl_algorithm_is_known_by_its_name(tmp_path, name):
+    rl = replace(RL[name].config, gamma=0.5)
+    config = RunConfig(algorithm=BGPOConfig(rl=rl))
+    read, _ = read_config(write(tmp_path / "config.json", config))
+    assert read == config
+    assert type(read.algorithm.rl) is type(rl)
+
+
+@pytest.mark.parametrize("name", ablation.VARIANTS)
+def test_variants_have_the_settings_that_fit(tmp_path, name):
+    config = RunConfig(name=name, algorithm=replace(ablation.VARIANTS[name][1], beta=0.3))
+    path = write(tmp_path / "config.json", config, encoders=None)
+    assert read_config(path) == (config, None)
+
+
+def test_what_an_earlier_version_did_not_know_has_its_default(tmp_path):
+    settings = asdict(RunConfig())
+    del settings["checkpoint_minutes"], settings["algorithm"]["rl"]["critic_layer_norm"]
+    (tmp_path / "config.json").write_text(json.dumps(settings))
+    assert read_config(tmp_path / "config.json") == (RunConfig(), None)
+
+
+def nested(**rl):
+    settings = asdict(BGPOConfig())
+    return {"algorithm": {**settings, "rl": {**settings["rl"], **rl}}}
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"color": 1}, "unknown setting color"),
+        (nested(momentum=0.9), r"unknown setting algorithm.rl.momentum"),
+        (nested(gamma="0.9"), r"algorithm.rl.gamma is '0.9'"),
+        (nested(clip_targets=1), "algorithm.rl.clip_targets is 1"),
+        (nested(hidden_sizes=[5, 0.5]), "algorithm.rl.hidden_sizes is 0.5"),
+        ({"algorithm": {"state": "smell"}}, "algorithm.state is 'smell'"),
+        ({"algorithm": {"rl": 3}}, "algorithm.rl is 3"),
+        (nested(name="ppo"), "algorithm.rl.name is 'ppo', of no known RL algorithm"),
+        ({"algorithm": 3}, "no settings of a run"),
+        ({"seeds": 3}, "seeds is 3"),
+        ({"seeds": []}, "needs seeds"),
+        ({"encoders": 3}, "encoders is 3"),
+        ({"name": "mine", "algorithm": {"momentum": 1}}, "'mine' are of no known algorithm"),
+    ],
+)
+def test_what_is_no_run_of_this_version_is_refused(tmp_path, changes, said):
+    path = write(tmp_path / "config.json", RunConfig(), **changes)
+    with pytest.raises(ValueError, match=said) as error:
+        read_config(path)
+    assert "\n" not in str(error.value)
+    assert str(path) in str(error.value)
+
+
+@pytest.mark.parametrize("text", ["", "[]", '{"seeds":', "\x00", "null"])
+def test_what_is_not_json_of_settings_is_refused(tmp_path, text):
+    (tmp_path / "config.json").write_text(text)
+    with pytest.raises(ValueError, match=r"config.json cannot be read \(.*\): use the version"):
+        read_config(tmp_path / "config.json")

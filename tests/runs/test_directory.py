@@ -1,0 +1,182 @@
+"""A run's directory: one process at a time, complete, and of the same run; else nothing changes."""
+
+import csv
+import json
+import os
+import shutil
+import signal
+import socket
+from dataclasses import replace
+
+import pytest
+
+from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
+from bgpo_trl.runs.directory import check_settings, holds_run
+from bgpo_trl.training import Trainer
+from tests.test_training import assert_equal, at_step
+
+pytestmark = pytest.mark.usefixtures("easy_world")
+ELSEWHERE = "put it back as the run left it, or begin a new run in another directory"
+
+
+@pytest.fixture(scope="module")
+def make(bank, encoders, make_config):
+    def make(directory, config=None, **arguments):
+        parts = {"bank": bank, "encoders": encoders, "progress": False, **arguments}
+        return Trainer(config or make_config(), directory, **parts)
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def interrupted(easy_world, make, tmp_path_factory):
+    """A run that was interrupted half-way, with rows after its last checkpoint."""
+    directory = tmp_path_factory.mktemp("interrupted") / "run"
+    with make(directory) as trainer:
+        at_step(trainer, 25, lambda: signal.raise_signal(signal.SIGINT))
+        with pytest.raises(KeyboardInterrupt):
+            trainer.run()
+    for name in ("train.csv", "eval.csv"):
+        with (directory / name).open("a") as file:
+            file.write("bgpo,3,9,9,grasp_glass,1,1.0,5\n" * 2)
+    return directory
+
+
+@pytest.fixture
+def run(interrupted, tmp_path):
+    return shutil.copytree(interrupted, tmp_path / "run")
+
+
+def rows(path):
+    with open(path, newline="") as file:
+        return [tuple(row.values()) for row in csv.DictReader(file)]
+
+
+def interrupt(trainer, step):
+    at_step(trainer, step, lambda: signal.raise_signal(signal.SIGINT))
+    with pytest.raises(KeyboardInterrupt):
+        trainer.run()
+
+
+def test_one_process_at_a_time_is_in_a_runs_directory(run, make, other_process, refused):
+    first = other_process(run)
+    assert first.stdout.readline() == "has it\n"
+    told = f"{run} is in use by process {first.pid} on {socket.gethostname()}"
+    for resume in (False, True):
+        refused(lambda resume=resume: make(run, resume=resume), told, "let it finish, or stop it")
+    first.communicate("\n")
+    with make(run, resume=True):
+        second = other_process(run)
+        assert f"in use by process {os.getpid()} on" in second.communicate()[1]
+    assert not (run / "lock").exists()
+
+
+def remove(*names):
+    def do(run):
+        for name in names:
+            shutil.rmtree(run / name) if (run / name).is_dir() else (run / name).unlink()
+
+    return do
+
+
+def cut(name):
+    return lambda run: (run / name).write_bytes((run / name).read_bytes()[:-200])
+
+
+def edit_settings(run):
+    settings = json.loads((run / "config.json").read_text())
+    (run / "config.json").write_text(json.dumps({**settings, "task_starts": [0, 1, 2]}))
+
+
+DAMAGES = {
+    "no checkpoint": (remove("checkpoint"), "has rows of a run, but no checkpoint", ELSEWHERE),
+    "rows alone": (
+        remove("checkpoint", "config.json"), "has rows of a run, but no checkpoint", ELSEWHERE),
+    "no settings": (remove("config.json"), "has a checkpoint, but no config.json", ELSEWHERE),
+    "checkpoint alone": (
+        remove("config.json", "train.csv", "eval.csv"), "but no config.json", ELSEWHERE),
+    "no training episodes": (remove("train.csv"), "train.csv has 0 bytes and no", "put the file"),
+    "no tests": (remove("eval.csv"), "eval.csv has 0 bytes and no row that", "put the file back"),
+    "fewer tests": (cut("eval.csv"), "bytes and no row that ends at", "put the file back as"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("damage", "cause", "remedy"), DAMAGES.values(), ids=DAMAGES.keys())
+def test_a_run_that_lacks_something_is_refused_as_it_is(run, make, refused, damage, cause, remedy):
+    damage(run)
+    refused(lambda: make(run, resume=True), cause, remedy)
+    if (run / "config.json").exists():
+        refused(lambda: make(run), "already holds a run", "choose another run directory")
+
+
+def test_a_checkpoint_knows_the_settings_of_its_run(run, make, make_config, refused):
+    edit_settings(run)
+    config = make_config(task_starts=(0, 1, 2))
+    refused(
+        lambda: make(run, config, resume=True),
+        "run/checkpoint holds a run with other settings (task_starts is [0, 2, 4] there and [0, 1,",
+        "choose another run directory, or the same settings",
+    )
+
+
+def test_a_checkpoint_without_settings_goes_by_those_beside_it(run, make):
+    """As runs have it that were begun before checkpoints had them."""
+    state = load_checkpoint(run / "checkpoint")
+    del state["settings"], state["later"]
+    save_checkpoint(run / "checkpoint", state)
+    with make(run, resume=True) as trainer:
+        assert trainer.env_steps == 25
+
+
+def test_what_has_logged_nothing_is_begun(make, make_config, tmp_path):
+    config = make_config("state", "ddpg", episodes=2)
+    assert not holds_run(tmp_path)
+    for _ in range(2):
+        with make(tmp_path, config, resume=True):
+            assert holds_run(tmp_path)
+    with pytest.raises(ValueError, match="already holds a run"):
+        make(tmp_path, config)
+    with make(tmp_path, config, resume=True) as trainer:
+        trainer.run()
+    assert len(rows(tmp_path / "train.csv")) == 4
+
+
+def test_a_run_made_longer_is_the_longer_run(make, make_config, tmp_path):
+    """Seeds that were done early have gone on, and nothing of that is lost."""
+    run, straight = tmp_path / "longer", tmp_path / "straight"
+    config = make_config(episodes=16)
+    with make(straight, config) as trainer:
+        trainer.run()
+    for episodes in (12, 13):
+        with make(run, replace(config, episodes=episodes), resume=True) as trainer:
+            trainer.run()
+        played = rows(run / "train.csv")
+        assert len(set(played)) == len(played) == 2 * episodes
+        assert max(int(row[2]) for row in played) == episodes
+        assert load_checkpoint(run / "checkpoint")["later"]
+    with make(run, config, resume=True) as trainer:
+        interrupt(trainer, 1)
+    with make(run, config, resume=True) as trainer:
+        trainer.run()
+    for file in ("train.csv", "eval.csv"):
+        # What was played early is logged late.
+        assert sorted(rows(run / file)) == sorted(rows(straight / file))
+    assert (run / "config.json").read_text() == (straight / "config.json").read_text()
+    assert_equal(*(load_checkpoint(folder / "checkpoint") for folder in (run, straight)))
+
+    with pytest.raises(ValueError, match="episodes is 16 there and 13 here"):
+        make(run, replace(config, episodes=13), resume=True)
+
+
+def test_settings_are_compared_one_by_one(make, make_config, tmp_path):
+    with make(tmp_path):
+        pass
+    settings = json.loads((tmp_path / "config.json").read_text())
+    check_settings(tmp_path, settings)
+    longer = {**settings, "episodes": 11}
+    check_settings(tmp_path, longer, longer=True)
+    with pytest.raises(ValueError, match=r"\(episodes is 10 there and 11 here\)"):
+        check_settings(tmp_path, longer)
+    for episodes in (9, "11", True):
+        with pytest.raises(ValueError, match="episodes is 10 there and"):
+            check_settings(tmp_path, {**settings, "episodes": episodes}, longer=True)

@@ -1,0 +1,90 @@
+"""The graphs that a run keeps of its GWR-B."""
+
+import csv
+
+import pytest
+import torch
+from tests.test_checkpoint import largest_file
+
+from bgpo_trl.modules.gwr import GWRB
+from bgpo_trl.runs.gwr_graphs import growth_moments, load_graphs, save_graph
+from bgpo_trl.training import Trainer
+
+
+def grown(seed=0, n=30, **arguments):
+    generator = torch.Generator().manual_seed(seed)
+    gwr = GWRB(3, batch_size=[2], generator=[generator] * 2, **arguments)
+    for _ in range(n):
+        gwr.adapt(torch.rand(2, 3, generator=generator))
+    return gwr
+
+
+@pytest.mark.parametrize(
+    ("episodes", "moments"),
+    [(1, [1]), (6, [1, 2, 3, 4, 5, 6]), (10, [2, 4, 5, 7, 9, 10]), (600, [*range(100, 601, 100)])],
+)
+def test_moments_are_spread_over_the_run(episodes, moments):
+    assert growth_moments(episodes) == moments
+
+
+def test_a_graph_comes_back_as_it_was(tmp_path):
+    early, late = grown(n=5), grown(n=30)
+    save_graph(tmp_path, 30, late)
+    save_graph(tmp_path, 5, early)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "episode-000005.safetensors",
+        "episode-000030.safetensors",
+    ]
+    graphs = load_graphs(tmp_path)
+    assert list(graphs) == [5, 30]
+    for gwr, loaded in zip((early, late), graphs.values(), strict=True):
+        for first, second in zip(gwr.graph(0), loaded.graph(), strict=True):
+            assert first.equal(second)
+        assert loaded.get_extra_state()[0]["next_node"] == gwr.get_extra_state()[0]["next_node"]
+
+
+def test_a_run_keeps_its_first_seeds_graph(tmp_path, bank, encoders, make_config):
+    config = make_config(episodes=8)
+    with Trainer(config, tmp_path, bank=bank, encoders=encoders, progress=False) as trainer:
+        trainer.run()
+    graphs = load_graphs(tmp_path / "gwr")
+    assert list(graphs) == growth_moments(8)
+    with (tmp_path / "train.csv").open(newline="") as file:
+        logged = {
+            int(r["episode"]): r["num_nodes"] for r in csv.DictReader(file) if r["seed"] == "3"
+        }
+    found = {episode: str(int(gwr.num_nodes)) for episode, gwr in graphs.items()}
+    assert found == {episode: logged[episode] for episode in graphs}
+    last = graphs[8].graph()
+    # All episodes have 6 steps, so both seeds end with their eighth.
+    for first, second in zip(last, trainer.algorithm.gwr.graph(0), strict=True):
+        assert first.equal(second)
+    assert not last.weights.equal(trainer.algorithm.gwr.graph(1).weights)
+
+
+def test_algorithms_without_a_graph_keep_none(tmp_path, bank, encoders, make_config):
+    config = make_config(name="ddpg", episodes=2)
+    with Trainer(config, tmp_path, bank=bank, encoders=encoders, progress=False) as trainer:
+        trainer.run()
+    assert not (tmp_path / "gwr").exists()
+    assert load_graphs(tmp_path / "gwr") == {}
+
+
+def test_a_full_disk_leaves_the_graph_that_was_there(tmp_path):
+    before = save_graph(tmp_path, 5, grown(n=5)).read_bytes()
+    with (
+        largest_file(100),
+        pytest.raises(OSError, match=r"cannot write .*: make room, or choose") as error,
+    ):
+        save_graph(tmp_path, 5, grown(n=30))
+    assert "\n" not in str(error.value)
+    (only,) = tmp_path.iterdir()
+    assert only.read_bytes() == before
+
+
+@pytest.mark.parametrize("content", [b"", b"\x00" * 100, None])
+def test_a_damaged_graph_is_refused(tmp_path, content):
+    path = save_graph(tmp_path, 5, grown())
+    path.write_bytes(path.read_bytes()[:-9] if content is None else content)
+    with pytest.raises(ValueError, match=r"episode-000005.safetensors is damaged or no graph"):
+        load_graphs(tmp_path)
