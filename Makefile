@@ -40,8 +40,8 @@ typecheck: $(SETUP)  ## pyright
 
 bench: $(SETUP) $(GL)  ## speed: frames, updates, training steps, GWR-B
 	$(BIN)/pip install -q -c constraints.txt -e '.[bench]'
-	$(BIN)/python benchmarks/throughput.py
-	$(BIN)/python benchmarks/gwr.py
+	$(BIN)/python benchmarks/speed/throughput.py
+	$(BIN)/python benchmarks/speed/gwr.py
 
 clean:  ## remove caches and build leftovers, never .venv or runs
 	rm -rf build dist ./*.egg-info .pytest_cache .ruff_cache .hypothesis

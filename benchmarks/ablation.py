@@ -15,13 +15,13 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal
 
-from experiment import Arguments as Common
-from experiment import command_line, run_config, run_experiment
 from torchrl.envs import RenameTransform
 
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.bgpo import BGPO, Composition, Parts
 from bgpo_trl.configs import BGPOConfig
+from bgpo_trl.experiments.run import Arguments as Common
+from bgpo_trl.experiments.run import command_line, run_config, run_experiment
 from bgpo_trl.transforms import BehaviorLookup
 
 
@@ -92,7 +92,7 @@ def main(arguments: Arguments) -> None:
     if not arguments.continual:
         config = replace(config, task_starts=(0, 0, 0))
     name = "ablation-continual" if arguments.continual else "ablation"
-    run_experiment(arguments, name, config, make_of(arguments.variant))
+    print(run_experiment(arguments, name, config, make_of(arguments.variant)))
 
 
 if __name__ == "__main__":

@@ -9,12 +9,12 @@ writes a run directory with ``config.json``, ``train.csv``, ``eval.csv``, ``chec
 
 from __future__ import annotations
 
-from experiment import Arguments, command_line, run_config, run_experiment
+from bgpo_trl.experiments.run import Arguments, command_line, run_config, run_experiment
 
 
 def main(arguments: Arguments) -> None:
     """Runs the experiment."""
-    run_experiment(arguments, "continual", run_config(arguments))
+    print(run_experiment(arguments, "continual", run_config(arguments)))
 
 
 if __name__ == "__main__":

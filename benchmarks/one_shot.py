@@ -23,7 +23,6 @@ import numpy as np
 import torch
 import tyro
 from ablation import make_of
-from experiment import command_line, commit_of_code
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
@@ -33,6 +32,7 @@ from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.encoders.representation import embed_demonstrations
 from bgpo_trl.evaluation import Evaluator, Snapshot
+from bgpo_trl.experiments.run import command_line, commit_of_code
 from bgpo_trl.figures.curves import save_figure
 from bgpo_trl.runs.config_file import read_config
 from bgpo_trl.seeding import stream_seed

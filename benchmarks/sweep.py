@@ -25,16 +25,20 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
-import experiment
 from ablation import VARIANTS
-from jobs import Job, connected, play_jobs
-from merge import merge
 
 from bgpo_trl.algorithms.bgpo import BGPO
 from bgpo_trl.encoders.pretrained import load_pretrained
+from bgpo_trl.experiments import run as experiment
+from bgpo_trl.experiments.merge import merge
 from bgpo_trl.files.locking import DirectoryLock
 from bgpo_trl.runs.directory import check_settings, holds_run
 from bgpo_trl.runs.results import read_json
+
+try:
+    from bgpo_trl.experiments.ray_jobs import Job, connected, play_jobs
+except ImportError as error:
+    sys.exit(f"error: {error}")
 
 
 @dataclass(frozen=True)

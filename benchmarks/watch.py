@@ -18,14 +18,14 @@ from pathlib import Path
 import numpy as np
 import tyro
 from ablation import make_of
-from experiment import command_line
-from growth import draw_growth
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont, ImageOps
 
 from bgpo_trl import TrainedPolicy, load_run
 from bgpo_trl.data.recording import record_demonstrations
+from bgpo_trl.experiments.run import command_line
 from bgpo_trl.figures.curves import plot_frame_strips, save_figure
+from bgpo_trl.figures.of_run import draw_growth
 from bgpo_trl.figures.video import save_gif
 from bgpo_trl.runs.config_file import read_config
 from suites import nico

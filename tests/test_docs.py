@@ -119,7 +119,7 @@ def test_a_command_is_understood(command, monkeypatch, parse_only):
     "command",
     [
         "python benchmarks/continual.py --presett quick",
-        "python benchmarks/concurrent.py --preset huge",
+        "python benchmarks/concurrent_tasks.py --preset huge",
         "python -m suites.nico.explore --tasks grasp_glass",
         "python -m bgpo_trl.data.recording --per-task 3",
     ],

@@ -10,13 +10,13 @@ from contextlib import ExitStack
 import numpy as np
 import pytest
 import torch
-from tests.test_checkpoint import largest_file
 
 from bgpo_trl.data.recording import load_demonstrations
 from bgpo_trl.encoders import fitting
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.files.checkpoint import load_checkpoint
 from bgpo_trl.training import Trainer
+from tests.files.test_checkpoint import largest_file
 from tests.resumable import learn_to_see, play
 from tests.test_training import assert_same_run, at_step
 

@@ -1,9 +1,8 @@
 """Measures of learning several tasks, and how sure they are: from success rates to one number.
 
 All work on plain arrays. ``success`` ``[..., E, T]`` is the share of successes on each of ``T``
-tasks at each of ``E`` evaluations (`bgpo_trl.runs.results.Curves` has it with a leading seed
-dimension); a success rate of 0 counts as 0, and NaN means that there was no test, as of a task that has not been
-presented yet.
+tasks at each of ``E`` evaluations (`bgpo_trl.runs.results.Curves` adds a leading seed dimension).
+NaN means that there was no test, as of a task that has not been presented yet.
 """
 
 from __future__ import annotations

@@ -5,14 +5,14 @@ from dataclasses import replace
 from functools import partial
 
 import ablation
-import experiment
-import growth
 import pytest
 import torch
 
 from benchmarks import ablation as packaged_ablation
 from benchmarks import ladder
 from bgpo_trl.algorithms import ALGORITHMS
+from bgpo_trl.experiments import run as experiment
+from bgpo_trl.figures import of_run as growth
 from bgpo_trl.training import Trainer
 
 

@@ -10,9 +10,10 @@ import pytest
 import torch
 from torchrl.envs import check_env_specs
 
-from benchmarks import ablation, experiment
+from benchmarks import ablation
 from benchmarks.ablation import VARIANTS
 from bgpo_trl.algorithms.bgpo import BGPO
+from bgpo_trl.experiments import run as experiment
 from bgpo_trl.files.checkpoint import load_checkpoint
 from bgpo_trl.runs.results import read_rows
 from bgpo_trl.transforms import BehaviorLookup, GroupLookup, TaskSchedule

@@ -64,7 +64,7 @@ CASES = [
     ("continual.py --seeds", "()", "needs seeds"),
     ("continual.py --threads 0", "threads", "must be at least 1, got 0"),
     ("continual.py --device cuda:99", "no device 'cuda:99'", "use auto or cpu"),
-    ("concurrent.py --device gpu", "no device 'gpu'", "use auto or cpu"),
+    ("concurrent_tasks.py --device gpu", "no device 'gpu'", "use auto or cpu"),
     ("ablation.py --algorithm maml", "--algorithm", "the variants are BGPO's"),
     ("ladder.py --rungs", "--rungs names none", "name some of a, b, c, d"),
     ("ladder.py --episodes 0", "episodes", "must be at least 1, got 0"),
@@ -77,7 +77,7 @@ CASES = [
     ("continual.py --out damaged --resume", "config.json is damaged", "put it back as the run"),
     ("continual.py --out nowhere --resume", "nowhere holds no run to resume", "check --out, or"),
     (
-        "concurrent.py --out empty --resume",
+        "concurrent_tasks.py --out empty --resume",
         "empty holds no run to resume",
         "begin without --resume",
     ),
@@ -183,7 +183,7 @@ def test_without_opengl_no_recording_is_begun(folder, monkeypatch):
 )
 def test_without_opengl_no_run_is_begun(tmp_path, backend, told):
     process = subprocess.run(
-        [sys.executable, str(ROOT / "benchmarks" / "concurrent.py"), "--out", "run"],
+        [sys.executable, str(ROOT / "benchmarks" / "concurrent_tasks.py"), "--out", "run"],
         cwd=tmp_path,
         env={**os.environ, "PYTHONPATH": str(ROOT), "MUJOCO_GL": backend},
         capture_output=True,

@@ -16,14 +16,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, get_args, get_type_hints
 
-import experiment
 import pytest
 import tyro
 
-from benchmarks import concurrent, continual, ladder, summary
+from benchmarks import concurrent_tasks, continual, ladder, summary
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.rl import RL
 from bgpo_trl.configs import PRESETS, DDPGConfig
+from bgpo_trl.experiments import run as experiment
 from bgpo_trl.files.checkpoint import load_checkpoint
 from bgpo_trl.runs.logger import EVAL_COLUMNS
 from bgpo_trl.runs.results import read_rows
@@ -77,10 +77,13 @@ def test_the_ladder_takes_the_settings_of_each_rl_algorithm():
         assert (arguments.rungs, arguments.out) == (("a",), Path("here"))
 
 
-@pytest.mark.parametrize("script", ["continual", "concurrent", "ablation"])
+@pytest.mark.parametrize("script", ["continual", "concurrent_tasks", "ablation"])
 def test_a_run_with_another_rl_algorithm_has_a_name_of_its_own(tmp_path, monkeypatch, script):
     monkeypatch.chdir(tmp_path)
-    taken = tmp_path / "runs" / f"{script}-{'gwr' if script == 'ablation' else 'bgpo'}-sac-quick"
+    name = {"ablation": "ablation-gwr", "concurrent_tasks": "concurrent-bgpo"}.get(
+        script, f"{script}-bgpo"
+    )
+    taken = tmp_path / "runs" / f"{name}-sac-quick"
     taken.mkdir(parents=True)
     (taken / "config.json").touch()
     line = ["--rl", "sac", *(["--variant", "gwr"] if script == "ablation" else [])]
@@ -165,7 +168,7 @@ def test_a_finished_run_only_says_so_until_it_is_made_longer(
         with pytest.raises(ValueError, match="holds a run with other settings"):
             continual.main(replace(again, **other))
     with pytest.raises(ValueError, match=r"with other settings .*task_starts is \[0, 2, 4\] there"):
-        concurrent.main(replace(again, episodes=9))
+        concurrent_tasks.main(replace(again, episodes=9))
     assert files(run) == before
 
     (run / "final.csv").unlink()  # as if it had been interrupted in its last tests
@@ -257,8 +260,8 @@ def test_the_command_line_runs_every_algorithm_and_says_its_name(
     tiniest, monkeypatch, tmp_path, capsys, name
 ):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["concurrent.py", "--algorithm", name])
-    runpy.run_path(str(ROOT / "benchmarks" / "concurrent.py"), run_name="__main__")
+    monkeypatch.setattr(sys, "argv", ["concurrent_tasks.py", "--algorithm", name])
+    runpy.run_path(str(ROOT / "benchmarks" / "concurrent_tasks.py"), run_name="__main__")
     run = Path("runs") / f"concurrent-{name}-quick"
     printed = capsys.readouterr().out
     assert f"curve and figures: {run}" in printed
@@ -302,7 +305,7 @@ def test_the_command_line_runs_every_algorithm_and_says_its_name(
 
 def test_concurrent_presents_all_tasks_from_the_start(tiny, tmp_path, capsys):
     run = tmp_path / "run"
-    concurrent.main(experiment.Arguments(out=run))
+    concurrent_tasks.main(experiment.Arguments(out=run))
     assert json.loads((run / "config.json").read_text())["task_starts"] == [0, 0, 0]
     assert {row["task"] for row in read_rows(run / "eval.csv")} == set(TASKS)
 
@@ -333,26 +336,6 @@ def test_concurrent_presents_all_tasks_from_the_start(tiny, tmp_path, capsys):
         assert f"| {task} | {100 * late[task]:.1f} |" in printed
     for name in ("success.png", "groups.png"):
         assert (run / name).read_bytes().startswith(b"\x89PNG")
-
-
-@pytest.mark.parametrize("script", ["concurrent.py", "continual.py"])
-def test_scripts_find_the_standard_library_beside_concurrent(tmp_path, script):
-    code = (
-        "import sys, runpy; sys.path.insert(0, sys.argv[1]); "
-        "from concurrent.futures import ThreadPoolExecutor; import concurrent; "
-        "assert concurrent.__file__.startswith(sys.argv[1]); "
-        "assert ThreadPoolExecutor(1).submit(int, '7').result() == 7"
-    )
-    folder = str(ROOT / "benchmarks")
-    subprocess.run([sys.executable, "-S", "-c", code, folder], check=True, cwd=tmp_path)
-    told = subprocess.run(
-        [sys.executable, str(ROOT / "benchmarks" / script), "--help"],
-        check=True,
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-    ).stdout
-    assert "--preset" in told
 
 
 def test_the_best_part_of_a_run_is_the_best_mean_over_a_tenth(tmp_path):

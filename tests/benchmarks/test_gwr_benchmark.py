@@ -5,7 +5,7 @@ import json
 import pytest
 import torch
 
-from benchmarks import gwr
+from benchmarks.speed import gwr
 
 
 def test_results_are_written_and_printed(tmp_path, capsys, monkeypatch):

@@ -8,8 +8,10 @@ import shutil
 import numpy as np
 import pytest
 
-from benchmarks import ablation, claims, comparison, report, report_tables
+from benchmarks import ablation, report
 from bgpo_trl.algorithms import ALGORITHMS
+from bgpo_trl.analysis import claims, comparison
+from bgpo_trl.analysis import tables as report_tables
 from suites import nico
 
 TASKS = nico.ALL_TASKS

@@ -8,18 +8,18 @@ from dataclasses import asdict, replace
 from itertools import product
 from types import SimpleNamespace
 
-import jobs
-import merge
 import pytest
 import sweep
-from comparison import GROUPS, Statistics, read_group
-from jobs import Job
-from report_tables import main_table
 
 from benchmarks import report, summary
 from benchmarks.ablation import VARIANTS
 from benchmarks.report import markdown
+from bgpo_trl.analysis.comparison import GROUPS, Statistics, read_group
+from bgpo_trl.analysis.tables import main_table
 from bgpo_trl.configs import PRESETS
+from bgpo_trl.experiments import merge
+from bgpo_trl.experiments import ray_jobs as jobs
+from bgpo_trl.experiments.ray_jobs import Job
 from bgpo_trl.training import Trainer
 from suites import nico
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks import throughput
+from benchmarks.speed import throughput
 from bgpo_trl.configs import BGPOConfig, DDPGConfig
 from suites import nico
 from suites.nico.base import Environment

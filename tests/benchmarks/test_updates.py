@@ -5,7 +5,7 @@ from importlib.util import find_spec
 
 import torch
 
-from benchmarks.updates import BATCH, Floor, Ours, TorchRLLoop, contenders, floor_batch
+from benchmarks.speed.updates import BATCH, Floor, Ours, TorchRLLoop, contenders, floor_batch
 
 
 def weights(ours: Ours) -> list[torch.Tensor]:

@@ -3,12 +3,12 @@
 import hashlib
 from types import SimpleNamespace
 
-import growth
 import numpy as np
 import pytest
 import watch
 from PIL import Image
 
+from bgpo_trl.figures import of_run as growth
 from bgpo_trl.runs.gwr_graphs import load_graphs
 from suites import nico
 from suites.nico.demonstrator import Demonstrator

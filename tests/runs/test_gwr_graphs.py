@@ -4,11 +4,11 @@ import csv
 
 import pytest
 import torch
-from tests.test_checkpoint import largest_file
 
 from bgpo_trl.modules.gwr import GWRB
 from bgpo_trl.runs.gwr_graphs import growth_moments, load_graphs, save_graph
 from bgpo_trl.training import Trainer
+from tests.files.test_checkpoint import largest_file
 
 
 def grown(seed=0, n=30, **arguments):

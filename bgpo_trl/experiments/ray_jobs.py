@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import inspect
 import logging
 import os
 import socket
@@ -20,8 +21,11 @@ from bgpo_trl.files.progress import progress_bar
 
 try:
     import ray
-except ImportError:
-    sys.exit("error: sweeps run on Ray, which is not installed: pip install 'bgpo_trl[ray]'")
+    from ray.exceptions import RayError
+except ImportError as error:
+    raise ImportError(
+        "sweeps run on Ray, which is not installed: pip install 'bgpo_trl[ray]'"
+    ) from error
 
 # A job that takes its worker down each time must come to an end.
 RETRIES = 10
@@ -90,7 +94,7 @@ def work(job: Job, play: Callable[[Job], None], command: Sequence[str]) -> None:
     ):
         if job.finished:
             return
-        print(f"{time.strftime('%F %T')} process {os.getpid()} on {socket.gethostname()}")
+        log.write(f"{time.strftime('%F %T')} process {os.getpid()} on {socket.gethostname()}\n")
         try:
             play(job)
         except BaseException:
@@ -117,8 +121,9 @@ def play_jobs(
     Raises:
         KeyboardInterrupt: At Ctrl-C; it is passed on to ``play``, which has a minute to save.
     """
-    here = Path(__file__).resolve().parent
-    path = [str(here), str(here.parent), os.environ.get("PYTHONPATH", "")]
+    # Workers import what `play` needs, from beside it and from this package.
+    folders = [Path(inspect.getfile(play)).resolve().parent, Path(__file__).resolve().parents[2]]
+    path = [*map(str, folders), os.environ.get("PYTHONPATH", "")]
     environment = {"PYTHONPATH": os.pathsep.join(filter(None, path)), "OMP_NUM_THREADS": "1"}
     task = ray.remote(
         num_cpus=cpus,
@@ -137,7 +142,7 @@ def play_jobs(
                     job = pending.pop(ended)
                     try:
                         ray.get(ended)
-                    except ray.exceptions.RayError as error:
+                    except RayError as error:
                         failed[job] = _reason(error)
                     bar.write(f"{job}: {'failed' if job in failed else 'finished'}")
                 bar.update(_episodes(jobs) - bar.n)
@@ -155,6 +160,6 @@ def _episodes(jobs: Iterable[Job]) -> int:
     return sum(max(0, path.read_bytes().count(b"\n") - 1) for path in files if path.exists())
 
 
-def _reason(error: ray.exceptions.RayError) -> str:
+def _reason(error: RayError) -> str:
     cause = getattr(error, "cause", None) or error
     return f"{type(cause).__name__}: {(str(cause).splitlines() or [''])[0]}"

@@ -1,6 +1,6 @@
 """What GWR-B costs: time and memory against the number of nodes, and of the networks of a run.
 
-    python benchmarks/gwr.py
+    python benchmarks/speed/gwr.py
 
 prints a table and writes it as ``gwr.json``, with the times against nodes as ``gwr.png``.
 """
@@ -20,12 +20,12 @@ from typing import Annotated, Any
 import torch
 import tyro
 from matplotlib.figure import Figure
+from timing import Timing, interleave
 from torch import Tensor
 
 from bgpo_trl.figures.curves import save_figure
 from bgpo_trl.machine import set_threads
 from bgpo_trl.modules.gwr import GWRB
-from bgpo_trl.timing import Timing, interleave
 
 CALLS = ("lookup", "adapt", "lookup + adapt")
 

@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from itertools import pairwise
 from typing import Any
 
-from comparison import (
+from bgpo_trl.analysis import metrics
+from bgpo_trl.analysis.comparison import (
     ADDITIONS,
     ALGORITHMS,
     PUBLISHED,
@@ -18,9 +19,7 @@ from comparison import (
     late_scores,
     variant,
 )
-from report_tables import Table
-
-from bgpo_trl.analysis import metrics
+from bgpo_trl.analysis.tables import Table
 
 Groups = Mapping[str, Mapping[str, Run]]
 """Runs by the names of their directories, by the key of their group."""

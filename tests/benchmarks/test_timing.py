@@ -1,8 +1,7 @@
 """Interleaved timing, against a clock that is told what to show."""
 
 import pytest
-
-from bgpo_trl.timing import Timing, interleave, ratio
+from timing import Timing, interleave, ratio
 
 
 def test_contenders_take_turns_and_only_rounds_after_the_warmup_count():

@@ -12,12 +12,12 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
-import jobs
-import merge
 import pytest
-from jobs import Job
 
 from bgpo_trl.configs import RunConfig
+from bgpo_trl.experiments import merge
+from bgpo_trl.experiments import ray_jobs as jobs
+from bgpo_trl.experiments.ray_jobs import Job
 from bgpo_trl.training import Trainer
 
 # What Ray starts here, it starts in vain on every core otherwise.

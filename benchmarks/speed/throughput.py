@@ -1,6 +1,6 @@
 """How fast it is, each part against what it could be at best and what one would use otherwise.
 
-    python benchmarks/throughput.py
+    python benchmarks/speed/throughput.py
 
 prints tables and writes ``throughput.json``: frames a second, DDPG updates a second, the whole
 training step of BGPO in a batch of seeds against one seed after the other, and memory over a long
@@ -26,12 +26,12 @@ import frames
 import torch
 import tyro
 import updates
+from timing import Timing, interleave, ratio
 
 from bgpo_trl.algorithms.bgpo import BGPO
 from bgpo_trl.configs import BGPOConfig
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.machine import usable_cores
-from bgpo_trl.timing import Timing, interleave, ratio
 from bgpo_trl.transforms import TaskSchedule
 
 Part = Literal["frames", "updates", "step", "memory"]

@@ -14,8 +14,6 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
-from growth import draw_groups, draw_growth, draw_nodes
-from resuming import as_begun, check_resumable, is_finished
 
 from bgpo_trl.algorithms import ALGORITHMS, Algorithm
 from bgpo_trl.algorithms.rl import RL
@@ -24,7 +22,9 @@ from bgpo_trl.configs import PRESETS, STAGE_PRESETS, RunConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.encoders.pretrained import load_pretrained, make_pretrained
 from bgpo_trl.evaluation import Evaluator, evaluate_random_policy
+from bgpo_trl.experiments.resuming import as_begun, check_resumable, is_finished
 from bgpo_trl.figures.curves import plot_frame_strips, plot_success_curves, save_figure
+from bgpo_trl.figures.of_run import draw_groups, draw_growth, draw_nodes
 from bgpo_trl.figures.video import save_gif
 from bgpo_trl.files.locking import DirectoryLock
 from bgpo_trl.files.progress import progress_bar
@@ -126,7 +126,7 @@ def run_experiment(
     name: str,
     config: RunConfig,
     make: Callable[..., Algorithm] | None = None,
-) -> None:
+) -> str:
     """Trains to the end, then measures and draws.
 
     The run's directory then holds, besides what `Trainer` writes, ``final.csv`` (success of the
@@ -141,6 +141,9 @@ def run_experiment(
         name: The experiment's, for the run's directory.
         config: The run.
         make: Makes the algorithm, where ``config.name`` does not say it.
+
+    Returns:
+        Results to print, and where the rest is.
 
     Raises:
         ValueError: If the directory holds another run, or none that could be resumed.
@@ -158,8 +161,7 @@ def run_experiment(
             check_resumable([out])
         config = as_begun(config, out, keep_eval_every=arguments.eval_every is not None)
         if is_finished(out, config):
-            print(f"{out} is finished, all {config.episodes} episodes: --episodes makes it longer")
-            return
+            return f"{out} is finished, all {config.episodes} episodes: --episodes makes it longer"
     elif (out / "config.json").exists():
         raise ValueError(f"{out} holds a run: --resume continues it, --out names another directory")
     with DirectoryLock(out):
@@ -189,26 +191,30 @@ def run_experiment(
         ) as trainer:
             trainer.run()
             summary = {"commit": commit, **measure(trainer, bank, out)}
-            draw(trainer, bank, out, summary["random_success"])
+            found = draw(trainer, bank, out, summary["random_success"])
             for path in sorted((out / "figures").iterdir()):
                 trainer.logger.log_media(f"figures/{path.stem}", path)
             # Last: it says that the rest is there.
             (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
-    print(f"curve and figures: {out}; in numbers: python benchmarks/summary.py {out}")
+    found.append(f"curve and figures: {out}; in numbers: python benchmarks/summary.py {out}")
+    return "\n".join(found)
 
 
 def draw(
     trainer: Trainer, bank: DemonstrationBank, out: Path, random_success: Mapping[str, float]
-) -> None:
-    """Draws the run, and says what GWR-B has become.
+) -> list[str]:
+    """Draws the run, and describes its GWR-B.
 
     Args:
         trainer: At the end of its run.
         bank: Demonstrations of both kinds.
         out: Where ``figures/`` and ``gwr.csv`` go.
         random_success: Of a random policy, by task.
+
+    Returns:
+        Lines on GWR-B, its task inference and its groups.
     """
-    config = trainer.config
+    config, found = trainer.config, list[str]()
     presented = dict(zip(config.tasks, config.task_starts, strict=True))
     figure = plot_success_curves(
         out / "eval.csv", presented=presented, random_success=random_success
@@ -225,11 +231,12 @@ def draw(
             gwr, bank.seen(), bank.held_out(config.held_out), len(config.tasks)
         )
         draw_growth(out, config, bank)
-        print(f"GWR-B nodes: {gwr.num_nodes.tolist()}")
-        print(f"task inference on held-out demonstrations: {accuracy.mean():.1%}")
+        found.append(f"GWR-B nodes: {gwr.num_nodes.tolist()}")
+        found.append(f"task inference on held-out demonstrations: {accuracy.mean():.1%}")
     if trainer.algorithm.groups is not None:
         draw_groups(out, presented, out / "figures" / "groups.png")
-        print(f"groups of behaviors: {trainer.algorithm.groups.num_groups.tolist()}")
+        found.append(f"groups of behaviors: {trainer.algorithm.groups.num_groups.tolist()}")
+    return found
 
 
 def measure(
@@ -337,11 +344,12 @@ def record_episodes(trainer: Trainer, bank: DemonstrationBank) -> dict[str, np.n
 
 def commit_of_code() -> str:
     """Returns the commit of this code, with ``-dirty`` where it was changed; "" where unknown."""
+    root = Path(__file__).parents[2]
+    if not (root / ".git").exists():  # installed, perhaps within a repository of something else
+        return ""
     command = ["git", "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
     try:
-        told = subprocess.run(
-            command, cwd=Path(__file__).parent, capture_output=True, text=True, check=True
-        )
+        told = subprocess.run(command, cwd=root, capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError):
         return ""
     return told.stdout.strip()
@@ -355,7 +363,8 @@ def command_line(
     What a person can mend is told in one line.
     """
     try:
-        main(tyro.cli(Annotated[arguments, tyro.conf.OmitArgPrefixes], description=description))
+        kind: Any = Annotated[arguments, tyro.conf.OmitArgPrefixes]
+        main(tyro.cli(kind, description=description))
     except (ValueError, OSError, RuntimeError) as error:
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:

@@ -31,7 +31,7 @@ LEARNING_RATE, GAMMA, TAU = 1e-3, 0.98, 0.005
 
 
 def contenders(seeds: int = 10, transitions: int = 50_000) -> dict[str, Contender]:
-    """Returns what to time against each other with `bgpo_trl.timing.interleave`.
+    """Returns what to time against each other with `timing.interleave`.
 
     Stable-Baselines3 is left out, with a line that says how to install it, if it is missing. The
     number of threads is the caller's choice: `torch.set_num_threads`.

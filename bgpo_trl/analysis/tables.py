@@ -6,7 +6,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from comparison import (
+
+from bgpo_trl.analysis import metrics
+from bgpo_trl.analysis.comparison import (
     Run,
     Statistics,
     Values,
@@ -15,8 +17,6 @@ from comparison import (
     starts,
     task_area,
 )
-
-from bgpo_trl.analysis import metrics
 from bgpo_trl.runs.results import read_outcomes, read_rows
 from suites import nico
 

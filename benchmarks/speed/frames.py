@@ -38,7 +38,7 @@ STOCK_FRAMES = 2
 
 
 def contenders(threads: int, encoder: VAE) -> dict[str, tuple[Callable[[], object], int]]:
-    """Returns what to time against each other with `bgpo_trl.timing.interleave`.
+    """Returns what to time against each other with `timing.interleave`.
 
     Args:
         threads: Threads of the bare limit and of our batched environment.

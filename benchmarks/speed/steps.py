@@ -1,6 +1,6 @@
 """Cost of a training step of each algorithm, interleaved in one process.
 
-    python benchmarks/steps.py bgpo-single bgpo bgpo-experts dist-nll maml
+    python benchmarks/speed/steps.py bgpo-single bgpo bgpo-experts dist-nll maml
 
 A step is of all seeds: act, simulate, render and encode while the update runs in a thread of its
 own, store. Each algorithm first plays with all tasks until it knows them apart and learns.
@@ -16,12 +16,12 @@ from typing import Annotated, Literal
 
 import numpy as np
 import tyro
-from experiment import AlgorithmName, command_line
+from timing import interleave
 
 from bgpo_trl.algorithms import ALGORITHMS, Algorithm
 from bgpo_trl.encoders.pretrained import load_pretrained
+from bgpo_trl.experiments.run import AlgorithmName, command_line
 from bgpo_trl.machine import set_threads
-from bgpo_trl.timing import interleave
 from bgpo_trl.transforms import TaskSchedule
 
 
