@@ -269,6 +269,9 @@ class BGPOConfig(AlgorithmConfig):
 
     beta: float = 0.1
     """Weight of the intrinsic reward (Sec. IV-A)."""
+    behavior_scale: float = 0.25
+    """Factor of b where actor and critic read it. Ours: 1 in the paper, which slows down the first
+    task (docs/learning.md)."""
     gwr: GWRBConfig = field(default_factory=GWRBConfig)
     """The network whose nodes are behaviors."""
     experts: bool = True
@@ -279,8 +282,11 @@ class BGPOConfig(AlgorithmConfig):
     in the paper."""
     demonstration_share: float = 0.25
     """See `AlgorithmConfig`. Ours: triples the success of a task's first hundred episodes."""
-    active_groups: int = 4
+    active_groups: int = 3
     """Groups that an update learns from at most, those played last. Ours."""
+    expert_batch_size: int = 64
+    """Transitions of each active group in an update of experts, as many as MAML and Dist-NLL have
+    of each task. Ours; without experts it is the RL algorithm's ``batch_size`` for all together."""
     groups: GWRBConfig = field(
         default_factory=lambda: GWRBConfig(activity_threshold=0.525, habituation_threshold=0.5)
     )
@@ -295,14 +301,10 @@ class BGPOConfig(AlgorithmConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         _at_least(self, 0, "beta")
-        _at_least(self, 1, "active_groups")
+        _at_least(self, 1, "active_groups", "expert_batch_size")
+        _positive(self, "behavior_scale")
         holds = self.even_replay or not self.experts
         _check(self, ("even_replay", holds, "set where there are experts"))
-        if self.experts and self.rl.batch_size < self.active_groups:
-            raise ValueError(
-                f"batch_size ({self.rl.batch_size}) must be at least active_groups "
-                f"({self.active_groups}), so that each of them has a transition"
-            )
 
 
 @dataclass(frozen=True)

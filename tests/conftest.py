@@ -30,8 +30,9 @@ settings.register_profile("bgpo_trl", deadline=None)
 settings.load_profile("bgpo_trl")
 torch.set_num_threads(1)
 
-# Of the algorithms that learn each task from data of its own.
+# Of the algorithms that learn each task, or group of behaviors, from data of its own.
 SMALL = {
+    "bgpo": {"expert_batch_size": 8},
     "maml": {"task_batch_size": 8, "adaptation_size": 12},
     "dist-nll": {"task_batch_size": 8, "samples": 24, "distillation_batch_size": 12},
 }

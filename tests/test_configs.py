@@ -49,6 +49,8 @@ SETTINGS = [
     (GWRBConfig, {"activity_threshold": 1.0}, "between 0 and 1"),
     (RunConfig, {"held_out": "training"}, "validation or test"),
     (BGPOConfig, {"active_groups": 0}, "at least 1"),
+    (BGPOConfig, {"expert_batch_size": 0}, "at least 1"),
+    (BGPOConfig, {"behavior_scale": 0.0}, "a number above 0"),
     (BGPOConfig, {"even_replay": False}, "set where there are experts"),
     (BGPOConfig, {"beta": -0.1}, "at least 0"),
     (BGPOConfig, {"beta": NAN}, "at least 0"),
@@ -76,10 +78,6 @@ def test_settings(refused, config, values, remedy):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        (
-            {"rl": DDPGConfig(batch_size=3)},
-            r"batch_size \(3\) must be at least active_groups \(4\)",
-        ),
         ({"rl": DDPGConfig(warmup_steps=49)}, r"warmup_steps \(49\) must be at least max_steps"),
     ],
 )

@@ -102,8 +102,10 @@ def plain_policy(algorithm, snapshot, index, task, episode, phi):
     if algorithm.config.experts:
         group = int(algorithm.groups.lookup(phi.expand(algorithm.n_seeds, -1)).group[index])
     policy.load_state_dict(algorithm.experts.actor_weights(index, group))
-    told = {algorithm.told: snapshot.policy["told"][task, episode]} if algorithm.told else {}
-    return lambda seen: policy(TensorDict({state: seen, **told}))["action"].detach()
+    context = {}
+    if algorithm.context is not None:
+        context = {algorithm.context: snapshot.policy["context"][task, episode]}
+    return lambda seen: policy(TensorDict({state: seen, **context}))["action"].detach()
 
 
 @pytest.mark.parametrize(
@@ -177,10 +179,10 @@ def test_what_the_policy_is_told_follows_from_held_out_demonstrations(make, bank
     held_out = bank.held_out()
     drawn = set()
     for number in range(5):
-        shown = [s.policy["told"] for s in take(by_phi, raw, number)]
+        shown = [s.policy["context"] for s in take(by_phi, raw, number)]
         assert not shown[0].equal(shown[1])
-        assert take(of_one, alone, number)[0].policy["told"].equal(shown[1])
-        told = [s.policy["told"] for s in take(evaluator, algorithm, number)]
+        assert take(of_one, alone, number)[0].policy["context"].equal(shown[1])
+        told = [s.policy["context"] for s in take(evaluator, algorithm, number)]
         for index, phi in enumerate(shown):
             for task in range(3):
                 of_task = held_out.embedding[held_out.task == task]
@@ -196,7 +198,7 @@ def test_a_label_tells_the_task(make):
     algorithm, evaluator = make("state", "oracle")
     expected = torch.eye(3).repeat_interleave(EPISODES, 0).view(3, EPISODES, 3)
     for snapshot in take(evaluator, algorithm):
-        assert snapshot.policy["told"].equal(expected)
+        assert snapshot.policy["context"].equal(expected)
 
 
 @pytest.mark.parametrize("name", ["ddpg", "maml", "dist-nll"])

@@ -231,7 +231,7 @@ def test_an_algorithm_may_be_made_under_another_name(make, make_config, tmp_path
     ((args, kwargs),) = made
     assert args == (config.algorithm,)
     assert kwargs["seeds"] == config.seeds
-    assert trainer.algorithm.told is None
+    assert trainer.algorithm.context is None
     for file in CSV_FILES:
         assert {row["algorithm"] for row in rows(tmp_path / file)} == {"no such algorithm"}
     with pytest.raises(KeyError, match="no such algorithm"):

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 from bgpo_trl.algorithms.algorithm import Algorithm
-from bgpo_trl.algorithms.bgpo import BGPO, labeled, untold
+from bgpo_trl.algorithms.bgpo import BGPO, labeled, no_context
 from bgpo_trl.algorithms.dist_nll import DistNLL
 from bgpo_trl.algorithms.maml import MAML
 from bgpo_trl.configs import (
@@ -40,13 +41,14 @@ _PAPER = DDPGConfig(
     clip_targets=False,
     pre_tanh_penalty=0.0,
 )
+_PUBLISHED: Any = {"rl": _PAPER, "gwr": GWRBConfig(activity_scale=1.0), "behavior_scale": 1.0}
 _SHOWN = 0.25
 
 ALGORITHMS: dict[str, Entry] = {
     "bgpo": Entry(BGPO, BGPOConfig(demonstration_share=_SHOWN)),
     "bgpo-experts": Entry(BGPO, BGPOConfig(demonstration_share=0.0)),
     "bgpo-single": Entry(BGPO, _SINGLE),
-    "bgpo-paper": Entry(BGPO, replace(_SINGLE, rl=_PAPER, gwr=GWRBConfig(activity_scale=1.0))),
+    "bgpo-paper": Entry(BGPO, replace(_SINGLE, **_PUBLISHED)),
     "maml": Entry(MAML, MAMLConfig()),
     "maml-demonstrations": Entry(MAML, MAMLConfig(demonstration_share=_SHOWN)),
     "maml-paper": Entry(MAML, MAMLConfig(rl=_PAPER, task_batch_size=256, adaptation_size=256 * 50)),
@@ -56,7 +58,7 @@ ALGORITHMS: dict[str, Entry] = {
         DistNLL, DistNLLConfig(rl=_PAPER, task_batch_size=256, distillation_batch_size=1_000)
     ),
     "oracle": Entry(partial(BGPO, compose=labeled), _SINGLE),
-    "ddpg": Entry(partial(BGPO, compose=untold), _SINGLE),
+    "ddpg": Entry(partial(BGPO, compose=no_context), _SINGLE),
 }
 """Algorithms with their settings: BGPO, without demonstrations, and with one actor and critic for
 all behaviors besides; the baselines of the paper, without demonstrations and with them; as

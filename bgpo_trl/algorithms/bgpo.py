@@ -11,7 +11,7 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torch.func import functional_call
 from torch.nn.functional import one_hot
-from torchrl.envs import Transform, UnaryTransform
+from torchrl.envs import ObservationNorm, Transform, UnaryTransform
 
 from bgpo_trl.algorithms.algorithm import Algorithm
 from bgpo_trl.algorithms.experts import ActiveGroups, Experts
@@ -65,8 +65,8 @@ class Composition:
     """From ``demo_embedding`` (or, for a reference, ``task``) to what the policy is told."""
     reward: Sequence[Transform] = ()
     """What changes the reward."""
-    told: NestedKey | None = "behavior"
-    """The entry that the policy is told. None: nothing."""
+    context: NestedKey | None = "behavior"
+    """The entry that tells the policy what to do. None: nothing does."""
 
 
 def self_organized(parts: Parts) -> Composition:
@@ -83,14 +83,14 @@ def labeled(parts: Parts) -> Composition:
         return one_hot(task, parts.n_tasks).float()
 
     return Composition(
-        infer=[UnaryTransform(["task"], ["task_one_hot"], fn=label)], told="task_one_hot"
+        infer=[UnaryTransform(["task"], ["task_one_hot"], fn=label)], context="task_one_hot"
     )
 
 
-def untold(parts: Parts) -> Composition:
+def no_context(parts: Parts) -> Composition:
     """The lower reference, plain DDPG: the policy is told nothing."""
     del parts
-    return Composition(told=None)
+    return Composition(context=None)
 
 
 class BGPO(Algorithm):
@@ -146,8 +146,18 @@ class BGPO(Algorithm):
         )
         composition = compose(parts)
         self.infer = list(composition.infer)
-        self.told = composition.told
-        self.needs_label = self.told == "task_one_hot"
+        self.context, context_size = composition.context, embedding_size
+        self.needs_label = self.context == "task_one_hot"
+        if self.needs_label:
+            context_size = schedule.n_tasks
+        elif self.context is None:
+            context_size = 0
+        else:
+            # Policies read b beside latents of unit scale, which it must not drown.
+            behavior, self.context = self.context, "context"
+            self.infer.append(
+                ObservationNorm(0.0, config.behavior_scale, [behavior], [self.context])
+            )
         grouping: list[Transform] = []
         if config.grouped:
             self.groups = BehaviorGroups(embedding_size, batch_size=batch, **asdict(config.groups))
@@ -160,8 +170,7 @@ class BGPO(Algorithm):
         self._beta = sum(t.beta for t in bonuses)
         lookups = [t for t in composition.infer if isinstance(t, BehaviorLookup)]
         self.gwr = lookups[0].gwr if lookups else None
-        told_size = {None: 0, "task_one_hot": schedule.n_tasks}.get(self.told, embedding_size)
-        self.in_keys = [config.state, *([] if self.told is None else [self.told])]
+        self.in_keys = [config.state, *([] if self.context is None else [self.context])]
         rl, keys = config.rl, self.in_keys
 
         n_slots = config.active_groups if config.grouped else 1
@@ -171,7 +180,7 @@ class BGPO(Algorithm):
             Problem(
                 seeds=seeds,
                 in_keys=keys,
-                in_features=self.state_size + told_size,
+                in_features=self.state_size + context_size,
                 return_bounds=(0.0, self._highest_return()),
                 device=self.device,
                 experts=range(n_experts),
@@ -232,9 +241,9 @@ class BGPO(Algorithm):
         return self.learn(self._sample())
 
     def _sample(self) -> TensorDictBase:
-        """Returns the transitions of an update, ``[S, E, B / E]``."""
+        """Returns the transitions of an update, ``[S, E, B]``."""
         config, (_, n_experts) = self.config, self.experts.active.group.shape
-        n_rows = config.rl.batch_size // n_experts
+        n_rows = config.expert_batch_size if config.experts else config.rl.batch_size
 
         def groups_of(n_rows: int) -> Tensor:
             if config.experts:
@@ -254,7 +263,7 @@ class BGPO(Algorithm):
     def freeze(
         self, index: int, embedding: Tensor, task: Tensor, generator: torch.Generator
     ) -> dict[str, Any]:
-        """Returns the weights and what is told of the policy of each test episode, ``[T, M, ...]``.
+        """Returns the weights and the context of the policy of each test episode, ``[T, M, ...]``.
 
         See `Algorithm.freeze`. A policy that is the same for all is returned as ``[1, 1, ...]``.
         The task is only read by the variant that is told the label.
@@ -274,22 +283,22 @@ class BGPO(Algorithm):
                 for key in each[0]
             }
         }
-        if self.told is not None:
+        if self.context is not None:
             # All seeds look the same demonstrations up: GWR-B knows only whole batches.
             shown = {"demo_embedding": embedding, "task": task}
             batch = TensorDict(shown, task.shape).expand(self.n_seeds, *task.shape)
             batch = batch.clone()
             for transform in self.infer:
                 batch = transform(batch)
-            frozen["told"] = batch[self.told][index].clone()
+            frozen["context"] = batch[self.context][index].clone()
         return frozen
 
     def act_frozen(self, frozen: TensorDictBase, state: Tensor) -> Tensor:
         """Returns the actions of test episodes; see `Algorithm.act_frozen`."""
         batch = state.shape[:-1]
         inputs = TensorDict({self.in_keys[0]: state}, batch)
-        if self.told is not None:
-            inputs.set(self.told, frozen["told"])
+        if self.context is not None:
+            inputs.set(self.context, frozen["context"])
         weights = {
             key: value.expand(*batch, *value.shape[len(batch) :])
             for key, value in frozen.get("actor").items()

@@ -9,7 +9,7 @@ from torchrl.envs import check_env_specs
 
 from benchmarks import ablation
 from bgpo_trl.algorithms.algorithm import observe
-from bgpo_trl.algorithms.bgpo import BGPO, labeled, self_organized, untold
+from bgpo_trl.algorithms.bgpo import BGPO, labeled, no_context, self_organized
 from bgpo_trl.configs import BGPOConfig, GWRBConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.encoders.pretrained import load_pretrained
@@ -22,7 +22,7 @@ from bgpo_trl.transforms import BehaviorLookup, GroupLookup, TaskSchedule
 VARIANTS = {
     "ground truth, label": ("state", "label", labeled, "oracle"),
     "latent, label": ("latent", "label", labeled, "oracle"),
-    "latent, nothing": ("latent", "nothing", untold, "ddpg"),
+    "latent, nothing": ("latent", "nothing", no_context, "ddpg"),
     "latent, phi": ("latent", "phi", ablation.VARIANTS["r_int"][0], "bgpo-single"),
     "latent, b": ("latent", "b", self_organized, "bgpo-single"),
     "even replay": ("latent", "b", self_organized, "bgpo-single"),
@@ -122,8 +122,8 @@ def test_each_variant_is_an_environment_with_the_input_it_is_named_after(make, v
     check_env_specs(algorithm.env)
 
     state, told, _, _ = VARIANTS[variant]
-    sizes = {"state": 16, "latent": 64, "task_one_hot": n_tasks, "behavior": 32}
-    keys = {"label": ["task_one_hot"], "nothing": []}.get(told, ["behavior"])
+    sizes = {"state": 16, "latent": 64, "task_one_hot": n_tasks, "context": 32}
+    keys = {"label": ["task_one_hot"], "nothing": []}.get(told, ["context"])
     start = algorithm.act(algorithm.env.reset())
     actor, critic = algorithm.learner.actor, algorithm.learner.loss.value_network
     assert actor.in_keys == [state, *keys]
@@ -136,6 +136,8 @@ def test_each_variant_is_an_environment_with_the_input_it_is_named_after(make, v
     assert start["action"].shape == (2, 4)
     assert ("task_one_hot" in start) == (told == "label")
     assert ("behavior" in start) == (told in ("phi", "b"))
+    if "behavior" in start:
+        assert start["context"].equal(0.25 * start["behavior"])
     assert ("group" in start) == (algorithm.groups is not None) == (variant in CHANGES)
     assert ("behavior_node" in start) == (told == "b")
     assert ("lae_h" in start) == (told in ("phi", "b"))
@@ -270,7 +272,7 @@ def test_frozen_policies_are_told_what_training_would_tell_and_learn_nothing(mak
     shown = (state["demo_embedding"].unsqueeze(1), state["task"].unsqueeze(1))
     for index, group in enumerate(groups_of(state, algorithm)):
         frozen = algorithm.freeze(index, *shown, torch.Generator())
-        assert frozen["told"][index, 0].equal(state["behavior"][index])
+        assert frozen["context"][index, 0].equal(0.25 * state["behavior"][index])
         row = index if algorithm.config.experts else 0  # else it is the same for all
         for key, value in algorithm.experts.actor_weights(index, group).items():
             assert frozen["actor"][key][row, 0].equal(value)
@@ -294,7 +296,7 @@ def test_test_episodes_are_played_by_the_expert_of_their_demonstration(make, ban
     assert all(len(of_seed.unique()) > 1 for of_seed in groups)
     for seed, t, m in torch.cartesian_prod(*map(torch.arange, groups.shape)).tolist():
         weight = algorithm.experts.actor_weights(seed, int(groups[seed, t, m]))
-        x = torch.cat([state[seed, t, m], behaviors[seed, t, m]])
+        x = torch.cat([state[seed, t, m], 0.25 * behaviors[seed, t, m]])
         hidden = (x @ weight["mlp.layers.0.weight"] + weight["mlp.layers.0.bias"]).relu()
         action = hidden @ weight["mlp.layers.1.weight"] + weight["mlp.layers.1.bias"]
         torch.testing.assert_close(actions[seed, t, m], action.tanh())
@@ -497,6 +499,7 @@ def play_on(algorithm, n_steps, state=None):
 @pytest.mark.parametrize("rl", ["ddpg", "td3", "sac"])
 def test_with_one_group_it_is_the_plain_learner_bit_for_bit(make, rl):
     lonely = {"groups": GWRBConfig(activity_threshold=1e-6), "active_groups": 1}
+    lonely["expert_batch_size"] = 16  # as in the single network's batch
     plain, one = make("latent, b", rl=rl), make("experts", rl=rl, **lonely)
     ours, theirs = play(plain, 30), play(one, 30)
     assert one.groups.num_groups.tolist() == [1, 1]
@@ -506,11 +509,10 @@ def test_with_one_group_it_is_the_plain_learner_bit_for_bit(make, rl):
 
 
 def test_slots_that_stay_free_change_nothing(make, make_config):
-    """Four slots with four times the batch, one of them used."""
-    ddpg = make_config().algorithm.rl
-    lonely = {"groups": GWRBConfig(activity_threshold=1e-6)}
+    """Four slots, one of them used."""
+    lonely = {"groups": GWRBConfig(activity_threshold=1e-6), "expert_batch_size": 16}
     plain = make("latent, b")
-    four = make("experts", config=replace(ddpg, batch_size=64), **lonely, active_groups=4)
+    four = make("experts", **lonely, active_groups=4)
     ours, theirs = play(plain, 30), play(four, 30)
     torch.testing.assert_close(ours["action"], theirs["action"], rtol=1e-4, atol=1e-5)
     start = weights(make("experts", **lonely, active_groups=4))
@@ -585,11 +587,12 @@ def test_demonstrations_are_a_quarter_of_each_experts_batch_and_were_shown_befor
                     ((frame >= steps.first) & (frame < steps.first + steps.length)).nonzero()
                 )
                 known = told[shown == number]
-                assert (known == one["behavior"]).all(-1).any()
+                assert (0.25 * known == one["context"]).all(-1).any()
+                behavior = 4 * one["context"]
                 ends = frame == int(steps.first[number] + steps.length[number]) - 2
                 assert bool(one["next", "terminated"]) == ends
                 phi = bank.seen().embedding[number]
-                reward = 1 + 0.1 * torch.exp(-(one["behavior"] - phi).norm()) if ends else 0.0
+                reward = 1 + 0.1 * torch.exp(-(behavior - phi).norm()) if ends else 0.0
                 assert float(one["next", "reward"]) == pytest.approx(float(reward), abs=1e-5)
                 n_seen += 1
             for expert in batch[seed]:
