@@ -179,10 +179,10 @@ def test_what_the_policy_is_told_follows_from_held_out_demonstrations(make, bank
     held_out = bank.held_out()
     drawn = set()
     for number in range(5):
-        shown = [s.policy["context"] for s in take(by_phi, raw, number)]
+        shown = [4 * s.policy["context"] for s in take(by_phi, raw, number)]
         assert not shown[0].equal(shown[1])
-        assert take(of_one, alone, number)[0].policy["context"].equal(shown[1])
-        told = [s.policy["context"] for s in take(evaluator, algorithm, number)]
+        assert (4 * take(of_one, alone, number)[0].policy["context"]).equal(shown[1])
+        context = [s.policy["context"] for s in take(evaluator, algorithm, number)]
         for index, phi in enumerate(shown):
             for task in range(3):
                 of_task = held_out.embedding[held_out.task == task]
@@ -190,7 +190,7 @@ def test_what_the_policy_is_told_follows_from_held_out_demonstrations(make, bank
                 assert found.any(1).all()
                 drawn |= {(task, int(row)) for row in found.nonzero()[:, 1]}
             phi = phi.expand(2, 3, EPISODES, 32)
-            assert told[index].equal(algorithm.gwr.lookup(phi).embedding[index])
+            assert (4 * context[index]).equal(algorithm.gwr.lookup(phi).embedding[index])
     assert len(drawn) == 12  # in time, all of them
 
 
