@@ -197,7 +197,7 @@ def test_training_draws_seen_demonstrations_and_tests_held_out_ones(
         store(transition)
 
     def spy_test(snapshots, *args):
-        tested_on.extend(snapshot.policy["told"].flatten(0, 1) for snapshot in snapshots)
+        tested_on.extend(4 * snapshot.policy["context"].flatten(0, 1) for snapshot in snapshots)
         return test(snapshots, *args)
 
     monkeypatch.setattr(trainer.algorithm, "store", spy_store)
