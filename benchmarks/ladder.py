@@ -15,17 +15,14 @@ seen on one rung:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
-from ablation import VARIANTS
 from summary import summarize
 from tyro.conf import subcommand
 
-from bgpo_trl.algorithms.bgpo import BGPO, Composition, Parts, labeled
+from bgpo_trl.algorithms.bgpo import BGPO
 from bgpo_trl.configs import PRESETS, BGPOConfig, DDPGConfig, SACConfig, TD3Config
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.experiments.resuming import check_resumable
@@ -36,12 +33,15 @@ from bgpo_trl.training import Trainer
 
 Rung = Literal["a", "b", "c", "d"]
 
-RUNGS: dict[str, tuple[str, BGPOConfig, Callable[[Parts], Composition]]] = {
-    "a": ("ground truth + label", replace(VARIANTS["none"][1], state="state"), labeled),
-    "b": ("latent + label", VARIANTS["none"][1], labeled),
-    "c": ("latent + phi", *reversed(VARIANTS["r_int"])),
-    "d": ("latent + b (BGPO as published)", *reversed(VARIANTS["gwr+r_int"])),
+_SINGLE = BGPOConfig(variant="published", experts=False, even_replay=False, demonstration_share=0.0)
+
+RUNGS: dict[str, tuple[str, BGPOConfig]] = {
+    "a": ("ground truth + label", replace(_SINGLE, variant="label", state="state")),
+    "b": ("latent + label", replace(_SINGLE, variant="label")),
+    "c": ("latent + phi", replace(_SINGLE, variant="without-gwr")),
+    "d": ("latent + b (BGPO as published)", _SINGLE),
 }
+"""What each rung has, and its hyperparameters."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ def main(arguments: Arguments) -> None:
     )
     tables = {}
     for rung in arguments.rungs:
-        _, bgpo, compose = RUNGS[rung]
+        _, bgpo = RUNGS[rung]
         out = arguments.out / rung
         algorithm = replace(bgpo, rl=arguments.rl)
         with Trainer(
@@ -98,7 +98,7 @@ def main(arguments: Arguments) -> None:
             out,
             bank=bank,
             encoders=encoders,
-            make=partial(BGPO, compose=compose),
+            make=BGPO,
             device=device,
             resume=arguments.resume,
         ) as trainer:

@@ -22,7 +22,6 @@ from pathlib import Path
 import numpy as np
 import torch
 import tyro
-from ablation import make_of
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
@@ -34,7 +33,6 @@ from bgpo_trl.encoders.representation import embed_demonstrations
 from bgpo_trl.evaluation import Evaluator, Snapshot
 from bgpo_trl.experiments.run import command_line, commit_of_code
 from bgpo_trl.figures.curves import save_figure
-from bgpo_trl.runs.config_file import read_config
 from bgpo_trl.seeding import stream_seed
 
 COLUMNS = ("share", "seed", "task", "episodes", "success", "task_inference", "activity")
@@ -89,10 +87,11 @@ def show(
     n_tasks, n_seeds = len(task), len(seeds)
     snapshots = [
         Snapshot(
+            number=_NUMBER,
             episode=0,
             env_steps=0,
             presented=torch.ones(n_tasks, dtype=torch.bool),
-            policy=algorithm.freeze(
+            policy=algorithm.snapshot(
                 index,
                 embedding,
                 task,
@@ -101,7 +100,7 @@ def show(
         )
         for index, seed in enumerate(seeds)
     ]
-    success = evaluator.run(snapshots, _NUMBER, algorithm).success.double().mean(-1)
+    success = evaluator.run(snapshots, algorithm.device).success.double().mean(-1)
     inferred, activity = torch.full((2, n_seeds, n_tasks), torch.nan, dtype=torch.double)
     if algorithm.gwr is not None:
         activity = algorithm.gwr.lookup(embedding.expand(n_seeds, *embedding.shape)).activity
@@ -206,8 +205,7 @@ def main(arguments: Arguments) -> None:
     commit = commit_of_code()
     torch.set_num_threads(arguments.threads)
     run, out = arguments.run, arguments.out or arguments.run
-    make = make_of(read_config(run / "config.json")[0].name)
-    rows = measure(load_run(run, make=make), arguments.shares, arguments.episodes, arguments.seed)
+    rows = measure(load_run(run), arguments.shares, arguments.episodes, arguments.seed)
     out.mkdir(parents=True, exist_ok=True)
     with (out / "one_shot.csv").open("w", newline="") as file:
         writer = csv.writer(file)

@@ -20,18 +20,16 @@ system that they share. Locks on files must hold across machines, as they do on 
 from __future__ import annotations
 
 import sys
-from dataclasses import asdict, dataclass, replace
-from functools import partial
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from ablation import VARIANTS
-
-from bgpo_trl.algorithms.bgpo import BGPO
+from bgpo_trl.algorithms import ABLATIONS
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.experiments import run as experiment
 from bgpo_trl.experiments.merge import merge
 from bgpo_trl.files.locking import DirectoryLock
+from bgpo_trl.runs.config_file import settings_of
 from bgpo_trl.runs.directory import check_settings, holds_run
 from bgpo_trl.runs.results import read_json
 
@@ -81,7 +79,7 @@ def make_jobs(arguments: Arguments) -> dict[Path, list[Job]]:
     jobs: dict[Path, list[Job]] = {}
     for setting in arguments.settings:
         # Those that are not an algorithm by a name of its own.
-        ablation = [v for v in VARIANTS if v not in ("gwr+r_int", "experts", "all")]
+        ablation = [v for v in ABLATIONS if v not in ("gwr+r_int", "experts", "all")]
         for name in ablation if setting == "ablation" else arguments.algorithms:
             config = experiment.run_config(
                 experiment.Arguments(
@@ -94,7 +92,7 @@ def make_jobs(arguments: Arguments) -> dict[Path, list[Job]]:
             starts = config.task_starts if setting == "continual" else (0, 0, 0)
             config = replace(config, name=name, task_starts=starts)
             if setting == "ablation":
-                config = replace(config, algorithm=VARIANTS[name][1])
+                config = replace(config, algorithm=ABLATIONS[name].config)
             merged = arguments.out.absolute() / f"{setting}-{name}"
             blocks = [
                 config.seeds[first : first + arguments.block]
@@ -121,22 +119,20 @@ def check_directories(jobs: dict[Path, list[Job]], encoders: str) -> None:
     """
     for merged, group in jobs.items():
         for job in group:
-            check_settings(job.directory, {**asdict(job.config), "encoders": encoders})
+            check_settings(job.directory, settings_of(job.config, encoders))
         path = merged / "config.json"
         if path.exists():  # merged before, from the same blocks or others
             if not any(merged.glob("seeds-*")):
                 raise ValueError(f"{merged} is a run of its own: choose another --out")
             seeds = read_json(path)["seeds"]
-            settings = {**asdict(group[0].config), "encoders": encoders, "seeds": seeds}
+            settings = {**settings_of(group[0].config, encoders), "seeds": seeds}
             check_settings(merged, settings)
 
 
 def play(job: Job) -> None:
     """Plays a job to its end, from its last checkpoint if there is one, and measures."""
-    name = job.config.name
-    make = partial(BGPO, compose=VARIANTS[name][0]) if name in VARIANTS else None
     arguments = experiment.Arguments(out=job.directory, resume=holds_run(job.directory))
-    experiment.run_experiment(arguments, "sweep", job.config, make)
+    experiment.run_experiment(arguments, "sweep", job.config)
 
 
 def main(arguments: Arguments) -> None:

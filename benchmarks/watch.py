@@ -17,7 +17,6 @@ from pathlib import Path
 
 import numpy as np
 import tyro
-from ablation import make_of
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont, ImageOps
 
@@ -27,7 +26,6 @@ from bgpo_trl.experiments.run import command_line
 from bgpo_trl.figures.curves import plot_frame_strips, save_figure
 from bgpo_trl.figures.of_run import draw_growth
 from bgpo_trl.figures.video import save_gif
-from bgpo_trl.runs.config_file import read_config
 from suites import nico
 from suites.nico.rendering import FrameRenderer
 
@@ -90,7 +88,7 @@ def demonstrate(tasks: Sequence[str], seed: int) -> dict[str, NDArray]:
 
 def play(policy: TrainedPolicy, task: str, demonstration: NDArray, seed: int) -> Episode:
     """Shows the policy a demonstration and returns what it does from the start with that seed."""
-    policy.watch(demonstration, task=task)
+    policy.condition(demonstration, task=task)
     env = nico.load(task, seed=seed)
     renderer = FrameRenderer(env.physics.model.ptr, "room", height=480, width=640)
 
@@ -153,8 +151,7 @@ def _draw(picture: Image.Image, episode: Episode, step: int, top: int) -> None:
 def main(arguments: Arguments) -> None:
     """Plays an episode of each task and writes the pictures."""
     run, out = arguments.run, arguments.out or arguments.run / "figures"
-    make = make_of(read_config(run / "config.json")[0].name)
-    policy = load_run(run, seed=arguments.policy, make=make)
+    policy = load_run(run, seed=arguments.policy)
     shown = demonstrate(policy.tasks, arguments.seed)
     episodes = [play(policy, task, frames, arguments.seed) for task, frames in shown.items()]
     out.mkdir(parents=True, exist_ok=True)

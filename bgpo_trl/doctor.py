@@ -236,23 +236,23 @@ def check_update_rate(seconds: float = 0.5) -> Iterator[Finding]:
     from bgpo_trl.configs import BGPOConfig
     from bgpo_trl.encoders.pretrained import load_pretrained
     from bgpo_trl.transforms import TaskSchedule
+    from bgpo_trl.world import World
 
     encoders, bank = load_pretrained()
     yield Finding("ok", "weights", f"encoders and {len(bank.task):,} embedded demonstrations")
     seeds = range(5)
-    learner = BGPO(
-        BGPOConfig(), seeds=seeds, schedule=TaskSchedule(), bank=bank.seen(), encoders=encoders
-    )
+    learner = BGPO(BGPOConfig(), seeds=seeds, bank=bank.seen(), encoders=encoders)
+    world = World(learner, seeds=seeds, schedule=TaskSchedule(), bank=bank.seen())
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # as in a run
     try:
-        transition, _ = learner.env.step_and_maybe_reset(learner.act(learner.env.reset()))
+        transition, _ = world.env.step_and_maybe_reset(learner.act(world.env.reset()))
         while not learner.update():  # not before it has seen enough
             learner.store(transition)
         rate = len(seeds) * _rate(learner.update, seconds)
     finally:
         torch.set_num_threads(threads)
-        learner.simulation.close()
+        world.close()
     yield Finding("ok", "updates/s", f"{rate:.0f}, {len(seeds)} seeds together on one core")
 
 

@@ -10,31 +10,35 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 from torch import Tensor
-from torchrl.envs import Compose, TransformedEnv
 
-from bgpo_trl.algorithms.algorithm import Algorithm, clip, observe
+from bgpo_trl.algorithms import Algorithm
+from bgpo_trl.algorithms.environments import observation_env
+from bgpo_trl.algorithms.policy import Policy
 from bgpo_trl.configs import AlgorithmConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.envs import NicoEnv
 from bgpo_trl.seeding import stream_seed
+from bgpo_trl.transforms import TaskSchedule
 
 
 @dataclass(frozen=True)
 class Snapshot:
-    """What a seed's evaluation depends on, taken at one moment of its training.
+    """Policy of a seed at one moment of its training, conditioned for one evaluation.
 
     Attributes:
-        episode: Training episodes before it.
-        env_steps: Environment steps before it.
-        presented: Which tasks were presented so far, bool ``[T]``.
-        policy: What the policy depends on, from `Algorithm.freeze`.
+        number: Evaluations of this seed before.
+        episode: Training episodes before.
+        env_steps: Environment steps before.
+        presented: Tasks presented so far, bool ``[T]``.
+        policy: Conditioned on a demonstration of each test episode.
     """
 
+    number: int
     episode: int
     env_steps: int
     presented: Tensor
-    policy: dict[str, Any]
+    policy: Policy
 
 
 @dataclass(frozen=True)
@@ -42,12 +46,14 @@ class TestResult:
     """Outcome of the test episodes of one evaluation of each seed.
 
     Attributes:
+        snapshots: Those that were tested, one of each seed.
         success: Bool ``[S, T, M]``: seeds, tasks, episodes of a task; also the extrinsic return.
         steps: Length of the episodes, int64 ``[S, T, M]``.
     """
 
     __test__ = False  # Not a test case of pytest's.
 
+    snapshots: Sequence[Snapshot]
     success: Tensor
     steps: Tensor
 
@@ -57,12 +63,12 @@ class Evaluator:
 
     Seeds reach an evaluation at different times. Each leaves a `Snapshot`; when all have, their
     test episodes run side by side. Starts and demonstrations of an evaluation follow from the seed
-    and its number alone.
+    and the evaluation's number alone.
 
     Args:
         config: The algorithm's hyperparameters.
         seeds: As in training.
-        n_tasks: Number of tasks, presented or not.
+        schedule: As in training.
         episodes: Test episodes ``M`` of each task.
         bank: Held-out demonstrations.
         encoders: As in training.
@@ -76,14 +82,15 @@ class Evaluator:
         config: AlgorithmConfig,
         *,
         seeds: Sequence[int],
-        n_tasks: int,
+        schedule: TaskSchedule,
         episodes: int,
         bank: DemonstrationBank,
         encoders: Representation | None,
     ) -> None:
         self.max_steps = config.max_steps
         self._state_key = config.state
-        self.seeds = tuple(seeds)
+        self.seeds, self.schedule = tuple(seeds), schedule
+        n_tasks = schedule.n_tasks
         self.shape = (len(seeds), n_tasks, episodes)
         self._rows_of = [torch.nonzero(bank.task == task).flatten() for task in range(n_tasks)]
         missing = [task for task, rows in enumerate(self._rows_of) if not len(rows)]
@@ -98,21 +105,37 @@ class Evaluator:
             batch_size=self.shape,
             observation="pixels" if config.state == "latent" else "state",
         )
-        self.env = TransformedEnv(
-            self.simulation, Compose([observe(config, encoders), clip(config)])
-        )
+        self.env = observation_env(config, self.simulation, encoders)
         self._task = torch.arange(n_tasks)[:, None].expand(self.shape).contiguous()
+        self._next = 0
+        self._waiting: list[list[Snapshot]] = [[] for _ in seeds]
 
     def _rng(self, seed: int, number: int) -> np.random.Generator:
         return np.random.default_rng([stream_seed(seed, "evaluation"), number])
 
-    def take(self, algorithm: Algorithm, index: int, number: int, env_steps: int) -> Snapshot:
-        """Returns a snapshot of one seed.
+    def take(self, algorithm: Algorithm, index: int, episode: int, env_steps: int) -> None:
+        """Queues a snapshot of one seed for its next evaluation.
 
         Args:
             algorithm: In training.
             index: Position of the seed in the batch.
-            number: How many evaluations of this seed were before.
+            episode: The seed's training episodes so far.
+            env_steps: The seed's environment steps so far.
+        """
+        number = self._next + len(self._waiting[index])
+        snapshot = self.snapshot(algorithm, index, number, episode=episode, env_steps=env_steps)
+        self._waiting[index].append(snapshot)
+
+    def snapshot(
+        self, algorithm: Algorithm, index: int, number: int, *, episode: int, env_steps: int = 0
+    ) -> Snapshot:
+        """Returns a snapshot of one seed for an evaluation.
+
+        Args:
+            algorithm: In training.
+            index: Position of the seed in the batch.
+            number: Of the evaluation.
+            episode: The seed's training episodes so far.
             env_steps: The seed's environment steps so far.
         """
         rng = self._rng(self.seeds[index], number)
@@ -122,42 +145,52 @@ class Evaluator:
                 for rows in self._rows_of
             ]
         )
-        episode = int(algorithm.source.episode[index])
+        generator = torch.Generator().manual_seed(int(rng.integers(2**63 - 1)))
         return Snapshot(
+            number=number,
             episode=episode,
             env_steps=env_steps,
-            presented=algorithm.source.schedule.presented(torch.tensor(episode)),
-            policy=algorithm.freeze(
-                index,
-                self._bank.embedding[drawn],
-                self._bank.task[drawn],
-                torch.Generator().manual_seed(int(rng.integers(2**63 - 1))),
+            presented=self.schedule.presented(torch.tensor(episode)),
+            policy=algorithm.snapshot(
+                index, self._bank.embedding[drawn], self._bank.task[drawn], generator
             ),
         )
+
+    def run_next(
+        self, device: torch.device | str = "cpu", watch: Callable[[], object] = lambda: None
+    ) -> TestResult | None:
+        """Plays the test episodes of the next evaluation, if all seeds have left their snapshot.
+
+        Args:
+            device: Where the networks are.
+            watch: As in `run`.
+        """
+        if not all(self._waiting):
+            return None
+        self._next += 1
+        return self.run([waiting.pop(0) for waiting in self._waiting], device, watch)
 
     @torch.no_grad()
     def run(
         self,
         snapshots: Sequence[Snapshot],
-        number: int,
-        algorithm: Algorithm,
+        device: torch.device | str = "cpu",
         watch: Callable[[], object] = lambda: None,
     ) -> TestResult:
         """Plays the test episodes of all tasks presented to each seed.
 
         Args:
             snapshots: One of each seed.
-            number: How many evaluations were before.
-            algorithm: The one that left them; what it has learned since makes no difference.
+            device: Where the networks are.
             watch: Called at the start and after each step, with `simulation` there to be looked at.
 
         Returns:
             Success and length; both 0 where a task was not yet presented.
         """
-        device = algorithm.device
-        policy = TensorDict.maybe_dense_stack([TensorDict(s.policy) for s in snapshots]).to(device)
+        policy = Policy.stack([snapshot.policy for snapshot in snapshots], device)
         starts = [
-            self._rng(seed, number).integers(2**32, size=self.shape[1:]) for seed in self.seeds
+            self._rng(seed, snapshot.number).integers(2**32, size=self.shape[1:])
+            for seed, snapshot in zip(self.seeds, snapshots, strict=True)
         ]
         self.simulation.seed_rows(np.stack(starts).ravel().tolist())
         presented = torch.stack([s.presented for s in snapshots])
@@ -167,7 +200,7 @@ class Evaluator:
         watch()
         for _ in range(self.max_steps):
             seen = state[self._state_key].to(device)
-            state.set("action", algorithm.act_frozen(policy, seen).cpu())
+            state.set("action", policy.act(seen).cpu())
             state.set("_step", active)
             state = self.env.step(state)["next"]
             watch()
@@ -176,7 +209,26 @@ class Evaluator:
             active = active & ~success
             if not active.any():
                 break
-        return TestResult(success, steps)
+        return TestResult(snapshots, success, steps)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Returns the queue and the number of the next evaluation."""
+        waiting = [
+            [{**vars(snapshot), "policy": snapshot.policy.state_dict()} for snapshot in of_seed]
+            for of_seed in self._waiting
+        ]
+        return {"next": self._next, "waiting": waiting}
+
+    def load_state_dict(self, state: dict[str, Any], algorithm: Algorithm) -> None:
+        """Continues from what `state_dict` returned; the algorithm is the one it was taken from."""
+        self._next = state["next"]
+        self._waiting = [
+            [
+                Snapshot(**{**saved, "policy": algorithm.policy(**saved["policy"])})
+                for saved in of_seed
+            ]
+            for of_seed in state["waiting"]
+        ]
 
 
 @torch.no_grad()

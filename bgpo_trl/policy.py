@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs import Compose
 
-from bgpo_trl.algorithms import ALGORITHMS, Algorithm
-from bgpo_trl.algorithms.algorithm import clip, observe
+from bgpo_trl.algorithms import Algorithm, entry
+from bgpo_trl.algorithms.environments import clip, encode
+from bgpo_trl.algorithms.policy import Policy
 from bgpo_trl.configs import RunConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.encoders.pretrained import load_pretrained
@@ -23,7 +24,6 @@ from bgpo_trl.encoders.representation import Representation, embed_demonstration
 from bgpo_trl.files.checkpoint import has_checkpoint, load_checkpoint
 from bgpo_trl.runs.config_file import read_config
 from bgpo_trl.seeding import stream_seed
-from bgpo_trl.transforms import TaskSchedule
 from suites.nico.rendering import FRAME_HEIGHT, FRAME_WIDTH
 
 _FRAME = (FRAME_HEIGHT, FRAME_WIDTH, 3)
@@ -84,20 +84,20 @@ class TrainedPolicy:
         self.bank = bank
         self.seed = seed
         self.tasks = config.tasks
-        self._observe = Compose([observe(config.algorithm, encoders), clip(config.algorithm)])
+        self._observe = Compose([encode(config.algorithm, encoders), clip(config.algorithm)])
         self._index = config.seeds.index(seed)
-        self._frozen: TensorDictBase | None = None
+        self._policy: Policy | None = None
         self._task = 0
 
     @torch.no_grad()
-    def watch(
+    def condition(
         self,
         demonstration: ArrayLike,
         *,
         task: str | None = None,
         generator: torch.Generator | None = None,
     ) -> Recognition:
-        """Takes up what a demonstration shows, whole or cut short, to do it from now on.
+        """Conditions the policy on a demonstration, whole or cut short.
 
         Args:
             demonstration: Frames, uint8 ``[T, 32, 64, 3]``, T at least 1.
@@ -105,7 +105,7 @@ class TrainedPolicy:
             generator: For what MAML draws to adapt itself; of the seed if None.
 
         Returns:
-            What the policy made of it.
+            The behavior and the group that the policy recognized.
 
         Raises:
             ValueError: If these are no such frames, or the label is unknown or missing; the policy
@@ -124,16 +124,14 @@ class TrainedPolicy:
         (embedding,) = embed_demonstrations(self.encoders, TensorDict(shown, [1]))
         if generator is None:
             generator = torch.Generator().manual_seed(stream_seed(self.seed, "one-shot"))
-        # The interface is that of evaluations: of all seeds, with test episodes of each task.
-        policy = TensorDict(
-            algorithm.freeze(
-                self._index,
-                embedding.expand(n_tasks, 1, -1),
-                torch.arange(n_tasks).unsqueeze(-1),
-                generator,
-            )
+        # One test episode of each task, as in evaluations.
+        policy = algorithm.snapshot(
+            self._index,
+            embedding.expand(n_tasks, 1, -1),
+            torch.arange(n_tasks).unsqueeze(-1),
+            generator,
         )
-        self._frozen = TensorDict.maybe_dense_stack([policy] * n_seeds).to(algorithm.device)
+        self._policy = Policy.stack([policy], algorithm.device)
         self._task = 0 if task is None else self.tasks.index(task)
         shown, index = embedding.expand(n_seeds, -1), self._index
         found: dict[str, Any] = {}
@@ -158,15 +156,14 @@ class TrainedPolicy:
         Raises:
             ValueError: If this is no such frame, or no demonstration was shown before.
         """
-        if self._frozen is None:
-            raise ValueError("the policy has seen no demonstration: show it one with watch()")
+        if self._policy is None:
+            raise ValueError("the policy has seen no demonstration: show it one with condition()")
         seen = _frames(frame, "a frame is uint8 [32, 64, 3]", 3)
         state = self._observe(TensorDict({"pixels": seen}))[self.config.algorithm.state].to(
             self.algorithm.device
         )
-        every = state.expand(len(self.config.seeds), len(self.tasks), 1, -1)
-        action = self.algorithm.act_frozen(self._frozen, every)
-        return action[self._index, self._task, 0].cpu().numpy()
+        action = self._policy.act(state.expand(1, len(self.tasks), 1, -1))
+        return action[0, self._task, 0].cpu().numpy()
 
 
 def load_run(
@@ -186,7 +183,6 @@ def load_run(
     Raises:
         ValueError: If there is no run, no checkpoint yet, no such seed or algorithm; if the run saw
             the ground truth instead of frames; or its encoders are not at hand.
-        RuntimeError: If there is no OpenGL: an algorithm comes with its simulations.
 
     Example:
         >>> import bgpo_trl
@@ -203,23 +199,18 @@ def load_run(
     if config.algorithm.state != "latent" or identity is None:
         raise ValueError(f"{path} learned from the ground truth: only runs from frames can watch")
     if make is None:
-        if config.name not in ALGORITHMS:
+        try:
+            make = entry(config.name).make
+        except ValueError:
             raise ValueError(
                 f"{path} is a run of {config.name!r}, which is not in ALGORITHMS: give make=, what "
                 "its Trainer was given"
-            )
-        make = ALGORITHMS[config.name].make
+            ) from None
     if not has_checkpoint(path / "checkpoint"):
         raise ValueError(f"{path} has no checkpoint yet: let the run reach its first one")
     encoders, bank = _encoders(path, identity)
     bank = bank.for_tasks(config.tasks)
-    algorithm = make(
-        config.algorithm,
-        seeds=config.seeds,
-        schedule=TaskSchedule(starts=config.task_starts),
-        bank=bank.seen(),
-        encoders=encoders,
-    )
+    algorithm = make(config.algorithm, seeds=config.seeds, bank=bank.seen(), encoders=encoders)
     saved = load_checkpoint(path / "checkpoint", mmap=True)
     try:
         state = saved["algorithm"]

@@ -7,7 +7,6 @@ import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
@@ -15,19 +14,21 @@ from typing import Any, Literal, Self
 import torch
 from tensordict import TensorDict, TensorDictBase
 
-from bgpo_trl.algorithms import ALGORITHMS, Algorithm
+from bgpo_trl.algorithms import Algorithm, entry
 from bgpo_trl.configs import RunConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.encoders.representation import Representation
-from bgpo_trl.evaluation import Evaluator, Snapshot
+from bgpo_trl.evaluation import Evaluator
 from bgpo_trl.files.checkpoint import save_checkpoint
 from bgpo_trl.files.interrupts import interrupts_wait
 from bgpo_trl.files.locking import DirectoryLock
 from bgpo_trl.files.progress import progress_bar
-from bgpo_trl.runs.directory import load_last, plain_settings
+from bgpo_trl.runs.config_file import settings_of
+from bgpo_trl.runs.directory import load_last
 from bgpo_trl.runs.gwr_graphs import growth_moments, save_graph
 from bgpo_trl.runs.logger import RunLogger
 from bgpo_trl.transforms import TaskSchedule
+from bgpo_trl.world import World
 
 
 class Trainer:
@@ -55,7 +56,7 @@ class Trainer:
             ``checkpoint/``, and in ``gwr/`` the graph of the first seed's GWR-B at some moments.
         bank: Embedded demonstrations, seen and held out; those of ``config.tasks`` are used.
         encoders: Trained encoders; None for a run that does not use them.
-        make: Makes the algorithm; by default the one that `ALGORITHMS` has under ``config.name``.
+        make: Makes the algorithm; by default the entry of ``config.name``.
         device: Where the networks are; see `Algorithm`.
         resume: Continue the run in the directory, from its last checkpoint; begin it where there is
             none.
@@ -89,27 +90,20 @@ class Trainer:
         bank = bank.for_tasks(config.tasks)
         schedule = TaskSchedule(starts=config.task_starts)
         seeds = config.seeds
-        make = ALGORITHMS[config.name].make if make is None else make
+        make = entry(config.name).make if make is None else make
         self.algorithm = make(
-            config.algorithm,
-            seeds=seeds,
-            schedule=schedule,
-            bank=bank.seen(),
-            encoders=encoders,
-            device=device,
+            config.algorithm, seeds=seeds, bank=bank.seen(), encoders=encoders, device=device
         )
+        self.world = World(self.algorithm, seeds=seeds, schedule=schedule, bank=bank.seen())
         self.evaluator = Evaluator(
             config.algorithm,
             seeds=seeds,
-            n_tasks=schedule.n_tasks,
+            schedule=schedule,
             episodes=config.eval_episodes,
             bank=bank.held_out(config.held_out),
             encoders=encoders,
         )
         self.env_steps = 0
-        # Snapshots of each seed that wait for the other seeds, and how many were evaluated.
-        self._waiting: list[list[Snapshot]] = [[] for _ in seeds]
-        self._evaluated = 0
         # For the progress bar: the latest episodes, and the latest test.
         self._successes: deque[int] = deque(maxlen=100)
         self._tested = ""
@@ -117,7 +111,7 @@ class Trainer:
         # Rows of seeds that were done early and went on.
         self._later: list[dict[str, Any]] = []
         encoders_used = None if encoders is None else encoders.identity
-        self._settings = plain_settings({**asdict(config), "encoders": encoders_used})
+        self._settings = settings_of(config, encoders_used)
         self._state: TensorDictBase | None = None
         self._lock = DirectoryLock(self.directory)
         try:
@@ -143,12 +137,12 @@ class Trainer:
                 at once.
             OSError: If the disk is full.
         """
-        algorithm, n_episodes = self.algorithm, self.config.episodes
+        algorithm, env, n_episodes = self.algorithm, self.world.env, self.config.episodes
         if self._state is None:
-            self._state = algorithm.env.reset()
+            self._state = env.reset()
             self.save()  # So that there are never rows without a checkpoint.
         state, saved = self._state, time.monotonic()
-        episodes = algorithm.source.episode
+        episodes = self.world.source.episode  # counted in place by each reset
         bar = progress_bar(
             "train",
             shown=self.progress,
@@ -165,7 +159,7 @@ class Trainer:
                     before = episodes.clone()
                     state = algorithm.act(state)
                     update = background.submit(algorithm.update)
-                    transition, state = algorithm.env.step_and_maybe_reset(state)
+                    transition, state = env.step_and_maybe_reset(state)
                     losses = update.result() or losses
                     algorithm.store(transition)
                     self.env_steps += 1
@@ -211,7 +205,7 @@ class Trainer:
         self, index: int, transition: TensorDictBase, losses: dict[str, torch.Tensor]
     ) -> None:
         algorithm, end = self.algorithm, transition.get("next")[index]
-        episode = int(algorithm.source.episode[index])
+        episode = int(self.world.source.episode[index])
         intrinsic = end.get("episode_intrinsic_reward", 0.0)  # not measured in every variant
         extrinsic = end.get("episode_extrinsic_reward", end["episode_reward"])
         nodes = 0 if algorithm.gwr is None else int(algorithm.gwr.num_nodes[index])
@@ -236,10 +230,7 @@ class Trainer:
         if index == 0 and algorithm.gwr is not None and episode in self._growth_moments:
             save_graph(self.directory / "gwr", episode, algorithm.gwr)
         if episode % self.config.eval_every == 0:
-            number = self._evaluated + len(self._waiting[index])
-            self._waiting[index].append(
-                self.evaluator.take(algorithm, index, number, self.env_steps)
-            )
+            self.evaluator.take(algorithm, index, episode, self.env_steps)
 
     def _log(self, row: dict[str, Any]) -> None:
         """Logs an episode, or keeps what only a longer run would log."""
@@ -250,11 +241,8 @@ class Trainer:
             self._later.append(row)
 
     def _evaluate(self) -> None:
-        while all(self._waiting):
-            snapshots = [waiting.pop(0) for waiting in self._waiting]
-            result = self.evaluator.run(snapshots, self._evaluated, self.algorithm)
-            self._evaluated += 1
-            for index, snapshot in enumerate(snapshots):
+        while (result := self.evaluator.run_next(self.algorithm.device)) is not None:
+            for index, snapshot in enumerate(result.snapshots):
                 for task in torch.nonzero(snapshot.presented).flatten().tolist():
                     for success, steps in zip(
                         result.success[index, task].tolist(),
@@ -281,10 +269,10 @@ class Trainer:
         assert self._state is not None
         state: dict[str, Any] = {
             "algorithm": self.algorithm.state_dict(),
+            "world": self.world.state_dict(),
+            "evaluator": self.evaluator.state_dict(),
             "state": self._state.clone().to_dict(),
             "env_steps": self.env_steps,
-            "waiting": [[vars(s) for s in waiting] for waiting in self._waiting],
-            "evaluated": self._evaluated,
             "later": self._later,
             "settings": self._settings,
             "position": self.logger.position(),
@@ -292,9 +280,8 @@ class Trainer:
         save_checkpoint(self.directory / "checkpoint", state)
 
     def _load(self, state: dict[str, Any]) -> None:
-        self.algorithm.env.reset()  # Transforms make their caches at the first reset.
+        self.world.load_state_dict(state["world"])
         self.algorithm.load_state_dict(state["algorithm"])
-        self._state = TensorDict(state["state"], self.algorithm.env.batch_size)
+        self.evaluator.load_state_dict(state["evaluator"], self.algorithm)
+        self._state = TensorDict(state["state"], self.world.env.batch_size)
         self.env_steps = state["env_steps"]
-        self._waiting = [[Snapshot(**s) for s in waiting] for waiting in state["waiting"]]
-        self._evaluated = state["evaluated"]

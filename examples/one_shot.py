@@ -38,7 +38,7 @@ def main(run: tyro.conf.Positional[Path], task: str = nico.ALL_TASKS[0], seed: i
         seed: Seed of both starts.
     """
     policy = bgpo_trl.load_run(run)
-    print(policy.watch(demonstrate(task, seed)))
+    print(policy.condition(demonstrate(task, seed)))
 
     env = nico.load(task, seed=seed + 1)
     timestep = env.reset()

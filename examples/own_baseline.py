@@ -3,8 +3,10 @@
 from functools import partial
 
 import torch
+from tensordict.nn import TensorDictModule
 
 from bgpo_trl.algorithms import Algorithm
+from bgpo_trl.algorithms.environments import no_context_env
 from bgpo_trl.configs import RunConfig
 from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.encoders.pretrained import load_pretrained
@@ -16,29 +18,29 @@ from bgpo_trl.training import Trainer
 class NearestNeighbors(Algorithm):
     """k nearest neighbors (Pari et al., 2021) of states [M, 96], and the actions [M, 4] there."""
 
-    def __init__(self, config, *, states, actions, encoders, **world):
-        super().__init__(config, encoders=encoders, **world)
-        self.env = self.compose(config, encoders)  # pixels -> latent, and the demonstrations
+    def __init__(self, config, *, states, actions, **others):
+        super().__init__(config, **others)
         self.scale, self.states, self.actions = states.std(0), states / states.std(0), actions
+        self.test_actor = TensorDictModule(self.choose, ["latent", "context"], ["action"])
 
-    def choose(self, *seen):
-        nearness, row = (-torch.cdist(torch.cat(seen, -1) / self.scale, self.states)).topk(5)
+    def make_env(self, base_env, source):  # pixels -> latent, and the demonstrations
+        return no_context_env(self.config, base_env, source, self.encoders)
+
+    def choose(self, latent, demonstration):
+        state = torch.cat([latent, demonstration], -1) / self.scale
+        nearness, row = (-torch.cdist(state, self.states)).topk(5)
         return (nearness.softmax(-1).unsqueeze(-1) * self.actions[row]).sum(-2)
 
-    def act(self, tensordict):
-        action = self.choose(tensordict["latent"], tensordict["demo_embedding"])
-        return tensordict.set("action", action)
+    def act(self, td):
+        return td.set("action", self.choose(td["latent"], td["demo_embedding"]))
 
     def store(self, transition): ...  # for updates, of which there are none
 
     def update(self):
         return {}
 
-    def freeze(self, index, embedding, task, generator):
-        return {"demo_embedding": embedding}
-
-    def act_frozen(self, frozen, state):
-        return self.choose(state, frozen["demo_embedding"])
+    def snapshot(self, index, embedding, task, generator):
+        return self.policy({}, context=embedding)
 
 
 if __name__ == "__main__":
@@ -51,9 +53,7 @@ if __name__ == "__main__":
     states, actions = torch.cat([latent[:, :-1], phi], -1)[taken], shown["action"][taken]
     config = RunConfig(name="knn", seeds=(0,), episodes=1, task_starts=(0, 0, 0), eval_episodes=5)
     make = partial(NearestNeighbors, states=states, actions=actions)
-    with Trainer(
-        config, f"{out}/run", bank=bank, encoders=encoders, make=make, resume=True
-    ) as trainer:
-        trainer.run()
+    with Trainer(config, f"{out}/run", bank=bank, encoders=encoders, make=make, resume=True) as run:
+        run.run()
     success = read_curves(f"{out}/run/eval.csv", config.tasks).success[0, -1]
     print(config.name, dict(zip(config.tasks, success.tolist(), strict=True)))

@@ -15,14 +15,15 @@ import pytest
 import torch
 from hypothesis import settings
 
-from bgpo_trl.algorithms import ALGORITHMS
+from bgpo_trl.algorithms import entry
 from bgpo_trl.algorithms.rl import RL
-from bgpo_trl.configs import RunConfig
+from bgpo_trl.configs import BGPOConfig, RunConfig
 from bgpo_trl.data.bank import DemonstrationBank, DemonstrationSteps
 from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.envs import NicoEnv
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
+from bgpo_trl.world import World
 from suites.nico import nico
 
 # How long an example takes says more about the other processes of the machine than about the code.
@@ -30,9 +31,8 @@ settings.register_profile("bgpo_trl", deadline=None)
 settings.load_profile("bgpo_trl")
 torch.set_num_threads(1)
 
-# Of the algorithms that learn each task, or group of behaviors, from data of its own.
+# Of the algorithms that learn each task from data of its own.
 SMALL = {
-    "bgpo": {"expert_batch_size": 8},
     "maml": {"task_batch_size": 8, "adaptation_size": 12},
     "dist-nll": {"task_batch_size": 8, "samples": 24, "distillation_batch_size": 12},
 }
@@ -79,7 +79,9 @@ def make_config():
         settings = {"state": state, "max_steps": 6, "rl": rl, **of_name(SMALL, name)}
         if state == "state":  # demonstrations are latents
             settings["demonstration_share"] = 0.0
-        algorithm = replace(ALGORITHMS[name].config, **settings)
+        if isinstance(entry(name).config, BGPOConfig):
+            settings["expert_batch_size"] = 8
+        algorithm = replace(entry(name).config, **settings)
         config = RunConfig(
             seeds=(3, 8),
             episodes=10,
@@ -91,6 +93,17 @@ def make_config():
         return replace(config, **changes)
 
     return make
+
+
+@pytest.fixture
+def in_world(bank):
+    """Puts an algorithm into a `World`, which becomes its attribute ``world``."""
+
+    def enter(algorithm, seeds, schedule, bank=bank):
+        algorithm.world = World(algorithm, seeds=seeds, schedule=schedule, bank=bank.seen())
+        return algorithm
+
+    return enter
 
 
 class EasyNicoEnv(NicoEnv):
@@ -114,7 +127,7 @@ def easy_world():
     It lasts for the module: mark all of it with `pytest.mark.usefixtures("easy_world")`.
     """
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("bgpo_trl.algorithms.algorithm.NicoEnv", EasyNicoEnv)
+        patch.setattr("bgpo_trl.world.NicoEnv", EasyNicoEnv)
         patch.setattr("bgpo_trl.evaluation.NicoEnv", EasyNicoEnv)
         yield EasyNicoEnv
 

@@ -22,7 +22,7 @@ def play(directory, parts):
     """Begins or continues a run; in a process of its own."""
     torch.set_num_threads(1)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("bgpo_trl.algorithms.algorithm.NicoEnv", EasyNicoEnv)
+        patch.setattr("bgpo_trl.world.NicoEnv", EasyNicoEnv)
         patch.setattr("bgpo_trl.evaluation.NicoEnv", EasyNicoEnv)
         config, bank, encoders = torch.load(parts, weights_only=False)
         with Trainer(

@@ -13,6 +13,8 @@ import pytest
 import torch
 import tyro
 
+from bgpo_trl.algorithms.environments import bgpo_env
+
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 # Commands that take a second: they are not only parsed but run.
@@ -165,3 +167,12 @@ def test_the_files_it_names_exist(page):
     missing = [name for name in named if not (ROOT / name).exists()]
     missing += [name for name in linked if not (page.parent / name).exists()]
     assert missing == []
+
+
+def test_the_composition_in_readme_is_the_one_that_is_trained():
+    def composition(text):
+        return [line.strip() for line in text.split("Compose(\n")[1].splitlines()]
+
+    shown = next(block for block in blocks(ROOT / "README.md", "python") if "Compose(\n" in block)
+    trained = composition(inspect.getsource(bgpo_env))
+    assert composition(shown)[: len(trained) - 1] == trained[:-1]

@@ -1,16 +1,16 @@
 """Test episodes against a plain loop over one environment, and what they must leave alone."""
 
 import copy
-from functools import partial
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
 
-from benchmarks import ablation
-from bgpo_trl.algorithms import ALGORITHMS
+from bgpo_trl.algorithms import ALGORITHMS, entry
 from bgpo_trl.algorithms.bgpo import BGPO
+from bgpo_trl.algorithms.policy import Policy
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.evaluation import Evaluator, evaluate_random_policy
 from bgpo_trl.modules.actor_critic import Actor
@@ -24,21 +24,20 @@ SEEDS = (3, 8)
 EPISODES = 4
 # Until there is data of most tasks, where each has its own.
 STEPS = {"maml": 40, "dist-nll": 55}  # and those named after them
-WITHOUT_GWR = partial(BGPO, compose=ablation.VARIANTS["r_int"][0])
 every_algorithm = pytest.mark.parametrize("name", ALGORITHMS)
 
 
 @pytest.fixture
-def make(bank, encoders, make_config):
+def make(bank, encoders, make_config, in_world):
     """Makes an algorithm that has played a little, and an evaluator for it."""
 
-    def make(state="latent", name="bgpo", make=None, seeds=SEEDS, starts=(0, 2, 4), n_steps=None):
+    def make(state="latent", name="bgpo", seeds=SEEDS, starts=(0, 2, 4), n_steps=None):
         config = make_config(state, name).algorithm
-        parts = {"seeds": seeds, "encoders": encoders}
-        make = make or ALGORITHMS[name].make
-        algorithm = make(config, schedule=TaskSchedule(starts), bank=bank.seen(), **parts)
+        parts, schedule = {"seeds": seeds, "encoders": encoders}, TaskSchedule(starts)
+        algorithm = entry(name).make(config, bank=bank.seen(), **parts)
+        in_world(algorithm, seeds, schedule)
         evaluator = Evaluator(
-            config, n_tasks=len(starts), episodes=EPISODES, bank=bank.held_out(), **parts
+            config, schedule=schedule, episodes=EPISODES, bank=bank.held_out(), **parts
         )
         n_usual = next((n for start, n in STEPS.items() if name.startswith(start)), 20)
         train(algorithm, n_usual if n_steps is None else n_steps)
@@ -48,10 +47,10 @@ def make(bank, encoders, make_config):
 
 
 def train(algorithm, n_steps):
-    state = algorithm.env.reset()
+    state = algorithm.world.env.reset()
     for _ in range(n_steps):
         algorithm.update()
-        transition, state = algorithm.env.step_and_maybe_reset(algorithm.act(state))
+        transition, state = algorithm.world.env.step_and_maybe_reset(algorithm.act(state))
         algorithm.store(transition)
 
 
@@ -71,9 +70,10 @@ def turn(algorithm):
 
 
 def take(evaluator, algorithm, number=0):
+    episodes = algorithm.world.source.episode.tolist()
     return [
-        evaluator.take(algorithm, index, number, env_steps=0)
-        for index in range(len(evaluator.seeds))
+        evaluator.snapshot(algorithm, index, number, episode=episode)
+        for index, episode in enumerate(episodes)
     ]
 
 
@@ -84,7 +84,7 @@ def assert_same_result(first, second):
 
 def plain_policy(algorithm, snapshot, index, task, episode, phi):
     """The policy that is to play a test episode, with a single set of weights."""
-    frozen, state = snapshot.policy["actor"], algorithm.config.state
+    frozen, state = snapshot.policy.parameters, algorithm.config.state
     size = {"in_keys": [state], "hidden_sizes": (64,)}
     if hasattr(algorithm, "students"):  # one head for each task, in order of appearance
         student = algorithm.students[index]
@@ -103,42 +103,40 @@ def plain_policy(algorithm, snapshot, index, task, episode, phi):
         group = int(algorithm.groups.lookup(phi.expand(algorithm.n_seeds, -1)).group[index])
     policy.load_state_dict(algorithm.experts.actor_weights(index, group))
     context = {}
-    if algorithm.context is not None:
-        context = {algorithm.context: snapshot.policy["context"][task, episode]}
+    if snapshot.policy.context is not None:
+        context = {"context": snapshot.policy.context[task, episode]}
     return lambda seen: policy(TensorDict({state: seen, **context}))["action"].detach()
 
 
 @pytest.mark.parametrize(
-    ("state", "name", "kind"),
+    ("state", "name"),
     [
-        ("latent", "bgpo", None),
-        ("latent", "bgpo-single", None),
-        ("latent", "bgpo-single", WITHOUT_GWR),
-        ("state", "oracle", None),
-        ("latent", "ddpg", None),
-        ("latent", "maml", None),
-        ("latent", "dist-nll", None),
+        ("latent", "bgpo"),
+        ("latent", "bgpo-single"),
+        ("latent", "r_int"),
+        ("state", "oracle"),
+        ("latent", "ddpg"),
+        ("latent", "maml"),
+        ("latent", "dist-nll"),
     ],
 )
 def test_a_test_episode_is_that_of_a_plain_loop_over_one_environment(
-    make, encoders, easy_world, monkeypatch, state, name, kind
+    make, encoders, easy_world, monkeypatch, state, name
 ):
-    algorithm, evaluator = make(state, name, kind)
+    algorithm, evaluator = make(state, name)
     turn(algorithm)
-    act, actions = algorithm.act_frozen, []
-    monkeypatch.setattr(
-        algorithm, "act_frozen", lambda *args: actions.append(act(*args)) or actions[-1]
-    )
+    act, actions = Policy.act, []
+    monkeypatch.setattr(Policy, "act", lambda *args: actions.append(act(*args)) or actions[-1])
     embeddings = []
-    freeze = algorithm.freeze
+    copy_policy = algorithm.snapshot
 
-    def freezing(index, embedding, *args):
+    def spy(index, embedding, *args):
         embeddings.append(embedding)
-        return freeze(index, embedding, *args)
+        return copy_policy(index, embedding, *args)
 
-    monkeypatch.setattr(algorithm, "freeze", freezing)
+    monkeypatch.setattr(algorithm, "snapshot", spy)
     snapshots = take(evaluator, algorithm, number=5)
-    result = evaluator.run(snapshots, 5, algorithm)
+    result = evaluator.run(snapshots)
 
     for index, seed in enumerate(SEEDS):
         rng = np.random.default_rng([stream_seed(seed, "evaluation"), 5])
@@ -157,7 +155,7 @@ def test_a_test_episode_is_that_of_a_plain_loop_over_one_environment(
                     if state == "latent":
                         seen = encoders.vae.latent(now["pixels"])
                     else:
-                        seen = algorithm.env.transform[0].forward(now.clone())["state"]
+                        seen = algorithm.world.env.transform[0].forward(now.clone())["state"]
                     action = policy(seen.clamp(-5, 5))
                     torch.testing.assert_close(
                         actions[steps][index, task, episode], action, rtol=1e-3, atol=1e-3
@@ -173,16 +171,16 @@ def test_a_test_episode_is_that_of_a_plain_loop_over_one_environment(
 
 def test_what_the_policy_is_told_follows_from_held_out_demonstrations(make, bank):
     algorithm, evaluator = make()
-    _, by_phi = make(make=WITHOUT_GWR)
-    raw, _ = make(make=WITHOUT_GWR, n_steps=1)
-    alone, of_one = make(make=WITHOUT_GWR, seeds=SEEDS[1:], n_steps=0)
+    _, by_phi = make(name="r_int")
+    raw, _ = make(name="r_int", n_steps=1)
+    alone, of_one = make(name="r_int", seeds=SEEDS[1:], n_steps=0)
     held_out = bank.held_out()
     drawn = set()
     for number in range(5):
-        shown = [4 * s.policy["context"] for s in take(by_phi, raw, number)]
+        shown = [4 * s.policy.context for s in take(by_phi, raw, number)]
         assert not shown[0].equal(shown[1])
-        assert (4 * take(of_one, alone, number)[0].policy["context"]).equal(shown[1])
-        context = [s.policy["context"] for s in take(evaluator, algorithm, number)]
+        assert (4 * take(of_one, alone, number)[0].policy.context).equal(shown[1])
+        context = [s.policy.context for s in take(evaluator, algorithm, number)]
         for index, phi in enumerate(shown):
             for task in range(3):
                 of_task = held_out.embedding[held_out.task == task]
@@ -198,14 +196,14 @@ def test_a_label_tells_the_task(make):
     algorithm, evaluator = make("state", "oracle")
     expected = torch.eye(3).repeat_interleave(EPISODES, 0).view(3, EPISODES, 3)
     for snapshot in take(evaluator, algorithm):
-        assert snapshot.policy["context"].equal(expected)
+        assert snapshot.policy.context.equal(expected)
 
 
 @pytest.mark.parametrize("name", ["ddpg", "maml", "dist-nll"])
 def test_all_but_weights_is_told_by_bgpo_and_oracle_only(make, name):
     algorithm, evaluator = make("state", name)
     for snapshot in take(evaluator, algorithm):
-        assert set(snapshot.policy) == {"actor"}
+        assert snapshot.policy.context is None
 
 
 def flat(state, where=""):
@@ -228,7 +226,7 @@ def test_testing_leaves_no_trace_in_training(make, name):
     algorithm, evaluator = make(name=name)
     before, chance = copy.deepcopy(algorithm.state_dict()), torch.random.get_rng_state()
     for number in range(2):
-        evaluator.run(take(evaluator, algorithm, number), number, algorithm)
+        evaluator.run(take(evaluator, algorithm, number))
     config = algorithm.config
     if isinstance(algorithm, BGPO):
         parts = {"experts": True, "active": True, "gwr": algorithm.gwr is not None}
@@ -238,7 +236,7 @@ def test_testing_leaves_no_trace_in_training(make, name):
         own = set()
     else:
         own = {"tasks", "heads", "students", "student_optimizers", "ended"}
-    assert set(before) == {*("learner", "replay", "source", "simulation", "noise"), *own}
+    assert set(before) == {"learner", "replay", "noise", *own}
     assert_same_values(algorithm.state_dict(), before)
     assert torch.random.get_rng_state().equal(chance)
 
@@ -247,8 +245,8 @@ def test_testing_leaves_no_trace_in_training(make, name):
 def test_a_snapshot_does_not_follow_the_training(make, name):
     algorithm, evaluator = make(name=name)
     snapshots = take(evaluator, algorithm)
-    before = evaluator.run(snapshots, 0, algorithm)
-    policies = copy.deepcopy([snapshot.policy for snapshot in snapshots])
+    before = evaluator.run(snapshots)
+    policies = [replace(s.policy, **copy.deepcopy(s.policy.state_dict())) for s in snapshots]
     nodes = None if algorithm.gwr is None else algorithm.gwr.graph(0).weights
     with torch.no_grad():
         for layer in last_layers(algorithm):
@@ -257,12 +255,13 @@ def test_a_snapshot_does_not_follow_the_training(make, name):
     if nodes is not None:
         assert not algorithm.gwr.graph(0).weights.equal(nodes)
     for snapshot, policy in zip(take(evaluator, algorithm), policies, strict=True):
-        for key, value in policy["actor"].items():
-            assert not snapshot.policy["actor"][key].equal(value), key
+        for key, value in policy.parameters.items():
+            assert not snapshot.policy.parameters[key].equal(value), key
 
-    assert_same_values([snapshot.policy for snapshot in snapshots], policies)
-    assert_same_result(evaluator.run(snapshots, 0, algorithm), before)
-    later = evaluator.run(take(evaluator, algorithm), 0, algorithm)
+    for snapshot, policy in zip(snapshots, policies, strict=True):
+        assert_same_values(snapshot.policy.state_dict(), policy.state_dict())
+    assert_same_result(evaluator.run(snapshots), before)
+    later = evaluator.run(take(evaluator, algorithm))
     assert not later.steps.equal(before.steps)
 
 
@@ -271,10 +270,7 @@ def test_an_evaluation_follows_from_seed_and_number(make, name):
     algorithm, evaluator = make(name=name)
     turn(algorithm)
     snapshots = [take(evaluator, algorithm, number) for number in (0, 1, 0)]
-    results = [
-        evaluator.run(taken, number, algorithm)
-        for taken, number in zip(snapshots, (0, 1, 0), strict=True)
-    ]
+    results = [evaluator.run(taken) for taken in snapshots]
     assert_same_result(results[0], results[2])
     assert not results[0].steps.equal(results[1].steps)
 
@@ -282,10 +278,15 @@ def test_an_evaluation_follows_from_seed_and_number(make, name):
         alone, evaluator = make(name=name, seeds=(seed,))
         turn(alone)
         (snapshot,) = take(evaluator, alone)
-        pairs = zip(flat(snapshot.policy), flat(snapshots[0][index].policy), strict=True)
+        pairs = zip(
+            flat(snapshot.policy.state_dict()),
+            flat(snapshots[0][index].policy.state_dict()),
+            strict=True,
+        )
         for (where, ours), (_, theirs) in pairs:
-            torch.testing.assert_close(ours, theirs, rtol=1e-3, atol=1e-4, msg=where)
-        result = evaluator.run([snapshot], 0, alone)
+            if ours is not None:
+                torch.testing.assert_close(ours, theirs, rtol=1e-3, atol=1e-4, msg=where)
+        result = evaluator.run([snapshot])
         assert result.success[0].equal(results[0].success[index])
         assert result.steps[0].equal(results[0].steps[index])
 
@@ -293,13 +294,13 @@ def test_an_evaluation_follows_from_seed_and_number(make, name):
 @pytest.mark.parametrize("starts", [(0, 2, 99), (99, 0, 99), (1, 99, 0)])
 def test_only_tasks_that_were_presented_are_tested(make, starts):
     algorithm, evaluator = make(starts=starts)
-    assert (algorithm.source.episode > 2).all()
+    assert (algorithm.world.source.episode > 2).all()
     presented = [start < 99 for start in starts]
     snapshots = take(evaluator, algorithm)
-    result = evaluator.run(snapshots, 0, algorithm)
+    result = evaluator.run(snapshots)
     for index, snapshot in enumerate(snapshots):
         assert snapshot.presented.tolist() == presented
-        assert snapshot.episode == algorithm.source.episode[index]
+        assert snapshot.episode == algorithm.world.source.episode[index]
         for task, tested in enumerate(presented):
             assert (result.steps[index, task] > 0).all() == tested
             assert result.success[index, task].any() <= tested
@@ -308,14 +309,14 @@ def test_only_tasks_that_were_presented_are_tested(make, starts):
 @pytest.mark.parametrize(("episode", "presented"), [(1, 1), (2, 1), (3, 2), (4, 2), (5, 3)])
 def test_a_task_counts_as_presented_once_an_episode_could_be_about_it(make, episode, presented):
     algorithm, evaluator = make(n_steps=0)
-    algorithm.source.episode.fill_(episode)
+    algorithm.world.source.episode.fill_(episode)
     assert take(evaluator, algorithm)[0].presented.sum() == presented
 
 
 def test_seeds_may_be_at_different_stages(make):
     algorithm, evaluator = make(n_steps=0)
-    algorithm.source.episode.copy_(torch.tensor([1, 3]))
-    result = evaluator.run(take(evaluator, algorithm), 0, algorithm)
+    algorithm.world.source.episode.copy_(torch.tensor([1, 3]))
+    result = evaluator.run(take(evaluator, algorithm))
     assert (result.steps > 0).all(-1).tolist() == [[True, False, False], [True, True, False]]
 
 
@@ -326,7 +327,7 @@ def test_a_bank_without_a_held_out_demonstration_of_a_task_is_refused(bank, enco
         Evaluator(
             make_config().algorithm,
             seeds=SEEDS,
-            n_tasks=3,
+            schedule=TaskSchedule((0, 0, 0)),
             episodes=1,
             bank=incomplete,
             encoders=encoders,
@@ -357,8 +358,6 @@ def test_test_episodes_can_be_watched(make):
     shown = []
     result = evaluator.run(
         take(evaluator, algorithm),
-        0,
-        algorithm,
         watch=lambda: shown.append(evaluator.simulation.frames()),
     )
     assert len(shown) == int(result.steps.max()) + 1
@@ -366,4 +365,4 @@ def test_test_episodes_can_be_watched(make):
         frames = np.stack([frame[index] for frame in shown])
         changed = (frames[1:] != frames[:-1]).any((1, 2, 3))
         assert not changed[int(result.steps[index]) :].any()  # it stands still when it is over
-    assert_same_result(result, evaluator.run(take(evaluator, algorithm), 0, algorithm))
+    assert_same_result(result, evaluator.run(take(evaluator, algorithm)))

@@ -6,34 +6,31 @@ import runpy
 import shutil
 import subprocess
 import sys
-from dataclasses import asdict, replace
-from functools import partial
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from tensordict import TensorDict
 
 import bgpo_trl
-from benchmarks import ablation
 from bgpo_trl.algorithms import ALGORITHMS
-from bgpo_trl.algorithms.bgpo import BGPO
+from bgpo_trl.algorithms.policy import Policy
 from bgpo_trl.configs import RepresentationConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.encoders.representation import Representation, save_representation
 from bgpo_trl.encoders.train import bank_path
 from bgpo_trl.evaluation import Evaluator
 from bgpo_trl.training import Trainer
+from bgpo_trl.transforms import TaskSchedule
 from suites import nico
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 ROOT = Path(__file__).parents[1]
 TASKS = nico.ALL_TASKS
-VARIANT = partial(BGPO, compose=ablation.VARIANTS["r_int"][0])
-MAKE = dict.fromkeys(ALGORITHMS) | {"r_int": VARIANT}
-LABELED = [name for name in MAKE if name.startswith(("maml", "dist-nll", "oracle"))]
-every_algorithm = pytest.mark.parametrize("name", MAKE)
+NAMES = [*ALGORITHMS, "r_int"]
+LABELED = [name for name in NAMES if name.startswith(("maml", "dist-nll", "oracle"))]
+every_algorithm = pytest.mark.parametrize("name", NAMES)
 
 
 def noise(seed, length):
@@ -71,7 +68,7 @@ def trainer_of(encoders, tested_bank, make_config, easy_world, tmp_path_factory)
 
     def trainer_of(name):
         if name not in trainers:
-            config = make_config(name=name if name in ALGORITHMS else "bgpo-single", episodes=16)
+            config = make_config(name=name, episodes=16)
             directory = tmp_path_factory.mktemp(name) / "run"
             metadata = {
                 "scene_version": nico.scene_version(),
@@ -81,11 +78,10 @@ def trainer_of(encoders, tested_bank, make_config, easy_world, tmp_path_factory)
             save_representation(Representation(encoders.vae, encoders.lae, metadata), weights)
             tested_bank.save(bank_path(weights), encoder_id=encoders.identity)
             trainers[name] = Trainer(
-                replace(config, name=name),
+                config,
                 directory,
                 bank=tested_bank,
                 encoders=encoders,
-                make=MAKE[name],
                 progress=False,
             )
             trainers[name].run()
@@ -97,7 +93,7 @@ def trainer_of(encoders, tested_bank, make_config, easy_world, tmp_path_factory)
 @pytest.fixture
 def load(trainer_of):
     def load(name="bgpo", **arguments):
-        return bgpo_trl.load_run(trainer_of(name).directory, make=MAKE[name], **arguments)
+        return bgpo_trl.load_run(trainer_of(name).directory, **arguments)
 
     return load
 
@@ -111,35 +107,34 @@ def test_it_acts_as_the_run_does_in_its_test_episodes(
     evaluator = Evaluator(
         config.algorithm,
         seeds=config.seeds,
-        n_tasks=3,
+        schedule=TaskSchedule(config.task_starts),
         episodes=1,
         bank=tested_bank.held_out(),
         encoders=encoders,
     )
     drawn, actions, frames = [], [], []
-    freeze, act_frozen = algorithm.freeze, algorithm.act_frozen
+    snapshot, act = algorithm.snapshot, Policy.act
 
-    def freezing(index, embedding, task, generator):
+    def spy(index, embedding, task, generator):
         drawn.append(generator.get_state())
-        return freeze(index, embedding, task, generator)
+        return snapshot(index, embedding, task, generator)
 
-    def acting(frozen, state):
-        actions.append(act_frozen(frozen, state))
+    def acting(policy, state):
+        actions.append(act(policy, state))
         return actions[-1]
 
-    monkeypatch.setattr(algorithm, "freeze", freezing)
-    monkeypatch.setattr(algorithm, "act_frozen", acting)
-    snapshots = [evaluator.take(algorithm, index, 5, 0) for index in range(2)]
-    evaluator.run(
-        snapshots, 5, algorithm, watch=lambda: frames.append(evaluator.simulation.frames())
-    )
+    monkeypatch.setattr(algorithm, "snapshot", spy)
+    monkeypatch.setattr(Policy, "act", acting)
+    snapshots = [evaluator.snapshot(algorithm, index, 5, episode=16) for index in range(2)]
+    evaluator.run(snapshots, watch=lambda: frames.append(evaluator.simulation.frames()))
+    monkeypatch.undo()
     assert len(actions) > 1
     for index, seed in enumerate(config.seeds):
         policy = load(name, seed=seed)
         for task, demonstration in enumerate(DEMONSTRATIONS):
             generator = torch.Generator()
             generator.set_state(drawn[index])
-            policy.watch(demonstration, task=TASKS[task], generator=generator)
+            policy.condition(demonstration, task=TASKS[task], generator=generator)
             for frame, action in zip(frames, actions, strict=False):
                 acted = policy.act(frame[index, task, 0])
                 assert acted.dtype == np.float32
@@ -153,16 +148,18 @@ def test_it_acts_exactly_as_the_frozen_policy_of_the_run(trainer_of, load, encod
     task = torch.arange(3)[:, None]
     for number, demonstration in enumerate(DEMONSTRATIONS):
         phi = embed(encoders, demonstration).expand(3, 1, -1)
-        frozen = algorithm.freeze(1, phi, task, torch.Generator().manual_seed(4))
-        both = TensorDict.stack([TensorDict(frozen)] * 2)
-        policy.watch(demonstration, task=TASKS[number], generator=torch.Generator().manual_seed(4))
+        snapshot = algorithm.snapshot(1, phi, task, torch.Generator().manual_seed(4))
+        both = Policy.stack([snapshot] * 2)
+        policy.condition(
+            demonstration, task=TASKS[number], generator=torch.Generator().manual_seed(4)
+        )
         for frame in noise(6, 3):
             latent = encoders.vae.latent(torch.from_numpy(frame)).clamp(-5, 5)
-            expected = algorithm.act_frozen(both, latent.expand(2, 3, 1, 64))[1, number, 0]
+            expected = both.act(latent.expand(2, 3, 1, 64))[1, number, 0]
             assert torch.from_numpy(policy.act(frame)).equal(expected)
 
 
-@pytest.mark.parametrize("name", [name for name in MAKE if name not in ("ddpg", *LABELED)])
+@pytest.mark.parametrize("name", [name for name in NAMES if name not in ("ddpg", *LABELED)])
 def test_what_it_is_shown_decides_what_it_does(load, encoders, name):
     policy, (frame,) = load(name), noise(0, 1)
     dark, bright = (np.full((20, 32, 64, 3), shade, np.uint8) for shade in (0, 255))
@@ -173,7 +170,7 @@ def test_what_it_is_shown_decides_what_it_does(load, encoders, name):
         policy.algorithm.gwr.set_extra_state(graphs)
     actions = []
     for shown in (dark, bright, dark):
-        policy.watch(shown)
+        policy.condition(shown)
         actions.append(policy.act(frame))
     assert np.abs(actions[0] - actions[1]).max() > 1e-4
     np.testing.assert_array_equal(actions[0], actions[2])
@@ -182,7 +179,7 @@ def test_what_it_is_shown_decides_what_it_does(load, encoders, name):
 @pytest.mark.parametrize("length", [1, 2, 20, 51, 70])
 def test_a_demonstration_may_have_any_length(trainer_of, load, encoders, length):
     policy, frames = load(seed=8), noise(9, 70)[:length]
-    seen = policy.watch(frames)
+    seen = policy.condition(frames)
     assert torch.allclose(seen.embedding, embed(encoders, frames), atol=1e-6)
     graph = trainer_of("bgpo").algorithm.gwr.graph(1)
     distance, best = (graph.weights - seen.embedding).norm(dim=-1).min(0)
@@ -200,23 +197,23 @@ def test_a_demonstration_may_have_any_length(trainer_of, load, encoders, length)
 
 def test_frames_may_be_lists_tensors_views_and_read_only(load):
     policy, frames = load(), noise(9, 8)
-    expected = policy.watch(frames[::-1].copy()).embedding
+    expected = policy.condition(frames[::-1].copy()).embedding
     read_only = frames[::-1].copy()
     read_only.flags.writeable = False
     for same in (frames[::-1], list(frames[::-1]), read_only, torch.tensor(read_only.copy())):
-        assert policy.watch(same).embedding.equal(expected)
+        assert policy.condition(same).embedding.equal(expected)
 
 
 @every_algorithm
 def test_only_those_who_do_not_infer_the_task_need_its_label(load, name):
     policy = load(name)
     if name not in LABELED:
-        assert policy.watch(DEMONSTRATIONS[0]).task is None
+        assert policy.condition(DEMONSTRATIONS[0]).task is None
         return
     with pytest.raises(ValueError, match=f"^{name} does not infer the task: name it") as error:
-        policy.watch(DEMONSTRATIONS[0])
+        policy.condition(DEMONSTRATIONS[0])
     assert "\n" not in str(error.value)
-    seen = policy.watch(DEMONSTRATIONS[0], task=TASKS[1])
+    seen = policy.condition(DEMONSTRATIONS[0], task=TASKS[1])
     assert (seen.task, seen.node) == (TASKS[1], None)
 
 
@@ -225,13 +222,13 @@ def test_the_label_decides_where_it_is_told(load):
     for name in LABELED:
         policy, actions = load(name), []
         for task in TASKS:
-            policy.watch(DEMONSTRATIONS[0], task=task)
+            policy.condition(DEMONSTRATIONS[0], task=task)
             actions.append(policy.act(frame))
         assert np.abs(actions[0] - actions[1]).max() > 1e-5, name
 
 
 def test_what_is_not_needed_is_not_loaded(trainer_of, load):
-    for name in MAKE:
+    for name in NAMES:
         held = len(trainer_of(name).algorithm.replay)
         assert len(load(name).algorithm.replay) == (held if "maml" in name else 0) < held + 1
 
@@ -245,7 +242,7 @@ def test_the_run_is_left_as_it_is(trainer_of, load):
     policy = load()
     nodes = policy.algorithm.gwr.num_nodes
     for frames in DEMONSTRATIONS:
-        policy.watch(frames)
+        policy.condition(frames)
     policy.act(frames[0])
     assert policy.algorithm.gwr.num_nodes.equal(nodes)
     assert files() == before
@@ -271,10 +268,10 @@ def test_nothing_is_done_before_something_was_shown(load):
 )
 def test_what_is_no_demonstration_is_refused(load, frames, said):
     policy, (frame,) = load(), noise(0, 1)
-    policy.watch(DEMONSTRATIONS[0])
+    policy.condition(DEMONSTRATIONS[0])
     before = policy.act(frame)
     with pytest.raises(ValueError, match=said) as error:
-        policy.watch(frames)
+        policy.condition(frames)
     assert "\n" not in str(error.value)
     np.testing.assert_array_equal(policy.act(frame), before)
 
@@ -282,14 +279,14 @@ def test_what_is_no_demonstration_is_refused(load, frames, said):
 @pytest.mark.parametrize("frame", [noise(0, 1), noise(0, 1)[0] / 255, noise(0, 1)[0, :, :-1], []])
 def test_what_is_no_frame_is_refused(load, frame):
     policy = load()
-    policy.watch(DEMONSTRATIONS[0])
+    policy.condition(DEMONSTRATIONS[0])
     with pytest.raises(ValueError, match=r"^a frame is uint8 \[32, 64, 3\], got"):
         policy.act(frame)
 
 
 def test_an_unknown_task_is_refused(load):
     with pytest.raises(ValueError, match=r"^no task 'juggle' in this run; choose one of grasp"):
-        load("oracle").watch(DEMONSTRATIONS[0], task="juggle")
+        load("oracle").condition(DEMONSTRATIONS[0], task="juggle")
 
 
 def spoil_encoders(run):
@@ -352,7 +349,7 @@ def test_the_first_seed_is_the_default(load):
     policies = [load(), load(seed=3), load(seed=8)]
     (frame,) = noise(0, 1)
     for policy in policies:
-        policy.watch(DEMONSTRATIONS[0])
+        policy.condition(DEMONSTRATIONS[0])
     first, same, other = (policy.act(frame) for policy in policies)
     np.testing.assert_array_equal(first, same)
     assert np.abs(first - other).max() > 1e-4
@@ -364,7 +361,7 @@ def test_the_example_tells_what_the_policy_saw_and_how_it_went(trainer_of, capsy
     assert frames.dtype == np.uint8 and len(frames) > 10
     example["main"](trainer_of("bgpo").directory, task="push_green_to_white", seed=4)
     seen, outcome = capsys.readouterr().out.splitlines()
-    assert seen == repr(bgpo_trl.load_run(trainer_of("bgpo").directory).watch(frames))
+    assert seen == repr(bgpo_trl.load_run(trainer_of("bgpo").directory).condition(frames))
     assert outcome in ("push_green_to_white: success", "push_green_to_white: no success")
 
 

@@ -6,14 +6,11 @@ import re
 import signal
 from collections import Counter, defaultdict
 from dataclasses import replace
-from functools import partial
 
 import pytest
 import torch
 
-from benchmarks import ablation
 from bgpo_trl.algorithms import ALGORITHMS
-from bgpo_trl.algorithms.bgpo import BGPO
 from bgpo_trl.files.checkpoint import load_checkpoint
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.training import Trainer
@@ -187,8 +184,7 @@ def test_a_seed_writes_what_it_would_write_alone(run_of, make, make_config, tmp_
 def test_training_draws_seen_demonstrations_and_tests_held_out_ones(
     make, make_config, bank, tmp_path, monkeypatch
 ):
-    without_gwr = partial(BGPO, compose=ablation.VARIANTS["r_int"][0])
-    trainer = make(tmp_path, make_config(episodes=4), make=without_gwr)
+    trainer = make(tmp_path, make_config(name="r_int", episodes=4))
     store, test = trainer.algorithm.store, trainer.evaluator.run
     trained_on, tested_on = [], []
 
@@ -197,7 +193,7 @@ def test_training_draws_seen_demonstrations_and_tests_held_out_ones(
         store(transition)
 
     def spy_test(snapshots, *args):
-        tested_on.extend(4 * snapshot.policy["context"].flatten(0, 1) for snapshot in snapshots)
+        tested_on.extend(4 * snapshot.policy.context.flatten(0, 1) for snapshot in snapshots)
         return test(snapshots, *args)
 
     monkeypatch.setattr(trainer.algorithm, "store", spy_store)
@@ -231,10 +227,10 @@ def test_an_algorithm_may_be_made_under_another_name(make, make_config, tmp_path
     ((args, kwargs),) = made
     assert args == (config.algorithm,)
     assert kwargs["seeds"] == config.seeds
-    assert trainer.algorithm.context is None
+    assert trainer.algorithm.variant.context is None
     for file in CSV_FILES:
         assert {row["algorithm"] for row in rows(tmp_path / file)} == {"no such algorithm"}
-    with pytest.raises(KeyError, match="no such algorithm"):
+    with pytest.raises(ValueError, match="no algorithm 'no such algorithm': choose one of bgpo"):
         make(tmp_path / "other", trainer.config)
 
 

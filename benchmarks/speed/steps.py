@@ -23,6 +23,7 @@ from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.experiments.run import AlgorithmName, command_line
 from bgpo_trl.machine import set_threads
 from bgpo_trl.transforms import TaskSchedule
+from bgpo_trl.world import World
 
 
 @dataclass(frozen=True)
@@ -51,20 +52,21 @@ class Steps:
     """An algorithm in training.
 
     Args:
-        algorithm: What learns.
+        algorithm: The learner.
+        world: Its environment.
     """
 
-    def __init__(self, algorithm: Algorithm) -> None:
-        self.algorithm = algorithm
+    def __init__(self, algorithm: Algorithm, world: World) -> None:
+        self.algorithm, self.env = algorithm, world.env
         self._background = ThreadPoolExecutor(1, "update")
-        self._state = algorithm.env.reset()
+        self._state = self.env.reset()
 
     def play(self, steps: int) -> None:
         """Takes training steps, each with its update."""
         for _ in range(steps):
             state = self.algorithm.act(self._state)
             update = self._background.submit(self.algorithm.update)
-            transition, self._state = self.algorithm.env.step_and_maybe_reset(state)
+            transition, self._state = self.env.step_and_maybe_reset(state)
             update.result()
             self.algorithm.store(transition)
 
@@ -80,16 +82,11 @@ def main(arguments: Arguments) -> None:
     encoders, bank = load_pretrained()
     running: dict[str, Steps] = {}
     for name in arguments.algorithms:
-        entry = ALGORITHMS[name]
-        running[name] = Steps(
-            entry.make(
-                entry.config,
-                seeds=range(arguments.seeds),
-                schedule=TaskSchedule(starts=(0, 0, 0)),
-                bank=bank.seen(),
-                encoders=encoders,
-            )
-        )
+        entry, seeds, seen = ALGORITHMS[name], range(arguments.seeds), bank.seen()
+        algorithm = entry.make(entry.config, seeds=seeds, bank=seen, encoders=encoders)
+        schedule = TaskSchedule(starts=(0, 0, 0))
+        world = World(algorithm, seeds=seeds, schedule=schedule, bank=seen)
+        running[name] = Steps(algorithm, world)
         running[name].play(arguments.played)
 
     def table(what: Literal["play", "update"]) -> None:

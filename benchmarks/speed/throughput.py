@@ -33,6 +33,7 @@ from bgpo_trl.configs import BGPOConfig
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.machine import usable_cores
 from bgpo_trl.transforms import TaskSchedule
+from bgpo_trl.world import World
 
 Part = Literal["frames", "updates", "step", "memory"]
 Table = dict[str, dict[str, Any]]
@@ -101,15 +102,11 @@ class Training:
 
     def __init__(self, seeds: range) -> None:
         encoders, bank = load_pretrained()
-        self.algorithm = BGPO(
-            BGPOConfig(),
-            seeds=seeds,
-            schedule=TaskSchedule((0, 0, 0)),
-            bank=bank.seen(),
-            encoders=encoders,
-        )
+        self.algorithm = BGPO(BGPOConfig(), seeds=seeds, bank=bank.seen(), encoders=encoders)
+        schedule = TaskSchedule((0, 0, 0))
+        self.world = World(self.algorithm, seeds=seeds, schedule=schedule, bank=bank.seen())
         self._background = ThreadPoolExecutor(1, "update")
-        self._state = self.algorithm.env.reset()
+        self._state = self.world.env.reset()
         while len(self.algorithm.replay) <= self.algorithm.config.rl.warmup_steps:
             self.step()
 
@@ -117,7 +114,7 @@ class Training:
         """Takes a step in all environments and makes an update of all seeds."""
         self._state = self.algorithm.act(self._state)
         update = self._background.submit(self.algorithm.update)
-        transition, self._state = self.algorithm.env.step_and_maybe_reset(self._state)
+        transition, self._state = self.world.env.step_and_maybe_reset(self._state)
         update.result()
         self.algorithm.store(transition)
 
@@ -137,13 +134,13 @@ class Training:
 
             object.__setattr__(owner, method, timed)
 
-        algorithm = self.algorithm
-        keep_time(algorithm.simulation, "_step", "simulate (physics and render)")
-        keep_time(algorithm.simulation, "_reset", "begin episodes")
-        keep_time(algorithm.simulation._renderer, "render", "of which render")
-        for transform in algorithm.env.transform:
+        algorithm, world = self.algorithm, self.world
+        keep_time(world.simulation, "_step", "simulate (physics and render)")
+        keep_time(world.simulation, "_reset", "begin episodes")
+        keep_time(world.simulation._renderer, "render", "of which render")
+        for transform in world.env.transform:
             keep_time(transform, "_step", type(transform).__name__)
-        keep_time(algorithm.env, "step_and_maybe_reset", "whole environment")
+        keep_time(world.env, "step_and_maybe_reset", "whole environment")
         for method in ("act", "update", "store"):
             keep_time(algorithm, method, method)
         keep_time(algorithm.replay, "sample", "of which sample")

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 from bgpo_trl.algorithms.algorithm import Algorithm
-from bgpo_trl.algorithms.bgpo import BGPO, labeled, no_context
+from bgpo_trl.algorithms.bgpo import BGPO
 from bgpo_trl.algorithms.dist_nll import DistNLL
 from bgpo_trl.algorithms.maml import MAML
 from bgpo_trl.configs import (
@@ -20,7 +19,7 @@ from bgpo_trl.configs import (
     MAMLConfig,
 )
 
-__all__ = ["ALGORITHMS", "Algorithm", "Entry"]
+__all__ = ["ABLATIONS", "ALGORITHMS", "Algorithm", "Entry", "entry"]
 
 
 @dataclass(frozen=True)
@@ -33,7 +32,7 @@ class Entry:
     """Its default hyperparameters."""
 
 
-_SINGLE = BGPOConfig(experts=False, even_replay=False, demonstration_share=0.0)
+_SINGLE = BGPOConfig(variant="published", experts=False, even_replay=False, demonstration_share=0.0)
 _PAPER = DDPGConfig(
     hidden_sizes=(64,),
     critic_layer_norm=False,
@@ -57,10 +56,35 @@ ALGORITHMS: dict[str, Entry] = {
     "dist-nll-paper": Entry(
         DistNLL, DistNLLConfig(rl=_PAPER, task_batch_size=256, distillation_batch_size=1_000)
     ),
-    "oracle": Entry(partial(BGPO, compose=labeled), _SINGLE),
-    "ddpg": Entry(partial(BGPO, compose=no_context), _SINGLE),
+    "oracle": Entry(BGPO, replace(_SINGLE, variant="label")),
+    "ddpg": Entry(BGPO, replace(_SINGLE, variant="no-context")),
 }
 """Algorithms with their settings: BGPO, without demonstrations, and with one actor and critic for
 all behaviors besides; the baselines of the paper, without demonstrations and with them; as
 references, DDPG that is told the task's label, and DDPG told nothing. Those named ``-paper`` are as
 published: networks of 64 units, batches of 256, no stabilisers."""
+
+ABLATIONS: dict[str, Entry] = {
+    "gwr+r_int": Entry(BGPO, _SINGLE),
+    "gwr": Entry(BGPO, replace(_SINGLE, variant="without-bonus")),
+    "r_int": Entry(BGPO, replace(_SINGLE, variant="without-gwr")),
+    "none": Entry(BGPO, replace(_SINGLE, variant="without-both")),
+    "even-replay": Entry(BGPO, replace(_SINGLE, variant="bgpo", even_replay=True)),
+    "experts": Entry(BGPO, replace(_SINGLE, variant="bgpo", even_replay=True, experts=True)),
+    "demonstrations": Entry(BGPO, replace(_SINGLE, demonstration_share=_SHOWN)),
+    "all": Entry(BGPO, BGPOConfig()),
+}
+"""The paper's ablations (Fig. 9): GWR-B and the intrinsic reward, one of them, none. Then what this
+package adds to the published algorithm, one thing at a time, and all of it."""
+
+
+def entry(name: str) -> Entry:
+    """Returns how to make an algorithm or an ablation.
+
+    Raises:
+        ValueError: If none has that name.
+    """
+    known = ALGORITHMS | ABLATIONS
+    if name not in known:
+        raise ValueError(f"no algorithm {name!r}: choose one of {', '.join(known)}")
+    return known[name]

@@ -8,17 +8,11 @@ from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl.envs import (
-    ClipTransform,
-    Compose,
-    ObservationNorm,
-    RewardSum,
-    StepCounter,
-    Transform,
-    TransformedEnv,
-)
+from torchrl.envs import EnvBase, TransformedEnv
 
+from bgpo_trl.algorithms.policy import Policy
 from bgpo_trl.algorithms.rl import Learner
 from bgpo_trl.configs import AlgorithmConfig
 from bgpo_trl.data.bank import DemonstrationBank
@@ -26,61 +20,23 @@ from bgpo_trl.data.demonstration_replay import DemonstrationReplay
 from bgpo_trl.data.group_replay import GroupReplay
 from bgpo_trl.data.task_replay import TaskReplay
 from bgpo_trl.encoders.representation import Representation
-from bgpo_trl.envs import NicoEnv
 from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.modules.gwr import GWRB
-from bgpo_trl.seeding import generators, stream_seed
-from bgpo_trl.transforms import DemonstrationSource, FrameEncoder, TaskSchedule
+from bgpo_trl.seeding import generators
+from bgpo_trl.transforms import DemonstrationSource
 from suites.nico.base import STATE_SIZE
-
-# Middle and spread of joints (rad), grip and object positions (m) in demonstrations, so that the
-# ground truth comes to the policy in the scale that latents have.
-_STATE_LOC = (0.3, 0.9, 0.9, 0.45, 0.36, 0, 0.68, 0.4, 0.12, 0.655, 0.45, -0.05, 0.645)
-_STATE_LOC += (0.41, -0.21, 0.645)
-_STATE_SCALE = (0.35, 0.25, 0.35, 0.3, 0.06, 0.15, 0.05, *(0.03, 0.05, 0.02) * 3)
-
-
-def observe(config: AlgorithmConfig, encoders: Representation | None) -> Transform:
-    """Returns the transform from what the simulation shows to the state.
-
-    Args:
-        config: Says whether that is latents or the ground truth.
-        encoders: The trained encoders; needed for latents.
-
-    Raises:
-        ValueError: If latents are asked for without encoders.
-    """
-    if config.state == "latent":
-        if encoders is None:
-            raise ValueError("state='latent' needs trained encoders")
-        return FrameEncoder(encoders.vae, del_keys=True)
-    loc, scale = torch.tensor(_STATE_LOC), torch.tensor(_STATE_SCALE)
-    return ObservationNorm(loc, scale, in_keys=["state"], standard_normal=True)
-
-
-def clip(config: AlgorithmConfig) -> Transform:
-    """Returns the transform that bounds what policies read of the state.
-
-    An object knocked off the table is dozens of deviations away and would swamp the rest. It comes
-    behind whatever else reads the state: trajectories are embedded as demonstrations are.
-    """
-    return ClipTransform(in_keys=[config.state], low=-5.0, high=5.0)
 
 
 class Algorithm(ABC):
     """A learner of several tasks, for a batch of seeds that share nothing but the encoders.
 
-    This class holds the world: simulations, draws of tasks and demonstrations, exploration noise;
-    and the gradient step. What is learned from what is each algorithm's own.
-
-    A step of training is ``act``, the environment's step, ``store``; an ``update`` may run while
-    the environment takes its step. For test episodes `freeze` copies what the policy of one seed
-    depends on, and `act_frozen` acts by such copies.
+    It needs no simulation: `World` brings it together with one. A step of training is `act`, the
+    environment's step, `store`; an `update` may run while the environment takes its step. For test
+    episodes `snapshot` copies the policy of one seed.
 
     Args:
         config: Hyperparameters.
         seeds: One for each element of the batch.
-        schedule: Which tasks are presented when.
         bank: Embedded demonstrations for training episodes.
         encoders: The trained encoders; None where they are not used. The frame encoder is moved to
             the device.
@@ -88,54 +44,52 @@ class Algorithm(ABC):
             the CPU.
 
     Attributes:
-        env: The world as the algorithm sees it, a composition of transforms.
-        source: The transform that draws task and demonstration of each episode.
-        simulation: The environment without its transforms.
         gwr: GWR-B, or None in an algorithm without it.
         groups: Groups of behaviors, or None in an algorithm that does not tell them apart.
         state_size: Number of features of the state.
         learner: The RL algorithm: losses of actor and critic, optimizer, target networks.
-        replay: What was experienced.
-        needs_label: Whether `freeze` and `act_frozen` depend on the label of a test episode's task.
-        needs_replay: Whether `freeze` depends on the replay.
+        replay: The experience.
+        test_actor: Network of test episodes, called with the parameters of a `Policy`.
+        needs_label: Whether policies depend on the label of a test episode's task.
+        needs_replay: Whether `snapshot` depends on the replay.
     """
 
-    env: TransformedEnv
     gwr: GWRB | None = None
     groups: BehaviorGroups | None = None
     needs_label: bool = True
     needs_replay: bool = True
     learner: Learner
     replay: GroupReplay | TaskReplay
+    test_actor: TensorDictModuleBase
 
     def __init__(
         self,
         config: AlgorithmConfig,
         *,
         seeds: Sequence[int],
-        schedule: TaskSchedule,
         bank: DemonstrationBank,
         encoders: Representation | None = None,
         device: torch.device | str = "cpu",
     ) -> None:
+        self.config = config
         self.device = torch.device(device)
-        self.n_seeds, self.n_tasks = len(seeds), schedule.n_tasks
+        self.n_seeds, self.n_tasks = len(seeds), len(bank.tasks)
+        self.encoders = encoders
         self.state_size = STATE_SIZE
         if encoders is not None:
             encoders.vae.to(self.device)
             if config.state == "latent":
                 self.state_size = encoders.vae.latent_size
-        batch = torch.Size([self.n_seeds])
-        self.source = DemonstrationSource(
-            bank, schedule, batch_size=batch, generator=generators(seeds, "demonstrations")
-        )
-        self.simulation = NicoEnv(
-            bank.tasks,
-            batch_size=batch,
-            seed=[stream_seed(seed, "env") for seed in seeds],
-            observation="pixels" if config.state == "latent" else "state",
-        )
         self._noise = generators(seeds, "exploration")
+
+    @abstractmethod
+    def make_env(self, base_env: EnvBase, source: DemonstrationSource) -> TransformedEnv:
+        """Returns the environment of training episodes: a composition of transforms.
+
+        Args:
+            base_env: The simulations ``[S]``.
+            source: Draws task and demonstration of each episode.
+        """
 
     @abstractmethod
     def act(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -143,25 +97,25 @@ class Algorithm(ABC):
 
     @abstractmethod
     def store(self, transition: TensorDictBase) -> None:
-        """Keeps a transition of each seed, ``[S]``, for updates to come."""
+        """Keeps a transition of each seed, ``[S]``, for later updates."""
 
     @abstractmethod
     def update(self) -> dict[str, Tensor]:
         """Makes one update of each seed from the transitions stored so far.
 
-        Touches neither the environment nor what acting changes, so that it may run while the
-        environment takes the step that has been chosen before.
+        Touches neither the environment nor the state that `act` changes, so that it may run while
+        the environment takes a step.
 
         Returns:
-            ``loss_actor``, ``loss_value`` and what else the RL algorithm minimizes, means over the
+            ``loss_actor``, ``loss_value`` and other losses of the RL algorithm, means over the
             seeds ``[]``; empty before the first update.
         """
 
     @abstractmethod
-    def freeze(
+    def snapshot(
         self, index: int, embedding: Tensor, task: Tensor, generator: torch.Generator
-    ) -> dict[str, Any]:
-        """Returns copies, on the CPU, of what the policy of one seed depends on in test episodes.
+    ) -> Policy:
+        """Returns a copy, on the CPU, of the policy of one seed, conditioned on demonstrations.
 
         Nothing is learned from the demonstrations, and nothing of the training changes.
 
@@ -169,53 +123,12 @@ class Algorithm(ABC):
             index: Position of the seed in the batch.
             embedding: phi of the demonstration of each test episode, ``[T, M, 32]``.
             task: Their labels, int64 ``[T, M]``. BGPO does not read them.
-            generator: For what the algorithm draws to prepare itself.
-
-        Returns:
-            Nested tensors, of the same shapes for all seeds of a run.
+            generator: For draws by which the algorithm prepares itself.
         """
 
-    @abstractmethod
-    def act_frozen(self, frozen: TensorDictBase, state: Tensor) -> Tensor:
-        """Returns the actions of test episodes, without noise.
-
-        Args:
-            frozen: What `freeze` returned, of all seeds, stacked ``[S]``, on the device.
-            state: What the policy sees, ``[S, T, M, features]``, on the device.
-
-        Returns:
-            ``[S, T, M, 4]``.
-        """
-
-    def compose(
-        self,
-        config: AlgorithmConfig,
-        encoders: Representation | None,
-        transforms: Sequence[Transform] = (),
-        *,
-        rewards: Sequence[str] = ("reward",),
-    ) -> TransformedEnv:
-        """Returns the world as the algorithm sees it.
-
-        Args:
-            config: Its hyperparameters.
-            encoders: The trained encoders.
-            transforms: What it adds, behind the draw of task and demonstration.
-            rewards: What is summed over each episode, as ``episode_...``.
-        """
-        return TransformedEnv(
-            self.simulation,
-            Compose(
-                [
-                    observe(config, encoders),
-                    StepCounter(config.max_steps),
-                    self.source,
-                    *transforms,
-                    clip(config),
-                    RewardSum(in_keys=list(rewards), out_keys=[f"episode_{r}" for r in rewards]),
-                ]
-            ),
-        )
+    def policy(self, parameters: dict[str, Tensor], context: Tensor | None = None) -> Policy:
+        """Returns a policy of `test_actor` with these parameters and this context."""
+        return Policy(self.test_actor, self.config.state, parameters, context)
 
     def demonstrations(
         self,
@@ -252,27 +165,23 @@ class Algorithm(ABC):
         Returns:
             What `update` returns.
         """
-        losses = self.learner.learn(self.moved(batch))
+        losses = self.learner.learn(self.to_device(batch))
         # "loss_qvalue" is TorchRL's name for it where there are several critics.
         return {key.replace("qvalue", "value"): v / self.n_seeds for key, v in losses.items()}
 
-    def moved(self, batch: TensorDictBase) -> TensorDictBase:
+    def to_device(self, batch: TensorDictBase) -> TensorDictBase:
         """Returns a batch where the networks are."""
         return batch if self.device == torch.device("cpu") else batch.to(self.device)
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns all that the future of the run depends on but the tensordict in flight."""
+        """Returns all that future actions, updates and snapshots depend on."""
         return {
-            "source": dict(self.source.state_dict()),
-            "simulation": self.simulation.simulation_state(),
             "noise": [generator.get_state() for generator in self._noise],
             **{name: dict(part.state_dict()) for name, part in self._learned().items()},
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continues from what `state_dict` returned."""
-        self.source.load_state_dict(state["source"])
-        self.simulation.load_simulation_state(state["simulation"])
         for name, part in self._learned().items():
             part.load_state_dict(state[name])
         for generator, saved in zip(self._noise, state["noise"], strict=True):

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Any, cast
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torch.func import functional_call
 from torch.nn.functional import one_hot
-from torchrl.envs import ObservationNorm, Transform, UnaryTransform
+from torchrl.envs import EnvBase, TransformedEnv
 
 from bgpo_trl.algorithms.algorithm import Algorithm
+from bgpo_trl.algorithms.environments import VARIANTS
 from bgpo_trl.algorithms.experts import ActiveGroups, Experts
+from bgpo_trl.algorithms.policy import Policy
 from bgpo_trl.algorithms.rl import Problem, make_learner
 from bgpo_trl.configs import BGPOConfig
 from bgpo_trl.data.bank import DemonstrationBank
@@ -23,101 +24,37 @@ from bgpo_trl.data.group_replay import GroupReplay
 from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.modules.gwr import GWRB
-from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.seeding import generators
-from bgpo_trl.transforms import (
-    BehaviorLookup,
-    BehaviorMatchingReward,
-    GroupLookup,
-    TaskSchedule,
-)
-
-
-@dataclass(frozen=True)
-class Parts:
-    """Material for the transforms of a variant."""
-
-    beta: float
-    """Weight of the intrinsic reward."""
-    n_tasks: int
-    """Length of a label's one-hot vector."""
-    gwr: GWRB
-    """One network a seed."""
-    lae: SequenceAutoencoder | None
-    """The sequence encoder, if there are encoders."""
-
-    def behavior_matching_reward(self) -> BehaviorMatchingReward:
-        """Returns the transform that pays the intrinsic reward.
-
-        Raises:
-            ValueError: If there are no encoders.
-        """
-        if self.lae is None:
-            raise ValueError("matching behaviors needs trained encoders")
-        return BehaviorMatchingReward(self.lae, beta=self.beta)
-
-
-@dataclass(frozen=True)
-class Composition:
-    """What the policy is told to do, and what it is paid for beside the task."""
-
-    infer: Sequence[Transform] = ()
-    """From ``demo_embedding`` (or, for a reference, ``task``) to what the policy is told."""
-    reward: Sequence[Transform] = ()
-    """What changes the reward."""
-    context: NestedKey | None = "behavior"
-    """The entry that tells the policy what to do. None: nothing does."""
-
-
-def self_organized(parts: Parts) -> Composition:
-    """BGPO itself: the policy is told the behavior that GWR-B finds, and paid for matching it."""
-    return Composition(
-        infer=[BehaviorLookup(parts.gwr, learn=True)], reward=[parts.behavior_matching_reward()]
-    )
-
-
-def labeled(parts: Parts) -> Composition:
-    """The upper reference: the policy is told the task's label."""
-
-    def label(task: Tensor) -> Tensor:
-        return one_hot(task, parts.n_tasks).float()
-
-    return Composition(
-        infer=[UnaryTransform(["task"], ["task_one_hot"], fn=label)], context="task_one_hot"
-    )
-
-
-def no_context(parts: Parts) -> Composition:
-    """The lower reference, plain DDPG: the policy is told nothing."""
-    del parts
-    return Composition(context=None)
+from bgpo_trl.transforms import DemonstrationSource
 
 
 class BGPO(Algorithm):
-    """BGPO, its ablations and the references without GWR-B, which differ by their transforms.
+    """BGPO, its ablations and its references; ``config.variant`` says which.
 
-    With ``config.experts``, each group of behaviors has an actor and a critic of its own; with
+    With ``config.experts``, each group of behaviors has an actor and a critic; with
     ``config.even_replay``, an update sees as many transitions of each of the groups played last;
     with a ``config.demonstration_share``, a part of them is taken from demonstrations. Without the
-    three it is the paper's algorithm.
+    three, the variant ``"published"`` is the paper's algorithm.
 
     Args:
         config: Hyperparameters.
         seeds: One for each element of the batch; they share nothing but the encoders.
-        schedule: Which tasks are presented when.
         bank: Embedded demonstrations for training episodes.
         encoders: The trained encoders; None where neither latents nor embeddings are used.
         device: As in `Algorithm`.
-        compose: Makes the transforms in which the variants differ.
 
     Attributes:
-        env: The composition of transforms.
         gwr: GWR-B, or None in the variants without it.
         groups: Groups of behaviors, or None where they are not told apart.
         experts: The networks, by group; without experts, of one group.
-        shown: Replay of the demonstrations that were shown, or None where they are not used.
+        shown: Replay of the demonstrations shown so far, or None where they are not used.
+
+    Raises:
+        ValueError: If there is no such variant, or it does not tell groups apart as the config
+            wants.
     """
 
+    config: BGPOConfig
     needs_replay = False
     replay: GroupReplay
 
@@ -126,66 +63,48 @@ class BGPO(Algorithm):
         config: BGPOConfig,
         *,
         seeds: Sequence[int],
-        schedule: TaskSchedule,
         bank: DemonstrationBank,
         encoders: Representation | None = None,
         device: torch.device | str = "cpu",
-        compose: Callable[[Parts], Composition] = self_organized,
     ) -> None:
-        super().__init__(
-            config, seeds=seeds, schedule=schedule, bank=bank, encoders=encoders, device=device
-        )
-        self.config = config
-        embedding_size, batch = bank.embedding.shape[-1], [len(seeds)]
-        streams = generators(seeds, "gwr")
-        parts = Parts(
-            beta=config.beta,
-            n_tasks=schedule.n_tasks,
-            gwr=GWRB(embedding_size, batch_size=batch, generator=streams, **asdict(config.gwr)),
-            lae=None if encoders is None else encoders.lae,
-        )
-        composition = compose(parts)
-        self.infer = list(composition.infer)
-        self.context, context_size = composition.context, embedding_size
-        self.needs_label = self.context == "task_one_hot"
-        if self.needs_label:
-            context_size = schedule.n_tasks
-        elif self.context is None:
-            context_size = 0
-        else:
-            # Policies read b beside latents of unit scale, which it must not drown.
-            behavior, self.context = self.context, "context"
-            self.infer.append(
-                ObservationNorm(0.0, config.behavior_scale, [behavior], [self.context])
+        super().__init__(config, seeds=seeds, bank=bank, encoders=encoders, device=device)
+        variant = VARIANTS.get(config.variant)
+        if variant is None or variant.groups != config.grouped:
+            fitting = ", ".join(name for name, v in VARIANTS.items() if v.groups == config.grouped)
+            raise ValueError(
+                f"variant {config.variant!r} does not go with experts={config.experts} and "
+                f"even_replay={config.even_replay}: choose one of {fitting}"
             )
-        grouping: list[Transform] = []
-        if config.grouped:
-            self.groups = BehaviorGroups(embedding_size, batch_size=batch, **asdict(config.groups))
-            grouping.append(GroupLookup(self.groups, learn=True))
-        bonuses = [t for t in composition.reward if isinstance(t, BehaviorMatchingReward)]
-        rewards = ["reward", *(["extrinsic_reward", "intrinsic_reward"] if bonuses else [])]
-        self.env = self.compose(
-            config, encoders, [*self.infer, *grouping, *composition.reward], rewards=rewards
-        )
-        self._beta = sum(t.beta for t in bonuses)
-        lookups = [t for t in composition.infer if isinstance(t, BehaviorLookup)]
-        self.gwr = lookups[0].gwr if lookups else None
-        self.in_keys = [config.state, *([] if self.context is None else [self.context])]
-        rl, keys = config.rl, self.in_keys
+        self.variant, embedding_size = variant, bank.embedding.shape[-1]
+        self.needs_label = variant.context == "label"
+        if variant.gwr:
+            self.gwr = GWRB(
+                embedding_size,
+                batch_size=[len(seeds)],
+                generator=generators(seeds, "gwr"),
+                **asdict(config.gwr),
+            )
+        if variant.groups:
+            self.groups = BehaviorGroups(
+                embedding_size, batch_size=[len(seeds)], **asdict(config.groups)
+            )
+        sizes = {"behavior": embedding_size, "label": self.n_tasks, None: 0}
+        self.in_keys = [config.state, *(["context"] if variant.context else [])]
 
+        rl, keys = config.rl, self.in_keys
         n_slots = config.active_groups if config.grouped else 1
-        n_experts = n_slots if config.experts else 1
         self.learner = make_learner(
             rl,
             Problem(
                 seeds=seeds,
                 in_keys=keys,
-                in_features=self.state_size + context_size,
+                in_features=self.state_size + sizes[variant.context],
                 return_bounds=(0.0, self._highest_return()),
                 device=self.device,
-                experts=range(n_experts),
+                experts=range(n_slots if config.experts else 1),
             ),
         )
+        self.test_actor = self.learner.actor
         self._active = ActiveGroups(len(seeds), n_slots)
         self.experts = Experts(
             self.learner,
@@ -199,10 +118,20 @@ class BGPO(Algorithm):
         )
         self.shown = self.demonstrations(config, bank, seeds, constant_keys=keys[1:])
 
+    def make_env(self, base_env: EnvBase, source: DemonstrationSource) -> TransformedEnv:
+        """Returns the variant's environment, see `bgpo_trl.algorithms.environments`."""
+        modules = self.encoders, self.gwr, self.groups
+        return self.variant.make_env(self.config, base_env, source, *modules)
+
+    @property
+    def beta(self) -> float:
+        """Weight of the intrinsic reward, 0 where it is not paid."""
+        return self.config.beta if self.variant.bonus else 0.0
+
     def _highest_return(self) -> float:
         """Returns the highest attainable return: of a success now, or after a time-out's bonus."""
-        success = 1.0 + self._beta
-        return max(success, self._beta + self.config.rl.gamma * success)
+        success = 1.0 + self.beta
+        return max(success, self.beta + self.config.rl.gamma * success)
 
     def _groups_of(self, tensordict: TensorDictBase) -> list[int]:
         return tensordict["group"].tolist() if self.config.grouped else [0] * self.n_seeds
@@ -217,7 +146,7 @@ class BGPO(Algorithm):
             expert = torch.zeros(self.n_seeds, dtype=torch.int64)
             for seed, group in enumerate(groups):
                 self._active.play(seed, group)
-        seen = self.moved(tensordict.select(*self.in_keys))
+        seen = self.to_device(tensordict.select(*self.in_keys))
         return tensordict.set("action", self.learner.act(seen, self._noise, expert))
 
     def store(self, transition: TensorDictBase) -> None:
@@ -229,9 +158,9 @@ class BGPO(Algorithm):
         ended = transition.get(("next", "done")).flatten()
         if ended.any():
             reward = torch.ones(self.n_seeds)
-            if self._beta:
+            if self.beta:
                 error = transition["behavior"] - transition["demo_embedding"]
-                reward += self._beta * torch.exp(-torch.linalg.vector_norm(error, dim=-1))
+                reward += self.beta * torch.exp(-torch.linalg.vector_norm(error, dim=-1))
             self.shown.add(transition, reward, group, ended)
 
     def update(self) -> dict[str, Tensor]:
@@ -260,54 +189,53 @@ class BGPO(Algorithm):
         return cast(TensorDictBase, torch.cat([played, shown], -1))
 
     @torch.no_grad()
-    def freeze(
+    def snapshot(
         self, index: int, embedding: Tensor, task: Tensor, generator: torch.Generator
-    ) -> dict[str, Any]:
-        """Returns the weights and the context of the policy of each test episode, ``[T, M, ...]``.
+    ) -> Policy:
+        """Returns a copy of one seed's policy; see `Algorithm.snapshot`.
 
-        See `Algorithm.freeze`. A policy that is the same for all is returned as ``[1, 1, ...]``.
-        The task is only read by the variant that is told the label.
+        With experts, its parameters are those of each episode's expert, ``[T, M, ...]``.
         """
         del generator
-        group = torch.zeros(1, 1, dtype=torch.int64)
         if self.config.experts and self.groups is not None:
             shown = embedding.expand(self.n_seeds, *embedding.shape)
             group = self.groups.lookup(shown).group[index]
-        experts = {
-            number: self.experts.actor_weights(index, number) for number in group.unique().tolist()
-        }
-        each = [experts[number] for number in group.flatten().tolist()]
-        frozen: dict[str, Any] = {
-            "actor": {
+            numbers = group.unique().tolist()
+            experts = {number: self.experts.actor_weights(index, number) for number in numbers}
+            each = [experts[number] for number in group.flatten().tolist()]
+            parameters = {
                 key: torch.stack([weights[key] for weights in each]).unflatten(0, group.shape)
                 for key in each[0]
             }
-        }
-        if self.context is not None:
-            # All seeds look the same demonstrations up: GWR-B knows only whole batches.
-            shown = {"demo_embedding": embedding, "task": task}
-            batch = TensorDict(shown, task.shape).expand(self.n_seeds, *task.shape)
-            batch = batch.clone()
-            for transform in self.infer:
-                batch = transform(batch)
-            frozen["context"] = batch[self.context][index].clone()
-        return frozen
+        else:
+            parameters = self.experts.actor_weights(index, 0)
+        context = self.context(index, embedding, task)
+        return self.policy(parameters, context)
 
-    def act_frozen(self, frozen: TensorDictBase, state: Tensor) -> Tensor:
-        """Returns the actions of test episodes; see `Algorithm.act_frozen`."""
-        batch = state.shape[:-1]
-        inputs = TensorDict({self.in_keys[0]: state}, batch)
-        if self.context is not None:
-            inputs.set(self.context, frozen["context"])
-        weights = {
-            key: value.expand(*batch, *value.shape[len(batch) :])
-            for key, value in frozen.get("actor").items()
-        }
-        functional_call(self.learner.actor, weights, (inputs,))
-        return inputs["action"]
+    def context(self, index: int, embedding: Tensor, task: Tensor) -> Tensor | None:
+        """Returns the context that demonstrations give the policy of one seed in test episodes.
+
+        Args:
+            index: Position of the seed in the batch.
+            embedding: phi of the demonstrations, ``[*B, 32]``.
+            task: Their labels, int64 ``[*B]``; only the variant that is given labels reads them.
+
+        Returns:
+            ``[*B, C]``, as the environment's ``context``; None for a policy without context.
+        """
+        if self.variant.context is None:
+            return None
+        if self.variant.context == "label":
+            return one_hot(task, self.n_tasks).float()
+        behavior = embedding
+        if self.gwr is not None:
+            only = torch.arange(self.n_seeds) == index
+            shown = embedding.expand(self.n_seeds, *embedding.shape)
+            behavior = self.gwr.lookup(shown, mask=only).embedding[index]
+        return self.config.behavior_scale * behavior
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns all that the future of the run depends on but the tensordict in flight."""
+        """Returns all that future actions, updates and snapshots depend on."""
         state = {**super().state_dict(), "experts": self.experts.state_dict()}
         state["active"] = self._active.state_dict()
         return state

@@ -10,11 +10,14 @@ from itertools import chain
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 from torch.func import functional_call
+from torchrl.envs import EnvBase, TransformedEnv
 
 from bgpo_trl.algorithms.algorithm import Algorithm, networks_of
+from bgpo_trl.algorithms.environments import no_context_env
+from bgpo_trl.algorithms.policy import Policy
 from bgpo_trl.algorithms.rl import Learner
 from bgpo_trl.configs import DistNLLConfig
 from bgpo_trl.data.bank import DemonstrationBank
@@ -25,7 +28,7 @@ from bgpo_trl.modules.multi_head_actor import MultiHeadActor
 from bgpo_trl.objectives.ddpg import DDPGLoss
 from bgpo_trl.objectives.distillation import DistillationLoss
 from bgpo_trl.seeding import generators, task_generators
-from bgpo_trl.transforms import TaskSchedule
+from bgpo_trl.transforms import DemonstrationSource
 
 
 class DistNLL(Algorithm):
@@ -41,7 +44,6 @@ class DistNLL(Algorithm):
     Args:
         config: Hyperparameters.
         seeds: One for each element of the batch; they share nothing but the encoders.
-        schedule: Which tasks are presented when.
         bank: Demonstrations for training episodes; only their tasks matter here.
         encoders: The trained encoders; None where latents are not used.
         device: As in `Algorithm`.
@@ -54,6 +56,7 @@ class DistNLL(Algorithm):
             episodes at different times.
     """
 
+    config: DistNLLConfig
     needs_replay = False
     replay: TaskReplay
 
@@ -62,16 +65,12 @@ class DistNLL(Algorithm):
         config: DistNLLConfig,
         *,
         seeds: Sequence[int],
-        schedule: TaskSchedule,
         bank: DemonstrationBank,
         encoders: Representation | None = None,
         device: torch.device | str = "cpu",
     ) -> None:
-        super().__init__(
-            config, seeds=seeds, schedule=schedule, bank=bank, encoders=encoders, device=device
-        )
-        self.config, ddpg = config, config.rl
-        self.env = self.compose(config, encoders)
+        super().__init__(config, seeds=seeds, bank=bank, encoders=encoders, device=device)
+        ddpg = config.rl
         self._network = {"in_keys": [config.state], "hidden_sizes": ddpg.hidden_sizes}
         every = [self.n_seeds, self.n_tasks]
         self.teacher = Actor(
@@ -128,17 +127,21 @@ class DistNLL(Algorithm):
             for student in self.students
         ]
         self._ended = torch.zeros(self.n_seeds, dtype=torch.bool)
-        # Called with the weights that `freeze` returns.
-        self._frozen = MultiHeadActor(
+        # Called with the parameters of a `Policy`.
+        self.test_actor = MultiHeadActor(
             self.state_size, batch_size=[self.n_seeds], **self._network
         ).to(self.device)
         for _ in range(self.n_tasks):
-            self._frozen.add_head()
+            self.test_actor.add_head()
+
+    def make_env(self, base_env: EnvBase, source: DemonstrationSource) -> TransformedEnv:
+        """Returns the environment of policies that observe the state only."""
+        return no_context_env(self.config, base_env, source, self.encoders)
 
     @torch.no_grad()
     def act(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the ``action`` ``[S, 4]`` of the tasks' teachers with exploration noise."""
-        seen = self.moved(tensordict.select(self.config.state))
+        seen = self.to_device(tensordict.select(self.config.state))
         teachers = networks_of(
             self.loss.actor_network_params, torch.arange(self.n_seeds), tensordict["task"]
         )
@@ -172,7 +175,7 @@ class DistNLL(Algorithm):
                 head = student.add_head(self._heads[index])
                 optimizer.add_param_group({"params": list(head.parameters())})
         drawn = self.replay.sample_seed(index, tasks, self.config.samples)
-        batch = self.moved(drawn.select(self.config.state))
+        batch = self.to_device(drawn.select(self.config.state))
         teachers = networks_of(
             self.loss.actor_network_params, torch.tensor(index), torch.tensor(tasks)
         )
@@ -186,32 +189,26 @@ class DistNLL(Algorithm):
             loss.backward()
             optimizer.step()
 
-    def freeze(
+    def snapshot(
         self, index: int, embedding: Tensor, task: Tensor, generator: torch.Generator
-    ) -> dict[str, Any]:
+    ) -> Policy:
         """Returns the multi-task policy's weights, heads in the order of the tasks.
 
-        See `Algorithm.freeze`. The head of a task of which nothing is known yet is zero. The
+        See `Algorithm.snapshot`. The head of a task of which nothing is known yet is zero. The
         demonstrations are not read.
         """
         del embedding, task, generator
-        like = self._frozen.state_dict()
+        like = self.test_actor.state_dict()
         weights = {key: torch.zeros_like(value[0]).cpu() for key, value in like.items()}
         for key, value in self.students[index].state_dict().items():
             if key.startswith("heads."):
                 _, head, name = key.split(".")
                 key = f"heads.{self._tasks[index][int(head)]}.{name}"
             weights[key] = value.to("cpu", copy=True)
-        return {"actor": weights}
-
-    def act_frozen(self, frozen: TensorDictBase, state: Tensor) -> Tensor:
-        """Returns the actions of test episodes; see `Algorithm.act_frozen`."""
-        inputs = TensorDict({self.config.state: state}, state.shape[:-1])
-        functional_call(self._frozen, dict(frozen.get("actor").items()), (inputs,))
-        return inputs["action"]
+        return self.policy(weights)
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns all that the future of the run depends on but the tensordict in flight."""
+        """Returns all that future actions, updates and snapshots depend on."""
         return {
             **super().state_dict(),
             "tasks": [list(tasks) for tasks in self._tasks],

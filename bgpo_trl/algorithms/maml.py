@@ -7,14 +7,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import chain
-from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 from torch.func import functional_call
+from torchrl.envs import EnvBase, TransformedEnv
 
 from bgpo_trl.algorithms.algorithm import Algorithm, networks_of
+from bgpo_trl.algorithms.environments import no_context_env
+from bgpo_trl.algorithms.policy import Policy
 from bgpo_trl.algorithms.rl import Learner
 from bgpo_trl.configs import MAMLConfig
 from bgpo_trl.data.bank import DemonstrationBank
@@ -23,7 +25,7 @@ from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.modules.actor_critic import Actor, Critic
 from bgpo_trl.objectives.maml import MAMLLoss
 from bgpo_trl.seeding import generators, task_generators
-from bgpo_trl.transforms import TaskSchedule
+from bgpo_trl.transforms import DemonstrationSource
 
 
 class MAML(Algorithm):
@@ -39,7 +41,6 @@ class MAML(Algorithm):
     Args:
         config: Hyperparameters.
         seeds: One for each element of the batch; they share nothing but the encoders.
-        schedule: Which tasks are presented when.
         bank: Demonstrations for training episodes; only their tasks matter here.
         encoders: The trained encoders; None where latents are not used.
         device: As in `Algorithm`.
@@ -50,6 +51,7 @@ class MAML(Algorithm):
         replay: One for each task.
     """
 
+    config: MAMLConfig
     loss: MAMLLoss
     replay: TaskReplay
 
@@ -58,16 +60,12 @@ class MAML(Algorithm):
         config: MAMLConfig,
         *,
         seeds: Sequence[int],
-        schedule: TaskSchedule,
         bank: DemonstrationBank,
         encoders: Representation | None = None,
         device: torch.device | str = "cpu",
     ) -> None:
-        super().__init__(
-            config, seeds=seeds, schedule=schedule, bank=bank, encoders=encoders, device=device
-        )
-        self.config, ddpg = config, config.rl
-        self.env = self.compose(config, encoders)
+        super().__init__(config, seeds=seeds, bank=bank, encoders=encoders, device=device)
+        ddpg = config.rl
         network = {"in_keys": [config.state], "hidden_sizes": ddpg.hidden_sizes}
         each, every = [self.n_seeds], [self.n_seeds, self.n_tasks]
         self.meta_actor = Actor(
@@ -82,10 +80,10 @@ class MAML(Algorithm):
         )
         # Called with the parameters of policies that were adapted.
         self._acting = Actor(self.state_size, batch_size=each, **network).to(self.device)
-        self._adapted = Actor(self.state_size, batch_size=every, **network).to(self.device)
+        self.test_actor = Actor(self.state_size, batch_size=every, **network).to(self.device)
         self.loss = MAMLLoss(
             self.meta_actor.to(self.device),
-            self._adapted,
+            self.test_actor,
             self.critic.to(self.device),
             inner_learning_rate=config.inner_learning_rate,
             return_bounds=(0.0, 1.0) if ddpg.clip_targets else None,
@@ -105,10 +103,14 @@ class MAML(Algorithm):
             ],
         )
 
+    def make_env(self, base_env: EnvBase, source: DemonstrationSource) -> TransformedEnv:
+        """Returns the environment of policies that observe the state only."""
+        return no_context_env(self.config, base_env, source, self.encoders)
+
     @torch.no_grad()
     def act(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the ``action`` ``[S, 4]`` of the adapted policies with exploration noise."""
-        seen = self.moved(tensordict.select(self.config.state))
+        seen = self.to_device(tensordict.select(self.config.state))
         adapted = networks_of(
             self.loss.actor_network_params, torch.arange(self.n_seeds), tensordict["task"]
         )
@@ -128,12 +130,12 @@ class MAML(Algorithm):
         order = torch.arange(self.config.task_batch_size).view(-1, 2).T.flatten()
         return self.learn(batch[..., order])
 
-    def freeze(
+    def snapshot(
         self, index: int, embedding: Tensor, task: Tensor, generator: torch.Generator
-    ) -> dict[str, Any]:
+    ) -> Policy:
         """Returns the weights of the policy adapted to each task, ``[T, ...]``.
 
-        See `Algorithm.freeze`. Without enough data of a task it does not adapt to it. The
+        See `Algorithm.snapshot`. Without enough data of a task it does not adapt to it. The
         demonstrations are not read.
         """
         del embedding, task
@@ -146,15 +148,8 @@ class MAML(Algorithm):
             draw = int(torch.randint(2**63 - 1, (), generator=generator))
             streams = [torch.Generator().manual_seed(draw) for _ in range(self.n_seeds)]
             data = self.replay.sample_played(self.config.adaptation_size, generator=streams)
-            adapted = self.loss.adapt(self.moved(data))
-        return {
-            "actor": {
-                key: value[index].detach().to("cpu", copy=True) for key, value in adapted.items()
-            }
+            adapted = self.loss.adapt(self.to_device(data))
+        parameters = {
+            key: value[index].detach().to("cpu", copy=True) for key, value in adapted.items()
         }
-
-    def act_frozen(self, frozen: TensorDictBase, state: Tensor) -> Tensor:
-        """Returns the actions of test episodes; see `Algorithm.act_frozen`."""
-        inputs = TensorDict({self.config.state: state}, state.shape[:-1])
-        functional_call(self._adapted, dict(frozen.get("actor").items()), (inputs,))
-        return inputs["action"]
+        return self.policy(parameters)

@@ -30,6 +30,7 @@ from bgpo_trl.files.locking import DirectoryLock
 from bgpo_trl.files.progress import progress_bar
 from bgpo_trl.machine import choose_device, set_threads
 from bgpo_trl.training import Trainer
+from bgpo_trl.transforms import TaskSchedule
 
 # Number of the evaluation after training, which no evaluation in training has: other starts.
 _LAST = 2**31
@@ -255,7 +256,7 @@ def measure(
     """
     algorithm, config, seen = trainer.algorithm, trainer.config, bank.seen()
     gwr = algorithm.gwr
-    rows = []
+    rows, schedule = [], TaskSchedule(config.task_starts)
     n_steps = config.algorithm.max_steps + 1
     bar = progress_bar("final tests", shown=trainer.progress, total=2 * n_steps, unit="step")
     for half, (kind, tested) in enumerate(
@@ -264,15 +265,16 @@ def measure(
         evaluator = Evaluator(
             config.algorithm,
             seeds=config.seeds,
-            n_tasks=len(config.tasks),
+            schedule=schedule,
             episodes=episodes,
             bank=tested,
             encoders=trainer.encoders,
         )
         snapshots = [
-            evaluator.take(algorithm, index, _LAST, 0) for index in range(len(config.seeds))
+            evaluator.snapshot(algorithm, index, _LAST, episode=config.episodes)
+            for index in range(len(config.seeds))
         ]
-        success = evaluator.run(snapshots, _LAST, algorithm, watch=bar.update).success
+        success = evaluator.run(snapshots, algorithm.device, watch=bar.update).success
         bar.set_postfix_str(f"success {success.float().mean():.2f}, {kind}", refresh=False)
         bar.update(half * n_steps - bar.n)  # episodes may all end earlier
         for task, name in enumerate(config.tasks):
@@ -321,17 +323,16 @@ def record_episodes(trainer: Trainer, bank: DemonstrationBank) -> dict[str, np.n
     evaluator = Evaluator(
         config.algorithm,
         seeds=config.seeds,
-        n_tasks=len(config.tasks),
+        schedule=TaskSchedule(config.task_starts),
         episodes=1,
         bank=bank.held_out(config.held_out),
         encoders=trainer.encoders,
     )
-    algorithm = trainer.algorithm
-    snapshots = [evaluator.take(algorithm, i, _LAST, 0) for i in range(len(config.seeds))]
+    algorithm, seeds = trainer.algorithm, range(len(config.seeds))
+    snapshots = [evaluator.snapshot(algorithm, i, _LAST, episode=config.episodes) for i in seeds]
     result = evaluator.run(
         snapshots,
-        _LAST,
-        algorithm,
+        algorithm.device,
         watch=lambda: frames.append(evaluator.simulation.frames()[0, :, 0]),
     )
     return {

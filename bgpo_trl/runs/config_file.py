@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
-from dataclasses import fields, is_dataclass
+import sys
+from dataclasses import asdict, is_dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
-from bgpo_trl.algorithms import ALGORITHMS
+from bgpo_trl.algorithms import ABLATIONS, ALGORITHMS
 from bgpo_trl.algorithms.rl import RL
 from bgpo_trl.configs import AlgorithmConfig, RLConfig, RunConfig
+from bgpo_trl.runs.directory import plain_settings
 
 
 def read_config(path: str | Path) -> tuple[RunConfig, str | None]:
@@ -35,7 +37,8 @@ def read_config(path: str | Path) -> tuple[RunConfig, str | None]:
         if not isinstance(encoders, str | None):
             raise ValueError(f"encoders is {encoders!r}")
         values = settings.pop("algorithm")
-        algorithm = _read(_algorithm_config(settings.get("name"), values), values, "algorithm.")
+        kind = _algorithm_config(settings.get("name"), settings.pop("algorithm_class", None))
+        algorithm = _read(kind, values, "algorithm.")
         return _read(RunConfig, {**settings, "algorithm": algorithm}, ""), encoders
     except (FileNotFoundError, NotADirectoryError):
         raise ValueError(f"{path.parent} holds no run: there is no {path.name}") from None
@@ -45,13 +48,34 @@ def read_config(path: str | Path) -> tuple[RunConfig, str | None]:
         ) from error
 
 
-def _algorithm_config(name: object, values: dict[str, Any]) -> type[AlgorithmConfig]:
-    """Returns the class of an algorithm's hyperparameters; a variant's is the one that fits."""
-    if isinstance(name, str) and name in ALGORITHMS:
-        return type(ALGORITHMS[name].config)
-    for kind in sorted({type(e.config) for e in ALGORITHMS.values()}, key=lambda k: len(fields(k))):
-        if values.keys() <= {field.name for field in fields(kind)}:
+def settings_of(config: RunConfig, encoders: str | None) -> dict[str, Any]:
+    """Returns what ``config.json`` stores: all settings, and the class of the hyperparameters.
+
+    Args:
+        config: The run.
+        encoders: Identity of its encoders; None if it uses none.
+    """
+    kind = type(config.algorithm)
+    name = f"{kind.__module__}.{kind.__qualname__}"
+    return plain_settings({**asdict(config), "algorithm_class": name, "encoders": encoders})
+
+
+def _algorithm_config(name: object, stored: object) -> type[AlgorithmConfig]:
+    """Returns the class of an algorithm's hyperparameters.
+
+    Args:
+        name: Of the algorithm.
+        stored: Its name in the file; None in files without it. Only classes of modules that this
+            process has imported are found, since a file should not decide what is imported.
+    """
+    if isinstance(stored, str):
+        module, _, attribute = stored.rpartition(".")
+        kind = getattr(sys.modules.get(module), attribute, None)
+        if isinstance(kind, type) and issubclass(kind, AlgorithmConfig):
             return kind
+    known = ALGORITHMS | ABLATIONS
+    if isinstance(name, str) and name in known:
+        return type(known[name].config)
     raise ValueError(f"the hyperparameters of {name!r} are of no known algorithm")
 
 

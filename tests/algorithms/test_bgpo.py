@@ -7,9 +7,9 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs import check_env_specs
 
-from benchmarks import ablation
-from bgpo_trl.algorithms.algorithm import observe
-from bgpo_trl.algorithms.bgpo import BGPO, labeled, no_context, self_organized
+from bgpo_trl.algorithms.bgpo import BGPO
+from bgpo_trl.algorithms.environments import encode
+from bgpo_trl.algorithms.policy import Policy
 from bgpo_trl.configs import BGPOConfig, GWRBConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.encoders.pretrained import load_pretrained
@@ -20,14 +20,14 @@ from bgpo_trl.transforms import BehaviorLookup, GroupLookup, TaskSchedule
 
 # What the policy sees, what it is told, the composition that tells it, and whose settings it has.
 VARIANTS = {
-    "ground truth, label": ("state", "label", labeled, "oracle"),
-    "latent, label": ("latent", "label", labeled, "oracle"),
-    "latent, nothing": ("latent", "nothing", no_context, "ddpg"),
-    "latent, phi": ("latent", "phi", ablation.VARIANTS["r_int"][0], "bgpo-single"),
-    "latent, b": ("latent", "b", self_organized, "bgpo-single"),
-    "even replay": ("latent", "b", self_organized, "bgpo-single"),
-    "experts": ("latent", "b", self_organized, "bgpo-experts"),
-    "all": ("latent", "b", self_organized, "bgpo"),
+    "ground truth, label": ("state", "label", "label", "oracle"),
+    "latent, label": ("latent", "label", "label", "oracle"),
+    "latent, nothing": ("latent", "nothing", "no-context", "ddpg"),
+    "latent, phi": ("latent", "phi", "without-gwr", "bgpo-single"),
+    "latent, b": ("latent", "b", "published", "bgpo-single"),
+    "even replay": ("latent", "b", "bgpo", "bgpo-single"),
+    "experts": ("latent", "b", "bgpo", "bgpo-experts"),
+    "all": ("latent", "b", "bgpo", "bgpo"),
 }
 # Many groups, and few of them active.
 GROUPS = {"groups": GWRBConfig(activity_threshold=0.9), "active_groups": 2}
@@ -38,7 +38,7 @@ SCHEDULE = TaskSchedule((0, 2, 4))
 
 
 @pytest.fixture
-def make(bank, encoders, make_config):
+def make(bank, encoders, make_config, in_world):
     def make(
         variant="latent, b",
         seeds=(3, 8),
@@ -48,23 +48,24 @@ def make(bank, encoders, make_config):
         config=None,
         **changes,
     ):
-        state, _, compose, name = VARIANTS[variant]
-        changes = {**({} if config is None else {"rl": config}), **changes}
+        state, _, kind, name = VARIANTS[variant]
+        changes = {"variant": kind, **({} if config is None else {"rl": config}), **changes}
         config = make_config(state, name if rl is None else f"{name}+{rl}").algorithm
         config = replace(config, **{**CHANGES.get(variant, {}), **changes})
-        parts = {"bank": bank.seen(), "encoders": encoders, "compose": compose}
-        return BGPO(config, seeds=seeds, schedule=schedule, **parts)
+        bank = bank.for_tasks(bank.tasks[: schedule.n_tasks])
+        algorithm = BGPO(config, seeds=seeds, bank=bank.seen(), encoders=encoders)
+        return in_world(algorithm, seeds, schedule, bank)
 
     return make
 
 
 def play(algorithm, n_steps, hidden=()):
     """Trains for some steps; BGPO gets none of the `hidden` entries. Returns transitions [S, T]."""
-    state, transitions = algorithm.env.reset(), []
+    state, transitions = algorithm.world.env.reset(), []
     for _ in range(n_steps):
         state = algorithm.act(state.exclude(*hidden))
         algorithm.update()
-        transition, state = algorithm.env.step_and_maybe_reset(state)
+        transition, state = algorithm.world.env.step_and_maybe_reset(state)
         transitions.append(transition.clone())
         algorithm.store(transition.exclude(*hidden, *(("next", key) for key in hidden)))
     return torch.stack(transitions, dim=1)
@@ -116,15 +117,15 @@ def assert_same_graph(first, second, **tolerance):
 def test_each_variant_is_an_environment_with_the_input_it_is_named_after(make, variant, n_tasks):
     algorithm = make(variant, schedule=TaskSchedule((0,) * n_tasks))
     before = None if algorithm.gwr is None else algorithm.gwr.graph(0)
-    for transform in algorithm.env.transform:
+    for transform in algorithm.world.env.transform:
         if isinstance(transform, BehaviorLookup | GroupLookup):
             transform.learn = False
-    check_env_specs(algorithm.env)
+    check_env_specs(algorithm.world.env)
 
     state, told, _, _ = VARIANTS[variant]
-    sizes = {"state": 16, "latent": 64, "task_one_hot": n_tasks, "context": 32}
-    keys = {"label": ["task_one_hot"], "nothing": []}.get(told, ["context"])
-    start = algorithm.act(algorithm.env.reset())
+    sizes = {"state": 16, "latent": 64, "context": n_tasks if told == "label" else 32}
+    keys = [] if told == "nothing" else ["context"]
+    start = algorithm.act(algorithm.world.env.reset())
     actor, critic = algorithm.learner.actor, algorithm.learner.loss.value_network
     assert actor.in_keys == [state, *keys]
     assert critic.in_keys == [state, *keys, "action"]
@@ -134,7 +135,6 @@ def test_each_variant_is_an_environment_with_the_input_it_is_named_after(make, v
     for key in (state, *keys):
         assert start[key].shape == (2, sizes[key])
     assert start["action"].shape == (2, 4)
-    assert ("task_one_hot" in start) == (told == "label")
     assert ("behavior" in start) == (told in ("phi", "b"))
     if "behavior" in start:
         assert start["context"].equal(0.25 * start["behavior"])
@@ -162,14 +162,14 @@ def test_phi_is_the_behavior_where_there_is_no_gwr(make, bank):
 
 def test_a_label_is_the_task_of_the_episode(make):
     data = play(make("latent, label", schedule=TaskSchedule((0, 0, 0))), 30)
-    assert data["task_one_hot"].argmax(-1).equal(data["task"])
-    assert data["task_one_hot"].sum(-1).unique().tolist() == [1]
+    assert data["context"].argmax(-1).equal(data["task"])
+    assert data["context"].sum(-1).unique().tolist() == [1]
     assert data["task"].unique().tolist() == [0, 1, 2]
 
 
 @pytest.mark.parametrize("variant", [v for v in VARIANTS if VARIANTS[v][1] != "label"])
 def test_bgpo_never_reads_the_label(make, variant):
-    label = ("task", "task_one_hot")
+    label = ("task",)
     algorithm, blind = make(variant), make(variant)
     learner = algorithm.learner
     for keys in (learner.actor.in_keys, learner.loss.in_keys, algorithm.in_keys):
@@ -179,7 +179,7 @@ def test_bgpo_never_reads_the_label(make, variant):
     seeing = play(algorithm, 40)
     not_seeing = play(blind, 40, hidden=["task"])
     kept = algorithm.replay.sample(torch.zeros(2, 1, dtype=torch.int64))
-    assert {"task", "task_one_hot"}.isdisjoint(kept.keys(True))
+    assert "task" not in kept.keys(True)
 
     assert seeing["task"].unique().tolist() == [0, 1, 2]
     behavior = [] if variant == "latent, nothing" else ["behavior"]
@@ -208,7 +208,7 @@ def test_a_reference_learns_the_same_from_whatever_demonstrations(make, bank, va
 
 def test_plain_ddpg_acts_and_learns_by_the_state_and_nothing_else(make):
     algorithm, blind = make("latent, nothing"), make("latent, nothing")
-    states = [learner.env.reset() for learner in (algorithm, blind)]
+    states = [learner.world.env.reset() for learner in (algorithm, blind)]
     kept = ["latent", "action", *(("next", key) for key in ("latent", "reward", "terminated"))]
     for _ in range(20):
         actions = [algorithm.act(states[0]), blind.act(states[1].select("latent"))]
@@ -216,7 +216,7 @@ def test_plain_ddpg_acts_and_learns_by_the_state_and_nothing_else(make):
         for index, learner in enumerate((algorithm, blind)):
             losses = learner.update()
             chosen = states[index].set("action", actions[index]["action"])
-            transition, states[index] = learner.env.step_and_maybe_reset(chosen)
+            transition, states[index] = learner.world.env.step_and_maybe_reset(chosen)
             learner.store(transition.select(*kept) if learner is blind else transition)
         assert actions[0]["action"].equal(actions[1]["action"])
     assert losses
@@ -229,7 +229,7 @@ def test_plain_ddpg_acts_and_learns_by_the_state_and_nothing_else(make):
 def test_what_is_said_of_a_labeled_task_is_its_place(make):
     """The first layer adds the row of weights that belongs to the label."""
     algorithm = make("latent, label", schedule=TaskSchedule((0, 0, 0)))
-    state = algorithm.env.reset()
+    state = algorithm.world.env.reset()
     first, second = algorithm.learner.actor.mlp.layers
     for index in range(2):
         weight = first.weight[index, 0]
@@ -241,11 +241,11 @@ def test_what_is_said_of_a_labeled_task_is_its_place(make):
 
 
 def act_in_tests(algorithm, state, embedding, task):
-    frozen = [
-        TensorDict(algorithm.freeze(index, embedding, task, torch.Generator()))
+    policies = [
+        algorithm.snapshot(index, embedding, task, torch.Generator())
         for index in range(algorithm.n_seeds)
     ]
-    return algorithm.act_frozen(TensorDict.maybe_dense_stack(frozen), state)
+    return Policy.stack(policies).act(state)
 
 
 @variants
@@ -263,19 +263,19 @@ def test_only_a_variant_with_a_label_acts_by_it(make, bank, variant):
 
 
 @pytest.mark.parametrize("variant", ["latent, b", "experts", "all"])
-def test_frozen_policies_are_told_what_training_would_tell_and_learn_nothing(make, variant):
+def test_snapshots_have_the_context_of_training_and_learn_nothing(make, variant):
     algorithm = make(variant)
     play(algorithm, 33)
     before = [algorithm.gwr.graph(i) for i in range(2)]
     states = algorithm.state_dict()
-    state = algorithm.env.reset()
+    state = algorithm.world.env.reset()
     shown = (state["demo_embedding"].unsqueeze(1), state["task"].unsqueeze(1))
     for index, group in enumerate(groups_of(state, algorithm)):
-        frozen = algorithm.freeze(index, *shown, torch.Generator())
-        assert frozen["context"][index, 0].equal(0.25 * state["behavior"][index])
-        row = index if algorithm.config.experts else 0  # else it is the same for all
+        policy = algorithm.snapshot(index, *shown, torch.Generator())
+        assert policy.context[index, 0].equal(0.25 * state["behavior"][index])
+        row = (index, 0) if algorithm.config.experts else ()  # else it is the same for all
         for key, value in algorithm.experts.actor_weights(index, group).items():
-            assert frozen["actor"][key][row, 0].equal(value)
+            assert policy.parameters[key][row].equal(value)
     for index, graph in enumerate(before):
         assert_same_graph(algorithm.gwr.graph(index), graph, rtol=0, atol=0)
     for part in ("experts", "active", "learner"):
@@ -336,7 +336,7 @@ def test_exploration_is_noise_of_each_seed_on_the_policys_action(make, make_conf
     algorithm, sources = make(variant, config=ddpg), generators((3, 8), "exploration")
     with torch.no_grad():  # so that some actions are cut off, and some are not
         algorithm.learner.actor.mlp.layers[-1].bias.copy_(torch.tensor([0.0, 1.0, -1.0, 0.0]))
-    state, n_cut = algorithm.env.reset(), 0
+    state, n_cut = algorithm.world.env.reset(), 0
     for _ in range(8):
         state = algorithm.act(state)
         action = plain_action(algorithm, state)
@@ -344,7 +344,7 @@ def test_exploration_is_noise_of_each_seed_on_the_policys_action(make, make_conf
             expected = action[index] + scale * torch.randn(4, generator=source)
             n_cut += int((expected.abs() > 1).sum())
             torch.testing.assert_close(state["action"][index], expected.clamp(-1, 1))
-        _, state = algorithm.env.step_and_maybe_reset(state)
+        _, state = algorithm.world.env.step_and_maybe_reset(state)
     assert (0 < n_cut < 64) == (scale > 0)
 
 
@@ -436,27 +436,44 @@ def test_each_seed_of_a_batch_learns_as_it_would_alone(make, variant, rl):
 
 
 @variants
-def test_missing_encoders_are_refused(make_config, bank, variant):
-    state, _, compose, name = VARIANTS[variant]
+def test_missing_encoders_are_refused(make_config, bank, in_world, variant):
+    state, _, kind, name = VARIANTS[variant]
     config = make_config(state, name).algorithm
-    parts = {"seeds": (0,), "schedule": SCHEDULE, "bank": bank.seen(), "compose": compose}
+    config = replace(config, **{"variant": kind, **CHANGES.get(variant, {})})
     if state == "state":
-        BGPO(config, **parts)
-        assert observe(config, None)
+        in_world(BGPO(config, seeds=(0,), bank=bank.seen()), (0,), SCHEDULE)
+        assert encode(config, None)
     else:
         with pytest.raises(ValueError, match="needs trained encoders"):
-            BGPO(config, **parts)
+            in_world(BGPO(config, seeds=(0,), bank=bank.seen()), (0,), SCHEDULE)
 
 
 @pytest.mark.parametrize("told", ["phi", "b"])
-def test_matching_behaviors_on_ground_truth_is_refused(make_config, bank, encoders, told):
-    compose = VARIANTS[f"latent, {told}"][2]
+def test_matching_behaviors_on_ground_truth_is_refused(make_config, bank, encoders, in_world, told):
     config = make_config("state", "bgpo-single").algorithm
-    parts = {"seeds": (0,), "schedule": SCHEDULE, "bank": bank.seen(), "compose": compose}
+    config = replace(config, variant=VARIANTS[f"latent, {told}"][2])
+
+    def enter(encoders):
+        algorithm = BGPO(config, seeds=(0,), bank=bank.seen(), encoders=encoders)
+        return in_world(algorithm, (0,), SCHEDULE).world.env.reset()
+
     with pytest.raises(ValueError, match="matching behaviors needs trained encoders"):
-        BGPO(config, **parts)
+        enter(None)
     with pytest.raises(ValueError, match="found no 'latent'"):
-        BGPO(config, encoders=encoders, **parts).env.reset()
+        enter(encoders)
+
+
+@pytest.mark.parametrize(
+    ("name", "variant", "message"),
+    [
+        ("bgpo-single", "unheard-of", "'unheard-of' .* choose one of published, without-bonus"),
+        ("bgpo", "published", "'published' does not go with experts=True"),
+    ],
+)
+def test_a_variant_that_does_not_exist_or_fit_is_refused(make_config, bank, name, variant, message):
+    config = replace(make_config(name=name).algorithm, variant=variant)
+    with pytest.raises(ValueError, match=message):
+        BGPO(config, seeds=(0,), bank=bank.seen())
 
 
 # ---- groups, experts, demonstrations
@@ -468,13 +485,14 @@ def test_a_restored_run_continues_as_the_saved_one(make, tmp_path, rl):
     algorithm = make("all", rl=rl, schedule=schedule)
     _, state = play_on(algorithm, 60)
     assert algorithm.groups.num_groups.min() > 2  # more than are active
-    save_checkpoint(tmp_path, {"algorithm": algorithm.state_dict(), "state": state.to_dict()})
+    parts = {"algorithm": algorithm.state_dict(), "world": algorithm.world.state_dict()}
+    save_checkpoint(tmp_path, {**parts, "state": state.to_dict()})
     other = make(
         "all", seeds=(5, 7), rl=rl, schedule=schedule
     )  # other weights, streams and simulations
     play_on(other, 12)
     saved = load_checkpoint(tmp_path)
-    other.env.reset()
+    other.world.load_state_dict(saved["world"])
     other.load_state_dict(saved["algorithm"])
     ours, _ = play_on(algorithm, 25, state)
     theirs, _ = play_on(other, 25, TensorDict(saved["state"], [2]))
@@ -486,11 +504,11 @@ def test_a_restored_run_continues_as_the_saved_one(make, tmp_path, rl):
 
 def play_on(algorithm, n_steps, state=None):
     """As `play`, from some state on; returns the tensordict in flight too."""
-    state, transitions = algorithm.env.reset() if state is None else state, []
+    state, transitions = algorithm.world.env.reset() if state is None else state, []
     for _ in range(n_steps):
         state = algorithm.act(state)
         algorithm.update()
-        transition, state = algorithm.env.step_and_maybe_reset(state)
+        transition, state = algorithm.world.env.step_and_maybe_reset(state)
         transitions.append(transition.clone())
         algorithm.store(transition)
     return torch.stack(transitions, dim=1), state
@@ -626,9 +644,9 @@ def test_nothing_is_known_of_tasks_that_have_not_been_presented(make, bank):
         shown, task = bank.embedding[:6].view(3, 2, 32), torch.zeros(3, 2).long()
         for index in range(2):
             policies = [
-                one.freeze(index, shown, task, torch.Generator()) for one in (first, second)
+                one.snapshot(index, shown, task, torch.Generator()) for one in (first, second)
             ]
-            assert_same_state(*policies)
+            assert_same_state(*(policy.state_dict() for policy in policies))
 
 
 def test_the_bonus_is_for_latents_as_they_are_and_the_policy_sees_them_clipped(
@@ -644,7 +662,7 @@ def test_the_bonus_is_for_latents_as_they_are_and_the_policy_sees_them_clipped(
 
     monkeypatch.setattr(encoders.vae, "latent", stretched)
     algorithm = make("all", seeds=(3,))
-    assert algorithm.env.observation_spec["latent"].shape == (1, 64)
+    assert algorithm.world.env.observation_spec["latent"].shape == (1, 64)
     raw.clear()  # what was seen to make the specs
     data = play(algorithm, 25)[0]
     frames, trajectory, n_ended, n_clipped = iter(raw), [], 0, 0
@@ -681,7 +699,7 @@ def test_the_bonus_tells_right_from_wrong_on_the_shipped_bank():
 
 def test_demonstrations_are_refused_where_the_state_is_the_ground_truth(make_config, bank):
     config = replace(make_config("state", "oracle").algorithm, demonstration_share=0.25)
-    parts = {"seeds": (0,), "schedule": SCHEDULE, "bank": bank.seen(), "compose": labeled}
+    parts = {"seeds": (0,), "bank": bank.seen()}
     with pytest.raises(
         ValueError, match="demonstrations are latents: set demonstration_share to 0"
     ):

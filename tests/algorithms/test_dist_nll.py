@@ -10,6 +10,7 @@ import torch
 from tensordict import TensorDict
 
 from bgpo_trl.algorithms.dist_nll import DistNLL
+from bgpo_trl.algorithms.policy import Policy
 from bgpo_trl.configs import DistNLLConfig
 from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
 from bgpo_trl.modules.multi_head_actor import MultiHeadActor
@@ -25,11 +26,13 @@ DEMONSTRATIONS = {"state": "latent", "name": "dist-nll-demonstrations"}
 
 
 @pytest.fixture
-def make(bank, encoders, make_config):
+def make(bank, encoders, make_config, in_world):
     def make(seeds=SEEDS, schedule=SCHEDULE, state="state", name="dist-nll", bank=bank, **changes):
         config = make_config(state, name).algorithm
         config = replace(config, **{"task_batch_size": 4, **changes})
-        return DistNLL(config, seeds=seeds, schedule=schedule, bank=bank.seen(), encoders=encoders)
+        of_tasks = bank.for_tasks(bank.tasks[: schedule.n_tasks])
+        algorithm = DistNLL(config, seeds=seeds, bank=of_tasks.seen(), encoders=encoders)
+        return in_world(algorithm, seeds, schedule, of_tasks)
 
     return make
 
@@ -39,12 +42,12 @@ def play(algorithm, n_steps, state=None, hidden=(), watch=lambda chosen: None):
 
     Returns transitions ``[S, T]`` and the tensordict in flight.
     """
-    state, transitions = algorithm.env.reset() if state is None else state, []
+    state, transitions = algorithm.world.env.reset() if state is None else state, []
     for _ in range(n_steps):
         state["action"] = algorithm.act(state.exclude(*hidden))["action"]
         watch(state)
         algorithm.update()
-        transition, state = algorithm.env.step_and_maybe_reset(state)
+        transition, state = algorithm.world.env.step_and_maybe_reset(state)
         transitions.append(transition.clone())
         algorithm.store(transition.exclude(*hidden, *(("next", key) for key in hidden)))
     return torch.stack(transitions, dim=1), state
@@ -85,10 +88,10 @@ def teachers_action(algorithm, seed, task, state):
     return (hidden @ second["weight"] + second["bias"]).tanh()
 
 
-def freeze(algorithm, index, embedding=0.0):
+def snapshot(algorithm, index, embedding=0.0):
     shape = (algorithm.n_tasks, 2)
     task = torch.arange(algorithm.n_tasks).unsqueeze(1).expand(shape)
-    return algorithm.freeze(index, torch.full((*shape, 32), embedding), task, torch.Generator())
+    return algorithm.snapshot(index, torch.full((*shape, 32), embedding), task, torch.Generator())
 
 
 def head_weights(student):
@@ -199,7 +202,7 @@ def test_a_teacher_stays_as_it_was_until_there_is_data_of_its_task(make):
     start = [value.clone() for value in weights]
     counts, learned = torch.zeros(2, N_TASKS).long(), torch.zeros(2, N_TASKS).bool()
     stages = []
-    state = algorithm.env.reset()
+    state = algorithm.world.env.reset()
     for _ in range(40):
         state = algorithm.act(state)
         if algorithm.update():
@@ -208,7 +211,7 @@ def test_a_teacher_stays_as_it_was_until_there_is_data_of_its_task(make):
             changed = (now != before).flatten(2).any(-1)
             assert changed.equal(learned)
         stages.append(tuple(learned.flatten().tolist()))
-        transition, state = algorithm.env.step_and_maybe_reset(state)
+        transition, state = algorithm.world.env.step_and_maybe_reset(state)
         algorithm.store(transition)
         counts[torch.arange(2), transition["task"]] += 1
         assert algorithm.replay.sizes.equal(counts)
@@ -299,7 +302,7 @@ def test_students_learn_from_their_teachers_at_the_end_of_each_episode(make, sch
     ]
     heads, orders = generators(SEEDS, "heads"), [[], []]
     optimizers = [torch.optim.Adam(student.parameters(), lr=1e-3) for student in students]
-    lessons, ended, state = [0, 0], [False, False], algorithm.env.reset()
+    lessons, ended, state = [0, 0], [False, False], algorithm.world.env.reset()
 
     def draw(index, tasks, number):
         shares = torch.rand(len(tasks) * number, generator=draws[index], dtype=torch.float64)
@@ -352,7 +355,7 @@ def test_students_learn_from_their_teachers_at_the_end_of_each_episode(make, sch
                 student.parameters(), students[index].parameters(), strict=True
             ):
                 torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-5)
-        transition, state = algorithm.env.step_and_maybe_reset(state)
+        transition, state = algorithm.world.env.step_and_maybe_reset(state)
         algorithm.store(transition)
         for index in range(2):
             seen[index][int(transition["task"][index])].append(transition["state"][index])
@@ -363,7 +366,7 @@ def test_students_learn_from_their_teachers_at_the_end_of_each_episode(make, sch
     for index, order in enumerate(orders):
         assert sorted(order) == [0, 1, 2]
         assert (order.index(1) < order.index(0)) == (schedule is OTHER_SCHEDULE)
-        frozen = freeze(algorithm, index)["actor"]
+        frozen = snapshot(algorithm, index).parameters
         for position, task in enumerate(order):
             for name, value in students[index].heads[position].state_dict().items():
                 expected = frozen[f"heads.{task}.{name}"]
@@ -375,7 +378,7 @@ def test_old_heads_and_the_trunk_are_kept_when_a_head_is_added(make):
     algorithm = make(learning_rate=1e-30)  # none to speak of, so that only the head is new
     start = [deepcopy(student.trunk.state_dict()) for student in algorithm.students]
     numbers = []
-    state = algorithm.env.reset()
+    state = algorithm.world.env.reset()
     for _ in range(40):
         _, state = play(algorithm, 1, state)
         numbers.append(tuple(len(student.heads) for student in algorithm.students))
@@ -408,17 +411,17 @@ def test_each_head_comes_to_do_what_the_teacher_of_its_task_does(make):
     for index in range(2):
         for task in range(N_TASKS):
             states = data["state"][index][data["task"][index] == task]
-            frozen = TensorDict.maybe_dense_stack([TensorDict(freeze(algorithm, index))] * 2)
-            actions = algorithm.act_frozen(frozen, states.expand(2, N_TASKS, -1, -1))[:, task]
+            policy = Policy.stack([snapshot(algorithm, index)] * 2)
+            actions = policy.act(states.expand(2, N_TASKS, -1, -1))[:, task]
             expected = wanted[task].expand_as(actions)
             torch.testing.assert_close(actions, expected, rtol=0, atol=0.1)
 
 
 def test_a_task_of_which_nothing_is_known_has_a_head_that_does_nothing(make):
     algorithm = make(schedule=TaskSchedule((0, 99, 99)))
-    start = freeze(algorithm, 0)["actor"]
+    start = snapshot(algorithm, 0).parameters
     play(algorithm, 40)
-    frozen = freeze(algorithm, 0)["actor"]
+    frozen = snapshot(algorithm, 0).parameters
     assert {key: value.shape for key, value in start.items()} == {
         key: value.shape for key, value in frozen.items()
     }
@@ -431,31 +434,31 @@ def test_preparing_a_test_leaves_no_trace_and_is_not_changed_later(make):
     algorithm = make()
     _, state = play(algorithm, 40)
     before = kept(algorithm)
-    frozen = freeze(algorithm, 1)["actor"]
+    frozen = snapshot(algorithm, 1).parameters
     assert_same(kept(algorithm), before)
     copied = deepcopy(frozen)
     play(algorithm, 20, state)
     assert_same(frozen, copied)
-    assert not frozen["heads.0.weight"].equal(freeze(algorithm, 1)["actor"]["heads.0.weight"])
+    assert not frozen["heads.0.weight"].equal(snapshot(algorithm, 1).parameters["heads.0.weight"])
 
 
-def test_frozen_policies_act_as_plain_ones_with_these_weights(make):
+def test_snapshots_act_as_plain_ones_with_these_weights(make):
     algorithm = make()
     play(algorithm, 40)
-    frozen = [freeze(algorithm, index) for index in range(2)]
-    stacked = TensorDict.maybe_dense_stack([TensorDict(one) for one in frozen])
+    frozen = [snapshot(algorithm, index) for index in range(2)]
+    stacked = Policy.stack(frozen)
     state = torch.randn(2, N_TASKS, 5, SIZE, generator=torch.Generator().manual_seed(0))
-    actions = algorithm.act_frozen(stacked, state)
+    actions = stacked.act(state)
     for index in range(2):
         alone = MultiHeadActor(SIZE, in_keys=["state"])
         for _ in range(N_TASKS):
             alone.add_head()
-        alone.load_state_dict(frozen[index]["actor"])
+        alone.load_state_dict(frozen[index].parameters)
         expected = alone(TensorDict({"state": state[index]}, [N_TASKS, 5]))["action"]
         torch.testing.assert_close(actions[index], expected)
     # What is learned since makes no difference.
     play(algorithm, 10)
-    assert algorithm.act_frozen(stacked, state).equal(actions)
+    assert stacked.act(state).equal(actions)
 
 
 def test_demonstrations_are_never_read(make):
@@ -467,7 +470,8 @@ def test_demonstrations_are_never_read(make):
         assert ours[key].equal(theirs[key]), key
     assert_same(dict(told.loss.state_dict()), dict(untold.loss.state_dict()))
     for index in range(2):
-        assert_same(freeze(told, index), freeze(untold, index, embedding=float("nan")))
+        blind = snapshot(untold, index, embedding=float("nan"))
+        assert_same(snapshot(told, index).parameters, blind.parameters)
 
 
 @pytest.mark.parametrize(
@@ -477,13 +481,14 @@ def test_a_restored_run_continues_as_the_saved_one(make, tmp_path, n_steps, chan
     algorithm = make(schedule=OTHER_SCHEDULE, **changes)
     _, state = play(algorithm, n_steps)
     n_heads = [len(student.heads) for student in algorithm.students]
-    save_checkpoint(tmp_path, {"algorithm": algorithm.state_dict(), "state": state.to_dict()})
+    parts = {"algorithm": algorithm.state_dict(), "world": algorithm.world.state_dict()}
+    save_checkpoint(tmp_path, {**parts, "state": state.to_dict()})
     other = make(seeds=(5, 7), schedule=OTHER_SCHEDULE, **changes)  # other weights and streams
     saved = load_checkpoint(tmp_path)
-    other.env.reset()
+    other.world.load_state_dict(saved["world"])
     other.load_state_dict(saved["algorithm"])
     assert [len(student.heads) for student in other.students] == n_heads
-    assert_same(freeze(algorithm, 0), freeze(other, 0))
+    assert_same(snapshot(algorithm, 0).parameters, snapshot(other, 0).parameters)
     ours, _ = play(algorithm, 20, state)
     theirs, _ = play(other, 20, TensorDict(saved["state"], [2]))
     assert (ours == theirs).all()

@@ -10,6 +10,7 @@ from tensordict import TensorDict
 from torch.nn.functional import layer_norm
 
 from bgpo_trl.algorithms.maml import MAML
+from bgpo_trl.algorithms.policy import Policy
 from bgpo_trl.configs import MAMLConfig
 from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
 from bgpo_trl.modules.actor_critic import Actor
@@ -24,11 +25,13 @@ DEMONSTRATIONS = {"state": "latent", "name": "maml-demonstrations", "task_batch_
 
 
 @pytest.fixture
-def make(bank, encoders, make_config):
+def make(bank, encoders, make_config, in_world):
     def make(seeds=SEEDS, schedule=SCHEDULE, state="state", name="maml", **changes):
         config = make_config(state, name).algorithm
         config = replace(config, **{"task_batch_size": 4, **changes})
-        return MAML(config, seeds=seeds, schedule=schedule, bank=bank.seen(), encoders=encoders)
+        of_tasks = bank.for_tasks(bank.tasks[: schedule.n_tasks])
+        algorithm = MAML(config, seeds=seeds, bank=of_tasks.seen(), encoders=encoders)
+        return in_world(algorithm, seeds, schedule, of_tasks)
 
     return make
 
@@ -38,12 +41,12 @@ def play(algorithm, n_steps, state=None, hidden=(), watch=lambda chosen: None):
 
     Returns transitions ``[S, T]`` and the tensordict in flight.
     """
-    state, transitions = algorithm.env.reset() if state is None else state, []
+    state, transitions = algorithm.world.env.reset() if state is None else state, []
     for _ in range(n_steps):
         state["action"] = algorithm.act(state.exclude(*hidden))["action"]
         watch(state)
         algorithm.update()
-        transition, state = algorithm.env.step_and_maybe_reset(state)
+        transition, state = algorithm.world.env.step_and_maybe_reset(state)
         transitions.append(transition.clone())
         algorithm.store(transition.exclude(*hidden, *(("next", key) for key in hidden)))
     return torch.stack(transitions, dim=1), state
@@ -100,11 +103,11 @@ def by_task(data):
     return [data["state"][data["task"] == task] for task in range(N_TASKS)]
 
 
-def freeze(algorithm, index, embedding=0.0, generator_seed=0):
+def snapshot(algorithm, index, embedding=0.0, generator_seed=0):
     shape = (algorithm.n_tasks, 2)
     task = torch.arange(algorithm.n_tasks).unsqueeze(1).expand(shape)
     generator = torch.Generator().manual_seed(generator_seed)
-    return algorithm.freeze(index, torch.full((*shape, 32), embedding), task, generator)
+    return algorithm.snapshot(index, torch.full((*shape, 32), embedding), task, generator)
 
 
 @pytest.mark.parametrize(
@@ -127,7 +130,7 @@ def test_a_seed_learns_in_a_batch_as_it_does_alone(make, schedule, changes):
         ):
             if ours.ndim:  # not the discount
                 torch.testing.assert_close(ours[index], theirs[0], rtol=1e-4, atol=1e-4, msg=key)
-        frozen, frozen_alone = freeze(batch, index)["actor"], freeze(alone, 0)["actor"]
+        frozen, frozen_alone = snapshot(batch, index).parameters, snapshot(alone, 0).parameters
         for key, value in frozen.items():
             torch.testing.assert_close(value, frozen_alone[key], rtol=1e-4, atol=1e-4)
         losses.append(alone.update())
@@ -143,7 +146,7 @@ def test_latents_are_played_and_learned_from_too(make):
     data, _ = play(algorithm, 24)
     assert data["latent"].shape == (2, 24, 64)
     assert data.get("pixels", None) is None
-    assert freeze(algorithm, 1)["actor"]["mlp.layers.0.weight"].shape == (3, 64, 64)
+    assert snapshot(algorithm, 1).parameters["mlp.layers.0.weight"].shape == (3, 64, 64)
     for value, before in zip(algorithm.meta_actor.parameters(), start, strict=True):
         assert not value.equal(before)
 
@@ -196,7 +199,7 @@ def test_tasks_that_are_never_presented_make_no_difference(make):
         meta, meta_alone = meta_weights(three, index), meta_weights(one, index)
         for key, value in meta.items():
             torch.testing.assert_close(value, meta_alone[key], rtol=1e-4, atol=1e-5)
-        frozen, frozen_alone = freeze(three, index)["actor"], freeze(one, index)["actor"]
+        frozen, frozen_alone = snapshot(three, index).parameters, snapshot(one, index).parameters
         for key, value in frozen.items():
             assert value[1].equal(meta[key])
             assert value[2].equal(meta[key])
@@ -213,7 +216,7 @@ def test_a_critic_stays_as_it_was_until_there_is_data_of_its_task(make):
     start = [p.detach().clone() for p in critics]
     counts, learned = torch.zeros(2, N_TASKS).long(), torch.zeros(2, N_TASKS).bool()
     stages = []
-    state = algorithm.env.reset()
+    state = algorithm.world.env.reset()
     for _ in range(50):
         state = algorithm.act(state)
         if algorithm.update():
@@ -222,7 +225,7 @@ def test_a_critic_stays_as_it_was_until_there_is_data_of_its_task(make):
             changed = (now != before).flatten(2).any(-1)
             assert changed.equal(learned)
         stages.append(tuple(learned.flatten().tolist()))
-        transition, state = algorithm.env.step_and_maybe_reset(state)
+        transition, state = algorithm.world.env.step_and_maybe_reset(state)
         algorithm.store(transition)
         counts[torch.arange(2), transition["task"]] += 1
         assert algorithm.replay.sizes.equal(counts)
@@ -235,7 +238,7 @@ def test_testing_adapts_by_one_plain_step_on_transitions_of_the_task(make):
     algorithm = make(schedule=TaskSchedule((0, 2, 99)), adaptation_size=20, inner_learning_rate=0.5)
     data, _ = play(algorithm, 40)
     for index in range(2):
-        frozen = freeze(algorithm, index, generator_seed=5)["actor"]
+        frozen = snapshot(algorithm, index, generator_seed=5).parameters
         draw = torch.randint(2**63 - 1, (), generator=torch.Generator().manual_seed(5))
         stream = torch.Generator().manual_seed(int(draw))
         shares = torch.rand(2 * 20, generator=stream, dtype=torch.float64).view(2, 20)
@@ -290,7 +293,9 @@ def test_each_half_of_a_tasks_batch_has_its_share_of_demonstrations(make, bank):
 def test_each_test_draws_its_own_transitions(make):
     algorithm = make()
     play(algorithm, 40)
-    first, same, other = (freeze(algorithm, 0, generator_seed=seed)["actor"] for seed in (5, 5, 6))
+    first, same, other = (
+        snapshot(algorithm, 0, generator_seed=seed).parameters for seed in (5, 5, 6)
+    )
     for key, value in first.items():
         assert value.equal(same[key])
         assert not value.equal(other[key])
@@ -299,7 +304,7 @@ def test_each_test_draws_its_own_transitions(make):
 def test_before_there_is_data_a_test_is_of_the_policy_as_it_starts(make):
     algorithm = make()
     for index in range(2):
-        frozen, meta = freeze(algorithm, index)["actor"], meta_weights(algorithm, index)
+        frozen, meta = snapshot(algorithm, index).parameters, meta_weights(algorithm, index)
         assert frozen.keys() == meta.keys()
         for key, value in frozen.items():
             assert value.equal(meta[key].expand_as(value))
@@ -310,7 +315,7 @@ def test_preparing_a_test_leaves_no_trace(make):
     _, state = play(algorithm, 40)
     before = kept(algorithm)
     gradients = [deepcopy(p.grad) for p in algorithm.loss.parameters()]
-    frozen = freeze(algorithm, 1)["actor"]
+    frozen = snapshot(algorithm, 1).parameters
     assert_same(kept(algorithm), before)
     assert_same([p.grad for p in algorithm.loss.parameters()], gradients)
     copied = deepcopy(frozen)
@@ -318,27 +323,27 @@ def test_preparing_a_test_leaves_no_trace(make):
     for key, value in frozen.items():
         assert not value.requires_grad
         assert value.equal(copied[key])
-        assert not value.equal(freeze(algorithm, 1)["actor"][key])
+        assert not value.equal(snapshot(algorithm, 1).parameters[key])
 
 
-def test_frozen_policies_act_as_plain_ones_with_these_weights(make):
+def test_snapshots_act_as_plain_ones_with_these_weights(make):
     algorithm = make()
     play(algorithm, 40)
-    frozen = [freeze(algorithm, index) for index in range(2)]
-    stacked = TensorDict.maybe_dense_stack([TensorDict(one) for one in frozen])
+    frozen = [snapshot(algorithm, index) for index in range(2)]
+    stacked = Policy.stack(frozen)
     state = torch.randn(2, N_TASKS, 5, SIZE, generator=torch.Generator().manual_seed(0))
-    actions = algorithm.act_frozen(stacked, state)
+    actions = stacked.act(state)
     assert actions.shape == (2, N_TASKS, 5, 4)
     for index in range(2):
         for task in range(N_TASKS):
             alone = Actor(SIZE, in_keys=["state"])
-            weights = {key: value[task] for key, value in frozen[index]["actor"].items()}
+            weights = {key: value[task] for key, value in frozen[index].parameters.items()}
             alone.load_state_dict(weights)
             expected = alone(TensorDict({"state": state[index, task]}, [5]))["action"]
             torch.testing.assert_close(actions[index, task], expected)
     # What is learned since makes no difference.
     play(algorithm, 10)
-    assert algorithm.act_frozen(stacked, state).equal(actions)
+    assert stacked.act(state).equal(actions)
 
 
 def test_demonstrations_are_never_read(make):
@@ -350,24 +355,26 @@ def test_demonstrations_are_never_read(make):
         assert ours[key].equal(theirs[key]), key
     assert_same(dict(told.loss.state_dict()), dict(untold.loss.state_dict()))
     for index in range(2):
-        assert_same(freeze(told, index), freeze(untold, index, embedding=float("nan")))
+        blind = snapshot(untold, index, embedding=float("nan"))
+        assert_same(snapshot(told, index).parameters, blind.parameters)
 
 
 @pytest.mark.parametrize("changes", [{}, DEMONSTRATIONS])
 def test_a_restored_run_continues_as_the_saved_one(make, tmp_path, changes):
     algorithm = make(**changes)
     _, state = play(algorithm, 20)
-    save_checkpoint(tmp_path, {"algorithm": algorithm.state_dict(), "state": state.to_dict()})
+    parts = {"algorithm": algorithm.state_dict(), "world": algorithm.world.state_dict()}
+    save_checkpoint(tmp_path, {**parts, "state": state.to_dict()})
     other = make(seeds=(5, 7), **changes)  # other weights, streams and simulations
     play(other, 12)
     saved = load_checkpoint(tmp_path)
-    other.env.reset()
+    other.world.load_state_dict(saved["world"])
     other.load_state_dict(saved["algorithm"])
     ours, _ = play(algorithm, 20, state)
     theirs, _ = play(other, 20, TensorDict(saved["state"], [2]))
     assert (ours == theirs).all()
     assert_same(kept(algorithm), kept(other))
-    assert_same(freeze(algorithm, 1), freeze(other, 1))
+    assert_same(snapshot(algorithm, 1), snapshot(other, 1))
 
 
 @pytest.mark.parametrize(

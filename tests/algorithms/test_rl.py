@@ -8,11 +8,11 @@ import torch
 from tensordict import TensorDict
 
 from bgpo_trl.algorithms import ALGORITHMS
-from bgpo_trl.algorithms.bgpo import BGPO, labeled
+from bgpo_trl.algorithms.bgpo import BGPO
+from bgpo_trl.algorithms.policy import Policy
 from bgpo_trl.algorithms.rl import RL, Problem, RLEntry, make_ddpg, make_learner
 from bgpo_trl.configs import DDPGConfig, RLConfig, TD3Config
 from bgpo_trl.seeding import generators
-from bgpo_trl.transforms import TaskSchedule
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 every_rl = pytest.mark.parametrize("name", RL)
@@ -183,8 +183,7 @@ def test_the_settings_reach_the_loss(name):
 def make_bgpo(bank, make_config):
     def make_bgpo(rl):
         config = make_config("state", f"oracle+{rl}").algorithm
-        schedule = TaskSchedule((0, 0, 0))
-        return BGPO(config, seeds=SEEDS, schedule=schedule, bank=bank.seen(), compose=labeled)
+        return BGPO(config, seeds=SEEDS, bank=bank.seen())
 
     return make_bgpo
 
@@ -193,14 +192,14 @@ def make_bgpo(bank, make_config):
 def test_test_episodes_are_without_noise(make_bgpo, bank, name):
     algorithm = make_bgpo(name)
     embedding, task = bank.held_out().embedding.view(3, 4, 32), torch.zeros(3, 4).long()
-    frozen = TensorDict.maybe_dense_stack(
-        [TensorDict(algorithm.freeze(i, embedding, task, torch.Generator())) for i in range(2)]
+    policy = Policy.stack(
+        [algorithm.snapshot(i, embedding, task, torch.Generator()) for i in range(2)]
     )
     state = torch.randn(2, 3, 4, 16)
     label = torch.tensor([1.0, 0, 0]).expand(2, 3, 4, 3)
-    shown = TensorDict({"state": state, "task_one_hot": label}, [2, 3, 4])
+    shown = TensorDict({"state": state, "context": label}, [2, 3, 4])
     expected = algorithm.learner.actor(shown.view(2, 1, 12))["action"].view(2, 3, 4, 4)
-    first, second = (algorithm.act_frozen(frozen, state) for _ in range(2))
+    first, second = (policy.act(state) for _ in range(2))
     assert first.equal(second)
     torch.testing.assert_close(first, expected)
 
@@ -230,7 +229,7 @@ def test_an_own_algorithm_is_one_entry(make_bgpo, monkeypatch):
     ((config, problem),) = made
     assert (config.name, config.batch_size) == ("own", 16)
     assert (problem.seeds, problem.in_features) == (SEEDS, 16 + 3)
-    assert problem.in_keys == ["state", "task_one_hot"]
+    assert problem.in_keys == ["state", "context"]
     assert problem.return_bounds == (0.0, 1.0)
     assert algorithm.learner.actor.mlp.layers[0].out_features == 5
 

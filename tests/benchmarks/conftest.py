@@ -4,13 +4,11 @@ import shutil
 from dataclasses import replace
 from functools import partial
 
-import ablation
 import pytest
 import torch
 
-from benchmarks import ablation as packaged_ablation
 from benchmarks import ladder
-from bgpo_trl.algorithms import ALGORITHMS
+from bgpo_trl.algorithms import ABLATIONS, ALGORITHMS
 from bgpo_trl.experiments import run as experiment
 from bgpo_trl.figures import of_run as growth
 from bgpo_trl.training import Trainer
@@ -26,13 +24,11 @@ def tiny(monkeypatch, encoders, bank, make_config):
     for name, entry in ALGORITHMS.items():
         small = replace(entry, config=make_config(name=name).algorithm)
         monkeypatch.setitem(ALGORITHMS, name, small)
-    for rung, (name, bgpo, compose) in ladder.RUNGS.items():
-        small = replace(bgpo, max_steps=6)
-        monkeypatch.setitem(ladder.RUNGS, rung, (name, small, compose))
-    for module in (ablation, packaged_ablation):
-        for variant, (compose, bgpo) in module.VARIANTS.items():
-            small = (compose, replace(bgpo, max_steps=6))
-            monkeypatch.setitem(module.VARIANTS, variant, small)
+    for rung, (name, bgpo) in ladder.RUNGS.items():
+        monkeypatch.setitem(ladder.RUNGS, rung, (name, replace(bgpo, max_steps=6)))
+    for name, entry in ABLATIONS.items():
+        small = replace(entry, config=replace(entry.config, max_steps=6))
+        monkeypatch.setitem(ABLATIONS, name, small)
     chance = torch.tensor([0.1, 0.2, 0.3])
     monkeypatch.setattr(experiment, "evaluate_random_policy", lambda **kwargs: chance)
 
@@ -58,9 +54,8 @@ def finished_runs(bank, encoders, make_config, tmp_path_factory):
     def finished(name):
         if name not in directories:
             directories[name] = tmp_path_factory.mktemp(name)
-            make, known = ablation.make_of(name), name if name in ALGORITHMS else "bgpo"
-            config = replace(make_config(name=known), name=name)
-            parts = {"bank": bank, "encoders": encoders, "make": make, "progress": False}
+            config = make_config(name=name)
+            parts = {"bank": bank, "encoders": encoders, "progress": False}
             with Trainer(config, directories[name], **parts) as trainer:
                 trainer.run()
         return directories[name]

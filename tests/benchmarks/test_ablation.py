@@ -11,7 +11,7 @@ import torch
 from torchrl.envs import check_env_specs
 
 from benchmarks import ablation
-from benchmarks.ablation import VARIANTS
+from bgpo_trl.algorithms import ABLATIONS
 from bgpo_trl.algorithms.bgpo import BGPO
 from bgpo_trl.experiments import run as experiment
 from bgpo_trl.files.checkpoint import load_checkpoint
@@ -19,29 +19,26 @@ from bgpo_trl.runs.results import read_rows
 from bgpo_trl.transforms import BehaviorLookup, GroupLookup, TaskSchedule
 
 pytestmark = pytest.mark.usefixtures("easy_world")
-variants = pytest.mark.parametrize("variant", VARIANTS)
+variants = pytest.mark.parametrize("variant", ABLATIONS)
 
 
 @pytest.fixture
-def make(bank, encoders, make_config):
+def make(bank, encoders, make_config, in_world):
     def make(variant, **changes):
-        small = make_config(name="bgpo-single").algorithm
-        config = small if variant is None else VARIANTS[variant][1]
-        config = replace(config, max_steps=small.max_steps, rl=small.rl, **changes)
-        parts = {"seeds": (3, 8), "schedule": TaskSchedule((0, 2, 4)), "encoders": encoders}
-        compose = {} if variant is None else {"compose": VARIANTS[variant][0]}
-        return BGPO(config, bank=bank.seen(), **parts, **compose)
+        config = replace(make_config(name=variant).algorithm, **changes)
+        algorithm = BGPO(config, seeds=(3, 8), bank=bank.seen(), encoders=encoders)
+        return in_world(algorithm, (3, 8), TaskSchedule((0, 2, 4)))
 
     return make
 
 
 def play(algorithm, n_steps):
     """Trains for some steps; returns transitions [S, T]."""
-    state, transitions = algorithm.env.reset(), []
+    state, transitions = algorithm.world.env.reset(), []
     for _ in range(n_steps):
         state = algorithm.act(state)
         algorithm.update()
-        transition, state = algorithm.env.step_and_maybe_reset(state)
+        transition, state = algorithm.world.env.step_and_maybe_reset(state)
         transitions.append(transition.clone())
         algorithm.store(transition)
     return torch.stack(transitions, dim=1)
@@ -86,16 +83,16 @@ FROM_REWARD = {"lae_h", "lae_c", "episode_extrinsic_reward", "episode_intrinsic_
 @variants
 def test_a_variant_writes_the_entries_of_its_transforms_and_no_others(make, variant):
     algorithm = make(variant)
-    for transform in algorithm.env.transform:
+    for transform in algorithm.world.env.transform:
         if isinstance(transform, BehaviorLookup | GroupLookup):
             transform.learn = False
-    check_env_specs(algorithm.env)
-    start = algorithm.act(algorithm.env.reset())
+    check_env_specs(algorithm.world.env)
+    start = algorithm.act(algorithm.world.env.reset())
     expected = COMMON | (FROM_GWR if has_gwr(variant) else set())
     expected |= FROM_REWARD if has_reward(variant) else set()
     expected |= FROM_GROUPS if has_groups(variant) else set()
     assert set(start.keys()) == expected | {"action"}
-    following = algorithm.env.step(start)["next"]
+    following = algorithm.world.env.step(start)["next"]
     rewards = {"extrinsic_reward", "intrinsic_reward"} if has_reward(variant) else set()
     assert set(following.keys()) == expected | {"reward"} | rewards
 
@@ -110,7 +107,8 @@ def test_the_behavior_is_that_of_gwr_or_the_demonstration_itself(make, bank, var
 
     shown = held_out.embedding.view(3, 4, 32)
     for index in range(2):
-        told = algorithm.freeze(index, shown, held_out.task.view(3, 4), torch.Generator())["told"]
+        task = held_out.task.view(3, 4)
+        context = algorithm.snapshot(index, shown, task, torch.Generator()).context
         known = shown
         if has_gwr(variant):
             looked_up = algorithm.gwr.lookup(shown.expand(2, 3, 4, 32)).embedding
@@ -118,7 +116,7 @@ def test_the_behavior_is_that_of_gwr_or_the_demonstration_itself(make, bank, var
             nodes = algorithm.gwr.graph(index).weights
             distances = (shown.reshape(-1, 1, 32) - nodes).norm(dim=-1)
             assert known.reshape(-1, 32).equal(nodes[distances.argmin(-1)])
-        assert told.equal(known)
+        assert context.equal(0.25 * known)
     if has_gwr(variant):
         assert (algorithm.gwr.num_nodes > 2).all()
     else:
@@ -161,11 +159,11 @@ def test_targets_are_bounded_by_what_can_be_earned(make, variant, beta):
 
 
 def test_the_variant_with_both_is_bgpo_bit_for_bit(make):
-    bgpo, variant = make(None), make("gwr+r_int")
+    bgpo, variant = make("bgpo-single"), make("gwr+r_int")
     ours, theirs = play(bgpo, 30), play(variant, 30)
     assert set(ours.keys(True, True)) == set(theirs.keys(True, True))
     assert (ours == theirs).all()
-    start = make(None).learner.loss.state_dict()
+    start = make("bgpo-single").learner.loss.state_dict()
     for key, value in bgpo.learner.loss.state_dict().items():
         assert value.equal(variant.learner.loss.state_dict()[key]), key
         if "target_" not in key and key.endswith("weight"):
@@ -179,20 +177,21 @@ def test_variants_differ_by_transforms_only(make):
     """The paper's four."""
     paper = ("gwr+r_int", "gwr", "r_int", "none")
     algorithms = {variant: make(variant) for variant in paper}
-    starts = {variant: algorithm.env.reset() for variant, algorithm in algorithms.items()}
+    starts = {variant: algorithm.world.env.reset() for variant, algorithm in algorithms.items()}
     reference, start = algorithms["none"], starts["none"]
-    transforms = [type(transform).__name__ for transform in reference.env.transform]
+    transforms = [type(transform).__name__ for transform in reference.world.env.transform]
     assert transforms == [
         *("FrameEncoder", "StepCounter", "DemonstrationSource"),
-        *("RenameTransform", "ClipTransform", "RewardSum"),
+        *("RenameTransform", "ObservationNorm", "ClipTransform", "RewardSum"),
     ]
     for variant, algorithm in algorithms.items():
-        assert algorithm.config == reference.config
-        assert algorithm.in_keys == ["latent", "behavior"]
+        assert replace(algorithm.config, variant="") == replace(reference.config, variant="")
+        assert algorithm.in_keys == ["latent", "context"]
         for key, value in algorithm.learner.loss.state_dict().items():
             assert value.equal(reference.learner.loss.state_dict()[key]), key
-        for kind in ("learner", "source", "simulation", "noise"):
+        for kind in ("learner", "noise"):
             assert_same(algorithm.state_dict()[kind], reference.state_dict()[kind], kind)
+        assert_same(algorithm.world.state_dict(), reference.world.state_dict(), "world")
         for key in ("latent", "task", "demo_index", "demo_embedding"):
             assert starts[variant][key].equal(start[key])
 
@@ -200,28 +199,33 @@ def test_variants_differ_by_transforms_only(make):
         if has_gwr(variant):
             expected[expected.index("RenameTransform")] = "BehaviorLookup"
         if has_reward(variant):
-            expected.insert(-2, "BehaviorMatchingReward")
-        assert [type(transform).__name__ for transform in algorithm.env.transform] == expected
+            expected.insert(-3, "BehaviorMatchingReward")
+        assert [type(transform).__name__ for transform in algorithm.world.env.transform] == expected
 
 
 def test_the_command_line_knows_every_variant():
     choices = get_type_hints(ablation.Arguments)["variant"]
-    assert set(get_args(choices)) == set(VARIANTS)
+    assert set(get_args(choices)) == set(ABLATIONS)
     assert ablation.Arguments().variant == "gwr+r_int"
     own = {field.name for field in fields(ablation.Arguments)}
     assert own - {field.name for field in fields(experiment.Arguments)} == {"variant", "continual"}
 
 
 def test_the_variants_beyond_the_paper_add_one_thing_at_a_time(make):
-    published = VARIANTS["gwr+r_int"][1]
+    published = ABLATIONS["gwr+r_int"].config
     assert not (published.experts or published.even_replay or published.demonstration_share)
     for variant, added in {
-        "even-replay": {"even_replay": True},
-        "experts": {"even_replay": True, "experts": True},
+        "even-replay": {"variant": "bgpo", "even_replay": True},
+        "experts": {"variant": "bgpo", "even_replay": True, "experts": True},
         "demonstrations": {"demonstration_share": 0.25},
-        "all": {"even_replay": True, "experts": True, "demonstration_share": 0.25},
+        "all": {
+            "variant": "bgpo",
+            "even_replay": True,
+            "experts": True,
+            "demonstration_share": 0.25,
+        },
     }.items():
-        assert VARIANTS[variant] == (VARIANTS["gwr+r_int"][0], replace(published, **added))
+        assert ABLATIONS[variant].config == replace(published, **added)
         algorithm = make(variant)
         assert (algorithm.groups is not None) == has_groups(variant)
         assert (algorithm.shown is not None) == (variant in ("demonstrations", "all"))

@@ -54,13 +54,13 @@ def test_without_gwr_b_there_is_nothing_to_infer(run_of, tmp_path, capsys, name)
 def test_policies_are_shown_the_beginning_of_new_demonstrations(run_of, tmp_path, monkeypatch):
     policy = load_run(run_of("bgpo"))
     told = []
-    freeze = policy.algorithm.freeze
+    snapshot = policy.algorithm.snapshot
 
-    def freezing(index, embedding, task, generator):
+    def spy(index, embedding, task, generator):
         told.append((index, embedding, task))
-        return freeze(index, embedding, task, generator)
+        return snapshot(index, embedding, task, generator)
 
-    monkeypatch.setattr(policy.algorithm, "freeze", freezing)
+    monkeypatch.setattr(policy.algorithm, "snapshot", spy)
     rows = one_shot.measure(policy, (0.3, 1.0), 2, 4)
     shown = record_demonstrations(
         tmp_path / "again", per_task=2, held_out_per_task=0, seed=4, progress=False
@@ -72,7 +72,7 @@ def test_policies_are_shown_the_beginning_of_new_demonstrations(run_of, tmp_path
         assert task.tolist() == [[0, 0], [1, 1], [2, 2]]
         for row in range(6):
             n_frames = round(share * int(shown["length"][row]))
-            expected = policy.watch(shown["pixels"][row, :n_frames].numpy()).embedding
+            expected = policy.condition(shown["pixels"][row, :n_frames].numpy()).embedding
             assert torch.allclose(embedding[row // 2, row % 2], expected, atol=1e-5)
         for index in range(2):
             weights = gwr.graph(index).weights

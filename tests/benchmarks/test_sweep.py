@@ -4,7 +4,7 @@ import contextlib
 import csv
 import json
 import sys
-from dataclasses import asdict, replace
+from dataclasses import replace
 from itertools import product
 from types import SimpleNamespace
 
@@ -12,14 +12,15 @@ import pytest
 import sweep
 
 from benchmarks import report, summary
-from benchmarks.ablation import VARIANTS
 from benchmarks.report import markdown
+from bgpo_trl.algorithms import ABLATIONS
 from bgpo_trl.analysis.comparison import GROUPS, Statistics, read_group
 from bgpo_trl.analysis.tables import main_table
 from bgpo_trl.configs import PRESETS
 from bgpo_trl.experiments import merge
 from bgpo_trl.experiments import ray_jobs as jobs
 from bgpo_trl.experiments.ray_jobs import Job
+from bgpo_trl.runs.config_file import settings_of
 from bgpo_trl.training import Trainer
 from suites import nico
 
@@ -40,7 +41,7 @@ def write_run(job):
     """What a run of a job leaves behind, of results that follow from seed and episode."""
     config, folder = job.config, job.directory
     folder.mkdir(parents=True, exist_ok=True)
-    settings = {**asdict(config), "encoders": "some"}
+    settings = settings_of(config, "some")
     (folder / "config.json").write_text(json.dumps(settings))
     told = {"commit": f"c{config.seeds[0] // 2}", "command": "a", "random_success": {"x": 0.5}}
     told["nodes"] = [100 + seed for seed in config.seeds] if config.name == "bgpo" else None
@@ -98,7 +99,7 @@ def test_a_job_is_a_block_of_seeds_of_an_algorithm_in_a_setting(tmp_path):
             assert job.config.task_starts == starts
             algorithm = job.config.algorithm
             if setting == "ablation":
-                assert algorithm == VARIANTS[name][1]
+                assert algorithm == ABLATIONS[name].config
             assert replace(PRESETS["desk"], algorithm=algorithm) == replace(
                 job.config,
                 seeds=PRESETS["desk"].seeds,

@@ -1,19 +1,18 @@
 """Settings read back from config.json."""
 
 import json
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 
 import pytest
 
-from benchmarks import ablation
-from bgpo_trl.algorithms import ALGORITHMS
+from bgpo_trl.algorithms import ABLATIONS, ALGORITHMS
 from bgpo_trl.algorithms.rl import RL
 from bgpo_trl.configs import PRESETS, BGPOConfig, DDPGConfig, RunConfig
-from bgpo_trl.runs.config_file import read_config
+from bgpo_trl.runs.config_file import read_config, settings_of
 
 
 def write(path, config, **changes):
-    path.write_text(json.dumps({**asdict(config), "encoders": "abc", **changes}))
+    path.write_text(json.dumps({**settings_of(config, "abc"), **changes}))
     return path
 
 
@@ -39,11 +38,23 @@ def test_an_rl_algorithm_is_known_by_its_name(tmp_path, name):
     assert type(read.algorithm.rl) is type(rl)
 
 
-@pytest.mark.parametrize("name", ablation.VARIANTS)
-def test_variants_have_the_settings_that_fit(tmp_path, name):
-    config = RunConfig(name=name, algorithm=replace(ablation.VARIANTS[name][1], beta=0.3))
+@pytest.mark.parametrize("name", ABLATIONS)
+def test_ablations_are_read(tmp_path, name):
+    config = RunConfig(name=name, algorithm=replace(ABLATIONS[name].config, beta=0.3))
     path = write(tmp_path / "config.json", config, encoders=None)
     assert read_config(path) == (config, None)
+
+
+@dataclass(frozen=True)
+class OwnConfig(BGPOConfig):
+    curiosity: float = 0.5
+
+
+def test_hyperparameters_of_an_unknown_algorithm_are_of_the_class_that_is_stored(tmp_path):
+    config = RunConfig(name="mine", algorithm=OwnConfig(curiosity=2.0))
+    read, _ = read_config(write(tmp_path / "config.json", config))
+    assert read == config
+    assert type(read.algorithm) is OwnConfig
 
 
 def test_what_an_earlier_version_did_not_know_has_its_default(tmp_path):
@@ -73,7 +84,8 @@ def nested(**rl):
         ({"seeds": 3}, "seeds is 3"),
         ({"seeds": []}, "needs seeds"),
         ({"encoders": 3}, "encoders is 3"),
-        ({"name": "mine", "algorithm": {"momentum": 1}}, "'mine' are of no known algorithm"),
+        ({"name": "mine", "algorithm_class": None}, "'mine' are of no known algorithm"),
+        ({"name": "mine", "algorithm_class": "os.path"}, "'mine' are of no known algorithm"),
     ],
 )
 def test_what_is_no_run_of_this_version_is_refused(tmp_path, changes, said):

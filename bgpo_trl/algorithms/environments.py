@@ -1,0 +1,312 @@
+"""Environments of BGPO and its variants: one composition of transforms each, to read and to copy.
+
+A composition goes from the frames of the simulation to the latents that the policy observes and the
+``context`` that it is conditioned on. Continual and concurrent learning differ only by the schedule
+within `DemonstrationSource`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+from torch.nn.functional import one_hot
+from torchrl.envs import (
+    ClipTransform,
+    Compose,
+    EnvBase,
+    ObservationNorm,
+    RenameTransform,
+    RewardSum,
+    StepCounter,
+    Transform,
+    TransformedEnv,
+    UnaryTransform,
+)
+
+from bgpo_trl.configs import AlgorithmConfig, BGPOConfig
+from bgpo_trl.encoders.representation import Representation
+from bgpo_trl.modules.behavior_groups import BehaviorGroups
+from bgpo_trl.modules.gwr import GWRB
+from bgpo_trl.transforms import (
+    BehaviorLookup,
+    BehaviorMatchingReward,
+    DemonstrationSource,
+    FrameEncoder,
+    GroupLookup,
+)
+
+__all__ = ["VARIANTS", "Variant"]
+
+# Middle and spread of joints (rad), grip and object positions (m) in demonstrations, so that the
+# ground truth comes to the policy in the scale that latents have.
+_STATE_LOC = (0.3, 0.9, 0.9, 0.45, 0.36, 0, 0.68, 0.4, 0.12, 0.655, 0.45, -0.05, 0.645)
+_STATE_LOC += (0.41, -0.21, 0.645)
+_STATE_SCALE = (0.35, 0.25, 0.35, 0.3, 0.06, 0.15, 0.05, *(0.03, 0.05, 0.02) * 3)
+
+
+def bgpo_env(
+    config: BGPOConfig,
+    base_env: EnvBase,
+    source: DemonstrationSource,
+    encoders: Representation | None,
+    gwr: GWRB,
+    groups: BehaviorGroups,
+) -> TransformedEnv:
+    """BGPO with experts: GWR-B infers the behavior, a coarse GWR-B the group whose expert acts."""
+    return TransformedEnv(
+        base_env,
+        Compose(
+            [
+                encode(config, encoders),  # pixels -> latent
+                StepCounter(config.max_steps),
+                source,  # -> task, demo_embedding
+                BehaviorLookup(gwr, learn=True),  # demo_embedding -> behavior
+                GroupLookup(groups, learn=True),  # demo_embedding -> group
+                match_behavior(config, encoders),  # reward + beta * exp(-||behavior - phi_g||)
+                behavior_as_context(config),  # behavior -> context
+                clip(config),
+                sum_rewards("reward", "extrinsic_reward", "intrinsic_reward"),
+            ]
+        ),
+    )
+
+
+def published_env(
+    config: BGPOConfig,
+    base_env: EnvBase,
+    source: DemonstrationSource,
+    encoders: Representation | None,
+    gwr: GWRB,
+    groups: None,
+) -> TransformedEnv:
+    """BGPO as published (Alg. 1): one policy for all behaviors."""
+    return TransformedEnv(
+        base_env,
+        Compose(
+            [
+                encode(config, encoders),
+                StepCounter(config.max_steps),
+                source,
+                BehaviorLookup(gwr, learn=True),
+                match_behavior(config, encoders),
+                behavior_as_context(config),
+                clip(config),
+                sum_rewards("reward", "extrinsic_reward", "intrinsic_reward"),
+            ]
+        ),
+    )
+
+
+def without_bonus_env(
+    config: BGPOConfig,
+    base_env: EnvBase,
+    source: DemonstrationSource,
+    encoders: Representation | None,
+    gwr: GWRB,
+    groups: None,
+) -> TransformedEnv:
+    """The ablation with GWR-B and without the intrinsic reward (Fig. 9)."""
+    return TransformedEnv(
+        base_env,
+        Compose(
+            [
+                encode(config, encoders),
+                StepCounter(config.max_steps),
+                source,
+                BehaviorLookup(gwr, learn=True),
+                behavior_as_context(config),
+                clip(config),
+                sum_rewards("reward"),
+            ]
+        ),
+    )
+
+
+def without_gwr_env(
+    config: BGPOConfig,
+    base_env: EnvBase,
+    source: DemonstrationSource,
+    encoders: Representation | None,
+    gwr: None,
+    groups: None,
+) -> TransformedEnv:
+    """The ablation without GWR-B: the demonstration's own embedding is the behavior (Fig. 9)."""
+    return TransformedEnv(
+        base_env,
+        Compose(
+            [
+                encode(config, encoders),
+                StepCounter(config.max_steps),
+                source,
+                RenameTransform(["demo_embedding"], ["behavior"], create_copy=True),
+                match_behavior(config, encoders),
+                behavior_as_context(config),
+                clip(config),
+                sum_rewards("reward", "extrinsic_reward", "intrinsic_reward"),
+            ]
+        ),
+    )
+
+
+def without_both_env(
+    config: BGPOConfig,
+    base_env: EnvBase,
+    source: DemonstrationSource,
+    encoders: Representation | None,
+    gwr: None,
+    groups: None,
+) -> TransformedEnv:
+    """The ablation without GWR-B and without the intrinsic reward (Fig. 9)."""
+    return TransformedEnv(
+        base_env,
+        Compose(
+            [
+                encode(config, encoders),
+                StepCounter(config.max_steps),
+                source,
+                RenameTransform(["demo_embedding"], ["behavior"], create_copy=True),
+                behavior_as_context(config),
+                clip(config),
+                sum_rewards("reward"),
+            ]
+        ),
+    )
+
+
+def label_env(
+    config: BGPOConfig,
+    base_env: EnvBase,
+    source: DemonstrationSource,
+    encoders: Representation | None,
+    gwr: None,
+    groups: None,
+) -> TransformedEnv:
+    """The upper reference: the context is the one-hot label of the task."""
+    n_tasks = source.schedule.n_tasks
+
+    def label(task: Tensor) -> Tensor:
+        return one_hot(task, n_tasks).float()
+
+    return TransformedEnv(
+        base_env,
+        Compose(
+            [
+                encode(config, encoders),
+                StepCounter(config.max_steps),
+                source,
+                UnaryTransform(["task"], ["context"], fn=label),
+                clip(config),
+                sum_rewards("reward"),
+            ]
+        ),
+    )
+
+
+def no_context_env(
+    config: AlgorithmConfig,
+    base_env: EnvBase,
+    source: DemonstrationSource,
+    encoders: Representation | None,
+    gwr: None = None,
+    groups: None = None,
+) -> TransformedEnv:
+    """The environment of MAML, Dist-NLL and plain DDPG, whose policies observe the state only."""
+    return TransformedEnv(
+        base_env,
+        Compose(
+            [
+                encode(config, encoders),
+                StepCounter(config.max_steps),
+                source,
+                clip(config),
+                sum_rewards("reward"),
+            ]
+        ),
+    )
+
+
+def observation_env(
+    config: AlgorithmConfig, base_env: EnvBase, encoders: Representation | None
+) -> TransformedEnv:
+    """The environment of test episodes, whose policies have been conditioned before."""
+    return TransformedEnv(base_env, Compose([encode(config, encoders), clip(config)]))
+
+
+def encode(config: AlgorithmConfig, encoders: Representation | None) -> Transform:
+    """Returns the transform from the simulation's observation to the state.
+
+    Raises:
+        ValueError: If ``config.state`` is ``"latent"`` and there are no encoders.
+    """
+    if config.state == "latent":
+        if encoders is None:
+            raise ValueError("state='latent' needs trained encoders")
+        return FrameEncoder(encoders.vae, del_keys=True)
+    loc, scale = torch.tensor(_STATE_LOC), torch.tensor(_STATE_SCALE)
+    return ObservationNorm(loc, scale, in_keys=["state"], standard_normal=True)
+
+
+def match_behavior(config: BGPOConfig, encoders: Representation | None) -> BehaviorMatchingReward:
+    """Returns the transform that pays the intrinsic reward.
+
+    Raises:
+        ValueError: If there are no encoders.
+    """
+    if encoders is None:
+        raise ValueError("matching behaviors needs trained encoders")
+    return BehaviorMatchingReward(encoders.lae, beta=config.beta)
+
+
+def behavior_as_context(config: BGPOConfig) -> ObservationNorm:
+    """Returns the transform from the behavior to the context, in a scale that suits the networks.
+
+    Latents have unit scale; an unscaled behavior beside them slows the first task down.
+    """
+    return ObservationNorm(0.0, config.behavior_scale, ["behavior"], ["context"])
+
+
+def clip(config: AlgorithmConfig) -> ClipTransform:
+    """Returns the transform that bounds the state that policies observe.
+
+    An object that was knocked off the table is dozens of deviations away and would dominate. The
+    transform comes after `BehaviorMatchingReward`, which embeds latents as demonstrations are.
+    """
+    return ClipTransform(in_keys=[config.state], low=-5.0, high=5.0)
+
+
+def sum_rewards(*keys: str) -> RewardSum:
+    """Returns the transform that adds up each of some rewards as ``episode_...``."""
+    return RewardSum(in_keys=list(keys), out_keys=[f"episode_{key}" for key in keys])
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A variant of BGPO: its environment, and which modules that needs."""
+
+    make_env: Callable[..., TransformedEnv]
+    """Called with a config, the simulation, a `DemonstrationSource`, the encoders, GWR-B and the
+    groups of behaviors; the last three are None where there are none."""
+    context: Literal["behavior", "label"] | None = "behavior"
+    """Meaning of the ``context`` that the policy is conditioned on; None for no context."""
+    gwr: bool = False
+    """Whether GWR-B infers the behavior."""
+    groups: bool = False
+    """Whether groups of behaviors are told apart, as experts and even replay need."""
+    bonus: bool = False
+    """Whether the intrinsic reward is paid."""
+
+
+VARIANTS: dict[str, Variant] = {
+    "bgpo": Variant(bgpo_env, gwr=True, groups=True, bonus=True),
+    "published": Variant(published_env, gwr=True, bonus=True),
+    "without-bonus": Variant(without_bonus_env, gwr=True),
+    "without-gwr": Variant(without_gwr_env, bonus=True),
+    "without-both": Variant(without_both_env),
+    "label": Variant(label_env, context="label"),
+    "no-context": Variant(no_context_env, context=None),
+}
+"""Variants by ``BGPOConfig.variant``; add one to train it and to load its runs."""

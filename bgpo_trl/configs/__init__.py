@@ -1,0 +1,37 @@
+"""Every default, each with its source: the paper's section, or "ours" and why."""
+
+from bgpo_trl.configs.algorithms import (
+    AlgorithmConfig,
+    BGPOConfig,
+    DistNLLConfig,
+    GWRBConfig,
+    MAMLConfig,
+)
+from bgpo_trl.configs.encoders import (
+    STAGE_PRESETS,
+    RepresentationConfig,
+    SequenceAutoencoderConfig,
+    StageConfig,
+    VAEConfig,
+)
+from bgpo_trl.configs.rl import DDPGConfig, RLConfig, SACConfig, TD3Config
+from bgpo_trl.configs.runs import PRESETS, RunConfig
+
+__all__ = [
+    "PRESETS",
+    "STAGE_PRESETS",
+    "AlgorithmConfig",
+    "BGPOConfig",
+    "DDPGConfig",
+    "DistNLLConfig",
+    "GWRBConfig",
+    "MAMLConfig",
+    "RLConfig",
+    "RepresentationConfig",
+    "RunConfig",
+    "SACConfig",
+    "SequenceAutoencoderConfig",
+    "StageConfig",
+    "TD3Config",
+    "VAEConfig",
+]

@@ -1,0 +1,172 @@
+"""Defaults of BGPO and the baselines, each with its source."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from bgpo_trl.configs.checks import at_least, check, positive
+from bgpo_trl.configs.rl import DDPGConfig, RLConfig
+
+
+@dataclass(frozen=True)
+class AlgorithmConfig:
+    """What all algorithms have in common, so that they are compared on equal terms."""
+
+    state: Literal["latent", "state"] = "latent"
+    """What the policy sees of the world: z of a frame, or (for the ladder) the ground truth."""
+    max_steps: int = 50
+    """Steps of an episode (Sec. IV-B)."""
+    rl: RLConfig = field(default_factory=DDPGConfig)
+    """The RL algorithm f_RL."""
+    demonstration_share: float = 0.0
+    """Share of an update's transitions that are taken from the demonstrations shown in training
+    episodes so far, with actions that the inverse model inferred. The paper has none."""
+
+    def __post_init__(self) -> None:
+        known = self.state in ("latent", "state")
+        share = self.demonstration_share
+        check(
+            self,
+            ("state", known, "latent or state"),
+            ("demonstration_share", 0 <= share < 1, "at least 0 and below 1"),
+        )
+        at_least(self, 1, "max_steps")
+        if share and self.rl.warmup_steps < self.max_steps:
+            # Else seeds would learn from demonstrations sooner or later than each would alone.
+            raise ValueError(
+                f"with a demonstration_share, warmup_steps ({self.rl.warmup_steps}) must be at "
+                f"least max_steps ({self.max_steps}), so that every seed was shown one by then"
+            )
+
+
+def _refuse_all_but_ddpg(who: str, rl: RLConfig) -> None:
+    if not isinstance(rl, DDPGConfig):
+        raise ValueError(
+            f"{who} is defined over DDPG, not {rl.name!r}: leave its rl as it is; BGPO, its "
+            "ablations and the references take any"
+        )
+
+
+@dataclass(frozen=True)
+class GWRBConfig:
+    """Growth of GWR-B; its other settings are those of Table 1 (`GWRB`)."""
+
+    activity_threshold: float = 0.8
+    """Activity below which a node is inserted (Table 1)."""
+    habituation_threshold: float = 0.15
+    """Habituation below which a node may have another inserted beside it (Table 1)."""
+    activity_scale: float = 0.25
+    """Factor of distances in the activity. Ours: with 1, as in the paper, each demonstration is so
+    far from the next that a node is made of every third; with 0.25 there are about 300 after 6,000
+    episodes."""
+
+    def __post_init__(self) -> None:
+        positive(self, "activity_scale")
+        check(
+            self,
+            ("activity_threshold", 0 < self.activity_threshold < 1, "between 0 and 1"),
+            ("habituation_threshold", 0 < self.habituation_threshold <= 1, "above 0, at most 1"),
+        )
+
+
+@dataclass(frozen=True)
+class BGPOConfig(AlgorithmConfig):
+    """Behavior-guided policy optimization (Alg. 1)."""
+
+    variant: str = "bgpo"
+    """Its environment, one of `bgpo_trl.algorithms.environments.VARIANTS`."""
+    beta: float = 0.1
+    """Weight of the intrinsic reward (Sec. IV-A)."""
+    behavior_scale: float = 0.25
+    """Factor of b where actor and critic read it. Ours: 1 in the paper, which slows down the first
+    task (docs/learning.md)."""
+    gwr: GWRBConfig = field(default_factory=GWRBConfig)
+    """The network whose nodes are behaviors."""
+    experts: bool = True
+    """An actor and a critic for each group of behaviors. Ours: one of each for all in the paper,
+    which learns a new task slowly (docs/learning.md)."""
+    even_replay: bool = True
+    """Draw an update's transitions in equal parts from the groups played last. Ours: from all alike
+    in the paper."""
+    demonstration_share: float = 0.25
+    """See `AlgorithmConfig`. Ours: triples the success of a task's first hundred episodes."""
+    active_groups: int = 3
+    """Groups that an update learns from at most, those played last. Ours."""
+    expert_batch_size: int = 64
+    """Transitions of each active group in an update of experts, as many as MAML and Dist-NLL have
+    of each task. Ours; without experts it is the RL algorithm's ``batch_size`` for all together."""
+    groups: GWRBConfig = field(
+        default_factory=lambda: GWRBConfig(activity_threshold=0.525, habituation_threshold=0.5)
+    )
+    """The coarse network that finds the groups. Ours: so it finds one group, seldom two, for each
+    of NICO's tasks (docs/learning.md)."""
+
+    @property
+    def grouped(self) -> bool:
+        """Whether groups of behaviors are told apart."""
+        return self.experts or self.even_replay
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        at_least(self, 0, "beta")
+        at_least(self, 1, "active_groups", "expert_batch_size")
+        positive(self, "behavior_scale")
+        holds = self.even_replay or not self.experts
+        check(self, ("even_replay", holds, "set where there are experts"))
+
+
+@dataclass(frozen=True)
+class MAMLConfig(AlgorithmConfig):
+    """Model-agnostic meta-learning over DDPG (Sec. IV-B; Finn et al., 2017)."""
+
+    inner_learning_rate: float = 1.0
+    """Length of the one gradient step by which the policy adapts to a task. Ours: long enough to
+    change what the policy does."""
+    task_batch_size: int = 64
+    """Transitions of each task in an update: half of them to adapt to, half to judge the adapted
+    policy by. Ours: three tasks together see more than the 128 of the other algorithms."""
+    adaptation_size: int = 256
+    """Transitions of the test task that the policy adapts to before its test episodes. Sec. IV-B
+    has "256 adaptation trajectories", about 50 times as much."""
+
+    rl: DDPGConfig = field(default_factory=DDPGConfig)
+    """Its own steps are DDPG's."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _refuse_all_but_ddpg("MAML", self.rl)
+        at_least(self, 0, "inner_learning_rate")
+        at_least(self, 1, "adaptation_size")
+        halves = self.task_batch_size >= 2 and self.task_batch_size % 2 == 0
+        check(self, ("task_batch_size", halves, "even and at least 2"))
+
+
+@dataclass(frozen=True)
+class DistNLLConfig(AlgorithmConfig):
+    """Policy distillation with a negative log-likelihood (Sec. IV-B; Rusu et al., 2016)."""
+
+    task_batch_size: int = 64
+    """Transitions of each task in an update of its teacher. Ours: three teachers together see more
+    than the 128 of the other algorithms."""
+    samples: int = 1_000
+    """States of each task that its head learns from at the end of an episode (Sec. IV-B)."""
+    distillation_batch_size: int = 125
+    """States of each task a gradient step, so eight steps an episode. Ours: the paper does not
+    say."""
+    learning_rate: float = 1e-3
+    """Rate of Adam for the multi-task policy. Ours: the teachers' own."""
+
+    rl: DDPGConfig = field(default_factory=DDPGConfig)
+    """Its teachers are DDPG's."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _refuse_all_but_ddpg("Dist-NLL", self.rl)
+        at_least(self, 1, "task_batch_size", "samples")
+        positive(self, "learning_rate")
+        if self.distillation_batch_size < 1 or self.samples % self.distillation_batch_size:
+            raise ValueError(
+                f"samples ({self.samples}) must be a multiple of distillation_batch_size "
+                f"({self.distillation_batch_size})"
+            )

@@ -1,0 +1,69 @@
+"""The world that an algorithm is trained in: simulations, and draws of tasks and demonstrations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+
+from bgpo_trl.algorithms import Algorithm
+from bgpo_trl.data.bank import DemonstrationBank
+from bgpo_trl.envs import NicoEnv
+from bgpo_trl.seeding import generators, stream_seed
+from bgpo_trl.transforms import DemonstrationSource, TaskSchedule
+
+__all__ = ["World"]
+
+
+class World:
+    """Simulations of a batch of seeds, with the transforms of an algorithm around them.
+
+    Args:
+        algorithm: Makes the environment.
+        seeds: One for each element of the batch.
+        schedule: When each task is presented.
+        bank: Embedded demonstrations for training episodes.
+
+    Attributes:
+        env: The algorithm's composition of transforms.
+        source: The transform that draws task and demonstration of each episode.
+        simulation: The environment without its transforms.
+    """
+
+    def __init__(
+        self,
+        algorithm: Algorithm,
+        *,
+        seeds: Sequence[int],
+        schedule: TaskSchedule,
+        bank: DemonstrationBank,
+    ) -> None:
+        batch = torch.Size([len(seeds)])
+        self.source = DemonstrationSource(
+            bank, schedule, batch_size=batch, generator=generators(seeds, "demonstrations")
+        )
+        self.simulation = NicoEnv(
+            bank.tasks,
+            batch_size=batch,
+            seed=[stream_seed(seed, "env") for seed in seeds],
+            observation="pixels" if algorithm.config.state == "latent" else "state",
+        )
+        self.env = algorithm.make_env(self.simulation, self.source)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Returns all that future observations depend on but the tensordict in flight."""
+        return {
+            "source": dict(self.source.state_dict()),
+            "simulation": self.simulation.simulation_state(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continues from what `state_dict` returned."""
+        self.env.reset()  # Transforms make their caches at the first reset.
+        self.source.load_state_dict(state["source"])
+        self.simulation.load_simulation_state(state["simulation"])
+
+    def close(self) -> None:
+        """Closes the simulations."""
+        self.simulation.close()
