@@ -7,16 +7,8 @@ It differs from `continual.py` by the schedule alone, and leaves the same files 
 
 from __future__ import annotations
 
-from dataclasses import replace
-
-from bgpo_trl.experiments.run import Arguments, command_line, run_config, run_experiment
-
-
-def main(arguments: Arguments) -> None:
-    """Runs the experiment."""
-    config = run_config(arguments)
-    print(run_experiment(arguments, "concurrent", replace(config, task_starts=(0, 0, 0))))
-
+from bgpo_trl.experiments.paper import concurrent as main
+from bgpo_trl.experiments.run import command_line
 
 if __name__ == "__main__":
     command_line(main, __doc__)

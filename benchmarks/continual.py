@@ -9,13 +9,8 @@ writes a run directory with ``config.json``, ``train.csv``, ``eval.csv``, ``chec
 
 from __future__ import annotations
 
-from bgpo_trl.experiments.run import Arguments, command_line, run_config, run_experiment
-
-
-def main(arguments: Arguments) -> None:
-    """Runs the experiment."""
-    print(run_experiment(arguments, "continual", run_config(arguments)))
-
+from bgpo_trl.experiments.paper import continual as main
+from bgpo_trl.experiments.run import command_line
 
 if __name__ == "__main__":
     command_line(main, __doc__)

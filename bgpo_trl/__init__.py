@@ -7,15 +7,21 @@ from suites import opengl as opengl
 
 if TYPE_CHECKING:
     from bgpo_trl.policy import TrainedPolicy, load_run
+
+    __version__: str
 else:
 
     def __getattr__(name):
-        # TorchRL and MuJoCo take seconds to import: only who asks for these waits for them.
+        if name == "__version__":
+            from importlib.metadata import version
+
+            return version("bgpo_trl")
         if name not in __all__:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        from bgpo_trl import policy as trained_policy
+        # TorchRL and MuJoCo take seconds to import: only users of these wait for them.
+        from bgpo_trl import policy
 
-        return getattr(trained_policy, name)
+        return getattr(policy, name)
 
 
-__all__ = ["TrainedPolicy", "load_run"]
+__all__ = ["TrainedPolicy", "__version__", "load_run"]

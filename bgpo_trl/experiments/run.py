@@ -7,7 +7,7 @@ import json
 import shlex
 import subprocess
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -357,15 +357,23 @@ def commit_of_code() -> str:
 
 
 def command_line(
-    main: Callable[[Any], None], description: str | None, arguments: type = Arguments
+    main: Callable[[Any], None],
+    description: str | None,
+    arguments: type = Arguments,
+    options: Sequence[str] | None = None,
 ) -> None:
-    """Runs ``main`` with the arguments of the command line.
+    """Runs ``main`` with the arguments of the command line; an expected error becomes one line.
 
-    What a person can mend is told in one line.
+    Args:
+        main: Called with the arguments.
+        description: For ``--help``.
+        arguments: Class of the arguments.
+        options: Command line of a subcommand of ``python -m bgpo_trl``; that of the script if None.
     """
+    program = None if options is None else shlex.join(["python", *sys.argv[:3]])
     try:
         kind: Any = Annotated[arguments, tyro.conf.OmitArgPrefixes]
-        main(tyro.cli(kind, description=description))
+        main(tyro.cli(kind, prog=program, description=description, args=options))
     except (ValueError, OSError, RuntimeError) as error:
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:

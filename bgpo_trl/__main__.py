@@ -1,0 +1,41 @@
+"""Command line of the installed package: ``python -m bgpo_trl continual --preset quick``."""
+
+from __future__ import annotations
+
+import sys
+
+USAGE = """usage: python -m bgpo_trl COMMAND [OPTIONS]
+
+  continual   learn the tasks one after the other
+  concurrent  learn all tasks from the start
+  ablation    learn with a variant of BGPO
+  doctor      check this installation
+
+python -m bgpo_trl COMMAND --help shows the options."""
+
+
+def main(arguments: list[str]) -> None:
+    """Runs a command.
+
+    Args:
+        arguments: The command and its options.
+    """
+    name, *options = arguments or ["--help"]
+    if name == "doctor":
+        from bgpo_trl import doctor
+
+        sys.exit(doctor.main(options))
+    if name not in ("continual", "concurrent", "ablation"):
+        sys.exit(USAGE if name in ("-h", "--help") else f"error: no command {name!r}\n{USAGE}")
+    # Imported here: the others need neither TorchRL nor the seconds that it takes.
+    from bgpo_trl.experiments import paper
+    from bgpo_trl.experiments.run import Arguments, command_line
+
+    kind = paper.AblationArguments if name == "ablation" else Arguments
+    run = getattr(paper, name)
+    sys.argv = ["-m", "bgpo_trl", name, *options]  # which a run's summary.json stores
+    command_line(run, run.__doc__, kind, options)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

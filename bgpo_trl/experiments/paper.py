@@ -1,0 +1,53 @@
+"""The paper's three experiments: tasks in sequence, all tasks from the start, the ablation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from bgpo_trl.algorithms import ABLATIONS
+from bgpo_trl.experiments.run import Arguments, run_config, run_experiment
+
+__all__ = ["AblationArguments", "ablation", "concurrent", "continual"]
+
+
+def continual(arguments: Arguments) -> None:
+    """Trains an algorithm on tasks presented one after the other (Fig. 8)."""
+    print(run_experiment(arguments, "continual", run_config(arguments)))
+
+
+def concurrent(arguments: Arguments) -> None:
+    """Trains an algorithm on tasks that are all presented from the start (Fig. 6)."""
+    config = replace(run_config(arguments), task_starts=(0, 0, 0))
+    print(run_experiment(arguments, "concurrent", config))
+
+
+@dataclass(frozen=True)
+class AblationArguments(Arguments):
+    """Trains a variant of BGPO and draws its success."""
+
+    variant: Literal[
+        "gwr+r_int", "gwr", "r_int", "none", "even-replay", "experts", "demonstrations", "all"
+    ] = "gwr+r_int"
+    """GWR-B and the intrinsic reward as published; one of them; or none. Or both, and besides:
+    replay drawn evenly over groups of behaviors; experts for the groups too; demonstrations as
+    experience; or all of it."""
+    continual: bool = False
+    """Tasks one after the other instead of all from the start."""
+
+
+def ablation(arguments: AblationArguments) -> None:
+    """Trains a variant of BGPO (Fig. 9).
+
+    Raises:
+        ValueError: If ``--algorithm`` is given.
+    """
+    if arguments.algorithm != "bgpo":
+        raise ValueError("--algorithm: the variants are BGPO's")
+    config = run_config(arguments)
+    algorithm = replace(ABLATIONS[arguments.variant].config, rl=config.algorithm.rl)
+    config = replace(config, name=arguments.variant, algorithm=algorithm)
+    if not arguments.continual:
+        config = replace(config, task_starts=(0, 0, 0))
+    name = "ablation-continual" if arguments.continual else "ablation"
+    print(run_experiment(arguments, name, config))
