@@ -249,7 +249,9 @@ def test_the_run_is_left_as_it_is(trainer_of, load):
 
 
 def test_nothing_is_done_before_something_was_shown(load):
-    with pytest.raises(ValueError, match=r"has seen no demonstration: show it one with watch\(\)"):
+    with pytest.raises(
+        ValueError, match=r"has seen no demonstration: show it one with condition\(\)"
+    ):
         load().act(noise(0, 1)[0])
 
 
@@ -326,7 +328,7 @@ def see_the_truth(run):
         (see_the_truth, "learned from the ground truth"),
         (widen, r"checkpoint does not fit .*config.json \(.*\): use the version of the code"),
         (lambda run: rewrite(run, seeds=[3, 8, 9]), r"checkpoint does not fit"),
-        (lambda run: rewrite(run, name="r_int"), "of 'r_int', which is not in ALGORITHMS: give ma"),
+        (lambda run: rewrite(run, name="mine"), "of 'mine', which is not in ALGORITHMS: give ma"),
     ],
 )
 def test_what_cannot_be_loaded_is_refused_in_a_line(trainer_of, tmp_path, spoil, said):

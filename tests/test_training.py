@@ -258,7 +258,7 @@ def test_a_run_can_be_interrupted_again_and_again(run_of, make, make_config, tmp
             trainer.run()
     saved = load_checkpoint(tmp_path / "checkpoint")
     assert saved["env_steps"] == sum(steps)
-    assert any(saved["waiting"])  # snapshots of one seed, for an evaluation of both
+    assert any(saved["evaluator"]["waiting"])  # snapshots of one seed, for an evaluation of both
     assert saved["algorithm"]["learner"]["optimizer"]["state"]  # it has begun to learn
     if name == "dist-nll":
         assert all(saved["algorithm"]["tasks"])

@@ -181,7 +181,7 @@ def test_tasks_that_are_never_presented_make_no_difference(make):
     three, one = (make(schedule=TaskSchedule(s), rl=ddpg) for s in ((0, 99, 99), (0,)))
     start = deepcopy(dict(three.loss.state_dict()))
     ours, theirs = play(three, 30)[0], play(one, 30)[0]
-    assert ours["demo_index"].equal(theirs["demo_index"])
+    assert ours["demo_embedding"].equal(theirs["demo_embedding"])
     torch.testing.assert_close(ours["action"], theirs["action"], rtol=1e-4, atol=1e-5)
     for key, value in three.loss.state_dict().items():
         if value.ndim:  # not the discount

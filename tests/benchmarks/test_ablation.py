@@ -72,7 +72,7 @@ def has_groups(variant):
 
 
 COMMON = {
-    *("latent", "step_count", "task", "demo_embedding", "demo_index", "behavior"),
+    *("latent", "step_count", "task", "demo_embedding", "demo_index", "behavior", "context"),
     *("episode_reward", "done", "terminated", "truncated"),
 }
 FROM_GWR = {"behavior_node"}
