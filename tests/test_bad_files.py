@@ -139,9 +139,10 @@ CASES = {
     "bank in no folder": (
         lambda f: bank().save(f / "file" / "b", encoder_id="x"), "cannot make the", "another"),
     # demonstrations
-    "no dataset": (lambda f: load_demonstrations(f / "nowhere"), "is no dataset", "record it anew"),
+    "no dataset": (
+        lambda f: load_demonstrations(f / "nowhere"), "is not a dataset", "record it again"),
     "dataset that is a file": (
-        lambda f: load_demonstrations(f / "file"), "is no dataset", "record it anew with"),
+        lambda f: load_demonstrations(f / "file"), "is not a dataset", "record it again with"),
     "recording into a file": (
         lambda f: record_demonstrations(f / "file", **TINY), "cannot make the folder", "another"),
     "recording of no task": (
