@@ -132,7 +132,8 @@ CASES = {
     "encoders of another scene": (
         lambda f: load_representation(scene_version="mars"), "is scene mars", "--train-encoders"),
     "no bank": (lambda f: load_bank(f / "a"), "there is no demonstration bank", "--train-encoders"),
-    "encoders for a bank": (lambda f: load_bank(default_weights()), "no bank", "--train-encoders"),
+    "encoders for a bank": (
+        lambda f: load_bank(default_weights()), "not a bank", "--train-encoders"),
     "bank of other encoders": (
         lambda f: DemonstrationBank.load(f / "bank", encoder_id="y"),
         "'encoder_id': 'x'", "--train-encoders"),
