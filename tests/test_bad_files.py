@@ -87,7 +87,7 @@ CASES = {
         "has the columns date,temperature", "choose another run directory"),
     "csv of rubbish": (
         lambda f: CsvFile(f / "binary" / "eval.csv", EVAL_COLUMNS),
-        "is no CSV file, this run writes algorithm", "choose another run directory"),
+        "is not a CSV file, this run writes algorithm", "choose another run directory"),
     "figure in a file": (
         lambda f: save_figure(figure(), f / "file" / "a.png"), "cannot make the folder", "another"),
     # checkpoints
@@ -103,14 +103,16 @@ CASES = {
     "run without a test": (
         lambda f: curves(f / "unevaluated"), "holds no test episode", "let the run evaluate first"),
     "table of something else": (
-        lambda f: curves(f / "foreign"), "lacks algorithm, episode", "name another run"),
+        lambda f: curves(f / "foreign"),
+        "lacks the columns algorithm, episode", "name another run"),
     "row with a word for a number": (
         lambda f: curves(f / "damaged"), "line 2 is damaged", "resume the run"),
     "row cut short": (lambda f: curves(f / "cut"), "line 2 is damaged", "resume the run"),
-    "binary table": (lambda f: curves(f / "binary"), "is no CSV file", "name another run"),
+    "binary table": (lambda f: curves(f / "binary"), "is not a CSV file", "name another run"),
     "table that talks to the terminal": (
-        lambda f: curves(f / "terminal"), "is no CSV file of a run (control", "name another run"),
-    "table that is a folder": (lambda f: read_rows(f), "is no CSV file", "name another run"),
+        lambda f: curves(f / "terminal"),
+        "is not a CSV file of a run (control", "name another run"),
+    "table that is a folder": (lambda f: read_rows(f), "is not a CSV file", "name another run"),
     "test of an unknown task": (
         lambda f: curves(f / "stranger"), "'juggle'", "none of grasp_glass"),
     "curves of a damaged table": (
