@@ -106,7 +106,7 @@ def backward_transfer(matrix: ArrayLike) -> Array:
     """
     matrix = np.asarray(matrix, float)
     if matrix.shape[-1] != matrix.shape[-2]:
-        raise ValueError(f"one phase a task is needed, got {list(matrix.shape[-2:])}")
+        raise ValueError(f"matrix must have one phase per task, got {list(matrix.shape[-2:])}")
     learned = np.diagonal(matrix, axis1=-2, axis2=-1)
     return _mean((matrix[..., -1, :] - learned)[..., :-1], axis=-1)
 
@@ -245,7 +245,7 @@ def interquartile_mean(scores: ArrayLike) -> float:
     """
     ordered = np.sort(np.asarray(scores, float), axis=None)
     if not ordered.size or not np.isfinite(ordered).all():
-        raise ValueError("scores must be finite, and at least one: leave out what was not tested")
+        raise ValueError("scores must be finite and not empty: leave out what was not tested")
     cut = ordered.size // 4
     return float(ordered[cut : ordered.size - cut].mean())
 
@@ -324,8 +324,8 @@ def _check_episodes(success: Array, episodes: NDArray, axis: int) -> None:
     n_evaluations = success.shape[axis] if success.ndim >= -axis else 0
     if not n_evaluations or episodes.shape != (n_evaluations,) or (np.diff(episodes) <= 0).any():
         raise ValueError(
-            "one evaluation at least is needed, and for each its training episodes, increasing: "
-            f"got success {[*success.shape]} for episodes {episodes.tolist()}"
+            "each evaluation needs a training episode, in increasing order: got success "
+            f"{[*success.shape]} for episodes {episodes.tolist()}"
         )
 
 
