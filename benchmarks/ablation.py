@@ -1,11 +1,11 @@
 """The paper's third experiment: BGPO without GWR-B, without the intrinsic reward, without both.
 
-Besides: what experts, even replay and demonstrations add to it.
+Further variants add even replay, experts and demonstrations.
 
     python benchmarks/ablation.py --variant r_int --preset quick
 
-The variants differ by the transforms below and by nothing else (Fig. 9). All tasks are presented
-from the start.
+Variants differ only in the transforms and settings below (Fig. 9). All tasks are presented from
+the start.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from bgpo_trl.transforms import BehaviorLookup
 
 
 def demonstration_itself() -> RenameTransform:
-    """Returns what stands in for GWR-B: the demonstration's embedding is the behavior."""
+    """Return the transform that replaces GWR-B: the demonstration's embedding is the behavior."""
     return RenameTransform(["demo_embedding"], ["behavior"], create_copy=True)
 
 
 def published(parts: Parts) -> Composition:
-    """BGPO's own composition, with GWR-B and the intrinsic reward."""
+    """Return BGPO's own composition, with GWR-B and the intrinsic reward."""
     return Composition(
         infer=[BehaviorLookup(parts.gwr, learn=True)],
         reward=[parts.behavior_matching_reward()],
@@ -59,31 +59,31 @@ VARIANTS: dict[str, tuple[Callable[[Parts], Composition], BGPOConfig]] = {
     "demonstrations": (published, replace(_SINGLE, demonstration_share=0.25)),
     "all": (published, BGPOConfig()),
 }
-"""The transforms and the settings of each variant. The first four are the paper's; the others add
-what it does not have, one thing at a time, and all of it."""
+"""Transforms and settings of each variant. The first four are the paper's; the others add to it:
+even replay, experts on top, demonstrations, and all three."""
 
 
 def make_of(name: str) -> Callable[..., BGPO] | None:
-    """Returns the function that makes the variant of that name; None for another name."""
+    """Return the factory of a variant; ``None`` for any other name."""
     return partial(BGPO, compose=VARIANTS[name][0]) if name in VARIANTS else None
 
 
 @dataclass(frozen=True)
 class Arguments(Common):
-    """Trains a variant of BGPO and draws its success."""
+    """Train a variant of BGPO and plot its success."""
 
     variant: Literal[
         "gwr+r_int", "gwr", "r_int", "none", "even-replay", "experts", "demonstrations", "all"
     ] = "gwr+r_int"
-    """GWR-B and the intrinsic reward as published; one of them; or none. Or both, and besides:
-    replay drawn evenly over groups of behaviors; experts for the groups too; demonstrations as
-    experience; or all of it."""
+    """Parts of BGPO: gwr+r_int (as published), gwr, r_int or none. On top of gwr+r_int: even-replay
+    (over groups of behaviors), experts (even replay and an expert per group), demonstrations
+    (replayed as experience), or all."""
     continual: bool = False
-    """Tasks one after the other instead of all from the start."""
+    """Present the tasks one after another instead of all from the start."""
 
 
 def main(arguments: Arguments) -> None:
-    """Runs a variant."""
+    """Run a variant."""
     if arguments.algorithm != "bgpo":
         raise ValueError("--algorithm: the variants are BGPO's")
     config = run_config(arguments)

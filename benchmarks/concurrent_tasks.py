@@ -2,7 +2,7 @@
 
     python benchmarks/concurrent_tasks.py --preset quick
 
-It differs from `continual.py` by the schedule alone, and leaves the same files behind.
+Differs from `continual.py` only in the schedule of tasks, and writes the same files.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from bgpo_trl.experiments.run import Arguments, command_line, run_config, run_ex
 
 
 def main(arguments: Arguments) -> None:
-    """Runs the experiment."""
+    """Run the experiment."""
     config = run_config(arguments)
     print(run_experiment(arguments, "concurrent", replace(config, task_starts=(0, 0, 0))))
 

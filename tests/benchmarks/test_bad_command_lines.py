@@ -66,7 +66,7 @@ CASES = [
     ("continual.py --device cuda:99", "no device 'cuda:99'", "use auto or cpu"),
     ("concurrent_tasks.py --device gpu", "no device 'gpu'", "use auto or cpu"),
     ("ablation.py --algorithm maml", "--algorithm", "the variants are BGPO's"),
-    ("ladder.py --rungs", "--rungs names none", "name some of a, b, c, d"),
+    ("ladder.py --rungs", "--rungs is empty", "name some of a, b, c, d"),
     ("ladder.py --episodes 0", "episodes", "must be at least 1, got 0"),
     ("ladder.py --threads 0", "threads", "must be at least 1, got 0"),
     # where it goes
@@ -91,10 +91,10 @@ CASES = [
     ("summary.py", "name the directory", "of a run"),
     ("summary.py file", "file/eval.csv is missing", "let the run in file finish"),
     ("summary.py unevaluated", "no test episode", "let the run evaluate first"),
-    ("report.py nowhere", "nowhere is no directory", "name the one that holds the runs"),
+    ("report.py nowhere", "nowhere is not a directory", "name the one that holds the runs"),
     ("report.py empty", "empty holds none of the runs", "that the figures need"),
     # measurements
-    ("throughput.py --parts", "--parts names none", "name some of frames"),
+    ("throughput.py --parts", "--parts is empty", "name some of frames"),
     ("throughput.py --rounds 0", "--rounds", "at least 1, got 0"),
     ("throughput.py --threads 0", "--threads", "at least 1, got 0"),
     ("gwr.py --nodes", "--nodes", "one or more, of at least 2"),
