@@ -177,7 +177,7 @@ def test_without_opengl_no_recording_is_begun(folder, monkeypatch):
 @pytest.mark.parametrize(
     ("backend", "told"),
     [
-        ("vulkan", "error: MUJOCO_GL is 'vulkan', which is no OpenGL backend: set it to egl"),
+        ("vulkan", "error: MUJOCO_GL is 'vulkan', which is not an OpenGL backend: set it to egl"),
         ("disabled", "error: no OpenGL context from the disabled backend"),
     ],
 )
