@@ -1,4 +1,4 @@
-"""A baseline of one's own, trained and tested like all others: python examples/own_baseline.py."""
+"""A custom baseline, trained and tested like all others: python examples/own_baseline.py."""
 
 from functools import partial
 
@@ -14,7 +14,7 @@ from bgpo_trl.training import Trainer
 
 
 class NearestNeighbors(Algorithm):
-    """k nearest neighbors (Pari et al., 2021) of states [M, 96], and the actions [M, 4] there."""
+    """Weighted k nearest neighbors (Pari et al., 2021) from states ``[M, 96]`` to actions ``[M, 4]``."""
 
     def __init__(self, config, *, states, actions, encoders, **world):
         super().__init__(config, encoders=encoders, **world)
@@ -29,7 +29,7 @@ class NearestNeighbors(Algorithm):
         action = self.choose(tensordict["latent"], tensordict["demo_embedding"])
         return tensordict.set("action", action)
 
-    def store(self, transition): ...  # for updates, of which there are none
+    def store(self, transition): ...  # There is nothing to update.
 
     def update(self):
         return {}
