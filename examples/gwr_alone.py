@@ -26,7 +26,7 @@ if __name__ == "__main__":
     generator = torch.Generator().manual_seed(0)
     points, ring = point_cloud(4_000, generator)
     # A point farther than -log(0.8) = 0.22 from all nodes adds a node. Clusters separate because
-    # an edge is removed once its node has won 15 times without renewing it.
+    # an edge is removed once one of its nodes has won 15 times without renewing it.
     gwr = GWRB(2, activity_threshold=0.8, max_age=15, init="data")
     for point in points:
         gwr.adapt(point)

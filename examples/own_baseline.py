@@ -14,7 +14,7 @@ from bgpo_trl.training import Trainer
 
 
 class NearestNeighbors(Algorithm):
-    """Weighted k nearest neighbors (Pari et al., 2021) from states ``[M, 96]`` to actions ``[M, 4]``."""
+    """k nearest neighbors (Pari et al., 2021): states ``[M, 96]`` with actions ``[M, 4]``."""
 
     def __init__(self, config, *, states, actions, encoders, **world):
         super().__init__(config, encoders=encoders, **world)
