@@ -142,7 +142,7 @@ def read_sections(directory: Path, out: Path) -> tuple[list[Section], dict[str, 
     sections.append(Section("The paper's claims", claims(groups, statistics), notes=[LEVEL]))
     table = additions(groups, statistics)
     if table:
-        sections.append(Section("What is added to the paper's algorithm", table, notes=[LEVEL]))
+        sections.append(Section("Additions to the paper's algorithm", table, notes=[LEVEL]))
     return sections, runs
 
 

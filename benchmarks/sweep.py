@@ -78,7 +78,7 @@ def make_jobs(arguments: Arguments) -> dict[Path, list[Job]]:
     if arguments.block < 1:
         raise ValueError(f"block must be at least 1, got {arguments.block}")
     if arguments.cpus_per_run <= 0 or arguments.gpus_per_run < 0:
-        raise ValueError("--cpus-per-run must be above 0, and --gpus-per-run not below")
+        raise ValueError("--cpus-per-run must be above 0 and --gpus-per-run at least 0")
     jobs: dict[Path, list[Job]] = {}
     for setting in arguments.settings:
         # The other variants run as algorithms, under their own names.

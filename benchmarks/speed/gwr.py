@@ -114,7 +114,7 @@ def calls_per_round(gwr: GWRB, weights: Tensor, n_inputs: int) -> dict[str, Call
 def measure(n_networks: int, n_nodes: int, arguments: Arguments) -> dict[str, Any]:
     """Return times (ms per network) and memory (bytes per node) of a batch of networks."""
     gwr, weights, held = make_gwr(n_networks, n_nodes, arguments.features)
-    # Small networks need many inputs for a call of milliseconds; large ones must end in a minute.
+    # Several inputs, so that a call takes milliseconds; fewer for large networks, to save time.
     n_inputs = max(1, min(20, 200_000 // (n_networks * n_nodes)))
     times = interleave(calls_per_round(gwr, weights, n_inputs), rounds=arguments.rounds)
     scale = 1e3 / (n_inputs * n_networks)

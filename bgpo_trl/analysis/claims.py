@@ -31,7 +31,7 @@ LEVEL = (
 _NAMES = ALGORITHMS | PUBLISHED
 _MEASURES = {"last 10 %": late_scores, "area": area_scores}
 _RIVALS = ("MAML", "Dist-NLL")
-# Each BGPO with the baselines that have the same access to demonstrations.
+# Each BGPO with the baselines under the same conditions (demonstrations, stabilizers).
 _PAIRS = {
     "bgpo": ("maml-demonstrations", "dist-nll-demonstrations"),
     "bgpo-experts": ("maml", "dist-nll"),

@@ -115,11 +115,11 @@ def _ablation(setting: str) -> Group:
     references = {f"{setting}-{key}": name for key, name in REFERENCES.items()}
     file = "fig9" if setting == "concurrent" else f"fig9-{setting}"
     return Group(
-        f"Fig. 9: what each part contributes, {SETTINGS[setting][1]}",
+        f"Fig. 9: contribution of each part, {SETTINGS[setting][1]}",
         {**published, **added, **references},
         (
             Picture(file, "the paper's four", (*published, *references)),
-            Picture(f"{file}-added", "what is added to them", tuple(added)),
+            Picture(f"{file}-added", "additions to them", tuple(added)),
         ),
     )
 

@@ -301,8 +301,8 @@ def percentile_interval(values: ArrayLike, confidence: float = 0.95) -> tuple[fl
     """
     if not np.size(values) or not 0 < confidence < 1:
         raise ValueError(
-            f"values must be at least one and confidence in (0, 1), got {np.size(values)} values "
-            f"and {confidence}"
+            "values must not be empty and confidence must be in (0, 1), got "
+            f"{np.size(values)} values and {confidence}"
         )
     tail = 100 * (1 - confidence) / 2
     low, high = np.percentile(np.asarray(values, float), [tail, 100 - tail])

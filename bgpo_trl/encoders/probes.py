@@ -2,9 +2,9 @@
 
     python -m bgpo_trl.encoders.probes data/nico data/nico-play
 
-Policies observe only latents and behaviors, so these probes bound what they can learn. Every
-probe is fitted on training demonstrations and evaluated on held-out ones. No other part of the
-encoders' training reads the ground-truth ``state``.
+Policies observe only latents and behaviors, so information that these lack cannot be learned
+later. Every probe is fitted on training demonstrations and evaluated on held-out ones. No other
+part of the encoders' training reads the ground-truth ``state``.
 """
 
 from __future__ import annotations

@@ -99,7 +99,7 @@ def load_checkpoint(
     for path in _checkpoints(directory):
         if _is_intact(path):
             return torch.load(path, map_location=map_location, weights_only=True, mmap=mmap)
-        warnings.warn(f"{path} is damaged: going on from the checkpoint before it.", stacklevel=2)
+        warnings.warn(f"{path} is damaged: resuming from the checkpoint before it.", stacklevel=2)
     raise ValueError(
         f"{directory} holds no intact checkpoint to resume from: start a new run in another "
         "directory."

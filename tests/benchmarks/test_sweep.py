@@ -127,7 +127,7 @@ def test_blocks_are_of_the_presets_seeds_and_length_unless_told():
         ({"algorithms": ()}, "name at least one of --algorithms"),
         ({"settings": ()}, "one of --settings"),
         ({"cpus_per_run": 0}, "--cpus-per-run must be above 0"),
-        ({"gpus_per_run": -1}, "--gpus-per-run not below"),
+        ({"gpus_per_run": -1}, "--gpus-per-run at least 0"),
     ],
 )
 def test_grids_that_cannot_be_are_refused(tmp_path, wrong, message):
