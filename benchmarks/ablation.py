@@ -1,6 +1,6 @@
 """The paper's third experiment: BGPO without GWR-B, without the intrinsic reward, without both.
 
-Besides: what experts, even replay and demonstrations add to it.
+Further variants add even replay, experts and demonstrations.
 
     python benchmarks/ablation.py --variant r_int --preset quick
 

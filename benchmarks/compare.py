@@ -1,11 +1,11 @@
-"""Whether two runs differ by more than their seeds do.
+"""Permutation test of the difference between two runs.
 
     python benchmarks/compare.py runs/before runs/after
 
-prints, for each task and part of training, the success of test episodes in both runs and the
-two-sided p of an exact permutation test over seeds: among all ways to deal the seeds out to the two
-runs, the share of those that lie as far apart as the runs do. Small means different; with five
-seeds each, the smallest possible is 2 / 252.
+prints, for each task and part of training, the test success of both runs and the two-sided p
+value of an exact permutation test over seeds: the share of all assignments of the seeds to the two
+runs whose means differ at least as much. With five seeds per run, the smallest possible p is
+2 / 252.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ from bgpo_trl.runs.results import read_tests
 
 @dataclass(frozen=True)
 class Arguments:
-    """Compares the ``eval.csv`` of two runs."""
+    """Compare the ``eval.csv`` of two runs."""
 
     first: tyro.conf.Positional[Path]
-    """A run's directory."""
+    """Directory of the first run."""
     second: tyro.conf.Positional[Path]
-    """Another's."""
+    """Directory of the second run."""
     every: int = 1_000
-    """Episodes of training that one row of the table is about."""
+    """Training episodes per row of the table."""
 
 
 def success_by_seed(
     path: Path, every: int, last: int | None = None
 ) -> dict[tuple[str, int], np.ndarray]:
-    """Returns the mean success ``[S]`` of each seed, by task and part of training.
+    """Return the mean success of each seed ``[S]``, by task and last episode of a part of training.
 
     Args:
         path: An ``eval.csv``.
-        every: Length of a part (episodes); the key tells where it ends.
-        last: Read no further than this episode.
+        every: Length of a part in training episodes.
+        last: Last training episode to read.
     """
     found: dict[tuple[str, int], dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
     for row in read_tests(path):
@@ -55,11 +55,11 @@ def success_by_seed(
 
 
 def permutation_p(first: np.ndarray, second: np.ndarray) -> float:
-    """Returns the two-sided p of the difference of two samples' means, by all permutations.
+    """Return the two-sided p value of the difference of two means, over all permutations.
 
     Args:
-        first: ``[A]``.
-        second: ``[B]``.
+        first: Sample ``[A]``.
+        second: Sample ``[B]``.
     """
     everything = np.concatenate([first, second])
     observed = abs(first.mean() - second.mean())
@@ -73,11 +73,11 @@ def permutation_p(first: np.ndarray, second: np.ndarray) -> float:
 
 
 def main(arguments: Arguments) -> None:
-    """Prints the table."""
+    """Print the table."""
     if arguments.every < 1:
         raise ValueError(f"--every must be at least 1 episode, got {arguments.every}")
     paths = arguments.first / "eval.csv", arguments.second / "eval.csv"
-    # Of a run cut short, only what both have is compared.
+    # If one run is shorter, only the part that both have is compared.
     last = min(max(int(row["episode"]) for row in read_tests(path)) for path in paths)
     first, second = (success_by_seed(path, arguments.every, last) for path in paths)
     shared = sorted(first.keys() & second.keys())

@@ -2,7 +2,7 @@
 
     python benchmarks/concurrent_tasks.py --preset quick
 
-It differs from `continual.py` by the schedule alone, and leaves the same files behind.
+Differs from `continual.py` only in the schedule of tasks, and writes the same files.
 """
 
 from __future__ import annotations

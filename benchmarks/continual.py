@@ -1,10 +1,10 @@
-"""The paper's second experiment: NICO's three tasks, presented one after the other (Fig. 8).
+"""The paper's second experiment: NICO's three tasks, presented one after another (Fig. 8).
 
     python benchmarks/continual.py --preset quick
 
 writes a run directory with ``config.json``, ``train.csv``, ``eval.csv``, ``checkpoint/``,
 ``final.csv`` and the figures ``success.png`` (success on each task against training episodes) and
-``gwr.png`` (the nodes of GWR-B in behavior space, coloured by task, Fig. 7).
+``gwr.png`` (nodes of GWR-B in behavior space, colored by task, Fig. 7).
 """
 
 from __future__ import annotations

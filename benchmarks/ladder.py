@@ -1,12 +1,12 @@
-"""Which part limits learning: the same learner, fed with less and less that is given to it.
+"""Which part limits learning: one learner with less and less given information.
 
     python benchmarks/ladder.py --rungs a b c d --episodes 2000
 
-All three tasks at once (the paper's concurrent setting). Rung (a) sees ground-truth state and the
-task's label; (b) latents and the label; (c) latents and the demonstration's embedding phi; (d) is
-BGPO: latents and the behavior b of GWR-B. A drop from one rung to the next names the part that is
-short: encoder, sequence encoder, self-organization. What the learner itself gains by a setting is
-seen on one rung:
+All three tasks are presented from the start (the paper's concurrent setting). Rung (a) observes
+the ground-truth state and the task label; (b) latents and the label; (c) latents and the
+demonstration's embedding phi; (d) is BGPO: latents and the behavior b of GWR-B. A drop from one
+rung to the next points to the limiting part: frame encoder, sequence encoder or
+self-organization. The effect of a setting of the learner is measured on one rung:
 
     python benchmarks/ladder.py --rungs a --out runs/ladder-64 ddpg --hidden-sizes 64
     python benchmarks/ladder.py --rungs a --out runs/ladder-td3 td3
@@ -46,16 +46,16 @@ RUNGS: dict[str, tuple[str, BGPOConfig]] = {
 
 @dataclass(frozen=True)
 class Arguments:
-    """Runs the rungs one after the other and prints a table."""
+    """Run the rungs one after another and print a table."""
 
     rungs: tuple[Rung, ...] = ("a", "b", "c", "d")
-    """Which to run."""
+    """Rungs to run."""
     episodes: int = 2_000
     """Training episodes of each seed."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds, run as one batch."""
     out: Path = Path("runs/ladder")
-    """One run directory a rung goes in here."""
+    """Parent of the rungs' run directories."""
     rl: (
         Annotated[DDPGConfig, subcommand("ddpg")]
         | Annotated[TD3Config, subcommand("td3")]
@@ -63,18 +63,18 @@ class Arguments:
     ) = field(default_factory=DDPGConfig)
     """The RL algorithm."""
     resume: bool = False
-    """Continue interrupted rungs; finished ones are only read."""
+    """Continue interrupted rungs and only read finished ones."""
     device: str = "auto"
-    """Where the networks are: cpu, cuda, or auto for a GPU if there is one."""
+    """Device of the networks: cpu, cuda, or auto for a GPU if there is one."""
     threads: int = 1
-    """Threads of PyTorch. More than one slows these small networks down; physics takes all cores by
-    itself."""
+    """Threads of PyTorch; more than one slows these small networks down. Physics always uses all
+    cores."""
 
 
 def main(arguments: Arguments) -> None:
-    """Runs the ladder."""
+    """Run the ladder."""
     if not arguments.rungs:
-        raise ValueError("--rungs names none: name some of a, b, c, d")
+        raise ValueError("--rungs is empty: name some of a, b, c, d")
     set_threads(arguments.threads)
     device = choose_device(arguments.device)
     if arguments.resume:

@@ -1,10 +1,10 @@
-"""How much of a demonstration a trained policy has to see.
+"""Success and task inference against the share of the demonstration that is shown.
 
     python benchmarks/one_shot.py runs/concurrent-bgpo-desk
 
-Shows the policies of all seeds of a run new demonstrations, cut short, and tests what they do:
-success and task inference by the share that they saw. Writes `one_shot.csv`, `one_shot.png` and,
-for the record, `one_shot.json` with the commit and the command, into the run's directory.
+Shows new demonstrations, cut short, to the policies of all seeds of a run and tests them. Writes
+``one_shot.csv``, ``one_shot.png`` and ``one_shot.json`` (commit and command) into the run
+directory.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from bgpo_trl.figures.curves import save_figure
 from bgpo_trl.seeding import stream_seed
 
 COLUMNS = ("share", "seed", "task", "episodes", "success", "task_inference", "activity")
-# Number of the evaluation, which none in training or at its end has: other starts.
+# Number of the evaluation; it seeds start states that neither training nor final tests used.
 _NUMBER = 2**31 + 1
 _COLORS = (
     "#222222",
@@ -45,26 +45,26 @@ _COLORS = (
     "#009E73",
     "#CC79A7",
     "#E69F00",
-)  # of "all", then of tasks
+)  # "all", then the tasks
 
 Row = tuple[float, int, str, int, float, float, float]
-"""A line of the CSV file; the last two are NaN in algorithms without GWR-B."""
+"""Row of the CSV file; the last two values are NaN for algorithms without GWR-B."""
 
 
 @dataclass(frozen=True)
 class Arguments:
-    """Tests the policies of a run with demonstrations that are cut short."""
+    """Test the policies of a run with demonstrations cut short."""
 
     run: tyro.conf.Positional[Path]
-    """The run's directory."""
+    """Run directory."""
     shares: tuple[float, ...] = (0.25, 0.5, 0.75, 1.0)
-    """Shares of a demonstration that are shown, from its start."""
+    """Shares of each demonstration to show, from its start."""
     episodes: int = 20
-    """Demonstrations, and test episodes, of each task and seed."""
+    """Demonstrations and test episodes per task and seed."""
     seed: int = 1
-    """Seed of the demonstrations; those that the shipped encoders learned from have 0."""
+    """Seed of the demonstrations; the pretrained encoders were trained on seed 0."""
     out: Path | None = None
-    """Folder to write to; the run's directory if not given."""
+    """Folder to write to; the run directory by default."""
     threads: int = 1
     """Threads of PyTorch."""
 
@@ -72,16 +72,17 @@ class Arguments:
 def show(
     policy: TrainedPolicy, embedding: torch.Tensor, task: torch.Tensor, evaluator: Evaluator
 ) -> list[tuple[int, int, float, float, float]]:
-    """Tests the policies of all seeds, each with the same demonstrations.
+    """Test the policies of all seeds, each with the same demonstrations.
 
     Args:
-        policy: Of one of the seeds.
-        embedding: phi of the demonstrations, ``[T, M, 32]``.
-        task: Their labels, ``[T, M]``.
-        evaluator: For ``M`` episodes of ``T`` tasks.
+        policy: Policy of one of the seeds.
+        embedding: Embeddings phi of the demonstrations, ``[T, M, 32]``.
+        task: Task labels, ``[T, M]``.
+        evaluator: Evaluator for ``M`` episodes of ``T`` tasks.
 
     Returns:
-        Seed, task, success, share of demonstrations whose task was inferred, and mean activity.
+        Tuples of seed, task, success, share of demonstrations whose task was inferred, and mean
+        activity.
     """
     algorithm, seeds = policy.algorithm, policy.config.seeds
     n_tasks, n_seeds = len(task), len(seeds)
@@ -118,10 +119,10 @@ def show(
 
 
 def measure(policy: TrainedPolicy, shares: Sequence[float], episodes: int, seed: int) -> list[Row]:
-    """Returns the rows of the CSV file; see `Arguments`.
+    """Return the rows of the CSV file; for the arguments see `Arguments`.
 
     Raises:
-        ValueError: If a share is not in (0, 1], or there are to be no episodes.
+        ValueError: If a share is not in (0, 1], or ``episodes`` is less than 1.
     """
     if not shares or not all(0 < share <= 1 for share in shares):
         raise ValueError(f"--shares are in (0, 1], got {', '.join(map(str, shares)) or 'none'}")
@@ -151,9 +152,9 @@ def measure(policy: TrainedPolicy, shares: Sequence[float], episodes: int, seed:
 
 
 def means(rows: Sequence[Row]) -> dict[str, dict[float, np.ndarray]]:
-    """Returns success, task inference and activity by task ("all": of all) and share, ``[S, 3]``.
+    """Return each seed's mean success, task inference and activity, ``[S, 3]``, by task and share.
 
-    Each row is a seed's mean.
+    The key ``"all"`` holds the means over tasks.
     """
     found: dict[str, dict[float, dict[int, list]]] = defaultdict(lambda: defaultdict(dict))
     for share, seed, task, _, *values in rows:
@@ -169,10 +170,10 @@ def means(rows: Sequence[Row]) -> dict[str, dict[float, np.ndarray]]:
 
 
 def plot(table: Mapping[str, Mapping[float, np.ndarray]]) -> Figure:
-    """Plots success and task inference by the share of the demonstrations that was seen.
+    """Plot success and task inference against the share of the demonstration shown.
 
-    Lines are means over seeds, by task and of all; one standard deviation is shaded for all. There
-    is no task inference in algorithms without GWR-B.
+    Lines are means over seeds, by task and over all tasks, the latter shaded by one standard
+    deviation. Algorithms without GWR-B have no task inference.
     """
     names = ["Success rate", "Task inferred"]
     if all(np.isnan(seeds[:, 1]).all() for shares in table.values() for seeds in shares.values()):
@@ -201,7 +202,7 @@ def plot(table: Mapping[str, Mapping[float, np.ndarray]]) -> Figure:
 
 
 def main(arguments: Arguments) -> None:
-    """Tests, and writes the files."""
+    """Run the tests and write the files."""
     commit = commit_of_code()
     torch.set_num_threads(arguments.threads)
     run, out = arguments.run, arguments.out or arguments.run
@@ -221,7 +222,7 @@ def main(arguments: Arguments) -> None:
     for task, shares in table.items():
         for share, seeds in shares.items():
             success, inferred, activity = seeds.mean(0)
-            # Nothing is inferred without GWR-B.
+            # NaN: an algorithm without GWR-B infers no task.
             from_gwr = " | |" if np.isnan(inferred) else f" {inferred:.1%} | {activity:.2f} |"
             print(f"| {task} | {share:.0%} | {success:.1%} |{from_gwr}")
 

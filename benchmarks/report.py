@@ -1,12 +1,12 @@
-"""The paper's figures and claims, from the directories of runs.
+"""Report of the paper's figures and claims from finished runs.
 
     python benchmarks/report.py
 
-reads the runs in ``benchmarks/results/comparison`` (or another directory of them) and writes beside
-them Figs. 6, 7, 8 and 9 (mean over seeds and one standard deviation), ``tables.md`` with confidence
-intervals and the claims, and ``report.html``, which holds all of it with frames of test episodes
-and the runs' settings. A run that is not there is listed as missing; one that is longer than
-another of its table is cut to the length of the shortest.
+reads the runs in ``benchmarks/results/comparison`` (or another directory) and writes beside them
+Figs. 6, 7, 8 and 9 (mean over seeds and one standard deviation), ``tables.md`` with confidence
+intervals and the claims, and ``report.html`` with all of these, frames of test episodes and the
+runs' settings. Missing runs are listed; longer runs are cut to the length of the shortest in their
+table.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ from suites import nico
 
 @dataclass(frozen=True)
 class Arguments:
-    """Reports on the runs in a directory."""
+    """Report on the runs in a directory."""
 
     runs: tyro.conf.Positional[Path] = Path("benchmarks/results/comparison")
-    """Holds one directory a run, named EXPERIMENT-ALGORITHM."""
+    """Parent of the run directories, which are named EXPERIMENT-ALGORITHM."""
     out: Path | None = None
-    """Where the report goes; beside the runs if not given."""
+    """Folder of the report; by default that of the runs."""
 
 
 def draw(group: Group, runs: dict[str, Run], folder: Path) -> dict[str, Path]:
-    """Draws a group's learning curves.
+    """Draw a group's learning curves.
 
     Returns:
-        The figures that there are runs for, by their captions.
+        Paths of the figures by caption, without figures that lack all runs.
     """
     figures = {}
     for picture in group.pictures:
@@ -66,10 +66,10 @@ def draw(group: Group, runs: dict[str, Run], folder: Path) -> dict[str, Path]:
 
 
 def draw_nodes(path: Path, to: Path) -> Table:
-    """Draws Fig. 7 from a run's ``gwr.csv``, by task and by group if it has groups.
+    """Draw Fig. 7 from a run's ``gwr.csv``, by task and, if it has groups, by group.
 
     Returns:
-        A table of the distances between the mean nodes of the tasks.
+        A table of the distances between the tasks' mean nodes.
     """
     rows = read_rows(path)
     tasks = np.array([int(row["task"]) for row in rows])
@@ -86,24 +86,24 @@ def draw_nodes(path: Path, to: Path) -> Table:
 
 
 def markdown(rows: Sequence[Sequence[str]]) -> str:
-    """Returns a table in Markdown."""
+    """Format a table in Markdown."""
     head, *body = rows
     lines = [head, ["---"] * len(head), *body]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
 def read_sections(directory: Path, out: Path) -> tuple[list[Section], dict[str, Run]]:
-    """Reads the runs in a directory, draws them and tells what they have come to.
+    """Read the runs in a directory, draw the figures and compute the tables.
 
     Args:
-        directory: Holds the runs.
+        directory: Parent of the run directories.
         out: Folder of the figures.
 
     Returns:
-        The report, and the runs by the names of their directories.
+        The sections of the report, and the runs by directory name.
 
     Raises:
-        ValueError: If none of the runs is there.
+        ValueError: If there are no runs.
     """
     statistics = Statistics()
     groups: dict[str, dict[str, Run]] = {}
@@ -111,7 +111,7 @@ def read_sections(directory: Path, out: Path) -> tuple[list[Section], dict[str, 
     for key, group in GROUPS.items():
         groups[key], notes = read_group(directory, group)
         section = Section(group.title, notes=notes)
-        # An ablation without any variant of its own would only repeat other tables.
+        # An ablation with only runs of other groups would repeat their tables.
         if any(not key.startswith("ablation") or name.startswith(key) for name in groups[key]):
             table = main_table(groups[key], statistics)
             section = Section(group.title, table, draw(group, groups[key], out), notes)
@@ -142,14 +142,14 @@ def read_sections(directory: Path, out: Path) -> tuple[list[Section], dict[str, 
     sections.append(Section("The paper's claims", claims(groups, statistics), notes=[LEVEL]))
     table = additions(groups, statistics)
     if table:
-        sections.append(Section("What is added to the paper's algorithm", table, notes=[LEVEL]))
+        sections.append(Section("Additions to the paper's algorithm", table, notes=[LEVEL]))
     return sections, runs
 
 
 def main(arguments: Arguments) -> None:
-    """Writes the report."""
+    """Write the report."""
     if not arguments.runs.is_dir():
-        raise ValueError(f"{arguments.runs} is no directory: name the one that holds the runs")
+        raise ValueError(f"{arguments.runs} is not a directory: name the one that holds the runs")
     out = arguments.out or arguments.runs
     sections, runs = read_sections(arguments.runs, out)
     text = []

@@ -1,9 +1,9 @@
-"""What runs have come to, in numbers and figures.
+"""Tables and figures of finished runs.
 
     python benchmarks/summary.py benchmarks/results/c*-desk
 
-prints for each run a table of its success by task and draws ``success.png``, and ``groups.png``
-where it has groups of behaviors, anew from its files.
+prints a table of success by task for each run, and redraws ``success.png`` and, for runs with
+groups of behaviors, ``groups.png``.
 """
 
 from __future__ import annotations
@@ -27,21 +27,24 @@ from suites import nico
 
 @dataclass(frozen=True)
 class Arguments:
-    """Sums up the directories of runs."""
+    """Summarize the directories of runs."""
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
     """Directories with ``config.json``, ``eval.csv`` and ``final.csv``."""
 
 
 def summarize(path: Path) -> dict[str, float]:
-    """Returns success over the last 10 % of training, by task and overall, and episodes to 80 %.
+    """Return success over the last 10 % of training, by task and overall, and episodes to 80 %.
 
     Args:
         path: An ``eval.csv`` with test episodes of every task.
 
     Returns:
-        By task; ``overall``, the mean over tasks; and ``episodes to 80 %``, as `Curves.episodes_to`
-        tells it; infinite if that is not reached.
+        Success by task; ``overall``, the mean over tasks; and ``episodes to 80 %``, the result of
+        `Curves.episodes_to`, infinite if not reached.
+
+    Raises:
+        ValueError: If a task has no test in that period.
     """
     rows = read_tests(path)
     last = max(int(row["episode"]) for row in rows)
@@ -59,7 +62,7 @@ def summarize(path: Path) -> dict[str, float]:
 
 
 def best(path: Path) -> dict[str, float]:
-    """Returns, by task, the highest success over any 10 % of training, in the mean over seeds.
+    """Return each task's highest mean success over seeds during any 10 % of training.
 
     Args:
         path: An ``eval.csv``.
@@ -79,7 +82,7 @@ def best(path: Path) -> dict[str, float]:
 
 
 def describe(run: Path) -> str:
-    """Returns the table of a run, in Markdown."""
+    """Return the table of a run in Markdown."""
     late, highest = summarize(run / "eval.csv"), best(run / "eval.csv")
     final = read_final_tests(run / "final.csv")
 
@@ -94,7 +97,7 @@ def describe(run: Path) -> str:
             raise ValueError(
                 f"{run / 'final.csv'} has no test of {named}: remove it and resume the run"
             )
-        if "" in cells:  # task inference where there is no GWR-B
+        if "" in cells:  # task inference of an algorithm without GWR-B
             return ""
         return f"{100 * np.mean([float(cell) for cell in cells]):.{digits}f}"
 
@@ -117,31 +120,31 @@ def describe(run: Path) -> str:
     entries = {"commit": str, "command": str} | dict.fromkeys(
         ("nodes", "groups", "group_purity"), list | NoneType
     )
-    told = read_json(run / "summary.json", entries)
+    summary = read_json(run / "summary.json", entries)
     episodes = read_json(run / "config.json").get("episodes")
-    if told.get("episodes", episodes) != episodes:
-        raise ValueError(f"{run} is being made longer: let the run finish")
-    nodes = "" if told["nodes"] is None else f"GWR-B nodes: {told['nodes']}. "
-    if told.get("groups"):
-        purity = " ".join(f"{100 * share:.1f}" for share in told.get("group_purity") or ())
-        nodes += f"Groups: {told['groups']}, {purity} % pure on held-out demonstrations. "
+    if summary.get("episodes", episodes) != episodes:
+        raise ValueError(f"{run} is being extended: let the run finish")
+    nodes = "" if summary["nodes"] is None else f"GWR-B nodes: {summary['nodes']}. "
+    if summary.get("groups"):
+        purity = " ".join(f"{100 * share:.1f}" for share in summary.get("group_purity") or ())
+        nodes += f"Groups: {summary['groups']}, {purity} % pure on held-out demonstrations. "
     reached = late["episodes to 80 %"]
     lines += [
         "",
         f"Episodes to 80 %: {'not reached' if np.isinf(reached) else int(reached)}. {nodes}"
-        f"Commit {told['commit']}: `{told['command']}`.",
+        f"Commit {summary['commit']}: `{summary['command']}`.",
     ]
     if own is not None and len(tasks) > 1:
         ratios = ", ".join(
             f"{task} {times or 'unknown'}"
             for task, times in zip(tasks[1:], ratio_cells(own), strict=True)
         )
-        lines.append(f"Own episodes to 50 %, as many times those of {tasks[0]}: {ratios}.")
+        lines.append(f"Own episodes to 50 %, relative to {tasks[0]}: {ratios}.")
     return "\n".join(lines)
 
 
 def _tasks(rows: list[dict[str, str]]) -> list[str]:
-    """Returns the tasks that were tested, in the order of their first test."""
+    """Return the tested tasks, in the order of their first test."""
     return list(dict.fromkeys(row["task"] for row in rows))
 
 
@@ -165,10 +168,10 @@ def _late_by_seed(path: Path) -> dict[str | None, list[float]]:
 
 
 def _presented(run: Path) -> dict[str, int]:
-    """Returns from which training episode each task of a run is presented."""
+    """Return the training episode from which each task of a run is presented."""
     path = run / "config.json"
     config = read_json(path, {"task_starts": list, "tasks": list | NoneType})
-    # Runs did not always say their tasks; then they had the paper's.
+    # Runs of earlier versions saved no task names; theirs are the paper's.
     tasks, starts = config.get("tasks") or nico.ALL_TASKS, config["task_starts"]
     known = all(isinstance(task, str) for task in tasks)
     if not known or len(tasks) != len(starts) or not all(type(start) is int for start in starts):
@@ -179,7 +182,7 @@ def _presented(run: Path) -> dict[str, int]:
 
 
 def main(arguments: Arguments) -> None:
-    """Prints the tables and draws the figures."""
+    """Print the tables and draw the figures."""
     if not arguments.runs:
         raise ValueError("name the directory of a run")
     for run in arguments.runs:

@@ -1,20 +1,21 @@
-"""Plays algorithms in settings over many seeds on Ray, and merges what the blocks of seeds leave.
+"""Run algorithms in settings over many seeds on Ray, and merge the blocks of seeds.
 
     python benchmarks/sweep.py --algorithms bgpo maml dist-nll --settings concurrent continual \
         --seeds 0 1 2 3 4 5 6 7 8 9 --block 5 --preset desk
 
-plays twelve jobs, as many at a time as there are cores. A job is a block of seeds of one algorithm
-in one setting, with a run directory such as ``runs/sweep/concurrent-bgpo/seeds-0-1-2-3-4``. When
-all blocks are there, they are merged into ``runs/sweep/concurrent-bgpo``, which holds what one run
-of all seeds would: ``python benchmarks/report.py runs/sweep`` reads it.
+runs twelve jobs, as many at a time as there are cores. A job is a block of seeds of one algorithm
+in one setting, with a run directory such as ``runs/sweep/concurrent-bgpo/seeds-0-1-2-3-4``.
+Finished blocks are merged into ``runs/sweep/concurrent-bgpo``, which holds the files of one run of
+all seeds: ``python benchmarks/report.py runs/sweep`` reads it.
 
-Whatever ended a sweep, the same command goes on from where it was, and plays nothing twice; seeds
-may be added. A job whose worker or machine is lost goes on elsewhere from its last checkpoint. One
-that fails by itself (a full disk, a damaged file) is told at the end, when the others are played.
+The same command resumes an interrupted sweep without repeating finished jobs, and seeds may be
+added. A job whose worker or machine is lost continues elsewhere from its last checkpoint. A job
+that fails with an error (such as a full disk or a damaged file) is reported after the others have
+finished.
 
-On a cluster (``--address auto`` on one of its machines, or ``HOST:6379``) all machines need Ray,
-and bgpo_trl with what it depends on; and this checkout and ``--out`` at the same path of a file
-system that they share. Locks on files must hold across machines, as they do on NFS.
+On a cluster (``--address auto`` on one of its machines, or ``HOST:6379``) all machines need Ray and
+bgpo_trl with its dependencies, and must see this checkout and ``--out`` at the same path of a
+shared file system. Its file locks must hold across machines, as they do on NFS.
 """
 
 from __future__ import annotations
@@ -41,41 +42,41 @@ except ImportError as error:
 
 @dataclass(frozen=True)
 class Arguments:
-    """Plays a grid of runs on Ray."""
+    """Run a grid of experiments on Ray."""
 
     algorithms: tuple[experiment.AlgorithmName, ...] = ("bgpo",)
-    """What learns; see concurrent.py."""
+    """Algorithms, as in concurrent_tasks.py."""
     settings: tuple[Literal["concurrent", "continual", "ablation"], ...] = ("concurrent",)
-    """All tasks from the start; one after the other; or BGPO without GWR-B, without the intrinsic
-    reward and without both, whatever the algorithms are."""
+    """Tasks all from the start (concurrent), one after another (continual), or the variants of BGPO
+    instead of the algorithms (ablation)."""
     preset: Literal["quick", "desk", "paper"] = "desk"
     """Size of the runs."""
     seeds: tuple[int, ...] | None = None
-    """Other seeds than the preset's."""
+    """Seeds; the preset's by default."""
     block: int = 5
-    """Seeds that are played as one run. Another number makes other runs."""
+    """Seeds per job. Another number makes other runs."""
     episodes: int | None = None
-    """Another length than the preset's; the tasks' starts keep their proportions."""
+    """Training episodes; the preset's by default. The task starts are scaled in proportion."""
     out: Path = Path("runs/sweep")
-    """Holds the runs."""
+    """Parent of the run directories."""
     address: str = "local"
-    """Of a Ray cluster; "local" starts Ray on this machine alone."""
+    """Address of a Ray cluster; "local" starts Ray on this machine."""
     cpus_per_run: float = 1
-    """Cores that Ray counts for a run."""
+    """Cores that Ray reserves per run."""
     gpus_per_run: float = 0
-    """GPUs that Ray gives to a run, or a share of one; networks are on the CPU without."""
+    """GPUs per run, or a share of one; with 0, networks are on the CPU."""
 
 
 def make_jobs(arguments: Arguments) -> dict[Path, list[Job]]:
-    """Returns the jobs of the grid, by the directory that they are merged into.
+    """Return the jobs of the grid, by the directory that they are merged into.
 
     Raises:
-        ValueError: If there is no such run, or nothing to play.
+        ValueError: If the settings are invalid, or the grid is empty.
     """
     if arguments.block < 1:
         raise ValueError(f"block must be at least 1, got {arguments.block}")
     if arguments.cpus_per_run <= 0 or arguments.gpus_per_run < 0:
-        raise ValueError("--cpus-per-run must be above 0, and --gpus-per-run not below")
+        raise ValueError("--cpus-per-run must be above 0 and --gpus-per-run at least 0")
     jobs: dict[Path, list[Job]] = {}
     for setting in arguments.settings:
         # Those that are not an algorithm by a name of its own.
@@ -108,39 +109,39 @@ def make_jobs(arguments: Arguments) -> dict[Path, list[Job]]:
 
 
 def check_directories(jobs: dict[Path, list[Job]], encoders: str) -> None:
-    """Makes sure that whatever is in the directories of the jobs belongs there.
+    """Check that the directories of the jobs hold no other runs.
 
     Args:
-        jobs: From `make_jobs`.
-        encoders: Identity of the encoders that the runs use.
+        jobs: Result of `make_jobs`.
+        encoders: Identity of the runs' encoders.
 
     Raises:
-        ValueError: If one of them holds something else.
+        ValueError: If a directory holds another run.
     """
     for merged, group in jobs.items():
         for job in group:
             check_settings(job.directory, settings_of(job.config, encoders))
         path = merged / "config.json"
-        if path.exists():  # merged before, from the same blocks or others
+        if path.exists():  # merged before, possibly from other blocks
             if not any(merged.glob("seeds-*")):
-                raise ValueError(f"{merged} is a run of its own: choose another --out")
+                raise ValueError(f"{merged} is not a run of a sweep: choose another --out")
             seeds = read_json(path)["seeds"]
             settings = {**settings_of(group[0].config, encoders), "seeds": seeds}
             check_settings(merged, settings)
 
 
 def play(job: Job) -> None:
-    """Plays a job to its end, from its last checkpoint if there is one, and measures."""
+    """Play a job to its end, from its last checkpoint if there is one, and measures."""
     arguments = experiment.Arguments(out=job.directory, resume=holds_run(job.directory))
     experiment.run_experiment(arguments, "sweep", job.config)
 
 
 def main(arguments: Arguments) -> None:
-    """Plays what is not finished, and merges what is."""
+    """Run the unfinished jobs, and merge the blocks."""
     jobs = make_jobs(arguments)
     check_directories(jobs, load_pretrained()[0].identity)
     todo = [job for group in jobs.values() for job in group if not job.finished]
-    print(f"{sum(map(len, jobs.values()))} jobs, {len(todo)} of them to play")
+    print(f"{sum(map(len, jobs.values()))} jobs, {len(todo)} of them to run")
     failed: dict[Job, str] = {}
     if todo:
         resources = {"cpus": arguments.cpus_per_run, "gpus": arguments.gpus_per_run}

@@ -1,11 +1,11 @@
-"""Shows what a run has learned: NICO beside the demonstration that it was shown.
+"""Film the trained policies of a run beside the demonstrations that they were shown.
 
     python benchmarks/watch.py runs/continual-bgpo-quick
 
-Writes `nico.gif` and the same as a strip of frames, `nico.png`, into the run's `figures/`: of each
-task the demonstration, what NICO then sees, and what an onlooker sees; green is success, red the
-end of the time. NICO starts from the same scene each time: what it was shown makes the difference.
-And `gwr_growth.png`, how GWR-B grew, where the run kept its graphs.
+Writes ``nico.gif``, and its frames as a strip ``nico.png``, into the run's ``figures/``: for each
+task the demonstration, the policy's observations and a view of the room, framed green on success
+and red on timeout. NICO starts from the same scene in every task, so only the demonstration makes
+the difference. If the run saved graphs, also writes ``gwr_growth.png``, the growth of GWR-B.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from bgpo_trl.figures.video import save_gif
 from suites import nico
 from suites.nico.rendering import FrameRenderer
 
-_ROOM = (180, 70, 600, 350)  # Where in the room's 640x480 pixels NICO and the table are.
+_ROOM = (180, 70, 600, 350)  # (pixels) crop of the 640x480 room view to NICO and the table
 _SIZES = ((256, 128), (256, 128), (192, 128))
 _BORDER, _CAPTION, _GAP = 4, 18, 8
 _COLORS = {None: "#999999", True: "#009E73", False: "#D55E00"}
@@ -38,28 +38,28 @@ _FPS = 10  # twice as fast as NICO
 
 @dataclass(frozen=True)
 class Arguments:
-    """Shows what a run has learned, beside what it was shown."""
+    """Film the trained policies of a run beside the demonstrations that they were shown."""
 
     run: tyro.conf.Positional[Path]
-    """The run's directory."""
+    """Run directory."""
     policy: int | None = None
-    """Which of the run's seeds acts; the first if not given."""
+    """Seed of the run whose policy acts; the first by default."""
     seed: int = 1
-    """Seed of demonstrations and starts; the shipped encoders learned from those of 0."""
+    """Seed of demonstrations and starts; the pretrained encoders were trained on seed 0."""
     out: Path | None = None
-    """Folder for the pictures; figures/ of the run if not given."""
+    """Folder for the pictures; figures/ of the run by default."""
 
 
 @dataclass(frozen=True)
 class Episode:
-    """A demonstration and what came of it.
+    """A demonstration and the policy's episode after it.
 
     Attributes:
-        task: Its name.
-        demonstration: uint8 ``[T, 32, 64, 3]``.
-        seen: What NICO saw, uint8 ``[N, 32, 64, 3]``.
-        room: What an onlooker saw, uint8 ``[N, 128, 192, 3]``.
-        success: How it ended.
+        task: Name of the task.
+        demonstration: Frames uint8 ``[T, 32, 64, 3]``.
+        seen: Observed frames, uint8 ``[N, 32, 64, 3]``.
+        room: View of the room, uint8 ``[N, 128, 192, 3]``.
+        success: Whether the episode succeeded.
     """
 
     task: str
@@ -70,12 +70,12 @@ class Episode:
 
     @property
     def outcome(self) -> str:
-        """How it ended, in words."""
+        """Outcome and length of the episode, as a caption."""
         return f"{'success' if self.success else 'no success'} after {len(self.seen) - 1} steps"
 
 
 def demonstrate(tasks: Sequence[str], seed: int) -> dict[str, NDArray]:
-    """Returns a new demonstration of each task, uint8 ``[T, 32, 64, 3]``, from another start."""
+    """Return a new demonstration of each task, uint8 ``[T, 32, 64, 3]``."""
     with tempfile.TemporaryDirectory() as folder:
         recorded = record_demonstrations(
             folder, tasks=tasks, per_task=1, held_out_per_task=0, seed=seed, progress=False
@@ -87,7 +87,7 @@ def demonstrate(tasks: Sequence[str], seed: int) -> dict[str, NDArray]:
 
 
 def play(policy: TrainedPolicy, task: str, demonstration: NDArray, seed: int) -> Episode:
-    """Shows the policy a demonstration and returns what it does from the start with that seed."""
+    """Show the policy a demonstration and returns what it does from the start with that seed."""
     policy.condition(demonstration, task=task)
     env = nico.load(task, seed=seed)
     renderer = FrameRenderer(env.physics.model.ptr, "room", height=480, width=640)
@@ -107,9 +107,9 @@ def play(policy: TrainedPolicy, task: str, demonstration: NDArray, seed: int) ->
 
 
 def compose(episodes: Sequence[Episode]) -> NDArray:
-    """Returns a picture of each step, the episodes below one another, uint8 ``[T, H, W, 3]``.
+    """Return a frame per step with the episodes below one another, uint8 ``[T, H, W, 3]``.
 
-    It goes on until the longest is over, and rests there for two seconds.
+    The frames continue to the end of the longest episode, and the last one is held for two seconds.
     """
     steps = max(max(len(e.demonstration), len(e.seen)) for e in episodes)
     height = _CAPTION + _SIZES[0][1] + 2 * _BORDER + _GAP
@@ -120,7 +120,7 @@ def compose(episodes: Sequence[Episode]) -> NDArray:
         for row, episode in enumerate(episodes):
             _draw(picture, episode, step, row * height + _GAP // 2)
         pictures.append(picture)
-    # With the same few colors throughout, what does not move takes no room: a quarter of the size.
+    # A palette shared by all frames keeps static pixels identical: a quarter of the file size.
     sample = [np.asarray(picture) for picture in pictures[:: max(1, steps // 4)] + pictures[-1:]]
     palette = Image.fromarray(np.concatenate(sample)).quantize(128)
     frames = [p.quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures]
@@ -136,20 +136,20 @@ def _draw(picture: Image.Image, episode: Episode, step: int, top: int) -> None:
     color = _COLORS[outcome]
     panels = (
         (shown, f"shown: {episode.task.replace('_', ' ')}", _COLORS[None]),
-        (episode.seen[now], "what NICO sees", color),
+        (episode.seen[now], "NICO's view", color),
         (episode.room[now], f"step {now}" if outcome is None else episode.outcome, color),
     )
     left = _GAP
     for (frame, caption, border), size in zip(panels, _SIZES, strict=True):
         image = Image.fromarray(frame).resize(size, Image.Resampling.NEAREST)
         picture.paste(ImageOps.expand(image, _BORDER, border), (left, top + _CAPTION))
-        told = "black" if border == _COLORS[None] else border
-        draw.text((left + _BORDER, top), caption, fill=told, font=font)
+        fill = "black" if border == _COLORS[None] else border
+        draw.text((left + _BORDER, top), caption, fill=fill, font=font)
         left += size[0] + 2 * _BORDER + _GAP
 
 
 def main(arguments: Arguments) -> None:
-    """Plays an episode of each task and writes the pictures."""
+    """Run an episode of each task and write the pictures."""
     run, out = arguments.run, arguments.out or arguments.run / "figures"
     policy = load_run(run, seed=arguments.policy)
     shown = demonstrate(policy.tasks, arguments.seed)
@@ -159,7 +159,7 @@ def main(arguments: Arguments) -> None:
     strips = {}
     for episode in episodes:
         strips[f"{episode.task}: the demonstration"] = episode.demonstration
-        strips[f"{episode.task}: what NICO sees, {episode.outcome}"] = episode.seen
+        strips[f"{episode.task}: NICO's view, {episode.outcome}"] = episode.seen
         print(f"{episode.task}: {episode.outcome}")
     save_figure(plot_frame_strips(strips), out / "nico.png")
     draw_growth(run, policy.config, policy.bank, out)

@@ -15,7 +15,7 @@ python -m bgpo_trl COMMAND --help shows the options."""
 
 
 def main(arguments: list[str]) -> None:
-    """Runs a command.
+    """Run a command.
 
     Args:
         arguments: The command and its options.

@@ -62,7 +62,7 @@ Check = Callable[[], Iterator[Finding]]
 def judge_version(
     name: str, found: str | None, wanted: str, exact: str | None = None, *, optional: bool = False
 ) -> Finding:
-    """Judges the version of a dependency.
+    """Judge the version of a dependency.
 
     Args:
         name: Of its distribution.
@@ -88,7 +88,7 @@ def judge_version(
 
 
 def judge_python(found: str, wanted: str) -> Finding:
-    """Judges the version of Python by the range of the package."""
+    """Judge the version of Python by the range of the package."""
     from packaging.specifiers import SpecifierSet
 
     if SpecifierSet(wanted).contains(found, prereleases=True):
@@ -97,7 +97,7 @@ def judge_python(found: str, wanted: str) -> Finding:
 
 
 def read_constraints(path: Path) -> dict[str, str]:
-    """Returns the versions in a ``constraints.txt`` by name; none if there is no such file."""
+    """Return the versions in a ``constraints.txt`` by name; none if there is no such file."""
     if not path.is_file():
         return {}
     lines = (line.partition("#")[0].strip() for line in path.read_text().splitlines())
@@ -106,7 +106,7 @@ def read_constraints(path: Path) -> dict[str, str]:
 
 
 def installed_version(name: str) -> str | None:
-    """Returns the version of a distribution, or None."""
+    """Return the version of a distribution, or None."""
     try:
         return importlib.metadata.version(name)
     except importlib.metadata.PackageNotFoundError:
@@ -117,7 +117,7 @@ def check_versions(
     version: Callable[[str], str | None] = installed_version,
     constraints: Path = CONSTRAINTS,
 ) -> Iterator[Finding]:
-    """Looks at Python, at all dependencies, and at the extras that a run can use."""
+    """Look at Python, at all dependencies, and at the extras that a run can use."""
     from packaging.requirements import Requirement
 
     try:
@@ -141,7 +141,7 @@ def check_versions(
 
 
 def judge_frames(still: np.ndarray, moved: np.ndarray) -> Finding:
-    """Judges two frames, uint8 ``[32, 64, 3]``, between which the arm has moved."""
+    """Judge two frames, uint8 ``[32, 64, 3]``, between which the arm has moved."""
     import numpy as np
 
     colours = len(np.unique(still.reshape(-1, still.shape[-1]), axis=0))
@@ -155,7 +155,7 @@ def judge_frames(still: np.ndarray, moved: np.ndarray) -> Finding:
 
 
 def check_frame(path: Path | None = None) -> Iterator[Finding]:
-    """Draws a frame before and after a movement; writes the first to a PNG where asked."""
+    """Draw a frame before and after a movement; writes the first to a PNG where asked."""
     import numpy as np
 
     from suites import nico
@@ -195,7 +195,7 @@ def _driver(renderer: FrameRenderer) -> str:
 
 
 def judge_frame_rate(one: float, every: float, cores: int) -> Finding:
-    """Judges frames a second, of one thread and of one for each core."""
+    """Judge frames a second, of one thread and of one for each core."""
     told = f"{one:.0f} on one core, {every:.0f} on {cores}"
     if every < FEW_FRAMES:
         told += ": few; is the machine busy, or MUJOCO_GL another than egl?"
@@ -204,7 +204,7 @@ def judge_frame_rate(one: float, every: float, cores: int) -> Finding:
 
 
 def check_frame_rate(seconds: float = 0.5) -> Iterator[Finding]:
-    """Measures ten simulations in one environment, with random actions."""
+    """Measure ten simulations in one environment, with random actions."""
     import torch
 
     from bgpo_trl.envs import NicoEnv
@@ -229,7 +229,7 @@ def check_frame_rate(seconds: float = 0.5) -> Iterator[Finding]:
 
 
 def check_update_rate(seconds: float = 0.5) -> Iterator[Finding]:
-    """Measures what BGPO learns a second with five seeds, and loads the shipped weights for it."""
+    """Measure what BGPO learns a second with five seeds, and loads the shipped weights for it."""
     import torch
 
     from bgpo_trl.algorithms.bgpo import BGPO
@@ -257,7 +257,7 @@ def check_update_rate(seconds: float = 0.5) -> Iterator[Finding]:
 
 
 def _rate(call: Callable[[], object], seconds: float) -> float:
-    """Returns how often a second something can be called."""
+    """Return how often a second something can be called."""
     call()
     start, calls = time.perf_counter(), 0
     while (spent := time.perf_counter() - start) < seconds:
@@ -270,7 +270,7 @@ def _rate(call: Callable[[], object], seconds: float) -> float:
 
 
 def check_device() -> Iterator[Finding]:
-    """Looks at cores, threads and GPUs."""
+    """Look at cores, threads and GPUs."""
     import torch
 
     from bgpo_trl.machine import usable_cores
@@ -282,7 +282,7 @@ def check_device() -> Iterator[Finding]:
 
 
 def judge_gpu(devices: Sequence[str], *, driver: bool) -> Finding:
-    """Judges the GPUs that PyTorch sees, and whether there is a driver for more."""
+    """Judge the GPUs that PyTorch sees, and whether there is a driver for more."""
     if devices:
         return Finding("ok", "device", f"cuda: {', '.join(devices)}")
     if driver:
@@ -292,7 +292,7 @@ def judge_gpu(devices: Sequence[str], *, driver: bool) -> Finding:
 
 
 def judge_disk(free: float, folder: Path) -> Finding:
-    """Judges the room (bytes) that is left where runs go."""
+    """Judge the room (bytes) that is left where runs go."""
     told = f"{free / 1e9:.1f} GB left in {folder}"
     if free < _ROOM_FOR_SOME:
         return Finding("wrong", "disk", f"{told}: make room, or go elsewhere with --out")
@@ -302,7 +302,7 @@ def judge_disk(free: float, folder: Path) -> Finding:
 
 
 def check_disk(folder: Path | None = None) -> Iterator[Finding]:
-    """Looks at the folder in which runs are kept, by default the current one."""
+    """Look at the folder in which runs are kept, by default the current one."""
     folder = Path.cwd() if folder is None else folder
     if not os.access(folder, os.W_OK):
         yield Finding("wrong", "disk", f"{folder} cannot be written: go elsewhere, or use --out")
@@ -314,7 +314,7 @@ def check_disk(folder: Path | None = None) -> Iterator[Finding]:
 
 
 def examine(checks: Mapping[str, Check]) -> Iterator[Finding]:
-    """Runs checks one after the other; one that breaks is a finding too."""
+    """Run checks one after the other; one that breaks is a finding too."""
     for name, check in checks.items():
         try:
             yield from check()
@@ -328,7 +328,7 @@ def _first_line(error: Exception) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command line; see ``--help``.
+    """Run the command line; see ``--help``.
 
     Returns:
         The exit status: 1 if something makes it unusable, else 0.

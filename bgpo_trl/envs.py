@@ -159,7 +159,7 @@ class NicoEnv(EnvBase):
             self._current["state"][row] = timestep.observation["privileged_state"]
 
     def _advance(self, rows: Iterable[int], actions: np.ndarray, rewards: np.ndarray) -> None:
-        """Steps simulations, in all threads, and draws what they have come to, in this one."""
+        """Step simulations, in all threads, and draws what they have come to, in this one."""
         waiting, arrived = deque(rows), deque[tuple[int, TimeStep]]()
 
         def step_next() -> bool:
@@ -240,7 +240,7 @@ class NicoEnv(EnvBase):
         return TensorDict({**self._observe(), "reward": reward, **self._dones()}, self.batch_size)
 
     def frames(self) -> np.ndarray:
-        """Returns a copy of the frames that were drawn last, uint8 ``[*B, 32, 64, 3]``.
+        """Return a copy of the frames that were drawn last, uint8 ``[*B, 32, 64, 3]``.
 
         Raises:
             ValueError: If frames are not observed.
@@ -251,7 +251,7 @@ class NicoEnv(EnvBase):
         return pixels.reshape(*self.batch_size, *pixels.shape[1:])
 
     def close(self, *, raise_if_closed: bool = True) -> None:
-        """Ends the threads and frees the renderer."""
+        """End the threads and frees the renderer."""
         self._pool.shutdown()
         if self._renderer is not None:
             self._renderer.close()
@@ -263,13 +263,13 @@ class NicoEnv(EnvBase):
             environments[0].task.random.seed(None if seed is None else seed + row)
 
     def seed_rows(self, seeds: Sequence[int]) -> None:
-        """Sets the seed of each simulation's next starts, in ``[0, 2**32)``."""
+        """Set the seed of each simulation's next starts, in ``[0, 2**32)``."""
         for environments, seed in zip(self._environments, seeds, strict=True):
             # All tasks of a simulation draw from one source.
             environments[0].task.random.seed(seed)
 
     def simulation_state(self) -> dict[str, Any]:
-        """Returns all that the future depends on, as tensors: physics, task, random numbers."""
+        """Return all that the future depends on, as tensors: physics, task, random numbers."""
         physics, random = [], []
         for environments in self._environments:
             physics.append(torch.from_numpy(environments[0].physics.full_state()))
@@ -291,7 +291,7 @@ class NicoEnv(EnvBase):
         }
 
     def load_simulation_state(self, state: dict[str, Any]) -> None:
-        """Continues from what `simulation_state` returned.
+        """Continue from what `simulation_state` returned.
 
         Raises:
             ValueError: If it belongs to another number of simulations or kind of observation.

@@ -114,7 +114,7 @@ class Evaluator:
         return np.random.default_rng([stream_seed(seed, "evaluation"), number])
 
     def take(self, algorithm: Algorithm, index: int, episode: int, env_steps: int) -> None:
-        """Queues a snapshot of one seed for its next evaluation.
+        """Queue a snapshot of one seed for its next evaluation.
 
         Args:
             algorithm: In training.
@@ -129,7 +129,7 @@ class Evaluator:
     def snapshot(
         self, algorithm: Algorithm, index: int, number: int, *, episode: int, env_steps: int = 0
     ) -> Snapshot:
-        """Returns a snapshot of one seed for an evaluation.
+        """Return a snapshot of one seed for an evaluation.
 
         Args:
             algorithm: In training.
@@ -159,7 +159,7 @@ class Evaluator:
     def run_next(
         self, device: torch.device | str = "cpu", watch: Callable[[], object] = lambda: None
     ) -> TestResult | None:
-        """Plays the test episodes of the next evaluation, if all seeds have left their snapshot.
+        """Play the test episodes of the next evaluation, if all seeds have left their snapshot.
 
         Args:
             device: Where the networks are.
@@ -177,7 +177,7 @@ class Evaluator:
         device: torch.device | str = "cpu",
         watch: Callable[[], object] = lambda: None,
     ) -> TestResult:
-        """Plays the test episodes of all tasks presented to each seed.
+        """Play the test episodes of all tasks presented to each seed.
 
         Args:
             snapshots: One of each seed.
@@ -212,7 +212,7 @@ class Evaluator:
         return TestResult(snapshots, success, steps)
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns the queue and the number of the next evaluation."""
+        """Return the queue and the number of the next evaluation."""
         waiting = [
             [{**vars(snapshot), "policy": snapshot.policy.state_dict()} for snapshot in of_seed]
             for of_seed in self._waiting
@@ -220,7 +220,7 @@ class Evaluator:
         return {"next": self._next, "waiting": waiting}
 
     def load_state_dict(self, state: dict[str, Any], algorithm: Algorithm) -> None:
-        """Continues from what `state_dict` returned; the algorithm is the one it was taken from."""
+        """Continue from what `state_dict` returned; the algorithm is the one it was taken from."""
         self._next = state["next"]
         self._waiting = [
             [
@@ -235,7 +235,7 @@ class Evaluator:
 def evaluate_random_policy(
     *, tasks: Sequence[str], episodes: int, seed: int = 0, max_steps: int = 50
 ) -> Tensor:
-    """Returns the success rate of uniformly random actions on each task, float32 ``[T]``."""
+    """Return the success rate of uniformly random actions on each task, float32 ``[T]``."""
     shape = (len(tasks), episodes)
     env = NicoEnv(
         tasks, batch_size=shape, seed=stream_seed(seed, "random policy") // 2, observation="state"

@@ -9,7 +9,7 @@ import torch
 
 
 def usable_cores(quota: str | Path = "/sys/fs/cgroup/cpu.max") -> int:
-    """Returns how many cores this process may use, at least 1.
+    """Return how many cores this process may use, at least 1.
 
     Heeds the process's affinity (``taskset``, Slurm) and a container's quota.
 
@@ -30,7 +30,7 @@ def usable_cores(quota: str | Path = "/sys/fs/cgroup/cpu.max") -> int:
 
 
 def set_threads(threads: int) -> None:
-    """Sets how many threads PyTorch uses.
+    """Set how many threads PyTorch uses.
 
     Raises:
         ValueError: If that is none.
@@ -41,7 +41,7 @@ def set_threads(threads: int) -> None:
 
 
 def choose_device(name: str = "auto") -> torch.device:
-    """Returns the device for networks and replay; the simulation is always on the CPU.
+    """Return the device for networks and replay; the simulation is always on the CPU.
 
     Args:
         name: ``"auto"`` (a CUDA GPU if there is one, else the CPU) or a device of PyTorch's.

@@ -97,7 +97,7 @@ class TrainedPolicy:
         task: str | None = None,
         generator: torch.Generator | None = None,
     ) -> Recognition:
-        """Conditions the policy on a demonstration, whole or cut short.
+        """Condition the policy on a demonstration, whole or cut short.
 
         Args:
             demonstration: Frames, uint8 ``[T, 32, 64, 3]``, T at least 1.
@@ -148,7 +148,7 @@ class TrainedPolicy:
 
     @torch.no_grad()
     def act(self, frame: ArrayLike) -> NDArray[np.float32]:
-        """Returns the action for what the robot sees, float32 ``[4]`` in [-1, 1].
+        """Return the action for what the robot sees, float32 ``[4]`` in [-1, 1].
 
         Args:
             frame: uint8 ``[32, 64, 3]``.
@@ -172,7 +172,7 @@ def load_run(
     seed: int | None = None,
     make: Callable[..., Algorithm] | None = None,
 ) -> TrainedPolicy:
-    """Loads what a run has learned up to its last checkpoint, finished or not.
+    """Load what a run has learned up to its last checkpoint, finished or not.
 
     Args:
         path: The run's directory, of which nothing is changed.
@@ -228,7 +228,7 @@ def load_run(
 
 
 def _encoders(path: Path, identity: str) -> tuple[Representation, DemonstrationBank]:
-    """Returns the encoders of a run, its own or those that come with the package."""
+    """Return the encoders of a run, its own or those that come with the package."""
     own = path / "encoders" / "nico.safetensors"
     encoders, bank = load_pretrained(own if own.exists() else None)
     if encoders.identity != identity:

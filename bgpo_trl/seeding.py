@@ -11,7 +11,7 @@ from torch import Tensor
 
 
 def stream_seed(seed: int, name: str) -> int:
-    """Returns the seed of a named stream, below 2**32, independent of all other names' and seeds'.
+    """Return the seed of a named stream, below 2**32, independent of all other names' and seeds'.
 
     Args:
         seed: Seed of the run.
@@ -22,7 +22,7 @@ def stream_seed(seed: int, name: str) -> int:
 
 
 def generators(seeds: Sequence[int], name: str) -> list[torch.Generator]:
-    """Returns one generator for each seed, for one purpose; seed by seed the same in any batch.
+    """Return one generator for each seed, for one purpose; seed by seed the same in any batch.
 
     Example:
         >>> alone, = generators([7], "exploration")
@@ -34,10 +34,10 @@ def generators(seeds: Sequence[int], name: str) -> list[torch.Generator]:
 
 
 def task_generators(seeds: Sequence[int], n_tasks: int, name: str) -> list[list[torch.Generator]]:
-    """Returns one generator for each task of each seed, for one purpose."""
+    """Return one generator for each task of each seed, for one purpose."""
     return [[generators([seed], f"{name} {task}")[0] for task in range(n_tasks)] for seed in seeds]
 
 
 def normal(generators: Sequence[torch.Generator], shape: Sequence[int]) -> Tensor:
-    """Returns standard normals ``[S, *shape]``, those of each seed from its own generator."""
+    """Return standard normals ``[S, *shape]``, those of each seed from its own generator."""
     return torch.stack([torch.randn(*shape, generator=generator) for generator in generators])

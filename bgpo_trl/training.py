@@ -130,7 +130,7 @@ class Trainer:
             raise
 
     def run(self) -> None:
-        """Trains to the end; does nothing where a resumed run is there already.
+        """Train to the end; does nothing where a resumed run is there already.
 
         Raises:
             KeyboardInterrupt: At the first Ctrl-C, when the step is over and saved; at a second one
@@ -182,7 +182,7 @@ class Trainer:
             bar.close()
 
     def close(self) -> None:
-        """Closes the run's files and mirrors, and lets other processes into its directory."""
+        """Close the run's files and mirrors, and lets other processes into its directory."""
         self.logger.close()
         self._lock.release()
 
@@ -233,7 +233,7 @@ class Trainer:
             self.evaluator.take(algorithm, index, episode, self.env_steps)
 
     def _log(self, row: dict[str, Any]) -> None:
-        """Logs an episode, or keeps what only a longer run would log."""
+        """Log an episode, or keeps what only a longer run would log."""
         if row["episode"] <= self.config.episodes:
             self._successes.append(row["success"])
             self.logger.log_train(row)
@@ -265,7 +265,7 @@ class Trainer:
             self._tested = ", in tests " + " ".join(f"{rate:.2f}" for rate in shown)
 
     def save(self) -> None:
-        """Writes a checkpoint from which `resume` continues to the same curve."""
+        """Write a checkpoint from which `resume` continues to the same curve."""
         assert self._state is not None
         state: dict[str, Any] = {
             "algorithm": self.algorithm.state_dict(),

@@ -52,18 +52,18 @@ class World:
         self.env = algorithm.make_env(self.simulation, self.source)
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns all that future observations depend on but the tensordict in flight."""
+        """Return all that future observations depend on but the tensordict in flight."""
         return {
             "source": dict(self.source.state_dict()),
             "simulation": self.simulation.simulation_state(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continues from what `state_dict` returned."""
+        """Continue from what `state_dict` returned."""
         self.env.reset()  # Transforms make their caches at the first reset.
         self.source.load_state_dict(state["source"])
         self.simulation.load_simulation_state(state["simulation"])
 
     def close(self) -> None:
-        """Closes the simulations."""
+        """Close the simulations."""
         self.simulation.close()

@@ -1,4 +1,4 @@
-"""GWR-B alone: it finds the clusters of a point cloud, how many there are included.
+"""GWR-B alone: find the clusters of a point cloud, without knowing their number.
 
 python examples/gwr_alone.py
 """
@@ -14,7 +14,7 @@ from bgpo_trl.modules.gwr import GWRB
 
 
 def point_cloud(n: int, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns points [n, 2] of a ring and a blob within it, and which of them are the ring's."""
+    """Return points ``[n, 2]`` of a ring with a blob inside, and whether each is on the ring."""
     ring = torch.rand(n, generator=generator) < 0.7
     angle = 2 * torch.pi * torch.rand(n, generator=generator)
     circle = torch.stack([angle.cos(), angle.sin()], dim=-1)
@@ -25,8 +25,8 @@ def point_cloud(n: int, generator: torch.Generator) -> tuple[torch.Tensor, torch
 if __name__ == "__main__":
     generator = torch.Generator().manual_seed(0)
     points, ring = point_cloud(4_000, generator)
-    # A point further than -log(0.8) = 0.22 from all nodes calls for a new one; edges that no point
-    # has confirmed for 15 of its node's wins go, and so clusters part.
+    # A point farther than -log(0.8) = 0.22 from all nodes adds a node. Clusters separate because
+    # an edge is removed once one of its nodes has won 15 times without renewing it.
     gwr = GWRB(2, activity_threshold=0.8, max_age=15, init="data")
     for point in points:
         gwr.adapt(point)
@@ -44,7 +44,7 @@ if __name__ == "__main__":
     axes = figure.add_subplot(aspect="equal")
     axes.scatter(*points.T, s=2, c="0.8")
     colors = [cluster_of_node[node] for node in graph.node.tolist()]
-    for edge in graph.edges:  # of positions, as weights are
+    for edge in graph.edges:  # pairs of rows of `weights`
         axes.plot(*graph.weights[edge].T, c="0.4", linewidth=0.8)
     axes.scatter(*graph.weights.T, s=14, c=colors, cmap="tab10", zorder=3)
     save_figure(figure, Path("runs/gwr-alone.png"))

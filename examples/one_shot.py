@@ -1,4 +1,4 @@
-"""Shows a trained policy one demonstration and lets it do the same from another start.
+"""Show a trained policy one demonstration, and let it solve the task from another start.
 
 python examples/one_shot.py runs/continual-bgpo-quick --task push_green_to_glass
 """
@@ -17,7 +17,7 @@ from suites.nico.demonstrator import Demonstrator
 
 
 def demonstrate(task: str, seed: int) -> np.ndarray:
-    """Returns what NICO sees while it is shown the task, uint8 ``[T, 32, 64, 3]``."""
+    """Return the frames of a demonstration of the task, uint8 ``[T, 32, 64, 3]``."""
     env = nico.load(task, seed=seed)
     demonstrator = Demonstrator(env, seed=seed)
     timestep = env.reset()
@@ -30,12 +30,12 @@ def demonstrate(task: str, seed: int) -> np.ndarray:
 
 
 def main(run: tyro.conf.Positional[Path], task: str = nico.ALL_TASKS[0], seed: int = 1) -> None:
-    """Runs the example.
+    """Run the example.
 
     Args:
         run: Directory of a finished run of BGPO.
-        task: What is demonstrated; the policy is not told.
-        seed: Seed of both starts.
+        task: Task to demonstrate; the policy does not get its label.
+        seed: Seed of the demonstration's start; the policy starts from the next seed.
     """
     policy = bgpo_trl.load_run(run)
     print(policy.condition(demonstrate(task, seed)))

@@ -1,4 +1,4 @@
-"""A baseline of one's own, trained and tested like all others: python examples/own_baseline.py."""
+"""A custom baseline, trained and tested like all others: python examples/own_baseline.py."""
 
 from functools import partial
 
@@ -16,7 +16,7 @@ from bgpo_trl.training import Trainer
 
 
 class NearestNeighbors(Algorithm):
-    """k nearest neighbors (Pari et al., 2021) of states [M, 96], and the actions [M, 4] there."""
+    """k nearest neighbors (Pari et al., 2021): states ``[M, 96]`` with actions ``[M, 4]``."""
 
     def __init__(self, config, *, states, actions, **others):
         super().__init__(config, **others)
@@ -34,7 +34,7 @@ class NearestNeighbors(Algorithm):
     def act(self, td):
         return td.set("action", self.choose(td["latent"], td["demo_embedding"]))
 
-    def store(self, transition): ...  # for updates, of which there are none
+    def store(self, transition): ...  # There is nothing to update.
 
     def update(self):
         return {}

@@ -1,6 +1,6 @@
-"""A pipeline of one's own in plain TorchRL: python examples/own_pipeline.py.
+"""A custom pipeline in plain TorchRL: python examples/own_pipeline.py.
 
-A second GWR-B learns the latents that the robot sees, and pays it for those that are new.
+A second GWR-B learns the robot's latents and adds a novelty bonus to the reward.
 """
 
 import torch
@@ -19,14 +19,14 @@ from bgpo_trl.transforms import BehaviorLookup, DemonstrationSource, FrameEncode
 
 
 class NoveltyReward(Transform):
-    """Adds weight * (1 - activity) of a GWR-B that learns every latent."""
+    """Add ``weight * (1 - activity)`` of a GWR-B that adapts to every latent."""
 
     def __init__(self, gwr: GWRB, weight: float) -> None:
         super().__init__(in_keys=["latent", "reward"], out_keys=["reward"])
         self.gwr, self.weight = gwr, weight
 
     def _step(self, tensordict, next_tensordict):
-        latent = next_tensordict["latent"] / 8  # 64 standardised features: now about as long as 1
+        latent = next_tensordict["latent"] / 8  # scales 64 standardized features to norm 1
         bonus = self.weight * (1 - self.gwr.adapt(latent).activity.unsqueeze(-1))
         return next_tensordict.set("reward", next_tensordict["reward"] + bonus)
 
@@ -41,7 +41,7 @@ if __name__ == "__main__":
     reward = NoveltyReward(places, weight=0.01)
     env = TransformedEnv(NicoEnv(seed=0), Compose(encode, StepCounter(50), source, infer, reward))
     actor, critic = Actor(64 + 32, hidden_sizes=(256,)), Critic(64 + 32, hidden_sizes=(256,))
-    loss = DDPGLoss(actor, critic, return_bounds=(0.0, 1.5))  # success, and 50 x 0.01 x novelty
+    loss = DDPGLoss(actor, critic, return_bounds=(0.0, 1.5))  # 1 + 50 steps of at most 0.01
     target_update = ForeachSoftUpdate(loss, tau=0.005)
     optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
     replay = TensorDictReplayBuffer(storage=LazyTensorStorage(10_000), batch_size=128)

@@ -1,4 +1,4 @@
-"""An RL algorithm of one's own in place of DDPG: TD3 that acts wholly at random now and then.
+"""A custom RL algorithm in place of DDPG: TD3 with epsilon-greedy exploration.
 
 python examples/own_rl_algorithm.py
 """
@@ -20,28 +20,28 @@ from bgpo_trl.training import Trainer
 
 @dataclass(frozen=True)
 class EpsilonConfig(TD3Config):
-    """What `TD3Config` has, under a name of its own, and one field more."""
+    """`TD3Config` with its own name and an additional field."""
 
     name: str = "td3-epsilon"
     epsilon: float = 0.2
 
 
 class EpsilonLearner(TD3Learner):
-    """Changes how TD3 explores; `learn` would change how it learns."""
+    """TD3 with another exploration; overriding `learn` would change how it learns."""
 
     config: EpsilonConfig
 
     def explore(self, action: Tensor, generators: Sequence[torch.Generator]) -> Tensor:
-        """Returns TD3's actions ``[S, 4]``, some of them replaced."""
+        """Return TD3's actions ``[S, 4]``, each random with probability epsilon."""
         action = super().explore(action, generators)
-        for row, generator in zip(action, generators, strict=True):  # a seed draws from its own
+        for row, generator in zip(action, generators, strict=True):  # one generator per seed
             if torch.rand((), generator=generator) < self.config.epsilon:
                 row.uniform_(-1, 1, generator=generator)
         return action
 
 
 def make(config: EpsilonConfig, problem: Problem) -> EpsilonLearner:
-    """Makes the networks and the loss of TD3, and puts them to another use."""
+    """Return a learner with the networks and the loss of TD3."""
     td3 = make_td3(config, problem)
     return EpsilonLearner(td3.actor, td3.loss, config)
 
@@ -49,10 +49,10 @@ def make(config: EpsilonConfig, problem: Problem) -> EpsilonLearner:
 RL["td3-epsilon"] = RLEntry(make, EpsilonConfig())
 
 if __name__ == "__main__":
-    # A minute's try: ground truth and the task's label. BGPO itself is BGPOConfig(rl=...) alone.
-    told = replace(ALGORITHMS["oracle"].config, state="state", rl=EpsilonConfig(warmup_steps=64))
+    # Ground truth and the task label keep this to a minute. For BGPO, use BGPOConfig(rl=...).
+    oracle = replace(ALGORITHMS["oracle"].config, state="state", rl=EpsilonConfig(warmup_steps=64))
     config = RunConfig(
-        (0, 1), 4, task_starts=(0, 0, 0), eval_every=2, name="oracle", algorithm=told
+        (0, 1), 4, task_starts=(0, 0, 0), eval_every=2, name="oracle", algorithm=oracle
     )
     with TemporaryDirectory() as folder, Trainer(config, folder, bank=load_pretrained()[1]) as run:
         run.run()

@@ -1,6 +1,6 @@
-"""A task of one's own, from its success test to its curve: python examples/own_task.py.
+"""A custom task, from its success test to its learning curve: python examples/own_task.py.
 
-Run again, it continues where it was. To see it learn rather than begin, raise `episodes`.
+A second call resumes the run. To see learning rather than its start, raise ``episodes``.
 """
 
 from pathlib import Path
@@ -19,7 +19,7 @@ OWN, OUT = "push_white_to_green", Path("runs/own-task")
 
 
 class PushWhiteToGreen(nico.NicoTask):
-    """Done when the white box touches the green box."""
+    """Success: the white box touches the green box."""
 
     def succeeded(self, physics):
         return physics.touching("white_box", "green_box")

@@ -38,7 +38,7 @@ _TABLES = ("train.csv", "eval.csv", "final.csv", "gwr.csv")
 
 
 def digest_of(run: Path) -> dict[str, Any]:
-    """Returns the digests of a run's tables, and of its tensors in sorted order."""
+    """Return the digests of a run's tables, and of its tensors in sorted order."""
     digests: dict[str, Any] = {}
     for name in _TABLES:
         if (run / name).exists():
@@ -67,7 +67,7 @@ def _tensors(state: Any) -> Iterator[torch.Tensor]:
 
 
 def main() -> None:
-    """Makes the runs that are not there yet, and compares."""
+    """Make the runs that are not there yet, and compares."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path, help="folder for the runs")
     parser.add_argument("--against", type=Path, help="folder of earlier runs")

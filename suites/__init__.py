@@ -1,1 +1,1 @@
-"""Simulation suites: dm_control domains that know nothing of torch or of ``bgpo_trl``."""
+"""Simulation suites: dm_control domains, independent of torch and ``bgpo_trl``."""

@@ -1,10 +1,10 @@
-"""The choice of the OpenGL backend, made by importing this module.
+"""Choice of the OpenGL backend, made by importing this module.
 
-MuJoCo and dm_control read ``MUJOCO_GL`` once, when they are first imported, be it by TorchRL: so
-import this before them. It sets, on Linux, EGL if its library can be loaded, else OSMesa. A value
-the user has set is kept, unless MuJoCo could not be imported with it: then there are no frames, and
-who asks for one is told why. It also sets ``LP_NUM_THREADS=0`` where unset: llvmpipe's worker
-threads cost more than they give on a 64x32 frame.
+MuJoCo and dm_control read ``MUJOCO_GL`` once, on their first import, which TorchRL may cause, so
+import this module first. On Linux, it sets ``MUJOCO_GL`` to EGL if its library can be loaded, else
+to OSMesa. A value set by the user is kept, unless MuJoCo's import would fail with it; then
+rendering is disabled, and `FrameRenderer` raises the reason. ``LP_NUM_THREADS`` is set to 0 if
+unset, since llvmpipe's worker threads cost more than they gain on a 64x32 frame.
 """
 
 import ctypes
@@ -21,7 +21,7 @@ _INSTALL_HINT = (
 )
 
 _LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa"}
-# What else both MuJoCo and dm_control know on Linux; with any other value they are not imported.
+# Other values that both MuJoCo and dm_control accept on Linux; their import fails with any other.
 _OTHERS = ("glfw", "on", "enable", "enabled", "true", "1")
 _OTHERS += ("off", "disable", "disabled", "false", "0")
 
@@ -38,18 +38,18 @@ def _loadable(library: str) -> bool:
 
 
 def choose_backend(loadable: Callable[[str], bool] = _loadable) -> str | None:
-    """Returns the off-screen OpenGL backend to use, or None to leave MuJoCo's own choice.
+    """Return the off-screen OpenGL backend to use, or ``None`` to leave MuJoCo's choice.
 
     Args:
-        loadable: Tells whether a shared library of that short name can be loaded.
+        loadable: Returns whether a shared library with the given short name can be loaded.
 
     Returns:
         The user's ``MUJOCO_GL`` if set; on Linux ``"egl"`` or ``"osmesa"``, whichever library is
-        found first; None on other systems, where MuJoCo brings a backend of its own.
+        found first; ``None`` on other systems, where MuJoCo includes a backend.
 
     Raises:
-        RuntimeError: If Linux has neither library, or not the one that the user's choice needs, or
-            that is no backend; the message says what to do.
+        RuntimeError: If Linux has neither library, or ``MUJOCO_GL`` is not a backend or lacks its
+            library.
     """
     chosen = os.environ.get("MUJOCO_GL")
     if platform.system() != "Linux":
@@ -58,16 +58,16 @@ def choose_backend(loadable: Callable[[str], bool] = _loadable) -> str | None:
         return chosen
     if chosen and chosen not in _LIBRARIES:
         raise RuntimeError(
-            f"MUJOCO_GL is {chosen!r}, which is no OpenGL backend: set it to egl, osmesa or glfw, "
-            "or do not set it"
+            f"MUJOCO_GL is {chosen!r}, which is not an OpenGL backend: set it to egl, osmesa or "
+            "glfw, or unset it"
         )
     for backend in (chosen,) if chosen else _LIBRARIES:
         if loadable(_LIBRARIES[backend]):
             return backend
     if chosen:
         raise RuntimeError(
-            f"MUJOCO_GL is {chosen!r}, but there is no library {_LIBRARIES[chosen]}: do not set "
-            "it, or install the library (Debian/Ubuntu: `apt-get install libegl1 libosmesa6`)"
+            f"MUJOCO_GL is {chosen!r}, but there is no library {_LIBRARIES[chosen]}: unset it, or "
+            "install the library (Debian/Ubuntu: `apt-get install libegl1 libosmesa6`)"
         )
     raise RuntimeError(_INSTALL_HINT)
 
@@ -77,15 +77,15 @@ def _configure() -> str:
     try:
         backend, refusal = choose_backend(), ""
     except RuntimeError as error:
-        # Physics works without OpenGL; the error belongs to whoever asks for a frame.
+        # Physics works without OpenGL, so the error is raised on the first rendering.
         backend, refusal = "disabled" if os.environ.get("MUJOCO_GL") else None, str(error)
     if backend is not None and backend != os.environ.get("MUJOCO_GL"):
         os.environ["MUJOCO_GL"] = backend
         context = sys.modules.get("mujoco.rendering.classic.gl_context")
-        if context is not None:  # Somebody imported MuJoCo first: have it choose again.
+        if context is not None:  # MuJoCo was imported first and must choose again.
             importlib.reload(context)
     return refusal
 
 
 refusal = _configure()
-"""Why there is no backend; empty where there is one."""
+"""Error message if there is no backend, else empty."""

@@ -87,7 +87,7 @@ CASES = {
         "has the columns date,temperature", "choose another run directory"),
     "csv of rubbish": (
         lambda f: CsvFile(f / "binary" / "eval.csv", EVAL_COLUMNS),
-        "is no CSV file, this run writes algorithm", "choose another run directory"),
+        "is not a CSV file, this run writes algorithm", "choose another run directory"),
     "figure in a file": (
         lambda f: save_figure(figure(), f / "file" / "a.png"), "cannot make the folder", "another"),
     # checkpoints
@@ -103,14 +103,16 @@ CASES = {
     "run without a test": (
         lambda f: curves(f / "unevaluated"), "holds no test episode", "let the run evaluate first"),
     "table of something else": (
-        lambda f: curves(f / "foreign"), "lacks algorithm, episode", "name another run"),
+        lambda f: curves(f / "foreign"),
+        "lacks the columns algorithm, episode", "name another run"),
     "row with a word for a number": (
         lambda f: curves(f / "damaged"), "line 2 is damaged", "resume the run"),
     "row cut short": (lambda f: curves(f / "cut"), "line 2 is damaged", "resume the run"),
-    "binary table": (lambda f: curves(f / "binary"), "is no CSV file", "name another run"),
+    "binary table": (lambda f: curves(f / "binary"), "is not a CSV file", "name another run"),
     "table that talks to the terminal": (
-        lambda f: curves(f / "terminal"), "is no CSV file of a run (control", "name another run"),
-    "table that is a folder": (lambda f: read_rows(f), "is no CSV file", "name another run"),
+        lambda f: curves(f / "terminal"),
+        "is not a CSV file of a run (control", "name another run"),
+    "table that is a folder": (lambda f: read_rows(f), "is not a CSV file", "name another run"),
     "test of an unknown task": (
         lambda f: curves(f / "stranger"), "'juggle'", "none of grasp_glass"),
     "curves of a damaged table": (
@@ -132,16 +134,18 @@ CASES = {
     "encoders of another scene": (
         lambda f: load_representation(scene_version="mars"), "is scene mars", "--train-encoders"),
     "no bank": (lambda f: load_bank(f / "a"), "there is no demonstration bank", "--train-encoders"),
-    "encoders for a bank": (lambda f: load_bank(default_weights()), "no bank", "--train-encoders"),
+    "encoders for a bank": (
+        lambda f: load_bank(default_weights()), "not a bank", "--train-encoders"),
     "bank of other encoders": (
         lambda f: DemonstrationBank.load(f / "bank", encoder_id="y"),
         "'encoder_id': 'x'", "--train-encoders"),
     "bank in no folder": (
         lambda f: bank().save(f / "file" / "b", encoder_id="x"), "cannot make the", "another"),
     # demonstrations
-    "no dataset": (lambda f: load_demonstrations(f / "nowhere"), "is no dataset", "record it anew"),
+    "no dataset": (
+        lambda f: load_demonstrations(f / "nowhere"), "is not a dataset", "record it again"),
     "dataset that is a file": (
-        lambda f: load_demonstrations(f / "file"), "is no dataset", "record it anew with"),
+        lambda f: load_demonstrations(f / "file"), "is not a dataset", "record it again with"),
     "recording into a file": (
         lambda f: record_demonstrations(f / "file", **TINY), "cannot make the folder", "another"),
     "recording of no task": (

@@ -71,7 +71,8 @@ def read_or_refused(read, expected) -> None:
         found = read()
     except (ValueError, OSError) as error:
         assert "\n" not in str(error)
-        assert any(word in str(error) for word in ("record it anew", "resume it", "train-encoders"))
+        remedies = ("record it again", "resume it", "train-encoders")
+        assert any(remedy in str(error) for remedy in remedies)
     else:
         assert found.keys() == expected.keys()
         for key, value in expected.items():

@@ -263,7 +263,9 @@ def test_it_outlives_a_broken_torch_and_a_backend_that_there_is_not(tmp_path):
     path = os.pathsep.join([str(tmp_path), str(ROOT)])
     lines = run_doctor(tmp_path, PYTHONPATH=path, MUJOCO_GL="vulkan")
     assert lines["status"] == "1"
-    assert lines["OpenGL"].startswith("wrong MUJOCO_GL is 'vulkan', which is no OpenGL backend: ")
+    assert lines["OpenGL"].startswith(
+        "wrong MUJOCO_GL is 'vulkan', which is not an OpenGL backend: "
+    )
     for what in ("frames/s", "updates/s", "device"):
         assert lines[what].startswith("wrong cannot be checked (ImportError: libcudart is missing)")
     assert lines["python"].startswith("ok ")

@@ -189,12 +189,12 @@ def test_a_bank_keeps_its_names_on_disk(tmp_path):
 
     tensors, told = load_tensors(path)
     save_tensors(path, tensors, {key: value for key, value in told.items() if key != "tasks"})
-    with pytest.raises(ValueError, match=r"does not say which tasks it is about\); make it anew"):
+    with pytest.raises(ValueError, match=r"its task names are missing\); make it again"):
         DemonstrationBank.load(path, encoder_id="abc")
 
 
 def test_a_label_without_a_name_is_refused():
-    with pytest.raises(ValueError, match=r"^there is a demonstration of task 1, but tasks names"):
+    with pytest.raises(ValueError, match=r"^a demonstration has task label 1, but tasks names"):
         replace(bank_of("a", "b"), tasks=("a",))
 
 

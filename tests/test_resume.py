@@ -163,7 +163,7 @@ def test_a_run_whose_newest_checkpoint_is_cut_goes_on_from_the_one_before(
         trainer.run()
     _, newest = sorted((tmp_path / "checkpoint").iterdir())
     newest.write_bytes(newest.read_bytes()[: newest.stat().st_size // 2])
-    with pytest.warns(UserWarning, match=f"{newest.name} is damaged: going on from the"):
+    with pytest.warns(UserWarning, match=f"{newest.name} is damaged: resuming from the"):
         resumed = make(tmp_path, resume=True)
     assert resumed.env_steps == 19
     resumed.run()
@@ -191,6 +191,6 @@ def test_stage_1_goes_on_from_the_checkpoint_before_a_cut_one(learned, tmp_path,
         patch.setattr(fitting, "save_checkpoint", save_or_die)
         learn_to_see(tmp_path)
     saved[-1].write_bytes(saved[-1].read_bytes()[:-1])
-    with pytest.warns(UserWarning, match=f"{saved[-1].name} is damaged: going on from the"):
+    with pytest.warns(UserWarning, match=f"{saved[-1].name} is damaged: resuming from the"):
         learn_to_see(tmp_path)
     assert_same_encoders(tmp_path, learned)

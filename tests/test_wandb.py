@@ -228,7 +228,9 @@ def test_rows_in_any_order_arrive_and_those_written_again_are_the_same(tmp_path)
 def test_a_figure_that_cannot_be_shown_is_one_warning_and_no_end(tmp_path):
     with RunLogger(tmp_path, config={}, wandb="offline") as logger:
         (tmp_path / "broken.png").write_bytes(b"no picture")
-        with pytest.warns(UserWarning, match="WandbLogger failed .* gets no more of this run"):
+        with pytest.warns(
+            UserWarning, match="WandbLogger failed .* is disabled for the rest of this run"
+        ):
             logger.log_media("figures/broken", tmp_path / "broken.png")
         logger.log_eval({"algorithm": "bgpo", "seed": 0, "episode": 1, "success": True})
         logger.log_media("figures/broken", tmp_path / "broken.png")

@@ -1,6 +1,7 @@
-"""Frames a second: the hardware's limit, our layers one by one, and what dm_control does by itself.
+"""Frames per second: the hardware's limit, each layer of this package, and stock dm_control.
 
-Ours step ten simulations a call. All get random actions and begin anew after 50 steps or a success.
+This package's layers step ten simulations per call. All contenders take random actions and reset
+after 50 steps or a success.
 """
 
 # MuJoCo's bindings come without stubs.
@@ -38,14 +39,14 @@ STOCK_FRAMES = 2
 
 
 def contenders(threads: int, encoder: VAE) -> dict[str, tuple[Callable[[], object], int]]:
-    """Returns what to time against each other with `timing.interleave`.
+    """Return the contenders for `timing.interleave`.
 
     Args:
-        threads: Threads of the bare limit and of our batched environment.
+        threads: Threads of the bare limit and of the batched environment.
         encoder: Any frame encoder, trained or not.
 
     Returns:
-        For each name, a call, and the number of frames it makes.
+        For each name, a call and the number of frames it makes.
     """
     task = nico.load(TASK, seed=0, time_limit=float("inf"))
     encode = Compose(FrameEncoder(encoder, del_keys=True))
@@ -63,17 +64,17 @@ def contenders(threads: int, encoder: VAE) -> dict[str, tuple[Callable[[], objec
 
 
 def actions(seed: int = 0) -> Callable[[int], np.ndarray]:
-    """Returns a source of random actions: ``draw(n)`` gives ``[n, 4]`` in [-1, 1]."""
+    """Return a source of random actions: ``draw(n)`` gives ``[n, 4]`` in [-1, 1]."""
     rng = np.random.default_rng(seed)
     return lambda n: rng.uniform(-1, 1, (n, 4))
 
 
 class BareLoop:
-    """Twenty `mj_step`, `mjr_render` and the reading of the pixels, for ten simulations: no more.
+    """Lower bound: 20 physics steps, one rendering and one readout per frame, for ten simulations.
 
-    Threads that draw at the same time are more than some OpenGL libraries bear, so each "thread" is
-    a process. Targets of the joints are those that random actions gave in a run before, for the
-    arms to move, and meet things, as in ours.
+    The "threads" are processes, since some OpenGL libraries do not support concurrent drawing from
+    threads. Joint targets are recorded from random actions, so that the arms move and hit objects
+    as in the other contenders.
 
     Args:
         threads: Processes that share the simulations.
@@ -91,7 +92,7 @@ class BareLoop:
             self._pipes.append(ours)
 
     def step(self) -> None:
-        """Makes a frame of each simulation."""
+        """Make a frame of each simulation."""
         for pipe in self._pipes:
             pipe.send(self._number)
         for pipe in self._pipes:
@@ -100,12 +101,12 @@ class BareLoop:
 
 
 def bare_process(pipe: Connection, starts: np.ndarray, targets: np.ndarray) -> None:
-    """Steps its simulations whenever it is told to.
+    """Step a share of the simulations on request.
 
     Args:
-        pipe: Brings the number of the step, takes None when it is done.
-        starts: Full states to start from, ``[R, N]``.
-        targets: Of the joints, ``[T, R, 6]``.
+        pipe: Delivers the number of the step; answered with ``None`` when the step is done.
+        starts: Full start states, ``[R, N]``.
+        targets: Joint targets, ``[T, R, 6]``.
     """
     model = mujoco.MjModel.from_xml_string(nico.scene_xml())
     datas = [mujoco.MjData(model) for _ in starts]
@@ -120,7 +121,7 @@ def bare_process(pipe: Connection, starts: np.ndarray, targets: np.ndarray) -> N
     view = mujoco.MjrRect(0, 0, FRAME_WIDTH, FRAME_HEIGHT)
     frame = np.empty((FRAME_HEIGHT, FRAME_WIDTH, 3), np.uint8)
     everything = mujoco.mjtCatBit.mjCAT_ALL.value
-    with contextlib.suppress(EOFError):  # The measurement is over.
+    with contextlib.suppress(EOFError):  # raised at the end of the measurement
         while True:
             number = pipe.recv()
             for data, start, target in zip(datas, starts, targets[number], strict=True):
@@ -135,7 +136,7 @@ def bare_process(pipe: Connection, starts: np.ndarray, targets: np.ndarray) -> N
 
 
 def record() -> tuple[np.ndarray, np.ndarray]:
-    """Plays an episode of random actions; returns starts ``[R, N]`` and targets ``[T, R, 6]``."""
+    """Record an episode of random actions: starts ``[R, N]`` and joint targets ``[T, R, 6]``."""
     draw, starts, targets = actions(), [], []
     environments = [
         nico.load(TASK, seed=i, observation="state", time_limit=float("inf")) for i in range(ROWS)
@@ -146,15 +147,15 @@ def record() -> tuple[np.ndarray, np.ndarray]:
     for _ in range(EPISODE):
         for environment, action in zip(environments, draw(ROWS), strict=True):
             environment.step(action)
-            environment._reset_next_step = False  # On, past a success.
+            environment._reset_next_step = False  # Keeps the episode going after a success.
         targets.append([np.array(e.physics.data.ctrl) for e in environments])
     return np.array(starts), np.array(targets)
 
 
 class Stock:
-    """The same task as dm_control and TorchRL wrap it, with MuJoCo's own visual settings.
+    """The same task as dm_control and TorchRL wrap it, with MuJoCo's default visual settings.
 
-    In a process of its own, because we tell Mesa's software renderer not to start threads.
+    It runs in a separate process, because this process disables the threads of Mesa's renderer.
     """
 
     def __init__(self) -> None:
@@ -163,13 +164,13 @@ class Stock:
         spawn.Process(target=stock_process, args=(theirs,), daemon=True).start()
 
     def step(self) -> None:
-        """Makes some frames of one simulation."""
+        """Make ``STOCK_FRAMES`` frames of one simulation."""
         self._pipe.send(None)
         self._pipe.recv()
 
 
 def stock_process(pipe: Connection) -> None:
-    """Makes ``STOCK_FRAMES`` frames whenever it is told to."""
+    """Make ``STOCK_FRAMES`` frames on each request."""
     os.environ.pop("LP_NUM_THREADS", None)
     xml = nico.scene_xml()
     start, end = xml.index("<quality"), xml.index("/>", xml.index("<quality")) + 2

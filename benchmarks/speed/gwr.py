@@ -1,8 +1,8 @@
-"""What GWR-B costs: time and memory against the number of nodes, and of the networks of a run.
+"""Cost of GWR-B: time and memory against the number of nodes, and for a batch of networks.
 
     python benchmarks/speed/gwr.py
 
-prints a table and writes it as ``gwr.json``, with the times against nodes as ``gwr.png``.
+prints a table and writes it as ``gwr.json``, and the times against nodes as ``gwr.png``.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ CALLS = ("lookup", "adapt", "lookup + adapt")
 
 @dataclass(frozen=True)
 class Arguments:
-    """Measures GWR-B."""
+    """Measure GWR-B."""
 
     out: Path = Path("benchmarks/results/gwr")
-    """Where the results go."""
+    """Folder of the results."""
     nodes: tuple[int, ...] = (100, 1_000, 10_000, 100_000, 1_000_000)
     """Sizes of a single network."""
     networks: int = 10
@@ -45,13 +45,13 @@ class Arguments:
     features: int = 32
     """Size of an input."""
     rounds: int = 30
-    """How often everything is timed."""
+    """Timing rounds."""
     threads: int = 1
     """Threads of PyTorch."""
 
 
 def synthetic_network(n_nodes: int, n_features: int, seed: int) -> dict[str, Any]:
-    """Returns the state of a network along a curve; each node is joined to the next three."""
+    """Return the state of a network along a curve, with each node joined to the next three."""
     generator = torch.Generator().manual_seed(seed)
     frequency, phase = torch.rand(2, n_features, generator=generator)
     node = torch.arange(n_nodes)
@@ -67,10 +67,10 @@ def synthetic_network(n_nodes: int, n_features: int, seed: int) -> dict[str, Any
 
 
 def make_gwr(n_networks: int, n_nodes: int, n_features: int) -> tuple[GWRB, Tensor, int]:
-    """Returns full networks, their weights `[S, N, d]`, and the bytes that they hold."""
+    """Return full networks, their weights ``[S, N, d]``, and their size in bytes."""
     gwr = GWRB(n_features, batch_size=[n_networks], max_nodes=n_nodes)
     state = [synthetic_network(n_nodes, n_features, seed) for seed in range(n_networks)]
-    # It counts what Python holds, the graph; tensors are allocated where it cannot look.
+    # tracemalloc sees the graph, which Python allocates, but not the tensors, added below.
     tracemalloc.start()
     gwr.load_state_dict({"_extra_state": state})
     held = tracemalloc.get_traced_memory()[0]
@@ -80,7 +80,7 @@ def make_gwr(n_networks: int, n_nodes: int, n_features: int) -> tuple[GWRB, Tens
 
 
 def calls_per_round(gwr: GWRB, weights: Tensor, n_inputs: int) -> dict[str, Callable[[], object]]:
-    """Returns what is timed: each call learns from, or looks up, `n_inputs` inputs in turn."""
+    """Return the calls to time, each of which processes ``n_inputs`` inputs in turn."""
     generator = torch.Generator().manual_seed(0)
     n_networks, n_nodes, n_features = weights.shape
 
@@ -112,9 +112,9 @@ def calls_per_round(gwr: GWRB, weights: Tensor, n_inputs: int) -> dict[str, Call
 
 
 def measure(n_networks: int, n_nodes: int, arguments: Arguments) -> dict[str, Any]:
-    """Returns times (ms a network) and memory (bytes a node) of a batch of networks."""
+    """Return times (ms per network) and memory (bytes per node) of a batch of networks."""
     gwr, weights, held = make_gwr(n_networks, n_nodes, arguments.features)
-    # A call should take milliseconds, yet all calls of the largest network only a minute.
+    # Several inputs, so that a call takes milliseconds; fewer for large networks, to save time.
     n_inputs = max(1, min(20, 200_000 // (n_networks * n_nodes)))
     times = interleave(calls_per_round(gwr, weights, n_inputs), rounds=arguments.rounds)
     scale = 1e3 / (n_inputs * n_networks)
@@ -129,14 +129,14 @@ def measure(n_networks: int, n_nodes: int, arguments: Arguments) -> dict[str, An
 
 
 def slope(rows: list[dict[str, Any]], call: str) -> float:
-    """Returns the exponent of time in nodes: the slope of a line through the logarithms."""
+    """Return the exponent of time in nodes, the slope of a regression line in log-log scale."""
     x = [math.log(row["nodes"]) for row in rows]
     y = [math.log(row[call]["median"]) for row in rows]
     return statistics.linear_regression(x, y).slope
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """Returns the measurements in Markdown."""
+    """Format the measurements in Markdown."""
     lines = [
         "| networks | nodes | lookup | adapt | lookup + adapt | read weights | bytes a node |",
         "|---|---|---|---|---|---|---|",
@@ -151,7 +151,7 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 
 def plot(rows: list[dict[str, Any]]) -> Figure:
-    """Plots times against nodes of a single network, medians and quartiles."""
+    """Plot times against nodes of a single network, as medians and quartiles."""
     figure = Figure(figsize=(4.8, 3.6), layout="constrained")
     axes = figure.add_subplot()
     nodes = [row["nodes"] for row in rows]
@@ -168,7 +168,7 @@ def plot(rows: list[dict[str, Any]]) -> Figure:
 
 
 def main(arguments: Arguments) -> None:
-    """Measures, prints and writes."""
+    """Measure, print and write the results."""
     if not arguments.nodes or min(arguments.nodes) < 2:
         raise ValueError(f"--nodes must be one or more, of at least 2, got {arguments.nodes}")
     for name in ("features", "networks", "rounds"):

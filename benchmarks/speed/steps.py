@@ -2,8 +2,9 @@
 
     python benchmarks/speed/steps.py bgpo-single bgpo bgpo-experts dist-nll maml
 
-A step is of all seeds: act, simulate, render and encode while the update runs in a thread of its
-own, store. Each algorithm first plays with all tasks until it knows them apart and learns.
+A step covers all seeds: act, simulate, render and encode while the update runs in a background
+thread, then store. Before timing, each algorithm trains on all tasks until it has groups and
+updates.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from bgpo_trl.world import World
 
 @dataclass(frozen=True)
 class Arguments:
-    """Times training steps and updates."""
+    """Time training steps and updates."""
 
     algorithms: Annotated[tuple[AlgorithmName, ...], tyro.conf.Positional] = (
         "bgpo-single",
@@ -39,17 +40,17 @@ class Arguments:
     )
     """Algorithms to compare; ratios are to the first."""
     seeds: int = 5
-    """Seeds in a batch."""
+    """Seeds per batch."""
     played: int = 400
-    """Steps before the first that counts."""
+    """Training steps before timing."""
     steps: int = 20
-    """Steps of a round."""
+    """Training steps per round."""
     rounds: int = 25
-    """Rounds that count."""
+    """Timing rounds."""
 
 
 class Steps:
-    """An algorithm in training.
+    """Algorithm in training, without logging and evaluation.
 
     Args:
         algorithm: The learner.
@@ -62,7 +63,7 @@ class Steps:
         self._state = self.env.reset()
 
     def play(self, steps: int) -> None:
-        """Takes training steps, each with its update."""
+        """Take training steps, each with its update."""
         for _ in range(steps):
             state = self.algorithm.act(self._state)
             update = self._background.submit(self.algorithm.update)
@@ -71,13 +72,13 @@ class Steps:
             self.algorithm.store(transition)
 
     def update(self, count: int) -> None:
-        """Makes updates alone."""
+        """Make updates without environment steps."""
         for _ in range(count):
             self.algorithm.update()
 
 
 def main(arguments: Arguments) -> None:
-    """Prints a table."""
+    """Print the table."""
     set_threads(1)
     encoders, bank = load_pretrained()
     running: dict[str, Steps] = {}

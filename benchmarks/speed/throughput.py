@@ -1,11 +1,11 @@
-"""How fast it is, each part against what it could be at best and what one would use otherwise.
+"""Speed of each part of training, against its upper bound and its usual alternatives.
 
     python benchmarks/speed/throughput.py
 
-prints tables and writes ``throughput.json``: frames a second, DDPG updates a second, the whole
-training step of BGPO in a batch of seeds against one seed after the other, and memory over a long
+prints tables and writes ``throughput.json``: frames per second, DDPG updates per second, the
+training step of BGPO in a batch of seeds against one seed after another, and memory over a long
 run. Contenders take turns, round by round, since the speed of a machine varies; a ratio is the
-median of the rounds' ratios. Times are medians, with quartiles.
+median of the rounds' ratios. Times are medians with quartiles.
 """
 
 from __future__ import annotations
@@ -41,24 +41,24 @@ Table = dict[str, dict[str, Any]]
 
 @dataclass(frozen=True)
 class Arguments:
-    """Measures the speed of all parts."""
+    """Measure the speed of all parts."""
 
     parts: tuple[Part, ...] = ("frames", "updates", "step", "memory")
     """Parts to measure."""
     seeds: int = 10
-    """Seeds of the batch."""
+    """Seeds per batch."""
     rounds: int = 100
-    """Rounds of each comparison."""
+    """Timing rounds of each comparison."""
     steps: int = 3_000
-    """Training steps of the measurement of memory."""
+    """Training steps of the memory measurement."""
     threads: int | None = None
-    """Threads for physics; one for each core if not given. PyTorch has one, as in training."""
+    """Threads for physics; one per core by default. PyTorch uses one, as in training."""
     out: Path = Path("benchmarks/results/throughput")
-    """Where ``throughput.json`` goes."""
+    """Folder of throughput.json."""
 
 
 def measure_frames(arguments: Arguments, threads: int) -> Table:
-    """Times a frame: the bare limit, our layers above it, and the stock one."""
+    """Time a frame: the bare limit, the layers of this package and stock dm_control."""
     encoders, _ = load_pretrained()
     each = _time_each(frames.contenders(threads, encoders.vae), arguments.rounds)
     return {
@@ -78,7 +78,7 @@ def measure_frames(arguments: Arguments, threads: int) -> Table:
 
 
 def measure_updates(arguments: Arguments) -> Table:
-    """Times an update of one seed: ours, the floor, TorchRL's loop and Stable-Baselines3."""
+    """Time an update of one seed: this package, the floor, TorchRL's loop and Stable-Baselines3."""
     each = _time_each(updates.contenders(arguments.seeds), arguments.rounds)
     floor = next(name for name in each if name.startswith("floor"))
     rivals = [name for name in ("TorchRL loop", "Stable-Baselines3") if name in each]
@@ -94,10 +94,10 @@ def measure_updates(arguments: Arguments) -> Table:
 
 
 class Training:
-    """BGPO in training, step by step, as `bgpo_trl.training.Trainer` runs it but for the logging.
+    """BGPO in training, as `bgpo_trl.training.Trainer` without logging and evaluation.
 
     Args:
-        seeds: The seeds of the batch.
+        seeds: Seeds of the batch.
     """
 
     def __init__(self, seeds: range) -> None:
@@ -111,7 +111,7 @@ class Training:
             self.step()
 
     def step(self) -> None:
-        """Takes a step in all environments and makes an update of all seeds."""
+        """Take a step in all environments, with an update of all seeds."""
         self._state = self.algorithm.act(self._state)
         update = self._background.submit(self.algorithm.update)
         transition, self._state = self.world.env.step_and_maybe_reset(self._state)
@@ -119,7 +119,7 @@ class Training:
         self.algorithm.store(transition)
 
     def time_parts(self) -> dict[str, float]:
-        """Makes every part keep its time from now on; returns the seconds by part, as they grow."""
+        """Time every part from now on; return seconds by part, a dict updated in place."""
         seconds: dict[str, float] = defaultdict(float)
 
         def keep_time(owner: Any, method: str, part: str) -> None:
@@ -148,7 +148,7 @@ class Training:
 
 
 def measure_step(arguments: Arguments) -> Table:
-    """Times a training step of a batch of seeds, and of as many runs of one seed, in turn."""
+    """Time a training step of a batch of seeds and of as many single-seed runs, in turn."""
     batch = Training(range(arguments.seeds))
     singles = [Training(range(seed, seed + 1)) for seed in range(arguments.seeds)]
 
@@ -176,7 +176,7 @@ def measure_step(arguments: Arguments) -> Table:
 
 
 def measure_memory(arguments: Arguments) -> Table:
-    """Tells the memory of a run at the start, at the end, and what of the growth is replay."""
+    """Measure the memory of a run over time, and the replay buffer's share of its growth."""
     training = Training(range(arguments.seeds))
     transition_size = training.algorithm.replay.transition_size
     marks: list[tuple[int, float, float]] = []
@@ -202,7 +202,7 @@ def measure_memory(arguments: Arguments) -> Table:
 def _time_each(
     contenders: dict[str, tuple[Callable[[], object], int]], rounds: int
 ) -> dict[str, list[float]]:
-    """Times calls that make several pieces each; returns seconds a piece, round by round."""
+    """Time calls that produce several items each; return seconds per item, round by round."""
     times = interleave({name: call for name, (call, _) in contenders.items()}, rounds=rounds)
     return {name: [t / contenders[name][1] for t in taken] for name, taken in times.items()}
 
@@ -218,7 +218,7 @@ def _resident() -> float:
 
 
 def show(table: Table) -> str:
-    """Returns a table in Markdown."""
+    """Format a table in Markdown."""
     columns = list(dict.fromkeys(column for row in table.values() for column in row))
     lines = ["| | " + " | ".join(columns) + " |", "|---|" + "---:|" * len(columns)]
     for name, row in table.items():
@@ -236,9 +236,9 @@ def show(table: Table) -> str:
 
 
 def main(arguments: Arguments) -> None:
-    """Measures what was asked for."""
+    """Run the chosen measurements."""
     if not arguments.parts:
-        raise ValueError("--parts names none: name some of frames, updates, step, memory")
+        raise ValueError("--parts is empty: name some of frames, updates, step, memory")
     for name in ("seeds", "rounds", "steps", "threads"):
         number = getattr(arguments, name)
         if number is not None and number < 1:

@@ -1,4 +1,4 @@
-"""Timing of pieces of code against each other on a machine whose speed varies."""
+"""Timing of contenders against each other on a machine whose speed varies."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Timing:
-    """Seconds that a call took: median, and the quartiles around it.
+    """Median and quartiles of the times of a call.
 
     Attributes:
-        median: Of all calls (s).
+        median: Median (s).
         low: First quartile (s).
         high: Third quartile (s).
     """
@@ -25,7 +25,7 @@ class Timing:
 
     @classmethod
     def of(cls, seconds: Sequence[float]) -> Timing:
-        """Summarizes the times of several calls (s)."""
+        """Summarize the times of several calls (s)."""
         low, median, high = np.percentile(seconds, [25, 50, 75])
         return cls(float(median), float(low), float(high))
 
@@ -37,18 +37,18 @@ def interleave(
     warmup: int = 2,
     clock: Callable[[], float] = time.perf_counter,
 ) -> dict[str, list[float]]:
-    """Times all contenders in turn, round by round, so that they meet the same noise.
+    """Time all contenders in turn, round by round, so that they share the same noise.
 
-    Ratios of two contenders are best taken round by round, and then their median: see `ratio`.
+    Compare two contenders by the median of their ratios round by round: see `ratio`.
 
     Args:
-        contenders: What to time, by name; each call should take a few milliseconds at least.
-        rounds: How often to call each.
-        warmup: Calls of each before the first that counts.
+        contenders: Calls to time, by name; each should take a few milliseconds or more.
+        rounds: Number of timed calls of each.
+        warmup: Number of untimed calls of each before.
         clock: Source of time (s).
 
     Returns:
-        The times (s) of each contender, one for each round.
+        The times (s) of each contender, one per round.
     """
     for _ in range(warmup):
         for call in contenders.values():
@@ -63,6 +63,6 @@ def interleave(
 
 
 def ratio(numerator: Sequence[float], denominator: Sequence[float]) -> Timing:
-    """Returns the quotients of two contenders' times, round by round (no unit)."""
+    """Return the round-by-round ratios of two contenders' times (no unit)."""
     pairs = zip(numerator, denominator, strict=True)
     return Timing.of([a / b for a, b in pairs])

@@ -1,9 +1,9 @@
-"""One DDPG update: ours, a TorchRL loop, Stable-Baselines3, and the least that torch must do.
+"""One DDPG update: this package, a TorchRL loop, Stable-Baselines3, and a floor in bare torch.
 
-An update is a sample of 256 transitions, one gradient step of actor and critic, and one of their
-targets. All contenders have the networks of the paper (96 inputs, 4 actions, 64 hidden units) and
-draw from 50,000 random transitions; those "without sampling" take the same batch every time, which
-stays in the cache. Only ours and the floor step several seeds together.
+An update samples 256 transitions and makes one gradient step of actor and critic and one step of
+their targets. All contenders have the networks of the paper (96 inputs, 4 actions, 64 hidden units)
+and draw from 50,000 random transitions; those "without sampling" reuse one batch, which stays in
+the cache. Only this package and the floor step several seeds together.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ LEARNING_RATE, GAMMA, TAU = 1e-3, 0.98, 0.005
 
 
 def contenders(seeds: int = 10, transitions: int = 50_000) -> dict[str, Contender]:
-    """Returns what to time against each other with `timing.interleave`.
+    """Return the contenders for `timing.interleave`.
 
-    Stable-Baselines3 is left out, with a line that says how to install it, if it is missing. The
-    number of threads is the caller's choice: `torch.set_num_threads`.
+    Stable-Baselines3 is skipped, with a line on how to install it, if it is missing. The caller
+    sets the number of threads with ``torch.set_num_threads``.
 
     Args:
-        seeds: How many seeds ours and the floor step together.
-        transitions: How many each replay buffer holds, for each seed.
+        seeds: Number of seeds that this package and the floor step together.
+        transitions: Number of transitions in each replay buffer, per seed.
 
     Returns:
-        For each name, a call that takes some milliseconds, and the number of updates it makes, each
-        seed's counted.
+        For each name, a call that takes some milliseconds and the number of updates it makes,
+        summed over seeds.
     """
     stack, single = Ours(seeds, transitions), Ours(1, transitions)
     fixed, fixed_single = Ours(seeds, BATCH), Ours(1, BATCH)
@@ -60,14 +60,14 @@ def contenders(seeds: int = 10, transitions: int = 50_000) -> dict[str, Contende
         found["Stable-Baselines3"] = stable_baselines3(transitions, updates=4), 4
     except ImportError:
         print(
-            "Goes on without Stable-Baselines3; to have it: pip install -c constraints.txt "
+            "Skipping Stable-Baselines3; to include it: pip install -c constraints.txt "
             "-e '.[bench]'"
         )
     return found
 
 
 def random_transitions(*shape: int, generator: torch.Generator) -> TensorDict:
-    """Returns transitions as BGPO stores them, of random numbers, one in ten a success."""
+    """Return random transitions with BGPO's entries, one in ten a success."""
 
     def normal(size: int) -> Tensor:
         return torch.randn(*shape, size, generator=generator)
@@ -83,9 +83,9 @@ class Ours:
     """The learner of `bgpo_trl.algorithms.bgpo.BGPO`, without an environment.
 
     Args:
-        seeds: Size of the batch of seeds.
-        transitions: How many random transitions to fill the replay buffer with.
-        **options: For the loss, as in `DDPGLoss`.
+        seeds: Number of seeds in the batch.
+        transitions: Number of random transitions in the replay buffer.
+        **options: Options of the loss, as in `DDPGLoss`.
     """
 
     def __init__(self, seeds: int, transitions: int, **options) -> None:
@@ -109,11 +109,11 @@ class Ours:
             self.replay.extend(random_transitions(steps, seeds, generator=generator))
 
     def update(self) -> None:
-        """Makes one update of every seed."""
+        """Make one update of every seed."""
         self.learn(self.replay.sample())
 
     def learn(self, batch: TensorDict) -> None:
-        """Makes one update of every seed from a batch ``[S, B]``."""
+        """Make one update of every seed from a batch ``[S, B]``."""
         losses = self.loss(batch)
         self.optimizer.zero_grad()
         (losses["loss_actor"] + losses["loss_value"]).backward()
@@ -122,20 +122,19 @@ class Ours:
 
 
 class Floor:
-    """DDPG of stacked seeds in bare torch: only what must be computed, nothing of it by name.
+    """Lower bound: DDPG of stacked seeds in bare torch, without TensorDicts.
 
-    No clipped targets, no penalty, no diagnostics, no TensorDict; the rest of the arithmetic is
-    that of `DDPGLoss` with these off.
+    The arithmetic is that of `DDPGLoss` without clipped targets, penalty and diagnostics.
 
     Args:
-        loss: Where the initial weights are copied from.
+        loss: Source of the initial weights.
     """
 
     def __init__(self, loss: DDPGLoss) -> None:
         def copy(params) -> list[Tensor]:
             return [tensor.detach().clone() for tensor in params.values(True, True)]
 
-        # Each a list of weight and bias of the first layer, then of the second.
+        # Order of each list: weight and bias of the first layer, then of the second.
         self.actor = [nn.Parameter(t) for t in copy(loss.actor_network_params)]
         self.critic = [nn.Parameter(t) for t in copy(loss.value_network_params)]
         self.target_actor = copy(loss.target_actor_network_params)
@@ -145,14 +144,14 @@ class Floor:
     def learn(
         self, state: Tensor, action: Tensor, next_state: Tensor, reward: Tensor, goes_on: Tensor
     ) -> None:
-        """Makes one update of every seed.
+        """Make one update of every seed.
 
         Args:
             state: Latent and behavior, ``[S, B, 96]``.
-            action: ``[S, B, 4]``.
-            next_state: As ``state``.
-            reward: ``[S, B, 1]``.
-            goes_on: 0 where the transition ended in a terminal state, else 1, ``[S, B, 1]``.
+            action: Actions ``[S, B, 4]``.
+            next_state: Next latent and behavior, ``[S, B, 96]``.
+            reward: Rewards ``[S, B, 1]``.
+            goes_on: 0 for terminal transitions, else 1, ``[S, B, 1]``.
         """
         with torch.no_grad():
             next_action = _mlp(self.target_actor, next_state).tanh()
@@ -179,7 +178,7 @@ def _mlp(weights: list[Tensor], x: Tensor) -> Tensor:
 
 
 def floor_batch(batch: TensorDict) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Returns a batch of `Ours` as the arguments of `Floor.learn`."""
+    """Return a batch of `Ours` as the arguments of `Floor.learn`."""
     successor = batch["next"]
     return (
         torch.cat([batch["latent"], batch["behavior"]], -1),
@@ -191,10 +190,10 @@ def floor_batch(batch: TensorDict) -> tuple[Tensor, Tensor, Tensor, Tensor, Tens
 
 
 class TorchRLLoop:
-    """DDPG as TorchRL's own example (sota-implementations/ddpg) writes it, with our sizes.
+    """DDPG as in TorchRL's own example (sota-implementations/ddpg), with the same network sizes.
 
     Args:
-        transitions: How many random transitions to fill the replay buffer with.
+        transitions: Number of random transitions in the replay buffer.
     """
 
     def __init__(self, transitions: int) -> None:
@@ -229,7 +228,7 @@ class TorchRLLoop:
         self.replay.extend(data.exclude("behavior"))
 
     def update(self) -> None:
-        """Makes one update."""
+        """Make one update."""
         batch = self.replay.sample()
         loss_value, _ = self.loss.loss_value(batch)
         loss_value.backward()
@@ -243,11 +242,11 @@ class TorchRLLoop:
 
 
 def stable_baselines3(transitions: int, updates: int) -> Callable[[], object]:
-    """Returns a call that makes some updates with the DDPG of Stable-Baselines3.
+    """Return a call that makes updates with the DDPG of Stable-Baselines3.
 
     Args:
-        transitions: How many random transitions to fill the replay buffer with.
-        updates: How many updates a call makes.
+        transitions: Number of random transitions in the replay buffer.
+        updates: Updates per call.
 
     Raises:
         ImportError: If Stable-Baselines3 is not installed.
@@ -257,7 +256,7 @@ def stable_baselines3(transitions: int, updates: int) -> Callable[[], object]:
     from stable_baselines3.common.logger import Logger
 
     class Nowhere(gymnasium.Env):
-        """Says what shape observations and actions have; never stepped."""
+        """Observation and action spaces only; never stepped."""
 
         observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (LATENT + BEHAVIOR,))
         action_space = gymnasium.spaces.Box(-1.0, 1.0, (ACTION,))

@@ -79,7 +79,7 @@ package adds to the published algorithm, one thing at a time, and all of it."""
 
 
 def entry(name: str) -> Entry:
-    """Returns how to make an algorithm or an ablation.
+    """Return how to make an algorithm or an ablation.
 
     Raises:
         ValueError: If none has that name.

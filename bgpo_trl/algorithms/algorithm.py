@@ -84,7 +84,7 @@ class Algorithm(ABC):
 
     @abstractmethod
     def make_env(self, base_env: EnvBase, source: DemonstrationSource) -> TransformedEnv:
-        """Returns the environment of training episodes: a composition of transforms.
+        """Return the environment of training episodes: a composition of transforms.
 
         Args:
             base_env: The simulations ``[S]``.
@@ -93,15 +93,15 @@ class Algorithm(ABC):
 
     @abstractmethod
     def act(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the ``action`` ``[S, 4]`` of the policy with exploration noise."""
+        """Write the ``action`` ``[S, 4]`` of the policy with exploration noise."""
 
     @abstractmethod
     def store(self, transition: TensorDictBase) -> None:
-        """Keeps a transition of each seed, ``[S]``, for later updates."""
+        """Keep a transition of each seed, ``[S]``, for later updates."""
 
     @abstractmethod
     def update(self) -> dict[str, Tensor]:
-        """Makes one update of each seed from the transitions stored so far.
+        """Make one update of each seed from the transitions stored so far.
 
         Touches neither the environment nor the state that `act` changes, so that it may run while
         the environment takes a step.
@@ -115,7 +115,7 @@ class Algorithm(ABC):
     def snapshot(
         self, index: int, embedding: Tensor, task: Tensor, generator: torch.Generator
     ) -> Policy:
-        """Returns a copy, on the CPU, of the policy of one seed, conditioned on demonstrations.
+        """Return a copy, on the CPU, of the policy of one seed, conditioned on demonstrations.
 
         Nothing is learned from the demonstrations, and nothing of the training changes.
 
@@ -127,7 +127,7 @@ class Algorithm(ABC):
         """
 
     def policy(self, parameters: dict[str, Tensor], context: Tensor | None = None) -> Policy:
-        """Returns a policy of `test_actor` with these parameters and this context."""
+        """Return a policy of `test_actor` with these parameters and this context."""
         return Policy(self.test_actor, self.config.state, parameters, context)
 
     def demonstrations(
@@ -137,7 +137,7 @@ class Algorithm(ABC):
         seeds: Sequence[int],
         constant_keys: Sequence[NestedKey] = (),
     ) -> DemonstrationReplay | None:
-        """Returns the replay of shown demonstrations; None if the algorithm is not to use them.
+        """Return the replay of shown demonstrations; None if the algorithm is not to use them.
 
         Args:
             config: Its hyperparameters.
@@ -160,7 +160,7 @@ class Algorithm(ABC):
         )
 
     def learn(self, batch: TensorDictBase) -> dict[str, Tensor]:
-        """Takes a gradient step on a batch, and one of the target networks towards the others.
+        """Take a gradient step on a batch, and one of the target networks towards the others.
 
         Returns:
             What `update` returns.
@@ -170,31 +170,31 @@ class Algorithm(ABC):
         return {key.replace("qvalue", "value"): v / self.n_seeds for key, v in losses.items()}
 
     def to_device(self, batch: TensorDictBase) -> TensorDictBase:
-        """Returns a batch where the networks are."""
+        """Return a batch where the networks are."""
         return batch if self.device == torch.device("cpu") else batch.to(self.device)
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns all that future actions, updates and snapshots depend on."""
+        """Return all that future actions, updates and snapshots depend on."""
         return {
             "noise": [generator.get_state() for generator in self._noise],
             **{name: dict(part.state_dict()) for name, part in self._learned().items()},
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continues from what `state_dict` returned."""
+        """Continue from what `state_dict` returned."""
         for name, part in self._learned().items():
             part.load_state_dict(state[name])
         for generator, saved in zip(self._noise, state["noise"], strict=True):
             generator.set_state(saved)
 
     def _learned(self) -> dict[str, Any]:
-        """Returns what changes by learning, which an algorithm need not have all of."""
+        """Return what changes by learning, which an algorithm need not have all of."""
         parts = ("learner", "replay")
         return {name: getattr(self, name) for name in parts if hasattr(self, name)}
 
 
 def networks_of(parameters: TensorDictBase, seed: Tensor, task: Tensor) -> dict[str, Tensor]:
-    """Returns some of the networks that there are for each task of each seed.
+    """Return some of the networks that there are for each task of each seed.
 
     Args:
         parameters: ``[S, T, ...]``.

@@ -119,7 +119,7 @@ class BGPO(Algorithm):
         self.shown = self.demonstrations(config, bank, seeds, constant_keys=keys[1:])
 
     def make_env(self, base_env: EnvBase, source: DemonstrationSource) -> TransformedEnv:
-        """Returns the variant's environment, see `bgpo_trl.algorithms.environments`."""
+        """Return the variant's environment, see `bgpo_trl.algorithms.environments`."""
         modules = self.encoders, self.gwr, self.groups
         return self.variant.make_env(self.config, base_env, source, *modules)
 
@@ -129,7 +129,7 @@ class BGPO(Algorithm):
         return self.config.beta if self.variant.bonus else 0.0
 
     def _highest_return(self) -> float:
-        """Returns the highest attainable return: of a success now, or after a time-out's bonus."""
+        """Return the highest attainable return: of a success now, or after a time-out's bonus."""
         success = 1.0 + self.beta
         return max(success, self.beta + self.config.rl.gamma * success)
 
@@ -138,7 +138,7 @@ class BGPO(Algorithm):
 
     @torch.no_grad()
     def act(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the ``action`` ``[S, 4]`` by which the policy explores."""
+        """Write the ``action`` ``[S, 4]`` by which the policy explores."""
         groups = self._groups_of(tensordict)
         if self.config.experts:
             expert = self.experts.play(groups)
@@ -150,7 +150,7 @@ class BGPO(Algorithm):
         return tensordict.set("action", self.learner.act(seen, self._noise, expert))
 
     def store(self, transition: TensorDictBase) -> None:
-        """Keeps a transition of each seed for updates to come, and the demonstration at its end."""
+        """Keep a transition of each seed for updates to come, and the demonstration at its end."""
         group = torch.tensor(self._groups_of(transition))
         self.replay.add(transition, group)
         if self.shown is None:
@@ -164,13 +164,13 @@ class BGPO(Algorithm):
             self.shown.add(transition, reward, group, ended)
 
     def update(self) -> dict[str, Tensor]:
-        """Makes one update of each seed; see `Algorithm.update`."""
+        """Make one update of each seed; see `Algorithm.update`."""
         if len(self.replay) < self.config.rl.warmup_steps:
             return {}
         return self.learn(self._sample())
 
     def _sample(self) -> TensorDictBase:
-        """Returns the transitions of an update, ``[S, E, B]``."""
+        """Return the transitions of an update, ``[S, E, B]``."""
         config, (_, n_experts) = self.config, self.experts.active.group.shape
         n_rows = config.expert_batch_size if config.experts else config.rl.batch_size
 
@@ -192,7 +192,7 @@ class BGPO(Algorithm):
     def snapshot(
         self, index: int, embedding: Tensor, task: Tensor, generator: torch.Generator
     ) -> Policy:
-        """Returns a copy of one seed's policy; see `Algorithm.snapshot`.
+        """Return a copy of one seed's policy; see `Algorithm.snapshot`.
 
         With experts, its parameters are those of each episode's expert, ``[T, M, ...]``.
         """
@@ -213,7 +213,7 @@ class BGPO(Algorithm):
         return self.policy(parameters, context)
 
     def context(self, index: int, embedding: Tensor, task: Tensor) -> Tensor | None:
-        """Returns the context that demonstrations give the policy of one seed in test episodes.
+        """Return the context that demonstrations give the policy of one seed in test episodes.
 
         Args:
             index: Position of the seed in the batch.
@@ -235,13 +235,13 @@ class BGPO(Algorithm):
         return self.config.behavior_scale * behavior
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns all that future actions, updates and snapshots depend on."""
+        """Return all that future actions, updates and snapshots depend on."""
         state = {**super().state_dict(), "experts": self.experts.state_dict()}
         state["active"] = self._active.state_dict()
         return state
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continues from what `state_dict` returned."""
+        """Continue from what `state_dict` returned."""
         super().load_state_dict(state)
         self.experts.load_state_dict(state["experts"])
         self._active.load_state_dict(state["active"])

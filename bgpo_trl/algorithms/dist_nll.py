@@ -135,12 +135,12 @@ class DistNLL(Algorithm):
             self.test_actor.add_head()
 
     def make_env(self, base_env: EnvBase, source: DemonstrationSource) -> TransformedEnv:
-        """Returns the environment of policies that observe the state only."""
+        """Return the environment of policies that observe the state only."""
         return no_context_env(self.config, base_env, source, self.encoders)
 
     @torch.no_grad()
     def act(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the ``action`` ``[S, 4]`` of the tasks' teachers with exploration noise."""
+        """Write the ``action`` ``[S, 4]`` of the tasks' teachers with exploration noise."""
         seen = self.to_device(tensordict.select(self.config.state))
         teachers = networks_of(
             self.loss.actor_network_params, torch.arange(self.n_seeds), tensordict["task"]
@@ -149,12 +149,12 @@ class DistNLL(Algorithm):
         return tensordict.set("action", self.learner.explore(seen["action"], self._noise))
 
     def store(self, transition: TensorDictBase) -> None:
-        """Keeps a transition of each seed with its task for updates to come."""
+        """Keep a transition of each seed with its task for updates to come."""
         self.replay.add(transition)
         self._ended = transition.get(("next", "done")).flatten().clone()
 
     def update(self) -> dict[str, Tensor]:
-        """Makes one update of each seed's teachers; see `Algorithm.update`.
+        """Make one update of each seed's teachers; see `Algorithm.update`.
 
         The multi-task policies of seeds whose episode has just ended learn from them after it.
         """
@@ -166,7 +166,7 @@ class DistNLL(Algorithm):
         return losses
 
     def _distill(self, index: int) -> None:
-        """Has the multi-task policy of a seed learn what its teachers do now."""
+        """Have the multi-task policy of a seed learn what its teachers do now."""
         tasks, student = self._tasks[index], self.students[index]
         optimizer = self._student_optimizers[index]
         for task in self.replay.ready[index].nonzero().flatten().tolist():
@@ -192,7 +192,7 @@ class DistNLL(Algorithm):
     def snapshot(
         self, index: int, embedding: Tensor, task: Tensor, generator: torch.Generator
     ) -> Policy:
-        """Returns the multi-task policy's weights, heads in the order of the tasks.
+        """Return the multi-task policy's weights, heads in the order of the tasks.
 
         See `Algorithm.snapshot`. The head of a task of which nothing is known yet is zero. The
         demonstrations are not read.
@@ -208,7 +208,7 @@ class DistNLL(Algorithm):
         return self.policy(weights)
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns all that future actions, updates and snapshots depend on."""
+        """Return all that future actions, updates and snapshots depend on."""
         return {
             **super().state_dict(),
             "tasks": [list(tasks) for tasks in self._tasks],
@@ -219,7 +219,7 @@ class DistNLL(Algorithm):
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continues from what `state_dict` returned."""
+        """Continue from what `state_dict` returned."""
         super().load_state_dict(state)
         self._ended = state["ended"].clone()
         for index, tasks in enumerate(state["tasks"]):

@@ -56,7 +56,10 @@ def bgpo_env(
     gwr: GWRB,
     groups: BehaviorGroups,
 ) -> TransformedEnv:
-    """BGPO with experts: GWR-B infers the behavior, a coarse GWR-B the group whose expert acts."""
+    """Return the environment of BGPO with experts.
+
+    GWR-B infers the behavior, a coarse GWR-B the group whose expert acts.
+    """
     return TransformedEnv(
         base_env,
         Compose(
@@ -83,7 +86,7 @@ def published_env(
     gwr: GWRB,
     groups: None,
 ) -> TransformedEnv:
-    """BGPO as published (Alg. 1): one policy for all behaviors."""
+    """Return the environment of BGPO as published (Alg. 1), with one policy for all behaviors."""
     return TransformedEnv(
         base_env,
         Compose(
@@ -109,7 +112,7 @@ def without_bonus_env(
     gwr: GWRB,
     groups: None,
 ) -> TransformedEnv:
-    """The ablation with GWR-B and without the intrinsic reward (Fig. 9)."""
+    """Return the environment of the ablation with GWR-B, without intrinsic reward (Fig. 9)."""
     return TransformedEnv(
         base_env,
         Compose(
@@ -134,7 +137,10 @@ def without_gwr_env(
     gwr: None,
     groups: None,
 ) -> TransformedEnv:
-    """The ablation without GWR-B: the demonstration's own embedding is the behavior (Fig. 9)."""
+    """Return the environment of the ablation without GWR-B (Fig. 9).
+
+    The behavior is the embedding of the demonstration itself.
+    """
     return TransformedEnv(
         base_env,
         Compose(
@@ -160,7 +166,7 @@ def without_both_env(
     gwr: None,
     groups: None,
 ) -> TransformedEnv:
-    """The ablation without GWR-B and without the intrinsic reward (Fig. 9)."""
+    """Return the environment of the ablation without GWR-B and intrinsic reward (Fig. 9)."""
     return TransformedEnv(
         base_env,
         Compose(
@@ -185,7 +191,7 @@ def label_env(
     gwr: None,
     groups: None,
 ) -> TransformedEnv:
-    """The upper reference: the context is the one-hot label of the task."""
+    """Return the environment of DDPG whose context is the one-hot label of the task."""
     n_tasks = source.schedule.n_tasks
 
     def label(task: Tensor) -> Tensor:
@@ -214,7 +220,7 @@ def no_context_env(
     gwr: None = None,
     groups: None = None,
 ) -> TransformedEnv:
-    """The environment of MAML, Dist-NLL and plain DDPG, whose policies observe the state only."""
+    """Return the environment of MAML, Dist-NLL and plain DDPG, without context."""
     return TransformedEnv(
         base_env,
         Compose(
@@ -232,12 +238,12 @@ def no_context_env(
 def observation_env(
     config: AlgorithmConfig, base_env: EnvBase, encoders: Representation | None
 ) -> TransformedEnv:
-    """The environment of test episodes, whose policies have been conditioned before."""
+    """Return the environment of test episodes, whose policies are conditioned already."""
     return TransformedEnv(base_env, Compose([encode(config, encoders), clip(config)]))
 
 
 def encode(config: AlgorithmConfig, encoders: Representation | None) -> Transform:
-    """Returns the transform from the simulation's observation to the state.
+    """Return the transform from the simulation's observation to the state.
 
     Raises:
         ValueError: If ``config.state`` is ``"latent"`` and there are no encoders.
@@ -251,7 +257,7 @@ def encode(config: AlgorithmConfig, encoders: Representation | None) -> Transfor
 
 
 def match_behavior(config: BGPOConfig, encoders: Representation | None) -> BehaviorMatchingReward:
-    """Returns the transform that pays the intrinsic reward.
+    """Return the transform that pays the intrinsic reward.
 
     Raises:
         ValueError: If there are no encoders.
@@ -262,7 +268,7 @@ def match_behavior(config: BGPOConfig, encoders: Representation | None) -> Behav
 
 
 def behavior_as_context(config: BGPOConfig) -> ObservationNorm:
-    """Returns the transform from the behavior to the context, in a scale that suits the networks.
+    """Return the transform from the behavior to the context, in a scale that suits the networks.
 
     Latents have unit scale; an unscaled behavior beside them slows the first task down.
     """
@@ -270,7 +276,7 @@ def behavior_as_context(config: BGPOConfig) -> ObservationNorm:
 
 
 def clip(config: AlgorithmConfig) -> ClipTransform:
-    """Returns the transform that bounds the state that policies observe.
+    """Return the transform that bounds the state that policies observe.
 
     An object that was knocked off the table is dozens of deviations away and would dominate. The
     transform comes after `BehaviorMatchingReward`, which embeds latents as demonstrations are.
@@ -279,7 +285,7 @@ def clip(config: AlgorithmConfig) -> ClipTransform:
 
 
 def sum_rewards(*keys: str) -> RewardSum:
-    """Returns the transform that adds up each of some rewards as ``episode_...``."""
+    """Return the transform that adds up each of some rewards as ``episode_...``."""
     return RewardSum(in_keys=list(keys), out_keys=[f"episode_{key}" for key in keys])
 
 

@@ -43,12 +43,12 @@ class ActiveGroups:
         return torch.tensor(self._slots)
 
     def slot(self, seed: int, group: int) -> int | None:
-        """Returns the slot of a group, None if it has none."""
+        """Return the slot of a group, None if it has none."""
         slots = self._slots[seed]
         return slots.index(group) if group in slots else None
 
     def play(self, seed: int, group: int) -> int:
-        """Makes a group the latest of a seed; returns its slot."""
+        """Make a group the latest of a seed; returns its slot."""
         slot, order = self.slot(seed, group), self._order[seed]
         if slot is None:
             slot = order[0]
@@ -58,16 +58,16 @@ class ActiveGroups:
         return slot
 
     def rows(self, n_rows: int) -> Tensor:
-        """Returns a group for each of ``n_rows`` rows, the active ones in turn, ``[S, R]``."""
+        """Return a group for each of ``n_rows`` rows, the active ones in turn, ``[S, R]``."""
         active = [[group for group in slots if group >= 0] or [-1] for slots in self._slots]
         return torch.tensor([[groups[i % len(groups)] for i in range(n_rows)] for groups in active])
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns the groups and the order in which they were played."""
+        """Return the groups and the order in which they were played."""
         return {"slots": [[*s] for s in self._slots], "order": [[*o] for o in self._order]}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continues from what `state_dict` returned."""
+        """Continue from what `state_dict` returned."""
         self._slots = [[*slots] for slots in state["slots"]]
         self._order = [[*order] for order in state["order"]]
 
@@ -96,7 +96,7 @@ class Experts:
         self._aside: list[dict[int, State]] = [{} for _ in range(self._batch[0])]
 
     def play(self, groups: Sequence[int]) -> Tensor:
-        """Makes the group of each seed's episode active.
+        """Make the group of each seed's episode active.
 
         Args:
             groups: One for each seed.
@@ -107,7 +107,7 @@ class Experts:
         return torch.tensor([self._play(seed, group) for seed, group in enumerate(groups)])
 
     def actor_weights(self, seed: int, group: int) -> State:
-        """Returns copies of the weights of a group's policy, on the CPU.
+        """Return copies of the weights of a group's policy, on the CPU.
 
         A group that was not played yet acts as the one it parted from.
 
@@ -124,12 +124,12 @@ class Experts:
         }
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns the networks that are put aside, and which groups are active."""
+        """Return the networks that are put aside, and which groups are active."""
         aside = [{group: dict(state) for group, state in row.items()} for row in self._aside]
         return {"active": self.active.state_dict(), "aside": aside}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continues from what `state_dict` returned; the learner is loaded by itself."""
+        """Continue from what `state_dict` returned; the learner is loaded by itself."""
         self.active.load_state_dict(state["active"])
         device = next(self.learner.loss.parameters()).device
         self._aside = [
@@ -156,7 +156,7 @@ class Experts:
         return slot
 
     def _with_networks(self, seed: int, group: int) -> int:
-        """Returns the group, or the nearest of those it descends from that has networks."""
+        """Return the group, or the nearest of those it descends from that has networks."""
         while group and group not in self._aside[seed] and self.active.slot(seed, group) is None:
             group = self._parent(seed, group)
         return group
@@ -177,7 +177,7 @@ class Experts:
 
 
 def _tensors(learner: Learner, batch: torch.Size) -> State:
-    """Returns the tensors of a learner that have a row for each expert, ``[S, E, ...]``."""
+    """Return the tensors of a learner that have a row for each expert, ``[S, E, ...]``."""
     tensors: State = {
         key: value
         for key, value in learner.loss.state_dict().items()

@@ -104,12 +104,12 @@ class MAML(Algorithm):
         )
 
     def make_env(self, base_env: EnvBase, source: DemonstrationSource) -> TransformedEnv:
-        """Returns the environment of policies that observe the state only."""
+        """Return the environment of policies that observe the state only."""
         return no_context_env(self.config, base_env, source, self.encoders)
 
     @torch.no_grad()
     def act(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the ``action`` ``[S, 4]`` of the adapted policies with exploration noise."""
+        """Write the ``action`` ``[S, 4]`` of the adapted policies with exploration noise."""
         seen = self.to_device(tensordict.select(self.config.state))
         adapted = networks_of(
             self.loss.actor_network_params, torch.arange(self.n_seeds), tensordict["task"]
@@ -118,11 +118,11 @@ class MAML(Algorithm):
         return tensordict.set("action", self.learner.explore(seen["action"], self._noise))
 
     def store(self, transition: TensorDictBase) -> None:
-        """Keeps a transition of each seed with its task for updates to come."""
+        """Keep a transition of each seed with its task for updates to come."""
         self.replay.add(transition)
 
     def update(self) -> dict[str, Tensor]:
-        """Makes one update of each seed; see `Algorithm.update`."""
+        """Make one update of each seed; see `Algorithm.update`."""
         if len(self.replay) < max(self.config.rl.warmup_steps, self.replay.enough):
             return {}
         batch = self.replay.sample()
@@ -133,7 +133,7 @@ class MAML(Algorithm):
     def snapshot(
         self, index: int, embedding: Tensor, task: Tensor, generator: torch.Generator
     ) -> Policy:
-        """Returns the weights of the policy adapted to each task, ``[T, ...]``.
+        """Return the weights of the policy adapted to each task, ``[T, ...]``.
 
         See `Algorithm.snapshot`. Without enough data of a task it does not adapt to it. The
         demonstrations are not read.

@@ -35,7 +35,7 @@ class Policy:
 
     @classmethod
     def stack(cls, policies: Sequence[Policy], device: torch.device | str = "cpu") -> Policy:
-        """Returns the policies of several seeds as one, ``[S]``, on a device."""
+        """Return the policies of several seeds as one, ``[S]``, on a device."""
         first = policies[0]
         contexts = [policy.context for policy in policies if policy.context is not None]
         return cls(
@@ -50,7 +50,7 @@ class Policy:
 
     @torch.no_grad()
     def act(self, state: Tensor) -> Tensor:
-        """Returns actions ``[..., T, M, 4]`` in [-1, 1] for states ``[..., T, M, features]``."""
+        """Return actions ``[..., T, M, 4]`` in [-1, 1] for states ``[..., T, M, features]``."""
         inputs: TensorDictBase = TensorDict({self.state_key: state}, state.shape[:-1])
         if self.context is not None:
             inputs["context"] = self.context
@@ -58,5 +58,5 @@ class Policy:
         return inputs["action"]
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns parameters and context, of which `Algorithm.policy` makes the policy again."""
+        """Return parameters and context, of which `Algorithm.policy` makes the policy again."""
         return {"parameters": self.parameters, "context": self.context}

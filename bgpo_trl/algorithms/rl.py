@@ -45,26 +45,26 @@ class Problem:
     """Numbers of the experts ``E``; an expert's random numbers follow from its seed and number."""
 
     def generators(self, name: str) -> list[torch.Generator]:
-        """Returns one generator for each expert of each seed, for one purpose."""
+        """Return one generator for each expert of each seed, for one purpose."""
         return [generators([s], f"{name} {e}")[0] for s in self.seeds for e in self.experts]
 
     def actor(self, network: Callable[..., Any], config: RLConfig) -> Any:
-        """Returns policies ``[S, E]`` of a class such as `Actor`."""
+        """Return policies ``[S, E]`` of a class such as `Actor`."""
         return self._network(network, config, self._shape, self.generators("actor"))
 
     def critic(self, config: RLConfig) -> Critic:
-        """Returns Q-functions ``[S, E]``."""
+        """Return Q-functions ``[S, E]``."""
         norm, streams = config.critic_layer_norm, self.generators("critic")
         return self._network(Critic, config, self._shape, streams, layer_norm=norm)
 
     def twin_critics(self, config: RLConfig) -> Critic:
-        """Returns Q-functions ``[S, E, 2]``."""
+        """Return Q-functions ``[S, E, 2]``."""
         first, second = (self.generators(name) for name in ("critic", "second critic"))
         norm, streams = config.critic_layer_norm, [*chain(*zip(first, second, strict=True))]
         return self._network(Critic, config, [*self._shape, 2], streams, layer_norm=norm)
 
     def loss_options(self, config: RLConfig) -> dict[str, Any]:
-        """Returns the arguments that the losses of this package have in common."""
+        """Return the arguments that the losses of this package have in common."""
         return {
             "return_bounds": self.return_bounds if config.clip_targets else None,
             "constant_keys": self.in_keys[1:],
@@ -125,7 +125,7 @@ class Learner:
     def act(
         self, tensordict: TensorDictBase, generators: Sequence[torch.Generator], expert: Tensor
     ) -> Tensor:
-        """Returns actions of a training step, ``[S, 4]`` in [-1, 1], on the CPU.
+        """Return actions of a training step, ``[S, 4]`` in [-1, 1], on the CPU.
 
         Args:
             tensordict: What the policies read, ``[S]``.
@@ -136,16 +136,16 @@ class Learner:
         return self.explore(_of_expert(action, expert), generators)
 
     def _for_all(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Returns what is read ``[S]`` by all experts, ``[S, E]``."""
+        """Return what is read ``[S]`` by all experts, ``[S, E]``."""
         return tensordict.unsqueeze(1).expand(*self.actor.batch_size)
 
     def explore(self, action: Tensor, generators: Sequence[torch.Generator]) -> Tensor:
-        """Returns actions ``[S, 4]`` with each seed's Gaussian noise, within [-1, 1]."""
+        """Return actions ``[S, 4]`` with each seed's Gaussian noise, within [-1, 1]."""
         noise = self.noise * normal(generators, action.shape[1:])
         return (action.cpu() + noise).clamp(-1.0, 1.0)
 
     def learn(self, batch: TensorDictBase) -> dict[str, Tensor]:
-        """Takes a gradient step on transitions ``[S, B]``, and one of the target networks.
+        """Take a gradient step on transitions ``[S, B]``, and one of the target networks.
 
         Returns:
             The parts of the loss, sums over the seeds ``[]``.
@@ -161,15 +161,15 @@ class Learner:
         return {key: value.detach() for key, value in parts.items()}
 
     def actor_is_due(self) -> bool:
-        """Returns whether this update is one of the actor and the target networks too."""
+        """Return whether this update is one of the actor and the target networks too."""
         return True
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns all that future updates depend on."""
+        """Return all that future updates depend on."""
         return {"loss": dict(self.loss.state_dict()), "optimizer": self.optimizer.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continues from what `state_dict` returned."""
+        """Continue from what `state_dict` returned."""
         self.loss.load_state_dict(state["loss"])
         self.optimizer.load_state_dict(state["optimizer"])
 
@@ -193,16 +193,16 @@ class TD3Learner(Learner):
         self.policy_delay, self.n_updates = config.policy_delay, 0
 
     def actor_is_due(self) -> bool:
-        """Returns whether this is the last of ``policy_delay`` updates; each call counts one."""
+        """Return whether this is the last of ``policy_delay`` updates; each call counts one."""
         self.n_updates += 1
         return self.n_updates % self.policy_delay == 0
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns all that future updates depend on."""
+        """Return all that future updates depend on."""
         return {**super().state_dict(), "n_updates": self.n_updates}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continues from what `state_dict` returned."""
+        """Continue from what `state_dict` returned."""
         super().load_state_dict(state)
         self.n_updates = state["n_updates"]
 
@@ -215,7 +215,7 @@ class SACLearner(Learner):
     def act(
         self, tensordict: TensorDictBase, generators: Sequence[torch.Generator], expert: Tensor
     ) -> Tensor:
-        """Returns actions drawn for a training step; see `Learner.act`."""
+        """Return actions drawn for a training step; see `Learner.act`."""
         noise = normal(generators, [self.actor.action_dim]).unsqueeze(1)
         noise = noise.expand(*self.actor.batch_size, -1)
         device = next(self.actor.parameters()).device
@@ -224,13 +224,13 @@ class SACLearner(Learner):
 
 
 def _of_expert(values: Tensor, expert: Tensor) -> Tensor:
-    """Returns those of one expert of each seed, ``[S, ...]`` of ``[S, E, ...]``."""
+    """Return those of one expert of each seed, ``[S, ...]`` of ``[S, E, ...]``."""
     seed = torch.arange(len(values), device=values.device)
     return values[seed, expert.to(values.device)]
 
 
 def make_ddpg(config: DDPGConfig, problem: Problem) -> Learner:
-    """Returns DDPG (Lillicrap et al., 2016), the paper's."""
+    """Return DDPG (Lillicrap et al., 2016), the paper's."""
     actor = problem.actor(Actor, config)
     loss = DDPGLoss(
         actor,
@@ -242,7 +242,7 @@ def make_ddpg(config: DDPGConfig, problem: Problem) -> Learner:
 
 
 def make_td3(config: TD3Config, problem: Problem) -> Learner:
-    """Returns TD3 (Fujimoto et al., 2018)."""
+    """Return TD3 (Fujimoto et al., 2018)."""
     actor = problem.actor(Actor, config)
     loss = TD3Loss(
         actor,
@@ -257,7 +257,7 @@ def make_td3(config: TD3Config, problem: Problem) -> Learner:
 
 
 def make_sac(config: SACConfig, problem: Problem) -> Learner:
-    """Returns SAC with a learned temperature (Haarnoja et al., 2018)."""
+    """Return SAC with a learned temperature (Haarnoja et al., 2018)."""
     actor = problem.actor(GaussianActor, config)
     loss = SACLoss(
         actor,
@@ -290,7 +290,7 @@ RL: dict[str, RLEntry] = {
 
 
 def make_learner(config: RLConfig, problem: Problem) -> Learner:
-    """Returns the RL algorithm that a config is of.
+    """Return the RL algorithm that a config is of.
 
     Raises:
         ValueError: If `RL` has none under its name.

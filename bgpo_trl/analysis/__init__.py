@@ -1,1 +1,1 @@
-"""Measures of continual learning and of task inference."""
+"""Measures of continual learning and task inference, and the tables of the report."""

@@ -1,4 +1,4 @@
-"""The paper's claims and further ones, each with its verdict from the runs."""
+"""Tests of the paper's claims, and of the additions to its algorithm, on finished runs."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from bgpo_trl.analysis.comparison import (
 from bgpo_trl.analysis.tables import Table
 
 Groups = Mapping[str, Mapping[str, Run]]
-"""Runs by the names of their directories, by the key of their group."""
+"""Runs by directory name, by group key."""
 
 LEVEL = (
     "The interval of the difference decides. Level: it includes 0, which does not prove that the "
@@ -31,7 +31,7 @@ LEVEL = (
 _NAMES = ALGORITHMS | PUBLISHED
 _MEASURES = {"last 10 %": late_scores, "area": area_scores}
 _RIVALS = ("MAML", "Dist-NLL")
-# Each BGPO and those baselines that it meets on equal terms.
+# Each BGPO with the baselines under the same conditions (demonstrations, stabilizers).
 _PAIRS = {
     "bgpo": ("maml-demonstrations", "dist-nll-demonstrations"),
     "bgpo-experts": ("maml", "dist-nll"),
@@ -41,7 +41,7 @@ _PAIRS = {
 
 
 def claims(groups: Groups, statistics: Statistics) -> Table:
-    """Returns the paper's claims with what was found, the table's head first."""
+    """Return the table of the paper's claims and their verdicts, headed by its column names."""
     judge = _Judge(groups, statistics, ("reproduced", "the opposite"))
     rows = [["the paper's claim", "tested", "measured", "difference [95 %]", "found"]]
     for setting in SETTINGS:
@@ -73,24 +73,24 @@ def claims(groups: Groups, statistics: Statistics) -> Table:
 
 
 def additions(groups: Groups, statistics: Statistics) -> Table:
-    """Returns what is gained by each addition to the paper's algorithm, the table's head first.
+    """Return the table of the gain of each addition to the paper's algorithm.
 
-    Empty if no run has such an addition.
+    Empty if no run has an addition.
     """
     judge = _Judge(groups, statistics, ("above", "below"))
     rows = [["added", "compared with", "setting", "measured", "difference [95 %]", "found"]]
     steps = [("even-replay", "gwr+r_int"), ("experts", "even-replay")]
     steps += [("demonstrations", "gwr+r_int"), ("all", "experts"), ("all", "gwr+r_int")]
-    there = False
+    any_run = False
     for setting, group in (("concurrent", "ablation"), ("continual", "ablation-continual")):
         for more, fewer in steps:
             pair = [(group, variant(setting, name)) for name in (more, fewer)]
-            there |= all(key in groups[group] for _, key in pair)
+            any_run |= all(key in groups[group] for _, key in pair)
             rows += [
                 [ADDITIONS[more], ADDITIONS[fewer], setting, what, *judge(what, *pair)]
                 for what in _MEASURES
             ]
-    return rows if there else []
+    return rows if any_run else []
 
 
 def _group(setting: str, algorithm: str) -> str:
@@ -98,24 +98,24 @@ def _group(setting: str, algorithm: str) -> str:
 
 
 class _Judge:
-    """Differences between runs, in words.
+    """Differences between runs, with intervals and verdicts.
 
     Args:
         groups: The runs.
-        statistics: Of their scores.
-        words: For a difference above 0, and for one below.
+        statistics: Source of the resampled scores.
+        words: Verdicts for a difference above 0 and below 0.
     """
 
     def __init__(self, groups: Groups, statistics: Statistics, words: tuple[str, str]) -> None:
         self._groups, self._statistics, self._words = groups, statistics, words
 
     def __call__(self, what: str, *keys: tuple[str, str]) -> list[str]:
-        """Returns a difference with its interval, and what it says.
+        """Return a difference with its interval, and the verdict.
 
         Args:
             what: The measure.
-            *keys: Group and directory of two runs, the second to be subtracted from the first; or
-                of four, the difference of the last two to be subtracted from that of the first two.
+            *keys: Group and directory of two runs, for first minus second; or of four runs, for the
+                difference of the first two minus that of the last two.
         """
         runs = [self._groups[group].get(key) for group, key in keys]
         missing = [key for (_, key), run in zip(keys, runs, strict=True) if run is None]
@@ -125,8 +125,8 @@ class _Judge:
         gain = _difference([metrics.interquartile_mean(of_run) for of_run in scores])
         drawn = _difference([self._statistics.resampled(of_run) for of_run in scores])
         low, high = metrics.percentile_interval(drawn)
-        found = self._words[0] if low > 0 else self._words[1] if high < 0 else "level"
-        return [f"{100 * gain:+.1f} [{100 * low:+.0f}, {100 * high:+.0f}]", found]
+        verdict = self._words[0] if low > 0 else self._words[1] if high < 0 else "level"
+        return [f"{100 * gain:+.1f} [{100 * low:+.0f}, {100 * high:+.0f}]", verdict]
 
 
 def _difference(values: list[Any]) -> Any:

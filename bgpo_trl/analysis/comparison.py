@@ -1,4 +1,4 @@
-"""The runs that are compared, and the measures on which they are."""
+"""Runs to compare, their groups and figures, and the scores they are compared on."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Picture:
     """A figure of learning curves."""
 
     file: str
-    """Name of the file, without its ending."""
+    """File name, without suffix."""
     caption: str
     """Subtitle, after the title of its group."""
     runs: tuple[str, ...]
@@ -31,11 +31,11 @@ class Picture:
 
 @dataclass(frozen=True)
 class Group:
-    """Runs on equal terms, which one table compares."""
+    """Runs under equal conditions, compared in one table."""
 
     title: str
     runs: dict[str, str]
-    """Names of the runs, by their directories."""
+    """Names of the runs, by directory."""
     pictures: tuple[Picture, ...]
 
 
@@ -59,8 +59,8 @@ SETTINGS = {
     "concurrent": ("6", "all tasks from the start"),
     "continual": ("8", "tasks one after the other"),
 }
-"""Number of the paper's figure and what it is about."""
-# Variants that are algorithms too: run once, under the algorithm's name.
+"""Number of the paper's figure, and its schedule of tasks."""
+# Variants that are also algorithms, run once under the algorithm's name.
 SAME = {"gwr+r_int": "bgpo-single", "experts": "bgpo-experts", "all": "bgpo"}
 PUBLISHED_VARIANTS = {
     "gwr+r_int": "GWR-B + r_int",
@@ -78,7 +78,7 @@ ADDITIONS = {
 
 
 def variant(setting: str, name: str) -> str:
-    """Returns the directory of a variant's run."""
+    """Return the directory of a variant's run."""
     if name in SAME:
         return f"{setting}-{SAME[name]}"
     return f"ablation-{name}" if setting == "concurrent" else f"ablation-continual-{name}"
@@ -115,11 +115,11 @@ def _ablation(setting: str) -> Group:
     references = {f"{setting}-{key}": name for key, name in REFERENCES.items()}
     file = "fig9" if setting == "concurrent" else f"fig9-{setting}"
     return Group(
-        f"Fig. 9: what each part contributes, {SETTINGS[setting][1]}",
+        f"Fig. 9: contribution of each part, {SETTINGS[setting][1]}",
         {**published, **added, **references},
         (
             Picture(file, "the paper's four", (*published, *references)),
-            Picture(f"{file}-added", "what is added to them", tuple(added)),
+            Picture(f"{file}-added", "additions to them", tuple(added)),
         ),
     )
 
@@ -131,7 +131,7 @@ GROUPS |= {"ablation": _ablation("concurrent"), "ablation-continual": _ablation(
 
 @dataclass(frozen=True)
 class Run:
-    """One run, as its files tell it."""
+    """Settings, summary and curves of one run."""
 
     directory: Path
     name: str
@@ -141,18 +141,17 @@ class Run:
 
 
 def read_group(runs: Path, group: Group) -> tuple[dict[str, Run], list[str]]:
-    """Reads the runs of a group and cuts them to a common length.
+    """Read the runs of a group and cut them to a common length.
 
     Args:
         runs: Directory of the runs.
-        group: What to read.
+        group: Group to read.
 
     Returns:
-        The runs that are there, by the names of their directories; and notes about those that are
-        missing, not finished or cut.
+        The runs found, by directory name, and notes on missing, unfinished or cut runs.
 
     Raises:
-        ValueError: If runs of a figure have other seeds, tasks or states than each other.
+        ValueError: If runs of the group differ in seeds or task starts.
     """
     found: dict[str, Run] = {}
     notes: list[str] = []
@@ -188,12 +187,12 @@ def read_group(runs: Path, group: Group) -> tuple[dict[str, Run], list[str]]:
 
 
 def starts(run: Run) -> list[int]:
-    """Returns the episode from which each task is presented."""
+    """Return the episode from which each task is presented."""
     return run.config["task_starts"]
 
 
 def late_scores(run: Run) -> Values:
-    """Returns success over the last 10 % of training, ``[S, T]``."""
+    """Return the mean success over the last 10 % of training, ``[S, T]``."""
     episodes = run.curves.episodes
     last = int(episodes[-1])
     window = max(1, round(0.1 * last))
@@ -201,20 +200,20 @@ def late_scores(run: Run) -> Values:
 
 
 def area_scores(run: Run) -> Values:
-    """Returns the area under each task's curve from its presentation on, ``[S, T]``."""
+    """Return the area under each task's curve since its presentation, ``[S, T]``."""
     return np.stack(
         [task_area(run, task, start) for task, start in enumerate(starts(run))], axis=-1
     )
 
 
 def task_area(run: Run, task: int, start: int, length: int | None = None) -> Values:
-    """Returns the area under a task's curve over the episodes after a start, ``[S]``.
+    """Return the area under a task's curve over the episodes after ``start``, ``[S]``.
 
     Args:
         run: The run.
-        task: Which task.
-        start: Episode from which on it is counted.
-        length: For how many episodes; to the end of training if None.
+        task: Label of the task.
+        start: Training episode from which to integrate.
+        length: Number of episodes; ``None`` to the end of training.
     """
     episodes = run.curves.episodes
     chosen = episodes > start
@@ -224,10 +223,10 @@ def task_area(run: Run, task: int, start: int, length: int | None = None) -> Val
 
 
 class Statistics:
-    """Statistics with intervals; those of a run do not depend on which others are there.
+    """Bootstrap statistics, with a seed per run so that they do not depend on the other runs.
 
     Args:
-        seed: Of the resampling.
+        seed: Seed of the resampling.
     """
 
     def __init__(self, seed: int = 0) -> None:
@@ -235,7 +234,7 @@ class Statistics:
         self._drawn: dict[bytes, Values] = {}
 
     def resampled(self, scores: Values) -> Values:
-        """Returns the interquartile mean of resampled scores."""
+        """Return the interquartile means of resampled scores."""
         key = scores.tobytes()
         if key not in self._drawn:
             rng = np.random.default_rng([self._seed, zlib.crc32(key)])
@@ -243,7 +242,7 @@ class Statistics:
         return self._drawn[key]
 
     def cell(self, scores: Values) -> str:
-        """Returns an interquartile mean with its interval, in per cent."""
+        """Format an interquartile mean with its interval, in percent."""
         low, high = metrics.percentile_interval(self.resampled(scores))
         middle = metrics.interquartile_mean(scores)
         return f"{100 * middle:.1f} [{100 * low:.0f}, {100 * high:.0f}]"

@@ -1,8 +1,8 @@
-"""Measures of learning several tasks, and how sure they are: from success rates to one number.
+"""Measures of multi-task and continual learning, with bootstrap confidence intervals.
 
-All work on plain arrays. ``success`` ``[..., E, T]`` is the share of successes on each of ``T``
-tasks at each of ``E`` evaluations (`bgpo_trl.runs.results.Curves` adds a leading seed dimension).
-NaN means that there was no test, as of a task that has not been presented yet.
+All functions take plain arrays. ``success`` ``[..., E, T]`` is the share of successes on each
+of ``T`` tasks at each of ``E`` evaluations (`bgpo_trl.runs.results.Curves` adds a leading seed
+dimension). NaN marks tasks that were not tested, because they had not been presented yet.
 """
 
 from __future__ import annotations
@@ -18,21 +18,22 @@ Array = NDArray[np.float64]
 def evaluation_matrix(
     success: ArrayLike, episodes: ArrayLike, ends: ArrayLike, *, window: int
 ) -> Array:
-    """Returns ``R[i, j]``: success on task j at the end of phase i.
+    """Return ``R[i, j]``, the success on task j at the end of phase i.
 
     Args:
-        success: ``[..., E, T]``.
+        success: Success ``[..., E, T]``.
         episodes: Training episodes before each evaluation, ``[E]``.
-        ends: Episode with which each phase ends, ``[P]``: the starts of the later tasks, and the
-            end of training.
-        window: Evaluations after at most so many episodes before the end of a phase are averaged.
+        ends: Last episode of each phase, ``[P]``: the starts of the later tasks, and the end of
+            training.
+        window: Number of training episodes before the end of a phase whose evaluations are
+            averaged.
 
     Returns:
         ``[..., P, T]``; NaN for tasks without a test in the window.
 
     Raises:
-        ValueError: If a phase has no evaluation in its window, or there are not as many episodes as
-            evaluations.
+        ValueError: If a phase has no evaluation in its window, or ``success`` and ``episodes`` do
+            not match.
     """
     success, episodes = np.asarray(success, float), np.asarray(episodes)
     _check_episodes(success, episodes, -2)
@@ -49,23 +50,22 @@ def evaluation_matrix(
 
 
 def average_performance(matrix: ArrayLike) -> Array:
-    """Returns the mean over tasks of success at the end of training, ``[...]``.
+    """Return the mean over tasks of success at the end of training, ``[...]``.
 
     Args:
-        matrix: From `evaluation_matrix`, ``[..., P, T]``.
+        matrix: Result of `evaluation_matrix`, ``[..., P, T]``.
     """
     return _mean(np.asarray(matrix, float)[..., -1, :], axis=-1)
 
 
 def forgetting_since_learned(matrix: ArrayLike) -> Array:
-    """Returns how much was lost since the end of each task's own phase, ``[...]``.
+    """Return the loss of success since the end of each task's own phase, ``[...]``.
 
-    The mean over all tasks but the last of ``R[j, j] - R[T - 1, j]``: phase j is that with which
-    task j comes in. Negative where a task has become better since; the negative of
-    `backward_transfer`.
+    The mean over all tasks but the last of ``R[j, j] - R[T - 1, j]``, where phase j introduces task
+    j; the negative of `backward_transfer`. Negative if tasks have improved since.
 
     Args:
-        matrix: From `evaluation_matrix`, as many phases as tasks, ``[..., T, T]``.
+        matrix: Result of `evaluation_matrix` with one phase per task, ``[..., T, T]``.
 
     Raises:
         ValueError: If the numbers of phases and tasks differ.
@@ -74,18 +74,18 @@ def forgetting_since_learned(matrix: ArrayLike) -> Array:
 
 
 def forgetting_since_best(success: ArrayLike) -> Array:
-    """Returns how much was lost since each task was done best, ``[...]``.
+    """Return the loss of success since each task's best evaluation, ``[...]``.
 
     The mean over tasks of the highest success at any evaluation minus that at the last one; never
     negative (Chaudhry et al., 2018, "Riemannian Walk for Incremental Learning", but over all
-    evaluations and tasks). Noise of single evaluations counts as forgetting: average them first,
+    evaluations and tasks). Noise of single evaluations counts as forgetting: average them first
     with `trailing_mean`.
 
     Args:
-        success: ``[..., E, T]``.
+        success: Success ``[..., E, T]``.
 
     Raises:
-        ValueError: If it is not of that shape.
+        ValueError: If ``success`` has another shape.
     """
     success = np.asarray(success, float)
     _check_episodes(success, np.arange(success.shape[-2] if success.ndim > 1 else 0), -2)
@@ -93,50 +93,50 @@ def forgetting_since_best(success: ArrayLike) -> Array:
 
 
 def backward_transfer(matrix: ArrayLike) -> Array:
-    """Returns how much earlier tasks have gained by learning later ones, ``[...]``.
+    """Return the gain of earlier tasks from learning later ones, ``[...]``.
 
     The mean over all tasks but the last of ``R[T - 1, j] - R[j, j]`` (Lopez-Paz & Ranzato, 2017,
     "Gradient Episodic Memory for Continual Learning").
 
     Args:
-        matrix: From `evaluation_matrix`, as many phases as tasks, ``[..., T, T]``.
+        matrix: Result of `evaluation_matrix` with one phase per task, ``[..., T, T]``.
 
     Raises:
         ValueError: If the numbers of phases and tasks differ.
     """
     matrix = np.asarray(matrix, float)
     if matrix.shape[-1] != matrix.shape[-2]:
-        raise ValueError(f"one phase a task is needed, got {list(matrix.shape[-2:])}")
+        raise ValueError(f"matrix must have one phase per task, got {list(matrix.shape[-2:])}")
     learned = np.diagonal(matrix, axis1=-2, axis2=-1)
     return _mean((matrix[..., -1, :] - learned)[..., :-1], axis=-1)
 
 
 def forward_transfer(area: ArrayLike, reference: ArrayLike) -> Array:
-    """Returns how much faster a task is learned than without what was learned before it.
+    """Return the gain in learning a task from having learned other tasks before.
 
-    ``(area - reference) / (1 - reference)``: 1 where it succeeds from the start, 0 where nothing is
-    gained, negative where it takes longer (Wolczyk et al., 2021, "Continual World").
+    ``(area - reference) / (1 - reference)``: 1 for success from the start, 0 for no gain, negative
+    for slower learning (Wolczyk et al., 2021, "Continual World").
 
     Args:
-        area: `area_under_curve` of a task from its presentation on.
-        reference: The same over as many episodes of a learner that has learned no task before.
+        area: `area_under_curve` of a task since its presentation.
+        reference: The same, over as many episodes, of a learner without earlier tasks.
     """
     area, reference = np.asarray(area, float), np.asarray(reference, float)
     return (area - reference) / (1 - reference)
 
 
 def area_under_curve(success: ArrayLike, episodes: ArrayLike) -> Array:
-    """Returns the mean height of curves over training, between 0 and 1, ``[...]``.
+    """Return the mean height of learning curves, between 0 and 1, ``[...]``.
 
-    Trapezoids between evaluations; before the first one, the curve rises from 0 at episode 0. Only
-    for curves without NaN.
+    Integrates by trapezoids; before the first evaluation, the curve rises linearly from 0 at
+    episode 0. Curves must not contain NaN.
 
     Args:
-        success: ``[..., E]``.
+        success: Success ``[..., E]``.
         episodes: Training episodes before each evaluation, ``[E]``.
 
     Raises:
-        ValueError: If there are not as many episodes as evaluations, or they do not increase.
+        ValueError: If the shapes do not match, or ``episodes`` do not increase.
     """
     success, episodes = np.asarray(success, float), np.asarray(episodes, float)
     _check_episodes(success, episodes, -1)
@@ -146,18 +146,18 @@ def area_under_curve(success: ArrayLike, episodes: ArrayLike) -> Array:
 
 
 def episodes_to(success: ArrayLike, episodes: ArrayLike, threshold: float = 0.8) -> Array:
-    """Returns the training episodes before the first evaluation that reaches a success rate.
+    """Return the training episodes before the first evaluation that reaches a success rate.
 
     Args:
-        success: ``[..., E]``.
+        success: Success ``[..., E]``.
         episodes: Training episodes before each evaluation, ``[E]``.
         threshold: The success rate.
 
     Returns:
-        ``[...]``; infinite where it is never reached.
+        ``[...]``; infinite where the rate is never reached.
 
     Raises:
-        ValueError: If there are not as many episodes as evaluations, or they do not increase.
+        ValueError: If the shapes do not match, or ``episodes`` do not increase.
     """
     _check_episodes(np.asarray(success, float), np.asarray(episodes), -1)
     reached = np.asarray(success, float) >= threshold
@@ -166,18 +166,18 @@ def episodes_to(success: ArrayLike, episodes: ArrayLike, threshold: float = 0.8)
 
 
 def trials_to(success: ArrayLike, threshold: float = 0.5, *, window: int = 20) -> float:
-    """Returns how many of its own training episodes a task takes to reach a success rate.
+    """Return the number of its own training episodes that a task takes to reach a success rate.
 
     Args:
-        success: Outcomes of the training episodes that were about the task, in order, ``[N]``.
+        success: Outcomes of the task's training episodes, in order, ``[N]``.
         threshold: The success rate.
-        window: The rate is that of the last so many of them; of fewer, there is none.
+        window: Number of latest episodes over which the rate is taken; it is undefined for fewer.
 
     Returns:
-        The episodes up to the first at which the rate is reached; infinite if it never is.
+        The first number of episodes at which the rate is reached, or infinity.
 
     Raises:
-        ValueError: If the window holds no episode.
+        ValueError: If the window is empty.
     """
     if window < 1:
         raise ValueError(f"window must be at least 1 episode, not {window}")
@@ -187,30 +187,30 @@ def trials_to(success: ArrayLike, threshold: float = 0.5, *, window: int = 20) -
 
 
 def times_the_first(episodes: ArrayLike) -> Array:
-    """Returns how many times as long as the first task each later one takes, ``[T - 1]``.
+    """Return the learning times of the later tasks as multiples of the first task's, ``[T - 1]``.
 
-    The median over seeds; a task that a seed never learns takes it infinitely long. Seeds that
-    never learn the first task say nothing and are left out; NaN if all are.
+    The median over seeds. A task that a seed never learns counts as infinitely long. Seeds that
+    never learn the first task are left out; NaN if none is left.
 
     Args:
-        episodes: From `trials_to`, ``[S, T]``, the tasks in the order of their presentation.
+        episodes: Results of `trials_to`, ``[S, T]``, with tasks in order of presentation.
     """
     episodes = np.asarray(episodes, float)
-    told = episodes[np.isfinite(episodes[:, 0])]
-    if not len(told):
+    learned = episodes[np.isfinite(episodes[:, 0])]
+    if not len(learned):
         return np.full(episodes.shape[1] - 1, np.nan)
-    return np.median(told[:, 1:] / told[:, :1], axis=0)
+    return np.median(learned[:, 1:] / learned[:, :1], axis=0)
 
 
 def trailing_mean(success: ArrayLike, n: int) -> Array:
-    """Returns the mean of each evaluation and up to ``n - 1`` before it.
+    """Return the mean of each evaluation and up to ``n - 1`` evaluations before it.
 
     Args:
-        success: ``[..., E, T]``.
+        success: Success ``[..., E, T]``.
         n: Number of evaluations, at least 1.
 
     Raises:
-        ValueError: If it is less.
+        ValueError: If ``n`` is less than 1, or ``success`` has another shape.
     """
     success = np.asarray(success, float)
     if n < 1 or success.ndim < 2:
@@ -226,26 +226,26 @@ def trailing_mean(success: ArrayLike, n: int) -> Array:
 
 
 def presented_mean(success: ArrayLike) -> Array:
-    """Returns the mean over the tasks presented by each evaluation, ``[..., E]``.
+    """Return the mean over the tasks presented by each evaluation, ``[..., E]``.
 
     Args:
-        success: ``[..., E, T]``.
+        success: Success ``[..., E, T]``.
     """
     return _mean(np.asarray(success, float), axis=-1)
 
 
 def interquartile_mean(scores: ArrayLike) -> float:
-    """Returns the mean of the middle half of all scores (Agarwal et al., 2021, "rliable").
+    """Return the mean of the middle half of all scores (Agarwal et al., 2021, "rliable").
 
     Args:
-        scores: Of any shape, such as ``[S, T]``: seeds and tasks.
+        scores: Scores of any shape, such as ``[S, T]`` for seeds and tasks.
 
     Raises:
-        ValueError: If there is none, or one is not finite.
+        ValueError: If there are no scores, or one is not finite.
     """
     ordered = np.sort(np.asarray(scores, float), axis=None)
     if not ordered.size or not np.isfinite(ordered).all():
-        raise ValueError("scores must be finite, and at least one: leave out what was not tested")
+        raise ValueError("scores must be finite and not empty: leave out what was not tested")
     cut = ordered.size // 4
     return float(ordered[cut : ordered.size - cut].mean())
 
@@ -257,22 +257,22 @@ def stratified_bootstrap(
     n_resamples: int = 2_000,
     rng: np.random.Generator,
 ) -> Array:
-    """Returns a statistic of resampled scores, from which intervals and differences are taken.
+    """Return a statistic of resampled scores, the basis of intervals and of differences.
 
-    Seeds are drawn anew, with replacement, for each task by itself (Agarwal et al., 2021, "Deep
+    Seeds are resampled with replacement, independently for each task (Agarwal et al., 2021, "Deep
     Reinforcement Learning at the Edge of the Statistical Precipice", section 4.1).
 
     Args:
-        scores: One of each seed on each task, ``[S, T]``.
-        statistic: Of an array of that shape.
+        scores: One score per seed and task, ``[S, T]``.
+        statistic: Function of an array of that shape.
         n_resamples: Number of resamples ``N``.
-        rng: Source of the draws.
+        rng: Random generator.
 
     Returns:
-        ``[N]``.
+        The statistic of each resample, ``[N]``.
 
     Raises:
-        ValueError: If scores are not finite, or not ``[S, T]``, or nothing is to be drawn.
+        ValueError: If scores are not finite or not ``[S, T]``, or ``n_resamples`` is less than 1.
 
     Example:
         >>> rng = np.random.default_rng(0)
@@ -290,19 +290,19 @@ def stratified_bootstrap(
 
 
 def percentile_interval(values: ArrayLike, confidence: float = 0.95) -> tuple[float, float]:
-    """Returns the interval that holds the middle share of resampled values.
+    """Return the percentile bootstrap interval of resampled values.
 
     Args:
-        values: From `stratified_bootstrap`, or sums and differences of such.
-        confidence: The share.
+        values: Results of `stratified_bootstrap`, or sums and differences of them.
+        confidence: Share of the values inside the interval.
 
     Raises:
-        ValueError: If there is no value, or the share does not lie in (0, 1).
+        ValueError: If there are no values, or ``confidence`` is not in (0, 1).
     """
     if not np.size(values) or not 0 < confidence < 1:
         raise ValueError(
-            f"values must be at least one and confidence in (0, 1), got {np.size(values)} values "
-            f"and {confidence}"
+            "values must not be empty and confidence must be in (0, 1), got "
+            f"{np.size(values)} values and {confidence}"
         )
     tail = 100 * (1 - confidence) / 2
     low, high = np.percentile(np.asarray(values, float), [tail, 100 - tail])
@@ -320,20 +320,20 @@ def _checked(scores: ArrayLike) -> Array:
 
 
 def _check_episodes(success: Array, episodes: NDArray, axis: int) -> None:
-    """Raises ValueError unless there is one episode, larger than the last, for each evaluation."""
-    found = success.shape[axis] if success.ndim >= -axis else 0
-    if not found or episodes.shape != (found,) or (np.diff(episodes) <= 0).any():
+    """Raise ``ValueError`` unless there is one episode per evaluation, in increasing order."""
+    n_evaluations = success.shape[axis] if success.ndim >= -axis else 0
+    if not n_evaluations or episodes.shape != (n_evaluations,) or (np.diff(episodes) <= 0).any():
         raise ValueError(
-            "one evaluation at least is needed, and for each its training episodes, increasing: "
-            f"got success {[*success.shape]} for episodes {episodes.tolist()}"
+            "each evaluation needs a training episode, in increasing order: got success "
+            f"{[*success.shape]} for episodes {episodes.tolist()}"
         )
 
 
 def _mean(values: Array, axis: int) -> Array:
-    """The mean of what is not NaN; NaN where nothing is."""
-    there = ~np.isnan(values)
-    count = there.sum(axis)
-    total = np.where(there, values, 0.0).sum(axis)
+    """Return the mean of the values that are not NaN; NaN where all are."""
+    valid = ~np.isnan(values)
+    count = valid.sum(axis)
+    total = np.where(valid, values, 0.0).sum(axis)
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 

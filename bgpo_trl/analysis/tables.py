@@ -1,4 +1,4 @@
-"""Tables of the report: success, forgetting, how fast a task is learned, and groups found."""
+"""Tables of the report: success, forgetting and transfer, learning times, groups of GWR-B."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from bgpo_trl.runs.results import read_outcomes, read_rows
 from suites import nico
 
 Table = list[list[str]]
-"""Rows of cells, the head first."""
+"""Rows of cells; the first row holds the column names."""
 
 
 def main_table(runs: Mapping[str, Run], statistics: Statistics) -> Table:
-    """Returns success of a group's runs."""
+    """Return the table of success of a group's runs."""
     rows = [["", "last 10 %: IQM", "mean", *(f"task {i + 1}" for i in range(3)), "area: IQM"]]
     rows[0].append("episodes to 80 %")
     for run in runs.values():
@@ -44,7 +44,7 @@ def main_table(runs: Mapping[str, Run], statistics: Statistics) -> Table:
 
 
 def continual_table(continual: Mapping[str, Run], concurrent: Mapping[str, Run]) -> Table:
-    """Returns forgetting and transfer of the continual runs."""
+    """Return the table of forgetting and transfer of the continual runs."""
     rows = [["", "forgotten since learned", "forgotten since best", "backward", "forward"]]
     for key, run in continual.items():
         success, episodes = run.curves.success, run.curves.episodes
@@ -79,15 +79,15 @@ def _spread(values: Values) -> str:
 
 
 def own_episodes(path: Path, tasks: Sequence[str], last: int | None = None) -> Values | None:
-    """Returns how many of its own training episodes each task took to 50 % success, ``[S, T]``.
+    """Return the training episodes of each task until 50 % of them succeed, ``[S, T]``.
 
     Args:
         path: A run's ``train.csv``.
-        tasks: Names of the tasks.
-        last: Training episode at which counting ends; the last of the run if None.
+        tasks: Task names.
+        last: Last training episode to count; ``None`` for the end of the run.
 
     Returns:
-        Infinite where it was not reached; None if the file is not there, or holds no episode.
+        Infinite where 50 % was not reached; ``None`` if the file is missing or has no episodes.
     """
     outcomes = read_outcomes(path, tasks, last) if path.exists() else []
     if not outcomes:
@@ -96,7 +96,7 @@ def own_episodes(path: Path, tasks: Sequence[str], last: int | None = None) -> V
 
 
 def speed_table(runs: Mapping[str, Run]) -> Table:
-    """Returns how many of its own training episodes each task took to 50 % success."""
+    """Return the table of learning times: each task's training episodes to 50 % success."""
     tasks = [f"task {i + 1}" for i in range(3)]
     rows = [["", *tasks, *(f"{task} : {tasks[0]}" for task in tasks[1:])]]
     for run in runs.values():
@@ -110,10 +110,10 @@ def speed_table(runs: Mapping[str, Run]) -> Table:
 
 
 def median_cell(episodes: Values) -> str:
-    """Returns the median over seeds, and how many never got there.
+    """Format the median over seeds, with the number of seeds that never reached 50 %.
 
     Args:
-        episodes: Of each seed; infinite where it never got there, ``[S]``.
+        episodes: Learning time of each seed, infinite where never reached, ``[S]``.
     """
     never = int(np.isinf(episodes).sum())
     median = float(np.median(episodes))
@@ -122,13 +122,13 @@ def median_cell(episodes: Values) -> str:
 
 
 def ratio_cells(episodes: Values) -> list[str]:
-    """Returns how many times as long as the first task each later one took, and of how many seeds.
+    """Format the later tasks' learning times as multiples of the first's, with the number of seeds.
 
     Args:
-        episodes: Infinite where 50 % was never reached, ``[S, T]``.
+        episodes: Learning times, infinite where 50 % was never reached, ``[S, T]``.
     """
-    told = int(np.isfinite(episodes[:, 0]).sum())
-    note = "" if told == len(episodes) else f" ({told} of {len(episodes)} seeds)"
+    learned = int(np.isfinite(episodes[:, 0]).sum())
+    note = "" if learned == len(episodes) else f" ({learned} of {len(episodes)} seeds)"
     return [
         "" if np.isnan(times) else ("not reached" if np.isinf(times) else f"{times:.2f}") + note
         for times in metrics.times_the_first(episodes).tolist()
@@ -136,7 +136,7 @@ def ratio_cells(episodes: Values) -> list[str]:
 
 
 def groups_table(runs: Iterable[Run]) -> Table:
-    """Returns what the runs with GWR-B found, by seed; empty if none of them has finished."""
+    """Return the table of groups, purity and task inference; empty if no run has finished."""
     rows = [["", "groups", "purity, %", "tasks inferred, %", "by seed", "nodes of GWR-B"]]
     for run in runs:
         if run.summary.get("nodes") is None:
@@ -157,7 +157,7 @@ def groups_table(runs: Iterable[Run]) -> Table:
 
 
 def _inferred(run: Run) -> list[float]:
-    """Returns the share of held-out demonstrations whose task is inferred, by seed."""
+    """Return the share of held-out demonstrations whose task is inferred, by seed."""
     path = run.directory / "final.csv"
     shares: dict[int, list[float]] = {seed: [] for seed in run.config["seeds"]}
     for row in read_rows(path) if path.exists() else []:
@@ -167,5 +167,5 @@ def _inferred(run: Run) -> list[float]:
 
 
 def _numbers(values: Iterable[float], digits: int = 0) -> str:
-    """Returns numbers in a row, without a decimal where it is 0."""
+    """Join numbers with spaces, dropping a decimal of 0."""
     return " ".join(f"{value:.{digits}f}".removesuffix(".0") for value in values)

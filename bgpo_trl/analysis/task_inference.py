@@ -1,4 +1,4 @@
-"""How well GWR-B and the groups tell tasks apart, measured with labels that they never see."""
+"""Task inference of GWR-B and purity of the groups, measured with labels that they never see."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from bgpo_trl.modules.gwr import GWRB
 
 @torch.no_grad()
 def match_counts(gwr: GWRB, bank: DemonstrationBank, n_tasks: int) -> Tensor:
-    """Counts for which demonstrations each node of GWR-B is the best match.
+    """Count the demonstrations of each task whose best-matching unit is a node.
 
     Args:
         gwr: The network(s), ``batch_size`` ``[*S]``.
@@ -21,8 +21,8 @@ def match_counts(gwr: GWRB, bank: DemonstrationBank, n_tasks: int) -> Tensor:
         n_tasks: Number of tasks.
 
     Returns:
-        Counts ``[*S, N, n_tasks]``, int64, nodes in order of creation, ``N`` the largest network's
-        size; rows beyond a smaller network's size are 0.
+        Counts int64 ``[*S, N, n_tasks]``, with nodes in order of creation and ``N`` the size of the
+        largest network; rows beyond a smaller network's size are 0.
     """
     node = gwr.lookup(bank.embedding.expand(*gwr.batch_size, *bank.embedding.shape)).node
     counts = torch.zeros(*gwr.batch_size, int(gwr.num_nodes.max()), n_tasks, dtype=torch.int64)
@@ -33,10 +33,10 @@ def match_counts(gwr: GWRB, bank: DemonstrationBank, n_tasks: int) -> Tensor:
 
 
 def majority_task(counts: Tensor) -> Tensor:
-    """Returns the task with the most matches of each node, int64 ``[..., N]``; -1 without a match.
+    """Return each node's most frequent task, int64 ``[..., N]``; -1 for nodes without a match.
 
     Args:
-        counts: From `match_counts`, ``[..., N, n_tasks]``.
+        counts: Result of `match_counts`, ``[..., N, n_tasks]``.
     """
     return torch.where(counts.sum(-1) > 0, counts.argmax(-1), -1)
 
@@ -44,11 +44,11 @@ def majority_task(counts: Tensor) -> Tensor:
 def task_inference_accuracy(
     gwr: GWRB, seen: DemonstrationBank, tested: DemonstrationBank, n_tasks: int
 ) -> Tensor:
-    """Returns how often the matched node's majority task is the demonstration's own, ``[*S]``.
+    """Return the share of demonstrations whose node has their task as its majority task, ``[*S]``.
 
     Args:
         gwr: The network(s), ``batch_size`` ``[*S]``.
-        seen: Demonstrations that give each node its majority task.
+        seen: Demonstrations that define each node's majority task.
         tested: Demonstrations whose task is inferred.
         n_tasks: Number of tasks.
     """
@@ -61,11 +61,11 @@ def task_inference_accuracy(
 
 @torch.no_grad()
 def group_purity(groups: BehaviorGroups, bank: DemonstrationBank, n_tasks: int) -> Tensor:
-    """Returns the share of demonstrations that are of the majority task of their group, ``[*S]``.
+    """Return the share of demonstrations whose task is the majority task of their group, ``[*S]``.
 
     Args:
         groups: The groups, ``batch_size`` ``[*S]``.
-        bank: Demonstrations, of whose labels the groups know nothing.
+        bank: Demonstrations, with labels that the groups do not use.
         n_tasks: Number of tasks.
     """
     batch = groups.batch_size

@@ -1,1 +1,1 @@
-"""Demonstrations and experience: recording, embedding bank, replay buffers."""
+"""Demonstrations and experience: recordings, the demonstration bank, replay buffers."""

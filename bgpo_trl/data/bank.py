@@ -1,4 +1,4 @@
-"""The bank of embedded demonstrations, and what a learner can take from their steps."""
+"""Bank of embedded demonstrations, with the latents and actions along them."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from bgpo_trl.files.tensor_file import load_tensors, save_tensors
 from suites import nico
 
 _LATENT_CODES, _ACTION_CODES = 25.0, 127.0
-"""Codes of an int8 for one standard deviation of a latent (so up to 5.08), for an action of 1."""
+"""Int8 codes per standard deviation of a latent (range +-5.08) and per unit of action."""
 
 
 @dataclass(frozen=True)
 class DemonstrationSteps:
-    """Latents and actions along demonstrations, in eight bits a number.
+    """Latents and actions along demonstrations, quantized to 8 bits.
 
-    Rounding errs by up to 0.02 standard deviations of a latent and by 0.004 of an action.
+    The rounding error is at most 0.02 standard deviations of a latent and 0.004 of an action.
 
     Attributes:
-        latent: The frames of all demonstrations one after the other, int8 ``[F, 64]``.
-        action: The action that leads from each frame to the next, int8 ``[F, 4]``; that of the last
-            frame of a demonstration means nothing.
-        first: The first frame of each demonstration, int64 ``[N]``.
-        length: Frames of each demonstration, int64 ``[N]``; 0 where none are kept.
+        latent: Frames of all demonstrations, concatenated, int8 ``[F, 64]``.
+        action: Action from each frame to the next, int8 ``[F, 4]``; undefined at the last frame of
+            a demonstration.
+        first: Index of the first frame of each demonstration, int64 ``[N]``.
+        length: Number of frames of each demonstration, int64 ``[N]``; 0 if its steps are not kept.
 
     Raises:
-        ValueError: If shapes or types do not fit together, or a frame is missing.
+        ValueError: If shapes or dtypes do not match, or an index lies outside ``latent``.
     """
 
     latent: Tensor
@@ -49,16 +49,16 @@ class DemonstrationSteps:
             and bool((self.first >= 0).all() and (self.length >= 0).all())
             and bool((self.first + self.length <= len(self.latent)).all())
         ):
-            raise ValueError("its steps do not fit together")
+            raise ValueError("the shapes, dtypes or indices of its steps do not match")
 
     @classmethod
     def of(cls, latent: Tensor, action: Tensor, length: Tensor) -> DemonstrationSteps:
-        """Takes in padded demonstrations.
+        """Quantize padded demonstrations.
 
         Args:
-            latent: Standardised latents ``[N, T, 64]``; beyond five deviations they are clipped.
-            action: ``[N, T - 1, 4]`` in [-1, 1].
-            length: Frames of each to be kept, int64 ``[N]``.
+            latent: Standardized latents ``[N, T, 64]``; clipped at five standard deviations.
+            action: Actions in [-1, 1], ``[N, T - 1, 4]``.
+            length: Number of frames to keep of each, int64 ``[N]``.
         """
         valid = torch.arange(latent.shape[1]) < length.unsqueeze(-1)
         padded = torch.nn.functional.pad(action, (0, 0, 0, 1))
@@ -70,19 +70,19 @@ class DemonstrationSteps:
         )
 
     def latents(self, frame: Tensor) -> Tensor:
-        """Returns the latents of frames int64 ``[...]``, float32 ``[..., 64]``."""
+        """Return the latents of frames int64 ``[...]``, float32 ``[..., 64]``."""
         return self.latent[frame] / _LATENT_CODES
 
     def actions(self, frame: Tensor) -> Tensor:
-        """Returns the actions that lead on from frames int64 ``[...]``, float32 ``[..., 4]``."""
+        """Return the actions taken at frames int64 ``[...]``, float32 ``[..., 4]``."""
         return self.action[frame] / _ACTION_CODES
 
     def select(self, rows: Tensor) -> DemonstrationSteps:
-        """Returns the steps of some demonstrations, sharing the frames of all."""
+        """Return the steps of the selected demonstrations, sharing the memory of all frames."""
         return replace(self, first=self.first[rows], length=self.length[rows])
 
     def __add__(self, other: DemonstrationSteps) -> DemonstrationSteps:
-        """Returns the steps of both."""
+        """Concatenate the steps of two sets of demonstrations."""
         return DemonstrationSteps(
             torch.cat([self.latent, other.latent]),
             torch.cat([self.action, other.action]),
@@ -93,18 +93,18 @@ class DemonstrationSteps:
 
 @dataclass(frozen=True)
 class DemonstrationBank:
-    """Embedded demonstrations: all that BGPO needs of them once the encoders are trained.
+    """Embedded demonstrations: the only form in which BGPO reads demonstrations.
 
     Attributes:
-        embedding: phi, float32 ``[N, 32]``.
-        task: Labels, int64 ``[N]``; for the draw of an episode's task and for evaluation.
-        train: Bool ``[N]``; False for demonstrations held out for test episodes.
-        tasks: Names of the tasks, in the order of their labels.
-        steps: Latents and actions along the demonstrations, in the same order; None in a bank
-            without them.
+        embedding: Embeddings phi, float32 ``[N, 32]``.
+        task: Task labels, int64 ``[N]``; used to draw an episode's task and for evaluation.
+        train: Bool ``[N]``; ``False`` for demonstrations held out for test episodes.
+        tasks: Task names, in the order of the labels.
+        steps: Latents and actions along the demonstrations, in the same order; ``None`` if the bank
+            does not store them.
 
     Raises:
-        ValueError: If a label has no name, or the steps are of another number of demonstrations.
+        ValueError: If a label has no name, or the number of demonstrations in ``steps`` differs.
     """
 
     embedding: Tensor
@@ -117,25 +117,25 @@ class DemonstrationBank:
         unknown = self.task[(self.task < 0) | (self.task >= len(self.tasks))]
         if len(unknown):
             raise ValueError(
-                f"there is a demonstration of task {int(unknown[0])}, but tasks names only "
+                f"a demonstration has task label {int(unknown[0])}, but tasks names only "
                 f"{len(self.tasks)}: {', '.join(self.tasks)}"
             )
         if self.steps is not None and len(self.steps.first) != len(self.embedding):
             raise ValueError(
-                f"there are steps of {len(self.steps.first)} demonstrations, but embeddings of "
+                f"the bank has steps of {len(self.steps.first)} demonstrations, but embeddings of "
                 f"{len(self.embedding)}"
             )
 
     def seen(self) -> DemonstrationBank:
-        """Returns the demonstrations for training episodes."""
+        """Return the demonstrations for training episodes."""
         return self._select(self.train)
 
     def held_out(self, part: Literal["validation", "test"] | None = None) -> DemonstrationBank:
-        """Returns the demonstrations for test episodes.
+        """Return the demonstrations for test episodes.
 
         Args:
-            part: Every other one of each task, from the first on to choose settings by, or from
-                the second on to report results on; None for all.
+            part: ``"validation"`` (first, third, ... of each task) to choose settings, ``"test"``
+                (second, fourth, ...) to report results, ``None`` for all.
         """
         rows = torch.nonzero(~self.train).flatten()
         if part is None:
@@ -145,17 +145,17 @@ class DemonstrationBank:
         return self._select(rows[place % 2 == (part == "test")])
 
     def of_task(self, task: int) -> DemonstrationBank:
-        """Returns the demonstrations of one task."""
+        """Return the demonstrations of one task."""
         return self._select(self.task == task)
 
     def for_tasks(self, tasks: Sequence[str]) -> DemonstrationBank:
-        """Returns the demonstrations of some tasks, labeled by their places among these.
+        """Return the demonstrations of the given tasks, relabeled by their positions in ``tasks``.
 
         Args:
-            tasks: Names, in the order of the labels wanted.
+            tasks: Task names, in the order of the new labels.
 
         Raises:
-            ValueError: If there is no demonstration of one of them.
+            ValueError: If the bank does not know one of the tasks.
         """
         missing = [name for name in tasks if name not in self.tasks]
         if missing:
@@ -168,7 +168,7 @@ class DemonstrationBank:
         return replace(kept, task=label[kept.task], tasks=tuple(tasks))
 
     def __add__(self, other: DemonstrationBank) -> DemonstrationBank:
-        """Returns the demonstrations of both; tasks that only the other has come last."""
+        """Concatenate two banks; task names found only in ``other`` are appended."""
         tasks = tuple(dict.fromkeys((*self.tasks, *other.tasks)))
         label = torch.tensor([tasks.index(name) for name in other.tasks])
         return DemonstrationBank(
@@ -189,10 +189,10 @@ class DemonstrationBank:
         )
 
     def save(self, path: str | Path, *, encoder_id: str) -> None:
-        """Writes the bank as safetensors, with the scene version and the encoders' identity.
+        """Write the bank as safetensors, with the scene version and the encoders' identity.
 
         Raises:
-            OSError: If the file cannot be written; one that was there stays.
+            OSError: If the file cannot be written; an existing file is kept.
         """
         tensors = {"embedding": self.embedding, "task": self.task, "train": self.train}
         if self.steps is not None:
@@ -206,17 +206,18 @@ class DemonstrationBank:
 
     @classmethod
     def load(cls, path: str | Path, *, encoder_id: str) -> DemonstrationBank:
-        """Reads a bank.
+        """Read a bank.
 
         Raises:
-            ValueError: If it is missing, damaged, or made in another scene or by other encoders.
+            ValueError: If it is missing, damaged, or was made in another scene or by other
+                encoders.
         """
         wanted = {"scene_version": nico.scene_version(), "encoder_id": encoder_id}
-        remedy = "make it anew with `--train-encoders`"
+        remedy = "make it again with `--train-encoders`"
         try:
             tensors, meta = load_tensors(path)
             if not meta.get("tasks"):
-                raise ValueError("it does not say which tasks it is about")
+                raise ValueError("its task names are missing")
             columns = {k.removeprefix("steps."): t for k, t in tensors.items() if "." in k}
             rows = {key: tensor for key, tensor in tensors.items() if "." not in key}
             steps = DemonstrationSteps(**columns) if columns else None
@@ -224,7 +225,7 @@ class DemonstrationBank:
         except FileNotFoundError:
             raise ValueError(f"there is no demonstration bank at {path}; {remedy}") from None
         except (ValueError, TypeError) as error:
-            raise ValueError(f"{path} is damaged or no bank ({error}); {remedy}") from None
+            raise ValueError(f"{path} is damaged or not a bank ({error}); {remedy}") from None
         embedding, task, train = bank.embedding, bank.task, bank.train
         if not (
             embedding.ndim == 2
@@ -236,5 +237,5 @@ class DemonstrationBank:
             raise ValueError(f"{path} is damaged (wrong shapes, or NaN); {remedy}")
         found = {key: meta.get(key) for key in wanted}
         if found != wanted:
-            raise ValueError(f"{path} belongs to {found}, but needed is {wanted}; {remedy}")
+            raise ValueError(f"{path} was made for {found}, not for {wanted}; {remedy}")
         return bank

@@ -1,4 +1,4 @@
-"""Demonstrations as experience: transitions of those that were shown in training episodes."""
+"""Replay of demonstrations: transitions of the demonstrations shown in training episodes."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ __all__ = ["DemonstrationReplay"]
 
 
 class DemonstrationReplay:
-    """Transitions of the demonstrations shown to each seed, drawn group by group.
+    """Transitions of the demonstrations shown to each seed, sampled by group.
 
-    A transition has the latents of two successive frames, the action between them, and what the
-    policy was told in the episode whose demonstration it was. The last one of a demonstration is a
-    success: it terminates, with the reward that the episode would have paid for doing as shown.
+    A transition consists of two successive latents, the action between them and the context (the
+    constant entries) of the episode in which the demonstration was shown. The last transition of a
+    demonstration counts as a success: it terminates, with the reward given to `add`.
 
     Args:
-        bank: The demonstrations that episodes are drawn from, with their steps.
-        generator: Sources of the draws, one for each of ``S`` seeds.
+        bank: Demonstrations that episodes are drawn from, with their steps.
+        generator: Random generators for sampling, one for each of ``S`` seeds.
         state_key: Name of the latent.
-        constant_keys: Entries that are constant within an episode, to be kept with each.
-        capacity: Demonstrations remembered for each seed; then the oldest are forgotten.
+        constant_keys: Entries that are constant within an episode, stored with each demonstration.
+        capacity: Demonstrations kept for each seed; the oldest are overwritten.
 
     Raises:
-        ValueError: If the bank has no steps, or none of some demonstration.
+        ValueError: If the bank lacks the steps of a demonstration.
     """
 
     def __init__(
@@ -44,13 +44,13 @@ class DemonstrationReplay:
     ) -> None:
         if bank.steps is None:
             raise ValueError(
-                "the bank has no steps of demonstrations to learn from: make it anew with "
+                "the bank has no steps of demonstrations to learn from: make it again with "
                 "`python -m bgpo_trl.encoders.make_bank`, or set demonstration_share to 0"
             )
         if (bank.steps.length < 2).any():
             row = int((bank.steps.length < 2).nonzero()[0])
             raise ValueError(
-                f"the bank has no steps of demonstration {row} to learn from: make it anew with "
+                f"the bank has no steps of demonstration {row} to learn from: make it again with "
                 "`python -m bgpo_trl.encoders.make_bank`, or set demonstration_share to 0"
             )
         self._steps = bank.steps
@@ -61,31 +61,31 @@ class DemonstrationReplay:
         )
 
     def __len__(self) -> int:
-        """Returns the number of demonstrations that every seed was shown at least."""
+        """Return the smallest number of demonstrations held for a seed."""
         return len(self._shown)
 
     def add(
         self, episode: TensorDictBase, reward: Tensor, group: Tensor, mask: Tensor | None = None
     ) -> None:
-        """Remembers the demonstration of an episode of each seed.
+        """Store the demonstration of an episode of each seed.
 
         Args:
             episode: Batch size ``[S]``, with ``"demo_index"`` int64 and the constant entries.
-            reward: Paid at the demonstration's end, float32 ``[S]``.
-            group: The group of each, int64 ``[S]``.
-            mask: Bool ``[S]``, which seeds add theirs; None for all.
+            reward: Reward of the demonstration's last transition, float32 ``[S]``.
+            group: Group of each demonstration, int64 ``[S]``.
+            mask: Seeds that store theirs, bool ``[S]``; ``None`` for all.
         """
         self._shown.add(episode.copy().set("reward", reward), group, mask)
 
     def sample(self, group: Tensor) -> TensorDict:
-        """Draws for each row a shown demonstration of its group, and one of its transitions.
+        """Draw, for each row, a demonstration of the row's group and one of its transitions.
 
         Args:
             group: As in `GroupReplay.sample`, ``[S, R]``.
 
         Returns:
-            Batch size ``[S, R]``, as `GroupReplay.sample`: the state, the constant entries,
-            ``"action"``, ``"priority_weight"`` and, under ``"next"``, the state, ``"reward"`` and
+            Batch size ``[S, R]``, with the state, the constant entries, ``"action"``,
+            ``"priority_weight"`` and, under ``"next"``, the state, ``"reward"`` and
             ``"terminated"``.
         """
         shown = self._shown.sample(group)
@@ -111,9 +111,9 @@ class DemonstrationReplay:
         )
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns all that future samples depend on."""
+        """Return the stored demonstrations and the states of the generators."""
         return self._shown.state_dict()
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Restores what `state_dict` returned, so that the same samples follow."""
+        """Restore the result of `state_dict`, so that the same samples follow."""
         self._shown.load_state_dict(state_dict)

@@ -1,4 +1,4 @@
-"""Experience replay that is drawn group by group, each seed from its own."""
+"""Replay buffer sampled by group, separately for each seed."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ GROUP = "group"
 
 
 class GroupReplay:
-    """Ring buffer of transitions that remembers the group of each; a row is drawn from one group.
+    """Ring buffer of transitions labeled by group, sampled row by row from a given group.
 
-    All groups of a seed share its capacity, so memory does not depend on how many there are.
+    All groups of a seed share its capacity, so memory does not grow with the number of groups.
 
     Args:
-        capacity: transitions kept for each seed; then the oldest are replaced.
-        generator: sources of the draws, one for each of ``S`` seeds.
-        keys: entries to store.
+        capacity: Transitions kept for each seed; the oldest are overwritten.
+        generator: Random generators for sampling, one for each of ``S`` seeds.
+        keys: Entries to store.
 
-    Examples:
+    Example:
         >>> replay = GroupReplay(100, generator=[torch.Generator()], keys=["state"])
         >>> for step in range(6):
         ...     transition = TensorDict({"state": torch.full([1, 1], float(step))}, [1])
@@ -51,16 +51,16 @@ class GroupReplay:
         self._index = [_Index() for _ in self._generators]
 
     def __len__(self) -> int:
-        """Returns the number of transitions that every seed holds at least."""
+        """Return the smallest number of transitions held for a seed."""
         return len(self._buffer)
 
     @property
     def transition_size(self) -> int:
-        """Bytes that a transition takes, its group included; 0 before the first one."""
+        """Bytes per transition, including its group; 0 before the first one."""
         return self._buffer.transition_size
 
     def sizes(self, group: Tensor) -> Tensor:
-        """Returns the number of transitions held of each of the groups ``[S, G]``."""
+        """Return the number of transitions held of each of the groups ``[S, G]``."""
         oldest = self._buffer.oldest.tolist()
         return torch.tensor(
             [
@@ -70,15 +70,15 @@ class GroupReplay:
         ).view(group.shape)
 
     def add(self, transition: TensorDictBase, group: Tensor, mask: Tensor | None = None) -> None:
-        """Stores one transition of each seed.
+        """Store one transition of each seed.
 
         Args:
-            transition: batch size ``[S]``, with the entries to store.
-            group: the group of each, int64 ``[S]``, at least 0.
-            mask: bool ``[S]``, which seeds store theirs; ``None`` for all.
+            transition: Batch size ``[S]``, with the entries to store.
+            group: Group of each transition, int64 ``[S]``, at least 0.
+            mask: Seeds that store theirs, bool ``[S]``; ``None`` for all.
 
         Raises:
-            ValueError: if an entry is missing, or of another shape or dtype than those stored.
+            ValueError: If an entry is missing, or its shape or dtype differs from those stored.
         """
         steps = self._buffer.n_added.tolist()
         missing = [key for key in self._buffer.keys or () if key not in transition.keys(True)]
@@ -98,21 +98,21 @@ class GroupReplay:
         seeds: Sequence[int] | None = None,
         generator: Sequence[torch.Generator] | None = None,
     ) -> TensorDict:
-        """Draws a transition for each row, uniformly and with replacement from the row's group.
+        """Draw a transition for each row, uniformly and with replacement from the row's group.
 
         Args:
-            group: the group of each row, int64 ``[S, R]``; -1 for rows that are to stay empty,
-                which draw nothing.
-            seeds: positions of the seeds to draw for, ``S`` of them; ``None`` for all.
-            generator: sources of the draws in place of the replay's own, one for each of those.
+            group: Group of each row, int64 ``[S, R]``; -1 leaves a row empty and draws nothing.
+            seeds: Positions of the ``S`` seeds to draw for; ``None`` for all.
+            generator: Random generators to use instead of the replay's, one for each of those
+                seeds.
 
         Returns:
-            Batch size ``[S, R]``, with ``"priority_weight"``, by which losses of TorchRL weight a
-            transition: 1, or 0 for rows without a group or of a group that holds nothing; their
-            other entries mean nothing.
+            Batch size ``[S, R]``, with ``"priority_weight"``, the weight of a transition in
+            TorchRL's losses: 1, or 0 for rows without a group or of an empty group, whose other
+            entries are undefined.
 
         Raises:
-            ValueError: if a seed holds no transition at all.
+            ValueError: If a seed holds no transition.
         """
         if not len(self):
             raise ValueError("every seed needs a transition before the first sample")
@@ -134,11 +134,11 @@ class GroupReplay:
         return drawn.set("priority_weight", torch.from_numpy(weight))
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns the filled part (a copy) and the states of the generators."""
+        """Return the filled part of the buffer (a copy) and the states of the generators."""
         return self._buffer.state_dict()
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Restores what `state_dict` returned, so that the same samples follow."""
+        """Restore the result of `state_dict`, so that the same samples follow."""
         self._buffer.load_state_dict(state_dict)
         self._index = [_Index() for _ in self._generators]
         for seed, (first, end) in enumerate(
@@ -153,16 +153,17 @@ class GroupReplay:
 
 
 def draw_shares(group: Tensor, generator: Sequence[torch.Generator]) -> Tensor:
-    """Draws a number in [0, 1) for each row that has a group; the others draw nothing.
+    """Draw a number in [0, 1) for each row that has a group.
 
-    So a seed draws the same however many slots it leaves free.
+    Rows without a group consume no random numbers, so a seed's draws do not depend on how many
+    slots are free.
 
     Args:
-        group: the group of each row, int64 ``[S, R]``; -1 for rows without one.
-        generator: one for each of ``S`` seeds.
+        group: Group of each row, int64 ``[S, R]``; -1 for rows without one.
+        generator: Random generators, one for each of ``S`` seeds.
 
     Returns:
-        float64 ``[S, R]``, 0 for rows without a group.
+        Float64 ``[S, R]``; 0 for rows without a group.
     """
     shares = torch.zeros(group.shape, dtype=torch.float64)
     for row, wanted, source in zip(shares, group >= 0, generator, strict=True):
@@ -171,7 +172,7 @@ def draw_shares(group: Tensor, generator: Sequence[torch.Generator]) -> Tensor:
 
 
 class _Index:
-    """The steps at which a seed stored transitions of each group, in order of time."""
+    """Steps at which a seed stored transitions of each group, in order of time."""
 
     def __init__(self) -> None:
         self._steps: dict[int, NDArray[np.int64]] = {}
@@ -191,7 +192,7 @@ class _Index:
         self._span[group] = first, end + 1
 
     def of(self, group: int, oldest: int) -> NDArray[np.int64]:
-        """Returns the steps of a group that are not overwritten yet."""
+        """Return the steps of a group that have not been overwritten."""
         if group not in self._steps:
             return np.empty(0, np.int64)
         steps, (first, end) = self._steps[group], self._span[group]

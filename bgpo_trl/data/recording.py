@@ -1,4 +1,4 @@
-"""Demonstrations as frames and actions: record, store, load."""
+"""Recorded demonstrations (frames, states, actions): record, store and load them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from suites.nico.rendering import FRAME_HEIGHT, FRAME_WIDTH, FrameRenderer
 
 MAX_STEPS = 50
 _META = "dataset.json"
-_REMEDY = "record it anew with `python -m bgpo_trl.data.recording PATH`"
+_REMEDY = "record it again with `python -m bgpo_trl.data.recording PATH`"
 
 
 def _empty(n: int) -> TensorDict:
@@ -64,35 +64,34 @@ def record_demonstrations(
     attempts: int = 100,
     progress: bool = True,
 ) -> TensorDict:
-    """Records successful demonstrations of each task; continues a recording that was interrupted.
+    """Record successful demonstrations of each task, or resume an interrupted recording.
 
-    Row ``i`` is determined by ``seed`` and ``i`` alone, so an interrupted recording ends the same.
+    Row ``i`` depends on ``seed`` and ``i`` alone, so a resumed recording gives the same dataset.
 
-    With ``play`` it records what the robot sees when it plays instead: it follows a demonstration
-    for a while, up to 30 steps, then moves at random until the 50 steps are over. A robot that
-    learns by trial and error sees much that no demonstration shows.
+    With ``play``, record play instead: follow a demonstration for up to 30 steps, then act at
+    random until step 50. Trial and error visits states that no demonstration shows.
 
     Args:
         path: Folder of the dataset; made if missing.
         tasks: Tasks to demonstrate, in the order of their labels.
         per_task: Demonstrations of each task (1,200 in Sec. IV-B).
         held_out_per_task: How many of those are held out for test episodes.
-        play: Record play in place of demonstrations.
-        seed: Seed of starts and of the demonstrator's noise.
-        attempts: How often in a row a task's demonstrator may fail.
+        play: Record play instead of demonstrations.
+        seed: Seed of the start states and of the demonstrator's noise.
+        attempts: Consecutive failures of a demonstrator after which recording stops.
         progress: Whether to show a progress bar.
 
     Returns:
         A memory-mapped TensorDict ``[N]`` with ``pixels`` uint8 ``[N, 51, 32, 64, 3]``, ``state``
         ``[N, 51, 16]``, ``action`` ``[N, 50, 4]``, ``length`` int64 ``[N]`` (frames, one more than
-        actions), ``task`` int64 ``[N]``, ``train`` bool ``[N]`` (False: held out) and ``seed``
-        int64 ``[N]``. What lies beyond the length is zero.
+        actions), ``task`` int64 ``[N]``, ``train`` bool ``[N]`` (``False``: held out) and ``seed``
+        int64 ``[N]``; zero beyond the length.
 
     Raises:
-        ValueError: If an argument is wrong, or there is another recording at that path.
-        OSError: If the disk has no room for it.
-        RuntimeError: If there is no OpenGL to render with, or a demonstrator fails too often; what
-            was recorded before is kept.
+        ValueError: If an argument is invalid, or ``path`` holds another recording.
+        OSError: If there is not enough disk space.
+        RuntimeError: If there is no OpenGL to render with, or a demonstrator fails too often;
+            earlier rows are kept.
     """
     nico.check_tasks(tasks)
     if not tasks:
@@ -124,7 +123,7 @@ def record_demonstrations(
             )
         if meta.get("checksum"):
             return load_demonstrations(path)
-    # Before anything is written: without OpenGL there is nothing to record.
+    # The renderer comes first, so that a machine without OpenGL fails before writing anything.
     physics = nico.Physics.from_xml_string(nico.scene_xml())
     shared = {"physics": physics, "renderer": FrameRenderer(physics.model.ptr)}
     environments = [nico.load(task, observation="both", **shared) for task in tasks]
@@ -150,7 +149,7 @@ def record_demonstrations(
                 raise RuntimeError(
                     f"the demonstrator of {tasks[task]!r} failed {attempts} times in a row "
                     f"({done[task]} of {tried[task]} attempts succeeded, "
-                    f"{done[task] / tried[task]:.0%}): mend its demonstration(), or raise attempts"
+                    f"{done[task] / tried[task]:.0%}): fix its demonstration(), or raise attempts"
                 )
             done[task] += 1
         n_frames = len(episode["pixels"])
@@ -159,7 +158,7 @@ def record_demonstrations(
         dataset["task"][row] = task
         dataset["seed"][row] = seed
         dataset["train"][row] = row % per_task < per_task - held_out_per_task
-        # Written last: a row without a length is recorded again.
+        # Written last, since a row whose length is 0 is recorded again.
         dataset["length"][row] = n_frames
     _write_meta(path, {**wanted, "checksum": _checksum(dataset)})
     return dataset
@@ -168,10 +167,7 @@ def record_demonstrations(
 def _demonstrate(
     env: Environment, seed: int, row: int, attempts: int
 ) -> tuple[dict[str, np.ndarray] | None, int]:
-    """Returns the first success, if any, and how many attempts there were.
-
-    The seeds of the attempts follow from seed and row.
-    """
+    """Return the first success, or ``None``, and the number of attempts."""
     sequence = np.random.SeedSequence([seed, row])
     for attempt in range(1, attempts + 1):
         start, noise = (int(child.generate_state(1)[0]) for child in sequence.spawn(2))
@@ -183,7 +179,7 @@ def _demonstrate(
 
 
 def _play(env: Environment, seed: int, row: int) -> dict[str, np.ndarray]:
-    """Returns an episode that leaves its demonstration for random movements, jerky or smooth."""
+    """Return an episode that follows a demonstration, then moves at random, jerkily or smoothly."""
     rng = np.random.default_rng([seed, row, 1])
     start, noise = (int(value) for value in rng.integers(2**32, size=2))
     demonstrator = Demonstrator(env, seed=noise)
@@ -207,7 +203,7 @@ def _perform(
     demonstrator: Demonstrator,
     policy: Callable[[TimeStep], np.ndarray],
 ) -> tuple[dict[str, np.ndarray], float]:
-    """Returns an episode from the start with that seed, and its last reward."""
+    """Return an episode from the start with seed ``start``, and its last reward."""
     env.task.random.seed(start)
     timestep = env.reset()
     demonstrator.reset()
@@ -234,7 +230,7 @@ def _read_meta(path: Path) -> dict:
     try:
         meta = json.loads((path / _META).read_text())
     except OSError:
-        raise ValueError(f"{path} is no dataset of demonstrations; {_REMEDY}") from None
+        raise ValueError(f"{path} is not a dataset of demonstrations; {_REMEDY}") from None
     except (ValueError, RecursionError):
         meta = None
     if not isinstance(meta, dict) or not (
@@ -251,7 +247,7 @@ def _make(path: Path, n: int) -> TensorDict:
     dataset = _empty(n)
     size = sum(value.numel() * value.element_size() for _, value in dataset.items())
     free = shutil.disk_usage(path).free
-    if size > free:  # Writing to a memory map on a full disk kills the process.
+    if size > free:  # Writing to a memory map on a full disk would kill the process.
         raise OSError(
             f"the dataset takes {size / 1e9:.1f} GB, {path} has {free / 1e9:.1f} GB left: "
             "make room or choose another folder"
@@ -266,8 +262,8 @@ def _open(path: Path, n: int) -> TensorDict:
         size = value.numel() * value.element_size()
         if not file.exists() or file.stat().st_size != size:
             raise ValueError(f"{file} is missing or truncated; remove {path} and {_REMEDY}")
-    # Not TensorDict.load_memmap: its meta.json, which the checksum does not cover, could have the
-    # bytes read as something else.
+    # Not TensorDict.load_memmap, which trusts the dtypes and shapes of its meta.json; the checksum
+    # does not cover that file.
     tensors = {
         key: MemoryMappedTensor.from_filename(
             path / f"{key}.memmap", dtype=value.dtype, shape=value.shape
@@ -278,14 +274,14 @@ def _open(path: Path, n: int) -> TensorDict:
 
 
 def load_demonstrations(path: str | Path, *, verify: bool = True) -> TensorDict:
-    """Opens a recorded dataset, memory-mapped.
+    """Open a recorded dataset, memory-mapped.
 
     Args:
         path: Folder of the dataset.
-        verify: Whether to compare the checksum, which reads all of it.
+        verify: Whether to verify the checksum, which reads the whole dataset.
 
     Returns:
-        What `record_demonstrations` returned.
+        The dataset as returned by `record_demonstrations`.
 
     Raises:
         ValueError: If it is missing, incomplete, damaged or of another scene version.
@@ -315,14 +311,14 @@ def main(
     play: bool = False,
     seed: int = 0,
 ) -> None:
-    """Records the dataset of demonstrations; the same command continues an interrupted one.
+    """Record the dataset of demonstrations; the same command resumes an interrupted recording.
 
     Args:
         path: Folder of the dataset.
         per_task: Demonstrations of each task.
         held_out_per_task: How many of those are held out for test episodes.
-        play: Record how the robot plays at random in place of demonstrations.
-        seed: Seed of starts and noise.
+        play: Record random play instead of demonstrations.
+        seed: Seed of the start states and of the noise.
     """
     record_demonstrations(
         path, per_task=per_task, held_out_per_task=held_out_per_task, play=play, seed=seed

@@ -1,4 +1,4 @@
-"""Experience of each task, for learners that are told the tasks' labels."""
+"""Replay buffer sampled by task, for algorithms that are given the task labels."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ __all__ = ["TaskReplay"]
 
 
 class TaskReplay:
-    """Replay drawn task by task, of each task as much, for learners that are told the labels.
+    """Replay buffer that draws the same number of transitions from each task.
 
     Args:
-        capacity: transitions kept of each seed, of all tasks.
-        n_tasks: number of tasks ``T``.
-        batch_size: transitions ``B`` drawn of each task by `sample`.
-        generator: sources of the draws, one for each of ``S`` seeds.
-        keys: entries to store.
-        demonstrations: replay of the demonstrations that were shown, for a share of each batch.
-        demonstration_share: that share, at least 0 and below 1.
+        capacity: Transitions kept for each seed, over all tasks.
+        n_tasks: Number of tasks ``T``.
+        batch_size: Transitions ``B`` that `sample` draws from each task.
+        generator: Random generators for sampling, one for each of ``S`` seeds.
+        keys: Entries to store.
+        demonstrations: Replay of the demonstrations shown, the source of a share of each batch.
+        demonstration_share: That share, in [0, 1).
 
     Raises:
-        ValueError: if there is no task, or no task could ever fill a batch.
+        ValueError: If there is no task, or no task could ever fill a batch.
 
-    Examples:
+    Example:
         >>> streams = [torch.Generator() for _ in range(10)]
         >>> options = {"n_tasks": 3, "batch_size": 2, "keys": ["state"]}
         >>> replay = TaskReplay(1000, generator=streams, **options)
@@ -70,30 +70,30 @@ class TaskReplay:
 
     @property
     def ready(self) -> Tensor:
-        """Which tasks of each seed fill a batch without repetition, bool ``[S, T]``."""
+        """Whether each task of each seed holds at least a batch of transitions, bool ``[S, T]``."""
         return self.sizes >= self.batch_size
 
     @property
     def enough(self) -> int:
-        """Transitions that fill a batch of some task, whichever tasks they are of.
+        """Number of transitions that guarantees a full batch of some task.
 
-        Learning that waits for them begins with the same step for all seeds, so that none begins
-        earlier, or counts more steps in its optimizer, than it would alone.
+        Waiting for this number makes learning start at the same step for all seeds, so that each
+        seed of a batch starts, and counts optimizer steps, as it would alone.
         """
         return self.n_tasks * (self.batch_size - 1) + 1
 
     def __len__(self) -> int:
-        """Returns the number of transitions that every seed holds at least, of all tasks."""
+        """Return the smallest number of transitions held for a seed, over all tasks."""
         return len(self._replay)
 
     def add(self, transition: TensorDictBase) -> None:
-        """Stores one transition of each seed with its task, and the demonstration at its end.
+        """Store one transition of each seed by task; also the demonstration, if an episode ends.
 
         Args:
-            transition: batch size ``[S]``, with the entries to store and ``"task"`` int64 ``[S]``.
+            transition: Batch size ``[S]``, with the entries to store and ``"task"`` int64 ``[S]``.
 
         Raises:
-            ValueError: if an entry is missing, or there is no such task.
+            ValueError: If an entry is missing, or a task does not exist.
         """
         task = transition.get("task", None)
         if task is None:
@@ -106,14 +106,14 @@ class TaskReplay:
             self._demonstrations.add(transition, torch.ones(len(task)), task, ended)
 
     def sample(self) -> TensorDictBase:
-        """Draws transitions of each task of each seed, those of demonstrations last.
+        """Draw transitions of each task of each seed, those of demonstrations last.
 
         Returns:
-            Batch size ``[S, T, B]``, with ``"priority_weight"``, by which losses of TorchRL weight
-            a transition: 1, or 0 for tasks that are not `ready`.
+            Batch size ``[S, T, B]``, with ``"priority_weight"``, the weight of a transition in
+            TorchRL's losses: 1, or 0 for tasks that are not `ready`.
 
         Raises:
-            ValueError: if no task is ready.
+            ValueError: If no task is ready.
         """
         task = self._ready_tasks()
         if self._demonstrations is None or not len(self._demonstrations):
@@ -125,27 +125,27 @@ class TaskReplay:
     def sample_played(
         self, batch_size: int, *, generator: Sequence[torch.Generator] | None = None
     ) -> TensorDict:
-        """Draws transitions that were played, of each task of each seed, as `sample`.
+        """Draw transitions of each task of each seed as `sample` does, without demonstrations.
 
         Args:
-            batch_size: how many of each.
-            generator: sources of the draws in place of the replay's own, one for each seed.
+            batch_size: Number of transitions per task and seed.
+            generator: Random generators to use instead of the replay's, one for each seed.
         """
         return self._draw(self._replay, self._ready_tasks(), batch_size, generator=generator)
 
     def sample_seed(self, seed: int, tasks: Sequence[int], batch_size: int) -> TensorDict:
-        """Draws transitions of some tasks of one seed, ``[len(tasks), B]``.
+        """Draw transitions of some tasks of one seed, ``[len(tasks), B]``.
 
         Args:
-            seed: position of the seed.
-            tasks: which, in this order; each holds a transition at least.
-            batch_size: how many of each.
+            seed: Position of the seed.
+            tasks: Labels of the tasks; each must hold a transition.
+            batch_size: Number of transitions ``B`` per task.
         """
         task = torch.tensor([tasks])
         return self._draw(self._replay, task, batch_size, seeds=[seed])[0]
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns all that future samples depend on."""
+        """Return the states of the buffers and their generators."""
         shown = self._demonstrations
         return {
             "played": self._replay.state_dict(),
@@ -153,7 +153,7 @@ class TaskReplay:
         }
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Restores what `state_dict` returned, so that the same samples follow."""
+        """Restore the result of `state_dict`, so that the same samples follow."""
         self._replay.load_state_dict(state_dict["played"])
         if self._demonstrations is not None:
             self._demonstrations.load_state_dict(state_dict["shown"])

@@ -1,1 +1,1 @@
-"""The VAE and the LSTM autoencoder: training, the shipped weights, probes of their latents."""
+"""The VAE and the LSTM autoencoder: training, pretrained weights and linear probes."""

@@ -1,4 +1,4 @@
-"""Supervised training of one network: Adam with warm-up and cosine decay, log and checkpoints."""
+"""Supervised training of one network: Adam with warm-up and cosine decay, logs and checkpoints."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from bgpo_trl.files.checkpoint import has_checkpoint, load_checkpoint, save_chec
 from bgpo_trl.files.progress import progress_bar
 
 Log = Callable[[dict[str, Any]], None]
-"""Receives one row of a training log: stage, step, learning_rate and the losses."""
+"""Consumer of a training log's rows: ``stage``, ``step``, ``learning_rate`` and the losses."""
 
 
 @dataclass(frozen=True)
 class Fit:
-    """The training loop that both stages of the representation share.
+    """Training loop shared by both stages of the representation.
 
     Attributes:
-        config: what is trained; its seed and intervals apply to every stage.
-        folder: where each stage has a folder of checkpoints; None for no checkpoints.
-        log: receives a row every ``config.log_every`` steps.
-        progress: whether to show a progress bar.
-        device: where to train.
+        config: Hyperparameters; the seed and the intervals apply to every stage.
+        folder: Parent of the stages' checkpoint folders; ``None`` disables checkpoints.
+        log: Receives a row every ``config.log_every`` steps.
+        progress: Whether to show a progress bar.
+        device: Device to train on.
     """
 
     config: RepresentationConfig
@@ -47,22 +47,22 @@ class Fit:
         schedule: VAEConfig | SequenceAutoencoderConfig,
         generator: torch.Generator,
     ) -> None:
-        """Trains ``loss.parameters()``, from the last checkpoint if there is one.
+        """Train ``loss.parameters()``, from the last checkpoint if there is one.
 
-        Moves the loss to the device and leaves it there.
+        The loss is moved to the device and stays there.
 
         Args:
-            stage: names the progress bar, the log rows and the checkpoint.
-            loss: maps a batch to a TensorDict whose ``loss_*`` entries are summed.
-            sample: draws a batch, on the CPU.
-            schedule: the stage's gradient steps and learning rate.
-            generator: the only source of randomness of ``sample`` and ``loss``; kept in the
-                checkpoint, so that an interrupted training continues to the same weights.
+            stage: Name of the progress bar, the log rows and the checkpoint.
+            loss: Maps a batch to a TensorDict whose ``loss_*`` entries are summed.
+            sample: Draws a batch, on the CPU.
+            schedule: Gradient steps and learning rate of the stage.
+            generator: The only source of randomness of ``sample`` and ``loss``; saved in the
+                checkpoint, so that a resumed training gives the same weights.
 
         Raises:
-            ValueError: if the loss is no longer finite, or the checkpoints are damaged or belong to
+            ValueError: If the loss is no longer finite, or the checkpoints are damaged or belong to
                 another configuration.
-            OSError: if a checkpoint cannot be written.
+            OSError: If a checkpoint cannot be written.
         """
         loss.to(self.device)
         optimizer = torch.optim.Adam(loss.parameters(), lr=schedule.learning_rate)
@@ -125,7 +125,7 @@ class Fit:
         saved = load_checkpoint(path)
         if saved["config"] != json.dumps(asdict(self.config)):
             raise ValueError(
-                f"{path} belongs to a training with another configuration: "
+                f"{path} was written with another configuration: "
                 "remove it or choose another checkpoint folder"
             )
         loss.load_state_dict(saved["loss"])

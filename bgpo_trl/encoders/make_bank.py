@@ -31,15 +31,16 @@ def make_bank(
     tasks: Sequence[str] = nico.ALL_TASKS,
     actions: Literal["inferred", "recorded"] = "inferred",
 ) -> DemonstrationBank:
-    """Embeds demonstrations, and keeps the steps of those for training.
+    """Embed demonstrations; keep the latents and actions of the training ones.
 
     Args:
         representation: The trained encoders.
-        dataset: Reads ``pixels`` ``[N, T, 32, 64, 3]``, ``length``, ``task`` and ``train`` ``[N]``.
-        tasks: Names of the tasks, in the order of their labels.
-        actions: Whether the steps have the actions that the VAE's inverse model infers from the
-            frames, which is all that an onlooker can know, or those that were recorded (``action``
-            ``[N, T - 1, 4]``), for comparison.
+        dataset: Reads ``pixels`` ``[N, T, 32, 64, 3]``, ``length``, ``task`` and ``train`` ``[N]``,
+            and ``action`` ``[N, T - 1, 4]``.
+        tasks: Task names, in the order of their labels.
+        actions: ``"inferred"`` stores the actions that the VAE's inverse model infers from the
+            frames, the only actions that an observer of a demonstration has; ``"recorded"`` stores
+            the true ones, for comparison.
     """
     vae, length = representation.vae, dataset["length"]
     latent = encode_frames(vae, dataset["pixels"], length)
@@ -63,13 +64,13 @@ def main(
     out: Path | None = None,
     actions: Literal["inferred", "recorded"] = "inferred",
 ) -> None:
-    """Embeds a recorded dataset with trained encoders.
+    """Embed a recorded dataset with trained encoders.
 
     Args:
         dataset: Folder of the recorded demonstrations.
-        weights: The encoders; those that come with the package if not given.
-        out: The bank to write; the one beside the encoders if not given.
-        actions: Actions of the steps that learners take from demonstrations.
+        weights: Encoder weights; the pretrained ones by default.
+        out: Bank to write; by default the one beside the encoder weights.
+        actions: Actions of the stored demonstrations, inferred from frames or recorded.
     """
     weights = default_weights() if weights is None else weights
     encoders = load_representation(weights, scene_version=nico.scene_version())

@@ -1,4 +1,4 @@
-"""Trained encoders and the bank of embedded demonstrations: load those shipped, or make new."""
+"""Trained encoders with their demonstration bank: load the pretrained ones, or train new ones."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from suites import nico
 def load_pretrained(
     weights: str | Path | None = None,
 ) -> tuple[Representation, DemonstrationBank]:
-    """Loads encoders and the bank that lies beside them.
+    """Load encoders and the bank beside them.
 
     Args:
-        weights: Encoder weights; those that come with the package if None.
+        weights: Encoder weights; the pretrained ones if ``None``.
 
     Raises:
-        ValueError: If either is missing, damaged or made for another scene.
+        ValueError: If either file is missing, damaged or was made for another scene.
     """
     weights = default_weights() if weights is None else Path(weights)
     encoders = load_representation(weights, scene_version=nico.scene_version())
@@ -51,26 +51,26 @@ def make_pretrained(
     device: torch.device | str = "cpu",
     tasks: Sequence[str] = nico.ALL_TASKS,
 ) -> tuple[Representation, DemonstrationBank]:
-    """Records demonstrations and play, trains both encoders, and embeds the demonstrations.
+    """Record demonstrations and play, train both encoders, and embed the demonstrations.
 
-    Each stage continues where it was interrupted.
+    Each interrupted stage is resumed.
 
     Args:
-        weights: Where to write the encoders; the bank goes beside them.
-        dataset: Folder of the demonstrations; recorded if not there yet. Half as many episodes of
-            play go to the folder of that name with ``-play`` at its end.
-        folder: Folder for the log, checkpoints and probes of the training.
+        weights: File to write the encoders to; the bank is written beside it.
+        dataset: Folder of the demonstrations, recorded if missing. Half as many episodes of play go
+            to the folder of the same name plus ``-play``.
+        folder: Folder for the training log, checkpoints and probes.
         config: Hyperparameters of the encoders.
         per_task: Demonstrations of each task.
         held_out_per_task: How many of those are held out.
         seed: Seed of the recording.
-        command: Stored with the weights.
+        command: Command line, stored with the weights.
         progress: Whether to show progress bars.
-        device: Where to train.
+        device: Device to train on.
         tasks: Tasks to demonstrate.
 
     Raises:
-        ValueError: If the dataset is damaged or of another scene.
+        ValueError: If the dataset is damaged or was recorded in another scene.
     """
     demonstrations = record_demonstrations(
         dataset,

@@ -1,10 +1,10 @@
-"""What the representation is worth: linear probes and distances, all on held-out demonstrations.
+"""Linear probes of the latents and distances between embeddings, on held-out demonstrations.
 
     python -m bgpo_trl.encoders.probes data/nico data/nico-play
 
-A policy sees nothing but latents and behaviors, so what cannot be read from them here cannot be
-learned later. Every probe is fitted on training demonstrations and measured on held-out ones.
-The ground-truth ``state`` is read here and nowhere else in stage 1.
+Policies observe only latents and behaviors, so information that these lack cannot be learned
+later. Every probe is fitted on training demonstrations and evaluated on held-out ones. No other
+part of the encoders' training reads the ground-truth ``state``.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from suites import nico
 
 JOINTS = ("yaw", "pitch", "elbow", "hand")
 OBJECTS = ("glass", "green", "white")
-_FIRST_OBJECT = 7  # state: 4 joints (rad), grip point (m), three objects (m)
+_FIRST_OBJECT = 7  # after 4 joints (rad) and the grip point (m)
 
 
 def probe(
@@ -51,27 +51,27 @@ def probe(
     *,
     play: TensorDictBase | None = None,
 ) -> dict[str, float]:
-    """Measures trained encoders.
+    """Evaluate trained encoders.
 
     Args:
-        representation: the encoders.
-        dataset: the demonstrations they were trained on, with their held-out part; reads
+        representation: The trained encoders.
+        dataset: Demonstrations that they were trained on, with their held-out part; reads
             ``pixels``, ``action``, ``length``, ``train``, ``task`` and ``state`` ``[N, T, 16]``.
-        folder: where to write ``probes.json`` and ``reconstructions.png``; None for nowhere.
-        activity_threshold: a_T of GWR-B (Table 1), for :func:`embedding_distances`.
-        play: recorded play, in the form of the dataset: adds the joints' and objects' errors there,
-            as ``play_...``, wherever all objects are still on the table.
+        folder: Folder for ``probes.json`` and ``reconstructions.png``; ``None`` writes nothing.
+        activity_threshold: Threshold a_T of GWR-B (Table 1), for `embedding_distances`.
+        play: Recorded play in the form of the dataset; adds the errors of joints and objects in
+            frames with all objects on the table, as ``play_...``.
 
     Returns:
-        Flat names to numbers: ``joint_<name>_rmse_rad`` and ``<object>_error_cm`` (linear probe of
-        one latent), ``inverse_rmse``, ``inverse_r2``, ``reconstruction`` (squared error a frame),
-        ``mean_frame_reconstruction`` (the same for the mean training frame, what a VAE that
-        learned nothing achieves), ``sequence_mse`` (of standardised latents, so 1 is nothing),
-        ``task_accuracy_linear``, ``task_accuracy_nearest``, ``active_dimensions`` and
-        the entries of :func:`embedding_distances`.
+        A flat dict: ``joint_<name>_rmse_rad`` and ``<object>_error_cm`` (linear probe of one
+        latent), ``inverse_rmse``, ``inverse_r2``, ``reconstruction`` (squared error per frame),
+        ``mean_frame_reconstruction`` (the same for the mean training frame, the level of an
+        untrained VAE), ``sequence_mse`` (of standardized latents, so 1 is the level of predicting
+        the mean), ``task_accuracy_linear``, ``task_accuracy_nearest``, ``active_dimensions`` and
+        the entries of `embedding_distances`.
 
     Raises:
-        ValueError: if the dataset has no training or no held-out demonstration.
+        ValueError: If the dataset has no training or no held-out demonstrations.
     """
     vae, lae = representation.vae, representation.lae
     train, held_out = split(dataset)
@@ -118,24 +118,23 @@ def probe(
 def embedding_distances(
     phi: Tensor, task: Tensor, activity_threshold: float = 0.8
 ) -> dict[str, float]:
-    """Describes how embedded demonstrations lie relative to each other.
+    """Measure how close embedded demonstrations lie, relative to the threshold of GWR-B.
 
-    GWR-B calls a demonstration known if its activity ``exp(-distance)`` to a node reaches a_T
-    (Eq. 2, Table 1), so ``-ln a_T`` (.223 for .8) is the distance everything is compared with: if
-    all demonstrations are closer together than that, the network never grows; if hardly any
-    are, it grows a node for each of them.
+    GWR-B adds no node for a demonstration whose activity ``exp(-distance)`` at a node reaches a_T
+    (Eq. 2, Table 1), so ``-ln a_T`` (0.223 for 0.8) is the reference distance: if all pairs are
+    closer, the network never grows; if hardly any are, it adds a node per demonstration.
 
     Args:
-        phi: ``[N, embedding_size]``.
-        task: int64 ``[N]``.
-        activity_threshold: a_T.
+        phi: Embeddings ``[N, embedding_size]``.
+        task: Task labels, int64 ``[N]``.
+        activity_threshold: Threshold a_T.
 
     Returns:
         ``phi_nearest_same_task`` and ``phi_nearest_other_task`` (median over demonstrations of the
         distance to the nearest one), ``phi_distance_same_task`` and ``phi_distance_other_task``
         (median over pairs), ``phi_threshold_distance`` (``-ln a_T``) and ``phi_nearest_known``
-        (share of demonstrations whose nearest neighbour is closer than that). NaN where there is
-        no such pair.
+        (share of demonstrations whose nearest neighbor is closer than that). NaN without such
+        pairs.
 
     Example:
         >>> phi = torch.tensor([[0.0], [0.1], [1.0]])
@@ -163,16 +162,16 @@ def embedding_distances(
 
 
 def ridge_predict(x: Tensor, y: Tensor, x_new: Tensor, penalty: float = 1e-4) -> Tensor:
-    """Fits ``y`` linearly (with intercept) on ``x`` and predicts for ``x_new``.
+    """Fit a ridge regression (with intercept) of ``y`` on ``x`` and predict for ``x_new``.
 
     Args:
-        x: ``[N, d]``.
-        y: ``[N, k]``.
-        x_new: ``[M, d]``.
-        penalty: L2 penalty on the coefficients of standardised ``x``, a row.
+        x: Inputs ``[N, d]``.
+        y: Targets ``[N, k]``.
+        x_new: Inputs to predict for, ``[M, d]``.
+        penalty: L2 penalty per row on the coefficients of standardized ``x``.
 
     Returns:
-        float32 ``[M, k]``.
+        Predictions, float32 ``[M, k]``.
     """
     scale, center = torch.std_mean(x.double(), 0)
     scale = scale.clamp_min(1e-8)
@@ -185,20 +184,20 @@ def ridge_predict(x: Tensor, y: Tensor, x_new: Tensor, penalty: float = 1e-4) ->
 
 @torch.no_grad()
 def reconstruction_picture(vae: VAE, demonstrations: TensorDictBase, columns: int = 12) -> Tensor:
-    """Returns original frames over their reconstructions, each pixel shown as 4 x 4.
+    """Return original frames above their reconstructions, each pixel enlarged to 4 x 4.
 
     Args:
-        vae: the encoder and decoder.
-        demonstrations: reads ``pixels`` ``[N, T, 32, 64, 3]`` and ``length`` ``[N]``; frames are
-            taken from all over them.
-        columns: number of frames.
+        vae: The trained VAE.
+        demonstrations: Reads ``pixels`` ``[N, T, 32, 64, 3]`` and ``length`` ``[N]``; frames are
+            spread over demonstrations and time.
+        columns: Number of frames.
 
     Returns:
-        uint8 ``[2 * 32 * 4, columns * 64 * 4, 3]``.
+        Picture uint8 ``[2 * 32 * 4, columns * 64 * 4, 3]``.
     """
     share = torch.linspace(0, 1, columns)
     demonstration = (share * (len(demonstrations) - 1)).round().long()
-    # A stride that is no divisor of 1 shows early, middle and late frames side by side.
+    # The stride mixes early, middle and late frames.
     time = (share * 5 % 1) * (demonstrations.get("length")[demonstration] - 1)
     frames = demonstrations.get("pixels")[demonstration, time.round().long()]
     decoded = (vae.decode(vae.encode(frames)[0]) * 255).round().to(torch.uint8)
@@ -236,7 +235,7 @@ def _probe_state(
 
 
 def _objects_on_table(state: Tensor) -> Tensor:
-    """Returns where all objects are higher than 0.6 m, bool, of state ``[..., 16]``."""
+    """Return whether all objects are above 0.6 m, bool, for states ``[..., 16]``."""
     return (state[..., _FIRST_OBJECT + 2 :: 3] > 0.6).all(-1)
 
 
@@ -290,20 +289,20 @@ def _median(values: Tensor) -> float:
 
 @dataclass(frozen=True)
 class Arguments:
-    """Measures trained encoders."""
+    """Evaluate trained encoders with linear probes."""
 
     dataset: tyro.conf.Positional[Path]
     """Folder of the recorded demonstrations."""
     play: tyro.conf.Positional[Path | None] = None
     """Folder of recorded play."""
     weights: Path = field(default_factory=default_weights)
-    """The encoders; by default those that come with the package."""
+    """Encoder weights; the pretrained ones by default."""
     out: Path = Path("runs/probes")
-    """Where ``probes.json`` and ``reconstructions.png`` go."""
+    """Folder for probes.json and reconstructions.png."""
 
 
 def main(arguments: Arguments) -> None:
-    """Runs the command line; see ``--help``."""
+    """Run the command line."""
     representation = load_representation(arguments.weights, scene_version=nico.scene_version())
     play = None if arguments.play is None else load_demonstrations(arguments.play)
     probe(representation, load_demonstrations(arguments.dataset), arguments.out, play=play)

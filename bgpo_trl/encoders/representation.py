@@ -1,8 +1,8 @@
-"""Stage 1: learn to see. Trains, embeds, saves and loads the two frozen encoders.
+"""Train, save and load the two frozen encoders, and embed demonstrations (Sec. III-A).
 
-``train_representation`` runs the paper's Sec. III-A: first the VAE with its inverse model on the
-frames of the demonstrations and of play, then the LSTM autoencoder on the latents of the
-demonstrations. What the result is worth is measured in :mod:`bgpo_trl.encoders.probes`.
+`train_representation` first trains the VAE with its inverse model on the frames of
+demonstrations and play, then the LSTM autoencoder on the latents of the demonstrations;
+`bgpo_trl.encoders.probes` evaluates the result.
 
 A dataset is a TensorDict ``[N]`` with ``pixels`` uint8 ``[N, T, 32, 64, 3]``, ``action``
 ``[N, T - 1, A]``, ``length`` int64 ``[N]`` (frames) and ``train`` bool ``[N]``.
@@ -30,11 +30,11 @@ from bgpo_trl.objectives.representation import SequenceReconstructionLoss, VAEIn
 
 @dataclass
 class Representation:
-    """The two trained encoders and where they come from.
+    """The two trained encoders and the metadata of their training.
 
     Attributes:
-        vae: frame encoder; ``vae.latent(pixels)`` is the latent used downstream.
-        lae: sequence encoder; ``lae.encode(latent, length)`` is phi.
+        vae: Frame encoder; ``vae.latent(pixels)`` is the latent used downstream.
+        lae: Sequence encoder; ``lae.encode(latent, length)`` is the embedding phi.
         metadata: ``scene_version``, ``config`` (JSON), ``seed``, ``command``.
     """
 
@@ -44,7 +44,7 @@ class Representation:
 
     @property
     def identity(self) -> str:
-        """A digest of all weights: what was embedded with other encoders has another."""
+        """Digest of all weights; it identifies the encoders that made an embedding."""
         return digest(_tensors(self))
 
 
@@ -60,26 +60,27 @@ def train_representation(
     progress: bool = True,
     device: torch.device | str = "cpu",
 ) -> Representation:
-    """Trains both encoders on the training demonstrations.
+    """Train both encoders on the training demonstrations.
 
     Args:
-        dataset: demonstrations, see the module's head. Held-out ones are not touched.
-        config: hyperparameters; ``RepresentationConfig()`` if not given.
-        play: episodes of play, in the form of the dataset, for the frame encoder to see besides the
-            demonstrations what trial and error brings.
-        scene_version: version of the scene that made the frames, stored with the weights.
-        command: the command line that asked for this, stored with the weights.
-        checkpoint: folder to write checkpoints to. An interrupted training that is called again
-            with the same folder continues, to the same weights.
-        log: receives a row every ``config.log_every`` steps.
-        progress: whether to show a progress bar for each of the two stages.
-        device: where to train.
+        dataset: Demonstrations, in the form given in the module docstring; held-out ones are not
+            read.
+        config: Hyperparameters; ``RepresentationConfig()`` by default.
+        play: Episodes of play in the same form, which train the frame encoder on states that
+            demonstrations never visit.
+        scene_version: Version of the scene of the frames, stored with the weights.
+        command: Command line, stored with the weights.
+        checkpoint: Folder for checkpoints. Calling an interrupted training again with the same
+            folder resumes it and gives the same weights.
+        log: Receives a row every ``config.log_every`` steps.
+        progress: Whether to show a progress bar for each of the two stages.
+        device: Device to train on.
 
     Returns:
         The trained encoders, on the CPU, in eval mode, without gradients.
 
     Raises:
-        ValueError: if the dataset or the configuration cannot be trained on, or ``checkpoint``
+        ValueError: If the dataset or the configuration cannot be trained on, or ``checkpoint``
             belongs to a training with another configuration.
     """
     config = config or RepresentationConfig()
@@ -101,16 +102,16 @@ def train_representation(
 
 @torch.no_grad()
 def encode_frames(vae: VAE, pixels: Tensor, length: Tensor, batch_size: int = 64) -> Tensor:
-    """Encodes the valid frames of demonstrations, a few demonstrations' worth at a time.
+    """Encode the valid frames of demonstrations in batches.
 
     Args:
-        vae: the trained frame encoder.
-        pixels: uint8 ``[N, T, 32, 64, 3]``.
-        length: int64 ``[N]``, valid frames of each.
-        batch_size: frames in one call of the encoder.
+        vae: The trained frame encoder.
+        pixels: Frames uint8 ``[N, T, 32, 64, 3]``.
+        length: Number of valid frames, int64 ``[N]``.
+        batch_size: Frames per call of the encoder.
 
     Returns:
-        Standardised latents, float32 ``[N, T, latent_size]``; zeros at and beyond ``length``.
+        Standardized latents, float32 ``[N, T, latent_size]``; zeros at and beyond ``length``.
     """
     latent = torch.zeros(*pixels.shape[:2], vae.latent_size)
     demonstration, time = valid_steps(length, pixels.shape[1]).nonzero(as_tuple=True)
@@ -121,38 +122,38 @@ def encode_frames(vae: VAE, pixels: Tensor, length: Tensor, batch_size: int = 64
 
 @torch.no_grad()
 def embed_demonstrations(representation: Representation, dataset: TensorDictBase) -> Tensor:
-    """Embeds whole demonstrations, as Alg. 1 does with a demonstration before an episode.
+    """Embed whole demonstrations, as Alg. 1 does before an episode.
 
     Args:
-        representation: the trained encoders.
-        dataset: reads ``pixels`` ``[N, T, 32, 64, 3]`` and ``length`` ``[N]``.
+        representation: The trained encoders.
+        dataset: Reads ``pixels`` ``[N, T, 32, 64, 3]`` and ``length`` ``[N]``.
 
     Returns:
-        phi, float32 ``[N, embedding_size]``.
+        Embeddings phi, float32 ``[N, embedding_size]``.
     """
     latent = encode_frames(representation.vae, dataset.get("pixels"), dataset.get("length"))
     return representation.lae.encode(latent, dataset.get("length"))
 
 
 def default_weights() -> Path:
-    """Returns where the weights that come with the package lie."""
+    """Return the path of the pretrained weights."""
     return Path(str(resources.files("bgpo_trl") / "weights" / "nico.safetensors"))
 
 
 def bank_path(weights: Path) -> Path:
-    """Returns where the bank embedded with encoders lies: ``nico_bank`` beside ``nico``."""
+    """Return the path of the bank of encoder weights: ``nico_bank`` beside ``nico``."""
     return weights.with_name(f"{weights.stem}_bank{weights.suffix}")
 
 
 def save_representation(representation: Representation, path: str | Path) -> None:
-    """Writes both encoders and the metadata to one safetensors file.
+    """Write both encoders and the metadata to one safetensors file.
 
     Args:
-        representation: what to save.
-        path: the file to write; missing folders are made.
+        representation: The encoders.
+        path: File to write; missing folders are made.
 
     Raises:
-        OSError: if it cannot be written; one that was there stays as it was.
+        OSError: If the file cannot be written; an existing file is kept.
     """
     save_tensors(path, _tensors(representation), representation.metadata)
 
@@ -160,17 +161,17 @@ def save_representation(representation: Representation, path: str | Path) -> Non
 def load_representation(
     path: str | Path | None = None, *, scene_version: str | None = None
 ) -> Representation:
-    """Reads encoders that :func:`save_representation` wrote.
+    """Read encoders written by `save_representation`.
 
     Args:
-        path: the file; the weights that come with the package if not given.
-        scene_version: version of the scene at hand; None to accept any.
+        path: The file; the pretrained weights by default.
+        scene_version: Required version of the scene; ``None`` accepts any.
 
     Returns:
         The encoders, in eval mode, without gradients.
 
     Raises:
-        ValueError: if the file is missing, damaged, or belongs to another scene.
+        ValueError: If the file is missing, damaged, or belongs to another scene.
     """
     path = Path(path) if path is not None else default_weights()
     remedy = "train new ones with --train-encoders"
@@ -208,10 +209,10 @@ def _tensors(representation: Representation) -> dict[str, Tensor]:
 
 
 def split(dataset: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
-    """Returns the training and the held-out demonstrations, by the key ``train``.
+    """Return the training and the held-out demonstrations, by the key ``train``.
 
     Raises:
-        ValueError: if there is none of either.
+        ValueError: If either set is empty.
     """
     chosen = dataset.get("train").bool()
     if chosen.all() or not chosen.any():
@@ -220,18 +221,18 @@ def split(dataset: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
 
 
 def valid_steps(length: Tensor, steps: int) -> Tensor:
-    """Returns the mask of valid steps, bool ``[N, steps]``, of ``length`` ``[N]``."""
+    """Return the mask of valid steps, bool ``[N, steps]``, for lengths ``[N]``."""
     return torch.arange(steps) < length.unsqueeze(-1)
 
 
 def valid_frames(dataset: TensorDictBase) -> Tensor:
-    """Returns all valid frames one after the other, uint8 ``[sum(length), 32, 64, 3]``."""
+    """Return all valid frames, concatenated, uint8 ``[sum(length), 32, 64, 3]``."""
     pixels = dataset.get("pixels")
     return pixels[valid_steps(dataset.get("length"), pixels.shape[1])]
 
 
 def mean_frame(frames: Tensor) -> Tensor:
-    """Returns the mean of uint8 ``[F, 32, 64, 3]`` as float32 ``[32, 64, 3]`` in [0, 1]."""
+    """Return the mean of uint8 ``[F, 32, 64, 3]`` as float32 ``[32, 64, 3]`` in [0, 1]."""
     return frames.sum(0, dtype=torch.int64) / (255 * len(frames))
 
 
@@ -240,7 +241,7 @@ def _train_vae(datasets: Sequence[TensorDictBase], config: VAEConfig, fit: Fit, 
     if length.max() < config.window:
         raise ValueError(f"the dataset has no training demonstration of {config.window} frames")
     frames = torch.cat([valid_frames(dataset) for dataset in datasets])
-    # The last frame of a demonstration leads nowhere; its action is never read.
+    # The padding after the last frame of a demonstration is never read.
     action = torch.cat([dataset.get("action") for dataset in datasets])
     padded = torch.nn.functional.pad(action, (0, 0, 0, 1))
     action = padded[valid_steps(length, padded.shape[1])]

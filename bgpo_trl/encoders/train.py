@@ -1,4 +1,4 @@
-"""Command line of stage 1: ``python -m bgpo_trl.encoders.train data/nico data/nico-play``."""
+"""Command line for training the encoders: ``python -m bgpo_trl.encoders.train data/nico``."""
 
 from __future__ import annotations
 
@@ -46,20 +46,20 @@ _COLUMNS = (
 
 @dataclass(frozen=True)
 class Arguments:
-    """Trains both encoders on recorded demonstrations and play, then probes them."""
+    """Train both encoders on recorded demonstrations and play, then probe them."""
 
     dataset: tyro.conf.Positional[Path]
     """Folder of the recorded demonstrations."""
     play: tyro.conf.Positional[Path | None] = None
-    """Folder of recorded play. Without it, the frame encoder sees demonstrations only."""
+    """Folder of recorded play; without it, the frame encoder learns from demonstrations only."""
     weights: Path = field(default_factory=default_weights)
-    """The file to write; by default the weights that come with the package."""
+    """File to write; by default the pretrained weights of the package."""
     folder: Path = Path("runs/encoders")
-    """Where checkpoints, log and probes go. The same folder continues an interrupted training."""
+    """Folder for checkpoints, log and probes; the same folder resumes an interrupted training."""
     config: RepresentationConfig = field(default_factory=RepresentationConfig)
     """Hyperparameters."""
     device: str = "auto"
-    """Where to train: cpu, cuda, or auto for a GPU if there is one."""
+    """Device to train on: cpu, cuda, or auto for a GPU if there is one."""
 
 
 def train_encoders(
@@ -73,26 +73,27 @@ def train_encoders(
     progress: bool = True,
     tasks: Sequence[str] = nico.ALL_TASKS,
 ) -> tuple[Representation, DemonstrationBank]:
-    """Trains, saves and probes both encoders, and embeds the demonstrations with them.
+    """Train, save and probe both encoders, and embed the demonstrations with them.
 
     Args:
-        dataset: demonstrations as in :mod:`bgpo_trl.encoders.representation`, with ``state`` and
+        dataset: Demonstrations as in `bgpo_trl.encoders.representation`, with ``state`` and
             ``task``.
-        play: recorded play, in the same form, or None.
-        weights: the safetensors file to write; the bank goes beside it, see `bank_path`.
-        folder: receives ``train.csv``, ``checkpoint/``, ``probes.json``, ``reconstructions.png``.
-        config: hyperparameters.
-        command: stored with the weights.
-        device: where to train.
-        progress: whether to show progress bars.
-        tasks: what the demonstrations are of, in the order of their labels.
+        play: Recorded play in the same form, or ``None``.
+        weights: Safetensors file to write; the bank is written beside it, see `bank_path`.
+        folder: Folder for ``train.csv``, ``checkpoint/``, ``probes.json`` and
+            ``reconstructions.png``.
+        config: Hyperparameters.
+        command: Command line, stored with the weights.
+        device: Device to train on.
+        progress: Whether to show progress bars.
+        tasks: Task names, in the order of their labels.
 
     Returns:
         The trained encoders and the bank of embedded demonstrations.
 
     Raises:
-        ValueError: as :func:`bgpo_trl.encoders.representation.train_representation`.
-        OSError: if the disk is full.
+        ValueError: As `train_representation`.
+        OSError: If a file cannot be written.
     """
     make_folder(folder)
     with CsvFile(folder / "train.csv", _COLUMNS) as file:
@@ -115,7 +116,7 @@ def train_encoders(
 
 
 def _log_of(file: CsvFile) -> Log:
-    """Returns a log that drops what an interrupted training wrote of the steps made again."""
+    """Return a log that replaces rows which an interrupted training wrote after its checkpoint."""
 
     def log(row: dict[str, Any]) -> None:
         again = file.path.read_bytes().find(f"\n{row['stage']},{row['step']},".encode())
@@ -127,7 +128,7 @@ def _log_of(file: CsvFile) -> Log:
 
 
 def main(arguments: Arguments) -> None:
-    """Runs the command line; see ``--help``."""
+    """Run the command line."""
     dataset = load_demonstrations(arguments.dataset)
     play = None if arguments.play is None else load_demonstrations(arguments.play)
     command = shlex.join(["python", "-m", "bgpo_trl.encoders.train", *sys.argv[1:]])

@@ -1,1 +1,1 @@
-"""What the scripts in `benchmarks/` share: running an experiment, jobs on Ray, merging of runs."""
+"""The paper's experiments: one run, and sweeps of runs on Ray."""

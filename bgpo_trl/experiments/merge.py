@@ -1,4 +1,4 @@
-"""Makes one run directory of the finished runs of blocks of its seeds."""
+"""Merge finished runs of blocks of seeds into one run directory."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from bgpo_trl.runs.results import read_json, read_rows
 
 
 def merge(blocks: Sequence[Path], directory: Path) -> None:
-    """Writes what one run of all seeds would have, each file whole or not at all.
+    """Write the files that one run of all seeds would have written, each atomically.
 
-    Rows are sorted by seed and episode. Losses stay means over the seeds of a block. What is of the
-    first seed alone, ``gwr.csv`` and figures, is the first block's; ``success.png`` and
-    ``groups.png`` are left to ``summary.py``.
+    Rows are sorted by seed and episode. Losses remain means over the seeds of a block. Files about
+    the first seed alone (``gwr.csv`` and figures) are copied from the first block, except
+    ``success.png`` and ``groups.png``, which ``summary.py`` draws.
 
     Args:
-        blocks: Run directories, which differ by their seeds alone.
-        directory: Where ``config.json``, ``train.csv``, ``eval.csv``, ``final.csv`` and
-            ``summary.json`` go; made if it does not exist.
+        blocks: Run directories that differ only in their seeds.
+        directory: Folder for ``config.json``, ``train.csv``, ``eval.csv``, ``final.csv`` and
+            ``summary.json``; made if missing.
 
     Raises:
-        ValueError: If a file is missing, or the blocks do not have each training episode of each
-            seed once.
+        ValueError: If a file is missing, or the blocks do not hold each training episode of each
+            seed exactly once.
         OSError: If the directory cannot be written.
     """
     configs = [read_json(block / "config.json") for block in blocks]
-    told = [read_json(block / "summary.json") for block in blocks]
+    summaries = [read_json(block / "summary.json") for block in blocks]
     seeds = [seed for config in configs for seed in config["seeds"]]
     tables = {
         name: sorted(
@@ -46,8 +46,8 @@ def merge(blocks: Sequence[Path], directory: Path) -> None:
     episodes = range(1, configs[0]["episodes"] + 1)
     if played != Counter((seed, episode) for seed in seeds for episode in episodes):
         raise ValueError(
-            f"{directory}: its blocks do not have each episode of each seed once; remove those "
-            "that were changed, and play them again"
+            f"{directory}: its blocks do not have each episode of each seed once; remove the "
+            "blocks that were changed, and run them again"
         )
 
     directory.mkdir(parents=True, exist_ok=True)
@@ -61,12 +61,12 @@ def merge(blocks: Sequence[Path], directory: Path) -> None:
         if path.name not in ("success.png", "groups.png"):
             _write(directory / path.relative_to(blocks[0]), path.read_bytes())
     summary = {
-        **told[0],
-        "commit": " ".join(dict.fromkeys(block["commit"] for block in told)),
+        **summaries[0],
+        "commit": " ".join(dict.fromkeys(block["commit"] for block in summaries)),
         "command": shlex.join(["python", *sys.argv]),
     }
-    for key in summary.keys() & {"nodes", "groups", "group_purity"}:  # one of each seed, or none
-        of_blocks = [block[key] for block in told]
+    for key in summary.keys() & {"nodes", "groups", "group_purity"}:  # a value per seed, or None
+        of_blocks = [block[key] for block in summaries]
         summary[key] = None if None in of_blocks else list(chain.from_iterable(of_blocks))
     _write_json(directory / "summary.json", summary)
     _write_json(directory / "config.json", {**configs[0], "seeds": seeds})

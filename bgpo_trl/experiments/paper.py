@@ -12,12 +12,12 @@ __all__ = ["AblationArguments", "ablation", "concurrent", "continual"]
 
 
 def continual(arguments: Arguments) -> None:
-    """Trains an algorithm on tasks presented one after the other (Fig. 8)."""
+    """Train an algorithm on tasks presented one after the other (Fig. 8)."""
     print(run_experiment(arguments, "continual", run_config(arguments)))
 
 
 def concurrent(arguments: Arguments) -> None:
-    """Trains an algorithm on tasks that are all presented from the start (Fig. 6)."""
+    """Train an algorithm on tasks that are all presented from the start (Fig. 6)."""
     config = replace(run_config(arguments), task_starts=(0, 0, 0))
     print(run_experiment(arguments, "concurrent", config))
 
@@ -37,7 +37,7 @@ class AblationArguments(Arguments):
 
 
 def ablation(arguments: AblationArguments) -> None:
-    """Trains a variant of BGPO (Fig. 9).
+    """Train a variant of BGPO (Fig. 9).
 
     Raises:
         ValueError: If ``--algorithm`` is given.

@@ -1,4 +1,4 @@
-"""Jobs on Ray: each is played to its end once, whatever becomes of the workers that play it."""
+"""Jobs on Ray: each is run to its end exactly once, even if workers are lost."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ except ImportError as error:
         "sweeps run on Ray, which is not installed: pip install 'bgpo_trl[ray]'"
     ) from error
 
-# A job that takes its worker down each time must come to an end.
+# Bounds the retries of a job that always crashes its worker.
 RETRIES = 10
 
 
 @dataclass(frozen=True)
 class Job:
-    """A run of some seeds, and its directory."""
+    """A run of a block of seeds, and its directory."""
 
     directory: Path
     config: RunConfig
@@ -43,51 +43,51 @@ class Job:
 
     @property
     def finished(self) -> bool:
-        """Whether it was played to its end."""
+        """Whether the job was run to its end."""
         return (self.directory / "finished").exists()
 
 
 @contextlib.contextmanager
 def connected(address: str, cpus: float, gpus: float) -> Iterator[None]:
-    """Connects to a Ray cluster, or starts Ray on this machine, until the end of the block.
+    """Connect to a Ray cluster, or start Ray on this machine, for the duration of the block.
 
     Args:
-        address: Of the cluster, or ``"local"``.
-        cpus: Cores of a job.
-        gpus: GPUs of a job.
+        address: Address of the cluster, or ``"local"``.
+        cpus: Cores per job.
+        gpus: GPUs per job.
 
     Raises:
         ValueError: If this machine is too small for a job.
         ConnectionError: If there is no such cluster.
     """
-    # Ray would report its use to its makers, and give workers what other processes leave of a core.
+    # Disables Ray's usage reports, and the niceness that it gives to workers.
     os.environ.update(RAY_USAGE_STATS_ENABLED="0", RAY_worker_niceness="0")
     options: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR}
     if address == "local":
-        # Jobs hand over nothing, so that the smallest store will do.
+        # Jobs pass no data between processes, so the smallest object store suffices.
         options |= {"include_dashboard": False, "object_store_memory": 80_000_000}
     try:
         ray.init(address, **options)
         for name, wanted in (("cpu", cpus), ("gpu", gpus)):
-            there = ray.cluster_resources().get(name.upper(), 0)
-            if address == "local" and wanted > there:
-                raise ValueError(f"--{name}s-per-run {wanted:g}: Ray finds {there:g} here")
+            available = ray.cluster_resources().get(name.upper(), 0)
+            if address == "local" and wanted > available:
+                raise ValueError(f"--{name}s-per-run {wanted:g}: Ray finds {available:g} here")
         yield
     finally:
         ray.shutdown()
 
 
 def work(job: Job, play: Callable[[Job], None], command: Sequence[str]) -> None:
-    """Plays a job in a worker, unless it is finished; what is printed goes to its ``log.txt``.
+    """Run a job in a worker unless it is finished, with its output in the job's ``log.txt``.
 
     Args:
-        job: What to play.
-        play: How.
-        command: Becomes ``sys.argv``, which in a worker is Ray's.
+        job: The job.
+        play: Function that runs it.
+        command: Value for ``sys.argv``, which Ray sets otherwise in a worker.
     """
     sys.argv = list(command)
     with (
-        DirectoryLock(job.directory, wait=True),  # Ray may believe a worker dead that still writes
+        DirectoryLock(job.directory, wait=True),  # A worker that Ray lost may still be writing.
         (job.directory / "log.txt").open("a", buffering=1) as log,
         contextlib.redirect_stdout(log),
         contextlib.redirect_stderr(log),
@@ -106,30 +106,30 @@ def work(job: Job, play: Callable[[Job], None], command: Sequence[str]) -> None:
 def play_jobs(
     jobs: Sequence[Job], play: Callable[[Job], None], *, cpus: float = 1, gpus: float = 0
 ) -> dict[Job, str]:
-    """Plays jobs on the Ray that this process is connected to, and shows how far they are.
+    """Run jobs on the connected Ray cluster, with a progress bar.
 
     Args:
-        jobs: What to play.
-        play: Called in a worker; goes on with what there is of a job, and returns at its end.
-        cpus: Cores of a job.
-        gpus: GPUs of a job.
+        jobs: The jobs.
+        play: Function called in a worker, which resumes a job and returns at its end.
+        cpus: Cores per job.
+        gpus: GPUs per job.
 
     Returns:
-        The jobs that failed, and why in one line: ``play`` raised, or lost its worker again and
-        again.
+        The failed jobs, each with a one-line reason: ``play`` raised, or its worker was lost
+        repeatedly.
 
     Raises:
-        KeyboardInterrupt: At Ctrl-C; it is passed on to ``play``, which has a minute to save.
+        KeyboardInterrupt: On Ctrl-C, which is passed on to ``play``; it has a minute to save.
     """
-    # Workers import what `play` needs, from beside it and from this package.
+    # Workers import modules beside `play` and from this package.
     folders = [Path(inspect.getfile(play)).resolve().parent, Path(__file__).resolve().parents[2]]
     path = [*map(str, folders), os.environ.get("PYTHONPATH", "")]
     environment = {"PYTHONPATH": os.pathsep.join(filter(None, path)), "OMP_NUM_THREADS": "1"}
     task = ray.remote(
         num_cpus=cpus,
         num_gpus=gpus,
-        max_retries=RETRIES,  # of jobs whose worker or machine is lost, not of those that raise
-        max_calls=1,  # a process for each job
+        max_retries=RETRIES,  # for lost workers or machines, not for jobs that raise
+        max_calls=1,  # one process per job
         runtime_env={"env_vars": environment},
     )(work)
     pending = {task.remote(job, play, sys.argv): job for job in jobs}
@@ -155,7 +155,7 @@ def play_jobs(
 
 
 def _episodes(jobs: Iterable[Job]) -> int:
-    """Returns how many training episodes are on record."""
+    """Return the number of training episodes on record."""
     files = (job.directory / "train.csv" for job in jobs)
     return sum(max(0, path.read_bytes().count(b"\n") - 1) for path in files if path.exists())
 

@@ -1,4 +1,4 @@
-"""What ``--resume`` finds in a run's directory."""
+"""State of a run directory, as ``--resume`` reads it."""
 
 from __future__ import annotations
 
@@ -13,40 +13,40 @@ from bgpo_trl.runs.results import read_json
 
 
 def as_begun(config: RunConfig, directory: Path, *, keep_eval_every: bool = False) -> RunConfig:
-    """Returns a run with the tasks' starts and the evaluations of the shorter one in a directory.
+    """Return a run with the task starts and evaluation interval of the shorter run in a directory.
 
     Args:
-        config: The run, of which these depend on its length.
-        directory: The run's.
-        keep_eval_every: Whether the evaluations are as they are for another reason.
+        config: The run; both settings depend on its length by default.
+        directory: The run directory.
+        keep_eval_every: Whether to keep the evaluation interval of ``config``.
     """
     try:
-        there, _ = read_config(directory / "config.json")
-    except ValueError:  # which who reads it next will tell
+        saved, _ = read_config(directory / "config.json")
+    except ValueError:  # reported by the next reader of the file
         return config
-    at_once = [[start == 0 for start in run.task_starts] for run in (there, config)]
+    at_once = [[start == 0 for start in run.task_starts] for run in (saved, config)]
     if at_once[0] != at_once[1]:  # another experiment
         return config
-    every = config.eval_every if keep_eval_every else there.eval_every
-    return replace(config, task_starts=there.task_starts, eval_every=every)
+    every = config.eval_every if keep_eval_every else saved.eval_every
+    return replace(config, task_starts=saved.task_starts, eval_every=every)
 
 
 def is_finished(directory: Path, config: RunConfig) -> bool:
-    """Returns whether a directory holds all of a run: training, final tests and figures."""
+    """Return whether a directory holds a complete run: training, final tests and figures."""
     try:
-        there, _ = read_config(directory / "config.json")
-        told = read_json(directory / "summary.json")
+        saved, _ = read_config(directory / "config.json")
+        summary = read_json(directory / "summary.json")
     except ValueError:
         return False
     tested = (directory / "final.csv").exists()
-    return tested and there == config and told.get("episodes") == config.episodes
+    return tested and saved == config and summary.get("episodes") == config.episodes
 
 
 def check_resumable(directories: Sequence[Path]) -> None:
-    """Makes sure that there is a run in one of some directories, for ``--resume``.
+    """Check that at least one of some directories holds a run, for ``--resume``.
 
     Raises:
-        ValueError: If there is none: the name may be mistyped.
+        ValueError: If none does, for example because ``--out`` is mistyped.
     """
     if not any(holds_run(directory) for directory in directories):
         named = " or ".join(map(str, directories))

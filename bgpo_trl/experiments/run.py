@@ -1,4 +1,4 @@
-"""Command line, run and final measurements, which the paper's experiments share."""
+"""Shared parts of the paper's experiments: command line, training run, final tests and figures."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ from bgpo_trl.machine import choose_device, set_threads
 from bgpo_trl.training import Trainer
 from bgpo_trl.transforms import TaskSchedule
 
-# Number of the evaluation after training, which no evaluation in training has: other starts.
+# Number of the evaluation after training; it seeds start states that training never tested.
 _LAST = 2**31
-_DATASET, _ENCODERS = "demonstrations", "encoders"  # in the directory of a run that makes its own
+_DATASET, _ENCODERS = "demonstrations", "encoders"  # folders of a run that trains its encoders
 FINAL_COLUMNS = ("seed", "demonstrations", "task", "episodes", "success", "task_inference")
 
 
@@ -52,50 +52,52 @@ AlgorithmName = Literal[
     "oracle",
     "ddpg",
 ]
-"""The keys of `ALGORITHMS`, as a command line has to be told them."""
+"""The keys of `ALGORITHMS`, spelled out for the command line's choices."""
 
 
 @dataclass(frozen=True)
 class Arguments:
-    """Trains an algorithm and draws its success."""
+    """Train an algorithm and plot its success."""
 
     algorithm: AlgorithmName = "bgpo"
-    """BGPO, without demonstrations (-experts), with one actor and critic for all behaviors besides
-    (-single); a baseline, or one that learns from demonstrations too; any of them as published
-    (-paper); or a reference: DDPG that is told the task's label (oracle) or nothing."""
+    """BGPO, also without replay of demonstrations (-experts) and without experts either (-single);
+    a baseline, with or without -demonstrations; any of them as published (-paper); or a reference:
+    DDPG with the task label as context (oracle) or without any (ddpg)."""
     rl: Literal["ddpg", "td3", "sac"] = "ddpg"
     """The RL algorithm of BGPO, its ablations and the references."""
     preset: Literal["smoke", "quick", "desk", "paper"] = "quick"
-    """Size of the run: every stage in minutes; learning to look at; five seeds; the paper's."""
+    """Size of the run: smoke (every stage in minutes), quick (visible learning), desk (five seeds)
+    or paper (the paper's size)."""
     out: Path | None = None
-    """The run's directory; runs/EXPERIMENT-ALGORITHM[-RL]-PRESET if not given."""
+    """Run directory; runs/EXPERIMENT-ALGORITHM[-RL]-PRESET by default."""
     seeds: tuple[int, ...] | None = None
-    """Other seeds than the preset's."""
+    """Seeds; the preset's by default."""
     episodes: int | None = None
-    """Another length than the preset's; the tasks' starts keep their proportions. With --resume, a
-    longer one goes on from where the run ended; the tasks' starts are what they were."""
+    """Training episodes; the preset's by default. The task starts are scaled in proportion. With
+    --resume, a larger number extends the run, whose task starts are kept."""
     eval_every: int | None = None
-    """Other training episodes between tests than the preset's."""
+    """Training episodes between evaluations; the preset's by default."""
     held_out: Literal["validation", "test"] = "validation"
-    """The half of the held-out demonstrations to test on: to choose settings by, or to report."""
+    """Half of the held-out demonstrations to test on: validation to choose settings, test to report
+    results."""
     resume: bool = False
     """Continue the run in the directory."""
     train_encoders: bool = False
-    """Record demonstrations and train the encoders anew instead of using the shipped ones."""
+    """Record demonstrations and train new encoders instead of using the pretrained ones."""
     wandb: Literal["online", "offline"] | None = None
-    """Log to Weights & Biases too."""
+    """Also log to Weights & Biases."""
     device: str = "auto"
-    """Where the networks are: cpu, cuda, or auto for a GPU if there is one."""
+    """Device of the networks: cpu, cuda, or auto for a GPU if there is one."""
     threads: int = 1
-    """Threads of PyTorch. More than one slows these small networks down; physics takes all cores by
-    itself."""
+    """Threads of PyTorch; more than one slows these small networks down. Physics always uses all
+    cores."""
 
 
 def run_config(arguments: Arguments) -> RunConfig:
-    """Returns the preset, for tasks one after the other, with the changes asked for.
+    """Return the preset of the continual setting, with the changes of the command line.
 
     Raises:
-        ValueError: If there is no such run.
+        ValueError: If the settings are invalid.
     """
     algorithm = ALGORITHMS[arguments.algorithm].config
     if arguments.rl != algorithm.rl.name:
@@ -128,36 +130,35 @@ def run_experiment(
     config: RunConfig,
     make: Callable[..., Algorithm] | None = None,
 ) -> str:
-    """Trains to the end, then measures and draws.
+    """Train to the end, run the final tests and draw the figures.
 
-    The run's directory then holds, besides what `Trainer` writes, ``final.csv`` (success of the
+    In addition to the files of `Trainer`, the run directory gets ``final.csv`` (success of the
     trained policies with demonstrations seen in training and with held-out ones, and task
-    inference), ``gwr.csv`` (nodes of the first seed's GWR-B), ``figures/`` (among them a video of a
-    test episode of each task) and, when all that is there, ``summary.json`` (commit, command,
-    success of a random policy, nodes of GWR-B, groups of behaviors). Weights & Biases gets what is
-    in ``figures/`` too.
+    inference), ``gwr.csv`` (nodes of the first seed's GWR-B), ``figures/`` (including a video of a
+    test episode of each task; also logged to Weights & Biases) and finally ``summary.json``
+    (commit, command, success of a random policy, nodes of GWR-B, groups of behaviors).
 
     Args:
-        arguments: From the command line.
-        name: The experiment's, for the run's directory.
-        config: The run.
-        make: Makes the algorithm, where ``config.name`` does not say it.
+        arguments: Arguments of the command line.
+        name: Name of the experiment, for the run directory.
+        config: Settings of the run.
+        make: Factory of the algorithm; by default the one registered as ``config.name``.
 
     Returns:
-        Results to print, and where the rest is.
+        Results to print, with the path of the run directory.
 
     Raises:
-        ValueError: If the directory holds another run, or none that could be resumed.
-        BlockingIOError: If another process is at work there.
+        ValueError: If the directory holds another run, or no run to resume.
+        BlockingIOError: If another process is using the directory.
     """
-    commit = commit_of_code()  # of the code that runs, whatever is committed meanwhile
+    commit = commit_of_code()  # read first, since commits may follow during training
     set_threads(arguments.threads)
     device = choose_device(arguments.device)
     rl = "" if arguments.rl == "ddpg" else f"-{arguments.rl}"
     out = arguments.out or Path("runs") / f"{name}-{config.name}{rl}-{arguments.preset}"
     makes_encoders = arguments.train_encoders or arguments.preset in STAGE_PRESETS
     if arguments.resume:
-        begun = makes_encoders and any((out / made).exists() for made in (_DATASET, _ENCODERS))
+        begun = makes_encoders and any((out / folder).exists() for folder in (_DATASET, _ENCODERS))
         if not begun:
             check_resumable([out])
         config = as_begun(config, out, keep_eval_every=arguments.eval_every is not None)
@@ -192,30 +193,30 @@ def run_experiment(
         ) as trainer:
             trainer.run()
             summary = {"commit": commit, **measure(trainer, bank, out)}
-            found = draw(trainer, bank, out, summary["random_success"])
+            lines = draw(trainer, bank, out, summary["random_success"])
             for path in sorted((out / "figures").iterdir()):
                 trainer.logger.log_media(f"figures/{path.stem}", path)
-            # Last: it says that the rest is there.
+            # Written last, as the mark of a complete run.
             (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
-    found.append(f"curve and figures: {out}; in numbers: python benchmarks/summary.py {out}")
-    return "\n".join(found)
+    lines.append(f"curve and figures: {out}; in numbers: python benchmarks/summary.py {out}")
+    return "\n".join(lines)
 
 
 def draw(
     trainer: Trainer, bank: DemonstrationBank, out: Path, random_success: Mapping[str, float]
 ) -> list[str]:
-    """Draws the run, and describes its GWR-B.
+    """Draw the figures of the run, and describe its GWR-B.
 
     Args:
-        trainer: At the end of its run.
-        bank: Demonstrations of both kinds.
-        out: Where ``figures/`` and ``gwr.csv`` go.
-        random_success: Of a random policy, by task.
+        trainer: The trainer after training.
+        bank: Training and held-out demonstrations.
+        out: Folder for ``figures/`` and ``gwr.csv``.
+        random_success: Success of a random policy, by task.
 
     Returns:
-        Lines on GWR-B, its task inference and its groups.
+        Lines about GWR-B, its task inference and its groups.
     """
-    config, found = trainer.config, list[str]()
+    config, lines = trainer.config, list[str]()
     presented = dict(zip(config.tasks, config.task_starts, strict=True))
     figure = plot_success_curves(
         out / "eval.csv", presented=presented, random_success=random_success
@@ -232,27 +233,27 @@ def draw(
             gwr, bank.seen(), bank.held_out(config.held_out), len(config.tasks)
         )
         draw_growth(out, config, bank)
-        found.append(f"GWR-B nodes: {gwr.num_nodes.tolist()}")
-        found.append(f"task inference on held-out demonstrations: {accuracy.mean():.1%}")
+        lines.append(f"GWR-B nodes: {gwr.num_nodes.tolist()}")
+        lines.append(f"task inference on held-out demonstrations: {accuracy.mean():.1%}")
     if trainer.algorithm.groups is not None:
         draw_groups(out, presented, out / "figures" / "groups.png")
-        found.append(f"groups of behaviors: {trainer.algorithm.groups.num_groups.tolist()}")
-    return found
+        lines.append(f"groups of behaviors: {trainer.algorithm.groups.num_groups.tolist()}")
+    return lines
 
 
 def measure(
     trainer: Trainer, bank: DemonstrationBank, out: Path, episodes: int = 20
 ) -> dict[str, Any]:
-    """Tests the trained policies with seen and with held-out demonstrations.
+    """Test the trained policies with seen and with held-out demonstrations.
 
     Args:
-        trainer: At the end of its run.
-        bank: Demonstrations of both kinds.
-        out: Where ``final.csv`` goes.
-        episodes: Test episodes of each seed, task and kind.
+        trainer: The trainer after training.
+        bank: Training and held-out demonstrations.
+        out: Folder for ``final.csv``.
+        episodes: Test episodes per seed, task and kind of demonstrations.
 
     Returns:
-        What ``summary.json`` says of the run.
+        Entries of ``summary.json``.
     """
     algorithm, config, seen = trainer.algorithm, trainer.config, bank.seen()
     gwr = algorithm.gwr
@@ -307,17 +308,17 @@ def measure(
 
 
 def record_episodes(trainer: Trainer, bank: DemonstrationBank) -> dict[str, np.ndarray]:
-    """Returns the frames of a test episode of each task by the first seed's trained policy.
+    """Return the frames of a test episode of each task with the first seed's trained policy.
 
     Args:
-        trainer: At the end of its run.
-        bank: Demonstrations; held-out ones are shown.
+        trainer: The trainer after training.
+        bank: Training and held-out demonstrations; held-out ones are shown.
 
     Returns:
         Frames uint8 ``[N, 32, 64, 3]``, by task and outcome.
 
     Raises:
-        ValueError: If the run is one from ground truth, without frames.
+        ValueError: If the run observes ground truth instead of frames.
     """
     config, frames = trainer.config, []
     evaluator = Evaluator(
@@ -344,16 +345,16 @@ def record_episodes(trainer: Trainer, bank: DemonstrationBank) -> dict[str, np.n
 
 
 def commit_of_code() -> str:
-    """Returns the commit of this code, with ``-dirty`` where it was changed; "" where unknown."""
+    """Return the commit of this code, with ``-dirty`` if it was modified; ``""`` if unknown."""
     root = Path(__file__).parents[2]
-    if not (root / ".git").exists():  # installed, perhaps within a repository of something else
+    if not (root / ".git").exists():  # An installed package may lie in another repository.
         return ""
     command = ["git", "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
     try:
-        told = subprocess.run(command, cwd=root, capture_output=True, text=True, check=True)
+        result = subprocess.run(command, cwd=root, capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError):
         return ""
-    return told.stdout.strip()
+    return result.stdout.strip()
 
 
 def command_line(
@@ -362,7 +363,7 @@ def command_line(
     arguments: type = Arguments,
     options: Sequence[str] | None = None,
 ) -> None:
-    """Runs ``main`` with the arguments of the command line; an expected error becomes one line.
+    """Run ``main`` with the arguments of the command line; an expected error becomes one line.
 
     Args:
         main: Called with the arguments.

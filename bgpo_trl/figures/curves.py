@@ -1,8 +1,8 @@
-"""Figures of a run: learning curves (Figs. 6, 8, 9 of the paper) and the GWR-B graph (Fig. 7).
+"""Learning curves (Figs. 6, 8, 9), nodes of GWR-B (Fig. 7) and frame strips.
 
-Figures are built without pyplot, so that drawing one changes nothing for whoever imports this, and
-the same data always gives the same file. Colors are Okabe and Ito's, which color-blind people can
-tell apart; line styles and markers differ as well.
+Figures are drawn without pyplot, hence without global state, and the same data always gives the
+same file. Colors are Okabe and Ito's colorblind-safe palette; line styles and markers differ as
+well.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from bgpo_trl.runs.results import read_tests
 _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 _LINES = ("-", "--", "-.", (0, (3, 1, 1, 1, 1, 1)), (0, (1, 1)), (0, (6, 2)))
 _MARKERS = ("o", "s", "^", "D", "v", "P")
-# Of groups, which are no tasks: Paul Tol's muted colors.
+# Paul Tol's muted colors, for groups, so that they are not taken for tasks.
 _GROUP_COLORS = ("#332288", "#CC6677", "#117733", "#88CCEE", "#882255", "#DDCC77", "#44AA99")
 _GRID_POINTS = 400
 _OVERALL = "All presented tasks"
 
 _Tests = dict[str, dict[int, list[tuple[int, str, float]]]]
-"""By algorithm and seed: training episode, task and success of each test episode."""
+"""Training episode, task and success of each test episode, by algorithm and seed."""
 
 
 def plot_success_curves(
@@ -44,28 +44,29 @@ def plot_success_curves(
     last: int | None = None,
     names: Mapping[str, str] | None = None,
 ) -> Figure:
-    """Plots success over training episodes, one panel for all tasks and one for each.
+    """Plot success against training episodes, in one panel for all tasks and one for each.
 
-    Each test episode succeeds or fails, so a seed's curve at episode e is its share of successes in
-    the test episodes after training episodes (e - window, e]: a trailing mean, which never shows
-    success before it was there. Lines are the mean over seeds, shaded by one standard deviation
-    over seeds (``ddof=0``), as in the paper. A seed counts where its window holds a test episode.
+    A seed's curve at episode e is its share of successes among the test episodes after training
+    episodes (e - window, e]. This trailing mean never shows success before it occurred. Lines are
+    means over seeds with a test episode in the window, shaded by one standard deviation
+    (``ddof=0``), as in the paper.
 
     Args:
         eval_csv: One or more ``eval.csv`` files, which may hold several algorithms and seeds.
-        presented: Training episode from which each task is presented, by its name. Episodes after
-            the first are marked with dashed lines; also gives the order of the panels.
+        presented: Training episode from which each task is presented, by task name, in the order
+            of the panels. Starts after the first are marked with dashed lines.
         random_success: Success rate of a random policy by task, marked with dotted lines.
-        window: Length of the trailing mean in training episodes; 5 % of the training if None.
-        last: Training episode at which the curves end; that of the longest if None.
-        names: What the legend calls algorithms, in its order; others follow under their own names.
+        window: Length of the trailing mean in training episodes; 5 % of the training if ``None``.
+        last: Training episode at which the curves end; by default that of the longest.
+        names: Legend names by algorithm, in legend order; other algorithms follow under their own
+            names.
 
     Returns:
         The figure.
 
     Raises:
-        ValueError: If a file is no ``eval.csv``, there are no test episodes, or the window is not
-            positive.
+        ValueError: If a file is not an ``eval.csv``, there are no test episodes, or the window is
+            not positive.
     """
     tests = _read_tests([eval_csv] if isinstance(eval_csv, str | os.PathLike) else eval_csv)
     names = names or {}
@@ -85,7 +86,7 @@ def plot_success_curves(
     n_rows = math.ceil((len(tasks) + 1) / n_columns)
     width = 3.5 * n_columns
     figure = Figure(figsize=(width, 2.4 * n_rows + 0.5))
-    # Side by side, the last tick label of a panel must not run into the first of the next.
+    # Padding keeps the tick labels of neighboring panels apart.
     figure.set_layout_engine("constrained", w_pad=0.1)
     panels = figure.subplots(n_rows, n_columns, sharex=True, sharey=True, squeeze=False).ravel()
     tested = {row[0] for seeds in tests.values() for rows in seeds.values() for row in rows}
@@ -106,14 +107,14 @@ def plot_success_curves(
             fontsize=9,
         )
         _style(panel)
-        # Room above 1, where no curve can be, for the labels of the dashed lines.
+        # The room above 1 takes the labels of the dashed lines.
         panel.set(xlim=(0, last), ylim=(0, 1.1), yticks=np.linspace(0, 1, 6))
         panel.xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10], integer=True))
         panel.xaxis.set_major_formatter("{x:,.0f}")
     for panel in panels[len(tasks) + 1 :]:
         panel.remove()
     for position, panel in enumerate(panels[: len(tasks) + 1]):
-        # The lowest panel of its column, which has no panel below that could carry the ticks.
+        # The lowest panel of each column carries the tick labels.
         if position + n_columns > len(tasks):
             panel.tick_params(labelbottom=True)
 
@@ -133,20 +134,20 @@ def plot_gwr_pca(
     task_names: Sequence[str],
     node_group: ArrayLike | None = None,
 ) -> Figure:
-    """Plots the nodes of a GWR-B on their first two principal components (Fig. 7 of the paper).
+    """Plot the nodes of a GWR-B on their first two principal components (Fig. 7 of the paper).
 
     Args:
-        weights: Weights of the nodes ``[N, d]``, N and d at least 2.
-        node_task: For each node, the position in ``task_names`` of the task with the most
-            demonstrations for which the node is the best match, or -1 if it is for none; ``[N]``.
+        weights: Weights of the nodes ``[N, d]``, with ``N`` and ``d`` at least 2.
+        node_task: Majority task of each node as a position in ``task_names``, ``[N]``; -1 for nodes
+            that are the best-matching unit of no demonstration.
         task_names: Names of the tasks.
-        node_group: Number of each node's group, ``[N]``, shown in a second panel; none if None.
+        node_group: Group of each node, ``[N]``, shown in a second panel; ``None`` for no panel.
 
     Returns:
         The figure.
 
     Raises:
-        ValueError: If the shapes do not fit, a weight is not finite, or a task does not exist.
+        ValueError: If the shapes do not match, a weight is not finite, or a task does not exist.
     """
     weights = np.asarray(weights, dtype=np.float64)
     kinds = {"task": np.asarray(node_task)}
@@ -204,17 +205,17 @@ def plot_gwr_pca(
 
 
 def plot_frame_strips(episodes: Mapping[str, NDArray], n_frames: int = 8) -> Figure:
-    """Shows episodes as rows of frames, from the first to the last.
+    """Show episodes as rows of frames, from the first to the last.
 
     Args:
-        episodes: Frames uint8 ``[N, 32, 64, 3]`` by the title of their row.
-        n_frames: Frames a row at most, evenly spaced in time.
+        episodes: Frames uint8 ``[N, 32, 64, 3]`` by row title.
+        n_frames: Maximum number of frames per row, evenly spaced in time.
 
     Returns:
         The figure.
 
     Raises:
-        ValueError: If there is no episode, or one without frames.
+        ValueError: If there are no episodes, or one has no frames.
     """
     if not episodes or any(len(frames) == 0 for frames in episodes.values()):
         raise ValueError("there is nothing to show: give episodes of at least one frame.")
@@ -231,16 +232,16 @@ def plot_frame_strips(episodes: Mapping[str, NDArray], n_frames: int = 8) -> Fig
         label = row[0].annotate(
             title, (0, 1), xytext=(0, 11), xycoords="axes fraction", textcoords="offset points"
         )
-        label.set(fontsize=7, in_layout=False)  # or a long one would widen its panel's column
+        label.set(fontsize=7, in_layout=False)  # A long title must not widen its column.
     return figure
 
 
 def save_figure(figure: Figure, path: str | os.PathLike[str]) -> None:
-    """Saves a figure at print quality, 300 dpi; the same figure always gives the same bytes.
+    """Save a figure at 300 dpi; the same figure always gives the same bytes.
 
     Args:
         figure: The figure.
-        path: Where to, ending in ``.png``; its folder is made if it does not exist.
+        path: File ending in ``.png``; its folder is made if missing.
     """
     path = Path(path)
     make_folder(path.parent)
@@ -261,7 +262,7 @@ def _read_tests(paths: Iterable[str | os.PathLike[str]]) -> _Tests:
 def _trailing_mean(
     rows: list[tuple[int, str, float]], task: str | None, grid: NDArray, window: int
 ) -> NDArray:
-    """Returns a seed's share of successes at each grid point; NaN where it has no test episode."""
+    """Return a seed's success rate at each grid point; NaN without test episodes in the window."""
     chosen = sorted((episode, success) for episode, name, success in rows if task in (None, name))
     episodes = np.array([episode for episode, _ in chosen])
     successes = np.cumsum([0.0, *(success for _, success in chosen)])
@@ -313,12 +314,12 @@ def _task_markers(task_names: Sequence[str]) -> list[tuple[int, str, str, str]]:
 
 
 def _principal_components(values: NDArray, shown: NDArray | None = None) -> tuple[NDArray, NDArray]:
-    """Returns points on the first two principal components of values, and their variance shares.
+    """Return points on the first two principal components of values, and their variance shares.
 
-    The points are those of ``shown``; of the values themselves if None.
+    The points are ``shown``, or the values themselves if ``None``.
     """
     _, scales, directions = np.linalg.svd(values - values.mean(axis=0), full_matrices=False)
-    # The sign of a direction is the solver's whim: let its largest part be positive.
+    # The solver's signs are arbitrary; making the largest component positive fixes them.
     largest = np.abs(directions).argmax(axis=1, keepdims=True)
     directions = directions * np.sign(np.take_along_axis(directions, largest, axis=1))
     variance = scales**2

@@ -1,4 +1,4 @@
-"""Figure of how groups of behaviors appeared during a run, and of which group played what."""
+"""Figure of the groups of behaviors in a run: their number and their episodes."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ class GroupedEpisodes:
     """Training episodes of one seed, in order.
 
     Attributes:
-        episode: Number of each, ``[E]``.
-        task: Position of its task in the names of the tasks, ``[E]``.
-        group: Number of the group that played it, ``[E]``.
-        num_groups: Groups known after it, ``[E]``.
+        episode: Training episode, ``[E]``.
+        task: Position of its task in the task names, ``[E]``.
+        group: Group that acted, ``[E]``.
+        num_groups: Number of groups after the episode, ``[E]``.
     """
 
     episode: NDArray[np.int64]
@@ -37,7 +37,7 @@ class GroupedEpisodes:
 
     @property
     def purity(self) -> float:
-        """Share of the episodes that are of the task that their group played most."""
+        """Share of the episodes whose task is the most frequent one of their group."""
         counts = np.zeros((self.group.max() + 1, self.task.max() + 1))
         np.add.at(counts, (self.group, self.task), 1)
         return float(counts.max(axis=1).sum() / len(self.task))
@@ -46,17 +46,17 @@ class GroupedEpisodes:
 def read_groups(
     path: str | os.PathLike[str], task_names: Sequence[str]
 ) -> dict[int, GroupedEpisodes]:
-    """Reads a run's ``train.csv``.
+    """Read the groups of a run.
 
     Args:
-        path: Of the file.
+        path: The ``train.csv`` of the run.
         task_names: Names of the tasks.
 
     Returns:
         The training episodes by seed, in increasing order.
 
     Raises:
-        ValueError: If the file is missing or damaged, or of a run that did not tell groups.
+        ValueError: If the file is missing or damaged, or its run has no groups.
     """
     columns: dict[str, Callable[[str], object]] = {"task": task_names.index}
     columns |= dict.fromkeys(("seed", "episode", "group", "num_groups"), count)
@@ -68,28 +68,28 @@ def read_groups(
 
 
 def plot_groups(seeds: Mapping[int, GroupedEpisodes], presented: Mapping[str, int]) -> Figure:
-    """Plots the number of groups over training, and below for each seed which group played what.
+    """Plot the number of groups over training and, for each seed, the episodes of each group.
 
-    Each group has a row, shaded from the episode on after which it was known, with a mark for each
-    episode that it played in the color of the episode's task. Where a group played several tasks,
-    the rarer ones are drawn over the others; how pure that leaves the groups is told above.
+    Each group has a row, shaded from the episode in which it appeared, with a mark for each of its
+    episodes in the color of the task. Marks of rarer tasks are drawn on top; the panel titles give
+    the purity.
 
     Args:
-        seeds: The training episodes by seed, from `read_groups`.
-        presented: Training episode from which each task is presented, by its name.
+        seeds: Training episodes by seed, from `read_groups`.
+        presented: Training episode from which each task is presented, by task name.
 
     Returns:
         The figure.
 
     Raises:
-        ValueError: If there is no episode.
+        ValueError: If there are no episodes.
     """
     if not seeds:
-        raise ValueError("there is no training episode to show: let the run play first.")
+        raise ValueError("there is no training episode to show: let the run train first.")
     tasks = list(presented)
     last = max(int(run.episode[-1]) for run in seeds.values())
     heights = [int(run.num_groups.max()) for run in seeds.values()]
-    # Inches; many groups of many seeds share what a page has.
+    # Inches; rows get thinner so that all of them fit on a page.
     row = min(0.17, 7.0 / sum(heights))
     width = 7.0
     sizes = [1.0, *(row * height for height in heights)]
@@ -115,7 +115,7 @@ def plot_groups(seeds: Mapping[int, GroupedEpisodes], presented: Mapping[str, in
 
 
 def _draw_counts(axes: Axes, runs: Sequence[GroupedEpisodes]) -> None:
-    """Draws the number of groups of each seed, the first above the others."""
+    """Draw the number of groups of each seed, the first seed on top."""
     for number, run in reversed(list(enumerate(runs))):
         color, line = ("0.2", 1.4) if number == 0 else ("0.7", 0.9)
         axes.step(run.episode, run.num_groups, where="post", color=color, linewidth=line)
@@ -126,10 +126,10 @@ def _draw_counts(axes: Axes, runs: Sequence[GroupedEpisodes]) -> None:
 
 
 def _draw_rows(axes: Axes, run: GroupedEpisodes, n_tasks: int, last: int, width: float) -> None:
-    """Draws a row for each group, and its episodes in it."""
+    """Draw a row with episodes for each group."""
     n_groups = int(run.num_groups.max())
     colors = [color for _, _, color, _ in _task_markers([""] * n_tasks)]
-    # Points; an episode is as wide as it is long, and never too thin to be seen.
+    # Points; the width of one episode on the axis, at least 0.4 to stay visible.
     line = max(0.4, 0.85 * 72 * width / last)
     for group in range(n_groups):
         known = run.episode[run.num_groups > group]
@@ -137,7 +137,7 @@ def _draw_rows(axes: Axes, run: GroupedEpisodes, n_tasks: int, last: int, width:
         episodes = [run.episode[(run.group == group) & (run.task == t)] for t in range(n_tasks)]
         for task in sorted(range(n_tasks), key=lambda task: -len(episodes[task])):
             marks = axes.vlines(episodes[task], group - 0.4, group + 0.4, colors[task], lw=line)
-            marks.set_snap(False)  # or neighbors of many are drawn with gaps, as pixels fall
+            marks.set_snap(False)  # Snapping to pixels would leave gaps between neighbors.
     axes.set(ylim=(n_groups - 0.4, -0.6))
     axes.yaxis.set_major_locator(MultipleLocator(math.ceil(n_groups / 10)))
     axes.tick_params(axis="y", length=0)

@@ -1,4 +1,4 @@
-"""Figure of how GWR-B grew during a run."""
+"""Figure of the growth of GWR-B during a run."""
 
 from __future__ import annotations
 
@@ -22,27 +22,27 @@ def plot_gwr_growth(
     num_nodes: Sequence[ArrayLike],
     task_names: Sequence[str],
 ) -> Figure:
-    """Plots the graph of a GWR-B over time, and its number of nodes below.
+    """Plot the graph of a GWR-B over time, and its number of nodes below.
 
     All panels have the same axes: the first two principal components of the last graph's nodes that
-    match demonstrations. What starts far away from all that match (GWR-B's two random nodes) may
-    lie outside; the titles count it.
+    match demonstrations. Nodes far from these (such as GWR-B's two random initial nodes) may lie
+    outside; the panel titles give their number.
 
     Args:
         graphs: By training episode: weights ``[N, d]``, edges ``[E, 2]`` between their rows, and
-            the task of each node ``[N]``, -1 for none, as in `plot_gwr_pca`.
-        num_nodes: Nodes after each training episode, from the first on, ``[episodes]`` a seed; the
-            graphs are those of the first.
+            the task of each node ``[N]`` with -1 for none, as in `plot_gwr_pca`.
+        num_nodes: Number of nodes after each training episode, ``[episodes]`` per seed; the graphs
+            belong to the first seed.
         task_names: Names of the tasks.
 
     Returns:
         The figure.
 
     Raises:
-        ValueError: If there is no graph.
+        ValueError: If there are no graphs.
     """
     if not graphs:
-        raise ValueError("there is no graph to show: let the run keep some first.")
+        raise ValueError("there is no graph to show: let the run save some first.")
     graphs = dict(sorted(graphs.items()))
     weights = [np.asarray(graph[0], dtype=np.float64) for graph in graphs.values()]
     tasks = [np.asarray(graph[2]) for graph in graphs.values()]

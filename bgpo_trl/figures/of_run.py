@@ -1,4 +1,4 @@
-"""GWR-B and groups of behaviors: how they grew during a run, and what became of them."""
+"""Figures of GWR-B and the groups of behaviors, drawn from the files of a run."""
 
 from __future__ import annotations
 
@@ -25,19 +25,18 @@ from bgpo_trl.transforms import TaskSchedule
 def draw_growth(
     run: Path, config: RunConfig, bank: DemonstrationBank, out: Path | None = None
 ) -> bool:
-    """Writes ``gwr_growth.png``: the first seed's graph over time, and how many nodes all have.
+    """Write ``gwr_growth.png``: the first seed's graph over time, and the number of nodes of all.
 
-    A node has the color of the task of most demonstrations that it matches, of the tasks that had
-    been presented by then.
+    A node has the color of its majority task among the tasks presented by then.
 
     Args:
-        run: Directory of the run.
-        config: The run.
-        bank: Its demonstrations.
-        out: Folder of the figure; ``figures/`` of the run if None.
+        run: Run directory.
+        config: Settings of the run.
+        bank: Demonstrations of the run.
+        out: Folder of the figure; ``figures/`` of the run if ``None``.
 
     Returns:
-        Whether there was anything to draw: runs without GWR-B keep no graphs.
+        Whether a figure was drawn: runs without GWR-B save no graphs.
 
     Raises:
         ValueError: If a file of the run is damaged.
@@ -61,15 +60,15 @@ def draw_growth(
 
 
 def draw_groups(run: Path, presented: Mapping[str, int], out: Path) -> None:
-    """Writes the figure of how many groups there were, and which of them played what.
+    """Write the figure of the number of groups and the episodes of each.
 
     Args:
-        run: Directory of the run, of which ``train.csv`` is read.
-        presented: Training episode from which each task is presented, by its name.
+        run: Run directory, whose ``train.csv`` is read.
+        presented: Training episode from which each task is presented, by task name.
         out: Path of the figure.
 
     Raises:
-        ValueError: If the file is missing or damaged, or of a run that did not tell groups.
+        ValueError: If the file is missing or damaged, or its run has no groups.
     """
     save_figure(plot_groups(read_groups(run / "train.csv", list(presented)), presented), out)
 
@@ -77,12 +76,12 @@ def draw_groups(run: Path, presented: Mapping[str, int], out: Path) -> None:
 def draw_nodes(
     run: Path, algorithm: Algorithm, bank: DemonstrationBank, tasks: Sequence[str]
 ) -> None:
-    """Writes the nodes of the first seed's GWR-B, ``gwr.csv``, and draws them (Fig. 7).
+    """Write the nodes of the first seed's GWR-B to ``gwr.csv`` and draw them (Fig. 7).
 
     Args:
-        run: Directory of the run.
-        algorithm: At the end of its run; one without GWR-B has nothing to write.
-        bank: Its demonstrations, by which nodes belong to tasks.
+        run: Run directory.
+        algorithm: The trained algorithm; without GWR-B, nothing is written.
+        bank: Demonstrations that define the nodes' majority tasks.
         tasks: Names of the tasks.
     """
     if algorithm.gwr is None:
@@ -98,13 +97,13 @@ def draw_nodes(
 
 
 def write_nodes(path: Path, weights: Tensor, tasks: Tensor, groups: Tensor | None = None) -> None:
-    """Writes the nodes of a GWR-B, one row each: its majority task (-1: none) and its weights.
+    """Write the nodes of a GWR-B, one row each: majority task (-1: none), group and weights.
 
     Args:
-        path: Of the CSV file.
-        weights: ``[N, d]``.
-        tasks: ``[N]``.
-        groups: Number of each node's group, ``[N]``; a column that is left out if None.
+        path: The CSV file.
+        weights: Weights ``[N, d]``.
+        tasks: Majority tasks ``[N]``.
+        groups: Group of each node, ``[N]``; the column is omitted if ``None``.
     """
     columns = {"task": tasks.tolist()} | ({} if groups is None else {"group": groups.tolist()})
     with path.open("w", newline="") as file:

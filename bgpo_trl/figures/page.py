@@ -1,4 +1,4 @@
-"""The report as one HTML file that needs nothing else."""
+"""The report as one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Section:
-    """A part of the report."""
+    """Section of the report: title, notes, figures and a table."""
 
     title: str
     table: list[list[str]] = field(default_factory=list)
-    """Its head first; none if empty."""
+    """Rows of cells, the first with the column names; omitted if empty."""
     figures: dict[str, Path] = field(default_factory=dict)
-    """By their captions."""
+    """Paths by caption."""
     notes: list[str] = field(default_factory=list)
 
 
@@ -41,11 +41,11 @@ def write_page(
     sections: Sequence[Section],
     runs: Mapping[str, tuple[Path, dict[str, Any], dict[str, Any]]],
 ) -> None:
-    """Writes the page.
+    """Write the page.
 
     Args:
-        path: Of the HTML file.
-        sections: What the report says, in order.
+        path: The HTML file.
+        sections: Sections of the report, in order.
         runs: Directory, settings and summary of each run, by name.
     """
     parts = ["<h1>bgpo_trl: the paper's experiments</h1>"]

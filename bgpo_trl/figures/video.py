@@ -1,4 +1,4 @@
-"""Videos of what the robot sees."""
+"""Videos of frames."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from PIL import Image
 def save_gif(
     frames: NDArray[np.uint8], path: str | os.PathLike[str], *, fps: float = 5.0, scale: int = 4
 ) -> None:
-    """Saves frames as an animated GIF that plays over and over.
+    """Save frames as an endlessly looping GIF.
 
     Args:
-        frames: uint8 ``[T, H, W, 3]``.
-        path: Where to, ending in ``.gif``; its folder is made if it does not exist.
-        fps: Frames a second; by default as fast as the robot acts, a step every 0.2 s.
-        scale: Size of a frame's pixel in pixels of the GIF.
+        frames: Frames uint8 ``[T, H, W, 3]``.
+        path: File ending in ``.gif``; its folder is made if missing.
+        fps: Frames per second; the default is the robot's speed, a step every 0.2 s.
+        scale: Pixels of the GIF per pixel of a frame, along each axis.
 
     Raises:
-        ValueError: If the frames have another shape or type, or there are none.
+        ValueError: If the frames have another shape or dtype, or there are none.
 
     Example:
         >>> import tempfile

@@ -1,1 +1,1 @@
-"""Files that survive crashes: checkpoints, tables, locks; and progress on the terminal."""
+"""Crash-safe files (checkpoints, CSV, tensors), locks, interrupts and progress bars."""

@@ -1,7 +1,7 @@
-"""Checkpoints that are there when a run needs them: complete, verified, and never only one.
+"""Checkpoints that survive crashes: written atomically, verified on loading, never fewer than one.
 
-A checkpoint is a file ``checkpoint-{number}-{digest}.pt``; ``digest`` is the start of its SHA-256,
-as in ``torch.hub``'s file names, since ``torch.load`` does not notice damaged bytes.
+A checkpoint is a file ``checkpoint-{number}-{digest}.pt``. As in ``torch.hub``'s file names,
+``digest`` is the start of its SHA-256, since ``torch.load`` does not detect damaged bytes.
 """
 
 from __future__ import annotations
@@ -23,23 +23,23 @@ _PLAIN_TYPES = (bool, int, float, str, type(None), Tensor, nn.Parameter)
 
 
 def save_checkpoint(directory: str | os.PathLike[str], state: dict[str, Any]) -> Path:
-    """Writes a checkpoint; the newest intact one before it is kept, older ones are removed.
+    """Write a checkpoint, keep the newest intact one before it, and remove older ones.
 
-    The file appears under its name only when all of it is on the disk, so that neither a kill nor a
-    power cut at any moment leaves less than the checkpoint before.
+    The file gets its name once it is complete on disk, so that a kill or a power cut at any moment
+    leaves the previous checkpoint.
 
     Args:
-        directory: Where the run keeps its checkpoints; made if it does not exist.
-        state: Dicts, lists and tuples of tensors, numbers, strings, booleans and None, nested as
-            ``state_dict`` methods return them. Random generators go in as their state:
+        directory: Checkpoint folder of the run; made if it does not exist.
+        state: Dicts, lists and tuples of tensors, numbers, strings, booleans and ``None``, nested
+            as ``state_dict`` methods return them. Random generators are saved by their state:
             ``generator.get_state()`` or NumPy's ``generator.bit_generator.state``.
 
     Returns:
-        The file.
+        The path of the checkpoint.
 
     Raises:
-        ValueError: If the state holds anything else, which loading would refuse.
-        OSError: If the file cannot be written, such as on a full disk; earlier ones stay.
+        ValueError: If the state holds any other type, which loading would refuse.
+        OSError: If the file cannot be written, such as on a full disk; earlier checkpoints stay.
 
     Example:
         >>> import tempfile
@@ -61,14 +61,14 @@ def save_checkpoint(directory: str | os.PathLike[str], state: dict[str, Any]) ->
         temporary.replace(path)
         _sync_directory(directory)
     except OSError as error:
-        with contextlib.suppress(OSError):  # Where the directory is none, there is nothing either.
+        with contextlib.suppress(OSError):  # The directory may be missing or a file.
             temporary.unlink()
         raise OSError(
             error.errno,
             f"cannot save a checkpoint in {directory} ({error.strerror}), earlier ones are kept: "
             "make room, then resume the run",
         ) from error
-    # A damaged one must not take the place of the one that a run has just fallen back to.
+    # Skips damaged checkpoints, so that the intact one just resumed from is kept.
     kept = next((candidate for candidate in earlier if _is_intact(candidate)), None)
     for old in earlier:
         if old != kept:
@@ -82,12 +82,12 @@ def load_checkpoint(
     map_location: str | torch.device = "cpu",
     mmap: bool = False,
 ) -> dict[str, Any]:
-    """Reads the newest intact checkpoint, with a warning for each newer one that is damaged.
+    """Read the newest intact checkpoint; warn about each newer one that is damaged.
 
     Args:
-        directory: Where the run keeps its checkpoints.
+        directory: Checkpoint folder of the run.
         map_location: Device of the tensors.
-        mmap: Leave tensors in the file until they are used; for those who need only some of them.
+        mmap: Whether to map tensors from the file lazily, for reading only some of them.
 
     Returns:
         The state as it was saved.
@@ -99,7 +99,7 @@ def load_checkpoint(
     for path in _checkpoints(directory):
         if _is_intact(path):
             return torch.load(path, map_location=map_location, weights_only=True, mmap=mmap)
-        warnings.warn(f"{path} is damaged: going on from the checkpoint before it.", stacklevel=2)
+        warnings.warn(f"{path} is damaged: resuming from the checkpoint before it.", stacklevel=2)
     raise ValueError(
         f"{directory} holds no intact checkpoint to resume from: start a new run in another "
         "directory."
@@ -107,12 +107,12 @@ def load_checkpoint(
 
 
 def has_checkpoint(directory: str | os.PathLike[str]) -> bool:
-    """Returns whether a run got as far as its first checkpoint, intact or not."""
+    """Return whether a directory holds a checkpoint, intact or not."""
     return bool(_checkpoints(Path(directory)))
 
 
 class _HashingFile:
-    """Hashes what passes through, and keeps the error that ``torch.save`` would hide."""
+    """Hash the bytes written, and keep the ``OSError`` that ``torch.save`` would hide."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
@@ -160,7 +160,7 @@ def _parse(path: Path) -> tuple[int, str]:
 
 
 def _checkpoints(directory: Path) -> list[Path]:
-    """Returns the checkpoints of a run, newest first."""
+    """Return the checkpoints in a directory, newest first."""
     found = [path for path in directory.glob("checkpoint-*.pt") if _NAME.fullmatch(path.name)]
     return sorted(found, key=_parse, reverse=True)
 

@@ -1,4 +1,4 @@
-"""CSV files that survive what happens to long runs: kills, full disks and resumed runs."""
+"""CSV files that survive kills, full disks and resumed runs."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from typing import Any, Self
 
 
 class CsvFile:
-    r"""An append-only CSV file with fixed columns that can be cut back to an earlier position.
+    r"""An append-only CSV file with fixed columns that can be truncated to an earlier position.
 
-    Rows go to the operating system one by one, unbuffered and whole: killing the process loses no
-    row, a row that does not fit on the disk leaves no trace, and half a row that a crashed machine
-    left at the end is dropped on opening. Tensors and NumPy values of one element are written as
-    numbers, booleans as 0 and 1, floats so that reading gives the same float back.
+    Each row is written unbuffered and whole: killing the process loses no row, a row that does not
+    fit on the disk leaves no trace, and opening the file drops a partial row left by a crash.
+    Tensors and NumPy values of one element are written as numbers, booleans as 0 and 1, and floats
+    with enough digits to be read back exactly.
 
     Args:
         path: The file; an existing one is continued.
@@ -58,11 +58,11 @@ class CsvFile:
             content = self._file.read()
             if not header.startswith(content[: len(header)]):
                 found = content[:300].partition(b"\n")[0].decode(errors="replace").strip()
-                # What is no text would do to a terminal whatever its bytes mean there.
+                # Binary content could hold terminal control sequences.
                 text = found.isascii() and found.isprintable()
                 raise ValueError(
-                    f"{self.path} {f'has the columns {found}' if text else 'is no CSV file'}, this "
-                    f"run writes {','.join(self.columns)}: choose another run directory."
+                    f"{self.path} {f'has the columns {found}' if text else 'is not a CSV file'}, "
+                    f"this run writes {','.join(self.columns)}: choose another run directory."
                 )
             self._file.truncate(content.rfind(b"\n") + 1)
             if len(content) < len(header):
@@ -72,14 +72,14 @@ class CsvFile:
             raise
 
     def write(self, row: Mapping[str, Any]) -> None:
-        """Appends a row; a column without a value stays empty.
+        """Append a row; columns without a value stay empty.
 
         Args:
             row: Values by column.
 
         Raises:
-            ValueError: If the row has a value for a column that the file does not have.
-            OSError: If the row cannot be written; the file then ends with the row before.
+            ValueError: If the file has no such column.
+            OSError: If the row cannot be written; the file then ends with the previous row.
         """
         unknown = [name for name in row if name not in self.columns]
         if unknown:
@@ -90,25 +90,25 @@ class CsvFile:
         self._append(_csv_line([plain_value(row.get(name)) for name in self.columns]))
 
     def position(self) -> int:
-        """Returns the size of the file in bytes, after making sure that the disk has it all."""
+        """Flush the file to disk and return its size in bytes."""
         os.fsync(self._file.fileno())
         return self._file.seek(0, os.SEEK_END)
 
     def truncate_to(self, position: int) -> None:
-        """Drops all rows written after a position.
+        """Drop all rows written after a position.
 
         Args:
-            position: What :meth:`position` returned. 0 drops all rows and keeps the header.
+            position: A result of `position`; 0 drops all rows and keeps the header.
 
         Raises:
-            ValueError: If the file is shorter than that, or the position is not the end of a row.
+            ValueError: If the file is shorter, or the position is not the end of a row.
         """
         position = max(position, self._header_size)
         check_position(self.path, position)
         self._file.truncate(position)
 
     def close(self) -> None:
-        """Closes the file; further writes are errors."""
+        """Close the file."""
         self._file.close()
 
     def __enter__(self) -> Self:
@@ -125,7 +125,7 @@ class CsvFile:
     def _append(self, line: bytes) -> None:
         start = self._file.seek(0, os.SEEK_END)
         try:
-            # A disk that fills up takes the part of a line that fits, and reports no error.
+            # On a full disk, write() stores the part that fits without raising.
             if self._file.write(line) != len(line):
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         except OSError as error:
@@ -137,7 +137,7 @@ class CsvFile:
 
 
 def has_rows(path: str | os.PathLike[str]) -> bool:
-    """Returns whether there is a CSV file with more than its header."""
+    """Return whether a CSV file exists and holds more than its header."""
     try:
         with open(path, "rb") as file:
             return bool(file.readline() and file.read(1))
@@ -146,14 +146,14 @@ def has_rows(path: str | os.PathLike[str]) -> bool:
 
 
 def check_position(path: str | os.PathLike[str], position: int) -> None:
-    """Makes sure that a file has a row that ends at a position.
+    """Check that a row of the file ends at the given position.
 
     Args:
-        path: The file, there or not.
-        position: In bytes, at least 1.
+        path: The file, which may be missing.
+        position: Position in bytes, at least 1.
 
     Raises:
-        ValueError: If it has none.
+        ValueError: If no row ends there.
     """
     path = Path(path)
     size = path.stat().st_size if path.exists() else 0
@@ -169,7 +169,7 @@ def check_position(path: str | os.PathLike[str], position: int) -> None:
 
 
 def plain_value(value: Any) -> Any:
-    """Returns the Python number in a tensor or array of one element, and a boolean as 0 or 1."""
+    """Convert a one-element tensor or array to a Python number, and a boolean to 0 or 1."""
     if hasattr(value, "item"):
         value = value.item()
     return int(value) if isinstance(value, bool) else value

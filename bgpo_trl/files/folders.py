@@ -1,4 +1,4 @@
-"""Folders that files go to, made on demand."""
+"""Folders, made on demand."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from pathlib import Path
 
 
 def make_folder(path: str | os.PathLike[str]) -> Path:
-    """Makes a folder, and those above it, unless it is there.
+    """Make a folder and its parents unless they exist.
 
     Raises:
-        OSError: If it cannot be made, such as where there is a file of that name.
+        OSError: If it cannot be made, for example because a file has that name.
     """
     path = Path(path)
     try:

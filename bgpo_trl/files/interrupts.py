@@ -1,4 +1,4 @@
-"""Ctrl-C that waits for a moment at which a run can be left."""
+"""Ctrl-C deferred to the next point at which a run can be stopped."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from typing import Any
 
 @contextmanager
 def interrupts_wait() -> Iterator[Callable[[], bool]]:
-    """Makes the first Ctrl-C wait for the end of the block, which is told by what it is given.
+    """Defer the first Ctrl-C to the end of the block; a second one interrupts at once.
 
-    Where Ctrl-C is ignored (in the background of a shell), handled by someone else, or meant for
-    another thread, it stays so.
+    Yields a function that returns whether Ctrl-C was pressed. Signal handling is left unchanged
+    outside the main thread and where SIGINT is ignored (background jobs) or has a custom handler.
     """
     asked = False
 

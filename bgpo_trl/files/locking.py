@@ -1,4 +1,4 @@
-"""A lock on a directory, so that one process at a time writes there."""
+"""Lock on a directory, so that only one process at a time writes to it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from typing import Self
 from bgpo_trl.files.folders import make_folder
 
 _OWNER = re.compile(r"process \d+ on \S+")
-_SECONDS = 0.5  # between two looks at a lock that is waited for
+_SECONDS = 0.5  # polling interval of a waiting process
 
 
 @dataclass
@@ -27,24 +27,23 @@ class _Held:
     count: int = 1
 
 
-# The lock is the process's, whichever of its objects asked for it; a fork holds none.
+# Keyed by process id, since a lock belongs to the process and a fork inherits none.
 _held: dict[tuple[int, Path], _Held] = {}
 
 
 class DirectoryLock:
-    """Keeps other processes off a directory until it is released, or this process ends.
+    """Exclusive lock on a directory, held until it is released or the process ends.
 
-    The kernel takes it back from a process that ends, however it does. What holds it may take it
-    again, as a `Trainer` does within a job of a sweep: it is free when the last one is released.
-
-    While it is held, the file ``lock`` in the directory names process and machine.
+    The kernel frees the lock of a process that is killed. The lock is reentrant within a process (a
+    `Trainer` takes it again within a job of a sweep): the last release frees it. While it is held,
+    the file ``lock`` in the directory names process and machine.
 
     Args:
-        directory: Made if it does not exist; removed at the end if it is still empty then.
-        wait: Wait for the other process instead of raising.
+        directory: The directory, made if missing; removed on release if it is then empty.
+        wait: Whether to wait for another process instead of raising.
 
     Raises:
-        BlockingIOError: If another process holds it.
+        BlockingIOError: If another process holds the lock.
         OSError: If the directory cannot be made, written or locked.
 
     Example:
@@ -74,7 +73,7 @@ class DirectoryLock:
         self._give_back = weakref.finalize(self, _release, key)
 
     def release(self) -> None:
-        """Gives it back; a second time, nothing happens."""
+        """Release the lock; repeated calls do nothing."""
         self._give_back()
 
     def __enter__(self) -> Self:
@@ -96,7 +95,7 @@ def _take(directory: Path) -> _Held:
         make_folder(directory)
         try:
             descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
-        except FileNotFoundError:  # Its last holder has just removed the folder.
+        except FileNotFoundError:  # The last holder has just removed the folder.
             continue
         except OSError as error:
             raise OSError(
@@ -106,22 +105,22 @@ def _take(directory: Path) -> _Held:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if _is_at(descriptor, path):
                 owner = f"process {os.getpid()} on {socket.gethostname()}\n"
-                with contextlib.suppress(OSError):  # A full disk does not undo the lock.
+                with contextlib.suppress(OSError):  # The lock holds even if the disk is full.
                     os.ftruncate(descriptor, 0)
                     os.write(descriptor, owner.encode())
                 return _Held(descriptor, made)
         except OSError as error:
-            told = os.read(descriptor, 300).decode(errors="replace").strip()
+            content = os.read(descriptor, 300).decode(errors="replace").strip()
             os.close(descriptor)
             if isinstance(error, BlockingIOError):
-                owner = told if _OWNER.fullmatch(told) else "another process"
+                owner = content if _OWNER.fullmatch(content) else "another process"
                 raise BlockingIOError(
                     f"{directory} is in use by {owner}: let it finish, or stop it"
                 ) from None
             raise OSError(
                 f"cannot lock {directory} ({error.strerror}): choose one on another disk"
             ) from None
-        os.close(descriptor)  # Its last holder has just removed the file.
+        os.close(descriptor)  # The last holder has just removed the file.
 
 
 def _release(key: tuple[int, Path]) -> None:
@@ -133,8 +132,8 @@ def _release(key: tuple[int, Path]) -> None:
     if held.count:
         return
     del _held[key]
-    with contextlib.suppress(OSError):  # moved, not empty, or not to be written any more
-        # The file first: whoever opened it before finds that it is gone, and makes another.
+    with contextlib.suppress(OSError):  # moved, not empty, or no longer writable
+        # The file goes before the lock, so that a process waiting on it notices and makes another.
         if _is_at(held.descriptor, directory / "lock"):
             (directory / "lock").unlink()
         for folder in held.made:

@@ -1,4 +1,4 @@
-"""The progress bar of every long stage."""
+"""Progress bar of the long-running stages."""
 
 from __future__ import annotations
 
@@ -12,17 +12,16 @@ from tqdm import tqdm
 def progress_bar(
     stage: str, iterable: Iterable[Any] | None = None, *, shown: bool = True, **arguments: Any
 ) -> tqdm:
-    """Returns a `tqdm` bar with the stage's name and its ETA.
+    """Return a ``tqdm`` bar with the stage's name and the remaining time.
 
-    At a terminal it is redrawn ten times a second. Elsewhere, as in a log file, each time adds a
-    line, so it is redrawn every 30 seconds. Give ``refresh=False`` to its ``set_postfix``, which
-    would redraw it each time.
+    It is redrawn ten times a second on a terminal and every 30 seconds elsewhere, since each redraw
+    adds a line to a log file. Pass ``refresh=False`` to ``set_postfix``, which otherwise redraws.
 
     Args:
-        stage: What is going on.
-        iterable: What to iterate over, if not counted by ``update``.
-        shown: Whether there is to be a bar at all.
-        **arguments: Further ones of `tqdm`, such as ``total``, ``initial`` and ``unit``.
+        stage: Name of the stage.
+        iterable: Iterable to wrap; ``None`` if progress is counted by ``update``.
+        shown: Whether to show the bar.
+        **arguments: Further arguments of ``tqdm``, such as ``total``, ``initial`` and ``unit``.
 
     Example:
         >>> sum(progress_bar("count", range(4), shown=False))
@@ -34,6 +33,6 @@ def progress_bar(
         desc=stage,
         disable=not shown,
         mininterval=seconds,
-        maxinterval=max(10.0, seconds),  # after which tqdm redraws it in any case
+        maxinterval=max(10.0, seconds),  # tqdm redraws after this time in any case
         **arguments,
     )

@@ -1,4 +1,4 @@
-"""Files of tensors, safetensors with a checksum: what is read is what was written, or an error."""
+"""Safetensors files with a checksum, so that damage is detected on reading."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from bgpo_trl.files.folders import make_folder
 
 
 def digest(tensors: Mapping[str, Tensor]) -> str:
-    """Returns the SHA-256 of the names and the bytes of tensors."""
+    """Return the SHA-256 of the names and bytes of tensors."""
     sha256 = hashlib.sha256()
     for key in sorted(tensors):
         sha256.update(key.encode())
@@ -25,21 +25,21 @@ def digest(tensors: Mapping[str, Tensor]) -> str:
 
 
 def _checksum(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> str:
-    told = json.dumps([digest(tensors), dict(metadata)], sort_keys=True)
-    return hashlib.sha256(told.encode()).hexdigest()
+    content = json.dumps([digest(tensors), dict(metadata)], sort_keys=True)
+    return hashlib.sha256(content.encode()).hexdigest()
 
 
 def save_tensors(
     path: str | os.PathLike[str], tensors: Mapping[str, Tensor], metadata: Mapping[str, str]
 ) -> None:
-    """Writes tensors and what is to be known of them; missing folders are made.
+    """Write tensors and their metadata; missing folders are made.
 
     Raises:
-        OSError: If the file cannot be written; one that was there stays as it was.
+        OSError: If the file cannot be written; an existing file is kept.
     """
     path = Path(path)
     make_folder(path.parent)
-    # Written aside first: an interrupted save must not destroy the file that was there.
+    # Written to a temporary file, so that an interrupted save keeps the existing file.
     partial = path.with_suffix(".partial")
     contiguous = {key: value.contiguous() for key, value in tensors.items()}
     try:
@@ -51,14 +51,14 @@ def save_tensors(
 
 
 def load_tensors(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Reads what `save_tensors` wrote.
+    """Read a file written by `save_tensors`.
 
     Returns:
         The tensors and the metadata.
 
     Raises:
-        FileNotFoundError: If there is no such file.
-        ValueError: If it is damaged, or no such file; the message only says how.
+        FileNotFoundError: If the file does not exist.
+        ValueError: If it is damaged or has another format; the message gives only the reason.
     """
     if not Path(path).is_file():
         raise FileNotFoundError(path)
@@ -68,7 +68,7 @@ def load_tensors(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], dict[
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
         written = metadata.pop("sha256", None)
         found = _checksum(tensors, metadata)
-    except Exception as error:  # The library raises errors of many kinds.
+    except Exception as error:  # safetensors raises many kinds of errors
         raise ValueError(next(iter(str(error).splitlines()), "unreadable")) from None
     if written != found:
         raise ValueError("checksum differs")

@@ -75,7 +75,7 @@ class StackedLinear(nn.Module):
     def reset_parameters(
         self, generator: torch.Generator | Sequence[torch.Generator] | None = None
     ) -> None:
-        """Draws all weights and biases anew.
+        """Draw all weights and biases anew.
 
         Args:
             generator: as in the constructor.
@@ -101,7 +101,7 @@ class StackedLinear(nn.Module):
             bias.uniform_(-bound, bound, generator=stream)
 
     def forward(self, *inputs: Tensor) -> Tensor:
-        """Applies each layer to its own slice of the inputs, side by side along the last dimension.
+        """Apply each layer to its own slice of the inputs, side by side along the last dimension.
 
         Inputs are not concatenated: each is multiplied with its own rows of the weights. That saves
         the copy, and the gradient of an input that needs none.
@@ -182,7 +182,7 @@ class StackedMLP(nn.Module):
         )
 
     def forward(self, *inputs: Tensor) -> Tensor:
-        """Maps the inputs, side by side along their last dimension, to the output.
+        """Map the inputs, side by side along their last dimension, to the output.
 
         Args:
             *inputs: ``[*S, *B, features]`` each, ``in_features`` together.
@@ -255,7 +255,7 @@ class Actor(TensorDictModuleBase):
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the action for each state.
+        """Write the action for each state.
 
         Args:
             tensordict: with ``in_keys``; ``"action"`` and ``"pre_tanh_action"`` are set in it.
@@ -322,7 +322,7 @@ class Critic(TensorDictModuleBase):
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the value of each state and action.
+        """Write the value of each state and action.
 
         Args:
             tensordict: with ``in_keys``; ``"state_action_value"`` is set in it.

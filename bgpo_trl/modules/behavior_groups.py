@@ -102,7 +102,7 @@ class BehaviorGroups(nn.Module):
         return torch.tensor([len(parent) for parent in self._parent]).view(self.batch_size)
 
     def parent(self, network: int, group: int) -> int:
-        """Returns the group that another one parted from; 0 for the first.
+        """Return the group that another one parted from; 0 for the first.
 
         Args:
             network: position in the flattened batch.
@@ -111,11 +111,11 @@ class BehaviorGroups(nn.Module):
         return self._parent[network][group]
 
     def forward(self, phi: Tensor) -> GroupMatch:
-        """The same as `lookup`."""
+        """Call `lookup`."""
         return self.lookup(phi)
 
     def lookup(self, phi: Tensor) -> GroupMatch:
-        """Finds the group of each input; changes nothing.
+        """Find the group of each input; changes nothing.
 
         Args:
             phi: `[*batch_size, *extra, d]`.
@@ -140,7 +140,7 @@ class BehaviorGroups(nn.Module):
         )
 
     def adapt(self, phi: Tensor, mask: Tensor | None = None) -> GroupMatch:
-        """Finds the group of one input for each network, and learns from it.
+        """Find the group of one input for each network, and learns from it.
 
         Args:
             phi: `[*batch_size, d]`.
@@ -176,13 +176,13 @@ class BehaviorGroups(nn.Module):
         )
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Returns what `state_dict` carries beside the coarse GWR-B's own."""
+        """Return what `state_dict` carries beside the coarse GWR-B's own."""
         return {
             "group": [list(group) for group in self._group],
             "parent": [list(parent) for parent in self._parent],
         }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Continues from what `get_extra_state` returned."""
+        """Continue from what `get_extra_state` returned."""
         self._group = [list(group) for group in state["group"]]
         self._parent = [list(parent) for parent in state["parent"]]

@@ -10,7 +10,7 @@ from torch import Tensor
 
 
 def lacking(reader: object, tensordict: TensorDictBase, keys: Iterable[NestedKey]) -> ValueError:
-    """Returns the error to be raised in place of a `KeyError`.
+    """Return the error to be raised in place of a `KeyError`.
 
     Args:
         reader: Name of what wanted to read.
@@ -26,7 +26,7 @@ def lacking(reader: object, tensordict: TensorDictBase, keys: Iterable[NestedKey
 
 
 def read(reader: TensorDictModuleBase, tensordict: TensorDictBase) -> list[Tensor]:
-    """Returns the ``in_keys`` of a network.
+    """Return the ``in_keys`` of a network.
 
     Raises:
         ValueError: If one is missing.

@@ -77,7 +77,7 @@ class GaussianActor(TensorDictModuleBase):
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the action without noise for each state.
+        """Write the action without noise for each state.
 
         Args:
             tensordict: with ``in_keys``; ``"loc"``, ``"scale"`` and ``"action"`` are set in it.
@@ -91,7 +91,7 @@ class GaussianActor(TensorDictModuleBase):
         return tensordict.set("action", loc.tanh())
 
     def sample(self, tensordict: TensorDictBase, noise: Tensor) -> TensorDictBase:
-        """Writes an action drawn for each state, differentiable with respect to the weights.
+        """Write an action drawn for each state, differentiable with respect to the weights.
 
         Args:
             tensordict: with ``in_keys``; besides what `forward` sets, ``"action_log_prob"``

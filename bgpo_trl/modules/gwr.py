@@ -147,7 +147,7 @@ class GWRB(nn.Module):
         return torch.tensor(counts, device=self._weights.device).view(self.batch_size)
 
     def graph(self, index: int | tuple[int, ...] = ()) -> BehaviorGraph:
-        """Copies the network at `index` of `batch_size`.
+        """Copy the network at `index` of `batch_size`.
 
         Raises:
             IndexError: if that is not a single network.
@@ -161,7 +161,7 @@ class GWRB(nn.Module):
         return self._topologies[network].to_graph(self._weights[network])
 
     def extra_repr(self) -> str:
-        """Tells `repr` how large the networks are and what makes them grow."""
+        """Tell `repr` how large the networks are and what makes them grow."""
         nodes = self.num_nodes.flatten()
         sizes = " to ".join(dict.fromkeys(str(int(n)) for n in nodes.aminmax()))
         thresholds = ("activity_threshold", "activity_scale", "habituation_threshold")
@@ -170,11 +170,11 @@ class GWRB(nn.Module):
         return ", ".join([f"{self.n_features}", *(f"{key}={x}" for key, x in parts.items())])
 
     def forward(self, phi: Numbers) -> BehaviorMatch:
-        """The same as `lookup`."""
+        """Call `lookup`."""
         return self.lookup(phi)
 
     def lookup(self, phi: Numbers, mask: Numbers | None = None) -> BehaviorMatch:
-        """Finds the best match of each input (step 2); changes nothing.
+        """Find the best match of each input (step 2); changes nothing.
 
         Args:
             phi: `[*batch_size, *extra, d]`, a tensor, an array or lists of numbers of any type;
@@ -224,7 +224,7 @@ class GWRB(nn.Module):
         )
 
     def adapt(self, phi: Numbers, mask: Numbers | None = None) -> BehaviorMatch:
-        """Finds the best match of one input for each network and learns from it (steps 2 to 5).
+        """Find the best match of one input for each network and learns from it (steps 2 to 5).
 
         Args:
             phi: `[*batch_size, d]`, as for `lookup`.
@@ -277,14 +277,14 @@ class GWRB(nn.Module):
         )
 
     def get_extra_state(self) -> list[dict[str, Any]]:
-        """Returns what `state_dict` carries: each network's `graph` and the identity due next."""
+        """Return what `state_dict` carries: each network's `graph` and the identity due next."""
         return [
             {**topology.to_graph(weights)._asdict(), "next_node": topology.next_identity}
             for topology, weights in zip(self._topologies, self._weights, strict=True)
         ]
 
     def set_extra_state(self, state: list[dict[str, Any]]) -> None:
-        """Replaces the networks by those that `get_extra_state` returned.
+        """Replace the networks by those that `get_extra_state` returned.
 
         Raises:
             ValueError: if there are more or fewer of them, or of other features, than here, or they
@@ -298,7 +298,7 @@ class GWRB(nn.Module):
         self._topologies, self._weights = topologies, weights
 
     def _activity(self, distance: Tensor) -> Tensor:
-        """Turns distances to the best matches into activities, in place (Eq. 2)."""
+        """Turn distances to the best matches into activities, in place (Eq. 2)."""
         return distance.mul_(-self.rule.activity_scale).exp_()
 
     def _spread(self, x: Tensor, network: Tensor, fill: float) -> Tensor:
@@ -306,7 +306,7 @@ class GWRB(nn.Module):
         return x.new_full((len(self._topologies), *x.shape[1:]), fill).index_copy(0, network, x)
 
     def _start(self, network: int, weights: Tensor) -> None:
-        """Creates the first node, or the second and its edge to the first (step 1)."""
+        """Create the first node, or the second and its edge to the first (step 1)."""
         topology = self._topologies[network]
         row = topology.add(self.rule.initial_habituation)
         self._weights[network, row] = weights
@@ -321,7 +321,7 @@ class GWRB(nn.Module):
         n_before: list[int],
         nearest: list[tuple[int, int, float]],
     ) -> None:
-        """Takes steps 3 to 5 for inputs `[A, d]`, one for each of A `networks`.
+        """Take steps 3 to 5 for inputs `[A, d]`, one for each of A `networks`.
 
         These had `n_before` nodes; `nearest` holds the rows of the two nearest nodes and the
         activity, and `embedding` `[A, d]` the weights w_c of the best match.

@@ -75,7 +75,7 @@ class GWRBEstimator(OneToOneFeatureMixin, TransformerMixin, ClusterMixin, BaseEs
         self.max_nodes = max_nodes
 
     def fit(self, X: npt.ArrayLike, y: object = None) -> Self:
-        """Starts a new network and learns the rows.
+        """Start a new network and learns the rows.
 
         Args:
             X: numbers `[n, d]`.
@@ -89,7 +89,7 @@ class GWRBEstimator(OneToOneFeatureMixin, TransformerMixin, ClusterMixin, BaseEs
         return self._learn(gwr.double(), rows)
 
     def partial_fit(self, X: npt.ArrayLike, y: object = None) -> Self:
-        """Learns further rows; the first call is the same as `fit`.
+        """Learn further rows; the first call is the same as `fit`.
 
         Args:
             X: numbers `[n, d]`.
@@ -103,7 +103,7 @@ class GWRBEstimator(OneToOneFeatureMixin, TransformerMixin, ClusterMixin, BaseEs
         return self._learn(self.gwr_, _to_tensor(self._validated(X, reset=False)))
 
     def predict(self, X: npt.ArrayLike) -> np.ndarray:
-        """Returns the identity of the node nearest to each row, int64 `[n]`; learns nothing.
+        """Return the identity of the node nearest to each row, int64 `[n]`; learns nothing.
 
         Args:
             X: numbers `[n, d]`.
@@ -112,7 +112,7 @@ class GWRBEstimator(OneToOneFeatureMixin, TransformerMixin, ClusterMixin, BaseEs
         return self.gwr_.lookup(rows).node.numpy()
 
     def transform(self, X: npt.ArrayLike) -> np.ndarray:
-        """Returns the weights of the node nearest to each row, `[n, d]`; learns nothing.
+        """Return the weights of the node nearest to each row, `[n, d]`; learns nothing.
 
         Args:
             X: numbers `[n, d]`; the result is float32 if they are, else float64.
@@ -141,6 +141,6 @@ class GWRBEstimator(OneToOneFeatureMixin, TransformerMixin, ClusterMixin, BaseEs
 
 
 def _to_tensor(X: npt.ArrayLike) -> torch.Tensor:
-    """Returns all rows, refused together before any of them is learned."""
+    """Return all rows, refused together before any of them is learned."""
     rows = torch.from_numpy(np.array(X, np.float64))
     return checked(rows, rows, "X")

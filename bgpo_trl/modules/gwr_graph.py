@@ -52,7 +52,7 @@ class BehaviorGraph(NamedTuple):
         return self.node[self.edges]
 
     def to_networkx(self) -> nx.Graph:
-        """Copies the graph for networkx, its nodes named by identity, as in `BehaviorMatch.node`.
+        """Copy the graph for networkx, its nodes named by identity, as in `BehaviorMatch.node`.
 
         Nodes have `weights` (an array `[d]`) and `habituation`, edges have `age`.
 

@@ -16,7 +16,7 @@ Numbers: TypeAlias = Tensor | npt.ArrayLike
 
 
 def as_shape(value: int | Sequence[int], name: str) -> torch.Size:
-    """Returns the argument called `name`, a size or several, as a shape.
+    """Return the argument called `name`, a size or several, as a shape.
 
     Raises:
         ValueError: if a size is no whole number of at least 1.
@@ -31,7 +31,7 @@ def as_shape(value: int | Sequence[int], name: str) -> torch.Size:
 def as_generators(
     value: torch.Generator | Sequence[torch.Generator] | None, count: int
 ) -> Sequence[torch.Generator | None]:
-    """Returns the argument called `generator` as one for each of `count` networks.
+    """Return the argument called `generator` as one for each of `count` networks.
 
     Raises:
         ValueError: if it is not one, or not so many.
@@ -47,7 +47,7 @@ def as_generators(
 
 
 def as_tensor(value: Numbers, name: str) -> Tensor:
-    """Returns the argument called `name` as a tensor, in its own type.
+    """Return the argument called `name` as a tensor, in its own type.
 
     Raises:
         ValueError: if it does not consist of numbers.
@@ -65,7 +65,7 @@ def as_tensor(value: Numbers, name: str) -> Tensor:
 
 
 def as_mask(value: Numbers, shape: torch.Size) -> Tensor:
-    """Returns the argument called `mask` as a tensor.
+    """Return the argument called `mask` as a tensor.
 
     Raises:
         ValueError: if it is not bool, or of another shape.
@@ -77,7 +77,7 @@ def as_mask(value: Numbers, shape: torch.Size) -> Tensor:
 
 
 def checked(phi: Tensor, weights: Tensor, name: str = "phi") -> Tensor:
-    """Returns the argument called `name` in the type and on the device of the weights.
+    """Return the argument called `name` in the type and on the device of the weights.
 
     Raises:
         ValueError: if it cannot be matched.
@@ -99,5 +99,5 @@ def pairwise_distances(phi: Tensor, weights: Tensor) -> Tensor:
 
 
 def to_tensor(numbers: list[Any], dtype: torch.dtype, device: torch.device) -> Tensor:
-    """The same as `torch.tensor`, by way of numpy, which reads a list four times as fast."""
+    """Call `torch.tensor` by way of NumPy, which reads a list four times as fast."""
     return torch.as_tensor(np.array(numbers), dtype=dtype, device=device)

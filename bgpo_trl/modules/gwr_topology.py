@@ -145,7 +145,7 @@ class Topology:
         return topology
 
     def to_graph(self, weights: Tensor) -> BehaviorGraph:
-        """Copies the network, given the weights of all rows."""
+        """Copy the network, given the weights of all rows."""
         rows = list(self.edges)
         position = {row: i for i, row in enumerate(rows)}
         edges = sorted(
@@ -167,7 +167,7 @@ class Topology:
         )
 
     def compact(self) -> list[int]:
-        """Closes the gaps that removed nodes have left; returns the former row of each node."""
+        """Close the gaps that removed nodes have left; returns the former row of each node."""
         rows = list(self.edges)
         position = {row: i for i, row in enumerate(rows)}
         self.identity = [self.identity[row] for row in rows]
@@ -180,7 +180,7 @@ class Topology:
         return rows
 
     def add(self, habituation: float) -> int:
-        """Creates a node without edges."""
+        """Create a node without edges."""
         row = len(self.identity)
         self.identity.append(self.next_identity)
         self.habituation.append(habituation)
@@ -190,15 +190,15 @@ class Topology:
         return row
 
     def connect(self, a: int, b: int, age: int = 0) -> None:
-        """Creates the edge a-b, or sets its age."""
+        """Create the edge a-b, or sets its age."""
         self.edges[a][b] = self.edges[b][a] = self.wins[a] + self.wins[b] - age
 
     def disconnect(self, a: int, b: int) -> None:
-        """Removes the edge a-b."""
+        """Remove the edge a-b."""
         del self.edges[a][b], self.edges[b][a]
 
     def learn(self, c: int, second: int, activity: float, rule: LearningRule) -> WeightUpdate:
-        """Takes steps 3 to 5 of `GWRB`, given the two nearest nodes."""
+        """Take steps 3 to 5 of `GWRB`, given the two nearest nodes."""
         self.connect(c, second)
         insert = (
             activity < rule.activity_threshold
@@ -243,7 +243,7 @@ class Topology:
 def read_state(
     state: list[dict[str, Any]], n_networks: int, n_features: int
 ) -> tuple[list[BehaviorGraph], list[Topology]]:
-    """Reads the networks of `GWRB.get_extra_state`.
+    """Read the networks of `GWRB.get_extra_state`.
 
     Raises:
         ValueError: if there are more or fewer of them, or of other features, or they are damaged.
@@ -266,7 +266,7 @@ def read_state(
 
 
 def with_room(weights: Tensor, topologies: list[Topology], networks: list[int]) -> Tensor:
-    """Returns the weights of all networks, with a spare row in each of `networks`.
+    """Return the weights of all networks, with a spare row in each of `networks`.
 
     Capacity grows by an eighth: in proportion, so that growth costs little, but by no more, as
     every row is searched. Where as many rows are out of use, those are put to use instead.

@@ -75,7 +75,7 @@ class MultiHeadActor(TensorDictModuleBase):
     def add_head(
         self, generator: torch.Generator | Sequence[torch.Generator] | None = None
     ) -> StackedLinear:
-        """Adds the head of a further task; the trunk and the other heads stay as they are.
+        """Add the head of a further task; the trunk and the other heads stay as they are.
 
         Args:
             generator: source of its initial weights, as in `StackedLinear`.
@@ -90,7 +90,7 @@ class MultiHeadActor(TensorDictModuleBase):
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the distribution of actions for each state.
+        """Write the distribution of actions for each state.
 
         Args:
             tensordict: with ``in_keys``; ``"loc"``, ``"scale"`` and ``"action"`` are set in it.

@@ -41,7 +41,7 @@ class SequenceAutoencoder(nn.Module):
         self.readout = nn.Linear(embedding_size, latent_size)
 
     def encode(self, z: Tensor, length: Tensor) -> Tensor:
-        """Embeds whole sequences.
+        """Embed whole sequences.
 
         Args:
             z: ``[..., T, latent_size]``; what lies at or beyond ``length`` has no influence.

@@ -86,7 +86,7 @@ class VAE(nn.Module):
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def encode(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns the posterior's mean and log-variance.
+        """Return the posterior's mean and log-variance.
 
         Args:
             pixels: uint8 ``[..., 32, 64, 3]``.
@@ -101,7 +101,7 @@ class VAE(nn.Module):
         return self.mean_head(coarse), self.log_variance_head(coarse)
 
     def decode(self, z: Tensor) -> Tensor:
-        """Returns the reconstructed frames in [0, 1].
+        """Return the reconstructed frames in [0, 1].
 
         Args:
             z: ``[..., latent_size]``, on the scale of mu (not of :meth:`latent`).
@@ -140,7 +140,7 @@ class VAE(nn.Module):
 
     @torch.no_grad()
     def latent(self, pixels: Tensor) -> Tensor:
-        """Returns the feature vector used downstream: mu, standardised. Carries no gradient.
+        """Return the feature vector used downstream: mu, standardised. Carries no gradient.
 
         Args:
             pixels: uint8 ``[..., 32, 64, 3]``.
@@ -154,12 +154,12 @@ class VAE(nn.Module):
         return self.standardize(self.mean_head(self._coarse(pixels)))
 
     def standardize(self, mu: Tensor) -> Tensor:
-        """Returns ``(mu - latent_mean) / latent_std``, ``[..., latent_size]``."""
+        """Return ``(mu - latent_mean) / latent_std``, ``[..., latent_size]``."""
         return (mu - self.latent_mean) / self.latent_std
 
     @torch.no_grad()
     def set_latent_scale(self, mu: Tensor, floor: float = 0.1) -> None:
-        """Sets the buffers that :meth:`latent` standardises with.
+        """Set the buffers that :meth:`latent` standardises with.
 
         Dimensions that the KL term switched off keep a tiny, meaningless spread. Dividing by it
         would blow that up into noise of the size of the signal, so no dimension is divided by

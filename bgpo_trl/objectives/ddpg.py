@@ -125,7 +125,7 @@ class DDPGLoss(StackedLoss, objectives.DDPGLoss):
         self._stack(actor_network, return_bounds, constant_keys, pre_tanh_penalty)
 
     def loss_value(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Computes the critic's loss; reads and writes what the class says.
+        """Compute the critic's loss; reads and writes what the class says.
 
         Args:
             tensordict: a batch of transitions ``[*S, *B]``.
@@ -154,7 +154,7 @@ class DDPGLoss(StackedLoss, objectives.DDPGLoss):
         }
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Computes the actor's loss; reads what the class says.
+        """Compute the actor's loss; reads what the class says.
 
         Args:
             tensordict: a batch of transitions ``[*S, *B]``.
@@ -181,7 +181,7 @@ class DDPGLoss(StackedLoss, objectives.DDPGLoss):
 def _float_pairs(
     targets: TensorDictBase, sources: TensorDictBase
 ) -> Iterator[tuple[Tensor, Tensor]]:
-    """Yields each target with its source, where they are tensors of their own."""
+    """Yield each target with its source, where they are tensors of their own."""
     for key, target in targets.items(True, True):
         source = sources[key]
         if target.is_floating_point() and not target.is_set_to(source.data):
@@ -221,7 +221,7 @@ class ForeachSoftUpdate(objectives.SoftUpdate):
 
     @torch.no_grad()
     def step(self) -> None:
-        """Moves each target towards its source: ``target <- eps * target + (1 - eps) * source``."""
+        """Move each target towards its source: ``target <- eps * target + (1 - eps) * source``."""
         torch._foreach_lerp_(  # pyright: ignore[reportPrivateImportUsage] as torch.optim does
             self._target_tensors, self._source_tensors, 1 - self.eps
         )

@@ -62,7 +62,7 @@ class DistillationLoss(LossModule):
         return [*self.actor_network.in_keys, self.tensor_keys.teacher_action]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
-        """Computes the loss; reads and returns what the class says.
+        """Compute the loss; reads and returns what the class says.
 
         Args:
             tensordict: states and the teachers' actions ``[T, B]``.

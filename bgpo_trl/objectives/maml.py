@@ -81,7 +81,7 @@ class MAMLLoss(DDPGLoss):
         self.inner_learning_rate = inner_learning_rate
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Computes the loss of the adapted policies, and keeps them in ``actor_network``.
+        """Compute the loss of the adapted policies, and keeps them in ``actor_network``.
 
         Args:
             tensordict: a batch of transitions ``[*S, T, B]``.
@@ -104,7 +104,7 @@ class MAMLLoss(DDPGLoss):
         return loss, {}
 
     def adapt(self, tensordict: TensorDictBase) -> Parameters:
-        """Returns the parameters of the policy after one gradient step on each task.
+        """Return the parameters of the policy after one gradient step on each task.
 
         Args:
             tensordict: transitions of each task ``[*S, T, B]``.
@@ -117,7 +117,7 @@ class MAMLLoss(DDPGLoss):
         return {key: value - self.inner_learning_rate * step[key] for key, value in start.items()}
 
     def policy_loss(self, parameters: Parameters, tensordict: TensorDictBase) -> Tensor:
-        """Returns ``L_i`` of policies with these parameters, ``[*S, T]``.
+        """Return ``L_i`` of policies with these parameters, ``[*S, T]``.
 
         Args:
             parameters: of one policy a task, ``[*S, T, ...]``.

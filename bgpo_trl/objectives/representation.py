@@ -101,7 +101,7 @@ class VAEInverseLoss(LossModule):
         return [*(f"loss_{name}" for name in self.weights), *self.weights]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
-        """Returns the three losses for a batch of windows; see the class."""
+        """Return the three losses for a batch of windows; see the class."""
         pixels = tensordict.get(self.tensor_keys.pixels, None)
         action = tensordict.get(self.tensor_keys.action, None)
         if pixels is None or action is None:
@@ -180,7 +180,7 @@ class SequenceReconstructionLoss(LossModule):
         return ["loss_reconstruction"]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
-        """Returns the loss for a batch of sequences; see the class."""
+        """Return the loss for a batch of sequences; see the class."""
         latent = tensordict.get(self.tensor_keys.latent, None)
         length = tensordict.get(self.tensor_keys.length, None)
         if latent is None or length is None:

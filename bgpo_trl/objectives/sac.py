@@ -95,7 +95,7 @@ class SACLoss(TwinCriticLoss, objectives.SACLoss):
 
     @dispatch()
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
-        """Computes all three losses; reads, writes and returns what the class says."""
+        """Compute all three losses; reads, writes and returns what the class says."""
         loss_qvalue, told = self.qvalue_v2_loss(tensordict)
         loss_actor, told_of_actor = self.actor_loss(tensordict)
         log_prob = told_of_actor["log_prob"]
@@ -105,7 +105,7 @@ class SACLoss(TwinCriticLoss, objectives.SACLoss):
         return TensorDict({**losses, **told, "alpha": self._alpha, "entropy": entropy})
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Computes the actor's loss; reads what the class says.
+        """Compute the actor's loss; reads what the class says.
 
         Args:
             tensordict: a batch of transitions ``[*S, *B]``.
@@ -120,7 +120,7 @@ class SACLoss(TwinCriticLoss, objectives.SACLoss):
         return loss.sum(), {"log_prob": log_prob.detach()}
 
     def qvalue_v2_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Computes the critics' loss; reads and writes what the class says.
+        """Compute the critics' loss; reads and writes what the class says.
 
         Args:
             tensordict: a batch of transitions ``[*S, *B]``.
@@ -147,12 +147,12 @@ class SACLoss(TwinCriticLoss, objectives.SACLoss):
         return -self._each(self.log_alpha, log_prob) * (log_prob + target)
 
     def _sample(self, data: TensorDictBase) -> tuple[TensorDictBase, Tensor]:
-        """Returns the data with actions of the policy, and their log-probabilities ``[*S, *B]``."""
+        """Return the data with actions of the policy, and their log-probabilities ``[*S, *B]``."""
         like = data.get(self.moving_keys[0])
         noise = self._normal(like.new_empty(*data.batch_size, self.actor_network.action_dim))
         data = self._actor.sample(data, noise)
         return data, data.get(self.tensor_keys.log_prob)
 
     def _each(self, of_seed: Tensor, like: Tensor) -> Tensor:
-        """Returns values of the seeds ``[*S]`` in a shape that goes with ``[*S, *B]``."""
+        """Return values of the seeds ``[*S]`` in a shape that goes with ``[*S, *B]``."""
         return of_seed.reshape(*self.batch_size, *[1] * (like.ndim - len(self.batch_size)))

@@ -55,7 +55,7 @@ class StackedLoss(LossModule):
         constant_keys: Sequence[NestedKey],
         pre_tanh_penalty: float = 0.0,
     ) -> None:
-        """Takes over what is common to all losses; called at the end of each constructor.
+        """Take over what is common to all losses; called at the end of each constructor.
 
         Raises:
             ValueError: if ``return_bounds`` is not an increasing pair, the penalty is negative, or
@@ -80,7 +80,7 @@ class StackedLoss(LossModule):
     def make_value_estimator(
         self, value_type: ValueEstimators | None = None, **hyperparams
     ) -> None:
-        """Sets the estimator of the target.
+        """Set the estimator of the target.
 
         Args:
             value_type: ``ValueEstimators.TD0`` or a value estimator of TorchRL.
@@ -95,7 +95,7 @@ class StackedLoss(LossModule):
         super().make_value_estimator(value_type, **{"gamma": 0.98, **hyperparams})
 
     def _successor(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Returns what the networks read of the next states.
+        """Return what the networks read of the next states.
 
         Raises:
             ValueError: if the batch lacks an entry.
@@ -118,7 +118,7 @@ class StackedLoss(LossModule):
     def _select(
         self, tensordict: TensorDictBase, keys: Sequence[NestedKey], reader: str | None = None
     ) -> TensorDictBase:
-        """Returns entries without their gradients.
+        """Return entries without their gradients.
 
         Raises:
             ValueError: if one is missing.
@@ -129,7 +129,7 @@ class StackedLoss(LossModule):
             raise lacking(reader or type(self).__name__, tensordict, keys) from None
 
     def _bootstrapped(self, tensordict: TensorDictBase, next_value: Tensor) -> Tensor:
-        """Returns the clipped target ``[*S, *B]`` for values ``[*S, *B, 1]`` of the next states.
+        """Return the clipped target ``[*S, *B]`` for values ``[*S, *B, 1]`` of the next states.
 
         Raises:
             ValueError: if the reward has another shape.
@@ -145,7 +145,7 @@ class StackedLoss(LossModule):
     def _penalized(
         self, value: Tensor, data: TensorDictBase, tensordict: TensorDictBase
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Returns the loss ``[]`` of an actor that ends in a tanh, and its diagnostics.
+        """Return the loss ``[]`` of an actor that ends in a tanh, and its diagnostics.
 
         ``-mean(value)``, and ``pre_tanh_penalty`` times the mean square of what was before the
         tanh, over batch and action dimensions, so that the tanh does not saturate.
@@ -204,7 +204,7 @@ class StackedLoss(LossModule):
         return self._bind(self._critic_name, "target_")
 
     def _bind(self, name: str, prefix: str = "", *, detach: bool = False) -> Any:
-        """Returns a copy of a network that holds these very parameters."""
+        """Return a copy of a network that holds these very parameters."""
         network = deepcopy(getattr(self, name))
         params = getattr(self, f"{prefix}{name}_params")
         (params.detach() if detach else params).to_module(network)
@@ -243,7 +243,7 @@ class TwinCriticLoss(StackedLoss):
         generator: torch.Generator | Sequence[torch.Generator] | None,
         pre_tanh_penalty: float = 0.0,
     ) -> None:
-        """Takes over what is common to all losses; called at the end of each constructor.
+        """Take over what is common to all losses; called at the end of each constructor.
 
         Raises:
             ValueError: if the batch sizes or the number of generators do not fit together.
@@ -267,7 +267,7 @@ class TwinCriticLoss(StackedLoss):
                 )
 
     def _normal(self, like: Tensor) -> Tensor:
-        """Returns standard normals of the shape of ``like``, ``[*S, ...]``."""
+        """Return standard normals of the shape of ``like``, ``[*S, ...]``."""
         if len(self.generators) < 2:
             drawn = torch.randn(like.shape, generator=next(iter(self.generators), None))
         else:
@@ -275,7 +275,7 @@ class TwinCriticLoss(StackedLoss):
         return drawn.to(like)
 
     def _twin_values(self, critic: Any, data: TensorDictBase) -> Tensor:
-        """Returns what both Q-functions say, ``[*S, 2, *B]``."""
+        """Return what both Q-functions say, ``[*S, 2, *B]``."""
         n_stacked = len(self.batch_size)
         data = data.select(*critic.in_keys).unsqueeze(n_stacked)
         shape = data.batch_size
@@ -285,7 +285,7 @@ class TwinCriticLoss(StackedLoss):
     def _critics_loss(
         self, tensordict: TensorDictBase, target: Tensor
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Returns the sum of both critics' losses ``[]``, and what they said of the batch."""
+        """Return the sum of both critics' losses ``[]``, and what they said of the batch."""
         n_stacked = len(self.batch_size)
         prediction = self._twin_values(self._critic, tensordict.detach())
         targets = target.unsqueeze(n_stacked).expand_as(prediction)
@@ -300,11 +300,11 @@ class TwinCriticLoss(StackedLoss):
         }
 
     def get_extra_state(self) -> Tensor:
-        """Returns the states of the generators, for `state_dict`."""
+        """Return the states of the generators, for `state_dict`."""
         states = [generator.get_state() for generator in self.generators]
         return torch.stack(states) if states else torch.empty(0, dtype=torch.uint8)
 
     def set_extra_state(self, state: Tensor) -> None:
-        """Continues the generators from what `get_extra_state` returned."""
+        """Continue the generators from what `get_extra_state` returned."""
         for generator, saved in zip(self.generators, state, strict=True):
             generator.set_state(saved.clone())  # a row of a tensor would crash it

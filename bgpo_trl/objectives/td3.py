@@ -105,14 +105,14 @@ class TD3Loss(TwinCriticLoss, objectives.TD3Loss):
 
     @dispatch()
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
-        """Computes both losses; reads, writes and returns what the class says."""
+        """Compute both losses; reads, writes and returns what the class says."""
         loss_qvalue, told = self.value_loss(tensordict)
         loss_actor, told_of_actor = self.actor_loss(tensordict)
         losses = {"loss_actor": loss_actor, "loss_qvalue": loss_qvalue}
         return TensorDict({**losses, **told, **told_of_actor})
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Computes the actor's loss; reads what the class says.
+        """Compute the actor's loss; reads what the class says.
 
         Args:
             tensordict: a batch of transitions ``[*S, *B]``.
@@ -128,7 +128,7 @@ class TD3Loss(TwinCriticLoss, objectives.TD3Loss):
         return self._penalized(value, data, tensordict)
 
     def value_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Computes the critics' loss; reads and writes what the class says.
+        """Compute the critics' loss; reads and writes what the class says.
 
         Args:
             tensordict: a batch of transitions ``[*S, *B]``.

@@ -1,1 +1,1 @@
-"""Directories of runs: what training writes there, and how it is read back."""
+"""Run directories: settings, logs, saved graphs and results."""

@@ -1,4 +1,4 @@
-"""The settings of a run, read back from its ``config.json``."""
+"""Settings of a run, read from its ``config.json``."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from bgpo_trl.runs.directory import plain_settings
 
 
 def read_config(path: str | Path) -> tuple[RunConfig, str | None]:
-    """Reads what `Trainer` wrote: the inverse of `dataclasses.asdict`.
+    """Read the settings that `Trainer` wrote: the inverse of ``dataclasses.asdict``.
 
-    Settings that a run of an earlier version lacks have their defaults.
+    Settings missing from a run of an earlier version get their defaults.
 
     Args:
         path: The ``config.json`` of a run.
 
     Returns:
-        The run, and the identity of the encoders that it used; None if it used none.
+        The settings, and the identity of the run's encoders; ``None`` if it used none.
 
     Raises:
-        ValueError: If there is no such file, or it is not one of a run of this version.
+        ValueError: If the file is missing, or was not written by this version.
     """
     path = Path(path)
     try:
@@ -49,7 +49,7 @@ def read_config(path: str | Path) -> tuple[RunConfig, str | None]:
 
 
 def settings_of(config: RunConfig, encoders: str | None) -> dict[str, Any]:
-    """Returns what ``config.json`` stores: all settings, and the class of the hyperparameters.
+    """Return what ``config.json`` stores: all settings, and the class of the hyperparameters.
 
     Args:
         config: The run.
@@ -61,7 +61,7 @@ def settings_of(config: RunConfig, encoders: str | None) -> dict[str, Any]:
 
 
 def _algorithm_config(name: object, stored: object) -> type[AlgorithmConfig]:
-    """Returns the class of an algorithm's hyperparameters.
+    """Return the class of an algorithm's hyperparameters.
 
     Args:
         name: Of the algorithm.
@@ -80,11 +80,11 @@ def _algorithm_config(name: object, stored: object) -> type[AlgorithmConfig]:
 
 
 def _read(hint: Any, value: Any, where: str) -> Any:
-    """Returns a value of JSON as what the annotation says; ``where`` names it in errors."""
+    """Convert a JSON value to its annotated type; ``where`` names it in errors."""
     if hint is RLConfig and isinstance(value, dict):
         name = value.get("name")
         if name not in RL:
-            raise ValueError(f"{where}name is {name!r}, of no known RL algorithm")
+            raise ValueError(f"{where}name is {name!r}, not a known RL algorithm")
         hint = type(RL[name].config)
     if is_dataclass(hint) and isinstance(value, dict):
         hints = get_type_hints(hint)

@@ -1,4 +1,4 @@
-"""What a run's directory holds, and whether a run may begin or go on there."""
+"""Contents of a run directory, and the checks before a run starts or resumes in it."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from bgpo_trl.files.folders import make_folder
 from bgpo_trl.runs.results import read_json
 
 CSV_FILES = ("train.csv", "eval.csv")
-"""What a run writes row by row."""
+"""Files to which a run appends rows."""
 
 
 def holds_run(directory: str | os.PathLike[str]) -> bool:
-    """Returns whether there is anything of a run in a directory."""
+    """Return whether a directory holds any file of a run."""
     names = ("config.json", *CSV_FILES, "checkpoint")
     return any((Path(directory) / name).exists() for name in names)
 
 
 def plain_settings(config: Any) -> Any:
-    """Returns settings as JSON keeps them, so that they compare equal when read back.
+    """Return settings as JSON stores them, so that they compare equal when read back.
 
     Args:
         config: A dataclass instance or a mapping.
@@ -37,15 +37,15 @@ def plain_settings(config: Any) -> Any:
 
 
 def check_settings(directory: str | os.PathLike[str], config: Any, *, longer: bool = False) -> None:
-    """Makes sure that a directory holds no run, or one with these settings.
+    """Check that a directory holds no run, or one with the given settings.
 
     Args:
-        directory: A run directory, there or not.
+        directory: A run directory, which may be missing.
         config: Settings of a run, a dataclass instance or a mapping.
-        longer: Whether that run may have fewer ``episodes``.
+        longer: Whether the existing run may have fewer ``episodes``.
 
     Raises:
-        ValueError: If it holds a run with other settings.
+        ValueError: If the directory holds a run with other settings.
     """
     path = Path(directory) / "config.json"
     if path.exists():
@@ -53,15 +53,16 @@ def check_settings(directory: str | os.PathLike[str], config: Any, *, longer: bo
 
 
 def claim_directory(directory: Path, config: Any, *, resume: bool) -> None:
-    """Writes ``config.json``, unless the directory holds a run that this one may not continue.
+    """Write ``config.json``, unless the directory holds a run that must not be continued.
 
     Args:
-        directory: Made if it does not exist.
+        directory: The run directory, made if missing.
         config: Settings of the run, a dataclass instance or a mapping.
-        resume: Whether it may hold that run, or its first ``episodes``.
+        resume: Whether the directory may hold this run, possibly with fewer ``episodes``.
 
     Raises:
-        ValueError: If the directory holds a run with other settings, or any without ``resume``.
+        ValueError: If the directory holds a run with other settings, or any run without
+            ``resume``.
         OSError: If the directory cannot be written.
     """
     check_settings(directory, config, longer=resume)
@@ -84,14 +85,14 @@ def claim_directory(directory: Path, config: Any, *, resume: bool) -> None:
 
 
 def load_last(directory: Path, config: Any) -> dict[str, Any] | None:
-    """Reads the checkpoint that a run goes on from, and changes nothing.
+    """Read the checkpoint that a run resumes from, without changing any file.
 
     Args:
-        directory: The run's.
-        config: Its settings, a dataclass instance or a mapping; ``episodes`` may have grown.
+        directory: The run directory.
+        config: Settings of the run, a dataclass instance or a mapping; ``episodes`` may have grown.
 
     Returns:
-        What the `Trainer` saved; None if nothing has been logged yet.
+        The state saved by `Trainer`; ``None`` if nothing has been logged yet.
 
     Raises:
         ValueError: If settings, rows or checkpoint are missing, damaged or of another run.
@@ -106,21 +107,21 @@ def load_last(directory: Path, config: Any) -> dict[str, Any] | None:
     if not (directory / "config.json").exists():
         raise ValueError(f"{directory} has a checkpoint, but no config.json: {remedy}")
     state = load_checkpoint(folder)
-    # Checkpoints did not always say; then config.json alone does.
+    # Checkpoints of earlier versions hold no settings; for those config.json has been compared.
     _compare(folder, state.get("settings", config), config, longer=True)
     for name, position in state["position"].items():
         check_position(directory / name, position)
     return state
 
 
-def _compare(where: str | os.PathLike[str], there: Any, here: Any, longer: bool) -> None:
-    there, here = dict(_flatten(there)), dict(_flatten(plain_settings(here)))
-    if longer and type(there.get("episodes")) is type(here.get("episodes")) is int:
-        there["episodes"] = max(there["episodes"], here["episodes"])
+def _compare(where: str | os.PathLike[str], saved: Any, config: Any, longer: bool) -> None:
+    old, new = dict(_flatten(saved)), dict(_flatten(plain_settings(config)))
+    if longer and type(old.get("episodes")) is type(new.get("episodes")) is int:
+        old["episodes"] = max(old["episodes"], new["episodes"])
     differences = [
-        f"{name} is {there.get(name, 'absent')} there and {here.get(name, 'absent')} here"
-        for name in {**there, **here}
-        if name not in there or name not in here or there[name] != here[name]
+        f"{name} is {old.get(name, 'absent')} there and {new.get(name, 'absent')} here"
+        for name in {**old, **new}
+        if name not in old or name not in new or old[name] != new[name]
     ]
     if differences:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""The graph of GWR-B at some moments of a run, kept to see how it grew."""
+"""Snapshots of the GWR-B graph during a run."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _NAME = re.compile(r"episode-(\d+)\.safetensors")
 
 
 def growth_moments(episodes: int, count: int = 6) -> list[int]:
-    """Returns the training episodes after which a graph is kept, evenly spaced, the last included.
+    """Return evenly spaced training episodes after which to save a graph, the last included.
 
     Example:
         >>> growth_moments(1200), growth_moments(3)
@@ -25,13 +25,13 @@ def growth_moments(episodes: int, count: int = 6) -> list[int]:
 
 
 def save_graph(directory: str | os.PathLike[str], episode: int, gwr: GWRB) -> Path:
-    """Writes the first network as ``episode-{episode}.safetensors``, whole or not at all.
+    """Write the first network atomically as ``episode-{episode}.safetensors``.
 
-    The tensors are those of `BehaviorGraph`, and ``next_node``, the identity due next.
+    The tensors are those of `BehaviorGraph` and ``next_node``, the id of the next node created.
 
     Args:
-        directory: Made if it does not exist.
-        episode: Training episodes that the network has learned from.
+        directory: Folder of the snapshots, made if missing.
+        episode: Number of training episodes so far.
         gwr: The network(s).
 
     Raises:
@@ -45,10 +45,10 @@ def save_graph(directory: str | os.PathLike[str], episode: int, gwr: GWRB) -> Pa
 
 
 def load_graphs(directory: str | os.PathLike[str]) -> dict[int, GWRB]:
-    """Reads what `save_graph` wrote, by training episode in increasing order.
+    """Read the graphs written by `save_graph`, keyed by training episode in increasing order.
 
     Returns:
-        Single networks; empty where nothing was kept.
+        Single networks; empty if there are no snapshots.
 
     Raises:
         ValueError: If a file is damaged.
@@ -64,5 +64,5 @@ def _load(path: Path) -> GWRB:
         gwr = GWRB(graph["weights"].shape[1])
         gwr.set_extra_state([{**graph, "next_node": int(graph["next_node"])}])
     except (ValueError, KeyError, IndexError, OSError) as error:
-        raise ValueError(f"{path} is damaged or no graph of GWR-B: remove it") from error
+        raise ValueError(f"{path} is damaged or not a graph of GWR-B: remove it") from error
     return gwr

@@ -1,9 +1,9 @@
-"""Run directories: the settings of a run, its CSV files, and an optional mirror to a dashboard.
+"""Run logger: writes settings and CSV files, and mirrors rows to a dashboard.
 
-A run directory holds ``config.json``, ``train.csv`` and ``eval.csv`` (and, by other modules,
-``checkpoint/`` and ``figures/``). The CSV files are the record of a run: they are always written,
-row by row, and a resumed run continues them byte for byte. Anything else that wants the numbers,
-such as Weights & Biases, is a mirror that may come and go without harm to the run.
+A run directory holds ``config.json``, ``train.csv`` and ``eval.csv`` (other modules add
+``checkpoint/`` and ``figures/``). The CSV files are the record of a run: they are always
+written, row by row, and a resumed run continues them byte for byte. Dashboards such as Weights
+& Biases are optional mirrors whose failure does not affect the run.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ EVAL_COLUMNS = (
     "return",
     "steps",
 )
-"""Columns of ``eval.csv``, one row a test episode."""
+"""Columns of ``eval.csv``, one row per test episode."""
 
 TRAIN_COLUMNS = (
     *EVAL_COLUMNS,
@@ -44,30 +44,30 @@ TRAIN_COLUMNS = (
     "loss_actor",
     "loss_value",
 )
-"""Default columns of ``train.csv``, one row a training episode."""
+"""Default columns of ``train.csv``, one row per training episode."""
 
 
 class RunLogger:
-    """Writes what a run reports into its directory, and mirrors it to a dashboard where wanted.
+    """Write the log of a run into its directory, and mirror it to dashboards.
+
+    A mirror gets each row as one ``log_metrics`` call with the row's numbers, named
+    ``{train,eval}/{task}/seed_{seed}/{column}``, at step ``episode``. A mirror that raises is
+    disabled for the rest of the run, with one warning. Rows rewritten by a resumed run reach it
+    twice, with the same values and steps.
 
     Args:
-        directory: The run directory; made if it does not exist.
+        directory: The run directory; made if missing.
         config: Settings of the run, a dataclass instance or a mapping, written to ``config.json``.
-        wandb: Also report to Weights & Biases, ``"online"``, or ``"offline"`` into
+        wandb: Also log to Weights & Biases, ``"online"``, or ``"offline"`` into
             ``directory/wandb`` for a later ``wandb sync``. Needs the extra ``wandb``.
-        resume: Continue the run that the directory holds, which may have had fewer ``episodes``.
-            Follow with :meth:`truncate_to`.
+        resume: Continue the run in the directory, which may have had fewer ``episodes``; call
+            `truncate_to` next.
         mirrors: TorchRL loggers that get every row as well.
         train_columns: Columns of ``train.csv``.
 
-    A row reaches a mirror as one ``log_metrics`` call with the row's numbers, named
-    ``{train,eval}/{task}/seed_{seed}/{column}``, at the step ``episode``. A mirror that fails is
-    left out for the rest of the run, with one warning: no dashboard ever ends a run. Rows that a
-    resumed run writes again reach it twice, with the same values at the same steps.
-
     Raises:
-        ValueError: If the directory holds a run with other settings or columns, or any run at all
-            without ``resume``.
+        ValueError: If the directory holds a run with other settings or columns, or any run without
+            ``resume``.
         OSError: If the directory cannot be written.
 
     Example:
@@ -101,10 +101,10 @@ class RunLogger:
             self._mirrors += _wandb_logger(self.directory, settings, wandb)
 
     def log_train(self, row: Mapping[str, Any]) -> None:
-        """Writes a training episode.
+        """Write a training episode.
 
         Args:
-            row: Values by column of ``train.csv``; absent ones stay empty.
+            row: Values by column of ``train.csv``; missing ones stay empty.
 
         Raises:
             ValueError: If there is no such column.
@@ -114,12 +114,12 @@ class RunLogger:
         self._mirror("train", row)
 
     def log_eval(self, row: Mapping[str, Any]) -> None:
-        """Writes a test episode.
+        """Write a test episode.
 
         Args:
-            row: Values by column of :data:`EVAL_COLUMNS`: the algorithm's and the task's names, the
-                seed, training episodes and environment steps of that seed so far, and the test
-                episode's success, extrinsic return and length in steps.
+            row: Values by column of `EVAL_COLUMNS`: names of the algorithm and the task, seed,
+                training episodes and environment steps of that seed so far, and the test episode's
+                success, extrinsic return and length in steps.
 
         Raises:
             ValueError: If there is no such column.
@@ -129,10 +129,10 @@ class RunLogger:
         self._mirror("eval", row)
 
     def log_media(self, name: str, path: str | os.PathLike[str]) -> None:
-        """Shows a finished figure or video on the dashboards that take files: Weights & Biases.
+        """Upload a finished figure or video to Weights & Biases, if it is in use.
 
         Args:
-            name: What it is shown under.
+            name: Name on the dashboard.
             path: A picture, or a video as GIF or MP4.
         """
         for mirror in list(self._mirrors):
@@ -140,24 +140,24 @@ class RunLogger:
                 self._try(mirror, partial(_log_wandb_media, mirror, name, Path(path)))
 
     def position(self) -> dict[str, int]:
-        """Returns where the CSV files end, for the checkpoint; all up to there is on the disk."""
+        """Flush the CSV files to disk and return their sizes, for the checkpoint."""
         return {file.path.name: file.position() for file in (self._train, self._eval)}
 
     def truncate_to(self, position: Mapping[str, int]) -> None:
-        """Drops the rows that a resumed run is going to write again.
+        """Drop the rows that a resumed run will write again.
 
         Args:
-            position: What :meth:`position` returned when the checkpoint was taken; empty to start
-                over, for a run that ended before its first checkpoint.
+            position: Result of `position` saved in the checkpoint; empty to start over, for a run
+                that ended before its first checkpoint.
 
         Raises:
-            ValueError: If a file does not reach that far.
+            ValueError: If a file is shorter.
         """
         for file in (self._train, self._eval):
             file.truncate_to(position.get(file.path.name, 0))
 
     def close(self) -> None:
-        """Closes the CSV files and the mirrors."""
+        """Close the CSV files and the mirrors."""
         self._train.close()
         self._eval.close()
         for mirror in list(self._mirrors):
@@ -193,14 +193,14 @@ class RunLogger:
         except Exception as error:
             self._mirrors.remove(mirror)
             warnings.warn(
-                f"{type(mirror).__name__} failed ({_reason(error)}) and gets no more of this run: "
-                "the CSV files have all of it.",
+                f"{type(mirror).__name__} failed ({_reason(error)}) and is disabled for the rest "
+                "of this run: the CSV files are complete.",
                 stacklevel=4,
             )
 
 
 def _wandb_logger(directory: Path, settings: Any, mode: str) -> list[Logger]:
-    """Returns a Weights & Biases logger, an offline one if there is no way online, or none."""
+    """Return a Weights & Biases logger, falling back to offline mode, then to none."""
     identity = directory / "wandb" / "run_id"
     for attempt in dict.fromkeys((mode, "offline")):
         try:
@@ -213,13 +213,13 @@ def _wandb_logger(directory: Path, settings: Any, mode: str) -> list[Logger]:
                     project="bgpo_trl",
                     save_dir=str(directory),
                     id=identity.read_text(),  # so that a resumed run continues its curves
-                    log_env_packages=False,  # they would tell paths of this machine
+                    log_env_packages=False,  # would reveal paths of this machine
                     config=settings,
                     mode=attempt,  # not `offline=`, which changes os.environ for good
                     settings={
                         "init_timeout": 30,
                         "finish_timeout": 60,
-                        "console": "off",  # a progress bar is no log
+                        "console": "off",  # would upload every redraw of the progress bar
                         "x_disable_meta": True,  # command, program and folders of this machine
                     },
                 )
@@ -227,7 +227,7 @@ def _wandb_logger(directory: Path, settings: Any, mode: str) -> list[Logger]:
         except ImportError:
             warnings.warn(
                 "wandb is not installed, so this run is kept in its CSV files only: "
-                "pip install 'bgpo_trl[wandb]' to have it there too.",
+                "pip install 'bgpo_trl[wandb]' to log to Weights & Biases too.",
                 stacklevel=3,
             )
             break
@@ -242,9 +242,9 @@ def _wandb_logger(directory: Path, settings: Any, mode: str) -> list[Logger]:
 
 
 def _log_wandb_media(mirror: WandbLogger, name: str, path: Path) -> None:
-    import wandb  # an extra; the mirror is there only if this is
+    import wandb  # an optional extra, installed if there is a WandbLogger
 
-    # A video by its path: wandb wants moviepy for the frames themselves, as TorchRL's log_video.
+    # The path rather than the frames, for which wandb (and TorchRL's log_video) needs moviepy.
     media = wandb.Video if path.suffix in (".gif", ".mp4") else wandb.Image
     mirror.experiment.log({name: media(str(path))})
 

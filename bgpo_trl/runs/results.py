@@ -1,4 +1,4 @@
-"""Success of runs, read back from their CSV files."""
+"""Results of runs, read from their CSV and JSON files."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ class Curves:
     """Test success of one run over its training.
 
     Attributes:
-        seeds: ``S`` of them, in increasing order.
-        tasks: ``T`` names.
+        seeds: The ``S`` seeds, in increasing order.
+        tasks: The ``T`` task names.
         episodes: Training episodes before each evaluation, increasing, ``[E]``.
-        success: Share of successes in a seed's test episodes of a task, ``[S, E, T]``; NaN where
-            there was no test, which is what tasks not yet presented have.
+        success: Share of successes among a seed's test episodes of a task, ``[S, E, T]``; NaN
+            where a task was not tested because it had not been presented yet.
     """
 
     seeds: tuple[int, ...]
@@ -39,15 +39,16 @@ class Curves:
     success: NDArray[np.float64]
 
     def until(self, episode: int) -> Curves:
-        """Returns the evaluations after at most so many training episodes."""
+        """Return the evaluations after at most ``episode`` training episodes."""
         kept = self.episodes <= episode
         return replace(self, episodes=self.episodes[kept], success=self.success[:, kept])
 
     def episodes_to(self, threshold: float = 0.8) -> float:
-        """Returns when success overall first reaches a rate; infinite if it never does.
+        """Return the training episode at which overall success first reaches a threshold.
 
-        That is the mean over seeds and the tasks presented, and over the last three evaluations: a
-        single one has few test episodes.
+        Overall success is the mean over seeds and the tasks presented so far, and over the last
+        three evaluations, since a single one has few test episodes. Infinite if it is never
+        reached.
         """
         presented = metrics.presented_mean(metrics.trailing_mean(self.success, 3))
         return float(metrics.episodes_to(presented.mean(axis=0), self.episodes, threshold))
@@ -58,33 +59,33 @@ def read_rows(
     columns: Mapping[str, Callable[[str], object]] | None = None,
     remedy: str = "resume the run, which writes it again, or take the line out",
 ) -> list[dict[str, str]]:
-    """Returns the rows of a CSV file of a run.
+    """Return the rows of a CSV file of a run.
 
     Args:
-        path: Of the file.
-        columns: Those that must be there, and what raises `ValueError` for cells that cannot be.
-        remedy: What to do about a damaged line.
+        path: The CSV file.
+        columns: Required columns, each with a function that raises ``ValueError`` for invalid
+            cells.
+        remedy: Advice for a damaged line, the end of the error message.
 
     Raises:
-        ValueError: If there is no such file, it is no CSV file, or it is not such a one.
+        ValueError: If the file is missing or not CSV, lacks a column or has an invalid cell.
     """
     path = Path(path)
     try:
         with path.open(newline="") as file:
             text = file.read()
-            # A terminal would take these for commands.
+            # Error messages quote the file, and a terminal would execute these as commands.
             if _CONTROL.search(text):
                 raise ValueError("control characters")
             reader = csv.DictReader(io.StringIO(text, newline=""))
-            rows, found = list(reader), reader.fieldnames or ()
+            rows, header = list(reader), reader.fieldnames or ()
     except (FileNotFoundError, NotADirectoryError):
         raise ValueError(f"{path} is missing: let the run in {path.parent} finish") from None
     except (OSError, ValueError, csv.Error) as error:
-        raise ValueError(f"{path} is no CSV file of a run ({error}): name another run") from None
-    missing = sorted(set(columns or ()).difference(found))
-    if found and missing:
-        lacks = ", ".join(missing)
-        raise ValueError(f"{path} is no such table of a run (it lacks {lacks}): name another run")
+        raise ValueError(f"{path} is not a CSV file of a run ({error}): name another run") from None
+    missing = sorted(set(columns or ()).difference(header))
+    if header and missing:
+        raise ValueError(f"{path} lacks the columns {', '.join(missing)}: name another run")
     for number, row in enumerate(rows, 2):
         try:
             for name, check in (columns or {}).items():
@@ -97,10 +98,10 @@ def read_rows(
 
 
 def read_tests(path: str | os.PathLike[str]) -> list[dict[str, str]]:
-    """Returns the rows of an ``eval.csv``, one a test episode.
+    """Return the rows of an ``eval.csv``, one per test episode.
 
     Raises:
-        ValueError: If the file is missing or empty, or a row is not of a test episode.
+        ValueError: If the file is missing or empty, or a row is invalid.
     """
     columns = {"algorithm": str, "seed": count, "episode": count, "task": str, "success": _share}
     rows = read_rows(path, columns)
@@ -110,27 +111,27 @@ def read_tests(path: str | os.PathLike[str]) -> list[dict[str, str]]:
 
 
 def read_final_tests(path: str | os.PathLike[str]) -> list[dict[str, str]]:
-    """Returns the rows of a ``final.csv``, one a seed, task and kind of demonstrations.
+    """Return the rows of a ``final.csv``, one per seed, task and kind of demonstrations.
 
     Raises:
-        ValueError: If the file is missing, or a row is not of such tests.
+        ValueError: If the file is missing, or a row is invalid.
     """
     columns = {"seed": count, "demonstrations": str, "task": str, "success": _share}
-    columns["task_inference"] = _share_or_nothing  # nothing where there is no GWR-B
+    columns["task_inference"] = _share_or_nothing  # empty for algorithms without GWR-B
     return read_rows(path, columns, "remove the file and resume the run, which tests again")
 
 
 def read_json(
     path: str | os.PathLike[str], entries: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
-    """Returns what a run keeps in ``config.json`` or ``summary.json``.
+    """Return the content of a run's ``config.json`` or ``summary.json``.
 
     Args:
-        path: Of the file.
-        entries: Types of those that must be there; an entry that may be None may be missing.
+        path: The JSON file.
+        entries: Types of the required entries; an entry that may be ``None`` may be missing.
 
     Raises:
-        ValueError: If there is no such file, or it is damaged.
+        ValueError: If the file is missing or damaged.
     """
     path = Path(path)
     try:
@@ -147,7 +148,7 @@ def read_json(
 
 
 def count(cell: str) -> None:
-    """Refuses, with a `ValueError`, what is no number of something."""
+    """Raise ``ValueError`` unless a cell is a non-negative integer below 2^53."""
     if not 0 <= int(cell) < 2**53:
         raise ValueError
 
@@ -163,14 +164,14 @@ def _share_or_nothing(cell: str) -> None:
 
 
 def read_curves(path: str | os.PathLike[str], tasks: Sequence[str]) -> Curves:
-    """Reads an ``eval.csv``.
+    """Read the test success of one run.
 
     Args:
-        path: Of the file of one run.
-        tasks: Names of the tasks, in the order of the curves.
+        path: The ``eval.csv`` of the run.
+        tasks: Task names, in the order of the curves.
 
     Raises:
-        ValueError: If the file is missing or empty, or a test is of another task.
+        ValueError: If the file is missing or empty, or tests another task.
     """
     tests: dict[tuple[int, int, str], list[float]] = defaultdict(list)
     for row in read_tests(path):
@@ -191,16 +192,16 @@ def read_curves(path: str | os.PathLike[str], tasks: Sequence[str]) -> Curves:
 def read_outcomes(
     path: str | os.PathLike[str], tasks: Sequence[str], last: int | None = None
 ) -> list[list[list[int]]]:
-    """Reads from a ``train.csv`` how each task's own training episodes went.
+    """Read the outcomes of each task's training episodes.
 
     Args:
-        path: Of the file of one run.
-        tasks: Names of the tasks.
-        last: Training episode after which episodes are left out; none is if None.
+        path: The ``train.csv`` of the run.
+        tasks: Task names.
+        last: Last training episode to include; ``None`` for all.
 
     Returns:
-        For each seed, in increasing order, and each task: 1 for an episode that succeeded and 0 for
-        one that did not, in the order of training.
+        For each seed, in increasing order, and each task: 1 (success) or 0 for each of its
+        training episodes, in order.
 
     Raises:
         ValueError: If the file is missing or damaged.

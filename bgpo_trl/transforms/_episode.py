@@ -89,7 +89,7 @@ class EpisodeTransform(Transform):
         return tensordict
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Adds the entries of this transform."""
+        """Add the entries of this transform."""
         self._check_order()
         for key, spec in self._entries(observation_spec).items():
             observation_spec[key] = spec
@@ -120,7 +120,7 @@ class EpisodeTransform(Transform):
         )
 
     def _others(self) -> tuple[list[nn.Module], list[nn.Module]]:
-        """Returns the transforms before this one, those of wrapped environments too, and after."""
+        """Return the transforms before this one, those of wrapped environments too, and after."""
         env, transforms = self.container, list[nn.Module]()
         while isinstance(env, TransformedEnv):
             transforms = [*_flat(env.transform), *transforms]
@@ -161,11 +161,11 @@ class DemonstrationLookup(EpisodeTransform):
         self.learn = learn
 
     def look_up(self, embedding: Tensor) -> tuple[Tensor, ...]:
-        """Returns the `out_keys` for embeddings `[*B, d]`."""
+        """Return the `out_keys` for embeddings `[*B, d]`."""
         raise NotImplementedError
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Looks up the demonstrations of any TensorDict; learns nothing."""
+        """Look up the demonstrations of any TensorDict; learns nothing."""
         embedding = tensordict.get(self.in_keys[0], None)
         if embedding is None:
             raise lacking(type(self).__name__, tensordict, self.in_keys)

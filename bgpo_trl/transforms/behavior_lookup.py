@@ -76,7 +76,7 @@ class BehaviorLookup(DemonstrationLookup):
         return self.network
 
     def look_up(self, embedding: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns behavior and node for embeddings `[*B, 32]`."""
+        """Return behavior and node for embeddings `[*B, 32]`."""
         match = self.gwr.lookup(embedding)
         return match.embedding, match.node
 

@@ -123,7 +123,7 @@ class BehaviorMatchingReward(EpisodeTransform):
         return {key: behavior.clone() for key in self.out_keys[:2]}
 
     def transform_reward_spec(self, reward_spec: Composite) -> Composite:
-        """Adds the parts of the reward; the sum can be larger than what the environment pays."""
+        """Add the parts of the reward; the sum can be larger than what the environment pays."""
         reward_key = self.in_keys[2]
         if reward_key not in reward_spec.keys(True, True):
             raise ValueError(f"the environment has no reward {reward_key!r}: name it in in_keys")

@@ -59,7 +59,7 @@ class TaskSchedule:
         return len(self.starts)
 
     def available(self, episode: Tensor) -> Tensor:
-        """Tells which tasks an episode may be about.
+        """Tell which tasks an episode may be about.
 
         Args:
             episode: episodes that went before, int64 `[*B]`.
@@ -75,7 +75,7 @@ class TaskSchedule:
         return starts == newest
 
     def presented(self, episodes: Tensor) -> Tensor:
-        """Tells which tasks any of the episodes so far could have been about.
+        """Tell which tasks any of the episodes so far could have been about.
 
         Args:
             episodes: number of episodes so far, int64 `[*B]`.

@@ -74,7 +74,7 @@ class FrameEncoder(Transform):
         return self.vae.latent(obs.to(device)).to(obs.device)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Encodes the frames of any TensorDict."""
+        """Encode the frames of any TensorDict."""
         for in_key, out_key in zip(self.in_keys, self.out_keys, strict=True):
             frames = tensordict.get(in_key, None)
             if frames is None:
@@ -105,7 +105,7 @@ class FrameEncoder(Transform):
         return tensordict
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Adds the latents and, with `del_keys`, drops the frames."""
+        """Add the latents and, with `del_keys`, drops the frames."""
         for in_key, out_key in zip(self.in_keys, self.out_keys, strict=True):
             if in_key not in observation_spec.keys(True, True):
                 raise _no_frames(in_key)

@@ -66,7 +66,7 @@ class GroupLookup(DemonstrationLookup):
         return self.network
 
     def look_up(self, embedding: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns group and activity for embeddings `[*B, 32]`."""
+        """Return group and activity for embeddings `[*B, 32]`."""
         match = self.groups.lookup(embedding)
         return match.group, match.activity
 

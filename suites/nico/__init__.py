@@ -1,6 +1,6 @@
 """NICO at a table: a dm_control suite of sparse-reward visuomotor tasks."""
 
-# First, because it has the OpenGL backend chosen before anything imports MuJoCo.
+# First, since importing it chooses the OpenGL backend, which must precede MuJoCo's import.
 from suites.nico import rendering  # isort: skip
 from suites.nico.base import NicoTask, scene_version
 from suites.nico.nico import ALL_TASKS, TASKS, add_task, check_tasks, load, register

@@ -1,4 +1,4 @@
-"""What NICO's tasks share: the action, the start of an episode, observation and reward."""
+"""Base of NICO's tasks: action, start states, observations and reward."""
 
 import hashlib
 from collections import OrderedDict
@@ -23,23 +23,23 @@ STATE_SIZE = 16
 # Change of the joint targets at |action| = 1 (rad): three arm joints, then the hand.
 ACTION_SCALE = np.array([0.2, 0.2, 0.2, 0.4])
 
-_PART = [0, 1, 2, 3, 3, 3]  # of the action, for each actuator: the three digits move as one hand
+_PART = [0, 1, 2, 3, 3, 3]  # action dimension of each actuator; the last moves all three digits
 _STEP = ACTION_SCALE[_PART]
 
-# The arc on which the objects stand, about the shoulder's yaw axis; left is positive.
+# Arc about the shoulder's yaw axis on which the objects stand; left is positive.
 ARC_RADIUS = 0.42  # (m)
 ARC_ANGLES = np.radians([22.0, 0.0, -22.0])  # glass, green box, white box
 ANGLE_JITTER = np.radians(2.5)
 RADIUS_JITTER = 0.012  # (m)
 
-# Where the palm starts: in view, among or above the objects.
-START_ANGLE = np.radians(18.0)  # to either side of the middle of the arc
+# Range of the palm's start: in view, among or above the objects.
+START_ANGLE = np.radians(18.0)  # to both sides of the middle of the arc
 START_RADIUS = (0.36, 0.42)  # (m)
 START_HEIGHT = (0.05, 0.12)  # (m) above the table
 
 
 def scene_version() -> str:
-    """Returns the version of scene, starts and action; datasets and encoders are valid for one."""
+    """Return the version of scene, starts and action, on which datasets and encoders depend."""
     layout = (ACTION_SCALE.tolist(), ARC_RADIUS, ARC_ANGLES.tolist(), ANGLE_JITTER, RADIUS_JITTER)
     starts = (START_ANGLE, START_RADIUS, START_HEIGHT)
     described = f"{scene_xml()}{layout}{starts}".encode()
@@ -47,17 +47,17 @@ def scene_version() -> str:
 
 
 def check_observation(observation: str) -> None:
-    """Raises ValueError if there is no such observation."""
+    """Raise ``ValueError`` if there is no such observation."""
     if observation not in get_args(Observation):
         choices = ", ".join(map(repr, get_args(Observation)))
         raise ValueError(f"observation is {observation!r}; choose one of {choices}")
 
 
 class Environment(control.Environment):
-    """``control.Environment`` whose success on the very last step still has discount 0."""
+    """``control.Environment`` that gives a success on the last step discount 0, too."""
 
     def observation_spec(self) -> Mapping[str, specs.Array]:
-        """Returns the specs of the observation, flattened where it is."""
+        """Return the specs of the observation, flattened if the observation is."""
         spec = super().observation_spec()
         if not self._flat_observation:
             return spec
@@ -66,34 +66,33 @@ class Environment(control.Environment):
         return {key: specs.Array(value.shape, value.dtype, key) for key, value in flat.items()}
 
     def step(self, action: np.ndarray) -> TimeStep:
-        """Advances one control step of 0.2 s."""
+        """Advance one control step of 0.2 s."""
         timestep = super().step(action)
         if timestep.last() and timestep.reward:
             return timestep._replace(discount=0.0)
         return timestep
 
     def close(self) -> None:
-        """Frees what it renders with, unless that is shared; a later frame makes it anew."""
+        """Free the renderer, unless it is shared; the next frame creates a new one."""
         self.task.close()
 
 
 class NicoTask(control.Task):
-    """Base of the tasks: subclasses say when they have succeeded, and how they are demonstrated.
+    """Base class of the tasks; subclasses define success and, for recording, a demonstration.
 
     The action ``[4]`` in [-1, 1] moves the targets of shoulder yaw, shoulder pitch and elbow by up
-    to 0.2 rad and of the hand by up to 0.4 rad a step. A target that has run further ahead of its
-    joint than one full step is brought back to that before, so that what the robot sees is nearly
-    all it needs to know.
+    to 0.2 rad and of the hand by up to 0.4 rad per step. Before each action, a target is brought
+    back to within one full step of its joint, so that the observation nearly determines the state.
 
     Args:
-        random: Source of the starts, or its seed; None draws one from the system.
+        random: Random state of the start states, or its seed; ``None`` for a random seed.
         observation: ``"pixels"`` (uint8 ``[32, 64, 3]``), ``"state"`` (``privileged_state``,
             float64 ``[16]``) or ``"both"``.
-        frame_size: Height and width of ``pixels``, where these are to be others.
-        renderer: Shared with other environments; made on demand if None.
+        frame_size: Height and width of ``pixels``.
+        renderer: Renderer shared with other environments; created on demand if ``None``.
 
     Raises:
-        ValueError: If there is no such observation, or the renderer's frames have another size.
+        ValueError: If there is no such observation, or the renderer has another frame size.
     """
 
     def __init__(
@@ -110,8 +109,8 @@ class NicoTask(control.Task):
                 f"frame_size is {tuple(frame_size)}, but the renderer's frames are "
                 f"{renderer.frame_size}: give both the same"
             )
-        # Under this name dm_control's wrappers put a source of their own: TorchRL's `set_seed`,
-        # shimmy's `reset(seed=...)`.
+        # dm_control's wrappers replace this attribute by name: TorchRL's `set_seed`, shimmy's
+        # `reset(seed=...)`.
         self._random = (
             random if isinstance(random, np.random.RandomState) else np.random.RandomState(random)
         )
@@ -122,26 +121,26 @@ class NicoTask(control.Task):
 
     @property
     def random(self) -> np.random.RandomState:
-        """Source of the starts."""
+        """Random state of the start states."""
         return self._random
 
     def succeeded(self, physics: Physics) -> bool:
-        """Returns whether the task is done."""
+        """Return whether the task is done."""
         raise NotImplementedError
 
     def demonstration(self, physics: Physics, random: np.random.Generator) -> Sequence[Phase]:
-        """Returns the movement that does the task, planned at the start of an episode.
+        """Return the movement that solves the task, planned at the start of an episode.
 
-        The hand is lifted above the objects before its first phase.
+        The demonstrator lifts the hand above the objects before the first phase.
 
         Args:
             physics: The simulation at the start of the episode.
-            random: Source of all that differs between demonstrations.
+            random: Source of all variation between demonstrations.
         """
         raise NotImplementedError
 
     def initialize_episode(self, physics: Physics) -> None:
-        """Places the objects with jitter on their arc and the arm somewhere above them."""
+        """Place the objects with jitter on their arc, and the arm at random above them."""
         for name, angle in zip(OBJECTS, ARC_ANGLES, strict=True):
             place = kinematics.polar(
                 ARC_RADIUS + self.random.uniform(-RADIUS_JITTER, RADIUS_JITTER),
@@ -150,7 +149,7 @@ class NicoTask(control.Task):
             turn = self.random.uniform(-np.pi / 9, np.pi / 9) / 2
             height = TABLE_HEIGHT + OBJECT_HALF_HEIGHT[name]
             physics.named.data.qpos[name] = [*place, height, np.cos(turn), 0, 0, np.sin(turn)]
-        # Resample a hand that would touch something.
+        # Resamples until the hand touches nothing.
         touching = True
         while touching:
             self._place_arm(physics)
@@ -168,7 +167,11 @@ class NicoTask(control.Task):
         physics.data.ctrl[:] = [*arm, curl, curl, curl]
 
     def before_step(self, action: np.ndarray, physics: Physics) -> None:
-        """Moves the joint targets by the action."""
+        """Move the joint targets by the action.
+
+        Raises:
+            ValueError: If the action is not 4 finite numbers.
+        """
         action = np.asarray(action, dtype=float)
         if action.shape != (4,) or not np.isfinite(action).all():
             raise ValueError(f"an action is 4 finite numbers in [-1, 1], not {action.tolist()}")
@@ -178,12 +181,12 @@ class NicoTask(control.Task):
         physics.set_control(np.minimum(np.maximum(target, lowest), highest))
 
     def action_spec(self, physics: Physics) -> specs.BoundedArray:
-        """Returns the spec of the action: float64 ``[4]`` in [-1, 1]."""
+        """Return the spec of the action: float64 ``[4]`` in [-1, 1]."""
         del physics
         return specs.BoundedArray((4,), float, [-1.0] * 4, [1.0] * 4, name="action")
 
     def observation_spec(self, physics: Physics) -> OrderedDict[str, specs.Array]:
-        """Returns the specs of what `get_observation` does, without rendering."""
+        """Return the specs of the observation, without rendering."""
         del physics
         observation: OrderedDict[str, specs.Array] = OrderedDict()
         if self._observation != "state":
@@ -195,7 +198,7 @@ class NicoTask(control.Task):
         return observation
 
     def get_observation(self, physics: Physics) -> OrderedDict[str, np.ndarray]:
-        """Returns new arrays: ``pixels`` (uint8 ``[H, W, 3]``), ``privileged_state`` (``[16]``)."""
+        """Return new arrays: ``pixels`` uint8 ``[H, W, 3]``, ``privileged_state`` ``[16]``."""
         observation: OrderedDict[str, np.ndarray] = OrderedDict()
         if self._observation != "state":
             if self._renderer is None:
@@ -207,15 +210,15 @@ class NicoTask(control.Task):
         return observation
 
     def get_reward(self, physics: Physics) -> float:
-        """Returns 1 on success, else 0."""
+        """Return 1 on success, else 0."""
         return float(self.succeeded(physics))
 
     def get_termination(self, physics: Physics) -> float | None:
-        """Returns discount 0 on success, else None."""
+        """Return discount 0 on success, else ``None``."""
         return 0.0 if self.succeeded(physics) else None
 
     def close(self) -> None:
-        """Frees the renderer that was made on demand."""
+        """Free the renderer if it was created on demand."""
         if self._renderer is not None and not self._shares_renderer:
             self._renderer.close()
             self._renderer = None

@@ -1,7 +1,7 @@
-"""Scripted demonstrations of NICO's tasks, in the policy's own action space.
+"""Scripted demonstrations of NICO's tasks, in the policy's action space.
 
-Each task says by which movement it is demonstrated (`NicoTask.demonstration`, `suites.nico.moves`);
-the demonstrator performs it, each episode at a speed and with a tremor of its own.
+Each task defines the movement (`NicoTask.demonstration`, `suites.nico.moves`); the demonstrator
+performs it with a random speed per episode and noise on the actions.
 """
 
 import numpy as np
@@ -19,16 +19,16 @@ _TREMOR = 0.06  # standard deviation of noise on the action
 
 
 class Demonstrator:
-    """Performs the task of an environment.
+    """Scripted policy for the task of an environment.
 
     Call ``reset()`` after each ``env.reset()``, then ``demonstrator(timestep)`` for each action.
 
     Args:
-        env: A NICO environment; its task says what is demonstrated.
+        env: A NICO environment, whose task defines the demonstration.
         seed: Seed of the noise, or its generator.
 
     Raises:
-        ValueError: If the environment's task says no demonstration.
+        ValueError: If the environment's task defines no demonstration.
 
     Example:
         >>> from suites import nico
@@ -59,7 +59,7 @@ class Demonstrator:
         self._speed = 0.0
 
     def reset(self) -> None:
-        """Plans a new demonstration for the current state of the environment."""
+        """Plan a new demonstration from the current state of the environment."""
         self._speed = self._random.uniform(*_SPEED)
         palm = self._physics.palm_position()
         palm[2] = CLEAR_HEIGHT
@@ -68,7 +68,7 @@ class Demonstrator:
         self._phases = [Phase(lambda _: lifted, FIST / 2), *plan]
 
     def __call__(self, timestep: TimeStep) -> np.ndarray:
-        """Returns the next action, ``[4]`` in [-1, 1].
+        """Return the next action, ``[4]`` in [-1, 1].
 
         Raises:
             RuntimeError: If ``reset()`` was not called first.

@@ -1,8 +1,8 @@
-"""Shows NICO at work: ``python -m suites.nico.explore --task push_green_to_glass``.
+"""Show an episode of NICO: ``python -m suites.nico.explore --task push_green_to_glass``.
 
-With a screen it opens MuJoCo's viewer, where the objects can be pushed about with the mouse.
-Without one, or with ``--out``, it writes an episode as a strip of frames (``.png``) or as an
-animation (``.gif``): what the robot sees above what an onlooker sees.
+With a screen, MuJoCo's viewer opens, in which the mouse can move objects. Without one, or with
+``--out``, an episode is written as a strip of frames (``.png``) or an animation (``.gif``): the
+robot's observation above a view of the room.
 """
 
 # MuJoCo's bindings come without stubs.
@@ -36,14 +36,14 @@ _POLICY = tyro.conf.create_mutex_group(required=False)
 
 @dataclass(frozen=True)
 class Arguments:
-    """Shows an episode of NICO: in a window, or as a picture where there is no screen."""
+    """Show an episode of NICO, in a window or, without a screen, as a picture."""
 
     task: str = nico.ALL_TASKS[0]
     """One of grasp_glass, push_green_to_glass, push_green_to_white."""
     out: Path | None = None
-    """File to write, .png or .gif; without a screen TASK.png if not given."""
+    """File to write, .png or .gif; by default TASK.png if there is no screen."""
     demonstrate: Annotated[bool, _POLICY, tyro.conf.FlagCreatePairsOff] = False
-    """Have the demonstrator act (the default)."""
+    """Act with the demonstrator (the default)."""
     random: Annotated[bool, _POLICY, tyro.conf.FlagCreatePairsOff] = False
     """Act at random."""
     seed: int = 0
@@ -51,7 +51,7 @@ class Arguments:
 
 
 class _ShownPhysics(nico.Physics):
-    """Simulation that runs in real time and shows each of its steps."""
+    """Simulation that runs in real time and shows each physics step."""
 
     show: Callable[[], None] | None = None
 
@@ -65,14 +65,14 @@ class _ShownPhysics(nico.Physics):
 
 
 def has_screen() -> bool:
-    """Returns whether a window can be opened."""
+    """Return whether a window can be opened."""
     if platform.system() != "Linux":
         return True
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 def make_policy(env: Environment, *, random: bool, seed: int) -> Policy:
-    """Returns a policy, time step -> action ``[4]``: random, or the demonstrator's."""
+    """Return a policy that maps a time step to an action ``[4]``: random, or the demonstrator."""
     generator = np.random.default_rng(seed)
     if random:
         return lambda _: generator.uniform(-1.0, 1.0, 4)
@@ -87,7 +87,7 @@ def make_policy(env: Environment, *, random: bool, seed: int) -> Policy:
 
 
 def picture_episode(task: str, *, random: bool = False, seed: int = 0) -> list[Image.Image]:
-    """Runs an episode and returns a captioned picture of each step.
+    """Run an episode and return a captioned picture of each step.
 
     Args:
         task: Name of the task.
@@ -95,7 +95,7 @@ def picture_episode(task: str, *, random: bool = False, seed: int = 0) -> list[I
         seed: Seed of the start and of the actions.
 
     Returns:
-        Pictures 320 pixels wide: the robot's 64x32 frame, enlarged, above the room.
+        Pictures 320 pixels wide: the enlarged 64x32 observation above a view of the room.
 
     Raises:
         ValueError: If there is no such task.
@@ -121,7 +121,7 @@ def _picture(seen: np.ndarray, room: np.ndarray, caption: str) -> Image.Image:
         (_PANEL_WIDTH, _PANEL_WIDTH // 2), Image.Resampling.NEAREST
     )
     picture.paste(enlarged, (0, 0))
-    # Rendered larger and reduced, as the scene does without multisampling.
+    # Rendered larger and then reduced, since the scene has no multisampling.
     reduced = Image.fromarray(room).resize((_PANEL_WIDTH, _PANEL_WIDTH * 3 // 4))
     picture.paste(reduced, (0, _PANEL_WIDTH // 2))
     ImageDraw.Draw(picture).text((6, picture.height - 16), caption, fill="white")
@@ -129,10 +129,10 @@ def _picture(seen: np.ndarray, room: np.ndarray, caption: str) -> Image.Image:
 
 
 def write_pictures(path: Path, pictures: Sequence[Image.Image]) -> None:
-    """Writes pictures of an episode as a strip of six (``.png``) or all of them (``.gif``).
+    """Write pictures of an episode as a strip of six (``.png``) or all of them (``.gif``).
 
     Raises:
-        ValueError: If the file's name ends otherwise.
+        ValueError: If the file has another suffix, or its folder does not exist.
         OSError: If it cannot be written.
     """
     _check_path(path)
@@ -156,12 +156,12 @@ def _check_path(path: Path) -> None:
 
 
 def view(task: str, *, random: bool = False, seed: int = 0) -> None:
-    """Runs episodes in MuJoCo's viewer until its window is closed.
+    """Run episodes in MuJoCo's viewer until its window is closed.
 
     Raises:
         ValueError: If there is no such task.
     """
-    import mujoco.viewer  # Needs a screen.
+    import mujoco.viewer  # fails without a screen
 
     physics = _ShownPhysics.from_xml_string(nico.scene_xml())
     env = nico.load(task, seed=seed, observation="state", physics=physics)
@@ -174,7 +174,7 @@ def view(task: str, *, random: bool = False, seed: int = 0) -> None:
 
 
 def main(arguments: Arguments) -> None:
-    """Runs the command line; see ``--help``."""
+    """Run the command line."""
     how = {"random": arguments.random, "seed": arguments.seed}
     if arguments.out is None and has_screen():
         view(arguments.task, **how)

@@ -10,12 +10,12 @@ from suites.nico.physics import Physics
 
 
 class GraspGlass(NicoTask):
-    """Done when the glass is held between thumb and fingers with the hand closing on it."""
+    """Success: the closing hand holds the glass between thumb and fingers."""
 
     def succeeded(self, physics: Physics) -> bool:
-        """Returns whether the task is done."""
+        """Return whether the glass is held."""
         return physics.held("glass")
 
     def demonstration(self, physics: Physics, random: np.random.Generator) -> Sequence[moves.Phase]:
-        """Returns the movement that does the task."""
+        """Return a grasp of the glass."""
         return moves.grasp(physics, random, "glass")

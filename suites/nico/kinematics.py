@@ -1,6 +1,6 @@
 """Closed-form inverse kinematics of NICO's arm: yaw, then two links in a vertical plane.
 
-Numbers are those of ``nico.xml`` (from NICO's published URDF); a test holds the two together.
+The numbers are those of ``nico.xml`` (from NICO's published URDF); a test compares them.
 """
 
 import numpy as np
@@ -17,18 +17,18 @@ PALM = (0.0, 0.075)  # (m) centre of the palm
 
 
 def polar(radius: float, angle: float) -> np.ndarray:
-    """Returns ``[x, y]`` (m) at a radius (m) and angle (rad, left +) about the yaw axis."""
+    """Return ``[x, y]`` (m) at a radius (m) and angle (rad, left positive) about the yaw axis."""
     return YAW_AXIS + radius * np.array([np.cos(angle), np.sin(angle)])
 
 
 def to_polar(position: np.ndarray) -> tuple[float, float]:
-    """Returns radius (m) and angle (rad, left +) of a point ``[x, y, ...]`` about the yaw axis."""
+    """Return radius (m) and angle (rad, left positive) of ``[x, y, ...]`` about the yaw axis."""
     x, y = np.asarray(position)[:2] - YAW_AXIS
     return float(np.hypot(x, y)), float(np.arctan2(y, x))
 
 
 def inverse(position: np.ndarray, point: tuple[float, float] = GRIP) -> np.ndarray:
-    """Returns joint angles that bring a point of the hand to a position, elbow low.
+    """Return the joint angles that bring a point of the hand to a position, with the elbow low.
 
     Args:
         position: Target ``[x, y, z]`` (m). Targets out of reach are approached with a straight arm.
@@ -48,7 +48,7 @@ def inverse(position: np.ndarray, point: tuple[float, float] = GRIP) -> np.ndarr
     distance = np.hypot(forward, down)
     cosine = (distance**2 - UPPER_ARM**2 - hand**2) / (2 * UPPER_ARM * hand)
     elbow = np.arccos(np.clip(cosine, -1.0, 1.0))
-    # Angle of the line to the target from the hanging direction, less the share of the elbow.
+    # The pitch is the target's angle from the hanging arm, minus the elbow's contribution.
     line = np.arctan2(forward, down)
     pitch = line - np.arctan2(hand * np.sin(elbow), UPPER_ARM + hand * np.cos(elbow))
     return np.array([yaw, pitch, elbow])

@@ -1,8 +1,8 @@
-"""What demonstrations are made of: phases of a movement, and the movements of NICO's own tasks.
+"""Building blocks of demonstrations: phases of a movement, and the movements of NICO's tasks.
 
-A movement leads the hand through a few noisy waypoints by inverse kinematics: above the place from
-which to sweep, down to the table, sideways into the object, and for grasping closes the hand. It
-follows the objects as they move.
+A movement leads the hand by inverse kinematics through a few noisy waypoints: above the start
+of the sweep, down to the table, sideways into the object, and for grasping closes the hand. The
+waypoints follow the objects as they move.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,8 +19,8 @@ SWEEP_HEIGHT: Final = TABLE_HEIGHT + 0.045  # (m) of the palm while it sweeps
 OPEN: Final = 0.05  # (rad) curl of a segment
 FIST: Final = 0.85  # (rad) curl of a segment
 
-# Where a pushed box lies, as (left of the arm's plane, beyond the wrist) (m): against the fist's
-# knuckles when pushed left, against the back of the hand when pushed right.
+# Contact point of a pushed box, as (left of the arm's plane, beyond the wrist) (m): the fist's
+# knuckles when pushed left, the back of the hand when pushed right.
 _BEFORE_KNUCKLES, _BEHIND_BACK = (0.078, 0.105), (-0.043, 0.075)
 _LEAD = 0.07  # (m) by which the hand aims ahead of the box it pushes
 _OUTWARD = 0.03  # (m) by which it aims beyond the arc
@@ -28,23 +28,23 @@ _NOISE = 0.006  # (m) standard deviation of the waypoints
 
 
 Place = Callable[[Physics], np.ndarray]
-"""Where the arm should be now: simulation -> joint angles (rad) ``[3]``."""
+"""Target of the arm: maps the simulation to joint angles (rad) ``[3]``."""
 
 
 @dataclass(frozen=True)
 class Phase:
-    """A part of a movement, which is over once its place is reached; the last goes on."""
+    """Part of a movement, which ends when its place is reached; the last phase goes on."""
 
     place: Place
-    """Where the arm goes, asked anew at each step."""
+    """Target of the arm, evaluated at each step."""
     curl: float
     """Angle of each of the hand's segments (rad); `OPEN` and `FIST` are usual."""
     tolerance: float = 0.035
-    """How near each joint must come to the place (rad)."""
+    """Largest distance of a joint from the target at which the phase ends (rad)."""
 
 
 def grasp(physics: Physics, random: np.random.Generator, name: str) -> Sequence[Phase]:
-    """Sweeps the open hand left until an object is between thumb and fingers, then closes it.
+    """Sweep the open hand left until an object is between thumb and fingers, then close it.
 
     Args:
         physics: The simulation at the start of the episode.
@@ -75,7 +75,7 @@ def grasp(physics: Physics, random: np.random.Generator, name: str) -> Sequence[
 
 
 def push(physics: Physics, random: np.random.Generator, box: str, target: str) -> Sequence[Phase]:
-    """Brings the fist to a box's far side from its target, then sweeps the box towards it.
+    """Move the fist to a box's far side from its target, then sweep the box towards the target.
 
     Args:
         physics: The simulation at the start of the episode.
@@ -94,8 +94,7 @@ def push(physics: Physics, random: np.random.Generator, box: str, target: str) -
         )
 
     def through(physics: Physics) -> np.ndarray:
-        # A box pushed along the arc drifts outwards along the hand, and off it unless the hand
-        # follows.
+        # A box pushed along the arc drifts outwards along the hand, so the hand follows outwards.
         radius, angle = kinematics.to_polar(physics.object_position(box))
         radius = (radius + kinematics.to_polar(physics.object_position(target))[0]) / 2
         place = kinematics.polar(radius + _OUTWARD, angle - side * _LEAD / radius)
@@ -116,12 +115,12 @@ def beside_object(
     point: tuple[float, float],
     noise: np.ndarray | float = 0.0,
 ) -> np.ndarray:
-    """Returns the arm angles (rad) ``[3]`` that put a point of the hand to the left of an object.
+    """Return the arm angles (rad) ``[3]`` that put a point of the hand to the left of an object.
 
     Args:
         physics: The simulation now.
         name: The object.
-        left: How far to its left, on the arc (m); negative is right.
+        left: Distance to the object's left along the arc (m); negative is right.
         height: Height of the hand's point (m).
         point: The hand's point, as in `kinematics.inverse`.
         noise: Added to ``[x, y]`` of the place (m).

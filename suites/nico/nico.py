@@ -1,4 +1,4 @@
-"""The suite's front: ``load``, ``add_task``, ``register`` and ``ALL_TASKS``."""
+"""Entry points of the suite: `load`, `add_task`, `register` and the lists of tasks."""
 
 from collections.abc import Mapping, Sequence
 from operator import itemgetter
@@ -22,23 +22,24 @@ _TASKS: dict[str, type[NicoTask]] = {
     "push_green_to_white": PushGreenToWhite,
 }
 ALL_TASKS = tuple(_TASKS)
-"""The paper's tasks, in its order."""
+"""Names of the paper's tasks, in its order."""
 TASKS: Mapping[str, type[NicoTask]] = MappingProxyType(_TASKS)
-"""Those and the tasks that were added, by name."""
+"""Classes of the paper's and of added tasks, by name."""
 
 
 def add_task(name: str, task: type[NicoTask]) -> None:
-    """Makes a task of one's own known by name, in this process, to all that asks for tasks so.
+    """Register a custom task under a name, for this process.
 
-    Added again, as when a notebook's cell runs twice, an own task replaces its earlier self.
-    ``ALL_TASKS``, the default of everything, stays the paper's tasks.
+    Adding the same name again replaces the task, for example when a notebook cell runs twice.
+    ``ALL_TASKS``, the default everywhere, keeps only the paper's tasks.
 
     Args:
-        name: What ``load``, datasets, settings and CSV files call it.
-        task: Says when it has succeeded and, to be recorded, how it is demonstrated.
+        name: Name of the task in `load`, datasets, settings and CSV files.
+        task: Class that defines success and, for recording, a demonstration.
 
     Raises:
-        ValueError: If the name is one of the paper's tasks' or no name, or the class is no task.
+        ValueError: If the name is taken by one of the paper's tasks or is not an identifier, or the
+            class is not a `NicoTask`.
 
     Example:
         >>> from suites import nico
@@ -59,11 +60,11 @@ def add_task(name: str, task: type[NicoTask]) -> None:
 
 
 def check_tasks(names: Sequence[str]) -> None:
-    """Raises ValueError if there is no such task, or one is named twice."""
+    """Raise ``ValueError`` if a task does not exist or is named twice."""
     for position, name in enumerate(names):
         if name not in TASKS:
             raise ValueError(
-                f"no NICO task {name!r}; choose one of {', '.join(TASKS)}, or make it known with "
+                f"no NICO task {name!r}; choose one of {', '.join(TASKS)}, or add it with "
                 "nico.add_task"
             )
         if name in names[:position]:
@@ -81,24 +82,24 @@ def load(
     renderer: FrameRenderer | None = None,
     environment_kwargs: Mapping[str, Any] | None = None,
 ) -> Environment:
-    """Returns an environment of NICO at the table.
+    """Return an environment of NICO at the table.
 
     Args:
-        task: One of ``TASKS``.
-        seed: Seed or source of the starts; None draws one from the system.
+        task: One of `TASKS`.
+        seed: Seed or random state of the start states; ``None`` for a random seed.
         observation: ``"pixels"`` (uint8 ``[32, 64, 3]``), ``"state"`` (``privileged_state``, the
             ground truth, float64 ``[16]``: joints (rad), grip and object positions (m)) or
             ``"both"``.
-        frame_size: Height and width of ``pixels``, such as ``(84, 84)`` for networks that ask for
-            it. Narrower frames show all that is on the table, too.
+        frame_size: Height and width of ``pixels``, such as ``(84, 84)``. Narrower frames also show
+            the whole table.
         time_limit: Length of an episode (s); a step takes 0.2 s.
-        physics: A simulation to share with other tasks that are not run at the same time.
-        renderer: A renderer to share with other environments, of the same size of frames.
+        physics: Simulation to share with other tasks that do not run at the same time.
+        renderer: Renderer to share with other environments of the same frame size.
         environment_kwargs: Further arguments of ``dm_control.rl.control.Environment``.
 
     Raises:
-        ValueError: If the task or the observation is unknown, there are no frames of that size, or
-            the episode has no length.
+        ValueError: If the task, the observation or the frame size is invalid, or ``time_limit`` is
+            not positive.
 
     Example:
         >>> from suites import nico
@@ -121,11 +122,10 @@ def load(
 
 
 def register() -> None:
-    """Makes the tasks known to ``dm_control.suite``, and so to its wrappers, as domain ``nico``.
+    """Register the tasks in ``dm_control.suite`` as domain ``nico``.
 
-    So ``suite.ALL_TASKS`` and ``TASKS_BY_DOMAIN`` list them, and TorchRL's
-    ``DMControlEnv("nico", "grasp_glass")`` finds them. A task that is added later takes another
-    call.
+    Then ``suite.ALL_TASKS`` and ``TASKS_BY_DOMAIN`` list them, and TorchRL's
+    ``DMControlEnv("nico", "grasp_glass")`` finds them. Call it again after adding a task.
 
     Example:
         >>> from dm_control import suite
@@ -150,7 +150,7 @@ def register() -> None:
         factory.__name__ = name
         tasks.add("no_reward_visualization")(factory)
     domain.SUITE = tasks  # pyright: ignore[reportAttributeAccessIssue]
-    suite._DOMAINS["nico"] = domain  # There is no other way into `suite.load`.
+    suite._DOMAINS["nico"] = domain  # `suite.load` has no public way to add a domain.
     suite.TASKS_BY_DOMAIN["nico"] = tuple(TASKS)
     ours = [("nico", name) for name in TASKS]
     for listed in ("ALL_TASKS", "EXTRA", "NO_REWARD_VIZ"):

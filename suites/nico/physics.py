@@ -20,19 +20,19 @@ TABLE_HEIGHT: Final = 0.62  # (m)
 OBJECT_HALF_HEIGHT: Final = {"glass": 0.035, "green_box": 0.025, "white_box": 0.025}  # (m)
 
 _FULL_STATE = mujoco.mjtState.mjSTATE_INTEGRATION.value
-_TOUCH_GAP = 0.002  # (m) two objects closer than this touch
-_PRESSING = 0.02  # (rad) a hand whose target lies this far beyond its curl is closing
+_TOUCH_GAP = 0.002  # (m) distance below which two objects touch
+_PRESSING = 0.02  # (rad) lead of the target over the curl above which a hand is closing
 
 
 def scene_xml() -> str:
-    """Returns the MJCF of the scene."""
+    """Return the MJCF of the scene."""
     return resources.files("suites.nico").joinpath("nico.xml").read_text()
 
 
 class Physics(dm_mujoco.Physics):
-    """MuJoCo simulation with the queries that NICO's tasks, demonstrator and probes need."""
+    """MuJoCo simulation with the queries of NICO's tasks, demonstrator and probes."""
 
-    # Names are looked up once: `named` takes many times as long as what it is read for.
+    # Indices are cached, since a lookup by `named` takes much longer than the read itself.
 
     @cached_property
     def _arm(self) -> list[int]:
@@ -60,7 +60,7 @@ class Physics(dm_mujoco.Physics):
 
     @cached_property
     def _hand(self) -> list[int]:
-        # Bodies come in the order of the tree: each after its parent.
+        # One pass suffices, since each body comes after its parent.
         bodies = {self._id("body", HAND)}
         for body, parent in enumerate(self.model.body_parentid):
             if parent in bodies:
@@ -82,43 +82,47 @@ class Physics(dm_mujoco.Physics):
         return lowest, highest
 
     def actuated_angles(self) -> np.ndarray:
-        """Returns the angle (rad) of the joint of each actuator, ``[6]``."""
+        """Return the angle (rad) of the joint of each actuator, ``[6]``."""
         return self.data.qpos[self._arm + self._curls]
 
     def arm_angles(self) -> np.ndarray:
-        """Returns shoulder yaw, shoulder pitch and elbow (rad), ``[3]``."""
+        """Return shoulder yaw, shoulder pitch and elbow (rad), ``[3]``."""
         return self.data.qpos[self._arm]
 
     def digit_curls(self) -> np.ndarray:
-        """Returns the angle (rad) of each segment of thumb, upper and lower finger, ``[3]``."""
+        """Return the angle (rad) of each segment of thumb, upper and lower finger, ``[3]``."""
         return self.data.qpos[self._curls]
 
     def joint_angles(self) -> np.ndarray:
-        """Returns the arm's three angles and the hand's mean curl (rad), ``[4]``."""
+        """Return the arm's three angles and the hand's mean curl (rad), ``[4]``."""
         return np.append(self.arm_angles(), self.digit_curls().mean())
 
     def grip_position(self) -> np.ndarray:
-        """Returns where the centre of a held glass would be (m), ``[3]``."""
+        """Return the center of the grip, where a held glass would be (m), ``[3]``."""
         return self.data.site_xpos[self._id("site", "grip")].copy()
 
     def palm_position(self) -> np.ndarray:
-        """Returns the centre of the palm (m), ``[3]``."""
+        """Return the centre of the palm (m), ``[3]``."""
         return self.data.site_xpos[self._id("site", "palm")].copy()
 
     def object_position(self, name: str) -> np.ndarray:
-        """Returns the centre of one of `OBJECTS` (m), ``[3]``; another name raises ValueError."""
+        """Return the center of an object (m), ``[3]``.
+
+        Raises:
+            ValueError: If ``name`` is not one of `OBJECTS`.
+        """
         return self.data.xpos[self._object_id("body", name)].copy()
 
     def privileged_state(self) -> np.ndarray:
-        """Returns joint angles (rad) ``[4]``, grip (m) ``[3]`` and object positions (m) ``[9]``."""
+        """Return joint angles (rad) ``[4]``, grip (m) ``[3]`` and object positions (m) ``[9]``."""
         objects = [self.object_position(name) for name in OBJECTS]
         return np.concatenate([self.joint_angles(), self.grip_position(), *objects])
 
     def get_state(self, sig: int | None = None) -> np.ndarray:
-        """Returns all that the simulation's future depends on, as one vector.
+        """Return the full state of the simulation as one vector.
 
-        Joint targets are among it, which dm_control leaves out: here an action moves them, so that
-        positions and velocities alone do not say where the robot is going.
+        Unlike dm_control's, it includes the joint targets, which actions move: positions and
+        velocities alone do not determine the future.
 
         Args:
             sig: Parts to return instead, bits of ``mujoco.mjtState``.
@@ -126,10 +130,10 @@ class Physics(dm_mujoco.Physics):
         return super().get_state(_FULL_STATE if sig is None else sig)
 
     def set_state(self, physics_state: np.ndarray, sig: int | None = None) -> None:
-        """Continues from what `get_state` returned, bit for bit; no ``forward()`` is needed.
+        """Restore a result of `get_state` exactly, without a need for ``forward()``.
 
         Args:
-            physics_state: The vector, of this simulation or of another one of the same scene.
+            physics_state: State vector of this simulation or of another one of the same scene.
             sig: Parts that it holds, as in `get_state`.
 
         Raises:
@@ -146,54 +150,53 @@ class Physics(dm_mujoco.Physics):
         mujoco.mj_forward(self.model.ptr, self.data.ptr)
 
     def full_state(self) -> np.ndarray:
-        """Returns what `get_state` does."""
+        """Return the result of `get_state`."""
         return self.get_state()
 
     def set_full_state(self, state: np.ndarray) -> None:
-        """Continues from it."""
+        """Restore a result of `full_state`."""
         self.set_state(state)
 
     def gap(self, first: str, second: str) -> float:
-        """Returns the smallest distance between two things (m); negative where they overlap.
+        """Return the smallest distance between two things (m); negative if they overlap.
 
         Args:
             first: An object, ``"table"``, ``"hand"`` (palm, wrist and digits) or any other geom.
-            second: The same.
+            second: The other, named in the same way.
 
         Raises:
-            ValueError: If there is no such thing in the scene.
+            ValueError: If the scene has no such thing.
         """
         pairs = itertools.product(self._geoms(first), self._geoms(second))
         model, data = self.model.ptr, self.data.ptr
         return min(mujoco.mj_geomDistance(model, data, *pair, 1.0, None) for pair in pairs)
 
     def touching(self, first: str, second: str) -> bool:
-        """Returns whether two things touch; they are named as in `gap`."""
+        """Return whether two things, named as in `gap`, touch."""
         return self.gap(first, second) < _TOUCH_GAP
 
     def robot_touches(self) -> bool:
-        """Returns whether any part of the robot touches the table or an object."""
+        """Return whether any part of the robot touches the table or an object."""
         bodies = self.model.body_rootid[self.model.geom_bodyid]
         robot = self._id("body", "torso")
         geoms = self.data.contact.geom
         return bool((bodies[geoms] == robot).any())
 
     def hand_closing(self) -> bool:
-        """Returns whether the hand is being closed: its target lies beyond its mean curl."""
+        """Return whether the hand is closing: its target lies beyond its mean curl."""
         targets = self.data.ctrl[len(ARM_JOINTS) :]
         return bool((targets - self.digit_curls()).mean() > _PRESSING)
 
     def held(self, name: str) -> bool:
-        """Returns whether an object is between thumb and finger side of a hand that is closing.
+        """Return whether an object is between thumb and finger side of a closing hand.
 
-        A finger touches it, the thumb or the palm touches it, and the hand is being closed.
-        Whether it stands or has been knocked over does not matter.
+        A finger and the thumb or palm must touch it. It may stand or have been knocked over.
 
         Args:
             name: One of `OBJECTS`.
 
         Raises:
-            ValueError: If it is not.
+            ValueError: If ``name`` is not one of `OBJECTS`.
         """
         held = self._object_id("geom", name)
         if not self.hand_closing():

@@ -10,12 +10,12 @@ from suites.nico.physics import Physics
 
 
 class PushGreenToGlass(NicoTask):
-    """Done when the green box touches the glass, standing or knocked over."""
+    """Success: the green box touches the glass, standing or knocked over."""
 
     def succeeded(self, physics: Physics) -> bool:
-        """Returns whether the task is done."""
+        """Return whether the green box touches the glass."""
         return physics.touching("green_box", "glass")
 
     def demonstration(self, physics: Physics, random: np.random.Generator) -> Sequence[moves.Phase]:
-        """Returns the movement that does the task."""
+        """Return a push of the green box to the glass."""
         return moves.push(physics, random, "green_box", "glass")

@@ -10,12 +10,12 @@ from suites.nico.physics import Physics
 
 
 class PushGreenToWhite(NicoTask):
-    """Done when the green box touches the white box."""
+    """Success: the green box touches the white box."""
 
     def succeeded(self, physics: Physics) -> bool:
-        """Returns whether the task is done."""
+        """Return whether the green box touches the white box."""
         return physics.touching("green_box", "white_box")
 
     def demonstration(self, physics: Physics, random: np.random.Generator) -> Sequence[moves.Phase]:
-        """Returns the movement that does the task."""
+        """Return a push of the green box to the white box."""
         return moves.push(physics, random, "green_box", "white_box")

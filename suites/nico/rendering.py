@@ -1,9 +1,9 @@
-"""Rendering of NICO's first-person frames at the speed the hardware allows."""
+"""Fast rendering of NICO's first-person frames."""
 
 # MuJoCo's bindings come without stubs.
 # pyright: reportAttributeAccessIssue=false
 
-from suites import opengl  # isort: skip (before MuJoCo, which reads once what this chooses)
+from suites import opengl  # isort: skip (before MuJoCo, which reads the choice on import)
 
 import atexit
 import contextlib
@@ -22,15 +22,15 @@ FRAME_HEIGHT = 32  # (pixels), the paper's "64x32 RGB image"
 FRAME_WIDTH = 64  # (pixels)
 FRAME_CAMERA = "eyes"
 
-# Not every OpenGL library bears threads that draw at the same time.
+# Serializes drawing, since some OpenGL libraries do not support concurrent threads.
 _turn = threading.RLock()
 _all: weakref.WeakSet[mujoco.Renderer] = weakref.WeakSet()
-# What the garbage collector would free at any moment, between the calls that draw another frame.
+# Deferred to a safe point, since the garbage collector could free them while a frame is drawn.
 _abandoned: list[mujoco.Renderer] = []
 
 
 def check_frame_size(model: mujoco.MjModel, frame_size: Sequence[int]) -> None:
-    """Raises ValueError if a scene has no frames of that height and width (pixels)."""
+    """Raise ``ValueError`` if a scene cannot render frames of that height and width (pixels)."""
     limits = (model.vis.global_.offheight, model.vis.global_.offwidth)
     try:
         height, width = map(operator.index, frame_size)
@@ -46,9 +46,10 @@ def check_frame_size(model: mujoco.MjModel, frame_size: Sequence[int]) -> None:
 
 @functools.cache
 def _release() -> Callable[[], object]:
-    """Returns the call that leaves no context current in a thread, once there is a display.
+    """Return the call that makes no OpenGL context current in the calling thread.
 
-    A context that is current in one thread is closed to all others.
+    A context that is current in one thread cannot be used by another. Call this once a display
+    exists.
     """
     backend = gl_context.GLContext.__module__
     if backend == "mujoco.egl":
@@ -70,51 +71,51 @@ def _release() -> Callable[[], object]:
 
 
 def _close(renderer: mujoco.Renderer) -> None:
-    # MuJoCo frees buffers by number in whichever context is current, be it another renderer's,
-    # whose frames would be garbage from then on. Rendering makes the own context current.
+    # MuJoCo frees buffers by number in the current context, which may be another renderer's and
+    # would be corrupted. Rendering first makes this renderer's context current.
     with _turn:
-        with contextlib.suppress(RuntimeError):  # It was closed before.
+        with contextlib.suppress(RuntimeError):  # already closed
             renderer.render()
         renderer.close()
 
 
 @functools.cache
 def _close_at_exit() -> None:
-    """Has all contexts closed at the end of the process; called when the first has been made."""
+    """Close all contexts at the end of the process; called after creating a context."""
     if gl_context.GLContext.__module__ == "mujoco.egl":
         from mujoco import egl
 
-        # MuJoCo and dm_control each end the one display, be there contexts of the other or not.
-        # The end of the process ends it, too.
+        # MuJoCo and dm_control both terminate the shared display, even while the other has
+        # contexts. The end of the process terminates it anyway.
         atexit.unregister(egl.EGL.eglTerminate)
     atexit.register(_close_all)
 
 
 def _close_all() -> None:
-    _turn.acquire()  # For good: a thread that still draws waits, as it would fail.
+    _turn.acquire()  # Never released, so that threads still drawing block instead of failing.
     for renderer in list(_all):
         _close(renderer)
 
 
 class FrameRenderer:
-    """Renders one fixed camera of a scene, for any number of simulations of that scene.
+    """Renderer of one fixed camera, for any number of simulations of a scene.
 
-    Keeps one OpenGL context, one scene and one camera. ``dm_control``'s ``physics.render`` builds
-    a camera each call, which costs several times the frame itself. Any thread may use it, or close
-    it; frames of all renderers are drawn one after the other.
+    It keeps one OpenGL context, one scene and one camera, whereas ``dm_control``'s
+    ``physics.render`` builds a camera per call, at several times the cost of the frame. It may be
+    used and closed from any thread; frames of all renderers are drawn one after another.
 
-    The robot's own camera shows as much from left to right in narrower frames as in the paper's,
-    and more above and below.
+    The robot's camera shows the same horizontal range in narrower frames than the paper's, and more
+    above and below.
 
     Args:
-        model: The compiled scene. Data of every other compilation of the same XML may be rendered.
+        model: The compiled scene. Data of other compilations of the same XML may be rendered too.
         camera: Name of the camera.
         height: Height of a frame (pixels).
         width: Width of a frame (pixels).
 
     Raises:
         RuntimeError: If no OpenGL context can be made; the message names the packages to install.
-        ValueError: If the scene has no such camera, or no frames of that size.
+        ValueError: If the scene has no such camera, or cannot render frames of that size.
     """
 
     def __init__(
@@ -142,12 +143,12 @@ class FrameRenderer:
                 _close_at_exit()
                 self._release = _release()
                 self._release()
-        except Exception as error:  # MuJoCo's backends raise errors of many kinds.
+        except Exception as error:  # MuJoCo's backends raise many kinds of errors.
             backend = os.environ.get("MUJOCO_GL", "default")
             reason = next(iter(str(error).splitlines()), type(error).__name__)
             raise RuntimeError(
                 f"no OpenGL context from the {backend} backend ({reason}): set MUJOCO_GL to egl "
-                "or osmesa, or do not set it, and see that the library is there (Debian/Ubuntu: "
+                "or osmesa, or unset it, and check that the library is installed (Debian/Ubuntu: "
                 "`apt-get install libegl1 libgl1-mesa-dri`, or `libosmesa6`)"
             ) from error
         self._camera = mujoco.MjvCamera()
@@ -158,11 +159,11 @@ class FrameRenderer:
         weakref.finalize(self, _abandoned.append, self._renderer).atexit = False
 
     def render(self, data: mujoco.MjData, out: np.ndarray | None = None) -> np.ndarray:
-        """Returns the frame that the camera sees.
+        """Render a frame.
 
         Args:
             data: State of the simulation.
-            out: Array to write into, uint8 ``[height, width, 3]``; a new one if None.
+            out: Array to write into, uint8 ``[height, width, 3]``; a new one if ``None``.
 
         Returns:
             RGB frame, uint8 ``[height, width, 3]``.
@@ -179,7 +180,7 @@ class FrameRenderer:
                 self._release()
 
     def driver(self) -> str:
-        """Returns what OpenGL calls that which draws, such as ``"llvmpipe (LLVM 15.0.6)"``."""
+        """Return OpenGL's name of the renderer, such as ``"llvmpipe (LLVM 15.0.6)"``."""
         from OpenGL import GL
 
         with _turn:
@@ -191,5 +192,5 @@ class FrameRenderer:
         return name.decode() if isinstance(name, bytes) else "unknown"
 
     def close(self) -> None:
-        """Frees the OpenGL context."""
+        """Free the OpenGL context."""
         _close(self._renderer)

@@ -41,7 +41,7 @@ def test_performance_forgetting_and_backward_transfer_by_hand():
     # Task 1 has lost 0.4, task 2 has gained 0.1; of task 3 nothing can be said.
     assert metrics.backward_transfer(matrix) == pytest.approx((-0.4 + 0.1) / 2)
     assert metrics.forgetting_since_learned(matrix) == pytest.approx(0.15)
-    with pytest.raises(ValueError, match="one phase a task"):
+    with pytest.raises(ValueError, match="one phase per task"):
         metrics.backward_transfer(matrix[1:])
 
 

@@ -66,7 +66,7 @@ CASES = [
     ("continual.py --device cuda:99", "no device 'cuda:99'", "use auto or cpu"),
     ("concurrent_tasks.py --device gpu", "no device 'gpu'", "use auto or cpu"),
     ("ablation.py --algorithm maml", "--algorithm", "the variants are BGPO's"),
-    ("ladder.py --rungs", "--rungs names none", "name some of a, b, c, d"),
+    ("ladder.py --rungs", "--rungs is empty", "name some of a, b, c, d"),
     ("ladder.py --episodes 0", "episodes", "must be at least 1, got 0"),
     ("ladder.py --threads 0", "threads", "must be at least 1, got 0"),
     # where it goes
@@ -91,10 +91,10 @@ CASES = [
     ("summary.py", "name the directory", "of a run"),
     ("summary.py file", "file/eval.csv is missing", "let the run in file finish"),
     ("summary.py unevaluated", "no test episode", "let the run evaluate first"),
-    ("report.py nowhere", "nowhere is no directory", "name the one that holds the runs"),
+    ("report.py nowhere", "nowhere is not a directory", "name the one that holds the runs"),
     ("report.py empty", "empty holds none of the runs", "that the figures need"),
     # measurements
-    ("throughput.py --parts", "--parts names none", "name some of frames"),
+    ("throughput.py --parts", "--parts is empty", "name some of frames"),
     ("throughput.py --rounds 0", "--rounds", "at least 1, got 0"),
     ("throughput.py --threads 0", "--threads", "at least 1, got 0"),
     ("gwr.py --nodes", "--nodes", "one or more, of at least 2"),
@@ -103,10 +103,10 @@ CASES = [
     ("bgpo_trl.data.recording file", "cannot make the folder file", "choose another"),
     ("bgpo_trl.data.recording new --per-task 0", "held_out_per_task", "less than per_task, 0"),
     ("bgpo_trl.data.recording new --seed -1", "seed", "must be at least 0, got -1"),
-    ("bgpo_trl.encoders.train empty", "empty is no dataset", "record it anew with"),
-    ("bgpo_trl.encoders.train empty --device gpu", "empty is no dataset", "record it anew with"),
+    ("bgpo_trl.encoders.train empty", "empty is not a dataset", "record it again with"),
+    ("bgpo_trl.encoders.train empty --device gpu", "empty is not a dataset", "record it again"),
     ("bgpo_trl.encoders.probes empty --weights file", "file is damaged", "--train-encoders"),
-    ("bgpo_trl.encoders.probes file", "file is no dataset", "record it anew with"),
+    ("bgpo_trl.encoders.probes file", "file is not a dataset", "record it again with"),
     ("suites.nico.explore --task juggle --out a.gif", "'juggle'", "choose one of grasp_glass"),
     ("suites.nico.explore --out a.jpeg", "cannot write a.jpeg", "ends in .png or .gif"),
     ("suites.nico.explore --out file/a.png", "there is no folder file", "make it first"),
@@ -177,7 +177,7 @@ def test_without_opengl_no_recording_is_begun(folder, monkeypatch):
 @pytest.mark.parametrize(
     ("backend", "told"),
     [
-        ("vulkan", "error: MUJOCO_GL is 'vulkan', which is no OpenGL backend: set it to egl"),
+        ("vulkan", "error: MUJOCO_GL is 'vulkan', which is not an OpenGL backend: set it to egl"),
         ("disabled", "error: no OpenGL context from the disabled backend"),
     ],
 )

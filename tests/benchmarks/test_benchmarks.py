@@ -293,7 +293,7 @@ def test_the_command_line_runs_every_algorithm_and_says_its_name(
     summed_up = summary.describe(run)
     assert ("GWR-B nodes: [" in summed_up) == with_gwr
     assert ("Groups: [" in summed_up) == with_groups
-    assert "Own episodes to 50 %, as many times those of grasp_glass: push" in summed_up
+    assert "Own episodes to 50 %, relative to grasp_glass: push" in summed_up
     table = [line.split("|") for line in summed_up.splitlines() if line.startswith("|")]
     assert [row[1].strip() for row in table[2:]] == [*TASKS, "all"]
     assert all((row[-2].strip() != "") == with_gwr for row in table[2:])
@@ -455,7 +455,7 @@ def test_a_summary_says_how_fast_each_task_was_learned(tmp_path):
     )
     # 1.5 and 0.5 times; 1 time and never.
     assert lines[8] == (
-        "Own episodes to 50 %, as many times those of grasp_glass: "
+        "Own episodes to 50 %, relative to grasp_glass: "
         "push_green_to_glass 1.00, push_green_to_white not reached."
     )
 

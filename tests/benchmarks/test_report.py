@@ -327,7 +327,7 @@ def test_the_same_files_make_the_same_report(reported, tmp_path, capsys):
 
 
 def test_a_folder_without_runs_is_refused(tmp_path):
-    with pytest.raises(ValueError, match="is no directory"):
+    with pytest.raises(ValueError, match="is not a directory"):
         report.main(report.Arguments(tmp_path / "none"))
     with pytest.raises(ValueError, match="holds none of the runs"):
         report.main(report.Arguments(tmp_path))

@@ -128,7 +128,7 @@ def test_blocks_are_of_the_presets_seeds_and_length_unless_told():
         ({"algorithms": ()}, "name at least one of --algorithms"),
         ({"settings": ()}, "one of --settings"),
         ({"cpus_per_run": 0}, "--cpus-per-run must be above 0"),
-        ({"gpus_per_run": -1}, "--gpus-per-run not below"),
+        ({"gpus_per_run": -1}, "--gpus-per-run at least 0"),
     ],
 )
 def test_grids_that_cannot_be_are_refused(tmp_path, wrong, message):
@@ -163,7 +163,7 @@ def test_directories_with_something_else_are_refused(few, tmp_path):
     alone = sweep.make_jobs(sweep.Arguments(out=tmp_path / "alone", **few))
     write_run(Job(tmp_path / "alone" / "concurrent-maml", alone.popitem()[1][0].config))
     before = contents(tmp_path)
-    with pytest.raises(ValueError, match="concurrent-maml is a run of its own"):
+    with pytest.raises(ValueError, match="concurrent-maml is not a run of a sweep"):
         sweep.main(sweep.Arguments(out=tmp_path / "alone", **few))
     assert contents(tmp_path) == before
 
@@ -312,7 +312,7 @@ def test_a_sweep_plays_what_is_missing_and_nothing_twice(without_ray, few, tmp_p
     sweep.main(arguments)
     assert contents(tmp_path) == before
     assert not played
-    assert capsys.readouterr().out.startswith("4 jobs, 0 of them to play\n")
+    assert capsys.readouterr().out.startswith("4 jobs, 0 of them to run\n")
 
     sweep.main(replace(arguments, algorithms=("maml",), seeds=(4, 0, 2, 5, 3, 1), block=2))
     assert played == [f"concurrent-maml/seeds-{block}" for block in ("2-5", "3-1")]

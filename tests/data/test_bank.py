@@ -101,7 +101,7 @@ def test_the_steps_of_two_are_those_of_one_after_the_other(steps):
     ],
 )
 def test_steps_that_do_not_fit_together_are_refused(steps, changes):
-    with pytest.raises(ValueError, match="do not fit together"):
+    with pytest.raises(ValueError, match="of its steps do not match"):
         replace(steps, **changes)
 
 
@@ -172,7 +172,7 @@ def test_steps_of_other_demonstrations_are_refused(with_steps, tmp_path):
         {"steps.other": torch.zeros(5)},
     ):
         save_tensors(tmp_path / "damaged", tensors | damage, meta)
-        with pytest.raises(ValueError, match=r"damaged is damaged or no bank .* make it anew"):
+        with pytest.raises(ValueError, match=r"damaged is damaged or not a bank .* make it again"):
             DemonstrationBank.load(tmp_path / "damaged", encoder_id="x")
 
 

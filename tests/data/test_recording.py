@@ -166,7 +166,7 @@ def test_a_demonstrator_that_never_succeeds_is_told_of(tmp_path, monkeypatch):
         record_demonstrations(tmp_path, attempts=3, progress=False, **options)
     told = re.fullmatch(
         r"the demonstrator of 'fickle' failed 3 times in a row \(2 of (\d+) attempts succeeded, "
-        r"(\d+)%\): mend its demonstration\(\), or raise attempts",
+        r"(\d+)%\): fix its demonstration\(\), or raise attempts",
         str(raised.value),
     )
     assert int(told[1]) >= 5
@@ -239,7 +239,7 @@ def truncate(path: Path) -> None:
         (lambda p: (p / "dataset.json").write_text("{"), r"dataset\.json is damaged; remove .*"),
         (lambda p: (p / "dataset.json").write_text("{}"), r"dataset\.json is damaged; remove .*"),
         (lambda p: (p / "dataset.json").write_bytes(b"\xff"), r"dataset\.json is damaged; .*"),
-        (lambda p: (p / "dataset.json").unlink(), r"copy is no dataset of demonstrations; .*"),
+        (lambda p: (p / "dataset.json").unlink(), r"copy is not a dataset of demonstrations; .*"),
         (lambda p: edit_meta(p, checksum=None), r"is not complete; resume it with .*"),
         (lambda p: edit_meta(p, scene_version="old"), r"was recorded in scene 'old', this is nico"),
     ],
@@ -252,7 +252,7 @@ def test_what_is_not_whole_is_refused_in_one_line(copy, damage, message):
 
     assert "\n" not in str(error.value)
     if "resume" not in message:
-        assert "record it anew with `python -m bgpo_trl.data.recording PATH`" in str(error.value)
+        assert "record it again with `python -m bgpo_trl.data.recording PATH`" in str(error.value)
 
 
 @pytest.mark.parametrize("meta", ["{", '{"_type": "os.system"}', None])
@@ -266,7 +266,7 @@ def test_what_says_how_to_read_the_tensors_is_not_believed(recorded, copy, meta)
 
 
 def test_a_folder_that_is_missing_is_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"is no dataset of demonstrations; record it anew with"):
+    with pytest.raises(ValueError, match=r"is not a dataset of demonstrations; record it again"):
         load_demonstrations(tmp_path / "nowhere")
 
 
@@ -357,20 +357,20 @@ def test_a_bank_of_other_encoders_or_another_scene_is_refused(bank, tmp_path, mo
     path = tmp_path / "bank.safetensors"
     bank.save(path, encoder_id="abc")
 
-    with pytest.raises(ValueError, match=r"belongs to .*'abc'.*, but needed is .*'xyz'.*; make it"):
+    with pytest.raises(ValueError, match=r"was made for .*'abc'.*, not for .*'xyz'.*; make it"):
         DemonstrationBank.load(path, encoder_id="xyz")
     monkeypatch.setattr(nico, "scene_version", lambda: "nico-2-00000000")
-    with pytest.raises(ValueError, match=r"but needed is .*nico-2-00000000.*; make it anew with"):
+    with pytest.raises(ValueError, match=r"not for .*nico-2-00000000.*; make it again with"):
         DemonstrationBank.load(path, encoder_id="abc")
 
 
 def test_a_bank_that_is_missing_or_damaged_is_refused(bank, tmp_path):
     path = tmp_path / "bank.safetensors"
-    with pytest.raises(ValueError, match=r"^there is no demonstration bank at .*; make it anew"):
+    with pytest.raises(ValueError, match=r"^there is no demonstration bank at .*; make it again"):
         DemonstrationBank.load(path, encoder_id="abc")
     bank.save(path, encoder_id="abc")
     path.write_bytes(path.read_bytes()[:-1])
     with pytest.raises(
-        ValueError, match=r"bank\.safetensors is damaged .*\(.*\); make it anew with"
+        ValueError, match=r"bank\.safetensors is damaged .*\(.*\); make it again with"
     ):
         DemonstrationBank.load(path, encoder_id="abc")

@@ -118,7 +118,7 @@ def test_a_bank_that_other_encoders_made_is_refused(made, copy):
         torch.manual_seed(5)
         other = replace(made[0], lae=SequenceAutoencoder())
     save_representation(other, copy)
-    with pytest.raises(ValueError, match=r"some_bank\.safetensors belongs to .*make it anew with"):
+    with pytest.raises(ValueError, match=r"some_bank\.safetensors was made for .*make it again"):
         load_pretrained(copy)
 
 

@@ -183,7 +183,7 @@ def test_bad_curves_are_refused(tmp_path, run):
     with pytest.raises(ValueError, match="no test episodes"):
         plot_success_curves([])
     (tmp_path / "other.csv").write_text("seed,task,loss\n")
-    with pytest.raises(ValueError, match=r"no such table of a run \(it lacks algorithm, episode"):
+    with pytest.raises(ValueError, match=r"lacks the columns algorithm, episode"):
         plot_success_curves(tmp_path / "other.csv")
     with pytest.raises(ValueError, match="window must be at least 1"):
         plot_success_curves(run, window=0)

@@ -90,5 +90,5 @@ def test_what_tells_no_groups_is_refused(path, tmp_path):
         read_groups(path, TASKS[:1])
     old = tmp_path / "old.csv"
     old.write_text("seed,episode,task\n0,1,grasp_glass\n")
-    with pytest.raises(ValueError, match="lacks group, num_groups"):
+    with pytest.raises(ValueError, match="lacks the columns group, num_groups"):
         read_groups(old, TASKS)

@@ -64,5 +64,5 @@ def test_tensors_and_graphs_hardly_begun_can_be_drawn():
 
 
 def test_without_a_graph_there_is_nothing_to_show():
-    with pytest.raises(ValueError, match="no graph to show: let the run keep some first"):
+    with pytest.raises(ValueError, match="no graph to show: let the run save some first"):
         plot_gwr_growth({}, [], TASKS)

@@ -79,7 +79,7 @@ def nested(**rl):
         (nested(hidden_sizes=[5, 0.5]), "algorithm.rl.hidden_sizes is 0.5"),
         ({"algorithm": {"state": "smell"}}, "algorithm.state is 'smell'"),
         ({"algorithm": {"rl": 3}}, "algorithm.rl is 3"),
-        (nested(name="ppo"), "algorithm.rl.name is 'ppo', of no known RL algorithm"),
+        (nested(name="ppo"), "algorithm.rl.name is 'ppo', not a known RL algorithm"),
         ({"algorithm": 3}, "no settings of a run"),
         ({"seeds": 3}, "seeds is 3"),
         ({"seeds": []}, "needs seeds"),

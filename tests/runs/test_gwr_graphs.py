@@ -86,5 +86,5 @@ def test_a_full_disk_leaves_the_graph_that_was_there(tmp_path):
 def test_a_damaged_graph_is_refused(tmp_path, content):
     path = save_graph(tmp_path, 5, grown())
     path.write_bytes(path.read_bytes()[:-9] if content is None else content)
-    with pytest.raises(ValueError, match=r"episode-000005.safetensors is damaged or no graph"):
+    with pytest.raises(ValueError, match=r"episode-000005.safetensors is damaged or not a graph"):
         load_graphs(tmp_path)

@@ -183,7 +183,8 @@ def test_a_failing_mirror_is_dropped_with_one_warning(tmp_path):
         for _ in range(4):
             logger.log_eval(ROW)
     assert [str(warning.message) for warning in caught] == [
-        "Recorder failed (no route) and gets no more of this run: the CSV files have all of it."
+        "Recorder failed (no route) and is disabled for the rest of this run: "
+        "the CSV files are complete."
     ]
     assert len(sound.calls) == 4
     assert len((tmp_path / "eval.csv").read_text().splitlines()) == 5

@@ -44,9 +44,12 @@ def test_the_choice_of_the_user_is_kept(on_linux, monkeypatch, chosen):
 @pytest.mark.parametrize(
     ("chosen", "message"),
     [
-        ("osmesa", r"^MUJOCO_GL is 'osmesa', but there is no library OSMesa: do not set it.*$"),
-        ("egl", r"^MUJOCO_GL is 'egl', but there is no library EGL: do not set it, or install .*$"),
-        ("EGL", r"^MUJOCO_GL is 'EGL', which is no OpenGL backend: set it to egl, osmesa or .*$"),
+        ("osmesa", r"^MUJOCO_GL is 'osmesa', but there is no library OSMesa: unset it.*$"),
+        ("egl", r"^MUJOCO_GL is 'egl', but there is no library EGL: unset it, or install .*$"),
+        (
+            "EGL",
+            r"^MUJOCO_GL is 'EGL', which is not an OpenGL backend: set it to egl, osmesa or .*$",
+        ),
     ],
 )
 def test_a_choice_that_mujoco_cannot_be_imported_with_is_refused(
@@ -125,7 +128,7 @@ except RuntimeError as error:
 
     observed, told = process.stdout.splitlines()
     assert "privileged_state" in observed
-    assert told.startswith("MUJOCO_GL is 'vulkan', which is no OpenGL backend: set it to egl")
+    assert told.startswith("MUJOCO_GL is 'vulkan', which is not an OpenGL backend: set it to egl")
 
 
 def test_frames_of_simulations_that_share_a_renderer_do_not_mix(physics, renderer):
