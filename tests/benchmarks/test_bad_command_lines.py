@@ -139,7 +139,7 @@ def test_a_command_that_cannot_be_is_answered_in_one_line(
         ("ladder.py --rungs e", "--rungs"),
         ("ladder.py ddpg --gamma 1.5", "gamma must be between 0 and 1, got 1.5"),
         ("ladder.py sac --hidden-sizes 64 0", "hidden_sizes must be one or more"),
-        ("compare.py run", "Another's"),
+        ("compare.py run", "Directory of the second run"),
         ("bgpo_trl.encoders.train empty --config.vae.batch-size 0", "batch_size must be at least"),
         ("bgpo_trl.data.recording", "PATH"),
         ("suites.nico.explore --random --demonstrate", "--demonstrate"),
