@@ -14,7 +14,7 @@ from torch import Tensor
 from torchrl.objectives import ValueEstimators
 from torchrl.objectives.utils import _cache_values, distance_loss
 
-from bgpo_trl.modules.entries import lacking
+from bgpo_trl.errors import missing_key
 from bgpo_trl.seeding import normal
 
 __all__ = ["StackedLoss", "TwinCriticLoss"]
@@ -103,7 +103,7 @@ class StackedLoss(LossModule):
         name = type(self).__name__
         successor = tensordict.get("next", None)
         if successor is None or successor.get(self.tensor_keys.reward, None) is None:
-            raise lacking(name, tensordict, [("next", self.tensor_keys.reward)])
+            raise missing_key(name, tensordict, [("next", self.tensor_keys.reward)])
         if successor.get(self.tensor_keys.terminated, None) is None:
             # The estimator would read "done" in its place, and stop at truncation too.
             raise ValueError(
@@ -126,7 +126,7 @@ class StackedLoss(LossModule):
         try:
             return tensordict.select(*keys).detach()
         except KeyError:
-            raise lacking(reader or type(self).__name__, tensordict, keys) from None
+            raise missing_key(reader or type(self).__name__, tensordict, keys) from None
 
     def _bootstrapped(self, tensordict: TensorDictBase, next_value: Tensor) -> Tensor:
         """Returns the clipped target ``[*S, *B]`` for values ``[*S, *B, 1]`` of the next states.
