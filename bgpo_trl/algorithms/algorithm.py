@@ -253,8 +253,7 @@ class Algorithm(ABC):
             What `update` returns.
         """
         losses = self.learner.learn(self.moved(batch))
-        # "loss_qvalue" is TorchRL's name for it where there are several critics.
-        return {key.replace("qvalue", "value"): v / self.n_seeds for key, v in losses.items()}
+        return {key: loss / self.n_seeds for key, loss in losses.items()}
 
     def moved(self, batch: TensorDictBase) -> TensorDictBase:
         """Returns a batch where the networks are."""

@@ -45,10 +45,6 @@ class GaussianActor(StackedNetwork):
         (torch.Size([7, 2]), torch.Size([7]))
     """
 
-    # What TorchRL's losses ask of a policy that samples.
-    dist_sample_keys = ("action",)
-    log_prob_keys = ("action_log_prob",)
-
     def __init__(
         self,
         in_features: int,
