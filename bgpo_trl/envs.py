@@ -15,8 +15,8 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from bgpo_trl.errors import missing_key
 from bgpo_trl.machine import usable_cores
-from bgpo_trl.modules.entries import lacking
 from suites import nico
 from suites.nico.base import STATE_SIZE, Environment, Observation, check_observation
 from suites.nico.rendering import FRAME_HEIGHT, FRAME_WIDTH, FrameRenderer
@@ -224,7 +224,7 @@ class NicoEnv(EnvBase):
             rows = rows & steps.reshape(-1).numpy()
         action = tensordict.get("action", None)
         if action is None:
-            raise lacking("NicoEnv", tensordict, ["action"])
+            raise missing_key("NicoEnv", tensordict, ["action"])
         if action.shape != (*self.batch_size, 4):
             raise ValueError(f"actions must be {[*self.batch_size, 4]}, got {[*action.shape]}")
         actions = action.reshape(-1, 4).double().numpy()

@@ -14,7 +14,8 @@ from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.envs import NicoEnv
 from bgpo_trl.modules.actor_critic import Actor, Critic
 from bgpo_trl.modules.gwr import GWRB
-from bgpo_trl.objectives.ddpg import DDPGLoss, ForeachSoftUpdate
+from bgpo_trl.objectives.ddpg import DDPGLoss
+from bgpo_trl.objectives.target_update import ForeachSoftUpdate
 from bgpo_trl.transforms import BehaviorLookup, DemonstrationSource, FrameEncoder, TaskSchedule
 
 
@@ -40,10 +41,9 @@ if __name__ == "__main__":
     infer = BehaviorLookup(behaviors, learn=True)  # demo_embedding -> behavior
     reward = NoveltyReward(places, weight=0.01)
     env = TransformedEnv(NicoEnv(seed=0), Compose(encode, StepCounter(50), source, infer, reward))
-    actor, critic = Actor(64 + 32, hidden_sizes=(256,)), Critic(64 + 32, hidden_sizes=(256,))
+    actor, critic = Actor(64 + 32), Critic(64 + 32)
     loss = DDPGLoss(actor, critic, return_bounds=(0.0, 1.5))  # 1 + 50 steps of at most 0.01
-    target_update = ForeachSoftUpdate(loss, tau=0.005)
-    optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
+    optimizer, targets = torch.optim.Adam(loss.parameters()), ForeachSoftUpdate(loss, tau=0.005)
     replay = TensorDictReplayBuffer(storage=LazyTensorStorage(10_000), batch_size=128)
     explore = AdditiveGaussianModule(env.action_spec, sigma_init=0.3, sigma_end=0.3)
     how = {"frames_per_batch": 100, "total_frames": 500, "auto_register_policy_transforms": False}
@@ -54,6 +54,6 @@ if __name__ == "__main__":
             optimizer.zero_grad()
             (losses["loss_actor"] + losses["loss_value"]).backward()
             optimizer.step()
-            target_update.step()
+            targets.step()
         print(f"reward {data['next', 'reward'].mean():.4f} a step, {places.num_nodes} places")
     print(f"{source.episode} episodes, {behaviors.num_nodes} behaviors")

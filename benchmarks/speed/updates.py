@@ -21,7 +21,8 @@ from torchrl.modules import MLP, TanhModule, ValueOperator
 
 from bgpo_trl.data.replay import ReplayBuffer
 from bgpo_trl.modules.actor_critic import Actor, Critic
-from bgpo_trl.objectives.ddpg import DDPGLoss, ForeachSoftUpdate
+from bgpo_trl.objectives.ddpg import DDPGLoss
+from bgpo_trl.objectives.target_update import ForeachSoftUpdate
 from bgpo_trl.seeding import generators
 
 Contender = tuple[Callable[[], object], int]
@@ -90,9 +91,10 @@ class Ours:
 
     def __init__(self, seeds: int, transitions: int, **options) -> None:
         numbers, size = range(seeds), LATENT + BEHAVIOR
+        network = {"hidden_sizes": (HIDDEN,), "batch_size": [seeds]}
         self.loss = DDPGLoss(
-            Actor(size, ACTION, batch_size=[seeds], generator=generators(numbers, "actor")),
-            Critic(size, ACTION, batch_size=[seeds], generator=generators(numbers, "critic")),
+            Actor(size, ACTION, generator=generators(numbers, "actor"), **network),
+            Critic(size, ACTION, generator=generators(numbers, "critic"), **network),
             **{"constant_keys": ["behavior"], "return_bounds": (0.0, 1.1), **options},
         )
         self.loss.make_value_estimator(gamma=GAMMA)

@@ -166,8 +166,7 @@ class Algorithm(ABC):
             What `update` returns.
         """
         losses = self.learner.learn(self.to_device(batch))
-        # "loss_qvalue" is TorchRL's name for it where there are several critics.
-        return {key.replace("qvalue", "value"): v / self.n_seeds for key, v in losses.items()}
+        return {key: loss / self.n_seeds for key, loss in losses.items()}
 
     def to_device(self, batch: TensorDictBase) -> TensorDictBase:
         """Return a batch where the networks are."""

@@ -19,8 +19,10 @@ from torchrl.objectives import LossModule
 from bgpo_trl.configs import DDPGConfig, RLConfig, SACConfig, TD3Config
 from bgpo_trl.modules.actor_critic import Actor, Critic
 from bgpo_trl.modules.gaussian_actor import GaussianActor
-from bgpo_trl.objectives.ddpg import DDPGLoss, ForeachSoftUpdate
+from bgpo_trl.objectives.ddpg import DDPGLoss
+from bgpo_trl.objectives.off_policy import OffPolicyLoss
 from bgpo_trl.objectives.sac import SACLoss
+from bgpo_trl.objectives.target_update import ForeachSoftUpdate
 from bgpo_trl.objectives.td3 import TD3Loss
 from bgpo_trl.seeding import generators, normal
 
@@ -145,23 +147,26 @@ class Learner:
         return (action.cpu() + noise).clamp(-1.0, 1.0)
 
     def learn(self, batch: TensorDictBase) -> dict[str, Tensor]:
-        """Take a gradient step on transitions ``[S, B]``, and one of the target networks.
+        """Take a gradient step on transitions ``[S, E, B]``, and one of the target networks.
 
         Returns:
-            The parts of the loss, sums over the seeds ``[]``.
+            The parts of the loss that the step minimized, sums over seeds and experts ``[]``.
         """
-        losses = self.loss(batch)
-        parts = {str(k): v for k, v in losses.items() if str(k).startswith("loss_")}
-        due = self.actor_is_due()
+        parts = self.losses(batch)
         self.optimizer.zero_grad()
-        torch.stack([v for k, v in parts.items() if due or k != "loss_actor"]).sum().backward()
+        torch.stack([*parts.values()]).sum().backward()
         self.optimizer.step()
-        if due:
+        if self.actor_is_due:
             self.target_update.step()
         return {key: value.detach() for key, value in parts.items()}
 
+    def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        """Return the parts of the loss to be minimized on transitions ``[S, E, B]``."""
+        return {str(k): v for k, v in self.loss(batch).items() if str(k).startswith("loss_")}
+
+    @property
     def actor_is_due(self) -> bool:
-        """Return whether this update is one of the actor and the target networks too."""
+        """Whether the next update is one of the actor and the target networks, too."""
         return True
 
     def state_dict(self) -> dict[str, Any]:
@@ -186,25 +191,46 @@ class TD3Learner(Learner):
         ValueError: If ``policy_delay`` is less than 1.
     """
 
-    def __init__(self, actor: Any, loss: LossModule, config: TD3Config) -> None:
+    loss: OffPolicyLoss
+
+    def __init__(self, actor: Any, loss: OffPolicyLoss, config: TD3Config) -> None:
         if config.policy_delay < 1:
             raise ValueError(f"policy_delay must be at least 1, got {config.policy_delay}")
         super().__init__(actor, loss, config, noise=config.noise)
         self.policy_delay, self.n_updates = config.policy_delay, 0
+        self.loss_actor = torch.zeros(())
 
-    def actor_is_due(self) -> bool:
-        """Return whether this is the last of ``policy_delay`` updates; each call counts one."""
+    def learn(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        """Take a gradient step on transitions ``[S, E, B]``; see `Learner.learn`.
+
+        Returns:
+            The parts of the loss; ``loss_actor`` is that of the actor's latest update, or 0.
+        """
+        parts = super().learn(batch)
         self.n_updates += 1
-        return self.n_updates % self.policy_delay == 0
+        self.loss_actor = parts.get("loss_actor", self.loss_actor)
+        return {"loss_actor": self.loss_actor, **parts}
+
+    def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        """Return the parts of the loss; without the actor's, where it waits."""
+        if self.actor_is_due:
+            return super().losses(batch)
+        return {"loss_value": self.loss.loss_value(batch)[0]}
+
+    @property
+    def actor_is_due(self) -> bool:
+        """Whether the next update is the last of ``policy_delay``."""
+        return (self.n_updates + 1) % self.policy_delay == 0
 
     def state_dict(self) -> dict[str, Any]:
         """Return all that future updates depend on."""
-        return {**super().state_dict(), "n_updates": self.n_updates}
+        latest = {"n_updates": self.n_updates, "loss_actor": self.loss_actor}
+        return {**super().state_dict(), **latest}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from what `state_dict` returned."""
         super().load_state_dict(state)
-        self.n_updates = state["n_updates"]
+        self.n_updates, self.loss_actor = state["n_updates"], state["loss_actor"]
 
 
 class SACLearner(Learner):

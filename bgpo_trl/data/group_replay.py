@@ -12,7 +12,7 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 
 from bgpo_trl.data.replay import ReplayBuffer
-from bgpo_trl.modules.entries import lacking
+from bgpo_trl.errors import missing_key
 
 __all__ = ["GroupReplay", "draw_shares"]
 
@@ -83,7 +83,7 @@ class GroupReplay:
         steps = self._buffer.n_added.tolist()
         missing = [key for key in self._buffer.keys or () if key not in transition.keys(True)]
         if set(missing) - {GROUP}:
-            raise lacking("GroupReplay", transition, missing)
+            raise missing_key("GroupReplay", transition, missing)
         kept = transition.select(*(key for key in self._buffer.keys or () if key != GROUP))
         self._buffer.add(kept.set(GROUP, group), mask)
         chosen = range(len(steps)) if mask is None else mask.nonzero().flatten().tolist()

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from bgpo_trl.data.demonstration_replay import DemonstrationReplay
 from bgpo_trl.data.group_replay import GroupReplay
-from bgpo_trl.modules.entries import lacking
+from bgpo_trl.errors import missing_key
 
 __all__ = ["TaskReplay"]
 
@@ -97,7 +97,7 @@ class TaskReplay:
         """
         task = transition.get("task", None)
         if task is None:
-            raise lacking("TaskReplay", transition, ["task"])
+            raise missing_key("TaskReplay", transition, ["task"])
         if not ((task >= 0) & (task < self.n_tasks)).all():
             raise ValueError(f"task must lie in 0..{self.n_tasks - 1}, got {task.tolist()}")
         self._replay.add(transition, task)

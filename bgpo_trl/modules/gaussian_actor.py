@@ -1,18 +1,18 @@
-"""The stochastic policy of SAC, with an optional batch of seeds in its weights."""
+"""Stochastic policy of SAC, with an optional stack of seeds in its weights."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
-import torch
 import torch.nn.functional as F
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import TensorDictModuleBase, dispatch
+from tensordict.nn import dispatch
 from torch import Tensor
 
-from bgpo_trl.modules.actor_critic import StackedMLP
-from bgpo_trl.modules.entries import read
+from bgpo_trl.modules.actor_critic import StackedNetwork
+from bgpo_trl.modules.stacked_mlp import StackedMLP
 
 __all__ = ["LOG_SCALE_BOUNDS", "GaussianActor"]
 
@@ -20,26 +20,24 @@ LOG_SCALE_BOUNDS = (-5.0, 2.0)
 """Lowest and highest logarithm of the scale, as in CleanRL's SAC."""
 
 
-class GaussianActor(TensorDictModuleBase):
+class GaussianActor(StackedNetwork):
     """Stochastic policy: an MLP for mean and scale of a Gaussian that is squashed by a tanh.
 
     (Haarnoja et al., 2018.) Called, it acts without noise: it reads ``in_keys``
     (``[*S, *B, features]`` each) and writes ``"loc"`` and ``"scale"`` ``[*S, *B, action_dim]`` and
-    ``"action"``, ``tanh(loc)``. `sample` draws actions by noise that it is given.
+    ``"action"``, ``tanh(loc)``. `sample` draws actions from given noise.
 
     Args:
-        in_features: size of all ``in_keys`` together.
-        action_dim: number of action components.
-        in_keys: entries to read, concatenated in this order.
-        hidden_sizes: width of each hidden layer.
-        batch_size: leading dimensions ``S`` of the weights, one independent policy for each index.
-        generator: source of the initial weights, as in
-            :class:`~bgpo_trl.modules.actor_critic.StackedLinear`.
+        in_features: Size of all ``in_keys`` together.
+        action_dim: Number of action components.
+        in_keys: Entries to read.
+        **mlp: ``hidden_sizes``, ``layer_norm``, ``batch_size`` and ``generator`` of `StackedMLP`.
 
     Raises:
-        ValueError: if the number of generators is not the number of policies.
+        ValueError: If the number of generators is not the number of policies.
 
-    Examples:
+    Example:
+        >>> import torch
         >>> from tensordict import TensorDict
         >>> actor = GaussianActor(3, 2, in_keys=["state"])
         >>> drawn = actor.sample(TensorDict({"state": torch.zeros(7, 3)}, 7), torch.randn(7, 2))
@@ -47,56 +45,43 @@ class GaussianActor(TensorDictModuleBase):
         (torch.Size([7, 2]), torch.Size([7]))
     """
 
-    in_keys: list[NestedKey]
-    # What TorchRL's losses ask of a policy that samples.
-    dist_sample_keys = ("action",)
-    log_prob_keys = ("action_log_prob",)
-
     def __init__(
         self,
-        in_features: int = 96,
+        in_features: int,
         action_dim: int = 4,
         *,
         in_keys: Sequence[NestedKey] = ("latent", "behavior"),
-        hidden_sizes: Sequence[int] = (64,),
-        batch_size: Sequence[int] = (),
-        generator: torch.Generator | Sequence[torch.Generator] | None = None,
+        **mlp: Any,
     ) -> None:
-        super().__init__()
-        self.in_keys = list(in_keys)
-        self.out_keys = ["loc", "scale", "action"]
+        super().__init__(in_keys, ["loc", "scale", "action"])
         self.action_dim = action_dim
-        self.batch_size = torch.Size(batch_size)
-        self.mlp = StackedMLP(
-            in_features,
-            2 * action_dim,
-            hidden_sizes=hidden_sizes,
-            batch_size=batch_size,
-            generator=generator,
-        )
+        self.mlp = StackedMLP(in_features, 2 * action_dim, **mlp)
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action without noise for each state.
 
         Args:
-            tensordict: with ``in_keys``; ``"loc"``, ``"scale"`` and ``"action"`` are set in it.
+            tensordict: With ``in_keys``; ``"loc"``, ``"scale"`` and ``"action"`` are set in it.
 
         Returns:
             The same tensordict.
+
+        Raises:
+            ValueError: If an entry is missing.
         """
-        loc, log_scale = self.mlp(*read(self, tensordict)).chunk(2, dim=-1)
+        loc, log_scale = self.mlp(*self.inputs(tensordict)).chunk(2, dim=-1)
         tensordict.set("loc", loc)
         tensordict.set("scale", log_scale.clamp(*LOG_SCALE_BOUNDS).exp())
         return tensordict.set("action", loc.tanh())
 
     def sample(self, tensordict: TensorDictBase, noise: Tensor) -> TensorDictBase:
-        """Write an action drawn for each state, differentiable with respect to the weights.
+        """Draw an action for each state, differentiable with respect to the weights.
 
         Args:
-            tensordict: with ``in_keys``; besides what `forward` sets, ``"action_log_prob"``
-                ``[*S, *B]`` is set in it, the log density of the action.
-            noise: standard normals ``[*S, *B, action_dim]``.
+            tensordict: With ``in_keys``; besides the entries that `forward` sets,
+                ``"action_log_prob"`` ``[*S, *B]`` is set in it, the log density of the action.
+            noise: Standard normals ``[*S, *B, action_dim]``.
 
         Returns:
             The same tensordict.

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import TensorDictModuleBase, dispatch
+from tensordict.nn import dispatch
 from torch import Tensor, nn
 
-from bgpo_trl.modules.actor_critic import StackedLinear, StackedMLP
-from bgpo_trl.modules.entries import read
+from bgpo_trl.configs import RLConfig
+from bgpo_trl.modules.actor_critic import StackedNetwork
+from bgpo_trl.modules.stacked_mlp import StackedLinear, StackedMLP
 
 __all__ = ["MultiHeadActor"]
 
@@ -19,22 +21,25 @@ __all__ = ["MultiHeadActor"]
 _MIN_SCALE, _MAX_SCALE = 0.1, 1.0
 
 
-class MultiHeadActor(TensorDictModuleBase):
-    """Maps the states of each task to a Gaussian over actions, by the head of that task.
+class MultiHeadActor(StackedNetwork):
+    """Policy with a Gaussian over actions for each task, from that task's head on a shared trunk.
 
     Reads ``in_keys`` (``[*S, T, *B, features]`` each, ``T`` the number of heads) and writes
     ``"loc"`` in [-1, 1] and ``"scale"`` in [0.1, 1], ``[*S, T, *B, action_dim]``, the mean and the
     standard deviation, and ``"action"``, which is the mean.
 
     Args:
-        in_features: size of all ``in_keys`` together.
-        action_dim: number of action components.
-        in_keys: entries to read, concatenated in this order.
-        hidden_sizes: width of each layer of the trunk, at least one.
-        batch_size: leading dimensions ``S`` of the weights, one independent policy for each index.
-        generator: source of the trunk's initial weights, as in `StackedLinear`.
+        in_features: Size of all ``in_keys`` together.
+        action_dim: Number of action components.
+        in_keys: Entries to read.
+        hidden_sizes: Width of each layer of the trunk, at least one.
+        **mlp: ``layer_norm``, ``batch_size`` and ``generator`` of the trunk, a `StackedMLP`.
 
-    Examples:
+    Raises:
+        ValueError: If the trunk has no layer, or the number of generators is not the number of
+            policies.
+
+    Example:
         >>> from tensordict import TensorDict
         >>> actor = MultiHeadActor(64)
         >>> _ = actor.add_head()
@@ -43,33 +48,21 @@ class MultiHeadActor(TensorDictModuleBase):
         torch.Size([2, 5, 4])
     """
 
-    in_keys: list[NestedKey]
-
     def __init__(
         self,
         in_features: int,
         action_dim: int = 4,
         *,
         in_keys: Sequence[NestedKey] = ("latent",),
-        hidden_sizes: Sequence[int] = (64,),
-        batch_size: Sequence[int] = (),
-        generator: torch.Generator | Sequence[torch.Generator] | None = None,
+        hidden_sizes: Sequence[int] = RLConfig.hidden_sizes,
+        **mlp: Any,
     ) -> None:
-        super().__init__()
         if not hidden_sizes:
             raise ValueError("hidden_sizes is empty: heads need a trunk of at least one layer")
-        self.in_keys = list(in_keys)
-        self.out_keys = ["loc", "scale", "action"]
-        self.batch_size = torch.Size(batch_size)
+        super().__init__(in_keys, ["loc", "scale", "action"])
         self.action_dim = action_dim
         *inner, self._width = hidden_sizes
-        self.trunk = StackedMLP(
-            in_features,
-            self._width,
-            hidden_sizes=inner,
-            batch_size=batch_size,
-            generator=generator,
-        )
+        self.trunk = StackedMLP(in_features, self._width, hidden_sizes=inner, **mlp)
         self.heads = nn.ModuleList()
 
     def add_head(
@@ -78,10 +71,13 @@ class MultiHeadActor(TensorDictModuleBase):
         """Add the head of a further task; the trunk and the other heads stay as they are.
 
         Args:
-            generator: source of its initial weights, as in `StackedLinear`.
+            generator: Source of its initial weights, as in `StackedLinear`.
 
         Returns:
-            The head, so that an optimizer can be told of its parameters.
+            The head, whose parameters an optimizer has yet to be given.
+
+        Raises:
+            ValueError: If the number of generators is not the number of policies.
         """
         head = StackedLinear(self._width, 2 * self.action_dim, self.batch_size, generator)
         reference = next(self.trunk.parameters())
@@ -93,16 +89,15 @@ class MultiHeadActor(TensorDictModuleBase):
         """Write the distribution of actions for each state.
 
         Args:
-            tensordict: with ``in_keys``; ``"loc"``, ``"scale"`` and ``"action"`` are set in it.
+            tensordict: With ``in_keys``; ``"loc"``, ``"scale"`` and ``"action"`` are set in it.
 
         Returns:
             The same tensordict.
 
         Raises:
-            ValueError: if an entry is missing, or the states are not of as many tasks as there are
-                heads.
+            ValueError: If an entry is missing, or the number of tasks is not the number of heads.
         """
-        hidden = self.trunk(*read(self, tensordict)).relu()
+        hidden = self.trunk(*self.inputs(tensordict)).relu()
         task_dim = len(self.batch_size)
         if hidden.shape[task_dim] != len(self.heads):
             raise ValueError(

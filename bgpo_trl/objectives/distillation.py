@@ -9,7 +9,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch.nn.functional import gaussian_nll_loss
 from torchrl.objectives import LossModule
 
-from bgpo_trl.modules.entries import lacking
+from bgpo_trl.errors import missing_key
 
 __all__ = ["DistillationLoss"]
 
@@ -72,10 +72,10 @@ class DistillationLoss(LossModule):
         """
         keys = self.tensor_keys
         if any(tensordict.get(key, None) is None for key in self.in_keys):
-            raise lacking("DistillationLoss", tensordict, self.in_keys)
+            raise missing_key("DistillationLoss", tensordict, self.in_keys)
         told = self.actor_network(tensordict.select(*self.actor_network.in_keys))
         if told.get(keys.loc, None) is None or told.get(keys.scale, None) is None:
-            raise lacking("DistillationLoss, from its actor,", told, [keys.loc, keys.scale])
+            raise missing_key("DistillationLoss, from its actor,", told, [keys.loc, keys.scale])
         loss = gaussian_nll_loss(
             told[keys.loc],
             tensordict[keys.teacher_action].detach(),

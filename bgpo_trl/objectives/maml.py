@@ -11,6 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torch.func import functional_call, grad
 
+from bgpo_trl.configs import MAMLConfig
 from bgpo_trl.objectives.ddpg import DDPGLoss
 
 __all__ = ["MAMLLoss"]
@@ -51,13 +52,15 @@ class MAMLLoss(DDPGLoss):
         ValueError: if ``inner_learning_rate`` is negative, or the batch sizes do not fit.
     """
 
+    actor_keys = ()
+
     def __init__(
         self,
         meta_network: TensorDictModuleBase,
         actor_network: TensorDictModuleBase,
         value_network: TensorDictModuleBase,
         *,
-        inner_learning_rate: float = 0.1,
+        inner_learning_rate: float = MAMLConfig.inner_learning_rate,
         **ddpg: Any,
     ) -> None:
         networks: list[Any] = [meta_network, actor_network, value_network]
@@ -69,8 +72,6 @@ class MAMLLoss(DDPGLoss):
             )
         if not inner_learning_rate >= 0:
             raise ValueError(f"inner_learning_rate must be >= 0, got {inner_learning_rate}")
-        # It is only called with parameters from elsewhere; a list keeps its own out of this module.
-        self._template = [deepcopy(actor_network).requires_grad_(False)]
         actor_network = deepcopy(actor_network).requires_grad_(False)
         start = dict(meta_network.named_parameters())
         with torch.no_grad():
@@ -123,14 +124,13 @@ class MAMLLoss(DDPGLoss):
             parameters: of one policy a task, ``[*S, T, ...]``.
             tensordict: transitions of each task ``[*S, T, B]``.
         """
-        data = self._select(tensordict, [*self.actor_in_keys, *self.value_exclusive_keys])
-        functional_call(self._template[0], parameters, (data,))
-        value = self._frozen_critic(data)[self.tensor_keys.state_action_value].squeeze(-1)
-        loss = -value
+        data = self.inputs.current(tensordict)
+        functional_call(self.network("actor_network"), parameters, (data,))
+        loss = -self.values(self.network("value_network", frozen=True), data)
         if self.pre_tanh_penalty:
             square = data[self.tensor_keys.pre_tanh_action].square().mean(-1)
             loss = loss + self.pre_tanh_penalty * square
-        return self._mean_per_seed(loss, tensordict)
+        return self.mean_per_seed(loss, tensordict)
 
     def _each_task(self) -> Parameters:
         n_stacked = len(self.batch_size) - 1

@@ -9,7 +9,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.objectives import LossModule
 
-from bgpo_trl.modules.entries import lacking
+from bgpo_trl.errors import missing_key
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
 
@@ -105,7 +105,7 @@ class VAEInverseLoss(LossModule):
         pixels = tensordict.get(self.tensor_keys.pixels, None)
         action = tensordict.get(self.tensor_keys.action, None)
         if pixels is None or action is None:
-            raise lacking("VAEInverseLoss", tensordict, self.in_keys)
+            raise missing_key("VAEInverseLoss", tensordict, self.in_keys)
         if pixels.ndim < 5 or pixels.shape[-4] < 2:
             raise ValueError(f"windows need at least 2 frames, got pixels {tuple(pixels.shape)}")
         mu, log_variance = self.vae.encode(pixels)
@@ -184,7 +184,7 @@ class SequenceReconstructionLoss(LossModule):
         latent = tensordict.get(self.tensor_keys.latent, None)
         length = tensordict.get(self.tensor_keys.length, None)
         if latent is None or length is None:
-            raise lacking("SequenceReconstructionLoss", tensordict, self.in_keys)
+            raise missing_key("SequenceReconstructionLoss", tensordict, self.in_keys)
         n_steps = int(length.max())
         reconstructed = self.lae.decode(self.lae.encode(latent, length), n_steps)
         back = length.unsqueeze(-1) - 1 - torch.arange(n_steps, device=length.device)

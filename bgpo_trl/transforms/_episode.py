@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Compose, EnvBase, RewardSum, StepCounter, Transform, TransformedEnv
 
-from bgpo_trl.modules.entries import lacking
+from bgpo_trl.errors import missing_key
 
 
 def starting(tensordict: TensorDictBase, done_key: NestedKey = "done") -> Tensor:
@@ -168,7 +168,7 @@ class DemonstrationLookup(EpisodeTransform):
         """Look up the demonstrations of any TensorDict; learns nothing."""
         embedding = tensordict.get(self.in_keys[0], None)
         if embedding is None:
-            raise lacking(type(self).__name__, tensordict, self.in_keys)
+            raise missing_key(type(self).__name__, tensordict, self.in_keys)
         for key, value in zip(self.out_keys, self.look_up(embedding), strict=True):
             tensordict.set(key, value)
         return tensordict

@@ -297,7 +297,7 @@ def test_students_learn_from_their_teachers_at_the_end_of_each_episode(make, sch
     seen = [[[] for _ in range(N_TASKS)] for _ in SEEDS]
     draws = generators(SEEDS, "replay")
     students = [
-        MultiHeadActor(SIZE, in_keys=["state"], generator=stream)
+        MultiHeadActor(SIZE, in_keys=["state"], hidden_sizes=(64,), generator=stream)
         for stream in generators(SEEDS, "student")
     ]
     heads, orders = generators(SEEDS, "heads"), [[], []]
@@ -386,7 +386,7 @@ def test_old_heads_and_the_trunk_are_kept_when_a_head_is_added(make):
             algorithm.students, start, generators(SEEDS, "heads"), strict=True
         ):
             assert_same(dict(student.trunk.state_dict()), dict(trunk))
-            drawn = MultiHeadActor(SIZE, in_keys=["state"])
+            drawn = MultiHeadActor(SIZE, in_keys=["state"], hidden_sizes=(64,))
             for head in student.heads:
                 assert_same(dict(head.state_dict()), dict(drawn.add_head(source).state_dict()))
     assert {number for of_seeds in numbers for number in of_seeds} == {0, 1, 2, 3}
@@ -450,7 +450,7 @@ def test_snapshots_act_as_plain_ones_with_these_weights(make):
     state = torch.randn(2, N_TASKS, 5, SIZE, generator=torch.Generator().manual_seed(0))
     actions = stacked.act(state)
     for index in range(2):
-        alone = MultiHeadActor(SIZE, in_keys=["state"])
+        alone = MultiHeadActor(SIZE, in_keys=["state"], hidden_sizes=(64,))
         for _ in range(N_TASKS):
             alone.add_head()
         alone.load_state_dict(frozen[index].parameters)

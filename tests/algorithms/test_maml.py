@@ -336,7 +336,7 @@ def test_snapshots_act_as_plain_ones_with_these_weights(make):
     assert actions.shape == (2, N_TASKS, 5, 4)
     for index in range(2):
         for task in range(N_TASKS):
-            alone = Actor(SIZE, in_keys=["state"])
+            alone = Actor(SIZE, in_keys=["state"], hidden_sizes=(64,))
             weights = {key: value[task] for key, value in frozen[index].parameters.items()}
             alone.load_state_dict(weights)
             expected = alone(TensorDict({"state": state[index, task]}, [5]))["action"]

@@ -60,7 +60,21 @@ def test_every_update_is_one_of_the_critics_and_every_other_one_of_td3s_actor(na
         assert critics
         assert now == (set(before) if due else critics)
         assert bool(changed(slow, targets(learner))) == due
-        assert "loss_actor" in told  # also where nothing is made of it
+        assert "loss_actor" in told  # also where it is the latest one
+
+
+def test_td3_computes_the_actors_loss_only_where_it_is_due(monkeypatch):
+    learner, computed, told = make("td3", policy_delay=3), [], []
+    loss_actor = learner.loss.loss_actor
+    monkeypatch.setattr(
+        learner.loss, "loss_actor", lambda batch: computed.append(update) or loss_actor(batch)
+    )
+    for update in range(1, 8):
+        assert learner.actor_is_due == learner.actor_is_due == (update % 3 == 0)  # asking is free
+        told.append(learner.learn(make_batch(2, 1, 16, seed=update))["loss_actor"])
+    assert computed == [3, 6]
+    assert told[0] == told[1] == 0
+    assert told[2] == told[3] == told[4] != told[5] == told[6]
 
 
 def test_td3s_delay_is_a_setting():

@@ -6,8 +6,12 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
+from torch.func import functional_call
 
-from bgpo_trl.modules.actor_critic import Actor, Critic, StackedLinear, StackedMLP
+from bgpo_trl.modules.actor_critic import Actor, Critic
+from bgpo_trl.modules.gaussian_actor import GaussianActor
+from bgpo_trl.modules.multi_head_actor import MultiHeadActor
+from bgpo_trl.modules.stacked_mlp import StackedLinear, StackedMLP
 
 
 def generators(n: int) -> list[torch.Generator]:
@@ -92,7 +96,7 @@ def test_bad_sizes_are_refused():
 
 
 def test_actor_is_the_network_of_the_paper():
-    actor = Actor()
+    actor = Actor(96, hidden_sizes=(64,))
     weights = [tuple(parameter.shape) for parameter in actor.parameters()]
     assert weights == [(96, 64), (64,), (64, 4), (4,)]
     latent, behavior = torch.randn(5, 64), torch.randn(5, 32)
@@ -104,7 +108,7 @@ def test_actor_is_the_network_of_the_paper():
 
 
 def test_critic_is_the_network_of_the_paper():
-    critic = Critic()
+    critic = Critic(96, hidden_sizes=(64,))
     weights = [tuple(parameter.shape) for parameter in critic.parameters()]
     assert weights == [(100, 64), (64,), (64, 1), (1,)]
     parts = {"latent": torch.randn(5, 64), "behavior": torch.randn(5, 32)}
@@ -154,12 +158,33 @@ def test_other_inputs_widths_and_depths_are_configuration():
 
 
 def test_stacked_actor_is_each_actor_alone_also_while_acting():
-    actor = Actor(batch_size=(3,), generator=generators(3))
+    actor = Actor(96, batch_size=(3,), generator=generators(3))
     latent, behavior = torch.randn(3, 64), torch.randn(3, 32)
     action = actor(TensorDict({"latent": latent, "behavior": behavior}, [3]))["action"]
     for i, generator in enumerate(generators(3)):
         data = TensorDict({"latent": latent[i], "behavior": behavior[i]}, [])
-        torch.testing.assert_close(action[i], Actor(generator=generator)(data)["action"])
+        torch.testing.assert_close(action[i], Actor(96, generator=generator)(data)["action"])
+
+
+@pytest.mark.parametrize("stack", [(), (3,), (2, 5)])
+@pytest.mark.parametrize("network", [Actor, Critic, GaussianActor, MultiHeadActor])
+def test_a_network_can_be_called_with_the_weights_of_any_stack(network, stack):
+    """Of one, of more seeds than its own, and of seeds with several tasks each."""
+
+    def make(batch_size):
+        made = network(3, 2, in_keys=["state"], hidden_sizes=(8,), batch_size=batch_size)
+        if network is MultiHeadActor:
+            made.add_head()
+        return made
+
+    other = make(stack)
+    data = TensorDict({"state": torch.randn(*stack, 1, 7, 3)}, [*stack, 1, 7])
+    data["action"] = torch.randn(*stack, 1, 7, 2)
+    expected, called = other(data.clone()), data.clone()
+    functional_call(make((4,)), dict(other.named_parameters()), (called,))
+    assert other.batch_size == stack
+    for key in other.out_keys:
+        assert called[key].equal(expected[key])
 
 
 def test_works_without_tensordict_and_names_a_missing_entry():

@@ -12,7 +12,8 @@ def generator(seed):
 
 
 def make(n_heads, seed=0, **arguments):
-    actor = MultiHeadActor(5, 2, in_keys=["state"], generator=generator(seed), **arguments)
+    arguments = {"in_keys": ["state"], "hidden_sizes": (64,), **arguments}
+    actor = MultiHeadActor(5, 2, generator=generator(seed), **arguments)
     for head in range(n_heads):
         actor.add_head(generator(100 * seed + head))
     return actor
@@ -111,7 +112,7 @@ def test_stacked_policies_are_each_one_alone(batch):
 
 
 def test_several_inputs_count_as_one_side_by_side():
-    apart = MultiHeadActor(5, 2, in_keys=["a", "b"], generator=generator(0))
+    apart = MultiHeadActor(5, 2, in_keys=["a", "b"], hidden_sizes=(64,), generator=generator(0))
     apart.add_head(generator(0))
     together = make(1)
     state = states(1, 7)

@@ -10,16 +10,18 @@ from torch import Tensor, nn
 from torchrl import objectives
 
 from bgpo_trl.modules.actor_critic import Actor, Critic
-from bgpo_trl.objectives.ddpg import DDPGLoss, ForeachSoftUpdate
+from bgpo_trl.objectives.ddpg import DDPGLoss
+from bgpo_trl.objectives.target_update import ForeachSoftUpdate
 
 STATE, ACTION = 6, 4
 UNBOUNDED = {"return_bounds": None, "pre_tanh_penalty": 0.0}
 
 
 def make_loss(generator=None, batch_size=(), **options) -> DDPGLoss:
-    networks = {"in_keys": ["state"], "batch_size": batch_size, "generator": generator}
+    networks = {"in_keys": ["state"], "hidden_sizes": (64,)}
+    networks |= {"batch_size": batch_size, "generator": generator}
     loss = DDPGLoss(Actor(STATE, ACTION, **networks), Critic(STATE, ACTION, **networks), **options)
-    loss.make_value_estimator()
+    loss.make_value_estimator(gamma=0.98)
     ForeachSoftUpdate(loss, tau=0.005)
     return loss
 
@@ -301,7 +303,7 @@ def test_targets_stay_attainable_on_data_that_makes_them_diverge():
 
 def test_learns_a_point_task():
     generator = torch.Generator().manual_seed(0)
-    networks = {"in_keys": ["state"], "generator": generator}
+    networks = {"in_keys": ["state"], "hidden_sizes": (64,), "generator": generator}
     actor = Actor(1, 1, **networks)
     loss = DDPGLoss(actor, Critic(1, 1, **networks))
     update = ForeachSoftUpdate(loss, tau=0.005)
@@ -393,7 +395,7 @@ def stack_with_weights(n_seeds: int, weights: Tensor | None, n_rows: int = 32, *
     streams = [torch.Generator().manual_seed(seed) for seed in range(n_seeds)]
     networks = {"in_keys": ["state"], "batch_size": (n_seeds,), "generator": streams}
     loss = DDPGLoss(Actor(STATE, ACTION, **networks), Critic(STATE, ACTION, **networks, **critic))
-    loss.make_value_estimator()
+    loss.make_value_estimator(gamma=0.98)
     ForeachSoftUpdate(loss, tau=0.005)
     batch = make_batch(n_seeds, n_rows)
     if weights is not None:

@@ -8,8 +8,9 @@ from torch import nn
 from torch.nn.functional import layer_norm
 
 from bgpo_trl.modules.actor_critic import Actor, Critic
-from bgpo_trl.objectives.ddpg import DDPGLoss, ForeachSoftUpdate
+from bgpo_trl.objectives.ddpg import DDPGLoss
 from bgpo_trl.objectives.maml import MAMLLoss
+from bgpo_trl.objectives.target_update import ForeachSoftUpdate
 
 TARGETS = torch.tensor([[0.5, -0.2], [-0.7, 0.9], [0.1, 0.4]]).double()
 
@@ -65,6 +66,7 @@ def transitions(*shape, n_states=3, seed=0, dtype=torch.float64):
 
 
 def quadratic_loss(**arguments):
+    arguments = {"inner_learning_rate": 0.1, **arguments}
     loss = MAMLLoss(Linear(), Linear([3]), Quadratic(TARGETS), **arguments)
     ForeachSoftUpdate(loss, tau=0.1)
     return loss
@@ -113,6 +115,7 @@ N_STATES, N_ACTIONS, TASKS = 3, 2, 3
 
 def stack_loss(n_seeds=2, **arguments):
     """A loss of stacked networks in which all tasks' Q-functions differ, in double precision."""
+    arguments = {"inner_learning_rate": 0.1, **arguments}
     stack = [] if n_seeds is None else [n_seeds]
     network = {"in_keys": ["state"], "hidden_sizes": (8,)}
     generator = torch.Generator().manual_seed(1)

@@ -12,8 +12,8 @@ from torchrl.modules import ProbabilisticActor, TanhNormal
 
 from bgpo_trl.modules.actor_critic import Actor, Critic
 from bgpo_trl.modules.gaussian_actor import GaussianActor
-from bgpo_trl.objectives.ddpg import ForeachSoftUpdate
 from bgpo_trl.objectives.sac import SACLoss
+from bgpo_trl.objectives.target_update import ForeachSoftUpdate
 from bgpo_trl.objectives.td3 import TD3Loss
 
 STATE, ACTION = 6, 4
@@ -27,6 +27,7 @@ def stream(seed: int) -> torch.Generator:
 
 def make_loss(name, seeds=(0,), *, stacked=False, **options):
     """Makes a loss of one seed, or of a stack of them; a seed starts the same in either."""
+    options = {"entropy_in_target": True, **options} if name == "sac" else options
     loss, actor = LOSSES[name]
     shape = [len(seeds)] if stacked else []
     network = {"in_keys": ["state"], "hidden_sizes": (16,)}
@@ -65,8 +66,8 @@ def total(losses: TensorDict) -> Tensor:
 def constant_critics(loss, online: tuple, target: tuple) -> None:
     """Makes both Q-functions and both target Q-functions equal to these numbers everywhere."""
     for params, values in (
-        (loss.qvalue_network_params, online),
-        (loss.target_qvalue_network_params, target),
+        (loss.value_network_params, online),
+        (loss.target_value_network_params, target),
     ):
         for tensor in params.values(True, True):
             tensor.data.zero_()
@@ -97,7 +98,7 @@ def test_the_smaller_target_value_is_believed_within_bounds(name, target_values,
     result = loss(batch)
     torch.testing.assert_close(result["target_value"], target)
     squares = (0.2 - target).square(), (0.6 - target).square()
-    torch.testing.assert_close(result["loss_qvalue"], (squares[0] + squares[1]).mean())
+    torch.testing.assert_close(result["loss_value"], (squares[0] + squares[1]).mean())
     torch.testing.assert_close(batch["td_error"], torch.maximum(*squares))
     torch.testing.assert_close(result["td_error_max"], torch.maximum(*squares).max())
 
@@ -139,11 +140,11 @@ def test_td3_smooths_the_target_action(monkeypatch, noise, clip):
     loss = make_loss("td3", policy_noise=noise, noise_clip=clip)
     loss.target_actor_network_params["mlp", "layers", "1", "bias"].data[0] = 3.0
     batch, judged = make_batch(32), []
-    judge = loss._twin_values
+    judge = loss.values
     monkeypatch.setattr(
-        loss, "_twin_values", lambda *args: judged.append(args[1]["action"]) or judge(*args)
+        loss, "values", lambda *args: judged.append(args[1]["action"]) or judge(*args)
     )
-    loss.value_loss(batch)
+    loss.loss_value(batch)
     action = Actor(STATE, ACTION, in_keys=["state"], hidden_sizes=(16,))
     loss.target_actor_network_params.data.to_module(action)
     action = action(batch["next"].select("state"))["action"]
@@ -160,13 +161,12 @@ def test_without_options_it_is_torchrls_loss(name):
     loss = make_loss(name, **options)
     critics = [Critic(STATE, ACTION, in_keys=["state"], hidden_sizes=(16,)) for _ in range(2)]
     for index, critic in enumerate(critics):
-        weights = loss.qvalue_network.state_dict()
+        weights = loss.value_network.state_dict()
         critic.load_state_dict({key: value[index] for key, value in weights.items()})
     actor = copy.deepcopy(loss.actor_network)
     if name == "td3":
         reference = objectives.TD3Loss(actor, critics, bounds=(-1.0, 1.0), loss_function="l2")
     else:
-        actor.dist_sample_keys = actor.log_prob_keys = ()  # another module is to draw
         policy = ProbabilisticActor(
             actor,
             in_keys=["loc", "scale"],
@@ -185,7 +185,8 @@ def test_without_options_it_is_torchrls_loss(name):
         theirs = reference(batch.clone())
     keys = ["loss_actor", "loss_qvalue", *(["loss_alpha"] if name == "sac" else [])]
     for key in keys:
-        torch.testing.assert_close(mine[key], theirs[key], rtol=1e-4, atol=1e-5)
+        ours = mine[key.replace("qvalue", "value")]  # TorchRL's name of it where there are two
+        torch.testing.assert_close(ours, theirs[key], rtol=1e-4, atol=1e-5)
     total(mine).backward()
     sum(theirs[key] for key in keys).backward()
     assert len(list(loss.parameters())) == len(list(reference.parameters()))
@@ -244,7 +245,7 @@ def test_each_network_learns_from_its_own_loss(name):
     loss = make_loss(name)
     parts = {
         "loss_actor": list(loss.actor_network_params.parameters()),
-        "loss_qvalue": list(loss.qvalue_network_params.parameters()),
+        "loss_value": list(loss.value_network_params.parameters()),
         **({"loss_alpha": [loss.log_alpha]} if name == "sac" else {}),
     }
     for key, learning in parts.items():

@@ -1,0 +1,31 @@
+"""Error messages that several packages share."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from tensordict import NestedKey, TensorDictBase
+
+
+def missing_key(
+    reader: object, tensordict: TensorDictBase, keys: Iterable[NestedKey]
+) -> ValueError:
+    """Return the error to raise in place of a `KeyError` when entries are missing.
+
+    Args:
+        reader: Name of what reads the entries, the first word of the message.
+        tensordict: TensorDict that lacks some of them.
+        keys: All entries that are read; those present are left out of the message.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> print(missing_key("Actor", TensorDict({"latent": 0.0}), ["latent", "behavior"]))
+        Actor found no 'behavior' in a TensorDict with ['latent']: write it before, or name another
+        entry
+    """
+    there = set(tensordict.keys(True))
+    missing = [key for key in keys if key not in there]
+    return ValueError(
+        f"{reader} found no {', '.join(map(repr, missing))} in a TensorDict with "
+        f"{sorted(map(str, tensordict.keys()))}: write it before, or name another entry"
+    )

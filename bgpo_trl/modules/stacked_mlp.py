@@ -1,0 +1,202 @@
+"""Perceptrons that hold the weights of a stack of seeds and apply all of them in one call."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import cast
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from bgpo_trl.configs import RLConfig
+
+__all__ = ["StackedLinear", "StackedMLP"]
+
+
+class StackedLinear(nn.Module):
+    """Linear layer with one weight matrix per seed, all of them applied in one call.
+
+    With ``batch_size=()`` it computes what :class:`torch.nn.Linear` computes. Weights and biases
+    start uniform in ``±1/sqrt(in_features)``, as there. The layer takes the shape of the stack from
+    its weights, so :func:`torch.func.functional_call` may call it with those of any other stack.
+
+    Args:
+        in_features: Size of the last input dimension.
+        out_features: Size of the last output dimension.
+        batch_size: Leading dimensions ``S`` of the weights, one independent layer for each index;
+            ``()`` for a single layer.
+        generator: Source of the initial weights. One generator fills all layers from one stream; a
+            sequence holds one per layer, in the order of the flattened ``batch_size``, and layer
+            ``i`` then starts exactly as a single layer that draws from generator ``i``. ``None``
+            draws from torch's default generator.
+
+    Attributes:
+        weight: ``[*S, in_features, out_features]``.
+        bias: ``[*S, out_features]``.
+
+    Raises:
+        ValueError: If a size is less than 1, or the number of generators is not that of layers.
+
+    Example:
+        >>> layer = StackedLinear(3, 5, batch_size=(10,))
+        >>> layer(torch.zeros(10, 256, 3)).shape
+        torch.Size([10, 256, 5])
+    """
+
+    def __init__(
+        self,
+        in_features: int,
+        out_features: int,
+        batch_size: Sequence[int] = (),
+        generator: torch.Generator | Sequence[torch.Generator] | None = None,
+    ) -> None:
+        super().__init__()
+        if in_features < 1 or out_features < 1:
+            raise ValueError(
+                "in_features and out_features must be at least 1, "
+                f"got {in_features} and {out_features}"
+            )
+        self.in_features = in_features
+        self.out_features = out_features
+        self.weight = nn.Parameter(torch.empty(*batch_size, in_features, out_features))
+        self.bias = nn.Parameter(torch.empty(*batch_size, out_features))
+        self.reset_parameters(generator)
+
+    @property
+    def batch_size(self) -> torch.Size:
+        """Leading dimensions ``S`` of the weights."""
+        return self.weight.shape[:-2]
+
+    @torch.no_grad()
+    def reset_parameters(
+        self, generator: torch.Generator | Sequence[torch.Generator] | None = None
+    ) -> None:
+        """Draw all weights and biases anew.
+
+        Args:
+            generator: As in the constructor.
+
+        Raises:
+            ValueError: If the number of generators is not the number of layers.
+        """
+        bound = 1 / math.sqrt(self.in_features)
+        if generator is None or isinstance(generator, torch.Generator):
+            self.weight.uniform_(-bound, bound, generator=generator)
+            self.bias.uniform_(-bound, bound, generator=generator)
+            return
+        n_layers = self.batch_size.numel()
+        if len(generator) != n_layers:
+            raise ValueError(
+                f"pass one generator per layer: batch_size {tuple(self.batch_size)} needs "
+                f"{n_layers}, got {len(generator)}"
+            )
+        weights = self.weight.view(n_layers, self.in_features, self.out_features)
+        biases = self.bias.view(n_layers, self.out_features)
+        for weight, bias, stream in zip(weights, biases, generator, strict=True):
+            weight.uniform_(-bound, bound, generator=stream)
+            bias.uniform_(-bound, bound, generator=stream)
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """Apply each layer to its own slice of the inputs, side by side along the last dimension.
+
+        Inputs are not concatenated: each is multiplied with its own rows of the weights. That saves
+        the copy, and the gradient of an input that needs none.
+
+        Args:
+            *inputs: ``[*S, *B, features]`` each, with any number of further batch dimensions ``B``
+                and ``in_features`` features together.
+
+        Returns:
+            ``[*S, *B, out_features]``.
+
+        Raises:
+            ValueError: If an input does not lead with the ``batch_size`` of the weights, or the
+                inputs do not have ``in_features`` together.
+        """
+        sizes = [input.shape[-1] for input in inputs]
+        stack = self.batch_size
+        if sum(sizes) != self.in_features or any(
+            input.shape[: len(stack)] != stack for input in inputs
+        ):
+            raise ValueError(
+                f"the inputs must have one leading index per layer and {self.in_features} features "
+                f"together, shape {[*stack]} + [*B, {self.in_features}], got "
+                f"{' and '.join(str([*input.shape]) for input in inputs)}"
+            )
+        n_layers = stack.numel()
+        weight = self.weight.reshape(n_layers, self.in_features, self.out_features)
+        output = self.bias.reshape(n_layers, 1, self.out_features)
+        for i, (input, rows) in enumerate(zip(inputs, weight.split(sizes, -2), strict=True)):
+            multiply_add = torch.Tensor.baddbmm_ if i else torch.Tensor.baddbmm
+            output = multiply_add(output, input.reshape(n_layers, -1, input.shape[-1]), rows)
+        shape = torch.Size([*inputs[0].shape[:-1], self.out_features])
+        # Not a view where none is needed: autograd is slow with what is then changed in place.
+        return output if output.shape == shape else output.view(shape)
+
+
+class StackedMLP(nn.Module):
+    """Perceptron of `StackedLinear` layers with ReLU between them.
+
+    With ``layer_norm``, each hidden layer's output is normalized over its units (Ba et al., 2016,
+    without gain and bias) before the ReLU. In a Q-function this bounds the values of actions that
+    no transition contains (Ball et al., 2023, "Efficient Online Reinforcement Learning with Offline
+    Data").
+
+    Args:
+        in_features: Size of the last dimension of all inputs together.
+        out_features: Size of the last output dimension.
+        hidden_sizes: Width of each hidden layer.
+        layer_norm: Whether to normalize the hidden layers.
+        batch_size: Leading dimensions ``S`` of the weights.
+        generator: As in `StackedLinear`.
+
+    Raises:
+        ValueError: If the number of generators is not the number of stacked perceptrons.
+
+    Example:
+        >>> mlp = StackedMLP(96, 4)
+        >>> mlp(torch.zeros(256, 64), torch.zeros(256, 32)).shape
+        torch.Size([256, 4])
+    """
+
+    def __init__(
+        self,
+        in_features: int,
+        out_features: int,
+        *,
+        hidden_sizes: Sequence[int] = RLConfig.hidden_sizes,
+        layer_norm: bool = False,
+        batch_size: Sequence[int] = (),
+        generator: torch.Generator | Sequence[torch.Generator] | None = None,
+    ) -> None:
+        super().__init__()
+        self.layer_norm = layer_norm
+        sizes = [in_features, *hidden_sizes, out_features]
+        self.layers = nn.ModuleList(
+            StackedLinear(n_in, n_out, batch_size, generator) for n_in, n_out in pairwise(sizes)
+        )
+
+    @property
+    def batch_size(self) -> torch.Size:
+        """Leading dimensions ``S`` of the weights."""
+        return cast(StackedLinear, self.layers[0]).batch_size
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """Map the inputs, side by side along their last dimension, to the output.
+
+        Args:
+            *inputs: ``[*S, *B, features]`` each, ``in_features`` together.
+
+        Returns:
+            ``[*S, *B, out_features]``, without an output nonlinearity.
+        """
+        first, *others = self.layers
+        x = first(*inputs)
+        for layer in others:
+            if self.layer_norm:
+                x = F.layer_norm(x, x.shape[-1:])
+            x = layer(x.relu_())
+        return x

@@ -1,0 +1,297 @@
+"""Base of off-policy actor-critic losses, with clipped targets for a stack of seeds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from copy import deepcopy
+from typing import Any, ClassVar
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
+from tensordict.nn import TensorDictParams, dispatch
+from torch import Tensor
+from torchrl.objectives import LossModule, ValueEstimators
+from torchrl.objectives.utils import distance_loss
+from torchrl.objectives.value import TD0Estimator
+
+from bgpo_trl.configs import RLConfig
+from bgpo_trl.objectives.transition import TransitionInputs, TransitionKeys
+
+__all__ = ["OffPolicyLoss"]
+
+
+class OffPolicyLoss(LossModule):
+    """Base of off-policy actor-critic losses for one seed or a stack of seeds ``S``.
+
+    A subclass defines `next_value` and `loss_actor`, and sets ``twin_critics`` if it has two and
+    ``actor_keys`` to the further entries of `loss_actor`. The base:
+
+    1. regresses the critics to ``r + gamma * next_value``, clipped to ``return_bounds``. Only
+       ``"terminated"`` ends the bootstrap; a truncated episode goes on;
+    2. takes the mean of a loss over the batch and its *sum* over the actor's ``batch_size``, so
+       that each seed has the gradient that it would have alone;
+    3. reads entries that are constant within an episode from the root, not from ``"next"``;
+    4. sums the losses of twin critics, one network with the ``batch_size`` ``[*S, 2]``.
+
+    Reads the ``in_keys`` of both networks (``"action"`` ``[*S, *B, action_dim]`` among them), those
+    that are not constant also under ``"next"``, ``("next", "reward")``, ``("next", "terminated")``
+    ``[*S, *B, 1]`` and, if present, ``"priority_weight"`` ``[*S, *B]``, a factor of each
+    transition's loss; masks (``loss_mask_key``) are not read. Writes ``"td_error"`` ``[*S, *B]``
+    into the input, the squared error, the larger one of twin critics, for prioritized replay.
+    Returns, without a batch size, what `loss_actor` returns and
+
+    - ``"loss_actor"``, ``"loss_value"`` ``[]``: to be added, with any other ``"loss_..."``;
+    - ``"pred_value"`` ``[*S, *B]``, or ``[*S, 2, *B]`` of twin critics: values of the batch;
+    - ``"target_value"`` ``[*S, *B]``: bootstrapped targets;
+    - ``"pred_value_max"``, ``"target_value_max"``, ``"td_error_max"`` ``[*S]``: over the batch.
+
+    Args:
+        actor_network: Policy; its ``batch_size``, if it has one, is taken as ``S``.
+        value_network: Q-function, or twin Q-functions.
+        return_bounds: Lowest and highest attainable return; ``None`` for no clipping.
+        pre_tanh_penalty: Weight of the penalty of `penalized`, 0 for none.
+        constant_keys: Entries of the networks' input that are constant within an episode.
+        loss_function: ``"l2"``, ``"l1"`` or ``"smooth_l1"``, of prediction and target.
+        delay_actor: Whether the actor has a target network, as the critics always have.
+
+    Raises:
+        ValueError: If ``return_bounds`` is not an increasing pair, the penalty is negative, there
+            is no such ``loss_function``, or the ``batch_size`` of twin critics is not ``[*S, 2]``.
+    """
+
+    tensor_keys: TransitionKeys
+    default_keys = TransitionKeys
+    _AcceptedKeys = TransitionKeys  # pyright: ignore[reportAssignmentType] each loss has its own
+    # The other estimators need whole trajectories, and replay serves single transitions.
+    default_value_estimator = ValueEstimators.TD0
+    twin_critics: ClassVar[bool] = False
+    actor_keys: ClassVar[Sequence[str]] = ()
+
+    actor_network: Any
+    actor_network_params: TensorDictParams
+    target_actor_network_params: TensorDictParams
+    value_network: Any
+    value_network_params: TensorDictParams
+    target_value_network_params: TensorDictParams
+
+    def __init__(
+        self,
+        actor_network: Any,  # a TensorDictModuleBase; TorchRL's methods ask for a TensorDictModule
+        value_network: Any,
+        *,
+        return_bounds: tuple[float, float] | None = None,
+        pre_tanh_penalty: float = 0.0,
+        constant_keys: Sequence[NestedKey] = (),
+        loss_function: str = "l2",
+        delay_actor: bool = True,
+    ) -> None:
+        if not (pre_tanh_penalty >= 0 and math.isfinite(pre_tanh_penalty)):
+            raise ValueError(f"pre_tanh_penalty must be a number >= 0, got {pre_tanh_penalty}")
+        if return_bounds is not None and not return_bounds[0] < return_bounds[1]:
+            raise ValueError(f"return_bounds must be (low, high) with low < high: {return_bounds}")
+        if loss_function not in ("l2", "l1", "smooth_l1"):
+            raise ValueError(f"loss_function must be l2, l1 or smooth_l1, got {loss_function!r}")
+        super().__init__()
+        self._made: dict[tuple[str, bool], Any] = {}
+        self.batch_size = torch.Size(getattr(actor_network, "batch_size", ()))
+        critics = torch.Size(getattr(value_network, "batch_size", ()))
+        if self.twin_critics and critics != (*self.batch_size, 2):
+            raise ValueError(
+                "value_network must hold two Q-functions for each actor, batch_size "
+                f"{[*self.batch_size, 2]}, got {[*critics]}"
+            )
+        self.convert_to_functional(actor_network, "actor_network", create_target_params=delay_actor)
+        self.convert_to_functional(value_network, "value_network", create_target_params=True)
+        self.return_bounds, self.pre_tanh_penalty = return_bounds, pre_tanh_penalty
+        self.loss_function, name = loss_function, type(self).__name__
+        self.inputs = TransitionInputs(name, actor_network, value_network, constant_keys)
+
+    @property
+    def in_keys(self) -> list[NestedKey]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Entries that `forward` accepts."""
+        keys, inputs = self.tensor_keys, self.inputs.keys
+        read = [*inputs, *self.value_network.in_keys, keys.priority_weight]
+        following = [*inputs, keys.reward, keys.done, keys.terminated]
+        return [*dict.fromkeys(read), *(unravel_key(("next", key)) for key in following)]
+
+    @property
+    def out_keys(self) -> list[NestedKey]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Entries that `forward` returns."""
+        told = ["pred_value", "target_value", "pred_value_max", "target_value_max", "td_error_max"]
+        return ["loss_actor", "loss_value", *told, *self.actor_keys]
+
+    def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> None:
+        """Set the estimator of the target.
+
+        Args:
+            value_type: ``ValueEstimators.TD0`` or a value estimator of TorchRL.
+            **hyperparams: Arguments of the estimator; ``gamma`` is `RLConfig.gamma` by default.
+
+        Raises:
+            ValueError: If gamma does not lie in [0, 1].
+            NotImplementedError: If the estimator is another one of ``ValueEstimators``.
+        """
+        hyperparams = {"gamma": RLConfig.gamma, "value_network": None, **hyperparams}
+        if not 0 <= hyperparams["gamma"] <= 1:
+            raise ValueError(f"gamma must be between 0 and 1, got {hyperparams['gamma']}")
+        if value_type is None or value_type == ValueEstimators.TD0:
+            value_type = TD0Estimator
+        elif isinstance(value_type, ValueEstimators):
+            raise NotImplementedError(f"{value_type} needs whole trajectories: choose TD0")
+        super().make_value_estimator(value_type, **hyperparams)
+        self.set_keys()  # the names of the entries, to the estimator too
+
+    @dispatch()
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """Compute all losses of a batch of transitions ``[*S, *B]``; see the class."""
+        loss_value, told = self.loss_value(tensordict)
+        loss_actor, told_of_actor = self.loss_actor(tensordict)
+        losses = {"loss_actor": loss_actor, "loss_value": loss_value}
+        return TensorDict({**losses, **told, **told_of_actor})
+
+    def next_value(self, successor: TensorDictBase) -> Tensor:
+        """Return the values of the next states, ``[*S, *B]``, from the networks' input there.
+
+        It is called without gradients.
+        """
+        raise NotImplementedError
+
+    def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """Compute the actor's loss.
+
+        Args:
+            tensordict: Batch of transitions ``[*S, *B]``.
+
+        Returns:
+            The loss ``[]`` and further entries for the result of `forward`.
+
+        Raises:
+            ValueError: If the batch lacks an entry.
+        """
+        raise NotImplementedError
+
+    def loss_value(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """Compute the loss of the critics, and writes ``"td_error"``.
+
+        Args:
+            tensordict: Batch of transitions ``[*S, *B]``.
+
+        Returns:
+            The loss ``[]`` and the critics' entries for the result of `forward`.
+
+        Raises:
+            ValueError: If the batch lacks an entry, or the reward has another shape.
+        """
+        with torch.no_grad():
+            target = self.target(tensordict)
+        data = self.inputs.select(tensordict, self.value_network.in_keys)
+        prediction = self.values(self.network("value_network"), data)
+        twin_dim = len(self.batch_size)
+        of_each = target.unsqueeze(twin_dim).expand_as(prediction) if self.twin_critics else target
+        distance = distance_loss(prediction, of_each, self.loss_function)
+        prediction = prediction.detach()
+        td_error = (prediction - of_each).square()
+        if self.twin_critics:
+            distance, td_error = distance.sum(twin_dim), td_error.amax(twin_dim)
+        tensordict.set(self.tensor_keys.priority, td_error)
+        return self.mean_per_seed(distance, tensordict).sum(), {
+            "pred_value": prediction,
+            "target_value": target,
+            "pred_value_max": self.flatten_batch(prediction).amax(-1),
+            "target_value_max": self.flatten_batch(target).amax(-1),
+            "td_error_max": self.flatten_batch(td_error).amax(-1),
+        }
+
+    def target(self, tensordict: TensorDictBase) -> Tensor:
+        """Return the clipped bootstrapped targets of transitions, ``[*S, *B]``."""
+        successor = self.inputs.following(tensordict, self.tensor_keys)
+        next_value = self.next_value(successor).unsqueeze(-1)
+        reward = tensordict.get(("next", self.tensor_keys.reward))
+        if reward.shape != next_value.shape:
+            raise ValueError(
+                f"the reward must be {[*next_value.shape]}, as the value is, got {[*reward.shape]}"
+            )
+        target = self.value_estimator.value_estimate(tensordict, next_value=next_value).squeeze(-1)
+        return target if self.return_bounds is None else target.clamp(*self.return_bounds)
+
+    def values(self, critic: Any, data: TensorDictBase) -> Tensor:
+        """Return a critic's values ``[*S, *B]``, or ``[*S, 2, *B]`` of twin critics.
+
+        Args:
+            critic: One of `network`.
+            data: States and actions ``[*S, *B]``.
+        """
+        if self.twin_critics:
+            dim = len(self.batch_size)
+            data = data.select(*critic.in_keys).unsqueeze(dim)
+            data = data.expand(*data.batch_size[:dim], 2, *data.batch_size[dim + 1 :])
+        return critic(data).get(self.tensor_keys.state_action_value).squeeze(-1)
+
+    def penalized(
+        self, value: Tensor, data: TensorDictBase, tensordict: TensorDictBase
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return ``-mean(value)`` and a penalty that keeps the actor's tanh from saturating.
+
+        The penalty is ``pre_tanh_penalty`` times the mean square of the actor's output before the
+        tanh, over batch and action dimensions.
+
+        Args:
+            value: Values of the actor's actions, ``[*S, *B]``.
+            data: Output of the actor ``[*S, *B]``.
+            tensordict: Batch of transitions, read for its weights.
+
+        Returns:
+            The loss ``[]`` and ``"pre_tanh_magnitude"`` ``[*S]``, the root of that mean square.
+
+        Raises:
+            ValueError: If the actor wrote no ``"pre_tanh_action"`` to penalize.
+        """
+        loss = -self.mean_per_seed(value, tensordict)
+        pre_tanh = data.get(self.tensor_keys.pre_tanh_action, None)
+        if pre_tanh is None:
+            if self.pre_tanh_penalty:
+                raise ValueError(
+                    f"the actor wrote no {self.tensor_keys.pre_tanh_action!r} to penalize: write "
+                    "it, name it with set_keys(pre_tanh_action=...), or pass pre_tanh_penalty=0"
+                )
+            return loss.sum(), {}
+        square = pre_tanh.square()
+        if self.pre_tanh_penalty:
+            loss = loss + self.pre_tanh_penalty * self.mean_per_seed(square, tensordict)
+        magnitude = self.flatten_batch(square.detach()).mean(-1).sqrt()
+        return loss.sum(), {"pre_tanh_magnitude": magnitude}
+
+    def mean_per_seed(self, loss: Tensor, tensordict: TensorDictBase) -> Tensor:
+        """Return the mean ``[*S]`` of ``[*S, *B, ...]``, weighted by ``"priority_weight"``."""
+        weights = tensordict.get(self.tensor_keys.priority_weight, None)
+        if weights is not None and self.use_prioritized_weights:
+            loss = loss * weights.reshape(*weights.shape, *[1] * (loss.ndim - weights.ndim))
+        return self.flatten_batch(loss).mean(-1)
+
+    def flatten_batch(self, values: Tensor) -> Tensor:
+        """Return values ``[*S, ...]`` with all but the leading dimensions ``S`` in one."""
+        return values.reshape(*self.batch_size, -1)
+
+    def network(self, name: str, *, frozen: bool = False) -> Any:
+        """Return a network that holds the very parameters of the loss.
+
+        Args:
+            name: ``"actor_network"`` or ``"value_network"``, each with ``"target_"`` before it for
+                the target network.
+            frozen: Whether gradients reach the network's input only, not its parameters.
+        """
+        # Made once: to put parameters in for each call, as TorchRL does, adds a sixth to its time.
+        if (name, frozen) not in self._made:
+            made = self._made[name, frozen] = deepcopy(getattr(self, name.removeprefix("target_")))
+            params = getattr(self, f"{name}_params")
+            (params.detach() if frozen else params).to_module(made)
+        return self._made[name, frozen]
+
+    def _apply(self, fn: Any) -> Any:
+        self._made.clear()  # a cast gives the parameters other memory
+        return super()._apply(fn)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # A copy makes its own: copies of detached tensors would no longer follow the parameters.
+        return {**super().__getstate__(), "_made": {}}

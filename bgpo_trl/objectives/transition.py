@@ -1,0 +1,126 @@
+"""Entries of transitions that the networks of a loss read."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+
+from bgpo_trl.errors import missing_key
+
+__all__ = ["TransitionInputs", "TransitionKeys"]
+
+
+@dataclass
+class TransitionKeys:
+    """Names of the entries of an off-policy loss, to be changed with its ``set_keys``."""
+
+    action: NestedKey = "action"
+    """Action of a transition, and of the actor."""
+    pre_tanh_action: NestedKey = "pre_tanh_action"
+    """Output of the actor before its tanh."""
+    log_prob: NestedKey = "action_log_prob"
+    """Log-probability of an action drawn from the actor."""
+    state_action_value: NestedKey = "state_action_value"
+    """Output of the critics."""
+    reward: NestedKey = "reward"
+    """Reward, under ``"next"``."""
+    done: NestedKey = "done"
+    """Whether the episode is over, under ``"next"``; accepted and not needed."""
+    terminated: NestedKey = "terminated"
+    """Whether nothing can follow, under ``"next"``: ends the bootstrap."""
+    priority: NestedKey = "td_error"
+    """Squared error of the critics, written for prioritized replay."""
+    priority_weight: NestedKey = "priority_weight"
+    """Factor of each transition's loss."""
+
+
+class TransitionInputs:
+    """Input of an actor and its critics, in the states and the next states of transitions.
+
+    An entry that is constant within an episode is not stored a second time under ``"next"``: its
+    next value is read from the root.
+
+    Args:
+        reader: Name of the loss, for messages.
+        actor_network: Policy.
+        value_network: Q-function; what the actor writes is not part of the input.
+        constant_keys: Entries that are constant within an episode.
+
+    Attributes:
+        keys: All entries of the input.
+        constant_keys: Those that are constant within an episode.
+        moving_keys: The others.
+
+    Example:
+        >>> from bgpo_trl.modules.actor_critic import Actor, Critic
+        >>> inputs = TransitionInputs("DDPGLoss", Actor(96), Critic(96), ["behavior"])
+        >>> inputs.moving_keys
+        ['latent']
+    """
+
+    def __init__(
+        self,
+        reader: str,
+        actor_network: TensorDictModuleBase,
+        value_network: TensorDictModuleBase,
+        constant_keys: Sequence[NestedKey] = (),
+    ) -> None:
+        self.reader = reader
+        written = set(actor_network.out_keys)
+        read = [*actor_network.in_keys, *(k for k in value_network.in_keys if k not in written)]
+        self.keys = [*dict.fromkeys(read)]
+        self.constant_keys = [key for key in constant_keys if key in self.keys]
+        self.moving_keys = [key for key in self.keys if key not in self.constant_keys]
+
+    def select(
+        self, tensordict: TensorDictBase, keys: Iterable[NestedKey], where: str = ""
+    ) -> TensorDictBase:
+        """Return entries without their gradients.
+
+        Args:
+            tensordict: Batch ``[*S, *B]``.
+            keys: Entries to read.
+            where: Addition to the reader's name in the message.
+
+        Raises:
+            ValueError: If an entry is missing.
+        """
+        try:
+            return tensordict.select(*keys).detach()
+        except KeyError:
+            raise missing_key(self.reader + where, tensordict, keys) from None
+
+    def current(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return the input in the states of transitions ``[*S, *B]``.
+
+        Raises:
+            ValueError: If an entry is missing.
+        """
+        return self.select(tensordict, self.keys)
+
+    def following(self, tensordict: TensorDictBase, names: TransitionKeys) -> TensorDictBase:
+        """Return the input in the next states of transitions ``[*S, *B]``.
+
+        Args:
+            tensordict: Batch of transitions.
+            names: Names of reward and termination, which must be there under ``"next"``.
+
+        Raises:
+            ValueError: If an entry is missing.
+        """
+        successor = tensordict.get("next", None)
+        if successor is None or successor.get(names.reward, None) is None:
+            raise missing_key(self.reader, tensordict, [("next", names.reward)])
+        if successor.get(names.terminated, None) is None:
+            # The estimator would read "done" in its place, and stop at truncation too.
+            raise ValueError(
+                f"the batch lacks ('next', {names.terminated!r}): store it, since only it tells a "
+                "success from a time-out"
+            )
+        data = self.select(successor, self.moving_keys, ", under 'next',")
+        for key in self.constant_keys:
+            data.set(key, tensordict[key])
+        return data
