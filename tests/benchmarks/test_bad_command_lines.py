@@ -94,11 +94,11 @@ CASES = [
     ("report.py nowhere", "nowhere is not a directory", "name the one that holds the runs"),
     ("report.py empty", "empty holds none of the runs", "that the figures need"),
     # measurements
-    ("throughput.py --parts", "--parts is empty", "name some of frames"),
-    ("throughput.py --rounds 0", "--rounds", "at least 1, got 0"),
-    ("throughput.py --threads 0", "--threads", "at least 1, got 0"),
-    ("gwr.py --nodes", "--nodes", "one or more, of at least 2"),
-    ("gwr.py --networks 0", "--networks", "at least 1, got 0"),
+    ("speed/throughput.py --parts", "--parts is empty", "name some of frames"),
+    ("speed/throughput.py --rounds 0", "--rounds", "at least 1, got 0"),
+    ("speed/throughput.py --threads 0", "--threads", "at least 1, got 0"),
+    ("speed/gwr.py --nodes", "--nodes", "one or more, of at least 2"),
+    ("speed/gwr.py --networks 0", "--networks", "at least 1, got 0"),
     # stage 1
     ("bgpo_trl.data.recording file", "cannot make the folder file", "choose another"),
     ("bgpo_trl.data.recording new --per-task 0", "held_out_per_task", "less than per_task, 0"),
