@@ -29,7 +29,7 @@ def main(arguments: list[str]) -> None:
         sys.exit(USAGE if name in ("-h", "--help") else f"error: no command {name!r}\n{USAGE}")
     # Imported here: the others need neither TorchRL nor the seconds that it takes.
     from bgpo_trl.experiments import paper
-    from bgpo_trl.experiments.run import Arguments, command_line
+    from bgpo_trl.experiments.arguments import Arguments, command_line
 
     kind = paper.AblationArguments if name == "ablation" else Arguments
     run = getattr(paper, name)
