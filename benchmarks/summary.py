@@ -19,8 +19,9 @@ import numpy as np
 import tyro
 
 from bgpo_trl.analysis.tables import median_cell, own_episodes, ratio_cells
-from bgpo_trl.figures.curves import plot_success_curves, save_figure
+from bgpo_trl.figures.curves import plot_success_curves
 from bgpo_trl.figures.of_run import draw_groups
+from bgpo_trl.figures.style import save_figure
 from bgpo_trl.runs.results import read_curves, read_final_tests, read_json, read_tests
 from suites import nico
 
