@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from bgpo_trl.data.bank import DemonstrationBank
-from bgpo_trl.data.recording import load_demonstrations, record_demonstrations
+from bgpo_trl.data.dataset import load_demonstrations
+from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.encoders.representation import default_weights, load_representation
 from bgpo_trl.figures.curves import plot_success_curves

@@ -22,7 +22,7 @@ import tyro
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from bgpo_trl.data.recording import load_demonstrations
+from bgpo_trl.data.dataset import load_demonstrations
 from bgpo_trl.encoders.representation import (
     Representation,
     default_weights,
