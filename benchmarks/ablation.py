@@ -10,9 +10,9 @@ All tasks are presented from the start.
 
 from __future__ import annotations
 
+from bgpo_trl.experiments.arguments import command_line
 from bgpo_trl.experiments.paper import AblationArguments as Arguments
 from bgpo_trl.experiments.paper import ablation as main
-from bgpo_trl.experiments.run import command_line
 
 if __name__ == "__main__":
     command_line(main, __doc__, Arguments)

@@ -7,8 +7,8 @@ Differs from `continual.py` only in the schedule of tasks, and writes the same f
 
 from __future__ import annotations
 
+from bgpo_trl.experiments.arguments import command_line
 from bgpo_trl.experiments.paper import concurrent as main
-from bgpo_trl.experiments.run import command_line
 
 if __name__ == "__main__":
     command_line(main, __doc__)

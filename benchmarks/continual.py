@@ -9,8 +9,8 @@ writes a run directory with ``config.json``, ``train.csv``, ``eval.csv``, ``chec
 
 from __future__ import annotations
 
+from bgpo_trl.experiments.arguments import command_line
 from bgpo_trl.experiments.paper import continual as main
-from bgpo_trl.experiments.run import command_line
 
 if __name__ == "__main__":
     command_line(main, __doc__)

@@ -25,9 +25,10 @@ from tyro.conf import subcommand
 from bgpo_trl.algorithms.bgpo import BGPO
 from bgpo_trl.configs import PRESETS, BGPOConfig, DDPGConfig, SACConfig, TD3Config
 from bgpo_trl.encoders.pretrained import load_pretrained
+from bgpo_trl.experiments.arguments import command_line
 from bgpo_trl.experiments.resuming import check_resumable
-from bgpo_trl.experiments.run import command_line
-from bgpo_trl.figures.curves import plot_success_curves, save_figure
+from bgpo_trl.figures.curves import plot_success_curves
+from bgpo_trl.figures.style import save_figure
 from bgpo_trl.machine import choose_device, set_threads
 from bgpo_trl.training import Trainer
 

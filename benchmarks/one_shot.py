@@ -31,8 +31,9 @@ from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.encoders.representation import embed_demonstrations
 from bgpo_trl.evaluation import Evaluator, Snapshot
-from bgpo_trl.experiments.run import command_line, commit_of_code
-from bgpo_trl.figures.curves import save_figure
+from bgpo_trl.experiments.arguments import command_line
+from bgpo_trl.experiments.run import commit_of_code
+from bgpo_trl.figures.style import save_figure
 from bgpo_trl.seeding import stream_seed
 
 COLUMNS = ("share", "seed", "task", "episodes", "success", "task_inference", "activity")

@@ -21,9 +21,11 @@ import tyro
 from bgpo_trl.analysis.claims import LEVEL, additions, claims
 from bgpo_trl.analysis.comparison import GROUPS, SETTINGS, Group, Run, Statistics, read_group
 from bgpo_trl.analysis.tables import Table, continual_table, groups_table, main_table, speed_table
-from bgpo_trl.experiments.run import command_line
-from bgpo_trl.figures.curves import plot_gwr_pca, plot_success_curves, save_figure
+from bgpo_trl.experiments.arguments import command_line
+from bgpo_trl.figures.curves import plot_success_curves
+from bgpo_trl.figures.nodes import plot_gwr_pca
 from bgpo_trl.figures.page import Section, write_page
+from bgpo_trl.figures.style import save_figure
 from bgpo_trl.runs.results import read_rows
 from suites import nico
 

@@ -18,9 +18,11 @@ from typing import Annotated
 import numpy as np
 import tyro
 
+from bgpo_trl.analysis.metrics import overall_episodes_to
 from bgpo_trl.analysis.tables import median_cell, own_episodes, ratio_cells
-from bgpo_trl.figures.curves import plot_success_curves, save_figure
+from bgpo_trl.figures.curves import plot_success_curves
 from bgpo_trl.figures.of_run import draw_groups
+from bgpo_trl.figures.style import save_figure
 from bgpo_trl.runs.results import read_curves, read_final_tests, read_json, read_tests
 from suites import nico
 
@@ -41,7 +43,7 @@ def summarize(path: Path) -> dict[str, float]:
 
     Returns:
         Success by task; ``overall``, the mean over tasks; and ``episodes to 80 %``, the result of
-        `Curves.episodes_to`, infinite if not reached.
+        `overall_episodes_to`, infinite if not reached.
 
     Raises:
         ValueError: If a task has no test in that period.
@@ -57,7 +59,8 @@ def summarize(path: Path) -> dict[str, float]:
             raise ValueError(f"{path} has no late test of {task!r}: let the run finish")
     table = {task: float(np.mean(late[task])) for task in _tasks(rows)}
     table["overall"] = sum(table.values()) / len(table)
-    table["episodes to 80 %"] = read_curves(path, _tasks(rows)).episodes_to(0.8)
+    curves = read_curves(path, _tasks(rows))
+    table["episodes to 80 %"] = overall_episodes_to(curves.success, curves.episodes)
     return table
 
 

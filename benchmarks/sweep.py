@@ -27,8 +27,9 @@ from typing import Literal
 
 from bgpo_trl.algorithms import ABLATIONS
 from bgpo_trl.encoders.pretrained import load_pretrained
-from bgpo_trl.experiments import run as experiment
+from bgpo_trl.experiments import arguments as experiment
 from bgpo_trl.experiments.merge import merge
+from bgpo_trl.experiments.run import run_experiment
 from bgpo_trl.files.locking import DirectoryLock
 from bgpo_trl.runs.config_file import settings_of
 from bgpo_trl.runs.directory import check_settings, holds_run
@@ -133,7 +134,7 @@ def check_directories(jobs: dict[Path, list[Job]], encoders: str) -> None:
 def play(job: Job) -> None:
     """Play a job to its end, from its last checkpoint if there is one, and measures."""
     arguments = experiment.Arguments(out=job.directory, resume=holds_run(job.directory))
-    experiment.run_experiment(arguments, "sweep", job.config)
+    run_experiment(arguments, "sweep", job.config)
 
 
 def main(arguments: Arguments) -> None:

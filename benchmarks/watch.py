@@ -22,9 +22,10 @@ from PIL import Image, ImageDraw, ImageFont, ImageOps
 
 from bgpo_trl import TrainedPolicy, load_run
 from bgpo_trl.data.recording import record_demonstrations
-from bgpo_trl.experiments.run import command_line
-from bgpo_trl.figures.curves import plot_frame_strips, save_figure
+from bgpo_trl.experiments.arguments import command_line
+from bgpo_trl.figures.frame_strips import plot_frame_strips
 from bgpo_trl.figures.of_run import draw_growth
+from bgpo_trl.figures.style import save_figure
 from bgpo_trl.figures.video import save_gif
 from suites import nico
 from suites.nico.rendering import FrameRenderer

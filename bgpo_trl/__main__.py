@@ -22,14 +22,14 @@ def main(arguments: list[str]) -> None:
     """
     name, *options = arguments or ["--help"]
     if name == "doctor":
-        from bgpo_trl import doctor
+        from bgpo_trl.doctor.__main__ import main as examine
 
-        sys.exit(doctor.main(options))
+        sys.exit(examine(options))
     if name not in ("continual", "concurrent", "ablation"):
         sys.exit(USAGE if name in ("-h", "--help") else f"error: no command {name!r}\n{USAGE}")
     # Imported here: the others need neither TorchRL nor the seconds that it takes.
     from bgpo_trl.experiments import paper
-    from bgpo_trl.experiments.run import Arguments, command_line
+    from bgpo_trl.experiments.arguments import Arguments, command_line
 
     kind = paper.AblationArguments if name == "ablation" else Arguments
     run = getattr(paper, name)

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import sys
-from collections import deque
 from collections.abc import Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
 from typing import Any
 
 import numpy as np
@@ -17,6 +14,8 @@ from torchrl.envs import EnvBase
 
 from bgpo_trl.errors import missing_key
 from bgpo_trl.machine import usable_cores
+from bgpo_trl.seeding import random_state, set_random_state
+from bgpo_trl.threads import Threads
 from suites import nico
 from suites.nico.base import STATE_SIZE, Environment, Observation, check_observation
 from suites.nico.rendering import FRAME_HEIGHT, FRAME_WIDTH, FrameRenderer
@@ -99,8 +98,7 @@ class NicoEnv(EnvBase):
         if observation != "state":
             self._renderer = FrameRenderer(self._environments[0][0].physics.model.ptr)
         threads = usable_cores() if threads is None else threads
-        self._helpers = min(count, threads) - 1
-        self._pool = ThreadPoolExecutor(max(1, self._helpers), "physics")
+        self._threads = Threads(min(count, threads), "physics")
         self._task = np.zeros(count, dtype=np.int64)
         self._current: dict[str, np.ndarray] = {}
         self._done = np.zeros(count, dtype=bool)
@@ -159,43 +157,17 @@ class NicoEnv(EnvBase):
             self._current["state"][row] = timestep.observation["privileged_state"]
 
     def _advance(self, rows: Iterable[int], actions: np.ndarray, rewards: np.ndarray) -> None:
-        """Step simulations, in all threads, and draws what they have come to, in this one."""
-        waiting, arrived = deque(rows), deque[tuple[int, TimeStep]]()
+        """Step simulations in all threads, and draw what they have come to in this one."""
 
-        def step_next() -> bool:
-            try:
-                row = waiting.popleft()
-            except IndexError:
-                return False
-            arrived.append((row, self._environment(row).step(actions[row])))
-            return True
+        def step(row: int) -> TimeStep:
+            return self._environment(row).step(actions[row])
 
-        def step_all() -> None:
-            while step_next():
-                pass
+        def record(row: int, timestep: TimeStep) -> None:
+            self._record(row, timestep)
+            rewards[row] = timestep.reward
+            self._done[row] = timestep.last()
 
-        def record() -> None:
-            while arrived:
-                row, timestep = arrived.popleft()
-                self._record(row, timestep)
-                rewards[row] = timestep.reward
-                self._done[row] = timestep.last()
-
-        helpers = [self._pool.submit(step_all) for _ in range(min(self._helpers, len(waiting) - 1))]
-        interval = sys.getswitchinterval()
-        try:
-            if helpers:
-                # A thread back from MuJoCo waits this long for a turn of Python, by default 5 ms:
-                # the time of several simulations.
-                sys.setswitchinterval(2e-4)
-            while step_next():
-                record()
-        finally:
-            wait(helpers)  # Whatever happens, nothing moves behind the caller's back.
-            sys.setswitchinterval(interval)
-        for helper in helpers:
-            helper.result()
-        record()
+        self._threads.each(rows, step, record)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         del kwargs
@@ -251,8 +223,8 @@ class NicoEnv(EnvBase):
         return pixels.reshape(*self.batch_size, *pixels.shape[1:])
 
     def close(self, *, raise_if_closed: bool = True) -> None:
-        """End the threads and frees the renderer."""
-        self._pool.shutdown()
+        """End the threads and free the renderer."""
+        self._threads.close()
         if self._renderer is not None:
             self._renderer.close()
         super().close(raise_if_closed=raise_if_closed)
@@ -272,16 +244,8 @@ class NicoEnv(EnvBase):
         """Return all that the future depends on, as tensors: physics, task, random numbers."""
         physics, random = [], []
         for environments in self._environments:
-            physics.append(torch.from_numpy(environments[0].physics.full_state()))
-            _, key, position, has_gauss, gauss = environments[0].task.random.get_state()
-            random.append(
-                {
-                    "key": torch.from_numpy(key.astype(np.int64)),
-                    "position": int(position),
-                    "has_gauss": int(has_gauss),
-                    "gauss": float(gauss),
-                }
-            )
+            physics.append(torch.from_numpy(environments[0].physics.get_state()))
+            random.append(random_state(environments[0].task.random))
         return {
             "physics": torch.stack(physics),
             "random": random,
@@ -307,17 +271,8 @@ class NicoEnv(EnvBase):
                 f"environment has {sorted(self._current)}: use the same observation"
             )
         for row, environments in enumerate(self._environments):
-            environments[0].physics.set_full_state(state["physics"][row].numpy())
-            random = state["random"][row]
-            environments[0].task.random.set_state(
-                (
-                    "MT19937",
-                    random["key"].numpy().astype(np.uint32),
-                    random["position"],
-                    random["has_gauss"],
-                    random["gauss"],
-                )
-            )
+            environments[0].physics.set_state(state["physics"][row].numpy())
+            set_random_state(environments[0].task.random, state["random"][row])
             for environment in environments:
                 environment._reset_next_step = False
         self._task[:] = state["task"].numpy()

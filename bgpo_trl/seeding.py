@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -41,3 +42,20 @@ def task_generators(seeds: Sequence[int], n_tasks: int, name: str) -> list[list[
 def normal(generators: Sequence[torch.Generator], shape: Sequence[int]) -> Tensor:
     """Return standard normals ``[S, *shape]``, those of each seed from its own generator."""
     return torch.stack([torch.randn(*shape, generator=generator) for generator in generators])
+
+
+def random_state(random: np.random.RandomState) -> dict[str, Any]:
+    """Return the state of NumPy's generator in a form that checkpoints can hold."""
+    _, key, position, has_gauss, gauss = random.get_state()
+    return {
+        "key": torch.from_numpy(key.astype(np.int64)),
+        "position": int(position),
+        "has_gauss": int(has_gauss),
+        "gauss": float(gauss),
+    }
+
+
+def set_random_state(random: np.random.RandomState, state: Mapping[str, Any]) -> None:
+    """Restore the result of `random_state`."""
+    key = state["key"].numpy().astype(np.uint32)
+    random.set_state(("MT19937", key, state["position"], state["has_gauss"], state["gauss"]))

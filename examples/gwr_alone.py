@@ -9,7 +9,7 @@ import networkx as nx
 import torch
 from matplotlib.figure import Figure
 
-from bgpo_trl.figures.curves import save_figure
+from bgpo_trl.figures.style import save_figure
 from bgpo_trl.modules.gwr import GWRB
 
 

@@ -7,10 +7,13 @@ import pytest
 import torch
 
 from bgpo_trl.data.bank import DemonstrationBank
-from bgpo_trl.data.recording import load_demonstrations, record_demonstrations
+from bgpo_trl.data.dataset import load_demonstrations
+from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.encoders.representation import default_weights, load_representation
-from bgpo_trl.figures.curves import plot_frame_strips, plot_success_curves, save_figure
+from bgpo_trl.figures.curves import plot_success_curves
+from bgpo_trl.figures.frame_strips import plot_frame_strips
+from bgpo_trl.figures.style import save_figure
 from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
 from bgpo_trl.files.csv_file import CsvFile
 from bgpo_trl.runs.logger import EVAL_COLUMNS, RunLogger

@@ -16,7 +16,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv
 
-from bgpo_trl.analysis import metrics
+from bgpo_trl.analysis import intervals, metrics
 from bgpo_trl.data.replay import ReplayBuffer
 from bgpo_trl.data.task_replay import TaskReplay
 from bgpo_trl.envs import NicoEnv
@@ -291,16 +291,16 @@ PARTS = {
         lambda: metrics.forgetting_since_best([0.1, 0.2]), "success [2]", "is needed"),
     "transfer without phases": (
         lambda: metrics.backward_transfer([[1, 2]]), "got [1, 2]", "one phase a task"),
-    "quartiles of nothing": (lambda: metrics.interquartile_mean([]), "at least one", "leave out"),
-    "quartiles of NaN": (lambda: metrics.interquartile_mean([NAN]), "finite", "leave out"),
+    "quartiles of nothing": (lambda: intervals.interquartile_mean([]), "at least one", "leave out"),
+    "quartiles of NaN": (lambda: intervals.interquartile_mean([NAN]), "finite", "leave out"),
     "bootstrap of NaN": (
-        lambda: metrics.stratified_bootstrap([[NAN]], rng=np.random.default_rng(0)),
+        lambda: intervals.stratified_bootstrap([[NAN]], rng=np.random.default_rng(0)),
         "with NaN", "must be finite"),
     "bootstrap of no draws": (
-        lambda: metrics.stratified_bootstrap([[1]], n_resamples=0, rng=np.random.default_rng(0)),
+        lambda: intervals.stratified_bootstrap([[1]], n_resamples=0, rng=np.random.default_rng(0)),
         "got 0", "at least 1"),
     "interval in percent": (
-        lambda: metrics.percentile_interval([1, 2], 95), "and 95", "confidence in (0, 1)"),
+        lambda: intervals.percentile_interval([1, 2], 95), "and 95", "confidence in (0, 1)"),
 }  # fmt: skip
 
 

@@ -12,7 +12,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from bgpo_trl.data.bank import DemonstrationBank, DemonstrationSteps
-from bgpo_trl.data.recording import load_demonstrations, record_demonstrations
+from bgpo_trl.data.dataset import load_demonstrations
+from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.encoders.representation import (
     Representation,
     load_representation,

@@ -12,7 +12,7 @@ import pytest
 import torch
 from PIL import Image
 
-from bgpo_trl.data.recording import load_demonstrations
+from bgpo_trl.data.dataset import load_demonstrations
 from suites import nico
 
 EXAMPLES = Path(__file__).parents[1] / "examples"

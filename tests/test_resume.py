@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from bgpo_trl.data.recording import load_demonstrations
+from bgpo_trl.data.dataset import load_demonstrations
 from bgpo_trl.encoders import fitting
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.files.checkpoint import load_checkpoint

@@ -143,7 +143,7 @@ def record() -> tuple[np.ndarray, np.ndarray]:
     ]
     for environment in environments:
         environment.reset()
-        starts.append(environment.physics.full_state())
+        starts.append(environment.physics.get_state())
     for _ in range(EPISODE):
         for environment, action in zip(environments, draw(ROWS), strict=True):
             environment.step(action)

@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 from timing import Timing, interleave
 from torch import Tensor
 
-from bgpo_trl.figures.curves import save_figure
+from bgpo_trl.figures.style import save_figure
 from bgpo_trl.machine import set_threads
 from bgpo_trl.modules.gwr import GWRB
 

@@ -21,7 +21,7 @@ from timing import interleave
 
 from bgpo_trl.algorithms import ALGORITHMS, Algorithm
 from bgpo_trl.encoders.pretrained import load_pretrained
-from bgpo_trl.experiments.run import AlgorithmName, command_line
+from bgpo_trl.experiments.arguments import AlgorithmName, command_line
 from bgpo_trl.machine import set_threads
 from bgpo_trl.transforms import TaskSchedule
 from bgpo_trl.world import World

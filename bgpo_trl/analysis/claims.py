@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from itertools import pairwise
 from typing import Any
 
-from bgpo_trl.analysis import metrics
+from bgpo_trl.analysis import intervals
 from bgpo_trl.analysis.comparison import (
     ADDITIONS,
     ALGORITHMS,
@@ -122,9 +122,9 @@ class _Judge:
         if missing:
             return ["", "missing: " + ", ".join(missing)]
         scores = [_MEASURES[what](run) for run in runs if run is not None]
-        gain = _difference([metrics.interquartile_mean(of_run) for of_run in scores])
+        gain = _difference([intervals.interquartile_mean(of_run) for of_run in scores])
         drawn = _difference([self._statistics.resampled(of_run) for of_run in scores])
-        low, high = metrics.percentile_interval(drawn)
+        low, high = intervals.percentile_interval(drawn)
         verdict = self._words[0] if low > 0 else self._words[1] if high < 0 else "level"
         return [f"{100 * gain:+.1f} [{100 * low:+.0f}, {100 * high:+.0f}]", verdict]
 

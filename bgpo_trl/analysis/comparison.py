@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bgpo_trl.analysis import metrics
+from bgpo_trl.analysis import intervals, metrics
 from bgpo_trl.runs.results import Curves, read_curves, read_json, read_rows
 from suites import nico
 
@@ -238,11 +238,11 @@ class Statistics:
         key = scores.tobytes()
         if key not in self._drawn:
             rng = np.random.default_rng([self._seed, zlib.crc32(key)])
-            self._drawn[key] = metrics.stratified_bootstrap(scores, rng=rng)
+            self._drawn[key] = intervals.stratified_bootstrap(scores, rng=rng)
         return self._drawn[key]
 
     def cell(self, scores: Values) -> str:
         """Format an interquartile mean with its interval, in percent."""
-        low, high = metrics.percentile_interval(self.resampled(scores))
-        middle = metrics.interquartile_mean(scores)
+        low, high = intervals.percentile_interval(self.resampled(scores))
+        middle = intervals.interquartile_mean(scores)
         return f"{100 * middle:.1f} [{100 * low:.0f}, {100 * high:.0f}]"

@@ -1,4 +1,4 @@
-"""Measures of multi-task and continual learning, with bootstrap confidence intervals.
+"""Measures of multi-task and continual learning.
 
 All functions take plain arrays. ``success`` ``[..., E, T]`` is the share of successes on each
 of ``T`` tasks at each of ``E`` evaluations (`bgpo_trl.runs.results.Curves` adds a leading seed
@@ -6,8 +6,6 @@ dimension). NaN marks tasks that were not tested, because they had not been pres
 """
 
 from __future__ import annotations
-
-from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -47,15 +45,6 @@ def evaluation_matrix(
             )
         phases.append(_mean(success[..., chosen, :], axis=-2))
     return np.stack(phases, axis=-2)
-
-
-def average_performance(matrix: ArrayLike) -> Array:
-    """Return the mean over tasks of success at the end of training, ``[...]``.
-
-    Args:
-        matrix: Result of `evaluation_matrix`, ``[..., P, T]``.
-    """
-    return _mean(np.asarray(matrix, float)[..., -1, :], axis=-1)
 
 
 def forgetting_since_learned(matrix: ArrayLike) -> Array:
@@ -165,6 +154,27 @@ def episodes_to(success: ArrayLike, episodes: ArrayLike, threshold: float = 0.8)
     return np.where(reached.any(axis=-1), first, np.inf)
 
 
+def overall_episodes_to(success: ArrayLike, episodes: ArrayLike, threshold: float = 0.8) -> float:
+    """Return the training episodes until overall success first reaches a rate.
+
+    Overall success is the mean over seeds and the tasks presented so far, and over the last three
+    evaluations, since a single one has few test episodes.
+
+    Args:
+        success: Success ``[S, E, T]``.
+        episodes: Training episodes before each evaluation, ``[E]``.
+        threshold: The success rate.
+
+    Returns:
+        The number of episodes; infinite if the rate is never reached.
+
+    Raises:
+        ValueError: If the shapes do not match, or ``episodes`` do not increase.
+    """
+    overall = presented_mean(trailing_mean(success, 3)).mean(axis=0)
+    return float(episodes_to(overall, episodes, threshold))
+
+
 def trials_to(success: ArrayLike, threshold: float = 0.5, *, window: int = 20) -> float:
     """Return the number of its own training episodes that a task takes to reach a success rate.
 
@@ -232,91 +242,6 @@ def presented_mean(success: ArrayLike) -> Array:
         success: Success ``[..., E, T]``.
     """
     return _mean(np.asarray(success, float), axis=-1)
-
-
-def interquartile_mean(scores: ArrayLike) -> float:
-    """Return the mean of the middle half of all scores (Agarwal et al., 2021, "rliable").
-
-    Args:
-        scores: Scores of any shape, such as ``[S, T]`` for seeds and tasks.
-
-    Raises:
-        ValueError: If there are no scores, or one is not finite.
-    """
-    ordered = np.sort(np.asarray(scores, float), axis=None)
-    if not ordered.size or not np.isfinite(ordered).all():
-        raise ValueError("scores must be finite and not empty: leave out what was not tested")
-    cut = ordered.size // 4
-    return float(ordered[cut : ordered.size - cut].mean())
-
-
-def stratified_bootstrap(
-    scores: ArrayLike,
-    statistic: Callable[[Array], float] = interquartile_mean,
-    *,
-    n_resamples: int = 2_000,
-    rng: np.random.Generator,
-) -> Array:
-    """Return a statistic of resampled scores, the basis of intervals and of differences.
-
-    Seeds are resampled with replacement, independently for each task (Agarwal et al., 2021, "Deep
-    Reinforcement Learning at the Edge of the Statistical Precipice", section 4.1).
-
-    Args:
-        scores: One score per seed and task, ``[S, T]``.
-        statistic: Function of an array of that shape.
-        n_resamples: Number of resamples ``N``.
-        rng: Random generator.
-
-    Returns:
-        The statistic of each resample, ``[N]``.
-
-    Raises:
-        ValueError: If scores are not finite or not ``[S, T]``, or ``n_resamples`` is less than 1.
-
-    Example:
-        >>> rng = np.random.default_rng(0)
-        >>> ours, theirs = [[0.9, 0.8], [0.7, 0.8]], [[0.5, 0.1], [0.3, 0.2]]
-        >>> gain = stratified_bootstrap(ours, rng=rng) - stratified_bootstrap(theirs, rng=rng)
-        >>> percentile_interval(gain)[0] > 0
-        True
-    """
-    scores = _checked(scores)
-    if n_resamples < 1:
-        raise ValueError(f"n_resamples must be at least 1, got {n_resamples}")
-    n_seeds, n_tasks = scores.shape
-    drawn = rng.integers(n_seeds, size=(n_resamples, n_seeds, n_tasks))
-    return np.array([statistic(scores[seeds, np.arange(n_tasks)]) for seeds in drawn])
-
-
-def percentile_interval(values: ArrayLike, confidence: float = 0.95) -> tuple[float, float]:
-    """Return the percentile bootstrap interval of resampled values.
-
-    Args:
-        values: Results of `stratified_bootstrap`, or sums and differences of them.
-        confidence: Share of the values inside the interval.
-
-    Raises:
-        ValueError: If there are no values, or ``confidence`` is not in (0, 1).
-    """
-    if not np.size(values) or not 0 < confidence < 1:
-        raise ValueError(
-            "values must not be empty and confidence must be in (0, 1), got "
-            f"{np.size(values)} values and {confidence}"
-        )
-    tail = 100 * (1 - confidence) / 2
-    low, high = np.percentile(np.asarray(values, float), [tail, 100 - tail])
-    return float(low), float(high)
-
-
-def _checked(scores: ArrayLike) -> Array:
-    scores = np.asarray(scores, float)
-    if scores.ndim != 2 or not scores.size or not np.isfinite(scores).all():
-        raise ValueError(
-            f"scores must be finite and [seeds, tasks], at least one of each, not of shape "
-            f"{list(scores.shape)}{'' if np.isfinite(scores).all() else ' with NaN or Inf'}"
-        )
-    return scores
 
 
 def _check_episodes(success: Array, episodes: NDArray, axis: int) -> None:

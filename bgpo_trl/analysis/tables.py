@@ -29,7 +29,8 @@ def main_table(runs: Mapping[str, Run], statistics: Statistics) -> Table:
     rows = [["", "last 10 %: IQM", "mean", *(f"task {i + 1}" for i in range(3)), "area: IQM"]]
     rows[0].append("episodes to 80 %")
     for run in runs.values():
-        late, reached = late_scores(run), run.curves.episodes_to(0.8)
+        late = late_scores(run)
+        reached = metrics.overall_episodes_to(run.curves.success, run.curves.episodes)
         rows.append(
             [
                 run.name,

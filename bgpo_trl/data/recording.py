@@ -1,56 +1,32 @@
-"""Recorded demonstrations (frames, states, actions): record, store and load them."""
+"""Record demonstrations (frames, states, actions) as a dataset."""
 
 from __future__ import annotations
 
-import hashlib
-import json
-import shutil
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 import tyro
 from dm_env import TimeStep
-from tensordict import MemoryMappedTensor, TensorDict
+from tensordict import TensorDict
 
-from bgpo_trl.files.folders import make_folder
+from bgpo_trl.data.dataset import (
+    checksum_of,
+    is_dataset,
+    load_demonstrations,
+    make_dataset,
+    open_dataset,
+    read_meta,
+    write_meta,
+)
 from bgpo_trl.files.progress import progress_bar
 from suites import nico
-from suites.nico.base import STATE_SIZE, Environment
+from suites.nico.base import Environment
 from suites.nico.demonstrator import Demonstrator
-from suites.nico.rendering import FRAME_HEIGHT, FRAME_WIDTH, FrameRenderer
-
-MAX_STEPS = 50
-_META = "dataset.json"
-_REMEDY = "record it again with `python -m bgpo_trl.data.recording PATH`"
-
-
-def _empty(n: int) -> TensorDict:
-    frames = MAX_STEPS + 1
-    return TensorDict(
-        {
-            "pixels": torch.zeros((), dtype=torch.uint8).expand(
-                n, frames, FRAME_HEIGHT, FRAME_WIDTH, 3
-            ),
-            "state": torch.zeros(()).expand(n, frames, STATE_SIZE),
-            "action": torch.zeros(()).expand(n, MAX_STEPS, 4),
-            "length": torch.zeros((), dtype=torch.int64).expand(n),
-            "task": torch.zeros((), dtype=torch.int64).expand(n),
-            "train": torch.zeros((), dtype=torch.bool).expand(n),
-            "seed": torch.zeros((), dtype=torch.int64).expand(n),
-        },
-        [n],
-    )
-
-
-def _checksum(dataset: TensorDict) -> str:
-    digest = hashlib.sha256()
-    for _, tensor in sorted(dataset.items()):
-        for rows in tensor.split(256):
-            digest.update(rows.numpy().data)
-    return digest.hexdigest()
+from suites.nico.rendering import FrameRenderer
 
 
 def record_demonstrations(
@@ -93,6 +69,31 @@ def record_demonstrations(
         RuntimeError: If there is no OpenGL to render with, or a demonstrator fails too often;
             earlier rows are kept.
     """
+    wanted = _settings(tasks, per_task, held_out_per_task, play, seed, attempts)
+    path = Path(path)
+    started = is_dataset(path)
+    if started and _is_complete(path, wanted):
+        return load_demonstrations(path)
+    # The renderer comes first, so that a machine without OpenGL fails before writing anything.
+    environments = _environments(tasks)
+    n = per_task * len(tasks)
+    dataset = open_dataset(path, n) if started else make_dataset(path, n)
+    if not started:
+        write_meta(path, wanted)
+    _record_rows(dataset, environments, wanted, attempts, progress)
+    write_meta(path, {**wanted, "checksum": checksum_of(dataset)})
+    return dataset
+
+
+def _settings(
+    tasks: Sequence[str],
+    per_task: int,
+    held_out_per_task: int,
+    play: bool,
+    seed: int,
+    attempts: int,
+) -> dict[str, Any]:
+    """Return what a recording is told apart by, after a check of the arguments."""
     nico.check_tasks(tasks)
     if not tasks:
         raise ValueError("name at least one of the tasks")
@@ -104,8 +105,7 @@ def record_demonstrations(
         raise ValueError(
             f"held_out_per_task is {held_out_per_task}: it must be less than per_task, {per_task}"
         )
-    path = Path(path)
-    wanted = {
+    return {
         "scene_version": nico.scene_version(),
         "tasks": list(tasks),
         "per_task": per_task,
@@ -113,38 +113,57 @@ def record_demonstrations(
         "seed": seed,
         **({"play": True} if play else {}),
     }
-    started = (path / _META).exists()
-    if started:
-        meta = _read_meta(path)
-        found = {key: meta.get(key) for key in {**wanted, **meta} if key != "checksum"}
-        if found != wanted:
-            raise ValueError(
-                f"{path} holds another recording ({found}); choose another folder or remove it"
-            )
-        if meta.get("checksum"):
-            return load_demonstrations(path)
-    # The renderer comes first, so that a machine without OpenGL fails before writing anything.
+
+
+def _is_complete(path: Path, wanted: Mapping[str, Any]) -> bool:
+    """Return whether a recording was completed.
+
+    Raises:
+        ValueError: If it has other settings.
+    """
+    meta = read_meta(path)
+    found = {key: meta.get(key) for key in {**wanted, **meta} if key != "checksum"}
+    if found != wanted:
+        raise ValueError(
+            f"{path} holds another recording ({found}); choose another folder or remove it"
+        )
+    return bool(meta.get("checksum"))
+
+
+def _environments(tasks: Sequence[str]) -> list[Environment]:
+    """Return an environment of each task, with one simulation and renderer for all."""
     physics = nico.Physics.from_xml_string(nico.scene_xml())
     shared = {"physics": physics, "renderer": FrameRenderer(physics.model.ptr)}
-    environments = [nico.load(task, observation="both", **shared) for task in tasks]
-    if started:
-        dataset = _open(path, per_task * len(tasks))
-    else:
-        dataset = _make(path, per_task * len(tasks))
-        _write_meta(path, wanted)
+    return [nico.load(task, observation="both", **shared) for task in tasks]
+
+
+def _record_rows(
+    dataset: TensorDict,
+    environments: Sequence[Environment],
+    wanted: Mapping[str, Any],
+    attempts: int,
+    progress: bool,
+) -> None:
+    """Record the rows that are not there yet."""
+    tasks, per_task, seed = wanted["tasks"], wanted["per_task"], wanted["seed"]
+    play, n_shown = "play" in wanted, per_task - wanted["held_out_per_task"]
     missing = torch.nonzero(dataset["length"] == 0).flatten().tolist()
     tried, done = [0] * len(tasks), [0] * len(tasks)
-    described = "record play" if play else "record demonstrations"
-    n = len(dataset)
-    for row in progress_bar(
-        described, missing, shown=progress, total=n, initial=n - len(missing), unit="episode"
-    ):
+    bar = progress_bar(
+        "record play" if play else "record demonstrations",
+        missing,
+        shown=progress,
+        total=len(dataset),
+        initial=len(dataset) - len(missing),
+        unit="episode",
+    )
+    for row in bar:
         task = row // per_task
         if play:
             episode = _play(environments[task], seed, row)
         else:
-            episode, n = _demonstrate(environments[task], seed, row, attempts)
-            tried[task] += n
+            episode, tries = _demonstrate(environments[task], seed, row, attempts)
+            tried[task] += tries
             if episode is None:
                 raise RuntimeError(
                     f"the demonstrator of {tasks[task]!r} failed {attempts} times in a row "
@@ -157,11 +176,9 @@ def record_demonstrations(
             dataset[key][row, : len(episode[key])] = torch.from_numpy(episode[key])
         dataset["task"][row] = task
         dataset["seed"][row] = seed
-        dataset["train"][row] = row % per_task < per_task - held_out_per_task
+        dataset["train"][row] = row % per_task < n_shown
         # Written last, since a row whose length is 0 is recorded again.
         dataset["length"][row] = n_frames
-    _write_meta(path, {**wanted, "checksum": _checksum(dataset)})
-    return dataset
 
 
 def _demonstrate(
@@ -218,90 +235,6 @@ def _perform(
         "action": np.stack(actions),
     }
     return episode, float(timestep.reward)
-
-
-def _write_meta(path: Path, meta: dict) -> None:
-    temporary = path / (_META + ".tmp")
-    temporary.write_text(json.dumps(meta, indent=2))
-    temporary.replace(path / _META)
-
-
-def _read_meta(path: Path) -> dict:
-    try:
-        meta = json.loads((path / _META).read_text())
-    except OSError:
-        raise ValueError(f"{path} is not a dataset of demonstrations; {_REMEDY}") from None
-    except (ValueError, RecursionError):
-        meta = None
-    if not isinstance(meta, dict) or not (
-        isinstance(meta.get("tasks"), list)
-        and isinstance(meta.get("per_task"), int)
-        and 0 < meta["per_task"] < 2**31
-    ):
-        raise ValueError(f"{path / _META} is damaged; remove {path} and {_REMEDY}")
-    return meta
-
-
-def _make(path: Path, n: int) -> TensorDict:
-    make_folder(path)
-    dataset = _empty(n)
-    size = sum(value.numel() * value.element_size() for _, value in dataset.items())
-    free = shutil.disk_usage(path).free
-    if size > free:  # Writing to a memory map on a full disk would kill the process.
-        raise OSError(
-            f"the dataset takes {size / 1e9:.1f} GB, {path} has {free / 1e9:.1f} GB left: "
-            "make room or choose another folder"
-        )
-    return dataset.memmap_like(str(path))
-
-
-def _open(path: Path, n: int) -> TensorDict:
-    expected = _empty(n)
-    for key, value in expected.items():
-        file = path / f"{key}.memmap"
-        size = value.numel() * value.element_size()
-        if not file.exists() or file.stat().st_size != size:
-            raise ValueError(f"{file} is missing or truncated; remove {path} and {_REMEDY}")
-    # Not TensorDict.load_memmap, which trusts the dtypes and shapes of its meta.json; the checksum
-    # does not cover that file.
-    tensors = {
-        key: MemoryMappedTensor.from_filename(
-            path / f"{key}.memmap", dtype=value.dtype, shape=value.shape
-        )
-        for key, value in expected.items()
-    }
-    return TensorDict(tensors, [n])
-
-
-def load_demonstrations(path: str | Path, *, verify: bool = True) -> TensorDict:
-    """Open a recorded dataset, memory-mapped.
-
-    Args:
-        path: Folder of the dataset.
-        verify: Whether to verify the checksum, which reads the whole dataset.
-
-    Returns:
-        The dataset as returned by `record_demonstrations`.
-
-    Raises:
-        ValueError: If it is missing, incomplete, damaged or of another scene version.
-    """
-    path = Path(path)
-    meta = _read_meta(path)
-    version = nico.scene_version()
-    if meta.get("scene_version") != version:
-        raise ValueError(
-            f"{path} was recorded in scene {meta.get('scene_version')!r}, this is {version}; "
-            f"{_REMEDY}"
-        )
-    if not meta.get("checksum"):
-        raise ValueError(
-            f"the recording at {path} is not complete; resume it with the same command"
-        )
-    dataset = _open(path, meta["per_task"] * len(meta["tasks"]))
-    if verify and _checksum(dataset) != meta["checksum"]:
-        raise ValueError(f"{path} is damaged (checksum differs); remove it and {_REMEDY}")
-    return dataset
 
 
 def main(

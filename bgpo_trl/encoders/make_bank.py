@@ -12,7 +12,7 @@ import tyro
 from tensordict import TensorDictBase
 
 from bgpo_trl.data.bank import DemonstrationBank, DemonstrationSteps
-from bgpo_trl.data.recording import load_demonstrations
+from bgpo_trl.data.dataset import load_demonstrations
 from bgpo_trl.encoders.representation import (
     Representation,
     bank_path,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -72,23 +73,13 @@ def make_pretrained(
     Raises:
         ValueError: If the dataset is damaged or was recorded in another scene.
     """
-    demonstrations = record_demonstrations(
-        dataset,
-        tasks=tasks,
-        per_task=per_task,
-        held_out_per_task=held_out_per_task,
-        seed=seed,
-        progress=progress,
-    )
-    folder_of_play = Path(dataset).with_name(f"{Path(dataset).name}-play")
-    play = record_demonstrations(
-        folder_of_play,
-        tasks=tasks,
+    record = partial(record_demonstrations, tasks=tasks, seed=seed, progress=progress)
+    demonstrations = record(dataset, per_task=per_task, held_out_per_task=held_out_per_task)
+    play = record(
+        Path(dataset).with_name(f"{Path(dataset).name}-play"),
         per_task=max(2, per_task // 2),
         held_out_per_task=max(1, held_out_per_task // 4),
         play=True,
-        seed=seed,
-        progress=progress,
     )
     return train_encoders(
         demonstrations,

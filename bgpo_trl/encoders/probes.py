@@ -1,4 +1,4 @@
-"""Linear probes of the latents and distances between embeddings, on held-out demonstrations.
+"""Linear probes of the latents and of the embeddings, on held-out demonstrations.
 
     python -m bgpo_trl.encoders.probes data/nico data/nico-play
 
@@ -10,7 +10,6 @@ part of the encoders' training reads the ground-truth ``state``.
 from __future__ import annotations
 
 import json
-import math
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -22,7 +21,8 @@ import tyro
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from bgpo_trl.data.recording import load_demonstrations
+from bgpo_trl.data.dataset import load_demonstrations
+from bgpo_trl.encoders.distances import embedding_distances
 from bgpo_trl.encoders.representation import (
     Representation,
     default_weights,
@@ -86,26 +86,12 @@ def probe(
     spread = (latent * vae.latent_std)[valid_steps(train.get("length"), latent.shape[1])].std(0)
     result["active_dimensions"] = float((spread > 0.1 * spread.max()).sum())
 
-    length, length_held_out = train.get("length"), held_out.get("length")
-    phi, phi_held_out = lae.encode(latent, length), lae.encode(latent_held_out, length_held_out)
-    task, task_held_out = train.get("task"), held_out.get("task")
-    scores = ridge_predict(phi, torch.nn.functional.one_hot(task).float(), phi_held_out)
-    nearest = torch.cdist(phi_held_out, phi).argmin(-1)
-    result |= {
-        "task_accuracy_linear": _mean(scores.argmax(-1) == task_held_out),
-        "task_accuracy_nearest": _mean(task[nearest] == task_held_out),
-        **embedding_distances(phi, task, activity_threshold),
-    }
+    phi = lae.encode(latent, train.get("length"))
+    phi_held_out = lae.encode(latent_held_out, held_out.get("length"))
+    result |= _probe_tasks(phi, train.get("task"), phi_held_out, held_out.get("task"))
+    result |= embedding_distances(phi, train.get("task"), activity_threshold)
     if play is not None:
-        played, played_held_out = split(play)
-        latents = [
-            encode_frames(vae, part.get("pixels"), part.get("length"))
-            for part in (played, played_held_out)
-        ]
-        errors = _probe_state(
-            latents[0], played, latents[1], played_held_out, only=_objects_on_table
-        )
-        result |= {f"play_{name}": error for name, error in errors.items()}
+        result |= _probe_play(vae, play)
     if folder is not None:
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
@@ -113,52 +99,6 @@ def probe(
         picture = reconstruction_picture(vae, held_out)
         matplotlib.image.imsave(folder / "reconstructions.png", picture.numpy())
     return result
-
-
-def embedding_distances(
-    phi: Tensor, task: Tensor, activity_threshold: float = 0.8
-) -> dict[str, float]:
-    """Measure how close embedded demonstrations lie, relative to the threshold of GWR-B.
-
-    GWR-B adds no node for a demonstration whose activity ``exp(-distance)`` at a node reaches a_T
-    (Eq. 2, Table 1), so ``-ln a_T`` (0.223 for 0.8) is the reference distance: if all pairs are
-    closer, the network never grows; if hardly any are, it adds a node per demonstration.
-
-    Args:
-        phi: Embeddings ``[N, embedding_size]``.
-        task: Task labels, int64 ``[N]``.
-        activity_threshold: Threshold a_T.
-
-    Returns:
-        ``phi_nearest_same_task`` and ``phi_nearest_other_task`` (median over demonstrations of the
-        distance to the nearest one), ``phi_distance_same_task`` and ``phi_distance_other_task``
-        (median over pairs), ``phi_threshold_distance`` (``-ln a_T``) and ``phi_nearest_known``
-        (share of demonstrations whose nearest neighbor is closer than that). NaN without such
-        pairs.
-
-    Example:
-        >>> phi = torch.tensor([[0.0], [0.1], [1.0]])
-        >>> distances = embedding_distances(phi, torch.tensor([0, 0, 1]))
-        >>> round(distances["phi_nearest_same_task"], 3)
-        0.1
-    """
-    distance = torch.cdist(phi, phi, compute_mode="donot_use_mm_for_euclid_dist")
-    itself = torch.eye(len(phi), dtype=torch.bool)
-    same = (task.unsqueeze(0) == task.unsqueeze(1)) & ~itself
-    other = task.unsqueeze(0) != task.unsqueeze(1)
-
-    def nearest(mask: Tensor) -> Tensor:
-        return distance.masked_fill(~mask, math.inf).amin(-1)
-
-    threshold = -math.log(activity_threshold)
-    return {
-        "phi_nearest_same_task": _median(nearest(same)),
-        "phi_nearest_other_task": _median(nearest(other)),
-        "phi_distance_same_task": _median(distance[same]),
-        "phi_distance_other_task": _median(distance[other]),
-        "phi_threshold_distance": threshold,
-        "phi_nearest_known": _mean(nearest(~itself) < threshold),
-    }
 
 
 def ridge_predict(x: Tensor, y: Tensor, x_new: Tensor, penalty: float = 1e-4) -> Tensor:
@@ -234,9 +174,31 @@ def _probe_state(
     }
 
 
+def _probe_play(vae: VAE, play: TensorDictBase) -> dict[str, float]:
+    """Return the errors in frames of play with all objects on the table."""
+    train, held_out = split(play)
+    latent, latent_held_out = (
+        encode_frames(vae, part.get("pixels"), part.get("length")) for part in (train, held_out)
+    )
+    errors = _probe_state(latent, train, latent_held_out, held_out, only=_objects_on_table)
+    return {f"play_{name}": error for name, error in errors.items()}
+
+
 def _objects_on_table(state: Tensor) -> Tensor:
     """Return whether all objects are above 0.6 m, bool, for states ``[..., 16]``."""
     return (state[..., _FIRST_OBJECT + 2 :: 3] > 0.6).all(-1)
+
+
+def _probe_tasks(
+    phi: Tensor, task: Tensor, phi_held_out: Tensor, task_held_out: Tensor
+) -> dict[str, float]:
+    """Return how often the task of a held-out demonstration is told from its embedding."""
+    scores = ridge_predict(phi, torch.nn.functional.one_hot(task).float(), phi_held_out)
+    nearest = torch.cdist(phi_held_out, phi).argmin(-1)
+    return {
+        "task_accuracy_linear": _mean(scores.argmax(-1) == task_held_out),
+        "task_accuracy_nearest": _mean(task[nearest] == task_held_out),
+    }
 
 
 @torch.no_grad()
@@ -280,11 +242,6 @@ def _probe_sequences(
 
 def _mean(values: Tensor) -> float:
     return values.double().mean().item()
-
-
-def _median(values: Tensor) -> float:
-    values = values[values.isfinite()]
-    return values.median().item() if values.numel() else math.nan
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from tensordict import TensorDictBase
 
 from bgpo_trl.configs import RepresentationConfig
 from bgpo_trl.data.bank import DemonstrationBank
-from bgpo_trl.data.recording import load_demonstrations
+from bgpo_trl.data.dataset import load_demonstrations
 from bgpo_trl.encoders.fitting import Log
 from bgpo_trl.encoders.make_bank import make_bank
 from bgpo_trl.encoders.probes import probe

@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from bgpo_trl.algorithms import ABLATIONS
-from bgpo_trl.experiments.run import Arguments, run_config, run_experiment
+from bgpo_trl.experiments.arguments import Arguments, run_config
+from bgpo_trl.experiments.run import run_experiment
 
 __all__ = ["AblationArguments", "ablation", "concurrent", "continual"]
 

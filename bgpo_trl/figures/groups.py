@@ -15,7 +15,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator, MultipleLocator
 from numpy.typing import NDArray
 
-from bgpo_trl.figures.curves import _legend, _mark_starts, _style, _task_markers
+from bgpo_trl.figures.style import add_legend, mark_starts, style_axes, task_markers
 from bgpo_trl.runs.results import count, read_rows
 
 
@@ -96,10 +96,10 @@ def plot_groups(seeds: Mapping[int, GroupedEpisodes], presented: Mapping[str, in
     figure = Figure(figsize=(width, sum(sizes) + 0.36 * len(sizes) + 0.7), layout="constrained")
     panels = figure.subplots(len(sizes), sharex=True, height_ratios=sizes)
     for axes in panels:
-        _style(axes)
+        style_axes(axes)
         axes.grid(visible=False)
 
-    _mark_starts(panels[0], presented, tasks, last)
+    mark_starts(panels[0], presented, tasks, last)
     _draw_counts(panels[0], list(seeds.values()))
     for axes, (seed, run) in zip(panels[1:], seeds.items(), strict=True):
         _draw_rows(axes, run, len(tasks), last, width)
@@ -108,9 +108,9 @@ def plot_groups(seeds: Mapping[int, GroupedEpisodes], presented: Mapping[str, in
     panels[-1].set_xlabel("Training episode", fontsize=9)
     panels[-1].set_xlim(0, last)
     panels[-1].xaxis.set_major_formatter("{x:,.0f}")
-    kinds = _task_markers(tasks)
+    kinds = task_markers(tasks)
     handles = [Line2D([], [], color=c, marker="s", linestyle="", ms=6) for _, _, c, _ in kinds]
-    _legend(figure, handles, [name for _, name, _, _ in kinds], width)
+    add_legend(figure, handles, [name for _, name, _, _ in kinds], width)
     return figure
 
 
@@ -128,7 +128,7 @@ def _draw_counts(axes: Axes, runs: Sequence[GroupedEpisodes]) -> None:
 def _draw_rows(axes: Axes, run: GroupedEpisodes, n_tasks: int, last: int, width: float) -> None:
     """Draw a row with episodes for each group."""
     n_groups = int(run.num_groups.max())
-    colors = [color for _, _, color, _ in _task_markers([""] * n_tasks)]
+    colors = [color for _, _, color, _ in task_markers([""] * n_tasks)]
     # Points; the width of one episode on the axis, at least 0.4 to stay visible.
     line = max(0.4, 0.85 * 72 * width / last)
     for group in range(n_groups):

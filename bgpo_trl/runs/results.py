@@ -16,8 +16,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bgpo_trl.analysis import metrics
-
 _CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f]")
 
 
@@ -42,16 +40,6 @@ class Curves:
         """Return the evaluations after at most ``episode`` training episodes."""
         kept = self.episodes <= episode
         return replace(self, episodes=self.episodes[kept], success=self.success[:, kept])
-
-    def episodes_to(self, threshold: float = 0.8) -> float:
-        """Return the training episode at which overall success first reaches a threshold.
-
-        Overall success is the mean over seeds and the tasks presented so far, and over the last
-        three evaluations, since a single one has few test episodes. Infinite if it is never
-        reached.
-        """
-        presented = metrics.presented_mean(metrics.trailing_mean(self.success, 3))
-        return float(metrics.episodes_to(presented.mean(axis=0), self.episodes, threshold))
 
 
 def read_rows(

@@ -149,14 +149,6 @@ class Physics(dm_mujoco.Physics):
         super().set_state(physics_state, sig)
         mujoco.mj_forward(self.model.ptr, self.data.ptr)
 
-    def full_state(self) -> np.ndarray:
-        """Return the result of `get_state`."""
-        return self.get_state()
-
-    def set_full_state(self, state: np.ndarray) -> None:
-        """Restore a result of `full_state`."""
-        self.set_state(state)
-
     def gap(self, first: str, second: str) -> float:
         """Return the smallest distance between two things (m); negative if they overlap.
 

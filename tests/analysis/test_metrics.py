@@ -1,4 +1,4 @@
-"""Measures against numbers worked out by hand, and their intervals against what they promise."""
+"""Measures against numbers worked out by hand."""
 
 import numpy as np
 import pytest
@@ -23,9 +23,8 @@ def test_seeds_are_measured_one_by_one():
     seeds = np.stack([SUCCESS, 0.5 * SUCCESS, np.nan_to_num(SUCCESS)])
     matrix = metrics.evaluation_matrix(seeds, EPISODES, [20, 40], window=10)
     assert matrix.shape == (3, 2, 2)
-    for measure in (metrics.average_performance, metrics.backward_transfer):
-        expected = [measure(of_seed) for of_seed in matrix]
-        np.testing.assert_allclose(measure(matrix), expected)
+    transfer = [metrics.backward_transfer(of_seed) for of_seed in matrix]
+    np.testing.assert_allclose(metrics.backward_transfer(matrix), transfer)
     best = [metrics.forgetting_since_best(of_seed) for of_seed in seeds]
     np.testing.assert_allclose(metrics.forgetting_since_best(seeds), best)
 
@@ -35,9 +34,8 @@ def test_a_phase_without_evaluation_is_refused():
         metrics.evaluation_matrix(SUCCESS, EPISODES, [25, 40], window=3)
 
 
-def test_performance_forgetting_and_backward_transfer_by_hand():
+def test_forgetting_and_backward_transfer_by_hand():
     matrix = [[0.8, NAN, NAN], [0.7, 0.9, NAN], [0.4, 1.0, 0.3]]
-    assert metrics.average_performance(matrix) == pytest.approx((0.4 + 1.0 + 0.3) / 3)
     # Task 1 has lost 0.4, task 2 has gained 0.1; of task 3 nothing can be said.
     assert metrics.backward_transfer(matrix) == pytest.approx((-0.4 + 0.1) / 2)
     assert metrics.forgetting_since_learned(matrix) == pytest.approx(0.15)
@@ -53,11 +51,9 @@ def test_forgetting_since_the_best_so_far_by_hand():
 
 def test_zero_is_a_score_and_not_a_missing_one():
     matrix = [[0.8, NAN], [0.0, 0.5]]
-    assert metrics.average_performance(matrix) == 0.25
     assert metrics.backward_transfer(matrix) == pytest.approx(-0.8)
     assert metrics.presented_mean([[0.0, NAN], [0.0, 1.0]]).tolist() == [0, 0.5]
     assert metrics.trailing_mean([[1.0], [0.0]], 2).tolist() == [[1], [0.5]]
-    assert metrics.interquartile_mean([0, 0, 0, 1]) == 0
     assert metrics.area_under_curve([0.0, 0.0], [10, 20]) == 0
     assert metrics.forgetting_since_best([[0.6], [0.0]]) == 0.6
 
@@ -74,6 +70,18 @@ def test_episodes_to_a_threshold():
     curves = [[0.1, 0.8, 0.2], [0.9, 0.9, 0.9], [0.0, 0.7, 0.79]]
     assert metrics.episodes_to(curves, [10, 20, 30]).tolist() == [20, 10, np.inf]
     assert metrics.episodes_to(curves, [10, 20, 30], 0.7).tolist() == [20, 10, 20]
+
+
+def test_overall_success_reaches_a_rate():
+    # By evaluation and task, of two seeds. Means over seeds and presented tasks: 1/2, 1, 1, then
+    # the second task comes in at 0 and is done.
+    seeds = np.ones((2, 5, 2))
+    seeds[:, :3, 1], seeds[:, 3, 1], seeds[0, 0, 0] = NAN, 0, 0
+    episodes = np.array([10, 20, 30, 40, 50])
+    # Over three evaluations: 1/2, 3/4, 5/6, (1 + 0) / 2, (1 + 1/2) / 2.
+    assert metrics.overall_episodes_to(seeds, episodes) == 30
+    assert metrics.overall_episodes_to(seeds, episodes, 0.7) == 20
+    assert metrics.overall_episodes_to(seeds[:, :2], episodes[:2]) == np.inf
 
 
 def test_own_episodes_until_half_of_the_last_twenty_succeed():
@@ -117,71 +125,3 @@ def test_trailing_mean_by_hand():
         [[0, NAN], [0.4, NAN], [1.4 / 3, 0], [0.6, 0.25]],
     )
     np.testing.assert_array_equal(metrics.trailing_mean(SUCCESS, 1), SUCCESS)
-
-
-def test_interquartile_mean_by_hand():
-    # A quarter of eight is two at each end.
-    assert metrics.interquartile_mean([[9, 3, 1, 2], [8, 0, 100, 4]]) == (3 + 4 + 2 + 8) / 4
-    assert metrics.interquartile_mean([1, 2, 30]) == 11  # three have no quarter to cut
-    assert metrics.interquartile_mean([5, 1, 2, 3, 4, 40]) == (2 + 3 + 4 + 5) / 4
-
-
-def test_resampling_draws_seeds_for_each_task_by_itself():
-    scores = np.array([[0.0, 10.0], [1.0, 11.0]])
-    seen = set()
-
-    def collect(drawn):
-        assert set(drawn[:, 0]) <= {0, 1}
-        assert set(drawn[:, 1]) <= {10, 11}
-        seen.add(tuple(drawn.ravel()))
-        return 0.0
-
-    metrics.stratified_bootstrap(scores, collect, n_resamples=500, rng=np.random.default_rng(0))
-    assert len(seen) == 16  # any seed with any other
-
-
-def test_the_interval_of_a_mean_is_that_of_theory():
-    rng = np.random.default_rng(1)
-    scores = rng.normal(size=(400, 1))
-    drawn = metrics.stratified_bootstrap(scores, np.mean, n_resamples=4_000, rng=rng)
-    low, high = metrics.percentile_interval(drawn)
-    error = scores.std() / np.sqrt(400)
-    assert [low, high] == pytest.approx(
-        [scores.mean() - 1.96 * error, scores.mean() + 1.96 * error], abs=0.15 * error
-    )
-    narrow = metrics.percentile_interval(drawn, confidence=0.5)
-    assert narrow == pytest.approx(
-        (scores.mean() - 0.674 * error, scores.mean() + 0.674 * error), abs=0.15 * error
-    )
-
-
-def test_intervals_follow_from_the_generator():
-    scores = np.random.default_rng(2).random((5, 3))
-    draws = [
-        metrics.stratified_bootstrap(scores, rng=np.random.default_rng(seed)) for seed in (0, 0, 1)
-    ]
-    assert draws[0].tolist() == draws[1].tolist() != draws[2].tolist()
-    assert draws[0].shape == (2_000,)
-
-
-@pytest.mark.parametrize("scores", [[0.5], [[0.5, NAN]], [[0.5, np.inf]], np.zeros((0, 3))])
-def test_scores_that_are_not_there_are_refused(scores):
-    with pytest.raises(ValueError, match=r"finite and \[seeds, tasks\]"):
-        metrics.stratified_bootstrap(scores, rng=np.random.default_rng(0))
-
-
-def test_rliable_agrees():
-    metrics_of_rliable = pytest.importorskip("rliable.metrics", reason="rliable is not needed")
-    library = pytest.importorskip("rliable.library", reason="rliable is not needed")
-    scores = np.random.default_rng(3).random((10, 3))
-    ours = metrics.interquartile_mean(scores)
-    assert ours == pytest.approx(float(metrics_of_rliable.aggregate_iqm(scores)))
-    _, theirs = library.get_interval_estimates(
-        {"x": scores}, lambda x: np.array([metrics_of_rliable.aggregate_iqm(x)]), reps=5_000
-    )
-    rng = np.random.default_rng(4)
-    drawn = metrics.stratified_bootstrap(scores, n_resamples=5_000, rng=rng)
-    width = np.ptp(theirs["x"])
-    assert metrics.percentile_interval(drawn) == pytest.approx(
-        theirs["x"].ravel(), abs=0.06 * width
-    )

@@ -9,6 +9,7 @@ import torch
 
 from benchmarks import ladder
 from bgpo_trl.algorithms import ABLATIONS, ALGORITHMS
+from bgpo_trl.experiments import arguments, measure
 from bgpo_trl.experiments import run as experiment
 from bgpo_trl.figures import of_run as growth
 from bgpo_trl.training import Trainer
@@ -20,6 +21,7 @@ def tiny(monkeypatch, encoders, bank, make_config):
     config = make_config(episodes=6)
     for module in (experiment, ladder):
         monkeypatch.setattr(module, "load_pretrained", lambda: (encoders, bank))
+    for module in (arguments, ladder):
         monkeypatch.setattr(module, "PRESETS", {"quick": config, "desk": config})
     for name, entry in ALGORITHMS.items():
         small = replace(entry, config=make_config(name=name).algorithm)
@@ -30,7 +32,7 @@ def tiny(monkeypatch, encoders, bank, make_config):
         small = replace(entry, config=replace(entry.config, max_steps=6))
         monkeypatch.setitem(ABLATIONS, name, small)
     chance = torch.tensor([0.1, 0.2, 0.3])
-    monkeypatch.setattr(experiment, "evaluate_random_policy", lambda **kwargs: chance)
+    monkeypatch.setattr(measure, "evaluate_random_policy", lambda **kwargs: chance)
 
 
 @pytest.fixture
@@ -42,7 +44,7 @@ def tiniest(tiny, monkeypatch):
         path.touch()
 
     monkeypatch.setattr(experiment, "measure", partial(experiment.measure, episodes=2))
-    for module in (experiment, growth):
+    for module in (measure, growth):
         monkeypatch.setattr(module, "save_figure", touch)
 
 

@@ -13,7 +13,7 @@ from torchrl.envs import check_env_specs
 from benchmarks import ablation
 from bgpo_trl.algorithms import ABLATIONS
 from bgpo_trl.algorithms.bgpo import BGPO
-from bgpo_trl.experiments import run as experiment
+from bgpo_trl.experiments.arguments import Arguments, command_line
 from bgpo_trl.files.checkpoint import load_checkpoint
 from bgpo_trl.runs.results import read_rows
 from bgpo_trl.transforms import BehaviorLookup, GroupLookup, TaskSchedule
@@ -208,7 +208,7 @@ def test_the_command_line_knows_every_variant():
     assert set(get_args(choices)) == set(ABLATIONS)
     assert ablation.Arguments().variant == "gwr+r_int"
     own = {field.name for field in fields(ablation.Arguments)}
-    assert own - {field.name for field in fields(experiment.Arguments)} == {"variant", "continual"}
+    assert own - {field.name for field in fields(Arguments)} == {"variant", "continual"}
 
 
 def test_the_variants_beyond_the_paper_add_one_thing_at_a_time(make):
@@ -237,7 +237,7 @@ def test_the_command_line_runs_a_variant_under_its_name(
 ):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["ablation.py", "--variant", variant])
-    experiment.command_line(ablation.main, "", ablation.Arguments)
+    command_line(ablation.main, "", ablation.Arguments)
     run = Path("runs") / f"ablation-{variant}-quick"
     assert f"curve and figures: {run}" in capsys.readouterr().out
     config = json.loads((run / "config.json").read_text())
@@ -257,6 +257,6 @@ def test_another_algorithm_has_no_variants(monkeypatch, tmp_path, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["ablation.py", "--algorithm", "maml"])
     with pytest.raises(SystemExit) as ended:
-        experiment.command_line(ablation.main, "", ablation.Arguments)
+        command_line(ablation.main, "", ablation.Arguments)
     assert ended.value.code == "error: --algorithm: the variants are BGPO's"
     assert not list(tmp_path.iterdir())

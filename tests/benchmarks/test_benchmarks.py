@@ -24,6 +24,7 @@ from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.rl import RL
 from bgpo_trl.configs import PRESETS, DDPGConfig
 from bgpo_trl.experiments import run as experiment
+from bgpo_trl.experiments.arguments import Arguments, run_config
 from bgpo_trl.files.checkpoint import load_checkpoint
 from bgpo_trl.runs.logger import EVAL_COLUMNS
 from bgpo_trl.runs.results import read_rows
@@ -40,22 +41,22 @@ def files(folder):
 
 def test_a_preset_is_taken_as_it_is():
     for name, preset in PRESETS.items():
-        assert experiment.run_config(experiment.Arguments(preset=name)) == preset
+        assert run_config(Arguments(preset=name)) == preset
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_another_algorithm_changes_nothing_else(name):
     for preset, config in PRESETS.items():
-        arguments = experiment.Arguments(algorithm=name, preset=preset)
+        arguments = Arguments(algorithm=name, preset=preset)
         entry = ALGORITHMS[name]
         expected = replace(config, name=name, algorithm=entry.config)
-        assert experiment.run_config(arguments) == expected
+        assert run_config(arguments) == expected
         published = name.endswith("-paper")
         assert (entry.config.rl == DDPGConfig()) is not published  # else the same learner for all
 
 
 def test_the_command_line_knows_every_algorithm():
-    choices = get_type_hints(experiment.Arguments)
+    choices = get_type_hints(Arguments)
     assert get_args(choices["algorithm"]) == tuple(ALGORITHMS)
     assert get_args(choices["rl"]) == tuple(RL)
 
@@ -63,8 +64,8 @@ def test_the_command_line_knows_every_algorithm():
 @pytest.mark.parametrize("rl", RL)
 @pytest.mark.parametrize("name", ["bgpo", "oracle", "ddpg"])
 def test_another_rl_algorithm_changes_nothing_else(name, rl):
-    plain = experiment.run_config(experiment.Arguments(algorithm=name))
-    config = experiment.run_config(experiment.Arguments(algorithm=name, rl=rl))
+    plain = run_config(Arguments(algorithm=name))
+    config = run_config(Arguments(algorithm=name, rl=rl))
     assert config == replace(plain, algorithm=replace(plain.algorithm, rl=RL[rl].config))
     assert dataclasses.asdict(config)["algorithm"]["rl"]["name"] == rl
 
@@ -107,7 +108,7 @@ def test_tasks_of_every_preset_start_when_the_paper_has_them_start(preset):
     ],
 )
 def test_another_length_keeps_the_proportions(preset, episodes, starts, eval_every):
-    config = experiment.run_config(experiment.Arguments(preset=preset, episodes=episodes))
+    config = run_config(Arguments(preset=preset, episodes=episodes))
     assert (config.episodes, config.task_starts) == (episodes, starts)
     assert config.eval_every == eval_every
     assert config == replace(
@@ -116,7 +117,7 @@ def test_another_length_keeps_the_proportions(preset, episodes, starts, eval_eve
 
 
 def test_other_seeds_change_nothing_else():
-    config = experiment.run_config(experiment.Arguments(preset="desk", seeds=(7, 9)))
+    config = run_config(Arguments(preset="desk", seeds=(7, 9)))
     assert config == replace(PRESETS["desk"], seeds=(7, 9))
 
 
@@ -125,11 +126,11 @@ def test_other_seeds_change_nothing_else():
 )
 def test_lengths_and_seeds_that_cannot_be_are_refused(arguments):
     with pytest.raises(ValueError, match=r"must be at least 1|needs seeds"):
-        experiment.run_config(experiment.Arguments(**arguments))
+        run_config(Arguments(**arguments))
 
 
 def test_continual_leaves_curve_and_figures(tiny, tmp_path, capsys):
-    continual.main(experiment.Arguments(out=tmp_path / "run"))
+    continual.main(Arguments(out=tmp_path / "run"))
     run_directory = tmp_path / "run"
     for name in ("success.png", "gwr.png", "gwr_growth.png", "groups.png"):
         assert (run_directory / "figures" / name).read_bytes().startswith(b"\x89PNG")
@@ -141,7 +142,7 @@ def test_continual_leaves_curve_and_figures(tiny, tmp_path, capsys):
 
     before = files(run_directory)
     with pytest.raises(ValueError, match="holds a run: --resume continues it, --out names another"):
-        continual.main(experiment.Arguments(out=run_directory))
+        continual.main(Arguments(out=run_directory))
     assert files(run_directory) == before
 
 
@@ -149,7 +150,7 @@ def test_a_finished_run_only_says_so_until_it_is_made_longer(
     tiniest, tmp_path, monkeypatch, capsys
 ):
     run = tmp_path / "run"
-    arguments = experiment.Arguments(out=run)
+    arguments = Arguments(out=run)
     continual.main(arguments)
     before, played = files(run), (run / "train.csv").read_text()
     again = replace(arguments, resume=True)
@@ -194,7 +195,7 @@ def test_a_run_that_was_interrupted_before_its_training_is_resumed(
 ):
     monkeypatch.setattr(experiment, "make_pretrained", lambda *_, **__: (encoders, bank))
     (tmp_path / "demonstrations").mkdir()
-    arguments = experiment.Arguments(out=tmp_path, resume=True, episodes=2)
+    arguments = Arguments(out=tmp_path, resume=True, episodes=2)
     with pytest.raises(ValueError, match="holds no run to resume"):
         continual.main(arguments)
     assert [path.name for path in tmp_path.iterdir()] == ["demonstrations"]
@@ -217,7 +218,7 @@ def test_another_process_is_kept_off_all_of_an_experiment(
             return function(*args, **kwargs)
 
         monkeypatch.setattr(experiment, name, do)
-    continual.main(experiment.Arguments(out=tmp_path / "run"))
+    continual.main(Arguments(out=tmp_path / "run"))
     assert events == ["load_pretrained", "measure"]
     assert not (tmp_path / "run" / "lock").exists()
 
@@ -242,7 +243,7 @@ def test_a_dashboard_gets_the_figures_before_it_is_closed(tiniest, monkeypatch, 
     figures = ["episodes.png", "groups.png", "gwr.png", "gwr_growth.png", "success.png"]
     figures += [f"{task}.gif" for task in TASKS]
     shown = [(f"figures/{Path(n).stem}", run / "figures" / n) for n in sorted(figures)]
-    arguments = experiment.Arguments(out=run, wandb="offline")
+    arguments = Arguments(out=run, wandb="offline")
     continual.main(arguments)
     rows = [read_rows(run / name) for name in ("train.csv", "eval.csv")]
     assert events == ["row"] * sum(map(len, rows)) + [*shown, "shutdown"]
@@ -305,7 +306,7 @@ def test_the_command_line_runs_every_algorithm_and_says_its_name(
 
 def test_concurrent_presents_all_tasks_from_the_start(tiny, tmp_path, capsys):
     run = tmp_path / "run"
-    concurrent_tasks.main(experiment.Arguments(out=run))
+    concurrent_tasks.main(Arguments(out=run))
     assert json.loads((run / "config.json").read_text())["task_starts"] == [0, 0, 0]
     assert {row["task"] for row in read_rows(run / "eval.csv")} == set(TASKS)
 

@@ -9,6 +9,7 @@ from bgpo_trl.data.bank import DemonstrationBank, DemonstrationSteps
 from bgpo_trl.encoders.make_bank import make_bank
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.files.tensor_file import load_tensors, save_tensors
+from suites import nico
 
 LENGTH = torch.tensor([4, 0, 2, 6, 0])
 
@@ -219,3 +220,54 @@ def test_the_banks_steps_are_those_of_its_embeddings():
     phi = encoders.lae.encode(seen.steps.latents(frame), length)
     distance = (phi - seen.embedding[rows]).norm(dim=-1)
     assert distance.max() < 0.03  # of about 3 between two demonstrations
+
+
+@pytest.fixture
+def plain_bank() -> DemonstrationBank:
+    generator = torch.Generator().manual_seed(0)
+    return DemonstrationBank(
+        embedding=torch.randn(6, 32, generator=generator),
+        task=torch.tensor([0, 0, 1, 1, 2, 2]),
+        train=torch.tensor([True, False] * 3),
+    )
+
+
+def test_a_bank_is_split_into_seen_and_held_out(plain_bank):
+    torch.testing.assert_close(plain_bank.seen().embedding, plain_bank.embedding[[0, 2, 4]])
+    torch.testing.assert_close(plain_bank.held_out().embedding, plain_bank.embedding[[1, 3, 5]])
+    assert plain_bank.seen().task.tolist() == plain_bank.held_out().task.tolist() == [0, 1, 2]
+    assert plain_bank.seen().train.all()
+    assert not plain_bank.held_out().train.any()
+
+
+def test_a_bank_is_read_as_it_was_written(plain_bank, tmp_path):
+    plain_bank.save(tmp_path / "bank.safetensors", encoder_id="abc")
+
+    loaded = DemonstrationBank.load(tmp_path / "bank.safetensors", encoder_id="abc")
+
+    for name in ("embedding", "task", "train"):
+        torch.testing.assert_close(getattr(loaded, name), getattr(plain_bank, name), rtol=0, atol=0)
+        assert getattr(loaded, name).dtype == getattr(plain_bank, name).dtype
+
+
+def test_a_bank_of_other_encoders_or_another_scene_is_refused(plain_bank, tmp_path, monkeypatch):
+    path = tmp_path / "bank.safetensors"
+    plain_bank.save(path, encoder_id="abc")
+
+    with pytest.raises(ValueError, match=r"was made for .*'abc'.*, not for .*'xyz'.*; make it"):
+        DemonstrationBank.load(path, encoder_id="xyz")
+    monkeypatch.setattr(nico, "scene_version", lambda: "nico-2-00000000")
+    with pytest.raises(ValueError, match=r"not for .*nico-2-00000000.*; make it again with"):
+        DemonstrationBank.load(path, encoder_id="abc")
+
+
+def test_a_bank_that_is_missing_or_damaged_is_refused(plain_bank, tmp_path):
+    path = tmp_path / "bank.safetensors"
+    with pytest.raises(ValueError, match=r"^there is no demonstration bank at .*; make it again"):
+        DemonstrationBank.load(path, encoder_id="abc")
+    plain_bank.save(path, encoder_id="abc")
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(
+        ValueError, match=r"bank\.safetensors is damaged .*\(.*\); make it again with"
+    ):
+        DemonstrationBank.load(path, encoder_id="abc")

@@ -10,28 +10,13 @@ import pytest
 import torch
 
 from bgpo_trl.data import recording as demonstrations
-from bgpo_trl.data.bank import DemonstrationBank
-from bgpo_trl.data.recording import (
-    load_demonstrations,
-    record_demonstrations,
-)
+from bgpo_trl.data.dataset import load_demonstrations, open_dataset
+from bgpo_trl.data.recording import record_demonstrations
 from suites import nico
 from suites.nico.demonstrator import Demonstrator
 
 TINY = {"per_task": 3, "held_out_per_task": 1, "progress": False}
 KEYS = {"pixels", "state", "action", "length", "task", "train", "seed"}
-
-
-@pytest.fixture(scope="module")
-def recorded(tmp_path_factory) -> Path:
-    path = tmp_path_factory.mktemp("recorded") / "made" / "by" / "recording"
-    record_demonstrations(path, **TINY)
-    return path
-
-
-@pytest.fixture
-def copy(recorded, tmp_path) -> Path:
-    return Path(shutil.copytree(recorded, tmp_path / "copy"))
 
 
 def contents(path: Path) -> dict[str, bytes]:
@@ -172,7 +157,7 @@ def test_a_demonstrator_that_never_succeeds_is_told_of(tmp_path, monkeypatch):
     assert int(told[1]) >= 5
     assert int(told[2]) == round(200 / int(told[1]))
 
-    before = demonstrations._open(tmp_path, 8)["length"].clone()
+    before = open_dataset(tmp_path, 8)["length"].clone()
     assert (before > 0).tolist() == [True] * 6 + [False] * 2
     monkeypatch.setattr(Fickle, "times", 99)
     mended = record_demonstrations(tmp_path, attempts=50, progress=False, **options)
@@ -213,61 +198,6 @@ def test_missing_rows_are_recorded_again(recorded, copy):
     record_demonstrations(copy, **TINY)
 
     assert contents(copy) == contents(recorded)
-
-
-@pytest.mark.parametrize("key", sorted(KEYS))
-def test_a_flipped_byte_is_noticed(copy, key):
-    values = np.memmap(copy / f"{key}.memmap", np.uint8, "r+")
-    values[len(values) // 2] ^= 1
-    values.flush()
-
-    with pytest.raises(ValueError, match=r"is damaged \(checksum differs\); remove it and .*$"):
-        load_demonstrations(copy)
-    assert len(load_demonstrations(copy, verify=False)) == 9
-
-
-def truncate(path: Path) -> None:
-    with open(path / "pixels.memmap", "r+b") as file:
-        file.truncate(1000)
-
-
-@pytest.mark.parametrize(
-    ("damage", "message"),
-    [
-        (truncate, r"pixels\.memmap is missing or truncated; remove .*"),
-        (lambda p: (p / "action.memmap").unlink(), r"action\.memmap is missing or truncated; .*"),
-        (lambda p: (p / "dataset.json").write_text("{"), r"dataset\.json is damaged; remove .*"),
-        (lambda p: (p / "dataset.json").write_text("{}"), r"dataset\.json is damaged; remove .*"),
-        (lambda p: (p / "dataset.json").write_bytes(b"\xff"), r"dataset\.json is damaged; .*"),
-        (lambda p: (p / "dataset.json").unlink(), r"copy is not a dataset of demonstrations; .*"),
-        (lambda p: edit_meta(p, checksum=None), r"is not complete; resume it with .*"),
-        (lambda p: edit_meta(p, scene_version="old"), r"was recorded in scene 'old', this is nico"),
-    ],
-)
-def test_what_is_not_whole_is_refused_in_one_line(copy, damage, message):
-    damage(copy)
-
-    with pytest.raises(ValueError, match=message) as error:
-        load_demonstrations(copy)
-
-    assert "\n" not in str(error.value)
-    if "resume" not in message:
-        assert "record it again with `python -m bgpo_trl.data.recording PATH`" in str(error.value)
-
-
-@pytest.mark.parametrize("meta", ["{", '{"_type": "os.system"}', None])
-def test_what_says_how_to_read_the_tensors_is_not_believed(recorded, copy, meta):
-    """TensorDict's own file is not under the checksum, and may name what to unpickle."""
-    (copy / "meta.json").unlink() if meta is None else (copy / "meta.json").write_text(meta)
-    found, expected = load_demonstrations(copy), load_demonstrations(recorded)
-    assert set(found.keys()) == KEYS
-    for key in KEYS:
-        torch.testing.assert_close(found[key], expected[key], rtol=0, atol=0)
-
-
-def test_a_folder_that_is_missing_is_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"is not a dataset of demonstrations; record it again"):
-        load_demonstrations(tmp_path / "nowhere")
 
 
 @pytest.mark.parametrize(
@@ -323,54 +253,3 @@ def test_the_command_ends_user_errors_in_one_line(recorded):
     assert process.returncode == 1
     assert process.stderr.startswith(f"error: {recorded} holds another recording")
     assert process.stderr.count("\n") == 1
-
-
-@pytest.fixture
-def bank() -> DemonstrationBank:
-    generator = torch.Generator().manual_seed(0)
-    return DemonstrationBank(
-        embedding=torch.randn(6, 32, generator=generator),
-        task=torch.tensor([0, 0, 1, 1, 2, 2]),
-        train=torch.tensor([True, False] * 3),
-    )
-
-
-def test_a_bank_is_split_into_seen_and_held_out(bank):
-    torch.testing.assert_close(bank.seen().embedding, bank.embedding[[0, 2, 4]])
-    torch.testing.assert_close(bank.held_out().embedding, bank.embedding[[1, 3, 5]])
-    assert bank.seen().task.tolist() == bank.held_out().task.tolist() == [0, 1, 2]
-    assert bank.seen().train.all()
-    assert not bank.held_out().train.any()
-
-
-def test_a_bank_is_read_as_it_was_written(bank, tmp_path):
-    bank.save(tmp_path / "bank.safetensors", encoder_id="abc")
-
-    loaded = DemonstrationBank.load(tmp_path / "bank.safetensors", encoder_id="abc")
-
-    for name in ("embedding", "task", "train"):
-        torch.testing.assert_close(getattr(loaded, name), getattr(bank, name), rtol=0, atol=0)
-        assert getattr(loaded, name).dtype == getattr(bank, name).dtype
-
-
-def test_a_bank_of_other_encoders_or_another_scene_is_refused(bank, tmp_path, monkeypatch):
-    path = tmp_path / "bank.safetensors"
-    bank.save(path, encoder_id="abc")
-
-    with pytest.raises(ValueError, match=r"was made for .*'abc'.*, not for .*'xyz'.*; make it"):
-        DemonstrationBank.load(path, encoder_id="xyz")
-    monkeypatch.setattr(nico, "scene_version", lambda: "nico-2-00000000")
-    with pytest.raises(ValueError, match=r"not for .*nico-2-00000000.*; make it again with"):
-        DemonstrationBank.load(path, encoder_id="abc")
-
-
-def test_a_bank_that_is_missing_or_damaged_is_refused(bank, tmp_path):
-    path = tmp_path / "bank.safetensors"
-    with pytest.raises(ValueError, match=r"^there is no demonstration bank at .*; make it again"):
-        DemonstrationBank.load(path, encoder_id="abc")
-    bank.save(path, encoder_id="abc")
-    path.write_bytes(path.read_bytes()[:-1])
-    with pytest.raises(
-        ValueError, match=r"bank\.safetensors is damaged .*\(.*\); make it again with"
-    ):
-        DemonstrationBank.load(path, encoder_id="abc")

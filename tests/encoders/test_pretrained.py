@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from bgpo_trl.configs import RepresentationConfig, SequenceAutoencoderConfig, VAEConfig
-from bgpo_trl.data.recording import load_demonstrations
+from bgpo_trl.data.dataset import load_demonstrations
 from bgpo_trl.encoders.pretrained import load_pretrained, make_pretrained
 from bgpo_trl.encoders.representation import save_representation
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder

@@ -43,18 +43,6 @@ def test_what_is_no_record_of_these_tasks_is_refused(tmp_path):
         read_curves(write(tmp_path / "eval.csv", [(0, 10, "b", 1)]), ["a"])
 
 
-def test_when_success_overall_reaches_a_rate(tmp_path):
-    # Means over seeds and presented tasks: 1/2, 1, 1, then task b comes in at 0 and is done.
-    rows = [(0, 10, "a", 0), (1, 10, "a", 1)]
-    rows += [(seed, episode, "a", 1) for seed in (0, 1) for episode in (20, 30, 40, 50)]
-    rows += [(seed, episode, "b", int(episode > 40)) for seed in (0, 1) for episode in (40, 50)]
-    curves = read_curves(write(tmp_path / "eval.csv", rows), ["a", "b"])
-    # Over three evaluations: 1/2, 3/4, 5/6, (1 + 0) / 2, (1 + 1/2) / 2.
-    assert curves.episodes_to() == 30
-    assert curves.episodes_to(0.7) == 20
-    assert curves.until(20).episodes_to() == np.inf
-
-
 def test_outcomes_of_each_tasks_own_training_episodes(tmp_path):
     rows = [(7, 1, "a", 0), (2, 1, "a", 1), (2, 3, "b", 0), (2, 2, "b", 1), (7, 2, "a", 1)]
     path = write(tmp_path / "train.csv", rows)

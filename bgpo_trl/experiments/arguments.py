@@ -1,0 +1,125 @@
+"""Command line of the experiments: its arguments, and the settings of a run that they stand for."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from bgpo_trl.algorithms import ALGORITHMS
+from bgpo_trl.algorithms.rl import RL
+from bgpo_trl.configs import PRESETS, RunConfig
+
+AlgorithmName = Literal[
+    "bgpo",
+    "bgpo-experts",
+    "bgpo-single",
+    "bgpo-paper",
+    "maml",
+    "maml-demonstrations",
+    "maml-paper",
+    "dist-nll",
+    "dist-nll-demonstrations",
+    "dist-nll-paper",
+    "oracle",
+    "ddpg",
+]
+"""The keys of `ALGORITHMS`, spelled out for the command line's choices."""
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Train an algorithm and plot its success."""
+
+    algorithm: AlgorithmName = "bgpo"
+    """BGPO, also without replay of demonstrations (-experts) and without experts either (-single);
+    a baseline, with or without -demonstrations; any of them as published (-paper); or a reference:
+    DDPG with the task label as context (oracle) or without any (ddpg)."""
+    rl: Literal["ddpg", "td3", "sac"] = "ddpg"
+    """The RL algorithm of BGPO, its ablations and the references."""
+    preset: Literal["smoke", "quick", "desk", "paper"] = "quick"
+    """Size of the run: smoke (every stage in minutes), quick (visible learning), desk (five seeds)
+    or paper (the paper's size)."""
+    out: Path | None = None
+    """Run directory; runs/EXPERIMENT-ALGORITHM[-RL]-PRESET by default."""
+    seeds: tuple[int, ...] | None = None
+    """Seeds; the preset's by default."""
+    episodes: int | None = None
+    """Training episodes; the preset's by default. The task starts are scaled in proportion. With
+    --resume, a larger number extends the run, whose task starts are kept."""
+    eval_every: int | None = None
+    """Training episodes between evaluations; the preset's by default."""
+    held_out: Literal["validation", "test"] = "validation"
+    """Half of the held-out demonstrations to test on: validation to choose settings, test to report
+    results."""
+    resume: bool = False
+    """Continue the run in the directory."""
+    train_encoders: bool = False
+    """Record demonstrations and train new encoders instead of using the pretrained ones."""
+    wandb: Literal["online", "offline"] | None = None
+    """Also log to Weights & Biases."""
+    device: str = "auto"
+    """Device of the networks: cpu, cuda, or auto for a GPU if there is one."""
+    threads: int = 1
+    """Threads of PyTorch; more than one slows these small networks down. Physics always uses all
+    cores."""
+
+
+def run_config(arguments: Arguments) -> RunConfig:
+    """Return the preset of the continual setting, with the changes of the command line.
+
+    Raises:
+        ValueError: If the settings are invalid.
+    """
+    algorithm = ALGORITHMS[arguments.algorithm].config
+    if arguments.rl != algorithm.rl.name:
+        algorithm = replace(algorithm, rl=RL[arguments.rl].config)
+    config = replace(
+        PRESETS[arguments.preset],
+        name=arguments.algorithm,
+        algorithm=algorithm,
+        held_out=arguments.held_out,
+    )
+    if arguments.seeds is not None:
+        config = replace(config, seeds=arguments.seeds)
+    if arguments.episodes is not None:
+        share, last = arguments.episodes / config.episodes, arguments.episodes - 1
+        starts = tuple(min(round(start * share), last) for start in config.task_starts)
+        config = replace(
+            config,
+            episodes=arguments.episodes,
+            task_starts=starts,
+            eval_every=max(1, min(config.eval_every, arguments.episodes)),
+        )
+    if arguments.eval_every is not None:
+        config = replace(config, eval_every=arguments.eval_every)
+    return config
+
+
+def command_line(
+    main: Callable[[Any], None],
+    description: str | None,
+    arguments: type = Arguments,
+    options: Sequence[str] | None = None,
+) -> None:
+    """Run ``main`` with the arguments of the command line; an expected error becomes one line.
+
+    Args:
+        main: Called with the arguments.
+        description: For ``--help``.
+        arguments: Class of the arguments.
+        options: Command line of a subcommand of ``python -m bgpo_trl``; that of the script if None.
+    """
+    program = None if options is None else shlex.join(["python", *sys.argv[:3]])
+    try:
+        kind: Any = Annotated[arguments, tyro.conf.OmitArgPrefixes]
+        main(tyro.cli(kind, prog=program, description=description, args=options))
+    except (ValueError, OSError, RuntimeError) as error:
+        sys.exit(f"error: {error}")
+    except KeyboardInterrupt:
+        sys.exit("interrupted: the same command with --resume continues")

@@ -1,0 +1,179 @@
+"""Measurements and drawings at the end of a run: final tests, task inference, figures, videos."""
+
+from __future__ import annotations
+
+import csv
+import shlex
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bgpo_trl.analysis.task_inference import group_purity, task_inference_accuracy
+from bgpo_trl.data.bank import DemonstrationBank
+from bgpo_trl.evaluation import Evaluator, evaluate_random_policy
+from bgpo_trl.figures.curves import plot_success_curves
+from bgpo_trl.figures.frame_strips import plot_frame_strips
+from bgpo_trl.figures.of_run import draw_groups, draw_growth, draw_nodes
+from bgpo_trl.figures.style import save_figure
+from bgpo_trl.figures.video import save_gif
+from bgpo_trl.files.progress import progress_bar
+from bgpo_trl.training import Trainer
+from bgpo_trl.transforms import TaskSchedule
+
+# Number of the evaluation after training; it seeds start states that training never tested.
+_LAST = 2**31
+FINAL_COLUMNS = ("seed", "demonstrations", "task", "episodes", "success", "task_inference")
+"""Columns of ``final.csv``, one row per seed, kind of demonstrations and task."""
+
+_Row = tuple[int, str, str, int, float, float | str]
+
+
+def measure(
+    trainer: Trainer, bank: DemonstrationBank, out: Path, episodes: int = 20
+) -> dict[str, Any]:
+    """Test the trained policies with seen and with held-out demonstrations.
+
+    Args:
+        trainer: The trainer after training.
+        bank: Training and held-out demonstrations.
+        out: Folder for ``final.csv``.
+        episodes: Test episodes per seed, task and kind of demonstrations.
+
+    Returns:
+        Entries of ``summary.json``.
+    """
+    algorithm, config = trainer.algorithm, trainer.config
+    gwr, rows = algorithm.gwr, _final_tests(trainer, bank, episodes)
+    with (out / "final.csv").open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(FINAL_COLUMNS)
+        writer.writerows(rows)
+    random_success = evaluate_random_policy(tasks=config.tasks, episodes=100)
+    summary = {
+        "command": shlex.join(["python", *sys.argv]),
+        "episodes": config.episodes,
+        "random_success": dict(zip(config.tasks, random_success.tolist(), strict=True)),
+        "nodes": None if gwr is None else gwr.num_nodes.tolist(),
+        "groups": None,
+    }
+    if algorithm.groups is not None:
+        purity = group_purity(algorithm.groups, bank.held_out(config.held_out), len(config.tasks))
+        summary["groups"] = algorithm.groups.num_groups.tolist()
+        summary["group_purity"] = purity.tolist()
+    return summary
+
+
+def _final_tests(trainer: Trainer, bank: DemonstrationBank, episodes: int) -> list[_Row]:
+    """Return the rows of ``final.csv``, after as many test episodes of each task and kind."""
+    algorithm, config, seen = trainer.algorithm, trainer.config, bank.seen()
+    gwr, rows, schedule = algorithm.gwr, list[_Row](), TaskSchedule(config.task_starts)
+    n_steps = config.algorithm.max_steps + 1
+    bar = progress_bar("final tests", shown=trainer.progress, total=2 * n_steps, unit="step")
+    for half, (kind, tested) in enumerate(
+        (("seen", seen), ("held-out", bank.held_out(config.held_out))), 1
+    ):
+        evaluator = Evaluator(
+            config.algorithm,
+            seeds=config.seeds,
+            schedule=schedule,
+            episodes=episodes,
+            bank=tested,
+            encoders=trainer.encoders,
+        )
+        snapshots = [
+            evaluator.snapshot(algorithm, index, _LAST, episode=config.episodes)
+            for index in range(len(config.seeds))
+        ]
+        success = evaluator.run(snapshots, algorithm.device, watch=bar.update).success
+        bar.set_postfix_str(f"success {success.float().mean():.2f}, {kind}", refresh=False)
+        bar.update(half * n_steps - bar.n)  # episodes may all end earlier
+        for task, name in enumerate(config.tasks):
+            of_task = tested.of_task(task)
+            inferred: list[float | str] = [""] * len(config.seeds)
+            if gwr is not None:
+                accuracy = task_inference_accuracy(gwr, seen, of_task, len(config.tasks))
+                inferred = [round(share, 4) for share in accuracy.tolist()]
+            for index, seed in enumerate(config.seeds):
+                share = round(success[index, task].float().mean().item(), 4)
+                rows.append((seed, kind, name, episodes, share, inferred[index]))
+    bar.close()
+    return rows
+
+
+def draw(
+    trainer: Trainer, bank: DemonstrationBank, out: Path, random_success: Mapping[str, float]
+) -> list[str]:
+    """Draw the figures of the run, and describe its GWR-B.
+
+    Args:
+        trainer: The trainer after training.
+        bank: Training and held-out demonstrations.
+        out: Folder for ``figures/`` and ``gwr.csv``.
+        random_success: Success of a random policy, by task.
+
+    Returns:
+        Lines about GWR-B, its task inference and its groups.
+    """
+    config, lines = trainer.config, list[str]()
+    presented = dict(zip(config.tasks, config.task_starts, strict=True))
+    figure = plot_success_curves(
+        out / "eval.csv", presented=presented, random_success=random_success
+    )
+    save_figure(figure, out / "figures" / "success.png")
+    episodes = record_episodes(trainer, bank)
+    save_figure(plot_frame_strips(episodes), out / "figures" / "episodes.png")
+    for title, frames in episodes.items():
+        save_gif(frames, out / "figures" / f"{title.split()[0]}.gif")
+    gwr = trainer.algorithm.gwr
+    if gwr is not None:
+        draw_nodes(out, trainer.algorithm, bank, config.tasks)
+        accuracy = task_inference_accuracy(
+            gwr, bank.seen(), bank.held_out(config.held_out), len(config.tasks)
+        )
+        draw_growth(out, config, bank)
+        lines.append(f"GWR-B nodes: {gwr.num_nodes.tolist()}")
+        lines.append(f"task inference on held-out demonstrations: {accuracy.mean():.1%}")
+    if trainer.algorithm.groups is not None:
+        draw_groups(out, presented, out / "figures" / "groups.png")
+        lines.append(f"groups of behaviors: {trainer.algorithm.groups.num_groups.tolist()}")
+    return lines
+
+
+def record_episodes(trainer: Trainer, bank: DemonstrationBank) -> dict[str, np.ndarray]:
+    """Return the frames of a test episode of each task with the first seed's trained policy.
+
+    Args:
+        trainer: The trainer after training.
+        bank: Training and held-out demonstrations; held-out ones are shown.
+
+    Returns:
+        Frames uint8 ``[N, 32, 64, 3]``, by task and outcome.
+
+    Raises:
+        ValueError: If the run observes ground truth instead of frames.
+    """
+    config, frames = trainer.config, []
+    evaluator = Evaluator(
+        config.algorithm,
+        seeds=config.seeds,
+        schedule=TaskSchedule(config.task_starts),
+        episodes=1,
+        bank=bank.held_out(config.held_out),
+        encoders=trainer.encoders,
+    )
+    algorithm, seeds = trainer.algorithm, range(len(config.seeds))
+    snapshots = [evaluator.snapshot(algorithm, i, _LAST, episode=config.episodes) for i in seeds]
+    result = evaluator.run(
+        snapshots,
+        algorithm.device,
+        watch=lambda: frames.append(evaluator.simulation.frames()[0, :, 0]),
+    )
+    return {
+        f"{name} ({'success' if result.success[0, task, 0] else 'no success'})": np.stack(
+            [frame[task] for frame in frames[: int(result.steps[0, task, 0]) + 1]]
+        )
+        for task, name in enumerate(config.tasks)
+    }

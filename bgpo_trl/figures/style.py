@@ -1,0 +1,106 @@
+"""Look that the figures share, and saving them.
+
+Figures are drawn without pyplot, hence without global state, and the same data always gives the
+same file. Colors are Okabe and Ito's colorblind-safe palette; line styles and markers differ as
+well.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from bgpo_trl.files.folders import make_folder
+
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+"""Colors of algorithms, or of tasks."""
+LINES = ("-", "--", "-.", (0, (3, 1, 1, 1, 1, 1)), (0, (1, 1)), (0, (6, 2)))
+"""Line styles that accompany them."""
+MARKERS = ("o", "s", "^", "D", "v", "P")
+"""Markers that accompany them."""
+
+
+def save_figure(figure: Figure, path: str | os.PathLike[str]) -> None:
+    """Save a figure at 300 dpi; the same figure always gives the same bytes.
+
+    Args:
+        figure: The figure.
+        path: File ending in ``.png``; its folder is made if missing.
+    """
+    path = Path(path)
+    make_folder(path.parent)
+    figure.savefig(path, format="png", dpi=300, metadata={"Software": None})
+
+
+def style_axes(axes: Axes) -> None:
+    """Give axes small ticks and a faint grid, without the upper and right spine."""
+    axes.tick_params(labelsize=8, length=3)
+    axes.grid(color="0.9", linewidth=0.6)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def add_legend(above: Figure | Axes, handles: list[Any], labels: list[str], width: float) -> None:
+    """Add a legend above a figure or axes, in as many columns as fit.
+
+    Args:
+        above: The figure or axes.
+        handles: Artists shown in the legend.
+        labels: Their names.
+        width: Room for the legend (inches).
+    """
+    # Inches: a letter of this size is about 0.065 wide, a handle with its gaps 0.55.
+    sizes = [0.065 * len(label) + 0.55 for label in labels]
+    columns = len(labels) if sum(sizes) <= width else max(1, int(width / max(sizes)))
+    outside: dict[str, Any] = {"loc": "outside upper center"}
+    if isinstance(above, Axes):
+        outside = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0)}
+    above.legend(handles, labels, ncols=columns, fontsize=8.5, frameon=False, **outside)
+
+
+def mark_starts(axes: Axes, starts: Mapping[str, int], tasks: Sequence[str], last: int) -> None:
+    """Mark the episodes from which tasks are presented with dashed lines, inside the axes.
+
+    Args:
+        axes: The axes, whose height is 1.1 in the scale of the labels.
+        starts: Training episode by task name.
+        tasks: All task names, whose positions number the labels.
+        last: Episode at which the axes end.
+    """
+    for task, episode in starts.items():
+        if not 0 < episode < last:
+            continue
+        axes.axvline(episode, color="0.35", linestyle=(0, (4, 3)), linewidth=0.9)
+        axes.annotate(
+            f"task {tasks.index(task) + 1}",
+            (episode, 1.05 / 1.1),
+            xycoords=axes.get_xaxis_transform(),
+            xytext=(3, 0),
+            textcoords="offset points",
+            va="center",
+            fontsize=7.5,
+            color="0.25",
+        )
+
+
+def task_markers(task_names: Sequence[str]) -> list[tuple[int, str, str, str]]:
+    """Return position, legend name, color and marker of each task."""
+    return [
+        (
+            task,
+            f"task {task + 1}: {readable(name)}",
+            COLORS[task % len(COLORS)],
+            MARKERS[task % len(MARKERS)],
+        )
+        for task, name in enumerate(task_names)
+    ]
+
+
+def readable(name: str) -> str:
+    """Return a task's name in words."""
+    return name.replace("_", " ")

@@ -1,0 +1,79 @@
+"""Work shared between the caller's thread and helpers."""
+
+from __future__ import annotations
+
+import sys
+from collections import deque
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor, wait
+from typing import TypeVar
+
+T = TypeVar("T")
+
+
+class Threads:
+    """Threads that share the rows of a batch, the caller's among them.
+
+    Args:
+        n: Number of threads, at least 1.
+        name: Prefix of the helpers' names.
+
+    Example:
+        >>> threads, results = Threads(3, "squares"), [0] * 5
+        >>> threads.each(range(5), lambda row: row**2, results.__setitem__)
+        >>> results
+        [0, 1, 4, 9, 16]
+    """
+
+    def __init__(self, n: int, name: str) -> None:
+        self._helpers = n - 1
+        self._pool = ThreadPoolExecutor(max(1, self._helpers), name)
+
+    def each(
+        self, rows: Iterable[int], work: Callable[[int], T], arrived: Callable[[int, T], object]
+    ) -> None:
+        """Work on rows in all threads, and hand each result over in the caller's thread.
+
+        Args:
+            rows: The rows.
+            work: Called with a row, in any thread.
+            arrived: Called with a row and its result, in the caller's thread, as soon as possible.
+        """
+        waiting, results = deque(rows), deque[tuple[int, T]]()
+
+        def work_on_next() -> bool:
+            try:
+                row = waiting.popleft()
+            except IndexError:
+                return False
+            results.append((row, work(row)))
+            return True
+
+        def work_on_all() -> None:
+            while work_on_next():
+                pass
+
+        def hand_over() -> None:
+            while results:
+                arrived(*results.popleft())
+
+        n_helpers = min(self._helpers, len(waiting) - 1)
+        helpers = [self._pool.submit(work_on_all) for _ in range(n_helpers)]
+        interval = sys.getswitchinterval()
+        try:
+            if helpers:
+                # A thread back from MuJoCo waits this long for a turn of Python, by default 5 ms:
+                # the time of several simulations.
+                sys.setswitchinterval(2e-4)
+            while work_on_next():
+                hand_over()
+        finally:
+            wait(helpers)  # Whatever happens, nothing moves behind the caller's back.
+            sys.setswitchinterval(interval)
+        for helper in helpers:
+            helper.result()
+        hand_over()
+
+    def close(self) -> None:
+        """End the helpers."""
+        self._pool.shutdown()

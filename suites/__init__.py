@@ -1,1 +1,0 @@
-"""Simulation suites: dm_control domains, independent of torch and ``bgpo_trl``."""

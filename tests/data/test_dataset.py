@@ -1,0 +1,71 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from bgpo_trl.data.dataset import load_demonstrations
+
+KEYS = {"pixels", "state", "action", "length", "task", "train", "seed"}
+
+
+def edit_meta(path: Path, **changes: object) -> None:
+    file = path / "dataset.json"
+    meta = {**json.loads(file.read_text()), **changes}
+    file.write_text(json.dumps({k: v for k, v in meta.items() if v is not None}))
+
+
+@pytest.mark.parametrize("key", sorted(KEYS))
+def test_a_flipped_byte_is_noticed(copy, key):
+    values = np.memmap(copy / f"{key}.memmap", np.uint8, "r+")
+    values[len(values) // 2] ^= 1
+    values.flush()
+
+    with pytest.raises(ValueError, match=r"is damaged \(checksum differs\); remove it and .*$"):
+        load_demonstrations(copy)
+    assert len(load_demonstrations(copy, verify=False)) == 9
+
+
+def truncate(path: Path) -> None:
+    with open(path / "pixels.memmap", "r+b") as file:
+        file.truncate(1000)
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (truncate, r"pixels\.memmap is missing or truncated; remove .*"),
+        (lambda p: (p / "action.memmap").unlink(), r"action\.memmap is missing or truncated; .*"),
+        (lambda p: (p / "dataset.json").write_text("{"), r"dataset\.json is damaged; remove .*"),
+        (lambda p: (p / "dataset.json").write_text("{}"), r"dataset\.json is damaged; remove .*"),
+        (lambda p: (p / "dataset.json").write_bytes(b"\xff"), r"dataset\.json is damaged; .*"),
+        (lambda p: (p / "dataset.json").unlink(), r"copy is not a dataset of demonstrations; .*"),
+        (lambda p: edit_meta(p, checksum=None), r"is not complete; resume it with .*"),
+        (lambda p: edit_meta(p, scene_version="old"), r"was recorded in scene 'old', this is nico"),
+    ],
+)
+def test_what_is_not_whole_is_refused_in_one_line(copy, damage, message):
+    damage(copy)
+
+    with pytest.raises(ValueError, match=message) as error:
+        load_demonstrations(copy)
+
+    assert "\n" not in str(error.value)
+    if "resume" not in message:
+        assert "record it again with `python -m bgpo_trl.data.recording PATH`" in str(error.value)
+
+
+@pytest.mark.parametrize("meta", ["{", '{"_type": "os.system"}', None])
+def test_what_says_how_to_read_the_tensors_is_not_believed(recorded, copy, meta):
+    """TensorDict's own file is not under the checksum, and may name what to unpickle."""
+    (copy / "meta.json").unlink() if meta is None else (copy / "meta.json").write_text(meta)
+    found, expected = load_demonstrations(copy), load_demonstrations(recorded)
+    assert set(found.keys()) == KEYS
+    for key in KEYS:
+        torch.testing.assert_close(found[key], expected[key], rtol=0, atol=0)
+
+
+def test_a_folder_that_is_missing_is_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"is not a dataset of demonstrations; record it again"):
+        load_demonstrations(tmp_path / "nowhere")

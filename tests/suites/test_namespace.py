@@ -1,0 +1,63 @@
+"""``suites`` belongs to no project: another one's suites lie beside NICO's."""
+
+import os
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+# Both are light; `suites.nico` itself would import dm_control.
+USE = "import suites.opengl, suites.other; print(*sorted(map(str, suites.__path__)))"
+
+
+@pytest.fixture
+def other(tmp_path):
+    """A folder with the suite of another project."""
+    package = tmp_path / "other project" / "suites" / "other"
+    package.mkdir(parents=True)
+    (package / "__init__.py").write_text("")
+    return package.parents[1]
+
+
+def imported_from(*folders: Path) -> str:
+    """Returns where the parts of ``suites`` were found, with some folders on the path."""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, folders))}
+    process = subprocess.run(
+        [sys.executable, "-c", USE], cwd="/", env=environment, capture_output=True, text=True
+    )
+    assert process.returncode == 0, process.stderr
+    return process.stdout
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_sources_of_two_projects_are_merged(other, first):
+    folders = [ROOT, other] if first else [other, ROOT]
+    found = imported_from(*folders)
+    assert all(str(folder / "suites") in found for folder in folders)
+
+
+def test_the_wheel_has_no_file_that_another_projects_suites_would_have(other, tmp_path):
+    copy, wheels = tmp_path / "copy", tmp_path / "wheels"
+    for name in ("bgpo_trl", "suites"):
+        shutil.copytree(ROOT / name, copy / name, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, copy / name)
+    wheels.mkdir()
+    # What pip calls, without the network that its isolated environment needs.
+    build = f"from setuptools.build_meta import build_wheel; build_wheel({str(wheels)!r})"
+    subprocess.run([sys.executable, "-c", build], cwd=copy, check=True, capture_output=True)
+    (wheel,) = wheels.iterdir()
+    installed = tmp_path / "site-packages"
+    with zipfile.ZipFile(wheel) as archive:
+        names = [name for name in archive.namelist() if name.startswith("suites/")]
+        archive.extractall(installed)
+    assert {name for name in names if name.count("/") == 1} == {"suites/opengl.py"}
+    assert {"suites/nico/__init__.py", "suites/nico/nico.xml", "suites/nico/py.typed"} <= {*names}
+    assert (installed / "bgpo_trl" / "weights" / "nico.safetensors").exists()
+
+    shutil.copytree(other / "suites", installed / "suites", dirs_exist_ok=True)
+    assert str(installed) in imported_from(installed)

@@ -1,0 +1,47 @@
+"""Rows shared between threads."""
+
+import sys
+import threading
+
+import pytest
+
+from bgpo_trl.threads import Threads
+
+
+@pytest.fixture(params=[1, 3, 20])
+def threads(request):
+    threads = Threads(request.param, "test")
+    yield threads
+    threads.close()
+
+
+def test_each_row_is_worked_on_once_and_its_result_is_handed_over_by_the_caller(threads):
+    rows, places = list(range(3, 15)), set()
+
+    def arrived(row, result):
+        places.add(threading.current_thread())
+        results.append((row, result))
+
+    for _ in range(2):
+        results: list[tuple[int, int]] = []
+        threads.each(rows, lambda row: row**2, arrived)
+        assert sorted(results) == [(row, row**2) for row in rows]
+    threads.each([], lambda row: row, arrived)
+    assert places == {threading.current_thread()}
+
+
+def test_an_error_in_any_thread_reaches_the_caller_when_all_have_ended(threads):
+    interval, working = sys.getswitchinterval(), []
+
+    def work(row):
+        working.append(row)
+        try:
+            if row == 7:
+                raise ValueError("row 7")
+        finally:
+            working.remove(row)
+
+    with pytest.raises(ValueError, match="row 7"):
+        threads.each(range(12), work, lambda row, result: None)
+    assert not working
+    assert sys.getswitchinterval() == interval
