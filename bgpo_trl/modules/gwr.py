@@ -33,10 +33,10 @@ class GWRB(nn.Module):
        tie). The activity is a = exp(-s ||phi - w_c||) (Eq. 2, where s = 1).
     3. The edge c-c' is created, or its age set to 0.
     4. If a < a_T and h_c < h_T, a node v with w_v = (w_c + phi) / 2 and h_v = h_0 is inserted:
-       edges v-c and v-c' replace c-c'. Otherwise c and its neighbors k learn, w_c += eps_c h_c (phi
-       - w_c), w_k += eps_n h_k (phi - w_k) (Eqs. 3, 4), and habituate, h <- h_inf + (h - h_inf)
-       exp(-alpha / tau), h_inf = h_0 - 1 / alpha (Eqs. 5, 6; i is read as the node's own firing
-       count, since the global iteration would soon habituate all nodes).
+       edges v-c and v-c' replace c-c'. Otherwise c and its neighbors k learn by Eqs. 3 and 4,
+       w_c += eps_c h_c (phi - w_c) and w_k += eps_n h_k (phi - w_k), and habituate by Eqs. 5 and 6,
+       h <- h_inf + (h - h_inf) exp(-alpha / tau) with h_inf = h_0 - 1 / alpha. (There, i is read as
+       the node's own firing count: the global iteration would soon habituate all nodes.)
     5. All edges of c age by 1. Edges older than kappa are removed, then nodes without edges.
 
     Time and memory are linear in nodes and edges. ``state_dict`` holds networks of any size.
