@@ -34,10 +34,10 @@ class AlgorithmConfig:
         )
         at_least(self, 1, "max_steps")
         if share and self.rl.warmup_steps < self.max_steps:
-            # Otherwise, seeds would learn from demonstrations sooner or later than each would alone.
+            # Else, seeds would learn from demonstrations sooner or later than each would alone.
             raise ValueError(
                 f"with a demonstration_share, warmup_steps ({self.rl.warmup_steps}) must be at "
-                f"least max_steps ({self.max_steps}), so that every seed has ended an episode by then"
+                f"least max_steps ({self.max_steps}), so that each seed has ended one episode"
             )
 
 
