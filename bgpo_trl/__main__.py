@@ -15,11 +15,7 @@ python -m bgpo_trl COMMAND --help shows the options."""
 
 
 def main(arguments: list[str]) -> None:
-    """Run a command.
-
-    Args:
-        arguments: The command and its options.
-    """
+    """Run a command, given its name and options."""
     name, *options = arguments or ["--help"]
     if name == "doctor":
         from bgpo_trl.doctor.__main__ import main as examine
@@ -27,13 +23,13 @@ def main(arguments: list[str]) -> None:
         sys.exit(examine(options))
     if name not in ("continual", "concurrent", "ablation"):
         sys.exit(USAGE if name in ("-h", "--help") else f"error: no command {name!r}\n{USAGE}")
-    # Imported here: the others need neither TorchRL nor the seconds that it takes.
+    # Imported late, since the other commands do without TorchRL, which takes seconds to import.
     from bgpo_trl.experiments import paper
     from bgpo_trl.experiments.arguments import Arguments, command_line
 
     kind = paper.AblationArguments if name == "ablation" else Arguments
     run = getattr(paper, name)
-    sys.argv = ["-m", "bgpo_trl", name, *options]  # which a run's summary.json stores
+    sys.argv = ["-m", "bgpo_trl", name, *options]  # stored in a run's summary.json
     command_line(run, run.__doc__, kind, options)
 
 

@@ -27,11 +27,11 @@ class Snapshot:
     """Policy of a seed at one moment of its training, conditioned for one evaluation.
 
     Attributes:
-        number: Evaluations of this seed before.
-        episode: Training episodes before.
-        env_steps: Environment steps before.
+        number: Number of earlier evaluations of this seed.
+        episode: Number of earlier training episodes.
+        env_steps: Number of earlier environment steps.
         presented: Tasks presented so far, bool ``[T]``.
-        policy: Conditioned on a demonstration of each test episode.
+        policy: The policy, conditioned on a demonstration of each test episode.
     """
 
     number: int
@@ -46,12 +46,13 @@ class TestResult:
     """Outcome of the test episodes of one evaluation of each seed.
 
     Attributes:
-        snapshots: Those that were tested, one of each seed.
-        success: Bool ``[S, T, M]``: seeds, tasks, episodes of a task; also the extrinsic return.
-        steps: Length of the episodes, int64 ``[S, T, M]``.
+        snapshots: The tested snapshots, one of each seed.
+        success: Success, which is also the extrinsic return, bool ``[S, T, M]`` (seeds, tasks,
+            episodes of a task).
+        steps: Lengths of the episodes, int64 ``[S, T, M]``.
     """
 
-    __test__ = False  # Not a test case of pytest's.
+    __test__ = False  # Keeps pytest from collecting it.
 
     snapshots: Sequence[Snapshot]
     success: Tensor
@@ -61,9 +62,9 @@ class TestResult:
 class Evaluator:
     """Tests snapshots of all seeds as one batch.
 
-    Seeds reach an evaluation at different times. Each leaves a `Snapshot`; when all have, their
-    test episodes run side by side. Starts and demonstrations of an evaluation follow from the seed
-    and the evaluation's number alone.
+    Seeds reach an evaluation at different times. Each leaves a `Snapshot`; once all have, their
+    test episodes run side by side. Start states and demonstrations depend only on the seed and the
+    number of the evaluation.
 
     Args:
         config: The algorithm's hyperparameters.
@@ -74,7 +75,7 @@ class Evaluator:
         encoders: As in training.
 
     Raises:
-        ValueError: If there is no demonstration of one of the tasks.
+        ValueError: If a task has no demonstration.
     """
 
     def __init__(
@@ -117,7 +118,7 @@ class Evaluator:
         """Queue a snapshot of one seed for its next evaluation.
 
         Args:
-            algorithm: In training.
+            algorithm: The algorithm in training.
             index: Position of the seed in the batch.
             episode: The seed's training episodes so far.
             env_steps: The seed's environment steps so far.
@@ -129,15 +130,7 @@ class Evaluator:
     def snapshot(
         self, algorithm: Algorithm, index: int, number: int, *, episode: int, env_steps: int = 0
     ) -> Snapshot:
-        """Return a snapshot of one seed for an evaluation.
-
-        Args:
-            algorithm: In training.
-            index: Position of the seed in the batch.
-            number: Of the evaluation.
-            episode: The seed's training episodes so far.
-            env_steps: The seed's environment steps so far.
-        """
+        """Return a seed's snapshot for evaluation ``number``; other arguments as for `take`."""
         rng = self._rng(self.seeds[index], number)
         drawn = torch.stack(
             [
@@ -159,12 +152,7 @@ class Evaluator:
     def run_next(
         self, device: torch.device | str = "cpu", watch: Callable[[], object] = lambda: None
     ) -> TestResult | None:
-        """Play the test episodes of the next evaluation, if all seeds have left their snapshot.
-
-        Args:
-            device: Where the networks are.
-            watch: As in `run`.
-        """
+        """Run the next evaluation if all seeds have queued a snapshot; arguments as for `run`."""
         if not all(self._waiting):
             return None
         self._next += 1
@@ -181,11 +169,11 @@ class Evaluator:
 
         Args:
             snapshots: One of each seed.
-            device: Where the networks are.
-            watch: Called at the start and after each step, with `simulation` there to be looked at.
+            device: Device of the networks.
+            watch: Called at the start and after each step, for looking at `simulation`.
 
         Returns:
-            Success and length; both 0 where a task was not yet presented.
+            Success and length; both 0 for tasks not yet presented.
         """
         policy = Policy.stack([snapshot.policy for snapshot in snapshots], device)
         starts = [
@@ -220,7 +208,7 @@ class Evaluator:
         return {"next": self._next, "waiting": waiting}
 
     def load_state_dict(self, state: dict[str, Any], algorithm: Algorithm) -> None:
-        """Continue from what `state_dict` returned; the algorithm is the one it was taken from."""
+        """Restore a `state_dict`, given the algorithm of its snapshots."""
         self._next = state["next"]
         self._waiting = [
             [

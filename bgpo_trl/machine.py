@@ -1,4 +1,4 @@
-"""What this machine offers: cores that may be used, and a device for the networks."""
+"""Resources of the machine: usable cores, threads, and the device of the networks."""
 
 from __future__ import annotations
 
@@ -11,11 +11,10 @@ import torch
 def usable_cores(quota: str | Path = "/sys/fs/cgroup/cpu.max") -> int:
     """Return how many cores this process may use, at least 1.
 
-    Heeds the process's affinity (``taskset``, Slurm) and a container's quota.
+    Respects the process's affinity (``taskset``, Slurm) and a container's quota.
 
     Args:
-        quota: Where Linux tells the quota and its period (us), as ``"200000 100000"`` or
-            ``"max 100000"``.
+        quota: File with quota and period (us), such as ``"200000 100000"`` or ``"max 100000"``.
     """
     if hasattr(os, "sched_getaffinity"):
         cores = len(os.sched_getaffinity(0))
@@ -24,37 +23,33 @@ def usable_cores(quota: str | Path = "/sys/fs/cgroup/cpu.max") -> int:
     try:
         allowed, period = Path(quota).read_text().split()
         cores = min(cores, round(int(allowed) / int(period)))
-    except (OSError, ValueError):  # No Linux, no control group, or no quota.
+    except (OSError, ValueError):  # Not Linux, or no quota.
         pass
     return max(1, cores)
 
 
 def set_threads(threads: int) -> None:
-    """Set how many threads PyTorch uses.
-
-    Raises:
-        ValueError: If that is none.
-    """
+    """Set the number of PyTorch's threads; raise ``ValueError`` if it is below 1."""
     if threads < 1:
-        raise ValueError(f"threads must be at least 1, got {threads}: small networks want just 1")
+        raise ValueError(f"threads must be at least 1, got {threads}: 1 is fastest here")
     torch.set_num_threads(threads)
 
 
 def choose_device(name: str = "auto") -> torch.device:
-    """Return the device for networks and replay; the simulation is always on the CPU.
+    """Return the device of the networks; simulations always run on the CPU.
 
     Args:
-        name: ``"auto"`` (a CUDA GPU if there is one, else the CPU) or a device of PyTorch's.
+        name: ``"auto"`` (a CUDA GPU if available, else the CPU) or a device of PyTorch.
 
     Raises:
-        ValueError: If there is no such device.
+        ValueError: If the device is not available.
     """
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:
         device = torch.device(name)
         torch.empty(0, device=device)
-    except (RuntimeError, AssertionError, NotImplementedError) as error:  # Without CUDA it asserts.
+    except (RuntimeError, AssertionError, NotImplementedError) as error:  # AssertionError: no CUDA.
         reason = str(error).splitlines()[0].partition(". ")[0]
         raise ValueError(f"no device {name!r} here ({reason}): use auto or cpu") from error
     return device

@@ -1,4 +1,4 @@
-"""One-shot use of a trained run: show its policy a demonstration, and let it act."""
+"""One-shot use of a trained run: condition its policy on a demonstration and let it act."""
 
 from __future__ import annotations
 
@@ -31,19 +31,18 @@ _FRAME = (FRAME_HEIGHT, FRAME_WIDTH, 3)
 
 @dataclass(frozen=True)
 class Recognition:
-    """What a policy made of a demonstration.
+    """Behavior and group that a policy recognizes in a demonstration.
 
     Attributes:
         embedding: phi of the demonstration, float32 ``[32]``.
-        behavior: The weights b of the best matching node of GWR-B, ``[32]``. None, as the next two,
-            in algorithms without GWR-B.
-        node: Its identity.
-        activity: Of the node, in [0, 1]: 1 where the demonstration is just like it.
-        group: The group of behaviors that it belongs to. None, as the next two, in algorithms that
-            do not tell groups apart.
-        group_activity: Of the best match among the groups' nodes, in [0, 1].
-        known: Whether that is high enough for the demonstration to be of a known group.
-        task: The label that came with the demonstration.
+        behavior: Weights b of the best-matching node of GWR-B, ``[32]``; None without GWR-B, as are
+            the next two.
+        node: Identity of that node.
+        activity: Activity of that node in [0, 1]; 1 for a demonstration equal to it.
+        group: Number of the group of behaviors; None without groups, as are the next two.
+        group_activity: Activity of the best match among the groups' nodes, in [0, 1].
+        known: Whether that reaches the threshold of a known group.
+        task: The label given with the demonstration.
     """
 
     embedding: Tensor = field(repr=False)
@@ -57,16 +56,14 @@ class Recognition:
 
 
 class TrainedPolicy:
-    """The policy of one seed of a run, as in test episodes: it learns nothing and adds no noise.
-
-    Made by `load_run`.
+    """The policy of one seed of a run, without learning or noise, as returned by `load_run`.
 
     Args:
         config: The run.
-        algorithm: The algorithm as the run left it, of all seeds.
-        encoders: The encoders that the run used.
-        bank: The demonstrations that the run used, embedded.
-        seed: Which of the run's seeds.
+        algorithm: The algorithm of all seeds, as left by the run.
+        encoders: The run's encoders.
+        bank: The run's demonstrations, embedded.
+        seed: One of the run's seeds.
     """
 
     def __init__(
@@ -97,19 +94,19 @@ class TrainedPolicy:
         task: str | None = None,
         generator: torch.Generator | None = None,
     ) -> Recognition:
-        """Condition the policy on a demonstration, whole or cut short.
+        """Condition the policy on a demonstration, complete or truncated.
 
         Args:
             demonstration: Frames, uint8 ``[T, 32, 64, 3]``, T at least 1.
-            task: The label of its task, for algorithms that are told it; others do not read it.
-            generator: For what MAML draws to adapt itself; of the seed if None.
+            task: Task label, for algorithms that need it; ignored by others.
+            generator: Source of MAML's draws for adaptation; None: derived from the seed.
 
         Returns:
-            The behavior and the group that the policy recognized.
+            The recognized behavior and group.
 
         Raises:
-            ValueError: If these are no such frames, or the label is unknown or missing; the policy
-                then does what it did before.
+            ValueError: If the frames have another dtype or shape, or the label is unknown or
+                missing; the policy is unchanged then.
         """
         frames = _frames(demonstration, "a demonstration is uint8 [T, 32, 64, 3], T at least 1", 4)
         algorithm, n_seeds, n_tasks = self.algorithm, len(self.config.seeds), len(self.tasks)
@@ -124,7 +121,7 @@ class TrainedPolicy:
         (embedding,) = embed_demonstrations(self.encoders, TensorDict(shown, [1]))
         if generator is None:
             generator = torch.Generator().manual_seed(stream_seed(self.seed, "one-shot"))
-        # One test episode of each task, as in evaluations.
+        # `snapshot` expects test episodes of every task.
         policy = algorithm.snapshot(
             self._index,
             embedding.expand(n_tasks, 1, -1),
@@ -134,27 +131,30 @@ class TrainedPolicy:
         self._policy = Policy.stack([policy], algorithm.device)
         self._task = 0 if task is None else self.tasks.index(task)
         shown, index = embedding.expand(n_seeds, -1), self._index
-        found: dict[str, Any] = {}
+        recognized: dict[str, Any] = {}
         if algorithm.gwr is not None:
             match = algorithm.gwr.lookup(shown)
-            found["behavior"], found["node"] = match.embedding[index], int(match.node[index])
-            found["activity"] = float(match.activity[index])
+            recognized["behavior"] = match.embedding[index]
+            recognized["node"] = int(match.node[index])
+            recognized["activity"] = float(match.activity[index])
         if algorithm.groups is not None:
             member = algorithm.groups.lookup(shown)
             activity = float(member.activity[index])
-            found["group"], found["group_activity"] = int(member.group[index]), activity
-            found["known"] = activity >= algorithm.groups.activity_threshold
-        return Recognition(embedding, **found, task=task)
+            recognized["group"] = int(member.group[index])
+            recognized["group_activity"] = activity
+            recognized["known"] = activity >= algorithm.groups.activity_threshold
+        return Recognition(embedding, **recognized, task=task)
 
     @torch.no_grad()
     def act(self, frame: ArrayLike) -> NDArray[np.float32]:
-        """Return the action for what the robot sees, float32 ``[4]`` in [-1, 1].
+        """Return the action for a frame, float32 ``[4]`` in [-1, 1].
 
         Args:
             frame: uint8 ``[32, 64, 3]``.
 
         Raises:
-            ValueError: If this is no such frame, or no demonstration was shown before.
+            ValueError: If the frame has another dtype or shape, or no demonstration was given
+                before.
         """
         if self._policy is None:
             raise ValueError("the policy has seen no demonstration: show it one with condition()")
@@ -172,17 +172,16 @@ def load_run(
     seed: int | None = None,
     make: Callable[..., Algorithm] | None = None,
 ) -> TrainedPolicy:
-    """Load what a run has learned up to its last checkpoint, finished or not.
+    """Load the policy of a run, finished or not, from its last checkpoint.
 
     Args:
-        path: The run's directory, of which nothing is changed.
-        seed: Which of the run's seeds; the first if None.
-        make: Makes the algorithm, where the run was one that `ALGORITHMS` does not have, as for
-            `Trainer`.
+        path: The run's directory, which is only read.
+        seed: One of the run's seeds; None: the first.
+        make: Constructor of the algorithm, as for `Trainer`, if it is not in `ALGORITHMS`.
 
     Raises:
-        ValueError: If there is no run, no checkpoint yet, no such seed or algorithm; if the run saw
-            the ground truth instead of frames; or its encoders are not at hand.
+        ValueError: If the run, its checkpoint, seed, algorithm or encoders cannot be found, or if
+            it learned from the ground truth instead of frames.
 
     Example:
         >>> import bgpo_trl
@@ -203,8 +202,8 @@ def load_run(
             make = entry(config.name).make
         except ValueError:
             raise ValueError(
-                f"{path} is a run of {config.name!r}, which is not in ALGORITHMS: give make=, what "
-                "its Trainer was given"
+                f"{path} is a run of {config.name!r}, which is not in ALGORITHMS: give make=, "
+                "as for its Trainer"
             ) from None
     if not has_checkpoint(path / "checkpoint"):
         raise ValueError(f"{path} has no checkpoint yet: let the run reach its first one")
@@ -215,7 +214,7 @@ def load_run(
     try:
         state = saved["algorithm"]
         if not algorithm.needs_replay:
-            state["replay"] = algorithm.replay.state_dict()  # What is left in the file is free.
+            state["replay"] = algorithm.replay.state_dict()  # Avoids reading it.
         algorithm.load_state_dict(state)
     except (KeyError, IndexError, RuntimeError, TypeError, ValueError) as error:
         reason = str(error).splitlines()[-1].strip()
@@ -228,13 +227,13 @@ def load_run(
 
 
 def _encoders(path: Path, identity: str) -> tuple[Representation, DemonstrationBank]:
-    """Return the encoders of a run, its own or those that come with the package."""
+    """Return the encoders of a run, its own or the shipped ones."""
     own = path / "encoders" / "nico.safetensors"
     encoders, bank = load_pretrained(own if own.exists() else None)
     if encoders.identity != identity:
-        found = own if own.exists() else "those that come with the package"
+        present = own if own.exists() else "those that come with the package"
         raise ValueError(
-            f"{path} was trained with the encoders {identity[:12]}, not with {found} "
+            f"{path} was trained with the encoders {identity[:12]}, not with {present} "
             f"({encoders.identity[:12]}): put its own at {own}, with their bank"
         )
     return encoders, bank
@@ -245,5 +244,5 @@ def _frames(frames: ArrayLike, wanted: str, ndim: int) -> Tensor:
     shape = array.shape
     if array.dtype != np.uint8 or array.ndim != ndim or shape[-3:] != _FRAME or not array.size:
         raise ValueError(f"{wanted}, got {array.dtype} {list(shape)}")
-    # A copy: what was given may be read-only.
+    # Copied, since the array may be read-only.
     return torch.tensor(np.ascontiguousarray(array))

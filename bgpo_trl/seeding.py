@@ -1,4 +1,4 @@
-"""Independent streams of random numbers, each named, all from one seed."""
+"""Independent, named streams of random numbers from one seed."""
 
 from __future__ import annotations
 
@@ -12,18 +12,13 @@ from torch import Tensor
 
 
 def stream_seed(seed: int, name: str) -> int:
-    """Return the seed of a named stream, below 2**32, independent of all other names' and seeds'.
-
-    Args:
-        seed: Seed of the run.
-        name: What the stream is for, such as ``"exploration"``.
-    """
+    """Return a seed below 2**32 for a stream such as ``"exploration"``, given the run's seed."""
     sequence = np.random.SeedSequence([seed, zlib.crc32(name.encode())])
     return int(sequence.generate_state(1)[0])
 
 
 def generators(seeds: Sequence[int], name: str) -> list[torch.Generator]:
-    """Return one generator for each seed, for one purpose; seed by seed the same in any batch.
+    """Return one generator per seed for a named stream, the same alone as in any batch.
 
     Example:
         >>> alone, = generators([7], "exploration")
@@ -35,12 +30,12 @@ def generators(seeds: Sequence[int], name: str) -> list[torch.Generator]:
 
 
 def task_generators(seeds: Sequence[int], n_tasks: int, name: str) -> list[list[torch.Generator]]:
-    """Return one generator for each task of each seed, for one purpose."""
+    """Return one generator per task of each seed, for a named stream."""
     return [[generators([seed], f"{name} {task}")[0] for task in range(n_tasks)] for seed in seeds]
 
 
 def normal(generators: Sequence[torch.Generator], shape: Sequence[int]) -> Tensor:
-    """Return standard normals ``[S, *shape]``, those of each seed from its own generator."""
+    """Return standard normals ``[S, *shape]``, each seed's from its own generator."""
     return torch.stack([torch.randn(*shape, generator=generator) for generator in generators])
 
 

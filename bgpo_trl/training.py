@@ -1,4 +1,4 @@
-"""The training loop: step all seeds, learn, test, log, save; continue what was interrupted."""
+"""The training loop: step all seeds, update, evaluate, log and save; resume an interrupted run."""
 
 from __future__ import annotations
 
@@ -32,42 +32,37 @@ from bgpo_trl.world import World
 
 
 class Trainer:
-    """One run: an algorithm, its test episodes, its files.
+    """One run: an algorithm, its evaluations and its files.
 
-    Each seed of the batch plays ``config.episodes`` training episodes. Seeds that are done early go
-    on, unlogged, until the last one is; everything that is logged is what the seed alone would have
-    logged, but for the losses, which are means over the seeds. A run may be resumed with more
-    ``config.episodes`` than it had: it is then what the longer run would have been.
+    Each seed of the batch plays ``config.episodes`` training episodes. Seeds that finish early go
+    on, unlogged, until the last one finishes; logged values are those of the seed alone, except for
+    the losses, which are means over seeds. A run resumed with more ``config.episodes`` equals a run
+    of that length. Each update runs while the environment steps, and learns from all earlier
+    transitions.
 
-    Each update runs while the environment takes a step, and learns from all transitions before it.
-
-    Checkpoints are written between steps only, and an interrupt (Ctrl-C) waits for the end of its
-    step, so that each checkpoint is a state that the run has been in. Whatever else ends a run
-    costs it what came after its last checkpoint, and no row: a resumed run writes them again. The
-    first one is written before the first step.
-
-    Rows are in their files at once. Mirrors such as Weights & Biases hear that it is over when the
-    trainer is closed, so that figures can still reach them after `run`: use it in a ``with`` block.
-    Until then no other process can write to the directory.
+    Checkpoints are written before the first step and between steps; Ctrl-C waits for the end of the
+    step and saves. After any other failure, a resumed run repeats the steps since the last
+    checkpoint and writes the same rows. Rows are written at once; mirrors such as Weights & Biases
+    stay open for figures until `close`, which also unlocks the directory. Use the trainer in a
+    ``with`` block.
 
     Args:
         config: The run.
         directory: The run's directory: ``config.json``, ``train.csv``, ``eval.csv``,
-            ``checkpoint/``, and in ``gwr/`` the graph of the first seed's GWR-B at some moments.
-        bank: Embedded demonstrations, seen and held out; those of ``config.tasks`` are used.
-        encoders: Trained encoders; None for a run that does not use them.
-        make: Makes the algorithm; by default the entry of ``config.name``.
-        device: Where the networks are; see `Algorithm`.
-        resume: Continue the run in the directory, from its last checkpoint; begin it where there is
-            none.
-        wandb: None, ``"online"`` or ``"offline"``: mirror the CSV there.
+            ``checkpoint/``, and in ``gwr/`` graphs of the first seed's GWR-B during training.
+        bank: Embedded demonstrations, seen and held out, of at least ``config.tasks``.
+        encoders: Trained encoders, or None if unused.
+        make: Constructor of the algorithm; by default that of the entry ``config.name``.
+        device: Device of the networks; see `Algorithm`.
+        resume: Continue from the last checkpoint in the directory, if there is one.
+        wandb: Mirror the CSV files: ``"online"``, ``"offline"`` or None.
         progress: Whether to show a progress bar.
 
     Raises:
-        ValueError: If the directory holds another run (other settings, other encoders), or one and
-            ``resume`` is False; if rows, checkpoint or ``config.json`` of a run to continue are
-            missing; or if the bank has no demonstration of one of the tasks.
-        BlockingIOError: If another process is at work in the directory.
+        ValueError: If the directory holds a run with other settings or encoders, or any run and
+            ``resume`` is False; if rows, checkpoint or ``config.json`` of a run to resume are
+            missing; or if the bank has no demonstration of a task.
+        BlockingIOError: If another process works in the directory.
     """
 
     def __init__(
@@ -104,11 +99,11 @@ class Trainer:
             encoders=encoders,
         )
         self.env_steps = 0
-        # For the progress bar: the latest episodes, and the latest test.
+        # For the progress bar: the latest training episodes, and the latest evaluation.
         self._successes: deque[int] = deque(maxlen=100)
         self._tested = ""
         self._growth_moments = growth_moments(config.episodes)
-        # Rows of seeds that were done early and went on.
+        # Rows of seeds that finished early, kept for a resumed run with more episodes.
         self._later: list[dict[str, Any]] = []
         encoders_used = None if encoders is None else encoders.identity
         self._settings = settings_of(config, encoders_used)
@@ -130,19 +125,19 @@ class Trainer:
             raise
 
     def run(self) -> None:
-        """Train to the end; does nothing where a resumed run is there already.
+        """Train to the end; return at once if a resumed run is complete.
 
         Raises:
-            KeyboardInterrupt: At the first Ctrl-C, when the step is over and saved; at a second one
-                at once.
+            KeyboardInterrupt: At the first Ctrl-C after the step is over and saved, at a second one
+                immediately.
             OSError: If the disk is full.
         """
         algorithm, env, n_episodes = self.algorithm, self.world.env, self.config.episodes
         if self._state is None:
             self._state = env.reset()
-            self.save()  # So that there are never rows without a checkpoint.
+            self.save()  # Rows without a checkpoint could not be resumed.
         state, saved = self._state, time.monotonic()
-        episodes = self.world.source.episode  # counted in place by each reset
+        episodes = self.world.source.episode  # updated in place
         bar = progress_bar(
             "train",
             shown=self.progress,
@@ -151,7 +146,7 @@ class Trainer:
             unit="episode",
         )
         losses: dict[str, torch.Tensor] = {}
-        # What is here now stays to the end: the garbage collector need not look at it again.
+        # Spares the garbage collector all objects that live until the end.
         gc.freeze()
         try:
             with interrupts_wait() as interrupted, ThreadPoolExecutor(1, "update") as background:
@@ -182,7 +177,7 @@ class Trainer:
             bar.close()
 
     def close(self) -> None:
-        """Close the run's files and mirrors, and lets other processes into its directory."""
+        """Close files and mirrors, and unlock the directory for other processes."""
         self.logger.close()
         self._lock.release()
 
@@ -233,7 +228,7 @@ class Trainer:
             self.evaluator.take(algorithm, index, episode, self.env_steps)
 
     def _log(self, row: dict[str, Any]) -> None:
-        """Log an episode, or keeps what only a longer run would log."""
+        """Log an episode, or keep it if only a longer run would log it."""
         if row["episode"] <= self.config.episodes:
             self._successes.append(row["success"])
             self.logger.log_train(row)
@@ -265,7 +260,7 @@ class Trainer:
             self._tested = ", in tests " + " ".join(f"{rate:.2f}" for rate in shown)
 
     def save(self) -> None:
-        """Write a checkpoint from which `resume` continues to the same curve."""
+        """Write a checkpoint, from which a resumed run continues identically."""
         assert self._state is not None
         state: dict[str, Any] = {
             "algorithm": self.algorithm.state_dict(),

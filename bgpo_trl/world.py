@@ -1,4 +1,4 @@
-"""The world that an algorithm is trained in: simulations, and draws of tasks and demonstrations."""
+"""Simulations and draws of tasks and demonstrations, in which an algorithm is trained."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ __all__ = ["World"]
 
 
 class World:
-    """Simulations of a batch of seeds, with the transforms of an algorithm around them.
+    """Simulations of a batch of seeds, within the transforms of an algorithm.
 
     Args:
-        algorithm: Makes the environment.
+        algorithm: The algorithm, which makes the environment.
         seeds: One for each element of the batch.
-        schedule: When each task is presented.
+        schedule: Times at which tasks are presented.
         bank: Embedded demonstrations for training episodes.
 
     Attributes:
-        env: The algorithm's composition of transforms.
+        env: The environment with the algorithm's transforms.
         source: The transform that draws task and demonstration of each episode.
-        simulation: The environment without its transforms.
+        simulation: The environment without transforms.
     """
 
     def __init__(
@@ -52,15 +52,15 @@ class World:
         self.env = algorithm.make_env(self.simulation, self.source)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return all that future observations depend on but the tensordict in flight."""
+        """Return the state of draws and simulations, without the tensordict between two steps."""
         return {
             "source": dict(self.source.state_dict()),
             "simulation": self.simulation.simulation_state(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from what `state_dict` returned."""
-        self.env.reset()  # Transforms make their caches at the first reset.
+        """Restore a `state_dict`."""
+        self.env.reset()  # Transforms create their caches at the first reset.
         self.source.load_state_dict(state["source"])
         self.simulation.load_simulation_state(state["simulation"])
 

@@ -1,4 +1,4 @@
-"""Algorithms that learn several tasks, by the names that command lines and CSV files give them."""
+"""Algorithms that learn several tasks, by their names in command lines and CSV files."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ __all__ = ["ABLATIONS", "ALGORITHMS", "Algorithm", "Entry", "entry"]
 
 @dataclass(frozen=True)
 class Entry:
-    """How to make an algorithm."""
+    """An algorithm and its default hyperparameters."""
 
     make: Callable[..., Algorithm]
     """Called with a config and the arguments of `Algorithm`."""
     config: AlgorithmConfig
-    """Its default hyperparameters."""
+    """The default hyperparameters."""
 
 
 _SINGLE = BGPOConfig(variant="published", experts=False, even_replay=False, demonstration_share=0.0)
@@ -59,10 +59,10 @@ ALGORITHMS: dict[str, Entry] = {
     "oracle": Entry(BGPO, replace(_SINGLE, variant="label")),
     "ddpg": Entry(BGPO, replace(_SINGLE, variant="no-context")),
 }
-"""Algorithms with their settings: BGPO, without demonstrations, and with one actor and critic for
-all behaviors besides; the baselines of the paper, without demonstrations and with them; as
-references, DDPG that is told the task's label, and DDPG told nothing. Those named ``-paper`` are as
-published: networks of 64 units, batches of 256, no stabilisers."""
+"""BGPO, also without demonstrations (``bgpo-experts``) and with a single actor and critic besides
+(``bgpo-single``); the paper's baselines, without and with demonstrations; two references, DDPG with
+the task's label (``oracle``) and without context (``ddpg``). Names in ``-paper`` follow the
+publication: networks of 64 units, batches of 256, no stabilizers."""
 
 ABLATIONS: dict[str, Entry] = {
     "gwr+r_int": Entry(BGPO, _SINGLE),
@@ -74,15 +74,15 @@ ABLATIONS: dict[str, Entry] = {
     "demonstrations": Entry(BGPO, replace(_SINGLE, demonstration_share=_SHOWN)),
     "all": Entry(BGPO, BGPOConfig()),
 }
-"""The paper's ablations (Fig. 9): GWR-B and the intrinsic reward, one of them, none. Then what this
-package adds to the published algorithm, one thing at a time, and all of it."""
+"""The paper's ablations (Fig. 9): with GWR-B and the intrinsic reward, one of them, neither. Then
+each addition of this package to the published algorithm by itself, and all of them."""
 
 
 def entry(name: str) -> Entry:
-    """Return how to make an algorithm or an ablation.
+    """Return the entry of an algorithm or an ablation.
 
     Raises:
-        ValueError: If none has that name.
+        ValueError: If the name is unknown.
     """
     known = ALGORITHMS | ABLATIONS
     if name not in known:

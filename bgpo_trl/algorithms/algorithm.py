@@ -1,4 +1,4 @@
-"""The base of all algorithms, and the interface of training and test episodes to them."""
+"""Base class of all algorithms: the interface to training and test episodes."""
 
 from __future__ import annotations
 
@@ -28,30 +28,28 @@ from suites.nico.base import STATE_SIZE
 
 
 class Algorithm(ABC):
-    """A learner of several tasks, for a batch of seeds that share nothing but the encoders.
+    """A multi-task learner for a batch of seeds that share nothing but the encoders.
 
-    It needs no simulation: `World` brings it together with one. A step of training is `act`, the
-    environment's step, `store`; an `update` may run while the environment takes its step. For test
-    episodes `snapshot` copies the policy of one seed.
+    A training step is `act`, the environment's step and `store`; an `update` may run while the
+    environment steps. `snapshot` copies the policy of one seed for test episodes. The simulation
+    belongs to `World`, not to the algorithm.
 
     Args:
         config: Hyperparameters.
-        seeds: One for each element of the batch.
+        seeds: One for each element of the batch ``S``.
         bank: Embedded demonstrations for training episodes.
-        encoders: The trained encoders; None where they are not used. The frame encoder is moved to
-            the device.
-        device: Where frames are encoded and networks learn. Simulations, GWR-B and replay stay on
-            the CPU.
+        encoders: Trained encoders, or None if unused. The frame encoder is moved to the device.
+        device: Device of the networks. Simulations, GWR-B and replay stay on the CPU.
 
     Attributes:
-        gwr: GWR-B, or None in an algorithm without it.
-        groups: Groups of behaviors, or None in an algorithm that does not tell them apart.
+        gwr: GWR-B, or None.
+        groups: Groups of behaviors, or None.
         state_size: Number of features of the state.
         learner: The RL algorithm: losses of actor and critic, optimizer, target networks.
-        replay: The experience.
+        replay: The replay buffer.
         test_actor: Network of test episodes, called with the parameters of a `Policy`.
-        needs_label: Whether policies depend on the label of a test episode's task.
-        needs_replay: Whether `snapshot` depends on the replay.
+        needs_label: Whether policies depend on the task label of a test episode.
+        needs_replay: Whether `snapshot` depends on the replay buffer.
     """
 
     gwr: GWRB | None = None
@@ -88,7 +86,7 @@ class Algorithm(ABC):
 
         Args:
             base_env: The simulations ``[S]``.
-            source: Draws task and demonstration of each episode.
+            source: The transform that draws task and demonstration of each episode.
         """
 
     @abstractmethod
@@ -97,33 +95,31 @@ class Algorithm(ABC):
 
     @abstractmethod
     def store(self, transition: TensorDictBase) -> None:
-        """Keep a transition of each seed, ``[S]``, for later updates."""
+        """Add a transition of each seed, ``[S]``, to the replay buffer."""
 
     @abstractmethod
     def update(self) -> dict[str, Tensor]:
         """Make one update of each seed from the transitions stored so far.
 
-        Touches neither the environment nor the state that `act` changes, so that it may run while
-        the environment takes a step.
+        It may run while the environment steps: it uses neither the environment nor any state that
+        `act` changes.
 
         Returns:
-            ``loss_actor``, ``loss_value`` and other losses of the RL algorithm, means over the
-            seeds ``[]``; empty before the first update.
+            ``loss_actor``, ``loss_value`` and other losses, means over the seeds ``[]``; empty
+            before the first update.
         """
 
     @abstractmethod
     def snapshot(
         self, index: int, embedding: Tensor, task: Tensor, generator: torch.Generator
     ) -> Policy:
-        """Return a copy, on the CPU, of the policy of one seed, conditioned on demonstrations.
-
-        Nothing is learned from the demonstrations, and nothing of the training changes.
+        """Copy the policy of one seed, conditioned on demonstrations, to the CPU; learn nothing.
 
         Args:
             index: Position of the seed in the batch.
             embedding: phi of the demonstration of each test episode, ``[T, M, 32]``.
-            task: Their labels, int64 ``[T, M]``. BGPO does not read them.
-            generator: For draws by which the algorithm prepares itself.
+            task: Their labels, int64 ``[T, M]``; ignored by BGPO.
+            generator: Source of randomness for algorithms that adapt before testing.
         """
 
     def policy(self, parameters: dict[str, Tensor], context: Tensor | None = None) -> Policy:
@@ -137,16 +133,16 @@ class Algorithm(ABC):
         seeds: Sequence[int],
         constant_keys: Sequence[NestedKey] = (),
     ) -> DemonstrationReplay | None:
-        """Return the replay of shown demonstrations; None if the algorithm is not to use them.
+        """Return the replay of shown demonstrations, or None without a ``demonstration_share``.
 
         Args:
-            config: Its hyperparameters.
-            bank: The demonstrations of training episodes.
+            config: Hyperparameters.
+            bank: Demonstrations for training episodes.
             seeds: The seeds.
-            constant_keys: What policies read that is constant within an episode.
+            constant_keys: Entries read by policies that are constant within an episode.
 
         Raises:
-            ValueError: If the bank has no steps, or they are not of the state that policies see.
+            ValueError: If the state is not the latent, or the bank has no steps.
         """
         if not config.demonstration_share:
             return None
@@ -160,48 +156,41 @@ class Algorithm(ABC):
         )
 
     def learn(self, batch: TensorDictBase) -> dict[str, Tensor]:
-        """Take a gradient step on a batch, and one of the target networks towards the others.
-
-        Returns:
-            What `update` returns.
-        """
+        """Take a gradient step on a batch and update the targets; return the losses of `update`."""
         losses = self.learner.learn(self.to_device(batch))
         return {key: loss / self.n_seeds for key, loss in losses.items()}
 
     def to_device(self, batch: TensorDictBase) -> TensorDictBase:
-        """Return a batch where the networks are."""
+        """Return a batch on the device of the networks."""
         return batch if self.device == torch.device("cpu") else batch.to(self.device)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return all that future actions, updates and snapshots depend on."""
+        """Return everything that future actions, updates and snapshots depend on."""
         return {
             "noise": [generator.get_state() for generator in self._noise],
             **{name: dict(part.state_dict()) for name, part in self._learned().items()},
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from what `state_dict` returned."""
+        """Restore a `state_dict`."""
         for name, part in self._learned().items():
             part.load_state_dict(state[name])
         for generator, saved in zip(self._noise, state["noise"], strict=True):
             generator.set_state(saved)
 
     def _learned(self) -> dict[str, Any]:
-        """Return what changes by learning, which an algorithm need not have all of."""
+        """Return the parts that learning changes, as far as the algorithm has them."""
         parts = ("learner", "replay")
         return {name: getattr(self, name) for name in parts if hasattr(self, name)}
 
 
 def networks_of(parameters: TensorDictBase, seed: Tensor, task: Tensor) -> dict[str, Tensor]:
-    """Return some of the networks that there are for each task of each seed.
+    """Select networks of tasks from parameters ``[S, T, ...]``, named as for ``functional_call``.
 
     Args:
         parameters: ``[S, T, ...]``.
-        seed: Positions of the seeds, int64, of any shape that goes with that of ``task``.
+        seed: Positions of the seeds, int64, broadcast against ``task``.
         task: The tasks, int64.
-
-    Returns:
-        Parameters of that shape, by the names that `torch.func.functional_call` takes.
     """
     flat = parameters.flatten_keys(".")
     return {str(key): value[seed, task] for key, value in flat.items()}

@@ -1,4 +1,4 @@
-"""Behavior-Guided Policy Optimization (Alg. 1): GWR-B infers the task, f_RL learns to do it."""
+"""Behavior-Guided Policy Optimization (Alg. 1): GWR-B infers the task, f_RL learns the policy."""
 
 from __future__ import annotations
 
@@ -29,29 +29,25 @@ from bgpo_trl.transforms import DemonstrationSource
 
 
 class BGPO(Algorithm):
-    """BGPO, its ablations and its references; ``config.variant`` says which.
+    """BGPO, its ablations and its references, selected by ``config.variant``.
 
-    With ``config.experts``, each group of behaviors has an actor and a critic; with
-    ``config.even_replay``, an update sees as many transitions of each of the groups played last;
-    with a ``config.demonstration_share``, a part of them is taken from demonstrations. Without the
-    three, the variant ``"published"`` is the paper's algorithm.
+    With ``experts``, each group of behaviors has its own actor and critic; with ``even_replay``, an
+    update draws equally from the groups played last; with a ``demonstration_share``, it also draws
+    from demonstrations. The variant ``"published"`` without these three is the paper's algorithm.
 
     Args:
         config: Hyperparameters.
-        seeds: One for each element of the batch; they share nothing but the encoders.
-        bank: Embedded demonstrations for training episodes.
-        encoders: The trained encoders; None where neither latents nor embeddings are used.
+        seeds: As in `Algorithm`.
+        bank: As in `Algorithm`.
+        encoders: As in `Algorithm`; None if neither latents nor embeddings are used.
         device: As in `Algorithm`.
 
     Attributes:
-        gwr: GWR-B, or None in the variants without it.
-        groups: Groups of behaviors, or None where they are not told apart.
-        experts: The networks, by group; without experts, of one group.
-        shown: Replay of the demonstrations shown so far, or None where they are not used.
+        experts: The networks, by group; of a single group without ``config.experts``.
+        shown: Replay of the demonstrations shown so far, or None.
 
     Raises:
-        ValueError: If there is no such variant, or it does not tell groups apart as the config
-            wants.
+        ValueError: If the variant is unknown, or does not fit ``experts`` and ``even_replay``.
     """
 
     config: BGPOConfig
@@ -119,17 +115,17 @@ class BGPO(Algorithm):
         self.shown = self.demonstrations(config, bank, seeds, constant_keys=keys[1:])
 
     def make_env(self, base_env: EnvBase, source: DemonstrationSource) -> TransformedEnv:
-        """Return the variant's environment, see `bgpo_trl.algorithms.environments`."""
+        """Return the variant's environment; see `bgpo_trl.algorithms.environments`."""
         modules = self.encoders, self.gwr, self.groups
         return self.variant.make_env(self.config, base_env, source, *modules)
 
     @property
     def beta(self) -> float:
-        """Weight of the intrinsic reward, 0 where it is not paid."""
+        """Weight of the intrinsic reward, 0 in variants without it."""
         return self.config.beta if self.variant.bonus else 0.0
 
     def _highest_return(self) -> float:
-        """Return the highest attainable return: of a success now, or after a time-out's bonus."""
+        """Return the highest attainable return, of a success now or after a time-out's bonus."""
         success = 1.0 + self.beta
         return max(success, self.beta + self.config.rl.gamma * success)
 
@@ -138,7 +134,7 @@ class BGPO(Algorithm):
 
     @torch.no_grad()
     def act(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the ``action`` ``[S, 4]`` by which the policy explores."""
+        """Write the ``action`` ``[S, 4]`` of the group's policy with exploration noise."""
         groups = self._groups_of(tensordict)
         if self.config.experts:
             expert = self.experts.play(groups)
@@ -150,7 +146,7 @@ class BGPO(Algorithm):
         return tensordict.set("action", self.learner.act(seen, self._noise, expert))
 
     def store(self, transition: TensorDictBase) -> None:
-        """Keep a transition of each seed for updates to come, and the demonstration at its end."""
+        """Store a transition of each seed and, at the end of an episode, its demonstration."""
         group = torch.tensor(self._groups_of(transition))
         self.replay.add(transition, group)
         if self.shown is None:
@@ -170,7 +166,7 @@ class BGPO(Algorithm):
         return self.learn(self._sample())
 
     def _sample(self) -> TensorDictBase:
-        """Return the transitions of an update, ``[S, E, B]``."""
+        """Sample the transitions of an update, ``[S, E, B]``."""
         config, (_, n_experts) = self.config, self.experts.active.group.shape
         n_rows = config.expert_batch_size if config.experts else config.rl.batch_size
 
@@ -192,9 +188,9 @@ class BGPO(Algorithm):
     def snapshot(
         self, index: int, embedding: Tensor, task: Tensor, generator: torch.Generator
     ) -> Policy:
-        """Return a copy of one seed's policy; see `Algorithm.snapshot`.
+        """Copy the policy of one seed; see `Algorithm.snapshot`.
 
-        With experts, its parameters are those of each episode's expert, ``[T, M, ...]``.
+        With experts, the parameters are those of each episode's expert, ``[T, M, ...]``.
         """
         del generator
         if self.config.experts and self.groups is not None:
@@ -213,15 +209,12 @@ class BGPO(Algorithm):
         return self.policy(parameters, context)
 
     def context(self, index: int, embedding: Tensor, task: Tensor) -> Tensor | None:
-        """Return the context that demonstrations give the policy of one seed in test episodes.
+        """Return the context of test episodes, ``[*B, C]``; None for a policy without context.
 
         Args:
             index: Position of the seed in the batch.
             embedding: phi of the demonstrations, ``[*B, 32]``.
-            task: Their labels, int64 ``[*B]``; only the variant that is given labels reads them.
-
-        Returns:
-            ``[*B, C]``, as the environment's ``context``; None for a policy without context.
+            task: Their labels, int64 ``[*B]``; read by the variant ``"label"`` only.
         """
         if self.variant.context is None:
             return None
@@ -235,13 +228,13 @@ class BGPO(Algorithm):
         return self.config.behavior_scale * behavior
 
     def state_dict(self) -> dict[str, Any]:
-        """Return all that future actions, updates and snapshots depend on."""
+        """Return everything that future actions, updates and snapshots depend on."""
         state = {**super().state_dict(), "experts": self.experts.state_dict()}
         state["active"] = self._active.state_dict()
         return state
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from what `state_dict` returned."""
+        """Restore a `state_dict`."""
         super().load_state_dict(state)
         self.experts.load_state_dict(state["experts"])
         self._active.load_state_dict(state["active"])

@@ -1,6 +1,6 @@
-"""Dist-NLL (section IV-B): one policy with a head a task, distilled from one DDPG teacher a task.
+"""Dist-NLL (Sec. IV-B): a policy with one head per task, distilled from one DDPG teacher per task.
 
-Unlike BGPO it is told the task, in training and in tests: by its label.
+Unlike BGPO, it knows the task label in training and tests.
 """
 
 from __future__ import annotations
@@ -34,26 +34,25 @@ from bgpo_trl.transforms import DemonstrationSource
 class DistNLL(Algorithm):
     """Policy distillation from teachers that are still learning; the policies read the state only.
 
-    1. Training episodes are played by the teacher of their task, with noise.
-    2. Each update is one of all teachers, each from its own replay with its own critic.
-    3. At the end of an episode of a seed, its multi-task policy learns from ``samples`` states of
-       each task, with the actions that the teacher of that task takes there now. A task's head is
-       added when there is data of it; the trunk and the other heads are kept.
+    1. Training episodes are played by the teacher of their task, with exploration noise.
+    2. An update is one of every teacher, each with its own replay and critic.
+    3. At the end of a seed's episode, its multi-task policy learns the teachers' current actions in
+       ``samples`` states of each task. A head is added once its task has data; trunk and other
+       heads are kept.
     4. Test episodes are played by the multi-task policy with the head of the true label.
 
     Args:
         config: Hyperparameters.
-        seeds: One for each element of the batch; they share nothing but the encoders.
-        bank: Demonstrations for training episodes; only their tasks matter here.
-        encoders: The trained encoders; None where latents are not used.
+        seeds: As in `Algorithm`.
+        bank: As in `Algorithm`; only the tasks are used.
+        encoders: As in `Algorithm`.
         device: As in `Algorithm`.
 
     Attributes:
         teacher: The tasks' policies, ``[S, T]`` stacked.
         critic: Their Q-functions, ``[S, T]`` stacked.
-        replay: One for each task.
-        students: The multi-task policy of each seed. They are not stacked: seeds end their
-            episodes at different times.
+        students: The multi-task policy of each seed; not stacked, since seeds end their episodes at
+            different times.
     """
 
     config: DistNLLConfig
@@ -93,7 +92,7 @@ class DistNLL(Algorithm):
             pre_tanh_penalty=ddpg.pre_tanh_penalty,
         )
         self.learner = Learner(self.teacher, self.loss, ddpg, noise=ddpg.noise)
-        # Called with the parameters of some of the teachers: of one a seed, of some of one seed's.
+        # Called with the parameters of teachers: one per seed to act, several of a seed to distill.
         self._acting, *self._teaching = (
             Actor(self.state_size, batch_size=[n], **self._network).to(self.device)
             for n in (self.n_seeds, *range(1, self.n_tasks + 1))
@@ -118,7 +117,7 @@ class DistNLL(Algorithm):
             MultiHeadActor(self.state_size, generator=stream, **self._network).to(self.device)
             for stream in streams
         ]
-        # The task of each head, in order of appearance.
+        # By seed: the task of each head, in order of appearance.
         self._tasks: list[list[int]] = [[] for _ in seeds]
         self._heads = generators(seeds, "heads")
         self._distillation = [DistillationLoss(student) for student in self.students]
@@ -135,7 +134,7 @@ class DistNLL(Algorithm):
             self.test_actor.add_head()
 
     def make_env(self, base_env: EnvBase, source: DemonstrationSource) -> TransformedEnv:
-        """Return the environment of policies that observe the state only."""
+        """Return an environment without context."""
         return no_context_env(self.config, base_env, source, self.encoders)
 
     @torch.no_grad()
@@ -149,14 +148,14 @@ class DistNLL(Algorithm):
         return tensordict.set("action", self.learner.explore(seen["action"], self._noise))
 
     def store(self, transition: TensorDictBase) -> None:
-        """Keep a transition of each seed with its task for updates to come."""
+        """Add a transition of each seed to the replay of its task."""
         self.replay.add(transition)
         self._ended = transition.get(("next", "done")).flatten().clone()
 
     def update(self) -> dict[str, Tensor]:
         """Make one update of each seed's teachers; see `Algorithm.update`.
 
-        The multi-task policies of seeds whose episode has just ended learn from them after it.
+        Then distill the teachers of the seeds whose episode has just ended.
         """
         if len(self.replay) < max(self.config.rl.warmup_steps, self.replay.enough):
             return {}
@@ -166,7 +165,7 @@ class DistNLL(Algorithm):
         return losses
 
     def _distill(self, index: int) -> None:
-        """Have the multi-task policy of a seed learn what its teachers do now."""
+        """Train the multi-task policy of a seed on its teachers' current actions."""
         tasks, student = self._tasks[index], self.students[index]
         optimizer = self._student_optimizers[index]
         for task in self.replay.ready[index].nonzero().flatten().tolist():
@@ -192,10 +191,10 @@ class DistNLL(Algorithm):
     def snapshot(
         self, index: int, embedding: Tensor, task: Tensor, generator: torch.Generator
     ) -> Policy:
-        """Return the multi-task policy's weights, heads in the order of the tasks.
+        """Copy the multi-task policy of one seed, its heads in the order of the tasks.
 
-        See `Algorithm.snapshot`. The head of a task of which nothing is known yet is zero. The
-        demonstrations are not read.
+        The head of a task without data is zero. Demonstrations are ignored. See
+        `Algorithm.snapshot`.
         """
         del embedding, task, generator
         like = self.test_actor.state_dict()
@@ -208,7 +207,7 @@ class DistNLL(Algorithm):
         return self.policy(weights)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return all that future actions, updates and snapshots depend on."""
+        """Return everything that future actions, updates and snapshots depend on."""
         return {
             **super().state_dict(),
             "tasks": [list(tasks) for tasks in self._tasks],
@@ -219,7 +218,7 @@ class DistNLL(Algorithm):
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from what `state_dict` returned."""
+        """Restore a `state_dict`."""
         super().load_state_dict(state)
         self._ended = state["ended"].clone()
         for index, tasks in enumerate(state["tasks"]):

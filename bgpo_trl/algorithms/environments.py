@@ -1,9 +1,4 @@
-"""Environments of BGPO and its variants: one composition of transforms each, to read and to copy.
-
-A composition goes from the frames of the simulation to the latents that the policy observes and the
-``context`` that it is conditioned on. Continual and concurrent learning differ only by the schedule
-within `DemonstrationSource`.
-"""
+"""Environments of BGPO and its variants: transforms from frames to latents and ``context``."""
 
 from __future__ import annotations
 
@@ -38,14 +33,9 @@ from bgpo_trl.transforms import (
     FrameEncoder,
     GroupLookup,
 )
+from suites.nico.base import STATE_CENTER, STATE_SCALE
 
 __all__ = ["VARIANTS", "Variant"]
-
-# Middle and spread of joints (rad), grip and object positions (m) in demonstrations, so that the
-# ground truth comes to the policy in the scale that latents have.
-_STATE_LOC = (0.3, 0.9, 0.9, 0.45, 0.36, 0, 0.68, 0.4, 0.12, 0.655, 0.45, -0.05, 0.645)
-_STATE_LOC += (0.41, -0.21, 0.645)
-_STATE_SCALE = (0.35, 0.25, 0.35, 0.3, 0.06, 0.15, 0.05, *(0.03, 0.05, 0.02) * 3)
 
 
 def bgpo_env(
@@ -56,10 +46,7 @@ def bgpo_env(
     gwr: GWRB,
     groups: BehaviorGroups,
 ) -> TransformedEnv:
-    """Return the environment of BGPO with experts.
-
-    GWR-B infers the behavior, a coarse GWR-B the group whose expert acts.
-    """
+    """Return the environment of BGPO, in which the inferred group selects the expert."""
     return TransformedEnv(
         base_env,
         Compose(
@@ -137,10 +124,7 @@ def without_gwr_env(
     gwr: None,
     groups: None,
 ) -> TransformedEnv:
-    """Return the environment of the ablation without GWR-B (Fig. 9).
-
-    The behavior is the embedding of the demonstration itself.
-    """
+    """Return the environment of the ablation whose behavior is the demonstration (Fig. 9)."""
     return TransformedEnv(
         base_env,
         Compose(
@@ -238,7 +222,7 @@ def no_context_env(
 def observation_env(
     config: AlgorithmConfig, base_env: EnvBase, encoders: Representation | None
 ) -> TransformedEnv:
-    """Return the environment of test episodes, whose policies are conditioned already."""
+    """Return the environment of test episodes, whose policies are already conditioned."""
     return TransformedEnv(base_env, Compose([encode(config, encoders), clip(config)]))
 
 
@@ -246,64 +230,60 @@ def encode(config: AlgorithmConfig, encoders: Representation | None) -> Transfor
     """Return the transform from the simulation's observation to the state.
 
     Raises:
-        ValueError: If ``config.state`` is ``"latent"`` and there are no encoders.
+        ValueError: If ``config.state`` is ``"latent"`` and ``encoders`` is None.
     """
     if config.state == "latent":
         if encoders is None:
             raise ValueError("state='latent' needs trained encoders")
         return FrameEncoder(encoders.vae, del_keys=True)
-    loc, scale = torch.tensor(_STATE_LOC), torch.tensor(_STATE_SCALE)
+    loc, scale = torch.tensor(STATE_CENTER), torch.tensor(STATE_SCALE)
     return ObservationNorm(loc, scale, in_keys=["state"], standard_normal=True)
 
 
 def match_behavior(config: BGPOConfig, encoders: Representation | None) -> BehaviorMatchingReward:
-    """Return the transform that pays the intrinsic reward.
-
-    Raises:
-        ValueError: If there are no encoders.
-    """
+    """Return the transform that adds the intrinsic reward; it needs encoders (``ValueError``)."""
     if encoders is None:
         raise ValueError("matching behaviors needs trained encoders")
     return BehaviorMatchingReward(encoders.lae, beta=config.beta)
 
 
 def behavior_as_context(config: BGPOConfig) -> ObservationNorm:
-    """Return the transform from the behavior to the context, in a scale that suits the networks.
+    """Return the transform that scales the behavior to the context.
 
-    Latents have unit scale; an unscaled behavior beside them slows the first task down.
+    Beside latents of unit scale, an unscaled behavior slows the first task down.
     """
     return ObservationNorm(0.0, config.behavior_scale, ["behavior"], ["context"])
 
 
 def clip(config: AlgorithmConfig) -> ClipTransform:
-    """Return the transform that bounds the state that policies observe.
+    """Return the transform that bounds the observed state to five standard deviations.
 
-    An object that was knocked off the table is dozens of deviations away and would dominate. The
-    transform comes after `BehaviorMatchingReward`, which embeds latents as demonstrations are.
+    An object knocked off the table is dozens of deviations away and would dominate. Clip after
+    `BehaviorMatchingReward`, since demonstrations are embedded without clipping.
     """
     return ClipTransform(in_keys=[config.state], low=-5.0, high=5.0)
 
 
 def sum_rewards(*keys: str) -> RewardSum:
-    """Return the transform that adds up each of some rewards as ``episode_...``."""
+    """Return the transform that sums each reward over the episode, as ``episode_...``."""
     return RewardSum(in_keys=list(keys), out_keys=[f"episode_{key}" for key in keys])
 
 
 @dataclass(frozen=True)
 class Variant:
-    """A variant of BGPO: its environment, and which modules that needs."""
+    """A variant of BGPO: its environment and the modules it needs."""
 
     make_env: Callable[..., TransformedEnv]
     """Called with a config, the simulation, a `DemonstrationSource`, the encoders, GWR-B and the
-    groups of behaviors; the last three are None where there are none."""
+    groups of behaviors; the last three may be None."""
     context: Literal["behavior", "label"] | None = "behavior"
-    """Meaning of the ``context`` that the policy is conditioned on; None for no context."""
+    """Meaning of the policy's ``context``; None for no context."""
     gwr: bool = False
     """Whether GWR-B infers the behavior."""
     groups: bool = False
-    """Whether groups of behaviors are told apart, as experts and even replay need."""
+    """Whether behaviors are grouped, as experts and even replay require."""
     bonus: bool = False
-    """Whether the intrinsic reward is paid."""
+    """Whether the intrinsic reward is added."""
 
 
 VARIANTS: dict[str, Variant] = {
@@ -315,4 +295,4 @@ VARIANTS: dict[str, Variant] = {
     "label": Variant(label_env, context="label"),
     "no-context": Variant(no_context_env, context=None),
 }
-"""Variants by ``BGPOConfig.variant``; add one to train it and to load its runs."""
+"""Variants by ``BGPOConfig.variant``; a new entry can be trained and its runs loaded."""

@@ -1,4 +1,4 @@
-"""Experts: a network of its own for each group of behaviors, a few of which learn at a time."""
+"""Experts: separate networks for each group of behaviors, of which only the active ones learn."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ _MOMENTS = "optimizer."
 
 
 class ActiveGroups:
-    """The groups that each seed played last, in a fixed number of slots.
+    """The groups played most recently by each seed, in a fixed number of slots.
 
-    A group that is played takes a free slot, or that of the group that was played longest ago.
+    A group that is played takes a free slot, or that of the least recently played group.
 
     Args:
         n_seeds: Number of seeds ``S``.
-        n_slots: Groups of each seed ``E`` that are active at a time.
+        n_slots: Number of active groups ``E`` of each seed.
 
     Example:
         >>> active = ActiveGroups(1, 2)
@@ -35,20 +35,20 @@ class ActiveGroups:
 
     def __init__(self, n_seeds: int, n_slots: int) -> None:
         self._slots = [[-1] * n_slots for _ in range(n_seeds)]
-        self._order = [list(range(n_slots)) for _ in range(n_seeds)]  # the latest last
+        self._order = [list(range(n_slots)) for _ in range(n_seeds)]  # most recent last
 
     @property
     def group(self) -> Tensor:
-        """The group in each slot, int64 ``[S, E]``; -1 in a free one."""
+        """The group in each slot, int64 ``[S, E]``; -1 in a free slot."""
         return torch.tensor(self._slots)
 
     def slot(self, seed: int, group: int) -> int | None:
-        """Return the slot of a group, None if it has none."""
+        """Return the slot of a group, or None if it is not active."""
         slots = self._slots[seed]
         return slots.index(group) if group in slots else None
 
     def play(self, seed: int, group: int) -> int:
-        """Make a group the latest of a seed; returns its slot."""
+        """Mark a group as the most recent of a seed; return its slot."""
         slot, order = self.slot(seed, group), self._order[seed]
         if slot is None:
             slot = order[0]
@@ -58,7 +58,7 @@ class ActiveGroups:
         return slot
 
     def rows(self, n_rows: int) -> Tensor:
-        """Return a group for each of ``n_rows`` rows, the active ones in turn, ``[S, R]``."""
+        """Assign the active groups in turn to ``n_rows`` rows, int64 ``[S, n_rows]``."""
         active = [[group for group in slots if group >= 0] or [-1] for slots in self._slots]
         return torch.tensor([[groups[i % len(groups)] for i in range(n_rows)] for groups in active])
 
@@ -67,7 +67,7 @@ class ActiveGroups:
         return {"slots": [[*s] for s in self._slots], "order": [[*o] for o in self._order]}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from what `state_dict` returned."""
+        """Restore a `state_dict`."""
         self._slots = [[*slots] for slots in state["slots"]]
         self._order = [[*order] for order in state["order"]]
 
@@ -75,17 +75,17 @@ class ActiveGroups:
 class Experts:
     """The networks of a learner, one set for each group of behaviors of each seed.
 
-    The learner's networks are a stack ``[S, E]``: those of the active groups. A group that becomes
-    active takes the place of the one played longest ago, whose networks, targets and moments of
-    the optimizer are put aside until it is played again. So an update costs the same however many
-    groups there are, and a group that is not played is not changed. A new group starts with the
-    networks of the group that it parted from, and without moments.
+    The learner's networks are a stack ``[S, E]``, those of the active groups. When a group becomes
+    active, the networks, targets and optimizer moments of the least recently played group are put
+    aside until it is played again. An update thus costs the same for any number of groups and
+    leaves inactive groups unchanged. A new group starts from its parent's networks, without
+    moments.
 
     Args:
         learner: Learner of a stack ``[S, E]``.
-        active: The active groups; only `play` changes them from now on.
-        parent: Returns the group that a group parted from, given the position of the seed and the
-            group. Group 0 has none.
+        active: The active groups, from now on changed only by `play`.
+        parent: Function from the position of a seed and a group to the group's parent; group 0 has
+            none.
     """
 
     def __init__(
@@ -96,24 +96,17 @@ class Experts:
         self._aside: list[dict[int, State]] = [{} for _ in range(self._batch[0])]
 
     def play(self, groups: Sequence[int]) -> Tensor:
-        """Make the group of each seed's episode active.
-
-        Args:
-            groups: One for each seed.
-
-        Returns:
-            Their slots, int64 ``[S]``.
-        """
+        """Activate the group of each seed's episode; return its slots, int64 ``[S]``."""
         return torch.tensor([self._play(seed, group) for seed, group in enumerate(groups)])
 
     def actor_weights(self, seed: int, group: int) -> State:
-        """Return copies of the weights of a group's policy, on the CPU.
+        """Copy the weights of a group's policy to the CPU.
 
-        A group that was not played yet acts as the one it parted from.
+        A group without networks (not yet played) uses those of its nearest ancestor.
 
         Args:
             seed: Position of the seed.
-            group: A group.
+            group: Number of the group.
         """
         prefix = "actor_network_params."
         state = self._state(seed, self._with_networks(seed, group))
@@ -124,12 +117,12 @@ class Experts:
         }
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the networks that are put aside, and which groups are active."""
+        """Return the networks put aside, and the active groups."""
         aside = [{group: dict(state) for group, state in row.items()} for row in self._aside]
         return {"active": self.active.state_dict(), "aside": aside}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from what `state_dict` returned; the learner is loaded by itself."""
+        """Restore a `state_dict`; the learner is loaded separately."""
         self.active.load_state_dict(state["active"])
         device = next(self.learner.loss.parameters()).device
         self._aside = [
@@ -156,7 +149,7 @@ class Experts:
         return slot
 
     def _with_networks(self, seed: int, group: int) -> int:
-        """Return the group, or the nearest of those it descends from that has networks."""
+        """Return the group, or its nearest ancestor that has networks."""
         while group and group not in self._aside[seed] and self.active.slot(seed, group) is None:
             group = self._parent(seed, group)
         return group
@@ -165,7 +158,7 @@ class Experts:
         slot = self.active.slot(seed, group)
         if slot is None and group in self._aside[seed]:
             return self._aside[seed][group]
-        return self._read(seed, slot or 0)  # before the first step, group 0 is in no slot yet
+        return self._read(seed, slot or 0)  # before the first step, group 0 has no slot
 
     def _read(self, seed: int, slot: int) -> State:
         tensors = _tensors(self.learner, self._batch)

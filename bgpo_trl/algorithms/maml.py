@@ -1,6 +1,6 @@
-"""MAML over DDPG (section IV-B): one policy that adapts to a task by one gradient step.
+"""MAML over DDPG (Sec. IV-B): one policy that adapts to a task by one gradient step.
 
-Unlike BGPO it is told the task, in training and in tests: by the data that it adapts to.
+Unlike BGPO, it knows the task label in training and tests, by which it selects data to adapt to.
 """
 
 from __future__ import annotations
@@ -29,26 +29,25 @@ from bgpo_trl.transforms import DemonstrationSource
 
 
 class MAML(Algorithm):
-    """MAML with one critic and one replay for each task; the policy reads the state only.
+    """MAML with one critic and one replay per task; the policy reads the state only.
 
-    1. Training episodes are played by the policy as last adapted to their task, with noise.
-    2. Each update adapts the policy to some transitions of each task, judges the adapted policies
-       by the tasks' critics on others, and improves what they were adapted from (`MAMLLoss`).
-       Tasks that have not yet been presented, or hardly, take no part.
-    3. Before the test episodes of a task, the policy makes one gradient step on
-       ``adaptation_size`` transitions of its replay, and plays them with the result.
+    1. Training episodes are played by the policy adapted to their task, with exploration noise.
+    2. An update adapts the policy to transitions of each task, evaluates the adapted policies with
+       the tasks' critics on other transitions, and improves the original policy (`MAMLLoss`). Tasks
+       with too few transitions are left out.
+    3. Test episodes of a task are played by the policy after one gradient step on
+       ``adaptation_size`` transitions of that task.
 
     Args:
         config: Hyperparameters.
-        seeds: One for each element of the batch; they share nothing but the encoders.
-        bank: Demonstrations for training episodes; only their tasks matter here.
-        encoders: The trained encoders; None where latents are not used.
+        seeds: As in `Algorithm`.
+        bank: As in `Algorithm`; only the tasks are used.
+        encoders: As in `Algorithm`.
         device: As in `Algorithm`.
 
     Attributes:
-        meta_actor: The policy that adapts, ``[S]`` stacked.
+        meta_actor: The policy before adaptation, ``[S]`` stacked.
         critic: The Q-functions, ``[S, T]`` stacked.
-        replay: One for each task.
     """
 
     config: MAMLConfig
@@ -78,7 +77,7 @@ class MAML(Algorithm):
             generator=[*chain(*task_generators(seeds, self.n_tasks, "critic"))],
             **network,
         )
-        # Called with the parameters of policies that were adapted.
+        # Called with the parameters of adapted policies.
         self._acting = Actor(self.state_size, batch_size=each, **network).to(self.device)
         self.test_actor = Actor(self.state_size, batch_size=every, **network).to(self.device)
         self.loss = MAMLLoss(
@@ -104,7 +103,7 @@ class MAML(Algorithm):
         )
 
     def make_env(self, base_env: EnvBase, source: DemonstrationSource) -> TransformedEnv:
-        """Return the environment of policies that observe the state only."""
+        """Return an environment without context."""
         return no_context_env(self.config, base_env, source, self.encoders)
 
     @torch.no_grad()
@@ -118,7 +117,7 @@ class MAML(Algorithm):
         return tensordict.set("action", self.learner.explore(seen["action"], self._noise))
 
     def store(self, transition: TensorDictBase) -> None:
-        """Keep a transition of each seed with its task for updates to come."""
+        """Add a transition of each seed to the replay of its task."""
         self.replay.add(transition)
 
     def update(self) -> dict[str, Tensor]:
@@ -126,17 +125,16 @@ class MAML(Algorithm):
         if len(self.replay) < max(self.config.rl.warmup_steps, self.replay.enough):
             return {}
         batch = self.replay.sample()
-        # Demonstrations come last; each half is to have its share of them.
+        # Demonstrations come last; interleaving gives each half the same share of them.
         order = torch.arange(self.config.task_batch_size).view(-1, 2).T.flatten()
         return self.learn(batch[..., order])
 
     def snapshot(
         self, index: int, embedding: Tensor, task: Tensor, generator: torch.Generator
     ) -> Policy:
-        """Return the weights of the policy adapted to each task, ``[T, ...]``.
+        """Copy the policy adapted to each task, ``[T, ...]``; see `Algorithm.snapshot`.
 
-        See `Algorithm.snapshot`. Without enough data of a task it does not adapt to it. The
-        demonstrations are not read.
+        For a task with too few transitions, the policy is not adapted. Demonstrations are ignored.
         """
         del embedding, task
         meta = dict(self.meta_actor.named_parameters())

@@ -1,4 +1,4 @@
-"""A policy that was conditioned on demonstrations and acts without exploration noise."""
+"""A policy conditioned on demonstrations, which acts without exploration noise."""
 
 from __future__ import annotations
 
@@ -17,15 +17,14 @@ __all__ = ["Policy"]
 
 @dataclass(frozen=True)
 class Policy:
-    """Copies of all that the actions of test episodes depend on; training does not change them.
+    """Snapshot of a policy for test episodes, unaffected by further training.
 
     Attributes:
         actor: Network that is called with ``parameters`` in place of its own.
-        state_key: Name of the state that it reads.
-        parameters: By their names in the actor. Leading dimensions, where there are some, are
-            those of the episodes: ``[T, ...]`` for a network a task, ``[T, M, ...]`` for one an
-            episode; in a stack they follow ``[S]``.
-        context: What the actor is conditioned on, ``[T, M, C]``; None if it reads no context.
+        state_key: Key of the state.
+        parameters: Copies, by their names in the actor. Leading dimensions: none, ``[T]`` (one
+            network per task) or ``[T, M]`` (one per episode), after ``[S]`` in a stack.
+        context: Input besides the state, ``[T, M, C]``; None if the actor reads no context.
     """
 
     actor: TensorDictModuleBase
@@ -35,7 +34,7 @@ class Policy:
 
     @classmethod
     def stack(cls, policies: Sequence[Policy], device: torch.device | str = "cpu") -> Policy:
-        """Return the policies of several seeds as one, ``[S]``, on a device."""
+        """Stack the policies of several seeds as one, ``[S]``, on a device."""
         first = policies[0]
         contexts = [policy.context for policy in policies if policy.context is not None]
         return cls(
@@ -58,5 +57,5 @@ class Policy:
         return inputs["action"]
 
     def state_dict(self) -> dict[str, Any]:
-        """Return parameters and context, of which `Algorithm.policy` makes the policy again."""
+        """Return parameters and context, the arguments of `Algorithm.policy`."""
         return {"parameters": self.parameters, "context": self.context}

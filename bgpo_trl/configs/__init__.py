@@ -1,4 +1,4 @@
-"""Every default, each with its source: the paper's section, or "ours" and why."""
+"""Defaults, each with its source: section or table of the paper, or "ours" and why."""
 
 from bgpo_trl.configs.algorithms import (
     AlgorithmConfig,

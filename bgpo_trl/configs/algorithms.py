@@ -1,4 +1,4 @@
-"""Defaults of BGPO and the baselines, each with its source."""
+"""Defaults of BGPO and the baselines."""
 
 from __future__ import annotations
 
@@ -11,17 +11,18 @@ from bgpo_trl.configs.rl import DDPGConfig, RLConfig
 
 @dataclass(frozen=True)
 class AlgorithmConfig:
-    """What all algorithms have in common, so that they are compared on equal terms."""
+    """Hyperparameters common to all algorithms, which are thus compared on equal terms."""
 
     state: Literal["latent", "state"] = "latent"
-    """What the policy sees of the world: z of a frame, or (for the ladder) the ground truth."""
+    """Observation of the policy: the latent z of a frame, or (benchmarks/ladder.py) the ground
+    truth."""
     max_steps: int = 50
     """Steps of an episode (Sec. IV-B)."""
     rl: RLConfig = field(default_factory=DDPGConfig)
     """The RL algorithm f_RL."""
     demonstration_share: float = 0.0
-    """Share of an update's transitions that are taken from the demonstrations shown in training
-    episodes so far, with actions that the inverse model inferred. The paper has none."""
+    """Share of an update's transitions taken from the demonstrations shown so far in training, with
+    actions inferred by the inverse model. Ours: the paper has none."""
 
     def __post_init__(self) -> None:
         known = self.state in ("latent", "state")
@@ -33,33 +34,32 @@ class AlgorithmConfig:
         )
         at_least(self, 1, "max_steps")
         if share and self.rl.warmup_steps < self.max_steps:
-            # Else seeds would learn from demonstrations sooner or later than each would alone.
+            # Else, seeds would learn from demonstrations sooner or later than each would alone.
             raise ValueError(
                 f"with a demonstration_share, warmup_steps ({self.rl.warmup_steps}) must be at "
-                f"least max_steps ({self.max_steps}), so that every seed was shown one by then"
+                f"least max_steps ({self.max_steps}), so that each seed has ended one episode"
             )
 
 
 def _refuse_all_but_ddpg(who: str, rl: RLConfig) -> None:
     if not isinstance(rl, DDPGConfig):
         raise ValueError(
-            f"{who} is defined over DDPG, not {rl.name!r}: leave its rl as it is; BGPO, its "
-            "ablations and the references take any"
+            f"{who} is defined over DDPG, not {rl.name!r}: keep its rl; BGPO, its ablations and "
+            "the references take any"
         )
 
 
 @dataclass(frozen=True)
 class GWRBConfig:
-    """Growth of GWR-B; its other settings are those of Table 1 (`GWRB`)."""
+    """Growth of GWR-B; for the settings of Table 1 not listed here, see `GWRB`."""
 
     activity_threshold: float = 0.8
     """Activity below which a node is inserted (Table 1)."""
     habituation_threshold: float = 0.15
-    """Habituation below which a node may have another inserted beside it (Table 1)."""
+    """Habituation below which a best-matching node allows an insertion (Table 1)."""
     activity_scale: float = 0.25
-    """Factor of distances in the activity. Ours: with 1, as in the paper, each demonstration is so
-    far from the next that a node is made of every third; with 0.25 there are about 300 after 6,000
-    episodes."""
+    """Factor of distances in the activity. Ours: with 1, as in the paper, every third demonstration
+    becomes a node; with 0.25 there are about 300 nodes after 6,000 episodes."""
 
     def __post_init__(self) -> None:
         positive(self, "activity_scale")
@@ -75,36 +75,37 @@ class BGPOConfig(AlgorithmConfig):
     """Behavior-guided policy optimization (Alg. 1)."""
 
     variant: str = "bgpo"
-    """Its environment, one of `bgpo_trl.algorithms.environments.VARIANTS`."""
+    """Its environment, a key of `bgpo_trl.algorithms.environments.VARIANTS`."""
     beta: float = 0.1
     """Weight of the intrinsic reward (Sec. IV-A)."""
     behavior_scale: float = 0.25
-    """Factor of b where actor and critic read it. Ours: 1 in the paper, which slows down the first
-    task (docs/learning.md)."""
+    """Factor of b in the context. Ours: 1 in the paper slows down the first task
+    (docs/learning.md)."""
     gwr: GWRBConfig = field(default_factory=GWRBConfig)
     """The network whose nodes are behaviors."""
     experts: bool = True
-    """An actor and a critic for each group of behaviors. Ours: one of each for all in the paper,
-    which learns a new task slowly (docs/learning.md)."""
+    """Whether each group of behaviors has its own actor and critic. Ours: with the paper's single
+    pair, a new task is learned slowly (docs/learning.md)."""
     even_replay: bool = True
-    """Draw an update's transitions in equal parts from the groups played last. Ours: from all alike
-    in the paper."""
+    """Whether an update draws equally from the groups played last. Ours: the paper draws uniformly
+    from all transitions."""
     demonstration_share: float = 0.25
     """See `AlgorithmConfig`. Ours: triples the success of a task's first hundred episodes."""
     active_groups: int = 3
-    """Groups that an update learns from at most, those played last. Ours."""
+    """Largest number of groups per update, those played last. Ours: bounds the cost of an
+    update."""
     expert_batch_size: int = 64
-    """Transitions of each active group in an update of experts, as many as MAML and Dist-NLL have
-    of each task. Ours; without experts it is the RL algorithm's ``batch_size`` for all together."""
+    """Transitions of each active group per update, with experts. Ours: as many as MAML and Dist-NLL
+    have per task; without experts, the RL algorithm's ``batch_size`` is shared by all groups."""
     groups: GWRBConfig = field(
         default_factory=lambda: GWRBConfig(activity_threshold=0.525, habituation_threshold=0.5)
     )
-    """The coarse network that finds the groups. Ours: so it finds one group, seldom two, for each
-    of NICO's tasks (docs/learning.md)."""
+    """The coarse network that finds the groups. Ours: with these thresholds it finds one group,
+    rarely two, for each task of NICO (docs/learning.md)."""
 
     @property
     def grouped(self) -> bool:
-        """Whether groups of behaviors are told apart."""
+        """Whether behaviors are grouped."""
         return self.experts or self.even_replay
 
     def __post_init__(self) -> None:
@@ -121,17 +122,17 @@ class MAMLConfig(AlgorithmConfig):
     """Model-agnostic meta-learning over DDPG (Sec. IV-B; Finn et al., 2017)."""
 
     inner_learning_rate: float = 1.0
-    """Length of the one gradient step by which the policy adapts to a task. Ours: long enough to
-    change what the policy does."""
+    """Step size of the gradient step that adapts the policy to a task. Ours: large enough to change
+    the policy's actions."""
     task_batch_size: int = 64
-    """Transitions of each task in an update: half of them to adapt to, half to judge the adapted
-    policy by. Ours: three tasks together see more than the 128 of the other algorithms."""
+    """Transitions of each task per update: half to adapt to, half to evaluate the adapted policy.
+    Ours: three tasks together exceed the 128 of the other algorithms."""
     adaptation_size: int = 256
-    """Transitions of the test task that the policy adapts to before its test episodes. Sec. IV-B
-    has "256 adaptation trajectories", about 50 times as much."""
+    """Transitions of the test task to adapt to before its test episodes. Ours: Sec. IV-B has "256
+    adaptation trajectories", about 50 times as much."""
 
     rl: DDPGConfig = field(default_factory=DDPGConfig)
-    """Its own steps are DDPG's."""
+    """DDPG, whose learner it uses."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -147,18 +148,18 @@ class DistNLLConfig(AlgorithmConfig):
     """Policy distillation with a negative log-likelihood (Sec. IV-B; Rusu et al., 2016)."""
 
     task_batch_size: int = 64
-    """Transitions of each task in an update of its teacher. Ours: three teachers together see more
-    than the 128 of the other algorithms."""
+    """Transitions of each task in an update of its teacher. Ours: three teachers together exceed
+    the 128 of the other algorithms."""
     samples: int = 1_000
-    """States of each task that its head learns from at the end of an episode (Sec. IV-B)."""
+    """States of each task from which its head learns at the end of an episode (Sec. IV-B)."""
     distillation_batch_size: int = 125
-    """States of each task a gradient step, so eight steps an episode. Ours: the paper does not
-    say."""
+    """States of each task per gradient step, hence eight steps per episode. Ours: not given in the
+    paper."""
     learning_rate: float = 1e-3
-    """Rate of Adam for the multi-task policy. Ours: the teachers' own."""
+    """Learning rate of Adam for the multi-task policy. Ours: the teachers'."""
 
     rl: DDPGConfig = field(default_factory=DDPGConfig)
-    """Its teachers are DDPG's."""
+    """DDPG, by which the teachers learn."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

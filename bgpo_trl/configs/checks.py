@@ -6,19 +6,19 @@ from math import inf
 
 
 def check(config: object, *needs: tuple[str, bool, str]) -> None:
-    """Raise ValueError for the first need (field, whether it holds, in words) that does not."""
+    """Raise ``ValueError`` for the first (field, condition, description) that does not hold."""
     for name, holds, need in needs:
         if not holds:
             raise ValueError(f"{name} must be {need}, got {getattr(config, name)}")
 
 
 def at_least(config: object, least: int, *names: str) -> None:
-    """Raise ValueError for a number that is smaller, or not finite."""
+    """Raise ``ValueError`` for a field that is smaller than ``least``, or not finite."""
     for name in names:
         check(config, (name, least <= getattr(config, name) < inf, f"at least {least}"))
 
 
 def positive(config: object, *names: str) -> None:
-    """Raise ValueError for a number that is not positive, or not finite."""
+    """Raise ``ValueError`` for a field that is not positive, or not finite."""
     for name in names:
         check(config, (name, 0 < getattr(config, name) < inf, "a number above 0"))

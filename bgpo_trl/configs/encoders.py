@@ -1,4 +1,4 @@
-"""Defaults of the encoders, each with its source."""
+"""Defaults of the encoders."""
 
 from __future__ import annotations
 
@@ -14,23 +14,24 @@ class VAEConfig:
     latent_size: int = 64
     """Dimensions of z (Sec. IV-A)."""
     batch_size: int = 128
-    """Frames a step, drawn as ``batch_size / window`` windows. Ours: 256 in Sec. IV-A, but on two
-    cores the time is better spent on more steps."""
+    """Frames per step, in ``batch_size / window`` windows. Ours: 256 in Sec. IV-A; on two cores
+    more steps are a better use of the time."""
     window: int = 2
-    """Consecutive frames a window. Ours: the inverse model needs pairs, and a window encodes each
-    frame once for both pairs it belongs to."""
+    """Consecutive frames per window. Ours: the inverse model needs pairs, and a window encodes each
+    frame only once."""
     learning_rate: float = 2e-3
-    """Peak rate of Adam. Ours: 1e-4 in Sec. IV-A, too slow for so few steps."""
+    """Peak learning rate of Adam. Ours: 1e-4 in Sec. IV-A, too low for so few steps."""
     warmup_steps: int = 100
-    """Steps of linear warm-up; cosine decay to zero follows. Ours."""
+    """Steps of linear warm-up, before cosine decay to zero. Ours."""
     steps: int = 2_500
-    """Gradient steps. Ours: the paper does not say."""
+    """Gradient steps. Ours: not given in the paper."""
     reconstruction_weight: float = 1.0
-    """Factor of the squared error summed over a frame. Ours."""
+    """Factor of the squared error summed over a frame. Ours: the unit of the other weights."""
     kl_weight: float = 0.01
-    """Factor of the KL divergence summed over dimensions."""
+    """Factor of the KL divergence summed over dimensions. Ours: a larger one drops the objects,
+    which are 5 pixels wide."""
     inverse_weight: float = 50.0
-    """Factor of the inverse model's ``1/2 ||a_hat - a||^2``."""
+    """Factor of the inverse model's ``1/2 ||a_hat - a||^2``. Ours: not given in the paper."""
 
     def __post_init__(self) -> None:
         at_least(self, 1, "latent_size", "batch_size", "warmup_steps", "steps")
@@ -45,15 +46,15 @@ class SequenceAutoencoderConfig:
     """Training of the LSTM autoencoder on latent sequences (stage 1b)."""
 
     embedding_size: int = 32
-    """LSTM units of encoder and decoder, so dimensions of phi (Sec. IV-A)."""
+    """LSTM units of encoder and decoder, hence dimensions of phi (Sec. IV-A)."""
     batch_size: int = 256
-    """Sequences a step (Sec. IV-A)."""
+    """Sequences per step (Sec. IV-A)."""
     learning_rate: float = 1e-3
-    """Peak rate of Adam (Sec. IV-A)."""
+    """Peak learning rate of Adam (Sec. IV-A)."""
     warmup_steps: int = 100
-    """Steps of linear warm-up; cosine decay to zero follows. Ours."""
+    """Steps of linear warm-up, before cosine decay to zero. Ours."""
     steps: int = 5_000
-    """Gradient steps. Ours: the paper does not say."""
+    """Gradient steps. Ours: not given in the paper."""
 
     def __post_init__(self) -> None:
         at_least(self, 1, "embedding_size", "batch_size", "warmup_steps", "steps")
@@ -71,7 +72,7 @@ class RepresentationConfig:
     seed: int = 0
     """Seed of initial weights, batches and sampling noise. Ours."""
     checkpoint_every: int = 250
-    """Steps between checkpoints (about a minute each). Ours."""
+    """Steps between checkpoints (about a minute). Ours."""
     log_every: int = 20
     """Steps between rows of the log. Ours."""
 
@@ -82,12 +83,12 @@ class RepresentationConfig:
 
 @dataclass(frozen=True)
 class StageConfig:
-    """Stage 1 of a preset that makes its own encoders."""
+    """Stage 1 of a preset that trains its own encoders."""
 
     per_task: int
     """Demonstrations of each task."""
     held_out_per_task: int
-    """How many of those are held out."""
+    """Held-out demonstrations among them."""
     config: RepresentationConfig
     """Training of the encoders."""
 
@@ -102,4 +103,4 @@ STAGE_PRESETS: dict[str, StageConfig] = {
         ),
     )
 }
-"""Presets that go through every stage from nothing instead of using the shipped encoders."""
+"""Presets that run every stage instead of using the shipped encoders."""

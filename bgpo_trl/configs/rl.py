@@ -1,4 +1,4 @@
-"""Defaults of the RL algorithms, each with its source."""
+"""Defaults of the RL algorithms."""
 
 from __future__ import annotations
 
@@ -9,36 +9,36 @@ from bgpo_trl.configs.checks import at_least, check, positive
 
 @dataclass(frozen=True)
 class RLConfig:
-    """What all RL algorithms f_RL of Alg. 1 have in common."""
+    """Hyperparameters common to all RL algorithms f_RL of Alg. 1."""
 
     name: str = ""
-    """The algorithm, as `bgpo_trl.algorithms.rl.RL` has it; tells the classes apart in
-    ``config.json``."""
+    """Key in `bgpo_trl.algorithms.rl.RL`, which identifies the class in ``config.json``."""
     hidden_sizes: tuple[int, ...] = (256,)
-    """Hidden layers of actor and critic. Ours: 64 units in Sec. IV-A, which limit what is learned
+    """Hidden layers of actor and critic. Ours: the 64 units of Sec. IV-A limit the success
     (docs/learning.md)."""
     critic_layer_norm: bool = True
-    """Normalize the critic's hidden layer. Ours: learns in half the episodes."""
+    """Whether the critic's hidden layers have layer norm. Ours: halves the episodes needed."""
     learning_rate: float = 1e-3
-    """Rate of Adam (Sec. IV-A)."""
+    """Learning rate of Adam (Sec. IV-A)."""
     batch_size: int = 128
-    """Transitions an update. Ours: 256 in Sec. IV-A; pays for half of the larger networks."""
+    """Transitions per update. Ours: 256 in Sec. IV-A; offsets half the cost of the larger
+    networks."""
     replay_size: int = 1_000_000
     """Transitions kept for each seed (Sec. IV-A)."""
     gamma: float = 0.95
-    """Discount. Ours: the paper does not say; an episode has about 20 steps."""
+    """Discount factor. Ours: not given in the paper; an episode has about 20 steps."""
     tau: float = 0.005
-    """Share of the weights that the target networks take over each update. Ours."""
+    """Rate of the target networks' soft update. Ours: not given in the paper."""
     clip_targets: bool = True
-    """Clip bootstrapped targets to the attainable returns [0, 1 + beta]. Ours: without it Q grows
+    """Whether bootstrapped targets are clipped to the attainable returns. Ours: otherwise Q grows
     to hundreds."""
     warmup_steps: int = 256
-    """Environment steps of each seed before the first update. Ours: one batch."""
+    """Environment steps of each seed before the first update. Ours: not given in the paper."""
 
     def __post_init__(self) -> None:
         positive(self, "learning_rate")
         at_least(self, 1, "batch_size", "warmup_steps")
-        # With less, learning would never begin.
+        # With a smaller replay, learning would never begin.
         least = max(self.batch_size, self.warmup_steps)
         check(
             self,
@@ -56,9 +56,9 @@ class DDPGConfig(RLConfig):
     name: str = "ddpg"
     """See `RLConfig`."""
     noise: float = 0.3
-    """Standard deviation of the Gaussian exploration noise on the action. Ours."""
+    """Standard deviation of the Gaussian exploration noise. Ours: not given in the paper."""
     pre_tanh_penalty: float = 0.01
-    """Weight of the squared pre-tanh actions. Ours: without it all actions saturate."""
+    """Weight of the squared pre-tanh actions. Ours: otherwise all actions saturate."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -67,20 +67,20 @@ class DDPGConfig(RLConfig):
 
 @dataclass(frozen=True)
 class TD3Config(RLConfig):
-    """TD3 (Fujimoto et al., 2018): two critics, a slower actor, noise on the target action."""
+    """TD3 (Fujimoto et al., 2018): two critics, delayed actor updates, target policy smoothing."""
 
     name: str = "td3"
     """See `RLConfig`."""
     noise: float = 0.3
-    """Standard deviation of the Gaussian exploration noise on the action. Ours: as in DDPG."""
+    """Standard deviation of the Gaussian exploration noise. Ours: as in DDPG."""
     pre_tanh_penalty: float = 0.01
     """Weight of the squared pre-tanh actions. Ours: as in DDPG."""
     policy_delay: int = 2
-    """Updates of the critics for each of the actor and the target networks (Fujimoto et al.)."""
+    """Updates of the critics per update of actor and target networks (Fujimoto et al.)."""
     policy_noise: float = 0.2
     """Standard deviation of the noise on the target action (Fujimoto et al.)."""
     noise_clip: float = 0.5
-    """Largest such noise (Fujimoto et al.)."""
+    """Bound of the noise on the target action (Fujimoto et al.)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -95,13 +95,13 @@ class SACConfig(RLConfig):
     name: str = "sac"
     """See `RLConfig`."""
     alpha_init: float = 0.1
-    """First temperature. Ours: 1 would outweigh a return of 1 for long."""
+    """Initial temperature. Ours: 1 would long outweigh a return of 1."""
     target_entropy: float = -4.0
-    """Entropy that the temperature keeps, in nats: minus the number of actions, as in Haarnoja et
-    al."""
+    """Entropy maintained by the temperature, in nats: minus the number of actions (Haarnoja et
+    al.)."""
     entropy_in_target: bool = False
-    """Whether the critics count entropy to come. Ours: Haarnoja et al. do, but then values leave
-    the range of returns that targets are clipped to; Ball et al. (2023) leave it out, too."""
+    """Whether the critics' targets include the entropy. Ours: False as in Ball et al. (2023),
+    unlike Haarnoja et al.; with entropy, values exceed the attainable returns."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

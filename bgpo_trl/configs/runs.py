@@ -12,28 +12,28 @@ from suites import nico
 
 @dataclass(frozen=True)
 class RunConfig:
-    """One run of an experiment: which seeds, how long, which tasks when."""
+    """One run of an experiment: its seeds, length, tasks and schedule."""
 
     seeds: tuple[int, ...] = tuple(range(10))
     """Seeds, run as one batch (Sec. IV: 10)."""
     episodes: int = 20_000
     """Training episodes of each seed (Figs. 6 and 8)."""
     tasks: tuple[str, ...] = nico.ALL_TASKS
-    """The tasks, by the names that the suite and the CSV files give them."""
+    """Names of the tasks, as in the suite and the CSV files; by default the paper's three."""
     task_starts: tuple[int, ...] = (0, 7_000, 13_000)
     """Episode from which each task is presented (Sec. IV-C); all 0 is the concurrent setting."""
     eval_every: int = 1
     """Training episodes between evaluations (1 in the paper)."""
     eval_episodes: int = 1
-    """Test episodes of each task presented so far, each evaluation. The paper has one episode of
-    one random task; testing every task costs more and says more."""
+    """Test episodes per evaluation, of each task presented so far. Ours: the paper tests one
+    episode of one random task, which is cheaper but noisier."""
     held_out: Literal["validation", "test"] = "validation"
-    """Which half of the held-out demonstrations test episodes show: the one by which settings are
-    chosen, or the one on which results are reported. Ours."""
+    """Half of the held-out demonstrations that test episodes show: ``"validation"`` for choosing
+    settings, ``"test"`` for reporting results. Ours."""
     checkpoint_minutes: float = 10.0
     """Minutes between checkpoints. Ours."""
     name: str = "bgpo"
-    """The algorithm, or the variant of it, as the CSV files call it."""
+    """Name of the algorithm or variant, as in the CSV files."""
     algorithm: AlgorithmConfig = field(default_factory=BGPOConfig)
     """The algorithm's hyperparameters."""
 
@@ -68,5 +68,5 @@ PRESETS: dict[str, RunConfig] = {
     ),
     "paper": RunConfig(),
 }
-"""What ``--preset`` names: every stage in minutes; learning to look at; five seeds overnight at
-most; the paper's scale."""
+"""Runs by ``--preset``: ``smoke`` passes every stage in minutes, ``quick`` shows learning, ``desk``
+is five seeds overnight at most, ``paper`` is the paper's scale."""

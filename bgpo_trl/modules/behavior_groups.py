@@ -11,17 +11,17 @@ from torch import Tensor, nn
 
 from bgpo_trl.modules.gwr import GWRB
 
-_NEVER = 2**62  # edges of this age do not occur: groups that are not met again are kept
+_NEVER = 2**62  # an age that no edge reaches
 
 
 class GroupMatch(TensorClass["tensor_only"]):
     """The group of each input.
 
     Attributes:
-        group: number of the group within its network, int64 `[*batch]`. Groups count up from 0 in
-            order of appearance; none is removed or renumbered.
-        activity: activity of the best-matching node in [0, 1], `[*batch]`; 0 where nothing is known
-            yet. Below the activity threshold the input is of no known group.
+        group: Number of the group within its network, int64 ``[*batch]``. Groups count up from 0 in
+            order of appearance and are never removed or renumbered.
+        activity: Activity of the best-matching node in [0, 1], ``[*batch]``; 0 in an empty network.
+            Below the activity threshold, the input belongs to no known group.
     """
 
     group: Tensor
@@ -31,30 +31,32 @@ class GroupMatch(TensorClass["tensor_only"]):
 class BehaviorGroups(nn.Module):
     """Groups of similar behaviors, or a batch of independent sets of groups.
 
-    A GWR-B with a low activity threshold makes few nodes: one where an input is far from all that
-    came before. Each node belongs to a group:
+    A GWR-B with a low activity threshold inserts few nodes, each far from all earlier ones. Every
+    node belongs to a group:
 
-    1. A node whose input was new (activity below the threshold) opens a group, of which the group
-       of its best match is the parent. It starts half-way between the two and is drawn towards
-       the inputs that it matches.
-    2. Any other node, such as the second of a network that starts with two similar inputs, belongs
-       to the group of its best match.
+    1. A node inserted for a new input (activity below the threshold) opens a group, whose parent is
+       the group of its best match. The node starts half-way between the two and moves towards the
+       inputs that it matches.
+    2. Any other node, such as the second of two similar first inputs, joins the group of its best
+       match.
 
-    Nodes are never removed (edges do not age out), so that a group is still known when its task
-    has not been shown for long. The network starts empty; until the first input all is group 0.
+    Edges do not expire, so nodes are never removed, and a group is kept however long its task is
+    absent. The network starts empty; until the first input, `lookup` returns group 0.
 
     Args:
-        n_features: size d of an input.
-        batch_size: shape of the batch (the seeds); `()` is a single set of groups.
+        n_features: Size d of an input.
+        batch_size: Shape of the batch (the seeds); ``()`` is a single set of groups.
         activity_threshold: a_T of the coarse GWR-B, below which an input is new.
-        habituation_threshold: h_T, below which a node that matches best may have another inserted
-            beside it. With the 0.15 of the fine network, tasks that appear together are mixed up
-            before any node can part.
-        activity_scale: factor of distances, as in `GWRB`.
-        max_groups: at this many groups a new node joins the group of its best match. None: no
-            limit.
+        habituation_threshold: h_T, below which a best-matching node allows an insertion. With the
+            0.15 of the fine network, tasks that appear together get mixed before any node splits.
+        activity_scale: Factor of distances, as in `GWRB`.
+        max_groups: Number of groups from which new nodes join the group of their best match; None:
+            no limit.
 
-    Examples:
+    Raises:
+        ValueError: If ``max_groups`` is below 1, or an argument of `GWRB` is out of range.
+
+    Example:
         >>> groups = BehaviorGroups(1, activity_threshold=0.5)
         >>> for x in [0.0, 0.1] * 6 + [3.0] * 2:
         ...     match = groups.adapt(torch.tensor([x]))
@@ -98,15 +100,15 @@ class BehaviorGroups(nn.Module):
 
     @property
     def num_groups(self) -> Tensor:
-        """Number of groups of each network, at least 1, int64 `[*batch_size]`."""
+        """Number of groups of each network, at least 1, int64 ``[*batch_size]``."""
         return torch.tensor([len(parent) for parent in self._parent]).view(self.batch_size)
 
     def parent(self, network: int, group: int) -> int:
-        """Return the group that another one parted from; 0 for the first.
+        """Return the parent of a group; 0 for the first group.
 
         Args:
-            network: position in the flattened batch.
-            group: number of the group.
+            network: Position in the flattened batch.
+            group: Number of the group.
         """
         return self._parent[network][group]
 
@@ -115,16 +117,10 @@ class BehaviorGroups(nn.Module):
         return self.lookup(phi)
 
     def lookup(self, phi: Tensor) -> GroupMatch:
-        """Find the group of each input; changes nothing.
-
-        Args:
-            phi: `[*batch_size, *extra, d]`.
-
-        Returns:
-            Matches `[*batch_size, *extra]`.
+        """Return the groups ``[*batch_size, *extra]`` of inputs ``[*batch_size, *extra, d]``.
 
         Raises:
-            ValueError: if phi has the wrong shape or holds NaN or Inf.
+            ValueError: If phi has the wrong shape or holds NaN or Inf.
         """
         match = self.gwr.lookup(phi, mask=self.gwr.num_nodes > 0)
         n_networks = self.batch_size.numel()
@@ -140,27 +136,27 @@ class BehaviorGroups(nn.Module):
         )
 
     def adapt(self, phi: Tensor, mask: Tensor | None = None) -> GroupMatch:
-        """Find the group of one input for each network, and learns from it.
+        """Find the group of one input per network and learn from it.
 
         Args:
-            phi: `[*batch_size, d]`.
-            mask: bool `[*batch_size]`, the networks that take part. None: all.
+            phi: ``[*batch_size, d]``.
+            mask: Networks that take part, bool ``[*batch_size]``; None: all.
 
         Returns:
-            Matches `[*batch_size]` from before learning; -1 and NaN where `mask` is False.
+            Matches ``[*batch_size]`` from before learning; -1 and NaN where ``mask`` is False.
 
         Raises:
-            ValueError: as `GWRB.adapt`.
+            ValueError: As `GWRB.adapt`.
         """
         before = self.gwr.num_nodes
         match = self.gwr.adapt(phi, mask)
         grown = (self.gwr.num_nodes > before).flatten().tolist()
         nodes, activity = match.node.flatten().tolist(), match.activity.flatten().tolist()
-        found = []
+        matched = []
         for i, (node, grew) in enumerate(zip(nodes, grown, strict=True)):
             of_node, parent = self._group[i], self._parent[i]
             group = -1 if node < 0 else of_node[node] if of_node else 0
-            found.append(group)
+            matched.append(group)
             if not grew:
                 continue
             full = self.max_groups is not None and len(parent) >= self.max_groups
@@ -170,19 +166,19 @@ class BehaviorGroups(nn.Module):
             else:
                 of_node.append(group)
         return GroupMatch(
-            group=torch.tensor(found).view(self.batch_size),
+            group=torch.tensor(matched).view(self.batch_size),
             activity=match.activity,
             batch_size=self.batch_size,
         )
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Return what `state_dict` carries beside the coarse GWR-B's own."""
+        """Return group and parent numbers, for ``state_dict``."""
         return {
             "group": [list(group) for group in self._group],
             "parent": [list(parent) for parent in self._parent],
         }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Continue from what `get_extra_state` returned."""
+        """Restore the numbers from `get_extra_state`."""
         self._group = [list(group) for group in state["group"]]
         self._parent = [list(parent) for parent in state["parent"]]

@@ -1,4 +1,4 @@
-"""GWR-B: the self-organizing network whose nodes are behavior embeddings (paper, section III-B)."""
+"""GWR-B: the self-organizing network whose nodes are behavior embeddings (paper, Sec. III-B)."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from bgpo_trl.modules.gwr_graph import BehaviorGraph, BehaviorMatch
+from bgpo_trl.modules.gwr_learning import learn, start, with_room
 from bgpo_trl.modules.gwr_tensors import (
     Numbers,
     as_generators,
@@ -19,7 +20,7 @@ from bgpo_trl.modules.gwr_tensors import (
     pairwise_distances,
     to_tensor,
 )
-from bgpo_trl.modules.gwr_topology import LearningRule, Topology, read_state, with_room
+from bgpo_trl.modules.gwr_topology import LearningRule, Topology, read_state
 
 
 class GWRB(nn.Module):
@@ -28,49 +29,46 @@ class GWRB(nn.Module):
     It learns from one input phi (an embedded demonstration) at a time:
 
     1. A network starts as two connected nodes with random weights, or as its first two inputs.
-    2. c and c' are the nearest and the second nearest node (Eq. 1); the older one wins a tie.
-    3. The edge c-c' is created, or its age set to 0. The activity is a = exp(-s ||phi - w_c||),
-       with s = 1 in the paper (Eq. 2).
-    4. If a < a_T and h_c < h_T, a node v is inserted: w_v = (w_c + phi) / 2, h_v = h_0, edges v-c
-       and v-c'; the edge c-c' is removed. Otherwise c and its neighbors k learn,
-       w_c += eps_c h_c (phi - w_c) and w_k += eps_n h_k (phi - w_k) (Eqs. 3, 4), and habituate,
-       h <- h_inf + (h - h_inf) exp(-alpha / tau) with h_inf = h_0 - 1 / alpha. (Eqs. 5, 6, i read
-       as the node's own firing count: the global iteration would soon habituate every node.)
-    5. All edges of c age by 1. Those older than kappa are removed, then nodes without edges.
+    2. Among all nodes, c and c' are the nearest and second nearest to phi (Eq. 1; the older wins a
+       tie). The activity is a = exp(-s ||phi - w_c||) (Eq. 2, where s = 1).
+    3. The edge c-c' is created, or its age set to 0.
+    4. If a < a_T and h_c < h_T, a node v with w_v = (w_c + phi) / 2 and h_v = h_0 is inserted:
+       edges v-c and v-c' replace c-c'. Otherwise c and its neighbors k learn by Eqs. 3 and 4,
+       w_c += eps_c h_c (phi - w_c) and w_k += eps_n h_k (phi - w_k), and habituate by Eqs. 5 and 6,
+       h <- h_inf + (h - h_inf) exp(-alpha / tau) with h_inf = h_0 - 1 / alpha. (There, i is read as
+       the node's own firing count: the global iteration would soon habituate all nodes.)
+    5. All edges of c age by 1. Edges older than kappa are removed, then nodes without edges.
 
-    Time and memory are linear in nodes and edges. `state_dict` carries networks of any size.
-
-    Reference: Hafez & Wermter, "Behavior Self-Organization Supports Task Inference for Continual
-    Robot Learning", 2021, section III-B; the defaults are its Table 1.
+    Time and memory are linear in nodes and edges. ``state_dict`` holds networks of any size.
+    Defaults: Table 1 of Hafez & Wermter, "Behavior Self-Organization Supports Task Inference for
+    Continual Robot Learning", 2021.
 
     Args:
-        n_features: size d of an input.
-        batch_size: shape of the batch of networks (the seeds), or how many there are in a row; `()`
-            is a single network.
+        n_features: Size d of an input.
+        batch_size: Shape of the batch of networks (the seeds), or their number; ``()`` is one
+            network.
         activity_threshold: a_T.
-        activity_scale: s, positive. Only here does the scale of inputs matter: a network with s
-            does what one with 1 does with inputs (and random weights) multiplied by s.
+        activity_scale: s > 0, equivalent to inputs (and random weights) multiplied by s.
         habituation_threshold: h_T.
         lr_best: eps_c, at most 1.
         lr_neighbor: eps_n, at most eps_c.
         initial_habituation: h_0, in (0, 1].
-        alpha_best: alpha of c; at least 1 / h_0, lest h fall below 0.
-        alpha_neighbor: alpha of the neighbors, likewise.
+        alpha_best: alpha of c, at least 1 / h_0, so that h stays positive.
+        alpha_neighbor: alpha of the neighbors, at least 1 / h_0.
         tau_best: tau of c; the larger, the slower it habituates.
         tau_neighbor: tau of the neighbors.
         max_age: kappa, at least 1.
-        max_nodes: at this many nodes a network adapts where it would insert. None: no limit.
-        init: `"random"` draws both weights uniformly from (-1, 1), the range of an LSTM's hidden
-            state. `"data"` leaves networks empty: the first input becomes a node and matches that
-            node; the second becomes another, joined to it by an edge of age 0; the third is the
-            first to be learned from.
-        generator: draws the random weights, network after network; a sequence holds one for each
-            network, which then starts as it would alone. None: torch's default generator.
+        max_nodes: Number of nodes from which a network learns instead of inserting; None: no limit.
+        init: ``"random"`` draws both weights uniformly from (-1, 1), the range of an LSTM's hidden
+            state. ``"data"`` starts empty: the first input becomes a node and matches it; the
+            second becomes another, with an edge of age 0; learning starts with the third.
+        generator: Source of the random weights, or one source per network, which then starts as it
+            would alone; None: torch's default generator.
 
     Raises:
-        ValueError: for an argument out of range.
+        ValueError: If an argument is out of range.
 
-    Examples:
+    Example:
         >>> gwr = GWRB(2, batch_size=[3], init="data")
         >>> phi = torch.tensor([[0.0, 0.0], [0.5, 0.0], [0.0, 0.5]])
         >>> gwr.adapt(phi).activity
@@ -79,14 +77,12 @@ class GWRB(nn.Module):
         tensor([-1, -1,  0])
         >>> gwr.num_nodes
         tensor([1, 1, 2])
-        >>> gwr.graph(2).edges
-        tensor([[0, 1]])
-        >>> gwr.lookup(torch.zeros(3, 100, 2)).embedding.shape
-        torch.Size([3, 100, 2])
+        >>> gwr.lookup(torch.zeros(3, 100, 2)).shape
+        torch.Size([3, 100])
     """
 
     _weights: Tensor  # [networks, capacity, d]; spare rows are inf, hence never the nearest
-    _network: Tensor  # 0, 1, ..., one a network
+    _network: Tensor  # index of each network, 0, 1, ...
 
     def __init__(
         self,
@@ -138,19 +134,19 @@ class GWRB(nn.Module):
             for i, source in enumerate(generators):
                 device = None if source is None else source.device
                 for weights in torch.rand(2, self.n_features, generator=source, device=device):
-                    self._start(i, 2 * weights - 1)
+                    start(self._weights[i], self._topologies[i], 2 * weights - 1, self.rule)
 
     @property
     def num_nodes(self) -> Tensor:
-        """Number of nodes of each network, int64 `[*batch_size]`."""
+        """Number of nodes of each network, int64 ``[*batch_size]``."""
         counts = [len(topology.edges) for topology in self._topologies]
         return torch.tensor(counts, device=self._weights.device).view(self.batch_size)
 
     def graph(self, index: int | tuple[int, ...] = ()) -> BehaviorGraph:
-        """Copy the network at `index` of `batch_size`.
+        """Copy the network at an index of the batch.
 
         Raises:
-            IndexError: if that is not a single network.
+            IndexError: If ``index`` does not select a single network.
         """
         try:
             network = int(torch.arange(len(self._topologies)).view(self.batch_size)[index])
@@ -161,7 +157,7 @@ class GWRB(nn.Module):
         return self._topologies[network].to_graph(self._weights[network])
 
     def extra_repr(self) -> str:
-        """Tell `repr` how large the networks are and what makes them grow."""
+        """Return sizes and thresholds, for ``repr``."""
         nodes = self.num_nodes.flatten()
         sizes = " to ".join(dict.fromkeys(str(int(n)) for n in nodes.aminmax()))
         thresholds = ("activity_threshold", "activity_scale", "habituation_threshold")
@@ -174,20 +170,18 @@ class GWRB(nn.Module):
         return self.lookup(phi)
 
     def lookup(self, phi: Numbers, mask: Numbers | None = None) -> BehaviorMatch:
-        """Find the best match of each input (step 2); changes nothing.
+        """Find the best match of each input (step 2), without learning.
 
         Args:
-            phi: `[*batch_size, *extra, d]`, a tensor, an array or lists of numbers of any type;
-                each network matches all of its `extra` inputs.
-            mask: bool `[*batch_size]`, the networks that take part. None: all.
+            phi: Numbers ``[*batch_size, *extra, d]``; each network matches all its ``extra``
+                inputs.
+            mask: Networks that take part, bool ``[*batch_size]``; None: all.
 
         Returns:
-            Matches `[*batch_size, *extra]`; where `mask` is False, embedding and activity are NaN
-            and the node is -1.
+            Matches ``[*batch_size, *extra]``; NaN and node -1 where ``mask`` is False.
 
         Raises:
-            ValueError: if phi has the wrong shape or holds NaN or Inf, or if a network is still
-                empty (`init="data"` before the first input).
+            ValueError: If phi has the wrong shape or holds NaN or Inf, or a network is still empty.
         """
         phi = as_tensor(phi, "phi")
         batch, networks, weights = phi.shape[:-1], len(self._topologies), self._weights
@@ -224,19 +218,18 @@ class GWRB(nn.Module):
         )
 
     def adapt(self, phi: Numbers, mask: Numbers | None = None) -> BehaviorMatch:
-        """Find the best match of one input for each network and learns from it (steps 2 to 5).
+        """Find the best match of one input per network and learn from it (steps 2 to 5).
 
         Args:
-            phi: `[*batch_size, d]`, as for `lookup`.
-            mask: bool `[*batch_size]`, the networks that take part. The others stay as they are,
-                whatever phi holds for them. None: all.
+            phi: Numbers ``[*batch_size, d]``.
+            mask: Networks that take part, bool ``[*batch_size]``; None: all. Others do not change,
+                whatever phi holds for them.
 
         Returns:
-            Matches `[*batch_size]` from before learning, which `lookup` would have returned; where
-            `mask` is False, embedding and activity are NaN and the node is -1.
+            Matches ``[*batch_size]`` from before learning; NaN and node -1 where ``mask`` is False.
 
         Raises:
-            ValueError: if phi or mask has the wrong shape, or phi holds NaN or Inf for a network
+            ValueError: If phi or mask has the wrong shape, or phi holds NaN or Inf for a network
                 that takes part; no network has changed then.
         """
         phi = as_tensor(phi, "phi")
@@ -254,7 +247,7 @@ class GWRB(nn.Module):
         topologies = [self._topologies[i] for i in networks]
         n_before = [len(topology.edges) for topology in topologies]
         for k in [k for k, n in enumerate(n_before) if n == 0]:
-            self._start(networks[k], phi[k])
+            start(self._weights[networks[k]], topologies[k], phi[k], self.rule)
 
         weights = self._weights
         searched = weights if mask is None else weights[network]
@@ -265,7 +258,7 @@ class GWRB(nn.Module):
         nearest = list(zip(best.tolist(), second.tolist(), activity.tolist(), strict=True))
         identities = [t.identity[match[0]] for t, match in zip(topologies, nearest, strict=True)]
         node = to_tensor(identities, best.dtype, best.device)
-        self._learn(phi, embedding, networks, n_before, nearest)
+        learn(weights, self._topologies, self.rule, phi, embedding, networks, n_before, nearest)
 
         if mask is not None:
             embedding = self._spread(embedding, network, torch.nan)
@@ -277,18 +270,18 @@ class GWRB(nn.Module):
         )
 
     def get_extra_state(self) -> list[dict[str, Any]]:
-        """Return what `state_dict` carries: each network's `graph` and the identity due next."""
+        """Return each network's `graph` and next identity, for ``state_dict``."""
         return [
             {**topology.to_graph(weights)._asdict(), "next_node": topology.next_identity}
             for topology, weights in zip(self._topologies, self._weights, strict=True)
         ]
 
     def set_extra_state(self, state: list[dict[str, Any]]) -> None:
-        """Replace the networks by those that `get_extra_state` returned.
+        """Replace the networks by those of `get_extra_state`.
 
         Raises:
-            ValueError: if there are more or fewer of them, or of other features, than here, or they
-                are damaged; nothing has changed then.
+            ValueError: If they are damaged, or their number or features differ; nothing has changed
+                then.
         """
         graphs, topologies = read_state(state, len(self._topologies), self.n_features)
         capacity = max(2, *(len(graph.node) for graph in graphs))
@@ -298,57 +291,9 @@ class GWRB(nn.Module):
         self._topologies, self._weights = topologies, weights
 
     def _activity(self, distance: Tensor) -> Tensor:
-        """Turn distances to the best matches into activities, in place (Eq. 2)."""
+        """Convert distances to the best matches into activities, in place (Eq. 2)."""
         return distance.mul_(-self.rule.activity_scale).exp_()
 
     def _spread(self, x: Tensor, network: Tensor, fill: float) -> Tensor:
-        """Places results of active networks among those of all, which are `fill` elsewhere."""
+        """Scatter the results of active networks into those of all, elsewhere ``fill``."""
         return x.new_full((len(self._topologies), *x.shape[1:]), fill).index_copy(0, network, x)
-
-    def _start(self, network: int, weights: Tensor) -> None:
-        """Create the first node, or the second and its edge to the first (step 1)."""
-        topology = self._topologies[network]
-        row = topology.add(self.rule.initial_habituation)
-        self._weights[network, row] = weights
-        if row > 0:
-            topology.connect(0, row)
-
-    def _learn(
-        self,
-        phi: Tensor,
-        embedding: Tensor,
-        networks: list[int],
-        n_before: list[int],
-        nearest: list[tuple[int, int, float]],
-    ) -> None:
-        """Take steps 3 to 5 for inputs `[A, d]`, one for each of A `networks`.
-
-        These had `n_before` nodes; `nearest` holds the rows of the two nearest nodes and the
-        activity, and `embedding` `[A, d]` the weights w_c of the best match.
-        """
-        weights = self._weights
-        inputs: list[int] = []
-        rows: list[int] = []  # of the weights of all networks, one after the other
-        steps: list[float] = []
-        erased: list[int] = []
-        for k, (i, n, match) in enumerate(zip(networks, n_before, nearest, strict=True)):
-            if n < 2:
-                if n == 1:
-                    self._start(i, phi[k])
-                continue
-            update = self._topologies[i].learn(*match, self.rule)
-            if update.insert:
-                new_row = len(self._topologies[i].identity) - 1
-                weights[i, new_row] = (embedding[k] + phi[k]) / 2
-            first = i * weights.shape[1]
-            inputs += [k] * len(update.moved)
-            rows += [first + row for row in update.moved]
-            steps += update.steps
-            erased += [first + row for row in update.removed]
-        flat = weights.view(-1, self.n_features)
-        if rows:
-            row, k = (to_tensor(x, torch.int64, phi.device) for x in (rows, inputs))
-            step = to_tensor(steps, phi.dtype, phi.device).unsqueeze(-1)
-            flat.index_copy_(0, row, flat.index_select(0, row).lerp(phi.index_select(0, k), step))
-        if erased:
-            flat[erased] = torch.inf

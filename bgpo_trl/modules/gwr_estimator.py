@@ -1,4 +1,4 @@
-"""GWR-B as an estimator of scikit-learn, which comes with the extra `sklearn`."""
+"""GWR-B as a scikit-learn estimator; needs the extra ``sklearn``."""
 
 from __future__ import annotations
 
@@ -16,27 +16,26 @@ try:
     from sklearn.utils import Tags
     from sklearn.utils.validation import check_is_fitted, validate_data
 except ImportError:
-    raise ImportError("the estimator is scikit-learn's: pip install 'bgpo_trl[sklearn]'") from None
+    raise ImportError("GWRBEstimator needs scikit-learn: pip install 'bgpo_trl[sklearn]'") from None
 
 
 class GWRBEstimator(OneToOneFeatureMixin, TransformerMixin, ClusterMixin, BaseEstimator):
     """A GWR-B network that learns the rows of a table, once and in their order.
 
-    It starts from the first two rows and computes in float64. The arguments are those of `GWRB`.
-    As nodes are created, a row belongs to the nearest: `predict` gives its identity, `transform`
-    its weights. Identities have gaps where nodes were removed or are nearest to no row.
+    It starts from the first two rows and computes in float64. For the arguments, see `GWRB`. A row
+    belongs to the nearest node: `predict` returns its identity, `transform` its weights. Identities
+    have gaps where nodes were removed or are nearest to no row.
 
-    scikit-learn's `check_estimator` passes; with constants that make nodes come and go quickly its
-    `check_clustering`, which asks for labels without gaps, does not.
+    scikit-learn's ``check_estimator`` passes. ``check_clustering``, which requires labels without
+    gaps, fails with constants under which nodes come and go quickly.
 
     Attributes:
-        gwr_: the network; its `graph()` has the nodes and their edges.
-        labels_: identities of the nodes nearest to the rows learned last, int64 `[n]`.
-        n_features_in_: number d of columns.
-        feature_names_in_: their names, if X had some.
+        gwr_: The network; its ``graph()`` has the nodes and their edges.
+        labels_: Identities of the nodes nearest to the rows learned last, int64 ``[n]``.
+        n_features_in_: Number d of columns.
+        feature_names_in_: Names of the columns, if X had any.
 
-    Examples:
-        >>> from bgpo_trl.modules.gwr_estimator import GWRBEstimator
+    Example:
         >>> model = GWRBEstimator(activity_scale=4).fit([[0.0, 0.0], [1.0, 1.0]])
         >>> model.partial_fit([[0.1, 0.0]]).predict([[0.0, 0.2], [0.9, 1.0]])
         array([0, 1])
@@ -60,7 +59,7 @@ class GWRBEstimator(OneToOneFeatureMixin, TransformerMixin, ClusterMixin, BaseEs
         max_age: int = 80,
         max_nodes: int | None = None,
     ) -> None:
-        # scikit-learn reads the names from this signature, and wants values as they were given.
+        # scikit-learn requires each argument to be stored unchanged under its own name.
         self.activity_threshold = activity_threshold
         self.activity_scale = activity_scale
         self.habituation_threshold = habituation_threshold
@@ -75,14 +74,14 @@ class GWRBEstimator(OneToOneFeatureMixin, TransformerMixin, ClusterMixin, BaseEs
         self.max_nodes = max_nodes
 
     def fit(self, X: npt.ArrayLike, y: object = None) -> Self:
-        """Start a new network and learns the rows.
+        """Learn the rows with a new network.
 
         Args:
-            X: numbers `[n, d]`.
-            y: ignored.
+            X: Numbers ``[n, d]``.
+            y: Ignored.
 
         Raises:
-            ValueError: if an argument of the estimator is out of range, or X holds NaN or Inf.
+            ValueError: If an argument of the estimator is out of range, or X holds NaN or Inf.
         """
         rows = _to_tensor(self._validated(X))
         gwr = GWRB(rows.shape[1], init="data", **self.get_params(deep=False))
@@ -92,30 +91,25 @@ class GWRBEstimator(OneToOneFeatureMixin, TransformerMixin, ClusterMixin, BaseEs
         """Learn further rows; the first call is the same as `fit`.
 
         Args:
-            X: numbers `[n, d]`.
-            y: ignored.
+            X: Numbers ``[n, d]``.
+            y: Ignored.
 
         Raises:
-            ValueError: as `fit`, and if d has changed; nothing is learned then.
+            ValueError: As `fit`, and if d has changed; nothing is learned then.
         """
         if not hasattr(self, "gwr_"):
             return self.fit(X)
         return self._learn(self.gwr_, _to_tensor(self._validated(X, reset=False)))
 
     def predict(self, X: npt.ArrayLike) -> np.ndarray:
-        """Return the identity of the node nearest to each row, int64 `[n]`; learns nothing.
-
-        Args:
-            X: numbers `[n, d]`.
-        """
+        """Return the identity of the node nearest to each row of X ``[n, d]``, int64 ``[n]``."""
         rows = self._rows(X)
         return self.gwr_.lookup(rows).node.numpy()
 
     def transform(self, X: npt.ArrayLike) -> np.ndarray:
-        """Return the weights of the node nearest to each row, `[n, d]`; learns nothing.
+        """Return the weights of the node nearest to each row of X, ``[n, d]``.
 
-        Args:
-            X: numbers `[n, d]`; the result is float32 if they are, else float64.
+        The result is float32 if X is, else float64.
         """
         rows = self._rows(X)
         return self.gwr_.lookup(rows).embedding.numpy().astype(rows.dtype)
@@ -141,6 +135,6 @@ class GWRBEstimator(OneToOneFeatureMixin, TransformerMixin, ClusterMixin, BaseEs
 
 
 def _to_tensor(X: npt.ArrayLike) -> torch.Tensor:
-    """Return all rows, refused together before any of them is learned."""
+    """Check all rows before any of them is learned."""
     rows = torch.from_numpy(np.array(X, np.float64))
     return checked(rows, rows, "X")

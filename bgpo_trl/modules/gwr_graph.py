@@ -1,4 +1,4 @@
-"""What GWR-B hands out: the matches of inputs, and copies of its graph."""
+"""Results of GWR-B: matches of inputs, and copies of its graph."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ class BehaviorMatch(TensorClass["tensor_only"]):
     """The best-matching node of each input.
 
     Attributes:
-        embedding: weight vector w_c of the node, the behavior b; a copy, `[*batch, d]`.
-        node: identity of the node within its network, int64 `[*batch]`. Identities count up from 0
-            in order of creation; none is reused or renumbered when a node is removed.
-        activity: exp(-activity_scale ||phi - w_c||) in [0, 1] (Eq. 2), `[*batch]`.
+        embedding: Copy of the node's weights w_c, the behavior b, ``[*batch, d]``.
+        node: Identity of the node within its network, int64 ``[*batch]``. Identities count up from
+            0 in order of creation and are never reused or renumbered.
+        activity: ``exp(-activity_scale ||phi - w_c||)`` in [0, 1] (Eq. 2), ``[*batch]``.
     """
 
     embedding: Tensor
@@ -29,15 +29,14 @@ class BehaviorMatch(TensorClass["tensor_only"]):
 class BehaviorGraph(NamedTuple):
     """A copy of one network, its nodes in order of creation.
 
-    Where nodes have been removed, the position of a node in this copy is no longer its identity:
-    `graph.weights` goes by position, `match.node` by identity. Edges are given in both.
+    Once nodes have been removed, a node's position in this copy differs from its identity.
 
     Attributes:
-        weights: `[N, d]`.
-        habituation: float64 `[N]`.
-        edges: positions (i, j), i < j, of the nodes they join, sorted; int64 `[E, 2]`.
-        ages: of the edges, int64 `[E]`.
-        node: identities of the nodes, as in `BehaviorMatch.node`; int64 `[N]`, ascending.
+        weights: By position, ``[N, d]``.
+        habituation: By position, float64 ``[N]``.
+        edges: Positions (i, j), i < j, of the connected nodes, sorted; int64 ``[E, 2]``.
+        ages: Ages of the edges, int64 ``[E]``.
+        node: Identities, as in `BehaviorMatch`, ascending; int64 ``[N]``.
     """
 
     weights: Tensor
@@ -48,18 +47,18 @@ class BehaviorGraph(NamedTuple):
 
     @property
     def edge_nodes(self) -> Tensor:
-        """The edges as identities of the nodes they join, int64 `[E, 2]`, in the same order."""
+        """The edges as pairs of identities, int64 ``[E, 2]``, in the same order."""
         return self.node[self.edges]
 
     def to_networkx(self) -> nx.Graph:
-        """Copy the graph for networkx, its nodes named by identity, as in `BehaviorMatch.node`.
+        """Return the graph for networkx, its nodes named by identity.
 
-        Nodes have `weights` (an array `[d]`) and `habituation`, edges have `age`.
+        Nodes have ``weights`` (array ``[d]``) and ``habituation``, edges have ``age``.
 
         Raises:
-            ImportError: if networkx is not installed.
+            ImportError: If networkx is not installed.
 
-        Examples:
+        Example:
             >>> from bgpo_trl.modules.gwr import GWRB
             >>> gwr = GWRB(2, init="data")
             >>> for point in ([0, 0], [1, 0], [0.9, 0.1]):

@@ -1,4 +1,4 @@
-"""What GWR-B is given, as tensors, and how far it is from the nodes."""
+"""Arguments of GWR-B as checked tensors, and distances to its nodes."""
 
 from __future__ import annotations
 
@@ -16,11 +16,7 @@ Numbers: TypeAlias = Tensor | npt.ArrayLike
 
 
 def as_shape(value: int | Sequence[int], name: str) -> torch.Size:
-    """Return the argument called `name`, a size or several, as a shape.
-
-    Raises:
-        ValueError: if a size is no whole number of at least 1.
-    """
+    """Return sizes as a shape; raise ``ValueError`` unless they are whole numbers of at least 1."""
     sizes = list(value) if isinstance(value, Sequence) else [value]
     if not all(isinstance(size, Integral) and size >= 1 for size in sizes):
         got = ", ".join(map(repr, sizes))
@@ -31,11 +27,7 @@ def as_shape(value: int | Sequence[int], name: str) -> torch.Size:
 def as_generators(
     value: torch.Generator | Sequence[torch.Generator] | None, count: int
 ) -> Sequence[torch.Generator | None]:
-    """Return the argument called `generator` as one for each of `count` networks.
-
-    Raises:
-        ValueError: if it is not one, or not so many.
-    """
+    """Return one generator (or None) per network; raise ``ValueError`` if there are others."""
     generators = value if isinstance(value, Sequence) else [value] * count
     if len(generators) != count or not all(
         generator is None or isinstance(generator, torch.Generator) for generator in generators
@@ -47,15 +39,11 @@ def as_generators(
 
 
 def as_tensor(value: Numbers, name: str) -> Tensor:
-    """Return the argument called `name` as a tensor, in its own type.
-
-    Raises:
-        ValueError: if it does not consist of numbers.
-    """
+    """Return numbers as a tensor of their own dtype; raise ``ValueError`` for anything else."""
     if isinstance(value, Tensor):
         return value
     try:
-        # Copied, as torch takes neither negative strides nor read-only memory.
+        # Copied: torch accepts neither negative strides nor read-only memory.
         return torch.from_numpy(np.array(value))
     except (TypeError, ValueError, RuntimeError):
         raise ValueError(
@@ -65,11 +53,7 @@ def as_tensor(value: Numbers, name: str) -> Tensor:
 
 
 def as_mask(value: Numbers, shape: torch.Size) -> Tensor:
-    """Return the argument called `mask` as a tensor.
-
-    Raises:
-        ValueError: if it is not bool, or of another shape.
-    """
+    """Return a mask as a tensor; raise ``ValueError`` unless it is bool and of that shape."""
     mask = as_tensor(value, "mask")
     if mask.shape != shape or mask.dtype != torch.bool:
         raise ValueError(f"mask must be bool {[*shape]}; got {mask.dtype} {[*mask.shape]}")
@@ -77,15 +61,15 @@ def as_mask(value: Numbers, shape: torch.Size) -> Tensor:
 
 
 def checked(phi: Tensor, weights: Tensor, name: str = "phi") -> Tensor:
-    """Return the argument called `name` in the type and on the device of the weights.
+    """Return an input in the dtype and on the device of the weights, without gradient.
 
     Raises:
-        ValueError: if it cannot be matched.
+        ValueError: If it is complex, not finite, or so large that squared distances overflow.
     """
     if phi.is_complex():
         raise ValueError(f"{name} must be real numbers; got complex ones")
     phi = phi.detach().to(weights)
-    # Farther out a squared distance could overflow, and every node would be equally near.
+    # Beyond this limit a squared distance could overflow, making all nodes equally near.
     limit = torch.finfo(phi.dtype).max ** 0.5 / 2
     if not torch.linalg.vector_norm(phi).item() <= limit:
         raise ValueError(f"{name} must be free of NaN, Inf and values beyond +-{limit:.0e}")
@@ -93,11 +77,11 @@ def checked(phi: Tensor, weights: Tensor, name: str = "phi") -> Tensor:
 
 
 def pairwise_distances(phi: Tensor, weights: Tensor) -> Tensor:
-    """Distances `[A, M, N]` of inputs `[A, M, d]` to nodes `[A, N, d]`."""
-    # By matrix product, the default of cdist, distances near 0 would be off by 1e-3.
+    """Return the distances ``[A, M, N]`` of inputs ``[A, M, d]`` to nodes ``[A, N, d]``."""
+    # The default of cdist, a matrix product, is off by 1e-3 near a distance of 0.
     return torch.cdist(phi, weights, compute_mode="donot_use_mm_for_euclid_dist")
 
 
 def to_tensor(numbers: list[Any], dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Call `torch.tensor` by way of NumPy, which reads a list four times as fast."""
+    """Return a list of numbers as a tensor; by way of NumPy, four times as fast."""
     return torch.as_tensor(np.array(numbers), dtype=dtype, device=device)

@@ -1,4 +1,4 @@
-"""The nodes and edges of a GWR-B network, and what of its learning rule needs no weights."""
+"""Nodes and edges of a GWR-B network: the part of its learning rule that needs no weights."""
 
 from __future__ import annotations
 
@@ -9,15 +9,16 @@ from numbers import Real
 from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from bgpo_trl.modules.gwr_graph import BehaviorGraph
 
 
 class Firing(NamedTuple):
-    """A node of habituation h moves by `lr * h` of its way to the input, then habituates.
+    """Effect of firing on a node of habituation h.
 
-    Each firing leaves `decay = exp(-alpha / tau)` of what h has above `floor = h_0 - 1 / alpha`.
+    The node moves by a fraction ``lr * h`` of its way to the input, then habituates: ``h <- floor +
+    (h - floor) * decay``, ``floor = h_0 - 1 / alpha``, ``decay = exp(-alpha / tau)``.
     """
 
     lr: float
@@ -30,7 +31,7 @@ class LearningRule:
     """The constants of GWR-B, explained in `GWRB`.
 
     Raises:
-        ValueError: for a value out of range.
+        ValueError: If a value is out of range.
     """
 
     activity_threshold: float
@@ -74,25 +75,25 @@ class LearningRule:
 
     @cached_property
     def best(self) -> Firing:
-        """What firing does to the best match (Eqs. 3, 5)."""
+        """Effect of firing on the best match (Eqs. 3, 5)."""
         floor = self.initial_habituation - 1 / self.alpha_best
         return Firing(self.lr_best, floor, math.exp(-self.alpha_best / self.tau_best))
 
     @cached_property
     def neighbor(self) -> Firing:
-        """What firing does to its neighbors (Eqs. 4, 6)."""
+        """Effect of firing on its neighbors (Eqs. 4, 6)."""
         floor = self.initial_habituation - 1 / self.alpha_neighbor
         return Firing(self.lr_neighbor, floor, math.exp(-self.alpha_neighbor / self.tau_neighbor))
 
 
 class WeightUpdate(NamedTuple):
-    """What learning from phi asks of the weights, in this order.
+    """Changes of the weights by which a network learns an input phi, in this order.
 
     Attributes:
-        insert: whether the next row becomes (w_c + phi) / 2.
-        moved: rows to move to phi ...
-        steps: ... by this much of their way.
-        removed: rows to erase.
+        insert: Whether the next row becomes ``(w_c + phi) / 2``.
+        moved: Rows that move towards phi.
+        steps: Fraction of the way to phi, for each of ``moved``.
+        removed: Rows to erase.
     """
 
     insert: bool
@@ -103,27 +104,27 @@ class WeightUpdate(NamedTuple):
 
 @dataclass(slots=True)
 class Topology:
-    """Nodes, edges and habituation of one network; a node is known by its row of the weights.
+    """Nodes, edges and habituation of one network; a node is identified by its row of the weights.
 
-    Plain Python on the host: an input touches the few edges of one node, which takes dictionaries
-    less time than the call of a single tensor operation. Rows are in order of creation. The row of
-    a removed node stays behind, out of use, until `compact`.
+    Plain Python on the host: an input changes the few edges of one node, which costs less than a
+    single tensor operation. Rows are in order of creation. The row of a removed node stays unused
+    until `compact`.
     """
 
-    identity: list[int] = field(default_factory=list)  # of the node in each row, ascending
-    habituation: list[float] = field(default_factory=list)  # of the node in each row
-    wins: list[int] = field(default_factory=list)  # how often it has been the best match
-    # Node -> {neighbor: reset}. An edge ages when either end wins, so its age is the wins of both
-    # less what they were at age 0. That `reset` is all to be kept, and a win touches no edge.
+    identity: list[int] = field(default_factory=list)  # by row, ascending
+    habituation: list[float] = field(default_factory=list)  # by row
+    wins: list[int] = field(default_factory=list)  # by row: times it was the best match
+    # Node -> {neighbor: reset}. An edge ages when either end wins, so a-b has age wins[a] + wins[b]
+    # - reset, where reset is that sum at age 0. Only reset is stored: a win updates no edge.
     edges: dict[int, dict[int, int]] = field(default_factory=dict)
     next_identity: int = 0
 
     @classmethod
     def from_graph(cls, graph: BehaviorGraph, next_identity: int) -> Topology:
-        """Rebuilds the topology that `to_graph` has copied.
+        """Rebuild the topology of a graph copied by `to_graph`.
 
         Raises:
-            ValueError: if it is no such graph.
+            ValueError: If the graph is inconsistent.
         """
         n, ends = len(graph.weights), graph.edges
         sound = (
@@ -135,7 +136,7 @@ class Topology:
         )
         if not sound:
             raise ValueError(
-                "the state is no graph of GWR-B, or a damaged one: load what state_dict returned"
+                "the state is damaged or not a graph of GWR-B: load one that state_dict returned"
             )
         identity, habituation = graph.node.tolist(), graph.habituation.tolist()
         edges = {row: {} for row in range(len(identity))}
@@ -167,7 +168,7 @@ class Topology:
         )
 
     def compact(self) -> list[int]:
-        """Close the gaps that removed nodes have left; returns the former row of each node."""
+        """Close the gaps left by removed nodes; return the former row of each node."""
         rows = list(self.edges)
         position = {row: i for i, row in enumerate(rows)}
         self.identity = [self.identity[row] for row in rows]
@@ -180,7 +181,7 @@ class Topology:
         return rows
 
     def add(self, habituation: float) -> int:
-        """Create a node without edges."""
+        """Create a node without edges; return its row."""
         row = len(self.identity)
         self.identity.append(self.next_identity)
         self.habituation.append(habituation)
@@ -190,7 +191,7 @@ class Topology:
         return row
 
     def connect(self, a: int, b: int, age: int = 0) -> None:
-        """Create the edge a-b, or sets its age."""
+        """Create the edge a-b, or set its age."""
         self.edges[a][b] = self.edges[b][a] = self.wins[a] + self.wins[b] - age
 
     def disconnect(self, a: int, b: int) -> None:
@@ -215,7 +216,7 @@ class Topology:
         return WeightUpdate(insert, moved, steps, self._age_edges(c, rule.max_age))
 
     def _fire(self, nodes: list[int], rule: LearningRule) -> list[float]:
-        """Habituates nodes, the first as the best match; returns the step of each."""
+        """Habituate nodes, the first as the best match; return each node's step."""
         steps, habituation = [], self.habituation
         lr, floor, decay = rule.best
         for node in nodes:
@@ -226,7 +227,7 @@ class Topology:
         return steps
 
     def _age_edges(self, c: int, max_age: int) -> list[int]:
-        """Ages the edges of c; those too old go, then nodes without edges, which it returns."""
+        """Age the edges of c, remove expired edges and isolated nodes; return these nodes."""
         wins = self.wins
         wins[c] += 1
         oldest = wins[c] - max_age
@@ -243,18 +244,18 @@ class Topology:
 def read_state(
     state: list[dict[str, Any]], n_networks: int, n_features: int
 ) -> tuple[list[BehaviorGraph], list[Topology]]:
-    """Read the networks of `GWRB.get_extra_state`.
+    """Read the networks from `GWRB.get_extra_state`.
 
     Raises:
-        ValueError: if there are more or fewer of them, or of other features, or they are damaged.
+        ValueError: If they are damaged, or their number or features differ.
     """
     wanted = {*BehaviorGraph._fields, "next_node"}
     if not all(wanted <= network.keys() for network in state):
         raise ValueError(f"the state of a network needs {sorted(wanted)}: see get_extra_state")
-    found = [network["weights"].shape[1] for network in state]
-    if found != [n_features] * n_networks:
+    sizes = [network["weights"].shape[1] for network in state]
+    if sizes != [n_features] * n_networks:
         raise ValueError(
-            f"the state has {len(found)} networks of {set(found)} features, this GWRB "
+            f"the state has {len(sizes)} networks of {set(sizes)} features, this GWRB "
             f"{n_networks} of {n_features}: build it with the same sizes"
         )
     graphs = [BehaviorGraph(*(network[x] for x in BehaviorGraph._fields)) for network in state]
@@ -263,21 +264,3 @@ def read_state(
         for graph, network in zip(graphs, state, strict=True)
     ]
     return graphs, topologies
-
-
-def with_room(weights: Tensor, topologies: list[Topology], networks: list[int]) -> Tensor:
-    """Return the weights of all networks, with a spare row in each of `networks`.
-
-    Capacity grows by an eighth: in proportion, so that growth costs little, but by no more, as
-    every row is searched. Where as many rows are out of use, those are put to use instead.
-    """
-    capacity = weights.shape[1]
-    share = max(16, capacity // 8)
-    full = [i for i in networks if len(topologies[i].identity) == capacity]
-    if any(capacity - len(topologies[i].edges) < share for i in full):
-        return nn.functional.pad(weights, (0, 0, 0, share), value=torch.inf)
-    for i in full:
-        rows = topologies[i].compact()
-        weights[i, : len(rows)] = weights[i, rows]
-        weights[i, len(rows) :] = torch.inf
-    return weights

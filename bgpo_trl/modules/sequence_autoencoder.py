@@ -1,4 +1,4 @@
-"""LSTM autoencoder over latent sequences: one demonstration to a 32-number embedding phi."""
+"""LSTM autoencoder over latent sequences: from a demonstration to its embedding phi."""
 
 from __future__ import annotations
 
@@ -7,23 +7,21 @@ from torch import Tensor, nn
 
 
 class SequenceAutoencoder(nn.Module):
-    """The paper's LAE (Sec. III-A, Fig. "LSTM Autoencoder"): LSTM encoder, LSTM decoder.
+    """The paper's LSTM autoencoder, LAE (Sec. III-A, Fig. "LSTM Autoencoder").
 
-    The embedding phi is the encoder's hidden state after the last valid latent. The decoder is fed
+    The embedding phi is the encoder's hidden state after the last valid latent. The decoder gets
     phi at every step and reconstructs the sequence in reverse order.
 
     Args:
-        latent_size: dimensions of one latent (paper: 64).
-        embedding_size: LSTM units of encoder and decoder, so dimensions of phi (paper: 32).
+        latent_size: Dimensions of a latent (paper: 64).
+        embedding_size: LSTM units of encoder and decoder, hence dimensions of phi (paper: 32).
 
     Raises:
-        ValueError: if a size is not positive.
+        ValueError: If a size is not positive.
 
     Example:
-        >>> import torch
-        >>> lae = SequenceAutoencoder()
         >>> z, length = torch.randn(5, 51, 64), torch.tensor([51, 30, 1, 2, 40])
-        >>> lae.encode(z, length).shape
+        >>> SequenceAutoencoder().encode(z, length).shape
         torch.Size([5, 32])
     """
 
@@ -41,17 +39,14 @@ class SequenceAutoencoder(nn.Module):
         self.readout = nn.Linear(embedding_size, latent_size)
 
     def encode(self, z: Tensor, length: Tensor) -> Tensor:
-        """Embed whole sequences.
+        """Embed whole sequences; return phi, float32 ``[..., embedding_size]`` in (-1, 1).
 
         Args:
-            z: ``[..., T, latent_size]``; what lies at or beyond ``length`` has no influence.
-            length: int64 ``[...]``, valid latents of each sequence, in 1..T.
-
-        Returns:
-            phi, float32 ``[..., embedding_size]`` in (-1, 1).
+            z: ``[..., T, latent_size]``; values at or beyond ``length`` are ignored.
+            length: Valid latents of each sequence, int64 ``[...]`` in 1..T.
 
         Raises:
-            ValueError: if shapes disagree or a length is outside 1..T.
+            ValueError: If shapes disagree or a length is outside 1..T.
         """
         if length.shape != z.shape[:-2]:
             raise ValueError(
@@ -72,7 +67,7 @@ class SequenceAutoencoder(nn.Module):
         return hidden.gather(1, last).reshape(*length.shape, self.embedding_size)
 
     def step(self, z: Tensor, h: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
-        """Advances the encoder by one latent; after the last one, ``h`` is phi.
+        """Advance the encoder by one latent; after the last one, ``h`` is phi.
 
         Args:
             z: ``[..., latent_size]``.
@@ -80,10 +75,10 @@ class SequenceAutoencoder(nn.Module):
             c: ``[..., embedding_size]``, zeros at the start of a sequence.
 
         Returns:
-            The new ``h`` and ``c``, ``[..., embedding_size]`` each.
+            The new ``h`` and ``c``.
 
         Raises:
-            ValueError: if shapes disagree.
+            ValueError: If shapes disagree.
         """
         shape = h.shape
         if z.shape != (*shape[:-1], self.latent_size) or shape[-1] != self.embedding_size:
@@ -97,15 +92,15 @@ class SequenceAutoencoder(nn.Module):
         return h.reshape(shape), c.reshape(shape)
 
     def decode(self, phi: Tensor, n_steps: int) -> Tensor:
-        """Reconstructs the last ``n_steps`` latents in reverse order (the last one first).
+        """Reconstruct the last ``n_steps`` latents in reverse order (the last one first).
 
         Args:
             phi: ``[..., embedding_size]``.
-            n_steps: how many latents to produce.
+            n_steps: Number of latents.
 
         Returns:
             float32 ``[..., n_steps, latent_size]``.
         """
-        fed = phi.reshape(-1, 1, self.embedding_size).expand(-1, n_steps, -1)
-        hidden, _ = self.decoder(fed)
+        inputs = phi.reshape(-1, 1, self.embedding_size).expand(-1, n_steps, -1)
+        hidden, _ = self.decoder(inputs)
         return self.readout(hidden).reshape(*phi.shape[:-1], n_steps, self.latent_size)

@@ -1,7 +1,6 @@
-"""Variational autoencoder with an inverse model: one camera frame to a 64-number latent.
+"""Variational autoencoder with an inverse model: from a camera frame to a 64-dimensional latent.
 
-Section IV-A of the paper fixes the layers; Section III-A the joint objective, which lives in
-:mod:`bgpo_trl.objectives.representation`.
+Layers: paper, Sec. IV-A. Objective: Sec. III-A, in `bgpo_trl.objectives.representation`.
 """
 
 from __future__ import annotations
@@ -23,34 +22,29 @@ _COARSE_SIZE = 4096
 class VAE(nn.Module):
     """Convolutional VAE over 64x32 RGB frames, with a one-layer inverse model on its latents.
 
-    The encoder has three 3x3 convolutions of 32, 64 and 128 channels, each followed by ReLU and
-    2x2 max-pooling, then two parallel dense layers for mean and log-variance. The decoder mirrors
-    it with three transposed convolutions (kernel 4, stride 2: every "upsample by 2, then 3x3
-    convolution" is one of these, at half the compute) and a sigmoid output. Everything runs
-    channels-last, which is the layout the frames already have.
+    Encoder: three 3x3 convolutions of 32, 64 and 128 channels, each followed by 2x2 max-pooling and
+    ReLU, then one dense layer each for mean and log-variance. Decoder: the mirror image, with
+    transposed convolutions (kernel 4, stride 2) in place of "upsample by 2, then 3x3 convolution",
+    at half the compute, and a sigmoid output. Tensors are channels-last, the layout of the frames.
 
-    A fixed camera shows mostly the same table. So both ends work relative to a mean frame: it is
-    subtracted from what the encoder reads, and it is what the decoder shows when its last layer
-    says nothing. This is input normalisation and an output bias, nothing else, but it spares the
-    network hundreds of steps of learning the background before it turns to the objects.
+    Encoder and decoder work on the difference to a mean frame, which they would otherwise spend
+    hundreds of steps learning: the fixed camera mostly shows the same table.
 
     Args:
-        latent_size: dimensions of z (paper: 64).
-        action_size: dimensions of an action (paper: 4).
+        latent_size: Dimensions of z (paper: 64).
+        action_size: Dimensions of an action (paper: 4).
 
     Raises:
-        ValueError: if a size is not positive.
+        ValueError: If a size is not positive.
 
     Attributes:
-        mean_frame: ``[32, 64, 3]`` buffer in [0, 1], set before training; grey until then.
-        latent_mean: ``[latent_size]`` buffer, subtracted from mu by :meth:`latent`.
-        latent_std: ``[latent_size]`` buffer, divides mu in :meth:`latent`.
+        mean_frame: Buffer ``[32, 64, 3]`` in [0, 1], set before training; grey until then.
+        latent_mean: Buffer ``[latent_size]``, subtracted from mu by `latent`.
+        latent_std: Buffer ``[latent_size]``, by which `latent` divides.
 
     Example:
-        >>> import torch
-        >>> vae = VAE()
         >>> frames = torch.zeros(10, 32, 64, 3, dtype=torch.uint8)
-        >>> vae.latent(frames).shape
+        >>> VAE().latent(frames).shape
         torch.Size([10, 64])
     """
 
@@ -70,8 +64,8 @@ class VAE(nn.Module):
         self.encoder = nn.ModuleList(nn.Conv2d(a, b, 3, padding=1) for a, b in pairwise(_CHANNELS))
         self.mean_head = nn.Linear(_COARSE_SIZE, latent_size)
         self.log_variance_head = nn.Linear(_COARSE_SIZE, latent_size)
-        # Starts with little noise (sigma .14): as loud as the signal, it would first teach the
-        # decoder to ignore z.
+        # Little noise at first (sigma 0.14): with noise as large as the signal, the decoder would
+        # learn to ignore z.
         nn.init.zeros_(self.log_variance_head.weight)
         nn.init.constant_(self.log_variance_head.bias, -4.0)
         self.decoder_dense = nn.Linear(latent_size, _COARSE_SIZE)
@@ -86,53 +80,44 @@ class VAE(nn.Module):
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def encode(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the posterior's mean and log-variance.
+        """Return mean and log-variance of the posterior, float32 ``[..., latent_size]`` each.
 
         Args:
             pixels: uint8 ``[..., 32, 64, 3]``.
 
-        Returns:
-            ``mu`` and ``log_variance``, float32 ``[..., latent_size]`` each.
-
         Raises:
-            ValueError: if ``pixels`` is not uint8 or not of that shape.
+            ValueError: If ``pixels`` has another dtype or shape.
         """
         coarse = self._coarse(pixels)
         return self.mean_head(coarse), self.log_variance_head(coarse)
 
     def decode(self, z: Tensor) -> Tensor:
-        """Return the reconstructed frames in [0, 1].
+        """Return reconstructed frames, float32 ``[..., 32, 64, 3]`` in [0, 1].
 
         Args:
-            z: ``[..., latent_size]``, on the scale of mu (not of :meth:`latent`).
-
-        Returns:
-            float32 ``[..., 32, 64, 3]``.
+            z: ``[..., latent_size]``, on the scale of mu (not of `latent`).
 
         Raises:
-            ValueError: if ``z`` has another size.
+            ValueError: If ``z`` has another size.
         """
         self._check_latent(z)
         x = F.relu(self.decoder_dense(z.reshape(-1, self.latent_size)))
         x = x.unflatten(-1, _COARSE_SHAPE).contiguous(memory_format=torch.channels_last)
         for convolution in self.decoder[:-1]:
             x = F.relu(convolution(x))
-        # The bound keeps pixels that are nearly always black or white able to change.
+        # eps: without it, pixels that are nearly always black or white could not change.
         x = self.decoder[-1](x).permute(0, 2, 3, 1) + torch.logit(self.mean_frame, eps=0.02)
         return torch.sigmoid(x).reshape(*z.shape[:-1], *FRAME_SHAPE)
 
     def inverse(self, z: Tensor, z_next: Tensor) -> Tensor:
-        """Predicts the action taken between two consecutive latents.
+        """Predict the action between consecutive latents, ``[..., action_size]`` in (-1, 1).
 
         Args:
             z: ``[..., latent_size]``, on the scale of mu.
-            z_next: ``[..., latent_size]``, one step later.
-
-        Returns:
-            float32 ``[..., action_size]`` in (-1, 1).
+            z_next: The latent one step later.
 
         Raises:
-            ValueError: if a latent has another size.
+            ValueError: If a latent has another size.
         """
         self._check_latent(z)
         self._check_latent(z_next)
@@ -140,16 +125,16 @@ class VAE(nn.Module):
 
     @torch.no_grad()
     def latent(self, pixels: Tensor) -> Tensor:
-        """Return the feature vector used downstream: mu, standardised. Carries no gradient.
+        """Return the feature vector used downstream: mu, standardized, without gradient.
 
         Args:
             pixels: uint8 ``[..., 32, 64, 3]``.
 
         Returns:
-            float32 ``[..., latent_size]``, about zero mean and unit variance on training frames.
+            float32 ``[..., latent_size]``, of about zero mean and unit variance on training frames.
 
         Raises:
-            ValueError: as :meth:`encode`.
+            ValueError: If ``pixels`` has another dtype or shape.
         """
         return self.standardize(self.mean_head(self._coarse(pixels)))
 
@@ -159,18 +144,17 @@ class VAE(nn.Module):
 
     @torch.no_grad()
     def set_latent_scale(self, mu: Tensor, floor: float = 0.1) -> None:
-        """Set the buffers that :meth:`latent` standardises with.
+        """Set the mean and standard deviation with which `latent` standardizes.
 
-        Dimensions that the KL term switched off keep a tiny, meaningless spread. Dividing by it
-        would blow that up into noise of the size of the signal, so no dimension is divided by
-        less than ``floor`` times the largest standard deviation.
+        Dimensions switched off by the KL term keep a tiny spread; dividing by it would turn them
+        into noise as large as the signal. ``floor`` bounds the divisor from below.
 
         Args:
-            mu: ``[N, latent_size]``, means of the training frames.
-            floor: the smallest divisor, relative to the largest standard deviation.
+            mu: Means of the training frames, ``[N, latent_size]``.
+            floor: Smallest divisor, relative to the largest standard deviation.
 
         Raises:
-            ValueError: if ``mu`` has fewer than two rows, or is constant or not finite.
+            ValueError: If ``mu`` has fewer than two rows, or is constant or not finite.
         """
         if mu.ndim != 2 or mu.shape[0] < 2:
             raise ValueError(f"mu must be [N, {self.latent_size}], N >= 2, got {tuple(mu.shape)}")
@@ -191,6 +175,6 @@ class VAE(nn.Module):
             )
         x = (pixels.reshape(-1, *FRAME_SHAPE) / 255 - self.mean_frame).permute(0, 3, 1, 2)
         for convolution in self.encoder:
-            # Pooling before ReLU gives the same result (both are monotone) on a quarter the data.
+            # Pooling before ReLU gives the same result (both are monotone), at a quarter the size.
             x = F.relu(F.max_pool2d(convolution(x), 2))
         return x.reshape(*pixels.shape[:-3], _COARSE_SIZE)

@@ -1,4 +1,4 @@
-"""Policy distillation: the multi-task policy learns which actions the tasks' teachers take."""
+"""Policy distillation: the multi-task policy learns the actions of the tasks' teachers."""
 
 from __future__ import annotations
 
@@ -17,23 +17,20 @@ __all__ = ["DistillationLoss"]
 class DistillationLoss(LossModule):
     """Negative log-likelihood of the teachers' actions (Rusu et al., 2016, Eq. 1, for Gaussians).
 
-    Reads the ``in_keys`` of the policy and ``"teacher_action"`` ``[T, B, action_dim]``. Returns
-    ``"loss_distillation"`` ``[]``: ``-log N(teacher_action; loc, scale^2)``, summed over action
+    Reads the ``in_keys`` of the policy and ``teacher_action`` ``[T, B, action_dim]``; writes
+    ``loss_distillation`` ``[]``: ``-log N(teacher_action; loc, scale^2)``, summed over action
     components and tasks, mean over ``B``.
 
     Args:
-        actor_network: policy that writes ``"loc"`` and ``"scale"``.
+        actor_network: Policy that writes ``loc`` and ``scale``.
+
+    Raises:
+        ValueError: From ``forward``, if an entry is missing or the policy writes no distribution.
     """
 
     @dataclass
     class _AcceptedKeys:
-        """Names of the entries, to be changed with ``set_keys``.
-
-        Attributes:
-            teacher_action: what the teacher does in a state.
-            loc: mean of the policy's actions.
-            scale: their standard deviation.
-        """
+        """Keys that ``set_keys`` can change."""
 
         teacher_action: NestedKey = "teacher_action"
         loc: NestedKey = "loc"
@@ -53,33 +50,26 @@ class DistillationLoss(LossModule):
 
     @property
     def out_keys(self) -> list[NestedKey]:
-        """Entries that are returned."""
+        """The keys that ``forward`` writes."""
         return ["loss_distillation"]
 
     @property
     def in_keys(self) -> list[NestedKey]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Entries that are read."""
+        """The keys that ``forward`` reads."""
         return [*self.actor_network.in_keys, self.tensor_keys.teacher_action]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
-        """Compute the loss; reads and returns what the class says.
-
-        Args:
-            tensordict: states and the teachers' actions ``[T, B]``.
-
-        Raises:
-            ValueError: if an entry is missing, or the policy writes no distribution.
-        """
+        """Return the loss for states and teachers' actions ``[T, B]``."""
         keys = self.tensor_keys
         if any(tensordict.get(key, None) is None for key in self.in_keys):
             raise missing_key("DistillationLoss", tensordict, self.in_keys)
-        told = self.actor_network(tensordict.select(*self.actor_network.in_keys))
-        if told.get(keys.loc, None) is None or told.get(keys.scale, None) is None:
-            raise missing_key("DistillationLoss, from its actor,", told, [keys.loc, keys.scale])
+        policy = self.actor_network(tensordict.select(*self.actor_network.in_keys))
+        if policy.get(keys.loc, None) is None or policy.get(keys.scale, None) is None:
+            raise missing_key("DistillationLoss, from its actor,", policy, [keys.loc, keys.scale])
         loss = gaussian_nll_loss(
-            told[keys.loc],
+            policy[keys.loc],
             tensordict[keys.teacher_action].detach(),
-            told[keys.scale].square(),
+            policy[keys.scale].square(),
             full=True,
             reduction="none",
         )

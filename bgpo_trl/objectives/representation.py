@@ -1,4 +1,4 @@
-"""Losses of the two representation networks (paper Sec. III-A), as TorchRL LossModules."""
+"""Losses of the VAE and the sequence autoencoder (paper, Sec. III-A), as TorchRL ``LossModule``."""
 
 from __future__ import annotations
 
@@ -15,39 +15,33 @@ from bgpo_trl.modules.vae import VAE
 
 
 class VAEInverseLoss(LossModule):
-    """Joint loss of the VAE and its inverse model, on windows of consecutive frames.
+    """Joint loss of the VAE and its inverse model, on windows of consecutive frames ``[*B, K]``.
 
-    What happens to a batch of windows ``[*B, K]``:
+    z is sampled from N(mu, sigma^2), once per frame. The terms are:
 
-    1. Every frame is encoded once and z is sampled from N(mu, sigma^2).
-    2. Reconstruction: squared error, summed over the 6144 numbers of a frame, mean over frames.
-    3. KL(N(mu, sigma^2) || N(0, 1)): summed over dimensions, mean over frames.
-    4. Inverse: ``1/2 ||a_hat_t - a_t||^2`` from the sampled ``[z_t, z_t+1]``, mean over the
-       ``K - 1`` transitions of every window.
+    - ``reconstruction``: squared error, summed over the 6144 values of a frame, mean over frames.
+      With a mean over pixels, a small object would count so little that the KL term would switch
+      off the dimensions that encode it.
+    - ``kl``: KL(N(mu, sigma^2) || N(0, 1)), summed over dimensions, mean over frames.
+    - ``inverse``: ``1/2 ||a_hat_t - a_t||^2``, with a_hat_t predicted from z_t and z_t+1, mean over
+      the ``K - 1`` transitions of every window.
 
-    Reconstruction is summed, not averaged, over pixels: a mean would divide what a small object
-    is worth by 6144 and the KL term would then switch off the dimensions that encode it.
-    The entries ``loss_*`` are weighted, so their sum is the objective; ``reconstruction``, ``kl``
-    and ``inverse`` are the same terms unweighted and detached, for logging.
-
-    Reads ``pixels`` uint8 ``[*B, K, 32, 64, 3]`` and ``action`` ``[*B, K, A]``, where
-    ``action[..., t, :]`` leads from frame ``t`` to ``t + 1`` (the last one is not used). Writes
-    scalars.
+    Reads ``pixels`` uint8 ``[*B, K, 32, 64, 3]`` and ``action`` ``[*B, K, A]``, where ``action[...,
+    t, :]`` leads from frame ``t`` to ``t + 1`` (the last one is ignored). Writes the terms,
+    detached, for logging, and weighted as ``loss_*``, which add up to the objective; all ``[]``.
 
     Args:
-        vae: the network to train; its parameters are this module's parameters.
-        reconstruction_weight: factor of the reconstruction.
-        kl_weight: factor of the KL divergence.
-        inverse_weight: factor of the inverse model's loss.
-        generator: source of the sampling noise; PyTorch's global one if not given.
+        vae: Network to train.
+        reconstruction_weight: Weight of ``reconstruction``.
+        kl_weight: Weight of ``kl``.
+        inverse_weight: Weight of ``inverse``.
+        generator: Source of the sampling noise; None: torch's default generator.
 
     Raises:
-        ValueError: from ``forward``, if windows are shorter than 2 frames, an entry is missing, or
+        ValueError: From ``forward``, if a window has fewer than 2 frames, an entry is missing, or
             actions have another shape.
 
     Example:
-        >>> import torch
-        >>> from tensordict import TensorDict
         >>> loss = VAEInverseLoss(VAE(), generator=torch.Generator().manual_seed(0))
         >>> windows = TensorDict({
         ...     "pixels": torch.zeros(3, 4, 32, 64, 3, dtype=torch.uint8),
@@ -101,7 +95,7 @@ class VAEInverseLoss(LossModule):
         return [*(f"loss_{name}" for name in self.weights), *self.weights]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
-        """Return the three losses for a batch of windows; see the class."""
+        """Return the terms for a batch of windows."""
         pixels = tensordict.get(self.tensor_keys.pixels, None)
         action = tensordict.get(self.tensor_keys.action, None)
         if pixels is None or action is None:
@@ -128,21 +122,21 @@ class VAEInverseLoss(LossModule):
 
 
 class SequenceReconstructionLoss(LossModule):
-    """Masked mean squared error of the sequence autoencoder (paper Sec. III-A).
+    """Masked mean squared error of the sequence autoencoder (paper, Sec. III-A).
 
-    Every sequence is embedded, reconstructed in reverse order, and compared with its own valid
-    latents read backwards. Steps at or beyond ``length`` count for nothing; every valid step of
-    the batch counts the same.
+    Each sequence is embedded, reconstructed in reverse order and compared with its valid latents,
+    those before ``length``. All valid steps of the batch have equal weight.
 
-    Reads ``latent`` ``[*B, T, latent_size]`` and ``length`` int64 ``[*B]``. Writes the scalar
-    ``loss_reconstruction``.
+    Reads ``latent`` ``[*B, T, latent_size]`` and ``length`` int64 ``[*B]``; writes
+    ``loss_reconstruction`` ``[]``.
 
     Args:
-        lae: the network to train; its parameters are this module's parameters.
+        lae: Network to train.
+
+    Raises:
+        ValueError: From ``forward``, if an entry is missing.
 
     Example:
-        >>> import torch
-        >>> from tensordict import TensorDict
         >>> loss = SequenceReconstructionLoss(SequenceAutoencoder())
         >>> length = torch.tensor([51, 9])
         >>> data = TensorDict({"latent": torch.randn(2, 51, 64), "length": length}, [2])
@@ -166,7 +160,7 @@ class SequenceReconstructionLoss(LossModule):
 
     @property
     def functional(self) -> bool:
-        """False: nn.LSTM caches its weights, so they cannot be swapped for functional calls."""
+        """False: ``nn.LSTM`` caches its weights, which rules out functional calls."""
         return False
 
     @property
@@ -180,7 +174,7 @@ class SequenceReconstructionLoss(LossModule):
         return ["loss_reconstruction"]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
-        """Return the loss for a batch of sequences; see the class."""
+        """Return the loss for a batch of sequences."""
         latent = tensordict.get(self.tensor_keys.latent, None)
         length = tensordict.get(self.tensor_keys.length, None)
         if latent is None or length is None:

@@ -1,4 +1,4 @@
-"""TorchRL transforms: what an environment becomes for BGPO, one part a file."""
+"""TorchRL transforms that turn an environment into BGPO's, one per file."""
 
 from bgpo_trl.transforms.behavior_lookup import BehaviorLookup
 from bgpo_trl.transforms.behavior_matching import BehaviorMatchingReward

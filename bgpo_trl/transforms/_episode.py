@@ -1,4 +1,4 @@
-"""What the transforms share that write at the start of an episode and act at its end."""
+"""Base classes of the transforms that write at the start of an episode and act at its end."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from bgpo_trl.errors import missing_key
 
 
 def starting(tensordict: TensorDictBase, done_key: NestedKey = "done") -> Tensor:
-    """Rows whose episode starts with this reset, bool `[*B]`: all without a `_reset` entry."""
+    """Return the rows that this reset starts, bool ``[*B]``; all if there is no ``_reset``."""
     reset_key = "_reset" if isinstance(done_key, str) else (*done_key[:-1], "_reset")
     reset = tensordict.get(reset_key, None)
     if reset is None:
@@ -27,9 +27,9 @@ def starting(tensordict: TensorDictBase, done_key: NestedKey = "done") -> Tensor
 def ending(
     tensordict: TensorDictBase, next_tensordict: TensorDictBase, done_key: NestedKey = "done"
 ) -> Tensor:
-    """Rows whose episode ends with this step, bool `[*B]`.
+    """Return the rows whose episode ends with this step, bool ``[*B]``.
 
-    A row that is stepped on after its end, or skipped by a partial step, does not end again.
+    A row that is stepped after its end, or skipped by a partial step, does not end again.
     """
     done = next_tensordict.get(done_key)
     was_done = tensordict.get(done_key, None)
@@ -42,22 +42,21 @@ def _one_a_row(mask: Tensor, tensordict: TensorDictBase) -> Tensor:
 
 
 class EpisodeTransform(Transform):
-    """Base of the transforms with entries that are set at reset and handed on from step to step.
+    """Base of the transforms whose entries are set at reset and copied from step to step.
 
-    Such entries are part of the observation, which must keep them: the next step reads them. What
-    happens at the end of an episode depends on `done`, so that a `StepCounter`, which sets it on
-    time-out, must come before. One that learns then must have one: an episode that is never over
-    teaches nothing. One that changes the reward must come before `RewardSum`.
-
-    Attributes:
-        learn: whether it learns at the end of an episode.
-        pays: whether it changes the reward.
+    These entries must stay in the observation, since the next step reads them. ``StepCounter`` must
+    come before the transform, so that ``done`` includes time-outs; it is required if the transform
+    learns at the end of episodes. ``RewardSum`` must come after a transform that changes the
+    reward.
 
     Args:
-        in_keys: entries read.
-        out_keys: entries written.
-        done_key: the entry that says where an episode has ended; its sibling `_reset` says where
-            one starts.
+        in_keys: Entries read.
+        out_keys: Entries written.
+        done_key: The ``done`` that ends an episode; its sibling ``_reset`` starts one.
+
+    Attributes:
+        learn: Whether it learns at the end of an episode.
+        pays: Whether it changes the reward.
     """
 
     learn: bool = False
@@ -70,26 +69,31 @@ class EpisodeTransform(Transform):
         self.done_key = unravel_key(done_key)
 
     def _entries(self, observation_spec: Composite) -> dict[NestedKey, TensorSpec]:
-        """Specs of the entries handed on, given the observation so far."""
+        """Return the specs of the entries written, given the observation so far."""
         raise NotImplementedError
 
     def _read_spec(self, observation_spec: Composite, key: NestedKey, source: str) -> TensorSpec:
         if key not in observation_spec.keys(True, True):
             raise ValueError(
-                f"{type(self).__name__} found no {key!r}: put {source} before it, or name another "
-                "entry in in_keys"
+                f"{type(self).__name__} found no {key!r}: put {source} before it, or give another "
+                "key in in_keys"
             )
         return observation_spec[key]
 
     def _reset_env_preprocess(self, tensordict: TensorDictBase | None) -> TensorDictBase | None:
-        # Specs are only made when they are asked for. Making them now, before anything is reset,
-        # lets a wrong composition be refused for what it is.
+        # Specs are made on demand. Making them before the reset reports a wrong composition by its
+        # cause.
         observation_spec = cast(EnvBase, self.container).observation_spec
-        self._check_limit(observation_spec)  # once more, as `learn` can have changed since
+        self._check_limit(observation_spec)  # again, since `learn` may have changed
         return tensordict
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Add the entries of this transform."""
+        """Add the entries of this transform.
+
+        Raises:
+            ValueError: If transforms are in the wrong order, or it learns without a
+                ``StepCounter``.
+        """
         self._check_order()
         for key, spec in self._entries(observation_spec).items():
             observation_spec[key] = spec
@@ -100,27 +104,25 @@ class EpisodeTransform(Transform):
         before, after = self._others()
         if any(isinstance(t, StepCounter) for t in after):
             raise ValueError(
-                f"put StepCounter before {type(self).__name__}: it has to see where episodes end"
+                f"put StepCounter before {type(self).__name__}, which has to see where episodes end"
             )
         if self.pays and any(isinstance(t, RewardSum) for t in before):
-            raise ValueError(
-                f"put RewardSum after {type(self).__name__}: it has to see the reward as paid"
-            )
+            raise ValueError(f"put RewardSum after {type(self).__name__}, which changes the reward")
 
     def _check_limit(self, observation_spec: Composite) -> None:
         if not self.learn or not isinstance(self.container, TransformedEnv):
             return
-        # A StepCounter within the workers of a ParallelEnv shows only in what it counts.
+        # A StepCounter within the workers of a ParallelEnv is visible only by the entry it writes.
         entries = [key if isinstance(key, str) else key[-1] for key in observation_spec.keys(True)]
         if "step_count" in entries or any(isinstance(t, StepCounter) for t in self._others()[0]):
             return
         raise ValueError(
             f"{type(self).__name__} learns when episodes end: put StepCounter(50) before it, or "
-            "StepCounter() if the environment has a time limit of its own"
+            "StepCounter() if the environment has its own time limit"
         )
 
     def _others(self) -> tuple[list[nn.Module], list[nn.Module]]:
-        """Return the transforms before this one, those of wrapped environments too, and after."""
+        """Return the transforms before and after this one, also of wrapped environments."""
         env, transforms = self.container, list[nn.Module]()
         while isinstance(env, TransformedEnv):
             transforms = [*_flat(env.transform), *transforms]
@@ -130,21 +132,27 @@ class EpisodeTransform(Transform):
 
 
 class DemonstrationLookup(EpisodeTransform):
-    """Base of the transforms that look a demonstration up in a network that learns from it.
+    """Base of the transforms that look up a demonstration in a network that learns from it.
 
-    1. At reset, what the network says of the episode's demonstration is written; it stays the same
-       until the episode is over.
-    2. When it is over (`done`), and with `learn=True`, the network adapts to the demonstration; the
-       networks of the rows whose episode goes on are left alone.
+    1. At reset, the result of the lookup is written; it stays the same until the episode ends.
+    2. At the end of an episode (``done``), with ``learn=True``, the network adapts to its
+       demonstration. The networks of other rows do not change.
+
+    Called on a TensorDict outside an environment, or in a replay buffer, it only looks up.
 
     Args:
-        network: the network, or one for each row: its `batch_size` is that of the environment, or
-            (if it does not learn here) the first dimensions of it.
-        learn: adapt the network. May be changed at any time; `train()` and `eval()`, which TorchRL
-            calls as it likes, have no influence on it.
-        in_keys: name of the demonstration's embedding.
-        out_keys: entries written.
-        done_key: the `done` that ends an episode.
+        network: One network, or one per row: its ``batch_size`` is the environment's or, if it does
+            not learn here, the leading dimensions of it.
+        learn: Adapt the network. May be changed at any time; unlike ``train()`` and ``eval()``, it
+            is not changed by TorchRL. Set it to False for ``check_env_specs`` if episodes can end
+            within the three steps of the check.
+        in_keys: Key of the demonstration's embedding.
+        out_keys: Entries written.
+        done_key: The ``done`` that ends an episode.
+
+    Raises:
+        ValueError: If the demonstration's embedding is missing, or the network is to learn from an
+            environment of another batch size.
     """
 
     def __init__(
@@ -161,11 +169,11 @@ class DemonstrationLookup(EpisodeTransform):
         self.learn = learn
 
     def look_up(self, embedding: Tensor) -> tuple[Tensor, ...]:
-        """Return the `out_keys` for embeddings `[*B, d]`."""
+        """Return the ``out_keys`` for embeddings ``[*B, d]``."""
         raise NotImplementedError
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Look up the demonstrations of any TensorDict; learns nothing."""
+        """Look up the demonstrations of any TensorDict, without learning."""
         embedding = tensordict.get(self.in_keys[0], None)
         if embedding is None:
             raise missing_key(type(self).__name__, tensordict, self.in_keys)
@@ -188,18 +196,13 @@ class DemonstrationLookup(EpisodeTransform):
         return next_tensordict
 
     def _demonstration_spec(self, observation_spec: Composite) -> TensorSpec:
-        """Spec of the demonstration's embedding.
-
-        Raises:
-            ValueError: if there is none, or the network is to learn from an environment of another
-                batch size.
-        """
+        """Return the spec of the demonstration's embedding, after checking the batch size."""
         demonstration = self._read_spec(observation_spec, self.in_keys[0], "DemonstrationSource")
         if self.learn and observation_spec.shape != self.network.batch_size:
             raise ValueError(
                 f"{type(self.network).__name__} was made for "
-                f"batch_size={tuple(self.network.batch_size)}, but the environment it is to learn "
-                f"from has {tuple(observation_spec.shape)}"
+                f"batch_size={tuple(self.network.batch_size)}, but the environment to learn from "
+                f"has {tuple(observation_spec.shape)}: make both the same"
             )
         return demonstration
 
@@ -213,6 +216,6 @@ def _flat(transform: nn.Module) -> Iterator[nn.Module]:
 
 
 def unbounded(observation_spec: Composite, *shape: int, dtype: torch.dtype) -> Unbounded:
-    """Spec of an entry of shape `[*B, *shape]`."""
+    """Return the spec of an entry of shape ``[*B, *shape]``."""
     size = torch.Size((*observation_spec.shape, *shape))
     return Unbounded(size, device=observation_spec.device, dtype=dtype)

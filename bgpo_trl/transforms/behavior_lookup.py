@@ -1,4 +1,4 @@
-"""Task inference: from a demonstration to the behavior it shows (paper, section III-B and C)."""
+"""Task inference: from a demonstration to its behavior (paper, Sec. III-B and III-C)."""
 
 from __future__ import annotations
 
@@ -14,39 +14,28 @@ from bgpo_trl.transforms._episode import DemonstrationLookup, unbounded
 
 
 class BehaviorLookup(DemonstrationLookup):
-    """Infers the task of an episode with GWR-B: its behavior `b` (Alg. 1).
+    """Infers the task of an episode with GWR-B: its behavior ``b`` (Alg. 1).
 
-    1. At reset, `b = w_c`, the weights of the node that matches the demonstration best, and the
-       node's identity for logging. They stay the same until the episode is over.
-    2. When it is over (`done`), and with `learn=True`, GWR-B adapts to its demonstration; the
-       networks of the rows whose episode goes on are left alone.
+    At reset, ``b = w_c``, the weights of the node that best matches the demonstration. At the end
+    of an episode GWR-B adapts to its demonstration; see `DemonstrationLookup`.
 
-    Algorithm 1 adapts right after it has taken `b`, at the start of the episode. Nobody asks GWR-B
-    anything in between, so every `b` is the same as there. But in TorchRL a reset need not be the
-    start of an episode: `check_env_specs` and collectors reset while they are being made, and an
-    interrupted episode is begun again. GWR-B learns nothing from such; only a check that happens to
-    play an episode to its end, within its three steps, has to be made with `learn = False`.
+    Algorithm 1 adapts at the start of the episode, right after reading ``b``; no lookup happens in
+    between, so every ``b`` is the same. In TorchRL, however, a reset need not start an episode:
+    ``check_env_specs``, collectors on construction and interrupted episodes reset, too.
 
-    Reads `demo_embedding` float32 `[*B, 32]` and `done`; writes `behavior` float32 `[*B, 32]` and
-    `behavior_node` int64 `[*B]`. Called on its own, or in a replay buffer, it only looks up.
-
-    The ablation without GWR-B, in which the demonstration itself is the behavior, has in its place
-    `RenameTransform(["demo_embedding"], ["behavior"], create_copy=True)`.
+    Reads ``demo_embedding`` float32 ``[*B, 32]`` and ``done``; writes ``behavior`` float32 ``[*B,
+    32]`` and, for logging, ``behavior_node`` int64 ``[*B]``. For the ablation without GWR-B, in
+    which the demonstration's embedding is the behavior, replace it by
+    ``RenameTransform(["demo_embedding"], ["behavior"], create_copy=True)``.
 
     Args:
-        gwr: the network, or one for each row: its `batch_size` is that of the environment, or (if
-            it does not learn here) the first dimensions of it.
-        learn: adapt GWR-B. May be changed at any time; `train()` and `eval()`, which TorchRL calls
-            as it likes, have no influence on it.
-        in_keys: name of the demonstration's embedding.
-        out_keys: names for behavior and node.
-        done_key: the `done` that ends an episode.
+        gwr: The ``network`` of `DemonstrationLookup`.
+        learn: Adapt GWR-B; see `DemonstrationLookup`.
+        in_keys: Key of the demonstration's embedding.
+        out_keys: Keys of behavior and node.
+        done_key: The ``done`` that ends an episode.
 
-    Raises:
-        ValueError: if GWR-B is to learn from an environment of another batch size, or no
-            demonstration is there to be looked up.
-
-    Examples:
+    Example:
         >>> from types import SimpleNamespace
         >>> from torchrl.envs import Compose, PendulumEnv, StepCounter, TransformedEnv
         >>> from bgpo_trl.transforms import DemonstrationSource, TaskSchedule
@@ -76,7 +65,7 @@ class BehaviorLookup(DemonstrationLookup):
         return self.network
 
     def look_up(self, embedding: Tensor) -> tuple[Tensor, Tensor]:
-        """Return behavior and node for embeddings `[*B, 32]`."""
+        """Return behavior and node for embeddings ``[*B, 32]``."""
         match = self.gwr.lookup(embedding)
         return match.embedding, match.node
 

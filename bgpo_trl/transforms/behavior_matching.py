@@ -1,4 +1,4 @@
-"""The intrinsic reward for behaving as demonstrated (paper, section III-C)."""
+"""The intrinsic reward for matching the demonstrated behavior (paper, Sec. III-C)."""
 
 from __future__ import annotations
 
@@ -15,37 +15,33 @@ from bgpo_trl.transforms._episode import EpisodeTransform, ending
 
 
 class BehaviorMatchingReward(EpisodeTransform):
-    """Rewards an episode, at its end, for how well it matches the behavior it was to show (Eq. 7).
+    """Rewards an episode, at its end, for how well it matches its behavior ``b`` (Eq. 7).
 
-    1. At reset, the encoder of the LSTM autoencoder reads the first latent `z_0`, from a state of
-       zeros.
-    2. At every step it reads the next latent. Its state travels in the TensorDict, so that no
-       trajectory has to be kept: after the last one, `lae_h` is `phi_g`, the embedding of the
-       generated trajectory.
-    3. On the step with which the episode ends, by success or by time-out, the intrinsic reward is
-       `exp(-||b - phi_g||)`; on all others it is 0.
-    4. The reward becomes extrinsic + beta * intrinsic; the two are also kept by themselves.
+    1. At reset, the encoder of the LSTM autoencoder reads the first latent ``z_0``, from a zero
+       state.
+    2. At every step it reads the next latent. Its state is part of the TensorDict, so no trajectory
+       is stored: after the last latent, ``lae_h`` is ``phi_g``, the embedding of the trajectory.
+    3. The intrinsic reward is ``exp(-||b - phi_g||)`` on the step that ends the episode, by success
+       or by time-out, and 0 on all others. The reward becomes extrinsic + beta * intrinsic.
 
-    It comes after `StepCounter`, which says when an episode times out, and before `RewardSum`,
-    which sums up the three rewards.
+    Put it after ``StepCounter`` and before ``RewardSum``.
 
-    Reads `latent` float32 `[*B, 64]`, `behavior` float32 `[*B, 32]`, `reward` `[*B, 1]`, `done`;
-    writes `lae_h` and `lae_c` float32 `[*B, 32]`, `extrinsic_reward` and `intrinsic_reward`
-    `[*B, 1]`, and `reward` anew. Rewards keep the dtype of `reward`.
+    Reads ``latent`` float32 ``[*B, 64]``, ``behavior`` float32 ``[*B, 32]``, ``reward`` ``[*B, 1]``
+    and ``done``; writes ``lae_h`` and ``lae_c`` float32 ``[*B, 32]``, ``extrinsic_reward``,
+    ``intrinsic_reward`` and ``reward`` ``[*B, 1]``, in the dtype of ``reward``.
 
     Args:
-        lae: the autoencoder, with `step(z [..., 64], h [..., 32], c [..., 32]) -> (h, c)`. No
-            gradient is recorded.
-        beta: weight of the intrinsic reward. With 0 it is still measured (the ablation without it).
-        in_keys: names of latent, behavior and reward.
-        out_keys: names for the two halves of the LSTM's state and the two parts of the reward.
-        done_key: the `done` that ends an episode.
+        lae: The autoencoder; called without gradient.
+        beta: Weight of the intrinsic reward, which is measured even if 0.
+        in_keys: Keys of latent, behavior and reward.
+        out_keys: Keys of the two parts of the LSTM's state and of the two parts of the reward.
+        done_key: The ``done`` that ends an episode.
 
     Raises:
-        ValueError: if beta is negative, or latents, behaviors or rewards are not there, or of other
-            sizes than the encoder's.
+        ValueError: If beta is negative, or latents, behaviors or rewards are missing or of another
+            size than the encoder's.
 
-    Examples:
+    Example:
         >>> from types import SimpleNamespace
         >>> from torchrl.envs import Compose, PendulumEnv, RenameTransform, StepCounter
         >>> from torchrl.envs import TransformedEnv, UnsqueezeTransform
@@ -87,7 +83,7 @@ class BehaviorMatchingReward(EpisodeTransform):
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        # phi_g is compared with the behavior, so they are of one size.
+        # The state has the size of phi_g, and so of the behavior.
         zeros = torch.zeros_like(tensordict_reset[self.in_keys[1]])
         self._read(tensordict_reset[self.in_keys[0]], zeros, zeros, tensordict_reset)
         return tensordict_reset
@@ -118,15 +114,15 @@ class BehaviorMatchingReward(EpisodeTransform):
         if sizes != (self.lae.latent_size, self.lae.embedding_size):
             raise ValueError(
                 f"latents and behaviors have sizes {sizes}, but the sequence encoder was made for "
-                f"{self.lae.latent_size} and {self.lae.embedding_size}: use those trained together"
+                f"{self.lae.latent_size} and {self.lae.embedding_size}: use a pair trained together"
             )
         return {key: behavior.clone() for key in self.out_keys[:2]}
 
     def transform_reward_spec(self, reward_spec: Composite) -> Composite:
-        """Add the parts of the reward; the sum can be larger than what the environment pays."""
+        """Add the parts of the reward and unbound their sum."""
         reward_key = self.in_keys[2]
         if reward_key not in reward_spec.keys(True, True):
-            raise ValueError(f"the environment has no reward {reward_key!r}: name it in in_keys")
+            raise ValueError(f"the environment has no {reward_key!r}: give its reward in in_keys")
         extrinsic = reward_spec[reward_key]
         like = {"shape": extrinsic.shape, "device": extrinsic.device, "dtype": extrinsic.dtype}
         reward_spec[self.out_keys[2]] = extrinsic.clone()

@@ -1,4 +1,4 @@
-"""Which task and which demonstration an episode starts with."""
+"""Task schedule, and draws of task and demonstration at the start of an episode."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from bgpo_trl.transforms._episode import EpisodeTransform, ending, starting, unb
 
 @dataclass(frozen=True)
 class TaskSchedule:
-    """When tasks are presented: the only difference between concurrent and continual learning.
+    """Times at which tasks are presented: the difference between concurrent and continual learning.
 
-    The defaults are the paper's continual experiment (section IV-C); its concurrent one (section
-    IV-B) is `TaskSchedule(starts=(0, 0, 0))`.
+    The defaults are the paper's continual experiment (Sec. IV-C); the concurrent one (Sec. IV-B) is
+    ``TaskSchedule(starts=(0, 0, 0))``.
 
     Attributes:
-        starts: for each task, the number of episodes after which it is presented.
-        cumulative: a presented task stays available. If False, only the newest ones are.
+        starts: For each task, the number of episodes after which it is presented.
+        cumulative: Whether presented tasks stay available; otherwise only the newest ones are.
 
     Raises:
-        ValueError: if no task is available from the start, or a start is negative.
+        ValueError: If no task is available from the start, or a start is negative.
 
-    Examples:
+    Example:
         >>> TaskSchedule().available(torch.tensor([0, 6_999, 7_000, 13_000]))
         tensor([[ True, False, False],
                 [ True, False, False],
@@ -48,7 +48,7 @@ class TaskSchedule:
     def __post_init__(self) -> None:
         if not self.starts or min(self.starts) != 0:
             raise ValueError(
-                f"starts must hold a 0, for a task to start with, and nothing below: {self.starts}"
+                f"starts must hold a 0, for the first task, and nothing below: {self.starts}"
             )
         if not all(isinstance(start, Integral) for start in self.starts):
             raise ValueError(f"starts must be whole numbers of episodes: {self.starts}")
@@ -59,13 +59,10 @@ class TaskSchedule:
         return len(self.starts)
 
     def available(self, episode: Tensor) -> Tensor:
-        """Tell which tasks an episode may be about.
+        """Return the tasks that may be drawn for an episode, bool ``[*B, n_tasks]``.
 
         Args:
-            episode: episodes that went before, int64 `[*B]`.
-
-        Returns:
-            bool `[*B, n_tasks]`.
+            episode: Number of earlier episodes, int64 ``[*B]``.
         """
         presented = self.presented(episode + 1)
         if self.cumulative:
@@ -75,82 +72,74 @@ class TaskSchedule:
         return starts == newest
 
     def presented(self, episodes: Tensor) -> Tensor:
-        """Tell which tasks any of the episodes so far could have been about.
+        """Return the tasks that were available in any episode so far, bool ``[*B, n_tasks]``.
 
         Args:
-            episodes: number of episodes so far, int64 `[*B]`.
-
-        Returns:
-            bool `[*B, n_tasks]`.
+            episodes: Number of episodes so far, int64 ``[*B]``.
         """
         return torch.tensor(self.starts, device=episodes.device) < episodes.unsqueeze(-1)
 
 
 class Bank(Protocol):
-    """Embedded demonstrations, as `bgpo_trl.data.recording.DemonstrationBank` holds them."""
+    """Embedded demonstrations, such as `DemonstrationBank`."""
 
     @property
     def embedding(self) -> Tensor:
-        """The embeddings phi_d, float32 `[N, 32]`."""
+        """The embeddings phi_d, float32 ``[N, 32]``."""
         ...
 
     @property
     def task(self) -> Tensor:
-        """The task that each is a demonstration of, int64 `[N]`."""
+        """The task of each demonstration, int64 ``[N]``."""
         ...
 
 
 class DemonstrationSource(EpisodeTransform):
     """Draws the task and the demonstration of each episode (Alg. 1, "Sample demonstration d").
 
-    1. At reset, before the environment itself is reset, each row whose episode starts gets one of
-       the tasks that the schedule has presented to it so far, and one of the demonstrations of that
-       task, both uniformly. The environment finds the task in the TensorDict it is reset with, and
-       so knows what to reward.
-    2. After it, task, embedding and index of the demonstration are in the observation; they stay
-       the same until the episode is over.
-    3. When it is over (`done`), the row's `episode` counts one more.
+    1. Before the environment is reset, each row whose episode starts gets one of the tasks
+       available to it, and one demonstration of that task, both drawn uniformly. The environment
+       reads the task from the TensorDict of the reset.
+    2. Task, embedding and index of the demonstration stay in the observation until the episode
+       ends.
+    3. When it ends (``done``), the row's ``episode`` count increases by 1.
 
-    Rows (seeds) share nothing: each has its own count and its own stream of draws, so that it
-    follows the same episodes alone as in any batch. A draw depends on nothing but the stream and
-    the count. So an episode that is not played to its end leaves no trace, be it the one that
-    `check_env_specs` or a `Collector` starts on construction, or one that an interruption cut
-    short: it starts again with the same demonstration. And to resume, `state_dict` (streams and
-    counts) is all there is to restore.
+    Each row (seed) has its own count and its own random stream, and so the same episodes alone as
+    in any batch. A draw depends only on stream and count: an episode that is not played to its end
+    (started by ``check_env_specs`` or a ``Collector`` on construction, or interrupted) starts again
+    with the same demonstration, and ``state_dict`` (streams and counts) suffices to resume.
 
-    Reads `done`; writes `task` int64 `[*B]`, `demo_embedding` float32 `[*B, 32]`, `demo_index`
-    int64 `[*B]` (position in the bank). An environment that is itself made of transformed
-    environments must have `task` in its `state_spec`, or it never sees it.
+    Reads ``done``; writes ``task`` int64 ``[*B]``, ``demo_embedding`` float32 ``[*B, 32]`` and
+    ``demo_index`` int64 ``[*B]`` (position in the bank). An environment that is made of transformed
+    environments must have ``task`` in its ``state_spec``, in order to read it.
 
     Args:
-        bank: the demonstrations, with tensors `embedding` `[N, 32]` and `task` `[N]`.
-        schedule: what is presented when: a `TaskSchedule`, or anything with its `n_tasks` and
-            `available`.
-        batch_size: batch size of the environment; `()` for a single one.
-        generator: source of the streams, one for all rows or a sequence with one a row. It is only
-            read here. None: torch's default generator.
-        follow: draw from what this other source has presented by now, rather than by the own count:
-            evaluation tests on the tasks of training with demonstrations of its own. Its batch
-            size must be the first dimensions of this one's.
-        out_keys: names for task, embedding and index.
-        done_key: the `done` that ends an episode.
+        bank: The demonstrations.
+        schedule: A `TaskSchedule`, or any object with its ``n_tasks`` and ``available``.
+        batch_size: Batch size of the environment; ``()`` is a single one.
+        generator: Source of the streams, one for all rows or one per row, used only on
+            construction; None: torch's default generator.
+        follow: Source whose ``episode`` count determines the available tasks, in place of the own
+            one: evaluation follows training. Its batch size is the leading dimensions of this
+            one's.
+        out_keys: Keys of task, embedding and index.
+        done_key: The ``done`` that ends an episode.
 
     Raises:
-        ValueError: for a bank of wrong shapes or without demonstrations of a task, a wrong number
-            of generators, an environment of another batch size or one that does not take the task.
+        ValueError: If the bank has wrong shapes or no demonstration of a task, the number of
+            generators is wrong, or the environment has another batch size or ignores the task.
 
-    Examples:
+    Example:
         >>> from types import SimpleNamespace
         >>> from torchrl.envs import Compose, PendulumEnv, StepCounter, TransformedEnv
         >>> bank = SimpleNamespace(embedding=torch.rand(6, 32), task=torch.arange(6) % 3)
         >>> source = DemonstrationSource(bank, TaskSchedule(starts=(0, 2, 4)))
         >>> env = TransformedEnv(PendulumEnv(), Compose(StepCounter(50), source))
-        >>> for _ in range(2):
-        ...     data = env.rollout(50)
+        >>> data = env.rollout(50)
         >>> data["demo_embedding"].shape, data["task"].unique()
         (torch.Size([50, 32]), tensor([0]))
         >>> source.episode
-        tensor(2)
+        tensor(1)
     """
 
     episode: Tensor
@@ -182,11 +171,11 @@ class DemonstrationSource(EpisodeTransform):
             raise ValueError("the bank holds NaN or Inf: embed the demonstrations anew")
         tasks = bank.task.cpu().numpy()
         self._demonstrations = [np.flatnonzero(tasks == t) for t in range(schedule.n_tasks)]
-        missing = [t for t, found in enumerate(self._demonstrations) if not len(found)]
+        missing = [t for t, rows in enumerate(self._demonstrations) if not len(rows)]
         if missing:
             raise ValueError(
                 f"the bank has no demonstration of task {missing[0]} of the schedule: record some, "
-                f"or let the schedule have fewer than {schedule.n_tasks} tasks"
+                f"or use a schedule of fewer than {schedule.n_tasks} tasks"
             )
         generators = generator if isinstance(generator, Sequence) else [generator] * n_rows
         if len(generators) != n_rows:
@@ -197,7 +186,9 @@ class DemonstrationSource(EpisodeTransform):
                 f"{tuple(follow.episode.shape)}"
             )
         self.schedule = schedule
-        self._follow = [] if follow is None else [follow]  # a list, as it is no part of this module
+        self._follow = (
+            [] if follow is None else [follow]
+        )  # a list, so that it is not registered as a submodule
         streams = [
             torch.randint(2**63 - 1, (), generator=g, device=None if g is None else g.device)
             for g in generators
@@ -217,7 +208,7 @@ class DemonstrationSource(EpisodeTransform):
         drawn = []
         for tasks, stream, episode in zip(available, streams, episodes, strict=True):
             rng = np.random.default_rng((stream, episode))
-            choices = [found for t, found in zip(tasks, self._demonstrations, strict=True) if t]
+            choices = [some for t, some in zip(tasks, self._demonstrations, strict=True) if t]
             demonstrations = choices[rng.integers(len(choices))]
             drawn.append(int(demonstrations[rng.integers(len(demonstrations))]))
         self._demo_index[rows] = torch.tensor(drawn, dtype=torch.int64, device=rows.device)

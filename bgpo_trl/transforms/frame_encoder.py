@@ -1,4 +1,4 @@
-"""Frames of the environment to latent vectors (paper, section III-A)."""
+"""Encoding of frames as latents (paper, Sec. III-A)."""
 
 from __future__ import annotations
 
@@ -15,31 +15,28 @@ from bgpo_trl.transforms._episode import starting, unbounded
 
 
 class FrameEncoder(Transform):
-    """Encodes every frame with a frozen encoder, `z = f_V(s)` (Alg. 1).
+    """Encodes every frame with a frozen encoder, ``z = f_V(s)`` (Alg. 1), without gradient.
 
-    1. At reset, the frames of the rows that are being reset are encoded, and no others: with one
-       environment a seed, episodes end one at a time and the encoder is what costs most.
-    2. At every step, all new frames are encoded, the last ones of an episode included.
-    3. With `del_keys`, the frames are then dropped, so that neither a replay buffer nor a rollout
-       stores them.
+    1. At reset, only the frames of the rows that are reset are encoded: with one environment per
+       seed, episodes end one at a time, and the encoder is the most expensive part.
+    2. At every step, all frames are encoded, including the last ones of an episode.
+    3. With ``del_keys``, the frames are then dropped, so that no replay buffer or rollout stores
+       them.
 
-    No gradient is recorded; the encoder's parameters are left as they are. It also works on its own
-    or in a replay buffer, on any TensorDict with frames.
-
-    Reads the `in_keys`, uint8 `[*B, 32, 64, 3]`; writes the `out_keys`, float32 `[*B, 64]`.
+    It also works in a replay buffer or on any TensorDict with frames. Reads the ``in_keys``, uint8
+    ``[*B, 32, 64, 3]``; writes the ``out_keys``, float32 ``[*B, 64]``.
 
     Args:
-        vae: the encoder, with `latent(frames [..., 32, 64, 3]) -> latents [..., 64]`.
-        in_keys: the frames.
-        out_keys: their latents, one for each of the `in_keys`.
-        del_keys: drop the frames once they are encoded.
-        done_key: the `done` whose sibling `_reset` tells which rows are being reset.
+        vae: The encoder; only its ``latent`` is called.
+        in_keys: Keys of the frames.
+        out_keys: Keys of the latents, one for each of ``in_keys``.
+        del_keys: Drop the frames once they are encoded.
+        done_key: The ``done`` whose sibling ``_reset`` selects the rows to reset.
 
     Raises:
-        ValueError: if `in_keys` and `out_keys` differ in number, or the environment has no such
-            frames.
+        ValueError: If the numbers of ``in_keys`` and ``out_keys`` differ, or frames are missing.
 
-    Examples:
+    Example:
         >>> from tensordict import TensorDict
         >>> encoder = FrameEncoder(VAE(), del_keys=True)
         >>> frames = torch.zeros(5, 32, 64, 3, dtype=torch.uint8)
@@ -69,7 +66,7 @@ class FrameEncoder(Transform):
 
     @torch.no_grad()
     def _apply_transform(self, obs: Tensor) -> Tensor:
-        # Simulations are on the CPU, wherever the encoder is.
+        # Simulations are on the CPU, even if the encoder is not.
         device = next((weights.device for weights in self.vae.parameters()), obs.device)
         return self.vae.latent(obs.to(device)).to(obs.device)
 
@@ -93,7 +90,7 @@ class FrameEncoder(Transform):
             return self.forward(tensordict_reset)
         for in_key, out_key in zip(self.in_keys, self.out_keys, strict=True):
             latent = self._apply_transform(tensordict_reset[in_key][rows])
-            # What is in the other rows does not matter: the environment keeps theirs.
+            # Values of the other rows do not matter: the environment ignores them.
             every = latent.new_zeros(*rows.shape, latent.shape[-1])
             every[rows] = latent
             tensordict_reset.set(out_key, every)
@@ -105,7 +102,7 @@ class FrameEncoder(Transform):
         return tensordict
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Add the latents and, with `del_keys`, drops the frames."""
+        """Add the latents and, with ``del_keys``, drop the frames."""
         for in_key, out_key in zip(self.in_keys, self.out_keys, strict=True):
             if in_key not in observation_spec.keys(True, True):
                 raise _no_frames(in_key)
@@ -120,6 +117,6 @@ class FrameEncoder(Transform):
 
 def _no_frames(key: NestedKey) -> ValueError:
     return ValueError(
-        f"FrameEncoder found no {key!r} in the environment: have it render, or name its frames in "
-        "in_keys"
+        f"FrameEncoder found no {key!r} in the environment: observe pixels, or give the key of its "
+        "frames in in_keys"
     )

@@ -1,4 +1,4 @@
-"""The group of behaviors that a demonstration belongs to."""
+"""Group inference: from a demonstration to its group of behaviors."""
 
 from __future__ import annotations
 
@@ -14,30 +14,22 @@ from bgpo_trl.transforms._episode import DemonstrationLookup, unbounded
 
 
 class GroupLookup(DemonstrationLookup):
-    """Finds the group of an episode's demonstration, by which experts and replay are chosen.
+    """Finds the group of an episode's demonstration, which selects the expert and the replay.
 
-    1. At reset, the number of the group, and the activity of the best match; below the activity
-       threshold of the groups, the demonstration is of none that is known. Both stay the same until
-       the episode is over.
-    2. When it is over (`done`), and with `learn=True`, the groups adapt to its demonstration, for
-       the reason that `BehaviorLookup` gives.
+    See `DemonstrationLookup` for when it looks up and learns. With an activity below the groups'
+    threshold, the demonstration belongs to no known group.
 
-    Reads `demo_embedding` float32 `[*B, 32]` and `done`; writes `group` int64 `[*B]` and
-    `group_activity` float32 `[*B]`. Called on its own, it only looks up.
+    Reads ``demo_embedding`` float32 ``[*B, 32]`` and ``done``; writes ``group`` int64 ``[*B]`` and
+    ``group_activity`` float32 ``[*B]``, the activity of the best match.
 
     Args:
-        groups: the groups, or a set of them for each row: its `batch_size` is that of the
-            environment, or (if it does not learn here) the first dimensions of it.
-        learn: adapt the groups; see `DemonstrationLookup`.
-        in_keys: name of the demonstration's embedding.
-        out_keys: names for group and activity.
-        done_key: the `done` that ends an episode.
+        groups: The ``network`` of `DemonstrationLookup`.
+        learn: Adapt the groups.
+        in_keys: Key of the demonstration's embedding.
+        out_keys: Keys of group and activity.
+        done_key: The ``done`` that ends an episode.
 
-    Raises:
-        ValueError: if the groups are to learn from an environment of another batch size, or no
-            demonstration is there to be looked up.
-
-    Examples:
+    Example:
         >>> from types import SimpleNamespace
         >>> from torchrl.envs import Compose, PendulumEnv, StepCounter, TransformedEnv
         >>> from bgpo_trl.transforms import DemonstrationSource, TaskSchedule
@@ -66,7 +58,7 @@ class GroupLookup(DemonstrationLookup):
         return self.network
 
     def look_up(self, embedding: Tensor) -> tuple[Tensor, Tensor]:
-        """Return group and activity for embeddings `[*B, 32]`."""
+        """Return group and activity for embeddings ``[*B, 32]``."""
         match = self.groups.lookup(embedding)
         return match.group, match.activity
 

@@ -20,6 +20,11 @@ CONTROL_TIMESTEP = 0.2  # (s)
 TIME_LIMIT = 10.0  # (s), the paper's 50 steps
 STATE_SIZE = 16
 
+# Mean and spread, over demonstrations, of the state: joints (rad), grip, object positions (m).
+STATE_CENTER = (0.3, 0.9, 0.9, 0.45, 0.36, 0, 0.68, 0.4, 0.12, 0.655, 0.45, -0.05, 0.645)
+STATE_CENTER += (0.41, -0.21, 0.645)
+STATE_SCALE = (0.35, 0.25, 0.35, 0.3, 0.06, 0.15, 0.05, *(0.03, 0.05, 0.02) * 3)
+
 # Change of the joint targets at |action| = 1 (rad): three arm joints, then the hand.
 ACTION_SCALE = np.array([0.2, 0.2, 0.2, 0.4])
 
