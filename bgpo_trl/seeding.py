@@ -41,7 +41,8 @@ def normal(generators: Sequence[torch.Generator], shape: Sequence[int]) -> Tenso
 
 def random_state(random: np.random.RandomState) -> dict[str, Any]:
     """Return the state of NumPy's generator in a form that checkpoints can hold."""
-    _, key, position, has_gauss, gauss = random.get_state()
+    state: Any = random.get_state()  # a tuple, which its annotation does not say
+    _, key, position, has_gauss, gauss = state
     return {
         "key": torch.from_numpy(key.astype(np.int64)),
         "position": int(position),

@@ -11,7 +11,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from bgpo_trl.algorithms import ALGORITHMS
-from bgpo_trl.algorithms.rl import RL, Learner, Problem, RLEntry
+from bgpo_trl.algorithms.learner import Learner
+from bgpo_trl.algorithms.rl import RL, LearnerSpec, RLEntry
 from bgpo_trl.configs import DDPGConfig, RunConfig
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.modules.actor_critic import Actor
@@ -42,10 +43,10 @@ class AWACConfig(DDPGConfig):
     name: str = "awac"
 
 
-def make(config: AWACConfig, problem: Problem) -> Learner:
+def make(config: AWACConfig, spec: LearnerSpec) -> Learner:
     """Return a learner with DDPG's networks, exploration and optimizer."""
-    actor, options = problem.actor(Actor, config), problem.loss_options(config)
-    loss = AdvantageWeightedLoss(actor, problem.critic(config), **options)
+    actor, options = spec.actor(Actor, config), spec.loss_options(config)
+    loss = AdvantageWeightedLoss(actor, spec.critic(config), **options)
     return Learner(actor, loss, config, noise=config.noise)
 
 

@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from bgpo_trl.algorithms import ALGORITHMS
-from bgpo_trl.algorithms.rl import RL, Problem, RLEntry, TD3Learner, make_td3
+from bgpo_trl.algorithms.learner import TD3Learner
+from bgpo_trl.algorithms.rl import RL, LearnerSpec, RLEntry, make_td3
 from bgpo_trl.configs import RunConfig, TD3Config
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.training import Trainer
@@ -40,9 +41,9 @@ class EpsilonLearner(TD3Learner):
         return action
 
 
-def make(config: EpsilonConfig, problem: Problem) -> EpsilonLearner:
+def make(config: EpsilonConfig, spec: LearnerSpec) -> EpsilonLearner:
     """Return a learner with the networks and the loss of TD3."""
-    td3 = make_td3(config, problem)
+    td3 = make_td3(config, spec)
     return EpsilonLearner(td3.actor, td3.loss, config)
 
 

@@ -12,9 +12,10 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 
+from bgpo_trl.algorithms.learner import Learner
 from bgpo_trl.algorithms.policy import Policy
-from bgpo_trl.algorithms.rl import Learner
-from bgpo_trl.configs import AlgorithmConfig
+from bgpo_trl.algorithms.rl import LearnerSpec
+from bgpo_trl.configs import AlgorithmConfig, DistNLLConfig, MAMLConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.demonstration_replay import DemonstrationReplay
 from bgpo_trl.data.group_replay import GroupReplay
@@ -125,6 +126,43 @@ class Algorithm(ABC):
     def policy(self, parameters: dict[str, Tensor], context: Tensor | None = None) -> Policy:
         """Return a policy of `test_actor` with these parameters and this context."""
         return Policy(self.test_actor, self.config.state, parameters, context)
+
+    def task_spec(self, config: AlgorithmConfig, seeds: Sequence[int]) -> LearnerSpec:
+        """Return the spec of networks ``[S, T]`` that read the state, one per task.
+
+        Args:
+            config: Hyperparameters.
+            seeds: The seeds.
+        """
+        return LearnerSpec(
+            seeds=seeds,
+            in_keys=[config.state],
+            in_features=self.state_size,
+            return_bounds=(0.0, 1.0),
+            device=self.device,
+            experts=range(self.n_tasks),
+        )
+
+    def task_replay(
+        self, config: MAMLConfig | DistNLLConfig, bank: DemonstrationBank, seeds: Sequence[int]
+    ) -> TaskReplay:
+        """Return an empty replay of each task.
+
+        Args:
+            config: Hyperparameters.
+            bank: The demonstrations of training episodes.
+            seeds: The seeds.
+        """
+        keys = [config.state, "action"]
+        return TaskReplay(
+            config.rl.replay_size,
+            n_tasks=self.n_tasks,
+            batch_size=config.task_batch_size,
+            generator=generators(seeds, "replay"),
+            demonstrations=self.demonstrations(config, bank, seeds),
+            demonstration_share=config.demonstration_share,
+            keys=[*keys, *(("next", key) for key in (config.state, "reward", "terminated"))],
+        )
 
     def demonstrations(
         self,

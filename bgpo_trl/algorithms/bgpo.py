@@ -16,7 +16,7 @@ from bgpo_trl.algorithms.algorithm import Algorithm
 from bgpo_trl.algorithms.environments import VARIANTS
 from bgpo_trl.algorithms.experts import ActiveGroups, Experts
 from bgpo_trl.algorithms.policy import Policy
-from bgpo_trl.algorithms.rl import Problem, make_learner
+from bgpo_trl.algorithms.rl import LearnerSpec, make_learner
 from bgpo_trl.configs import BGPOConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.demonstration_replay import DemonstrationReplay
@@ -91,7 +91,7 @@ class BGPO(Algorithm):
         n_slots = config.active_groups if config.grouped else 1
         self.learner = make_learner(
             rl,
-            Problem(
+            LearnerSpec(
                 seeds=seeds,
                 in_keys=keys,
                 in_features=self.state_size + sizes[variant.context],

@@ -6,7 +6,6 @@ Unlike BGPO, it knows the task label in training and tests.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import chain
 from typing import Any
 
 import torch
@@ -18,16 +17,14 @@ from torchrl.envs import EnvBase, TransformedEnv
 from bgpo_trl.algorithms.algorithm import Algorithm, networks_of
 from bgpo_trl.algorithms.environments import no_context_env
 from bgpo_trl.algorithms.policy import Policy
-from bgpo_trl.algorithms.rl import Learner
+from bgpo_trl.algorithms.rl import make_ddpg
 from bgpo_trl.configs import DistNLLConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.task_replay import TaskReplay
 from bgpo_trl.encoders.representation import Representation
-from bgpo_trl.modules.actor_critic import Actor, Critic
 from bgpo_trl.modules.multi_head_actor import MultiHeadActor
-from bgpo_trl.objectives.ddpg import DDPGLoss
 from bgpo_trl.objectives.distillation import DistillationLoss
-from bgpo_trl.seeding import generators, task_generators
+from bgpo_trl.seeding import generators
 from bgpo_trl.transforms import DemonstrationSource
 
 
@@ -69,52 +66,18 @@ class DistNLL(Algorithm):
         device: torch.device | str = "cpu",
     ) -> None:
         super().__init__(config, seeds=seeds, bank=bank, encoders=encoders, device=device)
-        ddpg = config.rl
-        self._network = {"in_keys": [config.state], "hidden_sizes": ddpg.hidden_sizes}
-        every = [self.n_seeds, self.n_tasks]
-        self.teacher = Actor(
-            self.state_size,
-            batch_size=every,
-            generator=[*chain(*task_generators(seeds, self.n_tasks, "actor"))],
-            **self._network,
-        )
-        self.critic = Critic(
-            self.state_size,
-            layer_norm=ddpg.critic_layer_norm,
-            batch_size=every,
-            generator=[*chain(*task_generators(seeds, self.n_tasks, "critic"))],
-            **self._network,
-        )
-        self.loss = DDPGLoss(
-            self.teacher.to(self.device),
-            self.critic.to(self.device),
-            return_bounds=(0.0, 1.0) if ddpg.clip_targets else None,
-            pre_tanh_penalty=ddpg.pre_tanh_penalty,
-        )
-        self.learner = Learner(self.teacher, self.loss, ddpg, noise=ddpg.noise)
-        # Called with the parameters of teachers: one per seed to act, several of a seed to distill.
-        self._acting, *self._teaching = (
-            Actor(self.state_size, batch_size=[n], **self._network).to(self.device)
-            for n in (self.n_seeds, *range(1, self.n_tasks + 1))
-        )
-        self.replay = TaskReplay(
-            ddpg.replay_size,
-            n_tasks=self.n_tasks,
-            batch_size=config.task_batch_size,
-            generator=generators(seeds, "replay"),
-            demonstrations=self.demonstrations(config, bank, seeds),
-            demonstration_share=config.demonstration_share,
-            keys=[
-                *(config.state, "action"),
-                *(("next", key) for key in (config.state, "reward", "terminated")),
-            ],
-        )
+        spec = self.task_spec(config, seeds)
+        self.learner = make_ddpg(config.rl, spec)
+        self.loss, self.teacher = self.learner.loss, self.learner.actor
+        self.critic = self.loss.value_network
+        self.replay = self.task_replay(config, bank, seeds)
         self._make_students(seeds)
 
     def _make_students(self, seeds: Sequence[int]) -> None:
         streams = generators(seeds, "student")
+        network = {"in_keys": [self.config.state], "hidden_sizes": self.config.rl.hidden_sizes}
         self.students = [
-            MultiHeadActor(self.state_size, generator=stream, **self._network).to(self.device)
+            MultiHeadActor(self.state_size, generator=stream, **network).to(self.device)
             for stream in streams
         ]
         # By seed: the task of each head, in order of appearance.
@@ -127,9 +90,9 @@ class DistNLL(Algorithm):
         ]
         self._ended = torch.zeros(self.n_seeds, dtype=torch.bool)
         # Called with the parameters of a `Policy`.
-        self.test_actor = MultiHeadActor(
-            self.state_size, batch_size=[self.n_seeds], **self._network
-        ).to(self.device)
+        self.test_actor = MultiHeadActor(self.state_size, batch_size=[self.n_seeds], **network).to(
+            self.device
+        )
         for _ in range(self.n_tasks):
             self.test_actor.add_head()
 
@@ -144,7 +107,7 @@ class DistNLL(Algorithm):
         teachers = networks_of(
             self.loss.actor_network_params, torch.arange(self.n_seeds), tensordict["task"]
         )
-        functional_call(self._acting, teachers, (seen,))
+        functional_call(self.teacher, teachers, (seen,))
         return tensordict.set("action", self.learner.explore(seen["action"], self._noise))
 
     def store(self, transition: TensorDictBase) -> None:
@@ -180,7 +143,7 @@ class DistNLL(Algorithm):
         )
         with torch.no_grad():
             shown = batch.copy()
-            functional_call(self._teaching[len(tasks) - 1], teachers, (shown,))
+            functional_call(self.teacher, teachers, (shown,))
         batch.set("teacher_action", shown["action"])
         for part in batch.split(self.config.distillation_batch_size, dim=1):
             loss = self._distillation[index](part)["loss_distillation"]

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bgpo_trl.algorithms.rl import Learner
+from bgpo_trl.algorithms.learner import Learner
 
 __all__ = ["ActiveGroups", "Experts"]
 

@@ -6,7 +6,6 @@ Unlike BGPO, it knows the task label in training and tests, by which it selects 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import chain
 
 import torch
 from tensordict import TensorDictBase
@@ -16,15 +15,15 @@ from torchrl.envs import EnvBase, TransformedEnv
 
 from bgpo_trl.algorithms.algorithm import Algorithm, networks_of
 from bgpo_trl.algorithms.environments import no_context_env
+from bgpo_trl.algorithms.learner import Learner
 from bgpo_trl.algorithms.policy import Policy
-from bgpo_trl.algorithms.rl import Learner
 from bgpo_trl.configs import MAMLConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.task_replay import TaskReplay
 from bgpo_trl.encoders.representation import Representation
-from bgpo_trl.modules.actor_critic import Actor, Critic
+from bgpo_trl.modules.actor_critic import Actor
 from bgpo_trl.objectives.maml import MAMLLoss
-from bgpo_trl.seeding import generators, task_generators
+from bgpo_trl.seeding import generators
 from bgpo_trl.transforms import DemonstrationSource
 
 
@@ -65,42 +64,26 @@ class MAML(Algorithm):
     ) -> None:
         super().__init__(config, seeds=seeds, bank=bank, encoders=encoders, device=device)
         ddpg = config.rl
-        network = {"in_keys": [config.state], "hidden_sizes": ddpg.hidden_sizes}
-        each, every = [self.n_seeds], [self.n_seeds, self.n_tasks]
+        spec = self.task_spec(config, seeds)
         self.meta_actor = Actor(
-            self.state_size, batch_size=each, generator=generators(seeds, "actor"), **network
-        )
-        self.critic = Critic(
             self.state_size,
-            layer_norm=ddpg.critic_layer_norm,
-            batch_size=every,
-            generator=[*chain(*task_generators(seeds, self.n_tasks, "critic"))],
-            **network,
-        )
-        # Called with the parameters of adapted policies.
-        self._acting = Actor(self.state_size, batch_size=each, **network).to(self.device)
-        self.test_actor = Actor(self.state_size, batch_size=every, **network).to(self.device)
+            batch_size=[self.n_seeds],
+            generator=generators(seeds, "actor"),
+            in_keys=spec.in_keys,
+            hidden_sizes=ddpg.hidden_sizes,
+        ).to(self.device)
+        self.critic = spec.critic(ddpg)
         self.loss = MAMLLoss(
-            self.meta_actor.to(self.device),
-            self.test_actor,
-            self.critic.to(self.device),
+            self.meta_actor,
+            spec.actor(Actor, ddpg),
+            self.critic,
             inner_learning_rate=config.inner_learning_rate,
-            return_bounds=(0.0, 1.0) if ddpg.clip_targets else None,
             pre_tanh_penalty=ddpg.pre_tanh_penalty,
+            **spec.loss_options(ddpg),
         )
+        self.test_actor = self.meta_actor  # called with adapted parameters
         self.learner = Learner(self.meta_actor, self.loss, ddpg, noise=ddpg.noise)
-        self.replay = TaskReplay(
-            ddpg.replay_size,
-            n_tasks=self.n_tasks,
-            batch_size=config.task_batch_size,
-            generator=generators(seeds, "replay"),
-            demonstrations=self.demonstrations(config, bank, seeds),
-            demonstration_share=config.demonstration_share,
-            keys=[
-                *(config.state, "action"),
-                *(("next", key) for key in (config.state, "reward", "terminated")),
-            ],
-        )
+        self.replay = self.task_replay(config, bank, seeds)
 
     def make_env(self, base_env: EnvBase, source: DemonstrationSource) -> TransformedEnv:
         """Return an environment without context."""
@@ -113,7 +96,7 @@ class MAML(Algorithm):
         adapted = networks_of(
             self.loss.actor_network_params, torch.arange(self.n_seeds), tensordict["task"]
         )
-        functional_call(self._acting, adapted, (seen,))
+        functional_call(self.meta_actor, adapted, (seen,))
         return tensordict.set("action", self.learner.explore(seen["action"], self._noise))
 
     def store(self, transition: TensorDictBase) -> None:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 
 from bgpo_trl.algorithms.experts import ActiveGroups, Experts
-from bgpo_trl.algorithms.rl import RL, Problem, make_learner
+from bgpo_trl.algorithms.rl import RL, LearnerSpec, make_learner
 
 every_rl = pytest.mark.parametrize("name", RL)
 SEEDS = (3, 8)
@@ -58,8 +58,8 @@ def test_the_groups_played_last_are_active(n_slots, played, n_rows, restored):
 
 def make(name="ddpg", n_slots=2, seeds=SEEDS):
     config = replace(RL[name].config, hidden_sizes=(8,))
-    problem = Problem(seeds, ["state"], 6, (0.0, 1.1), torch.device("cpu"), experts=range(n_slots))
-    learner = make_learner(config, problem)
+    spec = LearnerSpec(seeds, ["state"], 6, (0.0, 1.1), torch.device("cpu"), experts=range(n_slots))
+    learner = make_learner(config, spec)
     return Experts(learner, ActiveGroups(len(seeds), n_slots), lambda seed, group: PARENTS[group])
 
 

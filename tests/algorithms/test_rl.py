@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.bgpo import BGPO
 from bgpo_trl.algorithms.policy import Policy
-from bgpo_trl.algorithms.rl import RL, Problem, RLEntry, make_ddpg, make_learner
+from bgpo_trl.algorithms.rl import RL, LearnerSpec, RLEntry, make_ddpg, make_learner
 from bgpo_trl.configs import DDPGConfig, RLConfig, TD3Config
 from bgpo_trl.seeding import generators
 
@@ -21,8 +21,8 @@ SEEDS = (3, 8)
 
 def make(name, seeds=SEEDS, experts=(0,), **changes):
     config = replace(RL[name].config, hidden_sizes=(16,), **changes)
-    problem = Problem(seeds, ["state", "label"], 6 + 2, (0.0, 1.3), torch.device("cpu"), experts)
-    return make_learner(config, problem)
+    spec = LearnerSpec(seeds, ["state", "label"], 6 + 2, (0.0, 1.3), torch.device("cpu"), experts)
+    return make_learner(config, spec)
 
 
 def make_batch(*shape, seed=0):
@@ -185,7 +185,7 @@ def test_the_settings_reach_the_loss(name):
     settings = {"gamma": 0.5, "learning_rate": 0.02, "tau": 0.25, "hidden_sizes": (7, 5)}
     learner = make_learner(
         replace(RL[name].config, **settings),
-        Problem(SEEDS, ["state"], 6, (0.0, 1.0), torch.device("cpu")),
+        LearnerSpec(SEEDS, ["state"], 6, (0.0, 1.0), torch.device("cpu")),
     )
     assert learner.loss.value_estimator.gamma == 0.5
     assert [group["lr"] for group in learner.optimizer.param_groups] == [0.02]
@@ -234,21 +234,21 @@ class OwnConfig(RLConfig):
 def test_an_own_algorithm_is_one_entry(make_bgpo, monkeypatch):
     made = []
 
-    def make_own(config, problem):
-        made.append((config, problem))
-        return make_ddpg(DDPGConfig(hidden_sizes=(5,)), problem)
+    def make_own(config, spec):
+        made.append((config, spec))
+        return make_ddpg(DDPGConfig(hidden_sizes=(5,)), spec)
 
     monkeypatch.setitem(RL, "own", RLEntry(make_own, OwnConfig()))
     algorithm = make_bgpo("own")
-    ((config, problem),) = made
+    ((config, spec),) = made
     assert (config.name, config.batch_size) == ("own", 16)
-    assert (problem.seeds, problem.in_features) == (SEEDS, 16 + 3)
-    assert problem.in_keys == ["state", "context"]
-    assert problem.return_bounds == (0.0, 1.0)
+    assert (spec.seeds, spec.in_features) == (SEEDS, 16 + 3)
+    assert spec.in_keys == ["state", "context"]
+    assert spec.return_bounds == (0.0, 1.0)
     assert algorithm.learner.actor.mlp.layers[0].out_features == 5
 
 
 def test_a_config_of_no_known_algorithm_is_refused():
     for config in (OwnConfig(), DDPGConfig(name="td3")):
         with pytest.raises(ValueError, match=r"is of no known RL algorithm \(its name is"):
-            make_learner(config, Problem(SEEDS, ["state"], 6, (0.0, 1.0), torch.device("cpu")))
+            make_learner(config, LearnerSpec(SEEDS, ["state"], 6, (0.0, 1.0), torch.device("cpu")))

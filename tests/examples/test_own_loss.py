@@ -9,7 +9,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from bgpo_trl.algorithms.rl import RL, Problem, make_learner
+from bgpo_trl.algorithms.rl import RL, LearnerSpec, make_learner
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "own_loss.py"
 
@@ -30,8 +30,8 @@ def test_it_runs_and_every_task_is_tested(registry, capsys):
 
 def test_the_actor_imitates_good_actions_most(registry):
     config = runpy.run_path(str(EXAMPLE))["AWACConfig"](hidden_sizes=(8,))
-    problem = Problem([4, 7], ["state"], 3, (0.0, 1.0), torch.device("cpu"))
-    learner = make_learner(config, problem)
+    spec = LearnerSpec([4, 7], ["state"], 3, (0.0, 1.0), torch.device("cpu"))
+    learner = make_learner(config, spec)
     generator = torch.Generator().manual_seed(0)
     state, following = torch.randn(2, 2, 1, 16, 3, generator=generator).unbind(0)
     action = torch.rand(2, 1, 16, 4, generator=generator) * 2 - 1

@@ -9,7 +9,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from bgpo_trl.algorithms.rl import RL, Problem, make_learner
+from bgpo_trl.algorithms.rl import RL, LearnerSpec, make_learner
 from bgpo_trl.seeding import generators
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "own_rl_algorithm.py"
@@ -33,8 +33,8 @@ def test_it_runs_and_is_short(registry, capsys):
 
 def test_it_acts_at_random_now_and_then(registry):
     config = runpy.run_path(str(EXAMPLE))["EpsilonConfig"](noise=0.0, epsilon=0.5)
-    problem = Problem([4], ["state"], 3, (0.0, 1.0), torch.device("cpu"))
-    learner = make_learner(config, problem)
+    spec = LearnerSpec([4], ["state"], 3, (0.0, 1.0), torch.device("cpu"))
+    learner = make_learner(config, spec)
     data, sources = TensorDict({"state": torch.randn(1, 3)}, [1]), generators([4], "exploration")
     with torch.no_grad():
         usual = learner.actor(data.unsqueeze(1))["action"].squeeze(1)
