@@ -42,7 +42,7 @@ RUNGS: dict[str, tuple[str, BGPOConfig]] = {
     "c": ("latent + phi", replace(_SINGLE, variant="without-gwr")),
     "d": ("latent + b (BGPO as published)", _SINGLE),
 }
-"""What each rung has, and its hyperparameters."""
+"""Description and hyperparameters of each rung."""
 
 
 @dataclass(frozen=True)

@@ -22,11 +22,11 @@ from suites.nico.rendering import FRAME_HEIGHT, FRAME_WIDTH, FrameRenderer
 
 
 class NicoEnv(EnvBase):
-    """NICO at the table, one simulation for each element of the batch.
+    """NICO at the table, one simulation per element of the batch.
 
-    All simulations run in this process and share one renderer. Physics is stepped in threads, and
-    each frame is drawn by the caller's thread as soon as its simulation is there; results do not
-    depend on the number of threads. The task of an episode is chosen at reset, by the entry
+    All simulations run in this process and share one renderer. Threads step the physics, and the
+    caller's thread draws each frame as soon as its simulation has finished; results do not depend
+    on the number of threads. The task of an episode is chosen at reset, by the entry
     ``"task"`` of the reset's tensordict. Episodes end on success only: append ``StepCounter(50)``
     for the paper's time limit.
 
@@ -35,8 +35,8 @@ class NicoEnv(EnvBase):
     into ``tasks``. Reads ``"action"`` float32 ``[*B, 4]`` in [-1, 1]. ``"reward"`` is 1 on success,
     else 0; ``"terminated"`` and ``"done"`` are success, ``"truncated"`` is never set here.
 
-    An optional boolean entry ``"_step"`` ``[*B]`` says which simulations advance; the others repeat
-    what they showed last.
+    An optional boolean entry ``"_step"`` ``[*B]`` selects the simulations that advance; the others repeat
+    their last observation.
 
     Args:
         tasks: Names of the tasks, in the order of their presentation.
@@ -118,7 +118,7 @@ class NicoEnv(EnvBase):
             observation["state"] = Unbounded(shape=torch.Size([*batch, STATE_SIZE]))
             self._current["state"] = np.zeros((count, STATE_SIZE), np.float32)
         self.observation_spec = Composite(observation, shape=batch)
-        # What is not a state is withheld from `_reset` when this is wrapped in a TransformedEnv.
+        # A TransformedEnv passes only entries of the state spec on to `_reset`.
         self.state_spec = Composite({"task": observation["task"].clone()}, shape=batch)
         self.action_spec = Bounded(-1.0, 1.0, shape=torch.Size([*batch, 4]))
         # Not Bounded, which TorchRL's RewardScaling and RewardClipping refuse.

@@ -19,23 +19,20 @@ __all__ = ["Learner", "SACLearner", "TD3Learner"]
 
 
 class Learner:
-    """The policies of all seeds and how they improve: as they are, DDPG's.
+    """Policies of all seeds with their exploration and gradient steps, as DDPG has them.
 
-    Its optimizer is Adam on the sum of the loss's parts. Adam treats each weight by itself, so one
-    for all networks is one for each.
+    One Adam optimizer minimizes the sum of the losses. It treats each weight independently, so it
+    is equivalent to one optimizer per seed.
 
     Args:
-        actor: Called with what it reads, writes the ``action`` without noise. Its weights lead with
-            ``[S]``.
-        loss: Reads transitions ``[S, B]`` and returns, among others, entries ``loss_...`` ``[]`` to
-            be minimized, each a sum over the seeds. It has target networks.
-        config: Its ``gamma``, ``tau`` and ``learning_rate`` are used here.
+        actor: Writes the ``action`` without noise; its weights lead with ``[S, E]``.
+        loss: Returns entries ``loss_...`` ``[]`` to minimize, each a sum over seeds and experts.
+        config: Hyperparameters, of which ``gamma``, ``tau`` and ``learning_rate`` are read here.
         noise: Standard deviation of the Gaussian exploration noise.
 
     Attributes:
-        config: The hyperparameters.
-        optimizer: Of all that the loss is to learn.
-        target_update: Of the target networks.
+        optimizer: Optimizer of all parameters that need a gradient.
+        target_update: Soft update of the target networks.
     """
 
     def __init__(
@@ -53,27 +50,27 @@ class Learner:
         """Return actions of a training step, ``[S, 4]`` in [-1, 1], on the CPU.
 
         Args:
-            tensordict: What the policies read, ``[S]``.
-            generators: Sources of exploration, one for each seed.
-            expert: Which expert of each seed acts, int64 ``[S]``.
+            tensordict: Inputs of the policies, ``[S]``.
+            generators: Sources of the exploration noise, one per seed.
+            expert: Expert of each seed that acts, int64 ``[S]``.
         """
         action = self.actor(self._for_all(tensordict))["action"]
         return self.explore(_of_expert(action, expert), generators)
 
     def _for_all(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return what is read ``[S]`` by all experts, ``[S, E]``."""
+        """Return inputs ``[S]`` expanded to all experts, ``[S, E]``."""
         return tensordict.unsqueeze(1).expand(*self.actor.batch_size)
 
     def explore(self, action: Tensor, generators: Sequence[torch.Generator]) -> Tensor:
-        """Return actions ``[S, 4]`` with each seed's Gaussian noise, within [-1, 1]."""
+        """Add Gaussian noise to actions ``[S, 4]`` and clip them to [-1, 1]."""
         noise = self.noise * normal(generators, action.shape[1:])
         return (action.cpu() + noise).clamp(-1.0, 1.0)
 
     def learn(self, batch: TensorDictBase) -> dict[str, Tensor]:
-        """Take a gradient step on transitions ``[S, E, B]``, and one of the target networks.
+        """Take a gradient step on transitions ``[S, E, B]`` and update the target networks.
 
         Returns:
-            The parts of the loss that the step minimized, sums over seeds and experts ``[]``.
+            The losses that were minimized, sums over seeds and experts ``[]``.
         """
         parts = self.losses(batch)
         self.optimizer.zero_grad()
@@ -84,16 +81,16 @@ class Learner:
         return {key: value.detach() for key, value in parts.items()}
 
     def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
-        """Return the parts of the loss to be minimized on transitions ``[S, E, B]``."""
+        """Return the losses to minimize on transitions ``[S, E, B]``."""
         return {str(k): v for k, v in self.loss(batch).items() if str(k).startswith("loss_")}
 
     @property
     def actor_is_due(self) -> bool:
-        """Whether the next update is one of the actor and the target networks, too."""
+        """Whether the next update also updates the actor and the target networks."""
         return True
 
     def state_dict(self) -> dict[str, Any]:
-        """Return all that future updates depend on."""
+        """Return losses, targets and the state of the optimizer."""
         return {"loss": dict(self.loss.state_dict()), "optimizer": self.optimizer.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -103,11 +100,13 @@ class Learner:
 
 
 class TD3Learner(Learner):
-    """Updates actor and target networks less often than the critics (Fujimoto et al., 2018).
+    """Learner whose actor and targets are updated less often than its critics.
+
+    See Fujimoto et al. (2018).
 
     Args:
         actor: As in `Learner`.
-        loss: As in `Learner`; ``loss_actor`` is the part that waits.
+        loss: As in `Learner`; ``loss_actor`` is delayed.
         config: Hyperparameters.
 
     Raises:
@@ -127,7 +126,7 @@ class TD3Learner(Learner):
         """Take a gradient step on transitions ``[S, E, B]``; see `Learner.learn`.
 
         Returns:
-            The parts of the loss; ``loss_actor`` is that of the actor's latest update, or 0.
+            The losses; ``loss_actor`` is that of the latest update of the actor, 0 before.
         """
         parts = super().learn(batch)
         self.n_updates += 1
@@ -135,7 +134,7 @@ class TD3Learner(Learner):
         return {"loss_actor": self.loss_actor, **parts}
 
     def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
-        """Return the parts of the loss; without the actor's, where it waits."""
+        """Return the losses, without that of the actor if its update is not due."""
         if self.actor_is_due:
             return super().losses(batch)
         return {"loss_value": self.loss.loss_value(batch)[0]}
@@ -157,7 +156,7 @@ class TD3Learner(Learner):
 
 
 class SACLearner(Learner):
-    """Explores by what its stochastic policy draws (Haarnoja et al., 2018)."""
+    """Learner that explores by sampling from its policy (Haarnoja et al., 2018)."""
 
     actor: GaussianActor
 
@@ -173,6 +172,6 @@ class SACLearner(Learner):
 
 
 def _of_expert(values: Tensor, expert: Tensor) -> Tensor:
-    """Return those of one expert of each seed, ``[S, ...]`` of ``[S, E, ...]``."""
+    """Select one expert of each seed: ``[S, ...]`` of ``[S, E, ...]``."""
     seed = torch.arange(len(values), device=values.device)
     return values[seed, expert.to(values.device)]

@@ -1,7 +1,7 @@
-"""The RL algorithm f_RL of Alg. 1: DDPG, TD3, SAC, and the place for one's own.
+"""The RL algorithm f_RL of Alg. 1: DDPG, TD3 or SAC.
 
-An own one is an entry of `RL` under the ``name`` of its config, such as the one that
-``examples/own_rl_algorithm.py`` makes.
+Another one is added as an entry of `RL` under the ``name`` of its config, as
+``examples/own_rl_algorithm.py`` does.
 """
 
 from __future__ import annotations
@@ -28,23 +28,23 @@ __all__ = ["RL", "LearnerSpec", "RLEntry", "make_learner"]
 
 @dataclass(frozen=True)
 class LearnerSpec:
-    """What an RL algorithm is to learn: policies ``[S, E]``, one for each expert of each seed."""
+    """Shapes and inputs of a learner of policies ``[S, E]``, one per expert of each seed."""
 
     seeds: Sequence[int]
-    """One for each element ``S`` of the batch."""
+    """One per element ``S`` of the batch."""
     in_keys: Sequence[NestedKey]
-    """What the policy reads; all but the first are constant within an episode."""
+    """Entries that the policy reads; all but the first are constant within an episode."""
     in_features: int
-    """Size of all these together."""
+    """Total size of these entries."""
     return_bounds: tuple[float, float]
     """Lowest and highest attainable return."""
     device: torch.device
-    """Where networks and batches are."""
+    """Device of networks and batches."""
     experts: Sequence[int] = (0,)
-    """Numbers of the experts ``E``; an expert's random numbers follow from its seed and number."""
+    """Numbers of the experts ``E``. Seed and number determine an expert's initial weights."""
 
     def generators(self, name: str) -> list[torch.Generator]:
-        """Return one generator for each expert of each seed, for one purpose."""
+        """Return one generator per expert of each seed, for one purpose."""
         return [generators([s], f"{name} {e}")[0] for s in self.seeds for e in self.experts]
 
     def actor(self, network: Callable[..., Any], config: RLConfig) -> Any:
@@ -63,7 +63,7 @@ class LearnerSpec:
         return self._network(Critic, config, [*self._shape, 2], streams, layer_norm=norm)
 
     def loss_options(self, config: RLConfig) -> dict[str, Any]:
-        """Return the arguments that the losses of this package have in common."""
+        """Return the common arguments of the losses."""
         return {
             "return_bounds": self.return_bounds if config.clip_targets else None,
             "constant_keys": self.in_keys[1:],
@@ -93,7 +93,7 @@ class LearnerSpec:
 
 
 def make_ddpg(config: DDPGConfig, spec: LearnerSpec) -> Learner:
-    """Return DDPG (Lillicrap et al., 2016), the paper's."""
+    """Return a DDPG learner (Lillicrap et al., 2016), as in the paper."""
     actor = spec.actor(Actor, config)
     loss = DDPGLoss(
         actor,

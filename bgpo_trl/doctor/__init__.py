@@ -1,4 +1,4 @@
-"""Is this machine fit for it? ``python -m bgpo_trl.doctor`` looks, measures, and says what to do.
+"""Checks of this machine and installation: ``python -m bgpo_trl.doctor``.
 
 One line for each thing: ``ok``; ``note``, which costs something; or ``wrong``, which makes it
 unusable and the exit status 1. Only the standard library is imported before a check asks for more,

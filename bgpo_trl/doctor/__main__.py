@@ -16,7 +16,7 @@ from bgpo_trl.doctor.versions import check_versions
 
 
 def examine(checks: Mapping[str, Check]) -> Iterator[Finding]:
-    """Run checks one after the other; one that breaks is a finding too."""
+    """Run checks one after the other; report a check that raises as a finding."""
     for name, check in checks.items():
         try:
             yield from check()

@@ -1,4 +1,4 @@
-"""What a check finds."""
+"""Results of the doctor's checks."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class Finding:
-    """What came of one check.
+    """Result of one check.
 
     Attributes:
-        level: ``"ok"``; ``"note"``, usable but; ``"wrong"``, unusable.
-        what: What was looked at.
-        told: What was found, and where it is amiss what to do; one line.
+        level: ``"ok"``; ``"note"`` for usable with a limitation; ``"wrong"`` for unusable.
+        what: Subject of the check.
+        told: Result in one line, with a remedy if something is wrong.
     """
 
     level: Literal["ok", "note", "wrong"]

@@ -1,4 +1,4 @@
-"""Check of what the robot sees."""
+"""Check of the rendered frames."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def judge_frames(still: np.ndarray, moved: np.ndarray) -> Finding:
 
 
 def check_frame(path: Path | None = None) -> Iterator[Finding]:
-    """Draw a frame before and after a movement; writes the first to a PNG where asked."""
+    """Draw a frame before and after a movement; optionally write the first to a PNG."""
     import numpy as np
 
     from suites import nico

@@ -15,7 +15,7 @@ _ROOM_FOR_ALL, _ROOM_FOR_SOME = 10e9, 0.5e9
 
 
 def check_device() -> Iterator[Finding]:
-    """Look at cores, threads and GPUs."""
+    """Check cores, threads and GPUs."""
     import torch
 
     from bgpo_trl.machine import usable_cores
@@ -37,7 +37,7 @@ def judge_gpu(devices: Sequence[str], *, driver: bool) -> Finding:
 
 
 def judge_disk(free: float, folder: Path) -> Finding:
-    """Judge the room (bytes) that is left where runs go."""
+    """Judge the free disk space (bytes) in the folder of the runs."""
     told = f"{free / 1e9:.1f} GB left in {folder}"
     if free < _ROOM_FOR_SOME:
         return Finding("wrong", "disk", f"{told}: make room, or go elsewhere with --out")
@@ -47,7 +47,7 @@ def judge_disk(free: float, folder: Path) -> Finding:
 
 
 def check_disk(folder: Path | None = None) -> Iterator[Finding]:
-    """Look at the folder in which runs are kept, by default the current one."""
+    """Check the folder of the runs, by default the current one."""
     folder = Path.cwd() if folder is None else folder
     if not os.access(folder, os.W_OK):
         yield Finding("wrong", "disk", f"{folder} cannot be written: go elsewhere, or use --out")

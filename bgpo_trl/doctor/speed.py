@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from bgpo_trl.doctor.finding import Finding
 
 FEW_FRAMES = 100.0
-"""Frames a second below which rendering, not learning, is what a run waits for."""
+"""Frames a second below which rendering limits a run more than learning does."""
 
 
 def judge_frame_rate(one: float, every: float, cores: int) -> Finding:
@@ -46,7 +46,7 @@ def check_frame_rate(seconds: float = 0.5) -> Iterator[Finding]:
 
 
 def check_update_rate(seconds: float = 0.5) -> Iterator[Finding]:
-    """Measure what BGPO learns a second with five seeds, and loads the shipped weights for it."""
+    """Load the shipped weights and measure the updates a second of BGPO with five seeds."""
     import torch
 
     from bgpo_trl.algorithms.bgpo import BGPO
@@ -74,7 +74,7 @@ def check_update_rate(seconds: float = 0.5) -> Iterator[Finding]:
 
 
 def _rate(call: Callable[[], object], seconds: float) -> float:
-    """Return how often a second something can be called."""
+    """Return the number of calls a second."""
     call()
     start, calls = time.perf_counter(), 0
     while (spent := time.perf_counter() - start) < seconds:

@@ -10,7 +10,7 @@ from pathlib import Path
 from bgpo_trl.doctor.finding import Finding
 
 CONSTRAINTS = Path(__file__).parents[2] / "constraints.txt"
-"""Exact versions known to work together; only there in a checkout."""
+"""Exact versions known to work together; exists in a checkout only."""
 
 
 def judge_version(
@@ -71,7 +71,7 @@ def check_versions(
     version: Callable[[str], str | None] = installed_version,
     constraints: Path = CONSTRAINTS,
 ) -> Iterator[Finding]:
-    """Look at Python, at all dependencies, and at the extras that a run can use."""
+    """Check Python, all dependencies, and the extras that a run can use."""
     from packaging.requirements import Requirement
 
     try:
