@@ -88,7 +88,7 @@ def demonstrate(tasks: Sequence[str], seed: int) -> dict[str, NDArray]:
 
 
 def play(policy: TrainedPolicy, task: str, demonstration: NDArray, seed: int) -> Episode:
-    """Show the policy a demonstration and returns what it does from the start with that seed."""
+    """Show the policy a demonstration, and return its episode from the start with that seed."""
     policy.condition(demonstration, task=task)
     env = nico.load(task, seed=seed)
     renderer = FrameRenderer(env.physics.model.ptr, "room", height=480, width=640)

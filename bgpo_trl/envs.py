@@ -35,8 +35,8 @@ class NicoEnv(EnvBase):
     into ``tasks``. Reads ``"action"`` float32 ``[*B, 4]`` in [-1, 1]. ``"reward"`` is 1 on success,
     else 0; ``"terminated"`` and ``"done"`` are success, ``"truncated"`` is never set here.
 
-    An optional boolean entry ``"_step"`` ``[*B]`` selects the simulations that advance; the others repeat
-    their last observation.
+    An optional boolean entry ``"_step"`` ``[*B]`` selects the simulations that advance; the others
+    repeat their last observation.
 
     Args:
         tasks: Names of the tasks, in the order of their presentation.
@@ -157,7 +157,7 @@ class NicoEnv(EnvBase):
             self._current["state"][row] = timestep.observation["privileged_state"]
 
     def _advance(self, rows: Iterable[int], actions: np.ndarray, rewards: np.ndarray) -> None:
-        """Step simulations in all threads, and draw what they have come to in this one."""
+        """Step simulations in all threads and draw their frames in this one."""
 
         def step(row: int) -> TimeStep:
             return self._environment(row).step(actions[row])

@@ -93,7 +93,7 @@ def _settings(
     seed: int,
     attempts: int,
 ) -> dict[str, Any]:
-    """Return what a recording is told apart by, after a check of the arguments."""
+    """Check the arguments and return the settings that identify a recording."""
     nico.check_tasks(tasks)
     if not tasks:
         raise ValueError("name at least one of the tasks")

@@ -20,7 +20,7 @@ Parameters = dict[str, Tensor]
 
 
 class MAMLLoss(DDPGLoss):
-    """Loss of a policy by what it is worth after adapting to each task (Finn et al., 2017, Alg. 3).
+    """Loss of a policy after its adaptation to each task (Finn et al., 2017, Alg. 3).
 
     With the DDPG loss of task i's critic, ``L_i(theta) = -mean Q_i(s, pi_theta(s))`` (plus the
     penalty on the actor's output before its tanh, as in `DDPGLoss`), it

@@ -49,7 +49,7 @@ def read_config(path: str | Path) -> tuple[RunConfig, str | None]:
 
 
 def settings_of(config: RunConfig, encoders: str | None) -> dict[str, Any]:
-    """Return what ``config.json`` stores: all settings, and the class of the hyperparameters.
+    """Return the content of ``config.json``: all settings and the class of the hyperparameters.
 
     Args:
         config: The run.
