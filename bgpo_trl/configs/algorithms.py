@@ -14,7 +14,7 @@ class AlgorithmConfig:
     """Hyperparameters common to all algorithms, which are thus compared on equal terms."""
 
     state: Literal["latent", "state"] = "latent"
-    """Observation of the policy: the latent z of a frame (Alg. 1), or, for benchmarks/ladder.py, the
+    """Observation of the policy: the latent z of a frame (Alg. 1) or, for benchmarks/ladder.py, the
     ground truth."""
     max_steps: int = 50
     """Steps of an episode (Sec. IV-B)."""
