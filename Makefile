@@ -1,44 +1,44 @@
-# `make run` and `make test` do all of the setting up themselves; nothing has to be installed before.
+# Commands set up .venv when they need it; nothing has to be installed before.
 SHELL := /bin/bash
-# A Python 3.11 or 3.12 to make .venv with; found on the PATH if not given.
+# Python 3.11 or 3.12 for .venv; by default, the first one on the PATH.
 PYTHON ?=
-# Test processes.
+# Number of test processes.
 WORKERS ?= 2
 BIN := .venv/bin
 SETUP := .venv/.installed
 GL := .venv/.gl
 
-# Networks this small are fastest on one thread, and test processes must not fight for cores.
+# Small networks are fastest on one thread, and test processes compete for cores.
 export OMP_NUM_THREADS ?= 1
-# Keeps pyright from asking the network for a newer version of itself.
+# Keeps pyright from checking online for a newer version.
 export PYRIGHT_PYTHON_IGNORE_WARNINGS := 1
 
 .PHONY: help run test slow lint format typecheck bench clean
 
-help:  ## list these verbs
+help:  ## list these commands
 	@grep -hE '^[a-z]+:.*##' Makefile | sed -E 's/^([a-z]+):.*## */\1\t/' | expand -t 12
 
 run: $(SETUP) $(GL)  ## the continual-learning experiment in its shortest form
 	$(BIN)/python benchmarks/continual.py --preset quick
 
-test: lint typecheck $(GL)  ## lint, type check and the fast tests: what CI runs
+test: lint typecheck $(GL)  ## lint, type check and the fast tests, as in CI
 	$(BIN)/pytest -n $(WORKERS)
 
-slow: $(SETUP) $(GL)  ## the tests that `make test` leaves out
+slow: $(SETUP) $(GL)  ## the tests that take more than a few seconds each
 	$(BIN)/pytest -n $(WORKERS) -m slow
 
-lint: $(SETUP)  ## ruff, and whether all files are formatted
+lint: $(SETUP)  ## ruff, and a check of the formatting
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
-format: $(SETUP)  ## let ruff format and fix what it can
+format: $(SETUP)  ## format, and apply ruff's automatic fixes
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
 typecheck: $(SETUP)  ## pyright
 	$(BIN)/pyright
 
-bench: $(SETUP) $(GL)  ## speed: frames, updates, training steps, GWR-B
+bench: $(SETUP) $(GL)  ## speed of frames, updates, training steps and GWR-B
 	$(BIN)/pip install -q -c constraints.txt -e '.[bench]'
 	$(BIN)/python benchmarks/speed/throughput.py
 	$(BIN)/python benchmarks/speed/gwr.py
@@ -47,7 +47,7 @@ clean:  ## remove caches and build leftovers, never .venv or runs
 	rm -rf build dist ./*.egg-info .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -not -path './.venv/*' -prune -exec rm -rf {} +
 
-# pip is the target, as a Python without ensurepip leaves a .venv that has everything but pip.
+# The target is pip, since a Python without ensurepip leaves a .venv without it.
 $(BIN)/pip:
 	@for python in $(PYTHON) python3.11 python3.12 python3; do \
 		if "$$python" -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 12))' 2>/dev/null; then \

@@ -31,7 +31,7 @@ def usable_cores(quota: str | Path = "/sys/fs/cgroup/cpu.max") -> int:
 def set_threads(threads: int) -> None:
     """Set the number of PyTorch's threads; raise ``ValueError`` if it is below 1."""
     if threads < 1:
-        raise ValueError(f"threads must be at least 1, got {threads}: 1 is fastest here")
+        raise ValueError(f"threads must be at least 1, got {threads}: small networks need only 1")
     torch.set_num_threads(threads)
 
 

@@ -75,7 +75,7 @@ ABLATIONS: dict[str, Entry] = {
     "all": Entry(BGPO, BGPOConfig()),
 }
 """The paper's ablations (Fig. 9): with GWR-B and the intrinsic reward, one of them, neither. Then
-each addition of this package to the published algorithm by itself, and all of them."""
+each addition of this package to the published algorithm, and all of them together."""
 
 
 def entry(name: str) -> Entry:

@@ -173,11 +173,7 @@ class Algorithm(ABC):
     ) -> DemonstrationReplay | None:
         """Return the replay of shown demonstrations, or None without a ``demonstration_share``.
 
-        Args:
-            config: Hyperparameters.
-            bank: Demonstrations for training episodes.
-            seeds: The seeds.
-            constant_keys: Entries read by policies that are constant within an episode.
+        ``constant_keys`` are the entries read by policies that are constant within an episode.
 
         Raises:
             ValueError: If the state is not the latent, or the bank has no steps.
@@ -223,12 +219,6 @@ class Algorithm(ABC):
 
 
 def networks_of(parameters: TensorDictBase, seed: Tensor, task: Tensor) -> dict[str, Tensor]:
-    """Select networks of tasks from parameters ``[S, T, ...]``, named as for ``functional_call``.
-
-    Args:
-        parameters: ``[S, T, ...]``.
-        seed: Positions of the seeds, int64, broadcast against ``task``.
-        task: The tasks, int64.
-    """
+    """Select networks from parameters ``[S, T, ...]`` by position of the seed and task, int64."""
     flat = parameters.flatten_keys(".")
     return {str(key): value[seed, task] for key, value in flat.items()}

@@ -35,12 +35,7 @@ class BGPO(Algorithm):
     update draws equally from the groups played last; with a ``demonstration_share``, it also draws
     from demonstrations. The variant ``"published"`` without these three is the paper's algorithm.
 
-    Args:
-        config: Hyperparameters.
-        seeds: As in `Algorithm`.
-        bank: As in `Algorithm`.
-        encoders: As in `Algorithm`; None if neither latents nor embeddings are used.
-        device: As in `Algorithm`.
+    Arguments as for `Algorithm`; encoders may be None if neither latents nor embeddings are used.
 
     Attributes:
         experts: The networks, by group; of a single group without ``config.experts``.

@@ -38,12 +38,7 @@ class DistNLL(Algorithm):
        heads are kept.
     4. Test episodes are played by the multi-task policy with the head of the true label.
 
-    Args:
-        config: Hyperparameters.
-        seeds: As in `Algorithm`.
-        bank: As in `Algorithm`; only the tasks are used.
-        encoders: As in `Algorithm`.
-        device: As in `Algorithm`.
+    Arguments as for `Algorithm`; the bank provides only the tasks.
 
     Attributes:
         teacher: The tasks' policies, ``[S, T]`` stacked.

@@ -100,13 +100,9 @@ class Experts:
         return torch.tensor([self._play(seed, group) for seed, group in enumerate(groups)])
 
     def actor_weights(self, seed: int, group: int) -> State:
-        """Copy the weights of a group's policy to the CPU.
+        """Copy the weights of a group's policy to the CPU, given the position of the seed.
 
         A group without networks (not yet played) uses those of its nearest ancestor.
-
-        Args:
-            seed: Position of the seed.
-            group: Number of the group.
         """
         prefix = "actor_network_params."
         state = self._state(seed, self._with_networks(seed, group))

@@ -37,12 +37,7 @@ class MAML(Algorithm):
     3. Test episodes of a task are played by the policy after one gradient step on
        ``adaptation_size`` transitions of that task.
 
-    Args:
-        config: Hyperparameters.
-        seeds: As in `Algorithm`.
-        bank: As in `Algorithm`; only the tasks are used.
-        encoders: As in `Algorithm`.
-        device: As in `Algorithm`.
+    Arguments as for `Algorithm`; the bank provides only the tasks.
 
     Attributes:
         meta_actor: The policy before adaptation, ``[S]`` stacked.

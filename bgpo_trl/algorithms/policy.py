@@ -20,7 +20,7 @@ class Policy:
     """Snapshot of a policy for test episodes, unaffected by further training.
 
     Attributes:
-        actor: Network that is called with ``parameters`` in place of its own.
+        actor: Network, called with ``parameters`` instead of its weights.
         state_key: Key of the state.
         parameters: Copies, by their names in the actor. Leading dimensions: none, ``[T]`` (one
             network per task) or ``[T, M]`` (one per episode), after ``[S]`` in a stack.

@@ -14,12 +14,12 @@ class AlgorithmConfig:
     """Hyperparameters common to all algorithms, which are thus compared on equal terms."""
 
     state: Literal["latent", "state"] = "latent"
-    """Observation of the policy: the latent z of a frame, or (benchmarks/ladder.py) the ground
-    truth."""
+    """Observation of the policy: the latent z of a frame (Alg. 1) or, for benchmarks/ladder.py, the
+    ground truth."""
     max_steps: int = 50
     """Steps of an episode (Sec. IV-B)."""
     rl: RLConfig = field(default_factory=DDPGConfig)
-    """The RL algorithm f_RL."""
+    """The RL algorithm f_RL; DDPG in the paper."""
     demonstration_share: float = 0.0
     """Share of an update's transitions taken from the demonstrations shown so far in training, with
     actions inferred by the inverse model. Ours: the paper has none."""
@@ -75,7 +75,7 @@ class BGPOConfig(AlgorithmConfig):
     """Behavior-guided policy optimization (Alg. 1)."""
 
     variant: str = "bgpo"
-    """Its environment, a key of `bgpo_trl.algorithms.environments.VARIANTS`."""
+    """Its environment, a key of `bgpo_trl.algorithms.environments.VARIANTS`. Ours: with groups."""
     beta: float = 0.1
     """Weight of the intrinsic reward (Sec. IV-A)."""
     behavior_scale: float = 0.25

@@ -104,12 +104,7 @@ class BehaviorGroups(nn.Module):
         return torch.tensor([len(parent) for parent in self._parent]).view(self.batch_size)
 
     def parent(self, network: int, group: int) -> int:
-        """Return the parent of a group; 0 for the first group.
-
-        Args:
-            network: Position in the flattened batch.
-            group: Number of the group.
-        """
+        """Return the parent of a group (0 for the first) of a network in the flattened batch."""
         return self._parent[network][group]
 
     def forward(self, phi: Tensor) -> GroupMatch:
@@ -136,17 +131,10 @@ class BehaviorGroups(nn.Module):
         )
 
     def adapt(self, phi: Tensor, mask: Tensor | None = None) -> GroupMatch:
-        """Find the group of one input per network and learn from it.
-
-        Args:
-            phi: ``[*batch_size, d]``.
-            mask: Networks that take part, bool ``[*batch_size]``; None: all.
+        """Find the group of one input per network and learn from it; see `GWRB.adapt`.
 
         Returns:
             Matches ``[*batch_size]`` from before learning; -1 and NaN where ``mask`` is False.
-
-        Raises:
-            ValueError: As `GWRB.adapt`.
         """
         before = self.gwr.num_nodes
         match = self.gwr.adapt(phi, mask)

@@ -222,8 +222,8 @@ class GWRB(nn.Module):
 
         Args:
             phi: Numbers ``[*batch_size, d]``.
-            mask: Networks that take part, bool ``[*batch_size]``; None: all. Others do not change,
-                whatever phi holds for them.
+            mask: Networks that take part, bool ``[*batch_size]``; None: all. The others do not
+                change, and their phi is ignored.
 
         Returns:
             Matches ``[*batch_size]`` from before learning; NaN and node -1 where ``mask`` is False.

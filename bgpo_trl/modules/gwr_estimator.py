@@ -74,11 +74,7 @@ class GWRBEstimator(OneToOneFeatureMixin, TransformerMixin, ClusterMixin, BaseEs
         self.max_nodes = max_nodes
 
     def fit(self, X: npt.ArrayLike, y: object = None) -> Self:
-        """Learn the rows with a new network.
-
-        Args:
-            X: Numbers ``[n, d]``.
-            y: Ignored.
+        """Learn the rows of X ``[n, d]`` with a new network; ``y`` is ignored.
 
         Raises:
             ValueError: If an argument of the estimator is out of range, or X holds NaN or Inf.
@@ -88,11 +84,7 @@ class GWRBEstimator(OneToOneFeatureMixin, TransformerMixin, ClusterMixin, BaseEs
         return self._learn(gwr.double(), rows)
 
     def partial_fit(self, X: npt.ArrayLike, y: object = None) -> Self:
-        """Learn further rows; the first call is the same as `fit`.
-
-        Args:
-            X: Numbers ``[n, d]``.
-            y: Ignored.
+        """Learn further rows of X ``[n, d]``; the first call is the same as `fit`.
 
         Raises:
             ValueError: As `fit`, and if d has changed; nothing is learned then.
@@ -107,10 +99,7 @@ class GWRBEstimator(OneToOneFeatureMixin, TransformerMixin, ClusterMixin, BaseEs
         return self.gwr_.lookup(rows).node.numpy()
 
     def transform(self, X: npt.ArrayLike) -> np.ndarray:
-        """Return the weights of the node nearest to each row of X, ``[n, d]``.
-
-        The result is float32 if X is, else float64.
-        """
+        """Return the weights of the nearest node, ``[n, d]``; float32 if X is, else float64."""
         rows = self._rows(X)
         return self.gwr_.lookup(rows).embedding.numpy().astype(rows.dtype)
 

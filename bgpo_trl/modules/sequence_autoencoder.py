@@ -17,7 +17,8 @@ class SequenceAutoencoder(nn.Module):
         embedding_size: LSTM units of encoder and decoder, hence dimensions of phi (paper: 32).
 
     Raises:
-        ValueError: If a size is not positive.
+        ValueError: If a size is not positive; from methods, if shapes disagree or a length is
+            outside 1..T.
 
     Example:
         >>> z, length = torch.randn(5, 51, 64), torch.tensor([51, 30, 1, 2, 40])
@@ -44,9 +45,6 @@ class SequenceAutoencoder(nn.Module):
         Args:
             z: ``[..., T, latent_size]``; values at or beyond ``length`` are ignored.
             length: Valid latents of each sequence, int64 ``[...]`` in 1..T.
-
-        Raises:
-            ValueError: If shapes disagree or a length is outside 1..T.
         """
         if length.shape != z.shape[:-2]:
             raise ValueError(
@@ -67,18 +65,13 @@ class SequenceAutoencoder(nn.Module):
         return hidden.gather(1, last).reshape(*length.shape, self.embedding_size)
 
     def step(self, z: Tensor, h: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
-        """Advance the encoder by one latent; after the last one, ``h`` is phi.
+        """Advance the encoder by one latent; return the new ``h`` and ``c``.
 
         Args:
             z: ``[..., latent_size]``.
-            h: ``[..., embedding_size]``, zeros at the start of a sequence.
-            c: ``[..., embedding_size]``, zeros at the start of a sequence.
-
-        Returns:
-            The new ``h`` and ``c``.
-
-        Raises:
-            ValueError: If shapes disagree.
+            h: Hidden state, ``[..., embedding_size]``, zeros at the start; phi after the last
+                latent.
+            c: Cell state, ``[..., embedding_size]``, zeros at the start.
         """
         shape = h.shape
         if z.shape != (*shape[:-1], self.latent_size) or shape[-1] != self.embedding_size:
@@ -92,11 +85,7 @@ class SequenceAutoencoder(nn.Module):
         return h.reshape(shape), c.reshape(shape)
 
     def decode(self, phi: Tensor, n_steps: int) -> Tensor:
-        """Reconstruct the last ``n_steps`` latents in reverse order (the last one first).
-
-        Args:
-            phi: ``[..., embedding_size]``.
-            n_steps: Number of latents.
+        """Reconstruct the last ``n_steps`` latents of each phi, the last one first.
 
         Returns:
             float32 ``[..., n_steps, latent_size]``.

@@ -30,12 +30,16 @@ class VAE(nn.Module):
     Encoder and decoder work on the difference to a mean frame, which they would otherwise spend
     hundreds of steps learning: the fixed camera mostly shows the same table.
 
+    Frames are uint8 ``[..., 32, 64, 3]``. Latents are ``[..., latent_size]``, on the scale of mu
+    unless they come from `latent`.
+
     Args:
         latent_size: Dimensions of z (paper: 64).
         action_size: Dimensions of an action (paper: 4).
 
     Raises:
-        ValueError: If a size is not positive.
+        ValueError: If a size is not positive; from methods, if frames have another dtype or shape,
+            or latents another size.
 
     Attributes:
         mean_frame: Buffer ``[32, 64, 3]`` in [0, 1], set before training; grey until then.
@@ -80,26 +84,12 @@ class VAE(nn.Module):
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def encode(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        """Return mean and log-variance of the posterior, float32 ``[..., latent_size]`` each.
-
-        Args:
-            pixels: uint8 ``[..., 32, 64, 3]``.
-
-        Raises:
-            ValueError: If ``pixels`` has another dtype or shape.
-        """
+        """Return mean and log-variance of the posterior, float32 ``[..., latent_size]`` each."""
         coarse = self._coarse(pixels)
         return self.mean_head(coarse), self.log_variance_head(coarse)
 
     def decode(self, z: Tensor) -> Tensor:
-        """Return reconstructed frames, float32 ``[..., 32, 64, 3]`` in [0, 1].
-
-        Args:
-            z: ``[..., latent_size]``, on the scale of mu (not of `latent`).
-
-        Raises:
-            ValueError: If ``z`` has another size.
-        """
+        """Return reconstructed frames, float32 ``[..., 32, 64, 3]`` in [0, 1]."""
         self._check_latent(z)
         x = F.relu(self.decoder_dense(z.reshape(-1, self.latent_size)))
         x = x.unflatten(-1, _COARSE_SHAPE).contiguous(memory_format=torch.channels_last)
@@ -110,31 +100,16 @@ class VAE(nn.Module):
         return torch.sigmoid(x).reshape(*z.shape[:-1], *FRAME_SHAPE)
 
     def inverse(self, z: Tensor, z_next: Tensor) -> Tensor:
-        """Predict the action between consecutive latents, ``[..., action_size]`` in (-1, 1).
-
-        Args:
-            z: ``[..., latent_size]``, on the scale of mu.
-            z_next: The latent one step later.
-
-        Raises:
-            ValueError: If a latent has another size.
-        """
+        """Predict the action between consecutive latents, ``[..., action_size]`` in (-1, 1)."""
         self._check_latent(z)
         self._check_latent(z_next)
         return torch.tanh(self.inverse_head(torch.cat([z, z_next], -1)))
 
     @torch.no_grad()
     def latent(self, pixels: Tensor) -> Tensor:
-        """Return the feature vector used downstream: mu, standardized, without gradient.
+        """Return the features used downstream: mu, standardized, float32 ``[..., latent_size]``.
 
-        Args:
-            pixels: uint8 ``[..., 32, 64, 3]``.
-
-        Returns:
-            float32 ``[..., latent_size]``, of about zero mean and unit variance on training frames.
-
-        Raises:
-            ValueError: If ``pixels`` has another dtype or shape.
+        They carry no gradient. On training frames, mean and variance are about 0 and 1.
         """
         return self.standardize(self.mean_head(self._coarse(pixels)))
 

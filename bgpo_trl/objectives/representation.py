@@ -26,9 +26,9 @@ class VAEInverseLoss(LossModule):
     - ``inverse``: ``1/2 ||a_hat_t - a_t||^2``, with a_hat_t predicted from z_t and z_t+1, mean over
       the ``K - 1`` transitions of every window.
 
-    Reads ``pixels`` uint8 ``[*B, K, 32, 64, 3]`` and ``action`` ``[*B, K, A]``, where ``action[...,
-    t, :]`` leads from frame ``t`` to ``t + 1`` (the last one is ignored). Writes the terms,
-    detached, for logging, and weighted as ``loss_*``, which add up to the objective; all ``[]``.
+    Reads ``pixels`` uint8 ``[*B, K, 32, 64, 3]`` and ``action`` ``[*B, K, A]``, in which action t
+    leads from frame t to t + 1 (the last one is ignored). Writes the terms, all ``[]``: detached,
+    for logging, and weighted as ``loss_*``, which add up to the objective.
 
     Args:
         vae: Network to train.

@@ -143,9 +143,9 @@ class DemonstrationLookup(EpisodeTransform):
     Args:
         network: One network, or one per row: its ``batch_size`` is the environment's or, if it does
             not learn here, the leading dimensions of it.
-        learn: Adapt the network. May be changed at any time; unlike ``train()`` and ``eval()``, it
-            is not changed by TorchRL. Set it to False for ``check_env_specs`` if episodes can end
-            within the three steps of the check.
+        learn: Adapt the network. May be changed at any time; independent of ``train()`` and
+            ``eval()``, which TorchRL calls on all transforms. Set it to False for
+            ``check_env_specs`` if episodes can end within the three steps of the check.
         in_keys: Key of the demonstration's embedding.
         out_keys: Entries written.
         done_key: The ``done`` that ends an episode.

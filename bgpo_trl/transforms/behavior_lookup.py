@@ -17,7 +17,8 @@ class BehaviorLookup(DemonstrationLookup):
     """Infers the task of an episode with GWR-B: its behavior ``b`` (Alg. 1).
 
     At reset, ``b = w_c``, the weights of the node that best matches the demonstration. At the end
-    of an episode GWR-B adapts to its demonstration; see `DemonstrationLookup`.
+    of an episode GWR-B adapts to its demonstration. For the arguments, see `DemonstrationLookup`,
+    whose ``network`` is ``gwr``.
 
     Algorithm 1 adapts at the start of the episode, right after reading ``b``; no lookup happens in
     between, so every ``b`` is the same. In TorchRL, however, a reset need not start an episode:
@@ -27,13 +28,6 @@ class BehaviorLookup(DemonstrationLookup):
     32]`` and, for logging, ``behavior_node`` int64 ``[*B]``. For the ablation without GWR-B, in
     which the demonstration's embedding is the behavior, replace it by
     ``RenameTransform(["demo_embedding"], ["behavior"], create_copy=True)``.
-
-    Args:
-        gwr: The ``network`` of `DemonstrationLookup`.
-        learn: Adapt GWR-B; see `DemonstrationLookup`.
-        in_keys: Key of the demonstration's embedding.
-        out_keys: Keys of behavior and node.
-        done_key: The ``done`` that ends an episode.
 
     Example:
         >>> from types import SimpleNamespace

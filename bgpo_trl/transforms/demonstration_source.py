@@ -119,9 +119,8 @@ class DemonstrationSource(EpisodeTransform):
         batch_size: Batch size of the environment; ``()`` is a single one.
         generator: Source of the streams, one for all rows or one per row, used only on
             construction; None: torch's default generator.
-        follow: Source whose ``episode`` count determines the available tasks, in place of the own
-            one: evaluation follows training. Its batch size is the leading dimensions of this
-            one's.
+        follow: Another source, whose ``episode`` count determines the available tasks (evaluation
+            follows training) and whose batch size is the leading dimensions of ``batch_size``.
         out_keys: Keys of task, embedding and index.
         done_key: The ``done`` that ends an episode.
 

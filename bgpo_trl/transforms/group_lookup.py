@@ -16,18 +16,11 @@ from bgpo_trl.transforms._episode import DemonstrationLookup, unbounded
 class GroupLookup(DemonstrationLookup):
     """Finds the group of an episode's demonstration, which selects the expert and the replay.
 
-    See `DemonstrationLookup` for when it looks up and learns. With an activity below the groups'
-    threshold, the demonstration belongs to no known group.
+    For the arguments, see `DemonstrationLookup`, whose ``network`` is ``groups``. With an activity
+    below the groups' threshold, the demonstration belongs to no known group.
 
     Reads ``demo_embedding`` float32 ``[*B, 32]`` and ``done``; writes ``group`` int64 ``[*B]`` and
     ``group_activity`` float32 ``[*B]``, the activity of the best match.
-
-    Args:
-        groups: The ``network`` of `DemonstrationLookup`.
-        learn: Adapt the groups.
-        in_keys: Key of the demonstration's embedding.
-        out_keys: Keys of group and activity.
-        done_key: The ``done`` that ends an episode.
 
     Example:
         >>> from types import SimpleNamespace
