@@ -10,6 +10,8 @@ from bgpo_trl.configs import RunConfig
 from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.encoders.make_bank import make_bank
 from bgpo_trl.encoders.pretrained import load_pretrained
+from bgpo_trl.figures.curves import plot_success_curves
+from bgpo_trl.figures.style import save_figure
 from bgpo_trl.runs.results import read_rows
 from bgpo_trl.training import Trainer
 from suites import nico
@@ -40,6 +42,7 @@ if __name__ == "__main__":
     config = RunConfig(seeds=(0,), episodes=12, tasks=tasks, task_starts=starts, eval_every=6)
     with Trainer(config, OUT / "run", bank=bank, encoders=encoders, resume=True) as trainer:
         trainer.run()
+    save_figure(plot_success_curves(OUT / "run" / "eval.csv"), OUT / "success.png")
     for task in tasks:
         train, test = (
             [int(row["success"]) for row in read_rows(OUT / "run" / file) if row["task"] == task]

@@ -70,6 +70,7 @@ def test_own_task_is_recorded_learned_and_counted_under_its_name(run):
     for row in [*train, *tests]:
         assert row["success"] == "1" or row["steps"] == "50"
     assert re.search(r"GWR-B, \d+ nodes: task inferred for \d+%, held out\n$", out)
+    assert Path("runs/own-task/success.png").read_bytes().startswith(b"\x89PNG")
 
     assert run("own_task.py") == out  # a run that is over is only told of again
 
