@@ -1,7 +1,4 @@
-"""A loss of one's own in place of DDPG's: the actor imitates actions in proportion to their value.
-
-python examples/own_loss.py
-"""
+"""A custom loss in place of that of DDPG: python examples/own_loss.py."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -52,9 +49,9 @@ def make(config: AWACConfig, spec: LearnerSpec) -> Learner:
 
 RL["awac"] = RLEntry(make, AWACConfig())
 
-if __name__ == "__main__":  # a minute's try: ground truth and the task's label
-    told = replace(ALGORITHMS["oracle"].config, state="state", rl=AWACConfig(warmup_steps=64))
-    config = RunConfig((0,), 4, task_starts=(0, 0, 0), eval_every=2, name="oracle", algorithm=told)
+if __name__ == "__main__":  # ground truth and the task label keep this to a minute
+    base = replace(ALGORITHMS["oracle"].config, state="state", rl=AWACConfig(warmup_steps=64))
+    config = RunConfig((0,), 4, task_starts=(0, 0, 0), eval_every=2, name="oracle", algorithm=base)
     with TemporaryDirectory() as folder, Trainer(config, folder, bank=load_pretrained()[1]) as run:
         run.run()
         print((Path(folder) / "eval.csv").read_text())

@@ -51,10 +51,8 @@ RL["td3-epsilon"] = RLEntry(make, EpsilonConfig())
 
 if __name__ == "__main__":
     # Ground truth and the task label keep this to a minute. For BGPO, use BGPOConfig(rl=...).
-    oracle = replace(ALGORITHMS["oracle"].config, state="state", rl=EpsilonConfig(warmup_steps=64))
-    config = RunConfig(
-        (0, 1), 4, task_starts=(0, 0, 0), eval_every=2, name="oracle", algorithm=oracle
-    )
+    own = replace(ALGORITHMS["oracle"].config, state="state", rl=EpsilonConfig(warmup_steps=64))
+    config = RunConfig((0, 1), 4, task_starts=(0, 0, 0), eval_every=2, name="oracle", algorithm=own)
     with TemporaryDirectory() as folder, Trainer(config, folder, bank=load_pretrained()[1]) as run:
         run.run()
         print((Path(folder) / "eval.csv").read_text())
