@@ -41,13 +41,12 @@ def normal(generators: Sequence[torch.Generator], shape: Sequence[int]) -> Tenso
 
 def random_state(random: np.random.RandomState) -> dict[str, Any]:
     """Return the state of NumPy's generator in a form that checkpoints can hold."""
-    state: Any = random.get_state()  # a tuple, which its annotation does not say
-    _, key, position, has_gauss, gauss = state
+    state = random.get_state(legacy=False)
     return {
-        "key": torch.from_numpy(key.astype(np.int64)),
-        "position": int(position),
-        "has_gauss": int(has_gauss),
-        "gauss": float(gauss),
+        "key": torch.from_numpy(state["state"]["key"].astype(np.int64)),
+        "position": int(state["state"]["pos"]),
+        "has_gauss": int(state["has_gauss"]),
+        "gauss": float(state["gauss"]),
     }
 
 

@@ -54,11 +54,6 @@ class GroupReplay:
         """Return the smallest number of transitions held for a seed."""
         return len(self._buffer)
 
-    @property
-    def transition_size(self) -> int:
-        """Bytes per transition, including its group; 0 before the first one."""
-        return self._buffer.transition_size
-
     def sizes(self, group: Tensor) -> Tensor:
         """Return the number of transitions held of each of the groups ``[S, G]``."""
         oldest = self._buffer.oldest.tolist()

@@ -79,11 +79,6 @@ class ReplayBuffer:
         return (self._n_added - self.capacity).clamp(min=0).view(self._shape)
 
     @property
-    def transition_size(self) -> int:
-        """Bytes per transition; 0 before the first one."""
-        return sum(rows[0].numel() * rows.element_size() for rows in self._rows.values())
-
-    @property
     def sizes(self) -> Tensor:
         """Number of transitions held for each seed, int64 ``[*S]``."""
         return self._n_added.clamp(max=self.capacity).view(self._shape)
@@ -127,20 +122,11 @@ class ReplayBuffer:
             )
         self._write(transitions, n_steps, mask)
 
-    def sample(
-        self,
-        batch_size: int | None = None,
-        *,
-        seeds: Sequence[int] | None = None,
-        generator: Sequence[torch.Generator] | None = None,
-    ) -> TensorDict:
+    def sample(self, batch_size: int | None = None) -> TensorDict:
         """Draw transitions of each seed, uniformly and with replacement.
 
         Args:
             batch_size: Transitions per seed; the ``batch_size`` of the buffer by default.
-            seeds: Positions of the seeds to draw for, in a stack of buffers; ``None`` for all.
-            generator: Random generators to use instead of the buffer's, one for each of those
-                seeds.
 
         Returns:
             A new tensordict of batch size ``[*S, B]`` that shares no memory with the buffer.
@@ -151,21 +137,17 @@ class ReplayBuffer:
         batch_size = self.batch_size if batch_size is None else batch_size
         if batch_size < 1:
             raise ValueError(f"batch_size must be at least 1, got {batch_size}")
-        sizes, own = self.sizes.view(-1).tolist(), self.generators
-        shape, columns = self._shape, self._seed
-        if seeds is not None:
-            sizes, own = [sizes[seed] for seed in seeds], [own[seed] for seed in seeds]
-            shape, columns = torch.Size([len(seeds)]), columns[list(seeds)]
+        sizes = self.sizes.view(-1).tolist()
         if not all(sizes):
             raise ValueError(f"every seed needs a transition before the first sample, got {sizes}")
         steps = torch.stack(
             [
-                torch.randint(size, (batch_size,), generator=source)
-                for size, source in zip(sizes, own if generator is None else generator, strict=True)
+                torch.randint(size, (batch_size,), generator=generator)
+                for size, generator in zip(sizes, self.generators, strict=True)
             ]
         )
-        rows = (steps * len(self.generators) + columns.unsqueeze(-1)).view(-1)
-        return self._read(rows, [*shape, batch_size])
+        rows = (steps * len(self.generators) + self._seed.unsqueeze(-1)).view(-1)
+        return self._read(rows, [*self._shape, batch_size])
 
     def take(
         self,

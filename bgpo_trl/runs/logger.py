@@ -44,7 +44,7 @@ TRAIN_COLUMNS = (
     "loss_actor",
     "loss_value",
 )
-"""Default columns of ``train.csv``, one row per training episode."""
+"""Columns of ``train.csv``, one row per training episode."""
 
 
 class RunLogger:
@@ -63,7 +63,6 @@ class RunLogger:
         resume: Continue the run in the directory, which may have had fewer ``episodes``; call
             `truncate_to` next.
         mirrors: TorchRL loggers that get every row as well.
-        train_columns: Columns of ``train.csv``.
 
     Raises:
         ValueError: If the directory holds a run with other settings or columns, or any run without
@@ -87,14 +86,13 @@ class RunLogger:
         wandb: Literal["online", "offline"] | None = None,
         resume: bool = False,
         mirrors: Sequence[Logger] = (),
-        train_columns: Sequence[str] = TRAIN_COLUMNS,
     ) -> None:
         self.directory = Path(directory)
         if wandb not in (None, "online", "offline"):
             raise ValueError(f'wandb must be "online", "offline" or None, not {wandb!r}.')
         settings = plain_settings(config)
         claim_directory(self.directory, settings, resume=resume)
-        self._train = CsvFile(self.directory / "train.csv", train_columns)
+        self._train = CsvFile(self.directory / "train.csv", TRAIN_COLUMNS)
         self._eval = CsvFile(self.directory / "eval.csv", EVAL_COLUMNS)
         self._mirrors = list(mirrors)
         if wandb is not None:
@@ -104,7 +102,7 @@ class RunLogger:
         """Write a training episode.
 
         Args:
-            row: Values by column of ``train.csv``; missing ones stay empty.
+            row: Values by column of `TRAIN_COLUMNS`; missing ones stay empty.
 
         Raises:
             ValueError: If there is no such column.

@@ -85,57 +85,6 @@ def test_seed_of_a_stack_is_that_seed_alone():
         assert (stacked.sample() == torch.stack(batches)).all()
 
 
-def states(replay: ReplayBuffer) -> list[torch.Tensor]:
-    return [generator.get_state() for generator in replay.generators]
-
-
-@pytest.mark.parametrize("seeds", [[0], [2, 0], [3, 1, 2]])
-@pytest.mark.parametrize("batch_size", [None, 5])
-def test_some_seeds_draw_what_they_would_draw_with_all(seeds, batch_size):
-    some, every = (ReplayBuffer(6, batch_size=16, generator=generators(4)) for _ in range(2))
-    for step in range(8):
-        mask = torch.tensor([True, step % 2 == 0, step < 7, step == 3])
-        for replay in (some, every):
-            replay.add(transition(step, 4), mask)
-    before = states(some)
-    drawn, whole = some.sample(batch_size, seeds=seeds), every.sample(batch_size)
-    assert drawn.batch_size == (len(seeds), batch_size or 16)
-    assert (drawn == whole[seeds]).all()
-    for seed in range(4):  # and only they have drawn
-        expected = states(every) if seed in seeds else before
-        assert states(some)[seed].equal(expected[seed])
-    # They go on as they would have.
-    rest = [seed for seed in range(4) if seed not in seeds]
-    some.sample(batch_size, seeds=rest)
-    assert (some.sample() == every.sample()).all()
-
-
-def test_seeds_without_transitions_are_in_the_way_of_none_but_themselves():
-    replay = ReplayBuffer(4, batch_size=3, generator=generators(3))
-    replay.add(transition(5, 3), torch.tensor([True, False, True]))
-    drawn = replay.sample(seeds=[2, 0])
-    torch.testing.assert_close(drawn["latent"].squeeze(-1)[:, 0], torch.tensor([5.02, 5.00]))
-    for seeds in (None, [1], [0, 1]):
-        with pytest.raises(ValueError, match="every seed needs a transition"):
-            replay.sample(seeds=seeds)
-
-
-@pytest.mark.parametrize("seeds", [None, [2, 0]])
-def test_given_generators_draw_in_place_of_the_buffers_own(seeds):
-    replay = ReplayBuffer(20, batch_size=16, generator=generators(3))
-    replay.extend(torch.stack([transition(step, 3) for step in range(20)]))
-    before, positions = states(replay), [0, 1, 2] if seeds is None else seeds
-    given = [torch.Generator().manual_seed(90 + i) for i in range(len(positions))]
-    drawn = replay.sample(7, seeds=seeds, generator=given)
-    for row, seed in enumerate(positions):
-        index = torch.randint(20, (7,), generator=torch.Generator().manual_seed(90 + row))
-        torch.testing.assert_close(drawn["latent"][row], (index + seed / 100).unsqueeze(-1))
-    for state, old in zip(states(replay), before, strict=True):
-        assert state.equal(old)
-    with pytest.raises(ValueError, match="zip"):
-        replay.sample(seeds=seeds, generator=given[1:])
-
-
 def test_every_transition_is_drawn_equally_often():
     replay = ReplayBuffer(10, batch_size=1, generator=generators(2))
     replay.extend(torch.stack([transition(step, 2) for step in range(10)]))
