@@ -84,7 +84,7 @@ def tensors_of(experts, seed, slot):
     tensors = {
         key: value
         for key, value in learner.loss.state_dict().items()
-        if key != "_extra_state" and value.ndim > 1
+        if not key.endswith("_extra_state") and value.ndim > 1
     }
     if "log_alpha" in dict(learner.loss.named_parameters()):
         assert "log_alpha" in tensors
