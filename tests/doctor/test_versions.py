@@ -55,11 +55,11 @@ def test_the_versions_of_constraints_are_read(tmp_path):
 
 
 def test_all_dependencies_and_the_extras_of_a_run_are_looked_at(tmp_path):
-    versions = {"torch": "1.0", "mujoco": "4.0.0", "wandb": None}
+    installed = {"torch": "1.0", "mujoco": "4.0.0", "wandb": None}
     found = {
         finding.what: finding
         for finding in versions.check_versions(
-            lambda name: versions.get(name, "1.0.50"), tmp_path / "no constraints"
+            lambda name: installed.get(name, "1.0.50"), tmp_path / "no constraints"
         )
     }
     assert found.keys() >= {"python", "dm-control", "torch", "torchrl", "mujoco", "wandb", "ray"}
