@@ -381,10 +381,10 @@ def test_the_ladder_has_a_row_and_a_run_for_each_rung(tiny, tmp_path, capsys):
         assert {row["algorithm"] for row in train} == {config["name"]} == {f"rung {rung}"}
         assert all((float(row["intrinsic_return"]) > 0) == (rung in "cd") for row in train)
     assert seen == {
-        "a": ("state", {"state", "task_one_hot"}, False),
-        "b": ("latent", {"latent", "task_one_hot"}, False),
-        "c": ("latent", {"latent", "behavior"}, False),
-        "d": ("latent", {"latent", "behavior"}, True),
+        "a": ("state", {"state", "context"}, False),
+        "b": ("latent", {"latent", "context"}, False),
+        "c": ("latent", {"latent", "context"}, False),
+        "d": ("latent", {"latent", "context"}, True),
     }
 
     before = files(tmp_path)

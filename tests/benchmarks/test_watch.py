@@ -9,6 +9,7 @@ import watch
 from PIL import Image
 
 from bgpo_trl.figures import of_run as growth
+from bgpo_trl.runs.config_file import read_config
 from bgpo_trl.runs.gwr_graphs import load_graphs
 from suites import nico
 from suites.nico.demonstrator import Demonstrator
@@ -68,7 +69,7 @@ def test_an_episode_is_what_the_policy_does_from_that_start():
         return left.pop(0)
 
     policy = SimpleNamespace(
-        watch=lambda demonstration, task: watched.append((demonstration, task)),
+        condition=lambda demonstration, task: watched.append((demonstration, task)),
         act=act,
         config=SimpleNamespace(algorithm=SimpleNamespace(max_steps=50)),
     )
@@ -144,7 +145,7 @@ def test_frames_are_enlarged_without_blurring():
 
 def test_the_growth_figure_knows_only_tasks_that_were_presented(run_of, bank, monkeypatch):
     run, drawn = run_of("bgpo"), []
-    config = watch.read_config(run / "config.json")[0]
+    config = read_config(run / "config.json")[0]
     monkeypatch.setattr(growth, "plot_gwr_growth", lambda *given: drawn.append(given))
     monkeypatch.setattr(growth, "save_figure", lambda figure, path: drawn.append(path))
     assert growth.draw_growth(run, config, bank)
