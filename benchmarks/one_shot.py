@@ -35,6 +35,7 @@ from bgpo_trl.experiments.arguments import command_line
 from bgpo_trl.experiments.run import commit_of_code
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.seeding import stream_seed
+from bgpo_trl.transforms import TaskSchedule
 
 COLUMNS = ("share", "seed", "task", "episodes", "success", "task_inference", "activity")
 # Number of the evaluation; it seeds start states that neither training nor final tests used.
@@ -133,7 +134,7 @@ def measure(policy: TrainedPolicy, shares: Sequence[float], episodes: int, seed:
     evaluator = Evaluator(
         config.algorithm,
         seeds=config.seeds,
-        n_tasks=len(tasks),
+        schedule=TaskSchedule((0,) * len(tasks)),
         episodes=episodes,
         bank=policy.bank.held_out(),
         encoders=policy.encoders,

@@ -121,9 +121,9 @@ PARTS = {
         lambda: GWRB(2).set_extra_state([{"weights": torch.zeros(2, 2)}]),
         "the state of a network needs", "see get_extra_state"),
     "gwr edge to nowhere": (
-        lambda: filled({"edges": torch.tensor([[0, 7]])}), "damaged", "load what state_dict"),
+        lambda: filled({"edges": torch.tensor([[0, 7]])}), "damaged", "load one that"),
     "gwr NaN weights": (
-        lambda: filled({"weights": torch.full((2, 2), NAN)}), "damaged", "load what state_dict"),
+        lambda: filled({"weights": torch.full((2, 2), NAN)}), "damaged", "load one that"),
     # networks
     "vae of nothing": (lambda: VAE(0), "latent_size", "at least 1, got 0"),
     "vae float frames": (lambda: VAE().latent(torch.zeros(32, 64, 3)), "float32", "must be uint8"),
@@ -246,7 +246,7 @@ PARTS = {
         lambda: world(
             source(batch_size=[2]), BehaviorLookup(GWRB(32), learn=True), batch_size=[2]
         ).reset(),
-        "batch_size=()", "it is to learn from has (2,)"),
+        "batch_size=()", "environment to learn from has (2,)"),
     "bonus without latents": (
         lambda: world(
             source(), BehaviorLookup(GWRB(32), learn=True), BehaviorMatchingReward(lae)
@@ -257,10 +257,10 @@ PARTS = {
             FrameEncoder(VAE(16)), source(), BehaviorLookup(GWRB(32), learn=True),
             BehaviorMatchingReward(lae), observation="pixels",
         ).reset(),
-        "have sizes (16, 32)", "use those trained together"),
+        "have sizes (16, 32)", "use a pair trained together"),
     "NaN bonus": (lambda: BehaviorMatchingReward(lae, beta=NAN), "got nan", "must not be negative"),
     "encoder without frames": (
-        lambda: world(FrameEncoder(VAE())).reset(), "no 'pixels'", "have it render"),
+        lambda: world(FrameEncoder(VAE())).reset(), "no 'pixels'", "observe pixels"),
     "keys that do not pair": (
         lambda: FrameEncoder(VAE(), out_keys=("a", "b")), "got 2 for 1", "one of out_keys for"),
     "time limit too late": (
@@ -274,24 +274,24 @@ PARTS = {
         lambda: world(source(), RewardSum(), BehaviorMatchingReward(lae)).reset(),
         "BehaviorMatchingReward", "put RewardSum after"),
     # measures
-    "area of nothing": (lambda: metrics.area_under_curve([], []), "success [0]", "at least"),
+    "area of nothing": (lambda: metrics.area_under_curve([], []), "success [0]", "a training"),
     "area of unequal lists": (
-        lambda: metrics.area_under_curve([0.1, 0.2], [1]), "episodes [1", "for each"),
+        lambda: metrics.area_under_curve([0.1, 0.2], [1]), "episodes [1", "evaluation needs"),
     "area back in time": (
         lambda: metrics.area_under_curve([0.1, 0.2], [2, 1]), "[2.0, 1.0]", "increasing"),
     "threshold of unequal lists": (
-        lambda: metrics.episodes_to([0.1, 0.9], [1]), "episodes [1]", "for each"),
+        lambda: metrics.episodes_to([0.1, 0.9], [1]), "episodes [1]", "evaluation needs"),
     "matrix of unequal lists": (
-        lambda: metrics.evaluation_matrix([[0.1]], [1, 2], [2], window=2), "[1, 2]", "for each"),
+        lambda: metrics.evaluation_matrix([[0.1]], [1, 2], [2], window=2), "[1, 2]", "each evaluat"),
     "matrix without a test": (
         lambda: metrics.evaluation_matrix([[0.1]], [1], [9], window=2), "no evaluation", "larger"),
     "mean of no evaluations": (
         lambda: metrics.trailing_mean([[0.1]], 0), "got (1, 1), 0", "n at least 1"),
     "best of a single list": (
-        lambda: metrics.forgetting_since_best([0.1, 0.2]), "success [2]", "is needed"),
+        lambda: metrics.forgetting_since_best([0.1, 0.2]), "success [2]", "needs a training"),
     "transfer without phases": (
-        lambda: metrics.backward_transfer([[1, 2]]), "got [1, 2]", "one phase a task"),
-    "quartiles of nothing": (lambda: intervals.interquartile_mean([]), "at least one", "leave out"),
+        lambda: metrics.backward_transfer([[1, 2]]), "got [1, 2]", "one phase per task"),
+    "quartiles of nothing": (lambda: intervals.interquartile_mean([]), "not empty", "leave out"),
     "quartiles of NaN": (lambda: intervals.interquartile_mean([NAN]), "finite", "leave out"),
     "bootstrap of NaN": (
         lambda: intervals.stratified_bootstrap([[NAN]], rng=np.random.default_rng(0)),
@@ -300,7 +300,7 @@ PARTS = {
         lambda: intervals.stratified_bootstrap([[1]], n_resamples=0, rng=np.random.default_rng(0)),
         "got 0", "at least 1"),
     "interval in percent": (
-        lambda: intervals.percentile_interval([1, 2], 95), "and 95", "confidence in (0, 1)"),
+        lambda: intervals.percentile_interval([1, 2], 95), "and 95", "must be in (0, 1)"),
 }  # fmt: skip
 
 

@@ -178,7 +178,9 @@ def measure_step(arguments: Arguments) -> Table:
 def measure_memory(arguments: Arguments) -> Table:
     """Measure the memory of a run over time, and the replay buffer's share of its growth."""
     training = Training(range(arguments.seeds))
-    transition_size = training.algorithm.replay.transition_size
+    group = torch.zeros(arguments.seeds, 1, dtype=torch.int64)
+    stored = training.algorithm.replay.sample(group).exclude("priority_weight")[0, 0]
+    transition_size = stored.bytes() + group.element_size()
     marks: list[tuple[int, float, float]] = []
     every = max(1, arguments.steps // 4)
     for step in range(arguments.steps + 1):

@@ -11,6 +11,7 @@ import summary
 import watch
 
 from bgpo_trl.files.checkpoint import save_checkpoint
+from bgpo_trl.runs.config_file import read_config
 from suites import nico
 
 TASKS = nico.ALL_TASKS
@@ -200,7 +201,7 @@ del GROWTH["gwr/episode-000010.safetensors missing"]  # There are others.
 
 @pytest.mark.parametrize("damage", GROWTH.values(), ids=GROWTH.keys())
 def test_growth_is_not_drawn_from_damaged_files(run, bank, damage, tmp_path):
-    config = watch.read_config(run / "config.json")[0]
+    config = read_config(run / "config.json")[0]
     damage(run)
     refusal(lambda: watch.draw_growth(run, config, bank, tmp_path / "out"))
     assert not (tmp_path / "out").exists()

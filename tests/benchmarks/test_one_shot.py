@@ -98,8 +98,8 @@ def test_policies_are_shown_the_beginning_of_new_demonstrations(run_of, tmp_path
 def test_all_shares_are_tested_from_the_same_starts(run_of, monkeypatch):
     policy, numbers = load_run(run_of("bgpo")), []
 
-    def run(self, snapshots, number, algorithm):
-        numbers.append(number)
+    def run(self, snapshots, device):
+        numbers.extend({snapshot.number for snapshot in snapshots})
         assert all(snapshot.presented.all() for snapshot in snapshots)
         return SimpleNamespace(success=torch.ones(2, 3, 1, dtype=torch.bool))
 

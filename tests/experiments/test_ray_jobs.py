@@ -191,9 +191,9 @@ def test_a_machine_that_is_too_small_is_told(monkeypatch):
 
 def test_a_missing_ray_is_told_with_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
-    monkeypatch.delitem(sys.modules, "jobs")
-    with pytest.raises(SystemExit, match=r"pip install 'bgpo_trl\[ray\]'"):
-        __import__("jobs")
+    monkeypatch.delitem(sys.modules, "bgpo_trl.experiments.ray_jobs")
+    with pytest.raises(ImportError, match=r"pip install 'bgpo_trl\[ray\]'"):
+        __import__("bgpo_trl.experiments.ray_jobs")
 
 
 @pytest.fixture
