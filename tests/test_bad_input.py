@@ -282,7 +282,7 @@ PARTS = {
     "threshold of unequal lists": (
         lambda: metrics.episodes_to([0.1, 0.9], [1]), "episodes [1]", "evaluation needs"),
     "matrix of unequal lists": (
-        lambda: metrics.evaluation_matrix([[0.1]], [1, 2], [2], window=2), "[1, 2]", "each evaluat"),
+        lambda: metrics.evaluation_matrix([[0.1]], [1, 2], [2], window=2), "[1, 2]", "each eval"),
     "matrix without a test": (
         lambda: metrics.evaluation_matrix([[0.1]], [1], [9], window=2), "no evaluation", "larger"),
     "mean of no evaluations": (
