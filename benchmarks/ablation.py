@@ -12,7 +12,13 @@ from __future__ import annotations
 
 from bgpo_trl.experiments.arguments import command_line
 from bgpo_trl.experiments.paper import AblationArguments as Arguments
-from bgpo_trl.experiments.paper import ablation as main
+from bgpo_trl.experiments.paper import ablation
+
+
+def main(arguments: Arguments) -> None:
+    """Run the experiment and print its results."""
+    print(ablation(arguments))
+
 
 if __name__ == "__main__":
     command_line(main, __doc__, Arguments)

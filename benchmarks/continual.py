@@ -9,8 +9,14 @@ writes a run directory with ``config.json``, ``train.csv``, ``eval.csv``, ``chec
 
 from __future__ import annotations
 
-from bgpo_trl.experiments.arguments import command_line
-from bgpo_trl.experiments.paper import continual as main
+from bgpo_trl.experiments.arguments import Arguments, command_line
+from bgpo_trl.experiments.paper import continual
+
+
+def main(arguments: Arguments) -> None:
+    """Run the experiment and print its results."""
+    print(continual(arguments))
+
 
 if __name__ == "__main__":
-    command_line(main, __doc__)
+    command_line(main, __doc__, Arguments)

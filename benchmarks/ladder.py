@@ -17,11 +17,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from summary import summarize
 from tyro.conf import subcommand
 
+from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.bgpo import BGPO
 from bgpo_trl.configs import PRESETS, BGPOConfig, DDPGConfig, SACConfig, TD3Config
 from bgpo_trl.encoders.pretrained import load_pretrained
@@ -34,7 +35,7 @@ from bgpo_trl.training import Trainer
 
 Rung = Literal["a", "b", "c", "d"]
 
-_SINGLE = BGPOConfig(variant="published", experts=False, even_replay=False, demonstration_share=0.0)
+_SINGLE: Any = ALGORITHMS["bgpo-single"].config
 
 RUNGS: dict[str, tuple[str, BGPOConfig]] = {
     "a": ("ground truth + label", replace(_SINGLE, variant="label", state="state")),

@@ -30,7 +30,7 @@ def main(arguments: list[str]) -> None:
     kind = paper.AblationArguments if name == "ablation" else Arguments
     run = getattr(paper, name)
     sys.argv = ["-m", "bgpo_trl", name, *options]  # stored in a run's summary.json
-    command_line(run, run.__doc__, kind, options)
+    command_line(lambda asked: print(run(asked)), run.__doc__, kind, options)
 
 
 if __name__ == "__main__":

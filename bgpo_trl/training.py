@@ -8,8 +8,7 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -20,6 +19,7 @@ from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.evaluation import Evaluator
 from bgpo_trl.files.checkpoint import save_checkpoint
+from bgpo_trl.files.closing import Closing
 from bgpo_trl.files.interrupts import interrupts_wait
 from bgpo_trl.files.locking import DirectoryLock
 from bgpo_trl.files.progress import progress_bar
@@ -31,7 +31,7 @@ from bgpo_trl.transforms import TaskSchedule
 from bgpo_trl.world import World
 
 
-class Trainer:
+class Trainer(Closing):
     """One run: an algorithm, its evaluations and its files.
 
     Each seed of the batch plays ``config.episodes`` training episodes. Seeds that finish early go
@@ -180,17 +180,6 @@ class Trainer:
         """Close files and mirrors, and unlock the directory for other processes."""
         self.logger.close()
         self._lock.release()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc_value: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def _success_so_far(self) -> str:
         rate = sum(self._successes) / len(self._successes)

@@ -65,14 +65,14 @@ the task's label (``oracle``) and without context (``ddpg``). Names in ``-paper`
 publication: networks of 64 units, batches of 256, no stabilizers."""
 
 ABLATIONS: dict[str, Entry] = {
-    "gwr+r_int": Entry(BGPO, _SINGLE),
+    "gwr+r_int": ALGORITHMS["bgpo-single"],
     "gwr": Entry(BGPO, replace(_SINGLE, variant="without-bonus")),
     "r_int": Entry(BGPO, replace(_SINGLE, variant="without-gwr")),
     "none": Entry(BGPO, replace(_SINGLE, variant="without-both")),
     "even-replay": Entry(BGPO, replace(_SINGLE, variant="bgpo", even_replay=True)),
-    "experts": Entry(BGPO, replace(_SINGLE, variant="bgpo", even_replay=True, experts=True)),
+    "experts": ALGORITHMS["bgpo-experts"],
     "demonstrations": Entry(BGPO, replace(_SINGLE, demonstration_share=_SHOWN)),
-    "all": Entry(BGPO, BGPOConfig()),
+    "all": ALGORITHMS["bgpo"],
 }
 """The paper's ablations (Fig. 9): with GWR-B and the intrinsic reward, one of them, neither. Then
 each addition of this package to the published algorithm, and all of them together."""

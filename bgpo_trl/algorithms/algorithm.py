@@ -14,8 +14,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 
 from bgpo_trl.algorithms.learner import Learner
 from bgpo_trl.algorithms.policy import Policy
-from bgpo_trl.algorithms.rl import LearnerSpec
-from bgpo_trl.configs import AlgorithmConfig, DistNLLConfig, MAMLConfig
+from bgpo_trl.configs import AlgorithmConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.demonstration_replay import DemonstrationReplay
 from bgpo_trl.data.group_replay import GroupReplay
@@ -127,43 +126,6 @@ class Algorithm(ABC):
         """Return a policy of `test_actor` with these parameters and this context."""
         return Policy(self.test_actor, self.config.state, parameters, context)
 
-    def task_spec(self, config: AlgorithmConfig, seeds: Sequence[int]) -> LearnerSpec:
-        """Return the spec of networks ``[S, T]`` that read the state, one per task.
-
-        Args:
-            config: Hyperparameters.
-            seeds: The seeds.
-        """
-        return LearnerSpec(
-            seeds=seeds,
-            in_keys=[config.state],
-            in_features=self.state_size,
-            return_bounds=(0.0, 1.0),
-            device=self.device,
-            experts=range(self.n_tasks),
-        )
-
-    def task_replay(
-        self, config: MAMLConfig | DistNLLConfig, bank: DemonstrationBank, seeds: Sequence[int]
-    ) -> TaskReplay:
-        """Return an empty replay of each task.
-
-        Args:
-            config: Hyperparameters.
-            bank: The demonstrations of training episodes.
-            seeds: The seeds.
-        """
-        keys = [config.state, "action"]
-        return TaskReplay(
-            config.rl.replay_size,
-            n_tasks=self.n_tasks,
-            batch_size=config.task_batch_size,
-            generator=generators(seeds, "replay"),
-            demonstrations=self.demonstrations(config, bank, seeds),
-            demonstration_share=config.demonstration_share,
-            keys=[*keys, *(("next", key) for key in (config.state, "reward", "terminated"))],
-        )
-
     def demonstrations(
         self,
         config: AlgorithmConfig,
@@ -216,9 +178,3 @@ class Algorithm(ABC):
         """Return the parts that learning changes, as far as the algorithm has them."""
         parts = ("learner", "replay")
         return {name: getattr(self, name) for name in parts if hasattr(self, name)}
-
-
-def networks_of(parameters: TensorDictBase, seed: Tensor, task: Tensor) -> dict[str, Tensor]:
-    """Select networks from parameters ``[S, T, ...]`` by position of the seed and task, int64."""
-    flat = parameters.flatten_keys(".")
-    return {str(key): value[seed, task] for key, value in flat.items()}

@@ -12,23 +12,19 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torch.func import functional_call
-from torchrl.envs import EnvBase, TransformedEnv
 
-from bgpo_trl.algorithms.algorithm import Algorithm, networks_of
-from bgpo_trl.algorithms.environments import no_context_env
 from bgpo_trl.algorithms.policy import Policy
 from bgpo_trl.algorithms.rl import make_ddpg
+from bgpo_trl.algorithms.task_algorithm import TaskAlgorithm, networks_of
 from bgpo_trl.configs import DistNLLConfig
 from bgpo_trl.data.bank import DemonstrationBank
-from bgpo_trl.data.task_replay import TaskReplay
 from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.modules.multi_head_actor import MultiHeadActor
 from bgpo_trl.objectives.distillation import DistillationLoss
 from bgpo_trl.seeding import generators
-from bgpo_trl.transforms import DemonstrationSource
 
 
-class DistNLL(Algorithm):
+class DistNLL(TaskAlgorithm):
     """Policy distillation from teachers that are still learning; the policies read the state only.
 
     1. Training episodes are played by the teacher of their task, with exploration noise.
@@ -38,7 +34,7 @@ class DistNLL(Algorithm):
        heads are kept.
     4. Test episodes are played by the multi-task policy with the head of the true label.
 
-    Arguments as for `Algorithm`; the bank provides only the tasks.
+    Arguments as for `TaskAlgorithm`.
 
     Attributes:
         teacher: The tasks' policies, ``[S, T]`` stacked.
@@ -49,7 +45,6 @@ class DistNLL(Algorithm):
 
     config: DistNLLConfig
     needs_replay = False
-    replay: TaskReplay
 
     def __init__(
         self,
@@ -61,11 +56,10 @@ class DistNLL(Algorithm):
         device: torch.device | str = "cpu",
     ) -> None:
         super().__init__(config, seeds=seeds, bank=bank, encoders=encoders, device=device)
-        spec = self.task_spec(config, seeds)
-        self.learner = make_ddpg(config.rl, spec)
+        self.learner = make_ddpg(config.rl, self.spec)
         self.loss, self.teacher = self.learner.loss, self.learner.actor
+        self.training_actor = self.teacher
         self.critic = self.loss.value_network
-        self.replay = self.task_replay(config, bank, seeds)
         self._make_students(seeds)
 
     def _make_students(self, seeds: Sequence[int]) -> None:
@@ -91,23 +85,9 @@ class DistNLL(Algorithm):
         for _ in range(self.n_tasks):
             self.test_actor.add_head()
 
-    def make_env(self, base_env: EnvBase, source: DemonstrationSource) -> TransformedEnv:
-        """Return an environment without context."""
-        return no_context_env(self.config, base_env, source, self.encoders)
-
-    @torch.no_grad()
-    def act(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the ``action`` ``[S, 4]`` of the tasks' teachers with exploration noise."""
-        seen = self.to_device(tensordict.select(self.config.state))
-        teachers = networks_of(
-            self.loss.actor_network_params, torch.arange(self.n_seeds), tensordict["task"]
-        )
-        functional_call(self.teacher, teachers, (seen,))
-        return tensordict.set("action", self.learner.explore(seen["action"], self._noise))
-
     def store(self, transition: TensorDictBase) -> None:
         """Add a transition of each seed to the replay of its task."""
-        self.replay.add(transition)
+        super().store(transition)
         self._ended = transition.get(("next", "done")).flatten().clone()
 
     def update(self) -> dict[str, Tensor]:
@@ -115,7 +95,7 @@ class DistNLL(Algorithm):
 
         Then distill the teachers of the seeds whose episode has just ended.
         """
-        if len(self.replay) < max(self.config.rl.warmup_steps, self.replay.enough):
+        if not self.ready():
             return {}
         losses = self.learn(self.replay.sample())
         for index in self._ended.nonzero().flatten().tolist():

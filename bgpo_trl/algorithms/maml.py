@@ -8,26 +8,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor
-from torch.func import functional_call
-from torchrl.envs import EnvBase, TransformedEnv
 
-from bgpo_trl.algorithms.algorithm import Algorithm, networks_of
-from bgpo_trl.algorithms.environments import no_context_env
 from bgpo_trl.algorithms.learner import Learner
 from bgpo_trl.algorithms.policy import Policy
+from bgpo_trl.algorithms.task_algorithm import TaskAlgorithm
 from bgpo_trl.configs import MAMLConfig
 from bgpo_trl.data.bank import DemonstrationBank
-from bgpo_trl.data.task_replay import TaskReplay
 from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.modules.actor_critic import Actor
 from bgpo_trl.objectives.maml import MAMLLoss
 from bgpo_trl.seeding import generators
-from bgpo_trl.transforms import DemonstrationSource
 
 
-class MAML(Algorithm):
+class MAML(TaskAlgorithm):
     """MAML with one critic and one replay per task; the policy reads the state only.
 
     1. Training episodes are played by the policy adapted to their task, with exploration noise.
@@ -37,7 +31,7 @@ class MAML(Algorithm):
     3. Test episodes of a task are played by the policy after one gradient step on
        ``adaptation_size`` transitions of that task.
 
-    Arguments as for `Algorithm`; the bank provides only the tasks.
+    Arguments as for `TaskAlgorithm`.
 
     Attributes:
         meta_actor: The policy before adaptation, ``[S]`` stacked.
@@ -46,7 +40,6 @@ class MAML(Algorithm):
 
     config: MAMLConfig
     loss: MAMLLoss
-    replay: TaskReplay
 
     def __init__(
         self,
@@ -59,48 +52,29 @@ class MAML(Algorithm):
     ) -> None:
         super().__init__(config, seeds=seeds, bank=bank, encoders=encoders, device=device)
         ddpg = config.rl
-        spec = self.task_spec(config, seeds)
         self.meta_actor = Actor(
             self.state_size,
             batch_size=[self.n_seeds],
             generator=generators(seeds, "actor"),
-            in_keys=spec.in_keys,
+            in_keys=self.spec.in_keys,
             hidden_sizes=ddpg.hidden_sizes,
         ).to(self.device)
-        self.critic = spec.critic(ddpg)
+        self.critic = self.spec.critic(ddpg)
         self.loss = MAMLLoss(
             self.meta_actor,
-            spec.actor(Actor, ddpg),
+            self.spec.actor(Actor, ddpg),
             self.critic,
             inner_learning_rate=config.inner_learning_rate,
             pre_tanh_penalty=ddpg.pre_tanh_penalty,
-            **spec.loss_options(ddpg),
+            **self.spec.loss_options(ddpg),
         )
-        self.test_actor = self.meta_actor  # called with adapted parameters
+        # Called with adapted parameters.
+        self.training_actor = self.test_actor = self.meta_actor
         self.learner = Learner(self.meta_actor, self.loss, ddpg, noise=ddpg.noise)
-        self.replay = self.task_replay(config, bank, seeds)
-
-    def make_env(self, base_env: EnvBase, source: DemonstrationSource) -> TransformedEnv:
-        """Return an environment without context."""
-        return no_context_env(self.config, base_env, source, self.encoders)
-
-    @torch.no_grad()
-    def act(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the ``action`` ``[S, 4]`` of the adapted policies with exploration noise."""
-        seen = self.to_device(tensordict.select(self.config.state))
-        adapted = networks_of(
-            self.loss.actor_network_params, torch.arange(self.n_seeds), tensordict["task"]
-        )
-        functional_call(self.meta_actor, adapted, (seen,))
-        return tensordict.set("action", self.learner.explore(seen["action"], self._noise))
-
-    def store(self, transition: TensorDictBase) -> None:
-        """Add a transition of each seed to the replay of its task."""
-        self.replay.add(transition)
 
     def update(self) -> dict[str, Tensor]:
         """Make one update of each seed; see `Algorithm.update`."""
-        if len(self.replay) < max(self.config.rl.warmup_steps, self.replay.enough):
+        if not self.ready():
             return {}
         batch = self.replay.sample()
         # Demonstrations come last; interleaving gives each half the same share of them.

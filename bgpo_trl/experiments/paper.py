@@ -1,4 +1,7 @@
-"""The paper's three experiments: tasks in sequence, all tasks from the start, the ablation."""
+"""The paper's three experiments: tasks in sequence, all tasks from the start, the ablation.
+
+Each trains to the end and returns its results as text.
+"""
 
 from __future__ import annotations
 
@@ -12,15 +15,15 @@ from bgpo_trl.experiments.run import run_experiment
 __all__ = ["AblationArguments", "ablation", "concurrent", "continual"]
 
 
-def continual(arguments: Arguments) -> None:
+def continual(arguments: Arguments) -> str:
     """Train an algorithm on tasks presented one after the other (Fig. 8)."""
-    print(run_experiment(arguments, "continual", run_config(arguments)))
+    return run_experiment(arguments, "continual", run_config(arguments))
 
 
-def concurrent(arguments: Arguments) -> None:
+def concurrent(arguments: Arguments) -> str:
     """Train an algorithm on tasks that are all presented from the start (Fig. 6)."""
     config = replace(run_config(arguments), task_starts=(0, 0, 0))
-    print(run_experiment(arguments, "concurrent", config))
+    return run_experiment(arguments, "concurrent", config)
 
 
 @dataclass(frozen=True)
@@ -37,7 +40,7 @@ class AblationArguments(Arguments):
     """Tasks one after the other instead of all from the start."""
 
 
-def ablation(arguments: AblationArguments) -> None:
+def ablation(arguments: AblationArguments) -> str:
     """Train a variant of BGPO (Fig. 9).
 
     Raises:
@@ -51,4 +54,4 @@ def ablation(arguments: AblationArguments) -> None:
     if not arguments.continual:
         config = replace(config, task_starts=(0, 0, 0))
     name = "ablation-continual" if arguments.continual else "ablation"
-    print(run_experiment(arguments, name, config))
+    return run_experiment(arguments, name, config)

@@ -8,11 +8,12 @@ import io
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
+
+from bgpo_trl.files.closing import Closing
 
 
-class CsvFile:
+class CsvFile(Closing):
     r"""An append-only CSV file with fixed columns that can be truncated to an earlier position.
 
     Each row is written unbuffered and whole: killing the process loses no row, a row that does not
@@ -110,17 +111,6 @@ class CsvFile:
     def close(self) -> None:
         """Close the file."""
         self._file.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc_value: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def _append(self, line: bytes) -> None:
         start = self._file.seek(0, os.SEEK_END)

@@ -14,12 +14,12 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 from torchrl.record.loggers import Logger
 from torchrl.record.loggers.wandb import WandbLogger
 
+from bgpo_trl.files.closing import Closing
 from bgpo_trl.files.csv_file import CsvFile, plain_value
 from bgpo_trl.runs.directory import claim_directory, plain_settings
 
@@ -47,7 +47,7 @@ TRAIN_COLUMNS = (
 """Columns of ``train.csv``, one row per training episode."""
 
 
-class RunLogger:
+class RunLogger(Closing):
     """Write the log of a run into its directory, and mirror it to dashboards.
 
     A mirror gets each row as one ``log_metrics`` call with the row's numbers, named
@@ -161,17 +161,6 @@ class RunLogger:
         for mirror in list(self._mirrors):
             self._try(mirror, mirror.shutdown)
         self._mirrors.clear()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc_value: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def _mirror(self, group: str, row: Mapping[str, Any]) -> None:
         values = {name: plain_value(value) for name, value in row.items()}

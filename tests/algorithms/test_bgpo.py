@@ -18,7 +18,7 @@ from bgpo_trl.modules.gwr import GWRB
 from bgpo_trl.seeding import generators
 from bgpo_trl.transforms import BehaviorLookup, GroupLookup, TaskSchedule
 
-# What the policy sees, what it is told, the composition that tells it, and whose settings it has.
+# By name: state, meaning of the context, variant, and the algorithm whose settings it has.
 VARIANTS = {
     "ground truth, label": ("state", "label", "label", "oracle"),
     "latent, label": ("latent", "label", "label", "oracle"),
@@ -81,7 +81,7 @@ def groups_of(state, algorithm):
 
 
 def plain_action(algorithm, state):
-    """What the policies do without noise, worked out from the weights that tests are given."""
+    """Actions without noise, computed from the weights of the snapshots."""
     actions = []
     for seed, group in enumerate(groups_of(state, algorithm)):
         weight = algorithm.experts.actor_weights(seed, group)

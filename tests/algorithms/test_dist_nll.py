@@ -79,7 +79,7 @@ def assert_same(first, second):
 
 
 def teachers_action(algorithm, seed, task, state):
-    """What a teacher does, worked out from its weights."""
+    """Actions of a teacher, computed from its weights."""
     params = algorithm.loss.actor_network_params["mlp", "layers"]
     first, second = (
         {key: value.detach()[seed, task] for key, value in params[layer].items()} for layer in "01"
@@ -456,7 +456,7 @@ def test_snapshots_act_as_plain_ones_with_these_weights(make):
         alone.load_state_dict(frozen[index].parameters)
         expected = alone(TensorDict({"state": state[index]}, [N_TASKS, 5]))["action"]
         torch.testing.assert_close(actions[index], expected)
-    # What is learned since makes no difference.
+    # Later learning makes no difference.
     play(algorithm, 10)
     assert stacked.act(state).equal(actions)
 

@@ -341,7 +341,7 @@ def test_snapshots_act_as_plain_ones_with_these_weights(make):
             alone.load_state_dict(weights)
             expected = alone(TensorDict({"state": state[index, task]}, [5]))["action"]
             torch.testing.assert_close(actions[index, task], expected)
-    # What is learned since makes no difference.
+    # Later learning makes no difference.
     play(algorithm, 10)
     assert stacked.act(state).equal(actions)
 

@@ -1,4 +1,4 @@
-"""What people get wrong at the command line: one line, exit status 1, and nothing half-written.
+"""Mistakes at the command line: one line, exit status 1, and nothing half-written.
 
 Flags that there are not, and values that are no numbers or no choices, are tyro's own to refuse: a
 box of several lines with exit status 2, which must name the flag and, where there are some, the

@@ -276,7 +276,7 @@ def test_the_command_line_runs_every_algorithm_and_says_its_name(
         assert {row["algorithm"] for row in rows} == {name}
         assert {row["task"] for row in rows} == set(TASKS)
 
-    # What is said of GWR-B is said where there is one.
+    # Lines on GWR-B appear only with algorithms that have one.
     with_gwr = name.startswith("bgpo")
     told = json.loads((run / "summary.json").read_text())
     assert (told["nodes"] is not None) == with_gwr

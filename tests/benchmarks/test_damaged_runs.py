@@ -86,7 +86,7 @@ def replaced(name, old, new):
 
 
 def of_the_file(name):
-    """What may have become of any file."""
+    """Kinds of damage that any file may have."""
     return {
         f"{name} missing": lambda run: (run / name).unlink(),
         f"{name} empty": content(name, b""),

@@ -1,0 +1,100 @@
+"""Base class of the algorithms that know the task label: networks and a replay for each task."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torch.func import functional_call
+from torchrl.envs import EnvBase, TransformedEnv
+
+from bgpo_trl.algorithms.algorithm import Algorithm
+from bgpo_trl.algorithms.environments import no_context_env
+from bgpo_trl.algorithms.rl import LearnerSpec
+from bgpo_trl.configs import DistNLLConfig, MAMLConfig
+from bgpo_trl.data.bank import DemonstrationBank
+from bgpo_trl.data.task_replay import TaskReplay
+from bgpo_trl.encoders.representation import Representation
+from bgpo_trl.objectives.off_policy import OffPolicyLoss
+from bgpo_trl.seeding import generators
+from bgpo_trl.transforms import DemonstrationSource
+
+__all__ = ["TaskAlgorithm", "networks_of"]
+
+
+class TaskAlgorithm(Algorithm):
+    """A learner whose training episodes are played by a policy of their task, ``[S, T]`` stacked.
+
+    The policies read the state only. Arguments as for `Algorithm`; the bank provides the tasks
+    and, with a ``demonstration_share``, demonstrations as experience.
+
+    Attributes:
+        spec: Shapes and inputs of the networks, one per task.
+        loss: Its ``actor_network_params`` are the policies of training episodes.
+        training_actor: Network that is called with some of these parameters.
+    """
+
+    config: MAMLConfig | DistNLLConfig
+    replay: TaskReplay
+    loss: OffPolicyLoss
+    training_actor: TensorDictModuleBase
+
+    def __init__(
+        self,
+        config: MAMLConfig | DistNLLConfig,
+        *,
+        seeds: Sequence[int],
+        bank: DemonstrationBank,
+        encoders: Representation | None = None,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        super().__init__(config, seeds=seeds, bank=bank, encoders=encoders, device=device)
+        self.spec = LearnerSpec(
+            seeds=seeds,
+            in_keys=[config.state],
+            in_features=self.state_size,
+            return_bounds=(0.0, 1.0),
+            device=self.device,
+            experts=range(self.n_tasks),
+        )
+        keys = [config.state, "action"]
+        self.replay = TaskReplay(
+            config.rl.replay_size,
+            n_tasks=self.n_tasks,
+            batch_size=config.task_batch_size,
+            generator=generators(seeds, "replay"),
+            demonstrations=self.demonstrations(config, bank, seeds),
+            demonstration_share=config.demonstration_share,
+            keys=[*keys, *(("next", key) for key in (config.state, "reward", "terminated"))],
+        )
+
+    def make_env(self, base_env: EnvBase, source: DemonstrationSource) -> TransformedEnv:
+        """Return an environment without context."""
+        return no_context_env(self.config, base_env, source, self.encoders)
+
+    @torch.no_grad()
+    def act(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the ``action`` ``[S, 4]`` of the tasks' policies with exploration noise."""
+        seen = self.to_device(tensordict.select(self.config.state))
+        policies = networks_of(
+            self.loss.actor_network_params, torch.arange(self.n_seeds), tensordict["task"]
+        )
+        functional_call(self.training_actor, policies, (seen,))
+        return tensordict.set("action", self.learner.explore(seen["action"], self._noise))
+
+    def store(self, transition: TensorDictBase) -> None:
+        """Add a transition of each seed to the replay of its task."""
+        self.replay.add(transition)
+
+    def ready(self) -> bool:
+        """Return whether there are enough transitions for an update."""
+        return len(self.replay) >= max(self.config.rl.warmup_steps, self.replay.enough)
+
+
+def networks_of(parameters: TensorDictBase, seed: Tensor, task: Tensor) -> dict[str, Tensor]:
+    """Select networks from parameters ``[S, T, ...]`` by position of the seed and task, int64."""
+    flat = parameters.flatten_keys(".")
+    return {str(key): value[seed, task] for key, value in flat.items()}
