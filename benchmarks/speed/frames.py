@@ -59,7 +59,8 @@ def contenders(threads: int, encoder: VAE) -> dict[str, tuple[Callable[[], objec
             _roller(TransformedEnv(_env(threads), encode)),
             ROWS,
         ),
-        "stock": (Stock().step, STOCK_FRAMES),
+        "stock": (Stock(default_visuals=True).step, STOCK_FRAMES),
+        "stock, visual settings as here": (Stock(default_visuals=False).step, STOCK_FRAMES),
     }
 
 
@@ -153,15 +154,20 @@ def record() -> tuple[np.ndarray, np.ndarray]:
 
 
 class Stock:
-    """The same task as dm_control and TorchRL wrap it, with MuJoCo's default visual settings.
+    """The same task as dm_control and TorchRL wrap it.
 
     It runs in a separate process, because this process disables the threads of Mesa's renderer.
+
+    Args:
+        default_visuals: Whether to use MuJoCo's default visual settings (shadows, multisampling)
+            and Mesa's threads, or those of the suite.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, default_visuals: bool) -> None:
         spawn = multiprocessing.get_context("spawn")
         self._pipe, theirs = spawn.Pipe()
-        spawn.Process(target=stock_process, args=(theirs,), daemon=True).start()
+        job = (theirs, default_visuals)
+        spawn.Process(target=stock_process, args=job, daemon=True).start()
 
     def step(self) -> None:
         """Make ``STOCK_FRAMES`` frames of one simulation."""
@@ -169,12 +175,13 @@ class Stock:
         self._pipe.recv()
 
 
-def stock_process(pipe: Connection) -> None:
+def stock_process(pipe: Connection, default_visuals: bool) -> None:
     """Make ``STOCK_FRAMES`` frames on each request."""
-    os.environ.pop("LP_NUM_THREADS", None)
     xml = nico.scene_xml()
-    start, end = xml.index("<quality"), xml.index("/>", xml.index("<quality")) + 2
-    xml = (xml[:start] + xml[end:]).replace('castshadow="false"', "")
+    if default_visuals:
+        os.environ.pop("LP_NUM_THREADS", None)
+        start, end = xml.index("<quality"), xml.index("/>", xml.index("<quality")) + 2
+        xml = (xml[:start] + xml[end:]).replace('castshadow="false"', "")
     environment = nico.load(
         TASK, seed=0, observation="state", physics=nico.Physics.from_xml_string(xml)
     )

@@ -1,14 +1,15 @@
 """One DDPG update: this package, a TorchRL loop, Stable-Baselines3, and a floor in bare torch.
 
-An update samples 256 transitions and makes one gradient step of actor and critic and one step of
-their targets. All contenders have the networks of the paper (96 inputs, 4 actions, 64 hidden units)
-and draw from 50,000 random transitions; those "without sampling" reuse one batch, which stays in
-the cache. Only this package and the floor step several seeds together.
+An update samples 128 transitions and makes one gradient step of actor and critic and one step of
+their targets. All contenders have networks of BGPO's default size (96 inputs, 4 actions, 256 hidden
+units, no layer norm) and draw from 50,000 random transitions; those "without sampling" reuse one
+batch, which stays in the cache. Only this package and the floor step several seeds together.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,6 +18,8 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 from torchrl import objectives
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.data.replay_buffers.samplers import RandomSampler
+from torchrl.data.replay_buffers.storages import Storage
 from torchrl.modules import MLP, TanhModule, ValueOperator
 
 from bgpo_trl.data.replay import ReplayBuffer
@@ -27,8 +30,8 @@ from bgpo_trl.seeding import generators
 
 Contender = tuple[Callable[[], object], int]
 
-LATENT, BEHAVIOR, ACTION, HIDDEN, BATCH = 64, 32, 4, 64, 256
-LEARNING_RATE, GAMMA, TAU = 1e-3, 0.98, 0.005
+LATENT, BEHAVIOR, ACTION, HIDDEN, BATCH = 64, 32, 4, 256, 128
+LEARNING_RATE, GAMMA, TAU = 1e-3, 0.95, 0.005
 
 
 def contenders(seeds: int = 10, transitions: int = 50_000) -> dict[str, Contender]:
@@ -54,6 +57,10 @@ def contenders(seeds: int = 10, transitions: int = 50_000) -> dict[str, Contende
         "ours, 1 seed": (_repeat(single.update, 4), 4),
         f"ours, {seeds} seeds, without sampling": (lambda: fixed.learn(batch), seeds),
         "ours, 1 seed, without sampling": (_repeat(lambda: fixed_single.learn(batch_single), 4), 4),
+        f"ours, {seeds} seeds, TorchRL's buffer": (
+            _with_torchrl_buffer(stack, seeds, transitions),
+            seeds,
+        ),
         f"floor, {seeds} seeds, without sampling": (_on_tensors(floor, batch), seeds),
         "TorchRL loop": (_repeat(TorchRLLoop(transitions).update, 4), 4),
     }
@@ -121,6 +128,38 @@ class Ours:
         (losses["loss_actor"] + losses["loss_value"]).backward()
         self.optimizer.step()
         self.target_update.step()
+
+
+class SeedSampler(RandomSampler):
+    """Uniform sampler of TorchRL's buffer for steps of ``S`` seeds stored as successive rows.
+
+    Args:
+        generators: Source of the sampled indices of each seed.
+    """
+
+    def __init__(self, generators: Sequence[torch.Generator]) -> None:
+        super().__init__()
+        self._generators = generators
+
+    def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[str, Any]]:
+        """Return rows of ``batch_size / S`` transitions of each seed, one seed after another."""
+        n_seeds = len(self._generators)
+        n_steps, share = len(storage) // n_seeds, batch_size // n_seeds
+        steps = [torch.randint(n_steps, (share,), generator=g) for g in self._generators]
+        return (torch.stack(steps) * n_seeds + torch.arange(n_seeds).unsqueeze(-1)).view(-1), {}
+
+
+def _with_torchrl_buffer(ours: Ours, seeds: int, transitions: int) -> Callable[[], object]:
+    """Return an update that samples from TorchRL's buffer instead."""
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(transitions * seeds),
+        sampler=SeedSampler(generators(range(seeds), "replay")),
+        batch_size=BATCH * seeds,
+    )
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(seeds):
+        buffer.extend(random_transitions(transitions, generator=generator))
+    return lambda: ours.learn(buffer.sample().view(seeds, BATCH))
 
 
 class Floor:

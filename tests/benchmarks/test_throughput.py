@@ -46,7 +46,7 @@ def test_contenders_come_with_the_frames_they_make(monkeypatch, threads):
     class Elsewhere:
         """In place of processes, which take seconds to start."""
 
-        def __init__(self, *args):
+        def __init__(self, *args, **kwargs):
             pass
 
         def step(self):
@@ -79,7 +79,7 @@ def test_ratios_are_against_the_named_contenders(monkeypatch):
     }
     monkeypatch.setattr(frames, "contenders", lambda *a: dict.fromkeys(seconds, (None, 10)))
     monkeypatch.setattr(throughput, "load_pretrained", lambda: (type("E", (), {"vae": None}), None))
-    monkeypatch.setattr(throughput, "interleave", lambda contenders, rounds: seconds)
+    monkeypatch.setattr(throughput, "interleave", lambda contenders, rounds, clock: seconds)
     row = throughput.measure_frames(throughput.Arguments(), threads=2)["ours"]
     assert row["frames a second"] == pytest.approx(10 / 30)
     assert row["share of the bare limit, 1 threads"] == pytest.approx(0.5)
