@@ -1,4 +1,4 @@
-"""A policy with a shared trunk and one Gaussian head a task, to be distilled from teachers."""
+"""Policy with one Gaussian head per task, to be distilled from teachers."""
 
 from __future__ import annotations
 
@@ -24,20 +24,14 @@ _MIN_SCALE, _MAX_SCALE = 0.1, 1.0
 class MultiHeadActor(StackedNetwork):
     """Policy with a Gaussian over actions for each task, from that task's head on a shared trunk.
 
-    Reads ``in_keys`` (``[*S, T, *B, features]`` each, ``T`` the number of heads) and writes
-    ``"loc"`` in [-1, 1] and ``"scale"`` in [0.1, 1], ``[*S, T, *B, action_dim]``, the mean and the
-    standard deviation, and ``"action"``, which is the mean.
-
-    Args:
-        in_features: Size of all ``in_keys`` together.
-        action_dim: Number of action components.
-        in_keys: Entries to read.
-        hidden_sizes: Width of each layer of the trunk, at least one.
-        **mlp: ``layer_norm``, ``batch_size`` and ``generator`` of the trunk, a `StackedMLP`.
+    Reads ``in_keys`` (``[*S, T, *B, features]`` each, ``T`` the number of heads) and writes mean
+    ``"loc"`` in [-1, 1] and standard deviation ``"scale"`` in [0.1, 1],
+    ``[*S, T, *B, action_dim]``, and ``"action"``, the mean. Arguments as for `Actor`;
+    ``hidden_sizes`` are the layers of the trunk.
 
     Raises:
-        ValueError: If the trunk has no layer, or the number of generators is not the number of
-            policies.
+        ValueError: If the trunk has no layer; from ``forward``, if an entry is missing or the
+            number of tasks is not that of heads.
 
     Example:
         >>> from tensordict import TensorDict
@@ -74,10 +68,7 @@ class MultiHeadActor(StackedNetwork):
             generator: Source of its initial weights, as in `StackedLinear`.
 
         Returns:
-            The head, whose parameters an optimizer has yet to be given.
-
-        Raises:
-            ValueError: If the number of generators is not the number of policies.
+            The head, whose parameters are yet to be given to an optimizer.
         """
         head = StackedLinear(self._width, 2 * self.action_dim, self.batch_size, generator)
         reference = next(self.trunk.parameters())
@@ -86,17 +77,7 @@ class MultiHeadActor(StackedNetwork):
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the distribution of actions for each state.
-
-        Args:
-            tensordict: With ``in_keys``; ``"loc"``, ``"scale"`` and ``"action"`` are set in it.
-
-        Returns:
-            The same tensordict.
-
-        Raises:
-            ValueError: If an entry is missing, or the number of tasks is not the number of heads.
-        """
+        """Write the distributions of actions; return the same tensordict."""
         hidden = self.trunk(*self.inputs(tensordict)).relu()
         task_dim = len(self.batch_size)
         if hidden.shape[task_dim] != len(self.heads):
