@@ -126,14 +126,8 @@ def ridge_predict(x: Tensor, y: Tensor, x_new: Tensor, penalty: float = 1e-4) ->
 def reconstruction_picture(vae: VAE, demonstrations: TensorDictBase, columns: int = 12) -> Tensor:
     """Return original frames above their reconstructions, each pixel enlarged to 4 x 4.
 
-    Args:
-        vae: The trained VAE.
-        demonstrations: Reads ``pixels`` ``[N, T, 32, 64, 3]`` and ``length`` ``[N]``; frames are
-            spread over demonstrations and time.
-        columns: Number of frames.
-
-    Returns:
-        Picture uint8 ``[2 * 32 * 4, columns * 64 * 4, 3]``.
+    Frames are spread over demonstrations and time; the picture is uint8
+    ``[2 * 32 * 4, columns * 64 * 4, 3]``.
     """
     share = torch.linspace(0, 1, columns)
     demonstration = (share * (len(demonstrations) - 1)).round().long()
@@ -175,7 +169,6 @@ def _probe_state(
 
 
 def _probe_play(vae: VAE, play: TensorDictBase) -> dict[str, float]:
-    """Return the errors in frames of play with all objects on the table."""
     train, held_out = split(play)
     latent, latent_held_out = (
         encode_frames(vae, part.get("pixels"), part.get("length")) for part in (train, held_out)
