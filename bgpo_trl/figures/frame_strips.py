@@ -10,14 +10,11 @@ from numpy.typing import NDArray
 
 
 def plot_frame_strips(episodes: Mapping[str, NDArray], n_frames: int = 8) -> Figure:
-    """Show episodes as rows of frames, from the first to the last.
+    """Plot episodes as rows of frames, from the first to the last.
 
     Args:
         episodes: Frames uint8 ``[N, 32, 64, 3]`` by row title.
         n_frames: Maximum number of frames per row, evenly spaced in time.
-
-    Returns:
-        The figure.
 
     Raises:
         ValueError: If there are no episodes, or one has no frames.
