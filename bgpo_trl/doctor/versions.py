@@ -19,11 +19,11 @@ def judge_version(
     """Judge the version of a dependency.
 
     Args:
-        name: Of its distribution.
+        name: Name of its distribution.
         found: The installed version; None if it is not installed.
-        wanted: The range that the code is written for, such as ``">=2.13,<3"``.
-        exact: The version known to work, where that is known.
-        optional: Whether most runs do without it.
+        wanted: The supported range, such as ``">=2.13,<3"``.
+        exact: The version known to work, or None.
+        optional: Whether most runs do not need it.
     """
     from packaging.specifiers import SpecifierSet
 

@@ -89,9 +89,6 @@ def load_checkpoint(
         map_location: Device of the tensors.
         mmap: Whether to map tensors from the file lazily, for reading only some of them.
 
-    Returns:
-        The state as it was saved.
-
     Raises:
         ValueError: If there is no intact checkpoint.
     """
