@@ -143,11 +143,7 @@ class GWRB(nn.Module):
         return torch.tensor(counts, device=self._weights.device).view(self.batch_size)
 
     def graph(self, index: int | tuple[int, ...] = ()) -> BehaviorGraph:
-        """Copy the network at an index of the batch.
-
-        Raises:
-            IndexError: If ``index`` does not select a single network.
-        """
+        """Copy the network at an index of the batch; ``IndexError`` unless it selects one network."""
         try:
             network = int(torch.arange(len(self._topologies)).view(self.batch_size)[index])
         except (IndexError, RuntimeError, ValueError):
@@ -291,9 +287,9 @@ class GWRB(nn.Module):
         self._topologies, self._weights = topologies, weights
 
     def _activity(self, distance: Tensor) -> Tensor:
-        """Convert distances to the best matches into activities, in place (Eq. 2)."""
+        """Convert distances into activities, in place (Eq. 2)."""
         return distance.mul_(-self.rule.activity_scale).exp_()
 
     def _spread(self, x: Tensor, network: Tensor, fill: float) -> Tensor:
-        """Scatter the results of active networks into those of all, elsewhere ``fill``."""
+        """Scatter results of the active networks into those of all; elsewhere ``fill``."""
         return x.new_full((len(self._topologies), *x.shape[1:]), fill).index_copy(0, network, x)
