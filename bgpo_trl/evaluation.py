@@ -65,13 +65,8 @@ class Evaluator:
     test episodes run side by side. Start states and demonstrations depend only on the seed and the
     number of the evaluation.
 
-    Args:
-        config: The algorithm's hyperparameters.
-        seeds: As in training.
-        schedule: As in training.
-        episodes: Test episodes ``M`` of each task.
-        bank: Held-out demonstrations.
-        encoders: As in training.
+    Config, seeds, schedule and encoders are those of training; the bank has held-out
+    demonstrations. Each task is tested in ``episodes`` episodes.
 
     Raises:
         ValueError: If a task has no demonstration.
@@ -162,12 +157,8 @@ class Evaluator:
     ) -> TestResult:
         """Play the test episodes of all tasks presented to each seed.
 
-        Success and length are 0 for tasks not yet presented.
-
-        Args:
-            snapshots: One of each seed.
-            device: Device of the networks.
-            watch: Called at the start and after each step, for looking at `simulation`.
+        Success and length are 0 for tasks not yet presented. ``device`` is that of the networks.
+        ``watch`` is called at the start and after each step, for looking at `simulation`.
         """
         policy = Policy.stack([snapshot.policy for snapshot in snapshots], device)
         starts = [

@@ -57,13 +57,13 @@ class Threads:
         interval = sys.getswitchinterval()
         try:
             if helpers:
-                # A thread back from MuJoCo waits this long for a turn of Python, by default 5 ms:
-                # the time of several simulations.
+                # A thread that returns from MuJoCo waits up to this long for the GIL, by default
+                # 5 ms, the time of several simulations.
                 sys.setswitchinterval(2e-4)
             while work_on_next():
                 hand_over()
         finally:
-            wait(helpers)  # Whatever happens, nothing moves behind the caller's back.
+            wait(helpers)  # No helper works on after the call, even if it raises.
             sys.setswitchinterval(interval)
         for helper in helpers:
             helper.result()

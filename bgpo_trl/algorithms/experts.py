@@ -17,13 +17,9 @@ _MOMENTS = "optimizer."
 
 
 class ActiveGroups:
-    """The groups played most recently by each seed, in a fixed number of slots.
+    """Groups played most recently by each seed ``S``, in a fixed number ``E`` of slots.
 
     A group that is played takes a free slot, or that of the least recently played group.
-
-    Args:
-        n_seeds: Number of seeds ``S``.
-        n_slots: Number of active groups ``E`` of each seed.
 
     Example:
         >>> active = ActiveGroups(1, 2)

@@ -45,10 +45,8 @@ class Learner:
     ) -> Tensor:
         """Return actions of a training step, ``[S, 4]`` in [-1, 1], on the CPU.
 
-        Args:
-            tensordict: Inputs of the policies, ``[S]``.
-            generators: Sources of the exploration noise, one per seed.
-            expert: Expert of each seed that acts, int64 ``[S]``.
+        The policies' inputs are ``[S]``, with one generator of exploration noise per seed;
+        ``expert`` ``[S]`` selects the expert that acts.
         """
         action = self.actor(self._for_all(tensordict))["action"]
         return self.explore(_of_expert(action, expert), generators)

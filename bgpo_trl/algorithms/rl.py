@@ -136,7 +136,7 @@ def make_sac(config: SACConfig, spec: LearnerSpec) -> Learner:
 
 @dataclass(frozen=True)
 class RLEntry:
-    """How to make an RL algorithm."""
+    """RL algorithm and its default hyperparameters."""
 
     make: Callable[[Any, LearnerSpec], Learner]
     """Called with a config and the spec."""

@@ -18,18 +18,11 @@ Array = NDArray[np.float64]
 def evaluation_matrix(
     success: ArrayLike, episodes: ArrayLike, ends: ArrayLike, *, window: int
 ) -> Array:
-    """Return ``R[i, j]``, the success on task j at the end of phase i.
+    """Return ``R[i, j]``, the success on task j at the end of phase i, ``[..., P, T]``.
 
-    Args:
-        success: Success ``[..., E, T]``.
-        episodes: Training episodes before each evaluation, ``[E]``.
-        ends: Last episode of each phase, ``[P]``: the starts of the later tasks, and the end of
-            training.
-        window: Number of training episodes before the end of a phase whose evaluations are
-            averaged.
-
-    Returns:
-        ``[..., P, T]``; NaN for tasks without a test in the window.
+    ``ends`` ``[P]`` are the last episodes of the phases: the starts of the later tasks, and the end
+    of training. Success is the mean over the evaluations in the ``window`` episodes before an end;
+    NaN for tasks without a test among them.
 
     Raises:
         ValueError: If a phase has no evaluation in its window.
@@ -92,11 +85,9 @@ def forward_transfer(area: ArrayLike, reference: ArrayLike) -> Array:
     """Return the gain in learning a task from having learned other tasks before.
 
     ``(area - reference) / (1 - reference)``: 1 for success from the start, 0 for no gain, negative
-    for slower learning (Wolczyk et al., 2021, "Continual World").
-
-    Args:
-        area: `area_under_curve` of a task since its presentation.
-        reference: The same, over as many episodes, of a learner without earlier tasks.
+    for slower learning (Wolczyk et al., 2021, "Continual World"). ``area`` is the
+    `area_under_curve` of a task since its presentation; ``reference`` is the same, over as many
+    episodes, of a learner without earlier tasks.
     """
     area, reference = np.asarray(area, float), np.asarray(reference, float)
     return (area - reference) / (1 - reference)
@@ -139,13 +130,8 @@ def overall_episodes_to(success: ArrayLike, episodes: ArrayLike, threshold: floa
 def trials_to(success: ArrayLike, threshold: float = 0.5, *, window: int = 20) -> float:
     """Return the number of its own training episodes that a task takes to reach a success rate.
 
-    Args:
-        success: Outcomes of the task's training episodes, in order, ``[N]``.
-        threshold: The success rate.
-        window: Number of latest episodes over which the rate is taken; it is undefined for fewer.
-
-    Returns:
-        The number of episodes, or infinity.
+    ``success`` ``[N]`` are the outcomes of these episodes in order. The rate is taken over the
+    latest ``window`` of them, and undefined for fewer; infinity if it is never reached.
 
     Raises:
         ValueError: If the window is empty.

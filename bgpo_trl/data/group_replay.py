@@ -146,10 +146,10 @@ class GroupReplay:
 
 
 def draw_shares(group: Tensor, generator: Sequence[torch.Generator]) -> Tensor:
-    """Draw a number in [0, 1) for each row ``[S, R]`` that has a group; 0 for the others (-1).
+    """Draw a number in [0, 1) for each row ``[S, R]`` that has a group.
 
-    Rows without a group consume no random numbers, so a seed's draws do not depend on how many
-    slots are free.
+    Rows without a group (-1) get 0 and consume no random numbers, so a seed's draws do not depend
+    on how many slots are free.
     """
     shares = torch.zeros(group.shape, dtype=torch.float64)
     for row, wanted, source in zip(shares, group >= 0, generator, strict=True):

@@ -148,12 +148,10 @@ class ReplayBuffer:
         *,
         seeds: Sequence[int] | None = None,
     ) -> TensorDict:
-        """Copy the transitions ``[S, R]`` that each seed stored at the given steps.
+        """Copy the transitions ``[S, R]`` that seeds stored at the given steps, int64 ``[S, R]``.
 
-        Args:
-            steps: Steps int64 ``[S, R]``, each at least `oldest` and less than `n_added`.
-            keys: Entries to return; ``None`` for all.
-            seeds: Positions of the ``S`` seeds; ``None`` for all.
+        Steps are at least `oldest` and less than `n_added`. ``keys`` are the entries to return and
+        ``seeds`` the positions of the seeds; ``None`` is all.
         """
         columns = self._seed if seeds is None else self._seed[list(seeds)]
         rows = steps % self.capacity * len(self.generators) + columns.unsqueeze(-1)

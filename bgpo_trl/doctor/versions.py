@@ -35,7 +35,7 @@ def judge_version(
     if not SpecifierSet(wanted).contains(found, prereleases=True):
         level = "note" if optional else "wrong"
         return Finding(level, name, f"{found} is outside {wanted}: {remedy}")
-    # A build's own label, such as +cpu or +cu128, is not part of what was tried.
+    # A build label, such as +cpu or +cu128, does not count.
     if exact is not None and found.partition("+")[0] != exact:
         return Finding("note", name, f"{found}, known to work is {exact}; if in doubt: {remedy}")
     return Finding("ok", name, found)

@@ -101,16 +101,11 @@ def train_representation(
 
 @torch.no_grad()
 def encode_frames(vae: VAE, pixels: Tensor, length: Tensor, batch_size: int = 64) -> Tensor:
-    """Encode the valid frames of demonstrations in batches.
-
-    Args:
-        vae: The trained frame encoder.
-        pixels: Frames uint8 ``[N, T, 32, 64, 3]``.
-        length: Number of valid frames, int64 ``[N]``.
-        batch_size: Frames per call of the encoder.
+    """Encode the valid frames of demonstrations, uint8 ``[N, T, 32, 64, 3]``, in batches.
 
     Returns:
-        Standardized latents, float32 ``[N, T, latent_size]``; zeros at and beyond ``length``.
+        Standardized latents, float32 ``[N, T, latent_size]``; zeros at and beyond ``length``
+        ``[N]``.
     """
     latent = torch.zeros(*pixels.shape[:2], vae.latent_size)
     demonstration, time = valid_steps(length, pixels.shape[1]).nonzero(as_tuple=True)
@@ -153,9 +148,7 @@ def load_representation(
 ) -> Representation:
     """Read encoders written by `save_representation`; they are in eval mode, without gradients.
 
-    Args:
-        path: The file; the pretrained weights by default.
-        scene_version: Required version of the scene; ``None`` accepts any.
+    By default, read the pretrained weights and accept any version of the scene.
 
     Raises:
         ValueError: If the file is missing, damaged, or belongs to another scene.

@@ -82,14 +82,7 @@ def draw_nodes(
 
 
 def write_nodes(path: Path, weights: Tensor, tasks: Tensor, groups: Tensor | None = None) -> None:
-    """Write the nodes of a GWR-B as CSV: majority task (-1: none), group and weights.
-
-    Args:
-        path: The CSV file.
-        weights: Weights ``[N, d]``.
-        tasks: Majority tasks ``[N]``.
-        groups: Group of each node, ``[N]``; the column is omitted if ``None``.
-    """
+    """Write nodes ``[N]`` as CSV: majority task (-1: none), group if given, weights ``[N, d]``."""
     columns = {"task": tasks.tolist()} | ({} if groups is None else {"group": groups.tolist()})
     with path.open("w", newline="") as file:
         writer = csv.writer(file)

@@ -53,11 +53,8 @@ def add_legend(above: Figure | Axes, handles: list[Any], labels: list[str], widt
 def mark_starts(axes: Axes, starts: Mapping[str, int], tasks: Sequence[str], last: int) -> None:
     """Mark the episodes from which tasks are presented with dashed lines, inside the axes.
 
-    Args:
-        axes: The axes, whose height is 1.1 in the scale of the labels.
-        starts: Training episode by task name.
-        tasks: All task names, whose positions number the labels.
-        last: Episode at which the axes end.
+    ``starts`` are the episodes by task name; a label gives the position of its task in ``tasks``.
+    The axes end at episode ``last`` and have the height 1.1 in the scale of the labels.
     """
     for task, episode in starts.items():
         if not 0 < episode < last:

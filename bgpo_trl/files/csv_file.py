@@ -16,14 +16,10 @@ from bgpo_trl.files.closing import Closing
 class CsvFile(Closing):
     r"""Append-only CSV file with fixed columns that can be truncated to an earlier position.
 
-    Rows are written unbuffered and whole: killing the process loses no row, a row that does not fit
-    on the disk leaves no trace, and opening the file drops a partial row left by a crash. Tensors
-    and NumPy values of one element are written as numbers, booleans as 0 and 1, and floats with
-    enough digits to be read back exactly.
-
-    Args:
-        path: The file; an existing one is continued.
-        columns: Names of the columns, the first line of the file.
+    An existing file is continued. Rows are written unbuffered and whole: killing the process loses
+    no row, a row that does not fit on the disk leaves no trace, and opening the file drops a
+    partial row left by a crash. Tensors and NumPy values of one element are written as numbers,
+    booleans as 0 and 1, and floats with enough digits to be read back exactly.
 
     Raises:
         ValueError: If the file exists with other columns, or two columns have the same name.

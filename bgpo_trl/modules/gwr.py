@@ -143,7 +143,11 @@ class GWRB(nn.Module):
         return torch.tensor(counts, device=self._weights.device).view(self.batch_size)
 
     def graph(self, index: int | tuple[int, ...] = ()) -> BehaviorGraph:
-        """Copy the network at an index of the batch; ``IndexError`` unless it selects one network."""
+        """Copy the network at an index of the batch.
+
+        Raises:
+            IndexError: If ``index`` does not select a single network.
+        """
         try:
             network = int(torch.arange(len(self._topologies)).view(self.batch_size)[index])
         except (IndexError, RuntimeError, ValueError):

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 class BehaviorMatch(TensorClass["tensor_only"]):
-    """The best-matching node of each input.
+    """Best-matching node of each input.
 
     Attributes:
         embedding: Copy of the node's weights w_c, the behavior b, ``[*batch, d]``.

@@ -16,8 +16,8 @@ from bgpo_trl.modules.stacked_mlp import StackedLinear, StackedMLP
 
 __all__ = ["MultiHeadActor"]
 
-# A teacher is deterministic, so nothing else keeps the likelihood of its actions from growing
-# without bound, and the steps towards them with it.
+# Teachers are deterministic: without a lowest scale, the likelihood of their actions, and with it
+# the gradient, would grow without bound.
 _MIN_SCALE, _MAX_SCALE = 0.1, 1.0
 
 
@@ -62,13 +62,10 @@ class MultiHeadActor(StackedNetwork):
     def add_head(
         self, generator: torch.Generator | Sequence[torch.Generator] | None = None
     ) -> StackedLinear:
-        """Add the head of a further task; the trunk and the other heads stay as they are.
+        """Add and return the head of a further task; trunk and other heads stay as they are.
 
-        Args:
-            generator: Source of its initial weights, as in `StackedLinear`.
-
-        Returns:
-            The head, whose parameters are yet to be given to an optimizer.
+        Its weights are drawn from ``generator``, as in `StackedLinear`. The caller gives its
+        parameters to an optimizer.
         """
         head = StackedLinear(self._width, 2 * self.action_dim, self.batch_size, generator)
         reference = next(self.trunk.parameters())

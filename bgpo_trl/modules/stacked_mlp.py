@@ -124,7 +124,7 @@ class StackedLinear(nn.Module):
             multiply_add = torch.Tensor.baddbmm_ if i else torch.Tensor.baddbmm
             output = multiply_add(output, input.reshape(n_layers, -1, input.shape[-1]), rows)
         shape = torch.Size([*inputs[0].shape[:-1], self.out_features])
-        # Not a view where none is needed: autograd is slow with what is then changed in place.
+        # A view only where needed: autograd is slow when a view is then changed in place.
         return output if output.shape == shape else output.view(shape)
 
 

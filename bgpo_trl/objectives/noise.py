@@ -67,4 +67,4 @@ class SeededNoise(nn.Module):
     def set_extra_state(self, state: Tensor) -> None:
         """Restore the result of `get_extra_state`."""
         for generator, saved in zip(self.generators, state, strict=True):
-            generator.set_state(saved.clone())  # a row of a tensor would crash it
+            generator.set_state(saved.clone())  # set_state crashes on a view

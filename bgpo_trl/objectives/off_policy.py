@@ -207,12 +207,8 @@ class OffPolicyLoss(LossModule):
         """Return ``-mean(value)`` plus a penalty that keeps the actor's tanh from saturating.
 
         The penalty is ``pre_tanh_penalty`` times the mean square of the actor's output before the
-        tanh, over batch and action dimensions.
-
-        Args:
-            value: Values of the actor's actions, ``[*S, *B]``.
-            data: Output of the actor ``[*S, *B]``.
-            tensordict: Batch of transitions, read for its weights.
+        tanh, over batch and action dimensions. ``value`` ``[*S, *B]`` and ``data`` are the values
+        and the outputs of the actor; the transitions of ``tensordict`` give the weights.
 
         Returns:
             The loss ``[]`` and ``"pre_tanh_magnitude"`` ``[*S]``, the root of that mean square.
@@ -247,14 +243,11 @@ class OffPolicyLoss(LossModule):
         return values.reshape(*self.batch_size, -1)
 
     def network(self, name: str, *, frozen: bool = False) -> Any:
-        """Return a network that shares its parameters with the loss.
+        """Return the actor or value network, or its target, sharing its parameters with the loss.
 
-        Args:
-            name: ``"actor_network"`` or ``"value_network"``, with ``"target_"`` before it for the
-                target.
-            frozen: Whether gradients reach the network's input only, not its parameters.
+        With ``frozen``, gradients reach the network's input only, not its parameters.
         """
-        # Made once: to put parameters in for each call, as TorchRL does, adds a sixth to its time.
+        # Made once: TorchRL puts the parameters in at each call, which takes a sixth longer.
         if (name, frozen) not in self._made:
             made = self._made[name, frozen] = deepcopy(getattr(self, name.removeprefix("target_")))
             params = getattr(self, f"{name}_params")
