@@ -13,7 +13,7 @@ def missing_key(
     """Return the error to raise in place of a `KeyError` when entries are missing.
 
     Args:
-        reader: Name of what reads the entries, the first word of the message.
+        reader: Name of the class that reads the entries, the first word of the message.
         tensordict: TensorDict that lacks some of them.
         keys: All entries that are read; those present are left out of the message.
 

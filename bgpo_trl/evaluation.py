@@ -43,12 +43,11 @@ class Snapshot:
 
 @dataclass(frozen=True)
 class TestResult:
-    """Outcome of the test episodes of one evaluation of each seed.
+    """Outcome of one evaluation of each seed ``S``: tasks ``T``, ``M`` test episodes each.
 
     Attributes:
         snapshots: The tested snapshots, one of each seed.
-        success: Success, which is also the extrinsic return, bool ``[S, T, M]`` (seeds, tasks,
-            episodes of a task).
+        success: Success, which is also the extrinsic return, bool ``[S, T, M]``.
         steps: Lengths of the episodes, int64 ``[S, T, M]``.
     """
 
@@ -60,19 +59,14 @@ class TestResult:
 
 
 class Evaluator:
-    """Tests snapshots of all seeds as one batch.
+    """Evaluation of all seeds as one batch.
 
     Seeds reach an evaluation at different times. Each leaves a `Snapshot`; once all have, their
     test episodes run side by side. Start states and demonstrations depend only on the seed and the
     number of the evaluation.
 
-    Args:
-        config: The algorithm's hyperparameters.
-        seeds: As in training.
-        schedule: As in training.
-        episodes: Test episodes ``M`` of each task.
-        bank: Held-out demonstrations.
-        encoders: As in training.
+    Config, seeds, schedule and encoders are those of training; the bank has held-out
+    demonstrations. Each task is tested in ``episodes`` episodes.
 
     Raises:
         ValueError: If a task has no demonstration.
@@ -115,13 +109,9 @@ class Evaluator:
         return np.random.default_rng([stream_seed(seed, "evaluation"), number])
 
     def take(self, algorithm: Algorithm, index: int, episode: int, env_steps: int) -> None:
-        """Queue a snapshot of one seed for its next evaluation.
+        """Queue a snapshot of the seed at position ``index`` for its next evaluation.
 
-        Args:
-            algorithm: The algorithm in training.
-            index: Position of the seed in the batch.
-            episode: The seed's training episodes so far.
-            env_steps: The seed's environment steps so far.
+        ``episode`` and ``env_steps`` count the seed's training episodes and steps so far.
         """
         number = self._next + len(self._waiting[index])
         snapshot = self.snapshot(algorithm, index, number, episode=episode, env_steps=env_steps)
@@ -167,13 +157,8 @@ class Evaluator:
     ) -> TestResult:
         """Play the test episodes of all tasks presented to each seed.
 
-        Args:
-            snapshots: One of each seed.
-            device: Device of the networks.
-            watch: Called at the start and after each step, for looking at `simulation`.
-
-        Returns:
-            Success and length; both 0 for tasks not yet presented.
+        Success and length are 0 for tasks not yet presented. ``device`` is that of the networks.
+        ``watch`` is called at the start and after each step, for looking at `simulation`.
         """
         policy = Policy.stack([snapshot.policy for snapshot in snapshots], device)
         starts = [

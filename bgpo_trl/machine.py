@@ -9,12 +9,10 @@ import torch
 
 
 def usable_cores(quota: str | Path = "/sys/fs/cgroup/cpu.max") -> int:
-    """Return how many cores this process may use, at least 1.
+    """Return the number of cores that this process may use, at least 1.
 
-    Respects the process's affinity (``taskset``, Slurm) and a container's quota.
-
-    Args:
-        quota: File with quota and period (us), such as ``"200000 100000"`` or ``"max 100000"``.
+    Respects the process's affinity (``taskset``, Slurm) and a container's quota, a file with quota
+    and period (us) such as ``"200000 100000"`` or ``"max 100000"``.
     """
     if hasattr(os, "sched_getaffinity"):
         cores = len(os.sched_getaffinity(0))
@@ -38,8 +36,7 @@ def set_threads(threads: int) -> None:
 def choose_device(name: str = "auto") -> torch.device:
     """Return the device of the networks; simulations always run on the CPU.
 
-    Args:
-        name: ``"auto"`` (a CUDA GPU if available, else the CPU) or a device of PyTorch.
+    ``"auto"`` is a CUDA GPU if available, else the CPU.
 
     Raises:
         ValueError: If the device is not available.

@@ -29,11 +29,6 @@ def generators(seeds: Sequence[int], name: str) -> list[torch.Generator]:
     return [torch.Generator().manual_seed(stream_seed(seed, name)) for seed in seeds]
 
 
-def task_generators(seeds: Sequence[int], n_tasks: int, name: str) -> list[list[torch.Generator]]:
-    """Return one generator per task of each seed, for a named stream."""
-    return [[generators([seed], f"{name} {task}")[0] for task in range(n_tasks)] for seed in seeds]
-
-
 def normal(generators: Sequence[torch.Generator], shape: Sequence[int]) -> Tensor:
     """Return standard normals ``[S, *shape]``, each seed's from its own generator."""
     return torch.stack([torch.randn(*shape, generator=generator) for generator in generators])

@@ -12,11 +12,9 @@ T = TypeVar("T")
 
 
 class Threads:
-    """Threads that share the rows of a batch, the caller's among them.
+    """Threads that share the rows of a batch; the caller's is one of ``n``.
 
-    Args:
-        n: Number of threads, at least 1.
-        name: Prefix of the helpers' names.
+    ``name`` is the prefix of the others' names.
 
     Example:
         >>> threads, results = Threads(3, "squares"), [0] * 5
@@ -32,12 +30,9 @@ class Threads:
     def each(
         self, rows: Iterable[int], work: Callable[[int], T], arrived: Callable[[int, T], object]
     ) -> None:
-        """Work on rows in all threads, and hand each result over in the caller's thread.
+        """Call ``work`` on each row in any thread; hand over the results in the caller's.
 
-        Args:
-            rows: The rows.
-            work: Called with a row, in any thread.
-            arrived: Called with a row and its result, in the caller's thread, as soon as possible.
+        ``arrived`` is called with a row and its result, as soon as possible.
         """
         waiting, results = deque(rows), deque[tuple[int, T]]()
 
@@ -62,13 +57,13 @@ class Threads:
         interval = sys.getswitchinterval()
         try:
             if helpers:
-                # A thread back from MuJoCo waits this long for a turn of Python, by default 5 ms:
-                # the time of several simulations.
+                # A thread that returns from MuJoCo waits up to this long for the GIL, by default
+                # 5 ms, the time of several simulations.
                 sys.setswitchinterval(2e-4)
             while work_on_next():
                 hand_over()
         finally:
-            wait(helpers)  # Whatever happens, nothing moves behind the caller's back.
+            wait(helpers)  # No helper works on after the call, even if it raises.
             sys.setswitchinterval(interval)
         for helper in helpers:
             helper.result()

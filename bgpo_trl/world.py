@@ -1,4 +1,4 @@
-"""Simulations and draws of tasks and demonstrations, in which an algorithm is trained."""
+"""Simulations of a batch of seeds, with their draws of tasks and demonstrations."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class World:
         bank: Embedded demonstrations for training episodes.
 
     Attributes:
-        env: The environment with the algorithm's transforms.
+        env: The simulation within the algorithm's transforms.
         source: The transform that draws task and demonstration of each episode.
         simulation: The environment without transforms.
     """

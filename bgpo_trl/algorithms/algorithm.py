@@ -82,11 +82,9 @@ class Algorithm(ABC):
 
     @abstractmethod
     def make_env(self, base_env: EnvBase, source: DemonstrationSource) -> TransformedEnv:
-        """Return the environment of training episodes: a composition of transforms.
+        """Return the environment of training episodes: simulations ``[S]`` within transforms.
 
-        Args:
-            base_env: The simulations ``[S]``.
-            source: The transform that draws task and demonstration of each episode.
+        ``source`` is the transform that draws task and demonstration of each episode.
         """
 
     @abstractmethod
@@ -101,8 +99,8 @@ class Algorithm(ABC):
     def update(self) -> dict[str, Tensor]:
         """Make one update of each seed from the transitions stored so far.
 
-        It may run while the environment steps: it uses neither the environment nor any state that
-        `act` changes.
+        It may run while the environment steps, so it uses neither the environment nor any state
+        that `act` changes.
 
         Returns:
             ``loss_actor``, ``loss_value`` and other losses, means over the seeds ``[]``; empty
@@ -135,7 +133,7 @@ class Algorithm(ABC):
     ) -> DemonstrationReplay | None:
         """Return the replay of shown demonstrations, or None without a ``demonstration_share``.
 
-        ``constant_keys`` are the entries read by policies that are constant within an episode.
+        ``constant_keys`` are the policies' inputs that are constant within an episode.
 
         Raises:
             ValueError: If the state is not the latent, or the bank has no steps.
@@ -175,6 +173,6 @@ class Algorithm(ABC):
             generator.set_state(saved)
 
     def _learned(self) -> dict[str, Any]:
-        """Return the parts that learning changes, as far as the algorithm has them."""
+        """Return the parts that learning changes."""
         parts = ("learner", "replay")
         return {name: getattr(self, name) for name in parts if hasattr(self, name)}

@@ -38,7 +38,7 @@ class BGPO(Algorithm):
     Arguments as for `Algorithm`; encoders may be None if neither latents nor embeddings are used.
 
     Attributes:
-        experts: The networks, by group; of a single group without ``config.experts``.
+        experts: The networks of each group; of a single group without ``config.experts``.
         shown: Replay of the demonstrations shown so far, or None.
 
     Raises:
@@ -110,7 +110,7 @@ class BGPO(Algorithm):
         self.shown = self.demonstrations(config, bank, seeds, constant_keys=keys[1:])
 
     def make_env(self, base_env: EnvBase, source: DemonstrationSource) -> TransformedEnv:
-        """Return the variant's environment; see `bgpo_trl.algorithms.environments`."""
+        """Return the variant's environment (`bgpo_trl.algorithms.environments`)."""
         modules = self.encoders, self.gwr, self.groups
         return self.variant.make_env(self.config, base_env, source, *modules)
 
@@ -120,7 +120,7 @@ class BGPO(Algorithm):
         return self.config.beta if self.variant.bonus else 0.0
 
     def _highest_return(self) -> float:
-        """Return the highest attainable return, of a success now or after a time-out's bonus."""
+        """Return the highest attainable return: a success now, or after the bonus of a time-out."""
         success = 1.0 + self.beta
         return max(success, self.beta + self.config.rl.gamma * success)
 
@@ -155,7 +155,7 @@ class BGPO(Algorithm):
             self.shown.add(transition, reward, group, ended)
 
     def update(self) -> dict[str, Tensor]:
-        """Make one update of each seed; see `Algorithm.update`."""
+        """Make one update of each seed."""
         if len(self.replay) < self.config.rl.warmup_steps:
             return {}
         return self.learn(self._sample())
@@ -183,10 +183,7 @@ class BGPO(Algorithm):
     def snapshot(
         self, index: int, embedding: Tensor, task: Tensor, generator: torch.Generator
     ) -> Policy:
-        """Copy the policy of one seed; see `Algorithm.snapshot`.
-
-        With experts, the parameters are those of each episode's expert, ``[T, M, ...]``.
-        """
+        """Copy the policy of one seed; with experts, that of each episode, ``[T, M, ...]``."""
         del generator
         if self.config.experts and self.groups is not None:
             shown = embedding.expand(self.n_seeds, *embedding.shape)
@@ -206,10 +203,7 @@ class BGPO(Algorithm):
     def context(self, index: int, embedding: Tensor, task: Tensor) -> Tensor | None:
         """Return the context of test episodes, ``[*B, C]``; None for a policy without context.
 
-        Args:
-            index: Position of the seed in the batch.
-            embedding: phi of the demonstrations, ``[*B, 32]``.
-            task: Their labels, int64 ``[*B]``; read by the variant ``"label"`` only.
+        ``embedding`` is ``[*B, 32]``. The labels ``[*B]`` are read by the variant ``"label"`` only.
         """
         if self.variant.context is None:
             return None

@@ -1,7 +1,4 @@
-"""Dist-NLL (Sec. IV-B): a policy with one head per task, distilled from one DDPG teacher per task.
-
-Unlike BGPO, it knows the task label in training and tests.
-"""
+"""Dist-NLL (Sec. IV-B): policy with a head per task, distilled from one DDPG teacher per task."""
 
 from __future__ import annotations
 
@@ -27,6 +24,8 @@ from bgpo_trl.seeding import generators
 class DistNLL(TaskAlgorithm):
     """Policy distillation from teachers that are still learning; the policies read the state only.
 
+    Unlike BGPO, it knows the task label in training and tests.
+
     1. Training episodes are played by the teacher of their task, with exploration noise.
     2. An update is one of every teacher, each with its own replay and critic.
     3. At the end of a seed's episode, its multi-task policy learns the teachers' current actions in
@@ -34,11 +33,9 @@ class DistNLL(TaskAlgorithm):
        heads are kept.
     4. Test episodes are played by the multi-task policy with the head of the true label.
 
-    Arguments as for `TaskAlgorithm`.
-
     Attributes:
-        teacher: The tasks' policies, ``[S, T]`` stacked.
-        critic: Their Q-functions, ``[S, T]`` stacked.
+        teacher: The tasks' policies, stacked ``[S, T]``.
+        critic: Their Q-functions, stacked ``[S, T]``.
         students: The multi-task policy of each seed; not stacked, since seeds end their episodes at
             different times.
     """
@@ -91,10 +88,7 @@ class DistNLL(TaskAlgorithm):
         self._ended = transition.get(("next", "done")).flatten().clone()
 
     def update(self) -> dict[str, Tensor]:
-        """Make one update of each seed's teachers; see `Algorithm.update`.
-
-        Then distill the teachers of the seeds whose episode has just ended.
-        """
+        """Update each seed's teachers, and distill them for seeds whose episode has just ended."""
         if not self.ready():
             return {}
         losses = self.learn(self.replay.sample())
@@ -131,8 +125,7 @@ class DistNLL(TaskAlgorithm):
     ) -> Policy:
         """Copy the multi-task policy of one seed, its heads in the order of the tasks.
 
-        The head of a task without data is zero. Demonstrations are ignored. See
-        `Algorithm.snapshot`.
+        The head of a task without data is zero.
         """
         del embedding, task, generator
         like = self.test_actor.state_dict()

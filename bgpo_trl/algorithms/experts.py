@@ -17,13 +17,9 @@ _MOMENTS = "optimizer."
 
 
 class ActiveGroups:
-    """The groups played most recently by each seed, in a fixed number of slots.
+    """Groups played most recently by each seed ``S``, in a fixed number ``E`` of slots.
 
     A group that is played takes a free slot, or that of the least recently played group.
-
-    Args:
-        n_seeds: Number of seeds ``S``.
-        n_slots: Number of active groups ``E`` of each seed.
 
     Example:
         >>> active = ActiveGroups(1, 2)
@@ -73,7 +69,7 @@ class ActiveGroups:
 
 
 class Experts:
-    """The networks of a learner, one set for each group of behaviors of each seed.
+    """Networks of a learner, one set for each group of behaviors of each seed.
 
     The learner's networks are a stack ``[S, E]``, those of the active groups. When a group becomes
     active, the networks, targets and optimizer moments of the least recently played group are put
@@ -84,8 +80,7 @@ class Experts:
     Args:
         learner: Learner of a stack ``[S, E]``.
         active: The active groups, from now on changed only by `play`.
-        parent: Function from the position of a seed and a group to the group's parent; group 0 has
-            none.
+        parent: Returns the parent of a group, given the position of the seed; group 0 has none.
     """
 
     def __init__(
@@ -166,7 +161,7 @@ class Experts:
 
 
 def _tensors(learner: Learner, batch: torch.Size) -> State:
-    """Return the tensors of a learner that have a row for each expert, ``[S, E, ...]``."""
+    """Return the tensors of a learner with a row for each expert, ``[S, E, ...]``."""
     tensors: State = {
         key: value
         for key, value in learner.loss.state_dict().items()

@@ -1,4 +1,4 @@
-"""Learners: how policies explore and improve, as DDPG, TD3 and SAC do."""
+"""Learners: exploration and gradient steps of DDPG, TD3 and SAC."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["Learner", "SACLearner", "TD3Learner"]
 
 
 class Learner:
-    """Policies of all seeds with their exploration and gradient steps, as DDPG has them.
+    """Policies of all seeds with the exploration and gradient steps of DDPG.
 
     One Adam optimizer minimizes the sum of the losses. It treats each weight independently, so it
     is equivalent to one optimizer per seed.
@@ -29,10 +29,6 @@ class Learner:
         loss: Returns entries ``loss_...`` ``[]`` to minimize, each a sum over seeds and experts.
         config: Hyperparameters, of which ``gamma``, ``tau`` and ``learning_rate`` are read here.
         noise: Standard deviation of the Gaussian exploration noise.
-
-    Attributes:
-        optimizer: Optimizer of all parameters that need a gradient.
-        target_update: Soft update of the target networks.
     """
 
     def __init__(
@@ -49,16 +45,14 @@ class Learner:
     ) -> Tensor:
         """Return actions of a training step, ``[S, 4]`` in [-1, 1], on the CPU.
 
-        Args:
-            tensordict: Inputs of the policies, ``[S]``.
-            generators: Sources of the exploration noise, one per seed.
-            expert: Expert of each seed that acts, int64 ``[S]``.
+        The policies' inputs are ``[S]``, with one generator of exploration noise per seed;
+        ``expert`` ``[S]`` selects the expert that acts.
         """
         action = self.actor(self._for_all(tensordict))["action"]
         return self.explore(_of_expert(action, expert), generators)
 
     def _for_all(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return inputs ``[S]`` expanded to all experts, ``[S, E]``."""
+        """Expand inputs ``[S]`` to all experts, ``[S, E]``."""
         return tensordict.unsqueeze(1).expand(*self.actor.batch_size)
 
     def explore(self, action: Tensor, generators: Sequence[torch.Generator]) -> Tensor:
@@ -67,10 +61,9 @@ class Learner:
         return (action.cpu() + noise).clamp(-1.0, 1.0)
 
     def learn(self, batch: TensorDictBase) -> dict[str, Tensor]:
-        """Take a gradient step on transitions ``[S, E, B]`` and update the target networks.
+        """Take a gradient step on transitions ``[S, E, B]``, update the targets; return the losses.
 
-        Returns:
-            The losses that were minimized, sums over seeds and experts ``[]``.
+        Losses are sums over seeds and experts ``[]``.
         """
         parts = self.losses(batch)
         self.optimizer.zero_grad()
@@ -90,24 +83,19 @@ class Learner:
         return True
 
     def state_dict(self) -> dict[str, Any]:
-        """Return losses, targets and the state of the optimizer."""
+        """Return the states of loss (with targets) and optimizer."""
         return {"loss": dict(self.loss.state_dict()), "optimizer": self.optimizer.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from what `state_dict` returned."""
+        """Restore a `state_dict`."""
         self.loss.load_state_dict(state["loss"])
         self.optimizer.load_state_dict(state["optimizer"])
 
 
 class TD3Learner(Learner):
-    """Learner whose actor and targets are updated less often than its critics.
+    """Learner whose actor and targets are updated once in ``policy_delay`` updates of its critics.
 
-    See Fujimoto et al. (2018).
-
-    Args:
-        actor: As in `Learner`.
-        loss: As in `Learner`; ``loss_actor`` is delayed.
-        config: Hyperparameters.
+    (Fujimoto et al., 2018.) Arguments as for `Learner`.
 
     Raises:
         ValueError: If ``policy_delay`` is less than 1.
@@ -123,11 +111,7 @@ class TD3Learner(Learner):
         self.loss_actor = torch.zeros(())
 
     def learn(self, batch: TensorDictBase) -> dict[str, Tensor]:
-        """Take a gradient step on transitions ``[S, E, B]``; see `Learner.learn`.
-
-        Returns:
-            The losses; ``loss_actor`` is that of the latest update of the actor, 0 before.
-        """
+        """Take a gradient step; ``loss_actor`` is that of the latest actor update, 0 before."""
         parts = super().learn(batch)
         self.n_updates += 1
         self.loss_actor = parts.get("loss_actor", self.loss_actor)
@@ -145,12 +129,12 @@ class TD3Learner(Learner):
         return (self.n_updates + 1) % self.policy_delay == 0
 
     def state_dict(self) -> dict[str, Any]:
-        """Return all that future updates depend on."""
+        """Return the states of loss and optimizer, and the number of updates."""
         latest = {"n_updates": self.n_updates, "loss_actor": self.loss_actor}
         return {**super().state_dict(), **latest}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from what `state_dict` returned."""
+        """Restore a `state_dict`."""
         super().load_state_dict(state)
         self.n_updates, self.loss_actor = state["n_updates"], state["loss_actor"]
 
@@ -172,6 +156,6 @@ class SACLearner(Learner):
 
 
 def _of_expert(values: Tensor, expert: Tensor) -> Tensor:
-    """Select one expert of each seed: ``[S, ...]`` of ``[S, E, ...]``."""
+    """Select one expert of each seed from ``[S, E, ...]``."""
     seed = torch.arange(len(values), device=values.device)
     return values[seed, expert.to(values.device)]

@@ -1,7 +1,4 @@
-"""MAML over DDPG (Sec. IV-B): one policy that adapts to a task by one gradient step.
-
-Unlike BGPO, it knows the task label in training and tests, by which it selects data to adapt to.
-"""
+"""MAML over DDPG (Sec. IV-B): one policy that adapts to a task by one gradient step."""
 
 from __future__ import annotations
 
@@ -24,6 +21,9 @@ from bgpo_trl.seeding import generators
 class MAML(TaskAlgorithm):
     """MAML with one critic and one replay per task; the policy reads the state only.
 
+    Unlike BGPO, it knows the task label in training and tests, by which it selects data to adapt
+    to.
+
     1. Training episodes are played by the policy adapted to their task, with exploration noise.
     2. An update adapts the policy to transitions of each task, evaluates the adapted policies with
        the tasks' critics on other transitions, and improves the original policy (`MAMLLoss`). Tasks
@@ -31,11 +31,9 @@ class MAML(TaskAlgorithm):
     3. Test episodes of a task are played by the policy after one gradient step on
        ``adaptation_size`` transitions of that task.
 
-    Arguments as for `TaskAlgorithm`.
-
     Attributes:
-        meta_actor: The policy before adaptation, ``[S]`` stacked.
-        critic: The Q-functions, ``[S, T]`` stacked.
+        meta_actor: The policy before adaptation, stacked ``[S]``.
+        critic: The Q-functions, stacked ``[S, T]``.
     """
 
     config: MAMLConfig
@@ -73,7 +71,7 @@ class MAML(TaskAlgorithm):
         self.learner = Learner(self.meta_actor, self.loss, ddpg, noise=ddpg.noise)
 
     def update(self) -> dict[str, Tensor]:
-        """Make one update of each seed; see `Algorithm.update`."""
+        """Make one update of each seed."""
         if not self.ready():
             return {}
         batch = self.replay.sample()
@@ -84,9 +82,9 @@ class MAML(TaskAlgorithm):
     def snapshot(
         self, index: int, embedding: Tensor, task: Tensor, generator: torch.Generator
     ) -> Policy:
-        """Copy the policy adapted to each task, ``[T, ...]``; see `Algorithm.snapshot`.
+        """Copy the policy adapted to each task, ``[T, ...]``.
 
-        For a task with too few transitions, the policy is not adapted. Demonstrations are ignored.
+        A task with too few transitions gets the policy without adaptation.
         """
         del embedding, task
         meta = dict(self.meta_actor.named_parameters())

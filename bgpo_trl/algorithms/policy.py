@@ -22,8 +22,8 @@ class Policy:
     Attributes:
         actor: Network, called with ``parameters`` instead of its weights.
         state_key: Key of the state.
-        parameters: Copies, by their names in the actor. Leading dimensions: none, ``[T]`` (one
-            network per task) or ``[T, M]`` (one per episode), after ``[S]`` in a stack.
+        parameters: By name in the actor. Leading dimensions: none, ``[T]`` (one network per task)
+            or ``[T, M]`` (one per episode), after ``[S]`` in a stack.
         context: Input besides the state, ``[T, M, C]``; None if the actor reads no context.
     """
 

@@ -93,7 +93,7 @@ class LearnerSpec:
 
 
 def make_ddpg(config: DDPGConfig, spec: LearnerSpec) -> Learner:
-    """Return a DDPG learner (Lillicrap et al., 2016), as in the paper."""
+    """Return a DDPG learner (Lillicrap et al., 2016)."""
     actor = spec.actor(Actor, config)
     loss = DDPGLoss(
         actor,
@@ -105,7 +105,7 @@ def make_ddpg(config: DDPGConfig, spec: LearnerSpec) -> Learner:
 
 
 def make_td3(config: TD3Config, spec: LearnerSpec) -> Learner:
-    """Return TD3 (Fujimoto et al., 2018)."""
+    """Return a TD3 learner (Fujimoto et al., 2018)."""
     actor = spec.actor(Actor, config)
     loss = TD3Loss(
         actor,
@@ -120,7 +120,7 @@ def make_td3(config: TD3Config, spec: LearnerSpec) -> Learner:
 
 
 def make_sac(config: SACConfig, spec: LearnerSpec) -> Learner:
-    """Return SAC with a learned temperature (Haarnoja et al., 2018)."""
+    """Return a SAC learner with a learned temperature (Haarnoja et al., 2018)."""
     actor = spec.actor(GaussianActor, config)
     loss = SACLoss(
         actor,
@@ -136,7 +136,7 @@ def make_sac(config: SACConfig, spec: LearnerSpec) -> Learner:
 
 @dataclass(frozen=True)
 class RLEntry:
-    """How to make an RL algorithm."""
+    """RL algorithm and its default hyperparameters."""
 
     make: Callable[[Any, LearnerSpec], Learner]
     """Called with a config and the spec."""
@@ -153,7 +153,7 @@ RL: dict[str, RLEntry] = {
 
 
 def make_learner(config: RLConfig, spec: LearnerSpec) -> Learner:
-    """Return the RL algorithm that a config is of.
+    """Return the learner of a config.
 
     Raises:
         ValueError: If `RL` has none under its name.

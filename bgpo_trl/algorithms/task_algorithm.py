@@ -26,10 +26,10 @@ __all__ = ["TaskAlgorithm", "networks_of"]
 
 
 class TaskAlgorithm(Algorithm):
-    """A learner whose training episodes are played by a policy of their task, ``[S, T]`` stacked.
+    """Algorithm with one policy per task, stacked ``[S, T]``, which plays its training episodes.
 
-    The policies read the state only. Arguments as for `Algorithm`; the bank provides the tasks
-    and, with a ``demonstration_share``, demonstrations as experience.
+    The policies read the state only. The bank provides the tasks and, with a
+    ``demonstration_share``, demonstrations as experience.
 
     Attributes:
         spec: Shapes and inputs of the networks, one per task.

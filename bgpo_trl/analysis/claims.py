@@ -73,10 +73,7 @@ def claims(groups: Groups, statistics: Statistics) -> Table:
 
 
 def additions(groups: Groups, statistics: Statistics) -> Table:
-    """Return the table of the gain of each addition to the paper's algorithm.
-
-    Empty if no run has an addition.
-    """
+    """Return the table of the gain of each addition to the paper's algorithm, or an empty one."""
     judge = _Judge(groups, statistics, ("above", "below"))
     rows = [["added", "compared with", "setting", "measured", "difference [95 %]", "found"]]
     steps = [("even-replay", "gwr+r_int"), ("experts", "even-replay")]
@@ -100,22 +97,17 @@ def _group(setting: str, algorithm: str) -> str:
 class _Judge:
     """Differences between runs, with intervals and verdicts.
 
-    Args:
-        groups: The runs.
-        statistics: Source of the resampled scores.
-        words: Verdicts for a difference above 0 and below 0.
+    ``words`` are the verdicts for a difference above 0 and below 0.
     """
 
     def __init__(self, groups: Groups, statistics: Statistics, words: tuple[str, str]) -> None:
         self._groups, self._statistics, self._words = groups, statistics, words
 
     def __call__(self, what: str, *keys: tuple[str, str]) -> list[str]:
-        """Return a difference with its interval, and the verdict.
+        """Return a difference of measure ``what`` with its interval, and the verdict.
 
-        Args:
-            what: The measure.
-            *keys: Group and directory of two runs, for first minus second; or of four runs, for the
-                difference of the first two minus that of the last two.
+        ``keys`` are group and directory of two runs, for first minus second; or of four runs, for
+        the difference of the first two minus that of the last two.
         """
         runs = [self._groups[group].get(key) for group, key in keys]
         missing = [key for (_, key), run in zip(keys, runs, strict=True) if run is None]

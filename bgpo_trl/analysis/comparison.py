@@ -141,11 +141,7 @@ class Run:
 
 
 def read_group(runs: Path, group: Group) -> tuple[dict[str, Run], list[str]]:
-    """Read the runs of a group and cut them to a common length.
-
-    Args:
-        runs: Directory of the runs.
-        group: Group to read.
+    """Read the runs of a group in a directory and cut them to a common length.
 
     Returns:
         The runs found, by directory name, and notes on missing, unfinished or cut runs.
@@ -207,13 +203,9 @@ def area_scores(run: Run) -> Values:
 
 
 def task_area(run: Run, task: int, start: int, length: int | None = None) -> Values:
-    """Return the area under a task's curve over the episodes after ``start``, ``[S]``.
+    """Return the area under a task's curve over ``length`` episodes after ``start``, ``[S]``.
 
-    Args:
-        run: The run.
-        task: Label of the task.
-        start: Training episode from which to integrate.
-        length: Number of episodes; ``None`` to the end of training.
+    Without ``length``, the area up to the end of training.
     """
     episodes = run.curves.episodes
     chosen = episodes > start
@@ -223,10 +215,9 @@ def task_area(run: Run, task: int, start: int, length: int | None = None) -> Val
 
 
 class Statistics:
-    """Bootstrap statistics, with a seed per run so that they do not depend on the other runs.
+    """Bootstrap statistics; each set of scores has its own stream of random numbers.
 
-    Args:
-        seed: Seed of the resampling.
+    Intervals of a run thus do not depend on the other runs.
     """
 
     def __init__(self, seed: int = 0) -> None:

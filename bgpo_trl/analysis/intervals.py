@@ -13,9 +13,6 @@ Array = NDArray[np.float64]
 def interquartile_mean(scores: ArrayLike) -> float:
     """Return the mean of the middle half of all scores (Agarwal et al., 2021, "rliable").
 
-    Args:
-        scores: Scores of any shape, such as ``[S, T]`` for seeds and tasks.
-
     Raises:
         ValueError: If there are no scores, or one is not finite.
     """
@@ -33,19 +30,11 @@ def stratified_bootstrap(
     n_resamples: int = 2_000,
     rng: np.random.Generator,
 ) -> Array:
-    """Return a statistic of resampled scores, the basis of intervals and of differences.
+    """Return a statistic of resampled scores, ``[n_resamples]``, the basis of intervals.
 
     Seeds are resampled with replacement, independently for each task (Agarwal et al., 2021, "Deep
-    Reinforcement Learning at the Edge of the Statistical Precipice", section 4.1).
-
-    Args:
-        scores: One score per seed and task, ``[S, T]``.
-        statistic: Function of an array of that shape.
-        n_resamples: Number of resamples ``N``.
-        rng: Random generator.
-
-    Returns:
-        The statistic of each resample, ``[N]``.
+    Reinforcement Learning at the Edge of the Statistical Precipice", section 4.1). Scores are
+    ``[S, T]``, one per seed and task; ``statistic`` is a function of an array of that shape.
 
     Raises:
         ValueError: If scores are not finite or not ``[S, T]``, or ``n_resamples`` is less than 1.
@@ -66,11 +55,7 @@ def stratified_bootstrap(
 
 
 def percentile_interval(values: ArrayLike, confidence: float = 0.95) -> tuple[float, float]:
-    """Return the percentile bootstrap interval of resampled values.
-
-    Args:
-        values: Results of `stratified_bootstrap`, or sums and differences of them.
-        confidence: Share of the values inside the interval.
+    """Return the percentile bootstrap interval of resampled values, or of their differences.
 
     Raises:
         ValueError: If there are no values, or ``confidence`` is not in (0, 1).

@@ -1,8 +1,10 @@
 """Measures of multi-task and continual learning.
 
-All functions take plain arrays. ``success`` ``[..., E, T]`` is the share of successes on each
-of ``T`` tasks at each of ``E`` evaluations (`bgpo_trl.runs.results.Curves` adds a leading seed
+All functions take plain arrays. ``success`` ``[..., E, T]`` is the share of successes on each of
+``T`` tasks at each of ``E`` evaluations (`bgpo_trl.runs.results.Curves` adds a leading seed
 dimension). NaN marks tasks that were not tested, because they had not been presented yet.
+``episodes`` ``[E]`` are the training episodes before each evaluation. ``ValueError`` is raised if
+they do not increase, or shapes do not match.
 """
 
 from __future__ import annotations
@@ -16,22 +18,14 @@ Array = NDArray[np.float64]
 def evaluation_matrix(
     success: ArrayLike, episodes: ArrayLike, ends: ArrayLike, *, window: int
 ) -> Array:
-    """Return ``R[i, j]``, the success on task j at the end of phase i.
+    """Return ``R[i, j]``, the success on task j at the end of phase i, ``[..., P, T]``.
 
-    Args:
-        success: Success ``[..., E, T]``.
-        episodes: Training episodes before each evaluation, ``[E]``.
-        ends: Last episode of each phase, ``[P]``: the starts of the later tasks, and the end of
-            training.
-        window: Number of training episodes before the end of a phase whose evaluations are
-            averaged.
-
-    Returns:
-        ``[..., P, T]``; NaN for tasks without a test in the window.
+    ``ends`` ``[P]`` are the last episodes of the phases: the starts of the later tasks, and the end
+    of training. Success is the mean over the evaluations in the ``window`` episodes before an end;
+    NaN for tasks without a test among them.
 
     Raises:
-        ValueError: If a phase has no evaluation in its window, or ``success`` and ``episodes`` do
-            not match.
+        ValueError: If a phase has no evaluation in its window.
     """
     success, episodes = np.asarray(success, float), np.asarray(episodes)
     _check_episodes(success, episodes, -2)
@@ -50,14 +44,7 @@ def evaluation_matrix(
 def forgetting_since_learned(matrix: ArrayLike) -> Array:
     """Return the loss of success since the end of each task's own phase, ``[...]``.
 
-    The mean over all tasks but the last of ``R[j, j] - R[T - 1, j]``, where phase j introduces task
-    j; the negative of `backward_transfer`. Negative if tasks have improved since.
-
-    Args:
-        matrix: Result of `evaluation_matrix` with one phase per task, ``[..., T, T]``.
-
-    Raises:
-        ValueError: If the numbers of phases and tasks differ.
+    The negative of `backward_transfer`; below 0 if tasks have improved since.
     """
     return -backward_transfer(matrix)
 
@@ -67,14 +54,8 @@ def forgetting_since_best(success: ArrayLike) -> Array:
 
     The mean over tasks of the highest success at any evaluation minus that at the last one; never
     negative (Chaudhry et al., 2018, "Riemannian Walk for Incremental Learning", but over all
-    evaluations and tasks). Noise of single evaluations counts as forgetting: average them first
-    with `trailing_mean`.
-
-    Args:
-        success: Success ``[..., E, T]``.
-
-    Raises:
-        ValueError: If ``success`` has another shape.
+    evaluations and tasks). Noise of single evaluations counts as forgetting: average ``success``
+    ``[..., E, T]`` first with `trailing_mean`.
     """
     success = np.asarray(success, float)
     _check_episodes(success, np.arange(success.shape[-2] if success.ndim > 1 else 0), -2)
@@ -85,7 +66,7 @@ def backward_transfer(matrix: ArrayLike) -> Array:
     """Return the gain of earlier tasks from learning later ones, ``[...]``.
 
     The mean over all tasks but the last of ``R[T - 1, j] - R[j, j]`` (Lopez-Paz & Ranzato, 2017,
-    "Gradient Episodic Memory for Continual Learning").
+    "Gradient Episodic Memory for Continual Learning"), where phase j introduces task j.
 
     Args:
         matrix: Result of `evaluation_matrix` with one phase per task, ``[..., T, T]``.
@@ -104,28 +85,19 @@ def forward_transfer(area: ArrayLike, reference: ArrayLike) -> Array:
     """Return the gain in learning a task from having learned other tasks before.
 
     ``(area - reference) / (1 - reference)``: 1 for success from the start, 0 for no gain, negative
-    for slower learning (Wolczyk et al., 2021, "Continual World").
-
-    Args:
-        area: `area_under_curve` of a task since its presentation.
-        reference: The same, over as many episodes, of a learner without earlier tasks.
+    for slower learning (Wolczyk et al., 2021, "Continual World"). ``area`` is the
+    `area_under_curve` of a task since its presentation; ``reference`` is the same, over as many
+    episodes, of a learner without earlier tasks.
     """
     area, reference = np.asarray(area, float), np.asarray(reference, float)
     return (area - reference) / (1 - reference)
 
 
 def area_under_curve(success: ArrayLike, episodes: ArrayLike) -> Array:
-    """Return the mean height of learning curves, between 0 and 1, ``[...]``.
+    """Return the mean height of learning curves ``[..., E]``, between 0 and 1, ``[...]``.
 
     Integrates by trapezoids; before the first evaluation, the curve rises linearly from 0 at
     episode 0. Curves must not contain NaN.
-
-    Args:
-        success: Success ``[..., E]``.
-        episodes: Training episodes before each evaluation, ``[E]``.
-
-    Raises:
-        ValueError: If the shapes do not match, or ``episodes`` do not increase.
     """
     success, episodes = np.asarray(success, float), np.asarray(episodes, float)
     _check_episodes(success, episodes, -1)
@@ -135,18 +107,9 @@ def area_under_curve(success: ArrayLike, episodes: ArrayLike) -> Array:
 
 
 def episodes_to(success: ArrayLike, episodes: ArrayLike, threshold: float = 0.8) -> Array:
-    """Return the training episodes before the first evaluation that reaches a success rate.
+    """Return the training episodes until curves ``[..., E]`` first reach a success rate, ``[...]``.
 
-    Args:
-        success: Success ``[..., E]``.
-        episodes: Training episodes before each evaluation, ``[E]``.
-        threshold: The success rate.
-
-    Returns:
-        ``[...]``; infinite where the rate is never reached.
-
-    Raises:
-        ValueError: If the shapes do not match, or ``episodes`` do not increase.
+    Infinite where the rate is never reached.
     """
     _check_episodes(np.asarray(success, float), np.asarray(episodes), -1)
     reached = np.asarray(success, float) >= threshold
@@ -155,21 +118,10 @@ def episodes_to(success: ArrayLike, episodes: ArrayLike, threshold: float = 0.8)
 
 
 def overall_episodes_to(success: ArrayLike, episodes: ArrayLike, threshold: float = 0.8) -> float:
-    """Return the training episodes until overall success first reaches a rate.
+    """Return the training episodes until overall success first reaches a rate, else infinity.
 
     Overall success is the mean over seeds and the tasks presented so far, and over the last three
-    evaluations, since a single one has few test episodes.
-
-    Args:
-        success: Success ``[S, E, T]``.
-        episodes: Training episodes before each evaluation, ``[E]``.
-        threshold: The success rate.
-
-    Returns:
-        The number of episodes; infinite if the rate is never reached.
-
-    Raises:
-        ValueError: If the shapes do not match, or ``episodes`` do not increase.
+    evaluations, since a single one has few test episodes. ``success`` is ``[S, E, T]``.
     """
     overall = presented_mean(trailing_mean(success, 3)).mean(axis=0)
     return float(episodes_to(overall, episodes, threshold))
@@ -178,13 +130,8 @@ def overall_episodes_to(success: ArrayLike, episodes: ArrayLike, threshold: floa
 def trials_to(success: ArrayLike, threshold: float = 0.5, *, window: int = 20) -> float:
     """Return the number of its own training episodes that a task takes to reach a success rate.
 
-    Args:
-        success: Outcomes of the task's training episodes, in order, ``[N]``.
-        threshold: The success rate.
-        window: Number of latest episodes over which the rate is taken; it is undefined for fewer.
-
-    Returns:
-        The first number of episodes at which the rate is reached, or infinity.
+    ``success`` ``[N]`` are the outcomes of these episodes in order. The rate is taken over the
+    latest ``window`` of them, and undefined for fewer; infinity if it is never reached.
 
     Raises:
         ValueError: If the window is empty.
@@ -199,11 +146,9 @@ def trials_to(success: ArrayLike, threshold: float = 0.5, *, window: int = 20) -
 def times_the_first(episodes: ArrayLike) -> Array:
     """Return the learning times of the later tasks as multiples of the first task's, ``[T - 1]``.
 
-    The median over seeds. A task that a seed never learns counts as infinitely long. Seeds that
-    never learn the first task are left out; NaN if none is left.
-
-    Args:
-        episodes: Results of `trials_to`, ``[S, T]``, with tasks in order of presentation.
+    The median over seeds of `trials_to` ``[S, T]``, with tasks in order of presentation. A task
+    that a seed never learns counts as infinitely long. Seeds that never learn the first task are
+    left out; NaN if none is left.
     """
     episodes = np.asarray(episodes, float)
     learned = episodes[np.isfinite(episodes[:, 0])]
@@ -213,14 +158,10 @@ def times_the_first(episodes: ArrayLike) -> Array:
 
 
 def trailing_mean(success: ArrayLike, n: int) -> Array:
-    """Return the mean of each evaluation and up to ``n - 1`` evaluations before it.
-
-    Args:
-        success: Success ``[..., E, T]``.
-        n: Number of evaluations, at least 1.
+    """Return the mean of each evaluation and up to ``n - 1`` before it, ``[..., E, T]``.
 
     Raises:
-        ValueError: If ``n`` is less than 1, or ``success`` has another shape.
+        ValueError: If ``n`` is less than 1.
     """
     success = np.asarray(success, float)
     if n < 1 or success.ndim < 2:
@@ -236,11 +177,7 @@ def trailing_mean(success: ArrayLike, n: int) -> Array:
 
 
 def presented_mean(success: ArrayLike) -> Array:
-    """Return the mean over the tasks presented by each evaluation, ``[..., E]``.
-
-    Args:
-        success: Success ``[..., E, T]``.
-    """
+    """Return the mean of ``success`` over the tasks presented by each evaluation, ``[..., E]``."""
     return _mean(np.asarray(success, float), axis=-1)
 
 

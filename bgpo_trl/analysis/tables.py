@@ -82,13 +82,8 @@ def _spread(values: Values) -> str:
 def own_episodes(path: Path, tasks: Sequence[str], last: int | None = None) -> Values | None:
     """Return the training episodes of each task until 50 % of them succeed, ``[S, T]``.
 
-    Args:
-        path: A run's ``train.csv``.
-        tasks: Task names.
-        last: Last training episode to count; ``None`` for the end of the run.
-
-    Returns:
-        Infinite where 50 % was not reached; ``None`` if the file is missing or has no episodes.
+    Infinite where 50 % was not reached by episode ``last`` (the end of the run if ``None``);
+    ``None`` if ``path``, a ``train.csv``, is missing or has no episodes.
     """
     outcomes = read_outcomes(path, tasks, last) if path.exists() else []
     if not outcomes:
@@ -111,11 +106,7 @@ def speed_table(runs: Mapping[str, Run]) -> Table:
 
 
 def median_cell(episodes: Values) -> str:
-    """Format the median over seeds, with the number of seeds that never reached 50 %.
-
-    Args:
-        episodes: Learning time of each seed, infinite where never reached, ``[S]``.
-    """
+    """Format the median of learning times ``[S]``, and the number of infinite ones."""
     never = int(np.isinf(episodes).sum())
     median = float(np.median(episodes))
     cell = f"{median:.0f}" if np.isfinite(median) else "not reached"
@@ -123,10 +114,9 @@ def median_cell(episodes: Values) -> str:
 
 
 def ratio_cells(episodes: Values) -> list[str]:
-    """Format the later tasks' learning times as multiples of the first's, with the number of seeds.
+    """Format learning times ``[S, T]`` as multiples of the first task's.
 
-    Args:
-        episodes: Learning times, infinite where 50 % was never reached, ``[S, T]``.
+    Cells give the number of seeds if some never learned the first task.
     """
     learned = int(np.isfinite(episodes[:, 0]).sum())
     note = "" if learned == len(episodes) else f" ({learned} of {len(episodes)} seeds)"

@@ -15,14 +15,9 @@ from bgpo_trl.modules.gwr import GWRB
 def match_counts(gwr: GWRB, bank: DemonstrationBank, n_tasks: int) -> Tensor:
     """Count the demonstrations of each task whose best-matching unit is a node.
 
-    Args:
-        gwr: The network(s), ``batch_size`` ``[*S]``.
-        bank: Demonstrations to look up.
-        n_tasks: Number of tasks.
-
     Returns:
-        Counts int64 ``[*S, N, n_tasks]``, with nodes in order of creation and ``N`` the size of the
-        largest network; rows beyond a smaller network's size are 0.
+        Counts int64 ``[*S, N, n_tasks]`` of networks ``[*S]``, with nodes in order of creation and
+        ``N`` the size of the largest network; rows beyond a smaller network's size are 0.
     """
     node = gwr.lookup(bank.embedding.expand(*gwr.batch_size, *bank.embedding.shape)).node
     counts = torch.zeros(*gwr.batch_size, int(gwr.num_nodes.max()), n_tasks, dtype=torch.int64)
@@ -33,10 +28,9 @@ def match_counts(gwr: GWRB, bank: DemonstrationBank, n_tasks: int) -> Tensor:
 
 
 def majority_task(counts: Tensor) -> Tensor:
-    """Return each node's most frequent task, int64 ``[..., N]``; -1 for nodes without a match.
+    """Return each node's most frequent task, int64 ``[..., N]``, from its `match_counts`.
 
-    Args:
-        counts: Result of `match_counts`, ``[..., N, n_tasks]``.
+    Nodes without a match get -1.
     """
     return torch.where(counts.sum(-1) > 0, counts.argmax(-1), -1)
 
@@ -44,13 +38,9 @@ def majority_task(counts: Tensor) -> Tensor:
 def task_inference_accuracy(
     gwr: GWRB, seen: DemonstrationBank, tested: DemonstrationBank, n_tasks: int
 ) -> Tensor:
-    """Return the share of demonstrations whose node has their task as its majority task, ``[*S]``.
+    """Return the share of ``tested`` whose node has their task as its majority task, ``[*S]``.
 
-    Args:
-        gwr: The network(s), ``batch_size`` ``[*S]``.
-        seen: Demonstrations that define each node's majority task.
-        tested: Demonstrations whose task is inferred.
-        n_tasks: Number of tasks.
+    The demonstrations ``seen`` define each node's majority task.
     """
     task_of_node = majority_task(match_counts(gwr, seen, n_tasks))
     matched = match_counts(gwr, tested, n_tasks)
@@ -61,13 +51,7 @@ def task_inference_accuracy(
 
 @torch.no_grad()
 def group_purity(groups: BehaviorGroups, bank: DemonstrationBank, n_tasks: int) -> Tensor:
-    """Return the share of demonstrations whose task is the majority task of their group, ``[*S]``.
-
-    Args:
-        groups: The groups, ``batch_size`` ``[*S]``.
-        bank: Demonstrations, with labels that the groups do not use.
-        n_tasks: Number of tasks.
-    """
+    """Return the share of demonstrations of the majority task of their group, ``[*S]``."""
     batch = groups.batch_size
     group = groups.lookup(bank.embedding.expand(*batch, *bank.embedding.shape)).group
     counts = torch.zeros(*batch, int(groups.num_groups.max()), n_tasks)

@@ -25,10 +25,9 @@ class DemonstrationSteps:
 
     Attributes:
         latent: Frames of all demonstrations, concatenated, int8 ``[F, 64]``.
-        action: Action from each frame to the next, int8 ``[F, 4]``; undefined at the last frame of
-            a demonstration.
+        action: Action from each frame to the next, int8 ``[F, 4]``; undefined at a last frame.
         first: Index of the first frame of each demonstration, int64 ``[N]``.
-        length: Number of frames of each demonstration, int64 ``[N]``; 0 if its steps are not kept.
+        length: Number of frames of each, int64 ``[N]``; 0 if its steps are not kept.
 
     Raises:
         ValueError: If shapes or dtypes do not match, or an index lies outside ``latent``.
@@ -78,7 +77,7 @@ class DemonstrationSteps:
         return self.action[frame] / _ACTION_CODES
 
     def select(self, rows: Tensor) -> DemonstrationSteps:
-        """Return the steps of the selected demonstrations, sharing the memory of all frames."""
+        """Return the steps of selected demonstrations, sharing the memory of all frames."""
         return replace(self, first=self.first[rows], length=self.length[rows])
 
     def __add__(self, other: DemonstrationSteps) -> DemonstrationSteps:
@@ -100,11 +99,10 @@ class DemonstrationBank:
         task: Task labels, int64 ``[N]``; used to draw an episode's task and for evaluation.
         train: Bool ``[N]``; ``False`` for demonstrations held out for test episodes.
         tasks: Task names, in the order of the labels.
-        steps: Latents and actions along the demonstrations, in the same order; ``None`` if the bank
-            does not store them.
+        steps: Latents and actions along the demonstrations, or ``None`` if they are not stored.
 
     Raises:
-        ValueError: If a label has no name, or the number of demonstrations in ``steps`` differs.
+        ValueError: If a label has no name, or ``steps`` are of another number of demonstrations.
     """
 
     embedding: Tensor
@@ -131,11 +129,10 @@ class DemonstrationBank:
         return self._select(self.train)
 
     def held_out(self, part: Literal["validation", "test"] | None = None) -> DemonstrationBank:
-        """Return the demonstrations for test episodes.
+        """Return the demonstrations for test episodes, or a part of them.
 
-        Args:
-            part: ``"validation"`` (first, third, ... of each task) to choose settings, ``"test"``
-                (second, fourth, ...) to report results, ``None`` for all.
+        ``"validation"`` (first, third, ... of each task) is for choosing settings, ``"test"``
+        (second, fourth, ...) for reporting results.
         """
         rows = torch.nonzero(~self.train).flatten()
         if part is None:
@@ -150,9 +147,6 @@ class DemonstrationBank:
 
     def for_tasks(self, tasks: Sequence[str]) -> DemonstrationBank:
         """Return the demonstrations of the given tasks, relabeled by their positions in ``tasks``.
-
-        Args:
-            tasks: Task names, in the order of the new labels.
 
         Raises:
             ValueError: If the bank does not know one of the tasks.

@@ -23,14 +23,9 @@ _REMEDY = "record it again with `python -m bgpo_trl.data.recording PATH`"
 
 
 def load_demonstrations(path: str | Path, *, verify: bool = True) -> TensorDict:
-    """Open a recorded dataset, memory-mapped.
+    """Open a dataset recorded by `record_demonstrations`, memory-mapped.
 
-    Args:
-        path: Folder of the dataset.
-        verify: Whether to verify the checksum, which reads the whole dataset.
-
-    Returns:
-        The dataset as returned by `bgpo_trl.data.recording.record_demonstrations`.
+    ``verify`` compares the checksum, which reads the whole dataset.
 
     Raises:
         ValueError: If it is missing, incomplete, damaged or of another scene version.

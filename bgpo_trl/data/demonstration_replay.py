@@ -1,4 +1,4 @@
-"""Replay of demonstrations: transitions of the demonstrations shown in training episodes."""
+"""Replay of the demonstrations shown in training episodes."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ __all__ = ["DemonstrationReplay"]
 class DemonstrationReplay:
     """Transitions of the demonstrations shown to each seed, sampled by group.
 
-    A transition consists of two successive latents, the action between them and the context (the
-    constant entries) of the episode in which the demonstration was shown. The last transition of a
+    A transition has two successive latents, the action between them, and the constant entries (such
+    as the context) of the episode in which the demonstration was shown. The last transition of a
     demonstration counts as a success: it terminates, with the reward given to `add`.
 
     Args:
@@ -80,12 +80,9 @@ class DemonstrationReplay:
     def sample(self, group: Tensor) -> TensorDict:
         """Draw, for each row, a demonstration of the row's group and one of its transitions.
 
-        Args:
-            group: As in `GroupReplay.sample`, ``[S, R]``.
-
         Returns:
-            Batch size ``[S, R]``, with the state, the constant entries, ``"action"``,
-            ``"priority_weight"`` and, under ``"next"``, the state, ``"reward"`` and
+            Batch size ``[S, R]`` as in `GroupReplay.sample`, with the state, the constant entries,
+            ``"action"``, ``"priority_weight"`` and, under ``"next"``, the state, ``"reward"`` and
             ``"terminated"``.
         """
         shown = self._shown.sample(group)
@@ -115,5 +112,5 @@ class DemonstrationReplay:
         return self._shown.state_dict()
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Restore the result of `state_dict`, so that the same samples follow."""
+        """Restore a `state_dict`, so that the same samples follow."""
         self._shown.load_state_dict(state_dict)

@@ -31,9 +31,8 @@ class GroupReplay:
 
     Example:
         >>> replay = GroupReplay(100, generator=[torch.Generator()], keys=["state"])
-        >>> for step in range(6):
-        ...     transition = TensorDict({"state": torch.full([1, 1], float(step))}, [1])
-        ...     replay.add(transition, group=torch.tensor([step % 2]))
+        >>> for i in range(6):
+        ...     replay.add(TensorDict({"state": torch.tensor([i])}, [1]), torch.tensor([i % 2]))
         >>> drawn = replay.sample(torch.tensor([[1, 1, 1, 7]]))
         >>> (drawn["state"][0, :3] % 2 == 1).all(), drawn["priority_weight"][0]
         (tensor(True), tensor([1., 1., 1., 0.]))
@@ -73,7 +72,7 @@ class GroupReplay:
             mask: Seeds that store theirs, bool ``[S]``; ``None`` for all.
 
         Raises:
-            ValueError: If an entry is missing, or its shape or dtype differs from those stored.
+            ValueError: If an entry is missing, or differs in shape or dtype from those stored.
         """
         steps = self._buffer.n_added.tolist()
         missing = [key for key in self._buffer.keys or () if key not in transition.keys(True)]
@@ -98,8 +97,7 @@ class GroupReplay:
         Args:
             group: Group of each row, int64 ``[S, R]``; -1 leaves a row empty and draws nothing.
             seeds: Positions of the ``S`` seeds to draw for; ``None`` for all.
-            generator: Random generators to use instead of the replay's, one for each of those
-                seeds.
+            generator: Random generators of these seeds, in place of the replay's.
 
         Returns:
             Batch size ``[S, R]``, with ``"priority_weight"``, the weight of a transition in
@@ -133,7 +131,7 @@ class GroupReplay:
         return self._buffer.state_dict()
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Restore the result of `state_dict`, so that the same samples follow."""
+        """Restore a `state_dict`, so that the same samples follow."""
         self._buffer.load_state_dict(state_dict)
         self._index = [_Index() for _ in self._generators]
         for seed, (first, end) in enumerate(
@@ -148,17 +146,10 @@ class GroupReplay:
 
 
 def draw_shares(group: Tensor, generator: Sequence[torch.Generator]) -> Tensor:
-    """Draw a number in [0, 1) for each row that has a group.
+    """Draw a number in [0, 1) for each row ``[S, R]`` that has a group.
 
-    Rows without a group consume no random numbers, so a seed's draws do not depend on how many
-    slots are free.
-
-    Args:
-        group: Group of each row, int64 ``[S, R]``; -1 for rows without one.
-        generator: Random generators, one for each of ``S`` seeds.
-
-    Returns:
-        Float64 ``[S, R]``; 0 for rows without a group.
+    Rows without a group (-1) get 0 and consume no random numbers, so a seed's draws do not depend
+    on how many slots are free.
     """
     shares = torch.zeros(group.shape, dtype=torch.float64)
     for row, wanted, source in zip(shares, group >= 0, generator, strict=True):

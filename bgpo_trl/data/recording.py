@@ -116,11 +116,7 @@ def _settings(
 
 
 def _is_complete(path: Path, wanted: Mapping[str, Any]) -> bool:
-    """Return whether a recording was completed.
-
-    Raises:
-        ValueError: If it has other settings.
-    """
+    """Return whether a recording was completed; raise ``ValueError`` if it has other settings."""
     meta = read_meta(path)
     found = {key: meta.get(key) for key in {**wanted, **meta} if key != "checksum"}
     if found != wanted:
@@ -144,7 +140,6 @@ def _record_rows(
     attempts: int,
     progress: bool,
 ) -> None:
-    """Record the rows that are not there yet."""
     tasks, per_task, seed = wanted["tasks"], wanted["per_task"], wanted["seed"]
     play, n_shown = "play" in wanted, per_task - wanted["held_out_per_task"]
     missing = torch.nonzero(dataset["length"] == 0).flatten().tolist()

@@ -1,4 +1,4 @@
-"""Replay buffer sampled by task, for algorithms that are given the task labels."""
+"""Replay buffer sampled by task."""
 
 from __future__ import annotations
 
@@ -32,9 +32,8 @@ class TaskReplay:
         ValueError: If there is no task, or no task could ever fill a batch.
 
     Example:
-        >>> streams = [torch.Generator() for _ in range(10)]
-        >>> options = {"n_tasks": 3, "batch_size": 2, "keys": ["state"]}
-        >>> replay = TaskReplay(1000, generator=streams, **options)
+        >>> streams, keys = [torch.Generator() for _ in range(10)], ["state"]
+        >>> replay = TaskReplay(1000, n_tasks=3, batch_size=2, generator=streams, keys=keys)
         >>> played = {"state": torch.ones(10, 5), "task": torch.arange(10) % 2}
         >>> for _ in range(4):
         ...     replay.add(TensorDict(played, [10]))
@@ -70,15 +69,14 @@ class TaskReplay:
 
     @property
     def ready(self) -> Tensor:
-        """Whether each task of each seed holds at least a batch of transitions, bool ``[S, T]``."""
+        """Whether each task of each seed holds at least a batch, bool ``[S, T]``."""
         return self.sizes >= self.batch_size
 
     @property
     def enough(self) -> int:
         """Number of transitions that guarantees a full batch of some task.
 
-        Waiting for this number makes learning start at the same step for all seeds, so that each
-        seed of a batch starts, and counts optimizer steps, as it would alone.
+        Waiting for it makes learning start at the same step for all seeds, as each would alone.
         """
         return self.n_tasks * (self.batch_size - 1) + 1
 
@@ -89,8 +87,7 @@ class TaskReplay:
     def add(self, transition: TensorDictBase) -> None:
         """Store one transition of each seed by task; also the demonstration, if an episode ends.
 
-        Args:
-            transition: Batch size ``[S]``, with the entries to store and ``"task"`` int64 ``[S]``.
+        ``transition`` ``[S]`` has the entries to store and ``"task"`` int64 ``[S]``.
 
         Raises:
             ValueError: If an entry is missing, or a task does not exist.
@@ -106,11 +103,10 @@ class TaskReplay:
             self._demonstrations.add(transition, torch.ones(len(task)), task, ended)
 
     def sample(self) -> TensorDictBase:
-        """Draw transitions of each task of each seed, those of demonstrations last.
+        """Draw transitions ``[S, T, B]`` of each task of each seed, those of demonstrations last.
 
-        Returns:
-            Batch size ``[S, T, B]``, with ``"priority_weight"``, the weight of a transition in
-            TorchRL's losses: 1, or 0 for tasks that are not `ready`.
+        They have ``"priority_weight"``, the weight in TorchRL's losses: 1, or 0 for tasks that are
+        not `ready`.
 
         Raises:
             ValueError: If no task is ready.
@@ -125,21 +121,16 @@ class TaskReplay:
     def sample_played(
         self, batch_size: int, *, generator: Sequence[torch.Generator] | None = None
     ) -> TensorDict:
-        """Draw transitions of each task of each seed as `sample` does, without demonstrations.
+        """Draw as `sample` does, but ``batch_size`` transitions of each task and no demonstrations.
 
-        Args:
-            batch_size: Number of transitions per task and seed.
-            generator: Random generators to use instead of the replay's, one for each seed.
+        ``generator`` are random generators of the seeds, in place of the replay's.
         """
         return self._draw(self._replay, self._ready_tasks(), batch_size, generator=generator)
 
     def sample_seed(self, seed: int, tasks: Sequence[int], batch_size: int) -> TensorDict:
-        """Draw transitions of some tasks of one seed, ``[len(tasks), B]``.
+        """Draw transitions ``[len(tasks), B]`` of some tasks of the seed at a position.
 
-        Args:
-            seed: Position of the seed.
-            tasks: Labels of the tasks; each must hold a transition.
-            batch_size: Number of transitions ``B`` per task.
+        Each task must hold a transition.
         """
         task = torch.tensor([tasks])
         return self._draw(self._replay, task, batch_size, seeds=[seed])[0]
@@ -153,7 +144,7 @@ class TaskReplay:
         }
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Restore the result of `state_dict`, so that the same samples follow."""
+        """Restore a `state_dict`, so that the same samples follow."""
         self._replay.load_state_dict(state_dict["played"])
         if self._demonstrations is not None:
             self._demonstrations.load_state_dict(state_dict["shown"])

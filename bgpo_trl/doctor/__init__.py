@@ -1,6 +1,5 @@
 """Checks of this machine and installation: ``python -m bgpo_trl.doctor``.
 
-One line for each thing: ``ok``; ``note``, which costs something; or ``wrong``, which makes it
-unusable and the exit status 1. Only the standard library is imported before a check asks for more,
-so that whatever is broken is told like everything else.
+Each check prints a line: ``ok``; ``note``, usable with a limitation; or ``wrong``, unusable and
+exit status 1. Checks import third-party packages themselves, so that a broken one is reported too.
 """

@@ -26,11 +26,7 @@ def examine(checks: Mapping[str, Check]) -> Iterator[Finding]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; see ``--help``.
-
-    Returns:
-        The exit status: 1 if something makes it unusable, else 0.
-    """
+    """Run the command line (see ``--help``); return 1 if a finding is ``wrong``, else 0."""
     # Not tyro, which may be what is broken.
     parser = argparse.ArgumentParser("python -m bgpo_trl.doctor", description=doctor.__doc__)
     parser.add_argument("--frame", type=Path, metavar="PNG", help="write what the robot sees")

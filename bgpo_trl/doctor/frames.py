@@ -62,5 +62,5 @@ def check_frame(path: Path | None = None) -> Iterator[Finding]:
 def _driver(renderer: FrameRenderer) -> str:
     try:
         return renderer.driver()
-    except Exception as error:  # It is only told; PyOpenGL raises errors of many kinds.
+    except Exception as error:  # Only informative; PyOpenGL raises errors of many kinds.
         return f"renderer unknown ({first_line(error)})"

@@ -64,7 +64,7 @@ def check_update_rate(seconds: float = 0.5) -> Iterator[Finding]:
     torch.set_num_threads(1)  # as in a run
     try:
         transition, _ = world.env.step_and_maybe_reset(learner.act(world.env.reset()))
-        while not learner.update():  # not before it has seen enough
+        while not learner.update():  # empty during warm-up
             learner.store(transition)
         rate = len(seeds) * _rate(learner.update, seconds)
     finally:

@@ -19,11 +19,11 @@ def judge_version(
     """Judge the version of a dependency.
 
     Args:
-        name: Of its distribution.
+        name: Name of its distribution.
         found: The installed version; None if it is not installed.
-        wanted: The range that the code is written for, such as ``">=2.13,<3"``.
-        exact: The version known to work, where that is known.
-        optional: Whether most runs do without it.
+        wanted: The supported range, such as ``">=2.13,<3"``.
+        exact: The version known to work, or None.
+        optional: Whether most runs do not need it.
     """
     from packaging.specifiers import SpecifierSet
 
@@ -35,7 +35,7 @@ def judge_version(
     if not SpecifierSet(wanted).contains(found, prereleases=True):
         level = "note" if optional else "wrong"
         return Finding(level, name, f"{found} is outside {wanted}: {remedy}")
-    # A build's own label, such as +cpu or +cu128, is not part of what was tried.
+    # A build label, such as +cpu or +cu128, does not count.
     if exact is not None and found.partition("+")[0] != exact:
         return Finding("note", name, f"{found}, known to work is {exact}; if in doubt: {remedy}")
     return Finding("ok", name, found)

@@ -11,7 +11,7 @@ from torch import Tensor
 def embedding_distances(
     phi: Tensor, task: Tensor, activity_threshold: float = 0.8
 ) -> dict[str, float]:
-    """Measure how close embedded demonstrations lie, relative to the threshold of GWR-B.
+    """Measure the distances of embedded demonstrations relative to the threshold of GWR-B.
 
     GWR-B adds no node for a demonstration whose activity ``exp(-distance)`` at a node reaches a_T
     (Eq. 2, Table 1), so ``-ln a_T`` (0.223 for 0.8) is the reference distance: if all pairs are
@@ -28,12 +28,6 @@ def embedding_distances(
         (median over pairs), ``phi_threshold_distance`` (``-ln a_T``) and ``phi_nearest_known``
         (share of demonstrations whose nearest neighbor is closer than that). NaN without such
         pairs.
-
-    Example:
-        >>> phi = torch.tensor([[0.0], [0.1], [1.0]])
-        >>> distances = embedding_distances(phi, torch.tensor([0, 0, 1]))
-        >>> round(distances["phi_nearest_same_task"], 3)
-        0.1
     """
     distance = torch.cdist(phi, phi, compute_mode="donot_use_mm_for_euclid_dist")
     itself = torch.eye(len(phi), dtype=torch.bool)

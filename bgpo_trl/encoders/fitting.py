@@ -1,4 +1,4 @@
-"""Supervised training of one network: Adam with warm-up and cosine decay, logs and checkpoints."""
+"""Supervised training of one network, with logs and checkpoints."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Log = Callable[[dict[str, Any]], None]
 
 @dataclass(frozen=True)
 class Fit:
-    """Training loop shared by both stages of the representation.
+    """Training loop of both encoders: Adam with warm-up and cosine decay.
 
     Attributes:
         config: Hyperparameters; the seed and the intervals apply to every stage.
@@ -47,9 +47,7 @@ class Fit:
         schedule: VAEConfig | SequenceAutoencoderConfig,
         generator: torch.Generator,
     ) -> None:
-        """Train ``loss.parameters()``, from the last checkpoint if there is one.
-
-        The loss is moved to the device and stays there.
+        """Train ``loss.parameters()`` on the device, from the last checkpoint if there is one.
 
         Args:
             stage: Name of the progress bar, the log rows and the checkpoint.

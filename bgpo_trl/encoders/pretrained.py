@@ -24,10 +24,7 @@ from suites import nico
 def load_pretrained(
     weights: str | Path | None = None,
 ) -> tuple[Representation, DemonstrationBank]:
-    """Load encoders and the bank beside them.
-
-    Args:
-        weights: Encoder weights; the pretrained ones if ``None``.
+    """Load encoders (by default the pretrained ones) and the bank beside them.
 
     Raises:
         ValueError: If either file is missing, damaged or was made for another scene.

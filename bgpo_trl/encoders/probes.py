@@ -102,16 +102,10 @@ def probe(
 
 
 def ridge_predict(x: Tensor, y: Tensor, x_new: Tensor, penalty: float = 1e-4) -> Tensor:
-    """Fit a ridge regression (with intercept) of ``y`` on ``x`` and predict for ``x_new``.
+    """Predict ``y`` ``[M, k]`` for ``x_new`` ``[M, d]`` by ridge regression with intercept.
 
-    Args:
-        x: Inputs ``[N, d]``.
-        y: Targets ``[N, k]``.
-        x_new: Inputs to predict for, ``[M, d]``.
-        penalty: L2 penalty per row on the coefficients of standardized ``x``.
-
-    Returns:
-        Predictions, float32 ``[M, k]``.
+    It is fitted on ``x`` ``[N, d]``, standardized, and ``y`` ``[N, k]``; ``penalty`` is the L2
+    penalty per row on the coefficients.
     """
     scale, center = torch.std_mean(x.double(), 0)
     scale = scale.clamp_min(1e-8)
@@ -126,14 +120,8 @@ def ridge_predict(x: Tensor, y: Tensor, x_new: Tensor, penalty: float = 1e-4) ->
 def reconstruction_picture(vae: VAE, demonstrations: TensorDictBase, columns: int = 12) -> Tensor:
     """Return original frames above their reconstructions, each pixel enlarged to 4 x 4.
 
-    Args:
-        vae: The trained VAE.
-        demonstrations: Reads ``pixels`` ``[N, T, 32, 64, 3]`` and ``length`` ``[N]``; frames are
-            spread over demonstrations and time.
-        columns: Number of frames.
-
-    Returns:
-        Picture uint8 ``[2 * 32 * 4, columns * 64 * 4, 3]``.
+    Frames are spread over demonstrations and time; the picture is uint8
+    ``[2 * 32 * 4, columns * 64 * 4, 3]``.
     """
     share = torch.linspace(0, 1, columns)
     demonstration = (share * (len(demonstrations) - 1)).round().long()
@@ -175,7 +163,6 @@ def _probe_state(
 
 
 def _probe_play(vae: VAE, play: TensorDictBase) -> dict[str, float]:
-    """Return the errors in frames of play with all objects on the table."""
     train, held_out = split(play)
     latent, latent_held_out = (
         encode_frames(vae, part.get("pixels"), part.get("length")) for part in (train, held_out)
@@ -192,7 +179,7 @@ def _objects_on_table(state: Tensor) -> Tensor:
 def _probe_tasks(
     phi: Tensor, task: Tensor, phi_held_out: Tensor, task_held_out: Tensor
 ) -> dict[str, float]:
-    """Return how often the task of a held-out demonstration is told from its embedding."""
+    """Return the accuracies of inferring a held-out demonstration's task from its embedding."""
     scores = ridge_predict(phi, torch.nn.functional.one_hot(task).float(), phi_held_out)
     nearest = torch.cdist(phi_held_out, phi).argmin(-1)
     return {

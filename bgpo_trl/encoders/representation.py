@@ -63,15 +63,14 @@ def train_representation(
     """Train both encoders on the training demonstrations.
 
     Args:
-        dataset: Demonstrations, in the form given in the module docstring; held-out ones are not
-            read.
+        dataset: Demonstrations in the form given by the module; held-out ones are not read.
         config: Hyperparameters; ``RepresentationConfig()`` by default.
         play: Episodes of play in the same form, which train the frame encoder on states that
             demonstrations never visit.
         scene_version: Version of the scene of the frames, stored with the weights.
         command: Command line, stored with the weights.
-        checkpoint: Folder for checkpoints. Calling an interrupted training again with the same
-            folder resumes it and gives the same weights.
+        checkpoint: Folder for checkpoints, from which an interrupted training is resumed and then
+            gives the same weights.
         log: Receives a row every ``config.log_every`` steps.
         progress: Whether to show a progress bar for each of the two stages.
         device: Device to train on.
@@ -102,16 +101,11 @@ def train_representation(
 
 @torch.no_grad()
 def encode_frames(vae: VAE, pixels: Tensor, length: Tensor, batch_size: int = 64) -> Tensor:
-    """Encode the valid frames of demonstrations in batches.
-
-    Args:
-        vae: The trained frame encoder.
-        pixels: Frames uint8 ``[N, T, 32, 64, 3]``.
-        length: Number of valid frames, int64 ``[N]``.
-        batch_size: Frames per call of the encoder.
+    """Encode the valid frames of demonstrations, uint8 ``[N, T, 32, 64, 3]``, in batches.
 
     Returns:
-        Standardized latents, float32 ``[N, T, latent_size]``; zeros at and beyond ``length``.
+        Standardized latents, float32 ``[N, T, latent_size]``; zeros at and beyond ``length``
+        ``[N]``.
     """
     latent = torch.zeros(*pixels.shape[:2], vae.latent_size)
     demonstration, time = valid_steps(length, pixels.shape[1]).nonzero(as_tuple=True)
@@ -122,14 +116,9 @@ def encode_frames(vae: VAE, pixels: Tensor, length: Tensor, batch_size: int = 64
 
 @torch.no_grad()
 def embed_demonstrations(representation: Representation, dataset: TensorDictBase) -> Tensor:
-    """Embed whole demonstrations, as Alg. 1 does before an episode.
+    """Embed whole demonstrations as phi, float32 ``[N, embedding_size]`` (Alg. 1).
 
-    Args:
-        representation: The trained encoders.
-        dataset: Reads ``pixels`` ``[N, T, 32, 64, 3]`` and ``length`` ``[N]``.
-
-    Returns:
-        Embeddings phi, float32 ``[N, embedding_size]``.
+    Reads ``pixels`` ``[N, T, 32, 64, 3]`` and ``length`` ``[N]``.
     """
     latent = encode_frames(representation.vae, dataset.get("pixels"), dataset.get("length"))
     return representation.lae.encode(latent, dataset.get("length"))
@@ -146,11 +135,7 @@ def bank_path(weights: Path) -> Path:
 
 
 def save_representation(representation: Representation, path: str | Path) -> None:
-    """Write both encoders and the metadata to one safetensors file.
-
-    Args:
-        representation: The encoders.
-        path: File to write; missing folders are made.
+    """Write both encoders and the metadata to one safetensors file; missing folders are made.
 
     Raises:
         OSError: If the file cannot be written; an existing file is kept.
@@ -161,14 +146,9 @@ def save_representation(representation: Representation, path: str | Path) -> Non
 def load_representation(
     path: str | Path | None = None, *, scene_version: str | None = None
 ) -> Representation:
-    """Read encoders written by `save_representation`.
+    """Read encoders written by `save_representation`; they are in eval mode, without gradients.
 
-    Args:
-        path: The file; the pretrained weights by default.
-        scene_version: Required version of the scene; ``None`` accepts any.
-
-    Returns:
-        The encoders, in eval mode, without gradients.
+    By default, read the pretrained weights and accept any version of the scene.
 
     Raises:
         ValueError: If the file is missing, damaged, or belongs to another scene.

@@ -88,9 +88,6 @@ def train_encoders(
         progress: Whether to show progress bars.
         tasks: Task names, in the order of their labels.
 
-    Returns:
-        The trained encoders and the bank of embedded demonstrations.
-
     Raises:
         ValueError: As `train_representation`.
         OSError: If a file cannot be written.

@@ -43,16 +43,13 @@ def plot_success_curves(
 
     Args:
         eval_csv: One or more ``eval.csv`` files, which may hold several algorithms and seeds.
-        presented: Training episode from which each task is presented, by task name, in the order
-            of the panels. Starts after the first are marked with dashed lines.
+        presented: Training episode from which each task is presented, by task name, in the order of
+            the panels. Starts after the first are marked with dashed lines.
         random_success: Success rate of a random policy by task, marked with dotted lines.
         window: Length of the trailing mean in training episodes; 5 % of the training if ``None``.
         last: Training episode at which the curves end; by default that of the longest.
         names: Legend names by algorithm, in legend order; other algorithms follow under their own
             names.
-
-    Returns:
-        The figure.
 
     Raises:
         ValueError: If a file is not an ``eval.csv``, there are no test episodes, or the window is
@@ -127,7 +124,6 @@ def _tidy_panels(panels: NDArray, n_tasks: int) -> None:
 
 
 def _add_labels(figure: Figure, window: int, *, chance: bool) -> None:
-    """Add the labels of the axes and a legend, with random policies if ``chance``."""
     figure.supxlabel(f"Training episode (success: mean over the last {window:,})", fontsize=9)
     figure.supylabel("Success rate", fontsize=9)
     handles, labels = figure.axes[0].get_legend_handles_labels()

@@ -10,14 +10,9 @@ from numpy.typing import NDArray
 
 
 def plot_frame_strips(episodes: Mapping[str, NDArray], n_frames: int = 8) -> Figure:
-    """Show episodes as rows of frames, from the first to the last.
+    """Plot episodes, frames uint8 ``[N, 32, 64, 3]`` by title, as rows of frames.
 
-    Args:
-        episodes: Frames uint8 ``[N, 32, 64, 3]`` by row title.
-        n_frames: Maximum number of frames per row, evenly spaced in time.
-
-    Returns:
-        The figure.
+    A row has at most ``n_frames``, evenly spaced from the first to the last.
 
     Raises:
         ValueError: If there are no episodes, or one has no frames.

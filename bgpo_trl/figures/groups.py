@@ -46,14 +46,7 @@ class GroupedEpisodes:
 def read_groups(
     path: str | os.PathLike[str], task_names: Sequence[str]
 ) -> dict[int, GroupedEpisodes]:
-    """Read the groups of a run.
-
-    Args:
-        path: The ``train.csv`` of the run.
-        task_names: Names of the tasks.
-
-    Returns:
-        The training episodes by seed, in increasing order.
+    """Read the groups of a run from its ``train.csv``: training episodes by seed, in order.
 
     Raises:
         ValueError: If the file is missing or damaged, or its run has no groups.
@@ -77,9 +70,6 @@ def plot_groups(seeds: Mapping[int, GroupedEpisodes], presented: Mapping[str, in
     Args:
         seeds: Training episodes by seed, from `read_groups`.
         presented: Training episode from which each task is presented, by task name.
-
-    Returns:
-        The figure.
 
     Raises:
         ValueError: If there are no episodes.
@@ -126,7 +116,6 @@ def _draw_counts(axes: Axes, runs: Sequence[GroupedEpisodes]) -> None:
 
 
 def _draw_rows(axes: Axes, run: GroupedEpisodes, n_tasks: int, last: int, width: float) -> None:
-    """Draw a row with episodes for each group."""
     n_groups = int(run.num_groups.max())
     colors = [color for _, _, color, _ in task_markers([""] * n_tasks)]
     # Points; the width of one episode on the axis, at least 0.4 to stay visible.

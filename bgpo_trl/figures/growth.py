@@ -37,9 +37,6 @@ def plot_gwr_growth(
             belong to the first seed.
         task_names: Names of the tasks.
 
-    Returns:
-        The figure.
-
     Raises:
         ValueError: If there are no graphs.
     """
@@ -99,13 +96,7 @@ def _draw_graph(
 
 
 def _draw_counts(axes: Axes, num_nodes: Sequence[ArrayLike], graphs: Mapping[int, int]) -> None:
-    """Draw the number of nodes of each seed, the first seed on top with a dot for each graph.
-
-    Args:
-        axes: The axes.
-        num_nodes: Number of nodes after each training episode, ``[episodes]`` per seed.
-        graphs: Number of nodes of the first seed's graphs, by training episode.
-    """
+    """Draw the number of nodes of each seed, the first seed on top with a dot for each graph."""
     for number, counts in reversed(list(enumerate(num_nodes))):
         counts = np.asarray(counts)
         episodes = np.arange(1, len(counts) + 1)

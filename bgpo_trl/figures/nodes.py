@@ -33,9 +33,6 @@ def plot_gwr_pca(
         task_names: Names of the tasks.
         node_group: Group of each node, ``[N]``, shown in a second panel; ``None`` for no panel.
 
-    Returns:
-        The figure.
-
     Raises:
         ValueError: If the shapes do not match, a weight is not finite, or a task does not exist.
     """
@@ -66,12 +63,8 @@ def plot_gwr_pca(
 def principal_components(values: NDArray, shown: NDArray | None = None) -> tuple[NDArray, NDArray]:
     """Return points on the first two principal components of values, and their variance shares.
 
-    Args:
-        values: Values that define the components, ``[N, d]``.
-        shown: Values to place, ``[M, d]``; ``None`` for the same.
-
-    Returns:
-        Points ``[M, 2]``, and the share of the variance of each component, ``[2]``.
+    Components are those of ``values`` ``[N, d]``; points ``[M, 2]`` those of ``shown`` ``[M, d]``,
+    by default the values. Shares are ``[2]``.
     """
     _, scales, directions = np.linalg.svd(values - values.mean(axis=0), full_matrices=False)
     # The solver's signs are arbitrary; making the largest component positive fixes them.

@@ -28,16 +28,9 @@ def draw_growth(
 ) -> bool:
     """Write ``gwr_growth.png``: the first seed's graph over time, and the number of nodes of all.
 
-    A node has the color of its majority task among the tasks presented by then.
-
-    Args:
-        run: Run directory.
-        config: Settings of the run.
-        bank: Demonstrations of the run.
-        out: Folder of the figure; ``figures/`` of the run if ``None``.
-
-    Returns:
-        Whether a figure was drawn: runs without GWR-B save no graphs.
+    A node has the color of its majority task among the tasks presented by then. The folder is
+    ``out``, by default ``figures/`` of the run. Returns False for runs without GWR-B, which save no
+    graphs.
 
     Raises:
         ValueError: If a file of the run is damaged.
@@ -61,15 +54,10 @@ def draw_growth(
 
 
 def draw_groups(run: Path, presented: Mapping[str, int], out: Path) -> None:
-    """Write the figure of the number of groups and the episodes of each.
-
-    Args:
-        run: Run directory, whose ``train.csv`` is read.
-        presented: Training episode from which each task is presented, by task name.
-        out: Path of the figure.
+    """Write the figure of the groups of a run to the path ``out``; arguments as for `plot_groups`.
 
     Raises:
-        ValueError: If the file is missing or damaged, or its run has no groups.
+        ValueError: If ``train.csv`` is missing or damaged, or the run has no groups.
     """
     save_figure(plot_groups(read_groups(run / "train.csv", list(presented)), presented), out)
 
@@ -79,11 +67,7 @@ def draw_nodes(
 ) -> None:
     """Write the nodes of the first seed's GWR-B to ``gwr.csv`` and draw them (Fig. 7).
 
-    Args:
-        run: Run directory.
-        algorithm: The trained algorithm; without GWR-B, nothing is written.
-        bank: Demonstrations that define the nodes' majority tasks.
-        tasks: Names of the tasks.
+    The bank defines the nodes' majority tasks. Without GWR-B, nothing is written.
     """
     if algorithm.gwr is None:
         return
@@ -98,14 +82,7 @@ def draw_nodes(
 
 
 def write_nodes(path: Path, weights: Tensor, tasks: Tensor, groups: Tensor | None = None) -> None:
-    """Write the nodes of a GWR-B, one row each: majority task (-1: none), group and weights.
-
-    Args:
-        path: The CSV file.
-        weights: Weights ``[N, d]``.
-        tasks: Majority tasks ``[N]``.
-        groups: Group of each node, ``[N]``; the column is omitted if ``None``.
-    """
+    """Write nodes ``[N]`` as CSV: majority task (-1: none), group if given, weights ``[N, d]``."""
     columns = {"task": tasks.tolist()} | ({} if groups is None else {"group": groups.tolist()})
     with path.open("w", newline="") as file:
         writer = csv.writer(file)

@@ -41,13 +41,7 @@ def write_page(
     sections: Sequence[Section],
     runs: Mapping[str, tuple[Path, dict[str, Any], dict[str, Any]]],
 ) -> None:
-    """Write the page.
-
-    Args:
-        path: The HTML file.
-        sections: Sections of the report, in order.
-        runs: Directory, settings and summary of each run, by name.
-    """
+    """Write the page, given directory, settings and summary of each run by name."""
     parts = ["<h1>bgpo_trl: the paper's experiments</h1>"]
     parts.append(
         "<p>Curves: mean over seeds, shaded by one standard deviation. Brackets: 95 % stratified "

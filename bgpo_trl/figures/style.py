@@ -1,8 +1,7 @@
-"""Look that the figures share, and saving them.
+"""Common style of the figures, and saving them.
 
-Figures are drawn without pyplot, hence without global state, and the same data always gives the
-same file. Colors are Okabe and Ito's colorblind-safe palette; line styles and markers differ as
-well.
+Figures are drawn without pyplot, hence without global state. Colors are Okabe and Ito's
+colorblind-safe palette; line styles and markers differ as well.
 """
 
 from __future__ import annotations
@@ -26,12 +25,7 @@ MARKERS = ("o", "s", "^", "D", "v", "P")
 
 
 def save_figure(figure: Figure, path: str | os.PathLike[str]) -> None:
-    """Save a figure at 300 dpi; the same figure always gives the same bytes.
-
-    Args:
-        figure: The figure.
-        path: File ending in ``.png``; its folder is made if missing.
-    """
+    """Save a figure as PNG at 300 dpi; the same figure always gives the same bytes."""
     path = Path(path)
     make_folder(path.parent)
     figure.savefig(path, format="png", dpi=300, metadata={"Software": None})
@@ -46,14 +40,7 @@ def style_axes(axes: Axes) -> None:
 
 
 def add_legend(above: Figure | Axes, handles: list[Any], labels: list[str], width: float) -> None:
-    """Add a legend above a figure or axes, in as many columns as fit.
-
-    Args:
-        above: The figure or axes.
-        handles: Artists shown in the legend.
-        labels: Their names.
-        width: Room for the legend (inches).
-    """
+    """Add a legend above a figure or axes, in as many columns as fit into ``width`` (inches)."""
     # Inches: a letter of this size is about 0.065 wide, a handle with its gaps 0.55.
     sizes = [0.065 * len(label) + 0.55 for label in labels]
     columns = len(labels) if sum(sizes) <= width else max(1, int(width / max(sizes)))
@@ -66,11 +53,8 @@ def add_legend(above: Figure | Axes, handles: list[Any], labels: list[str], widt
 def mark_starts(axes: Axes, starts: Mapping[str, int], tasks: Sequence[str], last: int) -> None:
     """Mark the episodes from which tasks are presented with dashed lines, inside the axes.
 
-    Args:
-        axes: The axes, whose height is 1.1 in the scale of the labels.
-        starts: Training episode by task name.
-        tasks: All task names, whose positions number the labels.
-        last: Episode at which the axes end.
+    ``starts`` are the episodes by task name; a label gives the position of its task in ``tasks``.
+    The axes end at episode ``last`` and have the height 1.1 in the scale of the labels.
     """
     for task, episode in starts.items():
         if not 0 < episode < last:

@@ -13,23 +13,16 @@ from PIL import Image
 def save_gif(
     frames: NDArray[np.uint8], path: str | os.PathLike[str], *, fps: float = 5.0, scale: int = 4
 ) -> None:
-    """Save frames as an endlessly looping GIF.
+    """Save frames uint8 ``[T, H, W, 3]`` as an endlessly looping GIF.
 
     Args:
-        frames: Frames uint8 ``[T, H, W, 3]``.
+        frames: The frames, at least one.
         path: File ending in ``.gif``; its folder is made if missing.
         fps: Frames per second; the default is the robot's speed, a step every 0.2 s.
         scale: Pixels of the GIF per pixel of a frame, along each axis.
 
     Raises:
         ValueError: If the frames have another shape or dtype, or there are none.
-
-    Example:
-        >>> import tempfile
-        >>> path = Path(tempfile.mkdtemp()) / "dark.gif"
-        >>> save_gif(np.zeros((2, 32, 64, 3), np.uint8), path)
-        >>> Image.open(path).size
-        (256, 128)
     """
     if frames.dtype != np.uint8 or frames.ndim != 4 or frames.shape[-1] != 3 or not len(frames):
         raise ValueError(

@@ -84,13 +84,7 @@ def load_checkpoint(
 ) -> dict[str, Any]:
     """Read the newest intact checkpoint; warn about each newer one that is damaged.
 
-    Args:
-        directory: Checkpoint folder of the run.
-        map_location: Device of the tensors.
-        mmap: Whether to map tensors from the file lazily, for reading only some of them.
-
-    Returns:
-        The state as it was saved.
+    With ``mmap``, tensors are mapped from the file lazily, for reading only some of them.
 
     Raises:
         ValueError: If there is no intact checkpoint.

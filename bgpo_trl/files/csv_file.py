@@ -14,16 +14,12 @@ from bgpo_trl.files.closing import Closing
 
 
 class CsvFile(Closing):
-    r"""An append-only CSV file with fixed columns that can be truncated to an earlier position.
+    r"""Append-only CSV file with fixed columns that can be truncated to an earlier position.
 
-    Each row is written unbuffered and whole: killing the process loses no row, a row that does not
-    fit on the disk leaves no trace, and opening the file drops a partial row left by a crash.
-    Tensors and NumPy values of one element are written as numbers, booleans as 0 and 1, and floats
-    with enough digits to be read back exactly.
-
-    Args:
-        path: The file; an existing one is continued.
-        columns: Names of the columns, the first line of the file.
+    An existing file is continued. Rows are written unbuffered and whole: killing the process loses
+    no row, a row that does not fit on the disk leaves no trace, and opening the file drops a
+    partial row left by a crash. Tensors and NumPy values of one element are written as numbers,
+    booleans as 0 and 1, and floats with enough digits to be read back exactly.
 
     Raises:
         ValueError: If the file exists with other columns, or two columns have the same name.
@@ -73,10 +69,7 @@ class CsvFile(Closing):
             raise
 
     def write(self, row: Mapping[str, Any]) -> None:
-        """Append a row; columns without a value stay empty.
-
-        Args:
-            row: Values by column.
+        """Append a row of values by column; columns without a value stay empty.
 
         Raises:
             ValueError: If the file has no such column.
@@ -96,10 +89,7 @@ class CsvFile(Closing):
         return self._file.seek(0, os.SEEK_END)
 
     def truncate_to(self, position: int) -> None:
-        """Drop all rows written after a position.
-
-        Args:
-            position: A result of `position`; 0 drops all rows and keeps the header.
+        """Drop all rows after a result of `position`; 0 drops all and keeps the header.
 
         Raises:
             ValueError: If the file is shorter, or the position is not the end of a row.
@@ -136,11 +126,7 @@ def has_rows(path: str | os.PathLike[str]) -> bool:
 
 
 def check_position(path: str | os.PathLike[str], position: int) -> None:
-    """Check that a row of the file ends at the given position.
-
-    Args:
-        path: The file, which may be missing.
-        position: Position in bytes, at least 1.
+    """Check that a row of the file, which may be missing, ends at a position in bytes.
 
     Raises:
         ValueError: If no row ends there.

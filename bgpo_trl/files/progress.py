@@ -16,16 +16,7 @@ def progress_bar(
 
     It is redrawn ten times a second on a terminal and every 30 seconds elsewhere, since each redraw
     adds a line to a log file. Pass ``refresh=False`` to ``set_postfix``, which otherwise redraws.
-
-    Args:
-        stage: Name of the stage.
-        iterable: Iterable to wrap; ``None`` if progress is counted by ``update``.
-        shown: Whether to show the bar.
-        **arguments: Further arguments of ``tqdm``, such as ``total``, ``initial`` and ``unit``.
-
-    Example:
-        >>> sum(progress_bar("count", range(4), shown=False))
-        6
+    Without an iterable, progress is counted by ``update``. Further arguments go to ``tqdm``.
     """
     seconds = 0.1 if sys.stderr.isatty() else 30.0
     return tqdm(

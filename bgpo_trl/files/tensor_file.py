@@ -51,10 +51,7 @@ def save_tensors(
 
 
 def load_tensors(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Read a file written by `save_tensors`.
-
-    Returns:
-        The tensors and the metadata.
+    """Read the tensors and the metadata written by `save_tensors`.
 
     Raises:
         FileNotFoundError: If the file does not exist.

@@ -1,9 +1,7 @@
 """Policy and Q-function: perceptrons, with an optional stack of seeds in their weights.
 
-The paper (section IV-A): "The policy and Q-functions are parameterized by a 2-layer MLP each. The
-hidden layer is 64-dimensional with ReLU activation. The output layer is 1-dimensional with linear
-activation in the Q-network and 4-dimensional with tanh activation in the policy network." The width
-is 256 here by default (`RLConfig.hidden_sizes`).
+Paper, Sec. IV-A: one hidden layer of 64 ReLU units, and an output layer that is linear in the
+Q-function and tanh in the policy. The default here is one of 256 units (`RLConfig.hidden_sizes`).
 """
 
 from __future__ import annotations
@@ -30,6 +28,9 @@ class StackedNetwork(TensorDictModuleBase):
     Args:
         in_keys: Entries to read, side by side in this order, ``[*S, *B, features]`` each.
         out_keys: Entries that ``forward`` writes.
+
+    Raises:
+        ValueError: From ``forward``, if an entry is missing.
     """
 
     # Not a TensorDictModule: its forward adds 10 % to a DDPG update of 5 seeds with 256 units and
@@ -48,11 +49,7 @@ class StackedNetwork(TensorDictModuleBase):
         return cast(StackedMLP, next(self.children())).batch_size
 
     def inputs(self, tensordict: TensorDictBase) -> list[Tensor]:
-        """Return the values of ``in_keys``.
-
-        Raises:
-            ValueError: If an entry is missing.
-        """
+        """Return the values of ``in_keys``; raise ``ValueError`` if one is missing."""
         try:
             return [tensordict[key] for key in self.in_keys]
         except KeyError:
@@ -62,17 +59,14 @@ class StackedNetwork(TensorDictModuleBase):
 class Actor(StackedNetwork):
     """Deterministic policy: an MLP with tanh output.
 
-    Reads ``in_keys`` (``[*S, *B, features]`` each) and writes ``"action"`` ``[*S, *B, action_dim]``
-    in [-1, 1] and ``"pre_tanh_action"``, the same before the tanh, which `DDPGLoss` keeps small.
+    Reads ``in_keys``; writes ``"action"`` ``[*S, *B, action_dim]`` in [-1, 1] and
+    ``"pre_tanh_action"``, the same before the tanh, which `DDPGLoss` keeps small.
 
     Args:
         in_features: Size of all ``in_keys`` together; 64 + 32 for latent and behavior.
         action_dim: Number of action components.
-        in_keys: Entries to read.
+        in_keys: Entries to read, ``[*S, *B, features]`` each.
         **mlp: ``hidden_sizes``, ``layer_norm``, ``batch_size`` and ``generator`` of `StackedMLP`.
-
-    Raises:
-        ValueError: If the number of generators is not the number of policies.
 
     Example:
         >>> from tensordict import TensorDict
@@ -95,17 +89,7 @@ class Actor(StackedNetwork):
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the action for each state.
-
-        Args:
-            tensordict: With ``in_keys``; ``"action"`` and ``"pre_tanh_action"`` are set in it.
-
-        Returns:
-            The same tensordict.
-
-        Raises:
-            ValueError: If an entry is missing.
-        """
+        """Write the actions of states; return the same tensordict."""
         pre_tanh = self.mlp(*self.inputs(tensordict))
         tensordict.set("pre_tanh_action", pre_tanh)
         return tensordict.set("action", pre_tanh.tanh())
@@ -114,17 +98,8 @@ class Actor(StackedNetwork):
 class Critic(StackedNetwork):
     """Q-function: an MLP on state and action with a linear output.
 
-    Reads ``in_keys`` (``[*S, *B, features]`` each) and ``"action"`` ``[*S, *B, action_dim]``;
-    writes ``"state_action_value"`` ``[*S, *B, 1]``.
-
-    Args:
-        in_features: Size of all ``in_keys`` together, the action not counted.
-        action_dim: Number of action components.
-        in_keys: Entries to read before the action.
-        **mlp: ``hidden_sizes``, ``layer_norm``, ``batch_size`` and ``generator`` of `StackedMLP`.
-
-    Raises:
-        ValueError: If the number of generators is not the number of Q-functions.
+    Reads ``in_keys`` and ``"action"``; writes ``"state_action_value"`` ``[*S, *B, 1]``. Arguments
+    as for `Actor`, without the action in ``in_features`` and ``in_keys``.
 
     Example:
         >>> from tensordict import TensorDict
@@ -147,16 +122,6 @@ class Critic(StackedNetwork):
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the value of each state and action.
-
-        Args:
-            tensordict: With ``in_keys``; ``"state_action_value"`` is set in it.
-
-        Returns:
-            The same tensordict.
-
-        Raises:
-            ValueError: If an entry is missing.
-        """
+        """Write the values of states and actions; return the same tensordict."""
         value = self.mlp(*self.inputs(tensordict))
         return tensordict.set("state_action_value", value)

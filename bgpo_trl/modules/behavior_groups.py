@@ -15,7 +15,7 @@ _NEVER = 2**62  # an age that no edge reaches
 
 
 class GroupMatch(TensorClass["tensor_only"]):
-    """The group of each input.
+    """Group of each input.
 
     Attributes:
         group: Number of the group within its network, int64 ``[*batch]``. Groups count up from 0 in
@@ -29,7 +29,7 @@ class GroupMatch(TensorClass["tensor_only"]):
 
 
 class BehaviorGroups(nn.Module):
-    """Groups of similar behaviors, or a batch of independent sets of groups.
+    """Groups of similar behaviors, for one network or a batch of independent ones.
 
     A GWR-B with a low activity threshold inserts few nodes, each far from all earlier ones. Every
     node belongs to a group:
@@ -40,8 +40,8 @@ class BehaviorGroups(nn.Module):
     2. Any other node, such as the second of two similar first inputs, joins the group of its best
        match.
 
-    Edges do not expire, so nodes are never removed, and a group is kept however long its task is
-    absent. The network starts empty; until the first input, `lookup` returns group 0.
+    Edges do not expire, so groups are kept however long their tasks are absent. The network starts
+    empty; until the first input, `lookup` returns group 0.
 
     Args:
         n_features: Size d of an input.
@@ -167,6 +167,6 @@ class BehaviorGroups(nn.Module):
         }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restore the numbers from `get_extra_state`."""
+        """Restore the result of `get_extra_state`."""
         self._group = [list(group) for group in state["group"]]
         self._parent = [list(parent) for parent in state["parent"]]

@@ -1,4 +1,4 @@
-"""Stochastic policy of SAC, with an optional stack of seeds in its weights."""
+"""Stochastic policy of SAC."""
 
 from __future__ import annotations
 
@@ -23,18 +23,9 @@ LOG_SCALE_BOUNDS = (-5.0, 2.0)
 class GaussianActor(StackedNetwork):
     """Stochastic policy: an MLP for mean and scale of a Gaussian that is squashed by a tanh.
 
-    (Haarnoja et al., 2018.) Called, it acts without noise: it reads ``in_keys``
-    (``[*S, *B, features]`` each) and writes ``"loc"`` and ``"scale"`` ``[*S, *B, action_dim]`` and
-    ``"action"``, ``tanh(loc)``. `sample` draws actions from given noise.
-
-    Args:
-        in_features: Size of all ``in_keys`` together.
-        action_dim: Number of action components.
-        in_keys: Entries to read.
-        **mlp: ``hidden_sizes``, ``layer_norm``, ``batch_size`` and ``generator`` of `StackedMLP`.
-
-    Raises:
-        ValueError: If the number of generators is not the number of policies.
+    (Haarnoja et al., 2018.) A call acts without noise: it reads ``in_keys`` and writes ``"loc"``
+    and ``"scale"`` ``[*S, *B, action_dim]``, and ``"action"``, ``tanh(loc)``. `sample` draws
+    actions from given noise. Arguments as for `Actor`.
 
     Example:
         >>> import torch
@@ -59,32 +50,17 @@ class GaussianActor(StackedNetwork):
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the action without noise for each state.
-
-        Args:
-            tensordict: With ``in_keys``; ``"loc"``, ``"scale"`` and ``"action"`` are set in it.
-
-        Returns:
-            The same tensordict.
-
-        Raises:
-            ValueError: If an entry is missing.
-        """
+        """Write the actions without noise; return the same tensordict."""
         loc, log_scale = self.mlp(*self.inputs(tensordict)).chunk(2, dim=-1)
         tensordict.set("loc", loc)
         tensordict.set("scale", log_scale.clamp(*LOG_SCALE_BOUNDS).exp())
         return tensordict.set("action", loc.tanh())
 
     def sample(self, tensordict: TensorDictBase, noise: Tensor) -> TensorDictBase:
-        """Draw an action for each state, differentiable with respect to the weights.
+        """Draw actions of states, differentiable with respect to the weights.
 
-        Args:
-            tensordict: With ``in_keys``; besides the entries that `forward` sets,
-                ``"action_log_prob"`` ``[*S, *B]`` is set in it, the log density of the action.
-            noise: Standard normals ``[*S, *B, action_dim]``.
-
-        Returns:
-            The same tensordict.
+        Besides the entries of `forward` it writes ``"action_log_prob"`` ``[*S, *B]``, the log
+        density of the action. ``noise`` holds standard normals ``[*S, *B, action_dim]``.
         """
         self(tensordict)
         scale: Tensor = tensordict["scale"]

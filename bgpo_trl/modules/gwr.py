@@ -291,9 +291,9 @@ class GWRB(nn.Module):
         self._topologies, self._weights = topologies, weights
 
     def _activity(self, distance: Tensor) -> Tensor:
-        """Convert distances to the best matches into activities, in place (Eq. 2)."""
+        """Convert distances into activities, in place (Eq. 2)."""
         return distance.mul_(-self.rule.activity_scale).exp_()
 
     def _spread(self, x: Tensor, network: Tensor, fill: float) -> Tensor:
-        """Scatter the results of active networks into those of all, elsewhere ``fill``."""
+        """Scatter results of the active networks into those of all; elsewhere ``fill``."""
         return x.new_full((len(self._topologies), *x.shape[1:]), fill).index_copy(0, network, x)

@@ -20,14 +20,12 @@ except ImportError:
 
 
 class GWRBEstimator(OneToOneFeatureMixin, TransformerMixin, ClusterMixin, BaseEstimator):
-    """A GWR-B network that learns the rows of a table, once and in their order.
+    """GWR-B network that learns the rows of a table, once and in their order.
 
     It starts from the first two rows and computes in float64. For the arguments, see `GWRB`. A row
     belongs to the nearest node: `predict` returns its identity, `transform` its weights. Identities
-    have gaps where nodes were removed or are nearest to no row.
-
-    scikit-learn's ``check_estimator`` passes. ``check_clustering``, which requires labels without
-    gaps, fails with constants under which nodes come and go quickly.
+    have gaps where nodes were removed or are nearest to no row; this is why scikit-learn's
+    ``check_clustering`` can fail. Its ``check_estimator`` passes.
 
     Attributes:
         gwr_: The network; its ``graph()`` has the nodes and their edges.

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 class BehaviorMatch(TensorClass["tensor_only"]):
-    """The best-matching node of each input.
+    """Best-matching node of each input.
 
     Attributes:
         embedding: Copy of the node's weights w_c, the behavior b, ``[*batch, d]``.
@@ -63,11 +63,8 @@ class BehaviorGraph(NamedTuple):
             >>> gwr = GWRB(2, init="data")
             >>> for point in ([0, 0], [1, 0], [0.9, 0.1]):
             ...     match = gwr.adapt(point)
-            >>> graph = gwr.graph().to_networkx()
-            >>> graph.edges(data="age")
+            >>> gwr.graph().to_networkx().edges(data="age")
             EdgeDataView([(0, 1, 1)])
-            >>> sorted(graph[int(match.node)])
-            [0]
         """
         try:
             import networkx as nx

@@ -28,11 +28,7 @@ class Firing(NamedTuple):
 
 @dataclass(frozen=True)
 class LearningRule:
-    """The constants of GWR-B, explained in `GWRB`.
-
-    Raises:
-        ValueError: If a value is out of range.
-    """
+    """Constants of GWR-B, as in `GWRB`; those out of range raise ``ValueError``."""
 
     activity_threshold: float
     activity_scale: float

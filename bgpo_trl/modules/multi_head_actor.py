@@ -1,4 +1,4 @@
-"""A policy with a shared trunk and one Gaussian head a task, to be distilled from teachers."""
+"""Policy with one Gaussian head per task, to be distilled from teachers."""
 
 from __future__ import annotations
 
@@ -16,28 +16,22 @@ from bgpo_trl.modules.stacked_mlp import StackedLinear, StackedMLP
 
 __all__ = ["MultiHeadActor"]
 
-# A teacher is deterministic, so nothing else keeps the likelihood of its actions from growing
-# without bound, and the steps towards them with it.
+# Teachers are deterministic: without a lowest scale, the likelihood of their actions, and with it
+# the gradient, would grow without bound.
 _MIN_SCALE, _MAX_SCALE = 0.1, 1.0
 
 
 class MultiHeadActor(StackedNetwork):
     """Policy with a Gaussian over actions for each task, from that task's head on a shared trunk.
 
-    Reads ``in_keys`` (``[*S, T, *B, features]`` each, ``T`` the number of heads) and writes
-    ``"loc"`` in [-1, 1] and ``"scale"`` in [0.1, 1], ``[*S, T, *B, action_dim]``, the mean and the
-    standard deviation, and ``"action"``, which is the mean.
-
-    Args:
-        in_features: Size of all ``in_keys`` together.
-        action_dim: Number of action components.
-        in_keys: Entries to read.
-        hidden_sizes: Width of each layer of the trunk, at least one.
-        **mlp: ``layer_norm``, ``batch_size`` and ``generator`` of the trunk, a `StackedMLP`.
+    Reads ``in_keys`` (``[*S, T, *B, features]`` each, ``T`` the number of heads) and writes mean
+    ``"loc"`` in [-1, 1] and standard deviation ``"scale"`` in [0.1, 1],
+    ``[*S, T, *B, action_dim]``, and ``"action"``, the mean. Arguments as for `Actor`;
+    ``hidden_sizes`` are the layers of the trunk.
 
     Raises:
-        ValueError: If the trunk has no layer, or the number of generators is not the number of
-            policies.
+        ValueError: If the trunk has no layer; from ``forward``, if an entry is missing or the
+            number of tasks is not that of heads.
 
     Example:
         >>> from tensordict import TensorDict
@@ -68,16 +62,10 @@ class MultiHeadActor(StackedNetwork):
     def add_head(
         self, generator: torch.Generator | Sequence[torch.Generator] | None = None
     ) -> StackedLinear:
-        """Add the head of a further task; the trunk and the other heads stay as they are.
+        """Add and return the head of a further task; trunk and other heads stay as they are.
 
-        Args:
-            generator: Source of its initial weights, as in `StackedLinear`.
-
-        Returns:
-            The head, whose parameters an optimizer has yet to be given.
-
-        Raises:
-            ValueError: If the number of generators is not the number of policies.
+        Its weights are drawn from ``generator``, as in `StackedLinear`. The caller gives its
+        parameters to an optimizer.
         """
         head = StackedLinear(self._width, 2 * self.action_dim, self.batch_size, generator)
         reference = next(self.trunk.parameters())
@@ -86,17 +74,7 @@ class MultiHeadActor(StackedNetwork):
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the distribution of actions for each state.
-
-        Args:
-            tensordict: With ``in_keys``; ``"loc"``, ``"scale"`` and ``"action"`` are set in it.
-
-        Returns:
-            The same tensordict.
-
-        Raises:
-            ValueError: If an entry is missing, or the number of tasks is not the number of heads.
-        """
+        """Write the distributions of actions; return the same tensordict."""
         hidden = self.trunk(*self.inputs(tensordict)).relu()
         task_dim = len(self.batch_size)
         if hidden.shape[task_dim] != len(self.heads):

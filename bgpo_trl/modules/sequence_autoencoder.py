@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 
 class SequenceAutoencoder(nn.Module):
-    """The paper's LSTM autoencoder, LAE (Sec. III-A, Fig. "LSTM Autoencoder").
+    """LSTM autoencoder over sequences of latents, the paper's LAE (Sec. III-A).
 
     The embedding phi is the encoder's hidden state after the last valid latent. The decoder gets
     phi at every step and reconstructs the sequence in reverse order.
@@ -65,13 +65,10 @@ class SequenceAutoencoder(nn.Module):
         return hidden.gather(1, last).reshape(*length.shape, self.embedding_size)
 
     def step(self, z: Tensor, h: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
-        """Advance the encoder by one latent; return the new ``h`` and ``c``.
+        """Advance the encoder by one latent ``[..., latent_size]``; return the new ``h`` and ``c``.
 
-        Args:
-            z: ``[..., latent_size]``.
-            h: Hidden state, ``[..., embedding_size]``, zeros at the start; phi after the last
-                latent.
-            c: Cell state, ``[..., embedding_size]``, zeros at the start.
+        Both states are ``[..., embedding_size]`` and start as zeros. After the last latent, ``h``
+        is phi.
         """
         shape = h.shape
         if z.shape != (*shape[:-1], self.latent_size) or shape[-1] != self.embedding_size:
@@ -85,11 +82,7 @@ class SequenceAutoencoder(nn.Module):
         return h.reshape(shape), c.reshape(shape)
 
     def decode(self, phi: Tensor, n_steps: int) -> Tensor:
-        """Reconstruct the last ``n_steps`` latents of each phi, the last one first.
-
-        Returns:
-            float32 ``[..., n_steps, latent_size]``.
-        """
+        """Reconstruct ``[..., n_steps, latent_size]`` from each phi, the last latent first."""
         inputs = phi.reshape(-1, 1, self.embedding_size).expand(-1, n_steps, -1)
         hidden, _ = self.decoder(inputs)
         return self.readout(hidden).reshape(*phi.shape[:-1], n_steps, self.latent_size)

@@ -19,19 +19,18 @@ __all__ = ["StackedLinear", "StackedMLP"]
 class StackedLinear(nn.Module):
     """Linear layer with one weight matrix per seed, all of them applied in one call.
 
-    With ``batch_size=()`` it computes what :class:`torch.nn.Linear` computes. Weights and biases
-    start uniform in ``±1/sqrt(in_features)``, as there. The layer takes the shape of the stack from
-    its weights, so :func:`torch.func.functional_call` may call it with those of any other stack.
+    With ``batch_size=()`` it computes what :class:`torch.nn.Linear` computes, and starts with
+    weights from the same distribution, uniform in ``±1/sqrt(in_features)``. It takes the shape of
+    the stack from its weights, so :func:`torch.func.functional_call` may pass those of any other
+    stack.
 
     Args:
         in_features: Size of the last input dimension.
         out_features: Size of the last output dimension.
-        batch_size: Leading dimensions ``S`` of the weights, one independent layer for each index;
-            ``()`` for a single layer.
-        generator: Source of the initial weights. One generator fills all layers from one stream; a
-            sequence holds one per layer, in the order of the flattened ``batch_size``, and layer
-            ``i`` then starts exactly as a single layer that draws from generator ``i``. ``None``
-            draws from torch's default generator.
+        batch_size: Leading dimensions ``S`` of the weights, one independent layer for each index.
+        generator: Source of the initial weights: one for all layers, or one per layer in the order
+            of the flattened ``batch_size``, each of which starts as a single layer would. ``None``:
+            torch's default generator.
 
     Attributes:
         weight: ``[*S, in_features, out_features]``.
@@ -74,14 +73,7 @@ class StackedLinear(nn.Module):
     def reset_parameters(
         self, generator: torch.Generator | Sequence[torch.Generator] | None = None
     ) -> None:
-        """Draw all weights and biases anew.
-
-        Args:
-            generator: As in the constructor.
-
-        Raises:
-            ValueError: If the number of generators is not the number of layers.
-        """
+        """Draw all weights and biases anew; ``generator`` as in the constructor."""
         bound = 1 / math.sqrt(self.in_features)
         if generator is None or isinstance(generator, torch.Generator):
             self.weight.uniform_(-bound, bound, generator=generator)
@@ -102,19 +94,18 @@ class StackedLinear(nn.Module):
     def forward(self, *inputs: Tensor) -> Tensor:
         """Apply each layer to its own slice of the inputs, side by side along the last dimension.
 
-        Inputs are not concatenated: each is multiplied with its own rows of the weights. That saves
-        the copy, and the gradient of an input that needs none.
+        Each input is multiplied with its own rows of the weights. This saves concatenating the
+        inputs, and the gradient of an input that needs none.
 
         Args:
-            *inputs: ``[*S, *B, features]`` each, with any number of further batch dimensions ``B``
-                and ``in_features`` features together.
+            *inputs: ``[*S, *B, features]`` each, ``in_features`` together; ``B`` may be of any
+                length.
 
         Returns:
             ``[*S, *B, out_features]``.
 
         Raises:
-            ValueError: If an input does not lead with the ``batch_size`` of the weights, or the
-                inputs do not have ``in_features`` together.
+            ValueError: If an input does not lead with ``S``, or the features do not add up.
         """
         sizes = [input.shape[-1] for input in inputs]
         stack = self.batch_size
@@ -133,7 +124,7 @@ class StackedLinear(nn.Module):
             multiply_add = torch.Tensor.baddbmm_ if i else torch.Tensor.baddbmm
             output = multiply_add(output, input.reshape(n_layers, -1, input.shape[-1]), rows)
         shape = torch.Size([*inputs[0].shape[:-1], self.out_features])
-        # Not a view where none is needed: autograd is slow with what is then changed in place.
+        # A view only where needed: autograd is slow when a view is then changed in place.
         return output if output.shape == shape else output.view(shape)
 
 
@@ -152,9 +143,6 @@ class StackedMLP(nn.Module):
         layer_norm: Whether to normalize the hidden layers.
         batch_size: Leading dimensions ``S`` of the weights.
         generator: As in `StackedLinear`.
-
-    Raises:
-        ValueError: If the number of generators is not the number of stacked perceptrons.
 
     Example:
         >>> mlp = StackedMLP(96, 4)
@@ -185,14 +173,7 @@ class StackedMLP(nn.Module):
         return cast(StackedLinear, self.layers[0]).batch_size
 
     def forward(self, *inputs: Tensor) -> Tensor:
-        """Map the inputs, side by side along their last dimension, to the output.
-
-        Args:
-            *inputs: ``[*S, *B, features]`` each, ``in_features`` together.
-
-        Returns:
-            ``[*S, *B, out_features]``, without an output nonlinearity.
-        """
+        """Return the output ``[*S, *B, out_features]``; inputs as for `StackedLinear`."""
         first, *others = self.layers
         x = first(*inputs)
         for layer in others:

@@ -1,7 +1,4 @@
-"""Variational autoencoder with an inverse model: from a camera frame to a 64-dimensional latent.
-
-Layers: paper, Sec. IV-A. Objective: Sec. III-A, in `bgpo_trl.objectives.representation`.
-"""
+"""Variational autoencoder with an inverse model: from a camera frame to a 64-dimensional latent."""
 
 from __future__ import annotations
 
@@ -22,16 +19,15 @@ _COARSE_SIZE = 4096
 class VAE(nn.Module):
     """Convolutional VAE over 64x32 RGB frames, with a one-layer inverse model on its latents.
 
-    Encoder: three 3x3 convolutions of 32, 64 and 128 channels, each followed by 2x2 max-pooling and
-    ReLU, then one dense layer each for mean and log-variance. Decoder: the mirror image, with
-    transposed convolutions (kernel 4, stride 2) in place of "upsample by 2, then 3x3 convolution",
-    at half the compute, and a sigmoid output. Tensors are channels-last, the layout of the frames.
+    Encoder (Sec. IV-A): three 3x3 convolutions of 32, 64 and 128 channels, each followed by 2x2
+    max-pooling and ReLU, then one dense layer each for mean and log-variance. Decoder: the mirror
+    image, with transposed convolutions (kernel 4, stride 2) in place of "upsample by 2, then 3x3
+    convolution", at half the compute, and a sigmoid output. Both work on the difference to a mean
+    frame: the fixed camera mostly shows the same table, which would take hundreds of steps to
+    learn.
 
-    Encoder and decoder work on the difference to a mean frame, which they would otherwise spend
-    hundreds of steps learning: the fixed camera mostly shows the same table.
-
-    Frames are uint8 ``[..., 32, 64, 3]``. Latents are ``[..., latent_size]``, on the scale of mu
-    unless they come from `latent`.
+    Frames are uint8 ``[..., 32, 64, 3]``, and tensors channels-last like them. Latents are
+    ``[..., latent_size]``, on the scale of mu unless they come from `latent`.
 
     Args:
         latent_size: Dimensions of z (paper: 64).
@@ -107,10 +103,7 @@ class VAE(nn.Module):
 
     @torch.no_grad()
     def latent(self, pixels: Tensor) -> Tensor:
-        """Return the features used downstream: mu, standardized, float32 ``[..., latent_size]``.
-
-        They carry no gradient. On training frames, mean and variance are about 0 and 1.
-        """
+        """Return the features used downstream: mu, standardized, ``[..., latent_size]``."""
         return self.standardize(self.mean_head(self._coarse(pixels)))
 
     def standardize(self, mu: Tensor) -> Tensor:
@@ -119,14 +112,10 @@ class VAE(nn.Module):
 
     @torch.no_grad()
     def set_latent_scale(self, mu: Tensor, floor: float = 0.1) -> None:
-        """Set the mean and standard deviation with which `latent` standardizes.
+        """Set mean and standard deviation of `latent` from the mu ``[N, latent_size]`` of frames.
 
-        Dimensions switched off by the KL term keep a tiny spread; dividing by it would turn them
-        into noise as large as the signal. ``floor`` bounds the divisor from below.
-
-        Args:
-            mu: Means of the training frames, ``[N, latent_size]``.
-            floor: Smallest divisor, relative to the largest standard deviation.
+        The KL term switches dimensions off: they keep a tiny spread, and dividing by it would turn
+        them into noise as large as the signal. No divisor is below ``floor`` times the largest.
 
         Raises:
             ValueError: If ``mu`` has fewer than two rows, or is constant or not finite.

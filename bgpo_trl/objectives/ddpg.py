@@ -22,11 +22,12 @@ class DDPGLoss(OffPolicyLoss):
        ``beta``, returns lie in ``[0, 1 + beta]``.
     2. The actor minimizes ``-Q(s, pi(s)) + pre_tanh_penalty * pre_tanh_action ** 2``.
 
-    Without bounds and penalty DDPG diverges on sparse rewards: Q grows to hundreds and every action
-    saturates. With neither it is :class:`torchrl.objectives.DDPGLoss` with ``delay_actor=True``.
+    Without bounds and penalty, this is :class:`torchrl.objectives.DDPGLoss` with
+    ``delay_actor=True``, which diverges on sparse rewards: Q grows to hundreds and every action
+    saturates.
 
-    Entries are those of `OffPolicyLoss`; ``"pre_tanh_magnitude"`` ``[*S]``, the root mean square of
-    the actor's output before the tanh, is returned, too.
+    Reads and returns the entries of `OffPolicyLoss`, and returns ``"pre_tanh_magnitude"`` ``[*S]``,
+    the root mean square of the actor's output before the tanh.
 
     Args:
         actor_network: Policy; it must write ``"pre_tanh_action"`` unless the penalty is 0.
@@ -43,20 +44,11 @@ class DDPGLoss(OffPolicyLoss):
         >>> loss = DDPGLoss(Actor(6, 4, **seeds), Critic(6, 4, **seeds), return_bounds=(0.0, 1.0))
         >>> loss.make_value_estimator(gamma=0.95)
         >>> target_update = ForeachSoftUpdate(loss, tau=0.005)
-        >>> shape = (10, 256)
-        >>> batch = TensorDict({
-        ...     "state": torch.randn(*shape, 6),
-        ...     "action": torch.rand(*shape, 4) * 2 - 1,
-        ...     "next": {
-        ...         "state": torch.randn(*shape, 6),
-        ...         "reward": torch.zeros(*shape, 1),
-        ...         "terminated": torch.zeros(*shape, 1, dtype=torch.bool),
-        ...     },
-        ... }, shape)
-        >>> losses = loss(batch)
+        >>> state, zero = torch.randn(10, 256, 6), torch.zeros(10, 256, 1)
+        >>> after = {"state": state, "reward": zero, "terminated": zero.bool()}
+        >>> batch = {"state": state, "action": torch.zeros(10, 256, 4), "next": after}
+        >>> losses = loss(TensorDict(batch, [10, 256]))
         >>> (losses["loss_actor"] + losses["loss_value"]).backward()
-        >>> losses["td_error_max"].shape
-        torch.Size([10])
     """
 
     actor_keys = ("pre_tanh_magnitude",)
@@ -77,7 +69,7 @@ class DDPGLoss(OffPolicyLoss):
         return self.values(self.network("target_value_network"), data)
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Compute the actor's loss and ``"pre_tanh_magnitude"``; see the base class."""
+        """Compute the actor's loss ``[]`` and ``"pre_tanh_magnitude"``."""
         data = self.network("actor_network")(self.inputs.current(tensordict))
         value = self.values(self.network("value_network", frozen=True), data)
         return self.penalized(value, data, tensordict)

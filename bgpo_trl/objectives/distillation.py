@@ -1,4 +1,4 @@
-"""Policy distillation: the multi-task policy learns the actions of the tasks' teachers."""
+"""Policy distillation: a multi-task policy learns the actions of the tasks' teachers."""
 
 from __future__ import annotations
 
@@ -30,8 +30,6 @@ class DistillationLoss(LossModule):
 
     @dataclass
     class _AcceptedKeys:
-        """Keys that ``set_keys`` can change."""
-
         teacher_action: NestedKey = "teacher_action"
         loc: NestedKey = "loc"
         scale: NestedKey = "scale"
@@ -45,7 +43,7 @@ class DistillationLoss(LossModule):
 
     @property
     def functional(self) -> bool:
-        """False: the parameters stay in the network."""
+        """Whether parameters are passed to the network: no, they stay in it."""
         return False
 
     @property

@@ -22,34 +22,34 @@ Parameters = dict[str, Tensor]
 class MAMLLoss(DDPGLoss):
     """Loss of a policy after its adaptation to each task (Finn et al., 2017, Alg. 3).
 
-    With the DDPG loss of task i's critic, ``L_i(theta) = -mean Q_i(s, pi_theta(s))`` (plus the
-    penalty on the actor's output before its tanh, as in `DDPGLoss`), it
+    With ``L_i(theta) = -mean Q_i(s, pi_theta(s))``, the actor's loss in `DDPGLoss` (with its
+    penalty) for the critic of task i, it
 
     1. adapts the policy to each task, ``theta_i = theta - inner_learning_rate * grad L_i(theta)``,
        on the first half of the task's transitions;
-    2. judges the adapted policies by ``sum_i L_i(theta_i)`` on the second halves: the gradient with
-       respect to ``theta`` goes through step 1, second derivatives included;
-    3. trains each task's critic on all its transitions as `DDPGLoss` does. Its target action is
-       that of the adapted policy's slow copy, since it is the adapted policy whose value is asked.
+    2. evaluates the adapted policies by ``sum_i L_i(theta_i)`` on the second halves; the gradient
+       with respect to ``theta`` goes through step 1, second derivatives included;
+    3. trains each task's critic on all its transitions as `DDPGLoss` does. Target actions are those
+       of a slow copy of the adapted policy, since that policy's value is to be learned.
 
     ``theta`` are the parameters of ``meta_network``. Those of ``actor_network`` are the latest
-    ``theta_i``: they are written here, have no gradient, and target networks follow them.
+    ``theta_i``, written here, without gradient; the target networks follow them. They must be
+    updated by `ForeachSoftUpdate`, since TorchRL's `SoftUpdate` skips parameters without gradient.
 
-    Reads what `DDPGLoss` reads, with the batch size ``[*S, T, B]``, ``B`` even; and
-    ``"priority_weight"`` ``[*S, T, B]``, 0 for tasks of which nothing is known yet. Returns what
-    `DDPGLoss` returns, per task. Its targets are to be moved by `ForeachSoftUpdate`: TorchRL's own
-    `SoftUpdate` passes over what needs no gradient, as the parameters of ``actor_network`` do not.
+    Reads what `DDPGLoss` reads, with batch size ``[*S, T, B]``, ``B`` even, and
+    ``"priority_weight"`` ``[*S, T, B]``, 0 for tasks without data. Returns what `DDPGLoss` returns,
+    per task.
 
     Args:
-        meta_network: policy with a ``batch_size`` ``[*S]``.
-        actor_network: the same policy with a ``batch_size`` ``[*S, T]``; its parameters are
+        meta_network: Policy with ``batch_size`` ``[*S]``.
+        actor_network: The same policy with ``batch_size`` ``[*S, T]``; its parameters are
             overwritten.
-        value_network: Q-functions with a ``batch_size`` ``[*S, T]``.
-        inner_learning_rate: length of the step of adaptation.
-        **ddpg: other arguments of `DDPGLoss`.
+        value_network: Q-functions with ``batch_size`` ``[*S, T]``.
+        inner_learning_rate: Step size of the adaptation.
+        **ddpg: Other arguments of `DDPGLoss`.
 
     Raises:
-        ValueError: if ``inner_learning_rate`` is negative, or the batch sizes do not fit.
+        ValueError: If ``inner_learning_rate`` is negative, or the batch sizes do not fit.
     """
 
     actor_keys = ()
@@ -82,16 +82,10 @@ class MAMLLoss(DDPGLoss):
         self.inner_learning_rate = inner_learning_rate
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Compute the loss of the adapted policies, and keeps them in ``actor_network``.
-
-        Args:
-            tensordict: a batch of transitions ``[*S, T, B]``.
-
-        Returns:
-            The loss ``[]`` and no diagnostics.
+        """Compute the loss ``[]`` of the adapted policies, and store these in ``actor_network``.
 
         Raises:
-            ValueError: if the batch cannot be cut in halves.
+            ValueError: If the batch cannot be cut in halves.
         """
         if tensordict.batch_size[-1] % 2:
             raise ValueError(
@@ -105,25 +99,16 @@ class MAMLLoss(DDPGLoss):
         return loss, {}
 
     def adapt(self, tensordict: TensorDictBase) -> Parameters:
-        """Return the parameters of the policy after one gradient step on each task.
+        """Return the policy's parameters ``[*S, T, ...]`` after one gradient step on each task.
 
-        Args:
-            tensordict: transitions of each task ``[*S, T, B]``.
-
-        Returns:
-            Tensors ``[*S, T, ...]``, differentiable with respect to ``meta_network``.
+        They are differentiable with respect to ``meta_network``. Transitions are ``[*S, T, B]``.
         """
         start = self._each_task()
         step = grad(lambda parameters: self.policy_loss(parameters, tensordict).sum())(start)
         return {key: value - self.inner_learning_rate * step[key] for key, value in start.items()}
 
     def policy_loss(self, parameters: Parameters, tensordict: TensorDictBase) -> Tensor:
-        """Return ``L_i`` of policies with these parameters, ``[*S, T]``.
-
-        Args:
-            parameters: of one policy a task, ``[*S, T, ...]``.
-            tensordict: transitions of each task ``[*S, T, B]``.
-        """
+        """Return ``L_i`` ``[*S, T]`` of policies with parameters ``[*S, T, ...]``, one per task."""
         data = self.inputs.current(tensordict)
         functional_call(self.network("actor_network"), parameters, (data,))
         loss = -self.values(self.network("value_network", frozen=True), data)

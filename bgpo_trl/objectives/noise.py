@@ -1,4 +1,4 @@
-"""Gaussian noise of losses, from one generator per seed whose states are in the ``state_dict``."""
+"""Gaussian noise of losses, drawn from one generator per seed."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ __all__ = ["SeededNoise"]
 class SeededNoise(nn.Module):
     """Standard normal noise for a stack of seeds, each from its own generator.
 
-    TorchRL's losses draw from PyTorch's global generator: a seed of a stack would then differ from
-    that seed alone, and a resumed run from an uninterrupted one. The states of the generators are
-    the extra state of this module, so a loss that holds it saves and restores them.
+    TorchRL's losses draw from PyTorch's global generator, so that a seed of a stack would differ
+    from that seed alone, and a resumed run from an uninterrupted one. The ``state_dict`` of this
+    module, and of a loss that contains it, has the states of the generators.
 
     Args:
         batch_size: Leading dimensions ``S`` of the stack.
@@ -65,6 +65,6 @@ class SeededNoise(nn.Module):
         return torch.stack(states) if states else torch.empty(0, dtype=torch.uint8)
 
     def set_extra_state(self, state: Tensor) -> None:
-        """Continue the generators from the result of `get_extra_state`."""
+        """Restore the result of `get_extra_state`."""
         for generator, saved in zip(self.generators, state, strict=True):
-            generator.set_state(saved.clone())  # a row of a tensor would crash it
+            generator.set_state(saved.clone())  # set_state crashes on a view

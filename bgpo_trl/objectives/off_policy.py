@@ -24,8 +24,8 @@ __all__ = ["OffPolicyLoss"]
 class OffPolicyLoss(LossModule):
     """Base of off-policy actor-critic losses for one seed or a stack of seeds ``S``.
 
-    A subclass defines `next_value` and `loss_actor`, and sets ``twin_critics`` if it has two and
-    ``actor_keys`` to the further entries of `loss_actor`. The base:
+    A subclass defines `next_value` and `loss_actor`, sets ``twin_critics`` if it has two, and lists
+    in ``actor_keys`` the further entries that its `loss_actor` returns. The base
 
     1. regresses the critics to ``r + gamma * next_value``, clipped to ``return_bounds``. Only
        ``"terminated"`` ends the bootstrap; a truncated episode goes on;
@@ -34,12 +34,12 @@ class OffPolicyLoss(LossModule):
     3. reads entries that are constant within an episode from the root, not from ``"next"``;
     4. sums the losses of twin critics, one network with the ``batch_size`` ``[*S, 2]``.
 
-    Reads the ``in_keys`` of both networks (``"action"`` ``[*S, *B, action_dim]`` among them), those
-    that are not constant also under ``"next"``, ``("next", "reward")``, ``("next", "terminated")``
-    ``[*S, *B, 1]`` and, if present, ``"priority_weight"`` ``[*S, *B]``, a factor of each
-    transition's loss; masks (``loss_mask_key``) are not read. Writes ``"td_error"`` ``[*S, *B]``
-    into the input, the squared error, the larger one of twin critics, for prioritized replay.
-    Returns, without a batch size, what `loss_actor` returns and
+    Reads the ``in_keys`` of both networks, among them ``"action"`` ``[*S, *B, action_dim]``; under
+    ``"next"`` those that are not constant, ``"reward"`` and ``"terminated"`` ``[*S, *B, 1]``; and,
+    if present, ``"priority_weight"`` ``[*S, *B]``, a factor of each transition's loss. Masks
+    (``loss_mask_key``) are not read. Writes ``"td_error"`` ``[*S, *B]`` into the input, for
+    prioritized replay: the squared error, the larger one of twin critics. Returns, without a batch
+    size, the entries of `loss_actor` and
 
     - ``"loss_actor"``, ``"loss_value"`` ``[]``: to be added, with any other ``"loss_..."``;
     - ``"pred_value"`` ``[*S, *B]``, or ``[*S, 2, *B]`` of twin critics: values of the batch;
@@ -57,7 +57,8 @@ class OffPolicyLoss(LossModule):
 
     Raises:
         ValueError: If ``return_bounds`` is not an increasing pair, the penalty is negative, there
-            is no such ``loss_function``, or the ``batch_size`` of twin critics is not ``[*S, 2]``.
+            is no such ``loss_function``, or the ``batch_size`` of twin critics is not ``[*S, 2]``;
+            from ``forward``, if an entry is missing or the reward has another shape.
     """
 
     tensor_keys: TransitionKeys
@@ -151,38 +152,15 @@ class OffPolicyLoss(LossModule):
         return TensorDict({**losses, **told, **told_of_actor})
 
     def next_value(self, successor: TensorDictBase) -> Tensor:
-        """Return the values of the next states, ``[*S, *B]``, from the networks' input there.
-
-        It is called without gradients.
-        """
+        """Return the values ``[*S, *B]`` of the input at next states; called without gradients."""
         raise NotImplementedError
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Compute the actor's loss.
-
-        Args:
-            tensordict: Batch of transitions ``[*S, *B]``.
-
-        Returns:
-            The loss ``[]`` and further entries for the result of `forward`.
-
-        Raises:
-            ValueError: If the batch lacks an entry.
-        """
+        """Compute the actor's loss ``[]``, and further entries for the result of `forward`."""
         raise NotImplementedError
 
     def loss_value(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Compute the loss of the critics, and writes ``"td_error"``.
-
-        Args:
-            tensordict: Batch of transitions ``[*S, *B]``.
-
-        Returns:
-            The loss ``[]`` and the critics' entries for the result of `forward`.
-
-        Raises:
-            ValueError: If the batch lacks an entry, or the reward has another shape.
-        """
+        """Compute the critics' loss ``[]`` and their further entries; write ``"td_error"``."""
         with torch.no_grad():
             target = self.target(tensordict)
         data = self.inputs.select(tensordict, self.value_network.in_keys)
@@ -216,12 +194,7 @@ class OffPolicyLoss(LossModule):
         return target if self.return_bounds is None else target.clamp(*self.return_bounds)
 
     def values(self, critic: Any, data: TensorDictBase) -> Tensor:
-        """Return a critic's values ``[*S, *B]``, or ``[*S, 2, *B]`` of twin critics.
-
-        Args:
-            critic: One of `network`.
-            data: States and actions ``[*S, *B]``.
-        """
+        """Return a critic's values ``[*S, *B]``, or ``[*S, 2, *B]`` of twin critics."""
         if self.twin_critics:
             dim = len(self.batch_size)
             data = data.select(*critic.in_keys).unsqueeze(dim)
@@ -231,15 +204,11 @@ class OffPolicyLoss(LossModule):
     def penalized(
         self, value: Tensor, data: TensorDictBase, tensordict: TensorDictBase
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return ``-mean(value)`` and a penalty that keeps the actor's tanh from saturating.
+        """Return ``-mean(value)`` plus a penalty that keeps the actor's tanh from saturating.
 
         The penalty is ``pre_tanh_penalty`` times the mean square of the actor's output before the
-        tanh, over batch and action dimensions.
-
-        Args:
-            value: Values of the actor's actions, ``[*S, *B]``.
-            data: Output of the actor ``[*S, *B]``.
-            tensordict: Batch of transitions, read for its weights.
+        tanh, over batch and action dimensions. ``value`` ``[*S, *B]`` and ``data`` are the values
+        and the outputs of the actor; the transitions of ``tensordict`` give the weights.
 
         Returns:
             The loss ``[]`` and ``"pre_tanh_magnitude"`` ``[*S]``, the root of that mean square.
@@ -270,18 +239,15 @@ class OffPolicyLoss(LossModule):
         return self.flatten_batch(loss).mean(-1)
 
     def flatten_batch(self, values: Tensor) -> Tensor:
-        """Return values ``[*S, ...]`` with all but the leading dimensions ``S`` in one."""
+        """Flatten all but the leading dimensions ``S`` of values into one."""
         return values.reshape(*self.batch_size, -1)
 
     def network(self, name: str, *, frozen: bool = False) -> Any:
-        """Return a network that holds the very parameters of the loss.
+        """Return the actor or value network, or its target, sharing its parameters with the loss.
 
-        Args:
-            name: ``"actor_network"`` or ``"value_network"``, each with ``"target_"`` before it for
-                the target network.
-            frozen: Whether gradients reach the network's input only, not its parameters.
+        With ``frozen``, gradients reach the network's input only, not its parameters.
         """
-        # Made once: to put parameters in for each call, as TorchRL does, adds a sixth to its time.
+        # Made once: TorchRL puts the parameters in at each call, which takes a sixth longer.
         if (name, frozen) not in self._made:
             made = self._made[name, frozen] = deepcopy(getattr(self, name.removeprefix("target_")))
             params = getattr(self, f"{name}_params")

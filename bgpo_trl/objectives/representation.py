@@ -1,4 +1,4 @@
-"""Losses of the VAE and the sequence autoencoder (paper, Sec. III-A), as TorchRL ``LossModule``."""
+"""Losses of the VAE and the sequence autoencoder (paper, Sec. III-A)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from bgpo_trl.modules.vae import VAE
 class VAEInverseLoss(LossModule):
     """Joint loss of the VAE and its inverse model, on windows of consecutive frames ``[*B, K]``.
 
-    z is sampled from N(mu, sigma^2), once per frame. The terms are:
+    With z sampled from N(mu, sigma^2), once per frame, the terms are
 
     - ``reconstruction``: squared error, summed over the 6144 values of a frame, mean over frames.
       With a mean over pixels, a small object would count so little that the KL term would switch
@@ -27,8 +27,8 @@ class VAEInverseLoss(LossModule):
       the ``K - 1`` transitions of every window.
 
     Reads ``pixels`` uint8 ``[*B, K, 32, 64, 3]`` and ``action`` ``[*B, K, A]``, in which action t
-    leads from frame t to t + 1 (the last one is ignored). Writes the terms, all ``[]``: detached,
-    for logging, and weighted as ``loss_*``, which add up to the objective.
+    leads from frame t to t + 1 (the last one is ignored). Writes the terms ``[]``: detached, for
+    logging, and weighted as ``loss_*``, which add up to the objective.
 
     Args:
         vae: Network to train.
@@ -43,18 +43,14 @@ class VAEInverseLoss(LossModule):
 
     Example:
         >>> loss = VAEInverseLoss(VAE(), generator=torch.Generator().manual_seed(0))
-        >>> windows = TensorDict({
-        ...     "pixels": torch.zeros(3, 4, 32, 64, 3, dtype=torch.uint8),
-        ...     "action": torch.zeros(3, 4, 4),
-        ... }, [3, 4])
+        >>> frames = torch.zeros(3, 4, 32, 64, 3, dtype=torch.uint8)
+        >>> windows = TensorDict({"pixels": frames, "action": torch.zeros(3, 4, 4)}, [3, 4])
         >>> sorted(key for key in loss(windows).keys() if key.startswith("loss_"))
         ['loss_inverse', 'loss_kl', 'loss_reconstruction']
     """
 
     @dataclass
     class _AcceptedKeys:
-        """Keys that ``set_keys`` can change."""
-
         pixels: NestedKey = "pixels"
         action: NestedKey = "action"
 
@@ -81,7 +77,7 @@ class VAEInverseLoss(LossModule):
 
     @property
     def functional(self) -> bool:
-        """False: the parameters stay in the network."""
+        """Whether parameters are passed to the network: no, they stay in it."""
         return False
 
     @property
@@ -128,13 +124,10 @@ class SequenceReconstructionLoss(LossModule):
     those before ``length``. All valid steps of the batch have equal weight.
 
     Reads ``latent`` ``[*B, T, latent_size]`` and ``length`` int64 ``[*B]``; writes
-    ``loss_reconstruction`` ``[]``.
+    ``loss_reconstruction`` ``[]``. From ``forward``, a missing entry raises ``ValueError``.
 
     Args:
         lae: Network to train.
-
-    Raises:
-        ValueError: From ``forward``, if an entry is missing.
 
     Example:
         >>> loss = SequenceReconstructionLoss(SequenceAutoencoder())
@@ -146,8 +139,6 @@ class SequenceReconstructionLoss(LossModule):
 
     @dataclass
     class _AcceptedKeys:
-        """Keys that ``set_keys`` can change."""
-
         latent: NestedKey = "latent"
         length: NestedKey = "length"
 
@@ -160,7 +151,7 @@ class SequenceReconstructionLoss(LossModule):
 
     @property
     def functional(self) -> bool:
-        """False: ``nn.LSTM`` caches its weights, which rules out functional calls."""
+        """Whether parameters are passed to the network: no, ``nn.LSTM`` caches its weights."""
         return False
 
     @property

@@ -29,8 +29,8 @@ class SACLoss(OffPolicyLoss):
     3. The temperature ``alpha`` grows while the policy's entropy is below ``target_entropy``, and
        shrinks while it is above.
 
-    Entries are those of `OffPolicyLoss`. Returned are, too, ``"loss_alpha"`` ``[]``, to be added to
-    the other losses, and ``"alpha"`` and ``"entropy"`` ``[*S]``.
+    Reads and returns the entries of `OffPolicyLoss`, and returns ``"loss_alpha"`` ``[]``, to be
+    added to the other losses, and ``"alpha"`` and ``"entropy"`` ``[*S]``.
 
     Args:
         actor_network: A `GaussianActor`, or a policy with the same ``sample`` and ``action_dim``.
@@ -39,12 +39,11 @@ class SACLoss(OffPolicyLoss):
         target_entropy: Entropy of the policy, in nats over all action dimensions.
         entropy_in_target: Whether the Q-functions include the entropy to come.
         generator: Sources of the samples, one per seed, as in `SeededNoise`.
-        **common: Other arguments of `OffPolicyLoss`, but for ``pre_tanh_penalty`` and
+        **common: Other arguments of `OffPolicyLoss`, except ``pre_tanh_penalty`` and
             ``delay_actor``.
 
     Raises:
-        ValueError: If ``alpha_init`` is not positive, or the number of generators is not that of
-            the seeds.
+        ValueError: If ``alpha_init`` is not positive.
 
     Example:
         >>> from bgpo_trl.modules.actor_critic import Critic
@@ -88,7 +87,7 @@ class SACLoss(OffPolicyLoss):
         return value
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Compute the actor's loss, the temperature's, and their entries; see the base class."""
+        """Compute the actor's loss ``[]``, and the temperature's loss and entries."""
         data, log_prob = self._sample(self.inputs.current(tensordict))
         values = self.values(self.network("value_network", frozen=True), data)
         alpha = self.log_alpha.detach().exp()

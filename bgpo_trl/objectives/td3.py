@@ -24,10 +24,8 @@ class TD3Loss(OffPolicyLoss):
        target policy's action with clipped Gaussian noise (target policy smoothing), in [-1, 1].
     2. The actor maximizes the first Q-function, with the penalty of `DDPGLoss`.
 
-    The delay of the actor belongs to the training loop, which calls `loss_value` alone in updates
-    without the actor, as :class:`~bgpo_trl.algorithms.rl.TD3Learner` does.
-
-    Entries are those of `OffPolicyLoss` and ``"pre_tanh_magnitude"`` ``[*S]``, as in `DDPGLoss`.
+    The training loop delays the actor: `TD3Learner` calls `loss_value` alone in updates without it.
+    Reads and returns the entries of `DDPGLoss`.
 
     Args:
         actor_network: Policy; it must write ``"pre_tanh_action"`` unless the penalty is 0.
@@ -39,7 +37,7 @@ class TD3Loss(OffPolicyLoss):
         **common: Other arguments of `OffPolicyLoss`.
 
     Raises:
-        ValueError: If the noise is negative, or the number of generators is not that of the seeds.
+        ValueError: If the noise is negative.
 
     Example:
         >>> from bgpo_trl.modules.actor_critic import Actor, Critic
@@ -79,7 +77,7 @@ class TD3Loss(OffPolicyLoss):
         return self.values(self.network("target_value_network"), data).amin(len(self.batch_size))
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Compute the actor's loss and ``"pre_tanh_magnitude"``; see the base class."""
+        """Compute the actor's loss ``[]`` and ``"pre_tanh_magnitude"``."""
         data = self.network("actor_network")(self.inputs.current(tensordict))
         values = self.values(self.network("value_network", frozen=True), data)
         return self.penalized(values.select(len(self.batch_size), 0), data, tensordict)

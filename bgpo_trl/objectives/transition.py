@@ -41,12 +41,12 @@ class TransitionInputs:
     """Input of an actor and its critics, in the states and the next states of transitions.
 
     An entry that is constant within an episode is not stored a second time under ``"next"``: its
-    next value is read from the root.
+    next value is read from the root. Entries are detached; a missing one raises ``ValueError``.
 
     Args:
         reader: Name of the loss, for messages.
         actor_network: Policy.
-        value_network: Q-function; what the actor writes is not part of the input.
+        value_network: Q-function; entries that the actor writes are not part of the input.
         constant_keys: Entries that are constant within an episode.
 
     Attributes:
@@ -78,38 +78,21 @@ class TransitionInputs:
     def select(
         self, tensordict: TensorDictBase, keys: Iterable[NestedKey], where: str = ""
     ) -> TensorDictBase:
-        """Return entries without their gradients.
-
-        Args:
-            tensordict: Batch ``[*S, *B]``.
-            keys: Entries to read.
-            where: Addition to the reader's name in the message.
-
-        Raises:
-            ValueError: If an entry is missing.
-        """
+        """Return entries of a batch ``[*S, *B]``; ``where`` specifies the reader in errors."""
         try:
             return tensordict.select(*keys).detach()
         except KeyError:
             raise missing_key(self.reader + where, tensordict, keys) from None
 
     def current(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return the input in the states of transitions ``[*S, *B]``.
-
-        Raises:
-            ValueError: If an entry is missing.
-        """
+        """Return the input in the states of transitions ``[*S, *B]``."""
         return self.select(tensordict, self.keys)
 
     def following(self, tensordict: TensorDictBase, names: TransitionKeys) -> TensorDictBase:
         """Return the input in the next states of transitions ``[*S, *B]``.
 
-        Args:
-            tensordict: Batch of transitions.
-            names: Names of reward and termination, which must be there under ``"next"``.
-
         Raises:
-            ValueError: If an entry is missing.
+            ValueError: If the reward, the termination or an entry is missing under ``"next"``.
         """
         successor = tensordict.get("next", None)
         if successor is None or successor.get(names.reward, None) is None:
