@@ -29,7 +29,7 @@ class Arguments:
     """Measure how well demonstrations of an unknown task are detected."""
 
     bank: Path | None = None
-    """A bank of demonstrations embedded with the shipped encoders; the shipped bank if not given."""
+    """A bank made with the shipped encoders; the shipped bank if not given."""
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
     """Seeds of the draws of demonstrations."""
     draws: int = 600
@@ -56,9 +56,9 @@ def draw(found: dict[str, Detection]) -> Figure:
 
 def main(arguments: Arguments) -> None:
     """Print the table and write the results."""
-    bank = (
-        load_pretrained()[1] if arguments.bank is None else DemonstrationBank.load(arguments.bank)
-    )
+    encoders, bank = load_pretrained()
+    if arguments.bank is not None:
+        bank = DemonstrationBank.load(arguments.bank, encoder_id=encoders.identity)
     config = BGPOConfig().groups
     found = {
         task: leave_one_out(bank, i, config, seeds=arguments.seeds, draws=arguments.draws)
