@@ -14,6 +14,8 @@ T = TypeVar("T")
 class Threads:
     """Threads that share the rows of a batch, the caller's among them.
 
+    A copy, also in another process, starts threads of its own.
+
     Args:
         n: Number of threads, at least 1.
         name: Prefix of the helpers' names.
@@ -27,7 +29,11 @@ class Threads:
 
     def __init__(self, n: int, name: str) -> None:
         self._helpers = n - 1
+        self._name = name
         self._pool = ThreadPoolExecutor(max(1, self._helpers), name)
+
+    def __reduce__(self) -> tuple[type[Threads], tuple[int, str]]:
+        return Threads, (self._helpers + 1, self._name)
 
     def each(
         self, rows: Iterable[int], work: Callable[[int], T], arrived: Callable[[int, T], object]
