@@ -24,7 +24,7 @@ ROOMS = (
 """In the order of docs/design.md; ``top`` is the package itself."""
 TOP = ("envs", "world", "evaluation", "training", "policy", "doctor")
 """Modules and packages of ``top``, in their order."""
-OPEN = ("configs", "errors", "seeding", "machine", "threads")
+OPEN = ("configs", "errors", "seeding", "shapes", "machine", "threads")
 """Open to all; they import from none of the rooms."""
 LAST = ("__init__", "__main__")
 """What stands outside imports from anywhere: the package's face and its command line."""
