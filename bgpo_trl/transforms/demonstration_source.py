@@ -118,9 +118,9 @@ class DemonstrationSource(EpisodeTransform):
     Args:
         bank: The demonstrations.
         schedule: A `TaskSchedule`, or any object with its ``n_tasks`` and ``available``.
-        batch_size: Batch size of the environment; ``()`` is a single one.
+        batch_size: Batch size of the environment, or its length; ``()`` is a single one.
         generator: Source of the streams, one for all rows or one per row, used only on
-            construction; None: torch's default generator.
+            construction; None: torch's default generator. ``env.set_seed`` replaces the streams.
         follow: Another source, whose ``episode`` count determines the available tasks (evaluation
             follows training) and whose batch size is the leading dimensions of ``batch_size``.
         out_keys: Keys of task, embedding and index.
