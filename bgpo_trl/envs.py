@@ -12,9 +12,9 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from bgpo_trl.errors import missing_key
+from bgpo_trl.errors import as_shape, missing_key
 from bgpo_trl.machine import usable_cores
-from bgpo_trl.seeding import random_state, set_random_state
+from bgpo_trl.seeding import Seeding, random_state, row_seeds, set_random_state
 from bgpo_trl.threads import Threads
 from suites import nico
 from suites.nico.base import STATE_SIZE, Environment, Observation, check_observation
@@ -38,16 +38,21 @@ class NicoEnv(EnvBase):
     An optional boolean entry ``"_step"`` ``[*B]`` selects the simulations that advance; the others
     repeat their last observation.
 
+    ``set_seed`` also reaches the transforms of this package, at the next reset (see
+    `EpisodeTransform`). A copy, by ``copy.deepcopy`` or ``pickle``, continues as the original
+    would, with threads and a renderer of its own.
+
     Args:
         tasks: Names of the tasks, in the order of their presentation.
-        batch_size: Shape of the batch.
-        seed: Seed of each simulation's starts; an int counts up from there.
+        batch_size: Shape of the batch; an int is the length of a batch of one dimension.
+        seed: Seed of the first simulation's starts, from which the others count up; or one for
+            each; or None for seeds from the operating system.
         observation: ``"pixels"``, ``"state"`` or ``"both"``.
         threads: Threads for physics, the caller's among them; None takes one for each core.
 
     Raises:
-        ValueError: If a task is unknown, there are not as many seeds as simulations, or there is
-            to be no task, simulation or thread.
+        ValueError: If a task is unknown or named twice, there are not as many seeds as
+            simulations, a seed is out of range, or there is to be no task, simulation or thread.
 
     Example:
         >>> env = NicoEnv(batch_size=[2], seed=0)
@@ -59,27 +64,24 @@ class NicoEnv(EnvBase):
         self,
         tasks: Sequence[str] = nico.ALL_TASKS,
         *,
-        batch_size: Sequence[int] = (),
-        seed: int | Sequence[int] = 0,
+        batch_size: int | Sequence[int] = (),
+        seed: int | Sequence[int] | None = 0,
         observation: Observation = "pixels",
         threads: int | None = None,
     ) -> None:
-        super().__init__(batch_size=torch.Size(batch_size))
+        super().__init__(batch_size=as_shape(batch_size, "batch_size"))
         check_observation(observation)
         if threads is not None and threads < 1:
             raise ValueError(f"threads must be at least 1, or None for all cores, got {threads}")
         if not tasks or isinstance(tasks, str):
             raise ValueError(f"tasks must be names such as {nico.ALL_TASKS}, got {tasks!r}")
-        if not self.batch_size.numel():
-            raise ValueError(f"batch_size must be of at least 1 simulation, got {batch_size}")
+        nico.check_tasks(tasks)
         self.tasks = tuple(tasks)
         self.observation = observation
         count = self.batch_size.numel()
-        seeds = [seed + i for i in range(count)] if isinstance(seed, int) else list(seed)
-        if len(seeds) != count:
-            raise ValueError(f"{len(seeds)} seeds for {count} simulations: give one each")
+        self.seeding: Seeding | None = None  # read by the transforms
         self._environments: list[list[Environment]] = []
-        for row_seed in seeds:
+        for row_seed in row_seeds(seed, count):
             physics = nico.Physics.from_xml_string(nico.scene_xml())
             random = np.random.RandomState(row_seed)
             self._environments.append(
@@ -230,12 +232,12 @@ class NicoEnv(EnvBase):
         super().close(raise_if_closed=raise_if_closed)
 
     def _set_seed(self, seed: int | None) -> None:
-        for row, environments in enumerate(self._environments):
-            # All tasks of a simulation draw from one source.
-            environments[0].task.random.seed(None if seed is None else seed + row)
+        seeds = row_seeds(seed, len(self._environments))
+        self.seed_rows(seeds)
+        self.seeding = Seeding(tuple(seeds))
 
     def seed_rows(self, seeds: Sequence[int]) -> None:
-        """Set the seed of each simulation's next starts, in ``[0, 2**32)``."""
+        """Set the seed of each simulation's next starts, in ``[0, 2**32)``, and no other."""
         for environments, seed in zip(self._environments, seeds, strict=True):
             # All tasks of a simulation draw from one source.
             environments[0].task.random.seed(seed)

@@ -1,9 +1,11 @@
-"""Error messages that several packages share."""
+"""Checks of arguments and error messages that several packages share."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from numbers import Integral
 
+import torch
 from tensordict import NestedKey, TensorDictBase
 
 
@@ -29,3 +31,12 @@ def missing_key(
         f"{reader} found no {', '.join(map(repr, missing))} in a TensorDict with "
         f"{sorted(map(str, tensordict.keys()))}: write it before, or name another entry"
     )
+
+
+def as_shape(value: int | Sequence[int], name: str) -> torch.Size:
+    """Return sizes as a shape; raise ``ValueError`` unless they are whole numbers of at least 1."""
+    sizes = list(value) if isinstance(value, Sequence) else [value]
+    if not all(isinstance(size, Integral) and size >= 1 for size in sizes):
+        got = ", ".join(map(repr, sizes))
+        raise ValueError(f"{name} must be a whole number, at least 1; got {got}")
+    return torch.Size(sizes)

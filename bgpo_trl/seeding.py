@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -27,6 +29,43 @@ def generators(seeds: Sequence[int], name: str) -> list[torch.Generator]:
         True
     """
     return [torch.Generator().manual_seed(stream_seed(seed, name)) for seed in seeds]
+
+
+def row_seeds(seed: int | Iterable[int] | None, count: int) -> list[int]:
+    """Return a seed in ``[0, 2**32)`` for each row of a batch.
+
+    Args:
+        seed: Seed of the first row, from which the others count up; or one for each row; or None
+            for seeds from the operating system.
+        count: Number of rows.
+
+    Raises:
+        ValueError: If there are not as many seeds as rows, or one is out of range.
+
+    Example:
+        >>> row_seeds(7, 3), row_seeds([5, 2], 2)
+        ([7, 8, 9], [5, 2])
+    """
+    if seed is None:
+        return np.random.SeedSequence().generate_state(count).tolist()
+    counted = isinstance(seed, (int, Integral))
+    seeds = [int(seed)] if counted else [int(each) for each in seed]
+    if not counted and len(seeds) != count:
+        raise ValueError(f"{len(seeds)} seeds for {count} simulations: give one each")
+    if not all(0 <= each < 2**32 for each in seeds):
+        raise ValueError(f"a seed must lie in 0..2**32 - 1, got {seed}")
+    return [(seeds[0] + row) % 2**32 for row in range(count)] if counted else seeds
+
+
+@dataclass(frozen=True, eq=False)
+class Seeding:
+    """One call of an environment's ``set_seed``, equal to no other, even of the same seed.
+
+    Attributes:
+        seeds: A seed for each row.
+    """
+
+    seeds: tuple[int, ...]
 
 
 def normal(generators: Sequence[torch.Generator], shape: Sequence[int]) -> Tensor:

@@ -14,7 +14,8 @@ T = TypeVar("T")
 class Threads:
     """Threads that share the rows of a batch; the caller's is one of ``n``.
 
-    ``name`` is the prefix of the others' names.
+    ``name`` is the prefix of the others' names. A copy, also in another process, starts threads of
+    its own.
 
     Example:
         >>> threads, results = Threads(3, "squares"), [0] * 5
@@ -25,7 +26,11 @@ class Threads:
 
     def __init__(self, n: int, name: str) -> None:
         self._helpers = n - 1
+        self._name = name
         self._pool = ThreadPoolExecutor(max(1, self._helpers), name)
+
+    def __reduce__(self) -> tuple[type[Threads], tuple[int, str]]:
+        return Threads, (self._helpers + 1, self._name)
 
     def each(
         self, rows: Iterable[int], work: Callable[[int], T], arrived: Callable[[int, T], object]

@@ -196,9 +196,16 @@ PARTS = {
         lambda: NicoEnv(["juggle"], observation="state"), "'juggle'", "choose one of grasp_glass"),
     "no task": (lambda: NicoEnv([]), "got []", "must be names such as"),
     "a name for a list": (lambda: NicoEnv("grasp_glass"), "'grasp_glass'", "must be names such as"),
-    "no simulation": (lambda: NicoEnv(batch_size=[0]), "got [0]", "at least 1 simulation"),
+    "a task twice": (lambda: NicoEnv(["grasp_glass"] * 2), "'grasp_glass'", "name each once"),
+    "no simulation": (lambda: NicoEnv(batch_size=[0]), "got 0", "at least 1"),
+    "no row": (lambda: source(batch_size=0), "got 0", "at least 1"),
     "no thread": (lambda: NicoEnv(threads=0), "got 0", "at least 1, or None"),
     "too few seeds": (lambda: NicoEnv(batch_size=[2], seed=[1]), "1 seeds for 2", "give one each"),
+    "seed below 0": (lambda: NicoEnv(seed=-1), "got -1", "must lie in 0..2**32 - 1"),
+    "seed too large": (
+        lambda: NicoEnv(batch_size=2, seed=[0, 2**32]), "4294967296", "must lie in 0..2**32 - 1"),
+    "seed set below 0": (
+        lambda: NicoEnv(observation="state").set_seed(-1), "got -1", "must lie in 0..2**32 - 1"),
     "negative seed": (lambda: nico.load("grasp_glass", seed=-1), "Seed", "between 0 and 2**32"),
     "unknown observation": (
         lambda: NicoEnv(observation="pixel"), "'pixel'", "choose one of 'pixels'"),

@@ -1,8 +1,10 @@
 """NicoEnv against single environments of the suite, and its promises to TorchRL."""
 
 import itertools
+import pickle
 import threading
 import time
+from copy import deepcopy
 
 import numpy as np
 import pytest
@@ -112,6 +114,58 @@ def test_seeds_can_be_given_one_by_one_and_set_again():
     other = NicoEnv(batch_size=[2], seed=8, observation="state").reset()
     assert_equal(other, second)
     assert (first["state"][1] != second["state"][1]).any()
+
+
+@pytest.mark.parametrize(("seed", "same"), [(np.int64(3), 3), (np.array([3, 4]), 3)])
+def test_seeds_may_be_of_numpy(seed, same):
+    env, other = (NicoEnv(batch_size=2, seed=s, observation="state") for s in (seed, same))
+    assert_equal(env.reset(), other.reset())
+
+
+def test_without_a_seed_every_start_is_another():
+    first, second = (NicoEnv(batch_size=2, seed=None, observation="state") for _ in range(2))
+    starts = torch.cat([first.reset()["state"], second.reset()["state"]])
+    first.set_seed(None)
+    starts = torch.cat([starts, first.reset()["state"]])
+    assert len(starts.unique(dim=0)) == 6
+
+
+def test_a_batch_size_may_be_a_number():
+    assert NicoEnv(batch_size=2, observation="state").batch_size == (2,)
+
+
+def test_the_largest_seed_can_be_set_for_a_batch():
+    env = NicoEnv(batch_size=2, observation="state")
+    env.set_seed(2**32 - 1)
+    start = env.reset()["state"][1]
+    assert start.equal(NicoEnv(seed=0, observation="state").reset()["state"])
+
+
+@pytest.mark.parametrize(
+    "duplicate",
+    [deepcopy, lambda env: pickle.loads(pickle.dumps(env))],
+    ids=["deepcopy", "pickle"],
+)
+def test_a_copy_continues_as_the_original_does(duplicate):
+    env = NicoEnv(batch_size=[2], seed=3, observation="both", threads=2)
+    td = run(env, env.reset(task_td(2, 1)), actions(env, 3))[-1].exclude("reward")
+    other = duplicate(env)
+    check_env_specs(duplicate(env))
+    expected = run(env, td.clone(), actions(env, 5))
+    starts = [env.reset() for _ in range(2)]
+    env.close()  # The copy has a renderer and threads of its own ...
+    assert_equal(run(other, td, actions(other, 5)), expected)
+    for start in starts:  # ... and its random numbers.
+        assert_equal(other.reset(), start)
+
+
+def test_a_copy_of_a_done_row_waits_for_its_reset():
+    env = NicoEnv(batch_size=[2], seed=2, observation="state")
+    last = succeed(env, 1, env.reset(task_td(0, 0))).exclude("reward")
+    after = deepcopy(env).step(last.clone().set("action", torch.ones(2, 4)))["next"]
+    assert after["done"].tolist() == [[False], [True]]
+    assert after["state"][1].equal(last["state"][1])
+    assert not after["state"][0].equal(last["state"][0])
 
 
 def test_a_partial_reset_leaves_other_rows_alone():

@@ -8,7 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bgpo_trl.seeding import generators, stream_seed
+from bgpo_trl.seeding import generators, row_seeds, stream_seed
 
 seeds = st.integers(0, 2**40)
 names = st.sampled_from(
@@ -54,3 +54,31 @@ def test_generators_share_nothing():
 def test_a_negative_seed_is_refused():
     with pytest.raises(ValueError, match="non-negative"):
         stream_seed(-1, "env")
+
+
+@pytest.mark.parametrize("seed", [3, np.int64(3), np.uint8(3)])
+def test_rows_count_up_from_one_seed(seed):
+    assert row_seeds(seed, 3) == [3, 4, 5]
+
+
+def test_rows_count_on_from_0_after_the_largest_seed():
+    assert row_seeds(2**32 - 2, 4) == [2**32 - 2, 2**32 - 1, 0, 1]
+
+
+@pytest.mark.parametrize("seeds", [[8, 3], (8, 3), np.array([8, 3]), torch.tensor([8, 3])])
+def test_rows_take_the_seeds_given(seeds):
+    assert row_seeds(seeds, 2) == [8, 3]
+    with pytest.raises(ValueError, match=r"^2 seeds for 3 simulations: give one each$"):
+        row_seeds(seeds, 3)
+
+
+def test_without_a_seed_rows_have_fresh_ones():
+    first, second = row_seeds(None, 4), row_seeds(None, 4)
+    assert len({*first, *second}) == 8
+    assert all(0 <= seed < 2**32 for seed in (*first, *second))
+
+
+@pytest.mark.parametrize("seed", [-1, 2**32, [0, -1], [2**32, 0]])
+def test_a_seed_out_of_range_is_refused(seed):
+    with pytest.raises(ValueError, match=r"^a seed must lie in 0\.\.2\*\*32 - 1, got .*$"):
+        row_seeds(seed, 2)

@@ -1,5 +1,6 @@
 """Rows shared between threads."""
 
+import pickle
 import sys
 import threading
 
@@ -45,3 +46,11 @@ def test_an_error_in_any_thread_reaches_the_caller_when_all_have_ended(threads):
         threads.each(range(12), work, lambda row, result: None)
     assert not working
     assert sys.getswitchinterval() == interval
+
+
+def test_a_copy_works_in_threads_of_its_own(threads):
+    copy, results = pickle.loads(pickle.dumps(threads)), {}
+    threads.close()
+    copy.each(range(5), lambda row: row**2, results.__setitem__)
+    assert results == {row: row**2 for row in range(5)}
+    copy.close()

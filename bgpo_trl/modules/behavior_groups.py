@@ -45,7 +45,7 @@ class BehaviorGroups(nn.Module):
 
     Args:
         n_features: Size d of an input.
-        batch_size: Shape of the batch (the seeds); ``()`` is a single set of groups.
+        batch_size: Shape of the batch (the seeds), or its length; ``()`` is a single set of groups.
         activity_threshold: a_T of the coarse GWR-B, below which an input is new.
         habituation_threshold: h_T, below which a best-matching node allows an insertion. With the
             0.15 of the fine network, tasks that appear together get mixed before any node splits.
@@ -68,7 +68,7 @@ class BehaviorGroups(nn.Module):
         self,
         n_features: int,
         *,
-        batch_size: Sequence[int] = (),
+        batch_size: int | Sequence[int] = (),
         activity_threshold: float = 0.525,
         habituation_threshold: float = 0.5,
         activity_scale: float = 1.0,

@@ -8,16 +8,17 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
+from bgpo_trl.errors import as_shape
 from bgpo_trl.modules.gwr_graph import BehaviorGraph, BehaviorMatch
-from bgpo_trl.modules.gwr_learning import learn, start, with_room
+from bgpo_trl.modules.gwr_learning import learn, random_nodes, start, with_room
 from bgpo_trl.modules.gwr_tensors import (
     Numbers,
     as_generators,
     as_mask,
-    as_shape,
     as_tensor,
     checked,
     pairwise_distances,
+    scattered,
     to_tensor,
 )
 from bgpo_trl.modules.gwr_topology import LearningRule, Topology, read_state
@@ -130,11 +131,17 @@ class GWRB(nn.Module):
         spare = torch.full((networks, 16, self.n_features), torch.inf)
         self.register_buffer("_weights", spare, persistent=False)
         self.register_buffer("_network", torch.arange(networks), persistent=False)
+        self.init = init
         if init == "random":
             for i, source in enumerate(generators):
-                device = None if source is None else source.device
-                for weights in torch.rand(2, self.n_features, generator=source, device=device):
-                    start(self._weights[i], self._topologies[i], 2 * weights - 1, self.rule)
+                for node in random_nodes(self.n_features, source):
+                    start(self._weights[i], self._topologies[i], node, self.rule)
+
+    def redraw(self, generator: torch.Generator | Sequence[torch.Generator] | None = None) -> None:
+        """Draw random weights as on construction, in networks that have not learned yet."""
+        for i, source in enumerate(as_generators(generator, len(self._topologies))):
+            if self.init == "random" and self._topologies[i].is_new(self.rule):
+                self._weights[i, :2] = random_nodes(self.n_features, source).to(self._weights)
 
     @property
     def num_nodes(self) -> Tensor:
@@ -207,9 +214,8 @@ class GWRB(nn.Module):
         node = to_tensor(node, row.dtype, row.device).view(row.shape)
         activity = self._activity(distance)
         if mask is not None:
-            embedding = self._spread(embedding, network, torch.nan)
-            node = self._spread(node, network, -1)
-            activity = self._spread(activity, network, torch.nan)
+            results, n_networks = (embedding, node, activity), len(self._topologies)
+            embedding, node, activity = scattered(results, network, n_networks)
         return BehaviorMatch(
             embedding=embedding.view(*batch, self.n_features),
             node=node.view(batch),
@@ -261,9 +267,8 @@ class GWRB(nn.Module):
         learn(weights, self._topologies, self.rule, phi, embedding, networks, n_before, nearest)
 
         if mask is not None:
-            embedding = self._spread(embedding, network, torch.nan)
-            node = self._spread(node, network, -1)
-            activity = self._spread(activity, network, torch.nan)
+            results, n_networks = (embedding, node, activity), len(self._topologies)
+            embedding, node, activity = scattered(results, network, n_networks)
         batch = self.batch_size
         return BehaviorMatch(
             embedding.view(*batch, -1), node.view(batch), activity.view(batch), batch_size=batch
@@ -293,7 +298,3 @@ class GWRB(nn.Module):
     def _activity(self, distance: Tensor) -> Tensor:
         """Convert distances into activities, in place (Eq. 2)."""
         return distance.mul_(-self.rule.activity_scale).exp_()
-
-    def _spread(self, x: Tensor, network: Tensor, fill: float) -> Tensor:
-        """Scatter results of the active networks into those of all; elsewhere ``fill``."""
-        return x.new_full((len(self._topologies), *x.shape[1:]), fill).index_copy(0, network, x)

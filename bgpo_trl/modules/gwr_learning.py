@@ -9,6 +9,12 @@ from bgpo_trl.modules.gwr_tensors import to_tensor
 from bgpo_trl.modules.gwr_topology import LearningRule, Topology
 
 
+def random_nodes(n_features: int, generator: torch.Generator | None) -> Tensor:
+    """Draw the weights of a network's first two nodes uniformly from (-1, 1), ``[2, d]``."""
+    device = None if generator is None else generator.device
+    return 2 * torch.rand(2, n_features, generator=generator, device=device) - 1
+
+
 def start(weights: Tensor, topology: Topology, initial: Tensor, rule: LearningRule) -> None:
     """Create the first node of a network, or the second and its edge (step 1 of `GWRB`)."""
     row = topology.add(rule.initial_habituation)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from numbers import Integral
 from reprlib import repr as short_repr
 from typing import Any, TypeAlias
 
@@ -13,15 +12,6 @@ import torch
 from torch import Tensor
 
 Numbers: TypeAlias = Tensor | npt.ArrayLike
-
-
-def as_shape(value: int | Sequence[int], name: str) -> torch.Size:
-    """Return sizes as a shape; raise ``ValueError`` unless they are whole numbers of at least 1."""
-    sizes = list(value) if isinstance(value, Sequence) else [value]
-    if not all(isinstance(size, Integral) and size >= 1 for size in sizes):
-        got = ", ".join(map(repr, sizes))
-        raise ValueError(f"{name} must be a whole number, at least 1; got {got}")
-    return torch.Size(sizes)
 
 
 def as_generators(
@@ -85,3 +75,12 @@ def pairwise_distances(phi: Tensor, weights: Tensor) -> Tensor:
 def to_tensor(numbers: list[Any], dtype: torch.dtype, device: torch.device) -> Tensor:
     """Return a list of numbers as a tensor; by way of NumPy, four times as fast."""
     return torch.as_tensor(np.array(numbers), dtype=dtype, device=device)
+
+
+def scattered(results: Sequence[Tensor], network: Tensor, n_networks: int) -> list[Tensor]:
+    """Scatter results of some networks into those of all; elsewhere NaN, or -1 for nodes."""
+    fills = [torch.nan if x.is_floating_point() else -1 for x in results]
+    return [
+        x.new_full((n_networks, *x.shape[1:]), fill).index_copy(0, network, x)
+        for x, fill in zip(results, fills, strict=True)
+    ]

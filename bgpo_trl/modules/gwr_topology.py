@@ -163,6 +163,10 @@ class Topology:
             node=torch.tensor(identity, dtype=torch.int64, device=device),
         )
 
+    def is_new(self, rule: LearningRule) -> bool:
+        """Return whether the network is two nodes that have not learned from any input."""
+        return self.next_identity == 2 and self.habituation == [rule.initial_habituation] * 2
+
     def compact(self) -> list[int]:
         """Close the gaps left by removed nodes; return the former row of each node."""
         rows = list(self.edges)

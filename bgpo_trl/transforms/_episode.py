@@ -13,6 +13,7 @@ from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Compose, EnvBase, RewardSum, StepCounter, Transform, TransformedEnv
 
 from bgpo_trl.errors import missing_key
+from bgpo_trl.seeding import Seeding
 
 
 def starting(tensordict: TensorDictBase, done_key: NestedKey = "done") -> Tensor:
@@ -49,6 +50,12 @@ class EpisodeTransform(Transform):
     learns at the end of episodes. ``RewardSum`` must come after a transform that changes the
     reward.
 
+    One seed for all: TorchRL's ``TransformedEnv.set_seed`` reaches only the base environment.
+    `NicoEnv` therefore records its last ``set_seed``, and a transform that draws at random looks
+    there before each reset: a new seed takes effect on the transform and on the simulation at the
+    same reset, also in each worker of a ``ParallelEnv``. With any other base environment, call
+    `seed_rows`.
+
     Args:
         in_keys: Entries read.
         out_keys: Entries written.
@@ -61,12 +68,30 @@ class EpisodeTransform(Transform):
 
     learn: bool = False
     pays: bool = False
+    _seeding: Seeding | None = None
 
     def __init__(
         self, in_keys: Sequence[NestedKey], out_keys: Sequence[NestedKey], done_key: NestedKey
     ) -> None:
         super().__init__(in_keys=list(in_keys), out_keys=list(out_keys))
         self.done_key = unravel_key(done_key)
+
+    def seed_rows(self, seeds: Sequence[int]) -> None:
+        """Start random streams anew, from a seed for each row; this base class has none."""
+
+    def _follow_seed(self) -> None:
+        env = self.container
+        while isinstance(env, TransformedEnv):
+            env = env.base_env
+        # Not getattr, with which a ParallelEnv would ask its workers.
+        seeding = None if env is None else vars(env).get("seeding")
+        if seeding is not None and seeding is not self._seeding:
+            self.seed_rows(seeding.seeds)
+        self._seeding = seeding
+
+    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
+        self._follow_seed()  # A seed set earlier must not undo the load at the next reset.
+        super()._load_from_state_dict(*args, **kwargs)
 
     def _entries(self, observation_spec: Composite) -> dict[NestedKey, TensorSpec]:
         """Return the specs of the entries written, given the observation so far."""
@@ -85,6 +110,7 @@ class EpisodeTransform(Transform):
         # cause.
         observation_spec = cast(EnvBase, self.container).observation_spec
         self._check_limit(observation_spec)  # again, since `learn` may have changed
+        self._follow_seed()
         return tensordict
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:

@@ -10,6 +10,7 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 
 from bgpo_trl.modules.gwr import GWRB
+from bgpo_trl.seeding import generators
 from bgpo_trl.transforms._episode import DemonstrationLookup, unbounded
 
 
@@ -57,6 +58,11 @@ class BehaviorLookup(DemonstrationLookup):
     def gwr(self) -> GWRB:
         """The network."""
         return self.network
+
+    def seed_rows(self, seeds: Sequence[int]) -> None:
+        """Draw the random nodes of GWR-B anew, in the networks that learn and have not begun to."""
+        if self.learn:
+            self.gwr.redraw(generators(seeds, "gwr"))
 
     def look_up(self, embedding: Tensor) -> tuple[Tensor, Tensor]:
         """Return behavior and node for embeddings ``[*B, 32]``."""

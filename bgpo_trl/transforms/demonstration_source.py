@@ -13,6 +13,8 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 
+from bgpo_trl.errors import as_shape
+from bgpo_trl.seeding import generators
 from bgpo_trl.transforms._episode import EpisodeTransform, ending, starting, unbounded
 
 
@@ -116,9 +118,9 @@ class DemonstrationSource(EpisodeTransform):
     Args:
         bank: The demonstrations.
         schedule: A `TaskSchedule`, or any object with its ``n_tasks`` and ``available``.
-        batch_size: Batch size of the environment; ``()`` is a single one.
+        batch_size: Batch size of the environment, or its length; ``()`` is a single one.
         generator: Source of the streams, one for all rows or one per row, used only on
-            construction; None: torch's default generator.
+            construction; None: torch's default generator. ``env.set_seed`` replaces the streams.
         follow: Another source, whose ``episode`` count determines the available tasks (evaluation
             follows training) and whose batch size is the leading dimensions of ``batch_size``.
         out_keys: Keys of task, embedding and index.
@@ -152,14 +154,14 @@ class DemonstrationSource(EpisodeTransform):
         bank: Bank,
         schedule: TaskSchedule,
         *,
-        batch_size: Sequence[int] = (),
+        batch_size: int | Sequence[int] = (),
         generator: torch.Generator | Sequence[torch.Generator] | None = None,
         follow: DemonstrationSource | None = None,
         out_keys: Sequence[NestedKey] = ("task", "demo_embedding", "demo_index"),
         done_key: NestedKey = "done",
     ) -> None:
         super().__init__((), out_keys, done_key)
-        batch_size = torch.Size(batch_size)
+        batch_size = as_shape(batch_size, "batch_size")
         n_rows = batch_size.numel()
         if bank.embedding.ndim != 2 or bank.task.shape != bank.embedding.shape[:1]:
             raise ValueError(
@@ -176,27 +178,27 @@ class DemonstrationSource(EpisodeTransform):
                 f"the bank has no demonstration of task {missing[0]} of the schedule: record some, "
                 f"or use a schedule of fewer than {schedule.n_tasks} tasks"
             )
-        generators = generator if isinstance(generator, Sequence) else [generator] * n_rows
-        if len(generators) != n_rows:
-            raise ValueError(f"generator must be one or {n_rows}, one a row; got {len(generators)}")
+        sources = generator if isinstance(generator, Sequence) else [generator] * n_rows
+        if len(sources) != n_rows:
+            raise ValueError(f"generator must be one or {n_rows}, one a row; got {len(sources)}")
         if follow is not None and batch_size[: follow.episode.ndim] != follow.episode.shape:
             raise ValueError(
                 f"batch_size {tuple(batch_size)} must start with that of the source to follow, "
                 f"{tuple(follow.episode.shape)}"
             )
         self.schedule = schedule
-        self._follow = (
-            [] if follow is None else [follow]
-        )  # a list, so that it is not registered as a submodule
-        streams = [
-            torch.randint(2**63 - 1, (), generator=g, device=None if g is None else g.device)
-            for g in generators
-        ]
-        self.register_buffer("_stream", torch.tensor(streams).view(batch_size))
+        # A list, so that it is not registered as a submodule.
+        self._follow = [] if follow is None else [follow]
+        self.register_buffer("_stream", _streams(sources).view(batch_size))
         self.register_buffer("episode", torch.zeros(batch_size, dtype=torch.int64))
         self.register_buffer("_embedding", bank.embedding, persistent=False)
         self.register_buffer("_task", bank.task, persistent=False)
         self.register_buffer("_demo_index", torch.zeros_like(self.episode), persistent=False)
+
+    def seed_rows(self, seeds: Sequence[int]) -> None:
+        """Start anew: streams from a seed for each row, and counts, hence the schedule, at 0."""
+        self._stream.copy_(_streams(generators(seeds, "demonstrations")).view_as(self._stream))
+        self.episode.zero_()
 
     def _draw(self, rows: Tensor) -> None:
         presented = self._follow[0].episode if self._follow else self.episode
@@ -260,3 +262,12 @@ class DemonstrationSource(EpisodeTransform):
         if task_key not in observation_spec.keys(True, True):
             entries[task_key] = index.clone()
         return entries
+
+
+def _streams(generators: Sequence[torch.Generator | None]) -> Tensor:
+    """Draw the number of a stream from each generator, int64 ``[len(generators)]``."""
+    streams = [
+        torch.randint(2**63 - 1, (), generator=g, device=None if g is None else g.device)
+        for g in generators
+    ]
+    return torch.tensor(streams)

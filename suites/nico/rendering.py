@@ -102,7 +102,8 @@ class FrameRenderer:
 
     It keeps one OpenGL context, one scene and one camera, whereas ``dm_control``'s
     ``physics.render`` builds a camera per call, at several times the cost of the frame. It may be
-    used and closed from any thread; frames of all renderers are drawn one after another.
+    used and closed from any thread; frames of all renderers are drawn one after another. A copy,
+    also in another process, has a context of its own.
 
     The robot's camera shows the same horizontal range in narrower frames than the paper's, and more
     above and below.
@@ -151,12 +152,18 @@ class FrameRenderer:
                 "or osmesa, or unset it, and check that the library is installed (Debian/Ubuntu: "
                 "`apt-get install libegl1 libgl1-mesa-dri`, or `libosmesa6`)"
             ) from error
+        self._model, self._camera_name = model, camera
         self._camera = mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
         self._camera.fixedcamid = camera_id
         paper = FRAME_WIDTH / FRAME_HEIGHT
         self._taller = max(1.0, paper * height / width) if camera == FRAME_CAMERA else 1.0
         weakref.finalize(self, _abandoned.append, self._renderer).atexit = False
+
+    def __reduce__(self) -> tuple[Callable[..., "FrameRenderer"], tuple[mujoco.MjModel, str]]:
+        height, width = self.frame_size
+        make = functools.partial(FrameRenderer, height=height, width=width)
+        return make, (self._model, self._camera_name)
 
     def render(self, data: mujoco.MjData, out: np.ndarray | None = None) -> np.ndarray:
         """Render a frame.

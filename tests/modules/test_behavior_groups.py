@@ -219,3 +219,10 @@ def test_groups_of_nicos_demonstrations_are_each_of_one_task(shipped, starts):
             tasks_of.setdefault(group, set()).add(task)
         assert all(len(tasks) == 1 for tasks in tasks_of.values())
         assert set.union(*tasks_of.values()) == {0, 1, 2}
+
+
+def test_a_batch_size_may_be_a_number():
+    groups = BehaviorGroups(2, batch_size=2)
+    groups.adapt(torch.zeros(2, 2))
+    assert groups.lookup(torch.zeros(2, 2)).group.tolist() == [0, 0]
+    assert groups.num_groups.tolist() == [1, 1]

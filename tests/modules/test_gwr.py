@@ -358,6 +358,41 @@ def test_random_start_is_two_connected_nodes_within_the_range_of_phi():
     assert abs(graph.weights.mean()) < 0.1
 
 
+def test_redrawn_networks_are_as_if_constructed_so():
+    def generators():
+        return [torch.Generator().manual_seed(seed) for seed in (5, 6)]
+
+    gwr, fresh = GWRB(3, batch_size=2), GWRB(3, batch_size=2, generator=generators())
+    gwr.redraw(generators())
+    phi = torch.rand(2, 3, generator=torch.Generator().manual_seed(0))
+    for _ in range(2):
+        for network in range(2):
+            assert gwr.graph(network).weights.equal(fresh.graph(network).weights)
+            assert gwr.graph(network).ages.equal(fresh.graph(network).ages)
+        gwr.adapt(phi)
+        fresh.adapt(phi)
+
+
+@pytest.mark.parametrize("init", ["random", "data"])
+def test_networks_that_have_learned_are_not_redrawn(init):
+    gwr = GWRB(3, batch_size=2, init=init)
+    for phi in (torch.zeros(2, 3), torch.ones(2, 3)):
+        gwr.adapt(phi, mask=torch.tensor([True, False]))
+    resumed = GWRB(3, batch_size=2, init=init)
+    resumed.load_state_dict(gwr.state_dict())
+    for network in (gwr, resumed):
+        before = [network.graph(i).weights for i in range(2)]
+        network.redraw(torch.Generator().manual_seed(1))
+        assert network.graph(0).weights.equal(before[0])
+        assert network.graph(1).weights.equal(before[1]) == (init == "data")
+
+
+def test_redrawing_takes_a_generator_for_each_network():
+    gwr = GWRB(3, batch_size=2)
+    with pytest.raises(ValueError, match=r"torch\.Generator, or a sequence of 2, one a network"):
+        gwr.redraw([torch.Generator()])
+
+
 def test_network_of_a_batch_is_what_its_seed_is_alone():
     inputs = drifting_inputs(300, 3, 4)
     generators = [torch.Generator().manual_seed(seed) for seed in range(3)]

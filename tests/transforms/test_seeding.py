@@ -1,0 +1,163 @@
+"""One seed for simulation, demonstrations and GWR-B, alone and in workers."""
+
+import copy
+from functools import partial
+
+import pytest
+import torch
+from torchrl.envs import Compose, ParallelEnv, SerialEnv, StepCounter, TransformedEnv
+
+from bgpo_trl.envs import NicoEnv
+from bgpo_trl.modules.gwr import GWRB
+from bgpo_trl.transforms import (
+    BehaviorLookup,
+    BehaviorMatchingReward,
+    DemonstrationSource,
+    FrameEncoder,
+    TaskSchedule,
+)
+
+DRAWN = ("state", "demo_index", "behavior")  # by simulation, DemonstrationSource and GWR-B
+
+
+@pytest.fixture
+def compose(make_bank):
+    """Makes compositions that share no random numbers, until they get the same seed."""
+
+    def compose(batch_size=(), max_steps=50):
+        return TransformedEnv(
+            NicoEnv(batch_size=batch_size, seed=None, observation="state"),
+            Compose(
+                StepCounter(max_steps),
+                DemonstrationSource(make_bank(), TaskSchedule((0, 0, 0)), batch_size=batch_size),
+                BehaviorLookup(GWRB(32, batch_size=batch_size), learn=True),
+            ),
+        )
+
+    return compose
+
+
+def rollout(env, n_steps=3):
+    """Rests for some steps, within one episode unless the limit is shorter."""
+    action = torch.zeros(*env.batch_size, 4)
+
+    def rest(tensordict):
+        return tensordict.set("action", action)
+
+    return env.rollout(n_steps, rest, break_when_any_done=False)
+
+
+def assert_equal(first, second):
+    assert set(first.keys(True, True)) == set(second.keys(True, True))
+    for key, value in first.items(True, True):
+        assert value.equal(second[key]), key
+
+
+@pytest.mark.parametrize("batch_size", [(), (2,)])
+def test_the_same_seed_gives_the_same_episode_and_another_seed_another(compose, batch_size):
+    env, other = compose(batch_size), compose(batch_size)
+    env.set_seed(7)
+    first = rollout(env)
+    env.set_seed(7)
+    again = rollout(env)
+    other.set_seed(7)
+    elsewhere = rollout(other)
+    env.set_seed(17)
+    different = rollout(env)
+    assert_equal(first, again)
+    assert_equal(first, elsewhere)
+    for key in DRAWN:
+        assert not first[key].equal(different[key])
+
+
+def test_a_row_has_the_seed_counted_up_to_it(compose):
+    batch, alone = compose((2,)), compose()
+    batch.set_seed(7)
+    alone.set_seed(8)
+    assert_equal(rollout(batch)[1], rollout(alone))
+
+
+def test_a_seed_does_not_undo_what_was_learned(compose):
+    env = compose((2,), max_steps=2)
+    source, gwr = env.transform[1], env.transform[2].gwr
+    env.set_seed(7)
+    rollout(env, 6)
+    learned = [gwr.graph(row).weights for row in range(2)]
+    assert source.episode.tolist() == [3, 3]
+    env.set_seed(7)
+    env.reset()
+    assert source.episode.tolist() == [0, 0]
+    for row in range(2):
+        assert gwr.graph(row).weights.equal(learned[row])
+
+
+def test_a_seed_is_set_once(compose):
+    env = compose(max_steps=2)
+    env.set_seed(7)
+    drawn = [rollout(env, 2)["demo_index"][0].item() for _ in range(6)]
+    assert env.transform[1].episode == 6
+    assert len(set(drawn)) > 2
+
+
+def test_a_state_loaded_after_the_seed_was_set_is_kept(compose):
+    env, other = compose(), compose()
+    state = copy.deepcopy(other.state_dict())
+    env.set_seed(7)
+    env.load_state_dict(state)
+    for key in ("demo_index", "behavior"):
+        assert env.reset()[key].equal(other.reset()[key])
+
+
+def test_a_seed_can_be_given_to_a_source_in_any_environment(make_bank, MockEnv):
+    envs = []
+    for seeds in ([7, 8], [7, 8], [17, 18]):
+        source = DemonstrationSource(make_bank(), TaskSchedule((0, 0, 0)), batch_size=2)
+        source.seed_rows(seeds)
+        envs.append(TransformedEnv(MockEnv([0, 0]), Compose(StepCounter(50), source)))
+    first, same, other = (env.reset()["demo_index"] for env in envs)
+    assert first.equal(same)
+    assert not first.equal(other)
+
+
+def test_a_copy_draws_as_the_original_does(compose):
+    env = compose((2,), max_steps=2)
+    env.set_seed(7)
+    rollout(env, 3)
+    other = copy.deepcopy(env)
+    for _ in range(2):
+        assert_equal(rollout(env, 5), rollout(other, 5))
+
+
+def test_environments_side_by_side_draw_differently(compose):
+    env = SerialEnv(2, [compose, compose])
+    env.set_seed(0)
+    first = rollout(env)
+    for key in DRAWN:
+        assert not first[key][0].equal(first[key][1])
+    env.set_seed(0)
+    assert_equal(rollout(env), first)
+
+
+@pytest.mark.slow  # Two processes import everything.
+def test_spawned_workers_draw_differently(make_bank, make_modules):
+    vae, lae, gwr = make_modules()
+    whole = TransformedEnv(
+        NicoEnv(observation="both"),
+        Compose(
+            FrameEncoder(vae, del_keys=True),
+            StepCounter(50),
+            DemonstrationSource(make_bank(), TaskSchedule((0, 0, 0))),
+            BehaviorLookup(gwr, learn=True),
+            BehaviorMatchingReward(lae),
+        ),
+    )
+    env = ParallelEnv(2, partial(copy.deepcopy, whole), mp_start_method="spawn")
+    try:
+        env.set_seed(0)
+        first = rollout(env)
+        for key in (*DRAWN, "latent"):
+            assert not first[key][0].equal(first[key][1])
+        env.set_seed(0)
+        assert_equal(rollout(env), first)
+    finally:
+        env.close()
