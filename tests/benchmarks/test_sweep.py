@@ -20,10 +20,11 @@ from bgpo_trl.configs import PRESETS
 from bgpo_trl.experiments import merge
 from bgpo_trl.experiments import ray_jobs as jobs
 from bgpo_trl.experiments.ray_jobs import Job
-from bgpo_trl.runs.config_file import settings_of
+from bgpo_trl.runs.config_file import Digests, settings_of
 from bgpo_trl.training import Trainer
 from suites import nico
 
+SOME = Digests("some", "bank")
 HEAD = "algorithm,seed,episode,env_steps,task,success,return,steps"
 
 
@@ -41,7 +42,7 @@ def write_run(job):
     """What a run of a job leaves behind, of results that follow from seed and episode."""
     config, folder = job.config, job.directory
     folder.mkdir(parents=True, exist_ok=True)
-    settings = settings_of(config, "some")
+    settings = settings_of(config, SOME)
     (folder / "config.json").write_text(json.dumps(settings))
     told = {"commit": f"c{config.seeds[0] // 2}", "command": "a", "random_success": {"x": 0.5}}
     told["nodes"] = [100 + seed for seed in config.seeds] if config.name == "bgpo" else None
@@ -139,26 +140,26 @@ def test_grids_that_cannot_be_are_refused(tmp_path, wrong, message):
 
 def test_directories_with_something_else_are_refused(few, tmp_path):
     grid = sweep.make_jobs(sweep.Arguments(out=tmp_path, **few))
-    sweep.check_directories(grid, "some")  # there is nothing yet
+    sweep.check_directories(grid, SOME)  # there is nothing yet
     for group in grid.values():
         write_run(group[1])
-    sweep.check_directories(grid, "some")
+    sweep.check_directories(grid, SOME)
     with pytest.raises(ValueError, match="encoders is some there and others here"):
-        sweep.check_directories(grid, "others")
+        sweep.check_directories(grid, Digests("others", "bank"))
     longer = sweep.make_jobs(sweep.Arguments(out=tmp_path, episodes=7, **few))
     with pytest.raises(ValueError, match=r"seeds-2 holds a run with other settings .*episodes is"):
-        sweep.check_directories(longer, "some")
+        sweep.check_directories(longer, SOME)
 
     # Other blocks would be merged over what is there.
     folder = tmp_path / "concurrent-maml"
     config = json.loads((folder / "seeds-2" / "config.json").read_text())
     (folder / "config.json").write_text(json.dumps({**config, "seeds": [7, 8, 9]}))
-    sweep.check_directories(grid, "some")
+    sweep.check_directories(grid, SOME)
     others = sweep.make_jobs(
         sweep.Arguments(out=tmp_path, episodes=7, **{**few, "algorithms": ("maml",), "block": 3})
     )
     with pytest.raises(ValueError, match="concurrent-maml holds a run with other settings"):
-        sweep.check_directories(others, "some")
+        sweep.check_directories(others, SOME)
 
     alone = sweep.make_jobs(sweep.Arguments(out=tmp_path / "alone", **few))
     write_run(Job(tmp_path / "alone" / "concurrent-maml", alone.popitem()[1][0].config))
@@ -282,8 +283,8 @@ def without_ray(monkeypatch):
     monkeypatch.setattr(sweep, "connected", lambda *_, **__: contextlib.nullcontext())
     monkeypatch.setattr(sweep, "play_jobs", play_jobs)
     monkeypatch.setattr(sweep, "play", play)
-    some = (SimpleNamespace(identity="some"), None)
-    monkeypatch.setattr(sweep, "load_pretrained", lambda: some)
+    some = [SimpleNamespace(identity=digest) for digest in SOME]
+    monkeypatch.setattr(sweep, "pretrained_for", lambda tasks, bank: some)
     return SimpleNamespace(played=played, broken=broken)
 
 
