@@ -317,7 +317,7 @@ def test_a_run_of_own_tasks_is_loaded_where_the_task_is_known(
     assert policy.condition(DEMONSTRATIONS[0], task="at_once").task == "at_once"
 
     suite_nico._TASKS.pop("at_once")
-    said = f"the task 'at_once', added by the module {AtOnce.__module__!r} there: name the module"
+    said = f"the task 'at_once', added by the module {AtOnce.__module__!r}: name a module"
     with pytest.raises(ValueError, match=said):
         bgpo_trl.load_run(run)
 

@@ -65,10 +65,11 @@ def read_config(path: str | Path) -> tuple[RunConfig, Digests]:
         ) from error
     # The module is not imported, since a file should not decide what is imported.
     module = modules.get(unknown) if isinstance(modules, dict) else None
-    where = f"the module {module!r}" if isinstance(module, str) else "a module of its own"
+    known = isinstance(module, str) and module != "__main__"
+    where = f"the module {module!r}" if known else "a script or notebook"
     raise ValueError(
-        f"{path} has the task {unknown!r}, added by {where} there: name the module with --import, "
-        "or import it first in Python"
+        f"{path} has the task {unknown!r}, added by {where}: name a module that adds it with "
+        "--import, or add it first in Python"
     )
 
 

@@ -106,9 +106,10 @@ class Juggle(nico.NicoTask):
     ("modules", "where"),
     [
         (None, f"the module {Juggle.__module__!r}"),
-        ({}, "a module of its own"),
-        ({"juggle": 3}, "a module of its own"),
-        ([], "a module of its own"),
+        ({"juggle": "__main__"}, "a script or notebook"),
+        ({}, "a script or notebook"),
+        ({"juggle": 3}, "a script or notebook"),
+        ([], "a script or notebook"),
     ],
 )
 def test_the_module_of_a_task_is_named_but_not_imported(tmp_path, modules, where):
@@ -118,7 +119,7 @@ def test_the_module_of_a_task_is_named_but_not_imported(tmp_path, modules, where
     path = write(tmp_path / "config.json", config, **changes)
     assert read_config(path)[0] == config
     nico.nico._TASKS.pop("juggle")
-    said = f"has the task 'juggle', added by {where} there: name the module with --import"
+    said = f"has the task 'juggle', added by {where}: name a module that adds it with --import"
     with pytest.raises(ValueError, match=said):
         read_config(path)
 
