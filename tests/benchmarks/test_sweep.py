@@ -6,6 +6,7 @@ import json
 import sys
 from dataclasses import replace
 from itertools import product
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -108,6 +109,24 @@ def test_a_job_is_a_block_of_seeds_of_an_algorithm_in_a_setting(tmp_path):
                 name="bgpo",
             )
             assert hasattr(algorithm, "beta") == (name != "dist-nll")
+
+
+def test_workers_are_told_the_tasks_and_where_they_come_from(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    bank, tasks = Path("own.safetensors"), nico.ALL_TASKS[:2]
+    arguments = sweep.Arguments(
+        settings=("continual", "concurrent"), tasks=tasks, module="my_tasks", bank=bank
+    )
+    (continual,), (concurrent,) = sweep.make_jobs(arguments).values()
+    assert (continual.config.task_starts, concurrent.config.task_starts) == ((0, 3_000), (0, 0))
+    for job in (continual, concurrent):
+        assert job.config.tasks == tasks
+        assert (job.module, job.bank) == ("my_tasks", tmp_path / bank)
+    events = []
+    monkeypatch.setattr(sweep, "import_tasks", events.append)
+    monkeypatch.setattr(sweep, "run_experiment", lambda told, *_: events.append(told.bank))
+    sweep.play(continual)
+    assert events == ["my_tasks", tmp_path / bank]
 
 
 def test_blocks_are_of_the_presets_seeds_and_length_unless_told():
