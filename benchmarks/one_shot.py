@@ -28,33 +28,26 @@ from matplotlib.ticker import PercentFormatter
 from bgpo_trl import TrainedPolicy, load_run
 from bgpo_trl.analysis.task_inference import task_inference_accuracy
 from bgpo_trl.data.bank import DemonstrationBank
+from bgpo_trl.data.own_tasks import import_tasks
 from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.encoders.representation import embed_demonstrations
 from bgpo_trl.evaluation import Evaluator, Snapshot
-from bgpo_trl.experiments.arguments import command_line
+from bgpo_trl.experiments.arguments import ImportArguments, command_line
 from bgpo_trl.experiments.run import commit_of_code
-from bgpo_trl.figures.style import save_figure
+from bgpo_trl.figures.style import COLORS, save_figure
 from bgpo_trl.seeding import stream_seed
 from bgpo_trl.transforms import TaskSchedule
 
 COLUMNS = ("share", "seed", "task", "episodes", "success", "task_inference", "activity")
 # Number of the evaluation; it seeds start states that neither training nor final tests used.
 _NUMBER = 2**31 + 1
-_COLORS = (
-    "#222222",
-    "#0072B2",
-    "#D55E00",
-    "#009E73",
-    "#CC79A7",
-    "#E69F00",
-)  # "all", then the tasks
 
 Row = tuple[float, int, str, int, float, float, float]
 """Row of the CSV file; the last two values are NaN for algorithms without GWR-B."""
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Arguments(ImportArguments):
     """Test the policies of a run with demonstrations cut short."""
 
     run: tyro.conf.Positional[Path]
@@ -183,7 +176,8 @@ def plot(table: Mapping[str, Mapping[float, np.ndarray]]) -> Figure:
     figure = Figure(figsize=(7.0, 3.2), layout="constrained")
     panels = figure.subplots(1, len(names), sharex=True, sharey=True, squeeze=False)[0]
     for column, (axes, name) in enumerate(zip(panels, names, strict=True)):
-        for (task, shares), color in zip(table.items(), _COLORS, strict=False):
+        for number, (task, shares) in enumerate(table.items(), -1):  # "all" is the first
+            color = "#222222" if task == "all" else COLORS[number % len(COLORS)]
             shown = sorted(shares)
             seeds = np.stack([shares[share][:, column] for share in shown])
             mean, spread = seeds.mean(1), seeds.std(1)
@@ -206,6 +200,7 @@ def plot(table: Mapping[str, Mapping[float, np.ndarray]]) -> Figure:
 def main(arguments: Arguments) -> None:
     """Run the tests and write the files."""
     commit = commit_of_code()
+    import_tasks(arguments.module)
     torch.set_num_threads(arguments.threads)
     run, out = arguments.run, arguments.out or arguments.run
     rows = measure(load_run(run), arguments.shares, arguments.episodes, arguments.seed)

@@ -27,7 +27,6 @@ from bgpo_trl.figures.nodes import plot_gwr_pca
 from bgpo_trl.figures.page import Section, write_page
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.runs.results import read_rows
-from suites import nico
 
 
 @dataclass(frozen=True)
@@ -55,7 +54,7 @@ def draw(group: Group, runs: dict[str, Run], folder: Path) -> dict[str, Path]:
         save_figure(
             plot_success_curves(
                 [run.directory / "eval.csv" for run in shown],
-                presented=dict(zip(nico.ALL_TASKS, first.config["task_starts"], strict=True)),
+                presented=dict(zip(first.tasks, first.config["task_starts"], strict=True)),
                 random_success=first.summary.get("random_success"),
                 window=3 * first.config["eval_every"],
                 last=int(first.curves.episodes[-1]),
@@ -67,8 +66,13 @@ def draw(group: Group, runs: dict[str, Run], folder: Path) -> dict[str, Path]:
     return figures
 
 
-def draw_nodes(path: Path, to: Path) -> Table:
+def draw_nodes(path: Path, to: Path, names: Sequence[str]) -> Table:
     """Draw Fig. 7 from a run's ``gwr.csv``, by task and, if it has groups, by group.
+
+    Args:
+        path: The ``gwr.csv``.
+        to: Path of the figure.
+        names: Names of the run's tasks.
 
     Returns:
         A table of the distances between the tasks' mean nodes.
@@ -77,8 +81,8 @@ def draw_nodes(path: Path, to: Path) -> Table:
     tasks = np.array([int(row["task"]) for row in rows])
     groups = [int(row["group"]) for row in rows] if "group" in rows[0] else None
     weights = np.array([[float(v) for k, v in row.items() if k.startswith("w")] for row in rows])
-    save_figure(plot_gwr_pca(weights, tasks, nico.ALL_TASKS, groups), to)
-    numbers = [task for task in range(len(nico.ALL_TASKS)) if (tasks == task).any()]
+    save_figure(plot_gwr_pca(weights, tasks, names, groups), to)
+    numbers = [task for task in range(len(names)) if (tasks == task).any()]
     means = {task: weights[tasks == task].mean(0) for task in numbers}
     table: Table = [["distance of mean nodes", *(f"task {task + 1}" for task in numbers)]]
     for task in numbers:
@@ -105,23 +109,31 @@ def read_sections(directory: Path, out: Path) -> tuple[list[Section], dict[str, 
         The sections of the report, and the runs by directory name.
 
     Raises:
-        ValueError: If there are no runs.
+        ValueError: If there are no runs, or runs of different tasks.
     """
     statistics = Statistics()
-    groups: dict[str, dict[str, Run]] = {}
     sections: list[Section] = []
+    read = {key: read_group(directory, group) for key, group in GROUPS.items()}
+    groups = {key: found for key, (found, _) in read.items()}
+    runs = {name: run for group in groups.values() for name, run in group.items()}
+    if not runs:
+        raise ValueError(
+            f"{directory} holds none of the runs that the figures need: name their directories "
+            "EXPERIMENT-ALGORITHM, such as continual-bgpo"
+        )
+    if len({run.tasks for run in runs.values()}) > 1:
+        raise ValueError(
+            f"{directory} holds runs of different tasks: name a directory for each choice of tasks"
+        )
     for key, group in GROUPS.items():
-        groups[key], notes = read_group(directory, group)
+        notes = read[key][1]
         section = Section(group.title, notes=notes)
         # An ablation with only runs of other groups would repeat their tables.
         if any(not key.startswith("ablation") or name.startswith(key) for name in groups[key]):
             table = main_table(groups[key], statistics)
             section = Section(group.title, table, draw(group, groups[key], out), notes)
         sections.append(section)
-    runs = {name: run for group in groups.values() for name, run in group.items()}
-    if not runs:
-        raise ValueError(f"{directory} holds none of the runs that the figures need")
-    if groups["continual"]:
+    if groups["continual"] and len(next(iter(runs.values())).tasks) > 1:
         table = continual_table(groups["continual"], groups["concurrent"])
         sections.append(Section("Forgetting and transfer, continual (points)", table))
     for setting, (_, about) in SETTINGS.items():
@@ -134,8 +146,8 @@ def read_sections(directory: Path, out: Path) -> tuple[list[Section], dict[str, 
         title = "Groups found and tasks inferred on held-out demonstrations, by seed"
         sections.append(Section(title, table))
     title, nodes = "Fig. 7: nodes of one GWR-B", directory / "concurrent-bgpo" / "gwr.csv"
-    if nodes.exists():
-        table = draw_nodes(nodes, out / "fig7.png")
+    if nodes.exists() and nodes.parent.name in runs:
+        table = draw_nodes(nodes, out / "fig7.png", runs[nodes.parent.name].tasks)
         figures = {"first two principal components, first seed": out / "fig7.png"}
         sections.append(Section(title, table, figures))
     else:

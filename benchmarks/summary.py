@@ -13,7 +13,7 @@ from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
 from types import NoneType
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
@@ -23,7 +23,14 @@ from bgpo_trl.analysis.tables import median_cell, own_episodes, ratio_cells
 from bgpo_trl.figures.curves import plot_success_curves
 from bgpo_trl.figures.of_run import draw_groups
 from bgpo_trl.figures.style import save_figure
-from bgpo_trl.runs.results import read_curves, read_final_tests, read_json, read_tests
+from bgpo_trl.runs.results import (
+    count,
+    read_curves,
+    read_final_tests,
+    read_json,
+    read_rows,
+    read_tests,
+)
 from suites import nico
 
 
@@ -32,7 +39,7 @@ class Arguments:
     """Summarize the directories of runs."""
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
-    """Directories with ``config.json``, ``eval.csv`` and ``final.csv``."""
+    """Run directories; without final tests, those columns stay empty."""
 
 
 def summarize(path: Path) -> dict[str, float]:
@@ -87,9 +94,11 @@ def best(path: Path) -> dict[str, float]:
 def describe(run: Path) -> str:
     """Return the table of a run in Markdown."""
     late, highest = summarize(run / "eval.csv"), best(run / "eval.csv")
-    final = read_final_tests(run / "final.csv")
+    final, summary = _measured(run)
 
     def trained(task: str | None, kind: str, column: str, digits: int) -> str:
+        if final is None:
+            return ""
         cells = [
             row[column]
             for row in final
@@ -120,23 +129,16 @@ def describe(run: Path) -> str:
         cells += [trained(task, kind, "success", 1) for kind in ("seen", "held-out")]
         cells.append(trained(task, "held-out", "task_inference", 2))
         lines.append(f"| {task or 'all'} | " + " | ".join(cells) + " |")
-    entries = {"commit": str, "command": str} | dict.fromkeys(
-        ("nodes", "groups", "group_purity"), list | NoneType
-    )
-    summary = read_json(run / "summary.json", entries)
-    episodes = read_json(run / "config.json").get("episodes")
-    if summary.get("episodes", episodes) != episodes:
-        raise ValueError(f"{run} is being extended: let the run finish")
-    nodes = "" if summary["nodes"] is None else f"GWR-B nodes: {summary['nodes']}. "
+    reached = late["episodes to 80 %"]
+    facts = [f"Episodes to 80 %: {'not reached' if np.isinf(reached) else int(reached)}."]
+    if summary.get("nodes") is not None:
+        facts.append(f"GWR-B nodes: {summary['nodes']}.")
     if summary.get("groups"):
         purity = " ".join(f"{100 * share:.1f}" for share in summary.get("group_purity") or ())
-        nodes += f"Groups: {summary['groups']}, {purity} % pure on held-out demonstrations. "
-    reached = late["episodes to 80 %"]
-    lines += [
-        "",
-        f"Episodes to 80 %: {'not reached' if np.isinf(reached) else int(reached)}. {nodes}"
-        f"Commit {summary['commit']}: `{summary['command']}`.",
-    ]
+        facts.append(f"Groups: {summary['groups']}, {purity} % pure on held-out demonstrations.")
+    if summary:
+        facts.append(f"Commit {summary['commit']}: `{summary['command']}`.")
+    lines += ["", " ".join(facts)]
     if own is not None and len(tasks) > 1:
         ratios = ", ".join(
             f"{task} {times or 'unknown'}"
@@ -144,6 +146,42 @@ def describe(run: Path) -> str:
         )
         lines.append(f"Own episodes to 50 %, relative to {tasks[0]}: {ratios}.")
     return "\n".join(lines)
+
+
+def _measured(run: Path) -> tuple[list[dict[str, str]] | None, dict[str, Any]]:
+    """Return the final tests and the summary of a run; None and empty if only `Trainer` wrote it.
+
+    Raises:
+        ValueError: If a file is missing or damaged, or the run has not finished.
+    """
+    measured = any((run / name).exists() for name in ("final.csv", "summary.json"))
+    needed = {} if measured else {"episodes": int, "eval_every": int}
+    config = read_json(run / "config.json", needed)
+    if not measured:
+        tested = max(int(row["episode"]) for row in read_tests(run / "eval.csv"))
+        if tested + config["eval_every"] <= config["episodes"]:
+            raise ValueError(
+                f"{run} has tests until episode {tested} of {config['episodes']}: let the run "
+                "finish"
+            )
+        return None, {}
+    final = read_final_tests(run / "final.csv")
+    entries = {"commit": str, "command": str} | dict.fromkeys(
+        ("nodes", "groups", "group_purity"), list | NoneType
+    )
+    summary = read_json(run / "summary.json", entries)
+    if summary.get("episodes", config.get("episodes")) != config.get("episodes"):
+        raise ValueError(f"{run} is being extended: let the run finish")
+    return final, summary
+
+
+def _has_groups(run: Path) -> bool:
+    """Return whether a run found groups of behaviors."""
+    path = run / "summary.json"
+    if path.exists():
+        return bool(read_json(path).get("groups"))
+    rows = read_rows(run / "train.csv", {"num_groups": count})
+    return any(int(row["num_groups"]) > 1 for row in rows)
 
 
 def _tasks(rows: list[dict[str, str]]) -> list[str]:
@@ -192,7 +230,7 @@ def main(arguments: Arguments) -> None:
         described, presented = describe(run), _presented(run)
         print(f"{run}\n\n{described}\n")
         save_figure(plot_success_curves(run / "eval.csv", presented=presented), run / "success.png")
-        if read_json(run / "summary.json").get("groups"):
+        if _has_groups(run):
             draw_groups(run, presented, run / "groups.png")
 
 

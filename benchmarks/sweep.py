@@ -26,12 +26,13 @@ from pathlib import Path
 from typing import Literal
 
 from bgpo_trl.algorithms import ABLATIONS
-from bgpo_trl.encoders.pretrained import load_pretrained
+from bgpo_trl.data.own_tasks import import_tasks
 from bgpo_trl.experiments import arguments as experiment
+from bgpo_trl.experiments.arguments import at_once
 from bgpo_trl.experiments.merge import merge
-from bgpo_trl.experiments.run import run_experiment
+from bgpo_trl.experiments.run import pretrained_for, run_experiment
 from bgpo_trl.files.locking import DirectoryLock
-from bgpo_trl.runs.config_file import settings_of
+from bgpo_trl.runs.config_file import Digests, settings_of
 from bgpo_trl.runs.directory import check_settings, holds_run
 from bgpo_trl.runs.results import read_json
 
@@ -42,7 +43,7 @@ except ImportError as error:
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Arguments(experiment.TaskArguments):
     """Run a grid of experiments on Ray."""
 
     algorithms: tuple[experiment.AlgorithmName, ...] = ("bgpo",)
@@ -89,10 +90,10 @@ def make_jobs(arguments: Arguments) -> dict[Path, list[Job]]:
                     preset=arguments.preset,
                     seeds=arguments.seeds,
                     episodes=arguments.episodes,
+                    tasks=arguments.tasks,
                 )
             )
-            starts = config.task_starts if setting == "continual" else (0, 0, 0)
-            config = replace(config, name=name, task_starts=starts)
+            config = replace(config if setting == "continual" else at_once(config), name=name)
             if setting == "ablation":
                 config = replace(config, algorithm=ABLATIONS[name].config)
             merged = arguments.out.absolute() / f"{setting}-{name}"
@@ -100,8 +101,14 @@ def make_jobs(arguments: Arguments) -> dict[Path, list[Job]]:
                 config.seeds[first : first + arguments.block]
                 for first in range(0, len(config.seeds), arguments.block)
             ]
+            bank = None if arguments.bank is None else arguments.bank.absolute()
             jobs[merged] = [
-                Job(merged / "-".join(["seeds", *map(str, block)]), replace(config, seeds=block))
+                Job(
+                    merged / "-".join(["seeds", *map(str, block)]),
+                    replace(config, seeds=block),
+                    module=arguments.module,
+                    bank=bank,
+                )
                 for block in blocks
             ]
     if not jobs:
@@ -109,38 +116,44 @@ def make_jobs(arguments: Arguments) -> dict[Path, list[Job]]:
     return jobs
 
 
-def check_directories(jobs: dict[Path, list[Job]], encoders: str) -> None:
+def check_directories(jobs: dict[Path, list[Job]], digests: Digests) -> None:
     """Check that the directories of the jobs hold no other runs.
 
     Args:
         jobs: Result of `make_jobs`.
-        encoders: Identity of the runs' encoders.
+        digests: Digests of the runs' encoders and demonstrations.
 
     Raises:
         ValueError: If a directory holds another run.
     """
     for merged, group in jobs.items():
         for job in group:
-            check_settings(job.directory, settings_of(job.config, encoders))
+            check_settings(job.directory, settings_of(job.config, digests))
         path = merged / "config.json"
         if path.exists():  # merged before, possibly from other blocks
             if not any(merged.glob("seeds-*")):
                 raise ValueError(f"{merged} is not a run of a sweep: choose another --out")
             seeds = read_json(path)["seeds"]
-            settings = {**settings_of(group[0].config, encoders), "seeds": seeds}
+            settings = {**settings_of(group[0].config, digests), "seeds": seeds}
             check_settings(merged, settings)
 
 
 def play(job: Job) -> None:
     """Play a job to its end, from its last checkpoint if there is one, and measures."""
-    arguments = experiment.Arguments(out=job.directory, resume=holds_run(job.directory))
+    import_tasks(job.module)
+    arguments = experiment.Arguments(
+        out=job.directory, resume=holds_run(job.directory), bank=job.bank
+    )
     run_experiment(arguments, "sweep", job.config)
 
 
 def main(arguments: Arguments) -> None:
     """Run the unfinished jobs, and merge the blocks."""
+    import_tasks(arguments.module)
     jobs = make_jobs(arguments)
-    check_directories(jobs, load_pretrained()[0].identity)
+    tasks = next(iter(jobs.values()))[0].config.tasks
+    encoders, bank = pretrained_for(tasks, arguments.bank)
+    check_directories(jobs, Digests(encoders.identity, bank.identity))
     todo = [job for group in jobs.values() for job in group if not job.finished]
     print(f"{sum(map(len, jobs.values()))} jobs, {len(todo)} of them to run")
     failed: dict[Job, str] = {}

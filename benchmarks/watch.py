@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont, ImageOps
 
 from bgpo_trl import TrainedPolicy, load_run
+from bgpo_trl.data.own_tasks import import_tasks
 from bgpo_trl.data.recording import record_demonstrations
-from bgpo_trl.experiments.arguments import command_line
+from bgpo_trl.experiments.arguments import ImportArguments, command_line
 from bgpo_trl.figures.frame_strips import plot_frame_strips
 from bgpo_trl.figures.of_run import draw_growth
 from bgpo_trl.figures.style import save_figure
@@ -38,7 +39,7 @@ _FPS = 10  # twice as fast as NICO
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Arguments(ImportArguments):
     """Film the trained policies of a run beside the demonstrations that they were shown."""
 
     run: tyro.conf.Positional[Path]
@@ -152,6 +153,7 @@ def _draw(picture: Image.Image, episode: Episode, step: int, top: int) -> None:
 def main(arguments: Arguments) -> None:
     """Run an episode of each task and write the pictures."""
     run, out = arguments.run, arguments.out or arguments.run / "figures"
+    import_tasks(arguments.module)
     policy = load_run(run, seed=arguments.policy)
     shown = demonstrate(policy.tasks, arguments.seed)
     episodes = [play(policy, task, frames, arguments.seed) for task, frames in shown.items()]

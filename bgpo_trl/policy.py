@@ -19,10 +19,10 @@ from bgpo_trl.algorithms.environments import clip, encode
 from bgpo_trl.algorithms.policy import Policy
 from bgpo_trl.configs import RunConfig
 from bgpo_trl.data.bank import DemonstrationBank
-from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.encoders.representation import Representation, embed_demonstrations
 from bgpo_trl.files.checkpoint import has_checkpoint, load_checkpoint
 from bgpo_trl.runs.config_file import read_config
+from bgpo_trl.runs.demonstrations import load_inputs
 from bgpo_trl.seeding import stream_seed
 from suites.nico.rendering import FRAME_HEIGHT, FRAME_WIDTH
 
@@ -180,8 +180,8 @@ def load_run(
         make: Constructor of the algorithm, as for `Trainer`, if it is not in `ALGORITHMS`.
 
     Raises:
-        ValueError: If the run, its checkpoint, seed, algorithm or encoders cannot be found, or if
-            it learned from the ground truth instead of frames.
+        ValueError: If the run, its checkpoint, seed, algorithm, tasks, encoders or demonstrations
+            cannot be found, or if it learned from the ground truth instead of frames.
 
     Example:
         >>> import bgpo_trl
@@ -191,11 +191,11 @@ def load_run(
         ValueError: no-run holds no run: there is no config.json
     """
     path = Path(path)
-    config, identity = read_config(path / "config.json")
+    config, digests = read_config(path / "config.json")
     if seed is not None and seed not in config.seeds:
         seeds = ", ".join(map(str, config.seeds))
         raise ValueError(f"{path} has no seed {seed!r}: choose one of {seeds}")
-    if config.algorithm.state != "latent" or identity is None:
+    if config.algorithm.state != "latent" or digests.encoders is None:
         raise ValueError(f"{path} learned from the ground truth: only runs from frames can watch")
     if make is None:
         try:
@@ -207,8 +207,7 @@ def load_run(
             ) from None
     if not has_checkpoint(path / "checkpoint"):
         raise ValueError(f"{path} has no checkpoint yet: let the run reach its first one")
-    encoders, bank = _encoders(path, identity)
-    bank = bank.for_tasks(config.tasks)
+    encoders, bank = load_inputs(path, config.tasks, digests)
     algorithm = make(config.algorithm, seeds=config.seeds, bank=bank.seen(), encoders=encoders)
     saved = load_checkpoint(path / "checkpoint", mmap=True)
     try:
@@ -224,19 +223,6 @@ def load_run(
         ) from error
     seed = config.seeds[0] if seed is None else seed
     return TrainedPolicy(config, algorithm, encoders=encoders, bank=bank, seed=seed)
-
-
-def _encoders(path: Path, identity: str) -> tuple[Representation, DemonstrationBank]:
-    """Return the encoders of a run, its own or the shipped ones."""
-    own = path / "encoders" / "nico.safetensors"
-    encoders, bank = load_pretrained(own if own.exists() else None)
-    if encoders.identity != identity:
-        present = own if own.exists() else "those that come with the package"
-        raise ValueError(
-            f"{path} was trained with the encoders {identity[:12]}, not with {present} "
-            f"({encoders.identity[:12]}): put its own at {own}, with their bank"
-        )
-    return encoders, bank
 
 
 def _frames(frames: ArrayLike, wanted: str, ndim: int) -> Tensor:

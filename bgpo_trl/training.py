@@ -23,7 +23,8 @@ from bgpo_trl.files.closing import Closing
 from bgpo_trl.files.interrupts import interrupts_wait
 from bgpo_trl.files.locking import DirectoryLock
 from bgpo_trl.files.progress import progress_bar
-from bgpo_trl.runs.config_file import settings_of
+from bgpo_trl.runs.config_file import Digests, settings_of
+from bgpo_trl.runs.demonstrations import keep_bank
 from bgpo_trl.runs.directory import load_last
 from bgpo_trl.runs.gwr_graphs import growth_moments, save_graph
 from bgpo_trl.runs.logger import RunLogger
@@ -49,7 +50,8 @@ class Trainer(Closing):
     Args:
         config: The run.
         directory: The run's directory: ``config.json``, ``train.csv``, ``eval.csv``,
-            ``checkpoint/``, and in ``gwr/`` graphs of the first seed's GWR-B during training.
+            ``checkpoint/``, in ``gwr/`` graphs of the first seed's GWR-B during training, and
+            ``bank.safetensors`` if the demonstrations do not come with the encoders.
         bank: Embedded demonstrations, seen and held out, of at least ``config.tasks``.
         encoders: Trained encoders, or None if unused.
         make: Constructor of the algorithm; by default that of the entry ``config.name``.
@@ -59,9 +61,9 @@ class Trainer(Closing):
         progress: Whether to show a progress bar.
 
     Raises:
-        ValueError: If the directory holds a run with other settings or encoders, or any run and
-            ``resume`` is False; if rows, checkpoint or ``config.json`` of a run to resume are
-            missing; or if the bank has no demonstration of a task.
+        ValueError: If the directory holds a run with other settings, encoders or demonstrations, or
+            any run and ``resume`` is False; if rows, checkpoint or ``config.json`` of a run to
+            resume are missing; or if the bank has no demonstration of a task.
         BlockingIOError: If another process works in the directory.
     """
 
@@ -106,7 +108,7 @@ class Trainer(Closing):
         # Rows of seeds that finished early, kept for a resumed run with more episodes.
         self._later: list[dict[str, Any]] = []
         encoders_used = None if encoders is None else encoders.identity
-        self._settings = settings_of(config, encoders_used)
+        self._settings = settings_of(config, Digests(encoders_used, bank.identity))
         self._state: TensorDictBase | None = None
         self._lock = DirectoryLock(self.directory)
         try:
@@ -120,6 +122,8 @@ class Trainer(Closing):
                 self.logger.truncate_to(saved["position"])
                 for row in saved.get("later", []):
                     self._log(row)
+            if encoders is not None:  # Others cannot be loaded to watch demonstrations.
+                keep_bank(self.directory, bank, encoders)
         except BaseException:
             self._lock.release()
             raise

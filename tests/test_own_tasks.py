@@ -162,6 +162,28 @@ def test_a_run_does_not_depend_on_tasks_that_are_not_in_it(play):
         assert alone == beside
 
 
+def test_a_run_is_not_resumed_with_other_demonstrations(make_config, tmp_path):
+    config, bank = make_config("state", "oracle", tasks=("at_once",), task_starts=(0,)), bank_of
+    parts = {"resume": True, "progress": False}
+    with Trainer(config, tmp_path, bank=bank("at_once"), **parts) as trainer:
+        trainer.run()
+    with Trainer(config, tmp_path, bank=bank("at_once") + bank("grasp_glass"), **parts):
+        pass  # The same, beside others that the run does not show.
+    with pytest.raises(ValueError, match=r"holds a run with other settings \(bank is \w{64} there"):
+        Trainer(config, tmp_path, bank=bank("at_once", n=7), **parts)
+
+
+def test_a_module_may_be_renamed_between_a_run_and_its_resumption(make_config, tmp_path):
+    config = make_config("state", "oracle", tasks=("at_once",), task_starts=(0,))
+    for module in ("my_tasks", "renamed"):
+        nico.add_task("at_once", type("Renamed", (AtOnce,), {"__module__": module}))
+        bank = bank_of("at_once")
+        with Trainer(config, tmp_path, bank=bank, resume=True, progress=False) as trainer:
+            trainer.run()
+        stored = json.loads((tmp_path / "config.json").read_text())
+        assert stored["task_modules"] == {"at_once": module}
+
+
 def test_a_bank_selects_and_labels_tasks_by_name():
     bank = bank_of("a", "b", "c", n=2)
     chosen = bank.for_tasks(["c", "a"])

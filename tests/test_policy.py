@@ -6,7 +6,7 @@ import runpy
 import shutil
 import subprocess
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,12 +24,17 @@ from bgpo_trl.evaluation import Evaluator
 from bgpo_trl.training import Trainer
 from bgpo_trl.transforms import TaskSchedule
 from suites import nico
+from suites.nico import nico as suite_nico
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 ROOT = Path(__file__).parents[1]
 TASKS = nico.ALL_TASKS
 NAMES = [*ALGORITHMS, "r_int"]
 LABELED = [name for name in NAMES if name.startswith(("maml", "dist-nll", "oracle"))]
+METADATA = {
+    "scene_version": nico.scene_version(),
+    "config": json.dumps(asdict(RepresentationConfig())),
+}
 every_algorithm = pytest.mark.parametrize("name", NAMES)
 
 
@@ -70,12 +75,8 @@ def trainer_of(encoders, tested_bank, make_config, easy_world, tmp_path_factory)
         if name not in trainers:
             config = make_config(name=name, episodes=16)
             directory = tmp_path_factory.mktemp(name) / "run"
-            metadata = {
-                "scene_version": nico.scene_version(),
-                "config": json.dumps(asdict(RepresentationConfig())),
-            }
             weights = directory / "encoders" / "nico.safetensors"
-            save_representation(Representation(encoders.vae, encoders.lae, metadata), weights)
+            save_representation(Representation(encoders.vae, encoders.lae, METADATA), weights)
             tested_bank.save(bank_path(weights), encoder_id=encoders.identity)
             trainers[name] = Trainer(
                 config,
@@ -291,6 +292,36 @@ def test_an_unknown_task_is_refused(load):
         load("oracle").condition(DEMONSTRATIONS[0], task="juggle")
 
 
+class AtOnce(nico.NicoTask):
+    """Done with the first step, whatever it is."""
+
+    def succeeded(self, physics):
+        return physics.time() > 0
+
+
+def test_a_run_of_own_tasks_is_loaded_where_the_task_is_known(
+    encoders, bank, make_config, tmp_path
+):
+    nico.add_task("at_once", AtOnce)
+    tasks = ("at_once", TASKS[1])
+    own = replace(bank, tasks=("at_once", *TASKS[1:]))
+    config = make_config(tasks=tasks, task_starts=(0, 2), episodes=4)
+    run = tmp_path / "run"
+    weights = run / "encoders" / "nico.safetensors"
+    save_representation(Representation(encoders.vae, encoders.lae, METADATA), weights)
+    with Trainer(config, run, bank=own, encoders=encoders, progress=False) as trainer:
+        trainer.run()
+    policy = bgpo_trl.load_run(run)
+    assert (policy.tasks, policy.bank.tasks) == (tasks, tasks)
+    assert policy.bank.identity == own.for_tasks(tasks).identity
+    assert policy.condition(DEMONSTRATIONS[0], task="at_once").task == "at_once"
+
+    suite_nico._TASKS.pop("at_once")
+    said = f"the task 'at_once', added by the module {AtOnce.__module__!r}: name a module"
+    with pytest.raises(ValueError, match=said):
+        bgpo_trl.load_run(run)
+
+
 def spoil_encoders(run):
     shutil.rmtree(run / "encoders")
 
@@ -324,6 +355,7 @@ def see_the_truth(run):
         (spoil_checkpoints, "holds no intact checkpoint"),
         (spoil_encoders, r"was trained with the encoders \w{12}, not with those that come with"),
         (lambda run: rewrite(run, encoders="0" * 64), "trained with the encoders 000000000000, no"),
+        (lambda run: rewrite(run, bank="0" * 64), "with the demonstrations 000000000000, not with"),
         (lambda run: rewrite(run, encoders=None), "learned from the ground truth"),
         (see_the_truth, "learned from the ground truth"),
         (widen, r"checkpoint does not fit .*config.json \(.*\): use the version of the code"),

@@ -139,6 +139,15 @@ class Run:
     summary: dict[str, Any]
     curves: Curves
 
+    @property
+    def tasks(self) -> tuple[str, ...]:
+        """Names of the tasks; runs of earlier versions saved none, theirs are the paper's."""
+        return _tasks(self.config)
+
+
+def _tasks(config: dict[str, Any]) -> tuple[str, ...]:
+    return tuple(config.get("tasks") or nico.ALL_TASKS)
+
 
 def read_group(runs: Path, group: Group) -> tuple[dict[str, Run], list[str]]:
     """Read the runs of a group in a directory and cut them to a common length.
@@ -159,7 +168,7 @@ def read_group(runs: Path, group: Group) -> tuple[dict[str, Run], list[str]]:
         config = read_json(directory / "config.json")
         path = directory / "summary.json"
         summary = read_json(path) if path.exists() else {}
-        curves = read_curves(directory / "eval.csv", nico.ALL_TASKS)
+        curves = read_curves(directory / "eval.csv", _tasks(config))
         if int(curves.episodes[-1]) < config["episodes"]:
             notes.append(
                 f"{name}: not finished, {curves.episodes[-1]} of {config['episodes']} episodes"

@@ -18,7 +18,6 @@ from bgpo_trl.analysis.comparison import (
     task_area,
 )
 from bgpo_trl.runs.results import read_outcomes, read_rows
-from suites import nico
 
 Table = list[list[str]]
 """Rows of cells; the first row holds the column names."""
@@ -26,7 +25,8 @@ Table = list[list[str]]
 
 def main_table(runs: Mapping[str, Run], statistics: Statistics) -> Table:
     """Return the table of success of a group's runs."""
-    rows = [["", "last 10 %: IQM", "mean", *(f"task {i + 1}" for i in range(3)), "area: IQM"]]
+    tasks = _numbered(runs)
+    rows = [["", "last 10 %: IQM", "mean", *tasks, "area: IQM"]]
     rows[0].append("episodes to 80 %")
     for run in runs.values():
         late = late_scores(run)
@@ -42,6 +42,11 @@ def main_table(runs: Mapping[str, Run], statistics: Statistics) -> Table:
             ]
         )
     return rows
+
+
+def _numbered(runs: Mapping[str, Run]) -> list[str]:
+    """Return the column names of the tasks, which all runs have in common."""
+    return [f"task {number}" for number, _ in enumerate(next(iter(runs.values())).tasks, 1)]
 
 
 def continual_table(continual: Mapping[str, Run], concurrent: Mapping[str, Run]) -> Table:
@@ -93,11 +98,11 @@ def own_episodes(path: Path, tasks: Sequence[str], last: int | None = None) -> V
 
 def speed_table(runs: Mapping[str, Run]) -> Table:
     """Return the table of learning times: each task's training episodes to 50 % success."""
-    tasks = [f"task {i + 1}" for i in range(3)]
+    tasks = _numbered(runs)
     rows = [["", *tasks, *(f"{task} : {tasks[0]}" for task in tasks[1:])]]
     for run in runs.values():
         last = int(run.curves.episodes[-1])
-        episodes = own_episodes(run.directory / "train.csv", nico.ALL_TASKS, last)
+        episodes = own_episodes(run.directory / "train.csv", run.tasks, last)
         if episodes is None:
             rows.append([run.name, *["no train.csv"] * len(tasks), *[""] * (len(tasks) - 1)])
         else:

@@ -10,7 +10,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from bgpo_trl.files.tensor_file import load_tensors, save_tensors
+from bgpo_trl.files.tensor_file import digest, load_tensors, save_tensors
 from suites import nico
 
 _LATENT_CODES, _ACTION_CODES = 25.0, 127.0
@@ -80,6 +80,13 @@ class DemonstrationSteps:
         """Return the steps of selected demonstrations, sharing the memory of all frames."""
         return replace(self, first=self.first[rows], length=self.length[rows])
 
+    def compact(self) -> DemonstrationSteps:
+        """Return the steps without frames that belong to none of the demonstrations."""
+        first = self.length.cumsum(0) - self.length
+        frame = torch.arange(int(self.length.sum()))
+        frame += (self.first - first).repeat_interleave(self.length)
+        return replace(self, latent=self.latent[frame], action=self.action[frame], first=first)
+
     def __add__(self, other: DemonstrationSteps) -> DemonstrationSteps:
         """Concatenate the steps of two sets of demonstrations."""
         return DemonstrationSteps(
@@ -124,6 +131,11 @@ class DemonstrationBank:
                 f"{len(self.embedding)}"
             )
 
+    @property
+    def identity(self) -> str:
+        """Digest of the demonstrations, without the names of their tasks."""
+        return digest(self._tensors())
+
     def seen(self) -> DemonstrationBank:
         """Return the demonstrations for training episodes."""
         return self._select(self.train)
@@ -155,7 +167,7 @@ class DemonstrationBank:
         if missing:
             raise ValueError(
                 f"the bank has no demonstration of {missing[0]!r}, only of "
-                f"{', '.join(self.tasks)}: record and embed some (docs/extending.md)"
+                f"{', '.join(self.tasks)}: record and embed some, for --bank (docs/extending.md)"
             )
         label = torch.tensor([tasks.index(n) if n in tasks else -1 for n in self.tasks])
         kept = self._select(label[self.task] >= 0)
@@ -188,15 +200,19 @@ class DemonstrationBank:
         Raises:
             OSError: If the file cannot be written; an existing file is kept.
         """
-        tensors = {"embedding": self.embedding, "task": self.task, "train": self.train}
-        if self.steps is not None:
-            tensors |= {f"steps.{key}": value for key, value in vars(self.steps).items()}
         meta = {
             "scene_version": nico.scene_version(),
             "encoder_id": encoder_id,
             "tasks": ",".join(self.tasks),
         }
-        save_tensors(path, tensors, meta)
+        save_tensors(path, self._tensors(), meta)
+
+    def _tensors(self) -> dict[str, Tensor]:
+        tensors = {"embedding": self.embedding, "task": self.task, "train": self.train}
+        if self.steps is not None:
+            steps = vars(self.steps.compact())
+            tensors |= {f"steps.{key}": value for key, value in steps.items()}
+        return tensors
 
     @classmethod
     def load(cls, path: str | Path, *, encoder_id: str) -> DemonstrationBank:
@@ -207,7 +223,9 @@ class DemonstrationBank:
                 encoders.
         """
         wanted = {"scene_version": nico.scene_version(), "encoder_id": encoder_id}
-        remedy = "make it again with `--train-encoders`"
+        remedy = (
+            "make it again with `python -m bgpo_trl.encoders.make_bank`, or use `--train-encoders`"
+        )
         try:
             tensors, meta = load_tensors(path)
             if not meta.get("tasks"):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -22,6 +22,7 @@ from bgpo_trl.data.dataset import (
     read_meta,
     write_meta,
 )
+from bgpo_trl.data.own_tasks import import_tasks
 from bgpo_trl.files.progress import progress_bar
 from suites import nico
 from suites.nico.base import Environment
@@ -234,6 +235,8 @@ def _perform(
 
 def main(
     path: tyro.conf.Positional[Path],
+    tasks: tuple[str, ...] = nico.ALL_TASKS,
+    module: Annotated[str | None, tyro.conf.arg(name="import")] = None,
     per_task: int = 1_200,
     held_out_per_task: int = 200,
     play: bool = False,
@@ -243,13 +246,21 @@ def main(
 
     Args:
         path: Folder of the dataset.
+        tasks: Tasks to demonstrate.
+        module: Module that adds tasks with nico.add_task, imported first.
         per_task: Demonstrations of each task.
         held_out_per_task: How many of those are held out for test episodes.
         play: Record random play instead of demonstrations.
         seed: Seed of the start states and of the noise.
     """
+    import_tasks(module)
     record_demonstrations(
-        path, per_task=per_task, held_out_per_task=held_out_per_task, play=play, seed=seed
+        path,
+        tasks=tasks,
+        per_task=per_task,
+        held_out_per_task=held_out_per_task,
+        play=play,
+        seed=seed,
     )
 
 

@@ -1,4 +1,7 @@
-"""Embed recorded demonstrations: ``python -m bgpo_trl.encoders.make_bank data/nico``."""
+"""Embed recorded demonstrations for a run with ``--bank``.
+
+python -m bgpo_trl.encoders.make_bank data/own own_bank.safetensors
+"""
 
 from __future__ import annotations
 
@@ -12,10 +15,9 @@ import tyro
 from tensordict import TensorDictBase
 
 from bgpo_trl.data.bank import DemonstrationBank, DemonstrationSteps
-from bgpo_trl.data.dataset import load_demonstrations
+from bgpo_trl.data.dataset import load_demonstrations, read_meta
 from bgpo_trl.encoders.representation import (
     Representation,
-    bank_path,
     default_weights,
     encode_frames,
     load_representation,
@@ -60,22 +62,23 @@ def make_bank(
 
 def main(
     dataset: tyro.conf.Positional[Path],
+    out: tyro.conf.Positional[Path],
     weights: Path | None = None,
-    out: Path | None = None,
     actions: Literal["inferred", "recorded"] = "inferred",
 ) -> None:
     """Embed a recorded dataset with trained encoders.
 
     Args:
         dataset: Folder of the recorded demonstrations.
+        out: Bank to write.
         weights: Encoder weights; the pretrained ones by default.
-        out: Bank to write; by default the one beside the encoder weights.
         actions: Actions of the stored demonstrations, inferred from frames or recorded.
     """
     weights = default_weights() if weights is None else weights
     encoders = load_representation(weights, scene_version=nico.scene_version())
-    bank = make_bank(encoders, load_demonstrations(dataset), actions=actions)
-    bank.save(out or bank_path(weights), encoder_id=encoders.identity)
+    tasks = read_meta(dataset)["tasks"]
+    bank = make_bank(encoders, load_demonstrations(dataset), tasks=tasks, actions=actions)
+    bank.save(out, encoder_id=encoders.identity)
 
 
 if __name__ == "__main__":

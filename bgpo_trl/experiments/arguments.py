@@ -14,6 +14,8 @@ import tyro
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.rl import RL
 from bgpo_trl.configs import PRESETS, RunConfig
+from bgpo_trl.data.own_tasks import import_tasks
+from suites import nico
 
 AlgorithmName = Literal[
     "bgpo",
@@ -32,8 +34,28 @@ AlgorithmName = Literal[
 """The keys of `ALGORITHMS`, spelled out for the command line's choices."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class ImportArguments:
+    """Own tasks in a command."""
+
+    module: Annotated[str | None, tyro.conf.arg(name="import")] = None
+    """Module that adds tasks with nico.add_task, imported first; here or installed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskArguments(ImportArguments):
+    """Tasks of a run."""
+
+    tasks: tuple[str, ...] | None = None
+    """Tasks in the order of presentation; the paper's three by default. Unless three, they start at
+    even intervals."""
+    bank: Path | None = None
+    """Demonstrations embedded by bgpo_trl.encoders.make_bank; those of tasks that it lacks come
+    with the package. With --resume, the run's own by default."""
+
+
 @dataclass(frozen=True)
-class Arguments:
+class Arguments(TaskArguments):
     """Train an algorithm and plot its success."""
 
     algorithm: AlgorithmName = "bgpo"
@@ -73,14 +95,17 @@ class Arguments:
 def run_config(arguments: Arguments) -> RunConfig:
     """Return the preset of the continual setting, with the changes of the command line.
 
+    Imports the module of own tasks first.
+
     Raises:
-        ValueError: If the settings are invalid.
+        ValueError: If the settings are invalid, or a task does not exist.
     """
+    import_tasks(arguments.module)
     algorithm = ALGORITHMS[arguments.algorithm].config
     if arguments.rl != algorithm.rl.name:
         algorithm = replace(algorithm, rl=RL[arguments.rl].config)
     config = replace(
-        PRESETS[arguments.preset],
+        _with_tasks(PRESETS[arguments.preset], arguments.tasks),
         name=arguments.algorithm,
         algorithm=algorithm,
         held_out=arguments.held_out,
@@ -99,6 +124,28 @@ def run_config(arguments: Arguments) -> RunConfig:
     if arguments.eval_every is not None:
         config = replace(config, eval_every=arguments.eval_every)
     return config
+
+
+def at_once(config: RunConfig) -> RunConfig:
+    """Return a run whose tasks are all presented from the start."""
+    return replace(config, task_starts=(0,) * len(config.tasks))
+
+
+def _with_tasks(config: RunConfig, tasks: tuple[str, ...] | None) -> RunConfig:
+    """Return a preset with other tasks."""
+    if tasks is None:
+        return config
+    unknown = [name for name in tasks if name not in nico.TASKS]
+    if unknown or not tasks:
+        wrong = f"there is no task {unknown[0]!r}" if unknown else "it is empty"
+        raise ValueError(
+            f"--tasks: {wrong}; name some of {', '.join(nico.TASKS)}, or with --import MODULE some "
+            "that a module adds"
+        )
+    starts, n = config.task_starts, len(tasks)
+    if n != len(starts):
+        starts = tuple(position * config.episodes // n for position in range(n))
+    return replace(config, tasks=tasks, task_starts=starts)
 
 
 def command_line(

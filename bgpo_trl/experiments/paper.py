@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from bgpo_trl.algorithms import ABLATIONS
-from bgpo_trl.experiments.arguments import Arguments, run_config
+from bgpo_trl.experiments.arguments import Arguments, at_once, run_config
 from bgpo_trl.experiments.run import run_experiment
 
 __all__ = ["AblationArguments", "ablation", "concurrent", "continual"]
@@ -22,7 +22,7 @@ def continual(arguments: Arguments) -> str:
 
 def concurrent(arguments: Arguments) -> str:
     """Train an algorithm on tasks that are all presented from the start (Fig. 6)."""
-    config = replace(run_config(arguments), task_starts=(0, 0, 0))
+    config = at_once(run_config(arguments))
     return run_experiment(arguments, "concurrent", config)
 
 
@@ -52,6 +52,6 @@ def ablation(arguments: AblationArguments) -> str:
     algorithm = replace(ABLATIONS[arguments.variant].config, rl=config.algorithm.rl)
     config = replace(config, name=arguments.variant, algorithm=algorithm)
     if not arguments.continual:
-        config = replace(config, task_starts=(0, 0, 0))
+        config = at_once(config)
     name = "ablation-continual" if arguments.continual else "ablation"
     return run_experiment(arguments, name, config)

@@ -33,10 +33,19 @@ RETRIES = 10
 
 @dataclass(frozen=True)
 class Job:
-    """A run of a block of seeds, and its directory."""
+    """A run of a block of seeds, and its directory.
+
+    Attributes:
+        directory: Directory of the run.
+        config: The run.
+        module: Module that adds its tasks, see `bgpo_trl.data.own_tasks.import_tasks`.
+        bank: Demonstrations of tasks that are not the paper's.
+    """
 
     directory: Path
     config: RunConfig
+    module: str | None = None
+    bank: Path | None = None
 
     def __str__(self) -> str:
         return f"{self.directory.parent.name}/{self.directory.name}"
@@ -121,8 +130,9 @@ def play_jobs(
     Raises:
         KeyboardInterrupt: On Ctrl-C, which is passed on to ``play``; it has a minute to save.
     """
-    # Workers import modules beside `play` and from this package.
+    # Workers import modules beside `play`, from this package and, of own tasks, from here.
     folders = [Path(inspect.getfile(play)).resolve().parent, Path(__file__).resolve().parents[2]]
+    folders.append(Path.cwd())
     path = [*map(str, folders), os.environ.get("PYTHONPATH", "")]
     environment = {"PYTHONPATH": os.pathsep.join(filter(None, path)), "OMP_NUM_THREADS": "1"}
     task = ray.remote(

@@ -6,7 +6,7 @@ import json
 import shlex
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
@@ -21,6 +21,7 @@ from bgpo_trl.experiments.measure import draw, measure
 from bgpo_trl.experiments.resuming import as_begun, check_resumable, is_finished
 from bgpo_trl.files.locking import DirectoryLock
 from bgpo_trl.machine import choose_device, set_threads
+from bgpo_trl.runs.demonstrations import BANK
 from bgpo_trl.training import Trainer
 
 _DATASET, _ENCODERS = "demonstrations", "encoders"  # folders of a run that trains its encoders
@@ -50,9 +51,12 @@ def run_experiment(
         Results to print, with the path of the run directory.
 
     Raises:
-        ValueError: If the directory holds another run, or no run to resume.
+        ValueError: If the directory holds another run, or no run to resume; or if ``bank`` is given
+            for encoders that are yet to be trained.
         BlockingIOError: If another process is using the directory.
     """
+    if arguments.train_encoders and arguments.bank is not None:
+        raise ValueError("--bank is of the pretrained encoders: leave it or --train-encoders out")
     commit = commit_of_code()  # read first, since commits may follow during training
     set_threads(arguments.threads)
     device = choose_device(arguments.device)
@@ -65,8 +69,7 @@ def run_experiment(
     elif (out / "config.json").exists():
         raise ValueError(f"{out} holds a run: --resume continues it, --out names another directory")
     with DirectoryLock(out):
-        encoders, bank = _encoders(arguments, out, device)
-        bank = bank.for_tasks(config.tasks)
+        encoders, bank = _encoders(arguments, config.tasks, out, device)
         with Trainer(
             config,
             out,
@@ -88,8 +91,16 @@ def run_experiment(
     return "\n".join(lines)
 
 
-def _makes_encoders(arguments: Arguments) -> bool:
-    return arguments.train_encoders or arguments.preset in STAGE_PRESETS
+def _bank(arguments: Arguments, out: Path) -> Path | None:
+    """Return the bank that is given or, in a run to resume, kept."""
+    kept = out / BANK
+    return kept if arguments.bank is None and arguments.resume and kept.exists() else arguments.bank
+
+
+def _makes_encoders(arguments: Arguments, out: Path) -> bool:
+    # A bank fits the pretrained encoders alone.
+    small = arguments.preset in STAGE_PRESETS and _bank(arguments, out) is None
+    return arguments.train_encoders or small
 
 
 def _continued(arguments: Arguments, config: RunConfig, out: Path) -> RunConfig:
@@ -99,26 +110,49 @@ def _continued(arguments: Arguments, config: RunConfig, out: Path) -> RunConfig:
         ValueError: If the directory holds neither a run nor the beginning of its encoders.
     """
     begun = any((out / folder).exists() for folder in (_DATASET, _ENCODERS))
-    if not (_makes_encoders(arguments) and begun):
+    if not (_makes_encoders(arguments, out) and begun):
         check_resumable([out])
     return as_begun(config, out, keep_eval_every=arguments.eval_every is not None)
 
 
 def _encoders(
-    arguments: Arguments, out: Path, device: torch.device
+    arguments: Arguments, tasks: tuple[str, ...], out: Path, device: torch.device
 ) -> tuple[Representation, DemonstrationBank]:
-    """Return the pretrained encoders and their bank, or new ones made in the run directory."""
-    if not _makes_encoders(arguments):
-        return load_pretrained()
+    """Return the pretrained encoders and a bank, or new ones made in the run directory."""
+    if not _makes_encoders(arguments, out):
+        return pretrained_for(tasks, _bank(arguments, out))
     stage = STAGE_PRESETS.get(arguments.preset)
-    return make_pretrained(
+    encoders, bank = make_pretrained(
         out / _ENCODERS / "nico.safetensors",
         out / _DATASET,
         folder=out / _ENCODERS,
         command=shlex.join(["python", *sys.argv]),
         device=device,
+        tasks=tasks,
         **({} if stage is None else vars(stage)),
     )
+    return encoders, bank.for_tasks(tasks)
+
+
+def pretrained_for(
+    tasks: Sequence[str], bank: Path | None = None
+) -> tuple[Representation, DemonstrationBank]:
+    """Load the pretrained encoders and the demonstrations of some tasks.
+
+    Args:
+        tasks: Names of the tasks.
+        bank: Bank to take them from; those that it lacks are taken from the shipped one.
+
+    Raises:
+        ValueError: If the bank is missing, damaged or of other encoders, or a task has no
+            demonstrations.
+    """
+    encoders, found = load_pretrained()
+    if bank is not None:
+        own = DemonstrationBank.load(bank, encoder_id=encoders.identity)
+        lacking = [task for task in tasks if task not in own.tasks]
+        found = own + found.for_tasks(lacking) if lacking else own
+    return encoders, found.for_tasks(tasks)
 
 
 def commit_of_code() -> str:

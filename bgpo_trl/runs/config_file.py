@@ -6,15 +6,28 @@ import json
 import sys
 from dataclasses import asdict, is_dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
 
 from bgpo_trl.algorithms import ABLATIONS, ALGORITHMS
 from bgpo_trl.algorithms.rl import RL
 from bgpo_trl.configs import AlgorithmConfig, RLConfig, RunConfig
 from bgpo_trl.runs.directory import plain_settings
+from suites import nico
 
 
-def read_config(path: str | Path) -> tuple[RunConfig, str | None]:
+class Digests(NamedTuple):
+    """Digests of the files that a run was trained with.
+
+    Attributes:
+        encoders: That of its encoders; None if it used none.
+        bank: That of the demonstrations of its tasks; None in runs of an earlier version.
+    """
+
+    encoders: str | None
+    bank: str | None
+
+
+def read_config(path: str | Path) -> tuple[RunConfig, Digests]:
     """Read the settings that `Trainer` wrote: the inverse of ``dataclasses.asdict``.
 
     Settings missing from a run of an earlier version get their defaults.
@@ -23,41 +36,69 @@ def read_config(path: str | Path) -> tuple[RunConfig, str | None]:
         path: The ``config.json`` of a run.
 
     Returns:
-        The settings, and the identity of the run's encoders; ``None`` if it used none.
+        The settings, and the digests of the encoders and demonstrations.
 
     Raises:
-        ValueError: If the file is missing, or was not written by this version.
+        ValueError: If the file is missing, was not written by this version, or names a task that
+            has not been added.
     """
     path = Path(path)
     try:
         settings = json.loads(path.read_text())
         if not isinstance(settings, dict) or not isinstance(settings.get("algorithm"), dict):
             raise ValueError("it holds no settings of a run")
-        encoders = settings.pop("encoders", None)
-        if not isinstance(encoders, str | None):
-            raise ValueError(f"encoders is {encoders!r}")
-        values = settings.pop("algorithm")
+        digests = Digests(*(settings.pop(name, None) for name in Digests._fields))
+        for name, found in digests._asdict().items():
+            if not isinstance(found, str | None):
+                raise ValueError(f"{name} is {found!r}")
+        values, modules = settings.pop("algorithm"), settings.pop("task_modules", {})
         kind = _algorithm_config(settings.get("name"), settings.pop("algorithm_class", None))
         algorithm = _read(kind, values, "algorithm.")
-        return _read(RunConfig, {**settings, "algorithm": algorithm}, ""), encoders
+        unknown = _unknown_task(settings.get("tasks"))
+        if unknown is None:
+            return _read(RunConfig, {**settings, "algorithm": algorithm}, ""), digests
     except (FileNotFoundError, NotADirectoryError):
         raise ValueError(f"{path.parent} holds no run: there is no {path.name}") from None
     except (ValueError, OSError, RecursionError) as error:
         raise ValueError(
             f"{path} cannot be read ({error}): use the version of the code that made the run"
         ) from error
+    # The module is not imported, since a file should not decide what is imported.
+    module = modules.get(unknown) if isinstance(modules, dict) else None
+    known = isinstance(module, str) and module != "__main__"
+    where = f"the module {module!r}" if known else "a script or notebook"
+    raise ValueError(
+        f"{path} has the task {unknown!r}, added by {where}: name a module that adds it with "
+        "--import, or add it first in Python"
+    )
 
 
-def settings_of(config: RunConfig, encoders: str | None) -> dict[str, Any]:
-    """Return the content of ``config.json``: all settings and the class of the hyperparameters.
+def settings_of(config: RunConfig, digests: Digests) -> dict[str, Any]:
+    """Return the content of ``config.json``.
+
+    In addition to all settings, it names the class of the hyperparameters and the modules of tasks
+    that are not the paper's.
 
     Args:
         config: The run.
-        encoders: Identity of its encoders; None if it uses none.
+        digests: Digests of its encoders and demonstrations.
     """
     kind = type(config.algorithm)
-    name = f"{kind.__module__}.{kind.__qualname__}"
-    return plain_settings({**asdict(config), "algorithm_class": name, "encoders": encoders})
+    added = {name: nico.TASKS[name].__module__ for name in config.tasks}
+    return plain_settings(
+        {
+            **asdict(config),
+            "algorithm_class": f"{kind.__module__}.{kind.__qualname__}",
+            "task_modules": {name: added[name] for name in added if name not in nico.ALL_TASKS},
+            **digests._asdict(),
+        }
+    )
+
+
+def _unknown_task(tasks: object) -> str | None:
+    """Return the first task that is not in the suite; None if there is none, or no list."""
+    names = tasks if isinstance(tasks, list) else []
+    return next((name for name in names if isinstance(name, str) and name not in nico.TASKS), None)
 
 
 def _algorithm_config(name: object, stored: object) -> type[AlgorithmConfig]:

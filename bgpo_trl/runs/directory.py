@@ -115,7 +115,11 @@ def load_last(directory: Path, config: Any) -> dict[str, Any] | None:
 
 
 def _compare(where: str | os.PathLike[str], saved: Any, config: Any, longer: bool) -> None:
-    old, new = dict(_flatten(saved)), dict(_flatten(plain_settings(config)))
+    old, new = (
+        # A module that was renamed adds the same tasks.
+        {name: v for name, v in _flatten(settings) if not name.startswith("task_modules")}
+        for settings in (saved, plain_settings(config))
+    )
     if longer and type(old.get("episodes")) is type(new.get("episodes")) is int:
         old["episodes"] = max(old["episodes"], new["episodes"])
     differences = [

@@ -66,7 +66,8 @@ def finished_runs(bank, encoders, make_config, tmp_path_factory):
 
 
 @pytest.fixture
-def run_of(finished_runs, bank, encoders, monkeypatch, tmp_path):
+def run_of(finished_runs, encoders, monkeypatch, tmp_path):
     """Returns a copy of a finished run, whose encoders are taken for those of the package."""
-    monkeypatch.setattr("bgpo_trl.policy.load_pretrained", lambda own: (encoders, bank))
+    place = "bgpo_trl.runs.demonstrations.load_representation"
+    monkeypatch.setattr(place, lambda path, scene_version: encoders)
     return lambda name: shutil.copytree(finished_runs(name), tmp_path / "runs" / name)

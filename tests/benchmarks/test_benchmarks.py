@@ -353,7 +353,11 @@ def test_the_best_part_of_a_run_is_the_best_mean_over_a_tenth(tmp_path):
 
 def test_a_run_that_is_not_finished_cannot_be_summed_up(tmp_path):
     write_tests(tmp_path / "eval.csv", {100: ([1], [1], [0])})
-    with pytest.raises(ValueError, match=r"final\.csv is missing: let the run in .* finish"):
+    with pytest.raises(ValueError, match=r"config\.json is missing: let the run in .* finish"):
+        summary.main(summary.Arguments((tmp_path,)))
+    settings = {"episodes": 200, "eval_every": 100, "task_starts": [0, 0, 0]}
+    (tmp_path / "config.json").write_text(json.dumps(settings))
+    with pytest.raises(ValueError, match=r"has tests until episode 100 of 200: let the run finish"):
         summary.main(summary.Arguments((tmp_path,)))
     with pytest.raises(ValueError, match="name the directory of a run"):
         summary.main(summary.Arguments(()))

@@ -12,6 +12,7 @@ import watch
 
 from bgpo_trl.files.checkpoint import save_checkpoint
 from bgpo_trl.runs.config_file import read_config
+from bgpo_trl.runs.results import read_rows
 from suites import nico
 
 TASKS = nico.ALL_TASKS
@@ -149,6 +150,24 @@ def test_a_run_that_is_all_there_is_summed_up(run, capsys):
     assert "nan" not in told
     assert "GWR-B nodes: [3, 4]. Commit c: `python`." in told
     assert re.search(r"Episodes to 80 %: (\d+|not reached)\. ", told)
+
+
+def test_what_trainer_alone_writes_is_summed_up(run, capsys):
+    """Without final tests, and without what they and a command line leave."""
+    for name in ("final.csv", "summary.json"):
+        (run / name).unlink()
+    summary.main(summary.Arguments((run,)))
+    table, facts = capsys.readouterr().out.split("\n\n")[1:3]
+    rows = [line.split("|")[1:-1] for line in table.splitlines()[2:]]
+    assert [row[0].strip() for row in rows] == [*TASKS, "all"]
+    assert all(row[1].strip() and not "".join(row[5:]).strip() for row in rows)
+    assert re.fullmatch(r"Episodes to 80 %: (\d+|not reached)\.", facts.splitlines()[0])
+    assert (run / "success.png").exists()
+    assert (run / "groups.png").exists() == (max(n_groups(run)) > 1)
+
+
+def n_groups(run):
+    return [int(row["num_groups"]) for row in read_rows(run / "train.csv")]
 
 
 def foreign_checkpoint(state):

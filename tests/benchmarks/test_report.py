@@ -20,18 +20,19 @@ FIGURES += ["fig9.png", "fig9-added.png"]  # of the continual ablation, there is
 HEAD = "algorithm,seed,episode,env_steps,task,success,return,steps\n"
 
 
-def write_run(folder, name, level, *, episodes=40, starts=(0, 0, 0), seeds=(0, 1, 2)):
+def write_run(folder, name, level, *, episodes=40, starts=(0, 0, 0), seeds=(0, 1, 2), tasks=TASKS):
     """A run that succeeds in `level` of ten tests, in the last fifth; half as often before."""
     directory = folder / name
     directory.mkdir(parents=True)
     config = {"name": name.split("-", 1)[1], "seeds": list(seeds), "task_starts": list(starts)}
+    config |= {} if tasks == TASKS else {"tasks": list(tasks)}  # those of earlier versions
     config |= {"episodes": episodes, "eval_every": 2}
     (directory / "config.json").write_text(json.dumps(config))
     (directory / "summary.json").write_text(json.dumps({"commit": "abc", "command": "python x"}))
     lines = []
     for seed in seeds:
         for episode in range(2, episodes + 1, 2):
-            for task, start in zip(TASKS, starts, strict=True):
+            for task, start in zip(tasks, starts, strict=True):
                 if episode > start:
                     won = level if episode > 0.8 * episodes else level // 2
                     for test in range(10):
@@ -324,6 +325,32 @@ def test_the_same_files_make_the_same_report(reported, tmp_path, capsys):
     for name in names:
         assert (tmp_path / name).read_bytes() == (reported / name).read_bytes()
     assert capsys.readouterr().out.strip() == (tmp_path / "tables.md").read_text().strip()
+
+
+@pytest.mark.parametrize("tasks", [("juggle",), (*TASKS, "juggle")])
+def test_runs_of_other_tasks_are_reported(tmp_path, tasks):
+    starts = tuple(10 * position for position in range(len(tasks)))
+    for name, level in {"bgpo": 9, "ddpg": 2}.items():
+        write_run(tmp_path, f"concurrent-{name}", level, tasks=tasks, starts=(0,) * len(tasks))
+        write_run(tmp_path, f"continual-{name}", level, tasks=tasks, starts=starts)
+    (tmp_path / "concurrent-bgpo" / "gwr.csv").write_text(
+        f"task,w0,w1\n0,1,2\n{len(tasks) - 1},2,5\n-1,0,0\n"
+    )
+    report.main(report.Arguments(tmp_path))
+    text = (tmp_path / "tables.md").read_text()
+    for title in ("Fig. 6", "Fig. 8"):
+        found = rows_of(text, title)
+        assert found["BGPO"][1 : 2 + len(tasks)] == ["90.0", *["90"] * len(tasks)]
+        assert found["DDPG, told nothing"][1 : 2 + len(tasks)] == ["20.0", *["20"] * len(tasks)]
+    assert "nan" not in text
+    assert (tmp_path / "fig7.png").exists()
+
+
+def test_runs_of_different_tasks_are_not_compared(tmp_path):
+    write_run(tmp_path, "concurrent-bgpo", 9)
+    write_run(tmp_path, "continual-bgpo", 9, tasks=("juggle",), starts=(0,))
+    with pytest.raises(ValueError, match="holds runs of different tasks: name a directory for"):
+        report.main(report.Arguments(tmp_path))
 
 
 def test_a_folder_without_runs_is_refused(tmp_path):

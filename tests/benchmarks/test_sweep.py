@@ -6,6 +6,7 @@ import json
 import sys
 from dataclasses import replace
 from itertools import product
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -20,10 +21,11 @@ from bgpo_trl.configs import PRESETS
 from bgpo_trl.experiments import merge
 from bgpo_trl.experiments import ray_jobs as jobs
 from bgpo_trl.experiments.ray_jobs import Job
-from bgpo_trl.runs.config_file import settings_of
+from bgpo_trl.runs.config_file import Digests, settings_of
 from bgpo_trl.training import Trainer
 from suites import nico
 
+SOME = Digests("some", "bank")
 HEAD = "algorithm,seed,episode,env_steps,task,success,return,steps"
 
 
@@ -41,7 +43,7 @@ def write_run(job):
     """What a run of a job leaves behind, of results that follow from seed and episode."""
     config, folder = job.config, job.directory
     folder.mkdir(parents=True, exist_ok=True)
-    settings = settings_of(config, "some")
+    settings = settings_of(config, SOME)
     (folder / "config.json").write_text(json.dumps(settings))
     told = {"commit": f"c{config.seeds[0] // 2}", "command": "a", "random_success": {"x": 0.5}}
     told["nodes"] = [100 + seed for seed in config.seeds] if config.name == "bgpo" else None
@@ -109,6 +111,24 @@ def test_a_job_is_a_block_of_seeds_of_an_algorithm_in_a_setting(tmp_path):
             assert hasattr(algorithm, "beta") == (name != "dist-nll")
 
 
+def test_workers_are_told_the_tasks_and_where_they_come_from(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    bank, tasks = Path("own.safetensors"), nico.ALL_TASKS[:2]
+    arguments = sweep.Arguments(
+        settings=("continual", "concurrent"), tasks=tasks, module="my_tasks", bank=bank
+    )
+    (continual,), (concurrent,) = sweep.make_jobs(arguments).values()
+    assert (continual.config.task_starts, concurrent.config.task_starts) == ((0, 3_000), (0, 0))
+    for job in (continual, concurrent):
+        assert job.config.tasks == tasks
+        assert (job.module, job.bank) == ("my_tasks", tmp_path / bank)
+    events = []
+    monkeypatch.setattr(sweep, "import_tasks", events.append)
+    monkeypatch.setattr(sweep, "run_experiment", lambda told, *_: events.append(told.bank))
+    sweep.play(continual)
+    assert events == ["my_tasks", tmp_path / bank]
+
+
 def test_blocks_are_of_the_presets_seeds_and_length_unless_told():
     (group,) = sweep.make_jobs(sweep.Arguments(preset="paper")).values()
     assert [job.config.seeds for job in group] == [(0, 1, 2, 3, 4), (5, 6, 7, 8, 9)]
@@ -139,26 +159,26 @@ def test_grids_that_cannot_be_are_refused(tmp_path, wrong, message):
 
 def test_directories_with_something_else_are_refused(few, tmp_path):
     grid = sweep.make_jobs(sweep.Arguments(out=tmp_path, **few))
-    sweep.check_directories(grid, "some")  # there is nothing yet
+    sweep.check_directories(grid, SOME)  # there is nothing yet
     for group in grid.values():
         write_run(group[1])
-    sweep.check_directories(grid, "some")
+    sweep.check_directories(grid, SOME)
     with pytest.raises(ValueError, match="encoders is some there and others here"):
-        sweep.check_directories(grid, "others")
+        sweep.check_directories(grid, Digests("others", "bank"))
     longer = sweep.make_jobs(sweep.Arguments(out=tmp_path, episodes=7, **few))
     with pytest.raises(ValueError, match=r"seeds-2 holds a run with other settings .*episodes is"):
-        sweep.check_directories(longer, "some")
+        sweep.check_directories(longer, SOME)
 
     # Other blocks would be merged over what is there.
     folder = tmp_path / "concurrent-maml"
     config = json.loads((folder / "seeds-2" / "config.json").read_text())
     (folder / "config.json").write_text(json.dumps({**config, "seeds": [7, 8, 9]}))
-    sweep.check_directories(grid, "some")
+    sweep.check_directories(grid, SOME)
     others = sweep.make_jobs(
         sweep.Arguments(out=tmp_path, episodes=7, **{**few, "algorithms": ("maml",), "block": 3})
     )
     with pytest.raises(ValueError, match="concurrent-maml holds a run with other settings"):
-        sweep.check_directories(others, "some")
+        sweep.check_directories(others, SOME)
 
     alone = sweep.make_jobs(sweep.Arguments(out=tmp_path / "alone", **few))
     write_run(Job(tmp_path / "alone" / "concurrent-maml", alone.popitem()[1][0].config))
@@ -282,8 +302,8 @@ def without_ray(monkeypatch):
     monkeypatch.setattr(sweep, "connected", lambda *_, **__: contextlib.nullcontext())
     monkeypatch.setattr(sweep, "play_jobs", play_jobs)
     monkeypatch.setattr(sweep, "play", play)
-    some = (SimpleNamespace(identity="some"), None)
-    monkeypatch.setattr(sweep, "load_pretrained", lambda: some)
+    some = [SimpleNamespace(identity=digest) for digest in SOME]
+    monkeypatch.setattr(sweep, "pretrained_for", lambda tasks, bank: some)
     return SimpleNamespace(played=played, broken=broken)
 
 

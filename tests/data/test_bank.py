@@ -6,6 +6,8 @@ import pytest
 import torch
 
 from bgpo_trl.data.bank import DemonstrationBank, DemonstrationSteps
+from bgpo_trl.data.recording import record_demonstrations
+from bgpo_trl.encoders import make_bank as command
 from bgpo_trl.encoders.make_bank import make_bank
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.files.tensor_file import load_tensors, save_tensors
@@ -220,6 +222,49 @@ def test_the_banks_steps_are_those_of_its_embeddings():
     phi = encoders.lae.encode(seen.steps.latents(frame), length)
     distance = (phi - seen.embedding[rows]).norm(dim=-1)
     assert distance.max() < 0.03  # of about 3 between two demonstrations
+
+
+def test_compact_steps_hold_the_frames_of_their_demonstrations_alone(steps):
+    rows = [3, 0, 2]
+    compact = steps.select(torch.tensor(rows)).compact()
+    assert len(compact.latent) == len(compact.action) == LENGTH[rows].sum()
+    for place, row in enumerate(rows):
+        ours, theirs = frames(compact, place), frames(steps, row)
+        assert compact.latents(ours).equal(steps.latents(theirs))
+        assert compact.actions(ours).equal(steps.actions(theirs))
+
+
+def test_the_identity_is_that_of_the_demonstrations(bank, tmp_path):
+    path, tasks = tmp_path / "bank.safetensors", nico.ALL_TASKS[1:]
+    some = bank.for_tasks(tasks)
+    some.save(path, encoder_id="abc")
+    assert DemonstrationBank.load(path, encoder_id="abc").identity == some.identity
+    assert bank.for_tasks(tasks).identity == some.identity
+    # Bank and selection have the frames of all tasks in memory.
+    renamed = replace(some, tasks=("juggle", "dance"))
+    assert renamed.identity == some.identity
+    others = [
+        bank,
+        bank.for_tasks(tasks[::-1]),
+        replace(some, steps=None),
+        replace(some, embedding=some.embedding + 1e-6),
+        replace(some, train=~some.train),
+    ]
+    assert len({some.identity, *(other.identity for other in others)}) == 6
+
+
+def test_the_command_keeps_the_names_of_the_tasks(tmp_path, encoders, monkeypatch):
+    nico.add_task("push_again", nico.TASKS["push_green_to_white"])
+    folder, out = tmp_path / "recorded", tmp_path / "bank.safetensors"
+    record_demonstrations(
+        folder, tasks=["push_again"], per_task=2, held_out_per_task=1, progress=False
+    )
+    monkeypatch.setattr(command, "load_representation", lambda path, scene_version: encoders)
+    command.main(folder, out)
+    found = DemonstrationBank.load(out, encoder_id=encoders.identity)
+    assert found.tasks == ("push_again",)
+    assert found.task.tolist() == [0, 0]
+    assert found.train.tolist() == [True, False]
 
 
 @pytest.fixture

@@ -8,11 +8,12 @@ import pytest
 from bgpo_trl.algorithms import ABLATIONS, ALGORITHMS
 from bgpo_trl.algorithms.rl import RL
 from bgpo_trl.configs import PRESETS, BGPOConfig, DDPGConfig, RunConfig
-from bgpo_trl.runs.config_file import read_config, settings_of
+from bgpo_trl.runs.config_file import Digests, read_config, settings_of
+from suites import nico
 
 
 def write(path, config, **changes):
-    path.write_text(json.dumps({**settings_of(config, "abc"), **changes}))
+    path.write_text(json.dumps({**settings_of(config, Digests("abc", "def")), **changes}))
     return path
 
 
@@ -23,8 +24,8 @@ def test_what_was_written_is_read(tmp_path, preset, name):
         ALGORITHMS[name].config, state="state", rl=DDPGConfig(hidden_sizes=(5, 7), gamma=0.5)
     )
     config = replace(PRESETS[preset], name=name, algorithm=algorithm, checkpoint_minutes=3)
-    read, encoders = read_config(write(tmp_path / "config.json", config))
-    assert (read, encoders) == (config, "abc")
+    read, digests = read_config(write(tmp_path / "config.json", config))
+    assert (read, digests) == (config, Digests(encoders="abc", bank="def"))
     assert type(read.algorithm) is type(algorithm)
     assert isinstance(read.algorithm.rl.hidden_sizes, tuple)
 
@@ -42,7 +43,7 @@ def test_an_rl_algorithm_is_known_by_its_name(tmp_path, name):
 def test_ablations_are_read(tmp_path, name):
     config = RunConfig(name=name, algorithm=replace(ABLATIONS[name].config, beta=0.3))
     path = write(tmp_path / "config.json", config, encoders=None)
-    assert read_config(path) == (config, None)
+    assert read_config(path) == (config, (None, "def"))
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,7 @@ def test_what_an_earlier_version_did_not_know_has_its_default(tmp_path):
     settings = asdict(RunConfig())
     del settings["checkpoint_minutes"], settings["algorithm"]["rl"]["critic_layer_norm"]
     (tmp_path / "config.json").write_text(json.dumps(settings))
-    assert read_config(tmp_path / "config.json") == (RunConfig(), None)
+    assert read_config(tmp_path / "config.json") == (RunConfig(), (None, None))
 
 
 def nested(**rl):
@@ -84,6 +85,7 @@ def nested(**rl):
         ({"seeds": 3}, "seeds is 3"),
         ({"seeds": []}, "needs seeds"),
         ({"encoders": 3}, "encoders is 3"),
+        ({"bank": 3}, "bank is 3"),
         ({"name": "mine", "algorithm_class": None}, "'mine' are of no known algorithm"),
         ({"name": "mine", "algorithm_class": "os.path"}, "'mine' are of no known algorithm"),
     ],
@@ -94,6 +96,32 @@ def test_what_is_no_run_of_this_version_is_refused(tmp_path, changes, said):
         read_config(path)
     assert "\n" not in str(error.value)
     assert str(path) in str(error.value)
+
+
+class Juggle(nico.NicoTask):
+    """A task in name only."""
+
+
+@pytest.mark.parametrize(
+    ("modules", "where"),
+    [
+        (None, f"the module {Juggle.__module__!r}"),
+        ({"juggle": "__main__"}, "a script or notebook"),
+        ({}, "a script or notebook"),
+        ({"juggle": 3}, "a script or notebook"),
+        ([], "a script or notebook"),
+    ],
+)
+def test_the_module_of_a_task_is_named_but_not_imported(tmp_path, modules, where):
+    nico.add_task("juggle", Juggle)
+    config = RunConfig(tasks=("grasp_glass", "juggle"), task_starts=(0, 2))
+    changes = {} if modules is None else {"task_modules": modules}
+    path = write(tmp_path / "config.json", config, **changes)
+    assert read_config(path)[0] == config
+    nico.nico._TASKS.pop("juggle")
+    said = f"has the task 'juggle', added by {where}: name a module that adds it with --import"
+    with pytest.raises(ValueError, match=said):
+        read_config(path)
 
 
 @pytest.mark.parametrize("text", ["", "[]", '{"seeds":', "\x00", "null"])

@@ -1,0 +1,32 @@
+"""Import of the user's module that adds tasks to the suite, for ``--import`` on command lines."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from pathlib import Path
+
+
+def import_tasks(module: str | None) -> None:
+    """Import a module that calls `suites.nico.add_task`, from the current folder or installed.
+
+    Args:
+        module: Name of the module; nothing is imported if None.
+
+    Raises:
+        ValueError: If there is no such module.
+    """
+    if module is None:
+        return
+    folder = str(Path.cwd())
+    if folder not in sys.path:  # `python script.py` has the script's folder there instead
+        sys.path.append(folder)
+    try:
+        importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name is None or not f"{module}.".startswith(f"{error.name}."):
+            raise  # The module exists, and imports one that does not.
+        raise ValueError(
+            f"--import {module}: there is no such module in {folder} or installed; give the name "
+            "without .py, such as my_tasks"
+        ) from None

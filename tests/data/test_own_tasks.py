@@ -1,0 +1,47 @@
+"""Import of the user's tasks by name."""
+
+import sys
+
+import pytest
+
+from bgpo_trl.data.own_tasks import import_tasks
+from suites import nico
+
+OWN = """
+from suites import nico
+
+class Juggle(nico.NicoTask):
+    pass
+
+nico.add_task("juggle", Juggle)
+"""
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    """The current folder, with a module of tasks in it that is forgotten after the test."""
+    (tmp_path / "juggling.py").write_text(OWN)
+    (tmp_path / "astray.py").write_text("import no_such_library\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [path for path in sys.path if path])
+    yield tmp_path
+    sys.modules.pop("juggling", None)
+
+
+def test_a_module_of_the_current_folder_adds_its_tasks(folder):
+    import_tasks(None)
+    assert "juggle" not in nico.TASKS
+    import_tasks("juggling")
+    assert nico.TASKS["juggle"].__module__ == "juggling"
+    assert sys.modules["juggling"].__file__ == str(folder / "juggling.py")
+
+
+@pytest.mark.parametrize("name", ["juggle", "juggling.py", "juggling.tasks", "no.such"])
+def test_a_module_that_is_not_there_is_named_with_the_remedy(folder, name):
+    with pytest.raises(ValueError, match=rf"^--import {name}: there is no such module in {folder}"):
+        import_tasks(name)
+
+
+def test_what_a_module_lacks_itself_is_told_as_python_does():
+    with pytest.raises(ModuleNotFoundError, match="no_such_library"):
+        import_tasks("astray")

@@ -1,0 +1,44 @@
+"""Demonstrations of a run of the command line."""
+
+from dataclasses import replace
+
+import pytest
+
+from bgpo_trl.experiments import run as experiment
+from bgpo_trl.experiments.arguments import Arguments
+from suites import nico
+
+ONE, TWO, THREE = nico.ALL_TASKS
+
+
+@pytest.fixture
+def own(bank, encoders, monkeypatch, tmp_path):
+    """Path of a bank of two tasks, one of them shipped under the same name."""
+    monkeypatch.setattr(experiment, "load_pretrained", lambda: (encoders, bank))
+    path = tmp_path / "own.safetensors"
+    other = replace(bank, embedding=bank.embedding + 1)
+    renamed = replace(other.for_tasks([ONE, TWO]), tasks=("juggle", TWO))
+    renamed.save(path, encoder_id=encoders.identity)
+    return path
+
+
+def test_tasks_that_the_bank_lacks_are_those_of_the_package(own, bank):
+    found = experiment.pretrained_for(["juggle", TWO, THREE], own)[1]
+    assert found.tasks == ("juggle", TWO, THREE)
+    for task, name, offset in ((0, ONE, 1), (1, TWO, 1), (2, THREE, 0)):
+        shipped = bank.for_tasks([name])
+        assert found.of_task(task).embedding.equal(shipped.embedding + offset)
+        assert found.of_task(task).train.equal(shipped.train)
+    assert experiment.pretrained_for([TWO])[1].embedding.equal(bank.for_tasks([TWO]).embedding)
+
+
+def test_a_task_that_neither_bank_holds_is_refused(own):
+    with pytest.raises(ValueError, match=r"^the bank has no demonstration of 'dance'.*for --bank"):
+        experiment.pretrained_for([TWO, "dance"], own)
+
+
+def test_a_bank_does_not_go_with_encoders_that_are_yet_to_be_trained(own, tmp_path, make_config):
+    arguments = Arguments(bank=own, train_encoders=True, out=tmp_path / "run")
+    with pytest.raises(ValueError, match=r"^--bank is of the pretrained encoders: leave it or"):
+        experiment.run_experiment(arguments, "continual", make_config())
+    assert not (tmp_path / "run").exists()
