@@ -19,7 +19,7 @@ BANK = "bank.safetensors"
 
 
 def keep_bank(directory: Path, bank: DemonstrationBank, encoders: Representation) -> None:
-    """Store the demonstrations of a run in its directory, unless they come with its encoders.
+    """Store the demonstrations of a run, unless they are there already or come with its encoders.
 
     A copy, of at most a few megabytes, moves with the directory to other machines. Runs with the
     shipped demonstrations store none, since their digest in ``config.json`` identifies them.
@@ -32,13 +32,13 @@ def keep_bank(directory: Path, bank: DemonstrationBank, encoders: Representation
     Raises:
         OSError: If the file cannot be written.
     """
-    try:
-        beside = bank_path(_weights(directory))
-        shipped = DemonstrationBank.load(beside, encoder_id=encoders.identity)
-        if shipped.for_tasks(bank.tasks).identity == bank.identity:
-            return
-    except ValueError:  # missing, of other encoders or of other tasks
-        pass
+    for path in (directory / BANK, bank_path(_weights(directory))):
+        try:
+            there = DemonstrationBank.load(path, encoder_id=encoders.identity)
+            if there.for_tasks(bank.tasks).identity == bank.identity:
+                return
+        except ValueError:  # missing, damaged, of other encoders or of other tasks
+            continue
     bank.save(directory / BANK, encoder_id=encoders.identity)
 
 

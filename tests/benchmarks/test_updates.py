@@ -5,6 +5,7 @@ from importlib.util import find_spec
 
 import torch
 
+from benchmarks.speed import updates
 from benchmarks.speed.updates import BATCH, Floor, Ours, TorchRLLoop, contenders, floor_batch
 
 
@@ -26,7 +27,9 @@ def floor_weights(floor: Floor) -> list[torch.Tensor]:
     return [*floor.actor, *floor.critic, *floor.target_actor, *floor.target_critic]
 
 
-def test_the_floor_is_our_arithmetic_without_clipping_and_penalty():
+def test_the_floor_is_our_arithmetic_without_clipping_and_penalty(monkeypatch):
+    # In larger sums, rounding errors grow beyond the tolerance within three updates.
+    monkeypatch.setattr(updates, "HIDDEN", 64)
     ours = Ours(3, transitions=BATCH, return_bounds=None, pre_tanh_penalty=0.0)
     floor = Floor(ours.loss)
     start = [tensor.detach().clone() for tensor in weights(ours)]
