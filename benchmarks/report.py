@@ -55,7 +55,7 @@ def draw(group: Group, runs: dict[str, Run], folder: Path) -> dict[str, Path]:
         save_figure(
             plot_success_curves(
                 [run.directory / "eval.csv" for run in shown],
-                presented=dict(zip(nico.ALL_TASKS, first.config["task_starts"], strict=True)),
+                presented=dict(zip(nico.PAPER_TASKS, first.config["task_starts"], strict=True)),
                 random_success=first.summary.get("random_success"),
                 window=3 * first.config["eval_every"],
                 last=int(first.curves.episodes[-1]),
@@ -77,8 +77,8 @@ def draw_nodes(path: Path, to: Path) -> Table:
     tasks = np.array([int(row["task"]) for row in rows])
     groups = [int(row["group"]) for row in rows] if "group" in rows[0] else None
     weights = np.array([[float(v) for k, v in row.items() if k.startswith("w")] for row in rows])
-    save_figure(plot_gwr_pca(weights, tasks, nico.ALL_TASKS, groups), to)
-    numbers = [task for task in range(len(nico.ALL_TASKS)) if (tasks == task).any()]
+    save_figure(plot_gwr_pca(weights, tasks, nico.PAPER_TASKS, groups), to)
+    numbers = [task for task in range(len(nico.PAPER_TASKS)) if (tasks == task).any()]
     means = {task: weights[tasks == task].mean(0) for task in numbers}
     table: Table = [["distance of mean nodes", *(f"task {task + 1}" for task in numbers)]]
     for task in numbers:

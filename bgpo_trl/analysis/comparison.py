@@ -163,7 +163,7 @@ def read_group(runs: Path, group: Group) -> tuple[dict[str, Run], list[str]]:
         config = read_json(directory / "config.json")
         path = directory / "summary.json"
         summary = read_json(path) if path.exists() else {}
-        curves = read_curves(directory / "eval.csv", nico.ALL_TASKS)
+        curves = read_curves(directory / "eval.csv", nico.PAPER_TASKS)
         if int(curves.episodes[-1]) < config["episodes"]:
             notes.append(
                 f"{name}: not finished, {curves.episodes[-1]} of {config['episodes']} episodes"

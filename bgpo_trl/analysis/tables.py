@@ -102,7 +102,7 @@ def speed_table(runs: Mapping[str, Run]) -> Table:
     rows = [["", *tasks, *(f"{task} : {tasks[0]}" for task in tasks[1:])]]
     for run in runs.values():
         last = int(run.curves.episodes[-1])
-        episodes = own_episodes(run.directory / "train.csv", nico.ALL_TASKS, last)
+        episodes = own_episodes(run.directory / "train.csv", nico.PAPER_TASKS, last)
         if episodes is None:
             rows.append([run.name, *["no train.csv"] * len(tasks), *[""] * (len(tasks) - 1)])
         else:

@@ -32,7 +32,7 @@ from suites.nico.rendering import FrameRenderer
 def record_demonstrations(
     path: str | Path,
     *,
-    tasks: Sequence[str] = nico.ALL_TASKS,
+    tasks: Sequence[str] = nico.PAPER_TASKS,
     per_task: int = 1_200,
     held_out_per_task: int = 200,
     play: bool = False,

@@ -57,10 +57,10 @@ def write_run(job):
     final[0] += ",task_inference"
     for episode, seed in product(range(1, config.episodes + 1), config.seeds):
         row = f"{config.name},{seed},{episode},{7 * episode},{{}},{(seed + episode) % 2},0.1,5"
-        train.append(row.format(nico.ALL_TASKS[episode % 3]) + f",{sum(config.seeds)}.25")
+        train.append(row.format(nico.PAPER_TASKS[episode % 3]) + f",{sum(config.seeds)}.25")
         if episode % config.eval_every == 0:
-            tests += [row.format(task) for task in nico.ALL_TASKS] * 2
-    for kind, task, seed in product(("seen", "held-out"), nico.ALL_TASKS, config.seeds):
+            tests += [row.format(task) for task in nico.PAPER_TASKS] * 2
+    for kind, task, seed in product(("seen", "held-out"), nico.PAPER_TASKS, config.seeds):
         final.append(f"{seed},{kind},{task},0.{seed},1.0")
     for name, lines in (("train.csv", train), ("eval.csv", tests), ("final.csv", final)):
         (folder / name).write_text("\n".join(lines) + "\n")
