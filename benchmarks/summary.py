@@ -213,7 +213,7 @@ def _presented(run: Path) -> dict[str, int]:
     path = run / "config.json"
     config = read_json(path, {"task_starts": list, "tasks": list | NoneType})
     # Runs of earlier versions saved no task names; theirs are the paper's.
-    tasks, starts = config.get("tasks") or nico.ALL_TASKS, config["task_starts"]
+    tasks, starts = config.get("tasks") or nico.PAPER_TASKS, config["task_starts"]
     known = all(isinstance(task, str) for task in tasks)
     if not known or len(tasks) != len(starts) or not all(type(start) is int for start in starts):
         raise ValueError(

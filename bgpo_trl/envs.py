@@ -62,7 +62,7 @@ class NicoEnv(EnvBase):
 
     def __init__(
         self,
-        tasks: Sequence[str] = nico.ALL_TASKS,
+        tasks: Sequence[str] = nico.PAPER_TASKS,
         *,
         batch_size: int | Sequence[int] = (),
         seed: int | Sequence[int] | None = 0,
@@ -74,7 +74,7 @@ class NicoEnv(EnvBase):
         if threads is not None and threads < 1:
             raise ValueError(f"threads must be at least 1, or None for all cores, got {threads}")
         if not tasks or isinstance(tasks, str):
-            raise ValueError(f"tasks must be names such as {nico.ALL_TASKS}, got {tasks!r}")
+            raise ValueError(f"tasks must be names such as {nico.PAPER_TASKS}, got {tasks!r}")
         nico.check_tasks(tasks)
         self.tasks = tuple(tasks)
         self.observation = observation

@@ -29,7 +29,7 @@ def demonstrate(task: str, seed: int) -> np.ndarray:
     return np.stack(frames)
 
 
-def main(run: tyro.conf.Positional[Path], task: str = nico.ALL_TASKS[0], seed: int = 1) -> None:
+def main(run: tyro.conf.Positional[Path], task: str = nico.PAPER_TASKS[0], seed: int = 1) -> None:
     """Run the example.
 
     Args:

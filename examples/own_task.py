@@ -38,7 +38,7 @@ if __name__ == "__main__":
     bank += make_bank(encoders, shown, tasks=[OWN])
     print(f"{len(shown)} demonstrations, {shown['length'].float().mean():.0f} frames each")
 
-    tasks, starts = (OWN, *nico.ALL_TASKS), (0, 4, 6, 8)
+    tasks, starts = (OWN, *nico.PAPER_TASKS), (0, 4, 6, 8)
     config = RunConfig(seeds=(0,), episodes=12, tasks=tasks, task_starts=starts, eval_every=6)
     with Trainer(config, OUT / "run", bank=bank, encoders=encoders, resume=True) as trainer:
         trainer.run()

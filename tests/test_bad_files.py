@@ -56,7 +56,7 @@ def load_bank(path):
 
 
 def curves(path):
-    return read_curves(path / "eval.csv", nico.ALL_TASKS)
+    return read_curves(path / "eval.csv", nico.PAPER_TASKS)
 
 
 def figure():

@@ -16,7 +16,8 @@ import tyro
 from bgpo_trl.algorithms.environments import bgpo_env
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "suites/nico/README.md")]
+PAGES += sorted((ROOT / "docs").glob("*.md"))
 # Commands that take a second: they are not only parsed but run.
 CHEAP = {"benchmarks/compare.py"}
 

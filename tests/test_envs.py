@@ -79,7 +79,7 @@ def test_shapes_and_types(batch_size):
 def test_it_shows_what_the_suite_shows(task):
     env = NicoEnv(seed=5, observation="both")
     td = env.reset(TensorDict({"task": torch.tensor(task)}))
-    plain = nico.load(nico.ALL_TASKS[task], seed=5, observation="both")
+    plain = nico.load(nico.PAPER_TASKS[task], seed=5, observation="both")
     timestep = plain.reset()
 
     for action in actions(env, 6):

@@ -74,8 +74,8 @@ def play(tmp_path, make_config):
 
 
 def test_an_added_task_is_known_by_name_to_suite_and_environment():
-    assert nico.ALL_TASKS == ("grasp_glass", "push_green_to_glass", "push_green_to_white")
-    assert tuple(nico.TASKS)[:3] == nico.ALL_TASKS
+    assert nico.PAPER_TASKS == ("grasp_glass", "push_green_to_glass", "push_green_to_white")
+    assert tuple(nico.TASKS)[:3] == nico.PAPER_TASKS
     assert nico.TASKS["at_once"] is AtOnce
     env = nico.load("at_once", seed=0, observation="state")
     env.reset()
@@ -142,7 +142,7 @@ def test_random_success_is_measured_by_name():
 
 def test_success_of_an_own_task_is_counted_under_its_name(play):
     tasks = ("at_once", "push_green_to_white")
-    run = play("run", bank_of(*nico.ALL_TASKS, "at_once"), tasks=tasks, task_starts=(0, 3))
+    run = play("run", bank_of(*nico.PAPER_TASKS, "at_once"), tasks=tasks, task_starts=(0, 3))
 
     assert json.loads((run / "config.json").read_text())["tasks"] == [*tasks]
     train, tests = rows(run / "train.csv"), rows(run / "eval.csv")
@@ -154,7 +154,7 @@ def test_success_of_an_own_task_is_counted_under_its_name(play):
 
 
 def test_a_run_does_not_depend_on_tasks_that_are_not_in_it(play):
-    known = bank_of(*nico.ALL_TASKS)
+    known = bank_of(*nico.PAPER_TASKS)
     own = bank_of("at_once")
     runs = [play("alone", known), play("beside", known + own)]
     for name in ("train.csv", "eval.csv"):
@@ -240,5 +240,5 @@ def test_a_run_of_tasks_that_do_not_fit_is_refused(changes, message):
 def test_a_run_without_demonstrations_of_a_task_is_refused_before_it_writes(make_config, tmp_path):
     config = make_config("state", "oracle", tasks=("at_once",), task_starts=(0,))
     with pytest.raises(ValueError, match=r"^the bank has no demonstration of 'at_once', only of"):
-        Trainer(config, tmp_path / "run", bank=bank_of(*nico.ALL_TASKS), progress=False)
+        Trainer(config, tmp_path / "run", bank=bank_of(*nico.PAPER_TASKS), progress=False)
     assert list(tmp_path.iterdir()) == []

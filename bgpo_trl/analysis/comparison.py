@@ -146,7 +146,7 @@ class Run:
 
 
 def _tasks(config: dict[str, Any]) -> tuple[str, ...]:
-    return tuple(config.get("tasks") or nico.ALL_TASKS)
+    return tuple(config.get("tasks") or nico.PAPER_TASKS)
 
 
 def read_group(runs: Path, group: Group) -> tuple[dict[str, Run], list[str]]:

@@ -115,7 +115,7 @@ class DemonstrationBank:
     embedding: Tensor
     task: Tensor
     train: Tensor
-    tasks: tuple[str, ...] = nico.ALL_TASKS
+    tasks: tuple[str, ...] = nico.PAPER_TASKS
     steps: DemonstrationSteps | None = None
 
     def __post_init__(self) -> None:

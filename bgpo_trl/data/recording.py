@@ -33,7 +33,7 @@ from suites.nico.rendering import FrameRenderer
 def record_demonstrations(
     path: str | Path,
     *,
-    tasks: Sequence[str] = nico.ALL_TASKS,
+    tasks: Sequence[str] = nico.PAPER_TASKS,
     per_task: int = 1_200,
     held_out_per_task: int = 200,
     play: bool = False,
@@ -235,7 +235,7 @@ def _perform(
 
 def main(
     path: tyro.conf.Positional[Path],
-    tasks: tuple[str, ...] = nico.ALL_TASKS,
+    tasks: tuple[str, ...] = nico.PAPER_TASKS,
     module: Annotated[str | None, tyro.conf.arg(name="import")] = None,
     per_task: int = 1_200,
     held_out_per_task: int = 200,

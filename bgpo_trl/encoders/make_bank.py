@@ -30,7 +30,7 @@ def make_bank(
     representation: Representation,
     dataset: TensorDictBase,
     *,
-    tasks: Sequence[str] = nico.ALL_TASKS,
+    tasks: Sequence[str] = nico.PAPER_TASKS,
     actions: Literal["inferred", "recorded"] = "inferred",
 ) -> DemonstrationBank:
     """Embed demonstrations; keep the latents and actions of the training ones.

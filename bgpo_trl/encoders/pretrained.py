@@ -47,7 +47,7 @@ def make_pretrained(
     command: str = "",
     progress: bool = True,
     device: torch.device | str = "cpu",
-    tasks: Sequence[str] = nico.ALL_TASKS,
+    tasks: Sequence[str] = nico.PAPER_TASKS,
 ) -> tuple[Representation, DemonstrationBank]:
     """Record demonstrations and play, train both encoders, and embed the demonstrations.
 

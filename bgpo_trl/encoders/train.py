@@ -71,7 +71,7 @@ def train_encoders(
     command: str = "",
     device: torch.device | str = "cpu",
     progress: bool = True,
-    tasks: Sequence[str] = nico.ALL_TASKS,
+    tasks: Sequence[str] = nico.PAPER_TASKS,
 ) -> tuple[Representation, DemonstrationBank]:
     """Train, save and probe both encoders, and embed the demonstrations with them.
 

@@ -47,8 +47,8 @@ class TaskArguments(ImportArguments):
     """Tasks of a run."""
 
     tasks: tuple[str, ...] | None = None
-    """Tasks in the order of presentation; the paper's three by default. Unless three, they start at
-    even intervals."""
+    """Tasks in the order of presentation, or "all" for the suite's eight; the paper's three by
+    default. Unless three, they start at even intervals."""
     bank: Path | None = None
     """Demonstrations embedded by bgpo_trl.encoders.make_bank; those of tasks that it lacks come
     with the package. With --resume, the run's own by default."""
@@ -135,6 +135,8 @@ def _with_tasks(config: RunConfig, tasks: tuple[str, ...] | None) -> RunConfig:
     """Return a preset with other tasks."""
     if tasks is None:
         return config
+    if tasks == ("all",):
+        tasks = nico.ALL_TASKS
     unknown = [name for name in tasks if name not in nico.TASKS]
     if unknown or not tasks:
         wrong = f"there is no task {unknown[0]!r}" if unknown else "it is empty"

@@ -3,12 +3,13 @@
 # First, since importing it chooses the OpenGL backend, which must precede MuJoCo's import.
 from suites.nico import rendering  # isort: skip
 from suites.nico.base import NicoTask, scene_version
-from suites.nico.nico import ALL_TASKS, TASKS, add_task, check_tasks, load, register
+from suites.nico.nico import ALL_TASKS, PAPER_TASKS, TASKS, add_task, check_tasks, load, register
 from suites.nico.physics import OBJECTS, Physics, scene_xml
 
 __all__ = [
     "ALL_TASKS",
     "OBJECTS",
+    "PAPER_TASKS",
     "TASKS",
     "NicoTask",
     "Physics",

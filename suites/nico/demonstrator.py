@@ -80,7 +80,8 @@ class Demonstrator:
         targets = physics.data.ctrl[:4]
         arm = phase.place(physics) - targets[:3]
         hand = phase.curl - targets[3]
-        if len(self._phases) > 1 and np.abs(arm).max() < phase.tolerance:
+        reached = np.abs(arm).max() < phase.tolerance
+        if len(self._phases) > 1 and reached and (phase.until is None or phase.until(physics)):
             self._phases.pop(0)
             return self(timestep)
         arm *= min(1.0, self._speed / max(np.abs(arm).max(), 1e-6))

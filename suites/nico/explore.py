@@ -39,7 +39,7 @@ class Arguments:
     """Show an episode of NICO, in a window or, without a screen, as a picture."""
 
     task: str = nico.ALL_TASKS[0]
-    """One of grasp_glass, push_green_to_glass, push_green_to_white."""
+    """Name of the task, such as grasp_glass or lift_green; `suites/nico/README.md` lists all."""
     out: Path | None = None
     """File to write, .png or .gif; by default TASK.png if there is no screen."""
     demonstrate: Annotated[bool, _POLICY, tyro.conf.FlagCreatePairsOff] = False

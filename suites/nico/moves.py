@@ -1,29 +1,36 @@
 """Building blocks of demonstrations: phases of a movement, and the movements of NICO's tasks.
 
 A movement leads the hand by inverse kinematics through a few noisy waypoints: above the start
-of the sweep, down to the table, sideways into the object, and for grasping closes the hand. The
-waypoints follow the objects as they move.
+of the sweep, down to the table and sideways into the object, where it may close, or from above
+onto the object. The waypoints follow the objects as they move.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 
 from suites.nico import kinematics
-from suites.nico.physics import TABLE_HEIGHT, Physics
+from suites.nico.physics import OBJECT_HALF_HEIGHT, OBJECTS, TABLE_HEIGHT, Physics
 
 CLEAR_HEIGHT: Final = TABLE_HEIGHT + 0.125  # (m) of the palm while it travels over the objects
 SWEEP_HEIGHT: Final = TABLE_HEIGHT + 0.045  # (m) of the palm while it sweeps
 OPEN: Final = 0.05  # (rad) curl of a segment
 FIST: Final = 0.85  # (rad) curl of a segment
+GRIP: Final = 1.2  # (rad) curl of a segment, beyond what the joints reach, for a firm grip
 
 # Contact point of a pushed box, as (left of the arm's plane, beyond the wrist) (m): the fist's
 # knuckles when pushed left, the back of the hand when pushed right.
 _BEFORE_KNUCKLES, _BEHIND_BACK = (0.078, 0.105), (-0.043, 0.075)
+_FRONT = (0.02, 0.12)  # front of the fist, between palm and fingers
 _LEAD = 0.07  # (m) by which the hand aims ahead of the box it pushes
 _OUTWARD = 0.03  # (m) by which it aims beyond the arc
+# Distance from the grip at which the descending palm just misses the center of a box (m).
+_PALM = 0.076
+_LIFT_HEIGHT = TABLE_HEIGHT + 0.039  # (m) of the grip around a box to lift; higher, it slips
+_FIRM = 0.25  # (rad) lead of the targets over the curls with which it holds what it lifts
+_RISE = np.array([0.0, 0.0, 0.04])  # (m) from the grip to the place at which a lift aims
 _NOISE = 0.006  # (m) standard deviation of the waypoints
 
 
@@ -41,6 +48,8 @@ class Phase:
     """Angle of each of the hand's segments (rad); `OPEN` and `FIST` are usual."""
     tolerance: float = 0.035
     """Largest distance of a joint from the target at which the phase ends (rad)."""
+    until: Callable[[Physics], bool] | None = None
+    """Further condition for the end of the phase."""
 
 
 def grasp(physics: Physics, random: np.random.Generator, name: str) -> Sequence[Phase]:
@@ -51,9 +60,35 @@ def grasp(physics: Physics, random: np.random.Generator, name: str) -> Sequence[
         random: Source of the noise.
         name: The object.
     """
-    del physics
+    return [*_reach(physics, random, name), Phase(_stay, GRIP)]
+
+
+def lift(physics: Physics, random: np.random.Generator, name: str) -> Sequence[Phase]:
+    """Grasp a box as in `grasp`, then raise it.
+
+    Args:
+        physics: The simulation at the start of the episode.
+        random: Source of the noise.
+        name: The box.
+    """
+
+    def is_firm(physics: Physics) -> bool:
+        return (physics.data.ctrl[3:] - physics.digit_curls()).mean() > _FIRM
+
+    def up(physics: Physics) -> np.ndarray:
+        return kinematics.inverse(physics.grip_position() + _RISE, kinematics.GRIP)
+
+    reach = _reach(physics, random, name, _LIFT_HEIGHT)
+    return [*reach, Phase(_stay, GRIP, until=is_firm), Phase(up, GRIP)]
+
+
+def _reach(
+    physics: Physics, random: np.random.Generator, name: str, sweep_height: float = SWEEP_HEIGHT
+) -> Sequence[Phase]:
+    """Return a sweep of the open hand to the left that ends with an object in it."""
     noise = random.normal(0.0, _NOISE, 3)
-    right = random.uniform(0.065, 0.085)
+    # The palm would otherwise come down on a near neighbor.
+    right = min(random.uniform(0.065, 0.085), _room_on_the_right(physics, name) - _PALM)
 
     def beside(height: float) -> Place:
         return lambda physics: beside_object(
@@ -61,16 +96,12 @@ def grasp(physics: Physics, random: np.random.Generator, name: str) -> Sequence[
         )
 
     def around(physics: Physics) -> np.ndarray:
-        return beside_object(physics, name, 0.004, SWEEP_HEIGHT, kinematics.GRIP)
-
-    def hold(physics: Physics) -> np.ndarray:
-        return np.array(physics.data.ctrl[:3])
+        return beside_object(physics, name, 0.004, sweep_height, kinematics.GRIP)
 
     return [
         Phase(beside(CLEAR_HEIGHT), OPEN),
-        Phase(beside(SWEEP_HEIGHT), OPEN),
+        Phase(beside(sweep_height), OPEN),
         Phase(around, OPEN, tolerance=0.014),
-        Phase(hold, 1.2),
     ]
 
 
@@ -83,20 +114,49 @@ def push(physics: Physics, random: np.random.Generator, box: str, target: str) -
         box: The object to push.
         target: The object to push it to.
     """
-    noise = random.normal(0.0, _NOISE, 3)
     side = np.sign(_angle(physics, box) - _angle(physics, target))
+    return _sweep(random, box, side, lambda physics: _radius(physics, target))
+
+
+def push_aside(
+    physics: Physics, random: np.random.Generator, name: str, side: Literal[-1, 1]
+) -> Sequence[Phase]:
+    """Move the fist beside an object, then sweep the object along the arc to the other side.
+
+    Args:
+        physics: The simulation at the start of the episode.
+        random: Source of the noise.
+        name: The object.
+        side: 1 to push from the left to the right, -1 to push from the right to the left.
+    """
+    start = _radius(physics, name)
+    return _sweep(random, name, side, lambda _: start)
+
+
+def _sweep(
+    random: np.random.Generator, name: str, side: float, goal: Callable[[Physics], float]
+) -> Sequence[Phase]:
+    """Return a sweep of the fist along the arc that takes an object with it.
+
+    Args:
+        random: Source of the noise.
+        name: The object.
+        side: 1 to start on the object's left, -1 on its right.
+        goal: Radius (m) to which the sweep leads, evaluated at each step.
+    """
+    noise = random.normal(0.0, _NOISE, 3)
     away = side * random.uniform(0.025, 0.04)
     point = _BEFORE_KNUCKLES if side < 0 else _BEHIND_BACK
 
     def behind(height: float) -> Place:
         return lambda physics: beside_object(
-            physics, box, away, height + noise[2], point, noise[:2]
+            physics, name, away, height + noise[2], point, noise[:2]
         )
 
     def through(physics: Physics) -> np.ndarray:
-        # A box pushed along the arc drifts outwards along the hand, so the hand follows outwards.
-        radius, angle = kinematics.to_polar(physics.object_position(box))
-        radius = (radius + kinematics.to_polar(physics.object_position(target))[0]) / 2
+        # An object pushed along the arc drifts outwards along the hand, so the hand follows.
+        radius, angle = kinematics.to_polar(physics.object_position(name))
+        radius = (radius + goal(physics)) / 2
         place = kinematics.polar(radius + _OUTWARD, angle - side * _LEAD / radius)
         return kinematics.inverse(np.append(place, SWEEP_HEIGHT), point)
 
@@ -105,6 +165,26 @@ def push(physics: Physics, random: np.random.Generator, box: str, target: str) -
         Phase(behind(SWEEP_HEIGHT), FIST),
         Phase(through, FIST),
     ]
+
+
+def press(physics: Physics, random: np.random.Generator, name: str) -> Sequence[Phase]:
+    """Move the fist high above an object, then down onto it.
+
+    Args:
+        physics: The simulation at the start of the episode.
+        random: Source of the noise.
+        name: The object.
+    """
+    del physics
+    noise = random.normal(0.0, _NOISE, 3)
+    top = TABLE_HEIGHT + 2 * OBJECT_HALF_HEIGHT[name]
+
+    def over(height: float) -> Place:
+        return lambda physics: beside_object(
+            physics, name, 0.0, top + height + noise[2], _FRONT, noise[:2]
+        )
+
+    return [Phase(over(0.16), FIST, tolerance=0.014), Phase(over(-0.03), FIST)]
 
 
 def beside_object(
@@ -128,6 +208,21 @@ def beside_object(
     radius, angle = kinematics.to_polar(physics.object_position(name))
     place = kinematics.polar(radius, angle + left / radius) + noise
     return kinematics.inverse(np.append(place, height), point)
+
+
+def _stay(physics: Physics) -> np.ndarray:
+    return np.array(physics.data.ctrl[:3])
+
+
+def _room_on_the_right(physics: Physics, name: str) -> float:
+    """Return the distance along the arc (m) to the next object on the right, if any."""
+    radius, angle = kinematics.to_polar(physics.object_position(name))
+    others = [angle - _angle(physics, other) for other in OBJECTS if other != name]
+    return radius * min((turn for turn in others if turn > 0), default=np.inf)
+
+
+def _radius(physics: Physics, name: str) -> float:
+    return kinematics.to_polar(physics.object_position(name))[0]
 
 
 def _angle(physics: Physics, name: str) -> float:

@@ -11,34 +11,46 @@ from dm_control.utils import containers
 
 from suites.nico.base import CONTROL_TIMESTEP, TIME_LIMIT, Environment, NicoTask, Observation
 from suites.nico.grasp_glass import GraspGlass
+from suites.nico.lift_green import LiftGreen
 from suites.nico.physics import Physics, scene_xml
+from suites.nico.press_white import PressWhite
+from suites.nico.push_glass_right import PushGlassRight
 from suites.nico.push_green_to_glass import PushGreenToGlass
 from suites.nico.push_green_to_white import PushGreenToWhite
+from suites.nico.push_white_left import PushWhiteLeft
+from suites.nico.push_white_right import PushWhiteRight
 from suites.nico.rendering import FRAME_HEIGHT, FRAME_WIDTH, FrameRenderer, check_frame_size
 
 _TASKS: dict[str, type[NicoTask]] = {
     "grasp_glass": GraspGlass,
     "push_green_to_glass": PushGreenToGlass,
     "push_green_to_white": PushGreenToWhite,
+    "push_glass_right": PushGlassRight,
+    "lift_green": LiftGreen,
+    "press_white": PressWhite,
+    "push_white_left": PushWhiteLeft,
+    "push_white_right": PushWhiteRight,
 }
+PAPER_TASKS = ("grasp_glass", "push_green_to_glass", "push_green_to_white")
+"""Names of the paper's tasks, in its order, the default of the experiments."""
 ALL_TASKS = tuple(_TASKS)
-"""Names of the paper's tasks, in its order."""
+"""Names of all tasks of the suite, the paper's first."""
 TASKS: Mapping[str, type[NicoTask]] = MappingProxyType(_TASKS)
-"""Classes of the paper's and of added tasks, by name."""
+"""Classes of the suite's and of added tasks, by name."""
 
 
 def add_task(name: str, task: type[NicoTask]) -> None:
     """Register a custom task under a name, for this process.
 
     Adding the same name again replaces the task, for example when a notebook cell runs twice.
-    ``ALL_TASKS``, the default everywhere, keeps only the paper's tasks.
+    ``PAPER_TASKS``, the default everywhere, stays the same.
 
     Args:
         name: Name of the task in `load`, datasets, settings and CSV files.
         task: Class that defines success and, for recording, a demonstration.
 
     Raises:
-        ValueError: If the name is taken by one of the paper's tasks or is not an identifier, or the
+        ValueError: If the name is taken by one of the suite's tasks or is not an identifier, or the
             class is not a `NicoTask`.
 
     Example:

@@ -21,6 +21,7 @@ OBJECT_HALF_HEIGHT: Final = {"glass": 0.035, "green_box": 0.025, "white_box": 0.
 
 _FULL_STATE = mujoco.mjtState.mjSTATE_INTEGRATION.value
 _TOUCH_GAP = 0.002  # (m) distance below which two objects touch
+_VERTICAL = 0.9  # vertical component of its normal from which a contact is from above
 _PRESSING = 0.02  # (rad) lead of the target over the curl above which a hand is closing
 
 
@@ -178,6 +179,22 @@ class Physics(dm_mujoco.Physics):
         """Return whether the hand is closing: its target lies beyond its mean curl."""
         targets = self.data.ctrl[len(ARM_JOINTS) :]
         return bool((targets - self.digit_curls()).mean() > _PRESSING)
+
+    def pressed(self, name: str) -> bool:
+        """Return whether the hand touches an object's top or another part of it from above.
+
+        Args:
+            name: One of `OBJECTS`.
+
+        Raises:
+            ValueError: If ``name`` is not one of `OBJECTS`.
+        """
+        geom = self._object_id("geom", name)
+        for contact in self.data.contact:
+            pair = {contact.geom1, contact.geom2}
+            if geom in pair and pair & set(self._hand) and abs(contact.frame[2]) > _VERTICAL:
+                return True
+        return False
 
     def held(self, name: str) -> bool:
         """Return whether an object is between thumb and finger side of a closing hand.

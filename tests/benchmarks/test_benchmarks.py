@@ -31,7 +31,7 @@ from bgpo_trl.runs.results import read_rows
 from suites import nico
 
 ROOT = Path(__file__).parents[2]
-TASKS = nico.ALL_TASKS
+TASKS = nico.PAPER_TASKS
 
 
 def files(folder):

@@ -15,7 +15,7 @@ from bgpo_trl.runs.config_file import read_config
 from bgpo_trl.runs.results import read_rows
 from suites import nico
 
-TASKS = nico.ALL_TASKS
+TASKS = nico.PAPER_TASKS
 RUBBISH = bytes(range(1, 128)) * 3  # which is text, as far as UTF-8 goes
 FINAL = "seed,demonstrations,task,episodes,success,task_inference\n"
 

@@ -13,7 +13,7 @@ from bgpo_trl import load_run
 from bgpo_trl.data.recording import record_demonstrations
 from suites import nico
 
-TASKS = nico.ALL_TASKS
+TASKS = nico.PAPER_TASKS
 
 
 def test_every_seed_is_tested_with_every_share_of_every_task(run_of, tmp_path, capsys):

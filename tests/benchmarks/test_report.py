@@ -14,7 +14,7 @@ from bgpo_trl.analysis import claims, comparison
 from bgpo_trl.analysis import tables as report_tables
 from suites import nico
 
-TASKS = nico.ALL_TASKS
+TASKS = nico.PAPER_TASKS
 FIGURES = [f"fig{n}.png" for n in ("6", "6-without", "6-published", "7", "8", "8-without")]
 FIGURES += ["fig9.png", "fig9-added.png"]  # of the continual ablation, there is no run
 HEAD = "algorithm,seed,episode,env_steps,task,success,return,steps\n"

@@ -59,10 +59,10 @@ def write_run(job):
     final[0] += ",task_inference"
     for episode, seed in product(range(1, config.episodes + 1), config.seeds):
         row = f"{config.name},{seed},{episode},{7 * episode},{{}},{(seed + episode) % 2},0.1,5"
-        train.append(row.format(nico.ALL_TASKS[episode % 3]) + f",{sum(config.seeds)}.25")
+        train.append(row.format(nico.PAPER_TASKS[episode % 3]) + f",{sum(config.seeds)}.25")
         if episode % config.eval_every == 0:
-            tests += [row.format(task) for task in nico.ALL_TASKS] * 2
-    for kind, task, seed in product(("seen", "held-out"), nico.ALL_TASKS, config.seeds):
+            tests += [row.format(task) for task in nico.PAPER_TASKS] * 2
+    for kind, task, seed in product(("seen", "held-out"), nico.PAPER_TASKS, config.seeds):
         final.append(f"{seed},{kind},{task},0.{seed},1.0")
     for name, lines in (("train.csv", train), ("eval.csv", tests), ("final.csv", final)):
         (folder / name).write_text("\n".join(lines) + "\n")
@@ -113,7 +113,7 @@ def test_a_job_is_a_block_of_seeds_of_an_algorithm_in_a_setting(tmp_path):
 
 def test_workers_are_told_the_tasks_and_where_they_come_from(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    bank, tasks = Path("own.safetensors"), nico.ALL_TASKS[:2]
+    bank, tasks = Path("own.safetensors"), nico.PAPER_TASKS[:2]
     arguments = sweep.Arguments(
         settings=("continual", "concurrent"), tasks=tasks, module="my_tasks", bank=bank
     )

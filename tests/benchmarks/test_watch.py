@@ -38,7 +38,7 @@ def test_a_run_is_shown_and_left_as_it_is(run_of, undemonstrated, tmp_path, caps
     expected = {"nico.gif", "nico.png"} | ({"gwr_growth.png"} if name == "bgpo" else set())
     assert {path.name for path in out.iterdir()} == expected
     *outcomes, last = capsys.readouterr().out.splitlines()
-    for task, line in zip(nico.ALL_TASKS, outcomes, strict=True):
+    for task, line in zip(nico.PAPER_TASKS, outcomes, strict=True):
         assert line.startswith((f"{task}: no success after 6 steps", f"{task}: success after "))
     assert last == f"pictures: {out}"
     with Image.open(out / "nico.gif") as gif:
@@ -90,8 +90,8 @@ def test_an_episode_is_what_the_policy_does_from_that_start():
 
 
 def test_new_demonstrations_differ_by_task_and_seed():
-    first, same, other = (watch.demonstrate(nico.ALL_TASKS[:2], seed) for seed in (1, 1, 2))
-    for task in nico.ALL_TASKS[:2]:
+    first, same, other = (watch.demonstrate(nico.PAPER_TASKS[:2], seed) for seed in (1, 1, 2))
+    for task in nico.PAPER_TASKS[:2]:
         assert first[task].shape[1:] == (32, 64, 3) and first[task].any((1, 2, 3)).all()
         np.testing.assert_array_equal(first[task], same[task])
         assert not np.array_equal(first[task][0], other[task][0])
@@ -151,7 +151,7 @@ def test_the_growth_figure_knows_only_tasks_that_were_presented(run_of, bank, mo
     assert growth.draw_growth(run, config, bank)
     (graphs, counts, names), path = drawn
     assert path == run / "figures" / "gwr_growth.png"
-    assert names == nico.ALL_TASKS
+    assert names == nico.PAPER_TASKS
     assert list(graphs) == list(load_graphs(run / "gwr"))
     seen = bank.seen()
     for episode, (weights, edges, tasks) in graphs.items():

@@ -235,7 +235,7 @@ def test_compact_steps_hold_the_frames_of_their_demonstrations_alone(steps):
 
 
 def test_the_identity_is_that_of_the_demonstrations(bank, tmp_path):
-    path, tasks = tmp_path / "bank.safetensors", nico.ALL_TASKS[1:]
+    path, tasks = tmp_path / "bank.safetensors", nico.PAPER_TASKS[1:]
     some = bank.for_tasks(tasks)
     some.save(path, encoder_id="abc")
     assert DemonstrationBank.load(path, encoder_id="abc").identity == some.identity

@@ -18,7 +18,7 @@ TINY = RepresentationConfig(
     vae=VAEConfig(steps=2, batch_size=4, warmup_steps=1),
     lae=SequenceAutoencoderConfig(steps=2, batch_size=4, warmup_steps=1),
 )
-TASKS = nico.ALL_TASKS[::-1]
+TASKS = nico.PAPER_TASKS[::-1]
 ARGUMENTS = {
     "config": TINY,
     "tasks": TASKS,

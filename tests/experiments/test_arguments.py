@@ -6,7 +6,7 @@ from bgpo_trl.configs import PRESETS
 from bgpo_trl.experiments.arguments import Arguments, at_once, run_config
 from suites import nico
 
-ONE, TWO, THREE = nico.ALL_TASKS
+ONE, TWO, THREE = nico.PAPER_TASKS
 
 
 class Juggle(nico.NicoTask):
@@ -32,6 +32,12 @@ def test_tasks_are_presented_in_their_order(tasks, episodes, starts):
     config = run_config(Arguments(tasks=tasks, episodes=episodes))
     assert (config.tasks, config.task_starts) == (tasks, starts)
     assert at_once(config).task_starts == (0,) * len(tasks)
+
+
+def test_all_tasks_of_the_suite_come_at_even_intervals():
+    config = run_config(Arguments(tasks=("all",), episodes=4_000))
+    assert config.tasks == nico.ALL_TASKS and len(config.tasks) == 8
+    assert config.task_starts == tuple(range(0, 4_000, 500))
 
 
 def test_by_default_they_are_the_presets():

@@ -10,7 +10,7 @@ from bgpo_trl.runs.config_file import Digests
 from bgpo_trl.runs.demonstrations import BANK, keep_bank, load_inputs
 from suites import nico
 
-TASKS = nico.ALL_TASKS
+TASKS = nico.PAPER_TASKS
 
 
 @pytest.fixture(scope="module")

@@ -19,8 +19,11 @@ def random_actions(count: int, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).uniform(-1.0, 1.0, (count, 4))
 
 
-def test_all_tasks_are_the_three_of_the_paper():
-    assert nico.ALL_TASKS == ("grasp_glass", "push_green_to_glass", "push_green_to_white")
+def test_the_tasks_are_the_three_of_the_paper_and_five_more():
+    paper = ("grasp_glass", "push_green_to_glass", "push_green_to_white")
+    more = ("push_glass_right", "lift_green", "press_white", "push_white_left", "push_white_right")
+    assert paper == nico.PAPER_TASKS
+    assert (*paper, *more) == nico.ALL_TASKS == tuple(nico.TASKS)[:8]
 
 
 @all_tasks

@@ -98,6 +98,14 @@ def test_only_what_is_in_the_hand_is_touched_and_held(physics, name, curl, left,
         assert physics.held(other) is (held and other == name)
 
 
+@pytest.mark.parametrize("name", nico.OBJECTS)
+def test_what_the_palm_touches_from_the_side_is_not_pressed(physics, name):
+    put(physics, name, np.array([GRIP[0], GRIP[1], TABLE_HEIGHT + 0.03]), 0.0)
+
+    assert physics.touching("palm", name)
+    assert not physics.pressed(name)
+
+
 def test_the_hand_ends_at_the_wrist(physics):
     put(physics, "white_box", GRIP, 0.0)
     put(physics, "white_box", physics.named.data.geom_xpos["forearm"].copy(), 0.0)
@@ -122,13 +130,14 @@ def test_the_gap_to_the_hand_is_that_to_its_nearest_part(physics):
         (lambda physics: physics.gap("hand", "cup"), "no 'cup' .* one of hand, .*, white_box"),
         (lambda physics: physics.touching("cup", "hand"), "no 'cup' .* one of hand, .*, white_box"),
         (lambda physics: physics.held("cup"), "no object 'cup' .* one of glass, .*, white_box"),
+        (lambda physics: physics.pressed("cup"), "no object 'cup' .* one of glass, .*, white_box"),
         (lambda physics: physics.held("palm"), "no object 'palm' .* one of glass, .*, white_box"),
         (
             lambda physics: physics.object_position("cup"),
             "no object 'cup' .* one of glass, .*, white_box",
         ),
     ],
-    ids=["gap", "touching", "held", "held palm", "position"],
+    ids=["gap", "touching", "held", "pressed", "held palm", "position"],
 )
 def test_what_is_not_there_cannot_be_asked_for(physics, ask, refusal):
     with pytest.raises(ValueError, match=rf"^{refusal}$"):

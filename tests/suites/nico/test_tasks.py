@@ -51,7 +51,7 @@ def test_push_is_done_when_the_green_box_touches_the_target(physics, target, gap
     # Half the box and the radius of the glass, or half the other box.
     place(physics, {"green_box": (0.40, 0.0), target: (0.40 + 0.05 + gap, 0.0)})
 
-    done = {task for task in nico.ALL_TASKS if succeeded(task, physics)}
+    done = {task for task in nico.PAPER_TASKS if succeeded(task, physics)}
 
     task = {"glass": "push_green_to_glass", "white_box": "push_green_to_white"}[target]
     assert done == ({task} if touches else set())
@@ -82,7 +82,7 @@ def test_push_to_glass_counts_when_the_glass_was_knocked_over(physics):
 def test_no_push_is_done_when_only_glass_and_white_box_touch(physics):
     place(physics, {"glass": (0.40, 0.3), "white_box": (0.45, 0.3)})
 
-    assert not any(succeeded(task, physics) for task in nico.ALL_TASKS)
+    assert not any(succeeded(task, physics) for task in nico.PAPER_TASKS)
 
 
 GRIP = np.array([0.42, 0.05, TABLE_HEIGHT + 0.045])
@@ -145,3 +145,49 @@ def test_a_glass_that_was_knocked_over_can_be_held(physics):
     place(physics, {"glass": glass}, arm=ARM, curls=(CLOSED,) * 3, closing=0.1)
 
     assert succeeded("grasp_glass", physics)
+
+
+@pytest.mark.parametrize("radius", [0.40, 0.44])
+@pytest.mark.parametrize(
+    ("task", "name", "degrees", "moved"),
+    [
+        ("push_glass_right", "glass", 14.5, False),
+        ("push_glass_right", "glass", 13.5, True),
+        ("push_white_right", "white_box", -33.5, False),
+        ("push_white_right", "white_box", -34.5, True),
+        ("push_white_left", "white_box", -14.5, False),
+        ("push_white_left", "white_box", -13.5, True),
+    ],
+)
+def test_a_push_aside_counts_degrees_on_the_arc(physics, task, name, degrees, moved, radius):
+    place(physics, {name: kinematics.polar(radius, np.radians(degrees))})
+
+    assert succeeded(task, physics) is moved
+
+
+@pytest.mark.parametrize(
+    ("height", "closing", "lifted"), [(0.039, 0.1, False), (0.041, 0.1, True), (0.041, 0.0, False)]
+)
+def test_the_green_box_is_lifted_1_5_cm_above_the_table_in_a_closing_hand(
+    physics, height, closing, lifted
+):
+    box = (GRIP[0], GRIP[1], TABLE_HEIGHT + height)  # whose center is 0.025 m high on the table
+    place(physics, {"green_box": box}, arm=ARM, curls=(CLOSED,) * 3, closing=closing)
+
+    assert succeeded("lift_green", physics) is lifted
+
+
+@pytest.mark.parametrize(
+    ("above", "curl", "pressed"),
+    [
+        pytest.param(-0.012, 0.85, True, id="fist on the box"),
+        pytest.param(0.05, 0.85, False, id="fist above the box"),
+        pytest.param(-0.012, 0.5, False, id="half-open hand on the box"),
+    ],
+)
+def test_the_white_box_is_pressed_by_the_fist_on_its_top(physics, above, curl, pressed):
+    top = np.array([0.42, -0.2, TABLE_HEIGHT + 0.05 + above])
+    arm = kinematics.inverse(top, (0.02, 0.12))
+    place(physics, {"white_box": top[:2]}, arm=arm, curls=(curl,) * 3)
+
+    assert succeeded("press_white", physics) is pressed
