@@ -131,12 +131,16 @@ def at_once(config: RunConfig) -> RunConfig:
     return replace(config, task_starts=(0,) * len(config.tasks))
 
 
-def _with_tasks(config: RunConfig, tasks: tuple[str, ...] | None) -> RunConfig:
-    """Return a preset with other tasks."""
+def chosen_tasks(tasks: tuple[str, ...] | None, default: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the tasks that ``--tasks`` names.
+
+    Raises:
+        ValueError: If it is empty or a task does not exist.
+    """
     if tasks is None:
-        return config
+        return default
     if tasks == ("all",):
-        tasks = nico.ALL_TASKS
+        return nico.ALL_TASKS
     unknown = [name for name in tasks if name not in nico.TASKS]
     if unknown or not tasks:
         wrong = f"there is no task {unknown[0]!r}" if unknown else "it is empty"
@@ -144,6 +148,12 @@ def _with_tasks(config: RunConfig, tasks: tuple[str, ...] | None) -> RunConfig:
             f"--tasks: {wrong}; name some of {', '.join(nico.TASKS)}, or with --import MODULE some "
             "that a module adds"
         )
+    return tasks
+
+
+def _with_tasks(config: RunConfig, chosen: tuple[str, ...] | None) -> RunConfig:
+    """Return a preset with other tasks."""
+    tasks = chosen_tasks(chosen, config.tasks)
     starts, n = config.task_starts, len(tasks)
     if n != len(starts):
         starts = tuple(position * config.episodes // n for position in range(n))

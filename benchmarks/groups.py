@@ -1,0 +1,92 @@
+"""Groups of behaviors that form from the demonstrations of a bank, without learning a policy.
+
+    python benchmarks/groups.py
+    python benchmarks/groups.py --bank my_bank.safetensors --tasks all --draws 4000
+
+feeds networks with demonstrations in the order of training episodes, tasks one after the other and
+all from the start, and prints by activity threshold how many groups form and how pure they are on
+held-out demonstrations; also in how many of these GWR-B infers the task.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bgpo_trl.analysis.task_inference import group_purity, task_inference_accuracy
+from bgpo_trl.configs import BGPOConfig
+from bgpo_trl.data.bank import DemonstrationBank
+from bgpo_trl.data.own_tasks import import_tasks
+from bgpo_trl.experiments.arguments import TaskArguments, chosen_tasks, command_line
+from bgpo_trl.experiments.run import pretrained_for
+from bgpo_trl.modules.behavior_groups import BehaviorGroups
+from bgpo_trl.modules.gwr import GWRB
+from suites import nico
+
+
+@dataclass(frozen=True)
+class Arguments(TaskArguments):
+    """Measure the groups of behaviors that form from demonstrations."""
+
+    thresholds: tuple[float, ...] = (0.5, 0.525, 0.55, 0.575, 0.6)
+    """Activity thresholds of the coarse network."""
+    draws: int = 1_800
+    """Demonstrations that each network is fed with."""
+    seeds: tuple[int, ...] = (0, 1, 2, 3, 4, 5)
+    """Seeds of the draws."""
+
+
+def draw(
+    bank: DemonstrationBank, starts: Sequence[int], *, draws: int, seeds: Sequence[int]
+) -> Tensor:
+    """Draw demonstrations as training episodes do, int64 ``[draws, S]`` rows of the bank."""
+    of_task = [np.flatnonzero(bank.task == task) for task in range(len(starts))]
+    rows = np.empty((draws, len(seeds)), np.int64)
+    for column, seed in zip(rows.T, seeds, strict=True):
+        rng = np.random.default_rng(seed)
+        for episode in range(draws):
+            presented = [task for task, start in enumerate(starts) if start <= episode]
+            column[episode] = rng.choice(of_task[rng.choice(presented)])
+    return torch.from_numpy(rows)
+
+
+def main(arguments: Arguments) -> None:
+    """Print the table."""
+    torch.set_num_threads(1)
+    import_tasks(arguments.module)
+    tasks = chosen_tasks(arguments.tasks, nico.PAPER_TASKS)
+    _, bank = pretrained_for(tasks, arguments.bank)
+    config, n_tasks, seeds = BGPOConfig(), len(tasks), arguments.seeds
+    seen, held_out = bank.seen(), bank.held_out()
+    even = [i * arguments.draws // n_tasks for i in range(n_tasks)]
+    print("| order | network | a_T | groups or nodes, by seed | purity or inference, % |")
+    print("|---|---|---:|---|---|")
+    for order, starts in {"one after the other": even, "from the start": [0] * n_tasks}.items():
+        inputs = seen.embedding[draw(seen, starts, draws=arguments.draws, seeds=seeds)]
+        gwr = GWRB(32, batch_size=len(seeds), **asdict(config.gwr))
+        for x in inputs:
+            gwr.adapt(x)
+        right = task_inference_accuracy(gwr, seen, held_out, n_tasks)
+        print(row(order, "fine", config.gwr.activity_threshold, gwr.num_nodes, right))
+        for threshold in arguments.thresholds:
+            settings = replace(config.groups, activity_threshold=threshold)
+            groups = BehaviorGroups(32, batch_size=len(seeds), **asdict(settings))
+            for x in inputs:
+                groups.adapt(x)
+            purity = group_purity(groups, held_out, n_tasks)
+            print(row(order, "coarse", threshold, groups.num_groups, purity), flush=True)
+
+
+def row(order: str, network: str, threshold: float, counts: Tensor, shares: Tensor) -> str:
+    """Format a row of the table."""
+    numbers = " ".join(str(count) for count in counts.tolist())
+    percent = " ".join(f"{100 * share:.4g}" for share in shares.tolist())
+    return f"| {order} | {network} | {threshold} | {numbers} | {percent} |"
+
+
+if __name__ == "__main__":
+    command_line(main, __doc__, Arguments)
