@@ -1,6 +1,7 @@
 """Detection of a task that was never shown, by the activity of the groups of behaviors.
 
     python benchmarks/unknown_task.py
+    python benchmarks/unknown_task.py --bank my_bank.safetensors --tasks all
 
 leaves out each task in turn: groups form from demonstrations of the others, and the activity of
 held-out demonstrations says whether their task is known. It prints a table and writes
@@ -18,18 +19,17 @@ from matplotlib.figure import Figure
 
 from bgpo_trl.analysis.novelty import Detection, leave_one_out, roc_curve
 from bgpo_trl.configs import BGPOConfig
-from bgpo_trl.data.bank import DemonstrationBank
-from bgpo_trl.encoders.pretrained import load_pretrained
-from bgpo_trl.experiments.arguments import command_line
+from bgpo_trl.data.own_tasks import import_tasks
+from bgpo_trl.experiments.arguments import TaskArguments, chosen_tasks, command_line
+from bgpo_trl.experiments.run import pretrained_for
 from bgpo_trl.figures.style import COLORS, LINES, save_figure, style_axes
+from suites import nico
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Arguments(TaskArguments):
     """Measure how well demonstrations of an unknown task are detected."""
 
-    bank: Path | None = None
-    """A bank made with the shipped encoders; the shipped bank if not given."""
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
     """Seeds of the draws of demonstrations."""
     draws: int = 600
@@ -56,9 +56,8 @@ def draw(found: dict[str, Detection]) -> Figure:
 
 def main(arguments: Arguments) -> None:
     """Print the table and write the results."""
-    encoders, bank = load_pretrained()
-    if arguments.bank is not None:
-        bank = DemonstrationBank.load(arguments.bank, encoder_id=encoders.identity)
+    import_tasks(arguments.module)
+    _, bank = pretrained_for(chosen_tasks(arguments.tasks, nico.PAPER_TASKS), arguments.bank)
     config = BGPOConfig().groups
     found = {
         task: leave_one_out(bank, i, config, seeds=arguments.seeds, draws=arguments.draws)
