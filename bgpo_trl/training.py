@@ -125,7 +125,7 @@ class Trainer(Closing):
             if encoders is not None:  # Others cannot be loaded to watch demonstrations.
                 keep_bank(self.directory, bank, encoders)
         except BaseException:
-            self._lock.release()
+            self._lock.close()
             raise
 
     def run(self) -> None:
@@ -183,7 +183,7 @@ class Trainer(Closing):
     def close(self) -> None:
         """Close files and mirrors, and unlock the directory for other processes."""
         self.logger.close()
-        self._lock.release()
+        self._lock.close()
 
     def _success_so_far(self) -> str:
         rate = sum(self._successes) / len(self._successes)

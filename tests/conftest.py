@@ -1,4 +1,4 @@
-"""What all tests share: settings, and the parts of a run small enough to be played in a second."""
+"""Settings of all tests, and parts of a run that take about a second."""
 
 import hashlib
 import os
@@ -134,7 +134,7 @@ def easy_world():
 
 @pytest.fixture(autouse=True)
 def own_tasks_are_forgotten() -> Iterator[None]:
-    """What a test adds to the suite is gone after it."""
+    """Remove tasks that a test has added to the suite."""
     before = dict(nico._TASKS)
     yield
     nico._TASKS.clear()

@@ -1,4 +1,4 @@
-"""What `test_resume` runs in processes of its own, to kill them; imports no more than it needs."""
+"""Runs that `test_resume` starts in separate processes and kills; imports only what they need."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""What people get wrong with files: each is one line, and nothing is left half-written."""
+"""Wrong files: each is refused in one line, and nothing is left half-written."""
 
 from pathlib import Path
 

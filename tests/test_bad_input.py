@@ -1,4 +1,4 @@
-"""What people get wrong in Python: each wrong value is one line that says what, and what to do.
+"""Wrong values in Python: each is refused in one line that says what to do.
 
 A case is what is done, what the message says of the cause, and what of the remedy. Settings are in
 `test_configs.py`, files in `test_bad_files.py`, command lines in
@@ -98,7 +98,7 @@ def task_replay(task=None, capacity=5, batch_size=2):
 
 
 def filled(value):
-    """What a GWR-B keeps, with one thing changed."""
+    """Return the state of a GWR-B with one thing changed."""
     gwr = GWRB(2)
     gwr.load_state_dict({"_extra_state": [{**gwr.get_extra_state()[0], **value}]})
 
@@ -326,6 +326,6 @@ def test_a_policy_that_has_diverged_ends_the_run_in_one_line(make_config, bank, 
     ):
         trainer.run()
     assert load_checkpoint(tmp_path / "run" / "checkpoint")["env_steps"] == 0  # none since
-    # What is there can be read: headers, and not a row.
+    # The files can be read: headers without a row.
     for name in ("train.csv", "eval.csv"):
         assert (tmp_path / "run" / name).read_bytes().count(b"\n") == 1

@@ -1,4 +1,4 @@
-"""What README, CONTRIBUTING and the pages of docs/ show works as it stands."""
+"""Code and commands in README, CONTRIBUTING and docs/ work as they stand."""
 
 import functools
 import importlib.util

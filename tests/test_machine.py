@@ -1,4 +1,4 @@
-"""What the machine offers: quotas are heeded, devices found or refused."""
+"""Quotas of the machine are heeded, devices found or refused."""
 
 import os
 

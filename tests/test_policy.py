@@ -1,4 +1,4 @@
-"""What a run has learned, loaded: it acts as in the run's own test episodes."""
+"""Loaded policies act as in the test episodes of their runs."""
 
 import hashlib
 import json

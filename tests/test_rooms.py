@@ -27,7 +27,7 @@ TOP = ("envs", "world", "evaluation", "training", "policy", "doctor")
 OPEN = ("configs", "errors", "seeding", "machine", "threads")
 """Open to all; they import from none of the rooms."""
 LAST = ("__init__", "__main__")
-"""What stands outside imports from anywhere: the package's face and its command line."""
+"""The package's face and its command line, which import from anywhere."""
 
 
 def imported(path: Path) -> set[str]:

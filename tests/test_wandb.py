@@ -1,4 +1,4 @@
-"""What wandb itself, in its offline mode, has written of a run. Nothing here goes online."""
+"""Files that wandb writes in its offline mode. Nothing here goes online."""
 
 import csv
 import hashlib

@@ -11,9 +11,8 @@ import time
 import weakref
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
+from bgpo_trl.files.closing import Closing
 from bgpo_trl.files.folders import make_folder
 
 _OWNER = re.compile(r"process \d+ on \S+")
@@ -31,15 +30,15 @@ class _Held:
 _held: dict[tuple[int, Path], _Held] = {}
 
 
-class DirectoryLock:
-    """Exclusive lock on a directory, held until it is released or the process ends.
+class DirectoryLock(Closing):
+    """Exclusive lock on a directory, held until it is closed or the process ends.
 
     The kernel frees the lock of a process that is killed. The lock is reentrant within a process (a
-    `Trainer` takes it again within a job of a sweep): the last release frees it. While it is held,
+    `Trainer` takes it again within a job of a sweep): the last `close` frees it. While it is held,
     the file ``lock`` in the directory names process and machine.
 
     Args:
-        directory: The directory, made if missing; removed on release if it is then empty.
+        directory: The directory, made if missing; removed on `close` if it is then empty.
         wait: Whether to wait for another process instead of raising.
 
     Raises:
@@ -72,20 +71,9 @@ class DirectoryLock:
             time.sleep(_SECONDS)
         self._give_back = weakref.finalize(self, _release, key)
 
-    def release(self) -> None:
+    def close(self) -> None:
         """Release the lock; repeated calls do nothing."""
         self._give_back()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc_value: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.release()
 
 
 def _take(directory: Path) -> _Held:

@@ -40,7 +40,7 @@ def rows(path):
 
 
 def write_run(job):
-    """What a run of a job leaves behind, of results that follow from seed and episode."""
+    """Write the files of a finished job, with results that follow from seed and episode."""
     config, folder = job.config, job.directory
     folder.mkdir(parents=True, exist_ok=True)
     settings = settings_of(config, SOME)

@@ -16,7 +16,7 @@ EXAMPLE = Path(__file__).parents[2] / "examples" / "own_loss.py"
 
 @pytest.fixture
 def registry(monkeypatch):
-    """What the example enters in it is gone after the test."""
+    """Remove the entries of the example after the test."""
     monkeypatch.setitem(RL, "awac", None)
     return RL
 

@@ -17,7 +17,7 @@ EXAMPLE = Path(__file__).parents[2] / "examples" / "own_rl_algorithm.py"
 
 @pytest.fixture
 def registry(monkeypatch):
-    """What the example enters in it is gone after the test."""
+    """Remove the entries of the example after the test."""
     monkeypatch.setitem(RL, "td3-epsilon", None)
     return RL
 

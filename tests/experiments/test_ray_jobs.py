@@ -20,7 +20,7 @@ from bgpo_trl.experiments import ray_jobs as jobs
 from bgpo_trl.experiments.ray_jobs import Job
 from bgpo_trl.training import Trainer
 
-# What Ray starts here, it starts in vain on every core otherwise.
+# Otherwise Ray starts a worker on every core, in vain.
 SMALL = {"include_dashboard": False, "object_store_memory": 80_000_000}
 
 
@@ -257,7 +257,7 @@ def test_a_lost_machine_costs_nothing(cluster, bank, make_config, tmp_path):
         Trainer(config, reference, bank=bank, progress=False).run()
         for name in ("train.csv", "eval.csv"):
             assert (job.directory / name).read_bytes() == (reference / name).read_bytes()
-        # What comes after training is not played here.
+        # Nothing is played after training here.
         (job.directory / "final.csv").write_text("seed\n3\n")
         (job.directory / "summary.json").write_text('{"commit": "", "nodes": null}')
     merge.merge([job.directory for job in todo], tmp_path / "merged")

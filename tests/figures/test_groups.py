@@ -1,4 +1,4 @@
-"""What the figure of groups shows, from a train.csv written by hand; not how it looks."""
+"""Content of the figure of groups, from a train.csv written by hand; not its looks."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What the figure of GWR-B's growth shows; not how it looks."""
+"""Content of the figure of GWR-B's growth; not its looks."""
 
 import numpy as np
 import pytest

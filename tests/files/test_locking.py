@@ -49,11 +49,11 @@ def test_who_holds_it_may_take_it_again(other_process, tmp_path):
     """It is free when the last one is released, in whatever order."""
     first = DirectoryLock(tmp_path)
     second = DirectoryLock(tmp_path / "." / ".." / tmp_path.name)
-    first.release()
-    first.release()
+    first.close()
+    first.close()
     process = other_process(tmp_path, wait=True)
     assert process.stdout.readline() == "waits\n"
-    second.release()
+    second.close()
     assert "has it\n" in process.stdout
 
 

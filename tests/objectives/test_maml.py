@@ -326,7 +326,7 @@ def test_a_task_of_weight_zero_counts_for_nothing_and_is_not_adapted_to():
     for ours, theirs in zip(gradients(loss), first, strict=True):
         assert ours.equal(theirs)
 
-    # What is left is what the other tasks give.
+    # The rest is the contribution of the other tasks.
     expected = 0.0
     for task in (0, 2):
         loss.zero_grad()

@@ -159,7 +159,7 @@ def test_a_run_made_longer_is_the_longer_run(make, make_config, tmp_path):
     with make(run, config, resume=True) as trainer:
         trainer.run()
     for file in ("train.csv", "eval.csv"):
-        # What was played early is logged late.
+        # Episodes that were played early are logged late.
         assert sorted(rows(run / file)) == sorted(rows(straight / file))
     assert (run / "config.json").read_text() == (straight / "config.json").read_text()
     assert_equal(*(load_checkpoint(folder / "checkpoint") for folder in (run, straight)))

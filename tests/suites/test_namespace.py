@@ -47,7 +47,7 @@ def test_the_wheel_has_no_file_that_another_projects_suites_would_have(other, tm
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, copy / name)
     wheels.mkdir()
-    # What pip calls, without the network that its isolated environment needs.
+    # The hook that pip calls, without the network that its isolated environment needs.
     build = f"from setuptools.build_meta import build_wheel; build_wheel({str(wheels)!r})"
     subprocess.run([sys.executable, "-c", build], cwd=copy, check=True, capture_output=True)
     (wheel,) = wheels.iterdir()

@@ -1,4 +1,4 @@
-"""What an action does to the joint targets, in every task."""
+"""Effect of an action on the joint targets, in every task."""
 
 import numpy as np
 import pytest

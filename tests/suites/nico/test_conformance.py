@@ -1,4 +1,4 @@
-"""What every task of the suite must keep to; modelled on ``dm_control.suite.tests.suite_test``."""
+"""Rules that every task of the suite keeps, after ``dm_control.suite.tests.suite_test``."""
 
 import itertools
 import re
