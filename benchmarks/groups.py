@@ -20,12 +20,10 @@ from torch import Tensor
 from bgpo_trl.analysis.task_inference import group_purity, task_inference_accuracy
 from bgpo_trl.configs import BGPOConfig
 from bgpo_trl.data.bank import DemonstrationBank
-from bgpo_trl.data.own_tasks import import_tasks
-from bgpo_trl.experiments.arguments import TaskArguments, chosen_tasks, command_line
-from bgpo_trl.experiments.run import pretrained_for
+from bgpo_trl.experiments.arguments import TaskArguments, command_line, even_starts
+from bgpo_trl.experiments.run import bank_of
 from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.modules.gwr import GWRB
-from suites import nico
 
 
 @dataclass(frozen=True)
@@ -57,15 +55,16 @@ def draw(
 def main(arguments: Arguments) -> None:
     """Print the table."""
     torch.set_num_threads(1)
-    import_tasks(arguments.module)
-    tasks = chosen_tasks(arguments.tasks, nico.PAPER_TASKS)
-    _, bank = pretrained_for(tasks, arguments.bank)
-    config, n_tasks, seeds = BGPOConfig(), len(tasks), arguments.seeds
+    bank = bank_of(arguments)
+    config, n_tasks, seeds = BGPOConfig(), len(bank.tasks), arguments.seeds
     seen, held_out = bank.seen(), bank.held_out()
-    even = [i * arguments.draws // n_tasks for i in range(n_tasks)]
     print("| order | network | a_T | groups or nodes, by seed | purity or inference, % |")
     print("|---|---|---:|---|---|")
-    for order, starts in {"one after the other": even, "from the start": [0] * n_tasks}.items():
+    orders = {
+        "one after the other": even_starts(n_tasks, arguments.draws),
+        "from the start": (0,) * n_tasks,
+    }
+    for order, starts in orders.items():
         inputs = seen.embedding[draw(seen, starts, draws=arguments.draws, seeds=seeds)]
         gwr = GWRB(32, batch_size=len(seeds), **asdict(config.gwr))
         for x in inputs:

@@ -19,11 +19,9 @@ from matplotlib.figure import Figure
 
 from bgpo_trl.analysis.novelty import Detection, leave_one_out, roc_curve
 from bgpo_trl.configs import BGPOConfig
-from bgpo_trl.data.own_tasks import import_tasks
-from bgpo_trl.experiments.arguments import TaskArguments, chosen_tasks, command_line
-from bgpo_trl.experiments.run import pretrained_for
+from bgpo_trl.experiments.arguments import TaskArguments, command_line
+from bgpo_trl.experiments.run import bank_of
 from bgpo_trl.figures.style import COLORS, LINES, save_figure, style_axes
-from suites import nico
 
 
 @dataclass(frozen=True)
@@ -56,8 +54,7 @@ def draw(found: dict[str, Detection]) -> Figure:
 
 def main(arguments: Arguments) -> None:
     """Print the table and write the results."""
-    import_tasks(arguments.module)
-    _, bank = pretrained_for(chosen_tasks(arguments.tasks, nico.PAPER_TASKS), arguments.bank)
+    bank = bank_of(arguments)
     config = BGPOConfig().groups
     found = {
         task: leave_one_out(bank, i, config, seeds=arguments.seeds, draws=arguments.draws)

@@ -1,4 +1,4 @@
-"""Whatever happens to the bytes of a file, it is read as it was written, or refused in one line."""
+"""A file with damaged bytes is read as it was written, or refused in one line."""
 
 import json
 import pickle

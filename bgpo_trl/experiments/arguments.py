@@ -154,10 +154,14 @@ def chosen_tasks(tasks: tuple[str, ...] | None, default: tuple[str, ...]) -> tup
 def _with_tasks(config: RunConfig, chosen: tuple[str, ...] | None) -> RunConfig:
     """Return a preset with other tasks."""
     tasks = chosen_tasks(chosen, config.tasks)
-    starts, n = config.task_starts, len(tasks)
-    if n != len(starts):
-        starts = tuple(position * config.episodes // n for position in range(n))
+    same = len(tasks) == len(config.task_starts)
+    starts = config.task_starts if same else even_starts(len(tasks), config.episodes)
     return replace(config, tasks=tasks, task_starts=starts)
+
+
+def even_starts(n_tasks: int, episodes: int) -> tuple[int, ...]:
+    """Return the episodes from which tasks are presented at even intervals."""
+    return tuple(position * episodes // n_tasks for position in range(n_tasks))
 
 
 def command_line(

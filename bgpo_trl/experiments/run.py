@@ -14,15 +14,17 @@ import torch
 from bgpo_trl.algorithms import Algorithm
 from bgpo_trl.configs import STAGE_PRESETS, RunConfig
 from bgpo_trl.data.bank import DemonstrationBank
+from bgpo_trl.data.own_tasks import import_tasks
 from bgpo_trl.encoders.pretrained import load_pretrained, make_pretrained
 from bgpo_trl.encoders.representation import Representation
-from bgpo_trl.experiments.arguments import Arguments
+from bgpo_trl.experiments.arguments import Arguments, TaskArguments, chosen_tasks
 from bgpo_trl.experiments.measure import draw, measure
 from bgpo_trl.experiments.resuming import as_begun, check_resumable, is_finished
 from bgpo_trl.files.locking import DirectoryLock
 from bgpo_trl.machine import choose_device, set_threads
 from bgpo_trl.runs.demonstrations import BANK
 from bgpo_trl.training import Trainer
+from suites import nico
 
 _DATASET, _ENCODERS = "demonstrations", "encoders"  # folders of a run that trains its encoders
 
@@ -153,6 +155,16 @@ def pretrained_for(
         lacking = [task for task in tasks if task not in own.tasks]
         found = own + found.for_tasks(lacking) if lacking else own
     return encoders, found.for_tasks(tasks)
+
+
+def bank_of(arguments: TaskArguments) -> DemonstrationBank:
+    """Load the demonstrations that a command line names, embedded by the pretrained encoders.
+
+    Raises:
+        ValueError: As for `import_tasks`, `chosen_tasks` and `pretrained_for`.
+    """
+    import_tasks(arguments.module)
+    return pretrained_for(chosen_tasks(arguments.tasks, nico.PAPER_TASKS), arguments.bank)[1]
 
 
 def commit_of_code() -> str:

@@ -314,7 +314,7 @@ def test_a_task_of_weight_zero_counts_for_nothing_and_is_not_adapted_to():
         assert w.grad[:, 0].any()
         assert w.grad[:, 2].any()
 
-    # Whatever the task holds: other transitions, another Q-function.
+    # The result is independent of the content of the task: other transitions, another Q-function.
     batch[:, 1] = weighted(transitions(2, TASKS, 8, seed=5), 1.0, 0.0, 1.0)[:, 1]
     with torch.no_grad():
         for w in loss.value_network_params.parameters():
