@@ -10,7 +10,8 @@ from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.dataset import load_demonstrations
 from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.encoders.pretrained import load_pretrained
-from bgpo_trl.encoders.representation import default_weights, load_representation
+from bgpo_trl.encoders.representation import load_representation
+from bgpo_trl.encoders.shipped import default_weights
 from bgpo_trl.figures.curves import plot_success_curves
 from bgpo_trl.figures.frame_strips import plot_frame_strips
 from bgpo_trl.figures.style import save_figure
@@ -135,7 +136,8 @@ CASES = {
     "a bank for encoders": (
         lambda f: load_representation(f / "bank"), "damaged or holds no", "--train-enc"),
     "encoders of another scene": (
-        lambda f: load_representation(scene_version="mars"), "is scene mars", "--train-encoders"),
+        lambda f: load_representation(default_weights(), scene_version="mars"), "is scene mars",
+        "--train-encoders"),
     "no bank": (lambda f: load_bank(f / "a"), "there is no demonstration bank", "--train-encoders"),
     "encoders for a bank": (
         lambda f: load_bank(default_weights()), "not a bank", "--train-encoders"),

@@ -75,6 +75,13 @@ def test_own_task_is_recorded_learned_and_counted_under_its_name(run):
     assert run("own_task.py") == out  # a run that is over is only told of again
 
 
+# An unbounded state is no mistake.
+@pytest.mark.filterwarnings("ignore:.*A Box observation space m.*imum value is:UserWarning")
+def test_stable_baselines3_trains_on_a_task_and_is_tested(run):
+    out = run("sb3_on_nico.py")
+    assert re.fullmatch(r"grasp_glass: \d+% of 10 test episodes succeed after 300 steps\n", out)
+
+
 def test_own_pipeline_pays_for_what_is_new_and_plays_episodes(run):
     out = run("own_pipeline.py")
 

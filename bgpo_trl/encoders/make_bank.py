@@ -18,10 +18,10 @@ from bgpo_trl.data.bank import DemonstrationBank, DemonstrationSteps
 from bgpo_trl.data.dataset import load_demonstrations, read_meta
 from bgpo_trl.encoders.representation import (
     Representation,
-    default_weights,
     encode_frames,
     load_representation,
 )
+from bgpo_trl.encoders.shipped import default_weights
 from suites import nico
 
 

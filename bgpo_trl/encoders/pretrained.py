@@ -13,23 +13,27 @@ from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.encoders.representation import (
     Representation,
-    bank_path,
-    default_weights,
     load_representation,
 )
+from bgpo_trl.encoders.shipped import bank_path, default_weights
 from bgpo_trl.encoders.train import train_encoders
 from suites import nico
 
 
 def load_pretrained(
-    weights: str | Path | None = None,
+    weights: str | Path | None = None, *, tasks: Sequence[str] = nico.PAPER_TASKS
 ) -> tuple[Representation, DemonstrationBank]:
-    """Load encoders (by default the pretrained ones) and the bank beside them.
+    """Load encoders and the bank beside them.
+
+    Args:
+        weights: File of the encoders; by default the shipped ones for ``tasks``, see
+            `bgpo_trl.encoders.shipped.default_weights`.
+        tasks: Names of tasks.
 
     Raises:
         ValueError: If either file is missing, damaged or was made for another scene.
     """
-    weights = default_weights() if weights is None else Path(weights)
+    weights = default_weights(tasks) if weights is None else Path(weights)
     encoders = load_representation(weights, scene_version=nico.scene_version())
     bank = DemonstrationBank.load(bank_path(weights), encoder_id=encoders.identity)
     return encoders, bank

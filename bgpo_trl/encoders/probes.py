@@ -25,7 +25,6 @@ from bgpo_trl.data.dataset import load_demonstrations
 from bgpo_trl.encoders.distances import embedding_distances
 from bgpo_trl.encoders.representation import (
     Representation,
-    default_weights,
     encode_frames,
     load_representation,
     mean_frame,
@@ -33,6 +32,7 @@ from bgpo_trl.encoders.representation import (
     valid_frames,
     valid_steps,
 )
+from bgpo_trl.encoders.shipped import default_weights
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
 from bgpo_trl.objectives.representation import SequenceReconstructionLoss

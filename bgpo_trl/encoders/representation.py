@@ -13,7 +13,6 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from importlib import resources
 from pathlib import Path
 
 import torch
@@ -124,16 +123,6 @@ def embed_demonstrations(representation: Representation, dataset: TensorDictBase
     return representation.lae.encode(latent, dataset.get("length"))
 
 
-def default_weights() -> Path:
-    """Return the path of the pretrained weights."""
-    return Path(str(resources.files("bgpo_trl") / "weights" / "nico.safetensors"))
-
-
-def bank_path(weights: Path) -> Path:
-    """Return the path of the bank of encoder weights: ``nico_bank`` beside ``nico``."""
-    return weights.with_name(f"{weights.stem}_bank{weights.suffix}")
-
-
 def save_representation(representation: Representation, path: str | Path) -> None:
     """Write both encoders and the metadata to one safetensors file; missing folders are made.
 
@@ -143,17 +132,15 @@ def save_representation(representation: Representation, path: str | Path) -> Non
     save_tensors(path, _tensors(representation), representation.metadata)
 
 
-def load_representation(
-    path: str | Path | None = None, *, scene_version: str | None = None
-) -> Representation:
+def load_representation(path: str | Path, *, scene_version: str | None = None) -> Representation:
     """Read encoders written by `save_representation`; they are in eval mode, without gradients.
 
-    By default, read the pretrained weights and accept any version of the scene.
+    By default, any version of the scene is accepted.
 
     Raises:
         ValueError: If the file is missing, damaged, or belongs to another scene.
     """
-    path = Path(path) if path is not None else default_weights()
+    path = Path(path)
     remedy = "train new ones with --train-encoders"
     try:
         tensors, metadata = load_tensors(path)

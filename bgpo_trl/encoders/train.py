@@ -15,17 +15,16 @@ from tensordict import TensorDictBase
 
 from bgpo_trl.configs import RepresentationConfig
 from bgpo_trl.data.bank import DemonstrationBank
-from bgpo_trl.data.dataset import load_demonstrations
+from bgpo_trl.data.dataset import load_demonstrations, read_meta
 from bgpo_trl.encoders.fitting import Log
 from bgpo_trl.encoders.make_bank import make_bank
 from bgpo_trl.encoders.probes import probe
 from bgpo_trl.encoders.representation import (
     Representation,
-    bank_path,
-    default_weights,
     save_representation,
     train_representation,
 )
+from bgpo_trl.encoders.shipped import bank_path, default_weights
 from bgpo_trl.files.csv_file import CsvFile
 from bgpo_trl.files.folders import make_folder
 from bgpo_trl.machine import choose_device
@@ -137,6 +136,7 @@ def main(arguments: Arguments) -> None:
         arguments.config,
         command,
         choose_device(arguments.device),
+        tasks=read_meta(arguments.dataset)["tasks"],
     )
 
 

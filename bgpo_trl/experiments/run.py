@@ -17,6 +17,7 @@ from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.own_tasks import import_tasks
 from bgpo_trl.encoders.pretrained import load_pretrained, make_pretrained
 from bgpo_trl.encoders.representation import Representation
+from bgpo_trl.encoders.shipped import default_weights, weights_of_bank
 from bgpo_trl.experiments.arguments import Arguments, TaskArguments, chosen_tasks
 from bgpo_trl.experiments.measure import draw, measure
 from bgpo_trl.experiments.resuming import as_begun, check_resumable, is_finished
@@ -143,13 +144,15 @@ def pretrained_for(
 
     Args:
         tasks: Names of the tasks.
-        bank: Bank to take them from; those that it lacks are taken from the shipped one.
+        bank: Bank to take them from; those that it lacks are taken from the shipped one of the
+            same encoders.
 
     Raises:
         ValueError: If the bank is missing, damaged or of other encoders, or a task has no
             demonstrations.
     """
-    encoders, found = load_pretrained()
+    weights = default_weights(tasks) if bank is None else weights_of_bank(bank)
+    encoders, found = load_pretrained(weights)
     if bank is not None:
         own = DemonstrationBank.load(bank, encoder_id=encoders.identity)
         lacking = [task for task in tasks if task not in own.tasks]

@@ -7,10 +7,9 @@ from pathlib import Path
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.encoders.representation import (
     Representation,
-    bank_path,
-    default_weights,
     load_representation,
 )
+from bgpo_trl.encoders.shipped import bank_path, find_weights
 from bgpo_trl.runs.config_file import Digests
 from suites import nico
 
@@ -32,7 +31,7 @@ def keep_bank(directory: Path, bank: DemonstrationBank, encoders: Representation
     Raises:
         OSError: If the file cannot be written.
     """
-    for path in (directory / BANK, bank_path(_weights(directory))):
+    for path in (directory / BANK, bank_path(_weights(directory, encoders.identity))):
         try:
             there = DemonstrationBank.load(path, encoder_id=encoders.identity)
             if there.for_tasks(bank.tasks).identity == bank.identity:
@@ -55,7 +54,7 @@ def load_inputs(
     Raises:
         ValueError: If one of the files is missing, damaged or another one.
     """
-    own, weights = _own_weights(directory), _weights(directory)
+    own, weights = _own_weights(directory), _weights(directory, digests.encoders)
     encoders = load_representation(weights, scene_version=nico.scene_version())
     if encoders.identity != digests.encoders:
         present = own if own == weights else "those that come with the package"
@@ -78,7 +77,7 @@ def _own_weights(directory: Path) -> Path:
     return directory / "encoders" / "nico.safetensors"
 
 
-def _weights(directory: Path) -> Path:
-    """Return the path of a run's encoders: its own if it has some, else the shipped ones."""
+def _weights(directory: Path, identity: str | None) -> Path:
+    """Return the path of a run's encoders: its own if it has some, else shipped ones."""
     own = _own_weights(directory)
-    return own if own.exists() else default_weights()
+    return own if own.exists() else find_weights(identity)

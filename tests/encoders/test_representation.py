@@ -14,7 +14,6 @@ from bgpo_trl.configs import RepresentationConfig, SequenceAutoencoderConfig, VA
 from bgpo_trl.encoders.probes import probe
 from bgpo_trl.encoders.representation import (
     Representation,
-    default_weights,
     embed_demonstrations,
     encode_frames,
     load_representation,
@@ -305,7 +304,3 @@ def test_refuses_missing_and_damaged_weights(tiny: Representation, tmp_path: Pat
         path.write_bytes(damaged)
         with pytest.raises(ValueError, match=r"damaged.*--train-encoders"):
             load_representation(path)
-
-
-def test_default_weights_lie_in_the_package() -> None:
-    assert default_weights().parts[-3:] == ("bgpo_trl", "weights", "nico.safetensors")

@@ -1,0 +1,57 @@
+"""Encoders that come with the package: those of the paper's three tasks, and of the suite's eight.
+
+Results on the paper's tasks are those of the first. The second know the suite's other tasks too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from importlib import resources
+from pathlib import Path
+
+from bgpo_trl.encoders.representation import load_representation
+from bgpo_trl.files.tensor_file import load_tensors
+from suites import nico
+
+_PAPER, _EIGHT = "nico.safetensors", "nico_eight.safetensors"
+
+
+def default_weights(tasks: Sequence[str] = nico.PAPER_TASKS) -> Path:
+    """Return the path of the encoders for some tasks.
+
+    Those of the eight tasks, if one of the suite's further five is among them; otherwise, also for
+    own tasks, those of the paper's three.
+    """
+    further = set(nico.ALL_TASKS) - set(nico.PAPER_TASKS)
+    return _path(_PAPER if further.isdisjoint(tasks) else _EIGHT)
+
+
+def bank_path(weights: Path) -> Path:
+    """Return the path of the bank of encoder weights: ``nico_bank`` beside ``nico``."""
+    return weights.with_name(f"{weights.stem}_bank{weights.suffix}")
+
+
+def find_weights(identity: str | None) -> Path:
+    """Return the path of the shipped encoders with an identity.
+
+    Those of the paper's tasks if none have it.
+    """
+    eight = _path(_EIGHT)
+    found = eight.exists() and load_representation(eight).identity == identity
+    return eight if found else _path(_PAPER)
+
+
+def weights_of_bank(bank: Path) -> Path:
+    """Return the path of the shipped encoders that embedded a bank.
+
+    Those of the paper's tasks if it was embedded by others, or cannot be read.
+    """
+    try:
+        metadata = load_tensors(bank)[1]
+    except (FileNotFoundError, ValueError):
+        metadata = {}
+    return find_weights(metadata.get("encoder_id"))
+
+
+def _path(name: str) -> Path:
+    return Path(str(resources.files("bgpo_trl") / "weights" / name))
