@@ -21,11 +21,13 @@ shared file system. Its file locks must hold across machines, as they do on NFS.
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 from bgpo_trl.algorithms import ABLATIONS
+from bgpo_trl.configs import RunConfig
 from bgpo_trl.data.own_tasks import import_tasks
 from bgpo_trl.experiments import arguments as experiment
 from bgpo_trl.experiments.arguments import at_once
@@ -35,11 +37,16 @@ from bgpo_trl.files.locking import DirectoryLock
 from bgpo_trl.runs.config_file import Digests, settings_of
 from bgpo_trl.runs.directory import check_settings, holds_run
 from bgpo_trl.runs.results import read_json
+from suites import nico
 
 try:
     from bgpo_trl.experiments.ray_jobs import Job, connected, play_jobs
 except ImportError as error:
     sys.exit(f"error: {error}")
+
+Setting = Literal[
+    "concurrent", "continual", "ablation", "eight", "eight-reversed", "eight-concurrent"
+]
 
 
 @dataclass(frozen=True)
@@ -48,9 +55,10 @@ class Arguments(experiment.TaskArguments):
 
     algorithms: tuple[experiment.AlgorithmName, ...] = ("bgpo",)
     """Algorithms, as in concurrent_tasks.py."""
-    settings: tuple[Literal["concurrent", "continual", "ablation"], ...] = ("concurrent",)
+    settings: tuple[Setting, ...] = ("concurrent",)
     """Tasks all from the start (concurrent), one after another (continual), or the variants of BGPO
-    instead of the algorithms (ablation)."""
+    instead of the algorithms (ablation). Or the suite's eight tasks instead of --tasks: one after
+    another, in reverse order, or all from the start."""
     preset: Literal["quick", "desk", "paper"] = "desk"
     """Size of the runs."""
     seeds: tuple[int, ...] | None = None
@@ -59,6 +67,11 @@ class Arguments(experiment.TaskArguments):
     """Seeds per job. Another number makes other runs."""
     episodes: int | None = None
     """Training episodes; the preset's by default. The task starts are scaled in proportion."""
+    eval_every: int | None = None
+    """Training episodes between evaluations; the preset's by default."""
+    held_out: Literal["validation", "test"] = "validation"
+    """Half of the held-out demonstrations to test on: validation to choose settings, test to report
+    results."""
     out: Path = Path("runs/sweep")
     """Parent of the run directories."""
     address: str = "local"
@@ -79,23 +92,12 @@ def make_jobs(arguments: Arguments) -> dict[Path, list[Job]]:
         raise ValueError(f"block must be at least 1, got {arguments.block}")
     if arguments.cpus_per_run <= 0 or arguments.gpus_per_run < 0:
         raise ValueError("--cpus-per-run must be above 0 and --gpus-per-run at least 0")
+    # Those that are not an algorithm by a name of its own.
+    ablation = [v for v in ABLATIONS if v not in ("gwr+r_int", "experts", "all")]
     jobs: dict[Path, list[Job]] = {}
     for setting in arguments.settings:
-        # Those that are not an algorithm by a name of its own.
-        ablation = [v for v in ABLATIONS if v not in ("gwr+r_int", "experts", "all")]
         for name in ablation if setting == "ablation" else arguments.algorithms:
-            config = experiment.run_config(
-                experiment.Arguments(
-                    algorithm="bgpo" if setting == "ablation" else name,
-                    preset=arguments.preset,
-                    seeds=arguments.seeds,
-                    episodes=arguments.episodes,
-                    tasks=arguments.tasks,
-                )
-            )
-            config = replace(config if setting == "continual" else at_once(config), name=name)
-            if setting == "ablation":
-                config = replace(config, algorithm=ABLATIONS[name].config)
+            config = _config(arguments, setting, name)
             merged = arguments.out.absolute() / f"{setting}-{name}"
             blocks = [
                 config.seeds[first : first + arguments.block]
@@ -116,25 +118,51 @@ def make_jobs(arguments: Arguments) -> dict[Path, list[Job]]:
     return jobs
 
 
-def check_directories(jobs: dict[Path, list[Job]], digests: Digests) -> None:
+def _config(arguments: Arguments, setting: Setting, name: str) -> RunConfig:
+    """Return the settings of an algorithm's runs, or of a variant's in the setting "ablation"."""
+    tasks = arguments.tasks
+    if setting.startswith("eight"):
+        tasks = nico.ALL_TASKS[::-1] if setting == "eight-reversed" else nico.ALL_TASKS
+    named = name in get_args(experiment.AlgorithmName)
+    config = experiment.run_config(
+        experiment.Arguments(
+            algorithm=name if named else "bgpo",  # pyright: ignore[reportArgumentType]
+            preset=arguments.preset,
+            seeds=arguments.seeds,
+            episodes=arguments.episodes,
+            eval_every=arguments.eval_every,
+            held_out=arguments.held_out,
+            tasks=tasks,
+        )
+    )
+    config = replace(config, name=name)
+    if setting == "ablation":
+        config = replace(config, algorithm=ABLATIONS[name].config)
+    return config if setting in ("continual", "eight", "eight-reversed") else at_once(config)
+
+
+def check_directories(
+    jobs: dict[Path, list[Job]], digests: Mapping[tuple[str, ...], Digests]
+) -> None:
     """Check that the directories of the jobs hold no other runs.
 
     Args:
         jobs: Result of `make_jobs`.
-        digests: Digests of the runs' encoders and demonstrations.
+        digests: Digests of the encoders and demonstrations, by the tasks of a job.
 
     Raises:
         ValueError: If a directory holds another run.
     """
     for merged, group in jobs.items():
+        told = digests[group[0].config.tasks]
         for job in group:
-            check_settings(job.directory, settings_of(job.config, digests))
+            check_settings(job.directory, settings_of(job.config, told))
         path = merged / "config.json"
         if path.exists():  # merged before, possibly from other blocks
             if not any(merged.glob("seeds-*")):
                 raise ValueError(f"{merged} is not a run of a sweep: choose another --out")
             seeds = read_json(path)["seeds"]
-            settings = {**settings_of(group[0].config, digests), "seeds": seeds}
+            settings = {**settings_of(group[0].config, told), "seeds": seeds}
             check_settings(merged, settings)
 
 
@@ -151,9 +179,11 @@ def main(arguments: Arguments) -> None:
     """Run the unfinished jobs, and merge the blocks."""
     import_tasks(arguments.module)
     jobs = make_jobs(arguments)
-    tasks = next(iter(jobs.values()))[0].config.tasks
-    encoders, bank = pretrained_for(tasks, arguments.bank)
-    check_directories(jobs, Digests(encoders.identity, bank.identity))
+    digests = {
+        tasks: Digests(*(part.identity for part in pretrained_for(tasks, arguments.bank)))
+        for tasks in {group[0].config.tasks for group in jobs.values()}
+    }
+    check_directories(jobs, digests)
     todo = [job for group in jobs.values() for job in group if not job.finished]
     print(f"{sum(map(len, jobs.values()))} jobs, {len(todo)} of them to run")
     failed: dict[Job, str] = {}

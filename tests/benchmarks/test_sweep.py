@@ -26,6 +26,7 @@ from bgpo_trl.training import Trainer
 from suites import nico
 
 SOME = Digests("some", "bank")
+BY_TASKS = {nico.PAPER_TASKS: SOME}
 HEAD = "algorithm,seed,episode,env_steps,task,success,return,steps"
 
 
@@ -129,6 +130,27 @@ def test_workers_are_told_the_tasks_and_where_they_come_from(tmp_path, monkeypat
     assert events == ["my_tasks", tmp_path / bank]
 
 
+def test_the_eight_tasks_come_in_two_orders_or_at_once(tmp_path):
+    arguments = sweep.Arguments(
+        settings=("continual", "eight", "eight-reversed", "eight-concurrent"),
+        episodes=4_000,
+        eval_every=50,
+        held_out="test",
+        out=tmp_path,
+    )
+    grid = {path.name: group[0].config for path, group in sweep.make_jobs(arguments).items()}
+    assert list(grid) == [f"{setting}-bgpo" for setting in arguments.settings]
+    assert [config.tasks for config in grid.values()] == [
+        *(nico.PAPER_TASKS, nico.ALL_TASKS, nico.ALL_TASKS[::-1], nico.ALL_TASKS)
+    ]
+    each_500 = tuple(range(0, 4_000, 500))
+    assert [config.task_starts for config in grid.values()] == [
+        *((0, 1_400, 2_600), each_500, each_500, (0,) * 8)
+    ]
+    for config in grid.values():
+        assert (config.episodes, config.eval_every, config.held_out) == (4_000, 50, "test")
+
+
 def test_blocks_are_of_the_presets_seeds_and_length_unless_told():
     (group,) = sweep.make_jobs(sweep.Arguments(preset="paper")).values()
     assert [job.config.seeds for job in group] == [(0, 1, 2, 3, 4), (5, 6, 7, 8, 9)]
@@ -159,26 +181,26 @@ def test_grids_that_cannot_be_are_refused(tmp_path, wrong, message):
 
 def test_directories_with_something_else_are_refused(few, tmp_path):
     grid = sweep.make_jobs(sweep.Arguments(out=tmp_path, **few))
-    sweep.check_directories(grid, SOME)  # there is nothing yet
+    sweep.check_directories(grid, BY_TASKS)  # there is nothing yet
     for group in grid.values():
         write_run(group[1])
-    sweep.check_directories(grid, SOME)
+    sweep.check_directories(grid, BY_TASKS)
     with pytest.raises(ValueError, match="encoders is some there and others here"):
-        sweep.check_directories(grid, Digests("others", "bank"))
+        sweep.check_directories(grid, {nico.PAPER_TASKS: Digests("others", "bank")})
     longer = sweep.make_jobs(sweep.Arguments(out=tmp_path, episodes=7, **few))
     with pytest.raises(ValueError, match=r"seeds-2 holds a run with other settings .*episodes is"):
-        sweep.check_directories(longer, SOME)
+        sweep.check_directories(longer, BY_TASKS)
 
     # Other blocks would be merged over what is there.
     folder = tmp_path / "concurrent-maml"
     config = json.loads((folder / "seeds-2" / "config.json").read_text())
     (folder / "config.json").write_text(json.dumps({**config, "seeds": [7, 8, 9]}))
-    sweep.check_directories(grid, SOME)
+    sweep.check_directories(grid, BY_TASKS)
     others = sweep.make_jobs(
         sweep.Arguments(out=tmp_path, episodes=7, **{**few, "algorithms": ("maml",), "block": 3})
     )
     with pytest.raises(ValueError, match="concurrent-maml holds a run with other settings"):
-        sweep.check_directories(others, SOME)
+        sweep.check_directories(others, BY_TASKS)
 
     alone = sweep.make_jobs(sweep.Arguments(out=tmp_path / "alone", **few))
     write_run(Job(tmp_path / "alone" / "concurrent-maml", alone.popitem()[1][0].config))

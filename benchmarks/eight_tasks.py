@@ -1,0 +1,44 @@
+"""The benchmark of eight tasks (``docs/benchmark.md``): its whole grid, as one sweep on Ray.
+
+    python benchmarks/eight_tasks.py
+    python benchmarks/report.py runs/eight
+
+The same command resumes an interrupted grid. ``--algorithms bgpo --settings eight`` runs a part of
+it; ``benchmarks/sweep.py`` describes the other arguments.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import sweep
+
+from bgpo_trl.experiments.arguments import AlgorithmName, command_line
+
+
+@dataclass(frozen=True)
+class Arguments(sweep.Arguments):
+    """Run the benchmark of eight tasks on Ray."""
+
+    algorithms: tuple[AlgorithmName, ...] = (
+        "bgpo",
+        "bgpo-experts",
+        "bgpo-single",
+        "maml",
+        "maml-demonstrations",
+        "dist-nll",
+        "dist-nll-demonstrations",
+        "oracle",
+    )
+    settings: tuple[sweep.Setting, ...] = ("eight", "eight-reversed")
+    seeds: tuple[int, ...] | None = (10, 11, 12, 13, 14)
+    episodes: int | None = 4_000
+    eval_every: int | None = 50
+    held_out: Literal["validation", "test"] = "test"
+    out: Path = Path("runs/eight")
+
+
+if __name__ == "__main__":
+    command_line(sweep.main, __doc__, Arguments)
