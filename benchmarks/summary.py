@@ -152,15 +152,14 @@ def describe(run: Path) -> str:
 
 
 def _cost(costs: dict[int, Cost]) -> list[str]:
-    """Return the time of a training step with the fewest and with all tasks, and the memory."""
-    timed = {tasks: 1000 * cost.seconds / cost.steps for tasks, cost in costs.items() if cost.steps}
-    if not timed:
-        return []
+    """Return a sentence on the time of a training step and the memory; none without steps."""
+    timed = [(tasks, cost) for tasks, cost in costs.items() if cost.steps]
+    ends = timed if len(timed) < 2 else (timed[0], timed[-1])
     steps = " and ".join(
-        f"{timed[tasks]:.1f} ms with {tasks}"
-        for tasks in sorted({*timed})[:: max(1, len(timed) - 1)]
+        f"{1000 * cost.seconds / cost.steps:.1f} ms with {tasks}" for tasks, cost in ends
     )
-    return [f"A training step takes {steps} tasks presented, {costs[max(timed)].megabytes:.0f} MB."]
+    memory = f"{timed[-1][1].megabytes:.0f} MB" if timed else ""
+    return [f"A training step takes {steps} tasks presented, {memory}."] if timed else []
 
 
 def _measured(run: Path) -> tuple[list[dict[str, str]] | None, dict[str, Any]]:

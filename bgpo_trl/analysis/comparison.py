@@ -174,7 +174,8 @@ def read_group(runs: Path, group: Group) -> tuple[dict[str, Run], list[str]]:
         summary = read_json(path) if path.exists() else {}
         curves = read_curves(directory / "eval.csv", _tasks(config))
         if np.isnan(curves.success[:, -1]).any():
-            notes.append(f"{name}: left out, at episode {curves.episodes[-1]} it lacks a task")
+            episode = curves.episodes[-1]
+            notes.append(f"{name}: left out, no test of some task at episode {episode}")
             continue
         if int(curves.episodes[-1]) < config["episodes"]:
             notes.append(

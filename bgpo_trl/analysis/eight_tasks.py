@@ -165,7 +165,7 @@ def benchmark_table(
     rows[0] += ["forward transfer", "nodes", "groups", "hours", "megabytes"]
     for key, run in runs.items():
         change = metrics.change_since_learned(success_matrix(run))
-        algorithm = max((name for name in ALGORITHMS if key.endswith(f"-{name}")), key=len)
+        algorithm = next(name for name in ALGORITHMS if key.endswith(f"-{name}"))
         reference = references.get(f"{CONCURRENT}-{algorithm}")
         transfer = "-"
         if reference is not None:
