@@ -1,12 +1,15 @@
-"""Report of the paper's figures and claims from finished runs.
+"""Report of the paper's figures and claims, or of the benchmark of eight tasks, from finished runs.
 
     python benchmarks/report.py
 
 reads the runs in ``benchmarks/results/comparison`` (or another directory) and writes beside them
 Figs. 6, 7, 8 and 9 (mean over seeds and one standard deviation), ``tables.md`` with confidence
 intervals and the claims, and ``report.html`` with all of these, frames of test episodes and the
-runs' settings. Missing runs are listed; longer runs are cut to the length of the shortest in their
-table.
+runs' settings. Of runs named ``eight-ALGORITHM``, ``eight-reversed-ALGORITHM`` and
+``eight-concurrent-ALGORITHM`` (``python benchmarks/continual.py --tasks all``, the tasks in reverse
+order, ``benchmarks/concurrent_tasks.py --tasks all``) it makes the benchmark's table, heat maps of
+success after each phase, learning curves, and nodes, groups and cost by the number of tasks.
+Missing runs are listed; longer runs are cut to the length of the shortest in their table.
 """
 
 from __future__ import annotations
@@ -18,14 +21,17 @@ from pathlib import Path
 import numpy as np
 import tyro
 
+from bgpo_trl.analysis import eight_tasks
 from bgpo_trl.analysis.claims import LEVEL, additions, claims
 from bgpo_trl.analysis.comparison import GROUPS, SETTINGS, Group, Run, Statistics, read_group
 from bgpo_trl.analysis.tables import Table, continual_table, groups_table, main_table, speed_table
 from bgpo_trl.experiments.arguments import command_line
+from bgpo_trl.figures.counts import plot_counts, read_counts
 from bgpo_trl.figures.curves import plot_success_curves
 from bgpo_trl.figures.nodes import plot_gwr_pca
 from bgpo_trl.figures.page import Section, write_page
 from bgpo_trl.figures.style import save_figure
+from bgpo_trl.figures.success_matrix import plot_success_matrices
 from bgpo_trl.runs.results import read_rows
 
 
@@ -53,17 +59,20 @@ def draw(group: Group, runs: dict[str, Run], folder: Path) -> dict[str, Path]:
         first, path = shown[0], folder / f"{picture.file}.png"
         save_figure(
             plot_success_curves(
-                [run.directory / "eval.csv" for run in shown],
-                presented=dict(zip(first.tasks, first.config["task_starts"], strict=True)),
+                {run.name: run.directory / "eval.csv" for run in shown},
+                presented=_presented(first),
                 random_success=first.summary.get("random_success"),
                 window=3 * first.config["eval_every"],
                 last=int(first.curves.episodes[-1]),
-                names={run.config["name"]: run.name for run in shown},
             ),
             path,
         )
         figures[picture.caption] = path
     return figures
+
+
+def _presented(run: Run) -> dict[str, int]:
+    return dict(zip(run.tasks, run.config["task_starts"], strict=True))
 
 
 def draw_nodes(path: Path, to: Path, names: Sequence[str]) -> Table:
@@ -112,15 +121,86 @@ def read_sections(directory: Path, out: Path) -> tuple[list[Section], dict[str, 
         ValueError: If there are no runs, or runs of different tasks.
     """
     statistics = Statistics()
+    paper, runs = paper_sections(directory, out, statistics)
+    eight, more = eight_sections(directory, out, statistics)
+    if not runs and not more:
+        raise ValueError(
+            f"{directory} holds none of the runs that the figures need: name their directories "
+            "EXPERIMENT-ALGORITHM, such as continual-bgpo"
+        )
+    return paper + eight, runs | more
+
+
+def eight_sections(
+    directory: Path, out: Path, statistics: Statistics
+) -> tuple[list[Section], dict[str, Run]]:
+    """Return the sections of the benchmark of eight tasks and its runs; none without runs."""
+    groups = eight_tasks.GROUPS
+    read = {key: read_group(directory, group) for key, group in groups.items()}
+    runs = {name: run for found, _ in read.values() for name, run in found.items()}
+    references, sections = read[eight_tasks.CONCURRENT][0], list[Section]()
+    for key, (found, notes) in read.items() if runs else ():
+        title = groups[key].title
+        if not found:
+            sections.append(Section(title, notes=notes))
+            continue
+        if key in eight_tasks.SEQUENCES:
+            table = eight_tasks.benchmark_table(found, references, statistics)
+            figures, about = draw_sequence(found, out / key), list(eight_tasks.NOTES)
+            sections.append(Section(f"{title}: the benchmark", table, figures, about))
+        curves = draw(groups[key], found, out)
+        sections.append(Section(f"{title}: success", main_table(found, statistics), curves, notes))
+        table = eight_tasks.cost_table(found)
+        if table:
+            title = f"{title}: cost of a training step of all seeds, by presented tasks"
+            sections.append(Section(title, table))
+    table = groups_table(runs[name] for name in sorted(runs))
+    if table:
+        sections.append(Section("Eight tasks: groups and inferred tasks, by seed", table))
+    return sections, runs
+
+
+def draw_sequence(runs: dict[str, Run], path: Path) -> dict[str, Path]:
+    """Draw heat maps of success after each phase, and numbers of nodes and groups.
+
+    Args:
+        runs: Runs of tasks one after the other, by directory name.
+        path: Path of the figures, without their endings.
+
+    Returns:
+        Paths of the figures by caption.
+    """
+    first = next(iter(runs.values()))
+    matrices = {run.name: eight_tasks.success_matrix(run).mean(0) for run in runs.values()}
+    figures = {"success on each task after each phase": path.with_name(f"{path.name}-matrix.png")}
+    save_figure(plot_success_matrices(matrices, first.tasks), *figures.values())
+    last, counts = int(first.curves.episodes[-1]), {}
+    for run in runs.values():
+        train = run.directory / "train.csv"
+        of_run = read_counts(train, last) if train.exists() else {}
+        if of_run and of_run["num_nodes"].any():
+            counts[run.name] = of_run
+    if counts:
+        caption = "nodes and groups: mean over seeds, and from the lowest to the highest seed"
+        figures[caption] = path.with_name(f"{path.name}-counts.png")
+        save_figure(plot_counts(counts, _presented(first)), figures[caption])
+    return figures
+
+
+def paper_sections(
+    directory: Path, out: Path, statistics: Statistics
+) -> tuple[list[Section], dict[str, Run]]:
+    """Return the sections of the paper's experiments and their runs; none without runs.
+
+    Raises:
+        ValueError: If the runs are of different tasks.
+    """
     sections: list[Section] = []
     read = {key: read_group(directory, group) for key, group in GROUPS.items()}
     groups = {key: found for key, (found, _) in read.items()}
     runs = {name: run for group in groups.values() for name, run in group.items()}
     if not runs:
-        raise ValueError(
-            f"{directory} holds none of the runs that the figures need: name their directories "
-            "EXPERIMENT-ALGORITHM, such as continual-bgpo"
-        )
+        return [], {}
     if len({run.tasks for run in runs.values()}) > 1:
         raise ValueError(
             f"{directory} holds runs of different tasks: name a directory for each choice of tasks"

@@ -23,6 +23,7 @@ from bgpo_trl.analysis.tables import median_cell, own_episodes, ratio_cells
 from bgpo_trl.figures.curves import plot_success_curves
 from bgpo_trl.figures.of_run import draw_groups
 from bgpo_trl.figures.style import save_figure
+from bgpo_trl.runs.cost import Cost, read_costs
 from bgpo_trl.runs.results import (
     count,
     read_curves,
@@ -138,6 +139,8 @@ def describe(run: Path) -> str:
         facts.append(f"Groups: {summary['groups']}, {purity} % pure on held-out demonstrations.")
     if summary:
         facts.append(f"Commit {summary['commit']}: `{summary['command']}`.")
+    if (run / "cost.csv").exists():
+        facts += _cost(read_costs(run / "cost.csv"))
     lines += ["", " ".join(facts)]
     if own is not None and len(tasks) > 1:
         ratios = ", ".join(
@@ -146,6 +149,17 @@ def describe(run: Path) -> str:
         )
         lines.append(f"Own episodes to 50 %, relative to {tasks[0]}: {ratios}.")
     return "\n".join(lines)
+
+
+def _cost(costs: dict[int, Cost]) -> list[str]:
+    """Return a sentence on the time of a training step and the memory; none without steps."""
+    timed = [(tasks, cost) for tasks, cost in costs.items() if cost.steps]
+    ends = timed if len(timed) < 2 else (timed[0], timed[-1])
+    steps = " and ".join(
+        f"{1000 * cost.seconds / cost.steps:.1f} ms with {tasks}" for tasks, cost in ends
+    )
+    memory = f"{timed[-1][1].megabytes:.0f} MB" if timed else ""
+    return [f"A training step takes {steps} tasks presented, {memory}."] if timed else []
 
 
 def _measured(run: Path) -> tuple[list[dict[str, str]] | None, dict[str, Any]]:

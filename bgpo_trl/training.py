@@ -24,6 +24,7 @@ from bgpo_trl.files.interrupts import interrupts_wait
 from bgpo_trl.files.locking import DirectoryLock
 from bgpo_trl.files.progress import progress_bar
 from bgpo_trl.runs.config_file import Digests, settings_of
+from bgpo_trl.runs.cost import CostLog
 from bgpo_trl.runs.demonstrations import keep_bank
 from bgpo_trl.runs.directory import load_last
 from bgpo_trl.runs.gwr_graphs import growth_moments, save_graph
@@ -49,7 +50,7 @@ class Trainer(Closing):
 
     Args:
         config: The run.
-        directory: The run's directory: ``config.json``, ``train.csv``, ``eval.csv``,
+        directory: The run's directory: ``config.json``, ``train.csv``, ``eval.csv``, ``cost.csv``,
             ``checkpoint/``, in ``gwr/`` graphs of the first seed's GWR-B during training, and
             ``bank.safetensors`` if the demonstrations do not come with the encoders.
         bank: Embedded demonstrations, seen and held out, of at least ``config.tasks``.
@@ -85,7 +86,7 @@ class Trainer(Closing):
         self.progress = progress
         self.encoders = encoders
         bank = bank.for_tasks(config.tasks)
-        schedule = TaskSchedule(starts=config.task_starts)
+        self._schedule = schedule = TaskSchedule(starts=config.task_starts)
         seeds = config.seeds
         make = entry(config.name).make if make is None else make
         self.algorithm = make(
@@ -115,6 +116,7 @@ class Trainer(Closing):
             saved = load_last(self.directory, self._settings) if resume else None
             if saved is not None:
                 self._load(saved)
+            self._cost = CostLog(self.directory / "cost.csv", resume=saved is not None)
             self.logger = RunLogger(
                 self.directory, config=self._settings, wandb=wandb, resume=resume
             )
@@ -150,19 +152,24 @@ class Trainer(Closing):
             unit="episode",
         )
         losses: dict[str, torch.Tensor] = {}
+        n_tasks = self._n_tasks
         # Spares the garbage collector all objects that live until the end.
         gc.freeze()
         try:
             with interrupts_wait() as interrupted, ThreadPoolExecutor(1, "update") as background:
                 while int(episodes.min()) < n_episodes:
-                    before = episodes.clone()
+                    before, started = episodes.clone(), time.monotonic()
                     state = algorithm.act(state)
                     update = background.submit(algorithm.update)
                     transition, state = env.step_and_maybe_reset(state)
                     losses = update.result() or losses
                     algorithm.store(transition)
+                    self._cost.add_step(n_tasks, time.monotonic() - started)
                     self.env_steps += 1
                     self._state = state
+                    if self._n_tasks > n_tasks:
+                        self._cost.measure(n_tasks, algorithm.state_dict())
+                        n_tasks = self._n_tasks
                     for index in torch.nonzero(episodes > before).flatten().tolist():
                         self._end_of_episode(index, transition, losses)
                         if before[index] < n_episodes:
@@ -184,6 +191,11 @@ class Trainer(Closing):
         """Close files and mirrors, and unlock the directory for other processes."""
         self.logger.close()
         self._lock.close()
+
+    @property
+    def _n_tasks(self) -> int:
+        """Number of tasks that are presented to all seeds."""
+        return int(self._schedule.available(self.world.source.episode).sum(-1).min())
 
     def _success_so_far(self) -> str:
         rate = sum(self._successes) / len(self._successes)
@@ -266,6 +278,8 @@ class Trainer(Closing):
             "position": self.logger.position(),
         }
         save_checkpoint(self.directory / "checkpoint", state)
+        self._cost.measure(self._n_tasks, state["algorithm"])
+        self._cost.write()
 
     def _load(self, state: dict[str, Any]) -> None:
         self.world.load_state_dict(state["world"])

@@ -2,17 +2,21 @@
 
 import csv
 import hashlib
+import itertools
 import re
 import signal
 from collections import Counter, defaultdict
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
 
+from bgpo_trl import training
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.files.checkpoint import load_checkpoint
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
+from bgpo_trl.runs.cost import n_bytes, read_costs
 from bgpo_trl.training import Trainer
 from tests.conftest import of_name
 
@@ -245,6 +249,9 @@ def test_ctrl_c_waits_for_the_step_and_the_run_goes_on_from_it(uninterrupted, ma
 
     make(tmp_path, resume=True).run()
     assert_same_run(tmp_path, uninterrupted)
+    costs = [read_costs(run / "cost.csv").values() for run in (tmp_path, uninterrupted)]
+    ours, theirs = [[(cost.steps, cost.megabytes) for cost in of_run] for of_run in costs]
+    assert ours == theirs
 
 
 @every_learner
@@ -399,3 +406,43 @@ def test_a_run_with_other_encoders_is_another_run(uninterrupted, make, encoders)
 def test_runs_that_cannot_be_are_refused(make_config, changes, message):
     with pytest.raises(ValueError, match=message):
         make_config(**changes)
+
+
+def test_steps_are_counted_by_the_number_of_tasks_that_all_seeds_have(uninterrupted):
+    train, costs = rows(uninterrupted / "train.csv"), read_costs(uninterrupted / "cost.csv")
+    ends = [
+        max(int(row["env_steps"]) for row in train if int(row["episode"]) == end)
+        for end in (2, 4, 10)  # the tasks start at 0, 2 and 4
+    ]
+    assert list(costs) == [1, 2, 3]
+    assert list(itertools.accumulate(cost.steps for cost in costs.values())) == ends
+    sizes = [cost.megabytes for cost in costs.values()]
+    assert 0 < sizes[0] < sizes[1] < sizes[2]  # the replay grows
+    state = load_checkpoint(uninterrupted / "checkpoint")["algorithm"]
+    assert sizes[2] == pytest.approx(n_bytes(state) / 1e6, abs=1e-6)
+
+
+def test_the_time_of_a_step_is_that_of_training_without_tests_and_checkpoints(
+    make, make_config, tmp_path, monkeypatch
+):
+    clock = [0.0]
+    monkeypatch.setattr(training, "time", SimpleNamespace(monotonic=lambda: clock[0]))
+    trainer = make(tmp_path, make_config(episodes=4, checkpoint_minutes=0.0))
+
+    def taking(seconds, function):
+        def call(*arguments):
+            clock[0] += seconds
+            return function(*arguments)
+
+        return call
+
+    for owner, method, seconds in (
+        (trainer.algorithm, "act", 0.25),
+        (trainer.evaluator, "run_next", 100.0),
+        (trainer, "save", 100.0),
+    ):
+        monkeypatch.setattr(owner, method, taking(seconds, getattr(owner, method)))
+    trainer.run()
+    costs = read_costs(tmp_path / "cost.csv")
+    assert sum(cost.steps for cost in costs.values()) == trainer.env_steps
+    assert all(cost.seconds == 0.25 * cost.steps for cost in costs.values())

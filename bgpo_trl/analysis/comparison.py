@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,8 @@ from bgpo_trl.runs.results import Curves, read_curves, read_json, read_rows
 from suites import nico
 
 Values = NDArray[np.float64]
+Statistic = Callable[[Values], float]
+IQM: Statistic = intervals.interquartile_mean
 
 
 @dataclass(frozen=True)
@@ -153,10 +156,11 @@ def read_group(runs: Path, group: Group) -> tuple[dict[str, Run], list[str]]:
     """Read the runs of a group in a directory and cut them to a common length.
 
     Returns:
-        The runs found, by directory name, and notes on missing, unfinished or cut runs.
+        The runs found, by directory name, and notes on missing, unfinished or cut runs. Runs
+        without a test of their last task are left out.
 
     Raises:
-        ValueError: If runs of the group differ in seeds or task starts.
+        ValueError: If runs of the group differ in seeds, tasks or task starts.
     """
     found: dict[str, Run] = {}
     notes: list[str] = []
@@ -169,6 +173,10 @@ def read_group(runs: Path, group: Group) -> tuple[dict[str, Run], list[str]]:
         path = directory / "summary.json"
         summary = read_json(path) if path.exists() else {}
         curves = read_curves(directory / "eval.csv", _tasks(config))
+        if np.isnan(curves.success[:, -1]).any():
+            episode = curves.episodes[-1]
+            notes.append(f"{name}: left out, no test of some task at episode {episode}")
+            continue
         if int(curves.episodes[-1]) < config["episodes"]:
             notes.append(
                 f"{name}: not finished, {curves.episodes[-1]} of {config['episodes']} episodes"
@@ -179,16 +187,21 @@ def read_group(runs: Path, group: Group) -> tuple[dict[str, Run], list[str]]:
     first = next(iter(found.values()))
     last = min(int(run.curves.episodes[-1]) for run in found.values())
     for key, run in found.items():
-        for what in ("seeds", "task_starts"):
-            if run.config[what] != first.config[what]:
+        for what in ("seeds", "tasks", "task_starts"):
+            ours, theirs = (_terms(of)[what] for of in (run, first))
+            if ours != theirs:
                 raise ValueError(
-                    f"{run.directory} has {what} {run.config[what]}, {first.directory} has "
-                    f"{first.config[what]}: only runs on equal terms are compared"
+                    f"{run.directory} has {what} {ours}, {first.directory} has {theirs}: only runs "
+                    "on equal terms are compared"
                 )
         if run.curves.episodes[-1] > last:
             notes.append(f"{run.name}: cut at {last} of {run.curves.episodes[-1]} episodes")
         found[key] = replace(run, curves=run.curves.until(last))
     return found, notes
+
+
+def _terms(run: Run) -> dict[str, Any]:
+    return {**run.config, "tasks": run.tasks}
 
 
 def starts(run: Run) -> list[int]:
@@ -231,18 +244,23 @@ class Statistics:
 
     def __init__(self, seed: int = 0) -> None:
         self._seed = seed
-        self._drawn: dict[bytes, Values] = {}
+        self._drawn: dict[tuple[Statistic, bytes], Values] = {}
 
-    def resampled(self, scores: Values) -> Values:
-        """Return the interquartile means of resampled scores."""
+    def resampled(self, scores: Values, statistic: Statistic = IQM) -> Values:
+        """Return a statistic of resampled scores, by default interquartile means."""
         key = scores.tobytes()
-        if key not in self._drawn:
+        if (statistic, key) not in self._drawn:
             rng = np.random.default_rng([self._seed, zlib.crc32(key)])
-            self._drawn[key] = intervals.stratified_bootstrap(scores, rng=rng)
-        return self._drawn[key]
+            drawn = intervals.stratified_bootstrap(scores, statistic, rng=rng)
+            self._drawn[statistic, key] = drawn
+        return self._drawn[statistic, key]
 
-    def cell(self, scores: Values) -> str:
-        """Format an interquartile mean with its interval, in percent."""
-        low, high = intervals.percentile_interval(self.resampled(scores))
-        middle = intervals.interquartile_mean(scores)
-        return f"{100 * middle:.1f} [{100 * low:.0f}, {100 * high:.0f}]"
+    def cell(self, scores: Values, statistic: Statistic = IQM) -> str:
+        """Format a statistic of scores with its interval, in percent."""
+        low, high = intervals.percentile_interval(self.resampled(scores, statistic))
+        return f"{_percent(statistic(scores), 1)} [{_percent(low, 0)}, {_percent(high, 0)}]"
+
+
+def _percent(share: float, digits: int) -> str:
+    # Adding 0 turns -0.0 into 0.0.
+    return f"{round(100 * share, digits) + 0.0:.{digits}f}"

@@ -41,6 +41,23 @@ def evaluation_matrix(
     return np.stack(phases, axis=-2)
 
 
+def change_since_learned(matrix: ArrayLike) -> Array:
+    """Return each task's change of success since the end of its own phase, ``[..., T]``.
+
+    ``R[T - 1, j] - R[j, j]``, where phase j introduces task j.
+
+    Args:
+        matrix: Result of `evaluation_matrix` with one phase per task, ``[..., T, T]``.
+
+    Raises:
+        ValueError: If the numbers of phases and tasks differ.
+    """
+    matrix = np.asarray(matrix, float)
+    if matrix.shape[-1] != matrix.shape[-2]:
+        raise ValueError(f"matrix must have one phase per task, got {list(matrix.shape[-2:])}")
+    return matrix[..., -1, :] - np.diagonal(matrix, axis1=-2, axis2=-1)
+
+
 def forgetting_since_learned(matrix: ArrayLike) -> Array:
     """Return the loss of success since the end of each task's own phase, ``[...]``.
 
@@ -65,20 +82,10 @@ def forgetting_since_best(success: ArrayLike) -> Array:
 def backward_transfer(matrix: ArrayLike) -> Array:
     """Return the gain of earlier tasks from learning later ones, ``[...]``.
 
-    The mean over all tasks but the last of ``R[T - 1, j] - R[j, j]`` (Lopez-Paz & Ranzato, 2017,
-    "Gradient Episodic Memory for Continual Learning"), where phase j introduces task j.
-
-    Args:
-        matrix: Result of `evaluation_matrix` with one phase per task, ``[..., T, T]``.
-
-    Raises:
-        ValueError: If the numbers of phases and tasks differ.
+    The mean of `change_since_learned` over all tasks but the last (Lopez-Paz & Ranzato, 2017,
+    "Gradient Episodic Memory for Continual Learning").
     """
-    matrix = np.asarray(matrix, float)
-    if matrix.shape[-1] != matrix.shape[-2]:
-        raise ValueError(f"matrix must have one phase per task, got {list(matrix.shape[-2:])}")
-    learned = np.diagonal(matrix, axis1=-2, axis2=-1)
-    return _mean((matrix[..., -1, :] - learned)[..., :-1], axis=-1)
+    return _mean(change_since_learned(matrix)[..., :-1], axis=-1)
 
 
 def forward_transfer(area: ArrayLike, reference: ArrayLike) -> Array:

@@ -12,20 +12,22 @@ from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
 
+from bgpo_trl.runs.cost import read_costs, total_cost, write_costs
 from bgpo_trl.runs.results import read_json, read_rows
 
 
 def merge(blocks: Sequence[Path], directory: Path) -> None:
     """Write the files that one run of all seeds would have written, each atomically.
 
-    Rows are sorted by seed and episode. Losses remain means over the seeds of a block. Files about
-    the first seed alone (``gwr.csv`` and figures) are copied from the first block, except
-    ``success.png`` and ``groups.png``, which ``summary.py`` draws.
+    Rows are sorted by seed and episode. Losses remain means over the seeds of a block; costs are
+    sums over blocks, left out if a block has none. Files about the first seed alone (``gwr.csv``
+    and figures) are copied from the first block, except ``success.png`` and ``groups.png``, which
+    ``summary.py`` draws.
 
     Args:
         blocks: Run directories that differ only in their seeds.
-        directory: Folder for ``config.json``, ``train.csv``, ``eval.csv``, ``final.csv`` and
-            ``summary.json``; made if missing.
+        directory: Folder for ``config.json``, ``train.csv``, ``eval.csv``, ``final.csv``,
+            ``cost.csv`` and ``summary.json``; made if missing.
 
     Raises:
         ValueError: If a file is missing, or the blocks do not hold each training episode of each
@@ -57,6 +59,9 @@ def merge(blocks: Sequence[Path], directory: Path) -> None:
         writer.writeheader()
         writer.writerows(rows)
         _write(directory / name, text.getvalue().encode())
+    if all((block / "cost.csv").exists() for block in blocks):
+        costs = [read_costs(block / "cost.csv") for block in blocks]
+        write_costs(directory / "cost.csv", total_cost(costs))
     for path in (*blocks[0].glob("gwr.csv"), *blocks[0].glob("figures/*")):
         if path.name not in ("success.png", "groups.png"):
             _write(directory / path.relative_to(blocks[0]), path.read_bytes())

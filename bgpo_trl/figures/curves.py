@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence, Set
+from collections.abc import Mapping, Sequence, Set
 from typing import Any
 
 import numpy as np
@@ -21,18 +21,18 @@ _CHANCE: dict[str, Any] = {"color": "0.35", "linestyle": ":", "linewidth": 1.2}
 _GRID_POINTS = 400
 _OVERALL = "All presented tasks"
 
+_Path = str | os.PathLike[str]
 _Tests = dict[str, dict[int, list[tuple[int, str, float]]]]
-"""Training episode, task and success of each test episode, by algorithm and seed."""
+"""Training episode, task and success of each test episode, by legend name and seed."""
 
 
 def plot_success_curves(
-    eval_csv: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
+    eval_csv: str | os.PathLike[str] | Sequence[_Path] | Mapping[str, _Path],
     *,
     presented: Mapping[str, int] | None = None,
     random_success: Mapping[str, float] | None = None,
     window: int | None = None,
     last: int | None = None,
-    names: Mapping[str, str] | None = None,
 ) -> Figure:
     """Plot success against training episodes, in one panel for all tasks and one for each.
 
@@ -42,22 +42,20 @@ def plot_success_curves(
     (``ddof=0``), as in the paper.
 
     Args:
-        eval_csv: One or more ``eval.csv`` files, which may hold several algorithms and seeds.
+        eval_csv: One or more ``eval.csv`` files, which may hold several algorithms and seeds; or
+            files of one run each, by legend name.
         presented: Training episode from which each task is presented, by task name, in the order of
             the panels. Starts after the first are marked with dashed lines.
         random_success: Success rate of a random policy by task, marked with dotted lines.
         window: Length of the trailing mean in training episodes; 5 % of the training if ``None``.
         last: Training episode at which the curves end; by default that of the longest.
-        names: Legend names by algorithm, in legend order; other algorithms follow under their own
-            names.
 
     Raises:
         ValueError: If a file is not an ``eval.csv``, there are no test episodes, or the window is
             not positive.
     """
-    names, presented, random_success = names or {}, presented or {}, random_success or {}
-    paths = [eval_csv] if isinstance(eval_csv, str | os.PathLike) else eval_csv
-    tests = _read_tests(paths, names)
+    presented, random_success = presented or {}, random_success or {}
+    tests = _read_tests([eval_csv] if isinstance(eval_csv, str | os.PathLike) else eval_csv)
     rows = [row for seeds in tests.values() for rows in seeds.values() for row in rows]
     tasks = [*presented, *sorted({task for _, task, _ in rows} - set(presented))]
     last = max(episode for episode, _, _ in rows) if last is None else last
@@ -68,9 +66,9 @@ def plot_success_curves(
     figure, panels = _make_panels(len(tasks))
     grid = _grid({episode for episode, _, _ in rows}, last)
     for panel, task in zip(panels.flat, [None, *tasks], strict=False):
-        for index, (algorithm, seeds) in enumerate(tests.items()):
+        for index, (name, seeds) in enumerate(tests.items()):
             curves = [_trailing_mean(of_seed, task, grid, window) for of_seed in seeds.values()]
-            _draw_curve(panel, grid, np.array(curves), names.get(algorithm, algorithm), index)
+            _draw_curve(panel, grid, np.array(curves), name, index)
         starts = {name: episode for name, episode in presented.items() if task in (None, name)}
         mark_starts(panel, starts, tasks, last)
         if task is not None and task in random_success:
@@ -82,17 +80,17 @@ def plot_success_curves(
     return figure
 
 
-def _read_tests(paths: Iterable[str | os.PathLike[str]], names: Iterable[str]) -> _Tests:
-    """Return the test episodes in files, the named algorithms first."""
+def _read_tests(paths: Sequence[_Path] | Mapping[str, _Path]) -> _Tests:
+    """Return the test episodes in files, by algorithm or by the names of the files."""
     tests: _Tests = defaultdict(lambda: defaultdict(list))
-    for path in paths:
+    named = paths.items() if isinstance(paths, Mapping) else [(None, path) for path in paths]
+    for name, path in named:
         for row in read_tests(path):
             test = (int(row["episode"]), row["task"], float(row["success"]))
-            tests[row["algorithm"]][int(row["seed"])].append(test)
+            tests[name or row["algorithm"]][int(row["seed"])].append(test)
     if not tests:
         raise ValueError("there are no test episodes to plot: let the run evaluate first.")
-    order = [name for name in names if name in tests]
-    return {name: tests[name] for name in dict.fromkeys([*order, *tests])}
+    return tests
 
 
 def _make_panels(n_tasks: int) -> tuple[Figure, NDArray]:

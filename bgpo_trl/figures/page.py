@@ -42,10 +42,11 @@ def write_page(
     runs: Mapping[str, tuple[Path, dict[str, Any], dict[str, Any]]],
 ) -> None:
     """Write the page, given directory, settings and summary of each run by name."""
-    parts = ["<h1>bgpo_trl: the paper's experiments</h1>"]
+    parts = ["<h1>bgpo_trl: experiments</h1>"]
     parts.append(
         "<p>Curves: mean over seeds, shaded by one standard deviation. Brackets: 95 % stratified "
-        "bootstrap intervals over seeds and tasks of the interquartile mean (IQM).</p>"
+        "bootstrap intervals over seeds and tasks, of the interquartile mean (IQM) unless a note "
+        "says otherwise.</p>"
     )
     for section in sections:
         parts.append(f"<h2>{escape(section.title)}</h2>")

@@ -22,6 +22,7 @@ from bgpo_trl.experiments import merge
 from bgpo_trl.experiments import ray_jobs as jobs
 from bgpo_trl.experiments.ray_jobs import Job
 from bgpo_trl.runs.config_file import Digests, settings_of
+from bgpo_trl.runs.cost import Cost, read_costs, write_costs
 from bgpo_trl.training import Trainer
 from suites import nico
 
@@ -53,6 +54,8 @@ def write_run(job):
         told["group_purity"] = [1 - seed / 8 for seed in config.seeds]
     (folder / "summary.json").write_text(json.dumps(told))
     (folder / "gwr.csv").write_text(f"task,w0,w1\n0,1,2\n1,2,5\n2,0,{config.seeds[0]}\n")
+    n_seeds = len(config.seeds)
+    write_costs(folder / "cost.csv", {3: Cost(7, 0.5 * n_seeds, 2.0 * n_seeds)})
     (folder / "figures").mkdir(exist_ok=True)
     for name in ("episodes.png", "success.png"):
         (folder / "figures" / name).write_text(str(config.seeds[0]))
@@ -229,6 +232,7 @@ def test_merged_blocks_are_what_one_run_of_all_seeds_would_be(few, tmp_path, mon
         assert losses == {("0", "4.25"), ("2", "2.25"), ("4", "4.25")}  # by block
         config = json.loads((merged / "config.json").read_text())
         assert config == json.loads((whole.directory / "config.json").read_text())
+        assert read_costs(merged / "cost.csv") == {3: Cost(14, 1.5, 6.0)}  # of two blocks
         told = json.loads((merged / "summary.json").read_text())
         found = merged.name.endswith("bgpo")
         assert told.pop("group_purity", None) == ([0.5, 1.0, 0.75] if found else None)

@@ -91,14 +91,22 @@ def test_each_panel_shows_its_task_and_the_window_never_looks_ahead(tmp_path):
     assert curve(b) == {2: 0, 3: 0, 6: 1 / 2}
 
 
-def test_curves_may_end_early_and_be_called_otherwise(run):
-    names = {"MAML": "the second", "BGPO": "the first"}
-    whole, cut = plot_success_curves(run), plot_success_curves(run, last=50, window=5, names=names)
-    labels = [text.get_text() for text in cut.legends[0].get_texts()]
-    assert labels == ["the second (2 seeds)", "the first (2 seeds)", "Dist-NLL (2 seeds)"]
-    for index, before in ((0, 1), (1, 0), (2, 2)):
-        expected = {x: y for x, y in curve(whole.axes[0], before).items() if x <= 50}
+def test_curves_may_end_early(run):
+    whole, cut = plot_success_curves(run), plot_success_curves(run, last=50, window=5)
+    for index in range(3):
+        expected = {x: y for x, y in curve(whole.axes[0], index).items() if x <= 50}
         assert curve(cut.axes[0], index) == expected != {}
+
+
+def test_two_runs_of_one_algorithm_have_their_own_names_and_curves(tmp_path):
+    files = {
+        name: write_eval_csv(tmp_path / f"{number}.csv", [("bgpo", 0, 1, "a", number)])
+        for number, name in enumerate(("failed", "solved"))
+    }
+    figure = plot_success_curves(files)
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert labels == ["failed (1 seed)", "solved (1 seed)"]
+    assert [curve(figure.axes[0], index) for index in (0, 1)] == [{1: 0}, {1: 1}]
 
 
 def test_runs_may_be_spread_over_files_with_rows_in_any_order(run, tmp_path):
@@ -201,7 +209,7 @@ def visible_texts(figure: Figure) -> list[Text]:
     ]
 
 
-@pytest.mark.parametrize("n_tasks", [1, 3, 5])
+@pytest.mark.parametrize("n_tasks", [1, 3, 8])
 @pytest.mark.parametrize(
     "algorithms", [("bgpo",), ("GWR-B + intrinsic reward", "GWR-B", "no", "x")]
 )

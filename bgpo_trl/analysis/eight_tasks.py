@@ -1,0 +1,220 @@
+"""Benchmark of the suite's eight tasks: its runs, and one row of measures for each.
+
+The measures are those of Continual World (Wolczyk et al., 2021) and COOM (Tomilin et al., 2023),
+with one difference: there, only the newest task is trained; here, episodes are of all tasks
+presented so far.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from bgpo_trl.analysis import metrics
+from bgpo_trl.analysis.comparison import (
+    Group,
+    Picture,
+    Run,
+    Statistics,
+    Values,
+    late_scores,
+    starts,
+)
+from bgpo_trl.analysis.tables import Table
+from bgpo_trl.runs.cost import Cost, read_costs
+
+ALGORITHMS = {
+    "bgpo": "BGPO",
+    "bgpo-encoders-of-three": "BGPO, encoders of three tasks",
+    "maml-demonstrations": "MAML + demonstrations",
+    "dist-nll-demonstrations": "Dist-NLL + demonstrations",
+    "bgpo-experts": "BGPO without demonstrations",
+    "bgpo-single": "BGPO, one policy",
+    "maml": "MAML",
+    "dist-nll": "Dist-NLL",
+    "oracle": "DDPG, told the label",
+}
+CONCURRENT = "eight-concurrent"
+"""Key of the runs that serve as references of forward transfer."""
+SEQUENCES = {
+    "eight": "one after the other",
+    "eight-reversed": "one after the other, in reverse",
+}
+NOTES: tuple[str, ...] = (
+    "Means and 95 % intervals over seeds, in points; performance: mean success over the last 10 % "
+    "of training. Forgetting: success at the end of a task's own phase minus that at the end of "
+    "training, mean over all tasks; backward transfer: the negative, without the last task.",
+    "Forward transfer: (area - reference) / (1 - reference), areas under a task's curve over the "
+    "own episodes of its phase; reference: the same algorithm with all tasks from the start.",
+    "Nodes and groups: means over seeds. Hours and megabytes (replay, networks, GWR-B): of all "
+    "seeds together, without tests.",
+)
+
+
+def _group(key: str, title: str) -> Group:
+    shown = ("bgpo", "bgpo-encoders-of-three", "maml-demonstrations", "dist-nll-demonstrations")
+    alone = ("bgpo-experts", "bgpo-single", "maml", "dist-nll")
+
+    def picture(file: str, caption: str, algorithms: tuple[str, ...]) -> Picture:
+        return Picture(file, caption, tuple(f"{key}-{name}" for name in (*algorithms, "oracle")))
+
+    return Group(
+        f"Eight tasks, {title}",
+        {f"{key}-{name}": about for name, about in ALGORITHMS.items()},
+        (
+            picture(key, "with demonstrations as experience", shown),
+            picture(f"{key}-without", "without demonstrations as experience", alone),
+        ),
+    )
+
+
+GROUPS = {key: _group(key, title) for key, title in SEQUENCES.items()}
+GROUPS[CONCURRENT] = _group(CONCURRENT, "all from the start")
+
+
+def knows_label(run: Run) -> bool:
+    """Return whether the algorithm of a run is told the task's label."""
+    return run.config["name"].startswith(("maml", "dist-nll", "oracle"))
+
+
+def success_matrix(run: Run) -> Values:
+    """Return ``R[i, j]``, the success on task j at the end of phase i, ``[S, T, T]``.
+
+    Success is the mean over the last fifth of a phase, at least one evaluation; NaN for tasks that
+    have not been presented.
+
+    Raises:
+        ValueError: If tasks do not start one after the other, or a phase has no evaluation.
+    """
+    begun, last = starts(run), int(run.curves.episodes[-1])
+    lengths = [end - start for start, end in pairwise([*begun, last])]
+    if min(lengths) <= 0:
+        raise ValueError(
+            f"{run.directory} starts its tasks at {begun}: name runs of tasks that do not start "
+            f"one after the other {CONCURRENT}-ALGORITHM"
+        )
+    window = max(run.config["eval_every"], min(lengths) // 5)
+    matrix = metrics.evaluation_matrix(
+        run.curves.success, run.curves.episodes, [*begun[1:], last], window=window
+    )
+    if np.isnan(np.diagonal(matrix, axis1=-2, axis2=-1)).any():
+        raise ValueError(
+            f"{run.directory} has a phase of {min(lengths)} episodes without a test of its task: "
+            "evaluate more often than once a phase"
+        )
+    return matrix
+
+
+def own_episodes(begun: Sequence[int], task: int, episodes: ArrayLike) -> Values:
+    """Return the expected number of a task's own training episodes after ``episodes`` ``[E]``.
+
+    An episode is of each task presented so far with equal probability. ``begun`` are the episodes
+    from which tasks are presented.
+    """
+    later = sorted({start for start in begun if start >= begun[task]})
+    played = np.zeros(np.shape(episodes))
+    for start, end in pairwise([*later, np.inf]):
+        presented = sum(other <= start for other in begun)
+        played += (np.clip(episodes, start, end) - start) / presented
+    return played
+
+
+def forward_transfer(run: Run, reference: Run) -> Values:
+    """Return the forward transfer to each task but the first, ``[S, T - 1]``.
+
+    That of Continual World (`metrics.forward_transfer`): from the area under the task's curve over
+    its own phase and the mean area of a reference. As an episode is of any of the presented tasks,
+    both areas are taken over equally many of the task's own episodes. The first task is left out,
+    since nothing precedes it. Tasks of the reference may have another order.
+    """
+    begun, gains = starts(run), []
+    for task, end in enumerate([*begun[2:], run.curves.episodes[-1]], 1):
+        other = reference.tasks.index(run.tasks[task])
+        of_reference = own_episodes(starts(reference), other, reference.curves.episodes[-1])
+        length = min(float(own_episodes(begun, task, end)), float(of_reference))
+        reached = _own_area(reference, other, length).mean()
+        gains.append(metrics.forward_transfer(_own_area(run, task, length), reached))
+    return np.stack(gains, axis=-1)
+
+
+def _own_area(run: Run, task: int, length: float) -> Values:
+    """Return the area under a task's curve over its first ``length`` own episodes, ``[S]``."""
+    own = own_episodes(starts(run), task, run.curves.episodes)
+    curve = run.curves.success[:, own > 0, task]
+    own = own[own > 0]
+    before = own < length
+    last = [np.interp(length, [0, *own], [0, *of_seed]) for of_seed in curve]
+    heights = np.column_stack([curve[:, before], last])
+    return metrics.area_under_curve(heights, np.append(own[before], length))
+
+
+def benchmark_table(
+    runs: Mapping[str, Run], references: Mapping[str, Run], statistics: Statistics
+) -> Table:
+    """Return the table of the benchmark, one row for each run of a sequence; see `NOTES`.
+
+    Args:
+        runs: Runs by directory name.
+        references: Runs with all tasks from the start, by directory name.
+        statistics: Of the intervals.
+    """
+    rows = [["", "knows the label", "performance", "forgetting", "backward transfer"]]
+    rows[0] += ["forward transfer", "nodes", "groups", "hours", "megabytes"]
+    for key, run in runs.items():
+        change = metrics.change_since_learned(success_matrix(run))
+        algorithm = next(name for name in ALGORITHMS if key.endswith(f"-{name}"))
+        reference = references.get(f"{CONCURRENT}-{algorithm}")
+        transfer = "-"
+        if reference is not None:
+            transfer = statistics.cell(forward_transfer(run, reference), _mean)
+        costs = _costs(run)
+        hours = sum(cost.seconds for cost in costs.values()) / 3600
+        rows.append(
+            [
+                run.name,
+                "yes" if knows_label(run) else "no",
+                statistics.cell(late_scores(run), _mean),
+                statistics.cell(-change, _mean),
+                statistics.cell(change[:, :-1], _mean),
+                transfer,
+                *(_mean_number(run.summary.get(what)) for what in ("nodes", "groups")),
+                f"{hours:.1f}" if costs else "-",
+                f"{max(cost.megabytes for cost in costs.values()):.0f}" if costs else "-",
+            ]
+        )
+    return rows
+
+
+def cost_table(runs: Mapping[str, Run]) -> Table:
+    """Return the table of the cost of a training step by the number of presented tasks.
+
+    Empty if no run has a ``cost.csv``.
+    """
+    costs = {run.name: of_run for run in runs.values() if (of_run := _costs(run))}
+    numbers = sorted({tasks for of_run in costs.values() for tasks in of_run})
+    rows = [["", *(f"{number} task{'s' * (number > 1)}" for number in numbers)]]
+    for name, of_run in costs.items():
+        rows.append([name, *(_cost_cell(of_run.get(number)) for number in numbers)])
+    return rows if costs else []
+
+
+def _cost_cell(cost: Cost | None) -> str:
+    if cost is None or not cost.steps:
+        return "-"
+    return f"{1000 * cost.seconds / cost.steps:.1f} ms, {cost.megabytes:.0f} MB"
+
+
+def _costs(run: Run) -> dict[int, Cost]:
+    path = run.directory / "cost.csv"
+    return read_costs(path) if path.exists() else {}
+
+
+def _mean(scores: Values) -> float:
+    return float(np.mean(scores))
+
+
+def _mean_number(of_seeds: list[float] | None) -> str:
+    return "-" if of_seeds is None else f"{np.mean(of_seeds):.1f}".removesuffix(".0")

@@ -1,0 +1,128 @@
+"""Time and memory of training by the number of presented tasks, in ``cost.csv``."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import astuple, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from bgpo_trl.runs.results import count, read_rows
+
+
+@dataclass
+class Cost:
+    """Cost of the training steps with one number of presented tasks, of all seeds together."""
+
+    steps: int = 0
+    """Training steps; in each, every seed takes one step."""
+    seconds: float = 0.0
+    """Wall time of these steps, without tests and checkpoints."""
+    megabytes: float = 0.0
+    """Size of networks, replay, GWR-B and groups after the last of these steps, in 10^6 bytes."""
+
+
+COST_COLUMNS = ("tasks", *(field.name for field in fields(Cost)))
+"""Columns of ``cost.csv``, one row for each number of presented tasks."""
+
+
+class CostLog:
+    """Cost of a run, kept in a file beside its checkpoints.
+
+    Checkpoints of equal runs are equal, and times are not: hence a file of its own. It is replaced
+    as a whole with each checkpoint, so a resumed run does not count repeated steps twice.
+
+    Args:
+        path: The ``cost.csv``.
+        resume: Whether to continue the file, if there is one.
+
+    Raises:
+        ValueError: If the file to continue is damaged.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], *, resume: bool = False) -> None:
+        self.path = Path(path)
+        self.costs = read_costs(self.path) if resume and self.path.exists() else {}
+
+    def add_step(self, tasks: int, seconds: float) -> None:
+        """Count a training step of ``seconds`` with so many presented ``tasks``."""
+        cost = self.costs.setdefault(tasks, Cost())
+        cost.steps += 1
+        cost.seconds += seconds
+
+    def measure(self, tasks: int, state: Mapping[str, Any]) -> None:
+        """Note the size of the algorithm's ``state_dict`` with so many presented ``tasks``."""
+        self.costs.setdefault(tasks, Cost()).megabytes = n_bytes(state) / 1e6
+
+    def write(self) -> None:
+        """Replace the file.
+
+        Raises:
+            OSError: If it cannot be written.
+        """
+        write_costs(self.path, self.costs)
+
+
+def n_bytes(state: Any) -> int:
+    """Return the size of the tensors in nested mappings, lists and tuples."""
+    if isinstance(state, Tensor):
+        return state.nbytes
+    if isinstance(state, Mapping):
+        return sum(map(n_bytes, state.values()))
+    return sum(map(n_bytes, state)) if isinstance(state, list | tuple) else 0
+
+
+def read_costs(path: str | os.PathLike[str]) -> dict[int, Cost]:
+    """Read a ``cost.csv``: costs by the number of presented tasks, in increasing order.
+
+    Raises:
+        ValueError: If the file is missing or damaged.
+    """
+    checks = {"tasks": count, "steps": count, "seconds": _amount, "megabytes": _amount}
+    rows = read_rows(path, checks, "remove the file, and costs are counted anew")
+    found = {
+        int(row["tasks"]): Cost(int(row["steps"]), float(row["seconds"]), float(row["megabytes"]))
+        for row in rows
+    }
+    return dict(sorted(found.items()))
+
+
+def write_costs(path: Path, costs: Mapping[int, Cost]) -> None:
+    """Write a ``cost.csv`` atomically.
+
+    Raises:
+        OSError: If it cannot be written.
+    """
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(COST_COLUMNS)
+    for tasks, cost in sorted(costs.items()):
+        writer.writerow((tasks, cost.steps, f"{cost.seconds:.3f}", f"{cost.megabytes:.6f}"))
+    temporary = path.with_suffix(".tmp")
+    try:
+        temporary.write_text(text.getvalue())
+        temporary.replace(path)
+    except OSError as error:
+        raise OSError(
+            error.errno, f"cannot write {path} ({error.strerror}): make room, then resume the run"
+        ) from error
+
+
+def total_cost(costs: Sequence[Mapping[int, Cost]]) -> dict[int, Cost]:
+    """Return the sums of the costs of runs, by the number of presented tasks."""
+    total: dict[int, Cost] = {}
+    for tasks, cost in (row for of_run in costs for row in sorted(of_run.items())):
+        so_far = total.setdefault(tasks, Cost())
+        total[tasks] = Cost(*map(sum, zip(astuple(so_far), astuple(cost), strict=True)))
+    return total
+
+
+def _amount(cell: str) -> None:
+    if not (math.isfinite(float(cell)) and float(cell) >= 0):
+        raise ValueError

@@ -1,0 +1,50 @@
+"""Costs of training, against sums worked out by hand."""
+
+import pytest
+import torch
+
+from bgpo_trl.runs import cost
+from bgpo_trl.runs.cost import Cost, CostLog
+
+STATE = {"a": torch.zeros(3), "b": [{"c": torch.zeros(2, dtype=torch.int64)}, 7, None, "x"]}
+
+
+def test_steps_and_seconds_are_summed_by_the_number_of_tasks(tmp_path):
+    log = CostLog(tmp_path / "cost.csv")
+    for tasks, seconds in ((1, 0.25), (1, 0.5), (2, 1.0)):
+        log.add_step(tasks, seconds)
+    log.measure(1, STATE)  # 3 numbers of 4 bytes and 2 of 8
+    log.write()
+    lines = (tmp_path / "cost.csv").read_text().splitlines()
+    assert lines == ["tasks,steps,seconds,megabytes", "1,2,0.750,0.000028", "2,1,1.000,0.000000"]
+    assert cost.read_costs(tmp_path / "cost.csv") == log.costs
+
+
+def test_a_resumed_log_goes_on_and_a_new_one_begins_at_0(tmp_path):
+    for resume, steps in ((False, 1), (True, 2), (False, 1)):
+        log = CostLog(tmp_path / "cost.csv", resume=resume)
+        log.add_step(1, 0.5)
+        log.write()
+        assert cost.read_costs(tmp_path / "cost.csv")[1] == Cost(steps, 0.5 * steps)
+    assert CostLog(tmp_path / "none.csv", resume=True).costs == {}
+
+
+def test_costs_of_runs_are_added(tmp_path):
+    first, second = {1: Cost(5, 1.5, 2.0), 2: Cost(1, 0.5, 3.0)}, {1: Cost(4, 1.0, 1.0)}
+    assert cost.total_cost([first, second]) == {1: Cost(9, 2.5, 3.0), 2: Cost(1, 0.5, 3.0)}
+    assert first[1] == Cost(5, 1.5, 2.0)
+
+
+@pytest.mark.parametrize("row", ["1,2,-3,4", "1,2,nan,4", "1,2.5,3,4", "one,2,3,4", "1,2"])
+def test_a_damaged_file_is_refused(tmp_path, row):
+    path = tmp_path / "cost.csv"
+    path.write_text(f"tasks,steps,seconds,megabytes\n{row}\n")
+    with pytest.raises(ValueError, match=r"cost\.csv, line 2 is damaged: remove the file, and"):
+        CostLog(path, resume=True)
+    assert path.read_text().endswith(f"\n{row}\n")
+
+
+def test_a_file_that_cannot_be_written_is_told(tmp_path):
+    (tmp_path / "cost.tmp").mkdir()
+    with pytest.raises(OSError, match=r"cannot write .*cost\.csv .*: make room, then resume"):
+        CostLog(tmp_path / "cost.csv").write()
