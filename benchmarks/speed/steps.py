@@ -1,6 +1,7 @@
 """Cost of a training step of each algorithm, interleaved in one process.
 
     python benchmarks/speed/steps.py bgpo-single bgpo bgpo-experts dist-nll maml
+    python benchmarks/speed/steps.py bgpo --tasks 3 8 --played 1500
 
 A step covers all seeds: act, simulate, render and encode while the update runs in a background
 thread, then store. Before timing, each algorithm trains on all tasks until it has groups and
@@ -13,6 +14,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from typing import Annotated, Literal
 
 import numpy as np
@@ -25,6 +27,7 @@ from bgpo_trl.experiments.arguments import AlgorithmName, command_line
 from bgpo_trl.machine import set_threads
 from bgpo_trl.transforms import TaskSchedule
 from bgpo_trl.world import World
+from suites import nico
 
 
 @dataclass(frozen=True)
@@ -39,6 +42,8 @@ class Arguments:
         "maml",
     )
     """Algorithms to compare; ratios are to the first."""
+    tasks: tuple[int, ...] = (3,)
+    """Numbers of tasks: the first so many of the suite."""
     seeds: int = 5
     """Seeds per batch."""
     played: int = 400
@@ -80,15 +85,16 @@ class Steps:
 def main(arguments: Arguments) -> None:
     """Print the table."""
     set_threads(1)
-    encoders, bank = load_pretrained()
+    encoders, bank = load_pretrained(tasks=nico.ALL_TASKS[: max(arguments.tasks)])
     running: dict[str, Steps] = {}
-    for name in arguments.algorithms:
-        entry, seeds, seen = ALGORITHMS[name], range(arguments.seeds), bank.seen()
+    for name, n_tasks in product(arguments.algorithms, arguments.tasks):
+        entry, seeds = ALGORITHMS[name], range(arguments.seeds)
+        seen = bank.for_tasks(nico.ALL_TASKS[:n_tasks]).seen()
         algorithm = entry.make(entry.config, seeds=seeds, bank=seen, encoders=encoders)
-        schedule = TaskSchedule(starts=(0, 0, 0))
-        world = World(algorithm, seeds=seeds, schedule=schedule, bank=seen)
-        running[name] = Steps(algorithm, world)
-        running[name].play(arguments.played)
+        world = World(algorithm, seeds=seeds, schedule=TaskSchedule((0,) * n_tasks), bank=seen)
+        key = f"{name}, {n_tasks} tasks"
+        running[key] = Steps(algorithm, world)
+        running[key].play(arguments.played)
 
     def table(what: Literal["play", "update"]) -> None:
         calls = {
@@ -96,7 +102,7 @@ def main(arguments: Arguments) -> None:
         }
         wall = interleave(calls, rounds=arguments.rounds)
         cpu = interleave(calls, rounds=arguments.rounds, clock=time.process_time)
-        first = arguments.algorithms[0]
+        first = next(iter(running))
         described = "training step" if what == "play" else "update"
         for name in running:
             ms = 1_000 * np.median(wall[name]) / arguments.steps
