@@ -1,0 +1,69 @@
+"""Encoders of the package, by the tasks, the run or the bank they are wanted for."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from bgpo_trl.encoders import shipped
+from bgpo_trl.encoders.pretrained import load_pretrained
+from bgpo_trl.encoders.representation import load_representation
+from bgpo_trl.experiments.run import pretrained_for
+from bgpo_trl.runs.config_file import Digests
+from bgpo_trl.runs.demonstrations import keep_bank, load_inputs
+from suites import nico
+
+
+@pytest.mark.parametrize(
+    ("tasks", "name"),
+    [
+        (nico.PAPER_TASKS, "nico"),
+        (("grasp_glass",), "nico"),
+        (("juggle", "grasp_glass"), "nico"),
+        (nico.ALL_TASKS, "nico_eight"),
+        (("press_white",), "nico_eight"),
+        (("juggle", "press_white"), "nico_eight"),
+    ],
+)
+def test_encoders_of_eight_serve_the_tasks_that_the_paper_lacks(tasks, name):
+    path = shipped.default_weights(tasks)
+    assert path.parts[-3:] == ("bgpo_trl", "weights", f"{name}.safetensors")
+    encoders, bank = load_pretrained(tasks=tasks)
+    assert encoders.identity == load_representation(path).identity
+    assert {*tasks} - {"juggle"} <= {*bank.tasks}
+
+
+def test_files_are_at_most_12_megabytes():
+    for tasks in (nico.PAPER_TASKS, nico.ALL_TASKS):
+        weights = shipped.default_weights(tasks)
+        for path in (weights, shipped.bank_path(weights)):
+            assert path.stat().st_size < 12e6
+
+
+def test_a_run_finds_its_encoders_by_their_digest(tmp_path):
+    for tasks in (nico.PAPER_TASKS, nico.ALL_TASKS):
+        encoders, bank = load_pretrained(tasks=tasks)
+        paper = bank.for_tasks(nico.PAPER_TASKS)
+        keep_bank(tmp_path, paper, encoders)
+        digests = Digests(encoders.identity, paper.identity)
+        found, demonstrations = load_inputs(tmp_path, nico.PAPER_TASKS, digests)
+        assert found.identity == encoders.identity
+        assert demonstrations.identity == paper.identity
+    assert not any(tmp_path.iterdir())  # Both come with the package.
+
+
+def test_a_bank_brings_the_encoders_that_embedded_it(tmp_path):
+    path = tmp_path / "bank.safetensors"
+    for tasks in (nico.PAPER_TASKS, nico.ALL_TASKS):
+        weights = shipped.default_weights(tasks)
+        shutil.copy(shipped.bank_path(weights), path)
+        assert shipped.weights_of_bank(path) == weights
+        encoders, bank = pretrained_for(nico.PAPER_TASKS, path)
+        assert encoders.identity == load_representation(weights).identity
+        assert bank.tasks == nico.PAPER_TASKS
+
+
+def test_a_bank_that_cannot_be_read_is_left_for_its_reader_to_refuse(tmp_path: Path):
+    assert shipped.weights_of_bank(tmp_path / "nothing") == shipped.default_weights()
+    (tmp_path / "rubbish").write_bytes(b"rubbish")
+    assert shipped.weights_of_bank(tmp_path / "rubbish") == shipped.default_weights()
