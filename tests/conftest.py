@@ -21,6 +21,7 @@ from bgpo_trl.configs import BGPOConfig, RunConfig
 from bgpo_trl.data.bank import DemonstrationBank, DemonstrationSteps
 from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.envs import NicoEnv
+from bgpo_trl.figures import style
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
 from bgpo_trl.world import World
@@ -139,6 +140,15 @@ def own_tasks_are_forgotten() -> Iterator[None]:
     yield
     nico._TASKS.clear()
     nico._TASKS.update(before)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def usual_dpi() -> Iterator[int]:
+    """The resolution of figures, which are saved with fewer pixels here: these take the time."""
+    usual = style.DPI
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(style, "DPI", 60)
+        yield usual
 
 
 @pytest.fixture(scope="session", autouse=True)
