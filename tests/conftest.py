@@ -1,5 +1,6 @@
 """Settings of all tests, and parts of a run that take about a second."""
 
+import gc
 import hashlib
 import os
 import signal
@@ -37,6 +38,13 @@ SMALL = {
     "maml": {"task_batch_size": 8, "adaptation_size": 12},
     "dist-nll": {"task_batch_size": 8, "samples": 24, "distillation_batch_size": 12},
 }
+
+
+def pytest_collection_finish():
+    """Take what was imported from the garbage collector, which would walk it again and again."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(10_000)
 
 
 def of_name(settings, name):
