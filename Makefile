@@ -7,6 +7,8 @@ WORKERS ?= 2
 BIN := .venv/bin
 SETUP := .venv/.installed
 GL := .venv/.gl
+# A file's tests stay in one process, which makes what they share only once.
+PYTEST = $(BIN)/pytest -n $(WORKERS) --dist loadfile
 
 # Small networks are fastest on one thread, and test processes compete for cores.
 export OMP_NUM_THREADS ?= 1
@@ -22,10 +24,10 @@ run: $(SETUP) $(GL)  ## the continual-learning experiment in its shortest form
 	$(BIN)/python benchmarks/continual.py --preset quick
 
 test: lint typecheck $(GL)  ## lint, type check and the fast tests, as in CI
-	$(BIN)/pytest -n $(WORKERS)
+	$(PYTEST)
 
 slow: $(SETUP) $(GL)  ## the tests that take more than a few seconds each
-	$(BIN)/pytest -n $(WORKERS) -m slow
+	$(PYTEST) -m slow
 
 lint: $(SETUP)  ## ruff, and a check of the formatting
 	$(BIN)/ruff check .

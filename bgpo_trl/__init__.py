@@ -2,8 +2,15 @@
 
 from typing import TYPE_CHECKING
 
-# First, because TorchRL imports MuJoCo, which reads once what this chooses.
-from suites import opengl as opengl
+try:
+    # First, because TorchRL imports MuJoCo, which reads once what this chooses.
+    from suites import opengl as opengl
+except ImportError as error:
+    if error.path is None:
+        raise
+    raise ImportError(
+        f"{error}: another package `suites` hides ours: remove its __init__.py, or start elsewhere"
+    ) from None
 
 if TYPE_CHECKING:
     from bgpo_trl.policy import TrainedPolicy, load_run

@@ -40,7 +40,8 @@ class NicoEnv(EnvBase):
 
     ``set_seed`` also reaches the transforms of this package, at the next reset (see
     `EpisodeTransform`). A copy, by ``copy.deepcopy`` or ``pickle``, continues as the original
-    would, with threads and a renderer of its own.
+    would, with threads and a renderer of its own. Workers of a ``ParallelEnv`` therefore draw alike
+    until the ``ParallelEnv``'s ``set_seed``, which seeds each differently.
 
     Args:
         tasks: Names of the tasks, in the order of their presentation.

@@ -38,8 +38,8 @@ if __name__ == "__main__":
     bank += make_bank(encoders, shown, tasks=[OWN])
     print(f"{len(shown)} demonstrations, {shown['length'].float().mean():.0f} frames each")
 
-    tasks, starts = (OWN, *nico.PAPER_TASKS), (0, 4, 6, 8)
-    config = RunConfig(seeds=(0,), episodes=12, tasks=tasks, task_starts=starts, eval_every=6)
+    tasks, starts = (OWN, *nico.PAPER_TASKS), (0, 2, 4, 6)
+    config = RunConfig(seeds=(0,), episodes=8, tasks=tasks, task_starts=starts, eval_every=4)
     with Trainer(config, OUT / "run", bank=bank, encoders=encoders, resume=True) as trainer:
         trainer.run()
     save_figure(plot_success_curves(OUT / "run" / "eval.csv"), OUT / "success.png")

@@ -1,5 +1,6 @@
 """Settings of all tests, and parts of a run that take about a second."""
 
+import gc
 import hashlib
 import os
 import signal
@@ -21,6 +22,7 @@ from bgpo_trl.configs import BGPOConfig, RunConfig
 from bgpo_trl.data.bank import DemonstrationBank, DemonstrationSteps
 from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.envs import NicoEnv
+from bgpo_trl.figures import style
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
 from bgpo_trl.world import World
@@ -36,6 +38,13 @@ SMALL = {
     "maml": {"task_batch_size": 8, "adaptation_size": 12},
     "dist-nll": {"task_batch_size": 8, "samples": 24, "distillation_batch_size": 12},
 }
+
+
+def pytest_collection_finish():
+    """Take what was imported from the garbage collector, which would walk it again and again."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(10_000)
 
 
 def of_name(settings, name):
@@ -139,6 +148,15 @@ def own_tasks_are_forgotten() -> Iterator[None]:
     yield
     nico._TASKS.clear()
     nico._TASKS.update(before)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def usual_dpi() -> Iterator[int]:
+    """The resolution of figures, which are saved with fewer pixels here: these take the time."""
+    usual = style.DPI
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(style, "DPI", 60)
+        yield usual
 
 
 @pytest.fixture(scope="session", autouse=True)

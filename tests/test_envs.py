@@ -5,6 +5,7 @@ import pickle
 import threading
 import time
 from copy import deepcopy
+from functools import partial
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import (
     RewardClipping,
     RewardScaling,
+    SerialEnv,
     StepCounter,
     TransformedEnv,
     check_env_specs,
@@ -58,6 +60,11 @@ def task_td(*task: int) -> TensorDict:
 @observations
 def test_torchrl_finds_the_specs_kept(batch_size, observation):
     check_env_specs(NicoEnv(batch_size=batch_size, observation=observation))
+
+
+@pytest.mark.parametrize("task", nico.ALL_TASKS)
+def test_torchrl_finds_the_specs_of_every_task_kept(task):
+    check_env_specs(NicoEnv([task], observation="both"))
 
 
 @batch_sizes
@@ -128,6 +135,16 @@ def test_without_a_seed_every_start_is_another():
     first.set_seed(None)
     starts = torch.cat([starts, first.reset()["state"]])
     assert len(starts.unique(dim=0)) == 6
+
+
+@pytest.mark.parametrize(("seed", "alike"), [(0, True), (None, False)])
+def test_workers_draw_alike_from_the_default_seed_until_they_are_seeded(seed, alike):
+    env = SerialEnv(2, partial(NicoEnv, seed=seed, observation="state"))
+    first, second = env.reset()["state"]
+    assert first.equal(second) == alike
+    env.set_seed(0)
+    first, second = env.reset()["state"]
+    assert not first.equal(second)
 
 
 def test_a_batch_size_may_be_a_number():

@@ -21,7 +21,7 @@ from suites import nico
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 SEEDS = (3, 8)
-EPISODES = 4
+EPISODES = 2
 # Until there is data of most tasks, where each has its own.
 STEPS = {"maml": 40, "dist-nll": 55}  # and those named after them
 every_algorithm = pytest.mark.parametrize("name", ALGORITHMS)
@@ -31,13 +31,20 @@ every_algorithm = pytest.mark.parametrize("name", ALGORITHMS)
 def make(bank, encoders, make_config, in_world):
     """Makes an algorithm that has played a little, and an evaluator for it."""
 
-    def make(state="latent", name="bgpo", seeds=SEEDS, starts=(0, 2, 4), n_steps=None):
+    def make(
+        state="latent",
+        name="bgpo",
+        seeds=SEEDS,
+        starts=(0, 2, 4),
+        n_steps=None,
+        episodes=EPISODES,
+    ):
         config = make_config(state, name).algorithm
         parts, schedule = {"seeds": seeds, "encoders": encoders}, TaskSchedule(starts)
         algorithm = entry(name).make(config, bank=bank.seen(), **parts)
         in_world(algorithm, seeds, schedule)
         evaluator = Evaluator(
-            config, schedule=schedule, episodes=EPISODES, bank=bank.held_out(), **parts
+            config, schedule=schedule, episodes=episodes, bank=bank.held_out(), **parts
         )
         n_usual = next((n for start, n in STEPS.items() if name.startswith(start)), 20)
         train(algorithm, n_usual if n_steps is None else n_steps)
@@ -123,7 +130,8 @@ def plain_policy(algorithm, snapshot, index, task, episode, phi):
 def test_a_test_episode_is_that_of_a_plain_loop_over_one_environment(
     make, encoders, easy_world, monkeypatch, state, name
 ):
-    algorithm, evaluator = make(state, name)
+    episodes = 4
+    algorithm, evaluator = make(state, name, episodes=episodes)
     turn(algorithm)
     act, actions = Policy.act, []
     monkeypatch.setattr(Policy, "act", lambda *args: actions.append(act(*args)) or actions[-1])
@@ -140,9 +148,9 @@ def test_a_test_episode_is_that_of_a_plain_loop_over_one_environment(
 
     for index, seed in enumerate(SEEDS):
         rng = np.random.default_rng([stream_seed(seed, "evaluation"), 5])
-        starts = rng.integers(2**32, size=(3, EPISODES))
+        starts = rng.integers(2**32, size=(3, episodes))
         for task in range(3):
-            for episode in range(EPISODES):
+            for episode in range(episodes):
                 phi = embeddings[index][task, episode]
                 policy = plain_policy(algorithm, snapshots[index], index, task, episode, phi)
                 env = easy_world(

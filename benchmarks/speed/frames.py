@@ -18,11 +18,10 @@ import os
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 
-import mujoco
 import numpy as np
 import torch
+from bare_process import bare_process
 from dm_control.suite.wrappers import pixels
-from mujoco.rendering.classic.gl_context import GLContext
 from torchrl.envs import Compose, DMControlWrapper, EnvBase, TransformedEnv
 
 from bgpo_trl.envs import NicoEnv
@@ -32,7 +31,6 @@ from suites.nico.base import Environment
 from suites.nico.rendering import FRAME_CAMERA, FRAME_HEIGHT, FRAME_WIDTH
 
 ROWS = 10
-SUBSTEPS = 20
 TASK = "grasp_glass"
 EPISODE = 50
 STOCK_FRAMES = 2
@@ -84,11 +82,12 @@ class BareLoop:
     def __init__(self, threads: int) -> None:
         starts, targets = record()
         spawn = multiprocessing.get_context("spawn")
+        view = (FRAME_CAMERA, FRAME_WIDTH, FRAME_HEIGHT)
         self._number = 0
         self._pipes = []
         for rows in np.array_split(np.arange(ROWS), threads):
             ours, theirs = spawn.Pipe()
-            job = (theirs, starts[rows], targets[:, rows])
+            job = (theirs, nico.scene_xml(), view, starts[rows], targets[:, rows])
             spawn.Process(target=bare_process, args=job, daemon=True).start()
             self._pipes.append(ours)
 
@@ -99,41 +98,6 @@ class BareLoop:
         for pipe in self._pipes:
             pipe.recv()
         self._number = (self._number + 1) % EPISODE
-
-
-def bare_process(pipe: Connection, starts: np.ndarray, targets: np.ndarray) -> None:
-    """Step a share of the simulations on request.
-
-    Args:
-        pipe: Delivers the number of the step; answered with ``None`` when the step is done.
-        starts: Full start states, ``[R, N]``.
-        targets: Joint targets, ``[T, R, 6]``.
-    """
-    model = mujoco.MjModel.from_xml_string(nico.scene_xml())
-    datas = [mujoco.MjData(model) for _ in starts]
-    context = GLContext(640, 480)
-    context.make_current()
-    scene, option = mujoco.MjvScene(model, 200), mujoco.MjvOption()
-    renderer = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
-    mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, renderer)
-    camera = mujoco.MjvCamera()
-    camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
-    camera.fixedcamid = model.camera(FRAME_CAMERA).id
-    view = mujoco.MjrRect(0, 0, FRAME_WIDTH, FRAME_HEIGHT)
-    frame = np.empty((FRAME_HEIGHT, FRAME_WIDTH, 3), np.uint8)
-    everything = mujoco.mjtCatBit.mjCAT_ALL.value
-    with contextlib.suppress(EOFError):  # raised at the end of the measurement
-        while True:
-            number = pipe.recv()
-            for data, start, target in zip(datas, starts, targets[number], strict=True):
-                if number == 0:
-                    mujoco.mj_setState(model, data, start, mujoco.mjtState.mjSTATE_INTEGRATION)
-                data.ctrl[:] = target
-                mujoco.mj_step(model, data, SUBSTEPS)
-                mujoco.mjv_updateScene(model, data, option, None, camera, everything, scene)
-                mujoco.mjr_render(view, scene, renderer)
-                mujoco.mjr_readPixels(frame, None, view, renderer)
-            pipe.send(None)
 
 
 def record() -> tuple[np.ndarray, np.ndarray]:

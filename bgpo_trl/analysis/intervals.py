@@ -16,16 +16,22 @@ def interquartile_mean(scores: ArrayLike) -> float:
     Raises:
         ValueError: If there are no scores, or one is not finite.
     """
-    ordered = np.sort(np.asarray(scores, float), axis=None)
-    if not ordered.size or not np.isfinite(ordered).all():
+    scores = np.asarray(scores, float)
+    if not scores.size or not np.isfinite(scores).all():
         raise ValueError("scores must be finite and not empty: leave out what was not tested")
-    cut = ordered.size // 4
-    return float(ordered[cut : ordered.size - cut].mean())
+    return float(interquartile_means(scores[None])[0])
+
+
+def interquartile_means(samples: Array) -> Array:
+    """Return the `interquartile_mean` of each sample, ``[N]`` from ``[N, ...]``."""
+    ordered = np.sort(samples.reshape(len(samples), -1), axis=1)
+    cut = ordered.shape[1] // 4
+    return ordered[:, cut : ordered.shape[1] - cut].mean(1)
 
 
 def stratified_bootstrap(
     scores: ArrayLike,
-    statistic: Callable[[Array], float] = interquartile_mean,
+    statistic: Callable[[Array], Array] = interquartile_means,
     *,
     n_resamples: int = 2_000,
     rng: np.random.Generator,
@@ -34,7 +40,7 @@ def stratified_bootstrap(
 
     Seeds are resampled with replacement, independently for each task (Agarwal et al., 2021, "Deep
     Reinforcement Learning at the Edge of the Statistical Precipice", section 4.1). Scores are
-    ``[S, T]``, one per seed and task; ``statistic`` is a function of an array of that shape.
+    ``[S, T]``, one per seed and task; ``statistic`` maps resampled ones ``[N, S, T]`` to ``[N]``.
 
     Raises:
         ValueError: If scores are not finite or not ``[S, T]``, or ``n_resamples`` is less than 1.
@@ -51,7 +57,7 @@ def stratified_bootstrap(
         raise ValueError(f"n_resamples must be at least 1, got {n_resamples}")
     n_seeds, n_tasks = scores.shape
     drawn = rng.integers(n_seeds, size=(n_resamples, n_seeds, n_tasks))
-    return np.array([statistic(scores[seeds, np.arange(n_tasks)]) for seeds in drawn])
+    return statistic(scores[drawn, np.arange(n_tasks)])
 
 
 def percentile_interval(values: ArrayLike, confidence: float = 0.95) -> tuple[float, float]:

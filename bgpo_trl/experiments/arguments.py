@@ -65,8 +65,9 @@ class Arguments(TaskArguments):
     rl: Literal["ddpg", "td3", "sac"] = "ddpg"
     """The RL algorithm of BGPO, its ablations and the references."""
     preset: Literal["smoke", "quick", "desk", "paper"] = "quick"
-    """Size of the run: smoke (every stage in minutes), quick (visible learning), desk (five seeds)
-    or paper (the paper's size)."""
+    """Size of the run, with its time on two cores: smoke (12 episodes of 2 seeds, every stage in 2
+    minutes), quick (1,200 episodes of 3 seeds, 15 minutes), desk (6,000 episodes of 5 seeds, 70
+    minutes) or paper (20,000 episodes of 10 seeds, more than a day)."""
     out: Path | None = None
     """Run directory; runs/EXPERIMENT-ALGORITHM[-RL]-PRESET by default."""
     seeds: tuple[int, ...] | None = None
@@ -185,4 +186,5 @@ def command_line(
     except (ValueError, OSError, RuntimeError) as error:
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:
-        sys.exit("interrupted: the same command with --resume continues")
+        again = ": the same command with --resume continues"
+        sys.exit("interrupted" + again * hasattr(arguments, "resume"))

@@ -46,7 +46,7 @@ def measure(
         Entries of ``summary.json``.
     """
     algorithm, config = trainer.algorithm, trainer.config
-    gwr, rows = algorithm.gwr, _final_tests(trainer, bank, episodes)
+    gwr, rows = algorithm.gwr, _final_tests(trainer, bank, episodes=episodes)
     with (out / "final.csv").open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(FINAL_COLUMNS)
@@ -66,7 +66,7 @@ def measure(
     return summary
 
 
-def _final_tests(trainer: Trainer, bank: DemonstrationBank, episodes: int) -> list[_Row]:
+def _final_tests(trainer: Trainer, bank: DemonstrationBank, *, episodes: int) -> list[_Row]:
     """Return the rows of ``final.csv``, after as many test episodes of each task and kind."""
     algorithm, config, seen = trainer.algorithm, trainer.config, bank.seen()
     gwr, rows, schedule = algorithm.gwr, list[_Row](), TaskSchedule(config.task_starts)

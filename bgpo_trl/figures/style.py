@@ -31,13 +31,15 @@ LINES = ("-", "--", "-.", (0, (3, 1, 1, 1, 1, 1)), (0, (1, 1)), (0, (6, 2)))
 """Line styles that accompany them."""
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 """Markers that accompany them."""
+DPI = 300
+"""Resolution of saved figures."""
 
 
 def save_figure(figure: Figure, path: str | os.PathLike[str]) -> None:
-    """Save a figure as PNG at 300 dpi; the same figure always gives the same bytes."""
+    """Save a figure as PNG at `DPI`; the same figure always gives the same bytes."""
     path = Path(path)
     make_folder(path.parent)
-    figure.savefig(path, format="png", dpi=300, metadata={"Software": None})
+    figure.savefig(path, format="png", dpi=DPI, metadata={"Software": None})
 
 
 def style_axes(axes: Axes) -> None:

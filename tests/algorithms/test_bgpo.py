@@ -490,12 +490,12 @@ def test_a_restored_run_continues_as_the_saved_one(make, tmp_path, rl):
     other = make(
         "all", seeds=(5, 7), rl=rl, schedule=schedule
     )  # other weights, streams and simulations
-    play_on(other, 12)
+    play_on(other, 6)
     saved = load_checkpoint(tmp_path)
     other.world.load_state_dict(saved["world"])
     other.load_state_dict(saved["algorithm"])
-    ours, _ = play_on(algorithm, 25, state)
-    theirs, _ = play_on(other, 25, TensorDict(saved["state"], [2]))
+    ours, _ = play_on(algorithm, 15, state)
+    theirs, _ = play_on(other, 15, TensorDict(saved["state"], [2]))
     assert (ours == theirs).all()
     assert_same_state(algorithm.learner.state_dict(), other.learner.state_dict())
     assert_same_state(algorithm.experts.state_dict(), other.experts.state_dict())
@@ -638,7 +638,7 @@ def test_nothing_is_known_of_tasks_that_have_not_been_presented(make, bank):
         schedule = TaskSchedule((0, 99, 99))
         first = make(variant, schedule=schedule)
         second = make(variant, schedule=schedule, bank=other)
-        ours, theirs = play(first, 40), play(second, 40)
+        ours, theirs = play(first, 25), play(second, 25)
         assert (ours == theirs).all()
         assert_same_state(first.learner.state_dict(), second.learner.state_dict())
         shown, task = bank.embedding[:6].view(3, 2, 32), torch.zeros(3, 2).long()

@@ -16,15 +16,22 @@ def test_interquartile_mean_by_hand():
     assert intervals.interquartile_mean([5, 1, 2, 3, 4, 40]) == (2 + 3 + 4 + 5) / 4
 
 
+def test_the_mean_of_each_sample_is_that_of_it_alone():
+    samples = np.random.default_rng(5).normal(size=(20, 3, 5))
+    alone = [intervals.interquartile_mean(sample) for sample in samples]
+    np.testing.assert_allclose(intervals.interquartile_means(samples), alone, rtol=1e-12)
+
+
 def test_resampling_draws_seeds_for_each_task_by_itself():
     scores = np.array([[0.0, 10.0], [1.0, 11.0]])
     seen = set()
 
     def collect(drawn):
-        assert set(drawn[:, 0]) <= {0, 1}
-        assert set(drawn[:, 1]) <= {10, 11}
-        seen.add(tuple(drawn.ravel()))
-        return 0.0
+        assert drawn.shape == (500, 2, 2)
+        assert set(drawn[..., 0].flat) == {0, 1}
+        assert set(drawn[..., 1].flat) == {10, 11}
+        seen.update(map(tuple, drawn.reshape(500, 4)))
+        return drawn[:, 0, 0]
 
     intervals.stratified_bootstrap(scores, collect, n_resamples=500, rng=np.random.default_rng(0))
     assert len(seen) == 16  # any seed with any other
@@ -33,7 +40,9 @@ def test_resampling_draws_seeds_for_each_task_by_itself():
 def test_the_interval_of_a_mean_is_that_of_theory():
     rng = np.random.default_rng(1)
     scores = rng.normal(size=(400, 1))
-    drawn = intervals.stratified_bootstrap(scores, np.mean, n_resamples=4_000, rng=rng)
+    drawn = intervals.stratified_bootstrap(
+        scores, lambda samples: samples.mean((1, 2)), n_resamples=4_000, rng=rng
+    )
     low, high = intervals.percentile_interval(drawn)
     error = scores.std() / np.sqrt(400)
     assert [low, high] == pytest.approx(

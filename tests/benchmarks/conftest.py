@@ -2,7 +2,6 @@
 
 import shutil
 from dataclasses import replace
-from functools import partial
 
 import pytest
 import torch
@@ -17,7 +16,7 @@ from bgpo_trl.training import Trainer
 
 @pytest.fixture
 def tiny(monkeypatch, encoders, bank, make_config):
-    """The benchmarks with untrained encoders, and runs of a second."""
+    """The benchmarks with untrained encoders, runs of a second and two test episodes after it."""
     config = make_config(episodes=6)
     for module in (experiment, ladder):
         monkeypatch.setattr(module, "load_pretrained", lambda: (encoders, bank))
@@ -33,19 +32,34 @@ def tiny(monkeypatch, encoders, bank, make_config):
         monkeypatch.setitem(ABLATIONS, name, small)
     chance = torch.tensor([0.1, 0.2, 0.3])
     monkeypatch.setattr(measure, "evaluate_random_policy", lambda **kwargs: chance)
+    test = measure._final_tests
+    monkeypatch.setattr(measure, "_final_tests", lambda *run, episodes: test(*run, episodes=2))
 
 
 @pytest.fixture
 def tiniest(tiny, monkeypatch):
-    """Of what comes after training, less: few test episodes, and figures that are not drawn."""
+    """Of what comes after training, less: figures that are not drawn."""
 
     def touch(figure, path):
         path.parent.mkdir(exist_ok=True)
         path.touch()
 
-    monkeypatch.setattr(experiment, "measure", partial(experiment.measure, episodes=2))
     for module in (measure, growth):
         monkeypatch.setattr(module, "save_figure", touch)
+        for name in dir(module):
+            if name.startswith("plot_"):
+                monkeypatch.setattr(module, name, lambda *data, **options: None)
+
+
+@pytest.fixture
+def undrawn(tiny, monkeypatch):
+    """Nothing is drawn after training, and nothing said of it."""
+
+    def draw(trainer, bank, out, random_success):
+        (out / "figures").mkdir(exist_ok=True)
+        return []
+
+    monkeypatch.setattr(experiment, "draw", draw)
 
 
 @pytest.fixture(scope="session")

@@ -23,6 +23,7 @@ from benchmarks import concurrent_tasks, continual, ladder, summary
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.rl import RL
 from bgpo_trl.configs import PRESETS, DDPGConfig
+from bgpo_trl.experiments import measure
 from bgpo_trl.experiments import run as experiment
 from bgpo_trl.experiments.arguments import Arguments, run_config
 from bgpo_trl.files.checkpoint import load_checkpoint
@@ -147,7 +148,7 @@ def test_continual_leaves_curve_and_figures(tiny, tmp_path, capsys):
 
 
 def test_a_finished_run_only_says_so_until_it_is_made_longer(
-    tiniest, tmp_path, monkeypatch, capsys
+    undrawn, tmp_path, monkeypatch, capsys
 ):
     run = tmp_path / "run"
     arguments = Arguments(out=run)
@@ -191,7 +192,7 @@ def test_a_finished_run_only_says_so_until_it_is_made_longer(
 
 
 def test_a_run_that_was_interrupted_before_its_training_is_resumed(
-    tiniest, tmp_path, monkeypatch, encoders, bank
+    undrawn, tmp_path, monkeypatch, encoders, bank
 ):
     monkeypatch.setattr(experiment, "make_pretrained", lambda *_, **__: (encoders, bank))
     (tmp_path / "demonstrations").mkdir()
@@ -204,11 +205,11 @@ def test_a_run_that_was_interrupted_before_its_training_is_resumed(
 
 
 def test_another_process_is_kept_off_all_of_an_experiment(
-    tiniest, tmp_path, monkeypatch, other_process
+    undrawn, tmp_path, monkeypatch, other_process
 ):
     """Also while it makes its encoders, and while it is tested and drawn."""
-    events = []
-    for name in ("load_pretrained", "measure"):
+    events, steps = [], ["load_pretrained", "measure", "draw"]
+    for name in steps:
         function = getattr(experiment, name)
 
         def do(*args, name=name, function=function, **kwargs):
@@ -219,7 +220,7 @@ def test_another_process_is_kept_off_all_of_an_experiment(
 
         monkeypatch.setattr(experiment, name, do)
     continual.main(Arguments(out=tmp_path / "run"))
-    assert events == ["load_pretrained", "measure"]
+    assert events == steps
     assert not (tmp_path / "run" / "lock").exists()
 
 
@@ -304,9 +305,11 @@ def test_the_command_line_runs_every_algorithm_and_says_its_name(
             assert float(cell) == pytest.approx(100 * sum(of_kind) / 2, abs=0.05)
 
 
-def test_concurrent_presents_all_tasks_from_the_start(tiny, tmp_path, capsys):
-    run = tmp_path / "run"
+def test_concurrent_presents_all_tasks_from_the_start(tiny, tmp_path, capsys, monkeypatch):
+    run, asked, test = tmp_path / "run", [], measure._final_tests
+    monkeypatch.setattr(measure, "_final_tests", lambda *a, **b: asked.append(b) or test(*a, **b))
     concurrent_tasks.main(Arguments(out=run))
+    assert asked == [{"episodes": 20}]  # of which `tiny` leaves two
     assert json.loads((run / "config.json").read_text())["task_starts"] == [0, 0, 0]
     assert {row["task"] for row in read_rows(run / "eval.csv")} == set(TASKS)
 
@@ -315,8 +318,8 @@ def test_concurrent_presents_all_tasks_from_the_start(tiny, tmp_path, capsys):
         (seed, kind, task) for seed in (3, 8) for kind in ("seen", "held-out") for task in TASKS
     )
     for row in rows:
-        assert row["episodes"] == "20"
-        assert 20 * float(row["success"]) in range(21)
+        assert row["episodes"] == "2"
+        assert 2 * float(row["success"]) in range(3)
         assert 0 <= float(row["task_inference"]) <= 1
     told = json.loads((run / "summary.json").read_text())
     assert re.fullmatch(r"|[0-9a-f]{7,}(-dirty)?", told["commit"])
@@ -365,7 +368,7 @@ def test_a_run_that_is_not_finished_cannot_be_summed_up(tmp_path):
 
 def test_the_ladder_has_a_row_and_a_run_for_each_rung(tiny, tmp_path, capsys):
     ddpg = DDPGConfig(hidden_sizes=(7,), batch_size=16, warmup_steps=8, replay_size=200)
-    arguments = ladder.Arguments(episodes=4, seeds=(1,), out=tmp_path, rl=ddpg)
+    arguments = ladder.Arguments(episodes=2, seeds=(1,), out=tmp_path, rl=ddpg)
     ladder.main(arguments)
     printed = capsys.readouterr().out
     lines = printed.splitlines()
@@ -378,7 +381,7 @@ def test_the_ladder_has_a_row_and_a_run_for_each_rung(tiny, tmp_path, capsys):
         learner = load_checkpoint(tmp_path / rung / "checkpoint")["algorithm"]
         inputs = set(learner["replay"]["rows"]) - {"action", "next", "group"}
         seen[rung] = (config["algorithm"]["state"], inputs, "gwr" in learner)
-        assert (config["task_starts"], config["eval_every"]) == ([0, 0, 0], 4)
+        assert (config["task_starts"], config["eval_every"]) == ([0, 0, 0], 2)
         assert config["algorithm"]["rl"]["hidden_sizes"] == [7]
         assert (tmp_path / rung / "figures" / "success.png").exists()
         train = read_rows(tmp_path / rung / "train.csv")

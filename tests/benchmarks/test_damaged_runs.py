@@ -8,8 +8,9 @@ import warnings
 import one_shot
 import pytest
 import summary
-import watch
 
+from bgpo_trl.experiments.watch import WatchArguments, watch
+from bgpo_trl.figures.of_run import draw_growth
 from bgpo_trl.files.checkpoint import save_checkpoint
 from bgpo_trl.runs.config_file import read_config
 from bgpo_trl.runs.results import read_rows
@@ -197,11 +198,15 @@ LOADED = {
 }
 
 
-@pytest.mark.parametrize("script", [watch, one_shot])
+@pytest.mark.parametrize(
+    ("read", "arguments"),
+    [(watch, WatchArguments), (one_shot.main, one_shot.Arguments)],
+    ids=["watch", "one_shot"],
+)
 @pytest.mark.parametrize("damage", LOADED.values(), ids=LOADED.keys())
-def test_a_damaged_run_is_not_shown_or_tested(run, capsys, damage, script, tmp_path):
+def test_a_damaged_run_is_not_shown_or_tested(run, capsys, damage, read, arguments, tmp_path):
     damage(run)
-    refusal(lambda: script.main(script.Arguments(run, out=tmp_path / "out")))
+    refusal(lambda: read(arguments(run, out=tmp_path / "out")))
     assert capsys.readouterr().out == ""
     assert not (tmp_path / "out").exists()
 
@@ -222,5 +227,5 @@ del GROWTH["gwr/episode-000010.safetensors missing"]  # There are others.
 def test_growth_is_not_drawn_from_damaged_files(run, bank, damage, tmp_path):
     config = read_config(run / "config.json")[0]
     damage(run)
-    refusal(lambda: watch.draw_growth(run, config, bank, tmp_path / "out"))
+    refusal(lambda: draw_growth(run, config, bank, tmp_path / "out"))
     assert not (tmp_path / "out").exists()

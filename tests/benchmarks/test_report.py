@@ -346,6 +346,18 @@ def test_runs_of_other_tasks_are_reported(tmp_path, tasks):
     assert (tmp_path / "fig7.png").exists()
 
 
+def test_what_trainer_alone_writes_is_reported(run_of, tmp_path):
+    """Without what final tests and a command line leave."""
+    folder = tmp_path / "reported"
+    shutil.copytree(run_of("bgpo"), folder / "continual-bgpo")
+    assert not {"final.csv", "summary.json"} & {path.name for path in folder.rglob("*")}
+    report.main(report.Arguments(folder))
+    text = (folder / "tables.md").read_text()
+    (success,) = rows_of(text, "Fig. 8")["BGPO"][1:2]
+    assert 0 <= float(success) <= 100
+    assert "nan" not in text
+
+
 def test_runs_of_different_tasks_are_not_compared(tmp_path):
     write_run(tmp_path, "concurrent-bgpo", 9)
     write_run(tmp_path, "continual-bgpo", 9, tasks=("juggle",), starts=(0,))

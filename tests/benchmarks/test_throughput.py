@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from benchmarks.speed import throughput
+from benchmarks.speed.bare_process import SUBSTEPS
 from bgpo_trl.configs import BGPOConfig, DDPGConfig
 from suites import nico
 from suites.nico.base import Environment
@@ -29,7 +30,7 @@ def test_the_bare_loop_simulates_what_our_task_does():
         environment.step(draw(frames.ROWS)[0])
         environment._reset_next_step = False
         data.ctrl[:] = targets[step, 0]
-        mujoco.mj_step(model, data, frames.SUBSTEPS)
+        mujoco.mj_step(model, data, SUBSTEPS)
     np.testing.assert_allclose(data.qpos[:12], environment.physics.data.qpos[:12], atol=0.02)
     assert np.abs(data.qpos[:3] - starts[0][1:4]).max() > 0.05
 

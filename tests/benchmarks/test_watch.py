@@ -5,9 +5,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import watch
 from PIL import Image
 
+from bgpo_trl.experiments import watch
 from bgpo_trl.figures import of_run as growth
 from bgpo_trl.runs.config_file import read_config
 from bgpo_trl.runs.gwr_graphs import load_graphs
@@ -24,20 +24,21 @@ def files(folder):
 
 @pytest.fixture
 def undemonstrated(monkeypatch):
-    """Demonstrations that take no time, and show nothing."""
+    """Demonstrations that take no time and show nothing; films without a long last frame."""
     frames = np.random.default_rng(0).integers(256, size=(7, 32, 64, 3), dtype=np.uint8)
     monkeypatch.setattr(watch, "demonstrate", lambda tasks, seed: dict.fromkeys(tasks, frames))
+    monkeypatch.setattr(watch, "_FPS", 1)
 
 
 @pytest.mark.parametrize("name", ["bgpo", "oracle"])
-def test_a_run_is_shown_and_left_as_it_is(run_of, undemonstrated, tmp_path, capsys, name):
+def test_a_run_is_shown_and_left_as_it_is(run_of, undemonstrated, tmp_path, name):
     run, out = run_of(name), tmp_path / "pictures"
     before = files(run)
-    watch.main(watch.Arguments(run, policy=8, out=out))
+    told = watch.watch(watch.WatchArguments(run, policy=8, out=out))
     assert files(run) == before
     expected = {"nico.gif", "nico.png"} | ({"gwr_growth.png"} if name == "bgpo" else set())
     assert {path.name for path in out.iterdir()} == expected
-    *outcomes, last = capsys.readouterr().out.splitlines()
+    *outcomes, last = told.splitlines()
     for task, line in zip(nico.PAPER_TASKS, outcomes, strict=True):
         assert line.startswith((f"{task}: no success after 6 steps", f"{task}: success after "))
     assert last == f"pictures: {out}"
@@ -169,7 +170,7 @@ def test_the_growth_figure_knows_only_tasks_that_were_presented(run_of, bank, mo
 
 def test_what_cannot_be_shown_is_refused(run_of, tmp_path):
     with pytest.raises(ValueError, match="holds no run"):
-        watch.main(watch.Arguments(tmp_path))
+        watch.watch(watch.WatchArguments(tmp_path))
     with pytest.raises(ValueError, match="has no seed 5: choose one of 3, 8"):
-        watch.main(watch.Arguments(run_of("bgpo"), policy=5, out=tmp_path / "out"))
+        watch.watch(watch.WatchArguments(run_of("bgpo"), policy=5, out=tmp_path / "out"))
     assert not (tmp_path / "out").exists()

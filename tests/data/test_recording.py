@@ -1,7 +1,7 @@
 import json
 import re
+import runpy
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
@@ -241,15 +241,13 @@ def test_a_full_disk_is_noticed_before_recording(tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-def test_the_command_ends_user_errors_in_one_line(recorded):
+def test_the_command_ends_user_errors_in_one_line(recorded, monkeypatch, capsys):
     size = ["--per-task", "3", "--held-out-per-task", "1"]
-    process = subprocess.run(
-        [sys.executable, "-m", "bgpo_trl.data.recording", str(recorded), *size, "--seed", "1"],
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
+    monkeypatch.setattr(sys, "argv", ["recording", str(recorded), *size, "--seed", "1"])
+    monkeypatch.delitem(sys.modules, "bgpo_trl.data.recording")  # which runpy would warn of
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_module("bgpo_trl.data.recording", run_name="__main__", alter_sys=True)
 
-    assert process.returncode == 1
-    assert process.stderr.startswith(f"error: {recorded} holds another recording")
-    assert process.stderr.count("\n") == 1
+    assert ended.value.code.startswith(f"error: {recorded} holds another recording")
+    assert "\n" not in ended.value.code
+    assert capsys.readouterr() == ("", "")

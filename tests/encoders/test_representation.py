@@ -28,15 +28,15 @@ from suites import nico
 
 CONFIG = RepresentationConfig(
     vae=VAEConfig(
-        batch_size=32,
+        batch_size=16,
         window=2,
-        steps=90,
+        steps=120,
         learning_rate=2e-3,
         warmup_steps=10,
         kl_weight=0.01,
         inverse_weight=10.0,
     ),
-    lae=SequenceAutoencoderConfig(batch_size=64, steps=150, learning_rate=1e-2, warmup_steps=10),
+    lae=SequenceAutoencoderConfig(batch_size=32, steps=60, learning_rate=1e-2, warmup_steps=10),
     checkpoint_every=50,
 )
 TINY = RepresentationConfig(

@@ -10,7 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
+from PIL import Image
 
+from bgpo_trl.figures import style
 from bgpo_trl.figures.curves import plot_success_curves
 from bgpo_trl.figures.nodes import plot_gwr_pca
 from bgpo_trl.figures.style import save_figure
@@ -190,6 +192,14 @@ def test_the_same_data_gives_the_same_file_and_leaves_no_trace(run, tmp_path):
     assert all(image.startswith(b"\x89PNG") for image in content)
     assert dict(mpl.rcParams) == before
     assert plt.get_fignums() == []
+
+
+def test_a_saved_figure_has_300_pixels_an_inch(run, tmp_path, monkeypatch, usual_dpi):
+    monkeypatch.setattr(style, "DPI", usual_dpi)
+    figure = plot_success_curves(run)
+    save_figure(figure, tmp_path / "curves.png")
+    with Image.open(tmp_path / "curves.png") as image:
+        np.testing.assert_allclose(image.size, 300 * figure.get_size_inches(), atol=1)
 
 
 def visible_texts(figure: Figure) -> list[Text]:

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from bgpo_trl.modules.gwr import GWRB
 
-examples = pytest.mark.parametrize("n", [40, pytest.param(500, marks=pytest.mark.slow)])
+examples = pytest.mark.parametrize("n", [20, pytest.param(500, marks=pytest.mark.slow)])
 
 
 @st.composite

@@ -40,6 +40,27 @@ def test_sources_of_two_projects_are_merged(other, first):
     assert all(str(folder / "suites") in found for folder in folders)
 
 
+@pytest.mark.parametrize("files", [[], ["notes.txt"], ["__init__.py"]])
+def test_a_folder_of_that_name_in_the_working_directory(tmp_path, files):
+    """It does no harm, unless it claims the name for itself; then the remedy is told."""
+    (tmp_path / "suites").mkdir()
+    for name in files:
+        (tmp_path / "suites" / name).touch()
+    process = subprocess.run(  # Without site-packages, where an editable install would be found.
+        [sys.executable, "-S", "-c", "import bgpo_trl; print(bgpo_trl.opengl.__name__)"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+    )
+    if "__init__.py" in files:
+        told = process.stderr.splitlines()[-1]
+        assert told.startswith("ImportError: cannot import name 'opengl' from 'suites' (")
+        assert told.endswith("hides ours: remove its __init__.py, or start elsewhere")
+    else:
+        assert (process.stdout, process.stderr) == ("suites.opengl\n", "")
+
+
 def test_the_wheel_has_no_file_that_another_projects_suites_would_have(other, tmp_path):
     copy, wheels = tmp_path / "copy", tmp_path / "wheels"
     for name in ("bgpo_trl", "suites"):

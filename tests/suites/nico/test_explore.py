@@ -1,7 +1,4 @@
 import itertools
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -84,17 +81,3 @@ def test_a_window_opens_only_on_a_screen(tmp_path, monkeypatch, out, screen, sho
 )
 def test_flags_choose_who_acts(flags, random):
     assert tyro.cli(Arguments, args=flags).random is random
-
-
-def test_an_error_is_one_line():
-    process = subprocess.run(
-        [sys.executable, "-m", "suites.nico.explore", "--task", "juggle", "--out", "a.png"],
-        env=os.environ,
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-
-    assert process.returncode == 1
-    assert process.stderr.startswith("error: no NICO task 'juggle'; choose one of grasp_glass,")
-    assert process.stderr.count("\n") == 1
