@@ -18,8 +18,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from bgpo_trl.analysis.novelty import Detection, leave_one_out, roc_curve
-from bgpo_trl.configs import BGPOConfig
-from bgpo_trl.experiments.arguments import TaskArguments, command_line
+from bgpo_trl.encoders.shipped import groups_config
+from bgpo_trl.experiments.arguments import TaskArguments, chosen_weights, command_line
 from bgpo_trl.experiments.run import bank_of
 from bgpo_trl.figures.style import COLORS, LINES, save_figure, style_axes
 
@@ -55,7 +55,7 @@ def draw(found: dict[str, Detection]) -> Figure:
 def main(arguments: Arguments) -> None:
     """Print the table and write the results."""
     bank = bank_of(arguments)
-    config = BGPOConfig().groups
+    config = groups_config(chosen_weights(bank.tasks, arguments.bank))
     found = {
         task: leave_one_out(bank, i, config, seeds=arguments.seeds, draws=arguments.draws)
         for i, task in enumerate(bank.tasks)

@@ -16,8 +16,9 @@ from bgpo_trl.runs.results import Curves, read_curves, read_json, read_rows
 from suites import nico
 
 Values = NDArray[np.float64]
-Statistic = Callable[[Values], float]
-IQM: Statistic = intervals.interquartile_mean
+Statistic = Callable[[Values], Values]
+"""Maps samples of scores, ``[N, S, T]``, to a value of each, ``[N]``."""
+IQM: Statistic = intervals.interquartile_means
 
 
 @dataclass(frozen=True)
@@ -258,7 +259,8 @@ class Statistics:
     def cell(self, scores: Values, statistic: Statistic = IQM) -> str:
         """Format a statistic of scores with its interval, in percent."""
         low, high = intervals.percentile_interval(self.resampled(scores, statistic))
-        return f"{_percent(statistic(scores), 1)} [{_percent(low, 0)}, {_percent(high, 0)}]"
+        (middle,) = statistic(scores[None])
+        return f"{_percent(middle, 1)} [{_percent(low, 0)}, {_percent(high, 0)}]"
 
 
 def _percent(share: float, digits: int) -> str:

@@ -169,16 +169,16 @@ def benchmark_table(
         reference = references.get(f"{CONCURRENT}-{algorithm}")
         transfer = "-"
         if reference is not None:
-            transfer = statistics.cell(forward_transfer(run, reference), _mean)
+            transfer = statistics.cell(forward_transfer(run, reference), _means)
         costs = _costs(run)
         hours = sum(cost.seconds for cost in costs.values()) / 3600
         rows.append(
             [
                 run.name,
                 "yes" if knows_label(run) else "no",
-                statistics.cell(late_scores(run), _mean),
-                statistics.cell(-change, _mean),
-                statistics.cell(change[:, :-1], _mean),
+                statistics.cell(late_scores(run), _means),
+                statistics.cell(-change, _means),
+                statistics.cell(change[:, :-1], _means),
                 transfer,
                 *(_mean_number(run.summary.get(what)) for what in ("nodes", "groups")),
                 f"{hours:.1f}" if costs else "-",
@@ -212,8 +212,8 @@ def _costs(run: Run) -> dict[int, Cost]:
     return read_costs(path) if path.exists() else {}
 
 
-def _mean(scores: Values) -> float:
-    return float(np.mean(scores))
+def _means(samples: Values) -> Values:
+    return samples.mean(axis=(1, 2))
 
 
 def _mean_number(of_seeds: list[float] | None) -> str:

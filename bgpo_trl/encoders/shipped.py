@@ -6,9 +6,11 @@ Results on the paper's tasks are those of the first. The second know the suite's
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 
+from bgpo_trl.configs import BGPOConfig, GWRBConfig
 from bgpo_trl.encoders.representation import load_representation
 from bgpo_trl.files.tensor_file import load_tensors
 from suites import nico
@@ -51,6 +53,16 @@ def weights_of_bank(bank: Path) -> Path:
     except (FileNotFoundError, ValueError):
         metadata = {}
     return find_weights(metadata.get("encoder_id"))
+
+
+def groups_config(weights: Path) -> GWRBConfig:
+    """Return the settings of the coarse network that finds groups, for shipped encoders.
+
+    The embeddings of a task lie closer together with the encoders of eight tasks, so that groups
+    are tasks at a higher threshold (``benchmarks/groups.py``).
+    """
+    groups = BGPOConfig().groups
+    return replace(groups, activity_threshold=0.595) if weights == _path(_EIGHT) else groups
 
 
 def _path(name: str) -> Path:

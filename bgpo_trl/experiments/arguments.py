@@ -13,8 +13,9 @@ import tyro
 
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.rl import RL
-from bgpo_trl.configs import PRESETS, RunConfig
+from bgpo_trl.configs import PRESETS, BGPOConfig, RunConfig
 from bgpo_trl.data.own_tasks import import_tasks
+from bgpo_trl.encoders.shipped import default_weights, groups_config, weights_of_bank
 from suites import nico
 
 AlgorithmName = Literal[
@@ -102,11 +103,12 @@ def run_config(arguments: Arguments) -> RunConfig:
         ValueError: If the settings are invalid, or a task does not exist.
     """
     import_tasks(arguments.module)
+    config = _with_tasks(PRESETS[arguments.preset], arguments.tasks)
     algorithm = ALGORITHMS[arguments.algorithm].config
     if arguments.rl != algorithm.rl.name:
         algorithm = replace(algorithm, rl=RL[arguments.rl].config)
     config = replace(
-        _with_tasks(PRESETS[arguments.preset], arguments.tasks),
+        config,
         name=arguments.algorithm,
         algorithm=algorithm,
         held_out=arguments.held_out,
@@ -125,6 +127,19 @@ def run_config(arguments: Arguments) -> RunConfig:
     if arguments.eval_every is not None:
         config = replace(config, eval_every=arguments.eval_every)
     return config
+
+
+def chosen_weights(tasks: Sequence[str], bank: Path | None) -> Path:
+    """Return the path of the shipped encoders for some tasks, or those that embedded a bank."""
+    return default_weights(tasks) if bank is None else weights_of_bank(bank)
+
+
+def for_encoders(config: RunConfig, weights: Path) -> RunConfig:
+    """Return a run whose groups of behaviors suit shipped encoders; groups of its own are kept."""
+    algorithm = config.algorithm
+    if not isinstance(algorithm, BGPOConfig) or algorithm.groups != BGPOConfig().groups:
+        return config
+    return replace(config, algorithm=replace(algorithm, groups=groups_config(weights)))
 
 
 def at_once(config: RunConfig) -> RunConfig:

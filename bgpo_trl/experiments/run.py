@@ -17,8 +17,13 @@ from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.own_tasks import import_tasks
 from bgpo_trl.encoders.pretrained import load_pretrained, make_pretrained
 from bgpo_trl.encoders.representation import Representation
-from bgpo_trl.encoders.shipped import default_weights, weights_of_bank
-from bgpo_trl.experiments.arguments import Arguments, TaskArguments, chosen_tasks
+from bgpo_trl.experiments.arguments import (
+    Arguments,
+    TaskArguments,
+    chosen_tasks,
+    chosen_weights,
+    for_encoders,
+)
 from bgpo_trl.experiments.measure import draw, measure
 from bgpo_trl.experiments.resuming import as_begun, check_resumable, is_finished
 from bgpo_trl.files.locking import DirectoryLock
@@ -65,6 +70,7 @@ def run_experiment(
     device = choose_device(arguments.device)
     rl = "" if arguments.rl == "ddpg" else f"-{arguments.rl}"
     out = arguments.out or Path("runs") / f"{name}-{config.name}{rl}-{arguments.preset}"
+    config = for_encoders(config, chosen_weights(config.tasks, _bank(arguments, out)))
     if arguments.resume:
         config = _continued(arguments, config, out)
         if is_finished(out, config):
@@ -151,8 +157,7 @@ def pretrained_for(
         ValueError: If the bank is missing, damaged or of other encoders, or a task has no
             demonstrations.
     """
-    weights = default_weights(tasks) if bank is None else weights_of_bank(bank)
-    encoders, found = load_pretrained(weights)
+    encoders, found = load_pretrained(chosen_weights(tasks, bank))
     if bank is not None:
         own = DemonstrationBank.load(bank, encoder_id=encoders.identity)
         lacking = [task for task in tasks if task not in own.tasks]
