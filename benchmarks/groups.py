@@ -24,6 +24,7 @@ from bgpo_trl.experiments.arguments import TaskArguments, command_line, even_sta
 from bgpo_trl.experiments.run import bank_of
 from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.modules.gwr import GWRB
+from bgpo_trl.seeding import generators
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,8 @@ def main(arguments: Arguments) -> None:
     }
     for order, starts in orders.items():
         inputs = seen.embedding[draw(seen, starts, draws=arguments.draws, seeds=seeds)]
-        gwr = GWRB(32, batch_size=len(seeds), **asdict(config.gwr))
+        random = generators(seeds, "gwr")
+        gwr = GWRB(32, batch_size=len(seeds), generator=random, **asdict(config.gwr))
         for x in inputs:
             gwr.adapt(x)
         right = task_inference_accuracy(gwr, seen, held_out, n_tasks)

@@ -261,8 +261,10 @@ class Trainer(Closing):
                                 "steps": steps,
                             }
                         )
-            shown = result.success.float().mean((0, 2)).tolist()
-            self._tested = ", in tests " + " ".join(f"{rate:.2f}" for rate in shown)
+            presented = torch.stack([snapshot.presented for snapshot in result.snapshots])
+            shown = (result.success.float().mean(2).sum(0) / presented.sum(0)).tolist()
+            rates = ("-" if rate != rate else f"{rate:.2f}" for rate in shown)
+            self._tested = f", in tests {' '.join(rates)}"
 
     def save(self) -> None:
         """Write a checkpoint, from which a resumed run continues identically."""

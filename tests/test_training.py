@@ -351,11 +351,18 @@ def test_checkpoints_are_written_as_often_as_asked(make, make_config, tmp_path):
     assert max(int(number) for number in numbers) == 1 + trainer.env_steps  # one before the first
 
 
-@pytest.mark.parametrize(("eval_every", "tests"), [(99, ""), (2, r", in tests( [01]\.\d\d){3}")])
+@pytest.mark.parametrize(
+    ("settings", "tests"),
+    [
+        ({"eval_every": 99}, ""),
+        ({"eval_every": 2}, r", in tests( [01]\.\d\d){3}"),
+        ({"eval_every": 2, "task_starts": (0, 2, 99)}, r", in tests( [01]\.\d\d){2} -"),
+    ],
+)
 def test_the_progress_bar_tells_the_success_so_far(
-    make, make_config, tmp_path, capsys, eval_every, tests
+    make, make_config, tmp_path, capsys, settings, tests
 ):
-    make(tmp_path, make_config(eval_every=eval_every), progress=True).run()
+    make(tmp_path, make_config(**settings), progress=True).run()
     won = [int(row["success"]) for row in rows(tmp_path / "train.csv")]
     last = capsys.readouterr().err.split("\r")[-1]
     expected = rf"train: 100%\|.*\| 20/20 .*, success {sum(won) / len(won):.2f}{tests}\]\n"
