@@ -19,7 +19,8 @@ class FrameEncoder(Transform):
 
     1. At reset, only the frames of the rows that are reset are encoded: with one environment per
        seed, episodes end one at a time, and the encoder is the most expensive part.
-    2. At every step, all frames are encoded, including the last ones of an episode.
+    2. At every step, the frames of the rows that are stepped are encoded (all of them, without a
+       ``_step``), including the last ones of an episode. The other rows keep their latents.
     3. With ``del_keys``, the frames are then dropped, so that no replay buffer or rollout stores
        them.
 
@@ -81,6 +82,17 @@ class FrameEncoder(Transform):
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         return self.forward(next_tensordict)
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        stepped = tensordict.get("_step", None)
+        if stepped is None or not all(key in tensordict for key in self.out_keys):
+            return self.forward(next_tensordict)
+        rows = stepped.reshape(tensordict.batch_size)
+        for in_key, out_key in zip(self.in_keys, self.out_keys, strict=True):
+            latent = tensordict[out_key].clone()
+            latent[rows] = self._apply_transform(next_tensordict[in_key][rows])
+            next_tensordict.set(out_key, latent)
+        return self._drop(next_tensordict)
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase

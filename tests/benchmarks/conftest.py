@@ -19,7 +19,7 @@ def tiny(monkeypatch, encoders, bank, make_config):
     """The benchmarks with untrained encoders, runs of a second and two test episodes after it."""
     config = make_config(episodes=6)
     for module in (experiment, ladder):
-        monkeypatch.setattr(module, "load_pretrained", lambda: (encoders, bank))
+        monkeypatch.setattr(module, "load_pretrained", lambda *_, **__: (encoders, bank))
     for module in (arguments, ladder):
         monkeypatch.setattr(module, "PRESETS", {"quick": config, "desk": config})
     for name, entry in ALGORITHMS.items():

@@ -79,7 +79,9 @@ def test_ratios_are_against_the_named_contenders(monkeypatch):
         "stock": [100.0, 200.0],
     }
     monkeypatch.setattr(frames, "contenders", lambda *a: dict.fromkeys(seconds, (None, 10)))
-    monkeypatch.setattr(throughput, "load_pretrained", lambda: (type("E", (), {"vae": None}), None))
+    monkeypatch.setattr(
+        throughput, "load_pretrained", lambda *_, **__: (type("E", (), {"vae": None}), None)
+    )
     monkeypatch.setattr(throughput, "interleave", lambda contenders, rounds, clock: seconds)
     row = throughput.measure_frames(throughput.Arguments(), threads=2)["ours"]
     assert row["frames a second"] == pytest.approx(10 / 30)

@@ -37,6 +37,19 @@ def test_partial_reset_encodes_the_rows_that_are_reset_only(MockEnv, TopRow, pla
     assert steps["latent"].equal(vae.latent(steps["pixels"]))
 
 
+def test_partial_step_encodes_the_rows_that_are_stepped_only(MockEnv, TopRow):
+    vae = TopRow()
+    env = TransformedEnv(MockEnv([0, 1, 2], 9), FrameEncoder(vae))
+    data = env.rand_step(env.reset())["next"]
+    before, stepped = data["latent"], torch.tensor([True, False, True])
+    del vae.n_frames[:]
+    after = env.step(env.rand_action(data).set("_step", stepped))["next"]
+    assert vae.n_frames == [2]
+    assert after["latent"][stepped].equal(vae.latent(after["pixels"][stepped]))
+    assert not after["latent"][stepped].equal(before[stepped])
+    assert after["latent"][~stepped].equal(before[~stepped])
+
+
 def test_records_no_gradient_and_leaves_the_encoder_trainable(MockEnv):
     class Trainable(torch.nn.Linear):
         def latent(self, pixels):
