@@ -22,7 +22,7 @@ def told(finding: Finding) -> tuple[str, str]:
 
 def test_weights_that_do_not_load_are_told_with_their_remedy(monkeypatch, tmp_path):
     path = tmp_path / "nico.safetensors"
-    monkeypatch.setattr(pretrained, "default_weights", lambda: path)
+    monkeypatch.setattr(pretrained, "default_weights", lambda tasks: path)
     (finding,) = command.examine({"updates/s": check_update_rate})
     assert finding.level == "wrong"
     assert f"no encoder weights at {path}: train new ones" in told(finding)[1]
