@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import matplotlib.image
@@ -21,7 +21,7 @@ import tyro
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from bgpo_trl.data.dataset import load_demonstrations
+from bgpo_trl.data.dataset import load_demonstrations, read_meta
 from bgpo_trl.encoders.distances import embedding_distances
 from bgpo_trl.encoders.representation import (
     Representation,
@@ -239,15 +239,18 @@ class Arguments:
     """Folder of the recorded demonstrations."""
     play: tyro.conf.Positional[Path | None] = None
     """Folder of recorded play."""
-    weights: Path = field(default_factory=default_weights)
-    """Encoder weights; the pretrained ones by default."""
+    weights: Path | None = None
+    """Encoder weights; by default the pretrained ones for the dataset's tasks."""
     out: Path = Path("runs/probes")
     """Folder for probes.json and reconstructions.png."""
 
 
 def main(arguments: Arguments) -> None:
     """Run the command line."""
-    representation = load_representation(arguments.weights, scene_version=nico.scene_version())
+    weights = arguments.weights
+    if weights is None:
+        weights = default_weights(read_meta(arguments.dataset)["tasks"])
+    representation = load_representation(weights, scene_version=nico.scene_version())
     play = None if arguments.play is None else load_demonstrations(arguments.play)
     probe(representation, load_demonstrations(arguments.dataset), arguments.out, play=play)
 

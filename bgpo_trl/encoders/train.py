@@ -51,8 +51,8 @@ class Arguments:
     """Folder of the recorded demonstrations."""
     play: tyro.conf.Positional[Path | None] = None
     """Folder of recorded play; without it, the frame encoder learns from demonstrations only."""
-    weights: Path = field(default_factory=default_weights)
-    """File to write; by default the pretrained weights of the package."""
+    weights: Path | None = None
+    """File to write; by default the pretrained weights of the package for the dataset's tasks."""
     folder: Path = Path("runs/encoders")
     """Folder for checkpoints, log and probes; the same folder resumes an interrupted training."""
     config: RepresentationConfig = field(default_factory=RepresentationConfig)
@@ -125,18 +125,18 @@ def _log_of(file: CsvFile) -> Log:
 
 def main(arguments: Arguments) -> None:
     """Run the command line."""
-    dataset = load_demonstrations(arguments.dataset)
+    dataset, tasks = load_demonstrations(arguments.dataset), read_meta(arguments.dataset)["tasks"]
     play = None if arguments.play is None else load_demonstrations(arguments.play)
     command = shlex.join(["python", "-m", "bgpo_trl.encoders.train", *sys.argv[1:]])
     train_encoders(
         dataset,
         play,
-        arguments.weights,
+        default_weights(tasks) if arguments.weights is None else arguments.weights,
         arguments.folder,
         arguments.config,
         command,
         choose_device(arguments.device),
-        tasks=read_meta(arguments.dataset)["tasks"],
+        tasks=tasks,
     )
 
 

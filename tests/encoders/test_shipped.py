@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from bgpo_trl.encoders import shipped
+from bgpo_trl.encoders import shipped, train
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.encoders.representation import load_representation
 from bgpo_trl.experiments.run import pretrained_for
@@ -31,6 +31,21 @@ def test_encoders_of_eight_serve_the_tasks_that_the_paper_lacks(tasks, name):
     encoders, bank = load_pretrained(tasks=tasks)
     assert encoders.identity == load_representation(path).identity
     assert {*tasks} - {"juggle"} <= {*bank.tasks}
+
+
+@pytest.mark.parametrize("tasks", [nico.PAPER_TASKS, nico.ALL_TASKS])
+@pytest.mark.parametrize("given", [None, Path("other.safetensors")])
+def test_training_replaces_the_encoders_of_the_datasets_tasks_alone(monkeypatch, tasks, given):
+    asked = []
+    monkeypatch.setattr(train, "load_demonstrations", lambda path: path)
+    monkeypatch.setattr(train, "read_meta", lambda path: {"tasks": tasks})
+    monkeypatch.setattr(
+        train,
+        "train_encoders",
+        lambda dataset, play, weights, *_, tasks: asked.append((weights, tasks)),
+    )
+    train.main(train.Arguments(Path("data"), weights=given))
+    assert asked == [(given or shipped.default_weights(tasks), tasks)]
 
 
 def test_files_are_at_most_12_megabytes():
