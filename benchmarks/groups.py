@@ -20,6 +20,7 @@ from torch import Tensor
 from bgpo_trl.analysis.task_inference import group_purity, task_inference_accuracy
 from bgpo_trl.configs import BGPOConfig
 from bgpo_trl.data.bank import DemonstrationBank
+from bgpo_trl.encoders.shipped import default_weights, groups_config
 from bgpo_trl.experiments.arguments import TaskArguments, command_line, even_starts
 from bgpo_trl.experiments.run import bank_of
 from bgpo_trl.modules.behavior_groups import BehaviorGroups
@@ -74,7 +75,7 @@ def main(arguments: Arguments) -> None:
         right = task_inference_accuracy(gwr, seen, held_out, n_tasks)
         print(row(order, "fine", config.gwr.activity_threshold, gwr.num_nodes, right))
         for threshold in arguments.thresholds:
-            settings = replace(config.groups, activity_threshold=threshold)
+            settings = replace(groups_config(default_weights()), activity_threshold=threshold)
             groups = BehaviorGroups(32, batch_size=len(seeds), **asdict(settings))
             for x in inputs:
                 groups.adapt(x)

@@ -138,8 +138,6 @@ def _config(arguments: Arguments, setting: Setting, name: str) -> RunConfig:
     config = replace(config, name=name)
     if setting == "ablation":
         config = replace(config, algorithm=ABLATIONS[name].config)
-    weights = experiment.chosen_weights(config.tasks, arguments.bank)
-    config = experiment.for_encoders(config, weights)
     return config if setting in ("continual", "eight", "eight-reversed") else at_once(config)
 
 

@@ -22,6 +22,7 @@ from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.demonstration_replay import DemonstrationReplay
 from bgpo_trl.data.group_replay import GroupReplay
 from bgpo_trl.encoders.representation import Representation
+from bgpo_trl.encoders.shipped import find_weights, groups_config
 from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.modules.gwr import GWRB
 from bgpo_trl.seeding import generators
@@ -76,8 +77,12 @@ class BGPO(Algorithm):
                 **asdict(config.gwr),
             )
         if variant.groups:
+            found_by = config.groups
+            if found_by is None:
+                identity = None if encoders is None else encoders.identity
+                found_by = groups_config(find_weights(identity))
             self.groups = BehaviorGroups(
-                embedding_size, batch_size=[len(seeds)], **asdict(config.groups)
+                embedding_size, batch_size=[len(seeds)], **asdict(found_by)
             )
         sizes = {"behavior": embedding_size, "label": self.n_tasks, None: 0}
         self.in_keys = [config.state, *(["context"] if variant.context else [])]

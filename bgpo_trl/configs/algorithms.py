@@ -97,11 +97,10 @@ class BGPOConfig(AlgorithmConfig):
     expert_batch_size: int = 64
     """Transitions of each active group per update, with experts. Ours: as many as MAML and Dist-NLL
     have per task; without experts, the RL algorithm's ``batch_size`` is shared by all groups."""
-    groups: GWRBConfig = field(
-        default_factory=lambda: GWRBConfig(activity_threshold=0.525, habituation_threshold=0.5)
-    )
-    """The coarse network that finds the groups. Ours: with these thresholds it finds one group,
-    rarely two, for each task of NICO (docs/learning.md)."""
+    groups: GWRBConfig | None = None
+    """The coarse network that finds the groups, ours. By default one that finds one group, rarely
+    two, for each task of NICO with the encoders in use
+    (`bgpo_trl.encoders.shipped.groups_config`)."""
 
     @property
     def grouped(self) -> bool:

@@ -6,11 +6,11 @@ Results on the paper's tasks are those of the first. The second know the suite's
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from functools import cache
 from importlib import resources
 from pathlib import Path
 
-from bgpo_trl.configs import BGPOConfig, GWRBConfig
+from bgpo_trl.configs import GWRBConfig
 from bgpo_trl.encoders.representation import load_representation
 from bgpo_trl.files.tensor_file import load_tensors
 from suites import nico
@@ -38,9 +38,7 @@ def find_weights(identity: str | None) -> Path:
 
     Those of the paper's tasks if none have it.
     """
-    eight = _path(_EIGHT)
-    found = eight.exists() and load_representation(eight).identity == identity
-    return eight if found else _path(_PAPER)
+    return _path(_EIGHT if identity is not None and identity == _identity(_EIGHT) else _PAPER)
 
 
 def weights_of_bank(bank: Path) -> Path:
@@ -56,13 +54,21 @@ def weights_of_bank(bank: Path) -> Path:
 
 
 def groups_config(weights: Path) -> GWRBConfig:
-    """Return the settings of the coarse network that finds groups, for shipped encoders.
+    """Return the settings of the coarse network that finds groups, for encoders.
 
-    The embeddings of a task lie closer together with the encoders of eight tasks, so that groups
-    are tasks at a higher threshold (``benchmarks/groups.py``).
+    The embeddings of a task lie closer together with the shipped encoders of eight tasks, so that
+    groups are tasks at a higher threshold (``benchmarks/groups.py``). Other encoders get the
+    threshold of those of the paper's tasks.
     """
-    groups = BGPOConfig().groups
-    return replace(groups, activity_threshold=0.595) if weights == _path(_EIGHT) else groups
+    threshold = 0.595 if weights == _path(_EIGHT) else 0.525
+    return GWRBConfig(activity_threshold=threshold, habituation_threshold=0.5)
+
+
+@cache
+def _identity(name: str) -> str | None:
+    """Return the identity of shipped encoders; None if they are not there."""
+    path = _path(name)
+    return load_representation(path).identity if path.exists() else None
 
 
 def _path(name: str) -> Path:

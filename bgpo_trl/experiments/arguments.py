@@ -13,9 +13,9 @@ import tyro
 
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.rl import RL
-from bgpo_trl.configs import PRESETS, BGPOConfig, RunConfig
+from bgpo_trl.configs import PRESETS, RunConfig
 from bgpo_trl.data.own_tasks import import_tasks
-from bgpo_trl.encoders.shipped import default_weights, groups_config, weights_of_bank
+from bgpo_trl.encoders.shipped import default_weights, weights_of_bank
 from suites import nico
 
 AlgorithmName = Literal[
@@ -132,14 +132,6 @@ def run_config(arguments: Arguments) -> RunConfig:
 def chosen_weights(tasks: Sequence[str], bank: Path | None) -> Path:
     """Return the path of the shipped encoders for some tasks, or those that embedded a bank."""
     return default_weights(tasks) if bank is None else weights_of_bank(bank)
-
-
-def for_encoders(config: RunConfig, weights: Path) -> RunConfig:
-    """Return a run whose groups of behaviors suit shipped encoders; groups of its own are kept."""
-    algorithm = config.algorithm
-    if not isinstance(algorithm, BGPOConfig) or algorithm.groups != BGPOConfig().groups:
-        return config
-    return replace(config, algorithm=replace(algorithm, groups=groups_config(weights)))
 
 
 def at_once(config: RunConfig) -> RunConfig:

@@ -22,7 +22,6 @@ from bgpo_trl.experiments.arguments import (
     TaskArguments,
     chosen_tasks,
     chosen_weights,
-    for_encoders,
 )
 from bgpo_trl.experiments.measure import draw, measure
 from bgpo_trl.experiments.resuming import as_begun, check_resumable, is_finished
@@ -70,7 +69,6 @@ def run_experiment(
     device = choose_device(arguments.device)
     rl = "" if arguments.rl == "ddpg" else f"-{arguments.rl}"
     out = arguments.out or Path("runs") / f"{name}-{config.name}{rl}-{arguments.preset}"
-    config = for_encoders(config, chosen_weights(config.tasks, _bank(arguments, out)))
     if arguments.resume:
         config = _continued(arguments, config, out)
         if is_finished(out, config):

@@ -134,6 +134,8 @@ def _read(hint: Any, value: Any, where: str) -> Any:
             raise ValueError(f"unknown setting {where}{unknown[0]}")
         read = {key: _read(hints[key], item, f"{where}{key}.") for key, item in value.items()}
         return hint(**read)  # pyright: ignore[reportCallIssue]
+    if type(None) in get_args(hint):
+        return None if value is None else _read(get_args(hint)[0], value, where)
     if get_origin(hint) is tuple and isinstance(value, list):
         return tuple(_read(get_args(hint)[0], item, where) for item in value)
     if get_origin(hint) is Literal and value in get_args(hint):

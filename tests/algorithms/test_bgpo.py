@@ -17,6 +17,7 @@ from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
 from bgpo_trl.modules.gwr import GWRB
 from bgpo_trl.seeding import generators
 from bgpo_trl.transforms import BehaviorLookup, GroupLookup, TaskSchedule
+from suites import nico
 
 # By name: state, meaning of the context, variant, and the algorithm whose settings it has.
 VARIANTS = {
@@ -704,3 +705,17 @@ def test_demonstrations_are_refused_where_the_state_is_the_ground_truth(make_con
         ValueError, match="demonstrations are latents: set demonstration_share to 0"
     ):
         BGPO(config, **parts)
+
+
+@pytest.mark.parametrize(
+    ("tasks", "own", "threshold"),
+    [
+        (nico.PAPER_TASKS, None, 0.525),
+        (nico.ALL_TASKS, None, 0.595),
+        (nico.ALL_TASKS, GWRBConfig(activity_threshold=0.525), 0.525),
+    ],
+)
+def test_the_encoders_bring_the_threshold_of_groups_unless_it_is_set(tasks, own, threshold):
+    encoders, bank = load_pretrained(tasks=tasks)
+    algorithm = BGPO(BGPOConfig(groups=own), seeds=[0], bank=bank.seen(), encoders=encoders)
+    assert algorithm.groups.activity_threshold == threshold

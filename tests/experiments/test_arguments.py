@@ -1,12 +1,9 @@
 """Tasks on the command line, and what follows from them."""
 
-from dataclasses import replace
-
 import pytest
 
-from bgpo_trl.configs import PRESETS, BGPOConfig, GWRBConfig, MAMLConfig, RunConfig
-from bgpo_trl.encoders.shipped import default_weights
-from bgpo_trl.experiments.arguments import Arguments, at_once, for_encoders, run_config
+from bgpo_trl.configs import PRESETS
+from bgpo_trl.experiments.arguments import Arguments, at_once, run_config
 from suites import nico
 
 ONE, TWO, THREE = nico.PAPER_TASKS
@@ -61,17 +58,3 @@ def test_by_default_they_are_the_presets():
 def test_tasks_that_cannot_be_are_refused(tasks, said):
     with pytest.raises(ValueError, match=said):
         run_config(Arguments(tasks=tasks))
-
-
-def test_groups_have_the_threshold_of_the_encoders_unless_they_have_their_own():
-    paper, eight = (default_weights(tasks) for tasks in (nico.PAPER_TASKS, nico.ALL_TASKS))
-    run = RunConfig(tasks=nico.ALL_TASKS, task_starts=(0,) * 8)
-    assert for_encoders(run, paper) == run
-    for_eight = for_encoders(run, eight)
-    assert for_eight.algorithm.groups == replace(run.algorithm.groups, activity_threshold=0.595)
-    assert replace(for_eight, algorithm=run.algorithm) == run
-    assert for_encoders(for_eight, eight) == for_eight
-    own = replace(run, algorithm=BGPOConfig(groups=GWRBConfig(activity_threshold=0.7)))
-    assert for_encoders(own, eight) == own
-    label = replace(run, algorithm=MAMLConfig())
-    assert for_encoders(label, eight) == label

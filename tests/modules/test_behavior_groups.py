@@ -8,8 +8,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bgpo_trl.configs import BGPOConfig
 from bgpo_trl.encoders.pretrained import load_pretrained
+from bgpo_trl.encoders.shipped import default_weights, groups_config
 from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.modules.gwr import GWRB
 from bgpo_trl.transforms import TaskSchedule
@@ -202,7 +202,7 @@ def test_groups_of_nicos_demonstrations_are_each_of_one_task(shipped, starts):
     schedule, n_seeds = TaskSchedule(starts), 5
     n_groups = {3, 4, 5}
     seen, held_out = shipped.seen(), shipped.held_out()
-    groups = BehaviorGroups(32, batch_size=[n_seeds], **asdict(BGPOConfig().groups))
+    groups = BehaviorGroups(32, batch_size=[n_seeds], **asdict(groups_config(default_weights())))
     rows = [torch.nonzero(seen.task == task).flatten() for task in range(3)]
     generator = torch.Generator().manual_seed(0)
     for episode in range(200):

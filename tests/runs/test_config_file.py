@@ -7,7 +7,7 @@ import pytest
 
 from bgpo_trl.algorithms import ABLATIONS, ALGORITHMS
 from bgpo_trl.algorithms.rl import RL
-from bgpo_trl.configs import PRESETS, BGPOConfig, DDPGConfig, RunConfig
+from bgpo_trl.configs import PRESETS, BGPOConfig, DDPGConfig, GWRBConfig, RunConfig
 from bgpo_trl.runs.config_file import Digests, read_config, settings_of
 from suites import nico
 
@@ -44,6 +44,15 @@ def test_ablations_are_read(tmp_path, name):
     config = RunConfig(name=name, algorithm=replace(ABLATIONS[name].config, beta=0.3))
     path = write(tmp_path / "config.json", config, encoders=None)
     assert read_config(path) == (config, (None, "def"))
+
+
+@pytest.mark.parametrize("groups", [None, GWRBConfig(activity_threshold=0.7)])
+def test_a_setting_that_may_be_absent_is_read(tmp_path, groups):
+    path = write(tmp_path / "config.json", RunConfig(algorithm=BGPOConfig(groups=groups)))
+    assert read_config(path)[0].algorithm.groups == groups
+    path.write_text(path.read_text().replace("null", "7").replace("0.7", '"high"'))
+    with pytest.raises(ValueError, match=r"algorithm\.groups"):
+        read_config(path)
 
 
 @dataclass(frozen=True)
