@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from json import JSONDecodeError
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -142,12 +143,14 @@ def easy_world():
 
 
 @pytest.fixture(autouse=True)
-def own_tasks_are_forgotten() -> Iterator[None]:
-    """Remove tasks that a test has added to the suite."""
-    before = dict(nico._TASKS)
+def own_entries_are_forgotten() -> Iterator[None]:
+    """Remove tasks and RL algorithms that a test has added."""
+    registries: list[dict[str, Any]] = [nico._TASKS, RL]
+    before = [dict(registry) for registry in registries]
     yield
-    nico._TASKS.clear()
-    nico._TASKS.update(before)
+    for registry, entries in zip(registries, before, strict=True):
+        registry.clear()
+        registry.update(entries)
 
 
 @pytest.fixture(scope="session", autouse=True)
