@@ -220,21 +220,12 @@ def late_scores(run: Run) -> Values:
 
 def area_scores(run: Run) -> Values:
     """Return the area under each task's curve since its presentation, ``[S, T]``."""
-    return np.stack(
-        [task_area(run, task, start) for task, start in enumerate(starts(run))], axis=-1
-    )
-
-
-def task_area(run: Run, task: int, start: int, length: int | None = None) -> Values:
-    """Return the area under a task's curve over ``length`` episodes after ``start``, ``[S]``.
-
-    Without ``length``, the area up to the end of training.
-    """
-    episodes = run.curves.episodes
-    chosen = episodes > start
-    if length is not None:
-        chosen &= episodes <= start + length
-    return metrics.area_under_curve(run.curves.success[:, chosen, task], episodes[chosen] - start)
+    episodes, areas = run.curves.episodes, []
+    for task, start in enumerate(starts(run)):
+        since = episodes > start
+        curve = run.curves.success[:, since, task]
+        areas.append(metrics.area_under_curve(curve, episodes[since] - start))
+    return np.stack(areas, axis=-1)
 
 
 class Statistics:

