@@ -4,7 +4,6 @@ import math
 from copy import deepcopy
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
@@ -16,6 +15,7 @@ from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
 from bgpo_trl.modules.multi_head_actor import MultiHeadActor
 from bgpo_trl.seeding import generators
 from bgpo_trl.transforms import TaskSchedule
+from tests.algorithms.playing import assert_same, kept, play
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 SEEDS = (4, 6)
@@ -35,47 +35,6 @@ def make(bank, encoders, make_config, in_world):
         return in_world(algorithm, seeds, schedule, of_tasks)
 
     return make
-
-
-def play(algorithm, n_steps, state=None, hidden=(), watch=lambda chosen: None):
-    """Trains for some steps; the algorithm gets none of the `hidden` entries.
-
-    Returns transitions ``[S, T]`` and the tensordict in flight.
-    """
-    state, transitions = algorithm.world.env.reset() if state is None else state, []
-    for _ in range(n_steps):
-        state["action"] = algorithm.act(state.exclude(*hidden))["action"]
-        watch(state)
-        algorithm.update()
-        transition, state = algorithm.world.env.step_and_maybe_reset(state)
-        transitions.append(transition.clone())
-        algorithm.store(transition.exclude(*hidden, *(("next", key) for key in hidden)))
-    return torch.stack(transitions, dim=1), state
-
-
-def kept(algorithm):
-    """A copy of its state, without the memory that its replay has not filled yet."""
-    state = deepcopy(algorithm.state_dict())
-    played = state["replay"]["played"]
-    added, rows = played["n_added"].tolist(), TensorDict(played.pop("rows"))
-    for key, value in rows.items(True, True):
-        value = value.unflatten(0, (-1, len(added)))
-        state[key] = [value[:count, column] for column, count in enumerate(added)]
-    return state
-
-
-def assert_same(first, second):
-    """Two nested states, bit for bit."""
-    if isinstance(first, dict):
-        assert first.keys() == second.keys()
-        first, second = list(first.values()), list(second.values())
-    if isinstance(first, (list, tuple)):
-        for ours, theirs in zip(first, second, strict=True):
-            assert_same(ours, theirs)
-    elif isinstance(first, torch.Tensor):
-        assert first.equal(second)
-    else:
-        np.testing.assert_equal(first, second)
 
 
 def teachers_action(algorithm, seed, task, state):

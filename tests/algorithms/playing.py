@@ -1,0 +1,48 @@
+"""Steps of training with the baselines, and comparisons of their states."""
+
+from copy import deepcopy
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+
+
+def play(algorithm, n_steps, state=None, hidden=(), watch=lambda chosen: None):
+    """Trains for some steps; the algorithm gets none of the `hidden` entries.
+
+    Returns transitions ``[S, T]`` and the tensordict in flight.
+    """
+    state, transitions = algorithm.world.env.reset() if state is None else state, []
+    for _ in range(n_steps):
+        state["action"] = algorithm.act(state.exclude(*hidden))["action"]
+        watch(state)
+        algorithm.update()
+        transition, state = algorithm.world.env.step_and_maybe_reset(state)
+        transitions.append(transition.clone())
+        algorithm.store(transition.exclude(*hidden, *(("next", key) for key in hidden)))
+    return torch.stack(transitions, dim=1), state
+
+
+def kept(algorithm):
+    """A copy of its state, without the memory that its replay has not filled yet."""
+    state = deepcopy(algorithm.state_dict())
+    played = state["replay"]["played"]
+    added, rows = played["n_added"].tolist(), TensorDict(played.pop("rows"))
+    for key, value in rows.items(True, True):
+        value = value.unflatten(0, (-1, len(added)))
+        state[key] = [value[:count, column] for column, count in enumerate(added)]
+    return state
+
+
+def assert_same(first, second):
+    """Two nested states, bit for bit."""
+    if isinstance(first, dict):
+        assert first.keys() == second.keys()
+        first, second = list(first.values()), list(second.values())
+    if isinstance(first, (list, tuple)):
+        for ours, theirs in zip(first, second, strict=True):
+            assert_same(ours, theirs)
+    elif isinstance(first, torch.Tensor):
+        assert first.equal(second)
+    else:
+        np.testing.assert_equal(first, second)
