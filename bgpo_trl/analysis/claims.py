@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from itertools import pairwise
-from typing import Any
 
-from bgpo_trl.analysis import intervals
 from bgpo_trl.analysis.comparison import (
     ADDITIONS,
     ALGORITHMS,
@@ -114,13 +112,6 @@ class _Judge:
         if missing:
             return ["", "missing: " + ", ".join(missing)]
         scores = [_MEASURES[what](run) for run in runs if run is not None]
-        gain = _difference([intervals.interquartile_mean(of_run) for of_run in scores])
-        drawn = _difference([self._statistics.resampled(of_run) for of_run in scores])
-        low, high = intervals.percentile_interval(drawn)
-        verdict = self._words[0] if low > 0 else self._words[1] if high < 0 else "level"
-        return [f"{100 * gain:+.1f} [{100 * low:+.0f}, {100 * high:+.0f}]", verdict]
-
-
-def _difference(values: list[Any]) -> Any:
-    gap = values[0] - values[1]
-    return gap if len(values) == 2 else gap - (values[2] - values[3])
+        found = self._statistics.difference(*scores)
+        above, below = self._words
+        return [found.cell(), above if found.low > 0 else below if found.high < 0 else "level"]

@@ -6,7 +6,7 @@ import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -252,6 +252,32 @@ class Statistics:
         low, high = intervals.percentile_interval(self.resampled(scores, statistic))
         (middle,) = statistic(scores[None])
         return f"{_percent(middle, 1)} [{_percent(low, 0)}, {_percent(high, 0)}]"
+
+    def difference(self, *scores: Values, statistic: Statistic = IQM) -> Difference:
+        """Return the difference of a statistic between two runs' scores, with its interval.
+
+        Of four runs: the difference between the first two minus that between the last two.
+        """
+        gain = _difference([float(statistic(of_run[None])[0]) for of_run in scores])
+        drawn = _difference([self.resampled(of_run, statistic) for of_run in scores])
+        return Difference(gain, *intervals.percentile_interval(drawn))
+
+
+class Difference(NamedTuple):
+    """A difference of success between runs, and its 95 % interval."""
+
+    gain: float
+    low: float
+    high: float
+
+    def cell(self) -> str:
+        """Format the difference and its interval, in points."""
+        return f"{100 * self.gain:+.1f} [{100 * self.low:+.0f}, {100 * self.high:+.0f}]"
+
+
+def _difference(values: list[Any]) -> Any:
+    gap = values[0] - values[1]
+    return gap if len(values) == 2 else gap - (values[2] - values[3])
 
 
 def _percent(share: float, digits: int) -> str:

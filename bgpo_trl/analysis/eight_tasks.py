@@ -45,8 +45,9 @@ SEQUENCES = {
 }
 NOTES: tuple[str, ...] = (
     "Means and 95 % intervals over seeds, in points; performance: mean success over the last 10 % "
-    "of training. Forgetting: success at the end of a task's own phase minus that at the end of "
-    "training, mean over all tasks; backward transfer: the negative, without the last task.",
+    "of training. BGPO's lead: its performance minus the row's.",
+    "Forgetting: success at the end of a task's own phase minus that at the end of training, mean "
+    "over all tasks; backward transfer: the negative, without the last task.",
     "Forward transfer: (area - reference) / (1 - reference), areas under a task's curve over the "
     "own episodes of its phase; reference: the same algorithm with all tasks from the start.",
     "Nodes and groups: means over seeds. Hours and megabytes (replay, networks, GWR-B): of all "
@@ -118,9 +119,13 @@ def benchmark_table(
         references: Runs with all tasks from the start, by directory name.
         statistics: Of the intervals.
     """
-    rows = [["", "knows the label", "performance", "forgetting", "backward transfer"]]
-    rows[0] += ["forward transfer", "nodes", "groups", "hours", "megabytes"]
+    rows = [["", "knows the label", "performance", "BGPO's lead", "forgetting"]]
+    rows[0] += ["backward transfer", "forward transfer", "nodes", "groups", "hours", "megabytes"]
+    ours = next((run for key, run in runs.items() if key.endswith("-bgpo")), None)
     for key, run in runs.items():
+        scores, lead = late_scores(run), "-"
+        if ours is not None and run is not ours:
+            lead = statistics.difference(late_scores(ours), scores, statistic=_means).cell()
         change = metrics.change_since_learned(success_matrix(run))
         algorithm = next(name for name in ALGORITHMS if key.endswith(f"-{name}"))
         reference = references.get(f"{CONCURRENT}-{algorithm}")
@@ -133,7 +138,8 @@ def benchmark_table(
             [
                 run.name,
                 "yes" if knows_label(run) else "no",
-                statistics.cell(late_scores(run), _means),
+                statistics.cell(scores, _means),
+                lead,
                 statistics.cell(-change, _means),
                 statistics.cell(change[:, :-1], _means),
                 transfer,

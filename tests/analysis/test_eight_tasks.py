@@ -37,7 +37,7 @@ def test_tasks_that_do_not_start_one_after_the_other_have_no_matrix():
 def test_row_of_the_benchmark_by_hand(tmp_path):
     write_costs(tmp_path / "cost.csv", {1: Cost(100, 1800, 2.4), 3: Cost(50, 3600, 7.6)})
     run = make_run(directory=tmp_path, nodes=[10, 11], groups=[3, 3])
-    told = make_run(name="oracle")
+    told = make_run([*SUCCESS[:-1], [0.4, 0.8, 0.3]], name="oracle")
     head, ours, other = eight_tasks.benchmark_table(
         {"eight-bgpo": run, "eight-oracle": told}, {}, Statistics()
     )
@@ -47,7 +47,8 @@ def test_row_of_the_benchmark_by_hand(tmp_path):
     assert cells["forgetting"] == "0.0 [0, 0]"
     assert (cells["knows the label"], cells["nodes"], cells["groups"]) == ("no", "10.5", "3")
     assert (cells["hours"], cells["megabytes"], cells["forward transfer"]) == ("1.5", "8", "-")
-    assert other[1] == "yes"
+    assert cells["BGPO's lead"] == "-"
+    assert other[1:4] == ["yes", "50.0 [50, 50]", "+10.0 [+10, +10]"]
     assert other[-5:] == ["-"] * 5
 
 
