@@ -59,6 +59,7 @@ def main(arguments: Arguments) -> None:
     torch.set_num_threads(1)
     bank = bank_of(arguments)
     config, n_tasks, seeds = BGPOConfig(), len(bank.tasks), arguments.seeds
+    coarse = groups_config(default_weights())
     seen, held_out = bank.seen(), bank.held_out()
     print("| order | network | a_T | groups or nodes, by seed | purity or inference, % |")
     print("|---|---|---:|---|---|")
@@ -75,7 +76,7 @@ def main(arguments: Arguments) -> None:
         right = task_inference_accuracy(gwr, seen, held_out, n_tasks)
         print(row(order, "fine", config.gwr.activity_threshold, gwr.num_nodes, right))
         for threshold in arguments.thresholds:
-            settings = replace(groups_config(default_weights()), activity_threshold=threshold)
+            settings = replace(coarse, activity_threshold=threshold)
             groups = BehaviorGroups(32, batch_size=len(seeds), **asdict(settings))
             for x in inputs:
                 groups.adapt(x)

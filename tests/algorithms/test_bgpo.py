@@ -18,6 +18,7 @@ from bgpo_trl.modules.gwr import GWRB
 from bgpo_trl.seeding import generators
 from bgpo_trl.transforms import BehaviorLookup, GroupLookup, TaskSchedule
 from suites import nico
+from tests.algorithms.playing import assert_same
 
 # By name: state, meaning of the context, variant, and the algorithm whose settings it has.
 VARIANTS = {
@@ -92,20 +93,6 @@ def plain_action(algorithm, state):
             (hidden @ weight["mlp.layers.1.weight"] + weight["mlp.layers.1.bias"]).tanh()
         )
     return torch.stack(actions)
-
-
-def assert_same_state(first, second):
-    """Two nested states, bit for bit."""
-    if isinstance(first, dict):
-        assert first.keys() == second.keys()
-        first, second = list(first.values()), list(second.values())
-    if isinstance(first, (list, tuple)):
-        for ours, theirs in zip(first, second, strict=True):
-            assert_same_state(ours, theirs)
-    elif isinstance(first, torch.Tensor):
-        assert first.equal(second)
-    else:
-        assert first == second
 
 
 def assert_same_graph(first, second, **tolerance):
@@ -280,7 +267,7 @@ def test_snapshots_have_the_context_of_training_and_learn_nothing(make, variant)
     for index, graph in enumerate(before):
         assert_same_graph(algorithm.gwr.graph(index), graph, rtol=0, atol=0)
     for part in ("experts", "active", "learner"):
-        assert_same_state(algorithm.state_dict()[part], states[part])
+        assert_same(algorithm.state_dict()[part], states[part])
 
 
 def test_test_episodes_are_played_by_the_expert_of_their_demonstration(make, bank):
@@ -498,8 +485,8 @@ def test_a_restored_run_continues_as_the_saved_one(make, tmp_path, rl):
     ours, _ = play_on(algorithm, 15, state)
     theirs, _ = play_on(other, 15, TensorDict(saved["state"], [2]))
     assert (ours == theirs).all()
-    assert_same_state(algorithm.learner.state_dict(), other.learner.state_dict())
-    assert_same_state(algorithm.experts.state_dict(), other.experts.state_dict())
+    assert_same(algorithm.learner.state_dict(), other.learner.state_dict())
+    assert_same(algorithm.experts.state_dict(), other.experts.state_dict())
     assert other.groups.num_groups.equal(algorithm.groups.num_groups)
 
 
@@ -524,7 +511,7 @@ def test_with_one_group_it_is_the_plain_learner_bit_for_bit(make, rl):
     assert one.groups.num_groups.tolist() == [1, 1]
     for key in ("action", "latent", "behavior", "demo_index", ("next", "reward")):
         assert ours[key].equal(theirs[key]), key
-    assert_same_state(plain.learner.state_dict(), one.learner.state_dict())
+    assert_same(plain.learner.state_dict(), one.learner.state_dict())
 
 
 def test_slots_that_stay_free_change_nothing(make, make_config):
@@ -641,13 +628,13 @@ def test_nothing_is_known_of_tasks_that_have_not_been_presented(make, bank):
         second = make(variant, schedule=schedule, bank=other)
         ours, theirs = play(first, 25), play(second, 25)
         assert (ours == theirs).all()
-        assert_same_state(first.learner.state_dict(), second.learner.state_dict())
+        assert_same(first.learner.state_dict(), second.learner.state_dict())
         shown, task = bank.embedding[:6].view(3, 2, 32), torch.zeros(3, 2).long()
         for index in range(2):
             policies = [
                 one.snapshot(index, shown, task, torch.Generator()) for one in (first, second)
             ]
-            assert_same_state(*(policy.state_dict() for policy in policies))
+            assert_same(*(policy.state_dict() for policy in policies))
 
 
 def test_the_bonus_is_for_latents_as_they_are_and_the_policy_sees_them_clipped(
