@@ -43,13 +43,13 @@ def folder(tmp_path) -> Path:
         (tmp_path / name / "eval.csv").write_bytes(data)
         if name != "unevaluated":
             (tmp_path / name / "config.json").write_text('{"gamma": ')
-    bank().save(tmp_path / "bank", encoder_id="x")
+    bank().save(tmp_path / "bank")
     return tmp_path
 
 
 def bank() -> DemonstrationBank:
     task = torch.arange(3)
-    return DemonstrationBank(torch.zeros(3, 32), task, task > 0)
+    return DemonstrationBank(torch.zeros(3, 32), task, task > 0, encoder_id="x")
 
 
 def load_bank(path):
@@ -145,7 +145,7 @@ CASES = {
         lambda f: DemonstrationBank.load(f / "bank", encoder_id="y"),
         "'encoder_id': 'x'", "--train-encoders"),
     "bank in no folder": (
-        lambda f: bank().save(f / "file" / "b", encoder_id="x"), "cannot make the", "another"),
+        lambda f: bank().save(f / "file" / "b"), "cannot make the", "another"),
     # demonstrations
     "no dataset": (
         lambda f: load_demonstrations(f / "nowhere"), "is not a dataset", "record it again"),

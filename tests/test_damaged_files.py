@@ -154,15 +154,16 @@ def files(tmp_path_factory) -> Path:
     save_representation(small, folder / "encoders")
     task, length = torch.arange(3), torch.tensor([0, 2, 3])
     steps = DemonstrationSteps.of(torch.rand(3, 3, 2), torch.rand(3, 2, 4), length)
-    bank = DemonstrationBank(torch.rand(3, 2), task, task > 0, steps=steps)
-    bank.save(folder / "bank", encoder_id="x")
+    bank = DemonstrationBank(torch.rand(3, 2), task, task > 0, steps=steps, encoder_id="x")
+    bank.save(folder / "bank")
     return folder
 
 
 def read_bank(path: Path) -> dict[str, torch.Tensor]:
     bank = dict(vars(DemonstrationBank.load(path, encoder_id="x")))
     bank |= vars(bank.pop("steps"))
-    return bank | {"tasks": torch.tensor(list(",".join(bank["tasks"]).encode()))}
+    texts = {"tasks": ",".join(bank["tasks"]), "encoder_id": bank["encoder_id"]}
+    return bank | {key: torch.tensor(list(text.encode())) for key, text in texts.items()}
 
 
 def read_encoders(path: Path) -> dict[str, torch.Tensor]:

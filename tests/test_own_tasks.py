@@ -206,7 +206,7 @@ def test_banks_are_joined_by_the_names_of_their_tasks():
 
 def test_a_bank_keeps_its_names_on_disk(tmp_path):
     path = tmp_path / "bank.safetensors"
-    bank_of("at_once", "grasp_glass").save(path, encoder_id="abc")
+    replace(bank_of("at_once", "grasp_glass"), encoder_id="abc").save(path)
     assert DemonstrationBank.load(path, encoder_id="abc").tasks == ("at_once", "grasp_glass")
 
     tensors, told = load_tensors(path)

@@ -77,7 +77,7 @@ def trainer_of(encoders, tested_bank, make_config, easy_world, tmp_path_factory)
             directory = tmp_path_factory.mktemp(name) / "run"
             weights = directory / "encoders" / "nico.safetensors"
             save_representation(Representation(encoders.vae, encoders.lae, METADATA), weights)
-            tested_bank.save(bank_path(weights), encoder_id=encoders.identity)
+            replace(tested_bank, encoder_id=encoders.identity).save(bank_path(weights))
             trainers[name] = Trainer(
                 config,
                 directory,

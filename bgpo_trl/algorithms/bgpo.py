@@ -77,10 +77,7 @@ class BGPO(Algorithm):
                 **asdict(config.gwr),
             )
         if variant.groups:
-            found_by = config.groups
-            if found_by is None:
-                identity = None if encoders is None else encoders.identity
-                found_by = groups_config(find_weights(identity))
+            found_by = config.groups or groups_config(find_weights(bank.encoder_id))
             self.groups = BehaviorGroups(
                 embedding_size, batch_size=[len(seeds)], **asdict(found_by)
             )

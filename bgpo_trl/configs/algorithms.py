@@ -99,7 +99,7 @@ class BGPOConfig(AlgorithmConfig):
     have per task; without experts, the RL algorithm's ``batch_size`` is shared by all groups."""
     groups: GWRBConfig | None = None
     """The coarse network that finds the groups, ours. By default one that finds one group, rarely
-    two, for each task of NICO with the encoders in use
+    two, for each task of NICO with the encoders of the bank
     (`bgpo_trl.encoders.shipped.groups_config`)."""
 
     @property

@@ -107,6 +107,8 @@ class DemonstrationBank:
         train: Bool ``[N]``; ``False`` for demonstrations held out for test episodes.
         tasks: Task names, in the order of the labels.
         steps: Latents and actions along the demonstrations, or ``None`` if they are not stored.
+        encoder_id: Identity of the encoders that embedded them (`Representation.identity`), or
+            ``None`` if unknown.
 
     Raises:
         ValueError: If a label has no name, or ``steps`` are of another number of demonstrations.
@@ -117,6 +119,7 @@ class DemonstrationBank:
     train: Tensor
     tasks: tuple[str, ...] = nico.PAPER_TASKS
     steps: DemonstrationSteps | None = None
+    encoder_id: str | None = None
 
     def __post_init__(self) -> None:
         unknown = self.task[(self.task < 0) | (self.task >= len(self.tasks))]
@@ -174,7 +177,16 @@ class DemonstrationBank:
         return replace(kept, task=label[kept.task], tasks=tuple(tasks))
 
     def __add__(self, other: DemonstrationBank) -> DemonstrationBank:
-        """Concatenate two banks; task names found only in ``other`` are appended."""
+        """Concatenate two banks; task names found only in ``other`` are appended.
+
+        Raises:
+            ValueError: If they were embedded by different encoders.
+        """
+        if self.encoder_id != other.encoder_id:
+            raise ValueError(
+                f"one bank was embedded by the encoders {self.encoder_id}, the other by "
+                f"{other.encoder_id}: embed both by the same (bgpo_trl.encoders.make_bank)"
+            )
         tasks = tuple(dict.fromkeys((*self.tasks, *other.tasks)))
         label = torch.tensor([tasks.index(name) for name in other.tasks])
         return DemonstrationBank(
@@ -183,6 +195,7 @@ class DemonstrationBank:
             torch.cat([self.train, other.train]),
             tasks,
             None if self.steps is None or other.steps is None else self.steps + other.steps,
+            self.encoder_id,
         )
 
     def _select(self, rows: Tensor) -> DemonstrationBank:
@@ -194,15 +207,18 @@ class DemonstrationBank:
             steps=None if self.steps is None else self.steps.select(rows),
         )
 
-    def save(self, path: str | Path, *, encoder_id: str) -> None:
+    def save(self, path: str | Path) -> None:
         """Write the bank as safetensors, with the scene version and the encoders' identity.
 
         Raises:
+            ValueError: If ``encoder_id`` is unknown.
             OSError: If the file cannot be written; an existing file is kept.
         """
+        if self.encoder_id is None:
+            raise ValueError("set encoder_id: a saved bank says which encoders embedded it")
         meta = {
             "scene_version": nico.scene_version(),
-            "encoder_id": encoder_id,
+            "encoder_id": self.encoder_id,
             "tasks": ",".join(self.tasks),
         }
         save_tensors(path, self._tensors(), meta)
@@ -233,7 +249,8 @@ class DemonstrationBank:
             columns = {k.removeprefix("steps."): t for k, t in tensors.items() if "." in k}
             rows = {key: tensor for key, tensor in tensors.items() if "." not in key}
             steps = DemonstrationSteps(**columns) if columns else None
-            bank = cls(**rows, tasks=tuple(meta["tasks"].split(",")), steps=steps)
+            tasks = tuple(meta["tasks"].split(","))
+            bank = cls(**rows, tasks=tasks, steps=steps, encoder_id=encoder_id)
         except FileNotFoundError:
             raise ValueError(f"there is no demonstration bank at {path}; {remedy}") from None
         except (ValueError, TypeError) as error:

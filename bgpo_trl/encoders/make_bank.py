@@ -57,6 +57,7 @@ def make_bank(
         train,
         tuple(tasks),
         DemonstrationSteps.of(latent, action, length * train),
+        representation.identity,
     )
 
 
@@ -78,7 +79,7 @@ def main(
     encoders = load_representation(weights, scene_version=nico.scene_version())
     tasks = read_meta(dataset)["tasks"]
     bank = make_bank(encoders, load_demonstrations(dataset), tasks=tasks, actions=actions)
-    bank.save(out, encoder_id=encoders.identity)
+    bank.save(out)
 
 
 if __name__ == "__main__":

@@ -106,7 +106,7 @@ def train_encoders(
         )
     save_representation(representation, weights)
     bank = make_bank(representation, dataset, tasks=tasks)
-    bank.save(bank_path(weights), encoder_id=representation.identity)
+    bank.save(bank_path(weights))
     probe(representation, dataset, folder, play=play)
     return representation, bank
 

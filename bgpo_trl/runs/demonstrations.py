@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from bgpo_trl.data.bank import DemonstrationBank
@@ -38,7 +39,7 @@ def keep_bank(directory: Path, bank: DemonstrationBank, encoders: Representation
                 return
         except ValueError:  # missing, damaged, of other encoders or of other tasks
             continue
-    bank.save(directory / BANK, encoder_id=encoders.identity)
+    replace(bank, encoder_id=encoders.identity).save(directory / BANK)
 
 
 def load_inputs(

@@ -702,7 +702,8 @@ def test_demonstrations_are_refused_where_the_state_is_the_ground_truth(make_con
         (nico.ALL_TASKS, GWRBConfig(activity_threshold=0.525), 0.525),
     ],
 )
-def test_the_encoders_bring_the_threshold_of_groups_unless_it_is_set(tasks, own, threshold):
-    encoders, bank = load_pretrained(tasks=tasks)
-    algorithm = BGPO(BGPOConfig(groups=own), seeds=[0], bank=bank.seen(), encoders=encoders)
+def test_the_bank_brings_the_threshold_of_groups_unless_it_is_set(tasks, own, threshold):
+    bank = load_pretrained(tasks=tasks)[1]
+    config = BGPOConfig(groups=own, state="state", demonstration_share=0)
+    algorithm = BGPO(config, seeds=[0], bank=bank.seen())
     assert algorithm.groups.activity_threshold == threshold

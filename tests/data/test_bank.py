@@ -115,16 +115,16 @@ def test_steps_that_do_not_fit_together_are_refused(steps, changes):
 def with_steps(steps):
     embedding = torch.rand(5, 32, generator=torch.Generator().manual_seed(1))
     task = torch.tensor([0, 1, 2, 0, 1])
-    return DemonstrationBank(embedding, task, LENGTH > 0, steps=steps)
+    return DemonstrationBank(embedding, task, LENGTH > 0, steps=steps, encoder_id="x")
 
 
 def test_a_bank_is_read_with_the_steps_that_were_written(with_steps, tmp_path):
-    with_steps.save(tmp_path / "bank", encoder_id="x")
+    with_steps.save(tmp_path / "bank")
     read = DemonstrationBank.load(tmp_path / "bank", encoder_id="x")
     assert read.steps is not None
     assert_same(read.steps, with_steps.steps)
     assert read.embedding.equal(with_steps.embedding)
-    replace(with_steps, steps=None).save(tmp_path / "bank", encoder_id="x")
+    replace(with_steps, steps=None).save(tmp_path / "bank")
     assert DemonstrationBank.load(tmp_path / "bank", encoder_id="x").steps is None
 
 
@@ -165,7 +165,7 @@ def test_the_only_one_held_out_of_a_task_is_for_validation(bank):
 def test_steps_of_other_demonstrations_are_refused(with_steps, tmp_path):
     with pytest.raises(ValueError, match="steps of 3 demonstrations, but embeddings of 5"):
         replace(with_steps, steps=with_steps.seen().steps)
-    with_steps.save(tmp_path / "bank", encoder_id="x")
+    with_steps.save(tmp_path / "bank")
     tensors, meta = load_tensors(tmp_path / "bank")
     meta.pop("sha256", None)
     short = {f"steps.{key}": tensors[f"steps.{key}"][1:].clone() for key in ("first", "length")}
@@ -236,8 +236,8 @@ def test_compact_steps_hold_the_frames_of_their_demonstrations_alone(steps):
 
 def test_the_identity_is_that_of_the_demonstrations(bank, tmp_path):
     path, tasks = tmp_path / "bank.safetensors", nico.PAPER_TASKS[1:]
-    some = bank.for_tasks(tasks)
-    some.save(path, encoder_id="abc")
+    some = replace(bank.for_tasks(tasks), encoder_id="abc")
+    some.save(path)
     assert DemonstrationBank.load(path, encoder_id="abc").identity == some.identity
     assert bank.for_tasks(tasks).identity == some.identity
     # Bank and selection have the frames of all tasks in memory.
@@ -267,6 +267,20 @@ def test_the_command_keeps_the_names_of_the_tasks(tmp_path, encoders, monkeypatc
     assert found.train.tolist() == [True, False]
 
 
+def test_a_bank_says_which_encoders_embedded_it(plain_bank, tmp_path):
+    path, unknown = tmp_path / "bank.safetensors", replace(plain_bank, encoder_id=None)
+    plain_bank.save(path)
+    loaded = DemonstrationBank.load(path, encoder_id="abc")
+    for part in (loaded, loaded.seen(), loaded.for_tasks(loaded.tasks[1:]), loaded + plain_bank):
+        assert part.encoder_id == "abc"
+    with pytest.raises(ValueError, match="set encoder_id"):
+        unknown.save(path)
+    assert DemonstrationBank.load(path, encoder_id="abc").identity == plain_bank.identity
+    for other in (unknown, replace(plain_bank, encoder_id="xyz")):
+        with pytest.raises(ValueError, match="embedded by the encoders abc, the other by"):
+            plain_bank + other
+
+
 @pytest.fixture
 def plain_bank() -> DemonstrationBank:
     generator = torch.Generator().manual_seed(0)
@@ -274,6 +288,7 @@ def plain_bank() -> DemonstrationBank:
         embedding=torch.randn(6, 32, generator=generator),
         task=torch.tensor([0, 0, 1, 1, 2, 2]),
         train=torch.tensor([True, False] * 3),
+        encoder_id="abc",
     )
 
 
@@ -286,7 +301,7 @@ def test_a_bank_is_split_into_seen_and_held_out(plain_bank):
 
 
 def test_a_bank_is_read_as_it_was_written(plain_bank, tmp_path):
-    plain_bank.save(tmp_path / "bank.safetensors", encoder_id="abc")
+    plain_bank.save(tmp_path / "bank.safetensors")
 
     loaded = DemonstrationBank.load(tmp_path / "bank.safetensors", encoder_id="abc")
 
@@ -297,7 +312,7 @@ def test_a_bank_is_read_as_it_was_written(plain_bank, tmp_path):
 
 def test_a_bank_of_other_encoders_or_another_scene_is_refused(plain_bank, tmp_path, monkeypatch):
     path = tmp_path / "bank.safetensors"
-    plain_bank.save(path, encoder_id="abc")
+    plain_bank.save(path)
 
     with pytest.raises(ValueError, match=r"was made for .*'abc'.*, not for .*'xyz'.*; make it"):
         DemonstrationBank.load(path, encoder_id="xyz")
@@ -310,7 +325,7 @@ def test_a_bank_that_is_missing_or_damaged_is_refused(plain_bank, tmp_path):
     path = tmp_path / "bank.safetensors"
     with pytest.raises(ValueError, match=r"^there is no demonstration bank at .*; make it again"):
         DemonstrationBank.load(path, encoder_id="abc")
-    plain_bank.save(path, encoder_id="abc")
+    plain_bank.save(path)
     path.write_bytes(path.read_bytes()[:-1])
     with pytest.raises(
         ValueError, match=r"bank\.safetensors is damaged .*\(.*\); make it again with"
