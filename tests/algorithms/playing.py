@@ -1,4 +1,4 @@
-"""Steps of training with the baselines, and comparisons of their states."""
+"""Steps of training, and comparisons of what was learned."""
 
 from copy import deepcopy
 
@@ -21,6 +21,10 @@ def play(algorithm, n_steps, state=None, hidden=(), watch=lambda chosen: None):
         transitions.append(transition.clone())
         algorithm.store(transition.exclude(*hidden, *(("next", key) for key in hidden)))
     return torch.stack(transitions, dim=1), state
+
+
+def weights(algorithm):
+    return list(algorithm.learner.loss.parameters())
 
 
 def kept(algorithm):

@@ -1,80 +1,23 @@
 """BGPO as a whole: what it sees, what it learns from, and that seeds share nothing."""
 
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import pytest
 import torch
-from tensordict import TensorDict
 from torchrl.envs import check_env_specs
 
 from bgpo_trl.algorithms.bgpo import BGPO
 from bgpo_trl.algorithms.environments import encode
 from bgpo_trl.algorithms.policy import Policy
-from bgpo_trl.configs import BGPOConfig, GWRBConfig
 from bgpo_trl.data.bank import DemonstrationBank
-from bgpo_trl.encoders.pretrained import load_pretrained
-from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
 from bgpo_trl.modules.gwr import GWRB
 from bgpo_trl.seeding import generators
 from bgpo_trl.transforms import BehaviorLookup, GroupLookup, TaskSchedule
-from suites import nico
-from tests.algorithms.playing import assert_same
+from tests.algorithms.bgpo_variants import CHANGES, SCHEDULE, VARIANTS
+from tests.algorithms.playing import assert_same, play, weights
 
-# By name: state, meaning of the context, variant, and the algorithm whose settings it has.
-VARIANTS = {
-    "ground truth, label": ("state", "label", "label", "oracle"),
-    "latent, label": ("latent", "label", "label", "oracle"),
-    "latent, nothing": ("latent", "nothing", "no-context", "ddpg"),
-    "latent, phi": ("latent", "phi", "without-gwr", "bgpo-single"),
-    "latent, b": ("latent", "b", "published", "bgpo-single"),
-    "even replay": ("latent", "b", "bgpo", "bgpo-single"),
-    "experts": ("latent", "b", "bgpo", "bgpo-experts"),
-    "all": ("latent", "b", "bgpo", "bgpo"),
-}
-# Many groups, and few of them active.
-GROUPS = {"groups": GWRBConfig(activity_threshold=0.9), "active_groups": 2}
-CHANGES = {"even replay": {"even_replay": True, **GROUPS}, "experts": GROUPS, "all": GROUPS}
 pytestmark = pytest.mark.usefixtures("easy_world")
 variants = pytest.mark.parametrize("variant", VARIANTS)
-SCHEDULE = TaskSchedule((0, 2, 4))
-
-
-@pytest.fixture
-def make(bank, encoders, make_config, in_world):
-    def make(
-        variant="latent, b",
-        seeds=(3, 8),
-        schedule=SCHEDULE,
-        bank=bank,
-        rl=None,
-        config=None,
-        **changes,
-    ):
-        state, _, kind, name = VARIANTS[variant]
-        changes = {"variant": kind, **({} if config is None else {"rl": config}), **changes}
-        config = make_config(state, name if rl is None else f"{name}+{rl}").algorithm
-        config = replace(config, **{**CHANGES.get(variant, {}), **changes})
-        bank = bank.for_tasks(bank.tasks[: schedule.n_tasks])
-        algorithm = BGPO(config, seeds=seeds, bank=bank.seen(), encoders=encoders)
-        return in_world(algorithm, seeds, schedule, bank)
-
-    return make
-
-
-def play(algorithm, n_steps, hidden=()):
-    """Trains for some steps; BGPO gets none of the `hidden` entries. Returns transitions [S, T]."""
-    state, transitions = algorithm.world.env.reset(), []
-    for _ in range(n_steps):
-        state = algorithm.act(state.exclude(*hidden))
-        algorithm.update()
-        transition, state = algorithm.world.env.step_and_maybe_reset(state)
-        transitions.append(transition.clone())
-        algorithm.store(transition.exclude(*hidden, *(("next", key) for key in hidden)))
-    return torch.stack(transitions, dim=1)
-
-
-def weights(algorithm):
-    return list(algorithm.learner.loss.parameters())
 
 
 def groups_of(state, algorithm):
@@ -102,8 +45,10 @@ def assert_same_graph(first, second, **tolerance):
 
 @variants
 @pytest.mark.parametrize("n_tasks", [1, 3])
-def test_each_variant_is_an_environment_with_the_input_it_is_named_after(make, variant, n_tasks):
-    algorithm = make(variant, schedule=TaskSchedule((0,) * n_tasks))
+def test_each_variant_is_an_environment_with_the_input_it_is_named_after(
+    make_bgpo, variant, n_tasks
+):
+    algorithm = make_bgpo(variant, schedule=TaskSchedule((0,) * n_tasks))
     before = None if algorithm.gwr is None else algorithm.gwr.graph(0)
     for transform in algorithm.world.env.transform:
         if isinstance(transform, BehaviorLookup | GroupLookup):
@@ -135,37 +80,37 @@ def test_each_variant_is_an_environment_with_the_input_it_is_named_after(make, v
         assert_same_graph(algorithm.gwr.graph(0), before, rtol=0, atol=0)
 
 
-def test_what_the_policy_sees_is_in_the_scale_of_latents(make):
-    algorithm = make("ground truth, label", max_steps=50)
-    seen = play(algorithm, 60)["state"]
+def test_what_the_policy_sees_is_in_the_scale_of_latents(make_bgpo):
+    algorithm = make_bgpo("ground truth, label", max_steps=50)
+    seen = play(algorithm, 60)[0]["state"]
     assert seen.abs().max() <= 5
     assert seen.mean((0, 1)).abs().max() < 3
     assert 0.1 < seen.std() < 3
 
 
-def test_phi_is_the_behavior_where_there_is_no_gwr(make, bank):
-    data = play(make("latent, phi"), 20)
+def test_phi_is_the_behavior_where_there_is_no_gwr(make_bgpo, bank):
+    data, _ = play(make_bgpo("latent, phi"), 20)
     assert data["behavior"].equal(bank.seen().embedding[data["demo_index"]])
 
 
-def test_a_label_is_the_task_of_the_episode(make):
-    data = play(make("latent, label", schedule=TaskSchedule((0, 0, 0))), 30)
+def test_a_label_is_the_task_of_the_episode(make_bgpo):
+    data, _ = play(make_bgpo("latent, label", schedule=TaskSchedule((0, 0, 0))), 30)
     assert data["context"].argmax(-1).equal(data["task"])
     assert data["context"].sum(-1).unique().tolist() == [1]
     assert data["task"].unique().tolist() == [0, 1, 2]
 
 
 @pytest.mark.parametrize("variant", [v for v in VARIANTS if VARIANTS[v][1] != "label"])
-def test_bgpo_never_reads_the_label(make, variant):
+def test_bgpo_never_reads_the_label(make_bgpo, variant):
     label = ("task",)
-    algorithm, blind = make(variant), make(variant)
+    algorithm, blind = make_bgpo(variant), make_bgpo(variant)
     learner = algorithm.learner
     for keys in (learner.actor.in_keys, learner.loss.in_keys, algorithm.in_keys):
         names = {name for key in keys for name in ([key] if isinstance(key, str) else key)}
         assert names.isdisjoint(label)
 
-    seeing = play(algorithm, 40)
-    not_seeing = play(blind, 40, hidden=["task"])
+    seeing, _ = play(algorithm, 40)
+    not_seeing, _ = play(blind, 40, hidden=["task"])
     kept = algorithm.replay.sample(torch.zeros(2, 1, dtype=torch.int64))
     assert "task" not in kept.keys(True)
 
@@ -183,10 +128,10 @@ def test_bgpo_never_reads_the_label(make, variant):
 
 
 @pytest.mark.parametrize("variant", ["ground truth, label", "latent, nothing"])
-def test_a_reference_learns_the_same_from_whatever_demonstrations(make, bank, variant):
+def test_a_reference_learns_the_same_from_whatever_demonstrations(make_bgpo, bank, variant):
     other = DemonstrationBank(-3 * bank.embedding.flip(0), bank.task, bank.train)
-    algorithm, elsewhere = make(variant), make(variant, bank=other)
-    data, changed = play(algorithm, 30), play(elsewhere, 30)
+    algorithm, elsewhere = make_bgpo(variant), make_bgpo(variant, bank=other)
+    data, changed = play(algorithm, 30)[0], play(elsewhere, 30)[0]
     assert not data["demo_embedding"].equal(changed["demo_embedding"])
     for key in (*algorithm.in_keys, "action", "task", ("next", "reward")):
         assert data[key].equal(changed[key]), key
@@ -194,8 +139,8 @@ def test_a_reference_learns_the_same_from_whatever_demonstrations(make, bank, va
         assert ours.equal(theirs)
 
 
-def test_plain_ddpg_acts_and_learns_by_the_state_and_nothing_else(make):
-    algorithm, blind = make("latent, nothing"), make("latent, nothing")
+def test_plain_ddpg_acts_and_learns_by_the_state_and_nothing_else(make_bgpo):
+    algorithm, blind = make_bgpo("latent, nothing"), make_bgpo("latent, nothing")
     states = [learner.world.env.reset() for learner in (algorithm, blind)]
     kept = ["latent", "action", *(("next", key) for key in ("latent", "reward", "terminated"))]
     for _ in range(20):
@@ -214,9 +159,9 @@ def test_plain_ddpg_acts_and_learns_by_the_state_and_nothing_else(make):
         assert ours.equal(theirs)
 
 
-def test_what_is_said_of_a_labeled_task_is_its_place(make):
+def test_what_is_said_of_a_labeled_task_is_its_place(make_bgpo):
     """The first layer adds the row of weights that belongs to the label."""
-    algorithm = make("latent, label", schedule=TaskSchedule((0, 0, 0)))
+    algorithm = make_bgpo("latent, label", schedule=TaskSchedule((0, 0, 0)))
     state = algorithm.world.env.reset()
     first, second = algorithm.learner.actor.mlp.layers
     for index in range(2):
@@ -237,8 +182,8 @@ def act_in_tests(algorithm, state, embedding, task):
 
 
 @variants
-def test_only_a_variant_with_a_label_acts_by_it(make, bank, variant):
-    algorithm = make(variant, schedule=TaskSchedule((0, 0, 0)))
+def test_only_a_variant_with_a_label_acts_by_it(make_bgpo, bank, variant):
+    algorithm = make_bgpo(variant, schedule=TaskSchedule((0, 0, 0)))
     embedding = bank.held_out().embedding.view(3, 4, 32)
     state = torch.randn(2, 3, 4, algorithm.state_size, generator=torch.Generator().manual_seed(0))
     actions = [
@@ -251,8 +196,8 @@ def test_only_a_variant_with_a_label_acts_by_it(make, bank, variant):
 
 
 @pytest.mark.parametrize("variant", ["latent, b", "experts", "all"])
-def test_snapshots_have_the_context_of_training_and_learn_nothing(make, variant):
-    algorithm = make(variant)
+def test_snapshots_have_the_context_of_training_and_learn_nothing(make_bgpo, variant):
+    algorithm = make_bgpo(variant)
     play(algorithm, 33)
     before = [algorithm.gwr.graph(i) for i in range(2)]
     states = algorithm.state_dict()
@@ -270,9 +215,9 @@ def test_snapshots_have_the_context_of_training_and_learn_nothing(make, variant)
         assert_same(algorithm.state_dict()[part], states[part])
 
 
-def test_test_episodes_are_played_by_the_expert_of_their_demonstration(make, bank):
+def test_test_episodes_are_played_by_the_expert_of_their_demonstration(make_bgpo, bank):
     """By hand: the group of each demonstration, its expert's weights, what they do."""
-    algorithm = make("experts", schedule=TaskSchedule((0, 0, 0)))
+    algorithm = make_bgpo("experts", schedule=TaskSchedule((0, 0, 0)))
     play(algorithm, 60)
     assert algorithm.groups.num_groups.min() > 2
     shown = bank.held_out()
@@ -291,12 +236,12 @@ def test_test_episodes_are_played_by_the_expert_of_their_demonstration(make, ban
 
 
 @pytest.mark.parametrize("variant", ["latent, b", "all"])
-def test_episodes_follow_algorithm_1(make, bank, encoders, variant):
+def test_episodes_follow_algorithm_1(make_bgpo, bank, encoders, variant):
     """Behavior, growth of GWR-B and reward, worked out anew from latents and demonstrations."""
     seeds, phi = (3, 8), bank.seen().embedding
-    algorithm = make(variant, seeds=seeds)
+    algorithm = make_bgpo(variant, seeds=seeds)
     scale = algorithm.config.gwr.activity_scale
-    data = play(algorithm, 90)
+    data, _ = play(algorithm, 90)
     for index, seed in enumerate(seeds):
         gwr = GWRB(32, generator=generators([seed], "gwr"), activity_scale=scale)
         trajectory = []
@@ -319,9 +264,11 @@ def test_episodes_follow_algorithm_1(make, bank, encoders, variant):
 
 @variants
 @pytest.mark.parametrize("scale", [0.0, 0.7])
-def test_exploration_is_noise_of_each_seed_on_the_policys_action(make, make_config, variant, scale):
+def test_exploration_is_noise_of_each_seed_on_the_policys_action(
+    make_bgpo, make_config, variant, scale
+):
     ddpg = replace(make_config().algorithm.rl, noise=scale)
-    algorithm, sources = make(variant, config=ddpg), generators((3, 8), "exploration")
+    algorithm, sources = make_bgpo(variant, config=ddpg), generators((3, 8), "exploration")
     with torch.no_grad():  # so that some actions are cut off, and some are not
         algorithm.learner.actor.mlp.layers[-1].bias.copy_(torch.tensor([0.0, 1.0, -1.0, 0.0]))
     state, n_cut = algorithm.world.env.reset(), 0
@@ -348,8 +295,8 @@ def test_exploration_is_noise_of_each_seed_on_the_policys_action(make, make_conf
         ("latent, nothing", {"beta": 0.3}, 1.0),
     ],
 )
-def test_targets_are_clipped_to_the_attainable_returns(make, variant, changes, highest):
-    algorithm = make(variant, **changes)
+def test_targets_are_clipped_to_the_attainable_returns(make_bgpo, variant, changes, highest):
+    algorithm = make_bgpo(variant, **changes)
     play(algorithm, 7)
     target_bias = [
         value
@@ -369,13 +316,13 @@ def test_targets_are_clipped_to_the_attainable_returns(make, variant, changes, h
         torch.testing.assert_close(target, returns)
 
 
-def test_clipping_can_be_turned_off(make, make_config):
+def test_clipping_can_be_turned_off(make_bgpo, make_config):
     ddpg = replace(make_config().algorithm.rl, clip_targets=False)
-    assert make(config=ddpg).learner.loss.return_bounds is None
+    assert make_bgpo(config=ddpg).learner.loss.return_bounds is None
 
 
-def test_the_first_update_comes_after_the_warm_up_and_with_the_step_that_follows(make):
-    algorithm = make()
+def test_the_first_update_comes_after_the_warm_up_and_with_the_step_that_follows(make_bgpo):
+    algorithm = make_bgpo()
     start = [p.detach().clone() for p in weights(algorithm)]
     play(algorithm, algorithm.config.rl.warmup_steps)
     for value, before in zip(weights(algorithm), start, strict=True):
@@ -391,14 +338,14 @@ ALONE += [("even replay", None), *(("all", rl) for rl in ("ddpg", "td3", "sac"))
 
 
 @pytest.mark.parametrize(("variant", "rl"), ALONE)
-def test_each_seed_of_a_batch_learns_as_it_would_alone(make, variant, rl):
+def test_each_seed_of_a_batch_learns_as_it_would_alone(make_bgpo, variant, rl):
     seeds = (1, 2)  # no pixel of theirs is so near an edge that rounding moves it across
-    batch = make(variant, seeds=seeds, rl=rl)
-    together = play(batch, 60)
+    batch = make_bgpo(variant, seeds=seeds, rl=rl)
+    together = play(batch, 60)[0]
     losses = []
     for index, seed in enumerate(seeds):
-        alone = make(variant, seeds=(seed,), rl=rl)
-        data = play(alone, 60)[0]
+        alone = make_bgpo(variant, seeds=(seed,), rl=rl)
+        data = play(alone, 60)[0][0]
         whole = ["task", "demo_index", "step_count", ("next", "terminated")]
         for key in [*whole, *(["group"] if alone.groups is not None else [])]:
             assert together[index][key].equal(data[key]), key
@@ -462,248 +409,3 @@ def test_a_variant_that_does_not_exist_or_fit_is_refused(make_config, bank, name
     config = replace(make_config(name=name).algorithm, variant=variant)
     with pytest.raises(ValueError, match=message):
         BGPO(config, seeds=(0,), bank=bank.seen())
-
-
-# ---- groups, experts, demonstrations
-
-
-@pytest.mark.parametrize("rl", ["ddpg", "td3", "sac"])
-def test_a_restored_run_continues_as_the_saved_one(make, tmp_path, rl):
-    schedule = TaskSchedule((0, 0, 0))
-    algorithm = make("all", rl=rl, schedule=schedule)
-    _, state = play_on(algorithm, 60)
-    assert algorithm.groups.num_groups.min() > 2  # more than are active
-    parts = {"algorithm": algorithm.state_dict(), "world": algorithm.world.state_dict()}
-    save_checkpoint(tmp_path, {**parts, "state": state.to_dict()})
-    other = make(
-        "all", seeds=(5, 7), rl=rl, schedule=schedule
-    )  # other weights, streams and simulations
-    play_on(other, 6)
-    saved = load_checkpoint(tmp_path)
-    other.world.load_state_dict(saved["world"])
-    other.load_state_dict(saved["algorithm"])
-    ours, _ = play_on(algorithm, 15, state)
-    theirs, _ = play_on(other, 15, TensorDict(saved["state"], [2]))
-    assert (ours == theirs).all()
-    assert_same(algorithm.learner.state_dict(), other.learner.state_dict())
-    assert_same(algorithm.experts.state_dict(), other.experts.state_dict())
-    assert other.groups.num_groups.equal(algorithm.groups.num_groups)
-
-
-def play_on(algorithm, n_steps, state=None):
-    """As `play`, from some state on; returns the tensordict in flight too."""
-    state, transitions = algorithm.world.env.reset() if state is None else state, []
-    for _ in range(n_steps):
-        state = algorithm.act(state)
-        algorithm.update()
-        transition, state = algorithm.world.env.step_and_maybe_reset(state)
-        transitions.append(transition.clone())
-        algorithm.store(transition)
-    return torch.stack(transitions, dim=1), state
-
-
-@pytest.mark.parametrize("rl", ["ddpg", "td3", "sac"])
-def test_with_one_group_it_is_the_plain_learner_bit_for_bit(make, rl):
-    lonely = {"groups": GWRBConfig(activity_threshold=1e-6), "active_groups": 1}
-    lonely["expert_batch_size"] = 16  # as in the single network's batch
-    plain, one = make("latent, b", rl=rl), make("experts", rl=rl, **lonely)
-    ours, theirs = play(plain, 30), play(one, 30)
-    assert one.groups.num_groups.tolist() == [1, 1]
-    for key in ("action", "latent", "behavior", "demo_index", ("next", "reward")):
-        assert ours[key].equal(theirs[key]), key
-    assert_same(plain.learner.state_dict(), one.learner.state_dict())
-
-
-def test_slots_that_stay_free_change_nothing(make, make_config):
-    """Four slots, one of them used."""
-    lonely = {"groups": GWRBConfig(activity_threshold=1e-6), "expert_batch_size": 16}
-    plain = make("latent, b")
-    four = make("experts", **lonely, active_groups=4)
-    ours, theirs = play(plain, 30), play(four, 30)
-    torch.testing.assert_close(ours["action"], theirs["action"], rtol=1e-4, atol=1e-5)
-    start = weights(make("experts", **lonely, active_groups=4))
-    for value, other, begun in zip(weights(plain), weights(four), start, strict=True):
-        torch.testing.assert_close(value[:, 0], other[:, 0], rtol=1e-4, atol=1e-5)
-        assert other[:, 1:].equal(begun[:, 1:])
-
-
-def batches_of(algorithm):
-    """The batches that an algorithm learns from, as they come."""
-    batches, learn = [], algorithm.learn
-
-    def spy(batch):
-        batches.append((algorithm._active.group, batch.clone()))
-        return learn(batch)
-
-    algorithm.learn = spy
-    return batches
-
-
-@pytest.mark.parametrize("variant", ["even replay", "experts", "all"])
-def test_an_update_sees_as_much_of_each_group_played_last(make, bank, variant):
-    algorithm = make(variant, schedule=TaskSchedule((0, 0, 0)))
-    batches = batches_of(algorithm)
-    data = play(algorithm, 60)
-    frames = bank.seen().steps.latents(torch.arange(len(bank.seen().steps.latent)))
-    n_experts, n_shown = (2, 2) if variant == "all" else (1 + (variant == "experts"), 0)
-    n_full = 0
-    for step, (active, batch) in enumerate(batches, 60 - len(batches)):
-        assert batch.shape == (2, n_experts, 16 // n_experts)
-        for seed in range(2):
-            groups, past = active[seed].tolist(), data["group"][seed, :step]
-            n_full += -1 not in groups
-            latents = batch["latent"][seed].reshape(16, 1, 64)
-            played = (latents == data["latent"][seed, :step]).all(-1)
-            demonstrated = (latents == frames).all(-1).any(-1).tolist()
-            weight = batch["priority_weight"][seed].flatten().tolist()
-            for row in range(16):
-                if algorithm.config.experts:
-                    group = groups[row // 8]
-                else:
-                    group = [g for g in groups if g >= 0][row % (2 - groups.count(-1))]
-                is_shown = row % 8 >= 8 - n_shown
-                if weight[row]:
-                    of_group = bool((past[played[row]] == group).any())
-                    assert (of_group, demonstrated[row]) == (not is_shown, is_shown)
-                else:  # nothing is known of the group, or no demonstration of it was over
-                    assert is_shown or not (past == group).any()
-    assert n_full > 20
-
-
-def test_demonstrations_are_a_quarter_of_each_experts_batch_and_were_shown_before(make, bank):
-    algorithm = make("all", schedule=TaskSchedule((0, 0, 0)))
-    batches = batches_of(algorithm)
-    data, steps = play(algorithm, 60), bank.seen().steps
-    frames = steps.latents(torch.arange(len(steps.latent)))
-    n_seen = 0
-    for step, (_, batch) in enumerate(batches, 60 - len(batches)):
-        past = data[:, :step]
-        for seed in range(2):
-            ended = past["next", "done"][seed].flatten()
-            shown, told = past["demo_index"][seed][ended], past["behavior"][seed][ended]
-            for one in batch[seed].reshape(-1)[batch[seed]["priority_weight"].flatten() > 0]:
-                match = (frames == one["latent"]).all(-1)
-                assert bool(match.any()) != bool(
-                    (past["latent"][seed] == one["latent"]).all(-1).any()
-                )
-                if not match.any():
-                    continue
-                frame = int(match.nonzero())
-                number = int(
-                    ((frame >= steps.first) & (frame < steps.first + steps.length)).nonzero()
-                )
-                known = told[shown == number]
-                assert (0.25 * known == one["context"]).all(-1).any()
-                behavior = 4 * one["context"]
-                ends = frame == int(steps.first[number] + steps.length[number]) - 2
-                assert bool(one["next", "terminated"]) == ends
-                phi = bank.seen().embedding[number]
-                reward = 1 + 0.1 * torch.exp(-(behavior - phi).norm()) if ends else 0.0
-                assert float(one["next", "reward"]) == pytest.approx(float(reward), abs=1e-5)
-                n_seen += 1
-            for expert in batch[seed]:
-                is_shown = (frames == expert["latent"].unsqueeze(1)).all(-1).any(-1)
-                assert not is_shown[:6].any()
-    assert n_seen > 100
-
-
-def test_nothing_is_known_of_tasks_that_have_not_been_presented(make, bank):
-    """All that is in the bank of two of the three tasks is something else in one of two runs."""
-    later = bank.task > 0
-    generator = torch.Generator().manual_seed(9)
-    embedding, latent = bank.embedding.clone(), bank.steps.latent.clone()
-    embedding[later] = torch.randn(int(later.sum()), 32, generator=generator)
-    action = bank.steps.action.clone()
-    for row in later.nonzero().flatten().tolist():
-        first = int(bank.steps.first[row])
-        rows = slice(first, first + int(bank.steps.length[row]))
-        latent[rows], action[rows] = -latent[rows] + 3, -action[rows]
-    steps = replace(bank.steps, latent=latent, action=action)
-    other = replace(bank, embedding=embedding, steps=steps)
-    assert not other.steps.latent.equal(bank.steps.latent)
-
-    for variant in ("latent, b", "all"):
-        schedule = TaskSchedule((0, 99, 99))
-        first = make(variant, schedule=schedule)
-        second = make(variant, schedule=schedule, bank=other)
-        ours, theirs = play(first, 25), play(second, 25)
-        assert (ours == theirs).all()
-        assert_same(first.learner.state_dict(), second.learner.state_dict())
-        shown, task = bank.embedding[:6].view(3, 2, 32), torch.zeros(3, 2).long()
-        for index in range(2):
-            policies = [
-                one.snapshot(index, shown, task, torch.Generator()) for one in (first, second)
-            ]
-            assert_same(*(policy.state_dict() for policy in policies))
-
-
-def test_the_bonus_is_for_latents_as_they_are_and_the_policy_sees_them_clipped(
-    make, encoders, bank, monkeypatch
-):
-    """Latents much longer than they should be: phi_g is still that of a demonstration."""
-    raw, latent = [], encoders.vae.latent
-
-    def stretched(pixels):
-        stretch = 200 * latent(pixels)
-        raw.append(stretch.flatten())  # of the only seed
-        return stretch
-
-    monkeypatch.setattr(encoders.vae, "latent", stretched)
-    algorithm = make("all", seeds=(3,))
-    assert algorithm.world.env.observation_spec["latent"].shape == (1, 64)
-    raw.clear()  # what was seen to make the specs
-    data = play(algorithm, 25)[0]
-    frames, trajectory, n_ended, n_clipped = iter(raw), [], 0, 0
-    trajectory.append(next(frames))
-    for step in data:
-        assert step["latent"].equal(trajectory[-1].clamp(-5, 5))
-        n_clipped += int((trajectory[-1].abs() > 5).sum())
-        trajectory.append(next(frames))
-        assert step["next", "latent"].equal(trajectory[-1].clamp(-5, 5))
-        if step["next", "done"]:
-            length = torch.tensor([len(trajectory)])
-            phi_g = encoders.lae.encode(torch.stack(trajectory)[None], length)[0]
-            bonus = torch.exp(-(step["behavior"] - phi_g).norm())
-            torch.testing.assert_close(step["next", "intrinsic_reward"][0], bonus)
-            trajectory, n_ended = [next(frames)], n_ended + 1
-    assert n_ended > 3
-    assert n_clipped > 100
-
-
-def test_the_bonus_tells_right_from_wrong_on_the_shipped_bank():
-    """For a trajectory just like a demonstration, by what GWR-B says of another one."""
-    bank = load_pretrained()[1]
-    seen, held_out = bank.seen(), bank.held_out()
-    gwr = GWRB(32, generator=torch.Generator().manual_seed(0), **asdict(BGPOConfig().gwr))
-    order = torch.randperm(len(seen.task), generator=torch.Generator().manual_seed(1))[:300]
-    for phi in seen.embedding[order]:
-        gwr.adapt(phi)
-    behavior = gwr.lookup(held_out.embedding).embedding
-    bonus = torch.exp(-torch.cdist(behavior, held_out.embedding))
-    same = held_out.task.unsqueeze(1) == held_out.task
-    assert bonus[same].median() > 0.15
-    assert bonus[~same].median() < 0.05
-
-
-def test_demonstrations_are_refused_where_the_state_is_the_ground_truth(make_config, bank):
-    config = replace(make_config("state", "oracle").algorithm, demonstration_share=0.25)
-    parts = {"seeds": (0,), "bank": bank.seen()}
-    with pytest.raises(
-        ValueError, match="demonstrations are latents: set demonstration_share to 0"
-    ):
-        BGPO(config, **parts)
-
-
-@pytest.mark.parametrize(
-    ("tasks", "own", "threshold"),
-    [
-        (nico.PAPER_TASKS, None, 0.525),
-        (nico.ALL_TASKS, None, 0.595),
-        (nico.ALL_TASKS, GWRBConfig(activity_threshold=0.525), 0.525),
-    ],
-)
-def test_the_bank_brings_the_threshold_of_groups_unless_it_is_set(tasks, own, threshold):
-    bank = load_pretrained(tasks=tasks)[1]
-    config = BGPOConfig(groups=own, state="state", demonstration_share=0)
-    algorithm = BGPO(config, seeds=[0], bank=bank.seen())
-    assert algorithm.groups.activity_threshold == threshold

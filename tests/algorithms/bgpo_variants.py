@@ -1,0 +1,20 @@
+"""Variants of BGPO, by what their policies read."""
+
+from bgpo_trl.configs import GWRBConfig
+from bgpo_trl.transforms import TaskSchedule
+
+# By name: state, meaning of the context, variant, and the algorithm whose settings it has.
+VARIANTS = {
+    "ground truth, label": ("state", "label", "label", "oracle"),
+    "latent, label": ("latent", "label", "label", "oracle"),
+    "latent, nothing": ("latent", "nothing", "no-context", "ddpg"),
+    "latent, phi": ("latent", "phi", "without-gwr", "bgpo-single"),
+    "latent, b": ("latent", "b", "published", "bgpo-single"),
+    "even replay": ("latent", "b", "bgpo", "bgpo-single"),
+    "experts": ("latent", "b", "bgpo", "bgpo-experts"),
+    "all": ("latent", "b", "bgpo", "bgpo"),
+}
+# Many groups, and few of them active.
+GROUPS = {"groups": GWRBConfig(activity_threshold=0.9), "active_groups": 2}
+CHANGES = {"even replay": {"even_replay": True, **GROUPS}, "experts": GROUPS, "all": GROUPS}
+SCHEDULE = TaskSchedule((0, 2, 4))

@@ -1,0 +1,248 @@
+"""BGPO with groups of behaviors: experts, even replay, and demonstrations as experience."""
+
+from dataclasses import asdict, replace
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from bgpo_trl.algorithms.bgpo import BGPO
+from bgpo_trl.configs import BGPOConfig, GWRBConfig
+from bgpo_trl.encoders.pretrained import load_pretrained
+from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
+from bgpo_trl.modules.gwr import GWRB
+from bgpo_trl.transforms import TaskSchedule
+from suites import nico
+from tests.algorithms.playing import assert_same, play, weights
+
+pytestmark = pytest.mark.usefixtures("easy_world")
+
+
+@pytest.mark.parametrize("rl", ["ddpg", "td3", "sac"])
+def test_a_restored_run_continues_as_the_saved_one(make_bgpo, tmp_path, rl):
+    schedule = TaskSchedule((0, 0, 0))
+    algorithm = make_bgpo("all", rl=rl, schedule=schedule)
+    _, state = play(algorithm, 60)
+    assert algorithm.groups.num_groups.min() > 2  # more than are active
+    parts = {"algorithm": algorithm.state_dict(), "world": algorithm.world.state_dict()}
+    save_checkpoint(tmp_path, {**parts, "state": state.to_dict()})
+    other = make_bgpo(
+        "all", seeds=(5, 7), rl=rl, schedule=schedule
+    )  # other weights, streams and simulations
+    play(other, 6)
+    saved = load_checkpoint(tmp_path)
+    other.world.load_state_dict(saved["world"])
+    other.load_state_dict(saved["algorithm"])
+    ours, _ = play(algorithm, 15, state)
+    theirs, _ = play(other, 15, TensorDict(saved["state"], [2]))
+    assert (ours == theirs).all()
+    assert_same(algorithm.learner.state_dict(), other.learner.state_dict())
+    assert_same(algorithm.experts.state_dict(), other.experts.state_dict())
+    assert other.groups.num_groups.equal(algorithm.groups.num_groups)
+
+
+@pytest.mark.parametrize("rl", ["ddpg", "td3", "sac"])
+def test_with_one_group_it_is_the_plain_learner_bit_for_bit(make_bgpo, rl):
+    lonely = {"groups": GWRBConfig(activity_threshold=1e-6), "active_groups": 1}
+    lonely["expert_batch_size"] = 16  # as in the single network's batch
+    plain, one = make_bgpo("latent, b", rl=rl), make_bgpo("experts", rl=rl, **lonely)
+    ours, theirs = play(plain, 30)[0], play(one, 30)[0]
+    assert one.groups.num_groups.tolist() == [1, 1]
+    for key in ("action", "latent", "behavior", "demo_index", ("next", "reward")):
+        assert ours[key].equal(theirs[key]), key
+    assert_same(plain.learner.state_dict(), one.learner.state_dict())
+
+
+def test_slots_that_stay_free_change_nothing(make_bgpo, make_config):
+    """Four slots, one of them used."""
+    lonely = {"groups": GWRBConfig(activity_threshold=1e-6), "expert_batch_size": 16}
+    plain = make_bgpo("latent, b")
+    four = make_bgpo("experts", **lonely, active_groups=4)
+    ours, theirs = play(plain, 30)[0], play(four, 30)[0]
+    torch.testing.assert_close(ours["action"], theirs["action"], rtol=1e-4, atol=1e-5)
+    start = weights(make_bgpo("experts", **lonely, active_groups=4))
+    for value, other, begun in zip(weights(plain), weights(four), start, strict=True):
+        torch.testing.assert_close(value[:, 0], other[:, 0], rtol=1e-4, atol=1e-5)
+        assert other[:, 1:].equal(begun[:, 1:])
+
+
+def batches_of(algorithm):
+    """The batches that an algorithm learns from, as they come."""
+    batches, learn = [], algorithm.learn
+
+    def spy(batch):
+        batches.append((algorithm._active.group, batch.clone()))
+        return learn(batch)
+
+    algorithm.learn = spy
+    return batches
+
+
+@pytest.mark.parametrize("variant", ["even replay", "experts", "all"])
+def test_an_update_sees_as_much_of_each_group_played_last(make_bgpo, bank, variant):
+    algorithm = make_bgpo(variant, schedule=TaskSchedule((0, 0, 0)))
+    batches = batches_of(algorithm)
+    data, _ = play(algorithm, 60)
+    frames = bank.seen().steps.latents(torch.arange(len(bank.seen().steps.latent)))
+    n_experts, n_shown = (2, 2) if variant == "all" else (1 + (variant == "experts"), 0)
+    n_full = 0
+    for step, (active, batch) in enumerate(batches, 60 - len(batches)):
+        assert batch.shape == (2, n_experts, 16 // n_experts)
+        for seed in range(2):
+            groups, past = active[seed].tolist(), data["group"][seed, :step]
+            n_full += -1 not in groups
+            latents = batch["latent"][seed].reshape(16, 1, 64)
+            played = (latents == data["latent"][seed, :step]).all(-1)
+            demonstrated = (latents == frames).all(-1).any(-1).tolist()
+            weight = batch["priority_weight"][seed].flatten().tolist()
+            for row in range(16):
+                if algorithm.config.experts:
+                    group = groups[row // 8]
+                else:
+                    group = [g for g in groups if g >= 0][row % (2 - groups.count(-1))]
+                is_shown = row % 8 >= 8 - n_shown
+                if weight[row]:
+                    of_group = bool((past[played[row]] == group).any())
+                    assert (of_group, demonstrated[row]) == (not is_shown, is_shown)
+                else:  # nothing is known of the group, or no demonstration of it was over
+                    assert is_shown or not (past == group).any()
+    assert n_full > 20
+
+
+def test_demonstrations_are_a_quarter_of_each_experts_batch_and_were_shown_before(make_bgpo, bank):
+    algorithm = make_bgpo("all", schedule=TaskSchedule((0, 0, 0)))
+    batches = batches_of(algorithm)
+    data, steps = play(algorithm, 60)[0], bank.seen().steps
+    frames = steps.latents(torch.arange(len(steps.latent)))
+    n_seen = 0
+    for step, (_, batch) in enumerate(batches, 60 - len(batches)):
+        past = data[:, :step]
+        for seed in range(2):
+            ended = past["next", "done"][seed].flatten()
+            shown, told = past["demo_index"][seed][ended], past["behavior"][seed][ended]
+            for one in batch[seed].reshape(-1)[batch[seed]["priority_weight"].flatten() > 0]:
+                match = (frames == one["latent"]).all(-1)
+                assert bool(match.any()) != bool(
+                    (past["latent"][seed] == one["latent"]).all(-1).any()
+                )
+                if not match.any():
+                    continue
+                frame = int(match.nonzero())
+                number = int(
+                    ((frame >= steps.first) & (frame < steps.first + steps.length)).nonzero()
+                )
+                known = told[shown == number]
+                assert (0.25 * known == one["context"]).all(-1).any()
+                behavior = 4 * one["context"]
+                ends = frame == int(steps.first[number] + steps.length[number]) - 2
+                assert bool(one["next", "terminated"]) == ends
+                phi = bank.seen().embedding[number]
+                reward = 1 + 0.1 * torch.exp(-(behavior - phi).norm()) if ends else 0.0
+                assert float(one["next", "reward"]) == pytest.approx(float(reward), abs=1e-5)
+                n_seen += 1
+            for expert in batch[seed]:
+                is_shown = (frames == expert["latent"].unsqueeze(1)).all(-1).any(-1)
+                assert not is_shown[:6].any()
+    assert n_seen > 100
+
+
+def test_nothing_is_known_of_tasks_that_have_not_been_presented(make_bgpo, bank):
+    """All that is in the bank of two of the three tasks is something else in one of two runs."""
+    later = bank.task > 0
+    generator = torch.Generator().manual_seed(9)
+    embedding, latent = bank.embedding.clone(), bank.steps.latent.clone()
+    embedding[later] = torch.randn(int(later.sum()), 32, generator=generator)
+    action = bank.steps.action.clone()
+    for row in later.nonzero().flatten().tolist():
+        first = int(bank.steps.first[row])
+        rows = slice(first, first + int(bank.steps.length[row]))
+        latent[rows], action[rows] = -latent[rows] + 3, -action[rows]
+    steps = replace(bank.steps, latent=latent, action=action)
+    other = replace(bank, embedding=embedding, steps=steps)
+    assert not other.steps.latent.equal(bank.steps.latent)
+
+    for variant in ("latent, b", "all"):
+        schedule = TaskSchedule((0, 99, 99))
+        first = make_bgpo(variant, schedule=schedule)
+        second = make_bgpo(variant, schedule=schedule, bank=other)
+        ours, theirs = play(first, 25)[0], play(second, 25)[0]
+        assert (ours == theirs).all()
+        assert_same(first.learner.state_dict(), second.learner.state_dict())
+        shown, task = bank.embedding[:6].view(3, 2, 32), torch.zeros(3, 2).long()
+        for index in range(2):
+            policies = [
+                one.snapshot(index, shown, task, torch.Generator()) for one in (first, second)
+            ]
+            assert_same(*(policy.state_dict() for policy in policies))
+
+
+def test_the_bonus_is_for_latents_as_they_are_and_the_policy_sees_them_clipped(
+    make_bgpo, encoders, bank, monkeypatch
+):
+    """Latents much longer than they should be: phi_g is still that of a demonstration."""
+    raw, latent = [], encoders.vae.latent
+
+    def stretched(pixels):
+        stretch = 200 * latent(pixels)
+        raw.append(stretch.flatten())  # of the only seed
+        return stretch
+
+    monkeypatch.setattr(encoders.vae, "latent", stretched)
+    algorithm = make_bgpo("all", seeds=(3,))
+    assert algorithm.world.env.observation_spec["latent"].shape == (1, 64)
+    raw.clear()  # what was seen to make the specs
+    data = play(algorithm, 25)[0][0]
+    frames, trajectory, n_ended, n_clipped = iter(raw), [], 0, 0
+    trajectory.append(next(frames))
+    for step in data:
+        assert step["latent"].equal(trajectory[-1].clamp(-5, 5))
+        n_clipped += int((trajectory[-1].abs() > 5).sum())
+        trajectory.append(next(frames))
+        assert step["next", "latent"].equal(trajectory[-1].clamp(-5, 5))
+        if step["next", "done"]:
+            length = torch.tensor([len(trajectory)])
+            phi_g = encoders.lae.encode(torch.stack(trajectory)[None], length)[0]
+            bonus = torch.exp(-(step["behavior"] - phi_g).norm())
+            torch.testing.assert_close(step["next", "intrinsic_reward"][0], bonus)
+            trajectory, n_ended = [next(frames)], n_ended + 1
+    assert n_ended > 3
+    assert n_clipped > 100
+
+
+def test_the_bonus_tells_right_from_wrong_on_the_shipped_bank():
+    """For a trajectory just like a demonstration, by what GWR-B says of another one."""
+    bank = load_pretrained()[1]
+    seen, held_out = bank.seen(), bank.held_out()
+    gwr = GWRB(32, generator=torch.Generator().manual_seed(0), **asdict(BGPOConfig().gwr))
+    order = torch.randperm(len(seen.task), generator=torch.Generator().manual_seed(1))[:300]
+    for phi in seen.embedding[order]:
+        gwr.adapt(phi)
+    behavior = gwr.lookup(held_out.embedding).embedding
+    bonus = torch.exp(-torch.cdist(behavior, held_out.embedding))
+    same = held_out.task.unsqueeze(1) == held_out.task
+    assert bonus[same].median() > 0.15
+    assert bonus[~same].median() < 0.05
+
+
+def test_demonstrations_are_refused_where_the_state_is_the_ground_truth(make_config, bank):
+    config = replace(make_config("state", "oracle").algorithm, demonstration_share=0.25)
+    parts = {"seeds": (0,), "bank": bank.seen()}
+    with pytest.raises(
+        ValueError, match="demonstrations are latents: set demonstration_share to 0"
+    ):
+        BGPO(config, **parts)
+
+
+@pytest.mark.parametrize(
+    ("tasks", "own", "threshold"),
+    [
+        (nico.PAPER_TASKS, None, 0.525),
+        (nico.ALL_TASKS, None, 0.595),
+        (nico.ALL_TASKS, GWRBConfig(activity_threshold=0.525), 0.525),
+    ],
+)
+def test_the_bank_brings_the_threshold_of_groups_unless_it_is_set(tasks, own, threshold):
+    bank = load_pretrained(tasks=tasks)[1]
+    config = BGPOConfig(groups=own, state="state", demonstration_share=0)
+    algorithm = BGPO(config, seeds=[0], bank=bank.seen())
+    assert algorithm.groups.activity_threshold == threshold
