@@ -1,6 +1,5 @@
 """Loaded policies act as in the test episodes of their runs."""
 
-import hashlib
 import json
 import runpy
 import shutil
@@ -25,6 +24,7 @@ from bgpo_trl.training import Trainer
 from bgpo_trl.transforms import TaskSchedule
 from suites import nico
 from suites.nico import nico as suite_nico
+from tests.folders import contents
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 ROOT = Path(__file__).parents[1]
@@ -235,18 +235,15 @@ def test_what_is_not_needed_is_not_loaded(trainer_of, load):
 
 
 def test_the_run_is_left_as_it_is(trainer_of, load):
-    def files():
-        found = [path for path in trainer_of("bgpo").directory.rglob("*") if path.is_file()]
-        return {path: hashlib.sha256(path.read_bytes()).hexdigest() for path in found}
-
-    before = files()
+    run = trainer_of("bgpo").directory
+    before = contents(run)
     policy = load()
     nodes = policy.algorithm.gwr.num_nodes
     for frames in DEMONSTRATIONS:
         policy.condition(frames)
     policy.act(frames[0])
     assert policy.algorithm.gwr.num_nodes.equal(nodes)
-    assert files() == before
+    assert contents(run) == before
 
 
 def test_nothing_is_done_before_something_was_shown(load):

@@ -1,7 +1,6 @@
 """Whole runs, small ones: what they write, and that no interrupt changes it."""
 
 import csv
-import hashlib
 import itertools
 import re
 import signal
@@ -19,6 +18,7 @@ from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.runs.cost import n_bytes, read_costs
 from bgpo_trl.training import Trainer
 from tests.conftest import of_name
+from tests.folders import contents
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 CSV_FILES = ("train.csv", "eval.csv")
@@ -370,15 +370,11 @@ def test_the_progress_bar_tells_the_success_so_far(
 
 
 def test_a_finished_run_is_left_as_it_is(uninterrupted, make):
-    def contents():
-        files = [path for path in uninterrupted.rglob("*") if path.is_file()]
-        return {path: hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
-
-    before = contents()
+    before = contents(uninterrupted)
     with make(uninterrupted, resume=True) as trainer:
         trainer.algorithm.act = crash
         trainer.run()
-    assert contents() == before
+    assert contents(uninterrupted) == before
     assert trainer.env_steps == load_checkpoint(uninterrupted / "checkpoint")["env_steps"]
 
 

@@ -5,7 +5,6 @@ box of several lines with exit status 2, which must name the flag and, where the
 choices. Cases are as in `tests/test_bad_input.py`.
 """
 
-import hashlib
 import os
 import runpy
 import subprocess
@@ -18,6 +17,7 @@ import pytest
 
 from bgpo_trl.runs.logger import EVAL_COLUMNS
 from suites import opengl
+from tests.folders import contents
 
 ROOT = Path(__file__).parents[2]
 
@@ -35,13 +35,6 @@ def folder(tiny, tmp_path, monkeypatch):
     (tmp_path / "damaged" / "eval.csv").write_text(header + "bgpo,0,ten,5,grasp_glass,1,1,5\n")
     (tmp_path / "unevaluated" / "eval.csv").write_text(header)
     return tmp_path
-
-
-def contents(folder):
-    return {
-        path: hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
-        for path in folder.rglob("*")
-    }
 
 
 def ended_with(monkeypatch, command):
@@ -67,6 +60,7 @@ CASES = [
     ("continual.py --device cuda:99", "no device 'cuda:99'", "use auto or cpu"),
     ("concurrent_tasks.py --device gpu", "no device 'gpu'", "use auto or cpu"),
     ("ablation.py --algorithm maml", "--algorithm", "the variants are BGPO's"),
+    ("continual.py --algorithm maml --rl td3", "MAML is defined over DDPG", "not 'td3'"),
     ("ladder.py --rungs", "--rungs is empty", "name some of a, b, c, d"),
     ("ladder.py --episodes 0", "episodes", "must be at least 1, got 0"),
     ("ladder.py --threads 0", "threads", "must be at least 1, got 0"),
@@ -145,6 +139,8 @@ def test_a_command_that_cannot_be_is_answered_in_one_line(
     ("command", "named"),
     [
         ("continual.py --presett quick", "--presett"),
+        ("ladder.py --presett quick", "--presett"),
+        ("continual.py --preset huge", "desk"),
         ("continual.py --episodes 1.5", "--episodes"),
         ("continual.py --seeds a", "--seeds"),
         ("continual.py --algorithm ppo", "dist-nll"),
@@ -166,6 +162,21 @@ def test_a_flag_that_cannot_be_is_named(folder, monkeypatch, capsys, command, na
     assert "Traceback" not in told
     assert not out
     assert contents(folder) == before
+
+
+@pytest.mark.parametrize(
+    ("command", "name"),
+    [
+        ("continual.py --rl sac", "continual-bgpo-sac-quick"),
+        ("concurrent_tasks.py --rl sac", "concurrent-bgpo-sac-quick"),
+        ("ablation.py --rl sac --variant gwr", "ablation-gwr-sac-quick"),
+    ],
+)
+def test_a_run_with_another_rl_algorithm_has_a_name_of_its_own(folder, monkeypatch, command, name):
+    (folder / "runs" / name).mkdir(parents=True)
+    (folder / "runs" / name / "config.json").touch()
+    told = ended_with(monkeypatch, command)
+    assert told.startswith(f"error: runs/{name} holds a run: --resume")
 
 
 def test_a_folder_that_may_not_be_written_is_told(folder, monkeypatch):

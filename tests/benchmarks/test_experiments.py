@@ -1,0 +1,271 @@
+"""The paper's experiments: what they run and what they leave behind."""
+
+import csv
+import json
+import os
+import re
+import runpy
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from benchmarks import concurrent_tasks, continual, summary
+from bgpo_trl.algorithms import ALGORITHMS
+from bgpo_trl.experiments import measure
+from bgpo_trl.experiments import run as experiment
+from bgpo_trl.experiments.arguments import Arguments
+from bgpo_trl.files.checkpoint import load_checkpoint
+from bgpo_trl.runs.results import read_rows
+from suites import nico
+from tests.folders import contents
+
+ROOT = Path(__file__).parents[2]
+TASKS = nico.PAPER_TASKS
+
+
+def test_continual_leaves_curve_and_figures(tiny, tmp_path, capsys):
+    continual.main(Arguments(out=tmp_path / "run"))
+    run_directory = tmp_path / "run"
+    for name in ("success.png", "gwr.png", "gwr_growth.png", "groups.png"):
+        assert (run_directory / "figures" / name).read_bytes().startswith(b"\x89PNG")
+    assert json.loads((run_directory / "config.json").read_text())["episodes"] == 6
+    printed = capsys.readouterr().out
+    assert "GWR-B nodes: [" in printed
+    assert "groups of behaviors: [" in printed
+    assert f"curve and figures: {run_directory}" in printed
+
+    before = contents(run_directory)
+    with pytest.raises(ValueError, match="holds a run: --resume continues it, --out names another"):
+        continual.main(Arguments(out=run_directory))
+    assert contents(run_directory) == before
+
+
+def test_concurrent_presents_all_tasks_from_the_start(tiny, tmp_path, capsys, monkeypatch):
+    run, asked, test = tmp_path / "run", [], measure._final_tests
+    monkeypatch.setattr(measure, "_final_tests", lambda *a, **b: asked.append(b) or test(*a, **b))
+    concurrent_tasks.main(Arguments(out=run))
+    assert asked == [{"episodes": 20}]  # of which `tiny` leaves two
+    assert json.loads((run / "config.json").read_text())["task_starts"] == [0, 0, 0]
+    assert {row["task"] for row in read_rows(run / "eval.csv")} == set(TASKS)
+
+    rows = read_rows(run / "final.csv")
+    assert sorted((int(r["seed"]), r["demonstrations"], r["task"]) for r in rows) == sorted(
+        (seed, kind, task) for seed in (3, 8) for kind in ("seen", "held-out") for task in TASKS
+    )
+    for row in rows:
+        assert row["episodes"] == "2"
+        assert 2 * float(row["success"]) in range(3)
+        assert 0 <= float(row["task_inference"]) <= 1
+    told = json.loads((run / "summary.json").read_text())
+    assert re.fullmatch(r"|[0-9a-f]{7,}(-dirty)?", told["commit"])
+    assert len(told["nodes"]) == 2
+    assert told["random_success"] == pytest.approx(dict(zip(TASKS, [0.1, 0.2, 0.3], strict=True)))
+    nodes = read_rows(run / "gwr.csv")
+    assert len(nodes) == told["nodes"][0]
+    assert {node["task"] for node in nodes} <= {"-1", "0", "1", "2"}
+    assert {int(node["group"]) for node in nodes} <= set(range(told["groups"][0]))
+    assert [len(node) for node in nodes] == [34] * len(nodes)
+    assert (run / "figures" / "episodes.png").read_bytes().startswith(b"\x89PNG")
+
+    capsys.readouterr()
+    summary.main(summary.Arguments((run,)))
+    printed = capsys.readouterr().out
+    late = summary.summarize(run / "eval.csv")
+    for task in TASKS:
+        assert f"| {task} | {100 * late[task]:.1f} |" in printed
+    for name in ("success.png", "groups.png"):
+        assert (run / name).read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_the_command_line_runs_every_algorithm_and_says_its_name(
+    tiniest, monkeypatch, tmp_path, capsys, name
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["concurrent_tasks.py", "--algorithm", name])
+    runpy.run_path(str(ROOT / "benchmarks" / "concurrent_tasks.py"), run_name="__main__")
+    run = Path("runs") / f"concurrent-{name}-quick"
+    printed = capsys.readouterr().out
+    assert f"curve and figures: {run}" in printed
+    config = json.loads((run / "config.json").read_text())
+    assert config["name"] == name
+    assert config["algorithm"].get("beta") == (
+        None if name.startswith(("maml", "dist-nll")) else 0.1
+    )
+    for file in ("train.csv", "eval.csv"):
+        rows = read_rows(run / file)
+        assert {row["algorithm"] for row in rows} == {name}
+        assert {row["task"] for row in rows} == set(TASKS)
+
+    # Lines on GWR-B appear only with algorithms that have one.
+    with_gwr = name.startswith("bgpo")
+    told = json.loads((run / "summary.json").read_text())
+    assert (told["nodes"] is not None) == with_gwr
+    for file in ("gwr.csv", "figures/gwr.png"):
+        assert (run / file).exists() == with_gwr
+    # And of groups, where behaviors are told apart.
+    with_groups = name in ("bgpo", "bgpo-experts")
+    assert (told["groups"] is not None) == (run / "figures/groups.png").exists() == with_groups
+    if with_gwr:
+        assert ("group" in read_rows(run / "gwr.csv")[0]) == with_groups
+    assert ("GWR-B" in printed) == ("task inference" in printed) == with_gwr
+    rows = read_rows(run / "final.csv")
+    assert len(rows) == 2 * 2 * 3
+    assert all((row["task_inference"] != "") == with_gwr for row in rows)
+    summed_up = summary.describe(run)
+    assert ("GWR-B nodes: [" in summed_up) == with_gwr
+    assert ("Groups: [" in summed_up) == with_groups
+    assert "Own episodes to 50 %, relative to grasp_glass: push" in summed_up
+    table = [line.split("|") for line in summed_up.splitlines() if line.startswith("|")]
+    assert [row[1].strip() for row in table[2:]] == [*TASKS, "all"]
+    assert all((row[-2].strip() != "") == with_gwr for row in table[2:])
+    for task, row in zip(TASKS, table[2:], strict=False):
+        shares = [float(r["success"]) for r in rows if r["task"] == task]
+        for cell, of_kind in zip(row[6:8], (shares[:2], shares[2:]), strict=True):
+            assert float(cell) == pytest.approx(100 * sum(of_kind) / 2, abs=0.05)
+
+
+def test_a_finished_run_only_says_so_until_it_is_made_longer(
+    undrawn, tmp_path, monkeypatch, capsys
+):
+    run = tmp_path / "run"
+    arguments = Arguments(out=run)
+    continual.main(arguments)
+    before, played = contents(run), (run / "train.csv").read_text()
+    again = replace(arguments, resume=True)
+    with monkeypatch.context() as patch:
+        for name in ("load_pretrained", "make_pretrained", "Trainer", "measure", "draw"):
+            patch.delattr(experiment, name)
+        for same in (again, replace(again, episodes=6), replace(again, train_encoders=True)):
+            capsys.readouterr()
+            continual.main(same)
+            told = f"{run} is finished, all 6 episodes: --episodes makes it longer\n"
+            assert capsys.readouterr() == (told, "")
+    assert contents(run) == before
+
+    others = [{"episodes": 5}, {"seeds": (3,)}, {"eval_every": 3}, {"episodes": 9, "eval_every": 3}]
+    for other in others:
+        with pytest.raises(ValueError, match="holds a run with other settings"):
+            continual.main(replace(again, **other))
+    with pytest.raises(ValueError, match=r"with other settings .*task_starts is \[0, 2, 4\] there"):
+        concurrent_tasks.main(replace(again, episodes=9))
+    assert contents(run) == before
+
+    (run / "final.csv").unlink()  # as if it had been interrupted in its last tests
+    continual.main(again)
+    assert (run / "final.csv").exists()
+    assert (run / "train.csv").read_text() == played
+
+    for _ in range(2):
+        capsys.readouterr()
+        continual.main(replace(again, episodes=9))
+        settings = json.loads((run / "config.json").read_text())
+        assert (settings["episodes"], settings["task_starts"]) == (9, [0, 2, 4])
+        assert settings["eval_every"] == 2
+        assert json.loads((run / "summary.json").read_text())["episodes"] == 9
+        train = (run / "train.csv").read_text()
+        assert train.startswith(played)
+        assert train.count("\n") == 1 + 2 * 9
+    assert capsys.readouterr().out.startswith(f"{run} is finished, all 9 episodes")
+
+
+def test_a_run_that_was_interrupted_before_its_training_is_resumed(
+    undrawn, tmp_path, monkeypatch, encoders, bank
+):
+    monkeypatch.setattr(experiment, "make_pretrained", lambda *_, **__: (encoders, bank))
+    (tmp_path / "demonstrations").mkdir()
+    arguments = Arguments(out=tmp_path, resume=True, episodes=2)
+    with pytest.raises(ValueError, match="holds no run to resume"):
+        continual.main(arguments)
+    assert [path.name for path in tmp_path.iterdir()] == ["demonstrations"]
+    continual.main(replace(arguments, train_encoders=True))
+    assert (tmp_path / "summary.json").exists()
+
+
+def test_another_process_is_kept_off_all_of_an_experiment(
+    undrawn, tmp_path, monkeypatch, other_process
+):
+    """Also while it makes its encoders, and while it is tested and drawn."""
+    events, steps = [], ["load_pretrained", "measure", "draw"]
+    for name in steps:
+        function = getattr(experiment, name)
+
+        def do(*args, name=name, function=function, **kwargs):
+            other = other_process(tmp_path / "run")
+            assert f"in use by process {os.getpid()} on" in other.communicate()[1]
+            events.append(name)
+            return function(*args, **kwargs)
+
+        monkeypatch.setattr(experiment, name, do)
+    continual.main(Arguments(out=tmp_path / "run"))
+    assert events == steps
+    assert not (tmp_path / "run" / "lock").exists()
+
+
+def test_a_dashboard_gets_the_figures_before_it_is_closed(tiniest, monkeypatch, tmp_path):
+    events = []
+
+    class Dashboard:
+        def __init__(self, *args, **kwargs): ...
+
+        def log_metrics(self, metrics, step):
+            events.append("row")
+
+        def shutdown(self):
+            events.append("shutdown")
+
+    monkeypatch.setattr("bgpo_trl.runs.logger.WandbLogger", Dashboard)
+    monkeypatch.setattr(
+        "bgpo_trl.runs.logger._log_wandb_media", lambda dashboard, *media: events.append(media)
+    )
+    run = tmp_path / "run"
+    figures = ["episodes.png", "groups.png", "gwr.png", "gwr_growth.png", "success.png"]
+    figures += [f"{task}.gif" for task in TASKS]
+    shown = [(f"figures/{Path(n).stem}", run / "figures" / n) for n in sorted(figures)]
+    arguments = Arguments(out=run, wandb="offline")
+    continual.main(arguments)
+    rows = [read_rows(run / name) for name in ("train.csv", "eval.csv")]
+    assert events == ["row"] * sum(map(len, rows)) + [*shown, "shutdown"]
+    for task in TASKS:
+        assert (run / "figures" / f"{task}.gif").read_bytes().startswith(b"GIF89a")
+
+    events.clear()
+    (run / "summary.json").unlink()  # as if it had been killed when training was over
+    continual.main(replace(arguments, resume=True))
+    assert events == [*shown, "shutdown"]
+
+
+@pytest.mark.slow
+def test_smoke_goes_through_every_stage_from_nothing(tmp_path):
+    """Interrupted once on the way, like a person would: the same command goes on."""
+    script = str(ROOT / "benchmarks" / "continual.py")
+    command = [sys.executable, script, "--preset", "smoke", "--out", "run"]
+    options = {"cwd": tmp_path, "env": {**os.environ, "PYTHONPATH": str(ROOT)}, "text": True}
+    with subprocess.Popen(command, stderr=subprocess.PIPE, **options) as process:
+        episodes = tmp_path / "run" / "train.csv"
+        while not episodes.exists() or episodes.read_bytes().count(b"\n") < 5:
+            assert process.poll() is None, f"it ended early: {process.stderr.read()}"
+            time.sleep(0.05)
+        process.send_signal(signal.SIGINT)
+        assert process.stderr.read().endswith("the same command with --resume continues\n")
+    assert process.returncode == 1
+    assert load_checkpoint(tmp_path / "run" / "checkpoint")["evaluated"] < 2
+
+    result = subprocess.run([*command, "--resume"], capture_output=True, **options)
+    assert result.returncode == 0, result.stderr
+    told = "curve and figures: run; in numbers: python benchmarks/summary.py run\n"
+    assert result.stdout.endswith(told)
+    for name in (
+        *("config.json", "train.csv", "eval.csv", "figures/success.png", "figures/gwr.png"),
+        *("encoders/nico.safetensors", "encoders/nico_bank.safetensors", "encoders/probes.json"),
+        "demonstrations/dataset.json",
+    ):
+        assert (tmp_path / "run" / name).stat().st_size > 0
+    with open(tmp_path / "run" / "train.csv", newline="") as file:
+        episodes = [(row["seed"], int(row["episode"])) for row in csv.DictReader(file)]
+    assert sorted(episodes) == [(seed, n) for seed in "01" for n in range(1, 13)]

@@ -1,0 +1,80 @@
+"""The settings of a run that the command line asks for."""
+
+import dataclasses
+from dataclasses import replace
+from typing import get_args, get_type_hints
+
+import pytest
+
+from bgpo_trl.algorithms import ALGORITHMS
+from bgpo_trl.algorithms.rl import RL
+from bgpo_trl.configs import PRESETS, DDPGConfig
+from bgpo_trl.experiments.arguments import Arguments, run_config
+
+
+def test_a_preset_is_taken_as_it_is():
+    for name, preset in PRESETS.items():
+        assert run_config(Arguments(preset=name)) == preset
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_another_algorithm_changes_nothing_else(name):
+    for preset, config in PRESETS.items():
+        arguments = Arguments(algorithm=name, preset=preset)
+        entry = ALGORITHMS[name]
+        expected = replace(config, name=name, algorithm=entry.config)
+        assert run_config(arguments) == expected
+        published = name.endswith("-paper")
+        assert (entry.config.rl == DDPGConfig()) is not published  # else the same learner for all
+
+
+def test_the_command_line_knows_every_algorithm():
+    choices = get_type_hints(Arguments)
+    assert get_args(choices["algorithm"]) == tuple(ALGORITHMS)
+    assert get_args(choices["rl"]) == tuple(RL)
+
+
+@pytest.mark.parametrize("rl", RL)
+@pytest.mark.parametrize("name", ["bgpo", "oracle", "ddpg"])
+def test_another_rl_algorithm_changes_nothing_else(name, rl):
+    plain = run_config(Arguments(algorithm=name))
+    config = run_config(Arguments(algorithm=name, rl=rl))
+    assert config == replace(plain, algorithm=replace(plain.algorithm, rl=RL[rl].config))
+    assert dataclasses.asdict(config)["algorithm"]["rl"]["name"] == rl
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_tasks_of_every_preset_start_when_the_paper_has_them_start(preset):
+    config = PRESETS[preset]
+    shares = [start / config.episodes for start in config.task_starts]
+    assert shares == pytest.approx([0, 7_000 / 20_000, 13_000 / 20_000], abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("preset", "episodes", "starts", "eval_every"),
+    [
+        ("paper", 10_000, (0, 3_500, 6_500), 1),
+        ("quick", 2_400, (0, 840, 1_560), 60),
+        ("quick", 20, (0, 7, 13), 20),  # tested once at least
+    ],
+)
+def test_another_length_keeps_the_proportions(preset, episodes, starts, eval_every):
+    config = run_config(Arguments(preset=preset, episodes=episodes))
+    assert (config.episodes, config.task_starts) == (episodes, starts)
+    assert config.eval_every == eval_every
+    assert config == replace(
+        PRESETS[preset], episodes=episodes, task_starts=starts, eval_every=eval_every
+    )
+
+
+def test_other_seeds_change_nothing_else():
+    config = run_config(Arguments(preset="desk", seeds=(7, 9)))
+    assert config == replace(PRESETS["desk"], seeds=(7, 9))
+
+
+@pytest.mark.parametrize(
+    "arguments", [{"episodes": 0}, {"episodes": -3}, {"seeds": ()}, {"seeds": (2, 2)}]
+)
+def test_lengths_and_seeds_that_cannot_be_are_refused(arguments):
+    with pytest.raises(ValueError, match=r"must be at least 1|needs seeds"):
+        run_config(Arguments(**arguments))

@@ -1,0 +1,10 @@
+"""What a folder holds, to be compared before and after."""
+
+from pathlib import Path
+
+
+def contents(folder: Path) -> dict[Path, bytes | None]:
+    """Return all that lies below a folder: the bytes of each file, None for a folder."""
+    return {
+        path: path.read_bytes() if path.is_file() else None for path in sorted(folder.rglob("*"))
+    }
