@@ -70,7 +70,7 @@ class NicoEnv(EnvBase):
         observation: Observation = "pixels",
         threads: int | None = None,
     ) -> None:
-        super().__init__(batch_size=as_shape(batch_size, "batch_size"))
+        super().__init__(batch_size=as_shape(batch_size, "batch_size"), device="cpu")
         check_observation(observation)
         if threads is not None and threads < 1:
             raise ValueError(f"threads must be at least 1, or None for all cores, got {threads}")

@@ -35,9 +35,9 @@ class Threads:
     def each(
         self, rows: Iterable[int], work: Callable[[int], T], arrived: Callable[[int, T], object]
     ) -> None:
-        """Call ``work`` on each row in any thread; hand over the results in the caller's.
+        """Call ``work`` on each row in any thread.
 
-        ``arrived`` is called with a row and its result, as soon as possible.
+        The caller's thread calls ``arrived`` with each row and its result, as soon as possible.
         """
         waiting, results = deque(rows), deque[tuple[int, T]]()
 

@@ -7,6 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Literal
 
@@ -111,8 +112,8 @@ class Trainer(Closing):
         encoders_used = None if encoders is None else encoders.identity
         self._settings = settings_of(config, Digests(encoders_used, bank.identity))
         self._state: TensorDictBase | None = None
-        self._lock = DirectoryLock(self.directory)
-        try:
+        with ExitStack() as opened:
+            opened.enter_context(DirectoryLock(self.directory))
             saved = load_last(self.directory, self._settings) if resume else None
             if saved is not None:
                 self._load(saved)
@@ -120,15 +121,14 @@ class Trainer(Closing):
             self.logger = RunLogger(
                 self.directory, config=self._settings, wandb=wandb, resume=resume
             )
+            opened.enter_context(self.logger)
             if saved is not None:
                 self.logger.truncate_to(saved["position"])
                 for row in saved.get("later", []):
                     self._log(row)
             if encoders is not None:  # Others cannot be loaded to watch demonstrations.
                 keep_bank(self.directory, bank, encoders)
-        except BaseException:
-            self._lock.close()
-            raise
+            self._opened = opened.pop_all()
 
     def run(self) -> None:
         """Train to the end; return at once if a resumed run is complete.
@@ -189,8 +189,7 @@ class Trainer(Closing):
 
     def close(self) -> None:
         """Close files and mirrors, and unlock the directory for other processes."""
-        self.logger.close()
-        self._lock.close()
+        self._opened.close()
 
     @property
     def _n_tasks(self) -> int:

@@ -117,11 +117,19 @@ PARTS = {
     "gwr NaN input": (lambda: GWRB(2).adapt(torch.tensor([NAN, 0])), "NaN", "must be free of"),
     "gwr wrong size": (lambda: GWRB(2).lookup(torch.zeros(3)), "got [3]", "end with 2"),
     "gwr empty": (lambda: GWRB(2, init="data").lookup(torch.zeros(2)), "empty", "adapt() it"),
+    "gwr part of a node": (lambda: GWRB(2, max_nodes=2.5), "got 2.5", "a whole number, or None"),
+    "gwr no state": (lambda: GWRB(2).set_extra_state([None]), "state of a network", "get_extra_st"),
     "gwr half a state": (
         lambda: GWRB(2).set_extra_state([{"weights": torch.zeros(2, 2)}]),
         "the state of a network needs", "see get_extra_state"),
     "gwr edge to nowhere": (
         lambda: filled({"edges": torch.tensor([[0, 7]])}), "damaged", "load one that"),
+    "gwr ages below 0": (lambda: filled({"ages": torch.tensor([-5])}), "damaged", "load one that"),
+    "gwr habituation above 1": (
+        lambda: filled({"habituation": torch.tensor([1.0, 3.0])}), "damaged", "load one that"),
+    "gwr an edge twice": (
+        lambda: filled({"edges": torch.tensor([[0, 1], [1, 0]]), "ages": torch.tensor([0, 0])}),
+        "damaged", "load one that"),
     "gwr NaN weights": (
         lambda: filled({"weights": torch.full((2, 2), NAN)}), "damaged", "load one that"),
     # networks
@@ -150,6 +158,9 @@ PARTS = {
         lambda: MultiHeadActor(4, in_keys=["x"])(TensorDict({"x": torch.zeros(2, 5, 4)}, [2, 5])),
         "2 tasks for 0 heads", "add a head"),
     # losses
+    "ddpg with other weights": (
+        lambda: loss()(transitions().set("priority_weight", torch.ones(8, 1))),
+        "'priority_weight' must be one weight", "[8], got [8, 1]"),
     "ddpg without action": (lambda: loss()(transitions("action")), "found no 'action'", "write it"),
     "ddpg without next": (lambda: loss()(transitions("next")), "('next', 'reward')", "write it"),
     "ddpg without reward": (
@@ -219,6 +230,8 @@ PARTS = {
         lambda: NicoEnv(observation="state").reset(row({"task": torch.tensor(9)})),
         "got [9]", "must lie in 0..2"),
     "misspelt task": (lambda: nico.load("grasp_glas"), "'grasp_glas'", "choose one of grasp_glass"),
+    "a task called all": (
+        lambda: nico.add_task("all", nico.NicoTask), "cannot be called 'all'", "none of all"),
     "no time": (lambda: nico.load("grasp_glass", time_limit=NAN), "got nan", "above 0 s"),
     "demonstrator of a stranger": (
         lambda: Demonstrator(SimpleNamespace(task=None, physics=None)),

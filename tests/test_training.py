@@ -449,3 +449,17 @@ def test_the_time_of_a_step_is_that_of_training_without_tests_and_checkpoints(
     costs = read_costs(tmp_path / "cost.csv")
     assert sum(cost.steps for cost in costs.values()) == trainer.env_steps
     assert all(cost.seconds == 0.25 * cost.steps for cost in costs.values())
+
+
+def test_a_bank_that_cannot_be_kept_leaves_nothing_open(make, tmp_path, monkeypatch):
+    def refuse(*args):
+        raise OSError("cannot write the bank: make room")
+
+    closed = []
+    close = training.RunLogger.close
+    monkeypatch.setattr(training.RunLogger, "close", lambda log: (closed.append(1), close(log)))
+    monkeypatch.setattr(training, "keep_bank", refuse)
+    with pytest.raises(OSError, match="make room"):
+        make(tmp_path / "run")
+    assert closed == [1]
+    assert not (tmp_path / "run" / "lock").exists()

@@ -59,10 +59,10 @@ ALGORITHMS: dict[str, Entry] = {
     "oracle": Entry(BGPO, replace(_SINGLE, variant="label")),
     "ddpg": Entry(BGPO, replace(_SINGLE, variant="no-context")),
 }
-"""BGPO, also without demonstrations (``bgpo-experts``) and with a single actor and critic besides
-(``bgpo-single``); the paper's baselines, without and with demonstrations; two references, DDPG with
-the task's label (``oracle``) and without context (``ddpg``). Names in ``-paper`` follow the
-publication: networks of 64 units, batches of 256, no stabilizers."""
+"""BGPO; ``bgpo-experts``, BGPO without demonstrations; ``bgpo-single``, which in addition has only
+one actor and one critic; the paper's baselines, without and with demonstrations; two references,
+DDPG with the task's label (``oracle``) and without context (``ddpg``). Names in ``-paper`` follow
+the publication: networks of 64 units, batches of 256, no stabilizers."""
 
 ABLATIONS: dict[str, Entry] = {
     "gwr+r_int": ALGORITHMS["bgpo-single"],

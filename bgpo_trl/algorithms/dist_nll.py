@@ -106,7 +106,8 @@ class DistNLL(TaskAlgorithm):
                 head = student.add_head(self._heads[index])
                 optimizer.add_param_group({"params": list(head.parameters())})
         drawn = self.replay.sample_seed(index, tasks, self.config.samples)
-        batch = self.to_device(drawn.select(self.config.state))
+        # The weights are 0 where the replay holds no transition of a task any more.
+        batch = self.to_device(drawn.select(self.config.state, "priority_weight"))
         teachers = networks_of(
             self.loss.actor_network_params, torch.tensor(index), torch.tensor(tasks)
         )

@@ -241,7 +241,11 @@ def encode(config: AlgorithmConfig, encoders: Representation | None) -> Transfor
 
 
 def match_behavior(config: BGPOConfig, encoders: Representation | None) -> BehaviorMatchingReward:
-    """Return the transform that adds the intrinsic reward; it needs encoders (``ValueError``)."""
+    """Return the transform that adds the intrinsic reward.
+
+    Raises:
+        ValueError: If ``encoders`` is None.
+    """
     if encoders is None:
         raise ValueError("matching behaviors needs trained encoders")
     return BehaviorMatchingReward(encoders.lae, beta=config.beta)

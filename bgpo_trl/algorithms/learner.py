@@ -125,7 +125,7 @@ class TD3Learner(Learner):
 
     @property
     def actor_is_due(self) -> bool:
-        """Whether the next update is the last of ``policy_delay``."""
+        """Whether the next update also updates the actor: every ``policy_delay``-th does."""
         return (self.n_updates + 1) % self.policy_delay == 0
 
     def state_dict(self) -> dict[str, Any]:

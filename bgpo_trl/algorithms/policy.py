@@ -23,7 +23,7 @@ class Policy:
         actor: Network, called with ``parameters`` instead of its weights.
         state_key: Key of the state.
         parameters: By name in the actor. Leading dimensions: none, ``[T]`` (one network per task)
-            or ``[T, M]`` (one per episode), after ``[S]`` in a stack.
+            or ``[T, M]`` (one per episode). In a stack of seeds, ``[S]`` comes first.
         context: Input besides the state, ``[T, M, C]``; None if the actor reads no context.
     """
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from bgpo_trl.configs.checks import at_least, check, positive
+from bgpo_trl.configs.checks import at_least, check, positive, whole
 from bgpo_trl.configs.rl import DDPGConfig, RLConfig
 
 
@@ -32,7 +32,7 @@ class AlgorithmConfig:
             ("state", known, "latent or state"),
             ("demonstration_share", 0 <= share < 1, "at least 0 and below 1"),
         )
-        at_least(self, 1, "max_steps")
+        whole(self, 1, "max_steps")
         if share and self.rl.warmup_steps < self.max_steps:
             # Else, seeds would learn from demonstrations sooner or later than each would alone.
             raise ValueError(
@@ -75,7 +75,8 @@ class BGPOConfig(AlgorithmConfig):
     """Behavior-guided policy optimization (Alg. 1)."""
 
     variant: str = "bgpo"
-    """Its environment, a key of `bgpo_trl.algorithms.environments.VARIANTS`. Ours: with groups."""
+    """Key in `bgpo_trl.algorithms.environments.VARIANTS`, which selects the environment. Ours: the
+    default also finds groups."""
     beta: float = 0.1
     """Weight of the intrinsic reward (Sec. IV-A)."""
     behavior_scale: float = 0.25
@@ -110,7 +111,7 @@ class BGPOConfig(AlgorithmConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         at_least(self, 0, "beta")
-        at_least(self, 1, "active_groups", "expert_batch_size")
+        whole(self, 1, "active_groups", "expert_batch_size")
         positive(self, "behavior_scale")
         holds = self.even_replay or not self.experts
         check(self, ("even_replay", holds, "set where there are experts"))
@@ -137,9 +138,9 @@ class MAMLConfig(AlgorithmConfig):
         super().__post_init__()
         _refuse_all_but_ddpg("MAML", self.rl)
         at_least(self, 0, "inner_learning_rate")
-        at_least(self, 1, "adaptation_size")
-        halves = self.task_batch_size >= 2 and self.task_batch_size % 2 == 0
-        check(self, ("task_batch_size", halves, "even and at least 2"))
+        whole(self, 1, "adaptation_size")
+        whole(self, 2, "task_batch_size")
+        check(self, ("task_batch_size", self.task_batch_size % 2 == 0, "even"))
 
 
 @dataclass(frozen=True)
@@ -163,9 +164,9 @@ class DistNLLConfig(AlgorithmConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         _refuse_all_but_ddpg("Dist-NLL", self.rl)
-        at_least(self, 1, "task_batch_size", "samples")
+        whole(self, 1, "task_batch_size", "samples", "distillation_batch_size")
         positive(self, "learning_rate")
-        if self.distillation_batch_size < 1 or self.samples % self.distillation_batch_size:
+        if self.samples % self.distillation_batch_size:
             raise ValueError(
                 f"samples ({self.samples}) must be a multiple of distillation_batch_size "
                 f"({self.distillation_batch_size})"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from bgpo_trl.configs.checks import at_least, check, positive
+from bgpo_trl.configs.checks import at_least, check, positive, whole
 
 
 @dataclass(frozen=True)
@@ -34,11 +34,12 @@ class VAEConfig:
     """Factor of the inverse model's ``1/2 ||a_hat - a||^2``. Ours: not given in the paper."""
 
     def __post_init__(self) -> None:
-        at_least(self, 1, "latent_size", "batch_size", "warmup_steps", "steps")
+        whole(self, 1, "latent_size", "batch_size", "warmup_steps", "steps")
         positive(self, "learning_rate")
         at_least(self, 0, "reconstruction_weight", "kl_weight", "inverse_weight")
-        divides = self.window >= 2 and self.batch_size % self.window == 0
-        check(self, ("window", divides, f"at least 2 and divide batch_size {self.batch_size}"))
+        whole(self, 2, "window")
+        divides = self.batch_size % self.window == 0
+        check(self, ("window", divides, f"a divisor of batch_size {self.batch_size}"))
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,7 @@ class SequenceAutoencoderConfig:
     """Gradient steps. Ours: not given in the paper."""
 
     def __post_init__(self) -> None:
-        at_least(self, 1, "embedding_size", "batch_size", "warmup_steps", "steps")
+        whole(self, 1, "embedding_size", "batch_size", "warmup_steps", "steps")
         positive(self, "learning_rate")
 
 
@@ -77,8 +78,8 @@ class RepresentationConfig:
     """Steps between rows of the log. Ours."""
 
     def __post_init__(self) -> None:
-        at_least(self, 0, "seed")
-        at_least(self, 1, "checkpoint_every", "log_every")
+        whole(self, 0, "seed")
+        whole(self, 1, "checkpoint_every", "log_every")
 
 
 @dataclass(frozen=True)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from numbers import Integral
 
-from bgpo_trl.configs.checks import at_least, check, positive
+from bgpo_trl.configs.checks import at_least, check, positive, whole
 
 
 @dataclass(frozen=True)
@@ -37,12 +38,15 @@ class RLConfig:
 
     def __post_init__(self) -> None:
         positive(self, "learning_rate")
-        at_least(self, 1, "batch_size", "warmup_steps")
+        whole(self, 1, "batch_size", "warmup_steps", "replay_size")
         # With a smaller replay, learning would never begin.
         least = max(self.batch_size, self.warmup_steps)
+        sizes = bool(self.hidden_sizes) and all(
+            isinstance(size, Integral) and size >= 1 for size in self.hidden_sizes
+        )
         check(
             self,
-            ("hidden_sizes", min(self.hidden_sizes, default=0) >= 1, "one or more, of at least 1"),
+            ("hidden_sizes", sizes, "one or more whole numbers, of at least 1"),
             ("gamma", 0 <= self.gamma <= 1, "between 0 and 1"),
             ("tau", 0 < self.tau <= 1, "above 0 and at most 1"),
             ("replay_size", self.replay_size >= least, f"{least} (batch, warm-up) or more"),
@@ -85,7 +89,7 @@ class TD3Config(RLConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         at_least(self, 0, "noise", "pre_tanh_penalty", "policy_noise", "noise_clip")
-        at_least(self, 1, "policy_delay")
+        whole(self, 1, "policy_delay")
 
 
 @dataclass(frozen=True)

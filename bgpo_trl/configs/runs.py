@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from numbers import Integral
 from typing import Literal
 
 from bgpo_trl.configs.algorithms import AlgorithmConfig, BGPOConfig
-from bgpo_trl.configs.checks import at_least, check
+from bgpo_trl.configs.checks import at_least, check, whole
 from suites import nico
 
 
@@ -38,9 +39,12 @@ class RunConfig:
     """The algorithm's hyperparameters."""
 
     def __post_init__(self) -> None:
+        for name in ("seeds", "task_starts"):
+            numbers = all(isinstance(number, Integral) for number in getattr(self, name))
+            check(self, (name, numbers, "whole numbers"))
         if not self.seeds or len(set(self.seeds)) < len(self.seeds) or min(self.seeds) < 0:
             raise ValueError(f"a run needs seeds, all different and none negative: {self.seeds}")
-        at_least(self, 1, "episodes", "eval_every", "eval_episodes")
+        whole(self, 1, "episodes", "eval_every", "eval_episodes")
         at_least(self, 0, "checkpoint_minutes")
         check(self, ("held_out", self.held_out in ("validation", "test"), "validation or test"))
         nico.check_tasks(self.tasks)

@@ -148,7 +148,12 @@ class DemonstrationBank:
 
         ``"validation"`` (first, third, ... of each task) is for choosing settings, ``"test"``
         (second, fourth, ...) for reporting results.
+
+        Raises:
+            ValueError: If there is no such part.
         """
+        if part not in (None, "validation", "test"):
+            raise ValueError(f"part must be 'validation', 'test' or None, got {part!r}")
         rows = torch.nonzero(~self.train).flatten()
         if part is None:
             return self._select(rows)

@@ -11,6 +11,7 @@ import torch
 from tensordict import MemoryMappedTensor, TensorDict
 
 from bgpo_trl.files.folders import make_folder
+from bgpo_trl.files.whole_file import write_json
 from suites import nico
 from suites.nico.base import STATE_SIZE
 from suites.nico.rendering import FRAME_HEIGHT, FRAME_WIDTH
@@ -105,9 +106,7 @@ def checksum_of(dataset: TensorDict) -> str:
 
 def write_meta(path: Path, meta: dict) -> None:
     """Write the settings of a recording, and the checksum of a complete one, atomically."""
-    temporary = path / (_META + ".tmp")
-    temporary.write_text(json.dumps(meta, indent=2))
-    temporary.replace(path / _META)
+    write_json(path / _META, meta)
 
 
 def read_meta(path: Path) -> dict:

@@ -106,7 +106,7 @@ class TaskReplay:
         """Draw transitions ``[S, T, B]`` of each task of each seed, those of demonstrations last.
 
         They have ``"priority_weight"``, the weight in TorchRL's losses: 1, or 0 for tasks that are
-        not `ready`.
+        not `ready` and for demonstrations of a task of which none was shown yet.
 
         Raises:
             ValueError: If no task is ready.
@@ -130,7 +130,7 @@ class TaskReplay:
     def sample_seed(self, seed: int, tasks: Sequence[int], batch_size: int) -> TensorDict:
         """Draw transitions ``[len(tasks), B]`` of some tasks of the seed at a position.
 
-        Each task must hold a transition.
+        ``"priority_weight"`` is 0 for tasks that hold none.
         """
         task = torch.tensor([tasks])
         return self._draw(self._replay, task, batch_size, seeds=[seed])[0]

@@ -48,8 +48,8 @@ def make_bank(
     latent = encode_frames(vae, dataset["pixels"], length)
     action = dataset["action"]
     if actions == "inferred":
-        mean = latent * vae.latent_std + vae.latent_mean
-        action = vae.inverse(mean[:, :-1], mean[:, 1:])
+        mean = latent.to(vae.latent_std.device) * vae.latent_std + vae.latent_mean
+        action = vae.inverse(mean[:, :-1], mean[:, 1:]).cpu()
     train = dataset["train"].clone()
     return DemonstrationBank(
         representation.lae.encode(latent, length),

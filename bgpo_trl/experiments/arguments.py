@@ -60,9 +60,9 @@ class Arguments(TaskArguments):
     """Train an algorithm and plot its success."""
 
     algorithm: AlgorithmName = "bgpo"
-    """BGPO, also without replay of demonstrations (-experts) and without experts either (-single);
-    a baseline, with or without -demonstrations; any of them as published (-paper); or a reference:
-    DDPG with the task label as context (oracle) or without any (ddpg)."""
+    """bgpo; bgpo-experts: without demonstrations as experience; bgpo-single: without experts too;
+    maml and dist-nll: the baselines, with or without -demonstrations; -paper: as published; oracle
+    and ddpg: DDPG with the task label as context, and without context."""
     rl: Literal["ddpg", "td3", "sac"] = "ddpg"
     """The RL algorithm of BGPO, its ablations and the references."""
     preset: Literal["smoke", "quick", "desk", "paper"] = "quick"
@@ -106,6 +106,8 @@ def run_config(arguments: Arguments) -> RunConfig:
     config = _with_tasks(PRESETS[arguments.preset], arguments.tasks)
     algorithm = ALGORITHMS[arguments.algorithm].config
     if arguments.rl != algorithm.rl.name:
+        if arguments.algorithm.endswith("-paper"):
+            raise ValueError(f"--rl: {arguments.algorithm} uses DDPG, as published: leave --rl")
         algorithm = replace(algorithm, rl=RL[arguments.rl].config)
     config = replace(
         config,
@@ -126,6 +128,11 @@ def run_config(arguments: Arguments) -> RunConfig:
         )
     if arguments.eval_every is not None:
         config = replace(config, eval_every=arguments.eval_every)
+    if config.eval_every > config.episodes:
+        raise ValueError(
+            f"eval_every must be at most the {config.episodes} episodes of the run, got "
+            f"{config.eval_every}: its tests are its results"
+        )
     return config
 
 

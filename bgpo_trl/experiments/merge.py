@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import shlex
 import sys
 from collections import Counter
@@ -12,6 +11,8 @@ from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
 
+from bgpo_trl.files.folders import make_folder
+from bgpo_trl.files.whole_file import write_json, write_whole
 from bgpo_trl.runs.cost import read_costs, total_cost, write_costs
 from bgpo_trl.runs.results import read_json, read_rows
 
@@ -52,19 +53,20 @@ def merge(blocks: Sequence[Path], directory: Path) -> None:
             "blocks that were changed, and run them again"
         )
 
-    directory.mkdir(parents=True, exist_ok=True)
+    make_folder(directory)
     for name, rows in tables.items():
         text = io.StringIO()
         writer = csv.DictWriter(text, rows[0], lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
-        _write(directory / name, text.getvalue().encode())
+        write_whole(directory / name, text.getvalue())
     if all((block / "cost.csv").exists() for block in blocks):
         costs = [read_costs(block / "cost.csv") for block in blocks]
         write_costs(directory / "cost.csv", total_cost(costs))
     for path in (*blocks[0].glob("gwr.csv"), *blocks[0].glob("figures/*")):
         if path.name not in ("success.png", "groups.png"):
-            _write(directory / path.relative_to(blocks[0]), path.read_bytes())
+            copy = directory / path.relative_to(blocks[0])
+            write_whole(make_folder(copy.parent) / copy.name, path.read_bytes())
     summary = {
         **summaries[0],
         "commit": " ".join(dict.fromkeys(block["commit"] for block in summaries)),
@@ -73,16 +75,5 @@ def merge(blocks: Sequence[Path], directory: Path) -> None:
     for key in summary.keys() & {"nodes", "groups", "group_purity"}:  # a value per seed, or None
         of_blocks = [block[key] for block in summaries]
         summary[key] = None if None in of_blocks else list(chain.from_iterable(of_blocks))
-    _write_json(directory / "summary.json", summary)
-    _write_json(directory / "config.json", {**configs[0], "seeds": seeds})
-
-
-def _write_json(path: Path, content: dict) -> None:
-    _write(path, (json.dumps(content, indent=2) + "\n").encode())
-
-
-def _write(path: Path, content: bytes) -> None:
-    path.parent.mkdir(exist_ok=True)
-    temporary = path.with_name(f"{path.name}.tmp")
-    temporary.write_bytes(content)
-    temporary.replace(path)
+    write_json(directory / "summary.json", summary)
+    write_json(directory / "config.json", {**configs[0], "seeds": seeds})

@@ -33,9 +33,9 @@ class AblationArguments(Arguments):
     variant: Literal[
         "gwr+r_int", "gwr", "r_int", "none", "even-replay", "experts", "demonstrations", "all"
     ] = "gwr+r_int"
-    """GWR-B and the intrinsic reward as published; one of them; or none. Or both, and besides:
-    replay drawn evenly over groups of behaviors; experts for the groups too; demonstrations as
-    experience; or all of it."""
+    """gwr+r_int: the published algorithm; gwr, r_int: with GWR-B or the intrinsic reward only;
+    none: with neither. even-replay, demonstrations: the published algorithm with that addition;
+    experts: with even replay and experts; all: with all three."""
     continual: bool = False
     """Tasks one after the other instead of all from the start."""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shlex
 import subprocess
 import sys
@@ -26,6 +25,7 @@ from bgpo_trl.experiments.arguments import (
 from bgpo_trl.experiments.measure import draw, measure
 from bgpo_trl.experiments.resuming import as_begun, check_resumable, is_finished
 from bgpo_trl.files.locking import DirectoryLock
+from bgpo_trl.files.whole_file import write_json
 from bgpo_trl.machine import choose_device, set_threads
 from bgpo_trl.runs.demonstrations import BANK
 from bgpo_trl.training import Trainer
@@ -93,13 +93,13 @@ def run_experiment(
             for path in sorted((out / "figures").iterdir()):
                 trainer.logger.log_media(f"figures/{path.stem}", path)
             # Written last, as the mark of a complete run.
-            (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+            write_json(out / "summary.json", summary)
     lines.append(f"curve and figures: {out}; in numbers: python benchmarks/summary.py {out}")
     return "\n".join(lines)
 
 
 def _bank(arguments: Arguments, out: Path) -> Path | None:
-    """Return the bank that is given or, in a run to resume, kept."""
+    """Return the bank of the command line or, when resuming, that of the run directory."""
     kept = out / BANK
     return kept if arguments.bank is None and arguments.resume and kept.exists() else arguments.bank
 

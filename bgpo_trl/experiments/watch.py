@@ -152,7 +152,7 @@ def watch(arguments: WatchArguments) -> str:
     growth of GWR-B.
 
     Raises:
-        ValueError: If the directory holds no complete run, or the run has no such seed.
+        ValueError: If the directory holds no run that can be loaded, or the run has no such seed.
     """
     run, out = arguments.run, arguments.out or arguments.run / "figures"
     import_tasks(arguments.module)

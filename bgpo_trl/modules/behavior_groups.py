@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorClass
 from torch import Tensor, nn
 
+from bgpo_trl.errors import as_shape
 from bgpo_trl.modules.gwr import GWRB
 
 _NEVER = 2**62  # an age that no edge reaches
@@ -50,8 +51,8 @@ class BehaviorGroups(nn.Module):
         habituation_threshold: h_T, below which a best-matching node allows an insertion. With the
             0.15 of the fine network, tasks that appear together get mixed before any node splits.
         activity_scale: Factor of distances, as in `GWRB`.
-        max_groups: Number of groups from which new nodes join the group of their best match; None:
-            no limit.
+        max_groups: Largest number of groups. Once it is reached, a new node joins the group of its
+            best match. None: no limit.
 
     Raises:
         ValueError: If ``max_groups`` is below 1, or an argument of `GWRB` is out of range.
@@ -75,8 +76,8 @@ class BehaviorGroups(nn.Module):
         max_groups: int | None = None,
     ) -> None:
         super().__init__()
-        if max_groups is not None and max_groups < 1:
-            raise ValueError(f"max_groups must be at least 1, or None; got {max_groups}")
+        if max_groups is not None:
+            as_shape([max_groups], "max_groups")
         self.gwr = GWRB(
             n_features,
             batch_size=batch_size,
@@ -101,7 +102,8 @@ class BehaviorGroups(nn.Module):
     @property
     def num_groups(self) -> Tensor:
         """Number of groups of each network, at least 1, int64 ``[*batch_size]``."""
-        return torch.tensor([len(parent) for parent in self._parent]).view(self.batch_size)
+        counts = [len(parent) for parent in self._parent]
+        return torch.tensor(counts, device=self.gwr.num_nodes.device).view(self.batch_size)
 
     def parent(self, network: int, group: int) -> int:
         """Return the parent of a group (0 for the first) of a network in the flattened batch."""
@@ -123,7 +125,7 @@ class BehaviorGroups(nn.Module):
         group = torch.zeros_like(node)
         for row, nodes, known in zip(group, node, self._group, strict=True):
             if known:
-                row.copy_(torch.tensor(known)[nodes])
+                row.copy_(torch.tensor(known, device=nodes.device)[nodes])
         return GroupMatch(
             group=group.view(match.node.shape),
             activity=match.activity.nan_to_num(0.0),
@@ -154,7 +156,7 @@ class BehaviorGroups(nn.Module):
             else:
                 of_node.append(group)
         return GroupMatch(
-            group=torch.tensor(matched).view(self.batch_size),
+            group=torch.tensor(matched, device=match.node.device).view(self.batch_size),
             activity=match.activity,
             batch_size=self.batch_size,
         )
@@ -167,6 +169,17 @@ class BehaviorGroups(nn.Module):
         }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restore the result of `get_extra_state`."""
-        self._group = [list(group) for group in state["group"]]
-        self._parent = [list(parent) for parent in state["parent"]]
+        """Restore the result of `get_extra_state`.
+
+        Raises:
+            ValueError: If it is of another number of networks; nothing has changed then.
+        """
+        group, parent = state["group"], state["parent"]
+        n_networks = self.batch_size.numel()
+        if not len(group) == len(parent) == n_networks:
+            raise ValueError(
+                f"the state has groups of {len(group)} networks, this BehaviorGroups "
+                f"{n_networks}: build it with the same sizes"
+            )
+        self._group = [list(numbers) for numbers in group]
+        self._parent = [list(numbers) for numbers in parent]

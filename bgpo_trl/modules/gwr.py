@@ -49,7 +49,8 @@ class GWRB(nn.Module):
         batch_size: Shape of the batch of networks (the seeds), or their number; ``()`` is one
             network.
         activity_threshold: a_T.
-        activity_scale: s > 0, equivalent to inputs (and random weights) multiplied by s.
+        activity_scale: s > 0, the factor of distances in the activity. Inputs and random weights
+            multiplied by s have the same effect.
         habituation_threshold: h_T.
         lr_best: eps_c, at most 1.
         lr_neighbor: eps_n, at most eps_c.
@@ -59,7 +60,8 @@ class GWRB(nn.Module):
         tau_best: tau of c; the larger, the slower it habituates.
         tau_neighbor: tau of the neighbors.
         max_age: kappa, at least 1.
-        max_nodes: Number of nodes from which a network learns instead of inserting; None: no limit.
+        max_nodes: Largest number of nodes; a full network adapts its nodes instead of inserting
+            one. None: no limit.
         init: ``"random"`` draws both weights uniformly from (-1, 1), the range of an LSTM's hidden
             state. ``"data"`` starts empty: the first input becomes a node and matches it; the
             second becomes another, with an edge of age 0; learning starts with the third.
@@ -197,14 +199,14 @@ class GWRB(nn.Module):
                 f"phi must begin with dimensions {[*self.batch_size]} and end with "
                 f"{self.n_features}; got {[*phi.shape]}"
             )
-        mask = None if mask is None else as_mask(mask, self.batch_size)
+        mask = None if mask is None else as_mask(mask, self.batch_size).to(weights.device)
         network = self._network if mask is None else self._network[mask.flatten()]
         topologies = [self._topologies[i] for i in network.tolist()]
         if not all(topology.edges for topology in topologies):
             raise ValueError("an empty network matches nothing: adapt() it to an input first")
         phi = phi.reshape(networks, batch.numel() // networks, self.n_features)
         if mask is not None:
-            phi, weights = phi[mask.flatten()], weights[network]
+            phi, weights = phi.to(weights.device)[mask.flatten()], weights[network]
         distance, row = pairwise_distances(checked(phi, weights), weights).min(-1)
         node = [
             [topology.identity[i] for i in rows]
@@ -223,6 +225,7 @@ class GWRB(nn.Module):
             batch_size=batch,
         )
 
+    @torch.inference_mode(False)  # networks that grow there could not be changed outside
     def adapt(self, phi: Numbers, mask: Numbers | None = None) -> BehaviorMatch:
         """Find the best match of one input per network and learn from it (steps 2 to 5).
 
@@ -243,10 +246,10 @@ class GWRB(nn.Module):
             raise ValueError(
                 f"phi must be {[*self.batch_size, self.n_features]}; got {[*phi.shape]}"
             )
-        mask = None if mask is None else as_mask(mask, self.batch_size)
         phi, network = phi.reshape(-1, self.n_features), self._network
         if mask is not None:
-            phi, network = phi[mask.flatten()], network[mask.flatten()]
+            mask = as_mask(mask, self.batch_size).to(network.device).flatten()
+            phi, network = phi.to(mask.device)[mask], network[mask]
         phi = checked(phi, self._weights)
         networks = network.tolist()
         self._weights = with_room(self._weights, self._topologies, networks)

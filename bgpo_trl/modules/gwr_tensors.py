@@ -78,7 +78,7 @@ def to_tensor(numbers: list[Any], dtype: torch.dtype, device: torch.device) -> T
 
 
 def scattered(results: Sequence[Tensor], network: Tensor, n_networks: int) -> list[Tensor]:
-    """Scatter results of some networks into those of all; elsewhere NaN, or -1 for nodes."""
+    """Return results of all networks: those of ``network``, and NaN (nodes: -1) of the others."""
     fills = [torch.nan if x.is_floating_point() else -1 for x in results]
     return [
         x.new_full((n_networks, *x.shape[1:]), fill).index_copy(0, network, x)

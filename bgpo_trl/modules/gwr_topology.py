@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
-from numbers import Real
+from numbers import Integral, Real
 from typing import Any, NamedTuple
 
 import torch
@@ -48,6 +48,8 @@ class LearningRule:
         for name, value in constants.items():
             if not isinstance(value, Real) and (name, value) != ("max_nodes", None):
                 raise ValueError(f"{name} must be a number; got {value!r}")
+        if not isinstance(self.max_nodes, Integral | None):
+            raise ValueError(f"max_nodes must be a whole number, or None; got {self.max_nodes!r}")
         least_alpha = 1 / self.initial_habituation if self.initial_habituation > 0 else math.inf
         for holds, need in [
             (0 <= self.activity_threshold <= 1, "0 <= activity_threshold <= 1"),
@@ -128,7 +130,9 @@ class Topology:
             and ends.shape == (len(graph.ages), 2)
             and bool(((ends >= 0) & (ends < n)).all() and (ends[:, 0] != ends[:, 1]).all())
             and bool((graph.node.diff() > 0).all() and (graph.node < next_identity).all())
-            and bool(graph.weights.isfinite().all() and graph.habituation.isfinite().all())
+            and bool((graph.ages >= 0).all() and len(ends.sort().values.unique(dim=0)) == len(ends))
+            and bool((graph.habituation > 0).all() and (graph.habituation <= 1).all())
+            and bool(graph.weights.isfinite().all())
         )
         if not sound:
             raise ValueError(
@@ -250,7 +254,9 @@ def read_state(
         ValueError: If they are damaged, or their number or features differ.
     """
     wanted = {*BehaviorGraph._fields, "next_node"}
-    if not all(wanted <= network.keys() for network in state):
+    if not isinstance(state, list) or not all(
+        isinstance(network, dict) and wanted <= network.keys() for network in state
+    ):
         raise ValueError(f"the state of a network needs {sorted(wanted)}: see get_extra_state")
     sizes = [network["weights"].shape[1] for network in state]
     if sizes != [n_features] * n_networks:

@@ -12,6 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from bgpo_trl.configs import RLConfig
+from bgpo_trl.errors import as_shape
 
 __all__ = ["StackedLinear", "StackedMLP"]
 
@@ -27,7 +28,8 @@ class StackedLinear(nn.Module):
     Args:
         in_features: Size of the last input dimension.
         out_features: Size of the last output dimension.
-        batch_size: Leading dimensions ``S`` of the weights, one independent layer for each index.
+        batch_size: Leading dimensions ``S`` of the weights, one independent layer for each index,
+            or their length.
         generator: Source of the initial weights: one for all layers, or one per layer in the order
             of the flattened ``batch_size``, each of which starts as a single layer would. ``None``:
             torch's default generator.
@@ -49,7 +51,7 @@ class StackedLinear(nn.Module):
         self,
         in_features: int,
         out_features: int,
-        batch_size: Sequence[int] = (),
+        batch_size: int | Sequence[int] = (),
         generator: torch.Generator | Sequence[torch.Generator] | None = None,
     ) -> None:
         super().__init__()
@@ -60,6 +62,7 @@ class StackedLinear(nn.Module):
             )
         self.in_features = in_features
         self.out_features = out_features
+        batch_size = as_shape(batch_size, "batch_size")
         self.weight = nn.Parameter(torch.empty(*batch_size, in_features, out_features))
         self.bias = nn.Parameter(torch.empty(*batch_size, out_features))
         self.reset_parameters(generator)
@@ -157,7 +160,7 @@ class StackedMLP(nn.Module):
         *,
         hidden_sizes: Sequence[int] = RLConfig.hidden_sizes,
         layer_norm: bool = False,
-        batch_size: Sequence[int] = (),
+        batch_size: int | Sequence[int] = (),
         generator: torch.Generator | Sequence[torch.Generator] | None = None,
     ) -> None:
         super().__init__()

@@ -17,9 +17,10 @@ __all__ = ["DistillationLoss"]
 class DistillationLoss(LossModule):
     """Negative log-likelihood of the teachers' actions (Rusu et al., 2016, Eq. 1, for Gaussians).
 
-    Reads the ``in_keys`` of the policy and ``teacher_action`` ``[T, B, action_dim]``; writes
-    ``loss_distillation`` ``[]``: ``-log N(teacher_action; loc, scale^2)``, summed over action
-    components and tasks, mean over ``B``.
+    Reads the ``in_keys`` of the policy, ``teacher_action`` ``[T, B, action_dim]`` and, if present,
+    ``priority_weight`` ``[T, B]``, a factor of each state's loss; writes ``loss_distillation``
+    ``[]``: ``-log N(teacher_action; loc, scale^2)``, summed over action components and tasks, mean
+    over ``B``.
 
     Args:
         actor_network: Policy that writes ``loc`` and ``scale``.
@@ -33,6 +34,7 @@ class DistillationLoss(LossModule):
         teacher_action: NestedKey = "teacher_action"
         loc: NestedKey = "loc"
         scale: NestedKey = "scale"
+        priority_weight: NestedKey = "priority_weight"
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -71,4 +73,7 @@ class DistillationLoss(LossModule):
             full=True,
             reduction="none",
         )
-        return TensorDict({"loss_distillation": loss.sum(-1).mean(-1).sum()})
+        loss, weights = loss.sum(-1), tensordict.get(keys.priority_weight, None)
+        if weights is not None:
+            loss = loss * weights
+        return TensorDict({"loss_distillation": loss.mean(-1).sum()})

@@ -24,8 +24,8 @@ __all__ = ["OffPolicyLoss"]
 class OffPolicyLoss(LossModule):
     """Base of off-policy actor-critic losses for one seed or a stack of seeds ``S``.
 
-    A subclass defines `next_value` and `loss_actor`, sets ``twin_critics`` if it has two, and lists
-    in ``actor_keys`` the further entries that its `loss_actor` returns. The base
+    A subclass defines `next_value` and `loss_actor`, sets ``twin_critics`` if it has two critics,
+    and lists in ``actor_keys`` the further entries that its `loss_actor` returns. The base
 
     1. regresses the critics to ``r + gamma * next_value``, clipped to ``return_bounds``. Only
        ``"terminated"`` ends the bootstrap; a truncated episode goes on;
@@ -58,7 +58,7 @@ class OffPolicyLoss(LossModule):
     Raises:
         ValueError: If ``return_bounds`` is not an increasing pair, the penalty is negative, there
             is no such ``loss_function``, or the ``batch_size`` of twin critics is not ``[*S, 2]``;
-            from ``forward``, if an entry is missing or the reward has another shape.
+            from ``forward``, if an entry is missing, or reward or weights have another shape.
     """
 
     tensor_keys: TransitionKeys
@@ -235,6 +235,11 @@ class OffPolicyLoss(LossModule):
         """Return the mean ``[*S]`` of ``[*S, *B, ...]``, weighted by ``"priority_weight"``."""
         weights = tensordict.get(self.tensor_keys.priority_weight, None)
         if weights is not None and self.use_prioritized_weights:
+            if weights.shape != loss.shape[: weights.ndim]:
+                raise ValueError(
+                    f"{self.tensor_keys.priority_weight!r} must be one weight a transition, "
+                    f"{[*loss.shape]}, got {[*weights.shape]}"
+                )
             loss = loss * weights.reshape(*weights.shape, *[1] * (loss.ndim - weights.ndim))
         return self.flatten_batch(loss).mean(-1)
 

@@ -103,7 +103,7 @@ class SACLoss(OffPolicyLoss):
     def _sample(self, data: TensorDictBase) -> tuple[TensorDictBase, Tensor]:
         """Return the data with actions drawn, and their log-probabilities ``[*S, *B]``."""
         like = data.get(self.inputs.moving_keys[0])
-        noise = self.noise(like.new_empty(*data.batch_size, self.actor_network.action_dim))
+        noise = self.noise(like.new_empty(*like.shape[:-1], self.actor_network.action_dim))
         data = self.network("actor_network").sample(data, noise)
         return data, data.get(self.tensor_keys.log_prob)
 

@@ -13,6 +13,7 @@ from typing import Any
 
 from torch import Tensor
 
+from bgpo_trl.files.whole_file import write_whole
 from bgpo_trl.runs.results import count, read_rows
 
 
@@ -104,10 +105,8 @@ def write_costs(path: Path, costs: Mapping[int, Cost]) -> None:
     writer.writerow(COST_COLUMNS)
     for tasks, cost in sorted(costs.items()):
         writer.writerow((tasks, cost.steps, f"{cost.seconds:.3f}", f"{cost.megabytes:.6f}"))
-    temporary = path.with_suffix(".tmp")
     try:
-        temporary.write_text(text.getvalue())
-        temporary.replace(path)
+        write_whole(path, text.getvalue())
     except OSError as error:
         raise OSError(
             error.errno, f"cannot write {path} ({error.strerror}): make room, then resume the run"

@@ -15,7 +15,7 @@ from bgpo_trl.runs.config_file import Digests
 from suites import nico
 
 BANK = "bank.safetensors"
-"""File of a run directory: its demonstrations, unless they come with its encoders."""
+"""File of a run directory that holds its demonstrations, unless they come with its encoders."""
 
 
 def keep_bank(directory: Path, bank: DemonstrationBank, encoders: Representation) -> None:

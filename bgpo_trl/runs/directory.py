@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import json
 import os
@@ -13,6 +12,7 @@ from typing import Any
 from bgpo_trl.files.checkpoint import has_checkpoint, load_checkpoint
 from bgpo_trl.files.csv_file import check_position, has_rows
 from bgpo_trl.files.folders import make_folder
+from bgpo_trl.files.whole_file import write_json
 from bgpo_trl.runs.results import read_json
 
 CSV_FILES = ("train.csv", "eval.csv")
@@ -72,13 +72,9 @@ def claim_directory(directory: Path, config: Any, *, resume: bool) -> None:
         )
     make_folder(directory)
     path = directory / "config.json"
-    temporary = path.with_suffix(".tmp")
     try:
-        temporary.write_text(json.dumps(plain_settings(config), indent=2) + "\n")
-        temporary.replace(path)
+        write_json(path, plain_settings(config))
     except OSError as error:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
         raise OSError(
             f"cannot write {path} ({error.strerror}): make room, or choose another run directory"
         ) from None

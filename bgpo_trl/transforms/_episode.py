@@ -167,8 +167,8 @@ class DemonstrationLookup(EpisodeTransform):
     Called on a TensorDict outside an environment, or in a replay buffer, it only looks up.
 
     Args:
-        network: One network, or one per row: its ``batch_size`` is the environment's or, if it does
-            not learn here, the leading dimensions of it.
+        network: One network, or one per row. Its ``batch_size`` must be the environment's; if it
+            does not learn here, the leading dimensions suffice.
         learn: Adapt the network. May be changed at any time; independent of ``train()`` and
             ``eval()``, which TorchRL calls on all transforms. Set it to False for
             ``check_env_specs`` if episodes can end within the three steps of the check.

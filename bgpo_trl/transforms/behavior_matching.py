@@ -19,8 +19,9 @@ class BehaviorMatchingReward(EpisodeTransform):
 
     1. At reset, the encoder of the LSTM autoencoder reads the first latent ``z_0``, from a zero
        state.
-    2. At every step it reads the next latent. Its state is part of the TensorDict, so no trajectory
-       is stored: after the last latent, ``lae_h`` is ``phi_g``, the embedding of the trajectory.
+    2. At every step it reads the next latent of the rows that are stepped. Its state is part of the
+       TensorDict, so no trajectory is stored: after the last latent, ``lae_h`` is ``phi_g``, the
+       embedding of the trajectory.
     3. The intrinsic reward is ``exp(-||b - phi_g||)`` on the step that ends the episode, by success
        or by time-out, and 0 on all others. The reward becomes extrinsic + beta * intrinsic.
 
@@ -94,6 +95,11 @@ class BehaviorMatchingReward(EpisodeTransform):
         h_key, c_key, extrinsic_key, intrinsic_key = self.out_keys
         h, c = tensordict[h_key], tensordict[c_key]
         phi = self._read(next_tensordict[latent_key], h, c, next_tensordict)
+        stepped = tensordict.get("_step", None)
+        if stepped is not None:
+            rows = stepped.reshape(*phi.shape[:-1], 1)
+            for key, before in ((h_key, h), (c_key, c)):
+                next_tensordict.set(key, torch.where(rows, next_tensordict[key], before))
         error = torch.linalg.vector_norm(tensordict[behavior_key] - phi, dim=-1)
         extrinsic = next_tensordict[reward_key]
         ended = ending(tensordict, next_tensordict, self.done_key)
@@ -103,7 +109,9 @@ class BehaviorMatchingReward(EpisodeTransform):
         return next_tensordict.set(reward_key, extrinsic + self.beta * intrinsic)
 
     def _read(self, z: Tensor, h: Tensor, c: Tensor, into: TensorDictBase) -> Tensor:
-        h, c = self.lae.step(z, h, c)
+        # Simulations are on the CPU, even if the encoder is not.
+        device = next(self.lae.parameters()).device
+        h, c = (x.to(z.device) for x in self.lae.step(z.to(device), h.to(device), c.to(device)))
         into.set(self.out_keys[0], h).set(self.out_keys[1], c)
         return h
 

@@ -116,7 +116,7 @@ class DemonstrationSource(EpisodeTransform):
     environments must have ``task`` in its ``state_spec``, in order to read it.
 
     Args:
-        bank: The demonstrations.
+        bank: The demonstrations; other dtypes become float32 and int64.
         schedule: A `TaskSchedule`, or any object with its ``n_tasks`` and ``available``.
         batch_size: Batch size of the environment, or its length; ``()`` is a single one.
         generator: Source of the streams, one for all rows or one per row, used only on
@@ -191,8 +191,8 @@ class DemonstrationSource(EpisodeTransform):
         self._follow = [] if follow is None else [follow]
         self.register_buffer("_stream", _streams(sources).view(batch_size))
         self.register_buffer("episode", torch.zeros(batch_size, dtype=torch.int64))
-        self.register_buffer("_embedding", bank.embedding, persistent=False)
-        self.register_buffer("_task", bank.task, persistent=False)
+        self.register_buffer("_embedding", bank.embedding.float(), persistent=False)
+        self.register_buffer("_task", bank.task.long(), persistent=False)
         self.register_buffer("_demo_index", torch.zeros_like(self.episode), persistent=False)
 
     def seed_rows(self, seeds: Sequence[int]) -> None:
@@ -219,13 +219,14 @@ class DemonstrationSource(EpisodeTransform):
         if tensordict is None:
             tensordict = TensorDict({}, self.episode.shape, device=self.episode.device)
         self._draw(starting(tensordict, self.done_key))
-        return tensordict.set(self.out_keys[0], self._task[self._demo_index])
+        return tensordict.set(self.out_keys[0], self._task[self._demo_index].clone())
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
         task_key, embedding_key, index_key = self.out_keys
-        task = self._task[self._demo_index]
+        # Copies: without batch dimensions, indexing returns views of the bank.
+        task = self._task[self._demo_index].clone()
         reported = tensordict_reset.get(task_key, None)
         if reported is None:
             tensordict_reset.set(task_key, task)
@@ -234,7 +235,7 @@ class DemonstrationSource(EpisodeTransform):
                 f"the environment did not take the task drawn for it: it must read {task_key!r} "
                 "from the TensorDict it is reset with, and have it in its state_spec"
             )
-        tensordict_reset.set(embedding_key, self._embedding[self._demo_index])
+        tensordict_reset.set(embedding_key, self._embedding[self._demo_index].clone())
         return tensordict_reset.set(index_key, self._demo_index.clone())
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:

@@ -50,8 +50,8 @@ def add_task(name: str, task: type[NicoTask]) -> None:
         task: Class that defines success and, for recording, a demonstration.
 
     Raises:
-        ValueError: If the name is taken by one of the suite's tasks or is not an identifier, or the
-            class is not a `NicoTask`.
+        ValueError: If the name is taken by one of the suite's tasks, is "all" or not an identifier,
+            or the class is not a `NicoTask`.
 
     Example:
         >>> from suites import nico
@@ -61,10 +61,10 @@ def add_task(name: str, task: type[NicoTask]) -> None:
         >>> nico.add_task("touch_white_with_glass", TouchWhiteWithGlass)
         >>> nico.load("touch_white_with_glass", seed=0, observation="state").step([0] * 4).reward
     """
-    if name in ALL_TASKS or not name.isidentifier():
+    if name in (*ALL_TASKS, "all") or not name.isidentifier():
         raise ValueError(
             f"a task cannot be called {name!r}: take letters, digits and underscores, and none of "
-            f"{', '.join(ALL_TASKS)}"
+            f"all, {', '.join(ALL_TASKS)}"
         )
     if not (isinstance(task, type) and issubclass(task, NicoTask)):
         raise ValueError(f"{name} must be a subclass of NicoTask, got {task!r}")

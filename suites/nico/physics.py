@@ -21,7 +21,7 @@ OBJECT_HALF_HEIGHT: Final = {"glass": 0.035, "green_box": 0.025, "white_box": 0.
 
 _FULL_STATE = mujoco.mjtState.mjSTATE_INTEGRATION.value
 _TOUCH_GAP = 0.002  # (m) distance below which two objects touch
-_VERTICAL = 0.9  # vertical component of its normal from which a contact is from above
+_VERTICAL = 0.9  # least vertical component of the normal of a contact from above
 _PRESSING = 0.02  # (rad) lead of the target over the curl above which a hand is closing
 
 
@@ -191,8 +191,10 @@ class Physics(dm_mujoco.Physics):
         """
         geom = self._object_id("geom", name)
         for contact in self.data.contact:
+            # The normal points from the first geom to the second.
+            up = contact.frame[2] if contact.geom1 == geom else -contact.frame[2]
             pair = {contact.geom1, contact.geom2}
-            if geom in pair and pair & set(self._hand) and abs(contact.frame[2]) > _VERTICAL:
+            if geom in pair and pair & set(self._hand) and up > _VERTICAL:
                 return True
         return False
 

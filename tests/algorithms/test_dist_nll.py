@@ -455,7 +455,7 @@ def test_a_restored_run_continues_as_the_saved_one(make, tmp_path, n_steps, chan
     assert [len(student.heads) for student in other.students] > n_heads or min(n_heads) == 3
 
 
-@pytest.mark.parametrize("size", [0, 7])
-def test_samples_that_cannot_be_cut_in_batches_are_refused(size):
-    with pytest.raises(ValueError, match="must be a multiple of distillation_batch_size"):
+@pytest.mark.parametrize(("size", "need"), [(0, "at least 1"), (7, "must be a multiple of")])
+def test_samples_that_cannot_be_cut_in_batches_are_refused(size, need):
+    with pytest.raises(ValueError, match=rf"{need}.*\b{size}\b"):
         DistNLLConfig(samples=24, distillation_batch_size=size)

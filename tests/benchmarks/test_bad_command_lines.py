@@ -60,6 +60,8 @@ CASES = [
     ("continual.py --device cuda:99", "no device 'cuda:99'", "use auto or cpu"),
     ("concurrent_tasks.py --device gpu", "no device 'gpu'", "use auto or cpu"),
     ("ablation.py --algorithm maml", "--algorithm", "the variants are BGPO's"),
+    ("continual.py --episodes 10 --eval-every 50", "eval_every", "at most the 10 episodes"),
+    ("continual.py --algorithm bgpo-paper --rl sac", "--rl: bgpo-paper uses DDPG", "leave --rl"),
     ("continual.py --algorithm maml --rl td3", "MAML is defined over DDPG", "not 'td3'"),
     ("ladder.py --rungs", "--rungs is empty", "name some of a, b, c, d"),
     ("ladder.py --episodes 0", "episodes", "must be at least 1, got 0"),

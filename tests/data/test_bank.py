@@ -331,3 +331,8 @@ def test_a_bank_that_is_missing_or_damaged_is_refused(plain_bank, tmp_path):
         ValueError, match=r"bank\.safetensors is damaged .*\(.*\); make it again with"
     ):
         DemonstrationBank.load(path, encoder_id="abc")
+
+
+def test_a_part_that_there_is_not_is_refused(bank):
+    with pytest.raises(ValueError, match="part must be 'validation', 'test' or None, got 'Test'"):
+        bank.held_out("Test")

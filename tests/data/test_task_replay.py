@@ -267,3 +267,12 @@ def test_a_restored_task_replay_continues_as_the_saved_one(
 def test_arguments_without_a_meaning_are_refused(changes, message):
     with pytest.raises(ValueError, match=message):
         make(**changes)
+
+
+def test_a_task_whose_transitions_are_all_overwritten_has_no_weight():
+    replay = make(capacity=4, batch_size=3)
+    for step in range(4):
+        replay.add(of_tasks(step, 0, 0))
+    for step in range(4):
+        replay.add(of_tasks(step, 1, 1))
+    assert replay.sample_seed(0, [0, 1], 8)["priority_weight"].unique(dim=1).tolist() == [[0], [1]]

@@ -198,3 +198,9 @@ def test_works_without_tensordict_and_names_a_missing_entry():
         ValueError, match=r"^Actor found no 'state' in a .* with \['latent'\]: write"
     ):
         actor(TensorDict({"latent": state}, [5]))
+
+
+def test_a_batch_size_may_be_a_number():
+    assert Actor(6, batch_size=10).batch_size == (10,)
+    with pytest.raises(ValueError, match="batch_size must be a whole number, at least 1; got 0"):
+        Actor(6, batch_size=0)

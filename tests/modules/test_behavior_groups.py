@@ -184,7 +184,7 @@ def test_saved_groups_continue_as_the_others():
 
 
 def test_fewer_than_one_group_is_refused():
-    with pytest.raises(ValueError, match="max_groups must be at least 1, or None; got 0"):
+    with pytest.raises(ValueError, match="max_groups must be a whole number, at least 1; got 0"):
         BehaviorGroups(2, max_groups=0)
 
 
@@ -226,3 +226,13 @@ def test_a_batch_size_may_be_a_number():
     groups.adapt(torch.zeros(2, 2))
     assert groups.lookup(torch.zeros(2, 2)).group.tolist() == [0, 0]
     assert groups.num_groups.tolist() == [1, 1]
+
+
+def test_a_state_of_other_networks_is_refused_and_changes_nothing():
+    groups = BehaviorGroups(2, batch_size=3)
+    for phi in torch.eye(2)[[0, 1, 0]]:
+        groups.adapt(10 * phi.expand(3, 2))
+    before = groups.get_extra_state()
+    with pytest.raises(ValueError, match="groups of 2 networks, this BehaviorGroups 3"):
+        groups.set_extra_state(BehaviorGroups(2, batch_size=2).get_extra_state())
+    assert groups.get_extra_state() == before

@@ -146,3 +146,16 @@ def test_many_nodes_need_no_matrix_of_pairs():
     assert graph.edges[graph.edges[:, 1] == n].tolist() == [[30_000, n], [30_001, n]]
     assert len(graph.edges) == n
     assert int(graph.ages.sum()) == 2  # to 29,999 and to the new node
+
+
+def test_what_grew_in_inference_mode_learns_on_outside():
+    inside, outside = (GWRB(2, init="data", **GROWING) for _ in range(2))
+    inputs = list(drifting_inputs(60, 2))
+    with torch.inference_mode():
+        for phi in inputs[:30]:
+            inside.adapt(phi.clone())
+    for phi in inputs[30:]:
+        inside.adapt(phi)
+    for phi in inputs:
+        outside.adapt(phi)
+    assert_same_state(state_of(inside), state_of(outside))

@@ -137,3 +137,14 @@ def test_tasks_share_nothing_but_the_trunk():
     for head in (0, 1):
         for before, after in zip(together[2 * head :][:2], apart[2 * head :][:2], strict=True):
             assert before.equal(after) == (head == 0)
+
+
+def test_weights_are_factors_of_the_states_losses():
+    batch = told_batch()
+    whole = DistillationLoss(Told())(batch)["loss_distillation"]
+    weights = torch.tensor([[1.0, 1.0, 1.0], [0.0, 0.0, 0.0]])
+    first = DistillationLoss(Told())(batch.set("priority_weight", weights))["loss_distillation"]
+    second = DistillationLoss(Told())(batch.set("priority_weight", 1 - weights))
+    torch.testing.assert_close(first + second["loss_distillation"], whole)
+    first.backward()
+    assert (batch["told"].grad[0] != 0).any() and (batch["told"].grad[1] == 0).all()

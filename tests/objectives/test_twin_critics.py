@@ -337,3 +337,17 @@ def test_networks_and_generators_that_do_not_fit_are_refused(name):
         loss(policy, Critic(STATE, ACTION, batch_size=[3]))
     with pytest.raises(ValueError, match="3 are needed, got 1"):
         loss(policy, Critic(STATE, ACTION, batch_size=[3, 2]), generator=[stream(0)])
+
+
+def test_each_transition_has_a_draw_of_its_own_whatever_the_batch_size():
+    loss, batch = make_loss("sac"), make_batch(32)
+    batch["next", "state"] = batch["next", "state"][:1].expand(32, STATE).clone()
+    batch["next", "terminated"] = torch.zeros(32, 1, dtype=torch.bool)
+    batch["next", "reward"] = torch.zeros(32, 1)
+    loss(batch)
+    within = loss.target(batch)
+    loss = make_loss("sac")
+    without = TensorDict({**batch.exclude("td_error").to_dict()}, [])
+    loss(without)
+    torch.testing.assert_close(loss.target(without), within)
+    assert len(within.unique()) == 32

@@ -45,6 +45,6 @@ def test_a_damaged_file_is_refused(tmp_path, row):
 
 
 def test_a_file_that_cannot_be_written_is_told(tmp_path):
-    (tmp_path / "cost.tmp").mkdir()
+    (tmp_path / "cost.csv.tmp").mkdir()
     with pytest.raises(OSError, match=r"cannot write .*cost\.csv .*: make room, then resume"):
         CostLog(tmp_path / "cost.csv").write()

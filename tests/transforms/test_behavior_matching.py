@@ -161,3 +161,14 @@ def test_refuses_to_come_after_the_sum_of_rewards(MockEnv, make_modules):
     with pytest.raises(ValueError, match=refusal):
         reset(Compose(behavior(), RewardSum()), bonus())
     reset(behavior(), Compose(bonus(), RewardSum()))
+
+
+def test_rows_that_are_not_stepped_keep_their_embedding(make_env):
+    env = make_env([0, 1], lengths=9)
+    before = env.reset()
+    before["action"] = torch.full((2, 4), 0.5)
+    before["_step"] = torch.tensor([True, False])
+    after = env.step(before.clone())["next"]
+    for key in ("lae_h", "lae_c"):
+        assert not after[key][0].equal(before[key][0])
+        assert after[key][1].equal(before[key][1])

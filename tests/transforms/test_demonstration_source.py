@@ -230,3 +230,23 @@ def test_refuses_what_cannot_work(make_bank, MockEnv, generators, make):
     with pytest.raises(ValueError, match="put StepCounter before DemonstrationSource"):
         source = DemonstrationSource(make_bank(), CONCURRENT)
         TransformedEnv(MockEnv(), Compose(source, StepCounter(50))).reset()
+
+
+@pytest.mark.parametrize("seeds", [None, [4, 2]])
+def test_changes_of_an_observation_do_not_reach_the_bank(make, seeds):
+    env, source = make(seeds)
+    bank = source._embedding.clone(), source._task.clone()
+    data = env.reset()
+    for key in ("demo_embedding", "task", "demo_index"):
+        data[key].zero_()
+    assert source._embedding.equal(bank[0]) and source._task.equal(bank[1])
+
+
+def test_a_bank_of_other_dtypes_is_converted(make_bank, MockEnv):
+    bank = make_bank()
+    other = SimpleNamespace(embedding=bank.embedding.double(), task=bank.task.int())
+    source = DemonstrationSource(other, CONCURRENT)
+    env = TransformedEnv(MockEnv(), Compose(StepCounter(50), source))
+    check_env_specs(env)
+    data = env.reset()
+    assert data["demo_embedding"].dtype == torch.float32 and data["task"].dtype == torch.int64

@@ -191,3 +191,13 @@ def test_the_white_box_is_pressed_by_the_fist_on_its_top(physics, above, curl, p
     place(physics, {"white_box": top[:2]}, arm=arm, curls=(curl,) * 3)
 
     assert succeeded("press_white", physics) is pressed
+
+
+def test_a_box_that_lies_on_the_hand_is_not_pressed(physics):
+    box = np.array([0.42, -0.2, TABLE_HEIGHT + 0.2])
+    arm = kinematics.inverse(box, (0.02, 0.12))
+    found = set()
+    for above in np.arange(0.03, 0.08, 0.005):
+        place(physics, {"white_box": (*box[:2], box[2] + above)}, arm=arm, curls=(0.85,) * 3)
+        found.add((physics.touching("hand", "white_box"), succeeded("press_white", physics)))
+    assert found == {(True, False), (False, False)}
