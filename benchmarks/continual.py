@@ -2,9 +2,10 @@
 
     python benchmarks/continual.py --preset quick
 
-writes a run directory with ``config.json``, ``train.csv``, ``eval.csv``, ``checkpoint/``,
-``final.csv`` and the figures ``success.png`` (success on each task against training episodes) and
-``gwr.png`` (nodes of GWR-B in behavior space, colored by task, Fig. 7).
+writes a run directory with ``config.json``, ``train.csv``, ``eval.csv``, ``final.csv``,
+``gwr.csv``, ``cost.csv``, ``summary.json``, ``checkpoint/`` and ``figures/``, among them
+``success.png`` (success on each task against training episodes), ``gwr.png`` (nodes of GWR-B in
+behavior space, Fig. 7) and ``groups.png``.
 """
 
 from __future__ import annotations

@@ -32,10 +32,13 @@ class Arguments(sweep.Arguments):
         "dist-nll-demonstrations",
         "oracle",
     )
-    settings: tuple[sweep.Setting, ...] = ("eight", "eight-reversed")
+    settings: tuple[sweep.Setting, ...] = ("eight", "eight-reversed", "eight-concurrent")
     seeds: tuple[int, ...] | None = (10, 11, 12, 13, 14)
+    """Seeds."""
     episodes: int | None = 4_000
+    """Training episodes. The task starts are scaled in proportion."""
     eval_every: int | None = 50
+    """Training episodes between evaluations."""
     held_out: Literal["validation", "test"] = "test"
     out: Path = Path("runs/eight")
 

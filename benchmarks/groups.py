@@ -21,7 +21,7 @@ from bgpo_trl.analysis.task_inference import group_purity, task_inference_accura
 from bgpo_trl.configs import BGPOConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.encoders.shipped import default_weights, groups_config
-from bgpo_trl.experiments.arguments import TaskArguments, command_line, even_starts
+from bgpo_trl.experiments.arguments import BankArguments, check_draws, command_line, even_starts
 from bgpo_trl.experiments.run import bank_of
 from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.modules.gwr import GWRB
@@ -29,7 +29,7 @@ from bgpo_trl.seeding import generators
 
 
 @dataclass(frozen=True)
-class Arguments(TaskArguments):
+class Arguments(BankArguments):
     """Measure the groups of behaviors that form from demonstrations."""
 
     thresholds: tuple[float, ...] = (0.5, 0.525, 0.55, 0.575, 0.6)
@@ -57,9 +57,11 @@ def draw(
 def main(arguments: Arguments) -> None:
     """Print the table."""
     torch.set_num_threads(1)
+    check_draws(arguments.seeds, arguments.draws)
     bank = bank_of(arguments)
     config, n_tasks, seeds = BGPOConfig(), len(bank.tasks), arguments.seeds
     coarse = groups_config(default_weights())
+    settings = [replace(coarse, activity_threshold=a_t) for a_t in arguments.thresholds]
     seen, held_out = bank.seen(), bank.held_out()
     print("| order | network | a_T | groups or nodes, by seed | purity or inference, % |")
     print("|---|---|---:|---|---|")
@@ -75,12 +77,12 @@ def main(arguments: Arguments) -> None:
             gwr.adapt(x)
         right = task_inference_accuracy(gwr, seen, held_out, n_tasks)
         print(row(order, "fine", config.gwr.activity_threshold, gwr.num_nodes, right))
-        for threshold in arguments.thresholds:
-            settings = replace(coarse, activity_threshold=threshold)
-            groups = BehaviorGroups(32, batch_size=len(seeds), **asdict(settings))
+        for setting in settings:
+            groups = BehaviorGroups(32, batch_size=len(seeds), **asdict(setting))
             for x in inputs:
                 groups.adapt(x)
             purity = group_purity(groups, held_out, n_tasks)
+            threshold = setting.activity_threshold
             print(row(order, "coarse", threshold, groups.num_groups, purity), flush=True)
 
 

@@ -77,6 +77,8 @@ def main(arguments: Arguments) -> None:
     """Run the ladder."""
     if not arguments.rungs:
         raise ValueError("--rungs is empty: name some of a, b, c, d")
+    if len(set(arguments.rungs)) < len(arguments.rungs):
+        raise ValueError(f"--rungs: name each once, got {' '.join(arguments.rungs)}")
     set_threads(arguments.threads)
     device = choose_device(arguments.device)
     if arguments.resume:

@@ -107,6 +107,8 @@ def draw(tasks: Sequence[str], seed: int) -> Image.Image:
 
 def main(arguments: Arguments) -> None:
     """Run the command line."""
+    if arguments.starts < 1:
+        raise ValueError(f"--starts must be at least 1, got {arguments.starts}")
     tasks = nico.ALL_TASKS
     by_chance = chance(tasks, arguments.starts, arguments.seed)
     print("| task | chance | demonstrator | steps |\n|---|---:|---:|---:|")

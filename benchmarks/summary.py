@@ -1,6 +1,6 @@
 """Tables and figures of finished runs.
 
-    python benchmarks/summary.py benchmarks/results/c*-desk
+    python benchmarks/summary.py runs/continual-*
 
 prints a table of success by task for each run, and redraws ``success.png`` and, for runs with
 groups of behaviors, ``groups.png``.

@@ -122,6 +122,8 @@ def _config(arguments: Arguments, setting: Setting, name: str) -> RunConfig:
     """Return the settings of an algorithm's runs, or of a variant's in the setting "ablation"."""
     tasks = arguments.tasks
     if setting.startswith("eight"):
+        if tasks is not None:
+            raise ValueError(f"--tasks: the setting {setting} has the suite's eight: leave it out")
         tasks = nico.ALL_TASKS[::-1] if setting == "eight-reversed" else nico.ALL_TASKS
     named = name in get_args(experiment.AlgorithmName)
     config = experiment.run_config(
@@ -185,7 +187,7 @@ def main(arguments: Arguments) -> None:
     }
     check_directories(jobs, digests)
     todo = [job for group in jobs.values() for job in group if not job.finished]
-    print(f"{sum(map(len, jobs.values()))} jobs, {len(todo)} of them to run")
+    print(f"jobs: {sum(map(len, jobs.values()))}, to run: {len(todo)}")
     failed: dict[Job, str] = {}
     if todo:
         resources = {"cpus": arguments.cpus_per_run, "gpus": arguments.gpus_per_run}
@@ -198,7 +200,7 @@ def main(arguments: Arguments) -> None:
         if failed.keys().isdisjoint(group):
             with DirectoryLock(directory, wait=True):
                 merge([job.directory for job in group], directory)
-            print(f"{directory}: {len(group)} blocks of seeds")
+            print(f"{directory}: blocks of seeds: {len(group)}")
     if failed:
         sys.exit("\n".join(f"error: {job} failed: {why}" for job, why in failed.items()))
 

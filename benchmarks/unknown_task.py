@@ -19,20 +19,25 @@ from matplotlib.figure import Figure
 
 from bgpo_trl.analysis.novelty import Detection, leave_one_out, roc_curve
 from bgpo_trl.encoders.shipped import groups_config
-from bgpo_trl.experiments.arguments import TaskArguments, chosen_weights, command_line
+from bgpo_trl.experiments.arguments import (
+    BankArguments,
+    check_draws,
+    chosen_weights,
+    command_line,
+)
 from bgpo_trl.experiments.run import bank_of
 from bgpo_trl.figures.style import COLORS, LINES, save_figure, style_axes
 
 
 @dataclass(frozen=True)
-class Arguments(TaskArguments):
+class Arguments(BankArguments):
     """Measure how well demonstrations of an unknown task are detected."""
 
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
     """Seeds of the draws of demonstrations."""
     draws: int = 600
     """Demonstrations that the groups form from."""
-    out: Path = Path("benchmarks/results/unknown-task")
+    out: Path = Path("runs/unknown-task")
     """Folder of the results."""
 
 
@@ -55,6 +60,9 @@ def draw(found: dict[str, Detection]) -> Figure:
 def main(arguments: Arguments) -> None:
     """Print the table and write the results."""
     bank = bank_of(arguments)
+    check_draws(arguments.seeds, arguments.draws)
+    if len(bank.tasks) < 2:
+        raise ValueError("--tasks: name at least two, of which each is left out in turn")
     config = groups_config(chosen_weights(bank.tasks, arguments.bank))
     found = {
         task: leave_one_out(bank, i, config, seeds=arguments.seeds, draws=arguments.draws)

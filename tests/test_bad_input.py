@@ -304,7 +304,7 @@ PARTS = {
     "matrix of unequal lists": (
         lambda: metrics.evaluation_matrix([[0.1]], [1, 2], [2], window=2), "[1, 2]", "each eval"),
     "matrix without a test": (
-        lambda: metrics.evaluation_matrix([[0.1]], [1], [9], window=2), "no evaluation", "larger"),
+        lambda: metrics.evaluation_matrix([[0.1]], [1], [9], window=2), "no evaluation", "longer"),
     "mean of no evaluations": (
         lambda: metrics.trailing_mean([[0.1]], 0), "got (1, 1), 0", "n at least 1"),
     "best of a single list": (

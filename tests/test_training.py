@@ -398,8 +398,8 @@ def test_a_run_with_other_encoders_is_another_run(uninterrupted, make, encoders)
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"seeds": ()}, "needs seeds, all different"),
-        ({"seeds": (1, 1)}, "needs seeds, all different"),
+        ({"seeds": ()}, "seeds must be one or more, all different"),
+        ({"seeds": (1, 1)}, "seeds must be one or more, all different"),
         ({"seeds": (-1,)}, "none negative"),
         ({"episodes": 0}, "episodes must be at least 1, got 0"),
         ({"eval_every": 0}, "eval_every must be at least 1, got 0"),

@@ -34,7 +34,7 @@ CALLS = ("lookup", "adapt", "lookup + adapt")
 class Arguments:
     """Measure GWR-B."""
 
-    out: Path = Path("benchmarks/results/gwr")
+    out: Path = Path("runs/speed")
     """Folder of the results."""
     nodes: tuple[int, ...] = (100, 1_000, 10_000, 100_000, 1_000_000)
     """Sizes of a single network."""

@@ -54,7 +54,7 @@ class Arguments:
     """Training steps of the memory measurement."""
     threads: int | None = None
     """Threads for physics; one per core by default. PyTorch uses one, as in training."""
-    out: Path = Path("benchmarks/results/throughput")
+    out: Path = Path("runs/speed")
     """Folder of throughput.json."""
 
 

@@ -34,8 +34,8 @@ def evaluation_matrix(
         chosen = (episodes > end - window) & (episodes <= end)
         if not chosen.any():
             raise ValueError(
-                f"there is no evaluation in the {window} episodes before episode {end}: evaluate "
-                "more often or take a larger window"
+                f"there is no evaluation in the {window} episodes before episode {end}: test "
+                "more often, or for a longer run"
             )
         phases.append(_mean(success[..., chosen, :], axis=-2))
     return np.stack(phases, axis=-2)

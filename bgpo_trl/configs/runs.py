@@ -43,7 +43,9 @@ class RunConfig:
             numbers = all(isinstance(number, Integral) for number in getattr(self, name))
             check(self, (name, numbers, "whole numbers"))
         if not self.seeds or len(set(self.seeds)) < len(self.seeds) or min(self.seeds) < 0:
-            raise ValueError(f"a run needs seeds, all different and none negative: {self.seeds}")
+            raise ValueError(
+                f"seeds must be one or more, all different and none negative: {self.seeds}"
+            )
         whole(self, 1, "episodes", "eval_every", "eval_episodes")
         at_least(self, 0, "checkpoint_minutes")
         check(self, ("held_out", self.held_out in ("validation", "test"), "validation or test"))

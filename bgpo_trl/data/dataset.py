@@ -118,6 +118,8 @@ def read_meta(path: Path) -> dict:
     try:
         meta = json.loads((path / _META).read_text())
     except OSError:
+        if not path.exists():
+            raise ValueError(f"there is no dataset at {path}; {_REMEDY}") from None
         raise ValueError(f"{path} is not a dataset of demonstrations; {_REMEDY}") from None
     except (ValueError, RecursionError):
         meta = None

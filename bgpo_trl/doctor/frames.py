@@ -55,7 +55,12 @@ def check_frame(path: Path | None = None) -> Iterator[Finding]:
     if path is not None:
         from PIL import Image
 
-        Image.fromarray(still).resize((640, 320), Image.Resampling.NEAREST).save(path)
+        try:
+            Image.fromarray(still).resize((640, 320), Image.Resampling.NEAREST).save(path)
+        except (OSError, ValueError) as error:
+            told = f"cannot write {path} ({first_line(error)}): choose another for --frame"
+            yield Finding("wrong", "frame", told)
+            return
         yield Finding("ok", "frame", f"written to {path}")
 
 

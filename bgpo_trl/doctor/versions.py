@@ -81,11 +81,13 @@ def check_versions(
         return
     yield judge_python(platform.python_version(), distribution.metadata["Requires-Python"])
     exact = read_constraints(constraints)
+    seen = set()
     for line in distribution.requires or ():
         wanted = Requirement(line)
         optional = wanted.marker is not None
-        if optional and wanted.name not in ("wandb", "ray"):
-            continue  # for those who work on the package
+        if wanted.name in seen or (optional and wanted.name not in ("wandb", "ray")):
+            continue  # named by two extras, or for those who work on the package
+        seen.add(wanted.name)
         known = exact.get(wanted.name)
         found = version(wanted.name)
         yield judge_version(wanted.name, found, str(wanted.specifier), known, optional=optional)

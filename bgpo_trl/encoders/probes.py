@@ -22,7 +22,6 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from bgpo_trl.data.dataset import load_demonstrations, read_meta
-from bgpo_trl.encoders.distances import embedding_distances
 from bgpo_trl.encoders.representation import (
     Representation,
     encode_frames,
@@ -47,7 +46,6 @@ def probe(
     representation: Representation,
     dataset: TensorDictBase,
     folder: str | Path | None = None,
-    activity_threshold: float = 0.8,
     *,
     play: TensorDictBase | None = None,
 ) -> dict[str, float]:
@@ -58,7 +56,6 @@ def probe(
         dataset: Demonstrations that they were trained on, with their held-out part; reads
             ``pixels``, ``action``, ``length``, ``train``, ``task`` and ``state`` ``[N, T, 16]``.
         folder: Folder for ``probes.json`` and ``reconstructions.png``; ``None`` writes nothing.
-        activity_threshold: Threshold a_T of GWR-B (Table 1), for `embedding_distances`.
         play: Recorded play in the form of the dataset; adds the errors of joints and objects in
             frames with all objects on the table, as ``play_...``.
 
@@ -67,8 +64,7 @@ def probe(
         latent), ``inverse_rmse``, ``inverse_r2``, ``reconstruction`` (squared error per frame),
         ``mean_frame_reconstruction`` (the same for the mean training frame, the level of an
         untrained VAE), ``sequence_mse`` (of standardized latents, so 1 is the level of predicting
-        the mean), ``task_accuracy_linear``, ``task_accuracy_nearest``, ``active_dimensions`` and
-        the entries of `embedding_distances`.
+        the mean), ``task_accuracy_linear``, ``task_accuracy_nearest`` and ``active_dimensions``.
 
     Raises:
         ValueError: If the dataset has no training or no held-out demonstrations.
@@ -89,7 +85,6 @@ def probe(
     phi = lae.encode(latent, train.get("length"))
     phi_held_out = lae.encode(latent_held_out, held_out.get("length"))
     result |= _probe_tasks(phi, train.get("task"), phi_held_out, held_out.get("task"))
-    result |= embedding_distances(phi, train.get("task"), activity_threshold)
     if play is not None:
         result |= _probe_play(vae, play)
     if folder is not None:

@@ -44,20 +44,33 @@ class ImportArguments:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TaskArguments(ImportArguments):
+class BankArguments(ImportArguments):
+    """Tasks and their demonstrations."""
+
+    tasks: tuple[str, ...] | None = None
+    """Tasks in the order of presentation, or "all" for the suite's eight; the paper's three by
+    default."""
+    bank: Path | None = None
+    """Demonstrations embedded by bgpo_trl.encoders.make_bank; those of tasks that it lacks come
+    with the package."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskArguments(BankArguments):
     """Tasks of a run."""
 
     tasks: tuple[str, ...] | None = None
     """Tasks in the order of presentation, or "all" for the suite's eight; the paper's three by
     default. Unless three, they start at even intervals."""
-    bank: Path | None = None
-    """Demonstrations embedded by bgpo_trl.encoders.make_bank; those of tasks that it lacks come
-    with the package. With --resume, the run's own by default."""
 
 
 @dataclass(frozen=True)
 class Arguments(TaskArguments):
     """Train an algorithm and plot its success."""
+
+    bank: Path | None = None
+    """Demonstrations embedded by bgpo_trl.encoders.make_bank; those of tasks that it lacks come
+    with the package. With --resume, the run's own by default."""
 
     algorithm: AlgorithmName = "bgpo"
     """bgpo; bgpo-experts: without demonstrations as experience; bgpo-single: without experts too;
@@ -172,6 +185,14 @@ def _with_tasks(config: RunConfig, chosen: tuple[str, ...] | None) -> RunConfig:
     same = len(tasks) == len(config.task_starts)
     starts = config.task_starts if same else even_starts(len(tasks), config.episodes)
     return replace(config, tasks=tasks, task_starts=starts)
+
+
+def check_draws(seeds: Sequence[int], draws: int) -> None:
+    """Raise ``ValueError`` if there is nothing to draw, or seeds are missing or repeated."""
+    if draws < 1:
+        raise ValueError(f"--draws must be at least 1, got {draws}")
+    if not seeds or len(set(seeds)) < len(seeds) or min(seeds) < 0:
+        raise ValueError(f"--seeds must be one or more, all different and none negative: {seeds}")
 
 
 def even_starts(n_tasks: int, episodes: int) -> tuple[int, ...]:

@@ -28,6 +28,7 @@ from bgpo_trl.files.locking import DirectoryLock
 from bgpo_trl.files.whole_file import write_json
 from bgpo_trl.machine import choose_device, set_threads
 from bgpo_trl.runs.demonstrations import BANK
+from bgpo_trl.runs.directory import holds_run
 from bgpo_trl.training import Trainer
 from suites import nico
 
@@ -73,7 +74,7 @@ def run_experiment(
         config = _continued(arguments, config, out)
         if is_finished(out, config):
             return f"{out} is finished, all {config.episodes} episodes: --episodes makes it longer"
-    elif (out / "config.json").exists():
+    elif holds_run(out):
         raise ValueError(f"{out} holds a run: --resume continues it, --out names another directory")
     with DirectoryLock(out):
         encoders, bank = _encoders(arguments, config.tasks, out, device)

@@ -68,7 +68,7 @@ def read_rows(
             reader = csv.DictReader(io.StringIO(text, newline=""))
             rows, header = list(reader), reader.fieldnames or ()
     except (FileNotFoundError, NotADirectoryError):
-        raise ValueError(f"{path} is missing: let the run in {path.parent} finish") from None
+        raise _missing(path) from None
     except (OSError, ValueError, csv.Error) as error:
         raise ValueError(f"{path} is not a CSV file of a run ({error}): name another run") from None
     missing = sorted(set(columns or ()).difference(header))
@@ -83,6 +83,12 @@ def read_rows(
         except ValueError:
             raise ValueError(f"{path}, line {number} is damaged: {remedy}") from None
     return rows
+
+
+def _missing(path: Path) -> ValueError:
+    if not path.parent.exists():
+        return ValueError(f"there is no run at {path.parent}: name another")
+    return ValueError(f"{path} is missing: let the run in {path.parent} finish")
 
 
 def read_tests(path: str | os.PathLike[str]) -> list[dict[str, str]]:
@@ -125,7 +131,7 @@ def read_json(
     try:
         found = json.loads(path.read_text())
     except (FileNotFoundError, NotADirectoryError):
-        raise ValueError(f"{path} is missing: let the run in {path.parent} finish") from None
+        raise _missing(path) from None
     except (OSError, ValueError, RecursionError):
         found = None
     if not isinstance(found, dict) or not all(

@@ -167,8 +167,9 @@ def test_blocks_are_of_the_presets_seeds_and_length_unless_told():
     ("wrong", "message"),
     [
         ({"block": 0}, "block must be at least 1, got 0"),
-        ({"seeds": (1, 2, 1)}, "seeds, all different"),
-        ({"seeds": ()}, "needs seeds"),
+        ({"seeds": (1, 2, 1)}, "all different"),
+        ({"settings": ("eight",), "tasks": ("grasp_glass",)}, "--tasks: .* leave it out"),
+        ({"seeds": ()}, "seeds must be one or more"),
         ({"episodes": 0}, "episodes must be at least 1"),
         ({"algorithms": ()}, "name at least one of --algorithms"),
         ({"settings": ()}, "one of --settings"),
@@ -358,7 +359,7 @@ def test_a_sweep_plays_what_is_missing_and_nothing_twice(without_ray, few, tmp_p
     sweep.main(arguments)
     assert contents(tmp_path) == before
     assert not played
-    assert capsys.readouterr().out.startswith("4 jobs, 0 of them to run\n")
+    assert capsys.readouterr().out.startswith("jobs: 4, to run: 0\n")
 
     sweep.main(replace(arguments, algorithms=("maml",), seeds=(4, 0, 2, 5, 3, 1), block=2))
     assert played == [f"concurrent-maml/seeds-{block}" for block in ("2-5", "3-1")]

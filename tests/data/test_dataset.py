@@ -67,5 +67,5 @@ def test_what_says_how_to_read_the_tensors_is_not_believed(recorded, copy, meta)
 
 
 def test_a_folder_that_is_missing_is_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"is not a dataset of demonstrations; record it again"):
+    with pytest.raises(ValueError, match=r"there is no dataset at .*nowhere; record it again"):
         load_demonstrations(tmp_path / "nowhere")

@@ -36,6 +36,12 @@ def test_a_real_frame_is_drawn_and_written(tmp_path):
     assert picture.std() > 10
 
 
+def test_a_frame_that_cannot_be_written_is_told(tmp_path):
+    *_, written = frames.check_frame(tmp_path / "absent" / "frame.png")
+    assert written.level == "wrong"
+    assert "choose another for --frame" in written.told
+
+
 def test_a_renderer_that_draws_nothing_is_found_out(monkeypatch):
     monkeypatch.setattr(
         "suites.nico.rendering.FrameRenderer.render",

@@ -135,7 +135,6 @@ def test_inverse_model_sees_the_action(probed: dict[str, float]) -> None:
 def test_embeddings_tell_tasks_apart(probed: dict[str, float]) -> None:
     assert probed["task_accuracy_linear"] > 0.8
     assert probed["task_accuracy_nearest"] > 0.8
-    assert probed["phi_distance_same_task"] < probed["phi_distance_other_task"]
     assert probed["sequence_mse"] < 0.6
 
 
@@ -254,9 +253,9 @@ def test_command_writes_weights_log_and_probes(tmp_path: Path) -> None:
     assert (folder / "reconstructions.png").exists()
 
 
-@pytest.mark.parametrize("window", [1, 3])
-def test_refuses_windows_that_do_not_make_up_a_batch(window: int) -> None:
-    with pytest.raises(ValueError, match=f"^window must be .* divide batch_size 4, got {window}$"):
+@pytest.mark.parametrize(("window", "need"), [(1, "at least 2"), (3, "a divisor of batch_size 4")])
+def test_refuses_windows_that_do_not_make_up_a_batch(window: int, need: str) -> None:
+    with pytest.raises(ValueError, match=f"^window must be {need}, got {window}$"):
         replace(TINY.vae, window=window)
 
 

@@ -76,5 +76,5 @@ def test_other_seeds_change_nothing_else():
     "arguments", [{"episodes": 0}, {"episodes": -3}, {"seeds": ()}, {"seeds": (2, 2)}]
 )
 def test_lengths_and_seeds_that_cannot_be_are_refused(arguments):
-    with pytest.raises(ValueError, match=r"must be at least 1|needs seeds"):
+    with pytest.raises(ValueError, match=r"must be at least 1|seeds must be one or more"):
         run_config(Arguments(**arguments))

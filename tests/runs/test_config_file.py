@@ -92,7 +92,7 @@ def nested(**rl):
         (nested(name="ppo"), "algorithm.rl.name is 'ppo', not a known RL algorithm"),
         ({"algorithm": 3}, "no settings of a run"),
         ({"seeds": 3}, "seeds is 3"),
-        ({"seeds": []}, "needs seeds"),
+        ({"seeds": []}, "seeds must be one or more"),
         ({"encoders": 3}, "encoders is 3"),
         ({"bank": 3}, "bank is 3"),
         ({"name": "mine", "algorithm_class": None}, "'mine' are of no known algorithm"),
