@@ -1,0 +1,101 @@
+"""The parts of the package form layers: none imports from a later one."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "bgpo_trl"
+LAYERS = (
+    "files",
+    "modules",
+    "transforms",
+    "objectives",
+    "data",
+    "encoders",
+    "algorithms",
+    "runs",
+    "analysis",
+    "figures",
+    "top",
+    "experiments",
+)
+"""In the order of docs/design.md; ``top`` is the package itself."""
+TOP = ("envs", "world", "evaluation", "training", "policy", "doctor")
+"""Modules and packages of ``top``, in their order."""
+OPEN = ("configs", "errors", "seeding", "machine", "threads")
+"""Open to all; they import from none of the layers."""
+LAST = ("__init__", "__main__")
+"""The package's face and its command line, which import from anywhere."""
+
+
+def imported(path: Path) -> set[str]:
+    """Returns what a file imports, also inside functions, except for the eyes of type checkers."""
+    tree = ast.parse(path.read_text())
+    unseen = {
+        id(node)
+        for block in ast.walk(tree)
+        if isinstance(block, ast.If) and ast.unparse(block.test) == "TYPE_CHECKING"
+        for statement in block.body
+        for node in ast.walk(statement)
+    }
+    found = set()
+    for node in ast.walk(tree):
+        if id(node) in unseen:
+            continue
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: imports are absolute"
+            found |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return found
+
+
+def place(name: str) -> int | None:
+    """Returns the place of a part of the package among the layers; None if it is open to all."""
+    if name in OPEN:
+        return None
+    if name in TOP:
+        return 100 * LAYERS.index("top") + TOP.index(name)
+    return 100 * LAYERS.index(name)
+
+
+def parts(name: str) -> list[str]:
+    """Returns the names between dots, after that of the package; none for another package."""
+    first, *rest = name.split(".")
+    return rest if first == "bgpo_trl" else []
+
+
+FILES = {path: path.relative_to(PACKAGE).with_suffix("").parts[0] for path in PACKAGE.rglob("*.py")}
+
+
+def test_every_part_has_its_place():
+    assert set(FILES.values()) == {*LAYERS, *TOP, *OPEN, *LAST} - {"top"}
+
+
+@pytest.mark.parametrize("path", sorted(FILES), ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_no_layer_imports_from_a_later_one(path):
+    name = FILES[path]
+    if name in LAST:
+        return
+    for module in imported(path):
+        if not parts(module):
+            continue
+        other = parts(module)[0]
+        if other == name:
+            continue
+        here, there = place(name), place(other)
+        assert there is None or (here is not None and there < here), f"{name} imports {module}"
+
+
+def test_the_suite_does_not_know_that_anything_learns_from_it():
+    for path in (ROOT / "suites").rglob("*.py"):
+        packages = {module.partition(".")[0] for module in imported(path)}
+        assert not packages & {"bgpo_trl", "torch", "torchrl", "tensordict"}, path
+
+
+def test_the_package_does_not_know_of_scripts_and_tests():
+    for path in FILES:
+        packages = {module.partition(".")[0] for module in imported(path)}
+        assert not packages & {"benchmarks", "examples", "tests", "scripts"}, path
