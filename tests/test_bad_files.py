@@ -102,7 +102,7 @@ CASES = {
     "checkpoint in a file": (
         lambda f: save_checkpoint(f / "file", {"a": 1}), "cannot save a checkpoint", "make room"),
     # runs that are read
-    "no run": (lambda f: curves(f / "nowhere"), "eval.csv is missing", "let the run in"),
+    "no run": (lambda f: curves(f / "nowhere"), "there is no run at", "name another"),
     "run that is a file": (lambda f: curves(f / "file"), "eval.csv is missing", "let the run in"),
     "run without a test": (
         lambda f: curves(f / "unevaluated"), "holds no test episode", "let the run evaluate first"),
@@ -148,7 +148,7 @@ CASES = {
         lambda f: bank().save(f / "file" / "b"), "cannot make the", "another"),
     # demonstrations
     "no dataset": (
-        lambda f: load_demonstrations(f / "nowhere"), "is not a dataset", "record it again"),
+        lambda f: load_demonstrations(f / "nowhere"), "there is no dataset", "record it again"),
     "dataset that is a file": (
         lambda f: load_demonstrations(f / "file"), "is not a dataset", "record it again with"),
     "recording into a file": (

@@ -61,10 +61,11 @@ def add_task(name: str, task: type[NicoTask]) -> None:
         >>> nico.add_task("touch_white_with_glass", TouchWhiteWithGlass)
         >>> nico.load("touch_white_with_glass", seed=0, observation="state").step([0] * 4).reward
     """
-    if name in (*ALL_TASKS, "all") or not name.isidentifier():
+    taken = (*ALL_TASKS, "all")
+    if name in taken or not name.isidentifier():
         raise ValueError(
             f"a task cannot be called {name!r}: take letters, digits and underscores, and none of "
-            f"all, {', '.join(ALL_TASKS)}"
+            f"{', '.join(taken)}"
         )
     if not (isinstance(task, type) and issubclass(task, NicoTask)):
         raise ValueError(f"{name} must be a subclass of NicoTask, got {task!r}")
