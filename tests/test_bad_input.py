@@ -231,7 +231,7 @@ PARTS = {
         "got [9]", "must lie in 0..2"),
     "misspelt task": (lambda: nico.load("grasp_glas"), "'grasp_glas'", "choose one of grasp_glass"),
     "a task called all": (
-        lambda: nico.add_task("all", nico.NicoTask), "cannot be called 'all'", "none of grasp_glass"),
+        lambda: nico.add_task("all", nico.NicoTask), "called 'all'", "and none of grasp_glass"),
     "no time": (lambda: nico.load("grasp_glass", time_limit=NAN), "got nan", "above 0 s"),
     "demonstrator of a stranger": (
         lambda: Demonstrator(SimpleNamespace(task=None, physics=None)),
