@@ -1,4 +1,4 @@
-"""What a folder holds, to be compared before and after."""
+"""Contents of a folder, to be compared before and after a call."""
 
 from pathlib import Path
 
