@@ -59,8 +59,8 @@ def draw(found: dict[str, Detection]) -> Figure:
 
 def main(arguments: Arguments) -> None:
     """Print the table and write the results."""
-    bank = bank_of(arguments)
     check_draws(arguments.seeds, arguments.draws)
+    bank = bank_of(arguments)
     if len(bank.tasks) < 2:
         raise ValueError("--tasks: name at least two, of which each is left out in turn")
     config = groups_config(chosen_weights(bank.tasks, arguments.bank))

@@ -7,7 +7,7 @@ from numbers import Integral
 from typing import Literal
 
 from bgpo_trl.configs.algorithms import AlgorithmConfig, BGPOConfig
-from bgpo_trl.configs.checks import at_least, check, whole
+from bgpo_trl.configs.checks import at_least, check, check_seeds, whole
 from suites import nico
 
 
@@ -39,13 +39,9 @@ class RunConfig:
     """The algorithm's hyperparameters."""
 
     def __post_init__(self) -> None:
-        for name in ("seeds", "task_starts"):
-            numbers = all(isinstance(number, Integral) for number in getattr(self, name))
-            check(self, (name, numbers, "whole numbers"))
-        if not self.seeds or len(set(self.seeds)) < len(self.seeds) or min(self.seeds) < 0:
-            raise ValueError(
-                f"seeds must be one or more, all different and none negative: {self.seeds}"
-            )
+        check_seeds(self.seeds)
+        whole_starts = all(isinstance(start, Integral) for start in self.task_starts)
+        check(self, ("task_starts", whole_starts, "whole numbers"))
         whole(self, 1, "episodes", "eval_every", "eval_episodes")
         at_least(self, 0, "checkpoint_minutes")
         check(self, ("held_out", self.held_out in ("validation", "test"), "validation or test"))

@@ -14,6 +14,7 @@ import tyro
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.rl import RL
 from bgpo_trl.configs import PRESETS, RunConfig
+from bgpo_trl.configs.checks import check_seeds
 from bgpo_trl.data.own_tasks import import_tasks
 from bgpo_trl.encoders.shipped import default_weights, weights_of_bank
 from suites import nico
@@ -191,8 +192,7 @@ def check_draws(seeds: Sequence[int], draws: int) -> None:
     """Raise ``ValueError`` if there is nothing to draw, or seeds are missing or repeated."""
     if draws < 1:
         raise ValueError(f"--draws must be at least 1, got {draws}")
-    if not seeds or len(set(seeds)) < len(seeds) or min(seeds) < 0:
-        raise ValueError(f"--seeds must be one or more, all different and none negative: {seeds}")
+    check_seeds(seeds)
 
 
 def even_starts(n_tasks: int, episodes: int) -> tuple[int, ...]:

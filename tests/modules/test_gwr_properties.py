@@ -1,4 +1,4 @@
-"""What must hold of GWR-B for any input."""
+"""Properties of GWR-B that hold for any input."""
 
 import itertools
 
