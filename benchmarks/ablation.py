@@ -5,7 +5,7 @@ Further variants add even replay, experts and demonstrations.
     python benchmarks/ablation.py --variant r_int --preset quick
 
 The paper's variants (Fig. 9) differ by transforms alone, see `bgpo_trl.algorithms.environments`.
-All tasks are presented from the start.
+All tasks are presented from the start, with ``--continual`` one after the other.
 """
 
 from __future__ import annotations

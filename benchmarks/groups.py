@@ -34,6 +34,10 @@ class Arguments(BankArguments):
 
     thresholds: tuple[float, ...] = (0.5, 0.525, 0.55, 0.575, 0.6)
     """Activity thresholds of the coarse network."""
+    habituation_threshold: float = 0.5
+    """Habituation threshold of the coarse network."""
+    activity_scale: float = 0.25
+    """Factor of distances in the activity of the fine network."""
     draws: int = 1_800
     """Demonstrations that each network is fed with."""
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4, 5)
@@ -59,8 +63,11 @@ def main(arguments: Arguments) -> None:
     torch.set_num_threads(1)
     check_draws(arguments.seeds, arguments.draws)
     bank = bank_of(arguments)
-    config, n_tasks, seeds = BGPOConfig(), len(bank.tasks), arguments.seeds
-    coarse = groups_config(default_weights())
+    n_tasks, seeds = len(bank.tasks), arguments.seeds
+    fine = replace(BGPOConfig().gwr, activity_scale=arguments.activity_scale)
+    coarse = replace(
+        groups_config(default_weights()), habituation_threshold=arguments.habituation_threshold
+    )
     settings = [replace(coarse, activity_threshold=a_t) for a_t in arguments.thresholds]
     seen, held_out = bank.seen(), bank.held_out()
     print("| order | network | a_T | groups or nodes, by seed | purity or inference, % |")
@@ -72,11 +79,11 @@ def main(arguments: Arguments) -> None:
     for order, starts in orders.items():
         inputs = seen.embedding[draw(seen, starts, draws=arguments.draws, seeds=seeds)]
         random = generators(seeds, "gwr")
-        gwr = GWRB(32, batch_size=len(seeds), generator=random, **asdict(config.gwr))
+        gwr = GWRB(32, batch_size=len(seeds), generator=random, **asdict(fine))
         for x in inputs:
             gwr.adapt(x)
         right = task_inference_accuracy(gwr, seen, held_out, n_tasks)
-        print(row(order, "fine", config.gwr.activity_threshold, gwr.num_nodes, right))
+        print(row(order, "fine", fine.activity_threshold, gwr.num_nodes, right))
         for setting in settings:
             groups = BehaviorGroups(32, batch_size=len(seeds), **asdict(setting))
             for x in inputs:

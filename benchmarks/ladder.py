@@ -41,7 +41,7 @@ RUNGS: dict[str, tuple[str, BGPOConfig]] = {
     "a": ("ground truth + label", replace(_SINGLE, variant="label", state="state")),
     "b": ("latent + label", replace(_SINGLE, variant="label")),
     "c": ("latent + phi", replace(_SINGLE, variant="without-gwr")),
-    "d": ("latent + b (BGPO as published)", _SINGLE),
+    "d": ("latent + b (BGPO with one policy)", _SINGLE),
 }
 """Description and hyperparameters of each rung."""
 

@@ -92,6 +92,21 @@ def best(path: Path) -> dict[str, float]:
     return found
 
 
+def lengths(path: Path) -> dict[str, float]:
+    """Return the mean length of each task's successful tests over the last 10 % of training.
+
+    Args:
+        path: An ``eval.csv``. Tasks without a success, or without lengths, are left out.
+    """
+    rows = read_tests(path)
+    last = max(int(row["episode"]) for row in rows)
+    steps = defaultdict(list)
+    for row in rows:
+        if int(row["episode"]) > 0.9 * last and float(row["success"]) == 1 and row.get("steps"):
+            steps[row["task"]].append(int(row["steps"]))
+    return {task: float(np.mean(each)) for task, each in steps.items()}
+
+
 def describe(run: Path) -> str:
     """Return the table of a run in Markdown."""
     late, highest = summarize(run / "eval.csv"), best(run / "eval.csv")
@@ -116,10 +131,10 @@ def describe(run: Path) -> str:
 
     lines = [
         "| task | last 10 % | best 10 % | by seed | own episodes to 50 % | trained, seen "
-        "| trained, held-out | inferred |",
-        "|---|---:|---:|---|---:|---:|---:|---:|",
+        "| trained, held-out | inferred | steps to success |",
+        "|---|---:|---:|---|---:|---:|---:|---:|---:|",
     ]
-    by_seed = _late_by_seed(run / "eval.csv")
+    by_seed, steps = _late_by_seed(run / "eval.csv"), lengths(run / "eval.csv")
     tasks = [task for task in by_seed if task]
     own = own_episodes(run / "train.csv", tasks)
     for task in by_seed:
@@ -129,6 +144,7 @@ def describe(run: Path) -> str:
         cells.append("" if own is None or task is None else median_cell(own[:, tasks.index(task)]))
         cells += [trained(task, kind, "success", 1) for kind in ("seen", "held-out")]
         cells.append(trained(task, "held-out", "task_inference", 2))
+        cells.append(f"{steps[task]:.1f}" if task in steps else "")
         lines.append(f"| {task or 'all'} | " + " | ".join(cells) + " |")
     reached = late["episodes to 80 %"]
     facts = [f"Episodes to 80 %: {'not reached' if np.isinf(reached) else int(reached)}."]

@@ -118,14 +118,16 @@ class NicoEnv(EnvBase):
             observation["pixels"] = Bounded(0, 255, shape=batch + shape, dtype=torch.uint8)
             self._current["pixels"] = np.zeros((count, *shape), np.uint8)
         if self.observation != "pixels":
-            observation["state"] = Unbounded(shape=torch.Size([*batch, STATE_SIZE]))
+            observation["state"] = Unbounded(
+                shape=torch.Size([*batch, STATE_SIZE]), dtype=torch.float32
+            )
             self._current["state"] = np.zeros((count, STATE_SIZE), np.float32)
         self.observation_spec = Composite(observation, shape=batch)
         # A TransformedEnv passes only entries of the state spec on to `_reset`.
         self.state_spec = Composite({"task": observation["task"].clone()}, shape=batch)
-        self.action_spec = Bounded(-1.0, 1.0, shape=torch.Size([*batch, 4]))
+        self.action_spec = Bounded(-1.0, 1.0, shape=torch.Size([*batch, 4]), dtype=torch.float32)
         # Not Bounded, which TorchRL's RewardScaling and RewardClipping refuse.
-        self.reward_spec = Unbounded(shape=torch.Size([*batch, 1]))
+        self.reward_spec = Unbounded(shape=torch.Size([*batch, 1]), dtype=torch.float32)
         self.done_spec = Composite(
             {
                 key: Categorical(2, shape=torch.Size([*batch, 1]), dtype=torch.bool)
@@ -181,6 +183,11 @@ class NicoEnv(EnvBase):
                 rows = reset.reshape(-1).numpy()
             task = tensordict.get("task", None)
             if task is not None:
+                if task.is_floating_point() or task.shape.numel() != len(rows):
+                    raise ValueError(
+                        f"task must be a whole number for each of {len(rows)} simulations, got "
+                        f"{task.dtype} {[*task.shape]}"
+                    )
                 chosen = task.reshape(-1).numpy()
                 if ((chosen < 0) | (chosen >= len(self.tasks)))[rows].any():
                     raise ValueError(
@@ -202,7 +209,10 @@ class NicoEnv(EnvBase):
             raise missing_key("NicoEnv", tensordict, ["action"])
         if action.shape != (*self.batch_size, 4):
             raise ValueError(f"actions must be {[*self.batch_size, 4]}, got {[*action.shape]}")
-        actions = action.reshape(-1, 4).double().numpy()
+        moving = np.flatnonzero(rows).tolist()
+        if any(self._environment(row)._reset_next_step for row in moving):
+            raise ValueError("there is no episode to step in: reset the environment first")
+        actions = action.detach().reshape(-1, 4).double().numpy()
         # Checked for all before any of them moves.
         if not np.isfinite(actions[rows]).all():
             raise ValueError(
@@ -210,7 +220,7 @@ class NicoEnv(EnvBase):
                 "chose it, learning has diverged, lower its learning rate"
             )
         rewards = np.zeros((len(rows), 1), np.float32)
-        self._advance(np.flatnonzero(rows).tolist(), actions, rewards)
+        self._advance(moving, actions, rewards)
         reward = torch.from_numpy(rewards).reshape(*self.batch_size, 1)
         return TensorDict({**self._observe(), "reward": reward, **self._dones()}, self.batch_size)
 
@@ -238,7 +248,8 @@ class NicoEnv(EnvBase):
         self.seeding = Seeding(tuple(seeds))
 
     def seed_rows(self, seeds: Sequence[int]) -> None:
-        """Set the seed of each simulation's next starts, in ``[0, 2**32)``, and no other."""
+        """Set the seeds of the simulations' start states; transforms are not reseeded."""
+        seeds = row_seeds(seeds, len(self._environments))
         for environments, seed in zip(self._environments, seeds, strict=True):
             # All tasks of a simulation draw from one source.
             environments[0].task.random.seed(seed)
@@ -272,6 +283,11 @@ class NicoEnv(EnvBase):
             raise ValueError(
                 f"the state was saved with the observations {sorted(state['current'])}, this "
                 f"environment has {sorted(self._current)}: use the same observation"
+            )
+        if int(state["task"].max()) >= len(self.tasks):
+            raise ValueError(
+                f"the state was saved in task {int(state['task'].max())}, this environment has "
+                f"{len(self.tasks)} tasks: use the same tasks"
             )
         for row, environments in enumerate(self._environments):
             environments[0].physics.set_state(state["physics"][row].numpy())

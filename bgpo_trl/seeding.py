@@ -59,7 +59,7 @@ def row_seeds(seed: int | Iterable[int] | None, count: int) -> list[int]:
 
 @dataclass(frozen=True, eq=False)
 class Seeding:
-    """One call of an environment's ``set_seed``, equal to no other, even of the same seed.
+    """Mark of one call of ``set_seed``; two calls with the same seed are distinct.
 
     Attributes:
         seeds: A seed for each row.

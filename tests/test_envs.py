@@ -6,6 +6,7 @@ import threading
 import time
 from copy import deepcopy
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from torchrl.envs import (
 
 from bgpo_trl.envs import NicoEnv
 from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
+from bgpo_trl.modules.actor_critic import Actor
 from suites import nico
 from suites.nico.demonstrator import Demonstrator
 
@@ -501,3 +503,45 @@ def test_the_frames_last_drawn_can_be_looked_at():
     assert (env.frames() == after["pixels"].numpy()).all()
     with pytest.raises(ValueError, match="observe 'both'"):
         NicoEnv(seed=3, observation="state").frames()
+
+
+def test_a_policy_that_learns_may_act():
+    actor = Actor(16, 4, in_keys=["state"])
+    assert NicoEnv(observation="state").rollout(2, actor).shape == (2,)
+
+
+def test_a_row_without_an_episode_cannot_step():
+    env = NicoEnv(batch_size=2, observation="state", seed=0)
+    td = env.reset(TensorDict({"_reset": torch.tensor([True, False])}, [2]))
+    before = env.simulation_state()["physics"]
+    td["action"] = torch.ones(2, 4)
+    with pytest.raises(ValueError, match="reset the environment first"):
+        env.step(td)
+    assert env.simulation_state()["physics"].equal(before)
+    env.step(td.set("_step", torch.tensor([True, False])))
+
+
+def test_its_dtypes_do_not_depend_on_torchs_default():
+    default = torch.get_default_dtype()
+    try:
+        torch.set_default_dtype(torch.float64)
+        check_env_specs(NicoEnv(observation="state", seed=0))
+    finally:
+        torch.set_default_dtype(default)
+
+
+@pytest.mark.parametrize("task", [torch.zeros(2, 2).long(), torch.tensor([0.0, 1.7])])
+def test_a_task_is_a_whole_number_for_each_row(task):
+    env = NicoEnv(batch_size=2, observation="state")
+    with pytest.raises(ValueError, match="task must be a whole number for each of 2 simulations"):
+        env._reset(SimpleNamespace(get={"task": task}.get))
+
+
+def test_a_seed_a_row_is_needed_and_tasks_of_a_state_must_exist():
+    env = NicoEnv(batch_size=2, observation="state", seed=0)
+    with pytest.raises(ValueError, match="1 seeds for 2 simulations"):
+        env.seed_rows([1])
+    env.reset(TensorDict({"task": torch.tensor([0, 2])}, [2]))
+    fewer = NicoEnv(["grasp_glass"], batch_size=2, observation="state", seed=0)
+    with pytest.raises(ValueError, match="saved in task 2, this environment has 1 tasks"):
+        fewer.load_simulation_state(env.simulation_state())

@@ -34,7 +34,8 @@ class BGPO(Algorithm):
 
     With ``experts``, each group of behaviors has its own actor and critic; with ``even_replay``, an
     update draws equally from the groups played last; with a ``demonstration_share``, it also draws
-    from demonstrations. The variant ``"published"`` without these three is the paper's algorithm.
+    from demonstrations. The variant ``"published"`` without these three is the paper's algorithm,
+    in `bgpo-paper` with the paper's settings too.
 
     Arguments as for `Algorithm`; encoders may be None if neither latents nor embeddings are used.
 

@@ -109,7 +109,7 @@ def _compared(setting: str) -> Group:
 def _published(setting: str) -> Group:
     number, title = SETTINGS[setting]
     runs = {f"{setting}-{key}": name for key, name in PUBLISHED.items()}
-    picture = Picture(f"fig{number}-published", "no stabilisers, small networks", tuple(runs))
+    picture = Picture(f"fig{number}-published", "no stabilizers, small networks", tuple(runs))
     return Group(f"Fig. {number} as published: {title}", runs, (picture,))
 
 

@@ -1,8 +1,7 @@
 """Benchmark of the suite's eight tasks: its runs, and one row of measures for each.
 
 The measures are those of Continual World (Wolczyk et al., 2021) and COOM (Tomilin et al., 2023),
-with one difference: there, only the newest task is trained; here, episodes are of all tasks
-presented so far.
+with the differences that ``docs/benchmark.md`` lists.
 """
 
 from __future__ import annotations

@@ -29,10 +29,10 @@ def expected_own_episodes(begun: Sequence[int], task: int, episodes: ArrayLike) 
 def forward_transfer(run: Run, reference: Run) -> Values:
     """Return the forward transfer to each task but the first, ``[S, T - 1]``.
 
-    That of Continual World (`metrics.forward_transfer`): from the area under the task's curve over
-    its own phase and the mean area of a reference. As an episode is of any of the presented tasks,
-    both areas are taken over equally many of the task's own episodes. The first task is left out,
-    since nothing precedes it. Tasks of the reference may have another order.
+    Computed as in Continual World (`metrics.forward_transfer`), from the area under the task's
+    curve over its own phase and the mean area of a reference. As an episode is of any of the
+    presented tasks, both areas are taken over equally many of the task's own episodes. The first
+    task is left out, since nothing precedes it. Tasks of the reference may have another order.
     """
     begun, gains = starts(run), []
     for task, end in enumerate([*begun[2:], run.curves.episodes[-1]], 1):

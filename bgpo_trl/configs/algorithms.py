@@ -91,7 +91,8 @@ class BGPOConfig(AlgorithmConfig):
     """Whether an update draws equally from the groups played last. Ours: the paper draws uniformly
     from all transitions."""
     demonstration_share: float = 0.25
-    """See `AlgorithmConfig`. Ours: triples the success of a task's first hundred episodes."""
+    """See `AlgorithmConfig`. Ours: doubles to triples the success of a task's first hundred
+    episodes."""
     active_groups: int = 3
     """Largest number of groups per update, those played last. Ours: bounds the cost of an
     update."""
@@ -126,7 +127,7 @@ class MAMLConfig(AlgorithmConfig):
     the policy's actions."""
     task_batch_size: int = 64
     """Transitions of each task per update: half to adapt to, half to evaluate the adapted policy.
-    Ours: three tasks together exceed the 128 of the other algorithms."""
+    Ours: with three tasks, as many transitions as in an update of BGPO."""
     adaptation_size: int = 256
     """Transitions of the test task to adapt to before its test episodes. Ours: Sec. IV-B has "256
     adaptation trajectories", about 50 times as much."""
@@ -148,8 +149,8 @@ class DistNLLConfig(AlgorithmConfig):
     """Policy distillation with a negative log-likelihood (Sec. IV-B; Rusu et al., 2016)."""
 
     task_batch_size: int = 64
-    """Transitions of each task in an update of its teacher. Ours: three teachers together exceed
-    the 128 of the other algorithms."""
+    """Transitions of each task in an update of its teacher. Ours: with three tasks, as many
+    transitions as in an update of BGPO."""
     samples: int = 1_000
     """States of each task from which its head learns at the end of an episode (Sec. IV-B)."""
     distillation_batch_size: int = 125

@@ -1,6 +1,7 @@
 """Encoders that come with the package: those of the paper's three tasks, and of the suite's eight.
 
-Results on the paper's tasks are those of the first. The second know the suite's other tasks too.
+All results on the paper's tasks use the first; the second were also trained on the suite's other
+tasks.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ _PAPER, _EIGHT = "nico.safetensors", "nico_eight.safetensors"
 def default_weights(tasks: Sequence[str] = nico.PAPER_TASKS) -> Path:
     """Return the path of the encoders for some tasks.
 
-    Those of the eight tasks, if one of the suite's further five is among them; otherwise, also for
-    own tasks, those of the paper's three.
+    The encoders of eight tasks if one of the suite's further five is among them; otherwise, also
+    for own tasks, the encoders of the paper's three.
     """
     further = set(nico.ALL_TASKS) - set(nico.PAPER_TASKS)
     return _path(_PAPER if further.isdisjoint(tasks) else _EIGHT)
@@ -36,7 +37,7 @@ def bank_path(weights: Path) -> Path:
 def find_weights(identity: str | None) -> Path:
     """Return the path of the shipped encoders with an identity.
 
-    Those of the paper's tasks if none have it.
+    Falls back to the encoders of the paper's tasks if no shipped ones have this identity.
     """
     return _path(_EIGHT if identity is not None and identity == _identity(_EIGHT) else _PAPER)
 
@@ -44,7 +45,7 @@ def find_weights(identity: str | None) -> Path:
 def weights_of_bank(bank: Path) -> Path:
     """Return the path of the shipped encoders that embedded a bank.
 
-    Those of the paper's tasks if it was embedded by others, or cannot be read.
+    Falls back to the encoders of the paper's tasks if others embedded it, or it cannot be read.
     """
     try:
         metadata = load_tensors(bank)[1]

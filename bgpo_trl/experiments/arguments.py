@@ -52,8 +52,8 @@ class BankArguments(ImportArguments):
     """Tasks in the order of presentation, or "all" for the suite's eight; the paper's three by
     default."""
     bank: Path | None = None
-    """Demonstrations embedded by bgpo_trl.encoders.make_bank; those of tasks that it lacks come
-    with the package."""
+    """Demonstrations embedded by bgpo_trl.encoders.make_bank; for tasks missing in it, the
+    package's are used."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +62,7 @@ class TaskArguments(BankArguments):
 
     tasks: tuple[str, ...] | None = None
     """Tasks in the order of presentation, or "all" for the suite's eight; the paper's three by
-    default. Unless three, they start at even intervals."""
+    default. Unless there are three, they start at even intervals."""
 
 
 @dataclass(frozen=True)
@@ -70,8 +70,8 @@ class Arguments(TaskArguments):
     """Train an algorithm and plot its success."""
 
     bank: Path | None = None
-    """Demonstrations embedded by bgpo_trl.encoders.make_bank; those of tasks that it lacks come
-    with the package. With --resume, the run's own by default."""
+    """Demonstrations embedded by bgpo_trl.encoders.make_bank; for tasks missing in it, the
+    package's are used. With --resume, the run's own by default."""
 
     algorithm: AlgorithmName = "bgpo"
     """bgpo; bgpo-experts: without demonstrations as experience; bgpo-single: without experts too;

@@ -33,9 +33,9 @@ class AblationArguments(Arguments):
     variant: Literal[
         "gwr+r_int", "gwr", "r_int", "none", "even-replay", "experts", "demonstrations", "all"
     ] = "gwr+r_int"
-    """gwr+r_int: the published algorithm; gwr, r_int: with GWR-B or the intrinsic reward only;
-    none: with neither. even-replay, demonstrations: the published algorithm with that addition;
-    experts: with even replay and experts; all: with all three."""
+    """gwr+r_int: the paper's algorithm, with our stabilizers; gwr, r_int: with GWR-B or the
+    intrinsic reward only; none: with neither. even-replay, demonstrations: gwr+r_int with that
+    addition; experts: with even replay and experts; all: with all three."""
     continual: bool = False
     """Tasks one after the other instead of all from the start."""
 

@@ -50,7 +50,8 @@ class BehaviorGroups(nn.Module):
         activity_threshold: a_T of the coarse GWR-B, below which an input is new.
         habituation_threshold: h_T, below which a best-matching node allows an insertion. With the
             0.15 of the fine network, tasks that appear together get mixed before any node splits.
-        activity_scale: Factor of distances, as in `GWRB`.
+        activity_scale: Factor of distances, as in `GWRB`. The defaults fit the embeddings of the
+            shipped encoders of three tasks.
         max_groups: Largest number of groups. Once it is reached, a new node joins the group of its
             best match. None: no limit.
 
@@ -58,7 +59,7 @@ class BehaviorGroups(nn.Module):
         ValueError: If ``max_groups`` is below 1, or an argument of `GWRB` is out of range.
 
     Example:
-        >>> groups = BehaviorGroups(1, activity_threshold=0.5)
+        >>> groups = BehaviorGroups(1, activity_threshold=0.5, activity_scale=1.0)
         >>> for x in [0.0, 0.1] * 6 + [3.0] * 2:
         ...     match = groups.adapt(torch.tensor([x]))
         >>> groups.num_groups, groups.lookup(torch.tensor([[0.2], [2.9]])).group
@@ -72,7 +73,7 @@ class BehaviorGroups(nn.Module):
         batch_size: int | Sequence[int] = (),
         activity_threshold: float = 0.525,
         habituation_threshold: float = 0.5,
-        activity_scale: float = 1.0,
+        activity_scale: float = 0.25,
         max_groups: int | None = None,
     ) -> None:
         super().__init__()

@@ -108,12 +108,16 @@ class StackedLinear(nn.Module):
             ``[*S, *B, out_features]``.
 
         Raises:
-            ValueError: If an input does not lead with ``S``, or the features do not add up.
+            ValueError: If an input does not lead with ``S``, batches differ, or the features do not
+                add up.
         """
         sizes = [input.shape[-1] for input in inputs]
         stack = self.batch_size
-        if sum(sizes) != self.in_features or any(
-            input.shape[: len(stack)] != stack for input in inputs
+        batches = {input.shape[:-1] for input in inputs}
+        if (
+            sum(sizes) != self.in_features
+            or len(batches) != 1
+            or inputs[0].shape[: len(stack)] != stack
         ):
             raise ValueError(
                 f"the inputs must have one leading index per layer and {self.in_features} features "
@@ -124,7 +128,9 @@ class StackedLinear(nn.Module):
         weight = self.weight.reshape(n_layers, self.in_features, self.out_features)
         output = self.bias.reshape(n_layers, 1, self.out_features)
         for i, (input, rows) in enumerate(zip(inputs, weight.split(sizes, -2), strict=True)):
-            multiply_add = torch.Tensor.baddbmm_ if i else torch.Tensor.baddbmm
+            # In place is faster, but autocast does not support it.
+            in_place = i and not torch.is_autocast_enabled(input.device.type)
+            multiply_add = torch.Tensor.baddbmm_ if in_place else torch.Tensor.baddbmm
             output = multiply_add(output, input.reshape(n_layers, -1, input.shape[-1]), rows)
         shape = torch.Size([*inputs[0].shape[:-1], self.out_features])
         # A view only where needed: autograd is slow when a view is then changed in place.

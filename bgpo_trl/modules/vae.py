@@ -137,7 +137,8 @@ class VAE(nn.Module):
             raise ValueError(
                 f"pixels must be uint8 [..., 32, 64, 3], got {pixels.dtype} {tuple(pixels.shape)}"
             )
-        x = (pixels.reshape(-1, *FRAME_SHAPE) / 255 - self.mean_frame).permute(0, 3, 1, 2)
+        x = pixels.reshape(-1, *FRAME_SHAPE).to(self.mean_frame.dtype) / 255 - self.mean_frame
+        x = x.permute(0, 3, 1, 2)
         for convolution in self.encoder:
             # Pooling before ReLU gives the same result (both are monotone), at a quarter the size.
             x = F.relu(F.max_pool2d(convolution(x), 2))

@@ -19,7 +19,8 @@ class DDPGLoss(OffPolicyLoss):
 
     1. Target: ``r + gamma * Q'(s', pi'(s'))`` with target networks, clipped to ``return_bounds``.
        With an extrinsic reward of 0 or 1 that ends the episode and an intrinsic reward of at most
-       ``beta``, returns lie in ``[0, 1 + beta]``.
+       ``beta`` at its end, returns lie in ``[0, 1 + beta]``; if time-outs pay the intrinsic reward
+       and bootstrap, up to ``beta + gamma * (1 + beta)``.
     2. The actor minimizes ``-Q(s, pi(s)) + pre_tanh_penalty * pre_tanh_action ** 2``.
 
     Without bounds and penalty, this is :class:`torchrl.objectives.DDPGLoss` with

@@ -26,7 +26,8 @@ class DistillationLoss(LossModule):
         actor_network: Policy that writes ``loc`` and ``scale``.
 
     Raises:
-        ValueError: From ``forward``, if an entry is missing or the policy writes no distribution.
+        ValueError: From ``forward``, if an entry is missing or has the wrong shape, or the policy
+            writes no distribution.
     """
 
     @dataclass
@@ -66,14 +67,25 @@ class DistillationLoss(LossModule):
         policy = self.actor_network(tensordict.select(*self.actor_network.in_keys))
         if policy.get(keys.loc, None) is None or policy.get(keys.scale, None) is None:
             raise missing_key("DistillationLoss, from its actor,", policy, [keys.loc, keys.scale])
+        teacher_action = tensordict[keys.teacher_action].detach()
+        if teacher_action.shape != policy[keys.loc].shape:
+            raise ValueError(
+                f"{keys.teacher_action!r} must be {[*policy[keys.loc].shape]}, as the policy's "
+                f"{keys.loc!r} is, got {[*teacher_action.shape]}"
+            )
         loss = gaussian_nll_loss(
             policy[keys.loc],
-            tensordict[keys.teacher_action].detach(),
+            teacher_action,
             policy[keys.scale].square(),
             full=True,
             reduction="none",
         )
         loss, weights = loss.sum(-1), tensordict.get(keys.priority_weight, None)
         if weights is not None:
+            if weights.shape != loss.shape:
+                raise ValueError(
+                    f"{keys.priority_weight!r} must be one weight a state, {[*loss.shape]}, got "
+                    f"{[*weights.shape]}"
+                )
             loss = loss * weights
         return TensorDict({"loss_distillation": loss.mean(-1).sum()})

@@ -32,9 +32,10 @@ class MAMLLoss(DDPGLoss):
     3. trains each task's critic on all its transitions as `DDPGLoss` does. Target actions are those
        of a slow copy of the adapted policy, since that policy's value is to be learned.
 
-    ``theta`` are the parameters of ``meta_network``. Those of ``actor_network`` are the latest
-    ``theta_i``, written here, without gradient; the target networks follow them. They must be
-    updated by `ForeachSoftUpdate`, since TorchRL's `SoftUpdate` skips parameters without gradient.
+    ``theta`` are the parameters of ``meta_network``. Those in ``actor_network_params`` are the
+    latest ``theta_i``, written here, without gradient; the target networks follow them. They must
+    be updated by `ForeachSoftUpdate`, since TorchRL's `SoftUpdate` skips parameters without
+    gradient.
 
     Reads what `DDPGLoss` reads, with batch size ``[*S, T, B]``, ``B`` even, and
     ``"priority_weight"`` ``[*S, T, B]``, 0 for tasks without data. Returns what `DDPGLoss` returns,
@@ -42,8 +43,8 @@ class MAMLLoss(DDPGLoss):
 
     Args:
         meta_network: Policy with ``batch_size`` ``[*S]``.
-        actor_network: The same policy with ``batch_size`` ``[*S, T]``; its parameters are
-            overwritten.
+        actor_network: The same policy with ``batch_size`` ``[*S, T]``. It stays as it is; a copy of
+            it, with the parameters ``actor_network_params``, holds the adapted policies.
         value_network: Q-functions with ``batch_size`` ``[*S, T]``.
         inner_learning_rate: Step size of the adaptation.
         **ddpg: Other arguments of `DDPGLoss`.
@@ -64,8 +65,8 @@ class MAMLLoss(DDPGLoss):
         **ddpg: Any,
     ) -> None:
         networks: list[Any] = [meta_network, actor_network, value_network]
-        shapes = [torch.Size(network.batch_size) for network in networks]
-        if shapes[1][:-1] != shapes[0] or shapes[2] != shapes[1]:
+        shapes = [torch.Size(getattr(network, "batch_size", ())) for network in networks]
+        if not shapes[1] or shapes[1][:-1] != shapes[0] or shapes[2] != shapes[1]:
             raise ValueError(
                 "meta_network, actor_network and value_network must have the batch sizes [*S], "
                 f"[*S, T] and [*S, T], got {', '.join(str([*shape]) for shape in shapes)}"

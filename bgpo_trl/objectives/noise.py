@@ -66,5 +66,10 @@ class SeededNoise(nn.Module):
 
     def set_extra_state(self, state: Tensor) -> None:
         """Restore the result of `get_extra_state`."""
+        if len(state) != len(self.generators):
+            raise ValueError(
+                f"the state was saved with {len(state)} generators, this loss has "
+                f"{len(self.generators)}: pass as many"
+            )
         for generator, saved in zip(self.generators, state, strict=True):
             generator.set_state(saved.clone())  # set_state crashes on a view

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Sequence
 from copy import deepcopy
 from typing import Any, ClassVar
@@ -57,7 +58,8 @@ class OffPolicyLoss(LossModule):
 
     Raises:
         ValueError: If ``return_bounds`` is not an increasing pair, the penalty is negative, there
-            is no such ``loss_function``, or the ``batch_size`` of twin critics is not ``[*S, 2]``;
+            is no such ``loss_function``, the critics' ``batch_size`` is not the actor's, or that of
+            twin critics not ``[*S, 2]``;
             from ``forward``, if an entry is missing, or reward or weights have another shape.
     """
 
@@ -94,13 +96,16 @@ class OffPolicyLoss(LossModule):
         if loss_function not in ("l2", "l1", "smooth_l1"):
             raise ValueError(f"loss_function must be l2, l1 or smooth_l1, got {loss_function!r}")
         super().__init__()
-        self._made: dict[tuple[str, bool], Any] = {}
+        self._made: dict[tuple[str, bool], tuple[Any, list[Tensor]]] = {}
         self.batch_size = torch.Size(getattr(actor_network, "batch_size", ()))
         critics = torch.Size(getattr(value_network, "batch_size", ()))
-        if self.twin_critics and critics != (*self.batch_size, 2):
+        wanted = (*self.batch_size, 2) if self.twin_critics else self.batch_size
+        # A single Q-function without a batch size may be any module.
+        if critics != wanted and (self.twin_critics or critics):
             raise ValueError(
-                "value_network must hold two Q-functions for each actor, batch_size "
-                f"{[*self.batch_size, 2]}, got {[*critics]}"
+                f"value_network must hold {'two Q-functions' if self.twin_critics else 'one'} for "
+                f"each actor, batch_size {[*wanted]}, got {[*critics]}: a network in a container "
+                "such as TensorDictSequential has none"
             )
         self.convert_to_functional(actor_network, "actor_network", create_target_params=delay_actor)
         self.convert_to_functional(value_network, "value_network", create_target_params=True)
@@ -120,7 +125,14 @@ class OffPolicyLoss(LossModule):
     def out_keys(self) -> list[NestedKey]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Entries that `forward` returns."""
         told = ["pred_value", "target_value", "pred_value_max", "target_value_max", "td_error_max"]
-        return ["loss_actor", "loss_value", *told, *self.actor_keys]
+        of_actor = [*self.actor_keys]
+        if "pre_tanh_magnitude" in of_actor and not self._writes_pre_tanh:
+            of_actor.remove("pre_tanh_magnitude")
+        return ["loss_actor", "loss_value", *told, *of_actor]
+
+    @property
+    def _writes_pre_tanh(self) -> bool:
+        return self.tensor_keys.pre_tanh_action in self.actor_network.out_keys
 
     def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> None:
         """Set the estimator of the target.
@@ -253,11 +265,15 @@ class OffPolicyLoss(LossModule):
         With ``frozen``, gradients reach the network's input only, not its parameters.
         """
         # Made once: TorchRL puts the parameters in at each call, which takes a sixth longer.
-        if (name, frozen) not in self._made:
-            made = self._made[name, frozen] = deepcopy(getattr(self, name.removeprefix("target_")))
-            params = getattr(self, f"{name}_params")
+        params = getattr(self, f"{name}_params")
+        leaves = list(params.values(include_nested=True, leaves_only=True))
+        made, held = self._made.get((name, frozen), (None, []))
+        # Other parameters may have been put into the loss, for a while or for good.
+        if made is None or not all(map(operator.is_, leaves, held)):
+            made = deepcopy(getattr(self, name.removeprefix("target_")))
             (params.detach() if frozen else params).to_module(made)
-        return self._made[name, frozen]
+            self._made[name, frozen] = made, leaves
+        return made
 
     def _apply(self, fn: Any) -> Any:
         self._made.clear()  # a cast gives the parameters other memory

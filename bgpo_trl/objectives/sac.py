@@ -36,7 +36,8 @@ class SACLoss(OffPolicyLoss):
         actor_network: A `GaussianActor`, or a policy with the same ``sample`` and ``action_dim``.
         value_network: Twin Q-functions, ``batch_size`` ``[*S, 2]``.
         alpha_init: Initial temperature.
-        target_entropy: Entropy of the policy, in nats over all action dimensions.
+        target_entropy: Entropy of the policy, in nats over all action dimensions; None: minus their
+            number.
         entropy_in_target: Whether the Q-functions include the entropy to come.
         generator: Sources of the samples, one per seed, as in `SeededNoise`.
         **common: Other arguments of `OffPolicyLoss`, except ``pre_tanh_penalty`` and
@@ -60,11 +61,11 @@ class SACLoss(OffPolicyLoss):
 
     def __init__(
         self,
-        actor_network: TensorDictModuleBase,
+        actor_network: Any,  # with `sample` and `action_dim`
         value_network: TensorDictModuleBase,
         *,
         alpha_init: float = SACConfig.alpha_init,
-        target_entropy: float = SACConfig.target_entropy,
+        target_entropy: float | None = None,
         entropy_in_target: bool = SACConfig.entropy_in_target,
         generator: torch.Generator | Sequence[torch.Generator] | None = None,
         **common: Any,
@@ -73,7 +74,10 @@ class SACLoss(OffPolicyLoss):
             raise ValueError(f"alpha_init must be a number > 0, got {alpha_init}")
         unused: dict[str, Any] = {"pre_tanh_penalty": 0.0, "delay_actor": False}
         super().__init__(actor_network, value_network, **unused, **common)
-        self.target_entropy, self.entropy_in_target = target_entropy, entropy_in_target
+        self.target_entropy = (
+            -float(actor_network.action_dim) if target_entropy is None else target_entropy
+        )
+        self.entropy_in_target = entropy_in_target
         self.noise = SeededNoise(self.batch_size, generator)
         start = torch.full(self.batch_size, math.log(alpha_init))
         self.log_alpha = nn.Parameter(start.to(next(self.parameters()).device))
@@ -102,8 +106,9 @@ class SACLoss(OffPolicyLoss):
 
     def _sample(self, data: TensorDictBase) -> tuple[TensorDictBase, Tensor]:
         """Return the data with actions drawn, and their log-probabilities ``[*S, *B]``."""
-        like = data.get(self.inputs.moving_keys[0])
-        noise = self.noise(like.new_empty(*like.shape[:-1], self.actor_network.action_dim))
+        # A TensorDict without a batch size is read as one of vectors.
+        batch = data.batch_size or data.get(self.inputs.keys[0]).shape[:-1]
+        noise = self.noise(self.log_alpha.new_empty(*batch, self.actor_network.action_dim))
         data = self.network("actor_network").sample(data, noise)
         return data, data.get(self.tensor_keys.log_prob)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
 
 from bgpo_trl.errors import missing_key
@@ -71,8 +71,11 @@ class TransitionInputs:
         self.reader = reader
         written = set(actor_network.out_keys)
         read = [*actor_network.in_keys, *(k for k in value_network.in_keys if k not in written)]
-        self.keys = [*dict.fromkeys(read)]
-        self.constant_keys = [key for key in constant_keys if key in self.keys]
+        self.keys: list[NestedKey] = [*dict.fromkeys(unravel_key(key) for key in read)]
+        self.constant_keys = [unravel_key(key) for key in constant_keys]
+        unknown = [key for key in self.constant_keys if key not in self.keys]
+        if unknown:
+            raise ValueError(f"constant_keys must be among {self.keys}, got {unknown}")
         self.moving_keys = [key for key in self.keys if key not in self.constant_keys]
 
     def select(

@@ -79,6 +79,10 @@ class EpisodeTransform(Transform):
     def seed_rows(self, seeds: Sequence[int]) -> None:
         """Start random streams anew, from a seed for each row; this base class has none."""
 
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Raise ``TypeError``: outside an environment, there are no episodes to act on."""
+        raise TypeError(f"{type(self).__name__} needs episodes: append it to an environment")
+
     def _follow_seed(self) -> None:
         env = self.container
         while isinstance(env, TransformedEnv):
@@ -164,7 +168,8 @@ class DemonstrationLookup(EpisodeTransform):
     2. At the end of an episode (``done``), with ``learn=True``, the network adapts to its
        demonstration. The networks of other rows do not change.
 
-    Called on a TensorDict outside an environment, or in a replay buffer, it only looks up.
+    Called on a TensorDict outside an environment, or in a replay buffer, it only looks up. A
+    ``clone`` looks up in the same network, and with ``learn=True`` teaches it too.
 
     Args:
         network: One network, or one per row. Its ``batch_size`` must be the environment's; if it
@@ -204,7 +209,8 @@ class DemonstrationLookup(EpisodeTransform):
         if embedding is None:
             raise missing_key(type(self).__name__, tensordict, self.in_keys)
         for key, value in zip(self.out_keys, self.look_up(embedding), strict=True):
-            tensordict.set(key, value)
+            # The network may compute in another dtype than the one that the spec announces.
+            tensordict.set(key, value.to(embedding.dtype) if value.is_floating_point() else value)
         return tensordict
 
     def _reset(

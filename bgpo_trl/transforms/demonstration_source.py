@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from numbers import Integral
-from typing import Protocol
+from typing import Protocol, Self
 
 import numpy as np
 import torch
@@ -14,7 +14,7 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 
 from bgpo_trl.errors import as_shape
-from bgpo_trl.seeding import generators
+from bgpo_trl.seeding import generators, row_seeds
 from bgpo_trl.transforms._episode import EpisodeTransform, ending, starting, unbounded
 
 
@@ -197,8 +197,15 @@ class DemonstrationSource(EpisodeTransform):
 
     def seed_rows(self, seeds: Sequence[int]) -> None:
         """Start anew: streams from a seed for each row, and counts, hence the schedule, at 0."""
+        seeds = row_seeds(seeds, self.episode.numel())
         self._stream.copy_(_streams(generators(seeds, "demonstrations")).view_as(self._stream))
         self.episode.zero_()
+
+    def clone(self) -> Self:
+        """Return a copy with counts and streams of its own, where TorchRL's would share them."""
+        copy = super().clone()
+        copy._buffers = {key: buffer.clone() for key, buffer in self.named_buffers()}
+        return copy
 
     def _draw(self, rows: Tensor) -> None:
         presented = self._follow[0].episode if self._follow else self.episode

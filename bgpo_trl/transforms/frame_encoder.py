@@ -120,8 +120,10 @@ class FrameEncoder(Transform):
                 raise _no_frames(in_key)
             batch_dims = observation_spec.ndim
             frame = observation_spec[in_key].zero()[(0,) * batch_dims]
-            n_latent = self._apply_transform(frame).shape[-1]
-            observation_spec[out_key] = unbounded(observation_spec, n_latent, dtype=torch.float32)
+            latent = self._apply_transform(frame)
+            observation_spec[out_key] = unbounded(
+                observation_spec, latent.shape[-1], dtype=latent.dtype
+            )
             if self.del_keys:
                 del observation_spec[in_key]
         return observation_spec

@@ -145,7 +145,7 @@ class NicoTask(control.Task):
         raise NotImplementedError
 
     def initialize_episode(self, physics: Physics) -> None:
-        """Place the objects with jitter on their arc, and the arm at random above them."""
+        """Place the objects with jitter on their arc, and the hand at random in view."""
         for name, angle in zip(OBJECTS, ARC_ANGLES, strict=True):
             place = kinematics.polar(
                 ARC_RADIUS + self.random.uniform(-RADIUS_JITTER, RADIUS_JITTER),

@@ -138,7 +138,8 @@ def register() -> None:
     """Register the tasks in ``dm_control.suite`` as domain ``nico``.
 
     Then ``suite.ALL_TASKS`` and ``TASKS_BY_DOMAIN`` list them, and TorchRL's
-    ``DMControlEnv("nico", "grasp_glass")`` finds them. Call it again after adding a task.
+    ``DMControlEnv("nico", "grasp_glass")`` finds them, in this process: within workers, use
+    ``DMControlWrapper(nico.load("grasp_glass"))``. Call it again after adding a task.
 
     Example:
         >>> from dm_control import suite

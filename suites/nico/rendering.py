@@ -16,6 +16,7 @@ from collections.abc import Callable, Sequence
 
 import mujoco
 import numpy as np
+from dm_control._render import base as dm_control_contexts
 from mujoco.rendering.classic import gl_context
 
 FRAME_HEIGHT = 32  # (pixels), the paper's "64x32 RGB image"
@@ -70,6 +71,18 @@ def _release() -> Callable[[], object]:
     return lambda: None
 
 
+def _leave() -> None:
+    """Make no context current in the calling thread, and tell dm_control.
+
+    dm_control notes which of its contexts is current in a thread, and does not make it current
+    again: its next image would be black, of whatever environment.
+    """
+    _release()()
+    thread = threading.current_thread()
+    context = dm_control_contexts._CURRENT_CONTEXT_FOR_THREAD.pop(thread, None)
+    dm_control_contexts._CURRENT_THREAD_FOR_CONTEXT.pop(context, None)
+
+
 def _close(renderer: mujoco.Renderer) -> None:
     # MuJoCo frees buffers by number in the current context, which may be another renderer's and
     # would be corrupted. Rendering first makes this renderer's context current.
@@ -77,6 +90,7 @@ def _close(renderer: mujoco.Renderer) -> None:
         with contextlib.suppress(RuntimeError):  # already closed
             renderer.render()
         renderer.close()
+        _leave()
 
 
 @functools.cache
@@ -142,8 +156,7 @@ class FrameRenderer:
                 self._renderer = mujoco.Renderer(model, height, width, max_geom=200)
                 _all.add(self._renderer)
                 _close_at_exit()
-                self._release = _release()
-                self._release()
+                _leave()
         except Exception as error:  # MuJoCo's backends raise many kinds of errors.
             backend = os.environ.get("MUJOCO_GL", "default")
             reason = next(iter(str(error).splitlines()), type(error).__name__)
@@ -184,7 +197,7 @@ class FrameRenderer:
             try:
                 return self._renderer.render(out=out)
             finally:
-                self._release()
+                _leave()
 
     def driver(self) -> str:
         """Return OpenGL's name of the renderer, such as ``"llvmpipe (LLVM 15.0.6)"``."""
@@ -195,7 +208,7 @@ class FrameRenderer:
             try:
                 name = GL.glGetString(GL.GL_RENDERER)
             finally:
-                self._release()
+                _leave()
         return name.decode() if isinstance(name, bytes) else "unknown"
 
     def close(self) -> None:

@@ -66,6 +66,21 @@ def test_the_best_part_of_a_run_is_the_best_mean_over_a_tenth(tmp_path):
     assert set(summary.best(tmp_path / "eval.csv").values()) == {0.5}
 
 
+def test_the_length_of_a_task_is_that_of_its_late_successes(tmp_path):
+    rows = ["algorithm,seed,episode,task,success,steps"]
+    for seed, episode, success, steps in [
+        (0, 90, 1, 40),  # not among the last tenth
+        (0, 100, 1, 4),
+        (0, 100, 0, 50),
+        (1, 100, 1, 7),
+    ]:
+        rows.append(f"bgpo,{seed},{episode},{TASKS[0]},{success},{steps}")
+    rows.append(f"bgpo,0,100,{TASKS[1]},0,50")
+    (tmp_path / "eval.csv").write_text("\n".join(rows) + "\n")
+
+    assert summary.lengths(tmp_path / "eval.csv") == {TASKS[0]: 5.5}
+
+
 def test_a_run_that_is_not_finished_cannot_be_summed_up(tmp_path):
     write_tests(tmp_path / "eval.csv", {100: ([1], [1], [0])})
     with pytest.raises(ValueError, match=r"config\.json is missing: let the run in .* finish"):

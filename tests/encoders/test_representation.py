@@ -138,7 +138,7 @@ def test_embeddings_tell_tasks_apart(probed: dict[str, float]) -> None:
     assert probed["sequence_mse"] < 0.6
 
 
-def test_latents_are_standardised_and_zero_beyond_the_length(
+def test_latents_are_standardized_and_zero_beyond_the_length(
     trained: Representation, dataset: TensorDict
 ) -> None:
     train, _ = split(dataset)

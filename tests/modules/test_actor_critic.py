@@ -204,3 +204,8 @@ def test_a_batch_size_may_be_a_number():
     assert Actor(6, batch_size=10).batch_size == (10,)
     with pytest.raises(ValueError, match="batch_size must be a whole number, at least 1; got 0"):
         Actor(6, batch_size=0)
+
+
+def test_inputs_of_different_batches_are_refused():
+    with pytest.raises(ValueError, match=r"got \[2, 3, 6\] and \[3, 2, 6\]"):
+        StackedMLP(12, 4)(torch.zeros(2, 3, 6), torch.zeros(3, 2, 6))

@@ -25,7 +25,7 @@ def group_of(groups, *inputs):
 
 
 def line(**options):
-    return BehaviorGroups(1, **{"activity_threshold": 0.5, **options})
+    return BehaviorGroups(1, **{"activity_threshold": 0.5, "activity_scale": 1.0, **options})
 
 
 def test_until_the_first_input_all_is_group_0_and_nothing_is_known():
@@ -128,7 +128,7 @@ def test_nodes_and_groups_are_those_of_the_rule(inputs, threshold, habituation, 
 def test_networks_that_are_masked_out_stay_as_they_are_and_each_is_as_alone():
     inputs = torch.rand(40, 3, 2, generator=torch.Generator().manual_seed(0)) * 4
     masks = torch.rand(40, 3, generator=torch.Generator().manual_seed(1)) < 0.6
-    options = {"activity_threshold": 0.6}
+    options = {"activity_threshold": 0.6, "activity_scale": 1.0}
     together = BehaviorGroups(2, batch_size=[3], **options)
     alone = [BehaviorGroups(2, **options) for _ in range(3)]
     for phi, mask in zip(inputs, masks, strict=True):
@@ -162,7 +162,7 @@ def test_looking_up_changes_nothing():
 
 
 def test_saved_groups_continue_as_the_others():
-    groups, restored = (BehaviorGroups(1, batch_size=[2], activity_threshold=0.5) for _ in range(2))
+    groups, restored = (line(batch_size=[2]) for _ in range(2))
     restored.adapt(torch.tensor([[7.0], [8.0]]))
     inputs = torch.rand(80, 2, 1, generator=torch.Generator().manual_seed(3)) * 12
     only_first = torch.tensor([True, False])
@@ -229,7 +229,7 @@ def test_a_batch_size_may_be_a_number():
 
 
 def test_a_state_of_other_networks_is_refused_and_changes_nothing():
-    groups = BehaviorGroups(2, batch_size=3)
+    groups = BehaviorGroups(2, batch_size=3, activity_scale=1.0)
     for phi in torch.eye(2)[[0, 1, 0]]:
         groups.adapt(10 * phi.expand(3, 2))
     before = groups.get_extra_state()

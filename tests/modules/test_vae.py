@@ -1,3 +1,5 @@
+import copy
+
 import pytest
 import torch
 import torch.nn.functional as F
@@ -78,7 +80,7 @@ def test_inverse_reads_both_latents_in_order(vae: VAE) -> None:
     torch.testing.assert_close(vae.inverse(z, z_next), expected)
 
 
-def test_latent_is_standardised_mu_without_gradient(vae: VAE) -> None:
+def test_latent_is_standardized_mu_without_gradient(vae: VAE) -> None:
     pixels = frames(40)
     mu, _ = vae.encode(pixels)
     torch.testing.assert_close(vae.latent(pixels), mu, msg="unscaled before training")
@@ -128,3 +130,10 @@ def test_refuses_what_is_no_frame(vae: VAE, pixels: torch.Tensor) -> None:
     for function in (vae.encode, vae.latent):
         with pytest.raises(ValueError, match="uint8"):
             function(pixels)
+
+
+def test_it_computes_in_other_precisions(vae: VAE) -> None:
+    frames = torch.randint(256, (3, 32, 64, 3), dtype=torch.uint8)
+    exact = vae.latent(frames)
+    torch.testing.assert_close(copy.deepcopy(vae).double().latent(frames).float(), exact)
+    assert copy.deepcopy(vae).bfloat16().latent(frames).dtype == torch.bfloat16

@@ -148,3 +148,17 @@ def test_weights_are_factors_of_the_states_losses():
     torch.testing.assert_close(first + second["loss_distillation"], whole)
     first.backward()
     assert (batch["told"].grad[0] != 0).any() and (batch["told"].grad[1] == 0).all()
+
+
+@pytest.mark.parametrize(
+    ("entry", "change", "message"),
+    [
+        ("teacher_action", lambda x: x[..., :1], r"'teacher_action' must be \[2, 3, 2\], .* got"),
+        ("priority_weight", lambda x: x[..., :1], r"one weight a state, \[2, 3\], got \[2, 3, 1\]"),
+    ],
+)
+def test_entries_that_would_broadcast_are_refused(entry, change, message):
+    batch = told_batch()
+    batch[entry] = change(torch.ones(2, 3, 2))
+    with pytest.raises(ValueError, match=message):
+        DistillationLoss(Told())(batch)

@@ -3,7 +3,7 @@
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import nn
 from torch.nn.functional import layer_norm
 
@@ -398,3 +398,15 @@ def test_batch_sizes_that_do_not_fit_are_refused(shapes):
 def test_a_negative_rate_is_refused():
     with pytest.raises(ValueError, match=r"must be >= 0, got -0\.1"):
         quadratic_loss(inner_learning_rate=-0.1)
+
+
+def test_the_adapted_policies_are_a_copy_and_networks_without_a_stack_are_refused():
+    meta, tasks, critics = Linear(), Linear([3]), Quadratic(TARGETS)
+    before = tasks.weight.detach().clone()
+    loss = MAMLLoss(meta, tasks, critics, pre_tanh_penalty=0.0)
+    loss.loss_actor(TensorDict({"state": torch.randn(3, 4, 3).double()}, [3, 4]))
+    assert tasks.weight.equal(before)
+    assert not loss.actor_network_params["weight"].equal(before)
+    plain = TensorDictModule(nn.Linear(3, 2), ["state"], ["action"])
+    with pytest.raises(ValueError, match=r"must have the batch sizes \[\*S\], .* got \[\], \[\]"):
+        MAMLLoss(plain, plain, plain)

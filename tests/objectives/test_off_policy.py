@@ -5,6 +5,7 @@ import copy
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl import objectives
 from torchrl.objectives.value import TD0Estimator
 
@@ -126,3 +127,58 @@ def test_its_targets_move_as_with_torchrls_soft_update(kind):
     expected = losses[1].state_dict()
     for key, value in losses[0].state_dict().items():
         torch.testing.assert_close(value, expected[key])
+
+
+@every_loss
+def test_it_computes_with_the_parameters_put_into_it(kind):
+    batch, loss, other = make_batch(2, 3, 4), make(kind), make(kind, seed=1)
+    own = TensorDict.from_module(loss)
+    # Before the first call and after it: networks are made once and kept.
+    for _ in range(2):
+        with own.apply(torch.zeros_like).to_module(loss):
+            assert not loss(batch.clone())["pred_value"].any()
+        assert loss(batch.clone())["pred_value"].abs().amax() > 0
+    loss.value_network_params = other.value_network_params
+    predicted = loss(batch.clone())["pred_value"]
+    assert predicted.equal(other(batch.clone())["pred_value"])
+
+
+@every_loss
+def test_a_network_in_a_container_is_refused(kind):
+    # It hides the batch size, and with it the seeds whose losses are summed.
+    network = {"in_keys": ["state"], "batch_size": (3,)}
+    actor = LOSSES[kind](3, 2, **network)
+    critics = Critic(3, 2, in_keys=["state"], batch_size=(3, 2) if kind.twin_critics else (3,))
+    kind(actor, critics)
+    with pytest.raises(ValueError, match=r"value_network must hold .* each actor, batch_size"):
+        kind(TensorDictSequential(actor), critics)
+
+
+@every_loss
+def test_a_constant_entry_that_no_network_reads_is_refused(kind):
+    assert make(kind, constant_keys=[("label",)]).inputs.moving_keys == ["state"]
+    with pytest.raises(
+        ValueError, match=r"constant_keys must be among .*'label'.* got \['lable'\]"
+    ):
+        make(kind, constant_keys=["lable"])
+
+
+def test_an_actor_without_pre_tanh_actions_promises_no_magnitude():
+    actor = TensorDictModule(torch.nn.Linear(3, 2), ["state"], ["action"])
+    loss = DDPGLoss(actor, Critic(3, 2, in_keys=["state"]), pre_tanh_penalty=0.0)
+    batch = make_batch(4)
+    told = loss(batch)
+    assert set(loss.out_keys) == set(told.keys())
+    read = ["state", "reward", "terminated"]
+    successor = {f"next_{key}": batch["next", key] for key in read}
+    values = loss(state=batch["state"], action=batch["action"], **successor)
+    assert len(values) == len(loss.out_keys)
+
+
+@every_loss
+def test_it_runs_under_autocast(kind):
+    loss, batch = make(kind), make_batch(2, 3, 8)
+    exact = loss(batch.clone())["pred_value"]
+    with torch.autocast("cpu", torch.bfloat16):
+        rounded = loss(batch.clone())["pred_value"]
+    torch.testing.assert_close(rounded.float(), exact, atol=0.02, rtol=0.02)

@@ -351,3 +351,42 @@ def test_each_transition_has_a_draw_of_its_own_whatever_the_batch_size():
     loss(without)
     torch.testing.assert_close(loss.target(without), within)
     assert len(within.unique()) == 32
+
+
+def test_a_state_with_another_number_of_generators_is_refused():
+    seeded = make_loss("td3", (0, 1), stacked=True)
+    actor, critics = (
+        Actor(STATE, ACTION, in_keys=["state"], hidden_sizes=(16,), batch_size=(2,)),
+        Critic(STATE, ACTION, in_keys=["state"], hidden_sizes=(16,), batch_size=(2, 2)),
+    )
+    unseeded = TD3Loss(actor, critics)
+    with pytest.raises(ValueError, match="saved with 2 generators, this loss has 0"):
+        unseeded.load_state_dict(seeded.state_dict())
+
+
+def test_sacs_target_entropy_counts_the_actions_unless_told():
+    networks = [
+        (
+            GaussianActor(STATE, n, in_keys=["state"]),
+            Critic(STATE, n, in_keys=["state"], batch_size=2),
+        )
+        for n in (1, 3)
+    ]
+    assert [SACLoss(*pair).target_entropy for pair in networks] == [-1.0, -3.0]
+    assert SACLoss(*networks[0], target_entropy=-4.0).target_entropy == -4.0
+
+
+def test_sacs_noise_is_of_real_numbers_whatever_the_observation():
+    class Whole(GaussianActor):
+        """Reads whole numbers."""
+
+        def sample(self, tensordict, noise):
+            assert noise.dtype == torch.float32
+            return super().sample(tensordict.set("state", tensordict["state"].float()), noise)
+
+    critic = Critic(STATE, ACTION, in_keys=["state"], batch_size=2)
+    loss = SACLoss(Whole(STATE, ACTION, in_keys=["state"]), critic, constant_keys=["state"])
+    loss.make_value_estimator()
+    batch = make_batch(8)
+    batch["state"] = batch["state"].long()
+    assert loss.next_value(loss.inputs.following(batch, loss.tensor_keys)).shape == (8,)

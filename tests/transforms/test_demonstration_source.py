@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, RewardSum, SerialEnv, StepCounter, TransformedEnv, check_env_specs
 
@@ -250,3 +251,23 @@ def test_a_bank_of_other_dtypes_is_converted(make_bank, MockEnv):
     check_env_specs(env)
     data = env.reset()
     assert data["demo_embedding"].dtype == torch.float32 and data["task"].dtype == torch.int64
+
+
+def test_a_clone_counts_and_draws_by_itself(make, MockEnv):
+    env, source = make([3, 4])
+    env.rollout(7, break_when_any_done=False)
+    assert source.episode.tolist() == [2, 2]
+    beside = TransformedEnv(MockEnv([3, 4], 3), env.transform.clone())
+    (clone,) = (t for t in beside.transform if isinstance(t, DemonstrationSource))
+    assert beside.rollout(3)["demo_index"].equal(copy.deepcopy(env).rollout(3)["demo_index"])
+    clone.seed_rows([7, 8])
+    assert clone.episode.tolist() == [0, 0]
+    assert source.episode.tolist() == [2, 2]
+
+
+def test_it_needs_a_seed_a_row_and_an_environment(make):
+    _, source = make([3, 4])
+    with pytest.raises(ValueError, match="1 seeds for 2 simulations"):
+        source.seed_rows([1])
+    with pytest.raises(TypeError, match="DemonstrationSource needs episodes: append it to an"):
+        source(TensorDict(batch_size=[2]))

@@ -5,6 +5,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs import TransformedEnv, check_env_specs
 
+from bgpo_trl.modules.vae import VAE
 from bgpo_trl.transforms import FrameEncoder
 
 
@@ -78,3 +79,8 @@ def test_refuses_what_it_cannot_encode(MockEnv, make_modules):
         FrameEncoder(vae, ["left", "right"])
     with pytest.raises(ValueError, match=r"found no 'left'.*in_keys"):
         _ = TransformedEnv(MockEnv(), FrameEncoder(vae, ["left"])).observation_spec
+
+
+def test_the_spec_has_the_dtype_of_the_encoder(MockEnv):
+    env = TransformedEnv(MockEnv([0, 1]), FrameEncoder(VAE().double()))
+    assert env.observation_spec["latent"].dtype == env.reset()["latent"].dtype == torch.float64

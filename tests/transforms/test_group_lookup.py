@@ -13,7 +13,9 @@ from bgpo_trl.transforms import BehaviorLookup, DemonstrationSource, GroupLookup
 def make(MockEnv, make_bank, generators):
     def make(seeds=None, lengths=3, learn=True):
         batch_size = [] if seeds is None else [len(seeds)]
-        groups = BehaviorGroups(32, batch_size=batch_size, activity_threshold=0.25)
+        groups = BehaviorGroups(
+            32, batch_size=batch_size, activity_threshold=0.25, activity_scale=1.0
+        )
         source = DemonstrationSource(
             make_bank(),
             TaskSchedule((0, 0, 0)),
@@ -28,7 +30,9 @@ def make(MockEnv, make_bank, generators):
 
 
 def copy_of(groups):
-    copy = BehaviorGroups(32, batch_size=groups.batch_size, activity_threshold=0.25)
+    copy = BehaviorGroups(
+        32, batch_size=groups.batch_size, activity_threshold=0.25, activity_scale=1.0
+    )
     copy.load_state_dict(groups.state_dict())
     return copy
 
@@ -140,3 +144,10 @@ def test_refuses_what_cannot_work(make, MockEnv):
     )
     with pytest.raises(ValueError, match="put StepCounter"):
         endless.reset()
+
+
+def test_its_activity_has_the_dtype_of_the_embedding():
+    lookup = GroupLookup(BehaviorGroups(4).double(), learn=False)
+    lookup.groups.adapt(torch.zeros(4).double())
+    found = lookup(TensorDict({"demo_embedding": torch.rand(5, 4)}, [5]))
+    assert found["group_activity"].dtype == torch.float32

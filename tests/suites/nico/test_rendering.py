@@ -273,3 +273,28 @@ def test_an_environment_that_is_closed_leaves_a_shared_renderer_alone(load):
 def test_an_unknown_camera_is_refused(physics):
     with pytest.raises(ValueError, match=r"^no camera 'nose' in the scene; choose one of .*'eyes'"):
         FrameRenderer(physics.model.ptr, "nose")
+
+
+def test_images_of_dm_control_are_the_same_beside_our_frames():
+    code = """
+from dm_control import suite
+from suites import nico
+from suites.nico.rendering import FrameRenderer
+
+other = suite.load("cartpole", "balance", task_kwargs={"random": 0})
+other.reset()
+expected = other.physics.render(24, 32)
+env = nico.load("grasp_glass", seed=0)
+same = lambda: bool((other.physics.render(24, 32) == expected).all())
+made = same()
+env.reset()
+drawn = same()
+renderer = FrameRenderer(env.physics.model.ptr)
+renderer.render(env.physics.data.ptr)
+same()
+renderer.close()
+print(expected.std() > 10, made, drawn, same())
+"""
+    process = run_python(code)
+
+    assert (process.stdout, process.stderr) == ("True True True True\n", "")
