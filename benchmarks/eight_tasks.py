@@ -9,7 +9,7 @@ it; ``benchmarks/sweep.py`` describes the other arguments.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -37,11 +37,17 @@ class Arguments(sweep.Arguments):
     """Seeds."""
     episodes: int | None = 4_000
     """Training episodes. The task starts are scaled in proportion."""
-    eval_every: int | None = 50
-    """Training episodes between evaluations."""
+    eval_every: int | None = None
+    """Training episodes between evaluations; by default 50, or fewer in shorter runs."""
     held_out: Literal["validation", "test"] = "test"
     out: Path = Path("runs/eight")
 
 
+def main(arguments: Arguments) -> None:
+    """Run the grid."""
+    every = arguments.eval_every or min(50, arguments.episodes or 50)
+    sweep.main(replace(arguments, eval_every=every))
+
+
 if __name__ == "__main__":
-    command_line(sweep.main, __doc__, Arguments)
+    command_line(main, __doc__, Arguments)

@@ -9,6 +9,7 @@ runs' settings. Of runs named ``eight-ALGORITHM``, ``eight-reversed-ALGORITHM`` 
 ``eight-concurrent-ALGORITHM`` (``python benchmarks/continual.py --tasks all``, the tasks in reverse
 order, ``benchmarks/concurrent_tasks.py --tasks all``) it makes the benchmark's table, heat maps of
 success after each phase, learning curves, and nodes, groups and cost by the number of tasks.
+Runs of other algorithms, such as ``eight-mine`` or ``continual-mine``, get rows of their own.
 Missing runs are listed; longer runs are cut to the length of the shortest in their table.
 """
 
@@ -23,7 +24,15 @@ import tyro
 
 from bgpo_trl.analysis import eight_tasks
 from bgpo_trl.analysis.claims import LEVEL, additions, claims
-from bgpo_trl.analysis.comparison import GROUPS, SETTINGS, Group, Run, Statistics, read_group
+from bgpo_trl.analysis.comparison import (
+    GROUPS,
+    SETTINGS,
+    Group,
+    Run,
+    Statistics,
+    read_group,
+    with_own,
+)
 from bgpo_trl.analysis.tables import Table, continual_table, groups_table, main_table, speed_table
 from bgpo_trl.experiments.arguments import command_line
 from bgpo_trl.figures.counts import plot_counts, read_counts
@@ -135,7 +144,7 @@ def eight_sections(
     directory: Path, out: Path, statistics: Statistics
 ) -> tuple[list[Section], dict[str, Run]]:
     """Return the sections of the benchmark of eight tasks and its runs; none without runs."""
-    groups = eight_tasks.GROUPS
+    groups = with_own(directory, eight_tasks.GROUPS)
     read = {key: read_group(directory, group) for key, group in groups.items()}
     runs = {name: run for found, _ in read.values() for name, run in found.items()}
     references, sections = read[eight_tasks.CONCURRENT][0], list[Section]()
@@ -196,7 +205,8 @@ def paper_sections(
         ValueError: If the runs are of different tasks.
     """
     sections: list[Section] = []
-    read = {key: read_group(directory, group) for key, group in GROUPS.items()}
+    known = with_own(directory, GROUPS)
+    read = {key: read_group(directory, group) for key, group in known.items()}
     groups = {key: found for key, (found, _) in read.items()}
     runs = {name: run for group in groups.values() for name, run in group.items()}
     if not runs:
@@ -205,7 +215,7 @@ def paper_sections(
         raise ValueError(
             f"{directory} holds runs of different tasks: name a directory for each choice of tasks"
         )
-    for key, group in GROUPS.items():
+    for key, group in known.items():
         notes = read[key][1]
         section = Section(group.title, notes=notes)
         # An ablation with only runs of other groups would repeat their tables.

@@ -147,7 +147,10 @@ def describe(run: Path) -> str:
         cells.append(f"{steps[task]:.1f}" if task in steps else "")
         lines.append(f"| {task or 'all'} | " + " | ".join(cells) + " |")
     reached = late["episodes to 80 %"]
-    facts = [f"Episodes to 80 %: {'not reached' if np.isinf(reached) else int(reached)}."]
+    facts = []
+    # Among tasks one after the other, the first would be counted alone.
+    if not any(read_json(run / "config.json").get("task_starts") or ()):
+        facts.append(f"Episodes to 80 %: {'not reached' if np.isinf(reached) else int(reached)}.")
     if summary.get("nodes") is not None:
         facts.append(f"GWR-B nodes: {summary['nodes']}.")
     if summary.get("groups"):

@@ -115,7 +115,7 @@ class TrainedPolicy:
                 f"{self.config.name} does not infer the task: name it, task=... as one of "
                 f"{', '.join(self.tasks)}"
             )
-        if task is not None and task not in self.tasks:
+        if task is not None and algorithm.needs_label and task not in self.tasks:
             raise ValueError(f"no task {task!r} in this run; choose one of {', '.join(self.tasks)}")
         shown = {"pixels": frames.unsqueeze(0), "length": torch.tensor([len(frames)])}
         (embedding,) = embed_demonstrations(self.encoders, TensorDict(shown, [1]))
@@ -129,7 +129,7 @@ class TrainedPolicy:
             generator,
         )
         self._policy = Policy.stack([policy], algorithm.device)
-        self._task = 0 if task is None else self.tasks.index(task)
+        self._task = self.tasks.index(task) if task is not None and algorithm.needs_label else 0
         shown, index = embedding.expand(n_seeds, -1), self._index
         recognized: dict[str, Any] = {}
         if algorithm.gwr is not None:
@@ -206,7 +206,12 @@ def load_run(
                 "as for its Trainer"
             ) from None
     if not has_checkpoint(path / "checkpoint"):
-        raise ValueError(f"{path} has no checkpoint yet: let the run reach its first one")
+        blocks = sorted(block.parent.name for block in path.glob("seeds-*/checkpoint"))
+        if blocks:
+            raise ValueError(
+                f"{path} was merged: name one of its blocks, such as {path / blocks[0]}"
+            )
+        raise ValueError(f"{path} has no checkpoint: let the run reach its first one, or keep it")
     encoders, bank = load_inputs(path, config.tasks, digests)
     algorithm = make(config.algorithm, seeds=config.seeds, bank=bank.seen(), encoders=encoders)
     saved = load_checkpoint(path / "checkpoint", mmap=True)

@@ -65,7 +65,8 @@ class Trainer(Closing):
     Raises:
         ValueError: If the directory holds a run with other settings, encoders or demonstrations, or
             any run and ``resume`` is False; if rows, checkpoint or ``config.json`` of a run to
-            resume are missing; or if the bank has no demonstration of a task.
+            resume are missing; if the bank has no demonstration of a task, or is not of the
+            encoders.
         BlockingIOError: If another process works in the directory.
     """
 
@@ -86,6 +87,13 @@ class Trainer(Closing):
         self.directory = Path(directory)
         self.progress = progress
         self.encoders = encoders
+        used = None if encoders is None else encoders.identity
+        if None not in (used, bank.encoder_id) and used != bank.encoder_id:
+            raise ValueError(
+                f"the bank was embedded by the encoders {bank.encoder_id}, these are "
+                f"{used}: load both together (load_pretrained), or embed anew "
+                "(bgpo_trl.encoders.make_bank)"
+            )
         bank = bank.for_tasks(config.tasks)
         self._schedule = schedule = TaskSchedule(starts=config.task_starts)
         seeds = config.seeds
@@ -109,8 +117,7 @@ class Trainer(Closing):
         self._growth_moments = growth_moments(config.episodes)
         # Rows of seeds that finished early, kept for a resumed run with more episodes.
         self._later: list[dict[str, Any]] = []
-        encoders_used = None if encoders is None else encoders.identity
-        self._settings = settings_of(config, Digests(encoders_used, bank.identity))
+        self._settings = settings_of(config, Digests(used, bank.identity))
         self._state: TensorDictBase | None = None
         with ExitStack() as opened:
             opened.enter_context(DirectoryLock(self.directory))

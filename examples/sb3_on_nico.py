@@ -6,6 +6,8 @@ so the environment renders larger ones.
 
 from __future__ import annotations
 
+import sys
+
 import tyro
 from gymnasium import Env
 from shimmy import DmControlCompatibilityV0
@@ -46,6 +48,8 @@ def main(task: str = "grasp_glass", steps: int = 300, seed: int = 0, pixels: boo
         seed: Seed of the start states and of the learner; tests have the next one.
         pixels: Learn from frames instead of the simulation's state.
     """
+    if steps < 1:
+        raise ValueError(f"steps must be at least 1, got {steps}")
     env = make_env(task, seed, pixels=pixels)
     learner = SAC("MultiInputPolicy", env, seed=seed, buffer_size=min(steps, 20_000), device="cpu")
     learner.learn(steps)
@@ -54,4 +58,7 @@ def main(task: str = "grasp_glass", steps: int = 300, seed: int = 0, pixels: boo
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    try:
+        tyro.cli(main)
+    except ValueError as error:
+        sys.exit(f"error: {error}")

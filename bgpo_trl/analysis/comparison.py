@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -149,6 +149,28 @@ class Run:
         return _tasks(self.config)
 
 
+def with_own(runs: Path, groups: Mapping[str, Group]) -> dict[str, Group]:
+    """Add the other runs in a directory to the groups that their names begin with.
+
+    ``continual-mine`` joins the group ``continual``, under the name ``mine``, and its first figure.
+    """
+    ours = {name for group in groups.values() for name in group.runs}
+    extended = dict(groups)
+    for path in sorted(runs.glob("*/eval.csv")):
+        name = path.parent.name
+        keys = [key for key in groups if name.startswith(f"{key}-")]
+        if name not in ours and keys:
+            key = max(keys, key=len)
+            group = extended[key]
+            first, *others = group.pictures
+            extended[key] = replace(
+                group,
+                runs={**group.runs, name: name.removeprefix(f"{key}-")},
+                pictures=(replace(first, runs=(*first.runs, name)), *others),
+            )
+    return extended
+
+
 def _tasks(config: dict[str, Any]) -> tuple[str, ...]:
     return tuple(config.get("tasks") or nico.PAPER_TASKS)
 
@@ -161,7 +183,8 @@ def read_group(runs: Path, group: Group) -> tuple[dict[str, Run], list[str]]:
         without a test of their last task are left out.
 
     Raises:
-        ValueError: If runs of the group differ in seeds, tasks or task starts.
+        ValueError: If runs of the group differ in seeds, tasks, task starts, tests or the longest
+            episode.
     """
     found: dict[str, Run] = {}
     notes: list[str] = []
@@ -188,9 +211,9 @@ def read_group(runs: Path, group: Group) -> tuple[dict[str, Run], list[str]]:
     first = next(iter(found.values()))
     last = min(int(run.curves.episodes[-1]) for run in found.values())
     for key, run in found.items():
-        for what in ("seeds", "tasks", "task_starts"):
-            ours, theirs = (_terms(of)[what] for of in (run, first))
-            if ours != theirs:
+        for what in ("seeds", "tasks", "task_starts", "held_out", "eval_episodes", "max_steps"):
+            ours, theirs = (_terms(of).get(what) for of in (run, first))
+            if ours != theirs and None not in (ours, theirs):
                 raise ValueError(
                     f"{run.directory} has {what} {ours}, {first.directory} has {theirs}: only runs "
                     "on equal terms are compared"
@@ -202,7 +225,8 @@ def read_group(runs: Path, group: Group) -> tuple[dict[str, Run], list[str]]:
 
 
 def _terms(run: Run) -> dict[str, Any]:
-    return {**run.config, "tasks": run.tasks}
+    limit = {"max_steps": (run.config.get("algorithm") or {}).get("max_steps")}
+    return {**run.config, **limit, "tasks": run.tasks}
 
 
 def starts(run: Run) -> list[int]:
@@ -214,7 +238,7 @@ def late_scores(run: Run) -> Values:
     """Return the mean success over the last 10 % of training, ``[S, T]``."""
     episodes = run.curves.episodes
     last = int(episodes[-1])
-    window = max(1, round(0.1 * last))
+    window = max(run.config.get("eval_every", 1), round(0.1 * last))
     return metrics.evaluation_matrix(run.curves.success, episodes, [last], window=window)[:, 0]
 
 

@@ -75,9 +75,17 @@ GROUPS = {key: _group(key, title) for key, title in SEQUENCES.items()}
 GROUPS[CONCURRENT] = _group(CONCURRENT, "all from the start")
 
 
-def knows_label(run: Run) -> bool:
-    """Return whether the algorithm of a run is told the task's label."""
-    return run.config["name"].startswith(("maml", "dist-nll", "oracle"))
+def knows_label(run: Run) -> bool | None:
+    """Return whether the algorithm of a run is told the task's label; None if it is not said.
+
+    A run says it by ``needs_label`` in its ``summary.json``, as all runs since this entry exists.
+    """
+    if "needs_label" in run.summary:
+        return bool(run.summary["needs_label"])
+    name = run.config.get("name", "")
+    if name.startswith(("maml", "dist-nll", "oracle")):
+        return True
+    return False if name in ALGORITHMS else None
 
 
 def success_matrix(run: Run) -> Values:
@@ -96,7 +104,7 @@ def success_matrix(run: Run) -> Values:
             f"{run.directory} starts its tasks at {begun}: name runs of tasks that do not start "
             f"one after the other {CONCURRENT}-ALGORITHM"
         )
-    window = max(run.config["eval_every"], min(lengths) // 5)
+    window = max(run.config.get("eval_every", 1), min(lengths) // 5)
     matrix = metrics.evaluation_matrix(
         run.curves.success, run.curves.episodes, [*begun[1:], last], window=window
     )
@@ -126,7 +134,8 @@ def benchmark_table(
         if ours is not None and run is not ours:
             lead = statistics.difference(late_scores(ours), scores, statistic=_means).cell()
         change = metrics.change_since_learned(success_matrix(run))
-        algorithm = next(name for name in ALGORITHMS if key.endswith(f"-{name}"))
+        sequence = max((name for name in SEQUENCES if key.startswith(f"{name}-")), key=len)
+        algorithm = key.removeprefix(f"{sequence}-")
         reference = references.get(f"{CONCURRENT}-{algorithm}")
         transfer = "-"
         if reference is not None:
@@ -136,7 +145,7 @@ def benchmark_table(
         rows.append(
             [
                 run.name,
-                "yes" if knows_label(run) else "no",
+                {True: "yes", False: "no", None: "?"}[knows_label(run)],
                 statistics.cell(scores, _means),
                 lead,
                 statistics.cell(-change, _means),

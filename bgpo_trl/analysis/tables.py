@@ -30,7 +30,10 @@ def main_table(runs: Mapping[str, Run], statistics: Statistics) -> Table:
     rows[0].append("episodes to 80 %")
     for run in runs.values():
         late = late_scores(run)
-        reached = metrics.overall_episodes_to(run.curves.success, run.curves.episodes)
+        reached = "-"  # Among tasks one after the other, the first would be counted alone.
+        if not any(starts(run)):
+            episodes = metrics.overall_episodes_to(run.curves.success, run.curves.episodes)
+            reached = f"{episodes:.0f}" if np.isfinite(episodes) else "not reached"
         rows.append(
             [
                 run.name,
@@ -38,7 +41,7 @@ def main_table(runs: Mapping[str, Run], statistics: Statistics) -> Table:
                 f"{100 * late.mean():.1f}",
                 *(f"{100 * share:.0f}" for share in late.mean(0)),
                 statistics.cell(area_scores(run)),
-                f"{reached:.0f}" if np.isfinite(reached) else "not reached",
+                reached,
             ]
         )
     return rows
@@ -56,7 +59,10 @@ def continual_table(continual: Mapping[str, Run], concurrent: Mapping[str, Run])
         success, episodes = run.curves.success, run.curves.episodes
         ends = [*starts(run)[1:], int(episodes[-1])]
         matrix = metrics.evaluation_matrix(
-            success, episodes, ends, window=max(1, round(0.1 * episodes[-1]))
+            success,
+            episodes,
+            ends,
+            window=max(run.config.get("eval_every", 1), round(0.1 * episodes[-1])),
         )
         best = metrics.forgetting_since_best(metrics.trailing_mean(success, 3))
         cells = [

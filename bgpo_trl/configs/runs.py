@@ -45,6 +45,7 @@ class RunConfig:
         whole(self, 1, "episodes", "eval_every", "eval_episodes")
         at_least(self, 0, "checkpoint_minutes")
         check(self, ("held_out", self.held_out in ("validation", "test"), "validation or test"))
+        check(self, ("tasks", not isinstance(self.tasks, str), "a tuple of names"))
         nico.check_tasks(self.tasks)
         starts = self.task_starts
         check(

@@ -56,6 +56,7 @@ def measure(
         "command": shlex.join(["python", *sys.argv]),
         "episodes": config.episodes,
         "random_success": dict(zip(config.tasks, random_success.tolist(), strict=True)),
+        "needs_label": algorithm.needs_label,
         "nodes": None if gwr is None else gwr.num_nodes.tolist(),
         "groups": None,
     }

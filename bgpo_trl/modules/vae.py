@@ -14,6 +14,8 @@ FRAME_SHAPE = (32, 64, 3)
 _CHANNELS = (3, 32, 64, 128)
 _COARSE_SHAPE = (128, 4, 8)
 _COARSE_SIZE = 4096
+# On a CPU, activations of more frames do not fit into the cache, and take twice as long.
+_FRAMES_AT_ONCE = 64
 
 
 class VAE(nn.Module):
@@ -104,7 +106,11 @@ class VAE(nn.Module):
     @torch.no_grad()
     def latent(self, pixels: Tensor) -> Tensor:
         """Return the features used downstream: mu, standardized, ``[..., latent_size]``."""
-        return self.standardize(self.mean_head(self._coarse(pixels)))
+        _check_frames(pixels)
+        frames = pixels.reshape(-1, *FRAME_SHAPE)
+        parts = frames.split(_FRAMES_AT_ONCE) if frames.device.type == "cpu" else (frames,)
+        mu = torch.cat([self.mean_head(self._coarse(part)) for part in parts])
+        return self.standardize(mu).reshape(*pixels.shape[:-3], self.latent_size)
 
     def standardize(self, mu: Tensor) -> Tensor:
         """Return ``(mu - latent_mean) / latent_std``, ``[..., latent_size]``."""
@@ -133,13 +139,17 @@ class VAE(nn.Module):
             raise ValueError(f"a latent must be [..., {self.latent_size}], got {[*z.shape]}")
 
     def _coarse(self, pixels: Tensor) -> Tensor:
-        if pixels.dtype != torch.uint8 or pixels.shape[-3:] != FRAME_SHAPE:
-            raise ValueError(
-                f"pixels must be uint8 [..., 32, 64, 3], got {pixels.dtype} {tuple(pixels.shape)}"
-            )
+        _check_frames(pixels)
         x = pixels.reshape(-1, *FRAME_SHAPE).to(self.mean_frame.dtype) / 255 - self.mean_frame
         x = x.permute(0, 3, 1, 2)
         for convolution in self.encoder:
             # Pooling before ReLU gives the same result (both are monotone), at a quarter the size.
             x = F.relu(F.max_pool2d(convolution(x), 2))
         return x.reshape(*pixels.shape[:-3], _COARSE_SIZE)
+
+
+def _check_frames(pixels: Tensor) -> None:
+    if pixels.dtype != torch.uint8 or pixels.shape[-3:] != FRAME_SHAPE:
+        raise ValueError(
+            f"pixels must be uint8 [..., 32, 64, 3], got {pixels.dtype} {tuple(pixels.shape)}"
+        )
