@@ -41,7 +41,8 @@ class Recognition:
         activity: Activity of that node in [0, 1]; 1 for a demonstration equal to it.
         group: Number of the group of behaviors; None without groups, as are the next two.
         group_activity: Activity of the best match among the groups' nodes, in [0, 1].
-        known: Whether that reaches the threshold of a known group.
+        known: Whether that reaches the threshold of a known group. It is reliable for encoders that
+            have seen the task; of a task new to them, most demonstrations count as known.
         task: The label given with the demonstration.
     """
 

@@ -348,7 +348,7 @@ def see_the_truth(run):
     ("spoil", "said"),
     [
         (shutil.rmtree, r"run holds no run: there is no config.json$"),
-        (lambda run: shutil.rmtree(run / "checkpoint"), "has no checkpoint yet: let the run reach"),
+        (lambda run: shutil.rmtree(run / "checkpoint"), "has no checkpoint: let the run reach"),
         (spoil_checkpoints, "holds no intact checkpoint"),
         (spoil_encoders, r"was trained with the encoders \w{12}, not with those that come with"),
         (lambda run: rewrite(run, encoders="0" * 64), "trained with the encoders 000000000000, no"),

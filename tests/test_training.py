@@ -463,3 +463,10 @@ def test_a_bank_that_cannot_be_kept_leaves_nothing_open(make, tmp_path, monkeypa
         make(tmp_path / "run")
     assert closed == [1]
     assert not (tmp_path / "run" / "lock").exists()
+
+
+def test_encoders_and_a_bank_of_other_encoders_are_refused(make_config, encoders, bank, tmp_path):
+    foreign = replace(bank, encoder_id="of others")
+    with pytest.raises(ValueError, match=r"embedded by the encoders of others, these are .* anew"):
+        Trainer(make_config(), tmp_path / "run", bank=foreign, encoders=encoders)
+    assert not (tmp_path / "run").exists()

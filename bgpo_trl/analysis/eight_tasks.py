@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from bgpo_trl.analysis import metrics
+from bgpo_trl.analysis import comparison, metrics
 from bgpo_trl.analysis.comparison import (
     Group,
     Picture,
@@ -85,7 +85,7 @@ def knows_label(run: Run) -> bool | None:
     name = run.config.get("name", "")
     if name.startswith(("maml", "dist-nll", "oracle")):
         return True
-    return False if name in ALGORITHMS else None
+    return False if name in ALGORITHMS | comparison.ALGORITHMS | comparison.PUBLISHED else None
 
 
 def success_matrix(run: Run) -> Values:

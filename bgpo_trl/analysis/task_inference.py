@@ -1,4 +1,7 @@
-"""Task inference of GWR-B and purity of the groups, measured with labels that they never see."""
+"""Task inference of GWR-B and purity of the groups, measured with labels that they never see.
+
+Tasks count alike, however many demonstrations a bank holds of each.
+"""
 
 from __future__ import annotations
 
@@ -28,11 +31,16 @@ def match_counts(gwr: GWRB, bank: DemonstrationBank, n_tasks: int) -> Tensor:
 
 
 def majority_task(counts: Tensor) -> Tensor:
-    """Return each node's most frequent task, int64 ``[..., N]``, from its `match_counts`.
+    """Return the task of which a node matches most, int64 ``[..., N]``, from its `match_counts`.
 
     Nodes without a match get -1.
     """
-    return torch.where(counts.sum(-1) > 0, counts.argmax(-1), -1)
+    return torch.where(counts.sum(-1) > 0, _shares(counts).argmax(-1), -1)
+
+
+def _shares(counts: Tensor) -> Tensor:
+    """Return counts ``[..., N, n_tasks]`` as shares of each task's demonstrations."""
+    return counts / counts.sum(-2, keepdim=True).clamp(min=1)
 
 
 def task_inference_accuracy(
@@ -40,21 +48,24 @@ def task_inference_accuracy(
 ) -> Tensor:
     """Return the share of ``tested`` whose node has their task as its majority task, ``[*S]``.
 
-    The demonstrations ``seen`` define each node's majority task.
+    It is the mean over the tasks. The demonstrations ``seen`` define each node's majority task.
     """
     task_of_node = majority_task(match_counts(gwr, seen, n_tasks))
-    matched = match_counts(gwr, tested, n_tasks)
+    matched = _shares(match_counts(gwr, tested, n_tasks))
     right = matched.gather(-1, task_of_node.clamp(min=0).unsqueeze(-1)).squeeze(-1)
-    right = torch.where(task_of_node >= 0, right, 0)
-    return right.sum(-1) / matched.sum((-1, -2))
+    right = torch.where(task_of_node >= 0, right, 0.0)
+    return right.sum(-1) / len(tested.task.unique())
 
 
 @torch.no_grad()
 def group_purity(groups: BehaviorGroups, bank: DemonstrationBank, n_tasks: int) -> Tensor:
-    """Return the share of demonstrations of the majority task of their group, ``[*S]``."""
+    """Return the share of demonstrations of the majority task of their group, ``[*S]``.
+
+    A group's majority task is that of which it holds the largest share.
+    """
     batch = groups.batch_size
     group = groups.lookup(bank.embedding.expand(*batch, *bank.embedding.shape)).group
     counts = torch.zeros(*batch, int(groups.num_groups.max()), n_tasks)
     for index in np.ndindex(*batch):
         counts[index].index_put_((group[index], bank.task), torch.tensor(1.0), accumulate=True)
-    return counts.amax(-1).sum(-1) / len(bank.task)
+    return _shares(counts).amax(-1).sum(-1) / len(bank.task.unique())

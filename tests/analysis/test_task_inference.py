@@ -3,8 +3,14 @@
 import pytest
 import torch
 
-from bgpo_trl.analysis.task_inference import majority_task, match_counts, task_inference_accuracy
+from bgpo_trl.analysis.task_inference import (
+    group_purity,
+    majority_task,
+    match_counts,
+    task_inference_accuracy,
+)
 from bgpo_trl.data.bank import DemonstrationBank
+from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.modules.gwr import GWRB
 
 PLACES = torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 9.0]])
@@ -58,7 +64,8 @@ def test_counting_learns_nothing():
 
 def test_the_majority_of_no_match_is_none_and_of_a_tie_the_first():
     counts = torch.tensor([[[2, 1], [1, 3], [0, 0]], [[2, 2], [0, 1], [4, 0]]])
-    assert majority_task(counts).tolist() == [[0, 1, -1], [0, 1, 0]]
+    assert majority_task(counts).tolist() == [[0, 1, -1], [1, 1, 0]]  # shares, not counts
+    assert majority_task(torch.tensor([[1, 1], [2, 2]])).tolist() == [0, 0]
 
 
 @pytest.mark.parametrize(
@@ -79,4 +86,16 @@ def test_accuracy_of_each_network_of_a_batch():
     gwr = network((0, 1, 2), (1, 0), batch_size=[2])
     tested = bank((0, 0), (2, 0), (1, 1))  # the second network takes place 2 for place 0
     accuracy = task_inference_accuracy(gwr, SEEN, tested, 2)
-    torch.testing.assert_close(accuracy, torch.tensor([2 / 3, 1.0]))
+    torch.testing.assert_close(accuracy, torch.tensor([3 / 4, 1.0]))
+
+
+def test_a_task_counts_the_same_however_many_demonstrations_it_has():
+    # One group for two tasks, of which one has nine times as many demonstrations.
+    groups = BehaviorGroups(2)
+    for _ in range(3):
+        groups.adapt(PLACES[0])
+    shown = bank(*[(0, 0)] * 9, (1, 1))
+    assert group_purity(groups, shown, 2).item() == 0.5
+    gwr = network((0, 1))
+    both = bank(*[(0, 0)] * 9, (0, 1))
+    assert task_inference_accuracy(gwr, both, both, 2).item() == 0.5

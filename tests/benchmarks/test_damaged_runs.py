@@ -150,7 +150,7 @@ def test_a_run_that_is_all_there_is_summed_up(run, capsys):
     told = capsys.readouterr().out
     assert "nan" not in told
     assert "GWR-B nodes: [3, 4]. Commit c: `python`." in told
-    assert re.search(r"Episodes to 80 %: (\d+|not reached)\. ", told)
+    assert "Episodes to 80 %" not in told  # with one task presented, it would be of that alone
 
 
 def test_what_trainer_alone_writes_is_summed_up(run, capsys):
@@ -162,7 +162,7 @@ def test_what_trainer_alone_writes_is_summed_up(run, capsys):
     rows = [line.split("|")[1:-1] for line in table.splitlines()[2:]]
     assert [row[0].strip() for row in rows] == [*TASKS, "all"]
     assert all(row[1].strip() and not "".join(row[5:]).strip() for row in rows)
-    assert re.match(r"Episodes to 80 %: (\d+|not reached)\. A training step takes", facts)
+    assert facts.startswith("A training step takes")
     assert (run / "success.png").exists()
     assert (run / "groups.png").exists() == (max(n_groups(run)) > 1)
 

@@ -27,7 +27,8 @@ def write_run(folder, name, level, *, episodes=40, starts=(0, 0, 0), seeds=(0, 1
     directory.mkdir(parents=True)
     config = {"name": name.split("-", 1)[1], "seeds": list(seeds), "task_starts": list(starts)}
     config |= {} if tasks == TASKS else {"tasks": list(tasks)}  # those of earlier versions
-    config |= {"episodes": episodes, "eval_every": 2}
+    config |= {"episodes": episodes, "eval_every": 2, "eval_episodes": 10}
+    config |= {"held_out": "validation", "algorithm": {"max_steps": 50}}
     (directory / "config.json").write_text(json.dumps(config))
     (directory / "summary.json").write_text(json.dumps({"commit": "abc", "command": "python x"}))
     lines = []
@@ -218,10 +219,22 @@ def test_a_longer_run_is_cut_and_an_unfinished_one_is_told(runs):
     assert cut.tolist() == before.curves.success[:, :15].tolist()
 
 
-@pytest.mark.parametrize(("what", "value"), [("seeds", [0, 1]), ("task_starts", [0, 2, 4])])
+@pytest.mark.parametrize(
+    ("what", "value"),
+    [
+        ("seeds", [0, 1]),
+        ("task_starts", [0, 2, 4]),
+        ("held_out", "test"),
+        ("eval_episodes", 77),
+        ("max_steps", 30),
+    ],
+)
 def test_runs_on_other_terms_are_refused(runs, what, value):
     path = runs / "concurrent-ddpg" / "config.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), what: value}))
+    config = json.loads(path.read_text())
+    of_algorithm = {"algorithm": {**config["algorithm"], what: value}}
+    change = of_algorithm if what == "max_steps" else {what: value}
+    path.write_text(json.dumps({**config, **change}))
     with pytest.raises(ValueError, match=f"concurrent-ddpg has {what} .*on equal terms"):
         report.main(report.Arguments(runs))
 

@@ -109,3 +109,39 @@ def test_summary_of_a_run_of_eight_tasks(tmp_path):
     assert "A training step takes 10.0 ms with 1 and 15.0 ms with 8 tasks presented, 9 MB." in (
         described
     )
+
+
+def test_a_run_of_another_algorithm_has_its_row_and_says_whether_it_knows_the_label(tmp_path):
+    write_eight(tmp_path, "eight-bgpo", 8)
+    write_eight(tmp_path, "eight-concurrent-mine", 4, starts=(0,) * 8)
+    told = write_eight(tmp_path, "eight-mine", 4) / "summary.json"
+    told.write_text(json.dumps({"needs_label": True}))
+    # The least that a run of plain TorchRL must write.
+    least = write_eight(tmp_path, "eight-plain", 6)
+    config = json.loads((least / "config.json").read_text())
+    kept = {key: config[key] for key in ("seeds", "tasks", "task_starts", "episodes")}
+    (least / "config.json").write_text(json.dumps(kept))
+    for path in least.iterdir():
+        if path.name not in ("config.json", "eval.csv"):
+            path.unlink()
+    report.main(report.Arguments(tmp_path))
+    text = (tmp_path / "tables.md").read_text()
+    table = rows_of(text, "Eight tasks, one after the other: the benchmark")
+    assert table["mine"][:2] == ["yes", "40.0 [40, 40]"]
+    assert table["mine"][5] != "-"  # forward transfer, by its own reference
+    assert table["plain"][:3] == ["?", "60.0 [60, 60]", "+20.0 [+20, +20]"]
+    assert table["plain"][6:] == ["-"] * 4
+    assert "mine" in rows_of(text, "Eight tasks, all from the start")
+
+
+def test_rare_tests_are_enough_for_the_end_of_training(tmp_path):
+    path = write_eight(tmp_path, "eight-bgpo", 8)
+    config = json.loads((path / "config.json").read_text())
+    (path / "config.json").write_text(json.dumps(config | {"eval_every": 10}))
+    head, *lines = (path / "eval.csv").read_text().splitlines()
+    rare = [line for line in lines if int(line.split(",")[2]) % 10 == 0]
+    (path / "eval.csv").write_text("\n".join([head, *rare]) + "\n")
+    report.main(report.Arguments(tmp_path))
+    text = (tmp_path / "tables.md").read_text()
+    table = rows_of(text, "Eight tasks, one after the other: the benchmark")
+    assert table["BGPO"][1] == "80.0 [80, 80]"

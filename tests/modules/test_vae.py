@@ -137,3 +137,11 @@ def test_it_computes_in_other_precisions(vae: VAE) -> None:
     exact = vae.latent(frames)
     torch.testing.assert_close(copy.deepcopy(vae).double().latent(frames).float(), exact)
     assert copy.deepcopy(vae).bfloat16().latent(frames).dtype == torch.bfloat16
+
+
+def test_many_frames_are_encoded_as_few(vae: VAE) -> None:
+    frames = torch.randint(256, (2, 75, 32, 64, 3), dtype=torch.uint8)
+    latent = vae.latent(frames)
+    assert latent.shape == (2, 75, 64)
+    torch.testing.assert_close(latent[1, 70], vae.latent(frames[1, 70]))
+    assert vae.latent(frames[:0]).shape == (0, 75, 64)
