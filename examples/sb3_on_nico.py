@@ -1,7 +1,6 @@
 """Stable-Baselines3 on a NICO task, by Gymnasium: python examples/sb3_on_nico.py --steps 20000.
 
-Needs the extra `gymnasium`. A frame of 32 x 64 pixels is small for the CNN of Stable-Baselines3,
-so the environment renders larger ones.
+Needs the extra `gymnasium`. Frames are larger than 32 x 64 for the CNN of Stable-Baselines3.
 """
 
 from __future__ import annotations
@@ -19,10 +18,8 @@ from suites import nico
 
 def make_env(task: str, seed: int, *, pixels: bool) -> Env:
     """Return a task with Gymnasium's interface; without pixels, it observes the simulation."""
-    observation = "pixels" if pixels else "state"
-    return DmControlCompatibilityV0(
-        nico.load(task, seed=seed, observation=observation, frame_size=(84, 84))
-    )
+    options = {"observation": "pixels" if pixels else "state", "frame_size": (84, 84)}
+    return DmControlCompatibilityV0(nico.load(task, seed=seed, **options))
 
 
 def success_rate(learner: BaseAlgorithm, env: Env, episodes: int) -> float:
@@ -48,8 +45,6 @@ def main(task: str = "grasp_glass", steps: int = 300, seed: int = 0, pixels: boo
         seed: Seed of the start states and of the learner; tests have the next one.
         pixels: Learn from frames instead of the simulation's state.
     """
-    if steps < 1:
-        raise ValueError(f"steps must be at least 1, got {steps}")
     env = make_env(task, seed, pixels=pixels)
     learner = SAC("MultiInputPolicy", env, seed=seed, buffer_size=min(steps, 20_000), device="cpu")
     learner.learn(steps)
