@@ -183,8 +183,8 @@ def read_group(runs: Path, group: Group) -> tuple[dict[str, Run], list[str]]:
         without a test of their last task are left out.
 
     Raises:
-        ValueError: If runs of the group differ in seeds, tasks, task starts, tests or the longest
-            episode.
+        ValueError: If runs of the group differ in seeds, tasks, task starts, test episodes or the
+            time limit of an episode.
     """
     found: dict[str, Run] = {}
     notes: list[str] = []

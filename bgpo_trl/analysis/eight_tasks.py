@@ -78,7 +78,8 @@ GROUPS[CONCURRENT] = _group(CONCURRENT, "all from the start")
 def knows_label(run: Run) -> bool | None:
     """Return whether the algorithm of a run is told the task's label; None if it is not said.
 
-    A run says it by ``needs_label`` in its ``summary.json``, as all runs since this entry exists.
+    Runs record it as ``needs_label`` in ``summary.json``; without that entry, the algorithm's name
+    decides.
     """
     if "needs_label" in run.summary:
         return bool(run.summary["needs_label"])
