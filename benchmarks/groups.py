@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from bgpo_trl.analysis.task_inference import group_purity, task_inference_accuracy
-from bgpo_trl.configs import BGPOConfig
+from bgpo_trl.configs import BGPOConfig, GWRBConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.encoders.shipped import default_weights, groups_config
 from bgpo_trl.experiments.arguments import BankArguments, check_draws, command_line, even_starts
@@ -36,7 +36,7 @@ class Arguments(BankArguments):
     """Activity thresholds of the coarse network."""
     habituation_threshold: float = 0.5
     """Habituation threshold of the coarse network."""
-    activity_scale: float = 0.25
+    activity_scale: float = GWRBConfig.activity_scale
     """Factor of distances in the activity of the fine network."""
     draws: int = 1_800
     """Demonstrations that each network is fed with."""

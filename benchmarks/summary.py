@@ -57,11 +57,9 @@ def summarize(path: Path) -> dict[str, float]:
         ValueError: If a task has no test in that period.
     """
     rows = read_tests(path)
-    last = max(int(row["episode"]) for row in rows)
     late = defaultdict(list)
-    for row in rows:
-        if int(row["episode"]) > 0.9 * last:
-            late[row["task"]].append(float(row["success"]))
+    for row in _late(rows):
+        late[row["task"]].append(float(row["success"]))
     for task in _tasks(rows):
         if not late[task]:
             raise ValueError(f"{path} has no late test of {task!r}: let the run finish")
@@ -98,11 +96,9 @@ def lengths(path: Path) -> dict[str, float]:
     Args:
         path: An ``eval.csv``. Tasks without a success, or without lengths, are left out.
     """
-    rows = read_tests(path)
-    last = max(int(row["episode"]) for row in rows)
     steps = defaultdict(list)
-    for row in rows:
-        if int(row["episode"]) > 0.9 * last and float(row["success"]) == 1 and row.get("steps"):
+    for row in _late(read_tests(path)):
+        if float(row["success"]) == 1 and row.get("steps"):
             steps[row["task"]].append(int(row["steps"]))
     return {task: float(np.mean(each)) for task, each in steps.items()}
 
@@ -222,10 +218,15 @@ def _tasks(rows: list[dict[str, str]]) -> list[str]:
     return list(dict.fromkeys(row["task"] for row in rows))
 
 
+def _late(rows: list[dict[str, str]]) -> list[dict[str, str]]:
+    """Return the tests of the last 10 % of training."""
+    last = max(int(row["episode"]) for row in rows)
+    return [row for row in rows if int(row["episode"]) > 0.9 * last]
+
+
 def _late_by_seed(path: Path) -> dict[str | None, list[float]]:
     rows = read_tests(path)
-    last = max(int(row["episode"]) for row in rows)
-    late = [row for row in rows if int(row["episode"]) > 0.9 * last]
+    late = _late(rows)
     seeds = sorted({int(row["seed"]) for row in rows})
     found: dict[str | None, list[float]] = {}
     for task in _tasks(rows):

@@ -116,7 +116,8 @@ class TrainedPolicy:
                 f"{self.config.name} does not infer the task: name it, task=... as one of "
                 f"{', '.join(self.tasks)}"
             )
-        if task is not None and algorithm.needs_label and task not in self.tasks:
+        label = task if algorithm.needs_label else self.tasks[0]
+        if label not in self.tasks:
             raise ValueError(f"no task {task!r} in this run; choose one of {', '.join(self.tasks)}")
         shown = {"pixels": frames.unsqueeze(0), "length": torch.tensor([len(frames)])}
         (embedding,) = embed_demonstrations(self.encoders, TensorDict(shown, [1]))
@@ -130,7 +131,7 @@ class TrainedPolicy:
             generator,
         )
         self._policy = Policy.stack([policy], algorithm.device)
-        self._task = self.tasks.index(task) if task is not None and algorithm.needs_label else 0
+        self._task = self.tasks.index(label)
         shown, index = embedding.expand(n_seeds, -1), self._index
         recognized: dict[str, Any] = {}
         if algorithm.gwr is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -148,6 +148,22 @@ class Run:
         """Names of the tasks; runs of earlier versions saved none, theirs are the paper's."""
         return _tasks(self.config)
 
+    @property
+    def eval_every(self) -> int:
+        """Training episodes between tests; 1, the least, if the run does not say."""
+        return self.config.get("eval_every", 1)
+
+
+def setting_of(name: str, settings: Iterable[str]) -> str | None:
+    """Return the longest of some settings that the name of a run begins with; None without one.
+
+    Example:
+        >>> setting_of("eight-reversed-mine", ["eight", "eight-reversed"])
+        'eight-reversed'
+    """
+    fitting = [setting for setting in settings if name.startswith(f"{setting}-")]
+    return max(fitting, key=len, default=None)
+
 
 def with_own(runs: Path, groups: Mapping[str, Group]) -> dict[str, Group]:
     """Add the other runs in a directory to the groups that their names begin with.
@@ -158,9 +174,8 @@ def with_own(runs: Path, groups: Mapping[str, Group]) -> dict[str, Group]:
     extended = dict(groups)
     for path in sorted(runs.glob("*/eval.csv")):
         name = path.parent.name
-        keys = [key for key in groups if name.startswith(f"{key}-")]
-        if name not in ours and keys:
-            key = max(keys, key=len)
+        key = setting_of(name, groups)
+        if name not in ours and key is not None:
             group = extended[key]
             first, *others = group.pictures
             extended[key] = replace(
@@ -236,10 +251,14 @@ def starts(run: Run) -> list[int]:
 
 def late_scores(run: Run) -> Values:
     """Return the mean success over the last 10 % of training, ``[S, T]``."""
+    return success_at(run, [int(run.curves.episodes[-1])])[:, 0]
+
+
+def success_at(run: Run, ends: Sequence[int]) -> Values:
+    """Return the mean success over the 10 % of training before some episodes, ``[S, P, T]``."""
     episodes = run.curves.episodes
-    last = int(episodes[-1])
-    window = max(run.config.get("eval_every", 1), round(0.1 * last))
-    return metrics.evaluation_matrix(run.curves.success, episodes, [last], window=window)[:, 0]
+    window = max(run.eval_every, round(0.1 * int(episodes[-1])))
+    return metrics.evaluation_matrix(run.curves.success, episodes, ends, window=window)
 
 
 def area_scores(run: Run) -> Values:

@@ -19,6 +19,7 @@ from bgpo_trl.analysis.comparison import (
     Statistics,
     Values,
     late_scores,
+    setting_of,
     starts,
 )
 from bgpo_trl.analysis.tables import Table
@@ -105,7 +106,7 @@ def success_matrix(run: Run) -> Values:
             f"{run.directory} starts its tasks at {begun}: name runs of tasks that do not start "
             f"one after the other {CONCURRENT}-ALGORITHM"
         )
-    window = max(run.config.get("eval_every", 1), min(lengths) // 5)
+    window = max(run.eval_every, min(lengths) // 5)
     matrix = metrics.evaluation_matrix(
         run.curves.success, run.curves.episodes, [*begun[1:], last], window=window
     )
@@ -135,8 +136,7 @@ def benchmark_table(
         if ours is not None and run is not ours:
             lead = statistics.difference(late_scores(ours), scores, statistic=_means).cell()
         change = metrics.change_since_learned(success_matrix(run))
-        sequence = max((name for name in SEQUENCES if key.startswith(f"{name}-")), key=len)
-        algorithm = key.removeprefix(f"{sequence}-")
+        algorithm = key.removeprefix(f"{setting_of(key, SEQUENCES)}-")
         reference = references.get(f"{CONCURRENT}-{algorithm}")
         transfer = "-"
         if reference is not None:

@@ -15,6 +15,7 @@ from bgpo_trl.analysis.comparison import (
     area_scores,
     late_scores,
     starts,
+    success_at,
 )
 from bgpo_trl.analysis.transfer import forward_transfer
 from bgpo_trl.runs.results import read_outcomes, read_rows
@@ -56,15 +57,8 @@ def continual_table(continual: Mapping[str, Run], concurrent: Mapping[str, Run])
     """Return the table of forgetting and transfer of the continual runs."""
     rows = [["", "backward transfer", "forgotten since best", "forward transfer"]]
     for key, run in continual.items():
-        success, episodes = run.curves.success, run.curves.episodes
-        ends = [*starts(run)[1:], int(episodes[-1])]
-        matrix = metrics.evaluation_matrix(
-            success,
-            episodes,
-            ends,
-            window=max(run.config.get("eval_every", 1), round(0.1 * episodes[-1])),
-        )
-        best = metrics.forgetting_since_best(metrics.trailing_mean(success, 3))
+        matrix = success_at(run, [*starts(run)[1:], int(run.curves.episodes[-1])])
+        best = metrics.forgetting_since_best(metrics.trailing_mean(run.curves.success, 3))
         cells = [
             _spread(metrics.backward_transfer(matrix)),
             _spread(best),

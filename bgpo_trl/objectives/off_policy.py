@@ -125,14 +125,11 @@ class OffPolicyLoss(LossModule):
     def out_keys(self) -> list[NestedKey]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Entries that `forward` returns."""
         told = ["pred_value", "target_value", "pred_value_max", "target_value_max", "td_error_max"]
-        of_actor = [*self.actor_keys]
-        if "pre_tanh_magnitude" in of_actor and not self._writes_pre_tanh:
-            of_actor.remove("pre_tanh_magnitude")
+        # As in `penalized`: there is nothing to tell of an actor that does not write it.
+        silent = self.tensor_keys.pre_tanh_action not in self.actor_network.out_keys
+        left_out = {"pre_tanh_magnitude"} if silent else set()
+        of_actor = [key for key in self.actor_keys if key not in left_out]
         return ["loss_actor", "loss_value", *told, *of_actor]
-
-    @property
-    def _writes_pre_tanh(self) -> bool:
-        return self.tensor_keys.pre_tanh_action in self.actor_network.out_keys
 
     def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> None:
         """Set the estimator of the target.
