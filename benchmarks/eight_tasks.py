@@ -15,14 +15,14 @@ from typing import Literal
 
 import sweep
 
-from bgpo_trl.experiments.arguments import AlgorithmName, command_line
+from bgpo_trl.experiments.arguments import command_line
 
 
 @dataclass(frozen=True)
 class Arguments(sweep.Arguments):
     """Run the benchmark of eight tasks on Ray."""
 
-    algorithms: tuple[AlgorithmName, ...] = (
+    algorithms: tuple[str, ...] = (
         "bgpo",
         "bgpo-experts",
         "bgpo-single",

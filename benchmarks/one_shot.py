@@ -28,13 +28,13 @@ from matplotlib.ticker import PercentFormatter
 from bgpo_trl import TrainedPolicy, load_run
 from bgpo_trl.analysis.task_inference import task_inference_accuracy
 from bgpo_trl.data.bank import DemonstrationBank
-from bgpo_trl.data.own_tasks import import_tasks
 from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.encoders.representation import embed_demonstrations
 from bgpo_trl.evaluation import Evaluator, Snapshot
 from bgpo_trl.experiments.arguments import ImportArguments, command_line
 from bgpo_trl.experiments.run import commit_of_code
 from bgpo_trl.figures.style import COLORS, save_figure
+from bgpo_trl.own_module import import_own
 from bgpo_trl.seeding import stream_seed
 from bgpo_trl.transforms import TaskSchedule
 
@@ -200,7 +200,7 @@ def plot(table: Mapping[str, Mapping[float, np.ndarray]]) -> Figure:
 def main(arguments: Arguments) -> None:
     """Run the tests and write the files."""
     commit = commit_of_code()
-    import_tasks(arguments.module)
+    import_own(arguments.module)
     torch.set_num_threads(arguments.threads)
     run, out = arguments.run, arguments.out or arguments.run
     rows = measure(load_run(run), arguments.shares, arguments.episodes, arguments.seed)

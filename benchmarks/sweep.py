@@ -24,16 +24,16 @@ import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal
 
 from bgpo_trl.algorithms import ABLATIONS
 from bgpo_trl.configs import RunConfig
-from bgpo_trl.data.own_tasks import import_tasks
 from bgpo_trl.experiments import arguments as experiment
 from bgpo_trl.experiments.arguments import at_once
 from bgpo_trl.experiments.merge import merge
 from bgpo_trl.experiments.run import pretrained_for, run_experiment
 from bgpo_trl.files.locking import DirectoryLock
+from bgpo_trl.own_module import import_own
 from bgpo_trl.runs.config_file import Digests, settings_of
 from bgpo_trl.runs.directory import check_settings, holds_run
 from bgpo_trl.runs.results import read_json
@@ -53,7 +53,7 @@ Setting = Literal[
 class Arguments(experiment.TaskArguments):
     """Run a grid of experiments on Ray."""
 
-    algorithms: tuple[experiment.AlgorithmName, ...] = ("bgpo",)
+    algorithms: tuple[str, ...] = ("bgpo",)
     """Algorithms, as in concurrent_tasks.py."""
     settings: tuple[Setting, ...] = ("concurrent",)
     """Tasks all from the start (concurrent), one after another (continual), or the variants of BGPO
@@ -125,10 +125,9 @@ def _config(arguments: Arguments, setting: Setting, name: str) -> RunConfig:
         if tasks is not None:
             raise ValueError(f"--tasks: the setting {setting} has the suite's eight: leave it out")
         tasks = nico.ALL_TASKS[::-1] if setting == "eight-reversed" else nico.ALL_TASKS
-    named = name in get_args(experiment.AlgorithmName)
     config = experiment.run_config(
         experiment.Arguments(
-            algorithm=name if named else "bgpo",  # pyright: ignore[reportArgumentType]
+            algorithm="bgpo" if setting == "ablation" else name,
             preset=arguments.preset,
             seeds=arguments.seeds,
             episodes=arguments.episodes,
@@ -170,7 +169,7 @@ def check_directories(
 
 def play(job: Job) -> None:
     """Play a job to its end, from its last checkpoint if there is one, and measures."""
-    import_tasks(job.module)
+    import_own(job.module)
     arguments = experiment.Arguments(
         out=job.directory, resume=holds_run(job.directory), bank=job.bank
     )
@@ -179,7 +178,7 @@ def play(job: Job) -> None:
 
 def main(arguments: Arguments) -> None:
     """Run the unfinished jobs, and merge the blocks."""
-    import_tasks(arguments.module)
+    import_own(arguments.module)
     jobs = make_jobs(arguments)
     digests = {
         tasks: Digests(*(part.identity for part in pretrained_for(tasks, arguments.bank)))

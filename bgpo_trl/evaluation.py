@@ -120,7 +120,11 @@ class Evaluator:
     def snapshot(
         self, algorithm: Algorithm, index: int, number: int, *, episode: int, env_steps: int = 0
     ) -> Snapshot:
-        """Return a seed's snapshot for evaluation ``number``; other arguments as for `take`."""
+        """Return a seed's snapshot for evaluation ``number``; other arguments as for `take`.
+
+        Raises:
+            TypeError: If the algorithm returns no `Policy`, or one for other test episodes.
+        """
         rng = self._rng(self.seeds[index], number)
         drawn = torch.stack(
             [
@@ -129,14 +133,25 @@ class Evaluator:
             ]
         )
         generator = torch.Generator().manual_seed(int(rng.integers(2**63 - 1)))
+        policy = algorithm.snapshot(
+            index, self._bank.embedding[drawn], self._bank.task[drawn], generator
+        )
+        if not isinstance(policy, Policy):
+            raise TypeError(
+                f"snapshot of {type(algorithm).__name__} must return a Policy (self.policy(...)), "
+                f"got {type(policy).__name__}"
+            )
+        if policy.context is not None and policy.context.shape[:2] != drawn.shape:
+            raise TypeError(
+                f"the context of a Policy of {type(algorithm).__name__} must be "
+                f"{list(drawn.shape)} and its features, got {list(policy.context.shape)}"
+            )
         return Snapshot(
             number=number,
             episode=episode,
             env_steps=env_steps,
             presented=self.schedule.presented(torch.tensor(episode)),
-            policy=algorithm.snapshot(
-                index, self._bank.embedding[drawn], self._bank.task[drawn], generator
-            ),
+            policy=policy,
         )
 
     def run_next(

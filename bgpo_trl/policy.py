@@ -204,8 +204,8 @@ def load_run(
             make = entry(config.name).make
         except ValueError:
             raise ValueError(
-                f"{path} is a run of {config.name!r}, which is not in ALGORITHMS: give make=, "
-                "as for its Trainer"
+                f"{path} is a run of {config.name!r}, which is not in ALGORITHMS: name the "
+                "module that adds it with --import, or give make= as for its Trainer"
             ) from None
     if not has_checkpoint(path / "checkpoint"):
         blocks = sorted(block.parent.name for block in path.glob("seeds-*/checkpoint"))

@@ -144,6 +144,7 @@ class Trainer(Closing):
             KeyboardInterrupt: At the first Ctrl-C after the step is over and saved, at a second one
                 immediately.
             OSError: If the disk is full.
+            TypeError: If the algorithm returns no action, or no `Policy` for a test.
         """
         algorithm, env, n_episodes = self.algorithm, self.world.env, self.config.episodes
         if self._state is None:
@@ -166,7 +167,7 @@ class Trainer(Closing):
             with interrupts_wait() as interrupted, ThreadPoolExecutor(1, "update") as background:
                 while int(episodes.min()) < n_episodes:
                     before, started = episodes.clone(), time.monotonic()
-                    state = algorithm.act(state)
+                    state = self._act(state)
                     update = background.submit(algorithm.update)
                     transition, state = env.step_and_maybe_reset(state)
                     losses = update.result() or losses
@@ -197,6 +198,15 @@ class Trainer(Closing):
     def close(self) -> None:
         """Close files and mirrors, and unlock the directory for other processes."""
         self._opened.close()
+
+    def _act(self, state: TensorDictBase) -> TensorDictBase:
+        acted = self.algorithm.act(state)
+        if not isinstance(acted, TensorDictBase) or "action" not in acted:
+            raise TypeError(
+                f"act of {type(self.algorithm).__name__} must return the tensordict with an "
+                f"action, got {type(acted).__name__}"
+            )
+        return acted
 
     @property
     def _n_tasks(self) -> int:

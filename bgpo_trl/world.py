@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
+from torchrl.envs import EnvBase
 
 from bgpo_trl.algorithms import Algorithm
 from bgpo_trl.data.bank import DemonstrationBank
@@ -24,6 +25,9 @@ class World:
         seeds: One for each element of the batch.
         schedule: Times at which tasks are presented.
         bank: Embedded demonstrations for training episodes.
+
+    Raises:
+        TypeError: If the algorithm makes something else than an environment of all seeds.
 
     Attributes:
         env: The simulation within the algorithm's transforms.
@@ -50,6 +54,11 @@ class World:
             observation="pixels" if algorithm.config.state == "latent" else "state",
         )
         self.env = algorithm.make_env(self.simulation, self.source)
+        if not isinstance(self.env, EnvBase) or self.env.batch_size != batch:
+            raise TypeError(
+                f"make_env of {type(algorithm).__name__} must return the simulations {list(batch)} "
+                f"within transforms, got {type(self.env).__name__}"
+            )
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state of draws and simulations, without the tensordict between two steps."""

@@ -8,12 +8,15 @@ import runpy
 import shlex
 import sys
 from pathlib import Path
+from unittest import mock
 
 import pytest
 import torch
 import tyro
 
+from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.environments import bgpo_env
+from bgpo_trl.algorithms.rl import RL
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "suites/nico/README.md")]
@@ -89,7 +92,9 @@ def test_there_is_something_to_run():
 def test_the_python_of_a_page_runs_from_top_to_bottom(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     namespace = {}
-    with torch.random.fork_rng(devices=[]):
+    # Restores the registries to which pages add entries.
+    registries = mock.patch.dict(ALGORITHMS), mock.patch.dict(RL)
+    with torch.random.fork_rng(devices=[]), registries[0], registries[1]:
         torch.manual_seed(0)
         for number, block in enumerate(blocks(page, "python"), 1):
             exec(compile(block, f"{page.name}, python block {number}", "exec"), namespace)

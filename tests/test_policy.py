@@ -357,7 +357,7 @@ def see_the_truth(run):
         (see_the_truth, "learned from the ground truth"),
         (widen, r"checkpoint does not fit .*config.json \(.*\): use the version of the code"),
         (lambda run: rewrite(run, seeds=[3, 8, 9]), r"checkpoint does not fit"),
-        (lambda run: rewrite(run, name="mine"), "of 'mine', which is not in ALGORITHMS: give ma"),
+        (lambda run: rewrite(run, name="mine"), "of 'mine', which is not in ALGORITHMS: name t"),
     ],
 )
 def test_what_cannot_be_loaded_is_refused_in_a_line(trainer_of, tmp_path, spoil, said):

@@ -13,6 +13,9 @@ import torch
 
 from bgpo_trl import training
 from bgpo_trl.algorithms import ALGORITHMS
+from bgpo_trl.algorithms.bgpo import BGPO
+from bgpo_trl.algorithms.policy import Policy
+from bgpo_trl.envs import NicoEnv
 from bgpo_trl.files.checkpoint import load_checkpoint
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.runs.cost import n_bytes, read_costs
@@ -236,6 +239,37 @@ def test_an_algorithm_may_be_made_under_another_name(make, make_config, tmp_path
         assert {row["algorithm"] for row in rows(tmp_path / file)} == {"no such algorithm"}
     with pytest.raises(ValueError, match="no algorithm 'no such algorithm': choose one of bgpo"):
         make(tmp_path / "other", trainer.config)
+
+
+@pytest.mark.parametrize(
+    ("method", "wrong", "said"),
+    [
+        (
+            "make_env",
+            lambda *_: None,
+            r"^make_env of BGPO must return the simulations \[2\]",
+        ),
+        ("make_env", lambda env, source: NicoEnv(env.tasks), r"^make_env .* got NicoEnv$"),
+        (
+            "act",
+            lambda td: None,
+            "^act of BGPO must return the tensordict with an action, got N",
+        ),
+        ("act", lambda td: td, "^act of BGPO must return .* with an action, got TensorDict$"),
+        ("snapshot", lambda *_: None, r"^snapshot of BGPO must return a Policy .*, got NoneType$"),
+        (
+            "snapshot",
+            lambda *_: Policy(None, "state", {}, torch.zeros(3, 32)),  # pyright: ignore
+            r"^the context of a Policy of BGPO must be \[3, 1\] and its features, got \[3, 32\]$",
+        ),
+    ],
+)
+def test_what_an_algorithm_must_return_is_said_in_a_line(
+    make, make_config, tmp_path, monkeypatch, method, wrong, said
+):
+    monkeypatch.setattr(BGPO, method, staticmethod(wrong))
+    with pytest.raises(TypeError, match=said):
+        make(tmp_path, make_config("state", "ddpg", episodes=2)).run()
 
 
 @pytest.mark.parametrize("step", [1, 20])

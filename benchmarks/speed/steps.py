@@ -21,9 +21,9 @@ import numpy as np
 import tyro
 from timing import interleave
 
-from bgpo_trl.algorithms import ALGORITHMS, Algorithm
+from bgpo_trl.algorithms import Algorithm, entry
 from bgpo_trl.encoders.pretrained import load_pretrained
-from bgpo_trl.experiments.arguments import AlgorithmName, command_line
+from bgpo_trl.experiments.arguments import command_line
 from bgpo_trl.machine import set_threads
 from bgpo_trl.transforms import TaskSchedule
 from bgpo_trl.world import World
@@ -34,7 +34,7 @@ from suites import nico
 class Arguments:
     """Time training steps and updates."""
 
-    algorithms: Annotated[tuple[AlgorithmName, ...], tyro.conf.Positional] = (
+    algorithms: Annotated[tuple[str, ...], tyro.conf.Positional] = (
         "bgpo-single",
         "bgpo",
         "bgpo-experts",
@@ -88,9 +88,9 @@ def main(arguments: Arguments) -> None:
     encoders, bank = load_pretrained(tasks=nico.ALL_TASKS[: max(arguments.tasks)])
     running: dict[str, Steps] = {}
     for name, n_tasks in product(arguments.algorithms, arguments.tasks):
-        entry, seeds = ALGORITHMS[name], range(arguments.seeds)
+        known, seeds = entry(name), range(arguments.seeds)
         seen = bank.for_tasks(nico.ALL_TASKS[:n_tasks]).seen()
-        algorithm = entry.make(entry.config, seeds=seeds, bank=seen, encoders=encoders)
+        algorithm = known.make(known.config, seeds=seeds, bank=seen, encoders=encoders)
         world = World(algorithm, seeds=seeds, schedule=TaskSchedule((0,) * n_tasks), bank=seen)
         key = f"{name}, {n_tasks} tasks"
         running[key] = Steps(algorithm, world)

@@ -22,8 +22,8 @@ from bgpo_trl.data.dataset import (
     read_meta,
     write_meta,
 )
-from bgpo_trl.data.own_tasks import import_tasks
 from bgpo_trl.files.progress import progress_bar
+from bgpo_trl.own_module import import_own
 from suites import nico
 from suites.nico.base import Environment
 from suites.nico.demonstrator import Demonstrator
@@ -247,13 +247,13 @@ def main(
     Args:
         path: Folder of the dataset.
         tasks: Tasks to demonstrate.
-        module: Module that adds tasks with nico.add_task, imported first.
+        module: Module that adds tasks with nico.add_task, imported first; here or installed.
         per_task: Demonstrations of each task.
         held_out_per_task: How many of those are held out for test episodes.
         play: Record random play instead of demonstrations.
         seed: Seed of the start states and of the noise.
     """
-    import_tasks(module)
+    import_own(module)
     record_demonstrations(
         path,
         tasks=tasks,

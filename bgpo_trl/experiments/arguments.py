@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import tyro
 
@@ -15,33 +15,20 @@ from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.rl import RL
 from bgpo_trl.configs import PRESETS, RunConfig
 from bgpo_trl.configs.checks import check_seeds
-from bgpo_trl.data.own_tasks import import_tasks
 from bgpo_trl.encoders.shipped import default_weights, weights_of_bank
+from bgpo_trl.own_module import import_own
 from suites import nico
 
-AlgorithmName = Literal[
-    "bgpo",
-    "bgpo-experts",
-    "bgpo-single",
-    "bgpo-paper",
-    "maml",
-    "maml-demonstrations",
-    "maml-paper",
-    "dist-nll",
-    "dist-nll-demonstrations",
-    "dist-nll-paper",
-    "oracle",
-    "ddpg",
-]
-"""The keys of `ALGORITHMS`, spelled out for the command line's choices."""
+_Entry = TypeVar("_Entry")
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImportArguments:
-    """Own tasks in a command."""
+    """Own tasks and algorithms in a command."""
 
     module: Annotated[str | None, tyro.conf.arg(name="import")] = None
-    """Module that adds tasks with nico.add_task, imported first; here or installed."""
+    """Module that adds tasks (nico.add_task) or algorithms (ALGORITHMS), imported first; here or
+    installed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,12 +60,14 @@ class Arguments(TaskArguments):
     """Demonstrations embedded by bgpo_trl.encoders.make_bank; for tasks missing in it, the
     package's are used. With --resume, the run's own by default."""
 
-    algorithm: AlgorithmName = "bgpo"
+    algorithm: str = "bgpo"
     """bgpo; bgpo-experts: without demonstrations as experience; bgpo-single: without experts too;
-    maml and dist-nll: the baselines, with or without -demonstrations; -paper: as published; oracle
-    and ddpg: DDPG with the task label as context, and without context."""
-    rl: Literal["ddpg", "td3", "sac"] = "ddpg"
-    """The RL algorithm of BGPO, its ablations and the references."""
+    maml and dist-nll: the baselines, alone or followed by -demonstrations; bgpo-paper, maml-paper,
+    dist-nll-paper: as published; oracle and ddpg: DDPG with the task label as context, and without
+    context; or one that the module of --import adds."""
+    rl: str | None = None
+    """The RL algorithm of BGPO, its ablations and the references: ddpg, td3, sac, or one that the
+    module of --import adds; DDPG by default."""
     preset: Literal["smoke", "quick", "desk", "paper"] = "quick"
     """Size of the run, with its time on two cores: smoke (12 episodes of 2 seeds, every stage in 2
     minutes), quick (1,200 episodes of 3 seeds, 15 minutes), desk (6,000 episodes of 5 seeds, 70
@@ -114,15 +103,17 @@ def run_config(arguments: Arguments) -> RunConfig:
     Imports the module of own tasks first.
 
     Raises:
-        ValueError: If the settings are invalid, or a task does not exist.
+        ValueError: If the settings are invalid, or a task or algorithm does not exist.
     """
-    import_tasks(arguments.module)
+    import_own(arguments.module)
     config = _with_tasks(PRESETS[arguments.preset], arguments.tasks)
-    algorithm = ALGORITHMS[arguments.algorithm].config
-    if arguments.rl != algorithm.rl.name:
+    algorithm = chosen(ALGORITHMS, arguments.algorithm, "--algorithm").config
+    rl = algorithm.rl.name if arguments.rl is None else arguments.rl
+    if rl != algorithm.rl.name:
+        other = chosen(RL, rl, "--rl").config
         if arguments.algorithm.endswith("-paper"):
             raise ValueError(f"--rl: {arguments.algorithm} uses DDPG, as published: leave --rl")
-        algorithm = replace(algorithm, rl=RL[arguments.rl].config)
+        algorithm = replace(algorithm, rl=other)
     config = replace(
         config,
         name=arguments.algorithm,
@@ -148,6 +139,20 @@ def run_config(arguments: Arguments) -> RunConfig:
             f"{config.eval_every}: its tests are its results"
         )
     return config
+
+
+def chosen(entries: Mapping[str, _Entry], name: str, flag: str) -> _Entry:
+    """Return the entry that a flag names.
+
+    Raises:
+        ValueError: If there is none of that name.
+    """
+    if name not in entries:
+        raise ValueError(
+            f"{flag}: there is no {name!r}; name one of {', '.join(entries)}, or with --import "
+            "MODULE one that a module adds"
+        )
+    return entries[name]
 
 
 def chosen_weights(tasks: Sequence[str], bank: Path | None) -> Path:

@@ -13,7 +13,6 @@ import torch
 from bgpo_trl.algorithms import Algorithm
 from bgpo_trl.configs import STAGE_PRESETS, RunConfig
 from bgpo_trl.data.bank import DemonstrationBank
-from bgpo_trl.data.own_tasks import import_tasks
 from bgpo_trl.encoders.pretrained import load_pretrained, make_pretrained
 from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.experiments.arguments import (
@@ -27,6 +26,7 @@ from bgpo_trl.experiments.resuming import as_begun, check_resumable, is_finished
 from bgpo_trl.files.locking import DirectoryLock
 from bgpo_trl.files.whole_file import write_json
 from bgpo_trl.machine import choose_device, set_threads
+from bgpo_trl.own_module import import_own
 from bgpo_trl.runs.demonstrations import BANK
 from bgpo_trl.runs.directory import holds_run
 from bgpo_trl.training import Trainer
@@ -68,7 +68,7 @@ def run_experiment(
     commit = commit_of_code()  # read first, since commits may follow during training
     set_threads(arguments.threads)
     device = choose_device(arguments.device)
-    rl = "" if arguments.rl == "ddpg" else f"-{arguments.rl}"
+    rl = "" if arguments.rl in (None, "ddpg") else f"-{arguments.rl}"
     out = arguments.out or Path("runs") / f"{name}-{config.name}{rl}-{arguments.preset}"
     if arguments.resume:
         config = _continued(arguments, config, out)
@@ -168,9 +168,9 @@ def bank_of(arguments: TaskArguments) -> DemonstrationBank:
     """Load the demonstrations that a command line names, embedded by the pretrained encoders.
 
     Raises:
-        ValueError: As for `import_tasks`, `chosen_tasks` and `pretrained_for`.
+        ValueError: As for `import_own`, `chosen_tasks` and `pretrained_for`.
     """
-    import_tasks(arguments.module)
+    import_own(arguments.module)
     return pretrained_for(chosen_tasks(arguments.tasks, nico.PAPER_TASKS), arguments.bank)[1]
 
 

@@ -12,13 +12,13 @@ import tyro
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont, ImageOps
 
-from bgpo_trl.data.own_tasks import import_tasks
 from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.experiments.arguments import ImportArguments
 from bgpo_trl.figures.frame_strips import plot_frame_strips
 from bgpo_trl.figures.of_run import draw_growth
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.figures.video import save_gif
+from bgpo_trl.own_module import import_own
 from bgpo_trl.policy import TrainedPolicy, load_run
 from suites import nico
 from suites.nico.rendering import FrameRenderer
@@ -38,9 +38,9 @@ class WatchArguments(ImportArguments):
 
     run: tyro.conf.Positional[Path]
     """Run directory."""
-    policy: int | None = None
+    run_seed: int | None = None
     """Seed of the run whose policy acts; the first by default."""
-    seed: int = 1
+    scene_seed: int = 1
     """Seed of demonstrations and starts; the pretrained encoders were trained on seed 0."""
     out: Path | None = None
     """Folder for the pictures; figures/ of the run by default."""
@@ -155,10 +155,10 @@ def watch(arguments: WatchArguments) -> str:
         ValueError: If the directory holds no run that can be loaded, or the run has no such seed.
     """
     run, out = arguments.run, arguments.out or arguments.run / "figures"
-    import_tasks(arguments.module)
-    policy = load_run(run, seed=arguments.policy)
-    shown = demonstrate(policy.tasks, arguments.seed)
-    episodes = [play(policy, task, frames, arguments.seed) for task, frames in shown.items()]
+    import_own(arguments.module)
+    policy = load_run(run, seed=arguments.run_seed)
+    shown = demonstrate(policy.tasks, arguments.scene_seed)
+    episodes = [play(policy, task, frames, arguments.scene_seed) for task, frames in shown.items()]
     out.mkdir(parents=True, exist_ok=True)
     save_gif(compose(episodes), out / "nico.gif", fps=_FPS, scale=1)
     strips = {}

@@ -39,8 +39,8 @@ def read_config(path: str | Path) -> tuple[RunConfig, Digests]:
         The settings, and the digests of the encoders and demonstrations.
 
     Raises:
-        ValueError: If the file is missing, was not written by this version, or names a task that
-            has not been added.
+        ValueError: If the file is missing, was not written by this version, or names a task or
+            hyperparameters that this process does not know.
     """
     path = Path(path)
     try:
@@ -52,10 +52,11 @@ def read_config(path: str | Path) -> tuple[RunConfig, Digests]:
             if not isinstance(found, str | None):
                 raise ValueError(f"{name} is {found!r}")
         values, modules = settings.pop("algorithm"), settings.pop("task_modules", {})
-        kind = _algorithm_config(settings.get("name"), settings.pop("algorithm_class", None))
-        algorithm = _read(kind, values, "algorithm.")
+        name = settings.get("name")
+        kind = _algorithm_config(name, settings.pop("algorithm_class", None))
         unknown = _unknown_task(settings.get("tasks"))
-        if unknown is None:
+        if kind is not None and unknown is None:
+            algorithm = _read(kind, values, "algorithm.")
             return _read(RunConfig, {**settings, "algorithm": algorithm}, ""), digests
     except (FileNotFoundError, NotADirectoryError):
         raise ValueError(f"{path.parent} holds no run: there is no {path.name}") from None
@@ -63,6 +64,11 @@ def read_config(path: str | Path) -> tuple[RunConfig, Digests]:
         raise ValueError(
             f"{path} cannot be read ({error}): use the version of the code that made the run"
         ) from error
+    if kind is None:
+        raise ValueError(
+            f"{path} is a run of {name!r}, whose hyperparameters no imported module has: name the "
+            "module that adds it with --import, or import it first in Python"
+        )
     # The module is not imported, since a file should not decide what is imported.
     module = modules.get(unknown) if isinstance(modules, dict) else None
     known = isinstance(module, str) and module != "__main__"
@@ -101,8 +107,8 @@ def _unknown_task(tasks: object) -> str | None:
     return next((name for name in names if isinstance(name, str) and name not in nico.TASKS), None)
 
 
-def _algorithm_config(name: object, stored: object) -> type[AlgorithmConfig]:
-    """Return the class of an algorithm's hyperparameters.
+def _algorithm_config(name: object, stored: object) -> type[AlgorithmConfig] | None:
+    """Return the class of an algorithm's hyperparameters; None if it is unknown.
 
     Args:
         name: Of the algorithm.
@@ -115,9 +121,7 @@ def _algorithm_config(name: object, stored: object) -> type[AlgorithmConfig]:
         if isinstance(kind, type) and issubclass(kind, AlgorithmConfig):
             return kind
     known = ALGORITHMS | ABLATIONS
-    if isinstance(name, str) and name in known:
-        return type(known[name].config)
-    raise ValueError(f"the hyperparameters of {name!r} are of no known algorithm")
+    return type(known[name].config) if isinstance(name, str) and name in known else None
 
 
 def _read(hint: Any, value: Any, where: str) -> Any:

@@ -34,7 +34,7 @@ def undemonstrated(monkeypatch):
 def test_a_run_is_shown_and_left_as_it_is(run_of, undemonstrated, tmp_path, name):
     run, out = run_of(name), tmp_path / "pictures"
     before = files(run)
-    told = watch.watch(watch.WatchArguments(run, policy=8, out=out))
+    told = watch.watch(watch.WatchArguments(run, run_seed=8, out=out))
     assert files(run) == before
     expected = {"nico.gif", "nico.png"} | ({"gwr_growth.png"} if name == "bgpo" else set())
     assert {path.name for path in out.iterdir()} == expected
@@ -172,5 +172,5 @@ def test_what_cannot_be_shown_is_refused(run_of, tmp_path):
     with pytest.raises(ValueError, match="holds no run"):
         watch.watch(watch.WatchArguments(tmp_path))
     with pytest.raises(ValueError, match="has no seed 5: choose one of 3, 8"):
-        watch.watch(watch.WatchArguments(run_of("bgpo"), policy=5, out=tmp_path / "out"))
+        watch.watch(watch.WatchArguments(run_of("bgpo"), run_seed=5, out=tmp_path / "out"))
     assert not (tmp_path / "out").exists()

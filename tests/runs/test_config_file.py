@@ -95,8 +95,8 @@ def nested(**rl):
         ({"seeds": []}, "seeds must be one or more"),
         ({"encoders": 3}, "encoders is 3"),
         ({"bank": 3}, "bank is 3"),
-        ({"name": "mine", "algorithm_class": None}, "'mine' are of no known algorithm"),
-        ({"name": "mine", "algorithm_class": "os.path"}, "'mine' are of no known algorithm"),
+        ({"name": "mine", "algorithm_class": None}, "of 'mine', whose hyperparameters no im"),
+        ({"name": "mine", "algorithm_class": "os.path"}, "of 'mine', whose hyperparameters no im"),
     ],
 )
 def test_what_is_no_run_of_this_version_is_refused(tmp_path, changes, said):

@@ -1,4 +1,4 @@
-"""Import of the user's module that adds tasks to the suite, for ``--import`` on command lines."""
+"""Import of a module that adds tasks or algorithms, for ``--import`` on command lines."""
 
 from __future__ import annotations
 
@@ -7,8 +7,11 @@ import sys
 from pathlib import Path
 
 
-def import_tasks(module: str | None) -> None:
-    """Import a module that calls `suites.nico.add_task`, from the current folder or installed.
+def import_own(module: str | None) -> None:
+    """Import the user's module, from the current folder or installed.
+
+    It may add tasks with `suites.nico.add_task`, and entries to `bgpo_trl.algorithms.ALGORITHMS`
+    and `bgpo_trl.algorithms.rl.RL`.
 
     Args:
         module: Name of the module; nothing is imported if None.

@@ -4,7 +4,7 @@ import sys
 
 import pytest
 
-from bgpo_trl.data.own_tasks import import_tasks
+from bgpo_trl.own_module import import_own
 from suites import nico
 
 OWN = """
@@ -29,9 +29,9 @@ def folder(tmp_path, monkeypatch):
 
 
 def test_a_module_of_the_current_folder_adds_its_tasks(folder):
-    import_tasks(None)
+    import_own(None)
     assert "juggle" not in nico.TASKS
-    import_tasks("juggling")
+    import_own("juggling")
     assert nico.TASKS["juggle"].__module__ == "juggling"
     assert sys.modules["juggling"].__file__ == str(folder / "juggling.py")
 
@@ -39,9 +39,9 @@ def test_a_module_of_the_current_folder_adds_its_tasks(folder):
 @pytest.mark.parametrize("name", ["juggle", "juggling.py", "juggling.tasks", "no.such"])
 def test_a_module_that_is_not_there_is_named_with_the_remedy(folder, name):
     with pytest.raises(ValueError, match=rf"^--import {name}: there is no such module in {folder}"):
-        import_tasks(name)
+        import_own(name)
 
 
 def test_what_a_module_lacks_itself_is_told_as_python_does():
     with pytest.raises(ModuleNotFoundError, match="no_such_library"):
-        import_tasks("astray")
+        import_own("astray")
