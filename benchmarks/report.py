@@ -25,14 +25,13 @@ import tyro
 from bgpo_trl.analysis import eight_tasks
 from bgpo_trl.analysis.claims import LEVEL, additions, claims
 from bgpo_trl.analysis.comparison import (
-    GROUPS,
-    SETTINGS,
     Group,
     Run,
-    Statistics,
     read_group,
     with_own,
 )
+from bgpo_trl.analysis.intervals import Statistics
+from bgpo_trl.analysis.paper_runs import GROUPS, SETTINGS
 from bgpo_trl.analysis.tables import Table, continual_table, groups_table, main_table, speed_table
 from bgpo_trl.experiments.arguments import command_line
 from bgpo_trl.figures.counts import plot_counts, read_counts

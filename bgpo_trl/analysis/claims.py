@@ -5,16 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from itertools import pairwise
 
-from bgpo_trl.analysis.comparison import (
+from bgpo_trl.analysis.comparison import Run, area_scores, late_scores
+from bgpo_trl.analysis.intervals import Statistics
+from bgpo_trl.analysis.paper_runs import (
     ADDITIONS,
     ALGORITHMS,
     PUBLISHED,
     PUBLISHED_VARIANTS,
     SETTINGS,
-    Run,
-    Statistics,
-    area_scores,
-    late_scores,
     variant,
 )
 from bgpo_trl.analysis.tables import Table

@@ -1,24 +1,20 @@
-"""Runs to compare, their groups and figures, and the scores they are compared on."""
+"""Runs that are compared on equal terms: how they are read, and the scores they are compared on."""
 
 from __future__ import annotations
 
-import zlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bgpo_trl.analysis import intervals, metrics
+from bgpo_trl.analysis import metrics
 from bgpo_trl.runs.results import Curves, read_curves, read_json, read_rows
 from suites import nico
 
 Values = NDArray[np.float64]
-Statistic = Callable[[Values], Values]
-"""Maps samples of scores, ``[N, S, T]``, to a value of each, ``[N]``."""
-IQM: Statistic = intervals.interquartile_means
 
 
 @dataclass(frozen=True)
@@ -41,96 +37,6 @@ class Group:
     runs: dict[str, str]
     """Names of the runs, by directory."""
     pictures: tuple[Picture, ...]
-
-
-REFERENCES = {"oracle": "DDPG, told the label", "ddpg": "DDPG, told nothing"}
-ALGORITHMS = {
-    "bgpo": "BGPO",
-    "bgpo-experts": "BGPO without demonstrations",
-    "bgpo-single": "BGPO, one policy",
-    "maml": "MAML",
-    "maml-demonstrations": "MAML + demonstrations",
-    "dist-nll": "Dist-NLL",
-    "dist-nll-demonstrations": "Dist-NLL + demonstrations",
-    **REFERENCES,
-}
-PUBLISHED = {
-    "bgpo-paper": "BGPO as published",
-    "maml-paper": "MAML as published",
-    "dist-nll-paper": "Dist-NLL as published",
-}
-SETTINGS = {
-    "concurrent": ("6", "all tasks from the start"),
-    "continual": ("8", "tasks one after the other"),
-}
-"""Number of the paper's figure, and its schedule of tasks."""
-# Variants that are also algorithms, run once under the algorithm's name.
-SAME = {"gwr+r_int": "bgpo-single", "experts": "bgpo-experts", "all": "bgpo"}
-PUBLISHED_VARIANTS = {
-    "gwr+r_int": "GWR-B + r_int",
-    "gwr": "GWR-B",
-    "r_int": "r_int",
-    "none": "none",
-}
-ADDITIONS = {
-    "gwr+r_int": "GWR-B + r_int",
-    "even-replay": "+ even replay",
-    "experts": "+ even replay + experts",
-    "demonstrations": "+ demonstrations",
-    "all": "+ all three",
-}
-
-
-def variant(setting: str, name: str) -> str:
-    """Return the directory of a variant's run."""
-    if name in SAME:
-        return f"{setting}-{SAME[name]}"
-    return f"ablation-{name}" if setting == "concurrent" else f"ablation-continual-{name}"
-
-
-def _compared(setting: str) -> Group:
-    number, title = SETTINGS[setting]
-    alone = ("bgpo-experts", "maml", "dist-nll", *REFERENCES, "bgpo-single")
-    shown = ("bgpo", "maml-demonstrations", "dist-nll-demonstrations", *REFERENCES)
-
-    def picture(file: str, caption: str, algorithms: tuple[str, ...]) -> Picture:
-        return Picture(file, caption, tuple(f"{setting}-{key}" for key in algorithms))
-
-    return Group(
-        f"Fig. {number}: {title}",
-        {f"{setting}-{key}": name for key, name in ALGORITHMS.items()},
-        (
-            picture(f"fig{number}", "with demonstrations as experience", shown),
-            picture(f"fig{number}-without", "without demonstrations as experience", alone),
-        ),
-    )
-
-
-def _published(setting: str) -> Group:
-    number, title = SETTINGS[setting]
-    runs = {f"{setting}-{key}": name for key, name in PUBLISHED.items()}
-    picture = Picture(f"fig{number}-published", "no stabilizers, small networks", tuple(runs))
-    return Group(f"Fig. {number} as published: {title}", runs, (picture,))
-
-
-def _ablation(setting: str) -> Group:
-    published = {variant(setting, key): name for key, name in PUBLISHED_VARIANTS.items()}
-    added = {variant(setting, key): name for key, name in ADDITIONS.items()}
-    references = {f"{setting}-{key}": name for key, name in REFERENCES.items()}
-    file = "fig9" if setting == "concurrent" else f"fig9-{setting}"
-    return Group(
-        f"Fig. 9: contribution of each part, {SETTINGS[setting][1]}",
-        {**published, **added, **references},
-        (
-            Picture(file, "the paper's four", (*published, *references)),
-            Picture(f"{file}-added", "additions to them", tuple(added)),
-        ),
-    )
-
-
-GROUPS = {setting: _compared(setting) for setting in SETTINGS}
-GROUPS |= {f"{setting}-paper": _published(setting) for setting in SETTINGS}
-GROUPS |= {"ablation": _ablation("concurrent"), "ablation-continual": _ablation("continual")}
 
 
 @dataclass(frozen=True)
@@ -269,60 +175,3 @@ def area_scores(run: Run) -> Values:
         curve = run.curves.success[:, since, task]
         areas.append(metrics.area_under_curve(curve, episodes[since] - start))
     return np.stack(areas, axis=-1)
-
-
-class Statistics:
-    """Bootstrap statistics; each set of scores has its own stream of random numbers.
-
-    Intervals of a run thus do not depend on the other runs.
-    """
-
-    def __init__(self, seed: int = 0) -> None:
-        self._seed = seed
-        self._drawn: dict[tuple[Statistic, bytes], Values] = {}
-
-    def resampled(self, scores: Values, statistic: Statistic = IQM) -> Values:
-        """Return a statistic of resampled scores, by default interquartile means."""
-        key = scores.tobytes()
-        if (statistic, key) not in self._drawn:
-            rng = np.random.default_rng([self._seed, zlib.crc32(key)])
-            drawn = intervals.stratified_bootstrap(scores, statistic, rng=rng)
-            self._drawn[statistic, key] = drawn
-        return self._drawn[statistic, key]
-
-    def cell(self, scores: Values, statistic: Statistic = IQM) -> str:
-        """Format a statistic of scores with its interval, in percent."""
-        low, high = intervals.percentile_interval(self.resampled(scores, statistic))
-        (middle,) = statistic(scores[None])
-        return f"{_percent(middle, 1)} [{_percent(low, 0)}, {_percent(high, 0)}]"
-
-    def difference(self, *scores: Values, statistic: Statistic = IQM) -> Difference:
-        """Return the difference of a statistic between two runs' scores, with its interval.
-
-        Of four runs: the difference between the first two minus that between the last two.
-        """
-        gain = _difference([float(statistic(of_run[None])[0]) for of_run in scores])
-        drawn = _difference([self.resampled(of_run, statistic) for of_run in scores])
-        return Difference(gain, *intervals.percentile_interval(drawn))
-
-
-class Difference(NamedTuple):
-    """A difference of success between runs, and its 95 % interval."""
-
-    gain: float
-    low: float
-    high: float
-
-    def cell(self) -> str:
-        """Format the difference and its interval, in points."""
-        return f"{100 * self.gain:+.1f} [{100 * self.low:+.0f}, {100 * self.high:+.0f}]"
-
-
-def _difference(values: list[Any]) -> Any:
-    gap = values[0] - values[1]
-    return gap if len(values) == 2 else gap - (values[2] - values[3])
-
-
-def _percent(share: float, digits: int) -> str:
-    # Adding 0 turns -0.0 into 0.0.
-    return f"{round(100 * share, digits) + 0.0:.{digits}f}"

@@ -11,17 +11,17 @@ from itertools import pairwise
 
 import numpy as np
 
-from bgpo_trl.analysis import comparison, metrics
+from bgpo_trl.analysis import metrics, paper_runs
 from bgpo_trl.analysis.comparison import (
     Group,
     Picture,
     Run,
-    Statistics,
     Values,
     late_scores,
     setting_of,
     starts,
 )
+from bgpo_trl.analysis.intervals import Statistics
 from bgpo_trl.analysis.tables import Table
 from bgpo_trl.analysis.transfer import forward_transfer
 from bgpo_trl.runs.cost import Cost, read_costs
@@ -87,7 +87,7 @@ def knows_label(run: Run) -> bool | None:
     name = run.config.get("name", "")
     if name.startswith(("maml", "dist-nll", "oracle")):
         return True
-    return False if name in ALGORITHMS | comparison.ALGORITHMS | comparison.PUBLISHED else None
+    return False if name in ALGORITHMS | paper_runs.ALGORITHMS | paper_runs.PUBLISHED else None
 
 
 def success_matrix(run: Run) -> Values:

@@ -1,13 +1,17 @@
-"""Interquartile means of scores, and their bootstrap confidence intervals."""
+"""Interquartile means of scores, their bootstrap confidence intervals, and those of differences."""
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
+Statistic = Callable[[Array], Array]
+"""Maps samples of scores, ``[N, S, T]``, to a value of each, ``[N]``."""
 
 
 def interquartile_mean(scores: ArrayLike) -> float:
@@ -31,7 +35,7 @@ def interquartile_means(samples: Array) -> Array:
 
 def stratified_bootstrap(
     scores: ArrayLike,
-    statistic: Callable[[Array], Array] = interquartile_means,
+    statistic: Statistic = interquartile_means,
     *,
     n_resamples: int = 2_000,
     rng: np.random.Generator,
@@ -76,6 +80,53 @@ def percentile_interval(values: ArrayLike, confidence: float = 0.95) -> tuple[fl
     return float(low), float(high)
 
 
+class Statistics:
+    """Bootstrap statistics; each set of scores has its own stream of random numbers.
+
+    Intervals of a run thus do not depend on the other runs.
+    """
+
+    def __init__(self, seed: int = 0) -> None:
+        self._seed = seed
+        self._drawn: dict[tuple[Statistic, bytes], Array] = {}
+
+    def resampled(self, scores: Array, statistic: Statistic = interquartile_means) -> Array:
+        """Return a statistic of resampled scores, by default interquartile means."""
+        key = scores.tobytes()
+        if (statistic, key) not in self._drawn:
+            rng = np.random.default_rng([self._seed, zlib.crc32(key)])
+            drawn = stratified_bootstrap(scores, statistic, rng=rng)
+            self._drawn[statistic, key] = drawn
+        return self._drawn[statistic, key]
+
+    def cell(self, scores: Array, statistic: Statistic = interquartile_means) -> str:
+        """Format a statistic of scores with its interval, in percent."""
+        low, high = percentile_interval(self.resampled(scores, statistic))
+        (middle,) = statistic(scores[None])
+        return f"{_percent(middle, 1)} [{_percent(low, 0)}, {_percent(high, 0)}]"
+
+    def difference(self, *scores: Array, statistic: Statistic = interquartile_means) -> Difference:
+        """Return the difference of a statistic between two runs' scores, with its interval.
+
+        Of four runs: the difference between the first two minus that between the last two.
+        """
+        gain = _difference([float(statistic(of_run[None])[0]) for of_run in scores])
+        drawn = _difference([self.resampled(of_run, statistic) for of_run in scores])
+        return Difference(gain, *percentile_interval(drawn))
+
+
+class Difference(NamedTuple):
+    """A difference of success between runs, and its 95 % interval."""
+
+    gain: float
+    low: float
+    high: float
+
+    def cell(self) -> str:
+        """Format the difference and its interval, in points."""
+        return f"{100 * self.gain:+.1f} [{100 * self.low:+.0f}, {100 * self.high:+.0f}]"
+
+
 def _checked(scores: ArrayLike) -> Array:
     scores = np.asarray(scores, float)
     if scores.ndim != 2 or not scores.size or not np.isfinite(scores).all():
@@ -84,3 +135,13 @@ def _checked(scores: ArrayLike) -> Array:
             f"{list(scores.shape)}{'' if np.isfinite(scores).all() else ' with NaN or Inf'}"
         )
     return scores
+
+
+def _difference(values: list[Any]) -> Any:
+    gap = values[0] - values[1]
+    return gap if len(values) == 2 else gap - (values[2] - values[3])
+
+
+def _percent(share: float, digits: int) -> str:
+    # Adding 0 turns -0.0 into 0.0.
+    return f"{round(100 * share, digits) + 0.0:.{digits}f}"

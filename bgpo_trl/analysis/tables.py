@@ -10,13 +10,13 @@ import numpy as np
 from bgpo_trl.analysis import metrics
 from bgpo_trl.analysis.comparison import (
     Run,
-    Statistics,
     Values,
     area_scores,
     late_scores,
     starts,
     success_at,
 )
+from bgpo_trl.analysis.intervals import Statistics
 from bgpo_trl.analysis.transfer import forward_transfer
 from bgpo_trl.runs.results import read_outcomes, read_rows
 

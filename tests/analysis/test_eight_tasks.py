@@ -6,7 +6,7 @@ import pytest
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.bgpo import BGPO
 from bgpo_trl.analysis import eight_tasks
-from bgpo_trl.analysis.comparison import Statistics
+from bgpo_trl.analysis.intervals import Statistics
 from bgpo_trl.analysis.transfer import forward_transfer
 from bgpo_trl.runs.cost import Cost, write_costs
 from tests.analysis.runs import SUCCESS, make_run

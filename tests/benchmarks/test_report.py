@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks import report
 from bgpo_trl.algorithms import ABLATIONS, ALGORITHMS
-from bgpo_trl.analysis import claims, comparison
+from bgpo_trl.analysis import claims, comparison, intervals, paper_runs
 from bgpo_trl.analysis import tables as report_tables
 from bgpo_trl.analysis.transfer import forward_transfer
 from suites import nico
@@ -96,7 +96,7 @@ def test_tables_hold_what_the_runs_did(reported):
     area = (2 * 0.2 + 30 * 0.4 + 2 * 0.65 + 6 * 0.9) / 40
     assert late["BGPO"][5].startswith(f"{100 * area:.1f} [")
     missing = ["BGPO without demonstrations", "Dist-NLL + demonstrations"]
-    assert list(late) == [n for n in comparison.ALGORITHMS.values() if n not in missing]
+    assert list(late) == [n for n in paper_runs.ALGORITHMS.values() if n not in missing]
     published = rows_of((reported / "tables.md").read_text(), "Fig. 6 as published")
     assert {name: row[1] for name, row in published.items()} == {
         "BGPO as published": "40.0",
@@ -115,9 +115,9 @@ def test_how_far_the_tasks_lie_apart_in_behavior_space(reported):
 def claims_of(runs, table=claims.claims):
     """The rows of the claims, by all but the last two cells."""
     groups = {
-        key: comparison.read_group(runs, group)[0] for key, group in comparison.GROUPS.items()
+        key: comparison.read_group(runs, group)[0] for key, group in paper_runs.GROUPS.items()
     }
-    return {tuple(row[:-2]): row[-2:] for row in table(groups, comparison.Statistics())}
+    return {tuple(row[:-2]): row[-2:] for row in table(groups, intervals.Statistics())}
 
 
 def test_claims_are_judged_by_their_intervals(reported):
@@ -169,11 +169,11 @@ def test_what_is_added_is_compared_step_by_step(reported):
 
 
 def test_variants_that_are_algorithms_are_the_same_in_all():
-    for variant, algorithm in comparison.SAME.items():
+    for variant, algorithm in paper_runs.SAME.items():
         assert ABLATIONS[variant].config == ALGORITHMS[algorithm].config
-    variants = {*comparison.PUBLISHED_VARIANTS, *comparison.ADDITIONS}
+    variants = {*paper_runs.PUBLISHED_VARIANTS, *paper_runs.ADDITIONS}
     assert variants == set(ABLATIONS)
-    assert {*comparison.ALGORITHMS, *comparison.PUBLISHED} == set(ALGORITHMS)
+    assert {*paper_runs.ALGORITHMS, *paper_runs.PUBLISHED} == set(ALGORITHMS)
 
 
 def test_a_claim_may_turn_out_the_other_way(runs):
@@ -197,21 +197,21 @@ def test_a_missing_run_is_listed_and_not_made_up(reported, runs):
 
     path = runs / "ablation-r_int" / "eval.csv"
     path.write_text(HEAD)  # begun, not yet tested
-    read = {key: comparison.read_group(runs, group) for key, group in comparison.GROUPS.items()}
+    read = {key: comparison.read_group(runs, group) for key, group in paper_runs.GROUPS.items()}
     groups, notes = {key: found for key, (found, _) in read.items()}, read["ablation"][1]
     assert "r_int: missing (ablation-r_int/eval.csv is not there, or empty)" in notes
-    table = claims.claims(groups, comparison.Statistics())
+    table = claims.claims(groups, intervals.Statistics())
     missing = [row[0] for row in table if row[4] == "missing: ablation-r_int"]
     assert missing == ["GWR-B converges faster than r_int", "r_int converges faster than none"]
 
 
 def test_a_longer_run_is_cut_and_an_unfinished_one_is_told(runs):
-    before = comparison.read_group(runs, comparison.GROUPS["concurrent"])[0]["concurrent-ddpg"]
+    before = comparison.read_group(runs, paper_runs.GROUPS["concurrent"])[0]["concurrent-ddpg"]
     directory = runs / "concurrent-maml"
     lines = (directory / "eval.csv").read_text().splitlines()
     kept = [line for line in lines[1:] if int(line.split(",")[2]) <= 30]
     (directory / "eval.csv").write_text("\n".join([lines[0], *kept]) + "\n")
-    found, notes = comparison.read_group(runs, comparison.GROUPS["concurrent"])
+    found, notes = comparison.read_group(runs, paper_runs.GROUPS["concurrent"])
     assert {int(run.curves.episodes[-1]) for run in found.values()} == {30}
     assert "MAML: not finished, 30 of 40 episodes" in notes
     assert "BGPO: cut at 30 of 40 episodes" in notes
@@ -241,7 +241,7 @@ def test_runs_on_other_terms_are_refused(runs, what, value):
 
 def test_forgetting_and_transfer_by_hand(runs):
     continual, concurrent = (
-        comparison.read_group(runs, comparison.GROUPS[key])[0]
+        comparison.read_group(runs, paper_runs.GROUPS[key])[0]
         for key in ("continual", "concurrent")
     )
     head, *rows = report_tables.continual_table(continual, concurrent)
@@ -277,7 +277,7 @@ def test_how_fast_each_task_is_learned(tmp_path):
     seeds = [[learned(20), learned(30), never], [learned(40), learned(40), learned(30)]]
     write_training(directory, [*seeds, [never, learned(20), learned(20)]])
     write_run(tmp_path, "continual-ddpg", 2, episodes=120, seeds=(0, 1, 2))
-    found, _ = comparison.read_group(tmp_path, comparison.GROUPS["continual"])
+    found, _ = comparison.read_group(tmp_path, paper_runs.GROUPS["continual"])
     head, bgpo, ddpg = report_tables.speed_table(found)
     assert head == ["", *(f"task {i}" for i in (1, 2, 3)), "task 2 : task 1", "task 3 : task 1"]
     one = "(1 of 3 seeds never)"
@@ -307,7 +307,7 @@ def test_groups_and_inference_by_seed(tmp_path):
             for task, share in zip(TASKS, of_seed, strict=True)
         ]
         (directory / "final.csv").write_text(final + "".join(cells))
-    found, _ = comparison.read_group(tmp_path, comparison.GROUPS["continual"])
+    found, _ = comparison.read_group(tmp_path, paper_runs.GROUPS["continual"])
     _, *rows = report_tables.groups_table(found.values())
     inferred = ["97.83", "96.7 99"]  # 2.9 and 2.97 of 3
     assert rows == [

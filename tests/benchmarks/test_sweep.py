@@ -15,7 +15,9 @@ import sweep
 from benchmarks import report, summary
 from benchmarks.report import markdown
 from bgpo_trl.algorithms import ABLATIONS
-from bgpo_trl.analysis.comparison import GROUPS, Statistics, read_group
+from bgpo_trl.analysis.comparison import read_group
+from bgpo_trl.analysis.intervals import Statistics
+from bgpo_trl.analysis.paper_runs import GROUPS
 from bgpo_trl.analysis.tables import main_table
 from bgpo_trl.configs import PRESETS
 from bgpo_trl.experiments import merge
