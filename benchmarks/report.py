@@ -223,8 +223,9 @@ def paper_sections(
             section = Section(group.title, table, draw(group, groups[key], out), notes)
         sections.append(section)
     if groups["continual"] and len(next(iter(runs.values())).tasks) > 1:
-        table = continual_table(groups["continual"], groups["concurrent"])
-        sections.append(Section("Forgetting and transfer, continual (points)", table))
+        table = continual_table(groups["continual"], groups["concurrent"], statistics)
+        about = ["Means over seeds, in points, with 95 % intervals."]
+        sections.append(Section("Forgetting and transfer, continual", table, notes=about))
     for setting, (_, about) in SETTINGS.items():
         of_setting = groups[setting] | groups[f"{setting}-paper"]
         if of_setting:

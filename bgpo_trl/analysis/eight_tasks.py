@@ -21,7 +21,7 @@ from bgpo_trl.analysis.comparison import (
     setting_of,
     starts,
 )
-from bgpo_trl.analysis.intervals import Statistics
+from bgpo_trl.analysis.intervals import Statistics, means, percent_cell
 from bgpo_trl.analysis.tables import Table
 from bgpo_trl.analysis.transfer import forward_transfer
 from bgpo_trl.runs.cost import Cost, read_costs
@@ -48,8 +48,9 @@ NOTES: tuple[str, ...] = (
     "of training. BGPO's lead: its performance minus the row's.",
     "Forgetting: success at the end of a task's own phase minus that at the end of training, mean "
     "over all tasks; backward transfer: the negative, without the last task.",
-    "Forward transfer: (area - reference) / (1 - reference), areas under a task's curve over the "
-    "own episodes of its phase; reference: the same algorithm with all tasks from the start.",
+    "Forward transfer: (area - reference) / (1 - reference), areas under a task's curve over its "
+    "own episodes, from the first to the last test of its phase; reference: the same algorithm with "
+    "all tasks from the start, its seeds resampled too.",
     "Nodes and groups: means over seeds. Hours and megabytes (replay, networks, GWR-B): of all "
     "seeds together, without tests.",
 )
@@ -130,27 +131,26 @@ def benchmark_table(
     """
     rows = [["", "knows the label", "performance", "BGPO's lead", "forgetting"]]
     rows[0] += ["backward transfer", "forward transfer", "nodes", "groups", "hours", "megabytes"]
-    ours = next((run for key, run in runs.items() if key.endswith("-bgpo")), None)
+    ours = next((runs[key] for key in runs if _algorithm(key) == "bgpo"), None)
     for key, run in runs.items():
         scores, lead = late_scores(run), "-"
         if ours is not None and run is not ours:
-            lead = statistics.difference(late_scores(ours), scores, statistic=_means).cell()
+            lead = statistics.difference(late_scores(ours), scores, statistic=means).cell()
         change = metrics.change_since_learned(success_matrix(run))
-        algorithm = key.removeprefix(f"{setting_of(key, SEQUENCES)}-")
-        reference = references.get(f"{CONCURRENT}-{algorithm}")
+        reference = references.get(f"{CONCURRENT}-{_algorithm(key)}")
         transfer = "-"
         if reference is not None:
-            transfer = statistics.cell(forward_transfer(run, reference), _means)
+            transfer = percent_cell(*forward_transfer(run, reference, statistics))
         costs = _costs(run)
         hours = sum(cost.seconds for cost in costs.values()) / 3600
         rows.append(
             [
                 run.name,
                 {True: "yes", False: "no", None: "?"}[knows_label(run)],
-                statistics.cell(scores, _means),
+                statistics.cell(scores, means),
                 lead,
-                statistics.cell(-change, _means),
-                statistics.cell(change[:, :-1], _means),
+                statistics.cell(-change, means),
+                statistics.cell(change[:, :-1], means),
                 transfer,
                 *(_mean_number(run.summary.get(what)) for what in ("nodes", "groups")),
                 f"{hours:.1f}" if costs else "-",
@@ -158,6 +158,11 @@ def benchmark_table(
             ]
         )
     return rows
+
+
+def _algorithm(name: str) -> str:
+    """Return the algorithm in the name of a sequence's run."""
+    return name.removeprefix(f"{setting_of(name, SEQUENCES)}-")
 
 
 def cost_table(runs: Mapping[str, Run]) -> Table:
@@ -182,10 +187,6 @@ def _cost_cell(cost: Cost | None) -> str:
 def _costs(run: Run) -> dict[int, Cost]:
     path = run.directory / "cost.csv"
     return read_costs(path) if path.exists() else {}
-
-
-def _means(samples: Values) -> Values:
-    return samples.mean(axis=(1, 2))
 
 
 def _mean_number(of_seeds: list[float] | None) -> str:

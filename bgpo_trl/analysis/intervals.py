@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 Statistic = Callable[[Array], Array]
-"""Maps samples of scores, ``[N, S, T]``, to a value of each, ``[N]``."""
+"""Maps samples of scores, ``[N, S, T]``, to a value of each, ``[N]``, or to several."""
 
 
 def interquartile_mean(scores: ArrayLike) -> float:
@@ -31,6 +31,11 @@ def interquartile_means(samples: Array) -> Array:
     ordered = np.sort(samples.reshape(len(samples), -1), axis=1)
     cut = ordered.shape[1] // 4
     return ordered[:, cut : ordered.shape[1] - cut].mean(1)
+
+
+def means(samples: Array) -> Array:
+    """Return the mean of each sample, ``[N]`` from ``[N, S, T]``."""
+    return samples.mean(axis=(1, 2))
 
 
 def stratified_bootstrap(
@@ -101,9 +106,8 @@ class Statistics:
 
     def cell(self, scores: Array, statistic: Statistic = interquartile_means) -> str:
         """Format a statistic of scores with its interval, in percent."""
-        low, high = percentile_interval(self.resampled(scores, statistic))
         (middle,) = statistic(scores[None])
-        return f"{_percent(middle, 1)} [{_percent(low, 0)}, {_percent(high, 0)}]"
+        return percent_cell(middle, self.resampled(scores, statistic))
 
     def difference(self, *scores: Array, statistic: Statistic = interquartile_means) -> Difference:
         """Return the difference of a statistic between two runs' scores, with its interval.
@@ -125,6 +129,12 @@ class Difference(NamedTuple):
     def cell(self) -> str:
         """Format the difference and its interval, in points."""
         return f"{100 * self.gain:+.1f} [{100 * self.low:+.0f}, {100 * self.high:+.0f}]"
+
+
+def percent_cell(value: float, resampled: Array) -> str:
+    """Format a value and the interval of its resamples, in percent."""
+    low, high = percentile_interval(resampled)
+    return f"{_percent(value, 1)} [{_percent(low, 0)}, {_percent(high, 0)}]"
 
 
 def _checked(scores: ArrayLike) -> Array:

@@ -16,7 +16,7 @@ from bgpo_trl.analysis.comparison import (
     starts,
     success_at,
 )
-from bgpo_trl.analysis.intervals import Statistics
+from bgpo_trl.analysis.intervals import Statistics, means, percent_cell
 from bgpo_trl.analysis.transfer import forward_transfer
 from bgpo_trl.runs.results import read_outcomes, read_rows
 
@@ -53,24 +53,22 @@ def _numbered(runs: Mapping[str, Run]) -> list[str]:
     return [f"task {number}" for number, _ in enumerate(next(iter(runs.values())).tasks, 1)]
 
 
-def continual_table(continual: Mapping[str, Run], concurrent: Mapping[str, Run]) -> Table:
+def continual_table(
+    continual: Mapping[str, Run], concurrent: Mapping[str, Run], statistics: Statistics
+) -> Table:
     """Return the table of forgetting and transfer of the continual runs."""
     rows = [["", "backward transfer", "forgotten since best", "forward transfer"]]
     for key, run in continual.items():
         matrix = success_at(run, [*starts(run)[1:], int(run.curves.episodes[-1])])
         best = metrics.forgetting_since_best(metrics.trailing_mean(run.curves.success, 3))
-        cells = [
-            _spread(metrics.backward_transfer(matrix)),
-            _spread(best),
-        ]
-        beside = concurrent.get(key.replace("continual", "concurrent"))
-        forward = "" if beside is None else _spread(forward_transfer(run, beside).mean(-1))
+        change = metrics.change_since_learned(matrix)[:, :-1]
+        cells = [statistics.cell(scores, means) for scores in (change, best[:, None])]
+        beside = concurrent.get(f"concurrent-{key.removeprefix('continual-')}")
+        forward = ""
+        if beside is not None:
+            forward = percent_cell(*forward_transfer(run, beside, statistics))
         rows.append([run.name, *cells, forward])
     return rows
-
-
-def _spread(values: Values) -> str:
-    return f"{100 * values.mean():.1f} ± {100 * values.std():.1f}"
 
 
 def own_episodes(path: Path, tasks: Sequence[str], last: int | None = None) -> Values | None:

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from bgpo_trl.analysis import metrics
 from bgpo_trl.analysis.comparison import Run, Values, starts
+from bgpo_trl.analysis.intervals import Statistics
 
 
 def expected_own_episodes(begun: Sequence[int], task: int, episodes: ArrayLike) -> Values:
@@ -26,32 +27,52 @@ def expected_own_episodes(begun: Sequence[int], task: int, episodes: ArrayLike) 
     return played
 
 
-def forward_transfer(run: Run, reference: Run) -> Values:
-    """Return the forward transfer to each task but the first, ``[S, T - 1]``.
+def forward_transfer(run: Run, reference: Run, statistics: Statistics) -> tuple[float, Values]:
+    """Return the mean forward transfer to all tasks but the first, and its resamples, ``[N]``.
 
-    Computed as in Continual World (`metrics.forward_transfer`), from the area under the task's
-    curve over its own phase and the mean area of a reference. As an episode is of any of the
-    presented tasks, both areas are taken over equally many of the task's own episodes. The first
-    task is left out, since nothing precedes it. Tasks of the reference may have another order.
+    Computed as in Continual World (`metrics.forward_transfer`), from the areas of `own_areas`,
+    means over seeds. Seeds of the run and of the reference are resampled independently.
     """
-    begun, gains = starts(run), []
+    areas = own_areas(run, reference)
+    gain = metrics.forward_transfer(*(of_run.mean(0) for of_run in areas)).mean()
+    drawn = [statistics.resampled(of_run, _means_of_tasks) for of_run in areas]
+    return float(gain), metrics.forward_transfer(*drawn).mean(-1)
+
+
+def own_areas(run: Run, reference: Run) -> tuple[Values, Values]:
+    """Return the areas under each task's curves of a run and a reference, ``[S, T - 1]`` each.
+
+    The mean height of a task's curve from the first to the last test of its own phase. As an
+    episode is of any of the presented tasks, curves are over the expected number of the task's own
+    episodes, and the reference's is read off at the tests of the run: learners with the same curve
+    have the same area. The first task is left out, since nothing precedes it. Tasks of the
+    reference may have another order.
+    """
+    begun, areas = starts(run), []
     for task, end in enumerate([*begun[2:], run.curves.episodes[-1]], 1):
-        other = reference.tasks.index(run.tasks[task])
-        of_reference = expected_own_episodes(
-            starts(reference), other, reference.curves.episodes[-1]
-        )
-        length = min(float(expected_own_episodes(begun, task, end)), float(of_reference))
-        reached = _own_area(reference, other, length).mean()
-        gains.append(metrics.forward_transfer(_own_area(run, task, length), reached))
-    return np.stack(gains, axis=-1)
+        own, curves = _own_curves(run, task)
+        of_reference, others = _own_curves(reference, reference.tasks.index(run.tasks[task]))
+        last = min(float(expected_own_episodes(begun, task, end)), of_reference[-1])
+        first = min(max(own[0], of_reference[0]), last)
+        tests = np.array([first, *own[(own > first) & (own < last)], last])
+        areas.append((_mean_height(tests, own, curves), _mean_height(tests, of_reference, others)))
+    ours, theirs = zip(*areas, strict=True)
+    return np.stack(ours, axis=-1), np.stack(theirs, axis=-1)
 
 
-def _own_area(run: Run, task: int, length: float) -> Values:
-    """Return the area under a task's curve over its first ``length`` own episodes, ``[S]``."""
+def _own_curves(run: Run, task: int) -> tuple[Values, Values]:
+    """Return a task's expected own episodes at its tests, ``[E]``, and the curves, ``[S, E]``."""
     own = expected_own_episodes(starts(run), task, run.curves.episodes)
-    curve = run.curves.success[:, own > 0, task]
-    own = own[own > 0]
-    before = own < length
-    last = [np.interp(length, [0, *own], [0, *of_seed]) for of_seed in curve]
-    heights = np.column_stack([curve[:, before], last])
-    return metrics.area_under_curve(heights, np.append(own[before], length))
+    return own[own > 0], run.curves.success[:, own > 0, task]
+
+
+def _mean_height(tests: Values, episodes: Values, curves: Values) -> Values:
+    """Return the mean height of curves between the first and the last of some episodes, ``[S]``."""
+    heights = np.stack([np.interp(tests, episodes, curve) for curve in curves])
+    if tests[0] == tests[-1]:  # a single test
+        return heights[:, -1]
+    return np.trapezoid(heights, tests, axis=-1) / (tests[-1] - tests[0])
+
+
+def _means_of_tasks(samples: Values) -> Values:
+    return samples.mean(1)

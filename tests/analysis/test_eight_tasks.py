@@ -60,7 +60,7 @@ def test_forgetting_counts_all_tasks_and_backward_transfer_all_but_the_last():
     cells = dict(zip(head, row, strict=True))
     assert cells["forgetting"] == "10.0 [10, 10]"  # (0.6 - 0.3 + 0) / 3
     assert cells["backward transfer"] == "-15.0 [-15, -15]"
-    transfer = forward_transfer(run, references["eight-concurrent-bgpo"]).mean()
+    transfer, _ = forward_transfer(run, references["eight-concurrent-bgpo"], Statistics())
     assert cells["forward transfer"].startswith(f"{100 * transfer:.1f} [")
 
 

@@ -1,9 +1,11 @@
 """Forward transfer against numbers worked out by hand."""
 
 import numpy as np
+import pytest
 
-from bgpo_trl.analysis.transfer import expected_own_episodes, forward_transfer
-from tests.analysis.runs import STARTS, make_run
+from bgpo_trl.analysis.intervals import Statistics
+from bgpo_trl.analysis.transfer import expected_own_episodes, forward_transfer, own_areas
+from tests.analysis.runs import STARTS, SUCCESS, make_run
 
 
 def test_own_episodes_are_shared_among_the_presented_tasks():
@@ -16,21 +18,61 @@ def test_own_episodes_are_shared_among_the_presented_tasks():
     np.testing.assert_allclose(from_the_start, [2 + 1 / 3, 4, 2 + 16 / 3, 2 + 26 / 3])
 
 
-def test_forward_transfer_compares_equally_many_own_episodes():
+# The reference plays each task in every third episode, all alike: after 5/3, 10/3, 5, ... own
+# episodes.
+RISING = [[0.3] * 3, *[[0.6] * 3] * 5]
+
+
+def test_areas_are_over_the_own_episodes_between_the_tests_of_a_phase():
+    ours, theirs = own_areas(make_run(), make_run(RISING, (0, 0, 0), "cba"))
     # Task b: 0.4 after 2.5 own episodes, 0.6 after 5; task c: 0 after 5/3, 0.4 after 10/3.
-    b = (0.2 * 2.5 + 0.5 * 2.5) / 5
-    c = 0.2 / 2
-    # The reference plays each task in every third episode, all alike: 0.3 after 5/3, 0.6 after
-    # 10/3, 0.6 for good. At 5 own episodes it has played 15.
-    reference = make_run([[0.3] * 3, *[[0.6] * 3] * 5], (0, 0, 0), "cba")
-    of_b = (0.15 * 5 / 3 + 0.45 * 5 / 3 + 0.6 * 5 / 3) / 5
-    of_c = (0.15 + 0.45) / 2
-    expected = [(b - of_b) / (1 - of_b), (c - of_c) / (1 - of_c)]
-    np.testing.assert_allclose(forward_transfer(make_run(), reference), [expected] * 2)
+    np.testing.assert_allclose(ours, [[0.5, 0.2]] * 2)
+    # The reference is at 0.45 after 2.5 and at 0.6 after 5; at 0.3 after 5/3 and at 0.6 after 10/3.
+    np.testing.assert_allclose(theirs, [[(0.45 + 0.6) / 2, 0.45]] * 2)
+
+
+def test_forward_transfer_is_the_share_gained_of_what_is_left_to_gain():
+    gain, drawn = forward_transfer(make_run(), make_run(RISING, (0, 0, 0)), Statistics())
+    expected = ((0.5 - 0.525) / (1 - 0.525) + (0.2 - 0.45) / (1 - 0.45)) / 2
+    assert gain == pytest.approx(expected)
+    np.testing.assert_allclose(drawn, expected)  # the seeds are equal
+
+
+@pytest.mark.parametrize("curve", [lambda own: 0 * own + 0.8, lambda own: np.minimum(own / 9, 1)])
+def test_a_learner_gains_nothing_if_its_tasks_are_learned_alike_in_any_order(curve):
+    episodes = 5 * np.arange(1, 25)
+
+    def learner(starts):
+        own = [expected_own_episodes(starts, task, episodes) for task in range(3)]
+        success = [np.where(of_task > 0, curve(of_task), np.nan) for of_task in own]
+        return make_run(np.stack(success, -1), starts)
+
+    gain, _ = forward_transfer(learner((0, 40, 80)), learner((0, 0, 0)), Statistics())
+    assert gain == pytest.approx(0, abs=0.01)
+
+
+def test_a_single_test_of_a_phase_is_its_area():
+    run = make_run(SUCCESS[:5])  # of task c after 25 episodes
+    ours, theirs = own_areas(run, make_run(RISING, (0, 0, 0)))
+    np.testing.assert_allclose(ours[:, 1], 0)
+    np.testing.assert_allclose(theirs[:, 1], 0.3)
+
+
+def test_seeds_of_the_reference_widen_the_interval():
+    run, reference = make_run(), make_run(RISING, (0, 0, 0))
+    reference.curves.success[1] += 0.2
+    _, drawn = forward_transfer(run, reference, Statistics())
+    areas = [0.525, 0.45]  # of the reference, 0.2 more in its second seed
+    worst, best = (
+        np.mean([(a - b - more) / (1 - b - more) for a, b in zip([0.5, 0.2], areas, strict=True)])
+        for more in (0.2, 0.0)
+    )
+    assert (drawn.min(), drawn.max()) == (pytest.approx(worst), pytest.approx(best))
 
 
 def test_forward_transfer_finds_the_task_in_another_order():
     by_task = np.tile([[0.1, 0.5, 0.9]], (6, 1))
     ordered, turned = make_run(by_task, (0, 0, 0)), make_run(by_task[:, ::-1], (0, 0, 0), "cba")
-    gains = [forward_transfer(make_run(), reference) for reference in (ordered, turned)]
-    np.testing.assert_allclose(gains[0], gains[1])
+    areas = [own_areas(make_run(), reference) for reference in (ordered, turned)]
+    np.testing.assert_allclose(areas[0], areas[1])
+    np.testing.assert_allclose(areas[0][1], [[0.5, 0.9]] * 2)
