@@ -49,8 +49,8 @@ NOTES: tuple[str, ...] = (
     "Forgetting: success at the end of a task's own phase minus that at the end of training, mean "
     "over all tasks; backward transfer: the negative, without the last task.",
     "Forward transfer: (area - reference) / (1 - reference), areas under a task's curve over its "
-    "own episodes, from the first to the last test of its phase; reference: the same algorithm with "
-    "all tasks from the start, its seeds resampled too.",
+    "own episodes, from the first to the last test of its phase; reference: the same algorithm "
+    "with all tasks from the start, its seeds resampled too.",
     "Nodes and groups: means over seeds. Hours and megabytes (replay, networks, GWR-B): of all "
     "seeds together, without tests.",
 )
