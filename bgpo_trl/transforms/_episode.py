@@ -7,7 +7,6 @@ from typing import Any, cast
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from tensordict.utils import unravel_key
 from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Compose, EnvBase, RewardSum, StepCounter, Transform, TransformedEnv
@@ -16,36 +15,31 @@ from bgpo_trl.errors import missing_key
 from bgpo_trl.seeding import Seeding
 
 
-def starting(tensordict: TensorDictBase, done_key: NestedKey = "done") -> Tensor:
+def starting(tensordict: TensorDictBase) -> Tensor:
     """Return the rows that this reset starts, bool ``[*B]``; all if there is no ``_reset``."""
-    reset_key = "_reset" if isinstance(done_key, str) else (*done_key[:-1], "_reset")
-    reset = tensordict.get(reset_key, None)
+    reset = tensordict.get("_reset", None)
     if reset is None:
         return torch.ones(tensordict.batch_size, dtype=torch.bool, device=tensordict.device)
-    return _one_a_row(reset, tensordict)
+    return reset.reshape(tensordict.batch_size)
 
 
-def ending(
-    tensordict: TensorDictBase, next_tensordict: TensorDictBase, done_key: NestedKey = "done"
-) -> Tensor:
+def ending(tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> Tensor:
     """Return the rows whose episode ends with this step, bool ``[*B]``.
 
     A row that is stepped after its end, or skipped by a partial step, does not end again.
     """
-    done = next_tensordict.get(done_key)
-    was_done = tensordict.get(done_key, None)
-    return _one_a_row(done if was_done is None else done & ~was_done, next_tensordict)
-
-
-def _one_a_row(mask: Tensor, tensordict: TensorDictBase) -> Tensor:
-    ndim = tensordict.batch_dims
-    return mask.flatten(ndim).any(-1) if mask.ndim > ndim else mask
+    done = next_tensordict.get("done")
+    was_done = tensordict.get("done", None)
+    ended = done if was_done is None else done & ~was_done
+    return ended.reshape(next_tensordict.batch_size)
 
 
 class EpisodeTransform(Transform):
     """Base of the transforms whose entries are set at reset and copied from step to step.
 
-    These entries must stay in the observation, since the next step reads them. ``StepCounter`` must
+    An episode is that of a row: it ends with ``done`` ``[*B, 1]``, the environment's own, not one
+    of several agents. The entries must stay in the observation, since the next step reads them.
+    ``StepCounter`` must
     come before the transform, so that ``done`` includes time-outs; it is required if the transform
     learns at the end of episodes. ``RewardSum`` must come after a transform that changes the
     reward.
@@ -59,7 +53,6 @@ class EpisodeTransform(Transform):
     Args:
         in_keys: Entries read.
         out_keys: Entries written.
-        done_key: The ``done`` that ends an episode; its sibling ``_reset`` starts one.
 
     Attributes:
         learn: Whether it learns at the end of an episode.
@@ -70,11 +63,8 @@ class EpisodeTransform(Transform):
     pays: bool = False
     _seeding: Seeding | None = None
 
-    def __init__(
-        self, in_keys: Sequence[NestedKey], out_keys: Sequence[NestedKey], done_key: NestedKey
-    ) -> None:
+    def __init__(self, in_keys: Sequence[NestedKey], out_keys: Sequence[NestedKey]) -> None:
         super().__init__(in_keys=list(in_keys), out_keys=list(out_keys))
-        self.done_key = unravel_key(done_key)
 
     def seed_rows(self, seeds: Sequence[int]) -> None:
         """Start random streams anew, from a seed for each row; this base class has none."""
@@ -84,7 +74,10 @@ class EpisodeTransform(Transform):
         raise TypeError(f"{type(self).__name__} needs episodes: append it to an environment")
 
     def _follow_seed(self) -> None:
-        env = self.container
+        try:
+            env = self.container
+        except ValueError:  # in a replay buffer, which TorchRL does not take for a container
+            return
         while isinstance(env, TransformedEnv):
             env = env.base_env
         # Not getattr, with which a ParallelEnv would ask its workers.
@@ -179,7 +172,6 @@ class DemonstrationLookup(EpisodeTransform):
             ``check_env_specs`` if episodes can end within the three steps of the check.
         in_keys: Key of the demonstration's embedding.
         out_keys: Entries written.
-        done_key: The ``done`` that ends an episode.
 
     Raises:
         ValueError: If the demonstration's embedding is missing, or the network is to learn from an
@@ -193,9 +185,8 @@ class DemonstrationLookup(EpisodeTransform):
         learn: bool,
         in_keys: Sequence[NestedKey],
         out_keys: Sequence[NestedKey],
-        done_key: NestedKey,
     ) -> None:
-        super().__init__(in_keys, out_keys, done_key)
+        super().__init__(in_keys, out_keys)
         self.network = network
         self.learn = learn
 
@@ -222,7 +213,7 @@ class DemonstrationLookup(EpisodeTransform):
         for key in self.out_keys:
             next_tensordict.set(key, tensordict[key])
         if self.learn:
-            ended = ending(tensordict, next_tensordict, self.done_key)
+            ended = ending(tensordict, next_tensordict)
             if ended.any():
                 self.network.adapt(tensordict[self.in_keys[0]], mask=ended)
         return next_tensordict

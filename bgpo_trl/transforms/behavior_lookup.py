@@ -50,9 +50,8 @@ class BehaviorLookup(DemonstrationLookup):
         learn: bool,
         in_keys: Sequence[NestedKey] = ("demo_embedding",),
         out_keys: Sequence[NestedKey] = ("behavior", "behavior_node"),
-        done_key: NestedKey = "done",
     ) -> None:
-        super().__init__(gwr, learn=learn, in_keys=in_keys, out_keys=out_keys, done_key=done_key)
+        super().__init__(gwr, learn=learn, in_keys=in_keys, out_keys=out_keys)
 
     @property
     def gwr(self) -> GWRB:

@@ -36,7 +36,6 @@ class BehaviorMatchingReward(EpisodeTransform):
         beta: Weight of the intrinsic reward, which is measured even if 0.
         in_keys: Keys of latent, behavior and reward.
         out_keys: Keys of the two parts of the LSTM's state and of the two parts of the reward.
-        done_key: The ``done`` that ends an episode.
 
     Raises:
         ValueError: If beta is negative, or latents, behaviors or rewards are missing or of another
@@ -72,11 +71,10 @@ class BehaviorMatchingReward(EpisodeTransform):
         *,
         in_keys: Sequence[NestedKey] = ("latent", "behavior", "reward"),
         out_keys: Sequence[NestedKey] = ("lae_h", "lae_c", "extrinsic_reward", "intrinsic_reward"),
-        done_key: NestedKey = "done",
     ) -> None:
         if not 0 <= beta < math.inf:
             raise ValueError(f"beta must not be negative, got {beta}")
-        super().__init__(in_keys, out_keys, done_key)
+        super().__init__(in_keys, out_keys)
         self.lae = lae
         self.beta = beta
 
@@ -102,7 +100,7 @@ class BehaviorMatchingReward(EpisodeTransform):
                 next_tensordict.set(key, torch.where(rows, next_tensordict[key], before))
         error = torch.linalg.vector_norm(tensordict[behavior_key] - phi, dim=-1)
         extrinsic = next_tensordict[reward_key]
-        ended = ending(tensordict, next_tensordict, self.done_key)
+        ended = ending(tensordict, next_tensordict)
         intrinsic = torch.where(ended, torch.exp(-error), 0).unsqueeze(-1).to(extrinsic.dtype)
         next_tensordict.set(extrinsic_key, extrinsic)
         next_tensordict.set(intrinsic_key, intrinsic)

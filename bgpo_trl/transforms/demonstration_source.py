@@ -124,7 +124,6 @@ class DemonstrationSource(EpisodeTransform):
         follow: Another source, whose ``episode`` count determines the available tasks (evaluation
             follows training) and whose batch size is the leading dimensions of ``batch_size``.
         out_keys: Keys of task, embedding and index.
-        done_key: The ``done`` that ends an episode.
 
     Raises:
         ValueError: If the bank has wrong shapes or no demonstration of a task, the number of
@@ -158,9 +157,8 @@ class DemonstrationSource(EpisodeTransform):
         generator: torch.Generator | Sequence[torch.Generator] | None = None,
         follow: DemonstrationSource | None = None,
         out_keys: Sequence[NestedKey] = ("task", "demo_embedding", "demo_index"),
-        done_key: NestedKey = "done",
     ) -> None:
-        super().__init__((), out_keys, done_key)
+        super().__init__((), out_keys)
         batch_size = as_shape(batch_size, "batch_size")
         n_rows = batch_size.numel()
         if bank.embedding.ndim != 2 or bank.task.shape != bank.embedding.shape[:1]:
@@ -225,7 +223,7 @@ class DemonstrationSource(EpisodeTransform):
         super()._reset_env_preprocess(tensordict)
         if tensordict is None:
             tensordict = TensorDict({}, self.episode.shape, device=self.episode.device)
-        self._draw(starting(tensordict, self.done_key))
+        self._draw(starting(tensordict))
         return tensordict.set(self.out_keys[0], self._task[self._demo_index].clone())
 
     def _reset(
@@ -237,7 +235,7 @@ class DemonstrationSource(EpisodeTransform):
         reported = tensordict_reset.get(task_key, None)
         if reported is None:
             tensordict_reset.set(task_key, task)
-        elif (reported.reshape(task.shape) != task)[starting(tensordict, self.done_key)].any():
+        elif (reported.reshape(task.shape) != task)[starting(tensordict)].any():
             raise ValueError(
                 f"the environment did not take the task drawn for it: it must read {task_key!r} "
                 "from the TensorDict it is reset with, and have it in its state_spec"
@@ -251,7 +249,7 @@ class DemonstrationSource(EpisodeTransform):
             own_keys.append(task_key)
         for key in own_keys:
             next_tensordict.set(key, tensordict[key])
-        self.episode += ending(tensordict, next_tensordict, self.done_key)
+        self.episode += ending(tensordict, next_tensordict)
         return next_tensordict
 
     def _entries(self, observation_spec: Composite) -> dict[NestedKey, TensorSpec]:

@@ -32,7 +32,6 @@ class FrameEncoder(Transform):
         in_keys: Keys of the frames.
         out_keys: Keys of the latents, one for each of ``in_keys``.
         del_keys: Drop the frames once they are encoded.
-        done_key: The ``done`` whose sibling ``_reset`` selects the rows to reset.
 
     Raises:
         ValueError: If the numbers of ``in_keys`` and ``out_keys`` differ, or frames are missing.
@@ -53,7 +52,6 @@ class FrameEncoder(Transform):
         out_keys: Sequence[NestedKey] = ("latent",),
         *,
         del_keys: bool = False,
-        done_key: NestedKey = "done",
     ) -> None:
         if len(in_keys) != len(out_keys):
             raise ValueError(
@@ -63,7 +61,7 @@ class FrameEncoder(Transform):
         super().__init__(in_keys=list(in_keys), out_keys=list(out_keys))
         self.vae = vae
         self.del_keys = del_keys
-        self.done_key = done_key
+        self._latest: list[Tensor | None] = [None] * len(self.in_keys)
 
     @torch.no_grad()
     def _apply_transform(self, obs: Tensor) -> Tensor:
@@ -85,28 +83,32 @@ class FrameEncoder(Transform):
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         stepped = tensordict.get("_step", None)
-        if stepped is None or not all(key in tensordict for key in self.out_keys):
-            return self.forward(next_tensordict)
-        rows = stepped.reshape(tensordict.batch_size)
-        for in_key, out_key in zip(self.in_keys, self.out_keys, strict=True):
-            latent = tensordict[out_key].clone()
-            latent[rows] = self._apply_transform(next_tensordict[in_key][rows])
-            next_tensordict.set(out_key, latent)
-        return self._drop(next_tensordict)
+        before = [tensordict.get(key, None) for key in self.out_keys]
+        rows = None if stepped is None else stepped.reshape(tensordict.batch_size)
+        return self._encode(next_tensordict, rows, before)
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        rows = starting(tensordict, self.done_key)
-        if rows.all():
-            return self.forward(tensordict_reset)
-        for in_key, out_key in zip(self.in_keys, self.out_keys, strict=True):
-            latent = self._apply_transform(tensordict_reset[in_key][rows])
-            # Values of the other rows do not matter: the environment ignores them.
-            every = latent.new_zeros(*rows.shape, latent.shape[-1])
-            every[rows] = latent
-            tensordict_reset.set(out_key, every)
-        return self._drop(tensordict_reset)
+        rows = starting(tensordict)
+        return self._encode(tensordict_reset, None if rows.all() else rows, self._latest)
+
+    def _encode(
+        self, tensordict: TensorDictBase, rows: Tensor | None, before: Sequence[Tensor | None]
+    ) -> TensorDictBase:
+        """Encode some rows; the others keep their latents, which later transforms may read."""
+        old = [latent for latent in before if latent is not None]
+        if rows is None or [latent.shape[:-1] for latent in old] != [rows.shape] * len(before):
+            self.forward(tensordict)
+        else:
+            for in_key, out_key, latent in zip(self.in_keys, self.out_keys, old, strict=True):
+                latent = latent.clone()
+                latent[rows] = self._apply_transform(tensordict[in_key][rows])
+                tensordict.set(out_key, latent)
+            self._drop(tensordict)
+        # TorchRL does not hand a reset the observation before it.
+        self._latest = [tensordict[key] for key in self.out_keys]
+        return tensordict
 
     def _drop(self, tensordict: TensorDictBase) -> TensorDictBase:
         if self.del_keys:

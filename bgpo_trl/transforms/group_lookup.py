@@ -41,9 +41,8 @@ class GroupLookup(DemonstrationLookup):
         learn: bool,
         in_keys: Sequence[NestedKey] = ("demo_embedding",),
         out_keys: Sequence[NestedKey] = ("group", "group_activity"),
-        done_key: NestedKey = "done",
     ) -> None:
-        super().__init__(groups, learn=learn, in_keys=in_keys, out_keys=out_keys, done_key=done_key)
+        super().__init__(groups, learn=learn, in_keys=in_keys, out_keys=out_keys)
 
     @property
     def groups(self) -> BehaviorGroups:

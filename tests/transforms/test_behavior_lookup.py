@@ -4,6 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.collectors import Collector
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import (
     Compose,
     RenameTransform,
@@ -171,3 +172,17 @@ def test_a_time_limit_within_workers_will_do(MockEnv, make_bank, make_modules):
     source = DemonstrationSource(make_bank(), TaskSchedule((0, 0, 0)), batch_size=[2])
     lookup = BehaviorLookup(make_modules([0, 1])[2], learn=True)
     assert "behavior" in TransformedEnv(base, Compose(source, lookup)).reset()
+
+
+def test_a_replay_buffer_with_a_lookup_is_saved_and_loaded(make_modules):
+    def buffer():
+        lookup = BehaviorLookup(make_modules()[2], learn=False)
+        return TensorDictReplayBuffer(storage=LazyTensorStorage(4), transform=lookup, batch_size=4)
+
+    first, second = buffer(), buffer()
+    first.extend(TensorDict({"demo_embedding": torch.rand(4, 32)}, [4]))
+    second.load_state_dict(first.state_dict())
+    drawn = second.sample()
+    assert drawn["behavior"].equal(
+        first._transform[0].gwr.lookup(drawn["demo_embedding"]).embedding
+    )

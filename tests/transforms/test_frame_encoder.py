@@ -3,7 +3,7 @@
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.envs import TransformedEnv, check_env_specs
+from torchrl.envs import Compose, Transform, TransformedEnv, check_env_specs
 
 from bgpo_trl.modules.vae import VAE
 from bgpo_trl.transforms import FrameEncoder
@@ -36,6 +36,28 @@ def test_partial_reset_encodes_the_rows_that_are_reset_only(MockEnv, TopRow, pla
     assert vae.n_frames == [3, 3, 1, 3, 2]
     assert data["latent"].equal(vae.latent(data["pixels"]))
     assert steps["latent"].equal(vae.latent(steps["pixels"]))
+
+
+def test_later_transforms_see_the_latents_of_rows_that_are_not_reset(MockEnv, TopRow, play):
+    class Witness(Transform):
+        def _reset(self, tensordict, tensordict_reset):
+            seen.append(tensordict_reset["latent"].clone())
+            return tensordict_reset
+
+        def _call(self, next_tensordict):
+            seen.append(next_tensordict["latent"].clone())
+            return next_tensordict
+
+    seen, vae = [], TopRow()
+    transforms = Compose(FrameEncoder(vae, del_keys=True), Witness())
+    env = TransformedEnv(MockEnv([0, 1, 2], [2, 3, 3]), transforms)
+    start = env.reset()
+    del seen[:]
+    play(env, 2, start)
+    _, stepped, reset = seen
+    assert not stepped.equal(start["latent"])
+    assert reset[1:].equal(stepped[1:])  # only row 0 has ended
+    assert reset[0].equal(start["latent"][0])
 
 
 def test_partial_step_encodes_the_rows_that_are_stepped_only(MockEnv, TopRow):
