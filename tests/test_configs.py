@@ -47,6 +47,17 @@ SETTINGS = [
     (AlgorithmConfig, {"max_steps": 0}, "at least 1"),
     (AlgorithmConfig, {"demonstration_share": 1.0}, "at least 0 and below 1"),
     (AlgorithmConfig, {"demonstration_share": NAN}, "at least 0 and below 1"),
+    (
+        BGPOConfig,
+        {"demonstration_share": 0.99, "expert_batch_size": 8},
+        "less, to leave some of 8 transitions",
+    ),
+    (
+        MAMLConfig,
+        {"demonstration_share": 0.95, "task_batch_size": 4},
+        "less, to leave some of 4 transitions",
+    ),
+    (DistNLLConfig, {"demonstration_share": 0.999}, "less, to leave some of 64 transitions"),
     (GWRBConfig, {"activity_scale": 0.0}, "a number above 0"),
     (GWRBConfig, {"activity_threshold": 1.0}, "between 0 and 1"),
     (RunConfig, {"held_out": "training"}, "validation or test"),

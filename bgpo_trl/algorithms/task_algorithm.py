@@ -70,6 +70,11 @@ class TaskAlgorithm(Algorithm):
             demonstration_share=config.demonstration_share,
             keys=[*keys, *(("next", key) for key in (config.state, "reward", "terminated"))],
         )
+        if config.rl.replay_size < self.replay.enough:
+            raise ValueError(
+                f"replay_size must be at least {self.replay.enough}, so that a batch of one of "
+                f"{self.n_tasks} tasks is full and learning begins, got {config.rl.replay_size}"
+            )
 
     def make_env(self, base_env: EnvBase, source: DemonstrationSource) -> TransformedEnv:
         """Return an environment without context."""

@@ -41,6 +41,12 @@ class AlgorithmConfig:
             )
 
 
+def _check_played(config: AlgorithmConfig, rows: int) -> None:
+    """Raise ``ValueError`` if demonstrations leave none of an update's transitions to training."""
+    leaves = round(config.demonstration_share * rows) < rows
+    check(config, ("demonstration_share", leaves, f"less, to leave some of {rows} transitions"))
+
+
 def _refuse_all_but_ddpg(who: str, rl: RLConfig) -> None:
     if not isinstance(rl, DDPGConfig):
         raise ValueError(
@@ -116,6 +122,7 @@ class BGPOConfig(AlgorithmConfig):
         positive(self, "behavior_scale")
         holds = self.even_replay or not self.experts
         check(self, ("even_replay", holds, "set where there are experts"))
+        _check_played(self, self.expert_batch_size if self.experts else self.rl.batch_size)
 
 
 @dataclass(frozen=True)
@@ -142,6 +149,7 @@ class MAMLConfig(AlgorithmConfig):
         whole(self, 1, "adaptation_size")
         whole(self, 2, "task_batch_size")
         check(self, ("task_batch_size", self.task_batch_size % 2 == 0, "even"))
+        _check_played(self, self.task_batch_size)
 
 
 @dataclass(frozen=True)
@@ -166,6 +174,7 @@ class DistNLLConfig(AlgorithmConfig):
         super().__post_init__()
         _refuse_all_but_ddpg("Dist-NLL", self.rl)
         whole(self, 1, "task_batch_size", "samples", "distillation_batch_size")
+        _check_played(self, self.task_batch_size)
         positive(self, "learning_rate")
         if self.samples % self.distillation_batch_size:
             raise ValueError(

@@ -72,8 +72,11 @@ class GroupReplay:
             mask: Seeds that store theirs, bool ``[S]``; ``None`` for all.
 
         Raises:
-            ValueError: If an entry is missing, or differs in shape or dtype from those stored.
+            ValueError: If an entry is missing, or differs in shape or dtype from those stored; if a
+                group is negative.
         """
+        if not (group if mask is None else group[mask]).ge(0).all():
+            raise ValueError(f"a group must be at least 0, got {group.tolist()}")
         steps = self._buffer.n_added.tolist()
         missing = [key for key in self._buffer.keys or () if key not in transition.keys(True)]
         if set(missing) - {GROUP}:
@@ -105,11 +108,11 @@ class GroupReplay:
             entries are undefined.
 
         Raises:
-            ValueError: If a seed holds no transition.
+            ValueError: If one of these seeds holds no transition.
         """
-        if not len(self):
-            raise ValueError("every seed needs a transition before the first sample")
         seeds = range(len(self._generators)) if seeds is None else seeds
+        if not all(self._buffer.n_added[seed] for seed in seeds):
+            raise ValueError("every seed needs a transition before the first sample")
         sources = [self._generators[seed] for seed in seeds] if generator is None else generator
         oldest = self._buffer.oldest.tolist()
         steps = np.empty(group.shape, np.int64)

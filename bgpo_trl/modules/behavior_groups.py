@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from bgpo_trl.errors import as_shape
 from bgpo_trl.modules.gwr import GWRB
+from bgpo_trl.modules.gwr_topology import read_state
 
 _NEVER = 2**62  # an age that no edge reaches
 
@@ -162,6 +163,19 @@ class BehaviorGroups(nn.Module):
             batch_size=self.batch_size,
         )
 
+    def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
+        # Checked together before either is loaded: nodes and their groups belong together.
+        own, gwr = (state_dict.get(f"{prefix}{part}_extra_state") for part in ("", "gwr."))
+        if own is not None and gwr is not None:
+            _, topologies = read_state(gwr, self.batch_size.numel(), self.gwr.n_features)
+            nodes = [topology.next_identity for topology in topologies]
+            if [len(numbers) for numbers in own["group"]] != nodes:
+                raise ValueError(
+                    f"the state has groups of {[len(numbers) for numbers in own['group']]} nodes, "
+                    f"but {nodes} nodes: load one that state_dict returned"
+                )
+        super()._load_from_state_dict(state_dict, prefix, *args)
+
     def get_extra_state(self) -> dict[str, Any]:
         """Return group and parent numbers, for ``state_dict``."""
         return {
@@ -173,7 +187,8 @@ class BehaviorGroups(nn.Module):
         """Restore the result of `get_extra_state`.
 
         Raises:
-            ValueError: If it is of another number of networks; nothing has changed then.
+            ValueError: If it is of another number of networks, or a group is missing; nothing has
+                changed then.
         """
         group, parent = state["group"], state["parent"]
         n_networks = self.batch_size.numel()
@@ -182,5 +197,10 @@ class BehaviorGroups(nn.Module):
                 f"the state has groups of {len(group)} networks, this BehaviorGroups "
                 f"{n_networks}: build it with the same sizes"
             )
+        for numbers, parents in zip(group, parent, strict=True):
+            if not {*numbers, *parents} <= set(range(len(parents))):
+                raise ValueError(
+                    "a group is missing in the state: load one that state_dict returned"
+                )
         self._group = [list(numbers) for numbers in group]
         self._parent = [list(numbers) for numbers in parent]

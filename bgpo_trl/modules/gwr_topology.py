@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
+from itertools import product
 from numbers import Integral, Real
 from typing import Any, NamedTuple
 
@@ -12,6 +13,16 @@ import torch
 from torch import Tensor
 
 from bgpo_trl.modules.gwr_graph import BehaviorGraph
+
+_DAMAGED = "the state is damaged or not a graph of GWR-B: load one that state_dict returned"
+# Of the tensors of a graph: number of dimensions, and whether they are int64.
+_ENTRIES = {
+    "weights": (2, False),
+    "habituation": (1, False),
+    "edges": (2, True),
+    "ages": (1, True),
+    "node": (1, True),
+}
 
 
 class Firing(NamedTuple):
@@ -135,9 +146,7 @@ class Topology:
             and bool(graph.weights.isfinite().all())
         )
         if not sound:
-            raise ValueError(
-                "the state is damaged or not a graph of GWR-B: load one that state_dict returned"
-            )
+            raise ValueError(_DAMAGED)
         identity, habituation = graph.node.tolist(), graph.habituation.tolist()
         edges = {row: {} for row in range(len(identity))}
         topology = cls(identity, habituation, [0] * len(identity), edges, next_identity)
@@ -258,6 +267,17 @@ def read_state(
         isinstance(network, dict) and wanted <= network.keys() for network in state
     ):
         raise ValueError(f"the state of a network needs {sorted(wanted)}: see get_extra_state")
+    for network, (name, (ndim, whole)) in product(state, _ENTRIES.items()):
+        entry = network[name]
+        if (
+            not isinstance(entry, Tensor)
+            or entry.ndim != ndim
+            or entry.is_complex()
+            or (whole and entry.dtype != torch.int64)
+        ):
+            raise ValueError(f"{_DAMAGED} ({name})")
+    if not all(isinstance(network["next_node"], int) for network in state):
+        raise ValueError(f"{_DAMAGED} (next_node)")
     sizes = [network["weights"].shape[1] for network in state]
     if sizes != [n_features] * n_networks:
         raise ValueError(

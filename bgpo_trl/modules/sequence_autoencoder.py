@@ -60,6 +60,9 @@ class SequenceAutoencoder(nn.Module):
         if length.numel() and not (length.min() >= 1 and length.max() <= steps):
             raise ValueError(f"every length must be in 1..{steps}: drop empty sequences")
         # An LSTM is causal: reading its output at the last valid step masks the padding exactly.
+        # Without zeros, the gradient of padding that is NaN would be NaN all the same.
+        valid = torch.arange(steps, device=z.device) < length.unsqueeze(-1)
+        z = torch.where(valid.unsqueeze(-1), z, 0.0)
         hidden, _ = self.encoder(z.reshape(-1, steps, self.latent_size))
         last = (length.reshape(-1, 1, 1) - 1).expand(-1, 1, self.embedding_size)
         return hidden.gather(1, last).reshape(*length.shape, self.embedding_size)

@@ -96,7 +96,7 @@ class OffPolicyLoss(LossModule):
         if loss_function not in ("l2", "l1", "smooth_l1"):
             raise ValueError(f"loss_function must be l2, l1 or smooth_l1, got {loss_function!r}")
         super().__init__()
-        self._made: dict[tuple[str, bool], tuple[Any, list[Tensor]]] = {}
+        self._made: dict[tuple[str, bool], tuple[Any, list[Tensor], list[bool]]] = {}
         self.batch_size = torch.Size(getattr(actor_network, "batch_size", ()))
         critics = torch.Size(getattr(value_network, "batch_size", ()))
         wanted = (*self.batch_size, 2) if self.twin_critics else self.batch_size
@@ -236,20 +236,26 @@ class OffPolicyLoss(LossModule):
             return loss.sum(), {}
         square = pre_tanh.square()
         if self.pre_tanh_penalty:
-            loss = loss + self.pre_tanh_penalty * self.mean_per_seed(square, tensordict)
+            loss = loss + self.pre_tanh_penalty * self.mean_per_seed(square, tensordict, features=1)
         magnitude = self.flatten_batch(square.detach()).mean(-1).sqrt()
         return loss.sum(), {"pre_tanh_magnitude": magnitude}
 
-    def mean_per_seed(self, loss: Tensor, tensordict: TensorDictBase) -> Tensor:
-        """Return the mean ``[*S]`` of ``[*S, *B, ...]``, weighted by ``"priority_weight"``."""
+    def mean_per_seed(
+        self, loss: Tensor, tensordict: TensorDictBase, *, features: int = 0
+    ) -> Tensor:
+        """Return the mean ``[*S]`` of ``[*S, *B, ...]``, weighted by ``"priority_weight"``.
+
+        ``features`` is the number of dimensions after those of the transitions.
+        """
         weights = tensordict.get(self.tensor_keys.priority_weight, None)
         if weights is not None and self.use_prioritized_weights:
-            if weights.shape != loss.shape[: weights.ndim]:
+            transitions = loss.shape[: loss.ndim - features]
+            if weights.shape != transitions:
                 raise ValueError(
                     f"{self.tensor_keys.priority_weight!r} must be one weight a transition, "
-                    f"{[*loss.shape]}, got {[*weights.shape]}"
+                    f"{[*transitions]}, got {[*weights.shape]}"
                 )
-            loss = loss * weights.reshape(*weights.shape, *[1] * (loss.ndim - weights.ndim))
+            loss = loss * weights.reshape(*weights.shape, *[1] * features)
         return self.flatten_batch(loss).mean(-1)
 
     def flatten_batch(self, values: Tensor) -> Tensor:
@@ -264,12 +270,15 @@ class OffPolicyLoss(LossModule):
         # Made once: TorchRL puts the parameters in at each call, which takes a sixth longer.
         params = getattr(self, f"{name}_params")
         leaves = list(params.values(include_nested=True, leaves_only=True))
-        made, held = self._made.get((name, frozen), (None, []))
-        # Other parameters may have been put into the loss, for a while or for good.
-        if made is None or not all(map(operator.is_, leaves, held)):
-            made = deepcopy(getattr(self, name.removeprefix("target_")))
+        network = getattr(self, name.removeprefix("target_"))
+        modes = [module.training for module in network.modules()]
+        made, held, modes_held = self._made.get((name, frozen), (None, [], []))
+        # Other parameters may have been put into the loss, for a while or for good; a network may
+        # have been put into another mode.
+        if made is None or modes != modes_held or not all(map(operator.is_, leaves, held)):
+            made = deepcopy(network)
             (params.detach() if frozen else params).to_module(made)
-            self._made[name, frozen] = made, leaves
+            self._made[name, frozen] = made, leaves, modes
         return made
 
     def _apply(self, fn: Any) -> Any:

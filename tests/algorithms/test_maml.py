@@ -348,3 +348,16 @@ def test_a_restored_run_continues_as_the_saved_one(make, tmp_path, changes):
 def test_settings_without_a_meaning_are_refused(name, value):
     with pytest.raises(ValueError, match=f"^{name} must be .*, got {value}$"):
         MAMLConfig(**{name: value})
+
+
+def test_a_replay_too_small_to_fill_a_batch_is_refused(make, make_config):
+    rl = make_config("state", "maml").algorithm.rl
+    # Three tasks have a full batch of 8 among them after 3 * 7 + 1 transitions.
+    small = {"task_batch_size": 8, "rl": replace(rl, replay_size=22)}
+    assert make(**small).replay.enough == 22
+    with pytest.raises(ValueError, match=r"replay_size must be at least 22, .* learning begins"):
+        make(**{**small, "rl": replace(rl, replay_size=21)})
+
+
+def test_targets_are_clipped_to_the_attainable_returns(make):
+    assert make().loss.return_bounds == (0.0, 1.0)

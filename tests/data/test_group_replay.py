@@ -205,3 +205,13 @@ def test_a_transition_without_an_entry_changes_nothing():
         replay.add(bad, torch.tensor([0, 1]))
     assert (TensorDict(replay.state_dict()) == TensorDict(before)).all()
     assert replay.sizes(torch.tensor([[0, 1], [0, 1]])).tolist() == [[2, 0], [0, 2]]
+
+
+def test_a_negative_group_is_refused_where_it_would_be_stored():
+    replay = make(10)
+    with pytest.raises(ValueError, match=r"a group must be at least 0, got \[-1, 1\]"):
+        replay.add(transition(4, 2), torch.tensor([-1, 1]))
+    assert replay.sizes(torch.tensor([[1], [1]])).tolist() == [[0], [0]]
+    replay.add(transition(4, 2), torch.tensor([-1, 1]), torch.tensor([False, True]))
+    drawn = replay.sample(torch.tensor([[1]]), seeds=[1])  # of seed 0 there is nothing to draw
+    assert drawn["latent"].item() == transition(4, 2)["latent"][1].item()

@@ -236,3 +236,36 @@ def test_a_state_of_other_networks_is_refused_and_changes_nothing():
     with pytest.raises(ValueError, match="groups of 2 networks, this BehaviorGroups 3"):
         groups.set_extra_state(BehaviorGroups(2, batch_size=2).get_extra_state())
     assert groups.get_extra_state() == before
+
+
+def grown():
+    groups = BehaviorGroups(2, activity_threshold=0.5, activity_scale=1.0)
+    for phi in 10 * torch.eye(2)[[0, 0, 0, 1, 1, 1, 0, 1]]:
+        groups.adapt(phi)
+    assert groups.num_groups == 2
+    return groups
+
+
+def test_groups_and_nodes_are_loaded_together_or_not_at_all():
+    groups, other = grown(), BehaviorGroups(2)
+    state = groups.state_dict()
+    empty = other.state_dict()
+    wrong = {**state, "gwr._extra_state": empty["gwr._extra_state"]}
+    with pytest.raises(ValueError, match=r"groups of \[3\] nodes, but \[0\] nodes"):
+        other.load_state_dict(wrong)
+    assert other.get_extra_state() == empty["_extra_state"]
+    three = BehaviorGroups(3)
+    with pytest.raises(ValueError, match="features"):
+        three.load_state_dict(state)
+    assert three.num_groups == 1
+    other.load_state_dict(state)
+    assert other.lookup(torch.tensor([0.0, 10.0])).group == 1
+
+
+@pytest.mark.parametrize("damage", [{"group": [[0, 7]]}, {"parent": [[0, 5]]}])
+def test_a_state_that_names_a_missing_group_is_refused(damage):
+    groups = grown()
+    before = groups.get_extra_state()
+    with pytest.raises(ValueError, match="a group is missing in the state"):
+        groups.set_extra_state({**before, **damage})
+    assert groups.get_extra_state() == before

@@ -159,3 +159,25 @@ def test_what_grew_in_inference_mode_learns_on_outside():
     for phi in inputs:
         outside.adapt(phi)
     assert_same_state(state_of(inside), state_of(outside))
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"weights": None},
+        {"weights": torch.zeros(2)},
+        {"habituation": [1.0, 1.0]},
+        {"edges": torch.tensor([[0.0, 1.0]])},
+        {"edges": torch.tensor([0, 1])},
+        {"ages": torch.zeros(1)},
+        {"node": torch.tensor([0.0, 1.0])},
+        {"next_node": None},
+    ],
+    ids=str,
+)
+def test_entries_of_another_kind_are_refused(damage):
+    gwr = GWRB(1)
+    (before,) = gwr.get_extra_state()
+    with pytest.raises(ValueError, match=rf"damaged or not a graph .*\({next(iter(damage))}\)$"):
+        gwr.set_extra_state([{**before, **damage}])
+    assert_same_state(gwr.get_extra_state(), [before])

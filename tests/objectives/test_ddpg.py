@@ -391,6 +391,51 @@ def test_importance_weights_scale_each_transition():
     torch.testing.assert_close(weighted, (weights * distance).mean())
 
 
+def test_weights_count_only_if_they_are_used():
+    loss, batch = make_loss(), make_batch(8)
+    batch["priority_weight"] = torch.linspace(0, 2, 8)
+    told = loss(batch)
+    loss.use_prioritized_weights = False
+    error = (told["pred_value"] - told["target_value"]).square()
+    torch.testing.assert_close(loss(batch)["loss_value"], error.mean())
+
+
+@pytest.mark.parametrize("shape", [[2], [2, 8, 1], [8]])
+def test_weights_are_one_a_transition(shape):
+    networks = {"in_keys": ["state"], "batch_size": (2,)}
+    loss = DDPGLoss(Actor(STATE, ACTION, **networks), Critic(STATE, ACTION, **networks))
+    ForeachSoftUpdate(loss, tau=0.005)
+    weights = torch.ones(shape)
+    data = TensorDict(dict(make_batch(2, 8).items()), [])
+    with pytest.raises(ValueError, match=r"must be one weight a transition, \[2, 8\], got"):
+        loss(data.set("priority_weight", weights))
+
+
+def test_networks_follow_their_mode_after_the_first_call():
+    class Dropping(Actor):
+        def __init__(self) -> None:
+            super().__init__(STATE, ACTION, in_keys=["state"])
+            self.drop = torch.nn.Dropout(0.5)
+
+        def forward(self, tensordict):
+            hidden = self.drop(tensordict["state"])
+            return super().forward(tensordict.set("state", hidden))
+
+    torch.manual_seed(0)
+    loss = DDPGLoss(Dropping(), Critic(STATE, ACTION, in_keys=["state"]))
+    ForeachSoftUpdate(loss, tau=0.005)
+    batch = make_batch(8)
+
+    def losses():
+        return [loss(batch.clone())["loss_actor"].item() for _ in range(2)]
+
+    assert len({*losses()}) == 2
+    loss.actor_network.eval()
+    assert len({*losses()}) == 1
+    loss.actor_network.train()
+    assert len({*losses()}) == 2
+
+
 def stack_with_weights(n_seeds: int, weights: Tensor | None, n_rows: int = 32, **critic):
     """Gradients of a stack of seeds, one tensor for each layer, and what the loss tells."""
     streams = [torch.Generator().manual_seed(seed) for seed in range(n_seeds)]

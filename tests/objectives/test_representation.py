@@ -145,7 +145,7 @@ def test_sequence_loss_by_hand() -> None:
     assert loss(data[:1])[key].item() == pytest.approx(9 / 4)
 
 
-@pytest.mark.parametrize("filler", [0.0, 100.0])
+@pytest.mark.parametrize("filler", [0.0, 100.0, float("nan")])
 def test_sequence_loss_and_gradient_ignore_padding(filler: float) -> None:
     torch.manual_seed(0)
     loss = SequenceReconstructionLoss(SequenceAutoencoder())
