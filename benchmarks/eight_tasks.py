@@ -45,8 +45,9 @@ class Arguments(sweep.Arguments):
 
 def main(arguments: Arguments) -> None:
     """Run the grid."""
-    every = arguments.eval_every or min(50, arguments.episodes or 50)
-    sweep.main(replace(arguments, eval_every=every))
+    if arguments.eval_every is None:
+        arguments = replace(arguments, eval_every=min(50, arguments.episodes or 50))
+    sweep.main(arguments)
 
 
 if __name__ == "__main__":

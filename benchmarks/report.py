@@ -70,7 +70,7 @@ def draw(group: Group, runs: dict[str, Run], folder: Path) -> dict[str, Path]:
                 {run.name: run.directory / "eval.csv" for run in shown},
                 presented=_presented(first),
                 random_success=first.summary.get("random_success"),
-                window=3 * first.config["eval_every"],
+                window=3 * first.eval_every,
                 last=int(first.curves.episodes[-1]),
             ),
             path,

@@ -17,19 +17,26 @@ def import_own(module: str | None) -> None:
         module: Name of the module; nothing is imported if None.
 
     Raises:
-        ValueError: If there is no such module.
+        ValueError: If there is no such module, or another one has its name.
     """
     if module is None:
         return
     folder = str(Path.cwd())
+    missing = ValueError(
+        f"--import {module}: there is no such module in {folder} or installed; give the name "
+        "without .py, such as my_tasks"
+    )
+    names = module.split(".")
+    if not all(name.isidentifier() for name in names):
+        raise missing
     if folder not in sys.path:  # `python script.py` has the script's folder there instead
         sys.path.append(folder)
     try:
-        importlib.import_module(module)
+        found = importlib.import_module(module)
     except ModuleNotFoundError as error:
         if error.name is None or not f"{module}.".startswith(f"{error.name}."):
             raise  # The module exists, and imports one that does not.
-        raise ValueError(
-            f"--import {module}: there is no such module in {folder} or installed; give the name "
-            "without .py, such as my_tasks"
-        ) from None
+        raise missing from None
+    here, there = Path(folder, *names).with_suffix(".py"), found.__file__
+    if here.exists() and there is not None and not here.samefile(there):
+        raise ValueError(f"--import {module}: {there} has the same name: rename {here}")

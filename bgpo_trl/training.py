@@ -223,7 +223,8 @@ class Trainer(Closing):
         algorithm, end = self.algorithm, transition.get("next")[index]
         episode = int(self.world.source.episode[index])
         intrinsic = end.get("episode_intrinsic_reward", 0.0)  # not measured in every variant
-        extrinsic = end.get("episode_extrinsic_reward", end["episode_reward"])
+        pays = "episode_extrinsic_reward" in end
+        extrinsic = end["episode_extrinsic_reward" if pays else "episode_reward"]
         nodes = 0 if algorithm.gwr is None else int(algorithm.gwr.num_nodes[index])
         groups = 1 if algorithm.groups is None else int(algorithm.groups.num_groups[index])
         row = {

@@ -1,5 +1,6 @@
 """Import of the user's tasks by name."""
 
+import re
 import sys
 
 import pytest
@@ -36,12 +37,22 @@ def test_a_module_of_the_current_folder_adds_its_tasks(folder):
     assert sys.modules["juggling"].__file__ == str(folder / "juggling.py")
 
 
-@pytest.mark.parametrize("name", ["juggle", "juggling.py", "juggling.tasks", "no.such"])
+@pytest.mark.parametrize(
+    "name", ["juggle", "juggling.py", "juggling.tasks", "no.such", "./juggling", ".juggling", ""]
+)
 def test_a_module_that_is_not_there_is_named_with_the_remedy(folder, name):
-    with pytest.raises(ValueError, match=rf"^--import {name}: there is no such module in {folder}"):
+    said = rf"^--import {re.escape(name)}: there is no such module in {folder}"
+    with pytest.raises(ValueError, match=said):
         import_own(name)
 
 
 def test_what_a_module_lacks_itself_is_told_as_python_does():
     with pytest.raises(ModuleNotFoundError, match="no_such_library"):
         import_own("astray")
+
+
+def test_a_module_that_another_one_hides_is_named(folder):
+    (folder / "json.py").write_text(OWN)
+    with pytest.raises(ValueError, match=r"^--import json: .*json.* has the same name: rename "):
+        import_own("json")
+    assert "juggle" not in nico.TASKS

@@ -82,9 +82,11 @@ def entry(name: str) -> Entry:
     """Return the entry of an algorithm or an ablation.
 
     Raises:
-        ValueError: If the name is unknown.
+        ValueError: If the name is unknown, or that of an algorithm and an ablation.
     """
     known = ALGORITHMS | ABLATIONS
+    if name in ALGORITHMS and name in ABLATIONS:
+        raise ValueError(f"{name!r} is a variant of BGPO: add your algorithm under another name")
     if name not in known:
         raise ValueError(f"no algorithm {name!r}: choose one of {', '.join(known)}")
     return known[name]

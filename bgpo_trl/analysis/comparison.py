@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,10 @@ from bgpo_trl.runs.results import Curves, read_curves, read_json, read_rows
 from suites import nico
 
 Values = NDArray[np.float64]
+# Entries of a config.json that a comparison needs; those of runs that must be alike.
+_CONFIG = {"episodes": int, "seeds": list, "task_starts": list}
+_TESTS = ("held_out", "eval_every", "eval_episodes", "max_steps")
+_TERMS = ("seeds", "tasks", "task_starts", *_TESTS)
 
 
 @dataclass(frozen=True)
@@ -37,6 +42,8 @@ class Group:
     runs: dict[str, str]
     """Names of the runs, by directory."""
     pictures: tuple[Picture, ...]
+    own: tuple[str, ...] = ()
+    """Those of the runs that are not the package's, by directory."""
 
 
 @dataclass(frozen=True)
@@ -56,8 +63,8 @@ class Run:
 
     @property
     def eval_every(self) -> int:
-        """Training episodes between tests; 1, the least, if the run does not say."""
-        return self.config.get("eval_every", 1)
+        """Training episodes between tests."""
+        return _eval_every(self.config, self.curves)
 
 
 def setting_of(name: str, settings: Iterable[str]) -> str | None:
@@ -88,6 +95,7 @@ def with_own(runs: Path, groups: Mapping[str, Group]) -> dict[str, Group]:
                 group,
                 runs={**group.runs, name: name.removeprefix(f"{key}-")},
                 pictures=(replace(first, runs=(*first.runs, name)), *others),
+                own=(*group.own, name),
             )
     return extended
 
@@ -101,11 +109,12 @@ def read_group(runs: Path, group: Group) -> tuple[dict[str, Run], list[str]]:
 
     Returns:
         The runs found, by directory name, and notes on missing, unfinished or cut runs. Runs
-        without a test of their last task are left out.
+        without a test of their last task are left out, as are own runs that were trained or tested
+        otherwise than the first run.
 
     Raises:
-        ValueError: If runs of the group differ in seeds, tasks, task starts, test episodes or the
-            time limit of an episode.
+        ValueError: If the package's runs of the group differ in seeds, tasks, task starts, test
+            episodes or the time limit of an episode.
     """
     found: dict[str, Run] = {}
     notes: list[str] = []
@@ -114,7 +123,7 @@ def read_group(runs: Path, group: Group) -> tuple[dict[str, Run], list[str]]:
         if not (directory / "eval.csv").exists() or not read_rows(directory / "eval.csv"):
             notes.append(f"{name}: missing ({key}/eval.csv is not there, or empty)")
             continue
-        config = read_json(directory / "config.json")
+        config = read_json(directory / "config.json", _CONFIG)
         path = directory / "summary.json"
         summary = read_json(path) if path.exists() else {}
         curves = read_curves(directory / "eval.csv", _tasks(config))
@@ -122,7 +131,7 @@ def read_group(runs: Path, group: Group) -> tuple[dict[str, Run], list[str]]:
             episode = curves.episodes[-1]
             notes.append(f"{name}: left out, no test of some task at episode {episode}")
             continue
-        if int(curves.episodes[-1]) < config["episodes"]:
+        if config["episodes"] - int(curves.episodes[-1]) >= _eval_every(config, curves):
             notes.append(
                 f"{name}: not finished, {curves.episodes[-1]} of {config['episodes']} episodes"
             )
@@ -130,19 +139,33 @@ def read_group(runs: Path, group: Group) -> tuple[dict[str, Run], list[str]]:
     if not found:
         return found, [f"missing: {', '.join(group.runs)}"]
     first = next(iter(found.values()))
+    for key, run in list(found.items()):
+        other = _other_terms(run, first)
+        if other and key not in group.own:
+            raise ValueError(f"{other}: only runs on equal terms are compared")
+        if other:
+            notes.append(f"{run.name}: left out, since {other}")
+            del found[key]
     last = min(int(run.curves.episodes[-1]) for run in found.values())
     for key, run in found.items():
-        for what in ("seeds", "tasks", "task_starts", "held_out", "eval_episodes", "max_steps"):
-            ours, theirs = (_terms(of).get(what) for of in (run, first))
-            if ours != theirs and None not in (ours, theirs):
-                raise ValueError(
-                    f"{run.directory} has {what} {ours}, {first.directory} has {theirs}: only runs "
-                    "on equal terms are compared"
-                )
         if run.curves.episodes[-1] > last:
             notes.append(f"{run.name}: cut at {last} of {run.curves.episodes[-1]} episodes")
         found[key] = replace(run, curves=run.curves.until(last))
     return found, notes
+
+
+def _other_terms(run: Run, first: Run) -> str:
+    """Return in what a run was trained or tested otherwise than the first; "" if in nothing."""
+    for what in _TERMS:
+        ours, theirs = (_terms(of).get(what) for of in (run, first))
+        if ours != theirs and None not in (ours, theirs):
+            return f"{run.directory} has {what} {ours}, {first.directory} has {theirs}"
+    return ""
+
+
+def _eval_every(config: dict[str, Any], curves: Curves) -> int:
+    tested = [0, *curves.episodes.tolist()]
+    return config.get("eval_every") or min(after - before for before, after in pairwise(tested))
 
 
 def _terms(run: Run) -> dict[str, Any]:

@@ -51,7 +51,9 @@ def measure(
         writer = csv.writer(file)
         writer.writerow(FINAL_COLUMNS)
         writer.writerows(rows)
-    random_success = evaluate_random_policy(tasks=config.tasks, episodes=100)
+    random_success = evaluate_random_policy(
+        tasks=config.tasks, episodes=100, max_steps=config.algorithm.max_steps
+    )
     summary = {
         "command": shlex.join(["python", *sys.argv]),
         "episodes": config.episodes,

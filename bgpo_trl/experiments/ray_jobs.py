@@ -31,7 +31,7 @@ except ImportError as error:
 RETRIES = 10
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)  # Own hyperparameters may not be hashable.
 class Job:
     """A run of a block of seeds, and its directory.
 

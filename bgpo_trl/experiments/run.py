@@ -10,7 +10,7 @@ from pathlib import Path
 
 import torch
 
-from bgpo_trl.algorithms import Algorithm
+from bgpo_trl.algorithms import ABLATIONS, ALGORITHMS, Algorithm
 from bgpo_trl.configs import STAGE_PRESETS, RunConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.encoders.pretrained import load_pretrained, make_pretrained
@@ -68,7 +68,9 @@ def run_experiment(
     commit = commit_of_code()  # read first, since commits may follow during training
     set_threads(arguments.threads)
     device = choose_device(arguments.device)
-    rl = "" if arguments.rl in (None, "ddpg") else f"-{arguments.rl}"
+    registered = (ALGORITHMS | ABLATIONS).get(config.name)
+    usual = registered is None or registered.config.rl.name == config.algorithm.rl.name
+    rl = "" if usual else f"-{config.algorithm.rl.name}"
     out = arguments.out or Path("runs") / f"{name}-{config.name}{rl}-{arguments.preset}"
     if arguments.resume:
         config = _continued(arguments, config, out)

@@ -60,7 +60,7 @@ def write_page(
         frames = directory / "figures" / "episodes.png"
         if frames.exists():
             parts.append(_image(frames, f"frames of test episodes of {name}"))
-        if summary:
+        if summary.keys() >= {"commit", "command"}:
             parts.append(
                 f"<p>Commit {escape(str(summary.get('commit')))}: "
                 f"<code>{escape(str(summary.get('command')))}</code></p>"

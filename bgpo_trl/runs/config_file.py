@@ -88,10 +88,13 @@ def settings_of(config: RunConfig, digests: Digests) -> dict[str, Any]:
     Args:
         config: The run.
         digests: Digests of its encoders and demonstrations.
+
+    Raises:
+        ValueError: If a hyperparameter is of a type that `read_config` would not restore.
     """
     kind = type(config.algorithm)
     added = {name: nico.TASKS[name].__module__ for name in config.tasks}
-    return plain_settings(
+    settings = plain_settings(
         {
             **asdict(config),
             "algorithm_class": f"{kind.__module__}.{kind.__qualname__}",
@@ -99,6 +102,14 @@ def settings_of(config: RunConfig, digests: Digests) -> dict[str, Any]:
             **digests._asdict(),
         }
     )
+    try:
+        _read(kind, settings["algorithm"], "algorithm.")
+    except ValueError as error:
+        raise ValueError(
+            f"config.json cannot hold the setting {error}: annotate it as a number, a string, a "
+            "bool, a dataclass of these, a tuple of one of them (tuple[int, ...]), or one or None"
+        ) from None
+    return settings
 
 
 def _unknown_task(tasks: object) -> str | None:

@@ -31,7 +31,13 @@ def tiny(monkeypatch, encoders, bank, make_config):
         small = replace(entry, config=replace(entry.config, max_steps=6))
         monkeypatch.setitem(ABLATIONS, name, small)
     chance = torch.tensor([0.1, 0.2, 0.3])
-    monkeypatch.setattr(measure, "evaluate_random_policy", lambda **kwargs: chance)
+    limit = config.algorithm.max_steps
+
+    def of_random_policy(*, tasks, episodes, max_steps):
+        assert max_steps == limit
+        return chance
+
+    monkeypatch.setattr(measure, "evaluate_random_policy", of_random_policy)
     test = measure._final_tests
     monkeypatch.setattr(measure, "_final_tests", lambda *run, episodes: test(*run, episodes=2))
 

@@ -65,6 +65,7 @@ CASES = [
     ("continual.py --algorithm maml --rl td3", "MAML is defined over DDPG", "not 'td3'"),
     ("continual.py --algorithm ppo", "--algorithm: there is no 'ppo'", "name one of bgpo, "),
     ("continual.py --rl ppo", "--rl: there is no 'ppo'; name one of ddpg", "with --import MODULE"),
+    ("eight_tasks.py --eval-every 0", "eval_every", "must be at least 1, got 0"),
     ("speed/steps.py ppo", "no algorithm 'ppo'", "choose one of bgpo"),
     ("ladder.py --rungs", "--rungs is empty", "name some of a, b, c, d"),
     ("ladder.py --rungs a b a", "--rungs: name each once", "a b a"),

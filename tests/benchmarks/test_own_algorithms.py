@@ -8,7 +8,7 @@ import continual
 import pytest
 import sweep
 
-from bgpo_trl.algorithms import ALGORITHMS
+from bgpo_trl.algorithms import ALGORITHMS, entry
 from bgpo_trl.algorithms.rl import RL
 from bgpo_trl.experiments.arguments import Arguments, run_config
 from bgpo_trl.experiments.watch import WatchArguments, watch
@@ -115,3 +115,9 @@ def test_a_grid_has_an_algorithm_of_a_module(folder):
     for job in grid.values():
         assert (job.module, job.config.name) == ("my_algorithm", "mine")
         assert job.config.algorithm == ALGORITHMS["mine"].config
+
+
+def test_the_name_of_a_variant_is_not_free(monkeypatch):
+    monkeypatch.setitem(ALGORITHMS, "experts", ALGORITHMS["maml"])
+    with pytest.raises(ValueError, match="'experts' is a variant of BGPO: add your algorithm"):
+        entry("experts")

@@ -226,6 +226,7 @@ def test_a_longer_run_is_cut_and_an_unfinished_one_is_told(runs):
         ("task_starts", [0, 2, 4]),
         ("held_out", "test"),
         ("eval_episodes", 77),
+        ("eval_every", 7),
         ("max_steps", 30),
     ],
 )

@@ -134,6 +134,64 @@ def test_a_run_of_another_algorithm_has_its_row_and_says_whether_it_knows_the_la
     assert "mine" in rows_of(text, "Eight tasks, all from the start")
 
 
+def reduce_to_the_least(path):
+    """Leaves what a run of plain TorchRL must write."""
+    config = json.loads((path / "config.json").read_text())
+    kept = {key: config[key] for key in ("seeds", "tasks", "task_starts", "episodes")}
+    (path / "config.json").write_text(json.dumps(kept))
+    (path / "summary.json").write_text(json.dumps({"needs_label": False}))
+
+
+def test_the_least_that_a_run_must_write_is_enough_by_itself(tmp_path):
+    path = write_eight(tmp_path, "eight-plain", 6)
+    reduce_to_the_least(path)
+    report.main(report.Arguments(tmp_path))
+    text = (tmp_path / "tables.md").read_text()
+    table = rows_of(text, "Eight tasks, one after the other: the benchmark")
+    assert table["plain"][:3] == ["no", "60.0 [60, 60]", "-"]
+    found, notes = comparison.read_group(tmp_path, with_own_group(tmp_path))
+    assert found["eight-plain"].eval_every == 2
+    assert not [note for note in notes if "not finished" in note]
+    assert "Commit" not in (tmp_path / "report.html").read_text()
+    config = json.loads((path / "config.json").read_text())
+    (path / "config.json").write_text(json.dumps({**config, "episodes": None}))
+    with pytest.raises(ValueError, match=r"config.json is damaged"):
+        report.main(report.Arguments(tmp_path))
+
+
+def with_own_group(folder):
+    return comparison.with_own(folder, eight_tasks.GROUPS)["eight"]
+
+
+def test_an_own_run_on_other_terms_is_left_out_with_a_note(tmp_path):
+    write_eight(tmp_path, "eight-bgpo", 8)
+    write_eight(tmp_path, "eight-bgpo-trial", 8)
+    path = tmp_path / "eight-bgpo-trial" / "config.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "eval_every": 3}))
+    found, notes = comparison.read_group(tmp_path, with_own_group(tmp_path))
+    assert list(found) == ["eight-bgpo"]
+    (told,) = (note for note in notes if note.startswith("bgpo-trial: left out, since"))
+    assert "has eval_every 3" in told
+
+
+def test_a_run_is_finished_when_no_test_is_left_to_come(tmp_path):
+    path = write_eight(tmp_path, "eight-bgpo", 8) / "config.json"
+    config = json.loads(path.read_text())
+    for more, told in ((0, False), (config["eval_every"] - 1, False), (config["eval_every"], True)):
+        path.write_text(json.dumps({**config, "episodes": config["episodes"] + more}))
+        _, notes = comparison.read_group(tmp_path, eight_tasks.GROUPS["eight"])
+        assert any("not finished" in note for note in notes) is told
+
+
+def test_bgpos_lead_is_that_of_bgpo_and_no_other(tmp_path):
+    write_eight(tmp_path, "eight-my-bgpo", 8)
+    write_eight(tmp_path, "eight-oracle", 4)
+    report.main(report.Arguments(tmp_path))
+    text = (tmp_path / "tables.md").read_text()
+    table = rows_of(text, "Eight tasks, one after the other: the benchmark")
+    assert table["my-bgpo"][2] == table["DDPG, told the label"][2] == "-"
+
+
 def test_rare_tests_are_enough_for_the_end_of_training(tmp_path):
     path = write_eight(tmp_path, "eight-bgpo", 8)
     config = json.loads((path / "config.json").read_text())

@@ -8,13 +8,13 @@ import tempfile
 import threading
 import time
 from collections import Counter
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
-from bgpo_trl.configs import RunConfig
+from bgpo_trl.configs import BGPOConfig, RunConfig
 from bgpo_trl.experiments import merge
 from bgpo_trl.experiments import ray_jobs as jobs
 from bgpo_trl.experiments.ray_jobs import Job
@@ -264,3 +264,16 @@ def test_a_lost_machine_costs_nothing(cluster, bank, make_config, tmp_path):
     assert Counter((r["seed"], r["episode"]) for r in rows(tmp_path / "merged" / "train.csv")) == {
         (seed, str(episode)): 1 for seed in "123458" for episode in range(1, 41)
     }
+
+
+def test_jobs_need_no_hyperparameters_that_can_be_hashed(tmp_path):
+    @dataclass
+    class Part:
+        size: int = 1
+
+    @dataclass(frozen=True)
+    class Own(BGPOConfig):
+        part: Part = field(default_factory=Part)
+
+    first, second = (Job(tmp_path, RunConfig(algorithm=Own())) for _ in range(2))
+    assert {first: "failed"}.get(second) is None

@@ -1,7 +1,7 @@
 """Settings read back from config.json."""
 
 import json
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 
 import pytest
 
@@ -65,6 +65,25 @@ def test_hyperparameters_of_an_unknown_algorithm_are_of_the_class_that_is_stored
     read, _ = read_config(write(tmp_path / "config.json", config))
     assert read == config
     assert type(read.algorithm) is OwnConfig
+
+
+@dataclass(frozen=True)
+class ListConfig(BGPOConfig):
+    widths: list[int] = field(default_factory=lambda: [1, 2])
+
+
+@dataclass(frozen=True)
+class MixedConfig(BGPOConfig):
+    rate: int | float = 0.5
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "said"),
+    [(ListConfig(), r"algorithm.widths is \[1, 2\]"), (MixedConfig(), "algorithm.rate is 0.5")],
+)
+def test_what_could_not_be_read_back_is_not_written(algorithm, said):
+    with pytest.raises(ValueError, match=rf"^config.json cannot hold the setting {said}: annotate"):
+        settings_of(RunConfig(algorithm=algorithm), Digests("abc", "def"))
 
 
 def test_what_an_earlier_version_did_not_know_has_its_default(tmp_path):
