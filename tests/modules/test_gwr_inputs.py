@@ -151,3 +151,13 @@ def test_arguments_out_of_range_are_refused(wrong):
 def test_a_number_of_features_is_a_whole_number(wrong):
     with pytest.raises(ValueError, match="n_features"):
         GWRB(wrong)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_inputs_are_as_large_as_their_squared_distances_allow(sign):
+    gwr, far = GWRB(1, init="data"), 9e18  # the square of twice as much is just below 3.4e38
+    gwr.adapt([far])
+    assert gwr.lookup([-far]).activity == 0
+    assert gwr.lookup([far]).activity == 1
+    with pytest.raises(ValueError, match=r"values beyond \+-9e\+18$"):
+        gwr.adapt([sign * 9.5e18])

@@ -66,6 +66,15 @@ def test_a_frame_is_encoded_alike_alone_and_in_a_batch(vae: VAE) -> None:
     torch.testing.assert_close(vae.latent(pixels[:, ::2]), batch[:, ::2], rtol=1e-4, atol=1e-6)
 
 
+def test_decoder_can_change_pixels_that_are_always_black_or_white(vae: VAE) -> None:
+    vae.mean_frame[:16], vae.mean_frame[16:] = 0.0, 1.0
+    vae.decoder[-1].weight.data.zero_()
+    vae.decoder[-1].bias.data.zero_()
+    shown = vae.decode(torch.randn(1, 64))[0]
+    torch.testing.assert_close(shown[:16], torch.full((16, 64, 3), 0.02))
+    torch.testing.assert_close(shown[16:], torch.full((16, 64, 3), 0.98))
+
+
 def test_decoder_shows_the_mean_frame_when_its_last_layer_says_nothing(vae: VAE) -> None:
     with torch.no_grad():
         vae.decoder[-1].weight.zero_()
