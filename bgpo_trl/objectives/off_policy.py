@@ -37,7 +37,8 @@ class OffPolicyLoss(LossModule):
 
     Reads the ``in_keys`` of both networks, among them ``"action"`` ``[*S, *B, action_dim]``; under
     ``"next"`` those that are not constant, ``"reward"`` and ``"terminated"`` ``[*S, *B, 1]``; and,
-    if present, ``"priority_weight"`` ``[*S, *B]``, a factor of each transition's loss. Masks
+    if present, ``"priority_weight"`` ``[*S, *B]``, a factor of each transition's loss, and
+    ``"steps_to_next_obs"`` ``[*S, *B, 1]`` of TorchRL's ``MultiStep``, the power of gamma. Masks
     (``loss_mask_key``) are not read. Writes ``"td_error"`` ``[*S, *B]`` into the input, for
     prioritized replay: the squared error, the larger one of twin critics. Returns, without a batch
     size, the entries of `loss_actor` and

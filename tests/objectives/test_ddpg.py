@@ -391,6 +391,16 @@ def test_importance_weights_scale_each_transition():
     torch.testing.assert_close(weighted, (weights * distance).mean())
 
 
+def test_targets_of_several_steps_are_discounted_as_often():
+    loss, batch = make_loss(), make_batch(8)
+    constant_critic(loss, online=0.0, target=0.5)
+    steps = torch.arange(1, 9).unsqueeze(-1)
+    batch["next", "terminated"].zero_()
+    target = loss(batch.set("steps_to_next_obs", steps))["target_value"]
+    expected = batch["next", "reward"] + 0.5 * 0.98**steps
+    torch.testing.assert_close(target, expected.squeeze(-1))
+
+
 def test_weights_count_only_if_they_are_used():
     loss, batch = make_loss(), make_batch(8)
     batch["priority_weight"] = torch.linspace(0, 2, 8)
