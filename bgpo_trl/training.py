@@ -43,11 +43,11 @@ class Trainer(Closing):
     of that length. Each update runs while the environment steps, and learns from all earlier
     transitions.
 
-    Checkpoints are written before the first step and between steps; Ctrl-C waits for the end of the
-    step and saves. After any other failure, a resumed run repeats the steps since the last
-    checkpoint and writes the same rows. Rows are written at once; mirrors such as Weights & Biases
-    stay open for figures until `close`, which also unlocks the directory. Use the trainer in a
-    ``with`` block.
+    Checkpoints are written before the first step and between steps; Ctrl-C and SIGTERM wait for the
+    end of the step and save. After any other failure, a resumed run repeats the steps since the
+    last checkpoint and writes the same rows. Rows are written at once; mirrors such as Weights &
+    Biases stay open for figures until `close`, which also unlocks the directory. Use the trainer in
+    a ``with`` block.
 
     Args:
         config: The run.
@@ -141,8 +141,8 @@ class Trainer(Closing):
         """Train to the end; return at once if a resumed run is complete.
 
         Raises:
-            KeyboardInterrupt: At the first Ctrl-C after the step is over and saved, at a second one
-                immediately.
+            KeyboardInterrupt: At the first Ctrl-C or SIGTERM after the step is over and saved, at a
+                second one immediately.
             OSError: If the disk is full.
             TypeError: If the algorithm returns no action, or no `Policy` for a test.
         """

@@ -272,14 +272,17 @@ def test_what_an_algorithm_must_return_is_said_in_a_line(
         make(tmp_path, make_config("state", "ddpg", episodes=2)).run()
 
 
-@pytest.mark.parametrize("step", [1, 20])
-def test_ctrl_c_waits_for_the_step_and_the_run_goes_on_from_it(uninterrupted, make, tmp_path, step):
+@pytest.mark.parametrize(("number", "step"), [("SIGINT", 1), ("SIGTERM", 20)])
+def test_a_signal_waits_for_the_step_and_the_run_goes_on_from_it(
+    uninterrupted, make, tmp_path, number, step
+):
     trainer = make(tmp_path)
-    at_step(trainer, step, lambda: signal.raise_signal(signal.SIGINT))
+    at_step(trainer, step, lambda: signal.raise_signal(signal.Signals[number]))
     with pytest.raises(KeyboardInterrupt):
         trainer.run()
     assert load_checkpoint(tmp_path / "checkpoint")["env_steps"] == step
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
     make(tmp_path, resume=True).run()
     assert_same_run(tmp_path, uninterrupted)
@@ -351,11 +354,12 @@ def test_a_run_that_dies_goes_on_from_its_last_checkpoint(
     assert_same_run(tmp_path, uninterrupted)
 
 
-def test_a_second_ctrl_c_ends_the_run_at_once(make, tmp_path):
+@pytest.mark.parametrize("first", [signal.SIGINT, signal.SIGTERM])
+def test_a_second_signal_ends_the_run_at_once(make, tmp_path, first):
     trainer = make(tmp_path)
 
     def impatient():
-        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(first)
         signal.raise_signal(signal.SIGINT)
         raise AssertionError("went on after the second interrupt")
 
@@ -373,6 +377,7 @@ def test_ctrl_c_that_is_ignored_stays_so(make, make_config, tmp_path):
     try:
         trainer.run()
         assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+        assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
     finally:
         signal.signal(signal.SIGINT, before)
     assert len(rows(tmp_path / "train.csv")) == 4

@@ -1,4 +1,4 @@
-"""Ctrl-C deferred to the next point at which a run can be stopped."""
+"""Ctrl-C and the termination signal, deferred to the next point at which a run can be stopped."""
 
 from __future__ import annotations
 
@@ -8,13 +8,17 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+_USUAL = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
+
 
 @contextmanager
 def interrupts_wait() -> Iterator[Callable[[], bool]]:
-    """Defer the first Ctrl-C to the end of the block; a second one interrupts at once.
+    """Defer the first Ctrl-C or SIGTERM to the end of the block; a second one interrupts at once.
 
-    Yields a function that returns whether Ctrl-C was pressed. Signal handling is left unchanged
-    outside the main thread and where SIGINT is ignored (background jobs) or has a custom handler.
+    SIGTERM is what ``kill`` and cluster schedulers send before they end a process. Both raise
+    ``KeyboardInterrupt``. Yields a function that returns whether a signal came. Signal handling is
+    left unchanged outside the main thread, and of a signal that is ignored (Ctrl-C of background
+    jobs) or has a custom handler.
     """
     asked = False
 
@@ -24,16 +28,18 @@ def interrupts_wait() -> Iterator[Callable[[], bool]]:
             raise KeyboardInterrupt
         asked = True
 
-    if (
-        threading.current_thread() is not threading.main_thread()
-        or signal.getsignal(signal.SIGINT) is not signal.default_int_handler
-    ):
-        yield lambda: False
-        return
-    signal.signal(signal.SIGINT, ask)
+    in_main = threading.current_thread() is threading.main_thread()
+    usual = {
+        number: handler
+        for number, handler in _USUAL.items()
+        if in_main and signal.getsignal(number) is handler
+    }
+    for number in usual:
+        signal.signal(number, ask)
     try:
         yield lambda: asked
     finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        for number, handler in usual.items():
+            signal.signal(number, handler)
     if asked:
         raise KeyboardInterrupt

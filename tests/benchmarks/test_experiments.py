@@ -255,7 +255,7 @@ def test_smoke_goes_through_every_stage_from_nothing(tmp_path):
         process.send_signal(signal.SIGINT)
         assert process.stderr.read().endswith("the same command with --resume continues\n")
     assert process.returncode == 1
-    assert load_checkpoint(tmp_path / "run" / "checkpoint")["evaluated"] < 2
+    assert load_checkpoint(tmp_path / "run" / "checkpoint")["evaluator"]["next"] < 2
 
     result = subprocess.run([*command, "--resume"], capture_output=True, **options)
     assert result.returncode == 0, result.stderr
