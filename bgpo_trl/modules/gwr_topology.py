@@ -142,7 +142,8 @@ class Topology:
             and bool(((ends >= 0) & (ends < n)).all() and (ends[:, 0] != ends[:, 1]).all())
             and bool((graph.node.diff() > 0).all() and (graph.node < next_identity).all())
             and bool((graph.ages >= 0).all() and len(ends.sort().values.unique(dim=0)) == len(ends))
-            and bool((graph.habituation > 0).all() and (graph.habituation <= 1).all())
+            # With alpha = 1 / h_0, habituation decays to 0, or by rounding to just below.
+            and bool((graph.habituation >= -1e-9).all() and (graph.habituation <= 1).all())
             and bool(graph.weights.isfinite().all())
         )
         if not sound:

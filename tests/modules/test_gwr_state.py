@@ -181,3 +181,13 @@ def test_entries_of_another_kind_are_refused(damage):
     with pytest.raises(ValueError, match=rf"damaged or not a graph .*\({next(iter(damage))}\)$"):
         gwr.set_extra_state([{**before, **damage}])
     assert_same_state(gwr.get_extra_state(), [before])
+
+
+def test_fully_habituated_nodes_are_loaded():
+    rule = {"alpha_best": 1.0, "alpha_neighbor": 1.0, "tau_best": 1e-3, "tau_neighbor": 1e-3}
+    gwr, other = (GWRB(1, initial_habituation=1.0, **rule) for _ in range(2))
+    gwr.adapt(torch.tensor([0.5]))
+    (state,) = gwr.get_extra_state()
+    assert state["habituation"].tolist() == [0.0, 0.0]
+    other.load_state_dict(gwr.state_dict())
+    assert_same_state(other.get_extra_state(), [state])
