@@ -136,7 +136,7 @@ def benchmark_table(
         scores, lead = late_scores(run), "-"
         if ours is not None and run is not ours:
             lead = statistics.difference(late_scores(ours), scores, statistic=means).cell()
-        change = metrics.change_since_learned(success_matrix(run))
+        matrix = success_matrix(run)
         reference = references.get(f"{CONCURRENT}-{_algorithm(key)}")
         transfer = "-"
         if reference is not None:
@@ -149,8 +149,8 @@ def benchmark_table(
                 {True: "yes", False: "no", None: "?"}[knows_label(run)],
                 statistics.cell(scores, means),
                 lead,
-                statistics.cell(-change, means),
-                statistics.cell(change[:, :-1], means),
+                statistics.cell(-metrics.change_since_learned(matrix), means),
+                statistics.cell(metrics.backward_transfer(matrix), means),
                 transfer,
                 *(_mean_number(run.summary.get(what)) for what in ("nodes", "groups")),
                 f"{hours:.1f}" if costs else "-",

@@ -72,12 +72,12 @@ def forgetting_since_best(success: ArrayLike) -> Array:
 
 
 def backward_transfer(matrix: ArrayLike) -> Array:
-    """Return the gain of earlier tasks from learning later ones, ``[...]``.
+    """Return the gain of each task but the last from learning later ones, ``[..., T - 1]``.
 
-    The mean of `change_since_learned` over all tasks but the last (Lopez-Paz & Ranzato, 2017,
-    "Gradient Episodic Memory for Continual Learning").
+    `change_since_learned` of these tasks; its mean over them is the measure of Lopez-Paz & Ranzato
+    (2017, "Gradient Episodic Memory for Continual Learning").
     """
-    return _mean(change_since_learned(matrix)[..., :-1], axis=-1)
+    return change_since_learned(matrix)[..., :-1]
 
 
 def forward_transfer(area: ArrayLike, reference: ArrayLike) -> Array:
@@ -85,7 +85,7 @@ def forward_transfer(area: ArrayLike, reference: ArrayLike) -> Array:
 
     ``(area - reference) / (1 - reference)``: 1 for success from the start, 0 for no gain, negative
     for slower learning (Wolczyk et al., 2021, "Continual World"). ``area`` is the
-    `area_under_curve` of a task since its presentation; ``reference`` is the same, over as many
+    mean height of a task's curve since its presentation; ``reference`` is the same, over as many
     episodes, of a learner without earlier tasks.
     """
     area, reference = np.asarray(area, float), np.asarray(reference, float)

@@ -61,8 +61,8 @@ def continual_table(
     for key, run in continual.items():
         matrix = success_at(run, [*starts(run)[1:], int(run.curves.episodes[-1])])
         best = metrics.forgetting_since_best(metrics.trailing_mean(run.curves.success, 3))
-        change = metrics.change_since_learned(matrix)[:, :-1]
-        cells = [statistics.cell(scores, means) for scores in (change, best[:, None])]
+        measured = (metrics.backward_transfer(matrix), best[:, None])
+        cells = [statistics.cell(scores, means) for scores in measured]
         beside = concurrent.get(f"concurrent-{key.removeprefix('continual-')}")
         forward = ""
         if beside is not None:

@@ -39,10 +39,9 @@ class EpisodeTransform(Transform):
 
     An episode is that of a row: it ends with ``done`` ``[*B, 1]``, the environment's own, not one
     of several agents. The entries must stay in the observation, since the next step reads them.
-    ``StepCounter`` must
-    come before the transform, so that ``done`` includes time-outs; it is required if the transform
-    learns at the end of episodes. ``RewardSum`` must come after a transform that changes the
-    reward.
+    ``StepCounter`` must come before the transform, so that ``done`` includes time-outs; it is
+    required if the transform learns at the end of episodes. ``RewardSum`` must come after a
+    transform that changes the reward.
 
     One seed for all: TorchRL's ``TransformedEnv.set_seed`` reaches only the base environment.
     `NicoEnv` therefore records its last ``set_seed``, and a transform that draws at random looks
