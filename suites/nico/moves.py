@@ -22,12 +22,12 @@ GRIP: Final = 1.2  # (rad) curl of a segment, beyond what the joints reach, for 
 
 # Contact point of a pushed box, as (left of the arm's plane, beyond the wrist) (m): the fist's
 # knuckles when pushed left, the back of the hand when pushed right.
-_BEFORE_KNUCKLES, _BEHIND_BACK = (0.078, 0.105), (-0.043, 0.075)
+_BEFORE_KNUCKLES, _BEHIND_BACK = (0.078, 0.105), (-0.043, 0.06)
 _FRONT = (0.02, 0.12)  # front of the fist, between palm and fingers
 _LEAD = 0.07  # (m) by which the hand aims ahead of the box it pushes
-_OUTWARD = 0.03  # (m) by which it aims beyond the arc
+_AHEAD = 0.25  # (rad) by which the goal of a push aside is ahead on the arc
 # Distance from the grip at which the descending palm just misses the center of a box (m).
-_PALM = 0.076
+_PALM = 0.094
 _LIFT_HEIGHT = TABLE_HEIGHT + 0.039  # (m) of the grip around a box to lift; higher, it slips
 _FIRM = 0.25  # (rad) lead of the targets over the curls with which it holds what it lifts
 _RISE = np.array([0.0, 0.0, 0.04])  # (m) from the grip to the place at which a lift aims
@@ -50,6 +50,9 @@ class Phase:
     """Largest distance of a joint from the target at which the phase ends (rad)."""
     until: Callable[[Physics], bool] | None = None
     """Further condition for the end of the phase."""
+    limit: int = 50
+    """Steps after which the phase ends in any case; after the last phase, the movement is planned
+    anew."""
 
 
 def grasp(physics: Physics, random: np.random.Generator, name: str) -> Sequence[Phase]:
@@ -60,7 +63,7 @@ def grasp(physics: Physics, random: np.random.Generator, name: str) -> Sequence[
         random: Source of the noise.
         name: The object.
     """
-    return [*_reach(physics, random, name), Phase(_stay, GRIP)]
+    return [*_reach(physics, random, name), Phase(_stay, GRIP, limit=14)]
 
 
 def lift(physics: Physics, random: np.random.Generator, name: str) -> Sequence[Phase]:
@@ -79,7 +82,11 @@ def lift(physics: Physics, random: np.random.Generator, name: str) -> Sequence[P
         return kinematics.inverse(physics.grip_position() + _RISE, kinematics.GRIP)
 
     reach = _reach(physics, random, name, _LIFT_HEIGHT)
-    return [*reach, Phase(_stay, GRIP, until=is_firm), Phase(up, GRIP)]
+    return [
+        *reach,
+        Phase(_stay, GRIP, until=is_firm, limit=14),
+        Phase(up, GRIP, limit=16),
+    ]
 
 
 def _reach(
@@ -88,7 +95,7 @@ def _reach(
     """Return a sweep of the open hand to the left that ends with an object in it."""
     noise = random.normal(0.0, _NOISE, 3)
     # The palm would otherwise come down on a near neighbor.
-    right = min(random.uniform(0.065, 0.085), _room_on_the_right(physics, name) - _PALM)
+    right = min(random.uniform(0.065, 0.085), max(_room_on_the_right(physics, name) - _PALM, 0.03))
 
     def beside(height: float) -> Place:
         return lambda physics: beside_object(
@@ -100,8 +107,8 @@ def _reach(
 
     return [
         Phase(beside(CLEAR_HEIGHT), OPEN),
-        Phase(beside(sweep_height), OPEN),
-        Phase(around, OPEN, tolerance=0.014),
+        Phase(beside(sweep_height), OPEN, limit=8),
+        Phase(around, OPEN, tolerance=0.014, limit=9),
     ]
 
 
@@ -115,7 +122,7 @@ def push(physics: Physics, random: np.random.Generator, box: str, target: str) -
         target: The object to push it to.
     """
     side = np.sign(_angle(physics, box) - _angle(physics, target))
-    return _sweep(random, box, side, lambda physics: _radius(physics, target))
+    return _sweep(random, box, side, lambda physics: physics.object_position(target)[:2])
 
 
 def push_aside(
@@ -130,11 +137,15 @@ def push_aside(
         side: 1 to push from the left to the right, -1 to push from the right to the left.
     """
     start = _radius(physics, name)
-    return _sweep(random, name, side, lambda _: start)
+
+    def ahead(physics: Physics) -> np.ndarray:
+        return kinematics.polar(start, _angle(physics, name) - side * _AHEAD)
+
+    return _sweep(random, name, side, ahead)
 
 
 def _sweep(
-    random: np.random.Generator, name: str, side: float, goal: Callable[[Physics], float]
+    random: np.random.Generator, name: str, side: float, goal: Callable[[Physics], np.ndarray]
 ) -> Sequence[Phase]:
     """Return a sweep of the fist along the arc that takes an object with it.
 
@@ -142,10 +153,10 @@ def _sweep(
         random: Source of the noise.
         name: The object.
         side: 1 to start on the object's left, -1 on its right.
-        goal: Radius (m) to which the sweep leads, evaluated at each step.
+        goal: Place ``[x, y]`` (m) to which the sweep leads, evaluated at each step.
     """
     noise = random.normal(0.0, _NOISE, 3)
-    away = side * random.uniform(0.025, 0.04)
+    away = side * random.uniform(0.012, 0.025)
     point = _BEFORE_KNUCKLES if side < 0 else _BEHIND_BACK
 
     def behind(height: float) -> Place:
@@ -154,16 +165,16 @@ def _sweep(
         )
 
     def through(physics: Physics) -> np.ndarray:
-        # An object pushed along the arc drifts outwards along the hand, so the hand follows.
-        radius, angle = kinematics.to_polar(physics.object_position(name))
-        radius = (radius + goal(physics)) / 2
-        place = kinematics.polar(radius + _OUTWARD, angle - side * _LEAD / radius)
+        # The hand's rough skin takes the object along in the direction in which the hand moves.
+        box = physics.object_position(name)[:2]
+        way = goal(physics) - box
+        place = box + _LEAD * way / max(np.linalg.norm(way), 1e-6)
         return kinematics.inverse(np.append(place, SWEEP_HEIGHT), point)
 
     return [
         Phase(behind(CLEAR_HEIGHT), FIST),
-        Phase(behind(SWEEP_HEIGHT), FIST),
-        Phase(through, FIST),
+        Phase(behind(SWEEP_HEIGHT), FIST, limit=8),
+        Phase(through, FIST, limit=16),
     ]
 
 
