@@ -257,9 +257,9 @@ def load_all_seeds(path: str | Path, *, make: Callable[..., Algorithm] | None = 
             )
         raise ValueError(f"{path} has no checkpoint: let the run reach its first one, or keep it")
     encoders, bank = load_inputs(path, config.tasks, digests)
-    algorithm = make(config.algorithm, seeds=config.seeds, bank=bank.seen(), encoders=encoders)
     saved = load_checkpoint(path / "checkpoint", mmap=True)
     try:
+        algorithm = make(config.algorithm, seeds=config.seeds, bank=bank.seen(), encoders=encoders)
         state = saved["algorithm"]
         if not algorithm.needs_replay:
             state["replay"] = algorithm.replay.state_dict()  # Avoids reading it.
