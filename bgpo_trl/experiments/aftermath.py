@@ -108,14 +108,16 @@ class Criterion:
 def lifts(name: str, then: Continuation, episode: Episode) -> Outcome:
     """Close the hand and raise the arm in each way: the best lift of an object counts.
 
-    The lift is the height over the object's place on the table, a second after the raise.
+    The lift is the height over the object's place on the table, a second after the raise; 0 if the
+    hand does not touch the object then, which has been thrown or lost.
     """
-    best = -np.inf
+    best = 0.0
     for arm, steps in RAISES:
         physics = then.begin(episode.end)
         then.act((*arm, 1.0), steps)
         then.act((0.0, 0.0, 0.0, 1.0), _HELD_STEPS)
-        best = max(best, _height(physics, name))
+        if physics.touching(HAND, name):
+            best = max(best, _height(physics, name))
     return Outcome(best >= LIFT, best)
 
 
