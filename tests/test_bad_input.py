@@ -312,6 +312,7 @@ PARTS = {
     "transfer without phases": (
         lambda: metrics.backward_transfer([[1, 2]]), "got [1, 2]", "one phase per task"),
     "quartiles of nothing": (lambda: intervals.interquartile_mean([]), "not empty", "leave out"),
+    "an interval of one": (lambda: intervals.t_interval([0.5]), "two seeds", "needs the values"),
     "quartiles of NaN": (lambda: intervals.interquartile_mean([NAN]), "finite", "leave out"),
     "bootstrap of NaN": (
         lambda: intervals.stratified_bootstrap([[NAN]], rng=np.random.default_rng(0)),

@@ -1,4 +1,4 @@
-"""Interquartile means of scores, their bootstrap confidence intervals, and those of differences."""
+"""Means of scores, their confidence intervals (bootstrap and Student's t), and of differences."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import stdtrit
 
 Array = NDArray[np.float64]
 Statistic = Callable[[Array], Array]
@@ -83,6 +84,27 @@ def percentile_interval(values: ArrayLike, confidence: float = 0.95) -> tuple[fl
     tail = 100 * (1 - confidence) / 2
     low, high = np.percentile(np.asarray(values, float), [tail, 100 - tail])
     return float(low), float(high)
+
+
+def t_interval(values: ArrayLike, confidence: float = 0.95) -> tuple[float, float]:
+    """Return Student's t interval of the mean of values ``[N]``, one of each seed.
+
+    Raises:
+        ValueError: If there are fewer than two values, or ``confidence`` is not in (0, 1).
+
+    Example:
+        >>> [round(end, 3) for end in t_interval([0.5, 0.7, 0.6])]
+        [0.352, 0.848]
+    """
+    found = np.asarray(values, float)
+    if found.ndim != 1 or len(found) < 2 or not 0 < confidence < 1:
+        raise ValueError(
+            "an interval needs the values of at least two seeds and a confidence in (0, 1), got "
+            f"{list(found.shape)} and {confidence}"
+        )
+    error = found.std(ddof=1) / np.sqrt(len(found))
+    half = float(stdtrit(len(found) - 1, (1 + confidence) / 2) * error)
+    return float(found.mean()) - half, float(found.mean()) + half
 
 
 class Statistics:

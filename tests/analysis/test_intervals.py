@@ -64,6 +64,17 @@ def test_intervals_follow_from_the_generator():
     assert draws[0].shape == (2_000,)
 
 
+def test_t_intervals_are_those_of_the_table():
+    # Values of t for 95 %: 12.706 for one degree of freedom, 2.776 for four.
+    assert intervals.t_interval([0.4, 0.6]) == pytest.approx((0.5 - 1.2706, 0.5 + 1.2706), abs=1e-4)
+    values = [0.1, 0.2, 0.3, 0.4, 0.5]
+    half = 2.776 * np.sqrt(0.025 / 5)
+    assert intervals.t_interval(values) == pytest.approx((0.3 - half, 0.3 + half), abs=1e-4)
+    assert intervals.t_interval([0.5, 0.5, 0.5]) == (0.5, 0.5)
+    low, high = intervals.t_interval(values, 0.5)
+    assert high - low == pytest.approx(2 * 0.741 * np.sqrt(0.025 / 5), abs=1e-4)
+
+
 @pytest.mark.parametrize("scores", [[0.5], [[0.5, NAN]], [[0.5, np.inf]], np.zeros((0, 3))])
 def test_scores_that_are_not_there_are_refused(scores):
     with pytest.raises(ValueError, match=r"finite and \[seeds, tasks\]"):

@@ -80,6 +80,7 @@ CASES = [
     ("continual.py --bank new --train-encoders", "--bank is of the pretrained", "leave it or"),
     ("watch.py run --import juggling", "--import juggling: there is no such", "give the name"),
     ("one_shot.py run --import juggling", "--import juggling: there is no such", "give the name"),
+    ("looking.py run --import juggling", "--import juggling: there is no such", "give the name"),
     # where it goes
     ("continual.py --out file", "cannot make the folder file", "choose another"),
     ("continual.py --out file/run", "cannot make the folder file/run", "choose another"),
@@ -106,7 +107,11 @@ CASES = [
     ("summary.py unevaluated", "no test episode", "let the run evaluate first"),
     ("report.py nowhere", "nowhere is not a directory", "name the one that holds the runs"),
     ("report.py empty", "empty holds none of the runs", "that the figures need"),
+    ("looking.py empty", "empty holds no run", "there is no config.json"),
+    ("aftermath.py empty", "empty holds no run", "there is no config.json"),
     # measurements
+    ("aftermath.py", "nobody acts", "name a run directory, or give --demonstrators"),
+    ("aftermath.py --demonstrators --episodes 0", "--episodes", "at least 1, got 0"),
     ("speed/throughput.py --parts", "--parts is empty", "name some of frames"),
     ("speed/throughput.py --rounds 0", "--rounds", "at least 1, got 0"),
     ("speed/throughput.py --threads 0", "--threads", "at least 1, got 0"),
