@@ -34,11 +34,12 @@ _STEP = ACTION_SCALE[_PART]
 
 # Arc about the shoulder's yaw axis along which the objects are spread; left is positive. The green
 # box stands between the other two, which swap sides at random.
-ARC_RADIUS = 0.39  # (m)
-SIDE_ANGLE = np.radians(23.5)  # nominal angle of the glass (left) and the white box (right)
+ARC_RADIUS = 0.40  # (m)
+SIDE_ANGLE = np.radians(22.0)  # nominal angle of the glass (left) and the white box (right)
 GREEN_JITTER = np.radians(9.5)
 SIDE_JITTER = np.radians(8.7)
 RADIUS_JITTER = 0.03  # (m)
+LARGEST_STEP = 0.035  # (m) between the radii of neighbors: farther inward, a box cannot be pushed
 LEAST_ANGLE = np.radians(20.0)  # between neighbors: the fist fits in
 NOMINAL_ANGLES = np.array([SIDE_ANGLE, 0.0, -SIDE_ANGLE])  # of `OBJECTS`
 
@@ -51,6 +52,7 @@ START_HEIGHT = (0.05, 0.12)  # (m) above the table
 def scene_version() -> str:
     """Return the version of scene, starts and action, on which datasets and encoders depend."""
     layout = (ARC_RADIUS, SIDE_ANGLE, GREEN_JITTER, SIDE_JITTER, RADIUS_JITTER, LEAST_ANGLE)
+    layout += (LARGEST_STEP,)
     starts = (START_ANGLE, START_RADIUS, START_HEIGHT, ACTION_SCALE.tolist())
     described = f"{scene_xml()}{layout}{starts}".encode()
     return "nico-2-" + hashlib.sha256(described).hexdigest()[:8]
@@ -194,13 +196,20 @@ class NicoTask(control.Task):
         """Draw the places ``[x, y]`` (m) and turns (rad) of the objects, in the order `OBJECTS`."""
         swapped = self.random.uniform() < self.spread / 2
         nominal = NOMINAL_ANGLES[::-1] if swapped else NOMINAL_ANGLES
-        reach = self.spread * np.array([SIDE_JITTER, GREEN_JITTER, SIDE_JITTER])
-        angles = nominal
-        while True:
-            angles = nominal + reach * self.random.uniform(-1.0, 1.0, 3)
-            if np.abs(np.diff(angles)).min() >= LEAST_ANGLE:
-                break
-        radii = ARC_RADIUS + self.spread * self.random.uniform(-RADIUS_JITTER, RADIUS_JITTER, 3)
+        green = self.random.uniform(-GREEN_JITTER, GREEN_JITTER)
+        left, right = (
+            self.random.uniform(
+                max(SIDE_ANGLE - SIDE_JITTER, LEAST_ANGLE + inward), SIDE_ANGLE + SIDE_JITTER
+            )
+            for inward in (green, -green)
+        )
+        drawn = np.array([-right, green, left] if swapped else [left, green, -right])
+        angles = nominal + self.spread * (drawn - nominal)
+        steps = np.array([np.inf])
+        while np.abs(steps).max() > LARGEST_STEP:
+            jitter = self.random.uniform(-RADIUS_JITTER, RADIUS_JITTER, 3)
+            steps = np.diff(jitter)
+        radii = ARC_RADIUS + self.spread * jitter
         turns = self.spread * self.random.uniform(-np.pi, np.pi, 3)
         return [kinematics.polar(r, a) for r, a in zip(radii, angles, strict=True)], turns
 

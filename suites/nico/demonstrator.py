@@ -90,7 +90,8 @@ class Demonstrator:
             arm = self._phases[0].place(physics) - targets[:3]
         self._steps += 1
         hand = self._phases[0].curl - targets[3]
-        arm *= min(1.0, self._speed / max(np.abs(arm).max(), 1e-6))
+        speed = self._speed * self._phases[0].pace
+        arm *= min(1.0, speed / max(np.abs(arm).max(), 1e-6))
         hand = np.clip(hand, -_HAND_SPEED, _HAND_SPEED)
         action = np.append(arm, hand) / ACTION_SCALE
         action[:3] += _TREMOR * self._random.standard_normal(3)

@@ -22,10 +22,12 @@ GRIP: Final = 1.2  # (rad) curl of a segment, beyond what the joints reach, for 
 
 # Contact point of a pushed box, as (left of the arm's plane, beyond the wrist) (m): the fist's
 # knuckles when pushed left, the back of the hand when pushed right.
-_BEFORE_KNUCKLES, _BEHIND_BACK = (0.078, 0.105), (-0.043, 0.06)
+_BEFORE_KNUCKLES, _BEHIND_BACK = (0.078, 0.09), (-0.043, 0.045)
 _FRONT = (0.02, 0.12)  # front of the fist, between palm and fingers
-_LEAD = 0.07  # (m) by which the hand aims ahead of the box it pushes
-_AHEAD = 0.25  # (rad) by which the goal of a push aside is ahead on the arc
+_LEAD = 0.14  # (m) by which the hand aims ahead of the box it pushes
+_MIDDLE_REACH = 0.415  # (m) radius up to which a box is pushed to the right in this way
+_OUT = 0.02
+_AHEAD = 0.08  # (rad) by which the goal of a push aside is ahead on the arc
 # Distance from the grip at which the descending palm just misses the center of a box (m).
 _PALM = 0.094
 _LIFT_HEIGHT = TABLE_HEIGHT + 0.039  # (m) of the grip around a box to lift; higher, it slips
@@ -50,6 +52,8 @@ class Phase:
     """Largest distance of a joint from the target at which the phase ends (rad)."""
     until: Callable[[Physics], bool] | None = None
     """Further condition for the end of the phase."""
+    pace: float = 1.0
+    """Factor of the demonstrator's speed."""
     limit: int = 50
     """Steps after which the phase ends in any case; after the last phase, the movement is planned
     anew."""
@@ -85,7 +89,7 @@ def lift(physics: Physics, random: np.random.Generator, name: str) -> Sequence[P
     return [
         *reach,
         Phase(_stay, GRIP, until=is_firm, limit=14),
-        Phase(up, GRIP, limit=16),
+        Phase(up, GRIP, limit=12),
     ]
 
 
@@ -122,7 +126,7 @@ def push(physics: Physics, random: np.random.Generator, box: str, target: str) -
         target: The object to push it to.
     """
     side = np.sign(_angle(physics, box) - _angle(physics, target))
-    return _sweep(random, box, side, lambda physics: physics.object_position(target)[:2])
+    return _sweep(physics, random, box, side, lambda physics: physics.object_position(target)[:2])
 
 
 def push_aside(
@@ -139,13 +143,13 @@ def push_aside(
     start = _radius(physics, name)
 
     def ahead(physics: Physics) -> np.ndarray:
-        return kinematics.polar(start, _angle(physics, name) - side * _AHEAD)
+        return kinematics.polar(start + _OUT, _angle(physics, name) - side * _AHEAD)
 
-    return _sweep(random, name, side, ahead)
+    return _sweep(physics, random, name, side, ahead)
 
 
 def _sweep(
-    random: np.random.Generator, name: str, side: float, goal: Callable[[Physics], np.ndarray]
+    physics: Physics, random: np.random.Generator, name: str, side: float, goal: Callable[[Physics], np.ndarray]
 ) -> Sequence[Phase]:
     """Return a sweep of the fist along the arc that takes an object with it.
 
@@ -157,7 +161,10 @@ def _sweep(
     """
     noise = random.normal(0.0, _NOISE, 3)
     away = side * random.uniform(0.012, 0.025)
-    point = _BEFORE_KNUCKLES if side < 0 else _BEHIND_BACK
+    left, beyond = _BEFORE_KNUCKLES if side < 0 else _BEHIND_BACK
+    if side > 0:  # A far box would be out of reach of the middle of the hand.
+        beyond += max(0.0, _radius(physics, name) - _MIDDLE_REACH)
+    point = left, beyond
 
     def behind(height: float) -> Place:
         return lambda physics: beside_object(
@@ -174,7 +181,7 @@ def _sweep(
     return [
         Phase(behind(CLEAR_HEIGHT), FIST),
         Phase(behind(SWEEP_HEIGHT), FIST, limit=8),
-        Phase(through, FIST, limit=16),
+        Phase(through, FIST, limit=20),
     ]
 
 
@@ -195,7 +202,10 @@ def press(physics: Physics, random: np.random.Generator, name: str) -> Sequence[
             physics, name, 0.0, top + height + noise[2], _FRONT, noise[:2]
         )
 
-    return [Phase(over(0.16), FIST, tolerance=0.014), Phase(over(-0.03), FIST)]
+    return [
+        Phase(over(0.16), FIST, tolerance=0.014, limit=16, pace=0.85),
+        Phase(over(-0.03), FIST, limit=16, pace=0.85),
+    ]
 
 
 def beside_object(
