@@ -39,7 +39,7 @@ SIDE_ANGLE = np.radians(22.0)  # nominal angle of the glass (left) and the white
 GREEN_JITTER = np.radians(9.5)
 SIDE_JITTER = np.radians(8.7)
 RADIUS_JITTER = 0.03  # (m)
-LARGEST_STEP = 0.035  # (m) between the radii of neighbors: farther inward, a box cannot be pushed
+LARGEST_STEP = 0.03  # (m) between the radii of neighbors: farther inward, a box cannot be pushed
 LEAST_ANGLE = np.radians(20.0)  # between neighbors: the fist fits in
 NOMINAL_ANGLES = np.array([SIDE_ANGLE, 0.0, -SIDE_ANGLE])  # of `OBJECTS`
 

@@ -203,7 +203,7 @@ def press(physics: Physics, random: np.random.Generator, name: str) -> Sequence[
         )
 
     return [
-        Phase(over(0.16), FIST, tolerance=0.014, limit=16, pace=0.85),
+        Phase(over(0.15), FIST, tolerance=0.014, limit=24, pace=0.85),
         Phase(over(-0.03), FIST, limit=16, pace=0.85),
     ]
 
