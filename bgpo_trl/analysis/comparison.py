@@ -37,6 +37,7 @@ SAME = {"gwr+r_int": "bgpo-single", "experts": "bgpo-experts", "all": "bgpo"}
 # Entries of config.json that belong to an algorithm or to keeping its run. All others, such as
 # encoders, starts, and the half of the demonstrations to test on, are conditions of a comparison.
 _OF_THE_RUN = ("name", "algorithm", "algorithm_class", "seeds", "checkpoint_minutes")
+_USUAL = "practised"
 _OF_THE_SETTING = ("tasks", "task_starts", "task_modules", "schedule", "episodes")
 
 
@@ -117,8 +118,9 @@ class Setting:
 
     @property
     def schedule(self) -> str:
-        """Name of the schedule by which presented tasks are drawn, if its runs have one."""
-        return self.first.config.get("schedule") or ""
+        """Name of the schedule by which presented tasks are drawn, if it is not the usual one."""
+        schedule = self.first.config.get("schedule", _USUAL)
+        return "" if schedule == _USUAL else str(schedule)
 
     @property
     def title(self) -> str:
@@ -220,7 +222,7 @@ def read_settings(
         if run.unfinished:
             notes.append(f"{run.directory} {run.unfinished}: let the run finish")
         else:
-            starts, schedule = run.starts, run.config.get("schedule")
+            starts, schedule = run.starts, run.config.get("schedule", _USUAL)
             rising = all(start < end for start, end in pairwise(starts))
             kind = (run.tasks, not any(starts), rising, schedule)
             groups.setdefault(kind, []).append(run)
@@ -230,7 +232,7 @@ def read_settings(
     found.sort(key=lambda setting: (len(setting.first.tasks), setting.from_start))
     settings: list[Setting] = []
     for setting in found:
-        alike = [other for other in settings if other.slug.startswith(setting.slug)]
+        alike = [other for other in settings if replace(other, order="").slug == setting.slug]
         if alike:
             turned = alike[0].first.tasks[::-1] == setting.first.tasks
             order = "in reverse" if turned else f"order {len(alike) + 1}"

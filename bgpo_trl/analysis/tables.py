@@ -268,7 +268,10 @@ def _numbers(values: Iterable[float], digits: int = 0) -> str:
 
 
 def markdown(rows: Table) -> str:
-    """Format a table in Markdown."""
+    """Format a table in Markdown; columns of numbers are aligned on the right."""
     head, *body = rows
-    lines = [head, ["---", *["---:"] * (len(head) - 1)], *body]
+    numbers = [
+        all(cell[:1] in "+-0123456789" for cell in cells) for cells in zip(*body, strict=True)
+    ]
+    lines = [head, ["---:" if number else "---" for number in numbers], *body]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)

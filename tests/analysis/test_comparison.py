@@ -30,9 +30,11 @@ def test_runs_are_sorted_by_tasks_and_how_these_are_presented(tmp_path):
     write_run(tmp_path, "bgpo", 5, tasks=eight, starts=range(0, 40, 5), directory="a")
     write_run(tmp_path, "bgpo", 5, tasks=eight[::-1], starts=range(0, 40, 5), directory="b")
     write_run(tmp_path, "bgpo", 5, starts=(0, 0, 20), directory="c")
+    write_run(tmp_path, "bgpo", 5, starts=SEQUENCE, directory="0", schedule="sequential")
     (tmp_path / "no-run").mkdir()
     found, notes = settings_in(tmp_path)
     assert {title: setting.slug for title, setting in found.items()} == {
+        "3 tasks, one after the other, sequential": "continual-3-sequential",
         "3 tasks, one after the other": "continual-3",
         "3 tasks, from episodes 0, 0, 20": "staggered-3",
         "3 tasks, all from the start": "concurrent-3",
