@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from tensordict import TensorDict
 from torch import Tensor
 
@@ -66,7 +67,8 @@ class Evaluator:
     number of the evaluation.
 
     Config, seeds, schedule and encoders are those of training; the bank has held-out
-    demonstrations. Each task is tested in ``episodes`` episodes.
+    demonstrations. Each task is tested in ``episodes`` episodes. ``make_env`` makes the simulation,
+    with the arguments of `NicoEnv`, the default.
 
     Raises:
         ValueError: If a task has no demonstration.
@@ -81,6 +83,7 @@ class Evaluator:
         episodes: int,
         bank: DemonstrationBank,
         encoders: Representation | None,
+        make_env: Callable[..., NicoEnv] | None = None,
     ) -> None:
         self.max_steps = config.max_steps
         self._state_key = config.state
@@ -95,7 +98,7 @@ class Evaluator:
                 "each task"
             )
         self._bank = bank
-        self.simulation = NicoEnv(
+        self.simulation = (make_env or NicoEnv)(
             bank.tasks,
             batch_size=self.shape,
             observation="pixels" if config.state == "latent" else "state",
@@ -104,9 +107,6 @@ class Evaluator:
         self._task = torch.arange(n_tasks)[:, None].expand(self.shape).contiguous()
         self._next = 0
         self._waiting: list[list[Snapshot]] = [[] for _ in seeds]
-
-    def _rng(self, seed: int, number: int) -> np.random.Generator:
-        return np.random.default_rng([stream_seed(seed, "evaluation"), number])
 
     def take(self, algorithm: Algorithm, index: int, episode: int, env_steps: int) -> None:
         """Queue a snapshot of the seed at position ``index`` for its next evaluation.
@@ -125,7 +125,7 @@ class Evaluator:
         Raises:
             TypeError: If the algorithm returns no `Policy`, or one for other test episodes.
         """
-        rng = self._rng(self.seeds[index], number)
+        rng = _rng(self.seeds[index], number)
         drawn = torch.stack(
             [
                 rows[torch.from_numpy(rng.integers(len(rows), size=self.shape[2]))]
@@ -177,7 +177,7 @@ class Evaluator:
         """
         policy = Policy.stack([snapshot.policy for snapshot in snapshots], device)
         starts = [
-            self._rng(seed, snapshot.number).integers(2**32, size=self.shape[1:])
+            start_seeds(seed, snapshot.number, self.shape[1:])
             for seed, snapshot in zip(self.seeds, snapshots, strict=True)
         ]
         self.simulation.seed_rows(np.stack(starts).ravel().tolist())
@@ -217,6 +217,19 @@ class Evaluator:
             ]
             for of_seed in state["waiting"]
         ]
+
+
+def start_seeds(seed: int, number: int, shape: Sequence[int]) -> NDArray[np.int64]:
+    """Return the seeds of the start states of a seed's evaluation ``number``, of that shape.
+
+    The shape of an `Evaluator` is tasks by test episodes; `suites.nico.load` with one of these
+    seeds starts like the test episode.
+    """
+    return _rng(seed, number).integers(2**32, size=tuple(shape))
+
+
+def _rng(seed: int, number: int) -> np.random.Generator:
+    return np.random.default_rng([stream_seed(seed, "evaluation"), number])
 
 
 @torch.no_grad()

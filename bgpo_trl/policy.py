@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -168,6 +168,22 @@ class TrainedPolicy:
         return action[0, self._task, 0].cpu().numpy()
 
 
+class LoadedRun(NamedTuple):
+    """All seeds of a run, as left by its last checkpoint.
+
+    Attributes:
+        config: The run.
+        algorithm: The algorithm of all seeds.
+        encoders: The run's encoders.
+        bank: The run's demonstrations, embedded.
+    """
+
+    config: RunConfig
+    algorithm: Algorithm
+    encoders: Representation
+    bank: DemonstrationBank
+
+
 def load_run(
     path: str | Path,
     *,
@@ -199,6 +215,32 @@ def load_run(
         raise ValueError(f"{path} has no seed {seed!r}: choose one of {seeds}")
     if config.algorithm.state != "latent" or digests.encoders is None:
         raise ValueError(f"{path} learned from the ground truth: only runs from frames can watch")
+    config, algorithm, encoders, bank = load_all_seeds(path, make=make)
+    seed = config.seeds[0] if seed is None else seed
+    return TrainedPolicy(config, algorithm, encoders=encoders, bank=bank, seed=seed)
+
+
+def load_all_seeds(path: str | Path, *, make: Callable[..., Algorithm] | None = None) -> LoadedRun:
+    """Load the algorithm of all seeds of a run, finished or not, from its last checkpoint.
+
+    Unlike `load_run`, it also takes runs on the ground truth, if encoders embedded their
+    demonstrations.
+
+    Args:
+        path: The run's directory, which is only read.
+        make: Constructor of the algorithm, as for `Trainer`, if it is not in `ALGORITHMS`.
+
+    Raises:
+        ValueError: If the run, its checkpoint, algorithm, tasks, encoders or demonstrations cannot
+            be found.
+    """
+    path = Path(path)
+    config, digests = read_config(path / "config.json")
+    if digests.encoders is None:
+        raise ValueError(
+            f"{path} was trained without encoders, of which its demonstrations are unknown: give "
+            "its Trainer encoders"
+        )
     if make is None:
         try:
             make = entry(config.name).make
@@ -215,9 +257,9 @@ def load_run(
             )
         raise ValueError(f"{path} has no checkpoint: let the run reach its first one, or keep it")
     encoders, bank = load_inputs(path, config.tasks, digests)
-    algorithm = make(config.algorithm, seeds=config.seeds, bank=bank.seen(), encoders=encoders)
     saved = load_checkpoint(path / "checkpoint", mmap=True)
     try:
+        algorithm = make(config.algorithm, seeds=config.seeds, bank=bank.seen(), encoders=encoders)
         state = saved["algorithm"]
         if not algorithm.needs_replay:
             state["replay"] = algorithm.replay.state_dict()  # Avoids reading it.
@@ -228,8 +270,7 @@ def load_run(
             f"{path / 'checkpoint'} does not fit {path / 'config.json'} ({reason}): use the "
             "version of the code, and the make, of the run"
         ) from error
-    seed = config.seeds[0] if seed is None else seed
-    return TrainedPolicy(config, algorithm, encoders=encoders, bank=bank, seed=seed)
+    return LoadedRun(config, algorithm, encoders, bank)
 
 
 def _frames(frames: ArrayLike, wanted: str, ndim: int) -> Tensor:

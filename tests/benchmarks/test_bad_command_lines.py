@@ -80,6 +80,7 @@ CASES = [
     ("continual.py --bank new --train-encoders", "--bank is of the pretrained", "leave it or"),
     ("watch.py run --import juggling", "--import juggling: there is no such", "give the name"),
     ("one_shot.py run --import juggling", "--import juggling: there is no such", "give the name"),
+    ("looking.py run --import juggling", "--import juggling: there is no such", "give the name"),
     # where it goes
     ("continual.py --out file", "cannot make the folder file", "choose another"),
     ("continual.py --out file/run", "cannot make the folder file/run", "choose another"),
@@ -105,7 +106,11 @@ CASES = [
     ("report.py run", "run holds no test episode", "let the run evaluate first"),
     ("report.py empty", "empty holds no run", "name a run, or a folder of runs"),
     ("report.py damaged", "config.json is damaged", "put it back as the run left it"),
+    ("looking.py empty", "empty holds no run", "there is no config.json"),
+    ("aftermath.py empty", "empty holds no run", "there is no config.json"),
     # measurements
+    ("aftermath.py", "nobody acts", "name a run directory, or give --demonstrators"),
+    ("aftermath.py --demonstrators --episodes 0", "--episodes", "at least 1, got 0"),
     ("speed/throughput.py --parts", "--parts is empty", "name some of frames"),
     ("speed/throughput.py --rounds 0", "--rounds", "at least 1, got 0"),
     ("speed/throughput.py --threads 0", "--threads", "at least 1, got 0"),

@@ -5,6 +5,7 @@ import re
 import shutil
 import warnings
 
+import looking
 import one_shot
 import pytest
 import report
@@ -197,8 +198,12 @@ LOADED = {
 
 @pytest.mark.parametrize(
     ("read", "arguments"),
-    [(watch, WatchArguments), (one_shot.main, one_shot.Arguments)],
-    ids=["watch", "one_shot"],
+    [
+        (watch, WatchArguments),
+        (one_shot.main, one_shot.Arguments),
+        (looking.main, looking.Arguments),
+    ],
+    ids=["watch", "one_shot", "looking"],
 )
 @pytest.mark.parametrize("damage", LOADED.values(), ids=LOADED.keys())
 def test_a_damaged_run_is_not_shown_or_tested(run, capsys, damage, read, arguments, tmp_path):

@@ -1,0 +1,294 @@
+"""What a success is worth: the simulation continued from the states in which episodes succeeded.
+
+A task's criterion looks at one moment, and a learner finds the cheapest thing that pays. Here a
+grasped object is lifted, and what was pushed is left alone for two seconds.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bgpo_trl.evaluation import start_seeds
+from bgpo_trl.experiments.episodes import (
+    Episode,
+    evaluator_of,
+    play,
+    random_actions,
+    snapshots_of,
+)
+from bgpo_trl.policy import LoadedRun
+from suites import nico
+from suites.nico import kinematics
+from suites.nico.base import CONTROL_TIMESTEP, Environment
+from suites.nico.demonstrator import Demonstrator
+from suites.nico.physics import HAND, OBJECT_HALF_HEIGHT, TABLE_HEIGHT
+
+LIFT = 0.05  # (m) over the object's place on the table
+GAP = 0.015  # (m) between things that still count as together
+KEPT = 0.75  # least share of a displacement that remains
+STEPS = 10  # steps without action
+
+_DIRECTIONS = (
+    (0.0, 1.0, 0.0),
+    (0.0, 0.0, 1.0),
+    (0.0, 1.0, 1.0),
+    (0.0, 1.0, 0.5),
+    (0.0, 0.5, 1.0),
+    (0.5, 1.0, 1.0),
+    (-0.5, 1.0, 1.0),
+)
+_SPEEDS = ((0.2, 15), (0.5, 6))  # share of the largest action, and steps of the same movement
+RAISES = tuple(
+    (tuple(speed * part for part in direction), steps)
+    for direction, (speed, steps) in itertools.product(_DIRECTIONS, _SPEEDS)
+)
+"""Ways to raise the arm: actions of shoulder yaw, shoulder pitch and elbow, and their number."""
+_HELD_STEPS = 5  # steps at rest after a raise, in which what was thrown falls
+
+_UPRIGHT = 0.95  # least vertical component of the object's axis
+_ON_TABLE = 0.01  # (m) largest difference of its height from that of its place on the table
+_AT_REST = 0.02  # (m/s) largest speed
+
+# Number of the evaluation; it seeds start states that no other test uses.
+_NUMBER = 2**31 + 3
+
+
+class Outcome(NamedTuple):
+    """What became of a success.
+
+    Attributes:
+        holds: Whether it is one in earnest.
+        distance: Lift, gap or displacement (m), by the task's `Criterion`.
+    """
+
+    holds: bool
+    distance: float
+
+
+class Continuation:
+    """A simulation to be continued from states of others, with the actions of the tasks."""
+
+    def __init__(self) -> None:
+        self.physics = nico.Physics.from_xml_string(nico.scene_xml())
+        self._task = nico.NicoTask(random=0, observation="state")
+        self._n_sub_steps = round(CONTROL_TIMESTEP / self.physics.timestep())
+
+    def begin(self, state: NDArray) -> nico.Physics:
+        """Go to a state, as from ``physics.get_state()``, and return the simulation."""
+        self.physics.set_state(state)
+        return self.physics
+
+    def act(self, action: Iterable[float], steps: int) -> None:
+        """Repeat an action ``[4]``."""
+        for _ in range(steps):
+            self._task.before_step(np.array([*action]), self.physics)
+            self.physics.step(self._n_sub_steps)
+
+
+Judge = Callable[[Continuation, Episode], Outcome]
+
+
+@dataclass(frozen=True)
+class Criterion:
+    """How to find out whether the successes of a task are in earnest."""
+
+    distance: str
+    """Name of the distance that is measured."""
+    judge: Judge
+    """Continues the simulation from the end of an episode."""
+
+
+def lifts(name: str, then: Continuation, episode: Episode) -> Outcome:
+    """Close the hand and raise the arm in each way: the best lift of an object counts.
+
+    The lift is the height over the object's place on the table, a second after the raise; 0 if the
+    hand does not touch the object then, which has been thrown or lost.
+    """
+    best = 0.0
+    for arm, steps in RAISES:
+        physics = then.begin(episode.end)
+        then.act((*arm, 1.0), steps)
+        then.act((0.0, 0.0, 0.0, 1.0), _HELD_STEPS)
+        if physics.touching(HAND, name):
+            best = max(best, _height(physics, name))
+    return Outcome(best >= LIFT, best)
+
+
+def stays_together(first: str, second: str, then: Continuation, episode: Episode) -> Outcome:
+    """Do nothing for some steps: do two things, named as in ``physics.gap``, stay together?"""
+    physics = then.begin(episode.end)
+    then.act(np.zeros(4), STEPS)
+    gap = physics.gap(first, second)
+    return Outcome(gap <= GAP, gap)
+
+
+def stays_aside(name: str, side: int, then: Continuation, episode: Episode) -> Outcome:
+    """Do nothing for some steps: does an object stand, at rest, where it was pushed to?
+
+    Displacements are measured along the arc from where the object stood at the start, to the left
+    for ``side`` 1 and to the right for -1.
+    """
+    at_start = _arc(then.begin(episode.start), name)
+    physics = then.begin(episode.end)
+    at_success = side * (_arc(physics, name) - at_start)
+    then.act(np.zeros(4), STEPS)
+    displacement = side * (_arc(physics, name) - at_start)
+    kept = displacement >= KEPT * at_success and displacement > 0
+    return Outcome(kept and stands(physics, name), displacement)
+
+
+def stays_pressed(name: str, then: Continuation, episode: Episode) -> Outcome:
+    """Do nothing for some steps: is the hand still on an object, and does this stand?"""
+    together = stays_together(HAND, name, then, episode)
+    return Outcome(together.holds and stands(then.physics, name), together.distance)
+
+
+def stands(physics: nico.Physics, name: str) -> bool:
+    """Return whether an object stands upright on the table, at rest."""
+    upright = physics.named.data.xmat[name, "zz"] > _UPRIGHT
+    speed = np.linalg.norm(physics.named.data.qvel[name][:3])
+    return bool(upright and speed < _AT_REST and abs(_height(physics, name)) < _ON_TABLE)
+
+
+def _height(physics: nico.Physics, name: str) -> float:
+    """Return the height of an object over its place on the table (m)."""
+    height = physics.object_position(name)[2] - TABLE_HEIGHT - OBJECT_HALF_HEIGHT[name]
+    return float(height)
+
+
+def _arc(physics: nico.Physics, name: str) -> float:
+    """Return the place of an object along the arc (m), left positive."""
+    radius, angle = kinematics.to_polar(physics.object_position(name))
+    return radius * angle
+
+
+CRITERIA: dict[str, Criterion] = {
+    "grasp_glass": Criterion("lift", partial(lifts, "glass")),
+    "push_green_to_glass": Criterion("gap", partial(stays_together, "green_box", "glass")),
+    "push_green_to_white": Criterion("gap", partial(stays_together, "green_box", "white_box")),
+    "push_glass_right": Criterion("displacement", partial(stays_aside, "glass", -1)),
+    "lift_green": Criterion("lift", partial(lifts, "green_box")),
+    "press_white": Criterion("gap", partial(stays_pressed, "white_box")),
+    "push_white_left": Criterion("displacement", partial(stays_aside, "white_box", 1)),
+    "push_white_right": Criterion("displacement", partial(stays_aside, "white_box", -1)),
+}
+"""What is asked of a success, by task. Modules of own tasks may add entries."""
+
+
+class Row(NamedTuple):
+    """A success and what became of it, a row of ``aftermath.csv``."""
+
+    actor: str
+    seed: int
+    task: str
+    holds: bool
+    measure: str
+    distance: float
+
+
+def policy_episodes(run: LoadedRun, episodes: int) -> list[Episode]:
+    """Return the test episodes of all seeds' trained policies, as many of each task and seed."""
+    evaluator, first = evaluator_of(run, episodes), list[NDArray]()
+
+    def states() -> NDArray:
+        found = evaluator.simulation.simulation_state()["physics"].numpy()
+        return found.reshape(*evaluator.shape, -1)
+
+    result = evaluator.run(
+        snapshots_of(run, evaluator, _NUMBER),
+        run.algorithm.device,
+        watch=lambda: None if first else first.append(states()),
+    )
+    last = states()  # simulations stop where they succeed
+    evaluator.simulation.close()
+    return [
+        Episode(
+            run.config.tasks[at[1]],
+            run.config.seeds[at[0]],
+            bool(result.success[at]),
+            first[0][at],
+            last[at],
+        )
+        for at in np.ndindex(*evaluator.shape)
+    ]
+
+
+def scripted_episodes(
+    tasks: tuple[str, ...], seeds: Iterable[int], episodes: int, max_steps: int, actor: str
+) -> list[Episode]:
+    """Return the episodes of an entry of `SCRIPTED`, in the starts of `policy_episodes`."""
+    starts = {seed: start_seeds(seed, _NUMBER, (len(tasks), episodes)) for seed in seeds}
+    return [
+        episode
+        for seed, of_seed in starts.items()
+        for episode in play(tasks, of_seed, seed, SCRIPTED[actor], max_steps)
+    ]
+
+
+def demonstrate(env: Environment, seed: int) -> Demonstrator:
+    """Return the demonstrator of an environment at the start of an episode."""
+    demonstrator = Demonstrator(env, seed=seed)
+    demonstrator.reset()
+    return demonstrator
+
+
+SCRIPTED = {"demonstrators": demonstrate, "random actions": random_actions}
+"""Scripted policies by name."""
+
+
+def check_criteria(tasks: Iterable[str]) -> None:
+    """Raise ``ValueError`` if there is no criterion for a task."""
+    missing = [task for task in tasks if task not in CRITERIA]
+    if missing:
+        raise ValueError(
+            f"nothing says what a success of {missing[0]} is worth: add a Criterion to "
+            "bgpo_trl.experiments.aftermath.CRITERIA in the module of --import"
+        )
+
+
+def judge(actor: str, episodes: Iterable[Episode]) -> list[Row]:
+    """Find out what became of each success among some episodes.
+
+    Raises:
+        ValueError: If there is no criterion for a task.
+    """
+    successes = [episode for episode in episodes if episode.success]
+    check_criteria(episode.task for episode in successes)
+    then, rows = Continuation(), list[Row]()
+    for episode in successes:
+        criterion = CRITERIA[episode.task]
+        holds, distance = criterion.judge(then, episode)
+        row = (episode.task, bool(holds), criterion.distance, round(float(distance), 4))
+        rows.append(Row(actor, episode.seed, *row))
+    return rows
+
+
+def aftermath_table(
+    rows: Iterable[Row], played: Mapping[str, Mapping[str, int]]
+) -> list[list[str]]:
+    """Return the table by actor and task: successes, the share that holds, the median distance.
+
+    Args:
+        rows: The successes.
+        played: Number of episodes by actor and task.
+    """
+    rows = list(rows)
+    table = [["actor", "task", "successes", "of them hold, %", "median, cm"]]
+    for actor, counts in played.items():
+        for task, episodes in counts.items():
+            found = [row for row in rows if (row.actor, row.task) == (actor, task)]
+            cells = ["", ""]
+            if found:
+                # Adding 0 turns -0.0 into 0.0.
+                distance = round(100 * float(np.median([row.distance for row in found])), 1) + 0.0
+                share = 100 * np.mean([row.holds for row in found])
+                cells = [f"{share:.1f}", f"{distance:.1f} ({found[0].measure})"]
+            table.append([actor, task, f"{len(found)} of {episodes}", *cells])
+    return table

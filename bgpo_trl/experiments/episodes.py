@@ -1,0 +1,134 @@
+"""Test episodes of finished runs, and the same episodes played by scripted policies."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from dm_env import TimeStep
+from numpy.typing import NDArray
+
+from bgpo_trl.algorithms.bgpo import BGPO
+from bgpo_trl.envs import NicoEnv
+from bgpo_trl.evaluation import Evaluator, Snapshot
+from bgpo_trl.files.checkpoint import has_checkpoint
+from bgpo_trl.policy import LoadedRun, load_all_seeds
+from bgpo_trl.runs.config_file import read_config
+from bgpo_trl.transforms import TaskSchedule
+from suites import nico
+from suites.nico.base import Environment
+
+Actor = Callable[[TimeStep], NDArray]
+"""Scripted policy: maps a time step to an action ``[4]``."""
+
+
+def load_blocks(run: Path) -> list[LoadedRun]:
+    """Load all seeds of a run: the run itself, or the blocks of which it was merged.
+
+    Raises:
+        ValueError: As for `load_all_seeds`.
+    """
+    blocks = sorted(path for path in run.glob("seeds-*") if has_checkpoint(path / "checkpoint"))
+    if not blocks or has_checkpoint(run / "checkpoint"):
+        blocks = [run]
+    return [_load(block) for block in blocks]
+
+
+def _load(run: Path) -> LoadedRun:
+    # Rungs of benchmarks/ladder.py are variants of BGPO that ALGORITHMS does not list.
+    is_rung = read_config(run / "config.json")[0].name.startswith("rung ")
+    return load_all_seeds(run, make=BGPO if is_rung else None)
+
+
+def evaluator_of(
+    run: LoadedRun, episodes: int, make_env: Callable[..., NicoEnv] | None = None
+) -> Evaluator:
+    """Return an evaluator of all tasks of a run with its held-out demonstrations.
+
+    Args:
+        run: The run.
+        episodes: Test episodes of each task and seed.
+        make_env: Constructor of the simulation, `NicoEnv` if None.
+    """
+    config = run.config
+    return Evaluator(
+        config.algorithm,
+        seeds=config.seeds,
+        schedule=TaskSchedule((0,) * len(config.tasks)),
+        episodes=episodes,
+        bank=run.bank.held_out(config.held_out),
+        encoders=run.encoders,
+        make_env=make_env,
+    )
+
+
+def snapshots_of(run: LoadedRun, evaluator: Evaluator, number: int) -> list[Snapshot]:
+    """Return the trained policy of each seed, conditioned for evaluation ``number``."""
+    return [
+        evaluator.snapshot(run.algorithm, index, number, episode=run.config.episodes)
+        for index in range(len(run.config.seeds))
+    ]
+
+
+@dataclass(frozen=True)
+class Episode:
+    """First and last state of a test episode.
+
+    Attributes:
+        task: Name of the task.
+        seed: Seed of the run whose start it was.
+        success: Whether it ended with success.
+        start: State of the simulation at the start, as from ``physics.get_state()``.
+        end: The same at the end.
+    """
+
+    task: str
+    seed: int
+    success: bool
+    start: NDArray
+    end: NDArray
+
+
+def play(
+    tasks: tuple[str, ...],
+    starts: NDArray[np.int64],
+    seed: int,
+    make_actor: Callable[[Environment, int], Actor],
+    max_steps: int,
+) -> list[Episode]:
+    """Play an episode from each start with a scripted policy.
+
+    Args:
+        tasks: Names of the tasks.
+        starts: Seeds of the starts, ``[T, M]``, as from `start_seeds`.
+        seed: Seed of the run whose starts they are.
+        make_actor: Called at each start with the environment and the start's seed.
+        max_steps: Longest episode.
+    """
+    physics, episodes = nico.Physics.from_xml_string(nico.scene_xml()), []
+    for task, of_task in zip(tasks, starts.tolist(), strict=True):
+        for start_seed in of_task:
+            env = nico.load(
+                task,
+                seed=start_seed,
+                observation="state",
+                time_limit=float("inf"),
+                physics=physics,
+            )
+            timestep = env.reset()
+            start, act = physics.get_state(), make_actor(env, start_seed)
+            for _ in range(max_steps):
+                timestep = env.step(act(timestep))
+                if timestep.last():
+                    break
+            episodes.append(Episode(task, seed, timestep.last(), start, physics.get_state()))
+    return episodes
+
+
+def random_actions(env: Environment, seed: int) -> Actor:
+    """Return a policy of uniformly random actions."""
+    del env
+    random = np.random.default_rng(seed)
+    return lambda _: random.uniform(-1.0, 1.0, 4)

@@ -1,0 +1,186 @@
+"""The test of looking: success of a trained policy that is not shown where the objects are.
+
+A policy that has learned one movement for all starts succeeds without looking. The simulation is
+always the true one; what is altered is the picture of it that the policy gets.
+"""
+
+# MuJoCo's bindings come without stubs.
+# pyright: reportAttributeAccessIssue=false
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from typing import Any, Literal, NamedTuple
+
+import mujoco
+import numpy as np
+from dm_env import TimeStep
+from numpy.typing import NDArray
+
+from bgpo_trl.analysis import statistics
+from bgpo_trl.envs import NicoEnv
+from bgpo_trl.evaluation import start_seeds
+from bgpo_trl.experiments.episodes import evaluator_of, play, random_actions, snapshots_of
+from bgpo_trl.policy import LoadedRun
+from suites import nico
+from suites.nico import kinematics
+from suites.nico.base import ARC_ANGLES, ARC_RADIUS
+from suites.nico.physics import OBJECT_HALF_HEIGHT, OBJECTS, TABLE_HEIGHT
+
+Hidden = Literal["places", "objects"]
+
+VIEWS: dict[str, Hidden | None] = {
+    "seen": None,
+    "places hidden": "places",
+    "objects hidden": "objects",
+}
+"""What is hidden from the policy, by the name of the condition."""
+RANDOM = "random actions"
+"""Name of the condition without a policy."""
+
+# Number of the evaluation; it seeds start states that no other test uses.
+_NUMBER = 2**31 + 2
+
+
+class Row(NamedTuple):
+    """Success of a seed on a task in one condition, a row of ``looking.csv``."""
+
+    condition: str
+    seed: int
+    task: str
+    episodes: int
+    success: float
+
+
+def nominal_places() -> NDArray[np.float64]:
+    """Return the nominal place of each of `OBJECTS`, that of its center (m), ``[3, 3]``."""
+    return np.array(
+        [
+            [*kinematics.polar(ARC_RADIUS, angle), TABLE_HEIGHT + OBJECT_HALF_HEIGHT[name]]
+            for name, angle in zip(OBJECTS, ARC_ANGLES, strict=True)
+        ]
+    )
+
+
+class HidingEnv(NicoEnv):
+    """`NicoEnv` whose observations hide where the objects are; the simulation is the same.
+
+    Frames and ground truth show each object at its nominal place and turn; if only places are
+    hidden, moved and turned from there as it was since the start of the episode. The arm is shown
+    as it is. Episodes have to begin with a reset.
+
+    Args:
+        tasks: As for `NicoEnv`, as are all other arguments.
+        hidden: ``"places"`` hides where objects started, ``"objects"`` also how they move.
+    """
+
+    def __init__(
+        self, tasks: Sequence[str] = nico.PAPER_TASKS, *, hidden: Hidden, **arguments: Any
+    ) -> None:
+        super().__init__(tasks, **arguments)
+        self._hides_movement = hidden == "objects"
+        # What is shown has a simulation of its own, so that the true one is only read.
+        self._shown = nico.Physics.from_xml_string(nico.scene_xml())
+        joints = [self._shown.model.joint(name).qposadr[0] for name in OBJECTS]
+        self._poses = np.add.outer(joints, np.arange(7))
+        self._nominal = np.hstack([nominal_places(), [[1.0, 0.0, 0.0, 0.0]] * len(OBJECTS)])
+        self._starts = np.tile(self._nominal, (self.batch_size.numel(), 1, 1))
+
+    def _record(self, row: int, timestep: TimeStep) -> None:
+        environment, shown = self._environment(row), self._shown
+        true = environment.physics.data.qpos
+        if timestep.first():
+            self._starts[row] = true[self._poses]
+        shown.data.qpos[:] = true
+        shown.data.qpos[self._poses] = self._nominal
+        if not self._hides_movement:
+            shown.data.qpos[self._poses] = _moved(
+                self._nominal, self._starts[row], true[self._poses]
+            )
+        # All that is drawn follows from positions, hence without contacts and forces.
+        mujoco.mj_kinematics(shown.model.ptr, shown.data.ptr)
+        mujoco.mj_camlight(shown.model.ptr, shown.data.ptr)
+        if self._renderer is not None:
+            self._renderer.render(shown.data.ptr, out=self._current["pixels"][row])
+        if "state" in self._current:
+            observation = environment.task.get_observation(shown)
+            self._current["state"][row] = observation["privileged_state"]
+
+
+def _moved(poses: NDArray, start: NDArray, now: NDArray) -> NDArray:
+    """Move and turn poses ``[N, 7]``, position and quaternion, as others from ``start`` to now."""
+    out = poses.copy()
+    out[:, :3] += now[:, :3] - start[:, :3]
+    back, turn = np.empty((2, 4))
+    for i in range(len(poses)):
+        mujoco.mju_negQuat(back, start[i, 3:])
+        mujoco.mju_mulQuat(turn, now[i, 3:], back)
+        mujoco.mju_mulQuat(out[i, 3:], turn, poses[i, 3:])
+    return out
+
+
+def measure_looking(
+    run: LoadedRun, episodes: int, watch: Callable[[], object] = lambda: None
+) -> list[Row]:
+    """Test the policies of all seeds of a run in each condition, without noise.
+
+    Starts and demonstrations, held-out ones, are the same in all conditions. Random actions, played
+    from the same starts, show what needs neither eyes nor learning.
+
+    Args:
+        run: The run.
+        episodes: Test episodes of each task and seed.
+        watch: Called at each step of the policies, at most ``max_steps + 1`` times a condition.
+
+    Raises:
+        ValueError: If ``episodes`` is less than 1.
+    """
+    if episodes < 1:
+        raise ValueError(f"--episodes must be at least 1, got {episodes}")
+    config, found = run.config, {}
+    for name, hidden in VIEWS.items():
+        make_env = None if hidden is None else partial(HidingEnv, hidden=hidden)
+        evaluator = evaluator_of(run, episodes, make_env)
+        snapshots = snapshots_of(run, evaluator, _NUMBER)
+        success = evaluator.run(snapshots, run.algorithm.device, watch).success
+        found[name] = success.double().mean(-1).numpy()
+        evaluator.simulation.close()
+    found[RANDOM] = np.array([_by_chance(run, seed, episodes) for seed in config.seeds])
+    return [
+        Row(name, seed, task, episodes, round(float(success[i, j]), 4))
+        for name, success in found.items()
+        for i, seed in enumerate(config.seeds)
+        for j, task in enumerate(config.tasks)
+    ]
+
+
+def _by_chance(run: LoadedRun, seed: int, episodes: int) -> NDArray[np.float64]:
+    """Return the success of random actions from a seed's starts, ``[T]``."""
+    tasks, max_steps = run.config.tasks, run.config.algorithm.max_steps
+    starts = start_seeds(seed, _NUMBER, (len(tasks), episodes))
+    played = play(tasks, starts, seed, random_actions, max_steps)
+    return np.reshape([episode.success for episode in played], starts.shape).mean(-1)
+
+
+def success_by_condition(rows: Iterable[Row]) -> tuple[tuple[str, ...], dict[str, NDArray]]:
+    """Return the tasks, and each condition's success ``[S, T]``, in the order of the rows."""
+    found: dict[str, dict[int, list[float]]] = {}
+    tasks = dict[str, None]()
+    for row in rows:
+        tasks[row.task] = None
+        found.setdefault(row.condition, {}).setdefault(row.seed, []).append(row.success)
+    return tuple(tasks), {name: np.array([*seeds.values()]) for name, seeds in found.items()}
+
+
+def looking_table(rows: Iterable[Row]) -> list[list[str]]:
+    """Return the table of success (%) by task and condition: mean over seeds, 95 % t interval.
+
+    The last row holds the means over tasks. A single seed has no interval.
+    """
+    tasks, found = success_by_condition(rows)
+    table = [["success, %", *found]]
+    for column, task in enumerate(tasks):
+        table.append([task, *(statistics.mean(s[:, column]).percent() for s in found.values())])
+    table.append(["all", *(statistics.mean(s.mean(1)).percent() for s in found.values())])
+    return table

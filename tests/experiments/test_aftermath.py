@@ -1,0 +1,231 @@
+"""What becomes of successes: of those in earnest, and of touches, throws and falls."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+
+from bgpo_trl.evaluation import start_seeds
+from bgpo_trl.experiments import aftermath
+from bgpo_trl.experiments.aftermath import CRITERIA, Continuation, Row
+from bgpo_trl.experiments.episodes import play
+from suites import nico
+
+NUMBER = aftermath._NUMBER
+in_every_task = pytest.mark.parametrize("task", nico.ALL_TASKS)
+
+
+@cache
+def demonstrated(task):
+    """A success of the demonstrator."""
+    episodes = aftermath.scripted_episodes((task,), [1, 2], 1, 50, "demonstrators")
+    return next(episode for episode in episodes if episode.success)
+
+
+def outcome(task, episode, **changes):
+    return CRITERIA[task].judge(Continuation(), replace(episode, **changes))
+
+
+def ending(episode, change):
+    """The last state of an episode after a change."""
+    physics = Continuation().begin(episode.end)
+    change(physics)
+    return physics.get_state()
+
+
+@in_every_task
+def test_what_a_demonstrator_does_is_in_earnest(task):
+    holds, distance = outcome(task, demonstrated(task))
+    assert holds
+    if CRITERIA[task].distance == "gap":
+        assert distance < 0.005
+    else:
+        assert distance > {"lift": 0.1, "displacement": 0.03}[CRITERIA[task].distance]
+
+
+@pytest.mark.parametrize(
+    ("other", "task"), [("push_glass_right", "grasp_glass"), ("push_green_to_white", "lift_green")]
+)
+def test_what_is_merely_touched_is_not_lifted(other, task):
+    pushed = demonstrated(other)
+    name = "glass" if task == "grasp_glass" else "green_box"
+    assert Continuation().begin(pushed.end).touching("hand", name)
+    holds, lift = outcome(task, pushed)
+    assert not holds
+    assert lift < 0.01
+
+
+def test_what_is_thrown_up_is_not_lifted():
+    def throw(physics):
+        physics.named.data.qpos["glass"][:3] += [0.0, 0.3, 0.2]  # out of the hand's reach
+        physics.named.data.qvel["glass"][2] = 12.0  # in the air until 2.4 s later
+
+    pushed = demonstrated("push_glass_right")
+    thrown = ending(pushed, throw)
+    then = Continuation()
+    then.begin(thrown)
+    then.act(np.zeros(4), 11)  # of the faster raises, and the second after them
+    assert then.physics.object_position("glass")[2] > 1
+    assert outcome("grasp_glass", pushed, end=thrown) == (False, 0.0)
+
+
+def apart(velocity, distance=0.0):
+    def change(physics):
+        away = physics.object_position("green_box") - physics.object_position("glass")
+        away[2] = 0
+        away /= np.linalg.norm(away)
+        physics.named.data.qpos["green_box"][:3] += distance * away
+        physics.named.data.qvel["green_box"][:3] += velocity * away
+        physics.named.data.qpos["shoulder_pitch"] += 1.0  # The hand is no longer in the way.
+        physics.named.data.ctrl["shoulder_pitch"] += 1.0
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "together"),
+    [
+        (apart(0.0), True),
+        (apart(0.0, 0.01), True),
+        (apart(0.0, 0.025), False),
+        (apart(1.0), False),  # They touch, and part.
+    ],
+)
+def test_what_is_together_has_to_stay_so(change, together):
+    pushed = demonstrated("push_green_to_glass")
+    holds, gap = outcome("push_green_to_glass", pushed, end=ending(pushed, change))
+    assert holds == together
+    assert (gap <= 0.015) == together
+
+
+def topple(physics):
+    physics.named.data.qpos["glass"][3:] = [np.sqrt(0.5), np.sqrt(0.5), 0, 0]
+    physics.named.data.qpos["glass"][2] -= 0.01
+
+
+def slide(physics):
+    physics.named.data.qvel["glass"][0] = 3.0  # along the table, and off it
+    physics.named.data.qpos["shoulder_pitch"] += 1.0
+    physics.named.data.ctrl["shoulder_pitch"] += 1.0
+
+
+@pytest.mark.parametrize("change", [topple, slide])
+def test_what_was_pushed_aside_has_to_stand_there(change):
+    pushed = demonstrated("push_glass_right")
+    assert not outcome("push_glass_right", pushed, end=ending(pushed, change)).holds
+
+
+def test_what_moves_does_not_stand():
+    physics = Continuation().begin(demonstrated("press_white").start)
+    assert all(aftermath.stands(physics, name) for name in nico.OBJECTS)
+    physics.named.data.qvel["glass"][1] = 0.03
+    assert [aftermath.stands(physics, name) for name in nico.OBJECTS] == [False, True, True]
+
+
+def test_what_was_pushed_to_the_other_side_was_not_pushed_aside():
+    pushed = demonstrated("push_white_left")
+    left = outcome("push_white_left", pushed)
+    right = outcome("push_white_right", pushed)
+    assert left.holds and not right.holds
+    assert right.distance == -left.distance
+    assert not outcome("push_white_left", pushed, end=pushed.start).holds
+
+
+def test_what_comes_back_was_not_pushed_aside():
+    pushed, then = demonstrated("push_white_left"), Continuation()
+
+    def pull(physics):
+        """Brings the box back, half of the way to where it stood."""
+        start = Continuation().begin(pushed.start).object_position("white_box")
+        physics.named.data.qpos["white_box"][:2] += start[:2]
+        physics.named.data.qpos["white_box"][:2] /= 2
+        physics.named.data.qpos["shoulder_pitch"] += 1.0
+        physics.named.data.ctrl["shoulder_pitch"] += 1.0
+
+    # Success with the box at its farthest; the box then returns while nothing is done.
+    wait, then.act = then.act, lambda *_: pull(then.physics) or wait(*_)
+    holds, displacement = CRITERIA["push_white_left"].judge(then, pushed)
+    assert aftermath.stands(then.physics, "white_box")
+    assert not holds and displacement > 0
+
+
+def test_a_fist_in_the_air_presses_nothing():
+    pressed = demonstrated("press_white")
+
+    def rise(physics):
+        physics.named.data.qpos["shoulder_pitch"] += 1.0
+        physics.named.data.ctrl["shoulder_pitch"] += 1.0
+
+    holds, gap = outcome("press_white", pressed, end=ending(pressed, rise))
+    assert not holds and gap > 0.05
+
+
+def test_a_simulation_is_continued_as_in_the_environment():
+    env = nico.load("press_white", seed=5, observation="state")
+    env.reset()
+    then = Continuation()
+    then.begin(env.physics.get_state())
+    for action in np.random.default_rng(0).uniform(-1, 1, (5, 4)):
+        env.step(action)
+        then.act(action, 1)
+        np.testing.assert_array_equal(then.physics.get_state(), env.physics.get_state())
+
+
+class Close(nico.NicoTask):
+    """Success: the hand is a fist."""
+
+    def succeeded(self, physics):
+        return bool(physics.joint_angles()[3] > 0.6)
+
+
+def test_episodes_of_a_policy_are_those_of_its_actions(scripted_run):
+    action = [0.0, 0.1, 0.0, 0.2]
+    run = scripted_run(
+        "close", Close, lambda state: torch.tensor(action).expand(*state[..., :4].shape)
+    )
+    found = aftermath.policy_episodes(run, 5)
+    assert [episode.seed for episode in found] == [3] * 5 + [8] * 5
+    expected = [
+        episode
+        for seed in (3, 8)
+        for episode in play(
+            ("close",), start_seeds(seed, NUMBER, (1, 5)), seed, lambda *_: lambda _: action, 6
+        )
+    ]
+    physics = Continuation().physics
+    for ours, theirs in zip(found, expected, strict=True):
+        assert (ours.task, ours.seed, ours.success) == (theirs.task, theirs.seed, theirs.success)
+        np.testing.assert_array_equal(ours.start, theirs.start)
+        np.testing.assert_allclose(ours.end, theirs.end, atol=1e-6)
+        physics.set_state(ours.end)
+        assert ours.success == Close(random=0).succeeded(physics)
+    assert 0 < sum(episode.success for episode in found) < 10
+
+
+def test_own_tasks_need_a_criterion(monkeypatch):
+    episode = replace(demonstrated("press_white"), task="juggle")
+    with pytest.raises(ValueError, match="success of juggle is worth: add a Criterion to"):
+        aftermath.judge("policy", [episode])
+    assert aftermath.judge("policy", [replace(episode, success=False)]) == []
+    monkeypatch.setitem(CRITERIA, "juggle", CRITERIA["press_white"])
+    (row,) = aftermath.judge("policy", [episode])
+    assert row[:5] == ("policy", episode.seed, "juggle", True, "gap")
+
+
+def test_the_table_by_hand():
+    rows = [
+        Row("policy", 0, "a", True, "lift", 0.3),
+        Row("policy", 0, "a", False, "lift", 0.01),
+        Row("policy", 1, "a", True, "lift", 0.2),
+        Row("policy", 1, "b", False, "gap", -0.0001),
+        Row("random", 1, "b", True, "gap", 0.01),
+    ]
+    played = {"policy": {"a": 4, "b": 4}, "random": {"a": 4, "b": 5}}
+    assert aftermath.aftermath_table(rows, played)[1:] == [
+        ["policy", "a", "3 of 4", "66.7", "20.0 (lift)"],
+        ["policy", "b", "1 of 4", "0.0", "0.0 (gap)"],
+        ["random", "a", "0 of 4", "", ""],
+        ["random", "b", "1 of 5", "100.0", "1.0 (gap)"],
+    ]
