@@ -36,9 +36,16 @@ SAME = {"gwr+r_int": "bgpo-single", "experts": "bgpo-experts", "all": "bgpo"}
 
 # Entries of config.json that belong to an algorithm or to keeping its run. All others, such as
 # encoders, starts, and the half of the demonstrations to test on, are conditions of a comparison.
-_OF_THE_RUN = ("name", "algorithm", "algorithm_class", "seeds", "checkpoint_minutes")
+_OF_THE_RUN = (
+    "name",
+    "algorithm",
+    "algorithm_class",
+    "seeds",
+    "checkpoint_minutes",
+    "task_modules",
+)
 _USUAL = "practised"
-_OF_THE_SETTING = ("tasks", "task_starts", "task_modules", "schedule", "episodes")
+_OF_THE_SETTING = ("tasks", "task_starts", "schedule", "episodes")
 
 
 @dataclass(frozen=True)
