@@ -18,7 +18,7 @@ import numpy as np
 from dm_env import TimeStep
 from numpy.typing import NDArray
 
-from bgpo_trl.analysis.intervals import t_interval
+from bgpo_trl.analysis import statistics
 from bgpo_trl.envs import NicoEnv
 from bgpo_trl.evaluation import start_seeds
 from bgpo_trl.experiments.episodes import evaluator_of, play, random_actions, snapshots_of
@@ -181,14 +181,6 @@ def looking_table(rows: Iterable[Row]) -> list[list[str]]:
     tasks, found = success_by_condition(rows)
     table = [["success, %", *found]]
     for column, task in enumerate(tasks):
-        table.append([task, *(_cell(success[:, column]) for success in found.values())])
-    table.append(["all", *(_cell(success.mean(1)) for success in found.values())])
+        table.append([task, *(statistics.mean(s[:, column]).percent() for s in found.values())])
+    table.append(["all", *(statistics.mean(s.mean(1)).percent() for s in found.values())])
     return table
-
-
-def _cell(of_seeds: NDArray) -> str:
-    mean = f"{100 * of_seeds.mean():.1f}"
-    if len(of_seeds) < 2:
-        return mean
-    low, high = np.clip(t_interval(of_seeds), 0.0, 1.0)
-    return f"{mean} [{100 * low:.0f}, {100 * high:.0f}]"

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +15,7 @@ from matplotlib.ticker import MaxNLocator, MultipleLocator
 from numpy.typing import NDArray
 
 from bgpo_trl.figures.style import add_legend, mark_starts, style_axes, task_markers
-from bgpo_trl.runs.results import count, read_rows
+from bgpo_trl.runs.results import COUNT, Cells, read_table
 
 
 @dataclass(frozen=True)
@@ -51,13 +50,15 @@ def read_groups(
     Raises:
         ValueError: If the file is missing or damaged, or its run has no groups.
     """
-    columns: dict[str, Callable[[str], object]] = {"task": task_names.index}
-    columns |= dict.fromkeys(("seed", "episode", "group", "num_groups"), count)
-    rows: dict[int, list[tuple[int, int, int, int]]] = defaultdict(list)
-    for row in read_rows(path, columns):
-        episode, group, num_groups = (int(row[name]) for name in ("episode", "group", "num_groups"))
-        rows[int(row["seed"])].append((episode, task_names.index(row["task"]), group, num_groups))
-    return {seed: GroupedEpisodes(*np.array(sorted(rows[seed])).T) for seed in sorted(rows)}
+    columns: dict[str, Cells] = {"task": task_names}
+    columns |= dict.fromkeys(("seed", "episode", "group", "num_groups"), COUNT)
+    table = read_table(path, columns).sort_values(["seed", "episode"])
+    table["task"] = table["task"].map(list(task_names).index)
+    shown = ["episode", "task", "group", "num_groups"]
+    return {
+        int(seed): GroupedEpisodes(*table.loc[table["seed"] == seed, shown].to_numpy(np.int64).T)
+        for seed in table["seed"].unique()
+    }
 
 
 def plot_groups(seeds: Mapping[int, GroupedEpisodes], presented: Mapping[str, int]) -> Figure:

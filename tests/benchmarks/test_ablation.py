@@ -15,7 +15,7 @@ from bgpo_trl.algorithms import ABLATIONS
 from bgpo_trl.algorithms.bgpo import BGPO
 from bgpo_trl.experiments.arguments import Arguments, command_line
 from bgpo_trl.files.checkpoint import load_checkpoint
-from bgpo_trl.runs.results import read_rows
+from bgpo_trl.runs.results import read_table
 from bgpo_trl.transforms import BehaviorLookup, GroupLookup, TaskSchedule
 
 pytestmark = pytest.mark.usefixtures("easy_world")
@@ -243,10 +243,10 @@ def test_the_command_line_runs_a_variant_under_its_name(
     config = json.loads((run / "config.json").read_text())
     assert (config["name"], config["task_starts"]) == (variant, [0, 0, 0])
     for file in ("train.csv", "eval.csv"):
-        assert {row["algorithm"] for row in read_rows(run / file)} == {variant}
-    for row in read_rows(run / "train.csv"):
-        assert (int(row["num_nodes"]) > 1) == has_gwr(variant)
-        assert (float(row["intrinsic_return"]) > 0) == has_reward(variant)
+        assert set(read_table(run / file)["algorithm"]) == {variant}
+    train = read_table(run / "train.csv")
+    assert ((train["num_nodes"].astype(int) > 1) == has_gwr(variant)).all()
+    assert ((train["intrinsic_return"].astype(float) > 0) == has_reward(variant)).all()
     learner = load_checkpoint(run / "checkpoint")["algorithm"]
     assert ("gwr" in learner) == has_gwr(variant)
     assert ("groups" in learner) == has_groups(variant)

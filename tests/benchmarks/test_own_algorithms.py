@@ -12,7 +12,7 @@ from bgpo_trl.algorithms import ALGORITHMS, entry
 from bgpo_trl.algorithms.rl import RL
 from bgpo_trl.experiments.arguments import Arguments, run_config
 from bgpo_trl.experiments.watch import WatchArguments, watch
-from bgpo_trl.runs.results import read_rows
+from bgpo_trl.runs.results import read_table
 from suites import nico
 
 OWN = """
@@ -77,7 +77,7 @@ def test_an_algorithm_of_a_module_runs_and_is_filmed(
     continual.main(Arguments(algorithm="mine", module="my_algorithm"))
     run = folder / "runs" / "continual-mine-quick"
     assert str(run.relative_to(folder)) in capsys.readouterr().out
-    assert {row["algorithm"] for row in read_rows(run / "eval.csv")} == {"mine"}
+    assert set(read_table(run / "eval.csv")["algorithm"]) == {"mine"}
     told = json.loads((run / "config.json").read_text())
     assert told["algorithm"]["share"] == 0.25
 

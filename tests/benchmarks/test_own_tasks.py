@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import one_shot
 import pytest
-import summary
+import report
 
 from bgpo_trl.experiments.watch import WatchArguments, watch
 from bgpo_trl.own_module import import_own
@@ -51,7 +51,7 @@ def run(bank, encoders, make_config, tmp_path, monkeypatch):
 def test_a_run_is_filmed_tested_and_summed_up_where_its_module_is_named(run, capsys):
     with pytest.raises(ValueError, match="'at_once', added by the module 'at_once_tasks': name"):
         watch(WatchArguments(run))
-    summary.main(summary.Arguments((run,)))  # Needs no module.
+    report.main(report.Arguments((run,)))  # Needs no module.
     assert "| at_once |" in capsys.readouterr().out
 
     told = watch(WatchArguments(run, module="at_once_tasks"))
