@@ -22,7 +22,6 @@ from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.demonstration_replay import DemonstrationReplay
 from bgpo_trl.data.group_replay import GroupReplay
 from bgpo_trl.encoders.representation import Representation
-from bgpo_trl.encoders.shipped import find_weights, groups_config
 from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.modules.gwr import GWRB
 from bgpo_trl.seeding import generators
@@ -78,10 +77,14 @@ class BGPO(Algorithm):
                 **asdict(config.gwr),
             )
         if variant.groups:
-            found_by = config.groups or groups_config(find_weights(bank.encoder_id))
             self.groups = BehaviorGroups(
-                embedding_size, batch_size=[len(seeds)], **asdict(found_by)
+                embedding_size,
+                batch_size=[len(seeds)],
+                smallest=config.group_size,
+                evidence=config.group_evidence,
             )
+        self._shown_embedding = bank.embedding
+        self._revision = torch.zeros(len(seeds), dtype=torch.int64)
         sizes = {"behavior": embedding_size, "label": self.n_tasks, None: 0}
         self.in_keys = [config.state, *(["context"] if variant.context else [])]
 
@@ -109,6 +112,7 @@ class BGPO(Algorithm):
             rl.replay_size,
             generator=generators(seeds, "replay"),
             keys=[*keys, "action", *(("next", key) for key in (keys[0], "reward", "terminated"))],
+            source_key="demo_index" if variant.groups else None,
         )
         self.shown = self.demonstrations(config, bank, seeds, constant_keys=keys[1:])
 
@@ -144,18 +148,42 @@ class BGPO(Algorithm):
         return tensordict.set("action", self.learner.act(seen, self._noise, expert))
 
     def store(self, transition: TensorDictBase) -> None:
-        """Store a transition of each seed and, at the end of an episode, its demonstration."""
+        """Store a transition of each seed and, at the end of an episode, its demonstration.
+
+        Where demonstrations have changed their groups, all that is stored follows.
+        """
         group = torch.tensor(self._groups_of(transition))
         self.replay.add(transition, group)
-        if self.shown is None:
-            return
+        if self.shown is not None:
+            self._store_demonstration(self.shown, transition, group)
+        self._follow_groups()
+
+    def _store_demonstration(
+        self, shown: DemonstrationReplay, transition: TensorDictBase, group: Tensor
+    ) -> None:
         ended = transition.get(("next", "done")).flatten()
         if ended.any():
             reward = torch.ones(self.n_seeds)
             if self.beta:
                 error = transition["behavior"] - transition["demo_embedding"]
                 reward += self.beta * torch.exp(-torch.linalg.vector_norm(error, dim=-1))
-            self.shown.add(transition, reward, group, ended)
+            shown.add(transition, reward, group, ended)
+
+    def _follow_groups(self) -> None:
+        """Assign what is stored to the groups of today; put experts of former groups aside."""
+        if self.groups is None or (changed := self.groups.revision != self._revision).sum() == 0:
+            return
+        self._revision = self.groups.revision
+        shown = self._shown_embedding.expand(self.n_seeds, *self._shown_embedding.shape)
+        group_of = self.groups.lookup(shown, changed).group
+        for seed in changed.nonzero().flatten().tolist():
+            for replay in (self.replay, self.shown):
+                if replay is not None:
+                    replay.regroup(seed, group_of[seed])
+            known = self.groups.numbers(seed)
+            for group in self._active.group[seed].tolist():
+                if group >= 0 and group not in known:
+                    (self.experts if self.config.experts else self._active).rest(seed, group)
 
     def update(self) -> dict[str, Tensor]:
         """Make one update of each seed."""
@@ -230,6 +258,8 @@ class BGPO(Algorithm):
         super().load_state_dict(state)
         self.experts.load_state_dict(state["experts"])
         self._active.load_state_dict(state["active"])
+        if self.groups is not None:
+            self._revision = self.groups.revision
 
     def _learned(self) -> dict[str, Any]:
         parts = {"gwr": self.gwr, "groups": self.groups, "shown": self.shown}

@@ -53,6 +53,14 @@ class ActiveGroups:
         order.append(slot)
         return slot
 
+    def rest(self, seed: int, group: int) -> int:
+        """Free the slot of an active group, and return it."""
+        slot, order = self._slots[seed].index(group), self._order[seed]
+        self._slots[seed][slot] = -1
+        order.remove(slot)
+        order.insert(0, slot)
+        return slot
+
     def rows(self, n_rows: int) -> Tensor:
         """Assign the active groups in turn to ``n_rows`` rows, int64 ``[S, n_rows]``."""
         active = [[group for group in slots if group >= 0] or [-1] for slots in self._slots]
@@ -94,6 +102,11 @@ class Experts:
         """Activate the group of each seed's episode; return its slots, int64 ``[S]``."""
         return torch.tensor([self._play(seed, group) for seed, group in enumerate(groups)])
 
+    def rest(self, seed: int, group: int) -> None:
+        """Put the networks of an active group aside, until it is played again."""
+        slot = self.active.rest(seed, group)
+        self._aside[seed][group] = self._copy(seed, slot)
+
     def actor_weights(self, seed: int, group: int) -> State:
         """Copy the weights of a group's policy to the CPU, given the position of the seed.
 
@@ -134,7 +147,7 @@ class Experts:
         before = self.active.group[seed].tolist()
         slot = self.active.play(seed, group)
         if before[slot] >= 0:
-            aside[before[slot]] = {k: v.clone() for k, v in self._read(seed, slot).items()}
+            aside[before[slot]] = self._copy(seed, slot)
         if group or state:
             self._write(seed, slot, state)
         return slot
@@ -154,6 +167,9 @@ class Experts:
     def _read(self, seed: int, slot: int) -> State:
         tensors = _tensors(self.learner, self._batch)
         return {key: value[seed, slot] for key, value in tensors.items()}
+
+    def _copy(self, seed: int, slot: int) -> State:
+        return {key: value.clone() for key, value in self._read(seed, slot).items()}
 
     def _write(self, seed: int, slot: int, state: State) -> None:
         for key, value in _tensors(self.learner, self._batch).items():

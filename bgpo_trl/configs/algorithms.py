@@ -105,10 +105,10 @@ class BGPOConfig(AlgorithmConfig):
     expert_batch_size: int = 64
     """Transitions of each active group per update, with experts. Ours: as many as MAML and Dist-NLL
     have per task; without experts, the RL algorithm's ``batch_size`` is shared by all groups."""
-    groups: GWRBConfig | None = None
-    """The coarse network that finds the groups, ours. By default one that finds one group, rarely
-    two, for each task of NICO with the encoders of the bank
-    (`bgpo_trl.encoders.shipped.groups_config`)."""
+    group_size: int = 10
+    """Least number of different demonstrations of a group of behaviors. Ours."""
+    group_evidence: float = 3.0
+    """Standard errors by which the density between two groups must be lower than in them. Ours."""
 
     @property
     def grouped(self) -> bool:
@@ -119,7 +119,8 @@ class BGPOConfig(AlgorithmConfig):
         super().__post_init__()
         at_least(self, 0, "beta")
         whole(self, 1, "active_groups", "expert_batch_size")
-        positive(self, "behavior_scale")
+        positive(self, "behavior_scale", "group_evidence")
+        whole(self, 4, "group_size")
         holds = self.even_replay or not self.experts
         check(self, ("even_replay", holds, "set where there are experts"))
         _check_played(self, self.expert_batch_size if self.experts else self.rl.batch_size)
