@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any, cast
 
 import torch
@@ -89,25 +89,22 @@ class BGPO(Algorithm):
         self.in_keys = [config.state, *(["context"] if variant.context else [])]
 
         rl, keys = config.rl, self.in_keys
-        n_slots = config.active_groups if config.grouped else 1
-        self.learner = make_learner(
-            rl,
-            LearnerSpec(
-                seeds=seeds,
-                in_keys=keys,
-                in_features=self.state_size + sizes[variant.context],
-                return_bounds=(0.0, self._highest_return()),
-                device=self.device,
-                experts=range(n_slots if config.experts else 1),
-            ),
+        spec = LearnerSpec(
+            seeds=seeds,
+            in_keys=keys,
+            in_features=self.state_size + sizes[variant.context],
+            return_bounds=(0.0, self._highest_return()),
+            device=self.device,
         )
-        self.test_actor = self.learner.actor
-        self._active = ActiveGroups(len(seeds), n_slots)
+        n_active = config.active_groups if config.grouped else 1
+        self._active = ActiveGroups(len(seeds), n_active, config.rest_after)
         self.experts = Experts(
-            self.learner,
+            lambda width: make_learner(rl, replace(spec, experts=range(width))),
             self._active if config.experts else ActiveGroups(len(seeds), 1),
             lambda seed, group: 0 if self.groups is None else self.groups.parent(seed, group),
         )
+        self.learner = self.experts.learner
+        self.test_actor = self.learner.actor
         self.replay = GroupReplay(
             rl.replay_size,
             generator=generators(seeds, "replay"),
@@ -140,6 +137,7 @@ class BGPO(Algorithm):
         groups = self._groups_of(tensordict)
         if self.config.experts:
             expert = self.experts.play(groups)
+            self.learner = self.experts.learner
         else:
             expert = torch.zeros(self.n_seeds, dtype=torch.int64)
             for seed, group in enumerate(groups):
@@ -184,6 +182,7 @@ class BGPO(Algorithm):
             for group in self._active.group[seed].tolist():
                 if group >= 0 and group not in known:
                     (self.experts if self.config.experts else self._active).rest(seed, group)
+        self.learner = self.experts.learner
 
     def update(self) -> dict[str, Tensor]:
         """Make one update of each seed."""
@@ -193,7 +192,7 @@ class BGPO(Algorithm):
 
     def _sample(self) -> TensorDictBase:
         """Sample the transitions of an update, ``[S, E, B]``."""
-        config, (_, n_experts) = self.config, self.experts.active.group.shape
+        config, n_experts = self.config, self.experts.width
         n_rows = config.expert_batch_size if config.experts else config.rl.batch_size
 
         def groups_of(n_rows: int) -> Tensor:
@@ -255,8 +254,9 @@ class BGPO(Algorithm):
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a `state_dict`."""
-        super().load_state_dict(state)
         self.experts.load_state_dict(state["experts"])
+        self.learner = self.experts.learner
+        super().load_state_dict(state)
         self._active.load_state_dict(state["active"])
         if self.groups is not None:
             self._revision = self.groups.revision

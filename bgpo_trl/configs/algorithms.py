@@ -102,6 +102,10 @@ class BGPOConfig(AlgorithmConfig):
     active_groups: int = 3
     """Largest number of groups per update, those played last. Ours: bounds the cost of an
     update."""
+    rest_after: int = 500
+    """Training steps without being played after which a group rests: it has no part in updates and
+    its expert does not change until it is played again. Ours: from old transitions alone, an expert
+    gets worse (docs/learning.md)."""
     expert_batch_size: int = 64
     """Transitions of each active group per update, with experts. Ours: as many as MAML and Dist-NLL
     have per task; without experts, the RL algorithm's ``batch_size`` is shared by all groups."""
@@ -118,7 +122,7 @@ class BGPOConfig(AlgorithmConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         at_least(self, 0, "beta")
-        whole(self, 1, "active_groups", "expert_batch_size")
+        whole(self, 1, "active_groups", "rest_after", "expert_batch_size")
         positive(self, "behavior_scale", "group_evidence")
         whole(self, 4, "group_size")
         holds = self.even_replay or not self.experts
