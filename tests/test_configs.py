@@ -61,6 +61,7 @@ SETTINGS = [
     (GWRBConfig, {"activity_scale": 0.0}, "a number above 0"),
     (GWRBConfig, {"activity_threshold": 1.0}, "between 0 and 1"),
     (RunConfig, {"held_out": "training"}, "validation or test"),
+    (RunConfig, {"schedule": "cumulative"}, "practised or sequential"),
     (BGPOConfig, {"active_groups": 0}, "at least 1"),
     (BGPOConfig, {"expert_batch_size": 0}, "at least 1"),
     (BGPOConfig, {"behavior_scale": 0.0}, "a number above 0"),

@@ -19,7 +19,7 @@ Values = NDArray[np.float64]
 # Entries of a config.json that a comparison needs; those of runs that must be alike.
 _CONFIG = {"episodes": int, "seeds": list, "task_starts": list}
 _TESTS = ("held_out", "eval_every", "eval_episodes", "max_steps")
-_TERMS = ("seeds", "tasks", "task_starts", *_TESTS)
+_TERMS = ("seeds", "tasks", "task_starts", "schedule", *_TESTS)
 
 
 @dataclass(frozen=True)
@@ -170,7 +170,8 @@ def _eval_every(config: dict[str, Any], curves: Curves) -> int:
 
 def _terms(run: Run) -> dict[str, Any]:
     limit = {"max_steps": (run.config.get("algorithm") or {}).get("max_steps")}
-    return {**run.config, **limit, "tasks": run.tasks}
+    practised = {"schedule": "practised"}  # in all runs of earlier versions
+    return {**practised, **run.config, **limit, "tasks": run.tasks}
 
 
 def starts(run: Run) -> list[int]:
