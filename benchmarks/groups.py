@@ -5,8 +5,8 @@
 
 shows demonstrations in the order of training episodes, in four schedules, and prints by seed: how
 many groups there are at the end; how pure they are on held-out demonstrations; how many different
-demonstrations of its own each task needed before it had a group (the most demanding task); in how
-many held-out demonstrations GWR-B infers the task; and how long grouping took.
+demonstrations of its own each task needed before it had a group (the most demanding task); how long
+grouping took; the nodes of GWR-B, and in how many held-out demonstrations it infers the task.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from bgpo_trl.analysis.task_inference import group_purity, task_inference_accuracy
-from bgpo_trl.configs import BGPOConfig
+from bgpo_trl.configs import BGPOConfig, GWRBConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.experiments.arguments import BankArguments, check_draws, command_line, even_starts
 from bgpo_trl.experiments.run import bank_of
@@ -36,6 +36,8 @@ class Arguments(BankArguments):
 
     draws: int = 1_800
     """Demonstrations that each network is shown."""
+    activity_scale: float = GWRBConfig.activity_scale
+    """Factor of distances in the activity of GWR-B."""
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
     """Seeds of the draws."""
     scale: float = 1.0
@@ -95,7 +97,7 @@ def main(arguments: Arguments) -> None:
     check_draws(arguments.seeds, arguments.draws)
     bank, config = bank_of(arguments), BGPOConfig()
     bank = replace(bank, embedding=arguments.scale * bank.embedding)
-    fine = replace(config.gwr, activity_scale=config.gwr.activity_scale / arguments.scale)
+    fine = replace(config.gwr, activity_scale=arguments.activity_scale / arguments.scale)
     n_tasks, seen, held_out = len(bank.tasks), bank.seen(), bank.held_out()
     forward = even_starts(n_tasks, arguments.draws)
     schedules = {
@@ -104,8 +106,8 @@ def main(arguments: Arguments) -> None:
         "the newest only": TaskSchedule(forward, cumulative=False),
         "from the start": TaskSchedule((0,) * n_tasks),
     }
-    print("| order | groups, by seed | purity, % | needed | inferred by GWR-B, % | seconds |")
-    print("|---|---|---|---|---|---|")
+    print("| order | groups, by seed | purity, % | needed | seconds | nodes | inferred, % |")
+    print("|---|---|---|---|---|---|---|")
     for order, schedule in schedules.items():
         columns: list[list[str]] = []
         for seed in arguments.seeds:
@@ -121,8 +123,9 @@ def main(arguments: Arguments) -> None:
                     f"{int(groups.num_groups)}",
                     f"{100 * float(group_purity(groups, held_out, n_tasks)):.4g}",
                     f"{max(needed.values())}" if len(needed) == n_tasks else "never",
-                    f"{100 * float(inferred):.4g}",
                     f"{seconds:.1f}",
+                    f"{int(gwr.num_nodes)}",
+                    f"{100 * float(inferred):.4g}",
                 ]
             )
         cells = (" ".join(column) for column in zip(*columns, strict=True))

@@ -40,4 +40,4 @@ def test_the_shipped_tasks_form_three_pure_groups(capsys, scale):
         "from the start",
     ]
     assert all(row[1:3] == ["3", "100"] for row in cells)
-    assert all(1 < int(row[3]) <= 30 and float(row[4]) > 95 for row in cells)
+    assert all(1 < int(row[3]) <= 30 and float(row[6]) > 95 for row in cells)
