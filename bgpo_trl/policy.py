@@ -40,9 +40,10 @@ class Recognition:
         node: Identity of that node.
         activity: Activity of that node in [0, 1]; 1 for a demonstration equal to it.
         group: Number of the group of behaviors; None without groups, as are the next two.
-        group_activity: Activity of the best match among the groups' nodes, in [0, 1].
-        known: Whether that reaches the threshold of a known group. It is reliable for encoders that
-            have seen the task; of a task new to them, most demonstrations count as known.
+        group_novelty: Distance to the group's demonstrations, relative to the group's own extent.
+        known: Whether it lies within that extent, so that the novelty is at most 1. It is reliable
+            for encoders that have seen the task; of a task new to them, most demonstrations count
+            as known.
         task: The label given with the demonstration.
     """
 
@@ -51,7 +52,7 @@ class Recognition:
     node: int | None = None
     activity: float | None = None
     group: int | None = None
-    group_activity: float | None = None
+    group_novelty: float | None = None
     known: bool | None = None
     task: str | None = None
 
@@ -141,10 +142,9 @@ class TrainedPolicy:
             recognized["activity"] = float(match.activity[index])
         if algorithm.groups is not None:
             member = algorithm.groups.lookup(shown)
-            activity = float(member.activity[index])
             recognized["group"] = int(member.group[index])
-            recognized["group_activity"] = activity
-            recognized["known"] = activity >= algorithm.groups.activity_threshold
+            recognized["group_novelty"] = float(member.novelty[index])
+            recognized["known"] = bool(member.known[index])
         return Recognition(embedding, **recognized, task=task)
 
     @torch.no_grad()

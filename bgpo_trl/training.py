@@ -95,7 +95,9 @@ class Trainer(Closing):
                 "(bgpo_trl.encoders.make_bank)"
             )
         bank = bank.for_tasks(config.tasks)
-        self._schedule = schedule = TaskSchedule(starts=config.task_starts)
+        self._schedule = schedule = TaskSchedule(
+            config.task_starts, cumulative=config.schedule == "practised"
+        )
         seeds = config.seeds
         make = entry(config.name).make if make is None else make
         self.algorithm = make(
@@ -211,7 +213,7 @@ class Trainer(Closing):
     @property
     def _n_tasks(self) -> int:
         """Number of tasks that are presented to all seeds."""
-        return int(self._schedule.available(self.world.source.episode).sum(-1).min())
+        return int(self._schedule.presented(self.world.source.episode + 1).sum(-1).min())
 
     def _success_so_far(self) -> str:
         rate = sum(self._successes) / len(self._successes)

@@ -90,7 +90,7 @@ def make_config():
         if state == "state":  # demonstrations are latents
             settings["demonstration_share"] = 0.0
         if isinstance(entry(name).config, BGPOConfig):
-            settings["expert_batch_size"] = 8
+            settings |= {"expert_batch_size": 8, "group_size": 4}
         algorithm = replace(entry(name).config, **settings)
         config = RunConfig(
             seeds=(3, 8),

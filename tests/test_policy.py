@@ -190,8 +190,8 @@ def test_a_demonstration_may_have_any_length(trainer_of, load, encoders, length)
     assert seen.activity == pytest.approx(float(torch.exp(-scale * distance)))
     groups = trainer_of("bgpo").algorithm.groups
     member = groups.lookup(seen.embedding.expand(2, -1))[1]
-    assert (seen.group, seen.group_activity) == (int(member.group), float(member.activity))
-    assert seen.known == (seen.group_activity >= groups.activity_threshold)
+    assert (seen.group, seen.group_novelty) == (int(member.group), float(member.novelty))
+    assert seen.known == (seen.group_novelty <= 1)
     assert repr(seen).startswith(f"Recognition(node={seen.node}, activity=")
     assert policy.act(frames[-1]).shape == (4,)
 

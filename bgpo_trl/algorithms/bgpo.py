@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any, cast
 
 import torch
@@ -22,7 +22,6 @@ from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.demonstration_replay import DemonstrationReplay
 from bgpo_trl.data.group_replay import GroupReplay
 from bgpo_trl.encoders.representation import Representation
-from bgpo_trl.encoders.shipped import find_weights, groups_config
 from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.modules.gwr import GWRB
 from bgpo_trl.seeding import generators
@@ -78,37 +77,39 @@ class BGPO(Algorithm):
                 **asdict(config.gwr),
             )
         if variant.groups:
-            found_by = config.groups or groups_config(find_weights(bank.encoder_id))
             self.groups = BehaviorGroups(
-                embedding_size, batch_size=[len(seeds)], **asdict(found_by)
+                embedding_size,
+                batch_size=[len(seeds)],
+                smallest=config.group_size,
+                evidence=config.group_evidence,
             )
+        self._shown_embedding = bank.embedding
+        self._revision = torch.zeros(len(seeds), dtype=torch.int64)
         sizes = {"behavior": embedding_size, "label": self.n_tasks, None: 0}
         self.in_keys = [config.state, *(["context"] if variant.context else [])]
 
         rl, keys = config.rl, self.in_keys
-        n_slots = config.active_groups if config.grouped else 1
-        self.learner = make_learner(
-            rl,
-            LearnerSpec(
-                seeds=seeds,
-                in_keys=keys,
-                in_features=self.state_size + sizes[variant.context],
-                return_bounds=(0.0, self._highest_return()),
-                device=self.device,
-                experts=range(n_slots if config.experts else 1),
-            ),
+        spec = LearnerSpec(
+            seeds=seeds,
+            in_keys=keys,
+            in_features=self.state_size + sizes[variant.context],
+            return_bounds=(0.0, self._highest_return()),
+            device=self.device,
         )
-        self.test_actor = self.learner.actor
-        self._active = ActiveGroups(len(seeds), n_slots)
+        n_active = config.active_groups if config.grouped else 1
+        self._active = ActiveGroups(len(seeds), n_active, config.rest_after)
         self.experts = Experts(
-            self.learner,
+            lambda width: make_learner(rl, replace(spec, experts=range(width))),
             self._active if config.experts else ActiveGroups(len(seeds), 1),
             lambda seed, group: 0 if self.groups is None else self.groups.parent(seed, group),
         )
+        self.learner = self.experts.learner
+        self.test_actor = self.learner.actor
         self.replay = GroupReplay(
             rl.replay_size,
             generator=generators(seeds, "replay"),
             keys=[*keys, "action", *(("next", key) for key in (keys[0], "reward", "terminated"))],
+            source_key="demo_index" if variant.groups else None,
         )
         self.shown = self.demonstrations(config, bank, seeds, constant_keys=keys[1:])
 
@@ -136,6 +137,7 @@ class BGPO(Algorithm):
         groups = self._groups_of(tensordict)
         if self.config.experts:
             expert = self.experts.play(groups)
+            self.learner = self.experts.learner
         else:
             expert = torch.zeros(self.n_seeds, dtype=torch.int64)
             for seed, group in enumerate(groups):
@@ -144,18 +146,43 @@ class BGPO(Algorithm):
         return tensordict.set("action", self.learner.act(seen, self._noise, expert))
 
     def store(self, transition: TensorDictBase) -> None:
-        """Store a transition of each seed and, at the end of an episode, its demonstration."""
+        """Store a transition of each seed and, at the end of an episode, its demonstration.
+
+        Where demonstrations have changed their groups, all that is stored follows.
+        """
         group = torch.tensor(self._groups_of(transition))
         self.replay.add(transition, group)
-        if self.shown is None:
-            return
+        if self.shown is not None:
+            self._store_demonstration(self.shown, transition, group)
+        self._follow_groups()
+
+    def _store_demonstration(
+        self, shown: DemonstrationReplay, transition: TensorDictBase, group: Tensor
+    ) -> None:
         ended = transition.get(("next", "done")).flatten()
         if ended.any():
             reward = torch.ones(self.n_seeds)
             if self.beta:
                 error = transition["behavior"] - transition["demo_embedding"]
                 reward += self.beta * torch.exp(-torch.linalg.vector_norm(error, dim=-1))
-            self.shown.add(transition, reward, group, ended)
+            shown.add(transition, reward, group, ended)
+
+    def _follow_groups(self) -> None:
+        """Assign what is stored to the groups of today; put experts of former groups aside."""
+        if self.groups is None or (changed := self.groups.revision != self._revision).sum() == 0:
+            return
+        self._revision = self.groups.revision
+        shown = self._shown_embedding.expand(self.n_seeds, *self._shown_embedding.shape)
+        group_of = self.groups.lookup(shown, changed).group
+        for seed in changed.nonzero().flatten().tolist():
+            for replay in (self.replay, self.shown):
+                if replay is not None:
+                    replay.regroup(seed, group_of[seed])
+            known = self.groups.numbers(seed)
+            for group in self._active.group[seed].tolist():
+                if group >= 0 and group not in known:
+                    (self.experts if self.config.experts else self._active).rest(seed, group)
+        self.learner = self.experts.learner
 
     def update(self) -> dict[str, Tensor]:
         """Make one update of each seed."""
@@ -165,7 +192,7 @@ class BGPO(Algorithm):
 
     def _sample(self) -> TensorDictBase:
         """Sample the transitions of an update, ``[S, E, B]``."""
-        config, (_, n_experts) = self.config, self.experts.active.group.shape
+        config, n_experts = self.config, self.experts.width
         n_rows = config.expert_batch_size if config.experts else config.rl.batch_size
 
         def groups_of(n_rows: int) -> Tensor:
@@ -227,9 +254,12 @@ class BGPO(Algorithm):
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a `state_dict`."""
-        super().load_state_dict(state)
         self.experts.load_state_dict(state["experts"])
+        self.learner = self.experts.learner
+        super().load_state_dict(state)
         self._active.load_state_dict(state["active"])
+        if self.groups is not None:
+            self._revision = self.groups.revision
 
     def _learned(self) -> dict[str, Any]:
         parts = {"gwr": self.gwr, "groups": self.groups, "shown": self.shown}

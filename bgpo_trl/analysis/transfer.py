@@ -15,17 +15,21 @@ from bgpo_trl.analysis.scores import Values
 from bgpo_trl.analysis.statistics import Estimate, contrast
 
 
-def expected_own_episodes(begun: Sequence[int], task: int, episodes: ArrayLike) -> Values:
+def expected_own_episodes(
+    begun: Sequence[int], task: int, episodes: ArrayLike, *, practised: bool = True
+) -> Values:
     """Return the expected number of a task's own training episodes after ``episodes`` ``[E]``.
 
-    An episode is of each task presented so far with equal probability. ``begun`` are the episodes
-    from which tasks are presented.
+    An episode is of each task presented so far with equal probability; if earlier tasks are not
+    ``practised``, of each of the newest. ``begun`` are the episodes from which tasks are presented.
     """
     later = sorted({start for start in begun if start >= begun[task]})
     played = np.zeros(np.shape(episodes))
     for start, end in pairwise([*later, np.inf]):
-        presented = sum(other <= start for other in begun)
-        played += (np.clip(episodes, start, end) - start) / presented
+        newest = max(other for other in begun if other <= start)
+        drawn = [other <= start if practised else other == newest for other in begun]
+        if drawn[task]:
+            played += (np.clip(episodes, start, end) - start) / sum(drawn)
     return played
 
 
@@ -62,7 +66,7 @@ def own_areas(run: Run, reference: Run) -> tuple[Values, Values]:
     for task, end in enumerate([*begun[2:], run.last], 1):
         own, curves = _own_curves(run, task)
         of_reference, others = _own_curves(reference, reference.tasks.index(run.tasks[task]))
-        last = min(float(expected_own_episodes(begun, task, end)), of_reference[-1])
+        last = min(float(_own_episodes(run, task, end)), of_reference[-1])
         first = min(max(own[0], of_reference[0]), last)
         tests = np.array([first, *own[(own > first) & (own < last)], last])
         areas.append((_mean_height(tests, own, curves), _mean_height(tests, of_reference, others)))
@@ -72,8 +76,14 @@ def own_areas(run: Run, reference: Run) -> tuple[Values, Values]:
 
 def _own_curves(run: Run, task: int) -> tuple[Values, Values]:
     """Return a task's expected own episodes at its tests, ``[E]``, and the curves, ``[S, E]``."""
-    own = expected_own_episodes(run.starts, task, run.curves.episodes)
-    return own[own > 0], run.curves.success[:, own > 0, task]
+    own = _own_episodes(run, task, run.curves.episodes)
+    played = np.diff(own, prepend=0.0) > 0
+    return own[played], run.curves.success[:, played, task]
+
+
+def _own_episodes(run: Run, task: int, episodes: ArrayLike) -> Values:
+    practised = run.config.get("schedule", "practised") == "practised"
+    return expected_own_episodes(run.starts, task, episodes, practised=practised)
 
 
 def _mean_height(tests: Values, episodes: Values, curves: Values) -> Values:

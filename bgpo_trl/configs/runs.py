@@ -23,6 +23,10 @@ class RunConfig:
     """Names of the tasks, as in the suite and the CSV files; by default the paper's three."""
     task_starts: tuple[int, ...] = (0, 7_000, 13_000)
     """Episode from which each task is presented (Sec. IV-C); all 0 is the concurrent setting."""
+    schedule: Literal["practised", "sequential"] = "practised"
+    """Tasks that training episodes are drawn from: ``"practised"``, all presented so far;
+    ``"sequential"``, only the newest, as in Continual World and COOM. Tests are of all presented so
+    far in both."""
     eval_every: int = 1
     """Training episodes between evaluations (1 in the paper)."""
     eval_episodes: int = 1
@@ -45,6 +49,8 @@ class RunConfig:
         whole(self, 1, "episodes", "eval_every", "eval_episodes")
         at_least(self, 0, "checkpoint_minutes")
         check(self, ("held_out", self.held_out in ("validation", "test"), "validation or test"))
+        schedules = ("practised", "sequential")
+        check(self, ("schedule", self.schedule in schedules, " or ".join(schedules)))
         check(self, ("tasks", not isinstance(self.tasks, str), "a tuple of names"))
         nico.check_tasks(self.tasks)
         starts = self.task_starts

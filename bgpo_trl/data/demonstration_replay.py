@@ -57,7 +57,10 @@ class DemonstrationReplay:
         self._generators = list(generator)
         self._state_key, self._constant_keys = state_key, list(constant_keys)
         self._shown = GroupReplay(
-            capacity, generator=generator, keys=["demo_index", "reward", *constant_keys]
+            capacity,
+            generator=generator,
+            keys=["demo_index", "reward", *constant_keys],
+            source_key="demo_index",
         )
 
     def __len__(self) -> int:
@@ -106,6 +109,10 @@ class DemonstrationReplay:
             },
             group.shape,
         )
+
+    def regroup(self, seed: int, group: Tensor) -> None:
+        """Assign demonstrations of a seed to groups anew, from the group of each in the bank."""
+        self._shown.regroup(seed, group)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the stored demonstrations and the states of the generators."""

@@ -76,6 +76,9 @@ class Arguments(TaskArguments):
     """Run directory; runs/EXPERIMENT-ALGORITHM[-RL]-PRESET by default."""
     seeds: tuple[int, ...] | None = None
     """Seeds; the preset's by default."""
+    schedule: Literal["practised", "sequential"] = "practised"
+    """Tasks of training episodes: all presented so far (practised) or only the newest (sequential,
+    as in Continual World and COOM)."""
     episodes: int | None = None
     """Training episodes; the preset's by default. The task starts are scaled in proportion. With
     --resume, a larger number extends the run, whose task starts are kept."""
@@ -119,6 +122,7 @@ def run_config(arguments: Arguments) -> RunConfig:
         name=arguments.algorithm,
         algorithm=algorithm,
         held_out=arguments.held_out,
+        schedule=arguments.schedule,
     )
     if arguments.seeds is not None:
         config = replace(config, seeds=arguments.seeds)

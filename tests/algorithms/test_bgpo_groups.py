@@ -7,13 +7,12 @@ import torch
 from tensordict import TensorDict
 
 from bgpo_trl.algorithms.bgpo import BGPO
-from bgpo_trl.configs import BGPOConfig, GWRBConfig
+from bgpo_trl.configs import BGPOConfig
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
 from bgpo_trl.modules.gwr import GWRB
 from bgpo_trl.transforms import TaskSchedule
-from suites import nico
-from tests.algorithms.playing import assert_same, play, weights
+from tests.algorithms.playing import assert_same, play
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 
@@ -21,7 +20,7 @@ pytestmark = pytest.mark.usefixtures("easy_world")
 @pytest.mark.parametrize("rl", ["ddpg", "td3", "sac"])
 def test_a_restored_run_continues_as_the_saved_one(make_bgpo, tmp_path, rl):
     schedule = TaskSchedule((0, 0, 0))
-    algorithm = make_bgpo("all", rl=rl, schedule=schedule)
+    algorithm = make_bgpo("all", rl=rl, schedule=schedule, known=15)
     _, state = play(algorithm, 60)
     assert algorithm.groups.num_groups.min() > 2  # more than are active
     parts = {"algorithm": algorithm.state_dict(), "world": algorithm.world.state_dict()}
@@ -43,7 +42,7 @@ def test_a_restored_run_continues_as_the_saved_one(make_bgpo, tmp_path, rl):
 
 @pytest.mark.parametrize("rl", ["ddpg", "td3", "sac"])
 def test_with_one_group_it_is_the_plain_learner_bit_for_bit(make_bgpo, rl):
-    lonely = {"groups": GWRBConfig(activity_threshold=1e-6), "active_groups": 1}
+    lonely = {"group_size": 99, "active_groups": 4}
     lonely["expert_batch_size"] = 16  # as in the single network's batch
     plain, one = make_bgpo("latent, b", rl=rl), make_bgpo("experts", rl=rl, **lonely)
     ours, theirs = play(plain, 30)[0], play(one, 30)[0]
@@ -51,19 +50,6 @@ def test_with_one_group_it_is_the_plain_learner_bit_for_bit(make_bgpo, rl):
     for key in ("action", "latent", "behavior", "demo_index", ("next", "reward")):
         assert ours[key].equal(theirs[key]), key
     assert_same(plain.learner.state_dict(), one.learner.state_dict())
-
-
-def test_slots_that_stay_free_change_nothing(make_bgpo, make_config):
-    """Four slots, one of them used."""
-    lonely = {"groups": GWRBConfig(activity_threshold=1e-6), "expert_batch_size": 16}
-    plain = make_bgpo("latent, b")
-    four = make_bgpo("experts", **lonely, active_groups=4)
-    ours, theirs = play(plain, 30)[0], play(four, 30)[0]
-    torch.testing.assert_close(ours["action"], theirs["action"], rtol=1e-4, atol=1e-5)
-    start = weights(make_bgpo("experts", **lonely, active_groups=4))
-    for value, other, begun in zip(weights(plain), weights(four), start, strict=True):
-        torch.testing.assert_close(value[:, 0], other[:, 0], rtol=1e-4, atol=1e-5)
-        assert other[:, 1:].equal(begun[:, 1:])
 
 
 def batches_of(algorithm):
@@ -80,7 +66,7 @@ def batches_of(algorithm):
 
 @pytest.mark.parametrize("variant", ["even replay", "experts", "all"])
 def test_an_update_sees_as_much_of_each_group_played_last(make_bgpo, bank, variant):
-    algorithm = make_bgpo(variant, schedule=TaskSchedule((0, 0, 0)))
+    algorithm = make_bgpo(variant, schedule=TaskSchedule((0, 0, 0)), known=15)
     batches = batches_of(algorithm)
     data, _ = play(algorithm, 60)
     frames = bank.seen().steps.latents(torch.arange(len(bank.seen().steps.latent)))
@@ -107,6 +93,34 @@ def test_an_update_sees_as_much_of_each_group_played_last(make_bgpo, bank, varia
                 else:  # nothing is known of the group, or no demonstration of it was over
                     assert is_shown or not (past == group).any()
     assert n_full > 20
+
+
+@pytest.mark.parametrize("variant", ["even replay", "experts", "all"])
+def test_what_is_stored_is_of_the_group_that_its_demonstration_has_today(make_bgpo, bank, variant):
+    """Groups split while they are played."""
+    algorithm = make_bgpo(variant, schedule=TaskSchedule((0, 0, 0)), known=9)
+    shown = bank.seen().embedding
+    n_groups = set()
+    state, played = None, [set(), set()]
+    for _ in range(30):
+        data, state = play(algorithm, 4, state)
+        n_groups |= {*algorithm.groups.num_groups.tolist()}
+        group_of = algorithm.groups.lookup(shown.expand(2, *shown.shape)).group
+        replays = [algorithm.replay, *([algorithm.shown._shown] if algorithm.shown else [])]
+        for seed, replay in ((seed, replay) for seed in range(2) for replay in replays):
+            played[seed] |= {*data["group"][seed].tolist()}
+            if not len(replay):
+                continue
+            buffer = replay._buffer
+            group = buffer.read(seed, "group")
+            assert group.equal(group_of[seed][buffer.read(seed, "demo_index")])
+            counts = replay.sizes(torch.arange(9).expand(2, 9))[seed]
+            assert counts.equal(group.bincount(minlength=9))
+            known = {*algorithm.groups.numbers(seed), -1}
+            assert {*algorithm._active.group[seed].tolist()} <= known
+    assert n_groups >= {1, 3}
+    assert algorithm.groups.revision.min() > 0
+    assert all(len(groups) > 2 for groups in played)
 
 
 def test_demonstrations_are_a_quarter_of_each_experts_batch_and_were_shown_before(make_bgpo, bank):
@@ -231,18 +245,3 @@ def test_demonstrations_are_refused_where_the_state_is_the_ground_truth(make_con
         ValueError, match="demonstrations are latents: set demonstration_share to 0"
     ):
         BGPO(config, **parts)
-
-
-@pytest.mark.parametrize(
-    ("tasks", "own", "threshold"),
-    [
-        (nico.PAPER_TASKS, None, 0.525),
-        (nico.ALL_TASKS, None, 0.595),
-        (nico.ALL_TASKS, GWRBConfig(activity_threshold=0.525), 0.525),
-    ],
-)
-def test_the_bank_brings_the_threshold_of_groups_unless_it_is_set(tasks, own, threshold):
-    bank = load_pretrained(tasks=tasks)[1]
-    config = BGPOConfig(groups=own, state="state", demonstration_share=0)
-    algorithm = BGPO(config, seeds=[0], bank=bank.seen())
-    assert algorithm.groups.activity_threshold == threshold

@@ -19,6 +19,25 @@ def test_own_episodes_are_shared_among_the_presented_tasks():
     np.testing.assert_allclose(from_the_start, [2 + 1 / 3, 4, 2 + 16 / 3, 2 + 26 / 3])
 
 
+def test_own_episodes_without_practice_are_those_of_the_own_phase():
+    episodes = [5, 10, 20, 30]
+    expected = {0: [5, 10, 10, 10], 1: [0, 0, 10, 10], 2: [0, 0, 0, 10]}
+    for task, own in expected.items():
+        found = expected_own_episodes(STARTS, task, episodes, practised=False)
+        np.testing.assert_allclose(found, own)
+    two = expected_own_episodes((0, 4, 4), 2, episodes, practised=False)
+    np.testing.assert_allclose(two, [0.5, 3, 8, 13])
+
+
+def test_areas_without_practice_end_with_the_own_phase():
+    run = make_run()
+    run.config["schedule"] = "sequential"
+    ours, theirs = own_areas(run, make_run(RISING, (0, 0, 0)))
+    # Task b: 0.4 after 5 own episodes, 0.6 after 10; task c: 0 and 0.4.
+    np.testing.assert_allclose(ours, [[0.5, 0.2]] * 2)
+    np.testing.assert_allclose(theirs, [[0.6, 0.6]] * 2)
+
+
 # The reference plays each task in every third episode, all alike: after 5/3, 10/3, 5, ... own
 # episodes.
 RISING = [[0.3] * 3, *[[0.6] * 3] * 5]

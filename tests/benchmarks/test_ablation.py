@@ -76,7 +76,7 @@ COMMON = {
     *("episode_reward", "done", "terminated", "truncated"),
 }
 FROM_GWR = {"behavior_node"}
-FROM_GROUPS = {"group", "group_activity"}
+FROM_GROUPS = {"group", "group_novelty"}
 FROM_REWARD = {"lae_h", "lae_c", "episode_extrinsic_reward", "episode_intrinsic_reward"}
 
 

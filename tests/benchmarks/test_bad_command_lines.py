@@ -118,7 +118,6 @@ CASES = [
     ("speed/gwr.py --networks 0", "--networks", "at least 1, got 0"),
     ("groups.py --seeds 0 0", "seeds must be one or more", "all different"),
     ("groups.py --draws 0", "--draws", "at least 1, got 0"),
-    ("groups.py --thresholds 0.5 2", "activity_threshold", "between 0 and 1, got 2"),
     ("unknown_task.py --seeds 0 0", "seeds must be one or more", "all different"),
     ("unknown_task.py --tasks grasp_glass", "--tasks", "name at least two"),
     ("nico_tasks.py --starts 0", "--starts", "at least 1, got 0"),

@@ -130,9 +130,10 @@ def test_workers_are_told_the_tasks_and_where_they_come_from(tmp_path, monkeypat
     assert events == ["my_tasks", tmp_path / bank]
 
 
-def test_the_eight_tasks_come_in_two_orders_or_at_once(tmp_path):
+def test_the_eight_tasks_come_in_two_orders_unpractised_or_at_once(tmp_path):
+    settings = ("sequential", "eight", "eight-reversed", "eight-sequential", "eight-concurrent")
     arguments = sweep.Arguments(
-        settings=("continual", "eight", "eight-reversed", "eight-concurrent"),
+        settings=settings,
         episodes=4_000,
         eval_every=50,
         held_out="test",
@@ -141,11 +142,13 @@ def test_the_eight_tasks_come_in_two_orders_or_at_once(tmp_path):
     grid = {path.name: group[0].config for path, group in sweep.make_jobs(arguments).items()}
     assert list(grid) == [f"{setting}-bgpo" for setting in arguments.settings]
     assert [config.tasks for config in grid.values()] == [
-        *(nico.PAPER_TASKS, nico.ALL_TASKS, nico.ALL_TASKS[::-1], nico.ALL_TASKS)
+        *(nico.PAPER_TASKS, nico.ALL_TASKS, nico.ALL_TASKS[::-1], nico.ALL_TASKS, nico.ALL_TASKS)
     ]
+    unpractised = [config.schedule == "sequential" for config in grid.values()]
+    assert unpractised == [True, False, False, True, False]
     each_500 = tuple(range(0, 4_000, 500))
     assert [config.task_starts for config in grid.values()] == [
-        *((0, 1_400, 2_600), each_500, each_500, (0,) * 8)
+        *((0, 1_400, 2_600), each_500, each_500, each_500, (0,) * 8)
     ]
     for config in grid.values():
         assert (config.episodes, config.eval_every, config.held_out) == (4_000, 50, "test")

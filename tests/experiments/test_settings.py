@@ -70,9 +70,10 @@ def test_another_length_keeps_the_proportions(preset, episodes, starts, eval_eve
     )
 
 
-def test_other_seeds_change_nothing_else():
-    config = run_config(Arguments(preset="desk", seeds=(7, 9)))
-    assert config == replace(PRESETS["desk"], seeds=(7, 9))
+@pytest.mark.parametrize("change", [{"seeds": (7, 9)}, {"schedule": "sequential"}])
+def test_other_seeds_or_another_schedule_change_nothing_else(change):
+    config = run_config(Arguments(preset="desk", **change))
+    assert config == replace(PRESETS["desk"], **change)
 
 
 @pytest.mark.parametrize(
