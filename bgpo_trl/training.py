@@ -94,6 +94,11 @@ class Trainer(Closing):
                 f"{used}: load both together (load_pretrained), or embed anew "
                 "(bgpo_trl.encoders.make_bank)"
             )
+        if bank.spread < config.spread:
+            raise ValueError(
+                f"the bank was recorded at spread {bank.spread}, the run is at {config.spread}: "
+                "lower the run's spread, or record at a larger one"
+            )
         bank = bank.for_tasks(config.tasks)
         self._schedule = schedule = TaskSchedule(
             config.task_starts, cumulative=config.schedule == "practised"
@@ -103,7 +108,13 @@ class Trainer(Closing):
         self.algorithm = make(
             config.algorithm, seeds=seeds, bank=bank.seen(), encoders=encoders, device=device
         )
-        self.world = World(self.algorithm, seeds=seeds, schedule=schedule, bank=bank.seen())
+        self.world = World(
+            self.algorithm,
+            seeds=seeds,
+            schedule=schedule,
+            bank=bank.seen(),
+            spread=config.spread,
+        )
         self.evaluator = Evaluator(
             config.algorithm,
             seeds=seeds,
@@ -111,6 +122,7 @@ class Trainer(Closing):
             episodes=config.eval_episodes,
             bank=bank.held_out(config.held_out),
             encoders=encoders,
+            spread=config.spread,
         )
         self.env_steps = 0
         # For the progress bar: the latest training episodes, and the latest evaluation.

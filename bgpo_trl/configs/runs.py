@@ -27,6 +27,9 @@ class RunConfig:
     """Tasks that training episodes are drawn from: ``"practised"``, all presented so far;
     ``"sequential"``, only the newest, as in Continual World and COOM. Tests are of all presented so
     far in both."""
+    spread: float = 1.0
+    """Share of the suite's range of start states, from 0 (objects at their nominal places) to 1.
+    Ours."""
     eval_every: int = 1
     """Training episodes between evaluations (1 in the paper)."""
     eval_episodes: int = 1
@@ -53,6 +56,7 @@ class RunConfig:
         check(self, ("schedule", self.schedule in schedules, " or ".join(schedules)))
         check(self, ("tasks", not isinstance(self.tasks, str), "a tuple of names"))
         nico.check_tasks(self.tasks)
+        nico.check_spread(self.spread)
         starts = self.task_starts
         check(
             self,

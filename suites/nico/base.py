@@ -71,12 +71,14 @@ def check_spread(spread: float) -> None:
         raise ValueError(f"spread is {spread}: choose a number from 0 (nominal places) to 1")
 
 
-def nominal_places() -> dict[str, np.ndarray]:
-    """Return the place ``[x, y]`` (m) of each object at spread 0."""
-    return {
-        name: kinematics.polar(ARC_RADIUS, angle)
-        for name, angle in zip(OBJECTS, NOMINAL_ANGLES, strict=True)
-    }
+def nominal_places() -> np.ndarray:
+    """Return the place of the center of each of `OBJECTS` at spread 0 (m), ``[3, 3]``."""
+    return np.array(
+        [
+            [*kinematics.polar(ARC_RADIUS, angle), TABLE_HEIGHT + OBJECT_HALF_HEIGHT[name]]
+            for name, angle in zip(OBJECTS, NOMINAL_ANGLES, strict=True)
+        ]
+    )
 
 
 class Environment(control.Environment):
@@ -205,11 +207,10 @@ class NicoTask(control.Task):
         )
         drawn = np.array([-right, green, left] if swapped else [left, green, -right])
         angles = nominal + self.spread * (drawn - nominal)
-        steps = np.array([np.inf])
-        while np.abs(steps).max() > LARGEST_STEP:
+        jitter = self.random.uniform(-RADIUS_JITTER, RADIUS_JITTER, 3)
+        while np.abs(np.diff(jitter)).max() > LARGEST_STEP:
             jitter = self.random.uniform(-RADIUS_JITTER, RADIUS_JITTER, 3)
-            steps = np.diff(jitter)
-        radii = ARC_RADIUS + self.spread * jitter
+        radii: np.ndarray = ARC_RADIUS + self.spread * jitter
         turns = self.spread * self.random.uniform(-np.pi, np.pi, 3)
         return [kinematics.polar(r, a) for r, a in zip(radii, angles, strict=True)], turns
 
