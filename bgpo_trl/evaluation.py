@@ -67,8 +67,9 @@ class Evaluator:
     number of the evaluation.
 
     Config, seeds, schedule and encoders are those of training; the bank has held-out
-    demonstrations. ``spread`` is the share of the whole range of start states. Each task is tested in ``episodes`` episodes. ``make_env`` makes the simulation,
-    with the arguments of `NicoEnv`, the default.
+    demonstrations. ``spread`` is the share of the whole range of start states. Each task is tested
+    in ``episodes`` episodes. ``make_env`` makes the simulation, with the arguments of `NicoEnv`,
+    the default.
 
     Raises:
         ValueError: If a task has no demonstration.

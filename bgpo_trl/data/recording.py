@@ -245,6 +245,7 @@ def main(
     per_task: int = 1_200,
     held_out_per_task: int = 200,
     play: bool = False,
+    spread: float = 1.0,
     seed: int = 0,
 ) -> None:
     """Record the dataset of demonstrations; the same command resumes an interrupted recording.
@@ -256,6 +257,7 @@ def main(
         per_task: Demonstrations of each task.
         held_out_per_task: How many of those are held out for test episodes.
         play: Record random play instead of demonstrations.
+        spread: Share of the whole range of start states.
         seed: Seed of the start states and of the noise.
     """
     import_own(module)
@@ -265,6 +267,7 @@ def main(
         per_task=per_task,
         held_out_per_task=held_out_per_task,
         play=play,
+        spread=spread,
         seed=seed,
     )
 

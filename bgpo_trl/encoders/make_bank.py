@@ -32,6 +32,7 @@ def make_bank(
     *,
     tasks: Sequence[str] = nico.PAPER_TASKS,
     actions: Literal["inferred", "recorded"] = "inferred",
+    spread: float = 1.0,
 ) -> DemonstrationBank:
     """Embed demonstrations; keep the latents and actions of the training ones.
 
@@ -43,6 +44,7 @@ def make_bank(
         actions: ``"inferred"`` stores the actions that the VAE's inverse model infers from the
             frames, the only actions that an observer of a demonstration has; ``"recorded"`` stores
             the true ones, for comparison.
+        spread: Share of the range of start states that the dataset was recorded over.
     """
     vae, length = representation.vae, dataset["length"]
     latent = encode_frames(vae, dataset["pixels"], length)
@@ -58,6 +60,7 @@ def make_bank(
         tuple(tasks),
         DemonstrationSteps.of(latent, action, length * train),
         representation.identity,
+        spread,
     )
 
 
@@ -77,8 +80,14 @@ def main(
     """
     weights = default_weights() if weights is None else weights
     encoders = load_representation(weights, scene_version=nico.scene_version())
-    tasks = read_meta(dataset)["tasks"]
-    bank = make_bank(encoders, load_demonstrations(dataset), tasks=tasks, actions=actions)
+    meta = read_meta(dataset)
+    bank = make_bank(
+        encoders,
+        load_demonstrations(dataset),
+        tasks=meta["tasks"],
+        actions=actions,
+        spread=meta["spread"],
+    )
     bank.save(out)
 
 

@@ -34,7 +34,7 @@ class Representation:
     Attributes:
         vae: Frame encoder; ``vae.latent(pixels)`` is the latent used downstream.
         lae: Sequence encoder; ``lae.encode(latent, length)`` is the embedding phi.
-        metadata: ``scene_version``, ``config`` (JSON), ``seed``, ``command``.
+        metadata: ``scene_version``, ``spread``, ``config`` (JSON), ``seed``, ``command``.
     """
 
     vae: VAE
@@ -53,6 +53,7 @@ def train_representation(
     *,
     play: TensorDictBase | None = None,
     scene_version: str,
+    spread: float = 1.0,
     command: str = "",
     checkpoint: str | Path | None = None,
     log: Log | None = None,
@@ -67,6 +68,7 @@ def train_representation(
         play: Episodes of play in the same form, which train the frame encoder on states that
             demonstrations never visit.
         scene_version: Version of the scene of the frames, stored with the weights.
+        spread: Share of the range of start states of the recordings, stored with the weights.
         command: Command line, stored with the weights.
         checkpoint: Folder for checkpoints, from which an interrupted training is resumed and then
             gives the same weights.
@@ -91,6 +93,7 @@ def train_representation(
     lae = _train_lae(latent, train.get("length"), config.lae, fit, config.seed)
     metadata = {
         "scene_version": scene_version,
+        "spread": str(spread),
         "config": json.dumps(asdict(config)),
         "seed": str(config.seed),
         "command": command,

@@ -79,6 +79,8 @@ class Arguments(TaskArguments):
     schedule: Literal["practised", "sequential"] = "practised"
     """Tasks of training episodes: all presented so far (practised) or only the newest (sequential,
     as in Continual World and COOM)."""
+    spread: float = 1.0
+    """Share of the whole range of start states, from 0 (nominal places) to 1."""
     episodes: int | None = None
     """Training episodes; the preset's by default. The task starts are scaled in proportion. With
     --resume, a larger number extends the run, whose task starts are kept."""
@@ -123,6 +125,7 @@ def run_config(arguments: Arguments) -> RunConfig:
         algorithm=algorithm,
         held_out=arguments.held_out,
         schedule=arguments.schedule,
+        spread=arguments.spread,
     )
     if arguments.seeds is not None:
         config = replace(config, seeds=arguments.seeds)

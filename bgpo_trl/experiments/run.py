@@ -139,6 +139,7 @@ def _encoders(
         command=shlex.join(["python", *sys.argv]),
         device=device,
         tasks=tasks,
+        spread=arguments.spread,
         **({} if stage is None else vars(stage)),
     )
     return encoders, bank.for_tasks(tasks)

@@ -127,8 +127,8 @@ class NicoTask(control.Task):
         steady_steps: Control steps for which the condition of success has to hold.
 
     Raises:
-        ValueError: If there is no such observation, ``spread`` is not in [0, 1], or the renderer has
-            another frame size.
+        ValueError: If there is no such observation, ``spread`` is not in [0, 1], or the renderer
+            has another frame size.
     """
 
     steady_steps: ClassVar[int] = 1

@@ -149,11 +149,16 @@ def push_aside(
 
 
 def _sweep(
-    physics: Physics, random: np.random.Generator, name: str, side: float, goal: Callable[[Physics], np.ndarray]
+    physics: Physics,
+    random: np.random.Generator,
+    name: str,
+    side: float,
+    goal: Callable[[Physics], np.ndarray],
 ) -> Sequence[Phase]:
     """Return a sweep of the fist along the arc that takes an object with it.
 
     Args:
+        physics: The simulation at the start of the episode.
         random: Source of the noise.
         name: The object.
         side: 1 to start on the object's left, -1 on its right.

@@ -1,7 +1,7 @@
 """The eight tasks: what counts as success, and the movement that demonstrates it.
 
-A success is what a person would call so: it lasts for several control steps (`STEADY_STEPS`), so that
-a touch in passing, a thrown object or a glass that slips out of the hand earns nothing.
+A success is what a person would call so: it lasts for several control steps (`steady_steps`), so
+that a touch in passing, a thrown object or a glass that slips out of the hand earns nothing.
 """
 
 from __future__ import annotations
