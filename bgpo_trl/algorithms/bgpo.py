@@ -207,6 +207,7 @@ class BGPO(Algorithm):
             return draw(self.replay, n_rows)
         n_shown = round(config.demonstration_share * n_rows)
         played, shown = draw(self.replay, n_rows - n_shown), draw(self.shown, n_shown)
+        played["demonstrated"] = torch.zeros(played.shape, dtype=torch.bool)
         return cast(TensorDictBase, torch.cat([played, shown], -1))
 
     @torch.no_grad()

@@ -33,11 +33,14 @@ class RLConfig:
     clip_targets: bool = True
     """Whether bootstrapped targets are clipped to the attainable returns. Ours: otherwise Q grows
     to hundreds."""
+    imitation: float = 0.0
+    """Weight of the squared distance to demonstrated actions in the actor's loss. Ours."""
     warmup_steps: int = 256
     """Environment steps of each seed before the first update. Ours: not given in the paper."""
 
     def __post_init__(self) -> None:
         positive(self, "learning_rate")
+        at_least(self, 0, "imitation")
         whole(self, 1, "batch_size", "warmup_steps", "replay_size")
         # With a smaller replay, learning would never begin.
         least = max(self.batch_size, self.warmup_steps)

@@ -85,7 +85,7 @@ class DemonstrationReplay:
 
         Returns:
             Batch size ``[S, R]`` as in `GroupReplay.sample`, with the state, the constant entries,
-            ``"action"``, ``"priority_weight"`` and, under ``"next"``, the state, ``"reward"`` and
+            ``"action"``, ``"priority_weight"``, ``"demonstrated"`` (true) and, under ``"next"``, the state, ``"reward"`` and
             ``"terminated"``.
         """
         shown = self._shown.sample(group)
@@ -100,6 +100,7 @@ class DemonstrationReplay:
                 self._state_key: steps.latents(frame),
                 "action": steps.actions(frame),
                 "priority_weight": shown["priority_weight"],
+                "demonstrated": torch.ones(group.shape, dtype=torch.bool),
                 **{key: shown[key] for key in self._constant_keys},
                 "next": {
                     self._state_key: steps.latents(frame + 1),

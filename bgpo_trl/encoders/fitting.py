@@ -46,6 +46,7 @@ class Fit:
         sample: Callable[[torch.Generator], TensorDict],
         schedule: VAEConfig | SequenceAutoencoderConfig,
         generator: torch.Generator,
+        bfloat16: bool = False,
     ) -> None:
         """Train ``loss.parameters()`` on the device, from the last checkpoint if there is one.
 
@@ -56,6 +57,7 @@ class Fit:
             schedule: Gradient steps and learning rate of the stage.
             generator: The only source of randomness of ``sample`` and ``loss``; saved in the
                 checkpoint, so that a resumed training gives the same weights.
+            bfloat16: Whether to compute the loss in bfloat16 where that is precise enough.
 
         Raises:
             ValueError: If the loss is no longer finite, or the checkpoints are damaged or belong to
@@ -77,7 +79,9 @@ class Fit:
             rate = schedule.learning_rate * _decay(step, schedule.steps, schedule.warmup_steps)
             for group in optimizer.param_groups:
                 group["lr"] = rate
-            losses = loss(sample(generator).to(self.device))
+            batch = sample(generator).to(self.device)
+            with torch.autocast(torch.device(self.device).type, torch.bfloat16, enabled=bfloat16):
+                losses = loss(batch)
             objective = [value for key, value in losses.items() if key.startswith("loss_")]
             optimizer.zero_grad()
             torch.stack(objective).sum().backward()

@@ -66,7 +66,9 @@ def train_representation(
         dataset: Demonstrations in the form given by the module; held-out ones are not read.
         config: Hyperparameters; ``RepresentationConfig()`` by default.
         play: Episodes of play in the same form, which train the frame encoder on states that
-            demonstrations never visit.
+            demonstrations never visit. The inverse model then learns from the actions of play
+            alone, so that it has seen none of the actions that it infers for demonstrations;
+            without play, it learns from those of demonstrations.
         scene_version: Version of the scene of the frames, stored with the weights.
         spread: Share of the range of start states of the recordings, stored with the weights.
         command: Command line, stored with the weights.
@@ -215,6 +217,8 @@ def _train_vae(datasets: Sequence[TensorDictBase], config: VAEConfig, fit: Fit, 
     action = torch.cat([dataset.get("action") for dataset in datasets])
     padded = torch.nn.functional.pad(action, (0, 0, 0, 1))
     action = padded[valid_steps(length, padded.shape[1])]
+    # Demonstrations come first. Their actions are unknown, unless there is no play to learn from.
+    n_demonstrated = 0 if len(datasets) == 1 else int(datasets[0].get("length").sum())
     first = length.cumsum(0) - length
     starts = torch.cat(
         [
@@ -227,7 +231,8 @@ def _train_vae(datasets: Sequence[TensorDictBase], config: VAEConfig, fit: Fit, 
         n_windows = config.batch_size // config.window
         drawn = starts[torch.randint(len(starts), (n_windows,), generator=generator)]
         index = drawn.unsqueeze(-1) + torch.arange(config.window)
-        return TensorDict({"pixels": frames[index], "action": action[index]}, index.shape)
+        windows = {"pixels": frames[index], "action": action[index]}
+        return TensorDict({**windows, "action_known": drawn >= n_demonstrated}, [n_windows])
 
     generator = torch.Generator().manual_seed(seed)
     with torch.random.fork_rng(devices=[]):
@@ -241,7 +246,7 @@ def _train_vae(datasets: Sequence[TensorDictBase], config: VAEConfig, fit: Fit, 
         inverse_weight=config.inverse_weight,
         generator=generator,
     )
-    fit("vae", loss, sample, config, generator)
+    fit("vae", loss, sample, config, generator, config.bfloat16)
     vae.eval().requires_grad_(False)
     chunks = (chunk.to(fit.device) for chunk in frames.split(64))
     vae.set_latent_scale(torch.cat([vae.encode(chunk)[0] for chunk in chunks]))
