@@ -24,6 +24,7 @@ from bgpo_trl.data.bank import DemonstrationBank, DemonstrationSteps
 from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.envs import NicoEnv
 from bgpo_trl.figures import style
+from bgpo_trl.modules.inverse_model import InverseModel
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
 from bgpo_trl.world import World
@@ -59,7 +60,10 @@ def encoders():
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         vae, lae = VAE(), SequenceAutoencoder()
-    return Representation(vae.eval().requires_grad_(False), lae.eval().requires_grad_(False), {})
+        inverse = InverseModel()
+    for module in (vae, lae, inverse):
+        module.eval().requires_grad_(False)
+    return Representation(vae, lae, inverse, {})
 
 
 @pytest.fixture(scope="session")

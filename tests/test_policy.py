@@ -17,7 +17,7 @@ from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.policy import Policy
 from bgpo_trl.configs import RepresentationConfig
 from bgpo_trl.data.bank import DemonstrationBank
-from bgpo_trl.encoders.representation import Representation, save_representation
+from bgpo_trl.encoders.representation import save_representation
 from bgpo_trl.encoders.shipped import bank_path
 from bgpo_trl.evaluation import Evaluator
 from bgpo_trl.training import Trainer
@@ -76,7 +76,7 @@ def trainer_of(encoders, tested_bank, make_config, easy_world, tmp_path_factory)
             config = make_config(name=name, episodes=16)
             directory = tmp_path_factory.mktemp(name) / "run"
             weights = directory / "encoders" / "nico.safetensors"
-            save_representation(Representation(encoders.vae, encoders.lae, METADATA), weights)
+            save_representation(replace(encoders, metadata=METADATA), weights)
             replace(tested_bank, encoder_id=encoders.identity).save(bank_path(weights))
             trainers[name] = Trainer(
                 config,
@@ -305,7 +305,7 @@ def test_a_run_of_own_tasks_is_loaded_where_the_task_is_known(
     config = make_config(tasks=tasks, task_starts=(0, 2), episodes=4)
     run = tmp_path / "run"
     weights = run / "encoders" / "nico.safetensors"
-    save_representation(Representation(encoders.vae, encoders.lae, METADATA), weights)
+    save_representation(replace(encoders, metadata=METADATA), weights)
     with Trainer(config, run, bank=own, encoders=encoders, progress=False) as trainer:
         trainer.run()
     policy = bgpo_trl.load_run(run)

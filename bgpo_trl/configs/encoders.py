@@ -65,13 +65,41 @@ class SequenceAutoencoderConfig:
 
 
 @dataclass(frozen=True)
+class InverseModelConfig:
+    """Training of the inverse model on the latents of play (stage 1c). Ours."""
+
+    hidden_size: int = 512
+    """Units of each of the two hidden layers."""
+    dropout: float = 0.2
+    """Share of hidden units dropped in training."""
+    largest_action: float = 0.6
+    """Actions with a larger component are left out: demonstrators move slowly, and errors of fast
+    movements would prevail in the loss."""
+    batch_size: int = 512
+    """Windows per step."""
+    learning_rate: float = 2e-3
+    """Peak learning rate of Adam."""
+    warmup_steps: int = 100
+    """Steps of linear warm-up, before cosine decay to zero."""
+    steps: int = 4_000
+    """Gradient steps."""
+
+    def __post_init__(self) -> None:
+        whole(self, 1, "hidden_size", "batch_size", "warmup_steps", "steps")
+        positive(self, "learning_rate", "largest_action")
+        check(self, ("dropout", 0 <= self.dropout < 1, "at least 0 and below 1"))
+
+
+@dataclass(frozen=True)
 class RepresentationConfig:
-    """Stage 1: both encoders."""
+    """Stage 1: both encoders, and the inverse model."""
 
     vae: VAEConfig = field(default_factory=VAEConfig)
     """The frame encoder."""
     lae: SequenceAutoencoderConfig = field(default_factory=SequenceAutoencoderConfig)
     """The sequence encoder."""
+    inverse: InverseModelConfig = field(default_factory=InverseModelConfig)
+    """The inverse model."""
     seed: int = 0
     """Seed of initial weights, batches and sampling noise. Ours."""
     checkpoint_every: int = 250
@@ -103,6 +131,7 @@ STAGE_PRESETS: dict[str, StageConfig] = {
         config=RepresentationConfig(
             vae=VAEConfig(steps=20, batch_size=64),
             lae=SequenceAutoencoderConfig(steps=50, batch_size=32),
+            inverse=InverseModelConfig(steps=50, batch_size=32),
         ),
     )
 }

@@ -13,7 +13,12 @@ import torch
 from tensordict import TensorDict
 from torchrl.objectives import LossModule
 
-from bgpo_trl.configs import RepresentationConfig, SequenceAutoencoderConfig, VAEConfig
+from bgpo_trl.configs import (
+    InverseModelConfig,
+    RepresentationConfig,
+    SequenceAutoencoderConfig,
+    VAEConfig,
+)
 from bgpo_trl.files.checkpoint import has_checkpoint, load_checkpoint, save_checkpoint
 from bgpo_trl.files.progress import progress_bar
 
@@ -44,7 +49,7 @@ class Fit:
         stage: str,
         loss: LossModule,
         sample: Callable[[torch.Generator], TensorDict],
-        schedule: VAEConfig | SequenceAutoencoderConfig,
+        schedule: VAEConfig | SequenceAutoencoderConfig | InverseModelConfig,
         generator: torch.Generator,
         bfloat16: bool = False,
     ) -> None:

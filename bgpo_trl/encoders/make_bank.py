@@ -41,7 +41,7 @@ def make_bank(
         dataset: Reads ``pixels`` ``[N, T, 32, 64, 3]``, ``length``, ``task`` and ``train`` ``[N]``,
             and ``action`` ``[N, T - 1, 4]``.
         tasks: Task names, in the order of their labels.
-        actions: ``"inferred"`` stores the actions that the VAE's inverse model infers from the
+        actions: ``"inferred"`` stores the actions that the inverse model infers from the
             frames, the only actions that an observer of a demonstration has; ``"recorded"`` stores
             the true ones, for comparison.
         spread: Share of the range of start states that the dataset was recorded over.
@@ -50,8 +50,7 @@ def make_bank(
     latent = encode_frames(vae, dataset["pixels"], length)
     action = dataset["action"]
     if actions == "inferred":
-        mean = latent.to(vae.latent_std.device) * vae.latent_std + vae.latent_mean
-        action = vae.inverse(mean[:, :-1], mean[:, 1:]).cpu()
+        action = representation.inverse(latent, length)
     train = dataset["train"].clone()
     return DemonstrationBank(
         representation.lae.encode(latent, length),

@@ -32,6 +32,7 @@ from bgpo_trl.encoders.representation import (
     valid_steps,
 )
 from bgpo_trl.encoders.shipped import default_weights
+from bgpo_trl.modules.inverse_model import InverseModel
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
 from bgpo_trl.objectives.representation import SequenceReconstructionLoss
@@ -77,7 +78,7 @@ def probe(
     latent_held_out = encode_frames(vae, held_out.get("pixels"), held_out.get("length"))
     result = {
         **_probe_state(latent, train, latent_held_out, held_out),
-        **_probe_inverse(vae, latent, train),
+        **_probe_inverse(representation.inverse, latent, train),
         **_probe_reconstruction(vae, train, held_out),
         **_probe_sequences(lae, latent_held_out, held_out),
     }
@@ -212,12 +213,13 @@ def _probe_tasks(
 
 
 @torch.no_grad()
-def _probe_inverse(vae: VAE, latent: Tensor, shown: TensorDictBase) -> dict[str, float]:
-    mu = latent * vae.latent_std + vae.latent_mean
+def _probe_inverse(
+    inverse: InverseModel, latent: Tensor, shown: TensorDictBase
+) -> dict[str, float]:
     action = shown.get("action")
     valid = valid_steps(shown.get("length") - 1, action.shape[1])
     action = action[valid]
-    error = vae.inverse(mu[:, :-1], mu[:, 1:])[valid] - action
+    error = inverse(latent, shown.get("length"))[valid] - action
     left, all_ = error.square().sum(0), (action - action.mean(0)).square().sum(0)
     by_joint = zip(JOINTS, (1 - left / all_).tolist(), strict=True)
     return {

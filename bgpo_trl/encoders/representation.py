@@ -19,26 +19,38 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from bgpo_trl.configs import RepresentationConfig, SequenceAutoencoderConfig, VAEConfig
+from bgpo_trl.configs import (
+    InverseModelConfig,
+    RepresentationConfig,
+    SequenceAutoencoderConfig,
+    VAEConfig,
+)
 from bgpo_trl.encoders.fitting import Fit, Log
 from bgpo_trl.files.tensor_file import digest, load_tensors, save_tensors
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
+from bgpo_trl.modules.inverse_model import InverseModel, window
 from bgpo_trl.modules.vae import VAE
-from bgpo_trl.objectives.representation import SequenceReconstructionLoss, VAEInverseLoss
+from bgpo_trl.objectives.representation import (
+    ActionInferenceLoss,
+    SequenceReconstructionLoss,
+    VAEInverseLoss,
+)
 
 
 @dataclass
 class Representation:
-    """The two trained encoders and the metadata of their training.
+    """The two trained encoders, the inverse model, and the metadata of their training.
 
     Attributes:
         vae: Frame encoder; ``vae.latent(pixels)`` is the latent used downstream.
         lae: Sequence encoder; ``lae.encode(latent, length)`` is the embedding phi.
+        inverse: Inverse model on latents; it infers the actions of demonstrations for a bank.
         metadata: ``scene_version``, ``spread``, ``config`` (JSON), ``seed``, ``command``.
     """
 
     vae: VAE
     lae: SequenceAutoencoder
+    inverse: InverseModel
     metadata: dict[str, str]
 
     @property
@@ -93,6 +105,10 @@ def train_representation(
     vae = _train_vae(seen, config.vae, fit, config.seed)
     latent = encode_frames(vae, train.get("pixels"), train.get("length"))
     lae = _train_lae(latent, train.get("length"), config.lae, fit, config.seed)
+    own = seen[-1]
+    if play is not None:
+        latent = encode_frames(vae, own.get("pixels"), own.get("length"))
+    inverse = _train_inverse(latent, own, config.inverse, fit, config.seed)
     metadata = {
         "scene_version": scene_version,
         "spread": str(spread),
@@ -100,7 +116,7 @@ def train_representation(
         "seed": str(config.seed),
         "command": command,
     }
-    return Representation(vae.cpu(), lae.cpu(), metadata)
+    return Representation(vae.cpu(), lae.cpu(), inverse.cpu(), metadata)
 
 
 @torch.no_grad()
@@ -155,7 +171,8 @@ def load_representation(path: str | Path, *, scene_version: str | None = None) -
         trained_on = metadata["scene_version"]
         vae = VAE(config["vae"]["latent_size"], len(tensors["vae.inverse_head.bias"]))
         lae = SequenceAutoencoder(vae.latent_size, config["lae"]["embedding_size"])
-        for name, module in (("vae.", vae), ("lae.", lae)):
+        inverse = InverseModel(vae.latent_size, vae.action_size, config["inverse"]["hidden_size"])
+        for name, module in (("vae.", vae), ("lae.", lae), ("inverse.", inverse)):
             module.load_state_dict(
                 {k.removeprefix(name): v for k, v in tensors.items() if k.startswith(name)}
             )
@@ -167,16 +184,16 @@ def load_representation(path: str | Path, *, scene_version: str | None = None) -
         raise ValueError(
             f"{path} was trained on scene {trained_on}, this is scene {scene_version}: {remedy}"
         )
-    return Representation(
-        vae.eval().requires_grad_(False), lae.eval().requires_grad_(False), metadata
-    )
+    for module in (vae, lae, inverse):
+        module.eval().requires_grad_(False)
+    return Representation(vae, lae, inverse, metadata)
 
 
 def _tensors(representation: Representation) -> dict[str, Tensor]:
     return {
         f"{name}.{key}": value
-        for name, module in (("vae", representation.vae), ("lae", representation.lae))
-        for key, value in module.state_dict().items()
+        for name in ("vae", "lae", "inverse")
+        for key, value in getattr(representation, name).state_dict().items()
     }
 
 
@@ -251,6 +268,38 @@ def _train_vae(datasets: Sequence[TensorDictBase], config: VAEConfig, fit: Fit, 
     chunks = (chunk.to(fit.device) for chunk in frames.split(64))
     vae.set_latent_scale(torch.cat([vae.encode(chunk)[0] for chunk in chunks]))
     return vae
+
+
+def _train_inverse(
+    latent: Tensor,
+    episodes: TensorDictBase,
+    config: InverseModelConfig,
+    fit: Fit,
+    seed: int,
+) -> InverseModel:
+    """Train the inverse model on the latents ``[N, T, 64]`` and actions of episodes."""
+    length, action = episodes.get("length"), episodes.get("action")
+    slow = action.abs().amax(-1) <= config.largest_action
+    chosen = (slow & valid_steps(length - 1, action.shape[1])).nonzero()
+    if not len(chosen):
+        raise ValueError(
+            f"no recorded action is as small as largest_action {config.largest_action}"
+        )
+
+    def sample(generator: torch.Generator) -> TensorDict:
+        drawn = torch.randint(len(chosen), (config.batch_size,), generator=generator)
+        episode, step = chosen[drawn].unbind(-1)
+        windows = window(latent, length, episode, step)
+        return TensorDict({"window": windows, "action": action[episode, step]}, [len(drawn)])
+
+    generator = torch.Generator().manual_seed(seed)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        inverse = InverseModel(
+            latent.shape[-1], action.shape[-1], config.hidden_size, config.dropout
+        )
+        fit("inverse", ActionInferenceLoss(inverse), sample, config, generator)
+    return inverse.eval().requires_grad_(False)
 
 
 def _train_lae(

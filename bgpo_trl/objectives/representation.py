@@ -1,4 +1,4 @@
-"""Losses of the VAE and the sequence autoencoder (paper, Sec. III-A)."""
+"""Losses of the VAE, the sequence autoencoder and the inverse model (paper, Sec. III-A)."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from tensordict.utils import NestedKey
 from torchrl.objectives import LossModule
 
 from bgpo_trl.errors import missing_key
+from bgpo_trl.modules.inverse_model import InverseModel
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
 
@@ -124,6 +125,54 @@ class VAEInverseLoss(LossModule):
         }
         weighted = {f"loss_{name}": self.weights[name] * term for name, term in terms.items()}
         return TensorDict({**weighted, **{name: term.detach() for name, term in terms.items()}}, [])
+
+
+class ActionInferenceLoss(LossModule):
+    """Squared error of the inverse model, summed over an action.
+
+    Reads ``window`` ``[*B, 4 * latent_size]`` and ``action`` ``[*B, action_size]``; writes
+    ``loss_inverse`` ``[]``, a mean. From ``forward``, a missing entry raises ``ValueError``.
+
+    Args:
+        inverse: Network to train.
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        window: NestedKey = "window"
+        action: NestedKey = "action"
+
+    default_keys = _AcceptedKeys
+    tensor_keys: _AcceptedKeys
+
+    def __init__(self, inverse: InverseModel) -> None:
+        super().__init__()
+        self.inverse = inverse
+
+    @property
+    def functional(self) -> bool:
+        """Whether parameters are passed to the network: no, they stay in it."""
+        return False
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """The keys that ``forward`` reads."""
+        return [self.tensor_keys.window, self.tensor_keys.action]
+
+    @property
+    def out_keys(self) -> list[NestedKey]:
+        """The keys that ``forward`` writes."""
+        return ["loss_inverse"]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """Return the loss for a batch of windows."""
+        window = tensordict.get(self.tensor_keys.window, None)
+        action = tensordict.get(self.tensor_keys.action, None)
+        if window is None or action is None:
+            raise missing_key("ActionInferenceLoss", tensordict, self.in_keys)
+        # Without the clamp of `infer`, beyond which there would be no gradient.
+        error = (self.inverse.network(window) - action).square().sum(-1).mean()
+        return TensorDict({"loss_inverse": error}, [])
 
 
 class SequenceReconstructionLoss(LossModule):
