@@ -181,7 +181,7 @@ def main(arguments: Arguments) -> None:
     deviation = 100 * first.std(0, ddof=1)  # (cm)
     print("\n| standard deviation of the start, cm | x | y |\n|---|---:|---:|")
     for name, (x, y) in zip(nico.OBJECTS, deviation, strict=True):
-        print(f"| {name} | {x:.1f} | {y:.1f} |")
+        print(f"| {name} | {x:.2f} | {y:.2f} |")
     alike = all(np.array_equal(first, of_task) for of_task in starts.values())
     print(f"\nThe starts of all tasks are {'the same' if alike else 'NOT the same'}.")
 

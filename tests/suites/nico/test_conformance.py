@@ -238,7 +238,8 @@ def test_starts_are_spread_over_the_table(load):
         polar.append(polar_places(env.physics))
     deviation = 100 * np.std(places, axis=0)  # (cm)
     for name, (x, y) in zip(OBJECTS, deviation, strict=True):
-        assert x >= 1.5 - 0.1  # of 200 starts, whose deviation itself deviates by 5 %
+        # Of the green box 1.44 cm in the long run, since its radius is near to two others.
+        assert x >= (1.3 if name == "green_box" else 1.5)
         assert y >= (3.5 if name == "green_box" else 6.0)
 
     radii, angles, turns = np.moveaxis(polar, -1, 0)
