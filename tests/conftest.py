@@ -136,7 +136,7 @@ class EasyNicoEnv(NicoEnv):
             moved &= tensordict["_step"].reshape(-1).numpy()
         following = super()._step(tensordict)
         yaw = np.array([tasks[0].physics.arm_angles()[0] for tasks in self._environments])
-        self._done |= moved & (yaw > 0.2)
+        self._done |= moved & (yaw > 0.1)
         won = torch.from_numpy(moved & self._done).reshape(*self.batch_size, 1)
         return following.update({"reward": won.float(), **self._dones()})
 
