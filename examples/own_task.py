@@ -21,7 +21,9 @@ OWN, OUT = "push_white_to_green", Path("runs/own-task")
 
 
 class PushWhiteToGreen(nico.NicoTask):
-    """Success: the white box touches the green box."""
+    """Success: the white box touches the green box for two steps."""
+
+    steady_steps = 2
 
     def succeeded(self, physics):
         return physics.touching("white_box", "green_box")

@@ -12,6 +12,7 @@ from json import JSONDecodeError
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -121,7 +122,17 @@ def in_world(bank):
 
 
 class EasyNicoEnv(NicoEnv):
-    """Ends episodes with success, too, where the arm is turned far enough to one side."""
+    """Ends episodes with success, too, where the arm is turned far enough to one side.
+
+    Nothing collides or falls: a contact would make the rounding of a batch, which differs from that
+    of a seed alone, a hundred thousand times larger within two steps.
+    """
+
+    def __init__(self, *arguments, **settings):
+        super().__init__(*arguments, **settings)
+        disabled = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_GRAVITY
+        for tasks in self._environments:
+            tasks[0].physics.model.opt.disableflags |= disabled
 
     def _step(self, tensordict):
         moved = ~self._done
@@ -129,7 +140,7 @@ class EasyNicoEnv(NicoEnv):
             moved &= tensordict["_step"].reshape(-1).numpy()
         following = super()._step(tensordict)
         yaw = np.array([tasks[0].physics.arm_angles()[0] for tasks in self._environments])
-        self._done |= moved & (yaw > 0.15)
+        self._done |= moved & (yaw > 0.1)
         won = torch.from_numpy(moved & self._done).reshape(*self.batch_size, 1)
         return following.update({"reward": won.float(), **self._dones()})
 

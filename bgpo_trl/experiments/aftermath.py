@@ -1,7 +1,7 @@
 """What a success is worth: the simulation continued from the states in which episodes succeeded.
 
-A task's criterion looks at one moment, and a learner finds the cheapest thing that pays. Here a
-grasped object is lifted, and what was pushed is left alone for two seconds.
+A task's condition has to hold for two or three steps, and a learner finds the cheapest thing that
+pays. Here a grasped object is lifted, and what was pushed is left alone for two seconds.
 """
 
 from __future__ import annotations

@@ -46,7 +46,7 @@ NOMINAL_ANGLES = np.array([SIDE_ANGLE, 0.0, -SIDE_ANGLE])  # of `OBJECTS`
 # Range of the palm's start: in view, among or above the objects.
 START_ANGLE = np.radians(30.0)  # to both sides of the middle of the arc
 START_RADIUS = (0.34, 0.42)  # (m)
-START_HEIGHT = (0.05, 0.12)  # (m) above the table
+START_HEIGHT = (0.05, 0.12)  # (m) above the table; nominally the highest, over the green box
 
 
 def scene_version() -> str:
@@ -112,19 +112,26 @@ class NicoTask(control.Task):
     to 0.2 rad and of the hand by up to 0.4 rad per step. Before each action, a target is brought
     back to within one full step of its joint, so that the observation nearly determines the state.
 
-    An episode succeeds once `succeeded` has held for `steady_steps` control steps in a row.
+    `succeeded` tests a condition at one moment, at the end of each control step. The episode
+    succeeds, with reward 1, once the condition has held for `steady_steps` steps in a row. The
+    count is part of the simulation's state (``physics.get_state()``), and so is where the objects
+    stood at the start (``physics.start_position``), for conditions on how far something has moved.
+
+    Start states do not depend on the task: the same seed gives all tasks the same starts.
 
     Args:
         random: Random state of the start states, or its seed; ``None`` for a random seed.
-        spread: Share of the whole range of start states, from 0 (objects at their nominal places,
-            turned alike, the hand at the middle of its range) to 1.
+        spread: Share of the whole range of start states, from 0 to 1. At 0, objects are always at
+            `nominal_places`, unturned, and the half-open hand is above the green box. In between,
+            all deviations from that are scaled, and glass and white box swap sides with probability
+            ``spread / 2``.
         observation: ``"pixels"`` (uint8 ``[32, 64, 3]``), ``"state"`` (``privileged_state``,
             float64 ``[16]``) or ``"both"``.
         frame_size: Height and width of ``pixels``.
         renderer: Renderer shared with other environments; created on demand if ``None``.
 
     Attributes:
-        steady_steps: Control steps for which the condition of success has to hold.
+        steady_steps: Number of control steps in a row for which `succeeded` has to hold.
 
     Raises:
         ValueError: If there is no such observation, ``spread`` is not in [0, 1], or the renderer
@@ -166,7 +173,10 @@ class NicoTask(control.Task):
         return self._random
 
     def succeeded(self, physics: Physics) -> bool:
-        """Return whether the condition of success holds now; it counts once it has lasted."""
+        """Return whether the condition of success holds at this moment.
+
+        The episode succeeds once this has held for `steady_steps` control steps in a row.
+        """
         raise NotImplementedError
 
     def demonstration(self, physics: Physics, random: np.random.Generator) -> Sequence[Phase]:
@@ -195,7 +205,12 @@ class NicoTask(control.Task):
         physics.begin_episode()
 
     def _object_places(self) -> tuple[list[np.ndarray], np.ndarray]:
-        """Draw the places ``[x, y]`` (m) and turns (rad) of the objects, in the order `OBJECTS`."""
+        """Draw the places ``[x, y]`` (m) and turns (rad) of the objects, in the order `OBJECTS`.
+
+        The whole range is drawn from, whatever the spread, and scaled afterwards: what neighbors
+        have to keep between them holds for what is drawn and for the nominal places, hence for all
+        that lies in between.
+        """
         swapped = self.random.uniform() < self.spread / 2
         nominal = NOMINAL_ANGLES[::-1] if swapped else NOMINAL_ANGLES
         green = self.random.uniform(-GREEN_JITTER, GREEN_JITTER)
@@ -215,15 +230,19 @@ class NicoTask(control.Task):
         return [kinematics.polar(r, a) for r, a in zip(radii, angles, strict=True)], turns
 
     def _place_arm(self, physics: Physics) -> None:
-        angle, radius, height, curl = (
-            (low + high) / 2 + self.spread * (high - low) / 2 * self.random.uniform(-1.0, 1.0)
-            for low, high in (
+        lowest, highest = np.transpose(
+            [
                 (-START_ANGLE, START_ANGLE),
                 START_RADIUS,
                 START_HEIGHT,
                 physics.named.model.jnt_range["thumb_1"],
-            )
+            ]
         )
+        middle = (lowest + highest) / 2
+        drawn = middle + (highest - lowest) / 2 * self.random.uniform(-1.0, 1.0, 4)
+        # Of the middle of the range, the hand would touch the green box at its nominal place.
+        nominal = np.array([middle[0], middle[1], highest[2], middle[3]])
+        angle, radius, height, curl = (1.0 - self.spread) * nominal + self.spread * drawn
         palm = np.append(kinematics.polar(radius, angle), TABLE_HEIGHT + height)
         arm = kinematics.inverse(palm, kinematics.PALM)
         physics.data.qpos[:12] = [*arm, *[curl] * 9]
@@ -244,7 +263,7 @@ class NicoTask(control.Task):
         physics.set_control(np.minimum(np.maximum(target, lowest), highest))
 
     def after_step(self, physics: Physics) -> None:
-        """Count the steps for which the condition of success has held."""
+        """Count the steps in a row for which `succeeded` has held."""
         physics.count_steady(self.succeeded(physics))
 
     def action_spec(self, physics: Physics) -> specs.BoundedArray:
@@ -277,11 +296,11 @@ class NicoTask(control.Task):
         return observation
 
     def get_reward(self, physics: Physics) -> float:
-        """Return 1 on success, else 0."""
+        """Return 1 if `succeeded` has held for `steady_steps` steps, else 0."""
         return float(physics.steady_steps >= self.steady_steps)
 
     def get_termination(self, physics: Physics) -> float | None:
-        """Return discount 0 on success, else ``None``."""
+        """Return discount 0 if `succeeded` has held for `steady_steps` steps, else ``None``."""
         return 0.0 if physics.steady_steps >= self.steady_steps else None
 
     def close(self) -> None:

@@ -2,7 +2,8 @@
 
 A movement leads the hand by inverse kinematics through a few noisy waypoints: above the start
 of the sweep, down to the table and sideways into the object, where it may close, or from above
-onto the object. The waypoints follow the objects as they move.
+onto the object. The waypoints follow the objects as they move. Phases that may get stuck, against
+the table or a neighbor, end after some steps; a movement that has failed is planned anew.
 """
 
 from collections.abc import Callable, Sequence
@@ -14,26 +15,37 @@ import numpy as np
 from suites.nico import kinematics
 from suites.nico.physics import OBJECT_HALF_HEIGHT, OBJECTS, TABLE_HEIGHT, Physics
 
-CLEAR_HEIGHT: Final = TABLE_HEIGHT + 0.125  # (m) of the palm while it travels over the objects
-SWEEP_HEIGHT: Final = TABLE_HEIGHT + 0.045  # (m) of the palm while it sweeps
-OPEN: Final = 0.05  # (rad) curl of a segment
-FIST: Final = 0.85  # (rad) curl of a segment
+# Height of the palm (m) while it travels: the lowest digit passes over the glass, 7 cm high.
+CLEAR_HEIGHT: Final = TABLE_HEIGHT + 0.125
+# Height of the palm (m) while it sweeps: the digits clear the table and meet the boxes, 5 cm high.
+SWEEP_HEIGHT: Final = TABLE_HEIGHT + 0.045
+OPEN: Final = 0.05  # (rad) curl of a segment, just off the joint's stop
+FIST: Final = 0.85  # (rad) curl of a segment, just short of the joint's other stop
 GRIP: Final = 1.2  # (rad) curl of a segment, beyond what the joints reach, for a firm grip
 
 # Contact point of a pushed box, as (left of the arm's plane, beyond the wrist) (m): the fist's
-# knuckles when pushed left, the back of the hand when pushed right.
+# knuckles when pushed left, the back of the hand when pushed right. Both lie outside of the hand by
+# about half a box, so that the point is where the box's center should be.
 _BEFORE_KNUCKLES, _BEHIND_BACK = (0.078, 0.09), (-0.043, 0.045)
 _FRONT = (0.02, 0.12)  # front of the fist, between palm and fingers
-_LEAD = 0.14  # (m) by which the hand aims ahead of the box it pushes
-_MIDDLE_REACH = 0.415  # (m) radius up to which a box is pushed to the right in this way
-_OUT = 0.02
-_AHEAD = 0.08  # (rad) by which the goal of a push aside is ahead on the arc
+# Lead of the hand's target over the box it pushes (m), more than the arm moves in a step: the speed
+# is then the demonstrator's, and the direction that of the goal.
+_LEAD = 0.14
+# Radius (m) beyond which the fingers, not the middle of the hand, push a box to the right: with the
+# middle, the arm would have to be nearly straight.
+_MIDDLE_REACH = 0.415
+# Goal of a push aside, from the object: ahead on the arc (rad), and beyond the radius at which the
+# object started (m). It is the direction that counts: along the arc, and back to the radius.
+_AHEAD, _OUT = 0.08, 0.02
 # Distance from the grip at which the descending palm just misses the center of a box (m).
 _PALM = 0.094
 _LIFT_HEIGHT = TABLE_HEIGHT + 0.039  # (m) of the grip around a box to lift; higher, it slips
-_FIRM = 0.25  # (rad) lead of the targets over the curls with which it holds what it lifts
-_RISE = np.array([0.0, 0.0, 0.04])  # (m) from the grip to the place at which a lift aims
-_NOISE = 0.006  # (m) standard deviation of the waypoints
+# Mean lead of the targets over the curls (rad) from which on the hand is closed firmly enough to
+# lift: the object holds the digits back, whose targets go on.
+_FIRM = 0.25
+# From the grip to the place at which a lift aims (m): always ahead, so that the arm rises on.
+_RISE = np.array([0.0, 0.0, 0.04])
+_NOISE = 0.006  # (m) standard deviation of the waypoints, so that no two demonstrations are alike
 
 
 Place = Callable[[Physics], np.ndarray]
@@ -55,8 +67,8 @@ class Phase:
     pace: float = 1.0
     """Factor of the demonstrator's speed."""
     limit: int = 50
-    """Steps after which the phase ends in any case; after the last phase, the movement is planned
-    anew."""
+    """Steps after which the phase ends in any case, as long as an episode by default. After the
+    last phase, the movement is planned anew."""
 
 
 def grasp(physics: Physics, random: np.random.Generator, name: str) -> Sequence[Phase]:
@@ -98,7 +110,7 @@ def _reach(
 ) -> Sequence[Phase]:
     """Return a sweep of the open hand to the left that ends with an object in it."""
     noise = random.normal(0.0, _NOISE, 3)
-    # The palm would otherwise come down on a near neighbor.
+    # The palm would otherwise come down on a near neighbor; but 3 cm to the object have to remain.
     right = min(random.uniform(0.065, 0.085), max(_room_on_the_right(physics, name) - _PALM, 0.03))
 
     def beside(height: float) -> Place:

@@ -49,7 +49,7 @@ def add_task(name: str, task: type[NicoTask]) -> None:
 
     Args:
         name: Name of the task in `load`, datasets, settings and CSV files.
-        task: Class that defines success and, for recording, a demonstration.
+        task: Class that defines the condition of success and, for recording, a demonstration.
 
     Raises:
         ValueError: If the name is taken by one of the suite's tasks, is "all" or not an identifier,
@@ -103,7 +103,8 @@ def load(
     Args:
         task: One of `TASKS`.
         seed: Seed or random state of the start states; ``None`` for a random seed.
-        spread: Share of the whole range of start states, from 0 (nominal places) to 1.
+        spread: Share of the whole range of start states, from 0 (nominal places) to 1, see
+            `NicoTask`.
         observation: ``"pixels"`` (uint8 ``[32, 64, 3]``), ``"state"`` (``privileged_state``, the
             ground truth, float64 ``[16]``: joints (rad), grip and object positions (m)) or
             ``"both"``.
@@ -115,8 +116,8 @@ def load(
         environment_kwargs: Further arguments of ``dm_control.rl.control.Environment``.
 
     Raises:
-        ValueError: If the task, the observation or the frame size is invalid, or ``time_limit`` is
-            not positive.
+        ValueError: If the task, the spread, the observation or the frame size is invalid, or
+            ``time_limit`` is not positive.
 
     Example:
         >>> from suites import nico

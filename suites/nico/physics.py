@@ -114,15 +114,6 @@ class Physics(dm_mujoco.Physics):
         """
         return self.data.xpos[self._object_id("body", name)].copy()
 
-    def object_speed(self, name: str) -> float:
-        """Return the speed of an object's center (m/s).
-
-        Raises:
-            ValueError: If ``name`` is not one of `OBJECTS`.
-        """
-        first = self.model.body_dofadr[self._object_id("body", name)]
-        return float(np.linalg.norm(self.data.qvel[first : first + 3]))
-
     def start_position(self, name: str) -> np.ndarray:
         """Return where an object's center was at the start of the episode (m), ``[3]``.
 
@@ -135,17 +126,17 @@ class Physics(dm_mujoco.Physics):
     # What an episode remembers is in MuJoCo's user data, hence in `get_state`.
 
     def begin_episode(self) -> None:
-        """Note where the objects are, and that nothing has succeeded yet."""
+        """Store where the objects are, for `start_position`, and set `steady_steps` to 0."""
         self.data.userdata[0] = 0.0
         self.data.userdata[1:] = np.concatenate([self.object_position(name) for name in OBJECTS])
 
     @property
     def steady_steps(self) -> int:
-        """Number of latest control steps for which the condition of success has held."""
+        """Number of latest control steps in a row for which the condition of success has held."""
         return int(self.data.userdata[0])
 
     def count_steady(self, holds: bool) -> None:
-        """Count a control step for which the condition of success holds, or begin anew."""
+        """Add a control step to `steady_steps`, or set it to 0 if the condition does not hold."""
         self.data.userdata[0] = self.data.userdata[0] + 1.0 if holds else 0.0
 
     def privileged_state(self) -> np.ndarray:
@@ -233,7 +224,12 @@ class Physics(dm_mujoco.Physics):
         return False
 
     def stands(self, name: str) -> bool:
-        """Return whether an object stands upright on the table, unless it is turned on a side.
+        """Return whether an object stands upright on the table, not on another of its sides.
+
+        It may be moving.
+
+        Args:
+            name: One of `OBJECTS`.
 
         Raises:
             ValueError: If ``name`` is not one of `OBJECTS`.

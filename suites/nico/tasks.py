@@ -1,7 +1,8 @@
 """The eight tasks: what counts as success, and the movement that demonstrates it.
 
-A success is what a person would call so: it lasts for several control steps (`steady_steps`), so
-that a touch in passing, a thrown object or a glass that slips out of the hand earns nothing.
+A success is what a person would call so: its condition (`succeeded`) has to hold for some control
+steps in a row (`steady_steps`), so that a touch in passing, a thrown object or a glass that slips
+out of the hand earns nothing. Conditions hold wherever the objects are, and none holds at a start.
 """
 
 from __future__ import annotations
@@ -21,13 +22,13 @@ FIST: Final = 0.6  # (rad) mean curl beyond which the hand is a fist
 
 
 class Grasp(NicoTask):
-    """Success: the closing hand holds an object, which rests between thumb and fingers."""
+    """Success: the closing hand holds an object for three steps."""
 
     thing: ClassVar[str]
     steady_steps = 3
 
     def succeeded(self, physics: Physics) -> bool:
-        """Return whether the object is held."""
+        """Return whether the object is between thumb and fingers of the closing hand now."""
         return physics.held(self.thing)
 
     def demonstration(self, physics: Physics, random: np.random.Generator) -> Sequence[moves.Phase]:
@@ -36,13 +37,13 @@ class Grasp(NicoTask):
 
 
 class Lift(NicoTask):
-    """Success: the closing hand holds an object at least 1.5 cm above the table."""
+    """Success: the closing hand holds an object over 1.5 cm above the table for three steps."""
 
     thing: ClassVar[str]
     steady_steps = 3
 
     def succeeded(self, physics: Physics) -> bool:
-        """Return whether the object is held above the table."""
+        """Return whether the object is held above the table now."""
         height = physics.object_position(self.thing)[2] - OBJECT_HALF_HEIGHT[self.thing]
         return bool(height > TABLE_HEIGHT + LIFTED) and physics.held(self.thing)
 
@@ -52,13 +53,13 @@ class Lift(NicoTask):
 
 
 class Press(NicoTask):
-    """Success: the fist rests on an object."""
+    """Success: the fist rests on an object for two steps."""
 
     thing: ClassVar[str]
     steady_steps = 2
 
     def succeeded(self, physics: Physics) -> bool:
-        """Return whether the fist touches the object from above."""
+        """Return whether the fist touches the object from above now."""
         return bool(physics.joint_angles()[3] > FIST) and physics.pressed(self.thing)
 
     def demonstration(self, physics: Physics, random: np.random.Generator) -> Sequence[moves.Phase]:
@@ -67,14 +68,14 @@ class Press(NicoTask):
 
 
 class PushTogether(NicoTask):
-    """Success: a box has come to touch its target, wherever that stands, and both stay together."""
+    """Success: a box touches its target, wherever that is, for two steps."""
 
     thing: ClassVar[str]
     target: ClassVar[str]
     steady_steps = 2
 
     def succeeded(self, physics: Physics) -> bool:
-        """Return whether the box touches its target."""
+        """Return whether the box touches its target now."""
         return physics.touching(self.thing, self.target)
 
     def demonstration(self, physics: Physics, random: np.random.Generator) -> Sequence[moves.Phase]:
@@ -83,7 +84,7 @@ class PushTogether(NicoTask):
 
 
 class PushAside(NicoTask):
-    """Success: an object stands at least 5 cm to one side of where it stood at the start.
+    """Success: an object stands more than 5 cm to one side of where it started, for two steps.
 
     The displacement is measured along the arc about the shoulder's yaw axis.
     """
@@ -93,7 +94,7 @@ class PushAside(NicoTask):
     steady_steps = 2
 
     def succeeded(self, physics: Physics) -> bool:
-        """Return whether the object has moved far enough and stands upright."""
+        """Return whether the object is far enough to the side and stands upright now."""
         radius, angle = kinematics.to_polar(physics.object_position(self.thing))
         before = kinematics.to_polar(physics.start_position(self.thing))[1]
         left = radius * (angle - before)

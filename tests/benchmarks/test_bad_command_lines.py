@@ -120,7 +120,8 @@ CASES = [
     ("groups.py --draws 0", "--draws", "at least 1, got 0"),
     ("unknown_task.py --seeds 0 0", "seeds must be one or more", "all different"),
     ("unknown_task.py --tasks grasp_glass", "--tasks", "name at least two"),
-    ("nico_tasks.py --starts 0", "--starts", "at least 1, got 0"),
+    ("nico_tasks.py --starts 1", "--starts", "at least 2, got 1"),
+    ("nico_tasks.py --pictures no-such-folder", "no-such-folder", "make it first"),
     # stage 1
     ("bgpo_trl.data.recording file", "cannot make the folder file", "choose another"),
     ("bgpo_trl.data.recording new --per-task 0", "held_out_per_task", "less than per_task, 0"),
