@@ -70,8 +70,8 @@ class InverseModelConfig:
 
     hidden_size: int = 512
     """Units of each of the two hidden layers."""
-    dropout: float = 0.2
-    """Share of hidden units dropped in training."""
+    noise: float = 0.1
+    """Standard deviation of the noise added to the standardized latents."""
     largest_action: float = 0.6
     """Actions with a larger component are left out: demonstrators move slowly, and errors of fast
     movements would prevail in the loss."""
@@ -87,7 +87,7 @@ class InverseModelConfig:
     def __post_init__(self) -> None:
         whole(self, 1, "hidden_size", "batch_size", "warmup_steps", "steps")
         positive(self, "learning_rate", "largest_action")
-        check(self, ("dropout", 0 <= self.dropout < 1, "at least 0 and below 1"))
+        at_least(self, 0, "noise")
 
 
 @dataclass(frozen=True)

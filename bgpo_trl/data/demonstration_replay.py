@@ -85,8 +85,8 @@ class DemonstrationReplay:
 
         Returns:
             Batch size ``[S, R]`` as in `GroupReplay.sample`, with the state, the constant entries,
-            ``"action"``, ``"priority_weight"``, ``"demonstrated"`` (true) and, under ``"next"``, the state, ``"reward"`` and
-            ``"terminated"``.
+            ``"action"``, ``"priority_weight"``, ``"demonstrated"`` (true) and, under ``"next"``,
+            the state, ``"reward"`` and ``"terminated"``.
         """
         shown = self._shown.sample(group)
         steps, share = self._steps, draw_shares(group, self._generators)

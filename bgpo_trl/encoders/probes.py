@@ -65,9 +65,10 @@ def probe(
         ``<object>_error_cm`` and ``<object>_linear_error_cm`` (distance of a perceptron's and of a
         linear probe's place from the true one, mean over frames), ``inverse_rmse``, ``inverse_r2``
         and ``inverse_r2_<joint>`` (actions of the training demonstrations, as they are inferred for
-        the bank), ``reconstruction`` (squared error per frame), ``mean_frame_reconstruction`` (the same for the mean training frame, the level of an
-        untrained VAE), ``sequence_mse`` (of standardized latents, so 1 is the level of predicting
-        the mean), ``task_accuracy_linear``, ``task_accuracy_nearest`` and ``active_dimensions``.
+        the bank), ``reconstruction`` (squared error per frame), ``mean_frame_reconstruction`` (the
+        same for the mean training frame, the level of an untrained VAE), ``sequence_mse`` (of
+        standardized latents, so 1 is the level of predicting the mean), ``task_accuracy_linear``,
+        ``task_accuracy_nearest`` and ``active_dimensions``.
 
     Raises:
         ValueError: If the dataset has no training or no held-out demonstrations.

@@ -27,8 +27,8 @@ from bgpo_trl.configs import (
 )
 from bgpo_trl.encoders.fitting import Fit, Log
 from bgpo_trl.files.tensor_file import digest, load_tensors, save_tensors
-from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.inverse_model import InverseModel, window
+from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
 from bgpo_trl.objectives.representation import (
     ActionInferenceLoss,
@@ -290,15 +290,14 @@ def _train_inverse(
         drawn = torch.randint(len(chosen), (config.batch_size,), generator=generator)
         episode, step = chosen[drawn].unbind(-1)
         windows = window(latent, length, episode, step)
+        windows = windows + config.noise * torch.randn(windows.shape, generator=generator)
         return TensorDict({"window": windows, "action": action[episode, step]}, [len(drawn)])
 
     generator = torch.Generator().manual_seed(seed)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        inverse = InverseModel(
-            latent.shape[-1], action.shape[-1], config.hidden_size, config.dropout
-        )
-        fit("inverse", ActionInferenceLoss(inverse), sample, config, generator)
+        inverse = InverseModel(latent.shape[-1], action.shape[-1], config.hidden_size)
+    fit("inverse", ActionInferenceLoss(inverse), sample, config, generator)
     return inverse.eval().requires_grad_(False)
 
 

@@ -20,7 +20,6 @@ class InverseModel(nn.Module):
         latent_size: Dimensions of a latent.
         action_size: Dimensions of an action.
         hidden_size: Units of each of the two hidden layers.
-        dropout: Share of hidden units dropped in training.
 
     Example:
         >>> z, length = torch.randn(5, 51, 64), torch.tensor([51, 30, 2, 2, 40])
@@ -28,18 +27,11 @@ class InverseModel(nn.Module):
         torch.Size([5, 50, 4])
     """
 
-    def __init__(
-        self,
-        latent_size: int = 64,
-        action_size: int = 4,
-        hidden_size: int = 512,
-        dropout: float = 0.2,
-    ) -> None:
+    def __init__(self, latent_size: int = 64, action_size: int = 4, hidden_size: int = 512) -> None:
         super().__init__()
         self.network = nn.Sequential(
             nn.Linear((_BEFORE + _AFTER + 1) * latent_size, hidden_size),
             nn.ReLU(),
-            nn.Dropout(dropout),
             nn.Linear(hidden_size, hidden_size),
             nn.ReLU(),
             nn.Linear(hidden_size, action_size),

@@ -50,8 +50,8 @@ class VAE(nn.Module):
         action_size: Dimensions of an action (paper: 4).
 
     Raises:
-        ValueError: If there is no action, or no keypoint; from methods, if frames have another dtype or shape,
-            or latents another size.
+        ValueError: If there is no action, or no keypoint; from methods, if frames have another
+            dtype or shape, or latents another size.
 
     Attributes:
         mean_frame: Buffer ``[32, 64, 3]`` in [0, 1], set before training; grey until then.
