@@ -222,7 +222,9 @@ def valid_frames(dataset: TensorDictBase) -> Tensor:
 
 def mean_frame(frames: Tensor) -> Tensor:
     """Return the mean of uint8 ``[F, 32, 64, 3]`` as float32 ``[32, 64, 3]`` in [0, 1]."""
-    return frames.sum(0, dtype=torch.int64) / (255 * len(frames))
+    # In parts: a sum over all frames would first convert all of them to int64.
+    parts = [part.sum(0, dtype=torch.int64) for part in frames.split(1024)]
+    return torch.stack(parts).sum(0) / (255 * len(frames))
 
 
 def _train_vae(datasets: Sequence[TensorDictBase], config: VAEConfig, fit: Fit, seed: int) -> VAE:
