@@ -20,9 +20,6 @@ from bgpo_trl.configs import RLConfig
 from bgpo_trl.objectives.transition import TransitionInputs, TransitionKeys
 
 __all__ = ["OffPolicyLoss"]
-import os
-
-QFILTER = bool(os.environ.get("QFILTER"))
 
 
 class OffPolicyLoss(LossModule):
@@ -267,14 +264,6 @@ class OffPolicyLoss(LossModule):
         if demonstrated is None:
             return torch.zeros(tensordict.batch_size, device=tensordict.device)
         distance = (data.get(keys.action) - tensordict.get(keys.action)).square().sum(-1)
-        if QFILTER:
-            with torch.no_grad():
-                q = self.values(
-                    self.network("value_network"),
-                    self.inputs.select(tensordict, self.value_network.in_keys),
-                )
-                mine = self.values(self.network("value_network"), data)
-            distance = distance * (q > mine)
         return distance * demonstrated
 
     def mean_per_seed(
