@@ -127,8 +127,10 @@ class BGPOConfig(AlgorithmConfig):
     """Whether an update draws equally from the groups played last. Ours: the paper draws uniformly
     from all transitions."""
     demonstration_share: float = 0.25
-    """See `AlgorithmConfig`. Ours: doubles to triples the success of a task's first hundred
-    episodes."""
+    """See `AlgorithmConfig`. Ours: what demonstrations show is rarely found by chance."""
+    rl: RLConfig = field(default_factory=lambda: DDPGConfig(noise=0.1))
+    """See `AlgorithmConfig`. Ours: exploration noise on the scale of demonstrated actions, since
+    what to explore is near them; without demonstrations it is larger."""
     active_groups: int = 3
     """Largest number of groups per update, those played last. Ours: bounds the cost of an
     update."""

@@ -14,9 +14,9 @@ class RLConfig:
 
     name: str = ""
     """Key in `bgpo_trl.algorithms.rl.RL`, which identifies the class in ``config.json``."""
-    hidden_sizes: tuple[int, ...] = (256,)
-    """Hidden layers of actor and critic. Ours: the 64 units of Sec. IV-A limit the success
-    (docs/learning.md)."""
+    hidden_sizes: tuple[int, ...] = (256, 256)
+    """Hidden layers of actor and critic. Ours: the 64 units of Sec. IV-A limit the success, and a
+    second layer helps to read places from latents (docs/learning.md)."""
     critic_layer_norm: bool = True
     """Whether the critic's hidden layers have layer norm. Ours: halves the episodes needed."""
     learning_rate: float = 1e-3
@@ -33,8 +33,9 @@ class RLConfig:
     clip_targets: bool = True
     """Whether bootstrapped targets are clipped to the attainable returns. Ours: otherwise Q grows
     to hundreds."""
-    imitation: float = 0.0
-    """Weight of the squared distance to demonstrated actions in the actor's loss. Ours."""
+    imitation: float = 3.0
+    """Weight of the squared distance to demonstrated actions in the actor's loss, of no effect
+    without a ``demonstration_share``. Ours."""
     warmup_steps: int = 256
     """Environment steps of each seed before the first update. Ours: not given in the paper."""
 
