@@ -39,6 +39,7 @@ _PAPER = DDPGConfig(
     critic_layer_norm=False,
     batch_size=256,
     clip_targets=False,
+    imitation=0.0,
     pre_tanh_penalty=0.0,
 )
 _PUBLISHED: Any = {"rl": _PAPER, "gwr": GWRBConfig(activity_scale=1.0), "behavior_scale": 1.0}
