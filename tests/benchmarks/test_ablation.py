@@ -13,6 +13,7 @@ from torchrl.envs import check_env_specs
 from benchmarks import ablation
 from bgpo_trl.algorithms import ABLATIONS
 from bgpo_trl.algorithms.bgpo import BGPO
+from bgpo_trl.configs.rl import DDPGConfig
 from bgpo_trl.experiments.arguments import Arguments, command_line
 from bgpo_trl.files.checkpoint import load_checkpoint
 from bgpo_trl.runs.results import read_table
@@ -214,15 +215,16 @@ def test_the_command_line_knows_every_variant():
 def test_the_variants_beyond_the_paper_add_one_thing_at_a_time(make):
     published = ABLATIONS["gwr+r_int"].config
     assert not (published.experts or published.even_replay or published.demonstration_share)
+    shown = {"demonstration_share": 0.25, "rl": DDPGConfig(noise=0.1)}
     for variant, added in {
         "even-replay": {"variant": "bgpo", "even_replay": True},
         "experts": {"variant": "bgpo", "even_replay": True, "experts": True},
-        "demonstrations": {"demonstration_share": 0.25},
+        "demonstrations": shown,
         "all": {
             "variant": "bgpo",
             "even_replay": True,
             "experts": True,
-            "demonstration_share": 0.25,
+            **shown,
         },
     }.items():
         assert ABLATIONS[variant].config == replace(published, **added)

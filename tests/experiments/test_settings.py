@@ -25,7 +25,9 @@ def test_another_algorithm_changes_nothing_else(name):
         expected = replace(config, name=name, algorithm=entry.config)
         assert run_config(arguments) == expected
         published = name.endswith("-paper")
-        assert (entry.config.rl == DDPGConfig()) is not published  # else the same learner for all
+        noise = 0.1 if entry.config.demonstration_share else 0.3
+        # The same learner for all, but those as published.
+        assert (entry.config.rl == DDPGConfig(noise=noise)) is not published
 
 
 def test_the_command_line_names_every_algorithm(capsys):
@@ -42,7 +44,9 @@ def test_the_command_line_names_every_algorithm(capsys):
 def test_another_rl_algorithm_changes_nothing_else(name, rl):
     plain = run_config(Arguments(algorithm=name))
     config = run_config(Arguments(algorithm=name, rl=rl))
-    assert config == replace(plain, algorithm=replace(plain.algorithm, rl=RL[rl].config))
+    own = plain.algorithm.rl
+    expected = own if rl == own.name else RL[rl].config
+    assert config == replace(plain, algorithm=replace(plain.algorithm, rl=expected))
     assert dataclasses.asdict(config)["algorithm"]["rl"]["name"] == rl
 
 

@@ -263,8 +263,11 @@ def test_a_state_that_names_a_missing_group_is_refused():
 
 @pytest.mark.parametrize("tasks", [nico.PAPER_TASKS, nico.ALL_TASKS])
 @pytest.mark.parametrize("order", ["forward", "reversed", "from the start"])
-def test_groups_of_nicos_demonstrations_are_its_tasks(tasks, order):
-    """Draws as in a run; labels are used for the draws and the count alone."""
+def test_groups_of_nicos_demonstrations_are_of_one_task_each(tasks, order):
+    """Draws as in a run; labels are used for the draws and the count alone.
+
+    A task looks different from either side of the table, so that it may have two groups.
+    """
     bank = load_pretrained(tasks=tasks)[1]
     seen, held_out, n_tasks, each = bank.seen(), bank.held_out(), len(tasks), 60
     starts = [0 if order == "from the start" else each * task for task in range(n_tasks)]
@@ -275,8 +278,9 @@ def test_groups_of_nicos_demonstrations_are_its_tasks(tasks, order):
     for available in schedule.available(torch.arange(each * n_tasks + 60)):
         task = rng.choice(available.nonzero().flatten())
         groups.adapt(seen.embedding[int(rng.choice(rows[task]))])
-    assert int(groups.num_groups) == n_tasks
+    assert n_tasks <= int(groups.num_groups) <= 2 * n_tasks
     group = groups.lookup(held_out.embedding).group
-    majority = [group[held_out.task == task].mode().values.item() for task in range(n_tasks)]
-    assert len({*majority}) == n_tasks
-    assert float((group == torch.tensor(majority)[held_out.task]).float().mean()) > 0.99
+    majority = {int(g): held_out.task[group == g].mode().values.item() for g in group.unique()}
+    assert {*majority.values()} == {*range(n_tasks)}
+    of_group = torch.tensor([majority[int(g)] for g in group])
+    assert float((of_group == held_out.task).float().mean()) > 0.99

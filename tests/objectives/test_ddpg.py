@@ -476,7 +476,7 @@ def test_seeds_of_weight_zero_have_no_gradient_and_change_no_others(layer_norm):
     everything, _ = stack_with_weights(4, None, layer_norm=layer_norm)
     weights = torch.tensor([1.0, 0.0, 1.0, 0.0])
     weighted, told = stack_with_weights(4, weights, layer_norm=layer_norm)
-    assert len(weighted) == 8  # weight and bias of two layers of both networks
+    assert len(weighted) == 12  # weight and bias of three layers of both networks
     for grad, unweighted in zip(weighted, everything, strict=True):
         assert not grad[[1, 3]].any()
         assert grad[[0, 2]].equal(unweighted[[0, 2]])
