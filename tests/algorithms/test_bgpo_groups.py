@@ -234,7 +234,8 @@ def test_the_bonus_tells_right_from_wrong_on_the_shipped_bank():
     behavior = gwr.lookup(held_out.embedding).embedding
     bonus = torch.exp(-torch.cdist(behavior, held_out.embedding))
     same = held_out.task.unsqueeze(1) == held_out.task
-    assert bonus[same].median() > 0.15
+    # Half of the demonstrations of a task are from the other side of the table.
+    assert bonus[same].median() > 0.1
     assert bonus[~same].median() < 0.05
 
 
