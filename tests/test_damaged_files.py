@@ -168,6 +168,7 @@ def read_bank(path: Path) -> dict[str, torch.Tensor]:
     bank = dict(vars(DemonstrationBank.load(path, encoder_id="x")))
     bank |= vars(bank.pop("steps"))
     texts = {"tasks": ",".join(bank["tasks"]), "encoder_id": bank["encoder_id"]}
+    bank["spread"] = torch.tensor(bank["spread"])
     return bank | {key: torch.tensor(list(text.encode())) for key, text in texts.items()}
 
 

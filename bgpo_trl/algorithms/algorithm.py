@@ -147,6 +147,7 @@ class Algorithm(ABC):
             generator=generators(seeds, "demonstration replay"),
             state_key=config.state,
             constant_keys=constant_keys,
+            noise=config.demonstration_noise,
         )
 
     def learn(self, batch: TensorDictBase) -> dict[str, Tensor]:

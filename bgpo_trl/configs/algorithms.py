@@ -25,6 +25,9 @@ class AlgorithmConfig:
     demonstration_share: float = 0.0
     """Share of an update's transitions taken from the demonstrations shown so far in training, with
     actions inferred by the inverse model. Ours: the paper has none."""
+    demonstration_noise: float = 0.0
+    """Standard deviation of noise added to demonstrated states when they are sampled. Ours: keeps
+    policies from learning few demonstrations by heart."""
 
     def __post_init__(self) -> None:
         known = self.state in ("latent", "state")
@@ -36,6 +39,7 @@ class AlgorithmConfig:
         )
         whole(self, 1, "max_steps")
         positive(self, "state_limit")
+        at_least(self, 0, "demonstration_noise")
         if share and self.rl.warmup_steps < self.max_steps:
             # Else, seeds would learn from demonstrations sooner or later than each would alone.
             raise ValueError(

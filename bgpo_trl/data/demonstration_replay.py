@@ -11,6 +11,7 @@ from torch import Tensor
 
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.group_replay import GroupReplay, draw_shares
+from bgpo_trl.seeding import normal
 
 __all__ = ["DemonstrationReplay"]
 
@@ -27,6 +28,7 @@ class DemonstrationReplay:
         generator: Random generators for sampling, one for each of ``S`` seeds.
         state_key: Name of the latent.
         constant_keys: Entries that are constant within an episode, stored with each demonstration.
+        noise: Standard deviation of Gaussian noise added to each sampled state, not to the next.
         capacity: Demonstrations kept for each seed; the oldest are overwritten.
 
     Raises:
@@ -40,6 +42,7 @@ class DemonstrationReplay:
         generator: Sequence[torch.Generator],
         state_key: NestedKey = "latent",
         constant_keys: Sequence[NestedKey] = (),
+        noise: float = 0.0,
         capacity: int = 100_000,
     ) -> None:
         if bank.steps is None:
@@ -54,7 +57,7 @@ class DemonstrationReplay:
                 "`python -m bgpo_trl.encoders.make_bank`, or set demonstration_share to 0"
             )
         self._steps = bank.steps
-        self._generators = list(generator)
+        self._generators, self._noise = list(generator), noise
         self._state_key, self._constant_keys = state_key, list(constant_keys)
         self._shown = GroupReplay(
             capacity,
@@ -95,9 +98,12 @@ class DemonstrationReplay:
         step = (share * n_steps).long()
         frame = steps.first[number] + step
         ends = (step == n_steps - 1).unsqueeze(-1)
+        state = steps.latents(frame)
+        if self._noise:
+            state = state + self._noise * normal(self._generators, state.shape[1:])
         return TensorDict(
             {
-                self._state_key: steps.latents(frame),
+                self._state_key: state,
                 "action": steps.actions(frame),
                 "priority_weight": shown["priority_weight"],
                 "demonstrated": torch.ones(group.shape, dtype=torch.bool),

@@ -29,8 +29,8 @@ def test_a_task_has_its_own_group_if_most_of_both_are_the_others():
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.1])
-def test_the_shipped_tasks_form_three_pure_groups(capsys, scale):
-    groups.main(groups.Arguments(draws=300, seeds=(0,), scale=scale))
+def test_the_shipped_tasks_form_pure_groups_one_for_each_side(capsys, scale):
+    groups.main(groups.Arguments(draws=900, seeds=(0,), scale=scale))
     _, _, *rows = capsys.readouterr().out.splitlines()
     cells = [[cell.strip() for cell in row.split("|")[1:-1]] for row in rows]
     assert [row[0] for row in cells] == [
@@ -39,5 +39,5 @@ def test_the_shipped_tasks_form_three_pure_groups(capsys, scale):
         "the newest only",
         "from the start",
     ]
-    assert all(row[1:3] == ["3", "100"] for row in cells)
-    assert all(1 < int(row[3]) <= 30 and float(row[6]) > 95 for row in cells)
+    assert all(row[1:3] == ["6", "100"] for row in cells)
+    assert all(1 < int(row[3]) <= 60 and float(row[6]) > 95 for row in cells)
