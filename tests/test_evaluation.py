@@ -239,7 +239,8 @@ def test_testing_leaves_no_trace_in_training(make, name):
     config = algorithm.config
     if isinstance(algorithm, BGPO):
         parts = {"experts": True, "active": True, "gwr": algorithm.gwr is not None}
-        parts |= {"groups": config.grouped, "shown": config.demonstration_share > 0}
+        shown = config.demonstration_share > 0
+        parts |= {"groups": config.grouped, "shown": shown, "trials": shown and config.experts}
         own = {part for part, there in parts.items() if there}
     elif name.startswith("maml"):
         own = set()

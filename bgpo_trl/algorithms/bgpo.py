@@ -17,8 +17,9 @@ from bgpo_trl.algorithms.environments import VARIANTS
 from bgpo_trl.algorithms.experts import ActiveGroups, Experts
 from bgpo_trl.algorithms.policy import Policy
 from bgpo_trl.algorithms.rl import LearnerSpec, make_learner
+from bgpo_trl.algorithms.trials import GroupTrials
 from bgpo_trl.configs import BGPOConfig
-from bgpo_trl.data.bank import DemonstrationBank
+from bgpo_trl.data.bank import DemonstrationBank, DemonstrationSteps
 from bgpo_trl.data.demonstration_replay import DemonstrationReplay
 from bgpo_trl.data.group_replay import GroupReplay
 from bgpo_trl.encoders.representation import Representation
@@ -41,6 +42,8 @@ class BGPO(Algorithm):
     Attributes:
         experts: The networks of each group; of a single group without ``config.experts``.
         shown: Replay of the demonstrations shown so far, or None.
+        trials: Trials by which groups of one task are joined; None without experts or
+            demonstrations.
 
     Raises:
         ValueError: If the variant is unknown, or does not fit ``experts`` and ``even_replay``.
@@ -111,7 +114,14 @@ class BGPO(Algorithm):
             keys=[*keys, "action", *(("next", key) for key in (keys[0], "reward", "terminated"))],
             source_key="demo_index" if variant.groups else None,
         )
-        self.shown = self.demonstrations(config, bank, seeds, constant_keys=keys[1:])
+        self.shown = self.demonstrations(
+            config, bank, seeds, constant_keys=keys[1:], own_constants=not config.experts
+        )
+        self.trials: GroupTrials | None = None
+        if self.shown is not None and config.experts:
+            steps = cast(DemonstrationSteps, bank.steps)
+            starts = steps.latents(steps.first)
+            self.trials = GroupTrials(starts, seeds=seeds, smallest=config.group_size)
 
     def make_env(self, base_env: EnvBase, source: DemonstrationSource) -> TransformedEnv:
         """Return the variant's environment (`bgpo_trl.algorithms.environments`)."""
@@ -136,7 +146,7 @@ class BGPO(Algorithm):
         """Write the ``action`` ``[S, 4]`` of the group's policy with exploration noise."""
         groups = self._groups_of(tensordict)
         if self.config.experts:
-            expert = self.experts.play(groups)
+            expert = self.experts.play(self._played(tensordict, groups))
             self.learner = self.experts.learner
         else:
             expert = torch.zeros(self.n_seeds, dtype=torch.int64)
@@ -144,6 +154,19 @@ class BGPO(Algorithm):
                 self._active.play(seed, group)
         seen = self.to_device(tensordict.select(*self.in_keys))
         return tensordict.set("action", self.learner.act(seen, self._noise, expert))
+
+    def _played(self, tensordict: TensorDictBase, groups: list[int]) -> list[int]:
+        """Return the groups whose experts act, given those of the demonstrations."""
+        trials = self.trials
+        if trials is None:
+            return groups
+        begins = (tensordict["step_count"].flatten() == 0).tolist()
+        return [
+            trials.begin(seed, tensordict[self.config.state][seed], group)
+            if begins[seed]
+            else trials.playing(seed)
+            for seed, group in enumerate(groups)
+        ]
 
     def store(self, transition: TensorDictBase) -> None:
         """Store a transition of each seed and, at the end of an episode, its demonstration.
@@ -154,6 +177,7 @@ class BGPO(Algorithm):
         self.replay.add(transition, group)
         if self.shown is not None:
             self._store_demonstration(self.shown, transition, group)
+        self._join_groups(transition)
         self._follow_groups()
 
     def _store_demonstration(
@@ -167,6 +191,18 @@ class BGPO(Algorithm):
                 reward += self.beta * torch.exp(-torch.linalg.vector_norm(error, dim=-1))
             shown.add(transition, reward, group, ended)
 
+    def _join_groups(self, transition: TensorDictBase) -> None:
+        """Count the episodes that end; join groups that turn out to be one task."""
+        if self.trials is None or self.groups is None:
+            return
+        end = transition.get("next")
+        for seed in end["done"].flatten().nonzero().flatten().tolist():
+            success = bool(end["terminated"][seed])
+            self.trials.end(seed, int(transition["demo_index"][seed]), success)
+            pair = self.trials.same_task(seed)
+            if pair is not None and {*pair} <= {*self.groups.numbers(seed)}:
+                self.groups.join(seed, *pair)
+
     def _follow_groups(self) -> None:
         """Assign what is stored to the groups of today; put experts of former groups aside."""
         if self.groups is None or (changed := self.groups.revision != self._revision).sum() == 0:
@@ -179,6 +215,8 @@ class BGPO(Algorithm):
                 if replay is not None:
                     replay.regroup(seed, group_of[seed])
             known = self.groups.numbers(seed)
+            if self.trials is not None:
+                self.trials.regroup(seed, group_of[seed], known)
             for group in self._active.group[seed].tolist():
                 if group >= 0 and group not in known:
                     (self.experts if self.config.experts else self._active).rest(seed, group)
@@ -263,5 +301,10 @@ class BGPO(Algorithm):
             self._revision = self.groups.revision
 
     def _learned(self) -> dict[str, Any]:
-        parts = {"gwr": self.gwr, "groups": self.groups, "shown": self.shown}
+        parts = {
+            "gwr": self.gwr,
+            "groups": self.groups,
+            "shown": self.shown,
+            "trials": self.trials,
+        }
         return super()._learned() | {key: part for key, part in parts.items() if part is not None}

@@ -25,9 +25,9 @@ class AlgorithmConfig:
     demonstration_share: float = 0.0
     """Share of an update's transitions taken from the demonstrations shown so far in training, with
     actions inferred by the inverse model. Ours: the paper has none."""
-    demonstration_noise: float = 0.0
-    """Standard deviation of noise added to demonstrated states when they are sampled. Ours: keeps
-    policies from learning few demonstrations by heart."""
+    demonstration_noise: float = 0.4
+    """Standard deviation of the noise added to demonstrated states when they are sampled. Ours:
+    keeps policies from learning a few demonstrations by heart (docs/learning.md)."""
 
     def __post_init__(self) -> None:
         known = self.state in ("latent", "state")
@@ -130,21 +130,22 @@ class BGPOConfig(AlgorithmConfig):
     even_replay: bool = True
     """Whether an update draws equally from the groups played last. Ours: the paper draws uniformly
     from all transitions."""
-    demonstration_share: float = 0.25
+    demonstration_share: float = 0.75
     """See `AlgorithmConfig`. Ours: what demonstrations show is rarely found by chance."""
     rl: RLConfig = field(default_factory=lambda: DDPGConfig(noise=0.1))
     """See `AlgorithmConfig`. Ours: exploration noise on the scale of demonstrated actions, since
     what to explore is near them; without demonstrations it is larger."""
-    active_groups: int = 3
+    active_groups: int = 4
     """Largest number of groups per update, those played last. Ours: bounds the cost of an
     update."""
     rest_after: int = 500
     """Training steps without being played after which a group rests: it has no part in updates and
     its expert does not change until it is played again. Ours: from old transitions alone, an expert
     gets worse (docs/learning.md)."""
-    expert_batch_size: int = 64
+    expert_batch_size: int = 128
     """Transitions of each active group per update, with experts. Ours: as many as MAML and Dist-NLL
-    have per task; without experts, the RL algorithm's ``batch_size`` is shared by all groups."""
+    with demonstrations have per task; without experts, the RL algorithm's ``batch_size`` is shared
+    by all groups."""
     group_size: int = 10
     """Least number of different demonstrations of a group of behaviors. Ours."""
     group_evidence: float = 3.0

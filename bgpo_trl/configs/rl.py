@@ -33,9 +33,10 @@ class RLConfig:
     clip_targets: bool = True
     """Whether bootstrapped targets are clipped to the attainable returns. Ours: otherwise Q grows
     to hundreds."""
-    imitation: float = 3.0
+    imitation: float = 50.0
     """Weight of the squared distance to demonstrated actions in the actor's loss, of no effect
-    without a ``demonstration_share``. Ours."""
+    without a ``demonstration_share``. Ours: with a tenth of it, the critic pulls the policy away
+    from what was demonstrated (docs/learning.md)."""
     warmup_steps: int = 256
     """Environment steps of each seed before the first update. Ours: not given in the paper."""
 

@@ -28,6 +28,8 @@ class DemonstrationReplay:
         generator: Random generators for sampling, one for each of ``S`` seeds.
         state_key: Name of the latent.
         constant_keys: Entries that are constant within an episode, stored with each demonstration.
+        own_constants: Whether a transition comes with the constant entries of its own
+            demonstration, or else with those of any one of its group.
         noise: Standard deviation of Gaussian noise added to each sampled state, not to the next.
         capacity: Demonstrations kept for each seed; the oldest are overwritten.
 
@@ -42,6 +44,7 @@ class DemonstrationReplay:
         generator: Sequence[torch.Generator],
         state_key: NestedKey = "latent",
         constant_keys: Sequence[NestedKey] = (),
+        own_constants: bool = True,
         noise: float = 0.0,
         capacity: int = 100_000,
     ) -> None:
@@ -58,6 +61,7 @@ class DemonstrationReplay:
             )
         self._steps = bank.steps
         self._generators, self._noise = list(generator), noise
+        self._own_constants = own_constants
         self._state_key, self._constant_keys = state_key, list(constant_keys)
         self._shown = GroupReplay(
             capacity,
@@ -94,6 +98,7 @@ class DemonstrationReplay:
         shown = self._shown.sample(group)
         steps, share = self._steps, draw_shares(group, self._generators)
         number = shown["demo_index"]
+        constants = shown if self._own_constants else self._shown.sample(group)
         n_steps = steps.length[number] - 1
         step = (share * n_steps).long()
         frame = steps.first[number] + step
@@ -107,7 +112,7 @@ class DemonstrationReplay:
                 "action": steps.actions(frame),
                 "priority_weight": shown["priority_weight"],
                 "demonstrated": torch.ones(group.shape, dtype=torch.bool),
-                **{key: shown[key] for key in self._constant_keys},
+                **{key: constants[key] for key in self._constant_keys},
                 "next": {
                     self._state_key: steps.latents(frame + 1),
                     "reward": shown["reward"].unsqueeze(-1) * ends,

@@ -18,6 +18,7 @@ from bgpo_trl.modules.density_clusters import density_clusters
 from bgpo_trl.modules.gwr_tensors import as_mask
 
 _KNOWN_SHARE = 0.99  # of a group's own demonstrations that are to count as known
+_ARRAYS = ("points", "shown", "group", "member", "cluster")
 
 
 class GroupMatch(TensorClass["tensor_only"]):
@@ -58,6 +59,8 @@ class BehaviorGroups(nn.Module):
        group that splits, the larger part keeps the number; of groups that merge, the result has
        that of the group played most. A cluster that is left over becomes a new group, whose parent
        is the group with which it has most in common.
+    4. Groups that turn out to be one behavior can be joined (`join`), and stay so: the clusters of
+       their densest demonstrations are one group from then on.
 
     Args:
         n_features: Size d of an input.
@@ -114,6 +117,19 @@ class BehaviorGroups(nn.Module):
     def parent(self, network: int, group: int) -> int:
         """Return the parent of a group (0 for the first) of a network in the flattened batch."""
         return self._networks[network].parent[group]
+
+    def join(self, network: int, first: int, second: int) -> None:
+        """Join two groups of a network in the flattened batch, given their numbers.
+
+        Raises:
+            ValueError: If there is no such group, or both are the same.
+        """
+        missing = {first, second} - {*self.numbers(network)}
+        if missing or first == second:
+            raise ValueError(
+                f"groups to join must be two of {self.numbers(network)}, got {first} and {second}"
+            )
+        self._networks[network].join(first, second, self.smallest // 2)
 
     def forward(self, phi: Tensor) -> GroupMatch:
         """Call `lookup`."""
@@ -235,7 +251,9 @@ class _Network:
         member: Whether it is in the cluster of the group, [n]; False for outliers, and for those
             that have come since all were clustered.
         parent: Parent of each group, by number.
-        clustered: How many there were when they were last clustered.
+        cluster: Cluster of each of those that there were when they were last clustered; -1 for
+            outliers.
+        links: Pairs of demonstrations whose clusters are one group.
         revision: See `BehaviorGroups.revision`.
         reach: By group, the 99 % quantile of its members' distances to their k-th neighbor in it.
         rows: Position of each demonstration, by its bytes.
@@ -246,7 +264,8 @@ class _Network:
     group: NDArray[np.int64]
     member: NDArray[np.bool_]
     parent: list[int]
-    clustered: int = 0
+    cluster: NDArray[np.int64]
+    links: list[tuple[int, int]] = field(default_factory=list)
     revision: int = 0
     reach: dict[int, float] = field(default_factory=dict)
     rows: dict[bytes, int] = field(default_factory=dict)
@@ -254,7 +273,12 @@ class _Network:
     @classmethod
     def empty(cls, n_features: int) -> _Network:
         none = np.empty(0, np.int64)
-        return cls(np.empty((0, n_features)), none, none.copy(), none.astype(bool), [0])
+        return cls(np.empty((0, n_features)), none, none, none.astype(bool), [0], none)
+
+    @property
+    def clustered(self) -> int:
+        """How many demonstrations there were when they were last clustered."""
+        return len(self.cluster)
 
     def lookup(
         self, inputs: NDArray[np.float64], k: int
@@ -282,9 +306,26 @@ class _Network:
         self.shown[row] += 1
         return is_new
 
-    def regroup(self, labels: NDArray[np.int64], k: int) -> None:
-        """Turn clusters into groups: match them with the groups so far."""
+    def regroup(self, cluster: NDArray[np.int64], k: int) -> None:
+        """Turn new clusters ``[n]`` into groups."""
+        self.cluster = cluster
+        self._arrange(k)
+
+    def join(self, first: int, second: int, k: int) -> None:
+        """Join two groups from now on."""
+        self.links.append((self._densest(first, k), self._densest(second, k)))
+        self._arrange(k)
+
+    def _densest(self, group: int, k: int) -> int:
+        rows = np.flatnonzero(self.member & (self.group == group))
+        distances = cdist(self.points[rows], self.points[rows])
+        return int(rows[np.partition(distances, k, axis=1)[:, k].argmin()])
+
+    def _arrange(self, k: int) -> None:
+        """Match linked clusters with the groups so far."""
         before = self.group
+        labels = np.full(len(self.points), -1)
+        labels[: self.clustered] = self._linked()
         common = np.zeros((labels.max() + 1, len(self.parent)), np.int64)
         inside = labels >= 0
         np.add.at(common, (labels[inside], before[inside]), self.shown[inside])
@@ -293,15 +334,24 @@ class _Network:
             cluster, group = divmod(at, common.shape[1])
             if common[cluster, group] and cluster not in number and group not in number.values():
                 number[cluster] = group
-        for cluster in range(len(common)):
+        for cluster in np.unique(labels[inside]).tolist():
             if cluster not in number:
                 number[cluster] = len(self.parent)
                 self.parent.append(int(common[cluster].argmax()))
         self.group = np.array([number.get(label, -1) for label in labels.tolist()])
-        self.member, self.clustered = inside, len(labels)
+        self.member = inside
         self._measure(k)
         self.group[~inside] = self.lookup(self.points[~inside], k)[0]
         self.revision += int((self.group != before).any())
+
+    def _linked(self) -> NDArray[np.int64]:
+        """Return the clusters, of which linked ones have the same label."""
+        labels, inside = self.cluster.copy(), np.flatnonzero(self.cluster >= 0)
+        for link in self.links:
+            nearest = cdist(self.points[[*link]], self.points[inside]).argmin(1)
+            one, other = labels[inside[nearest]]
+            labels[labels == other] = one
+        return labels
 
     def _measure(self, k: int) -> None:
         """Measure the reach of each group."""
@@ -312,19 +362,16 @@ class _Network:
             self.reach[number] = float(np.quantile(kth, _KNOWN_SHARE))
 
     def state(self) -> dict[str, Any]:
-        arrays = {name: getattr(self, name) for name in ("points", "shown", "group", "member")}
-        tensors = {name: torch.from_numpy(array.copy()) for name, array in arrays.items()}
-        counts = {"clustered": self.clustered, "revision": self.revision}
-        return {**tensors, "parent": [*self.parent], **counts}
+        tensors = {name: torch.from_numpy(getattr(self, name).copy()) for name in _ARRAYS}
+        lists = {"parent": [*self.parent], "links": [*self.links]}
+        return {**tensors, **lists, "revision": self.revision}
 
     @classmethod
     def of_state(cls, state: dict[str, Any], k: int) -> _Network:
-        arrays = {
-            name: state[name].numpy().copy() for name in ("points", "shown", "group", "member")
-        }
-        others = {name: state[name] for name in ("clustered", "revision")}
-        network = cls(**arrays, parent=[*state["parent"]], **others)
-        sizes = {len(array) for array in arrays.values()}
+        arrays: dict[str, Any] = {name: state[name].numpy().copy() for name in _ARRAYS}
+        rest: dict[str, Any] = {name: [*state[name]] for name in ("parent", "links")}
+        network = cls(**arrays, **rest, revision=state["revision"])
+        sizes = {len(arrays[name]) for name in ("points", "shown", "group", "member")}
         if len(sizes) > 1 or not {*network.group.tolist()} <= {*range(len(network.parent))}:
             raise ValueError("a group is missing in the state: load one that state_dict returned")
         network.rows = {point.tobytes(): row for row, point in enumerate(network.points)}
