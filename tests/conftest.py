@@ -92,8 +92,9 @@ def make_config():
         small = {"hidden_sizes": (64,), "batch_size": 16, "warmup_steps": 8, "replay_size": 200}
         rl = replace(RL[rl or "ddpg"].config, **small)
         settings = {"state": state, "max_steps": 6, "rl": rl, **of_name(SMALL, name)}
-        if state == "state":  # demonstrations are latents
-            settings["demonstration_share"] = 0.0
+        # Demonstrations are latents; without noise, a test can tell them from what was played.
+        share = 0.25 if entry(name).config.demonstration_share and state == "latent" else 0.0
+        settings |= {"demonstration_share": share, "demonstration_noise": 0.0}
         if isinstance(entry(name).config, BGPOConfig):
             settings |= {"expert_batch_size": 8, "group_size": 4}
         algorithm = replace(entry(name).config, **settings)

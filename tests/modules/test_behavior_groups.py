@@ -248,6 +248,51 @@ def test_a_state_of_other_networks_is_refused_and_changes_nothing():
     assert groups.lookup(around(0, 1)).known.all()
 
 
+def test_joined_groups_stay_one_whatever_is_shown_next():
+    groups = BehaviorGroups(4, batch_size=[2])
+    inputs = torch.cat([around(place, 60) for place in range(3)])
+    for phi in inputs:
+        groups.adapt(phi.expand(2, -1))
+    assert groups.numbers(0) == groups.numbers(1) == [0, 1, 2]
+    revision = groups.revision
+    groups.join(0, 2, 0)
+    assert groups.revision.tolist() == [revision[0] + 1, revision[1]]
+    assert groups.num_groups.tolist() == [2, 3]
+    (merged,) = {*groups.numbers(0)} - {1}
+    for seed in (1, 2, 3):  # clustered anew, soon with a fourth group
+        for place, expected in enumerate((merged, 1, merged)):
+            group = groups.lookup(around(place, 9, seed).expand(2, -1, -1)).group
+            assert {*group[0].tolist()} == {expected}
+            assert {*group[1].tolist()} == {place}
+        for phi in torch.cat([around(place, 25, seed) for place in (0, 2, 3)]):
+            groups.adapt(phi.expand(2, -1))
+    assert groups.num_groups.tolist() == [3, 4]
+    restored = BehaviorGroups(4, batch_size=[2])
+    restored.load_state_dict(groups.state_dict())
+    for phi in around(1, 40, seed=9):
+        for each in (groups, restored):
+            each.adapt(phi.expand(2, -1))
+    assert restored.num_groups.tolist() == groups.num_groups.tolist() == [3, 4]
+    assert restored.numbers(0) == groups.numbers(0)
+
+
+def test_of_joined_groups_the_one_shown_most_keeps_its_number():
+    groups = BehaviorGroups(4)
+    show(groups, torch.cat([around(0, 40), around(1, 60)]))
+    groups.join(0, 0, 1)
+    assert groups.numbers(0) == [1]
+    assert group_of(groups, around(0, 9, seed=2)) == [1]
+
+
+@pytest.mark.parametrize("pair", [(0, 0), (0, 5), (-1, 0)])
+def test_only_two_groups_that_there_are_can_be_joined(pair):
+    groups = BehaviorGroups(4)
+    show(groups, torch.cat([around(0, 40), around(1, 60)]))
+    with pytest.raises(ValueError, match=r"groups to join must be two of \[0, 1\], got"):
+        groups.join(0, *pair)
+    assert int(groups.num_groups) == 2
+
+
 def test_a_state_that_names_a_missing_group_is_refused():
     groups = BehaviorGroups(4)
     show(groups, around(0, 12))
