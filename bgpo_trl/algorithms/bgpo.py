@@ -143,30 +143,34 @@ class BGPO(Algorithm):
 
     @torch.no_grad()
     def act(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the ``action`` ``[S, 4]`` of the group's policy with exploration noise."""
-        groups = self._groups_of(tensordict)
+        """Write the ``action`` ``[S, 4]`` of the group's policy with exploration noise.
+
+        Where groups have just been joined, the ``group`` of an episode that begins is updated.
+        """
         if self.config.experts:
-            expert = self.experts.play(self._played(tensordict, groups))
+            expert = self.experts.play(self._playing(tensordict))
             self.learner = self.experts.learner
         else:
             expert = torch.zeros(self.n_seeds, dtype=torch.int64)
-            for seed, group in enumerate(groups):
+            for seed, group in enumerate(self._groups_of(tensordict)):
                 self._active.play(seed, group)
         seen = self.to_device(tensordict.select(*self.in_keys))
         return tensordict.set("action", self.learner.act(seen, self._noise, expert))
 
-    def _played(self, tensordict: TensorDictBase, groups: list[int]) -> list[int]:
-        """Return the groups whose experts act, given those of the demonstrations."""
-        trials = self.trials
-        if trials is None:
+    def _playing(self, tensordict: TensorDictBase) -> list[int]:
+        """Return the groups whose experts act; update the groups of episodes that begin."""
+        groups, trials = self._groups_of(tensordict), self.trials
+        if trials is None or self.groups is None:
             return groups
-        begins = (tensordict["step_count"].flatten() == 0).tolist()
-        return [
-            trials.begin(seed, tensordict[self.config.state][seed], group)
-            if begins[seed]
-            else trials.playing(seed)
-            for seed, group in enumerate(groups)
-        ]
+        begins = tensordict["step_count"].flatten() == 0
+        if begins.any():
+            # The end of the last episode may have joined groups after the lookup of this one.
+            match = self.groups.lookup(tensordict["demo_embedding"], begins)
+            tensordict["group"] = torch.where(begins, match.group, tensordict["group"])
+        for seed in begins.nonzero().flatten().tolist():
+            start, group = tensordict[self.config.state][seed], int(tensordict["group"][seed])
+            trials.begin(seed, start, group)
+        return [trials.playing(seed) for seed in range(self.n_seeds)]
 
     def store(self, transition: TensorDictBase) -> None:
         """Store a transition of each seed and, at the end of an episode, its demonstration.

@@ -52,6 +52,43 @@ def test_with_one_group_it_is_the_plain_learner_bit_for_bit(make_bgpo, rl):
     assert_same(plain.learner.state_dict(), one.learner.state_dict())
 
 
+def test_joined_groups_have_one_expert_and_one_replay(make_bgpo, bank):
+    algorithm = make_bgpo("all", schedule=TaskSchedule((0, 0, 0)), known=15)
+    _, state = play(algorithm, 60)
+    shown = bank.seen().embedding.expand(2, -1, -1)
+    before, pair = algorithm.groups.lookup(shown).group[1], algorithm.groups.numbers(1)[:2]
+    pairs = iter([tuple(pair)])
+    algorithm.trials.same_task = lambda seed: next(pairs, None) if seed == 1 else None
+    play(algorithm, 7, state)
+    assert next(pairs, None) is None
+    after = algorithm.groups.lookup(shown).group[1]
+    (joined,) = after[(before == pair[0]) | (before == pair[1])].unique().tolist()
+    assert joined in pair
+    (other,) = {*pair} - {joined}
+    assert other not in algorithm.groups.numbers(1)
+    assert other not in algorithm._active.group[1]
+    for replay in (algorithm.replay, algorithm.shown._shown):
+        group = replay._buffer.read(1, "group")
+        assert group.equal(after[replay._buffer.read(1, "demo_index")])
+        assert joined in group
+
+
+def test_another_group_plays_where_demonstrations_of_the_group_never_began(make_bgpo):
+    algorithm = make_bgpo("all", known=15)
+    began = []
+    algorithm.trials.begin = lambda seed, start, group: began.append((seed, start.clone(), group))
+    algorithm.trials.playing = lambda seed: algorithm.groups.numbers(seed)[-1]
+    data, _ = play(algorithm, 30)
+    starts = data["step_count"].squeeze(-1) == 0
+    assert len(began) == starts.sum() > 2
+    for seed, start, group in began:
+        rows = (data["latent"][seed] == start).all(-1) & starts[seed]
+        assert rows.any() and (data["group"][seed][rows] == group).any()
+    for seed, active in enumerate(algorithm._active.group.tolist()):
+        assert algorithm.groups.numbers(seed)[-1] in active
+    assert {*data["group"].unique().tolist()} - {*algorithm._active.group.unique().tolist()}
+
+
 def batches_of(algorithm):
     """The batches that an algorithm learns from, as they come."""
     batches, learn = [], algorithm.learn
