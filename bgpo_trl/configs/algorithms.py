@@ -148,8 +148,9 @@ class BGPOConfig(AlgorithmConfig):
     by all groups."""
     group_size: int = 10
     """Least number of different demonstrations of a group of behaviors. Ours."""
-    group_evidence: float = 3.0
-    """Standard errors by which the density between two groups must be lower than in them. Ours."""
+    group_evidence: float = 1.0
+    """Standard errors by which the density between two groups must be lower than in them. Ours: a
+    low one, since trials can join groups of one task, and nothing splits one of several."""
 
     @property
     def grouped(self) -> bool:

@@ -70,7 +70,7 @@ PRESETS: dict[str, RunConfig] = {
         seeds=(0, 1), episodes=12, task_starts=(0, 4, 8), eval_every=6, eval_episodes=1
     ),
     "quick": RunConfig(
-        seeds=(0, 1, 2), episodes=900, task_starts=(0, 280, 520), eval_every=90, eval_episodes=10
+        seeds=(0, 1), episodes=1_200, task_starts=(0, 380, 700), eval_every=120, eval_episodes=10
     ),
     "desk": RunConfig(
         seeds=(0, 1, 2, 3, 4),

@@ -70,7 +70,7 @@ class Arguments(TaskArguments):
     module of --import adds; DDPG by default."""
     preset: Literal["smoke", "quick", "desk", "paper"] = "quick"
     """Size of the run, with its time on two cores: smoke (12 episodes of 2 seeds, every stage in 2
-    minutes), quick (900 episodes of 3 seeds, 20 minutes), desk (6,000 episodes of 5 seeds, 70
+    minutes), quick (1,200 episodes of 2 seeds, 20 minutes), desk (6,000 episodes of 5 seeds, 70
     minutes) or paper (20,000 episodes of 10 seeds, more than a day)."""
     out: Path | None = None
     """Run directory; runs/EXPERIMENT-ALGORITHM[-RL]-PRESET by default."""
