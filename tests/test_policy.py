@@ -349,7 +349,7 @@ def see_the_truth(run):
     [
         (shutil.rmtree, r"run holds no run: there is no config.json$"),
         (lambda run: shutil.rmtree(run / "checkpoint"), "has no checkpoint: let the run reach"),
-        (spoil_checkpoints, "holds no intact checkpoint"),
+        (spoil_checkpoints, "is damaged, and older checkpoints have learned less: resume the run"),
         (spoil_encoders, r"was trained with the encoders \w{12}, not with those that come with"),
         (lambda run: rewrite(run, encoders="0" * 64), "trained with the encoders 000000000000, no"),
         (lambda run: rewrite(run, bank="0" * 64), "with the demonstrations 000000000000, not with"),
@@ -368,6 +368,10 @@ def test_what_cannot_be_loaded_is_refused_in_a_line(trainer_of, tmp_path, spoil,
     with pytest.raises(ValueError, match=said) as error:
         bgpo_trl.load_run(run)
     assert "\n" not in str(error.value)
+
+
+def test_a_policy_tells_how_long_it_has_learned(load):
+    assert min(load().episodes, load(seed=8).episodes) == 10
 
 
 @pytest.mark.parametrize("seed", [0, -1, 4, "3", 3.5])

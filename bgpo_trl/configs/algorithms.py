@@ -72,7 +72,7 @@ class GWRBConfig:
     """Habituation below which a best-matching node allows an insertion (Table 1)."""
     activity_scale: float = 0.25
     """Factor of distances in the activity. Ours: with 1, as in the paper, every third demonstration
-    becomes a node; with 0.25 there are about 300 nodes after 6,000 episodes."""
+    becomes a node; with 0.25 there are about 200 nodes after 1,800 demonstrations."""
     lr_best: float = 0.1
     """Learning rate eps_c of the best-matching node (Table 1)."""
     lr_neighbor: float = 0.01

@@ -82,4 +82,4 @@ PRESETS: dict[str, RunConfig] = {
     "paper": RunConfig(),
 }
 """Runs by ``--preset``: ``smoke`` passes every stage in minutes, ``quick`` shows learning, ``desk``
-is five seeds in about an hour, ``paper`` is the paper's scale."""
+is five seeds in some hours, ``paper`` is the paper's scale."""

@@ -174,4 +174,5 @@ def watch(arguments: WatchArguments) -> str:
     save_figure(plot_frame_strips(strips), out / "nico.png")
     draw_growth(run, policy.config, policy.bank, out)
     outcomes = [f"{episode.task}: {episode.outcome}" for episode in episodes]
-    return "\n".join([*outcomes, f"pictures: {out}"])
+    learned = f"seed {policy.seed} after {policy.episodes:,} training episodes"
+    return "\n".join([learned, *outcomes, f"pictures: {out}"])
