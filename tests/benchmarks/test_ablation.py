@@ -215,11 +215,12 @@ def test_the_command_line_knows_every_variant():
 def test_the_variants_beyond_the_paper_add_one_thing_at_a_time(make):
     published = ABLATIONS["gwr+r_int"].config
     assert not (published.experts or published.even_replay or published.demonstration_share)
-    shown = {"demonstration_share": 0.25, "rl": DDPGConfig(noise=0.1)}
+    alone = {"demonstration_share": 0.75, "rl": DDPGConfig(noise=0.1, batch_size=384)}
+    shown = {**alone, "rl": DDPGConfig(noise=0.1), "expert_batch_size": 128}
     for variant, added in {
         "even-replay": {"variant": "bgpo", "even_replay": True},
         "experts": {"variant": "bgpo", "even_replay": True, "experts": True},
-        "demonstrations": shown,
+        "demonstrations": alone,
         "all": {
             "variant": "bgpo",
             "even_replay": True,

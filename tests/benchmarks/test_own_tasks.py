@@ -55,7 +55,9 @@ def test_a_run_is_filmed_tested_and_summed_up_where_its_module_is_named(run, cap
     assert "| at_once |" in capsys.readouterr().out
 
     told = watch(WatchArguments(run, module="at_once_tasks"))
-    assert told == f"at_once: success after 1 steps\npictures: {run / 'figures'}"
+    learned, *told = told.splitlines()
+    assert learned == "seed 3 after 4 training episodes"
+    assert told == ["at_once: success after 1 steps", f"pictures: {run / 'figures'}"]
 
     one_shot.main(one_shot.Arguments(run, (1.0,), episodes=2, module="at_once_tasks"))
     with (run / "one_shot.csv").open(newline="") as file:

@@ -54,15 +54,17 @@ def test_another_rl_algorithm_changes_nothing_else(name, rl):
 def test_tasks_of_every_preset_start_when_the_paper_has_them_start(preset):
     config = PRESETS[preset]
     shares = [start / config.episodes for start in config.task_starts]
-    assert shares == pytest.approx([0, 7_000 / 20_000, 13_000 / 20_000], abs=0.02)
+    # The quick run leaves its last task more of its few episodes.
+    paper, near = [0, 7_000 / 20_000, 13_000 / 20_000], 0.07 if preset == "quick" else 0.02
+    assert shares == pytest.approx(paper, abs=near)
 
 
 @pytest.mark.parametrize(
     ("preset", "episodes", "starts", "eval_every"),
     [
         ("paper", 10_000, (0, 3_500, 6_500), 1),
-        ("quick", 2_400, (0, 840, 1_560), 60),
-        ("quick", 20, (0, 7, 13), 20),  # tested once at least
+        ("quick", 2_400, (0, 760, 1_400), 120),
+        ("quick", 20, (0, 6, 12), 20),  # tested once at least
     ],
 )
 def test_another_length_keeps_the_proportions(preset, episodes, starts, eval_every):
