@@ -7,7 +7,7 @@ import pytest
 from bgpo_trl.encoders import probes
 
 
-@pytest.fixture(scope="session", autouse=True)
+@pytest.fixture(scope="module", autouse=True)
 def short_probes():
     with pytest.MonkeyPatch.context() as patch:
         short = partial(probes.perceptron_predict, steps=50)
