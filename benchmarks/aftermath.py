@@ -67,19 +67,22 @@ def episodes_of(arguments: Arguments) -> dict[str, list[Episode]]:
         raise ValueError("nobody acts: name a run directory, or give --demonstrators")
     if arguments.episodes < 1:
         raise ValueError(f"--episodes must be at least 1, got {arguments.episodes}")
-    tasks, seeds = nico.ALL_TASKS, arguments.seeds
+    tasks, seeds, spread = nico.ALL_TASKS, arguments.seeds, 1.0
     max_steps = round(TIME_LIMIT / CONTROL_TIMESTEP)
     episodes: dict[str, list[Episode]] = {}
     if arguments.run is not None:
         runs = load_blocks(arguments.run)
         config = runs[0].config
         tasks, max_steps = config.tasks, config.algorithm.max_steps
+        spread = config.spread
         seeds = [seed for run in runs for seed in run.config.seeds]
         check_criteria(tasks)
         played = [policy_episodes(run, arguments.episodes) for run in runs]
         episodes["policy"] = [episode for of_run in played for episode in of_run]
     for actor in ("demonstrators", "random actions")[not arguments.demonstrators :]:
-        episodes[actor] = scripted_episodes(tasks, seeds, arguments.episodes, max_steps, actor)
+        episodes[actor] = scripted_episodes(
+            tasks, seeds, arguments.episodes, max_steps, actor, spread
+        )
     return episodes
 
 

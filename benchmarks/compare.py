@@ -1,100 +1,84 @@
-"""Permutation test of the difference between two runs.
+"""Differences between two runs, task by task and over parts of training.
 
     python benchmarks/compare.py runs/before runs/after
 
-prints, for each task and part of training, the test success of both runs and the two-sided p
-value of an exact permutation test over seeds: the share of all assignments of the seeds to the two
-runs whose means differ at least as much. With five seeds per run, the smallest possible p is
-2 / 252.
+prints, for each task and their mean, the test success of both runs over the last 10 % of training,
+the second's lead with its 95 % interval (Welch), the p value of a permutation test of seeds, and
+what is found; with ``--every 500``, also over each part of training of so many episodes. If one run
+is shorter, only the part that both have is compared. ``report.py`` compares more runs at once.
 """
 
 from __future__ import annotations
 
-import sys
-from collections import defaultdict
-from dataclasses import dataclass
-from itertools import combinations
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 import tyro
 
-from bgpo_trl.runs.results import read_tests
+from bgpo_trl.analysis import metrics, statistics
+from bgpo_trl.analysis.comparison import differing_conditions, read_run
+from bgpo_trl.analysis.scores import Values, late_scores
+from bgpo_trl.analysis.tables import Table, markdown
+from bgpo_trl.experiments.arguments import command_line
 
 
 @dataclass(frozen=True)
 class Arguments:
-    """Compare the ``eval.csv`` of two runs."""
+    """Compare two runs."""
 
     first: tyro.conf.Positional[Path]
     """Directory of the first run."""
     second: tyro.conf.Positional[Path]
     """Directory of the second run."""
-    every: int = 1_000
-    """Training episodes per row of the table."""
+    every: int | None = None
+    """Training episodes in a part of training."""
+    anyway: bool = False
+    """Compare also runs under different conditions, such as other encoders or tests."""
 
 
-def success_by_seed(
-    path: Path, every: int, last: int | None = None
-) -> dict[tuple[str, int], np.ndarray]:
-    """Return the mean success of each seed ``[S]``, by task and last episode of a part of training.
+def rows_of(period: str, tasks: tuple[str, ...], first: Values, second: Values) -> Table:
+    """Return a row for each task and their mean, from scores ``[S, T]``.
 
-    Args:
-        path: An ``eval.csv``.
-        every: Length of a part in training episodes.
-        last: Last training episode to read.
+    Tasks that were not tested are left out.
     """
-    found: dict[tuple[str, int], dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
-    for row in read_tests(path):
-        if last is not None and int(row["episode"]) > last:
+    tested = [index for index in range(len(tasks)) if not np.isnan(first[:, index]).any()]
+    tested = [index for index in tested if not np.isnan(second[:, index]).any()]
+    rows = []
+    for what, chosen in [*((tasks[index], [index]) for index in tested), ("all", tested)]:
+        if not chosen:
             continue
-        end = -(-int(row["episode"]) // every) * every
-        found[row["task"], end][row["seed"]].append(float(row["success"]))
-    return {key: np.array([np.mean(s) for s in seeds.values()]) for key, seeds in found.items()}
-
-
-def permutation_p(first: np.ndarray, second: np.ndarray) -> float:
-    """Return the two-sided p value of the difference of two means, over all permutations.
-
-    Args:
-        first: Sample ``[A]``.
-        second: Sample ``[B]``.
-    """
-    everything = np.concatenate([first, second])
-    observed = abs(first.mean() - second.mean())
-    drawn = np.array(
-        [
-            abs(everything[list(own)].mean() - np.delete(everything, own).mean())
-            for own in combinations(range(len(everything)), len(first))
-        ]
-    )
-    return float((drawn >= observed - 1e-12).mean())
+        ours, theirs = first[:, chosen].mean(1), second[:, chosen].mean(1)
+        found = statistics.difference(theirs, ours)
+        p = "-" if np.isnan(found.p) else f"{found.p:.3f}"
+        cells = [f"{100 * scores.mean():.1f}" for scores in (ours, theirs)]
+        rows.append([period, what, *cells, found.estimate.points(), p, found.note])
+    return rows
 
 
 def main(arguments: Arguments) -> None:
     """Print the table."""
-    if arguments.every < 1:
-        raise ValueError(f"--every must be at least 1 episode, got {arguments.every}")
-    paths = arguments.first / "eval.csv", arguments.second / "eval.csv"
-    # If one run is shorter, only the part that both have is compared.
-    last = min(max(int(row["episode"]) for row in read_tests(path)) for path in paths)
-    first, second = (success_by_seed(path, arguments.every, last) for path in paths)
-    shared = sorted(first.keys() & second.keys())
-    if not shared:
-        raise ValueError("the runs share no task and part of training: nothing to compare")
-    print("| task | episodes up to | first | second | difference | p |")
-    print("|---|---:|---:|---:|---:|---:|")
-    for task, end in shared:
-        a, b = first[task, end], second[task, end]
-        print(
-            f"| {task} | {end} | {a.mean():.2f} | {b.mean():.2f} | {b.mean() - a.mean():+.2f} "
-            f"| {permutation_p(a, b):.2f} |"
-        )
+    every = arguments.every
+    if every is not None and every < 1:
+        raise ValueError(f"--every must be at least 1 episode, got {every}")
+    first, second = map(read_run, (arguments.first, arguments.second))
+    differing = differing_conditions(first, second, ("episodes",))
+    if first.tasks != second.tasks:
+        raise ValueError(f"{differing}: only runs of the same tasks in the same order are compared")
+    if differing and not arguments.anyway:
+        raise ValueError(f"{differing}: only runs under equal conditions are compared; --anyway")
+    last = min(first.last, second.last)
+    runs = [replace(run, curves=run.curves.until(last)) for run in (first, second)]
+    rows: Table = [["episodes", "task", "first", "second", "second - first", "p", "found"]]
+    for end in range(every, last + 1, every) if every else ():
+        matrices = [
+            metrics.evaluation_matrix(run.curves.success, run.curves.episodes, [end], window=every)
+            for run in runs
+        ]
+        rows += rows_of(f"to {end}", first.tasks, *(matrix[:, 0] for matrix in matrices))
+    rows += rows_of("last 10 %", first.tasks, *map(late_scores, runs))
+    print(*([differing] if differing else []), markdown(rows), sep="\n\n")
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Annotated[Arguments, tyro.conf.OmitArgPrefixes], description=__doc__))
-    except (ValueError, OSError) as error:
-        sys.exit(f"error: {error}")
+    command_line(main, __doc__, Arguments)

@@ -3,14 +3,16 @@
     python benchmarks/groups.py
     python benchmarks/groups.py --bank my_bank.safetensors --tasks all --draws 4000
 
-feeds networks with demonstrations in the order of training episodes, tasks one after the other and
-all from the start, and prints by activity threshold how many groups form and how pure they are on
-held-out demonstrations; also in how many of these GWR-B infers the task.
+shows demonstrations in the order of training episodes, in four schedules, and prints by seed: how
+many groups there are at the end; how pure they are on held-out demonstrations; how many different
+demonstrations of its own each task needed before it had a group (the most demanding task); how long
+grouping took; the nodes of GWR-B, and in how many held-out demonstrations it infers the task.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import time
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
@@ -20,84 +22,114 @@ from torch import Tensor
 from bgpo_trl.analysis.task_inference import group_purity, task_inference_accuracy
 from bgpo_trl.configs import BGPOConfig, GWRBConfig
 from bgpo_trl.data.bank import DemonstrationBank
-from bgpo_trl.encoders.shipped import default_weights, groups_config
 from bgpo_trl.experiments.arguments import BankArguments, check_draws, command_line, even_starts
 from bgpo_trl.experiments.run import bank_of
 from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.modules.gwr import GWRB
 from bgpo_trl.seeding import generators
+from bgpo_trl.transforms import TaskSchedule
 
 
 @dataclass(frozen=True)
 class Arguments(BankArguments):
     """Measure the groups of behaviors that form from demonstrations."""
 
-    thresholds: tuple[float, ...] = (0.5, 0.525, 0.55, 0.575, 0.6)
-    """Activity thresholds of the coarse network."""
-    habituation_threshold: float = 0.5
-    """Habituation threshold of the coarse network."""
-    activity_scale: float = GWRBConfig.activity_scale
-    """Factor of distances in the activity of the fine network."""
     draws: int = 1_800
-    """Demonstrations that each network is fed with."""
-    seeds: tuple[int, ...] = (0, 1, 2, 3, 4, 5)
+    """Demonstrations that each network is shown."""
+    activity_scale: float = GWRBConfig.activity_scale
+    """Factor of distances in the activity of GWR-B."""
+    seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
     """Seeds of the draws."""
+    scale: float = 1.0
+    """Factor of the embeddings, on which groups do not depend."""
 
 
-def draw(
-    bank: DemonstrationBank, starts: Sequence[int], *, draws: int, seeds: Sequence[int]
-) -> Tensor:
-    """Draw demonstrations as training episodes do, int64 ``[draws, S]`` rows of the bank."""
-    of_task = [np.flatnonzero(bank.task == task) for task in range(len(starts))]
-    rows = np.empty((draws, len(seeds)), np.int64)
-    for column, seed in zip(rows.T, seeds, strict=True):
-        rng = np.random.default_rng(seed)
-        for episode in range(draws):
-            presented = [task for task, start in enumerate(starts) if start <= episode]
-            column[episode] = rng.choice(of_task[rng.choice(presented)])
-    return torch.from_numpy(rows)
+def draw(bank: DemonstrationBank, schedule: TaskSchedule, draws: int, seed: int) -> Iterator[int]:
+    """Draw demonstrations as training episodes do: rows of the bank."""
+    of_task = [np.flatnonzero(bank.task == task) for task in range(schedule.n_tasks)]
+    rng = np.random.default_rng(seed)
+    for available in schedule.available(torch.arange(draws)):
+        yield int(rng.choice(of_task[rng.choice(available.nonzero().flatten())]))
+
+
+def own_groups(group: Tensor, task: Tensor) -> set[int]:
+    """Return the tasks most of whose demonstrations are in a group that holds mostly theirs."""
+    counts = torch.zeros(int(group.max()) + 1, int(task.max()) + 1)
+    counts.index_put_((group, task), torch.tensor(1.0), accumulate=True)
+    largest = counts.argmax(0)
+    is_own = counts[largest].argmax(-1) == torch.arange(len(largest))
+    return {*(is_own & (counts.sum(0) > 0)).nonzero().flatten().tolist()}
+
+
+def form(
+    bank: DemonstrationBank, rows: Sequence[int], config: BGPOConfig
+) -> tuple[BehaviorGroups, dict[int, int], float]:
+    """Let groups form.
+
+    Returns:
+        The groups; by task, the number of its different demonstrations when it first had a group of
+        its own; seconds.
+    """
+    groups = BehaviorGroups(
+        bank.embedding.shape[-1], smallest=config.group_size, evidence=config.group_evidence
+    )
+    shown: dict[int, None] = {}
+    needed: dict[int, int] = {}
+    seconds, revision = 0.0, -1
+    for row in rows:
+        shown[row] = None
+        begun = time.perf_counter()
+        groups.adapt(bank.embedding[row])
+        seconds += time.perf_counter() - begun
+        if int(groups.revision) == revision:
+            continue
+        revision = int(groups.revision)
+        so_far = torch.tensor([*shown])
+        task = bank.task[so_far]
+        for own in own_groups(groups.lookup(bank.embedding[so_far]).group, task) - needed.keys():
+            needed[own] = int((task == own).sum())
+    return groups, needed, seconds
 
 
 def main(arguments: Arguments) -> None:
     """Print the table."""
     torch.set_num_threads(1)
     check_draws(arguments.seeds, arguments.draws)
-    bank = bank_of(arguments)
-    n_tasks, seeds = len(bank.tasks), arguments.seeds
-    fine = replace(BGPOConfig().gwr, activity_scale=arguments.activity_scale)
-    coarse = replace(
-        groups_config(default_weights()), habituation_threshold=arguments.habituation_threshold
-    )
-    settings = [replace(coarse, activity_threshold=a_t) for a_t in arguments.thresholds]
-    seen, held_out = bank.seen(), bank.held_out()
-    print("| order | network | a_T | groups or nodes, by seed | purity or inference, % |")
-    print("|---|---|---:|---|---|")
-    orders = {
-        "one after the other": even_starts(n_tasks, arguments.draws),
-        "from the start": (0,) * n_tasks,
+    bank, config = bank_of(arguments), BGPOConfig()
+    bank = replace(bank, embedding=arguments.scale * bank.embedding)
+    fine = replace(config.gwr, activity_scale=arguments.activity_scale / arguments.scale)
+    n_tasks, seen, held_out = len(bank.tasks), bank.seen(), bank.held_out()
+    forward = even_starts(n_tasks, arguments.draws)
+    schedules = {
+        "one after the other": TaskSchedule(forward),
+        "in reverse": TaskSchedule(forward[::-1]),
+        "the newest only": TaskSchedule(forward, cumulative=False),
+        "from the start": TaskSchedule((0,) * n_tasks),
     }
-    for order, starts in orders.items():
-        inputs = seen.embedding[draw(seen, starts, draws=arguments.draws, seeds=seeds)]
-        random = generators(seeds, "gwr")
-        gwr = GWRB(32, batch_size=len(seeds), generator=random, **asdict(fine))
-        for x in inputs:
-            gwr.adapt(x)
-        right = task_inference_accuracy(gwr, seen, held_out, n_tasks)
-        print(row(order, "fine", fine.activity_threshold, gwr.num_nodes, right))
-        for setting in settings:
-            groups = BehaviorGroups(32, batch_size=len(seeds), **asdict(setting))
-            for x in inputs:
-                groups.adapt(x)
-            purity = group_purity(groups, held_out, n_tasks)
-            threshold = setting.activity_threshold
-            print(row(order, "coarse", threshold, groups.num_groups, purity), flush=True)
-
-
-def row(order: str, network: str, threshold: float, counts: Tensor, shares: Tensor) -> str:
-    """Format a row of the table."""
-    numbers = " ".join(str(count) for count in counts.tolist())
-    percent = " ".join(f"{100 * share:.4g}" for share in shares.tolist())
-    return f"| {order} | {network} | {threshold} | {numbers} | {percent} |"
+    print("| order | groups, by seed | purity, % | needed | seconds | nodes | inferred, % |")
+    print("|---|---|---|---|---|---|---|")
+    for order, schedule in schedules.items():
+        columns: list[list[str]] = []
+        for seed in arguments.seeds:
+            rows = [*draw(seen, schedule, arguments.draws, seed)]
+            groups, needed, seconds = form(seen, rows, config)
+            (random,) = generators([seed], "gwr")
+            gwr = GWRB(seen.embedding.shape[-1], generator=random, **asdict(fine))
+            for row in rows:
+                gwr.adapt(seen.embedding[row])
+            inferred = task_inference_accuracy(gwr, seen, held_out, n_tasks)
+            columns.append(
+                [
+                    f"{int(groups.num_groups)}",
+                    f"{100 * float(group_purity(groups, held_out, n_tasks)):.4g}",
+                    f"{max(needed.values())}" if len(needed) == n_tasks else "never",
+                    f"{seconds:.1f}",
+                    f"{int(gwr.num_nodes)}",
+                    f"{100 * float(inferred):.4g}",
+                ]
+            )
+        cells = (" ".join(column) for column in zip(*columns, strict=True))
+        print(f"| {order} | {' | '.join(cells)} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -19,11 +19,14 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from summary import summarize
 from tyro.conf import subcommand
 
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.bgpo import BGPO
+from bgpo_trl.analysis.comparison import read_run
+from bgpo_trl.analysis.scores import episodes_to_80, late_scores
+from bgpo_trl.analysis.statistics import mean
+from bgpo_trl.analysis.tables import markdown
 from bgpo_trl.configs import PRESETS, BGPOConfig, DDPGConfig, SACConfig, TD3Config
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.experiments.arguments import command_line
@@ -92,7 +95,7 @@ def main(arguments: Arguments) -> None:
         eval_every=max(1, min(100, arguments.episodes)),
         eval_episodes=5,
     )
-    tables = {}
+    table = [["rung", *base.tasks, "all", "episodes to 80 %"]]
     for rung in arguments.rungs:
         _, bgpo = RUNGS[rung]
         out = arguments.out / rung
@@ -108,15 +111,17 @@ def main(arguments: Arguments) -> None:
         ) as trainer:
             trainer.run()
         save_figure(plot_success_curves(out / "eval.csv"), out / "figures" / "success.png")
-        tables[rung] = summarize(out / "eval.csv")
-    columns = list(next(iter(tables.values())))
-    print("| rung | " + " | ".join(columns) + " |")
-    print("|---|" + "---|" * len(columns))
-    for rung, table in tables.items():
-        reached = table.pop("episodes to 80 %")
-        cells = [f"{success:.2f}" for success in table.values()]
-        cells.append("not reached" if math.isinf(reached) else f"{reached:.0f}")
-        print(f"| ({rung}) {RUNGS[rung][0]} | " + " | ".join(cells) + " |")
+        run = read_run(out)
+        late, reached = late_scores(run), episodes_to_80(run)
+        table += [
+            [
+                f"({rung}) {RUNGS[rung][0]}",
+                *(f"{100 * share:.1f}" for share in late.mean(0)),
+                mean(late.mean(1)).percent(),
+                "not reached" if math.isinf(reached) else f"{reached:.0f}",
+            ]
+        ]
+    print(markdown(table))
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""Measure the tasks of the suite: success of random actions and of the demonstrators.
+"""Measure the tasks of the suite: demonstrators, random actions, and the spread of the starts.
 
     python benchmarks/nico_tasks.py
 
-Prints a table, and with ``--picture`` draws a demonstration of each task as a strip of frames.
+Prints tables, and with ``--pictures`` draws a demonstration of each task and some start states.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,8 @@ from suites import nico
 from suites.nico.base import CONTROL_TIMESTEP, TIME_LIMIT, Environment
 from suites.nico.demonstrator import Demonstrator
 
-_FRAMES, _WIDTH, _HEIGHT, _TITLE, _GAP = 6, 128, 64, 14, 4
+_COLUMNS, _WIDTH, _HEIGHT, _TITLE, _GAP = 6, 128, 64, 14, 4
+_SPREADS = (0.0, 0.5, 1.0)  # of which start states are drawn
 
 
 @dataclass(frozen=True)
@@ -29,37 +31,71 @@ class Arguments:
 
     starts: int = 200
     """Start states of each task, and episodes of random actions."""
-    seed: int = 1
+    seed: int = 101
     """Seed of the starts and of the actions."""
-    picture: Path | None = None
-    """File to draw a demonstration of each task to, .png."""
+    pictures: Path | None = None
+    """Folder to draw tasks.png, demonstrations, and starts.png, start states, to."""
 
 
-def demonstrate(env: Environment, demonstrator: Demonstrator) -> tuple[list[NDArray], bool]:
-    """Return the frames of a demonstration (empty for states) and whether it succeeded."""
-    timestep = env.reset()
+class Demonstration(NamedTuple):
+    """An episode of a demonstrator.
+
+    Attributes:
+        start: Where the objects were at first, x and y (m), ``[3, 2]``.
+        frames: The frames, of which there are none if states are observed.
+        steps: Number of steps.
+        success: Whether the task was solved.
+    """
+
+    start: NDArray[np.float64]
+    frames: list[NDArray[np.uint8]]
+    steps: int
+    success: bool
+
+
+def demonstrate(env: Environment, demonstrator: Demonstrator) -> Demonstration:
+    """Play an episode of the demonstrator."""
+    timestep, timesteps = env.reset(), []
+    start = places(env.physics)
     demonstrator.reset()
-    frames = [timestep.observation.get("pixels", np.empty(0))]
+    timesteps.append(timestep)
     while not timestep.last():
         timestep = env.step(demonstrator(timestep))
-        frames.append(timestep.observation.get("pixels", np.empty(0)))
-    return frames, bool(timestep.reward)
+        timesteps.append(timestep)
+    frames = [step.observation["pixels"] for step in timesteps if "pixels" in step.observation]
+    return Demonstration(start, frames, len(timesteps) - 1, bool(timestep.reward))
+
+
+def places(physics: nico.Physics) -> NDArray[np.float64]:
+    """Return where the objects are now, x and y (m), ``[3, 2]``."""
+    return np.stack([physics.object_position(name)[:2] for name in nico.OBJECTS])
 
 
 class _Judge(nico.NicoTask):
-    """Task that never ends and notes which of the others are solved."""
+    """Task that never ends and notes which of the others are solved.
+
+    Each of them counts the steps for which its condition holds, as it would alone.
+    """
 
     def __init__(self, tasks: Sequence[str], seed: int) -> None:
         super().__init__(random=seed, observation="state")
         self._tasks = {name: nico.TASKS[name](random=0) for name in tasks}
+        self._counts = dict.fromkeys(tasks, 0)
         self.solved: set[str] = set()
 
     def initialize_episode(self, physics: nico.Physics) -> None:
         super().initialize_episode(physics)
+        self._counts = dict.fromkeys(self._tasks, 0)
         self.solved = set()
 
+    def after_step(self, physics: nico.Physics) -> None:
+        for name, task in self._tasks.items():
+            self._counts[name] = self._counts[name] + 1 if task.succeeded(physics) else 0
+            if self._counts[name] >= task.steady_steps:
+                self.solved.add(name)
+
     def get_reward(self, physics: nico.Physics) -> float:
-        self.solved.update(name for name, task in self._tasks.items() if task.succeeded(physics))
+        del physics
         return 0.0
 
     def get_termination(self, physics: nico.Physics) -> None:
@@ -85,43 +121,78 @@ def chance(tasks: Sequence[str], episodes: int, seed: int) -> dict[str, float]:
     return {name: count / episodes for name, count in counts.items()}
 
 
-def draw(tasks: Sequence[str], seed: int) -> Image.Image:
+def draw_demonstrations(tasks: Sequence[str], seed: int) -> Image.Image:
     """Return the first successful demonstration of each task as a titled row of frames."""
-    row = _TITLE + _HEIGHT + _GAP
-    picture = Image.new("RGB", (_FRAMES * (_WIDTH + _GAP) - _GAP, row * len(tasks)), "white")
-    for number, name in enumerate(tasks):
+    rows = []
+    for name in tasks:
         env = nico.load(name, seed=seed)
         demonstrator = Demonstrator(env, seed=seed)
-        frames, success = demonstrate(env, demonstrator)
-        while not success:
-            frames, success = demonstrate(env, demonstrator)
-        title = f"{name}, {len(frames) - 1} steps"
-        ImageDraw.Draw(picture).text((0, number * row), title, fill="black")
-        shown = np.linspace(0, len(frames) - 1, _FRAMES).round().astype(int)
-        for column, index in enumerate(shown):
-            frame = Image.fromarray(frames[index])
-            enlarged = frame.resize((_WIDTH, _HEIGHT), Image.Resampling.NEAREST)
-            picture.paste(enlarged, (column * (_WIDTH + _GAP), number * row + _TITLE))
+        shown = demonstrate(env, demonstrator)
+        while not shown.success:
+            shown = demonstrate(env, demonstrator)
+        chosen = np.linspace(0, shown.steps, _COLUMNS).round().astype(int)
+        rows.append((f"{name}, {shown.steps} steps", [shown.frames[index] for index in chosen]))
+    return _draw(rows)
+
+
+def draw_starts(seed: int) -> Image.Image:
+    """Return the first frame of some episodes, a titled row for each of several spreads."""
+    rows = []
+    for spread in _SPREADS:
+        env = nico.load(nico.ALL_TASKS[0], seed=seed, spread=spread)
+        frames = [env.reset().observation["pixels"] for _ in range(_COLUMNS)]
+        rows.append((f"spread {spread:g}", frames))
+    return _draw(rows)
+
+
+def _draw(rows: Sequence[tuple[str, Sequence[NDArray[np.uint8]]]]) -> Image.Image:
+    """Return titled rows of enlarged frames."""
+    height = _TITLE + _HEIGHT + _GAP
+    size = (_COLUMNS * (_WIDTH + _GAP) - _GAP, height * len(rows))
+    picture = Image.new("RGB", size, "white")
+    for number, (title, frames) in enumerate(rows):
+        ImageDraw.Draw(picture).text((0, number * height), title, fill="black")
+        for column, frame in enumerate(frames):
+            enlarged = Image.fromarray(frame).resize((_WIDTH, _HEIGHT), Image.Resampling.NEAREST)
+            picture.paste(enlarged, (column * (_WIDTH + _GAP), number * height + _TITLE))
     return picture
 
 
 def main(arguments: Arguments) -> None:
     """Run the command line."""
-    if arguments.starts < 1:
-        raise ValueError(f"--starts must be at least 1, got {arguments.starts}")
+    if arguments.starts < 2:
+        raise ValueError(f"--starts must be at least 2, got {arguments.starts}")
+    if arguments.pictures is not None and not arguments.pictures.is_dir():
+        raise ValueError(f"there is no folder {arguments.pictures}: make it first")
     tasks = nico.ALL_TASKS
     by_chance = chance(tasks, arguments.starts, arguments.seed)
-    print("| task | chance | demonstrator | steps |\n|---|---:|---:|---:|")
+    starts: dict[str, NDArray[np.float64]] = {}
+    print("| task | random actions | demonstrator | steps |\n|---|---:|---:|---:|")
     for name in tasks:
         env = nico.load(name, seed=arguments.seed, observation="state")
         demonstrator = Demonstrator(env, seed=arguments.seed)
         episodes = [demonstrate(env, demonstrator) for _ in range(arguments.starts)]
-        success = np.mean([done for _, done in episodes])
-        steps = np.mean([len(frames) - 1 for frames, done in episodes if done] or [np.nan])
+        starts[name] = np.stack([episode.start for episode in episodes])
+        success = np.mean([episode.success for episode in episodes])
+        steps = np.mean([episode.steps for episode in episodes if episode.success] or [np.nan])
         print(f"| `{name}` | {by_chance[name]:.1%} | {success:.1%} | {steps:.1f} |", flush=True)
-    if arguments.picture is not None:
-        draw(tasks, arguments.seed).save(arguments.picture, optimize=True)
-        print(f"picture: {arguments.picture}")
+
+    first = starts[tasks[0]]
+    deviation = 100 * first.std(0, ddof=1)  # (cm)
+    print("\n| standard deviation of the start, cm | x | y |\n|---|---:|---:|")
+    for name, (x, y) in zip(nico.OBJECTS, deviation, strict=True):
+        print(f"| {name} | {x:.2f} | {y:.2f} |")
+    alike = all(np.array_equal(first, of_task) for of_task in starts.values())
+    print(f"\nThe starts of all tasks are {'the same' if alike else 'NOT the same'}.")
+
+    if arguments.pictures is not None:
+        for name, picture in (
+            ("tasks.png", draw_demonstrations(tasks, arguments.seed)),
+            ("starts.png", draw_starts(arguments.seed)),
+        ):
+            path = arguments.pictures / name
+            picture.save(path, optimize=True)
+            print(f"picture: {path}")
 
 
 if __name__ == "__main__":

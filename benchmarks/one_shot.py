@@ -131,11 +131,18 @@ def measure(policy: TrainedPolicy, shares: Sequence[float], episodes: int, seed:
         episodes=episodes,
         bank=policy.bank.held_out(),
         encoders=policy.encoders,
+        spread=config.spread,
     )
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         shown = record_demonstrations(
-            folder, tasks=tasks, per_task=episodes, held_out_per_task=0, seed=seed, progress=False
+            folder,
+            tasks=tasks,
+            per_task=episodes,
+            held_out_per_task=0,
+            spread=config.spread,
+            seed=seed,
+            progress=False,
         ).to_tensordict()
     length = shown["length"].clone()
     for share in shares:

@@ -1,16 +1,18 @@
-"""Report of the paper's figures and claims, or of the benchmark of eight tasks, from finished runs.
+"""Report of finished runs: tables and figures.
 
-    python benchmarks/report.py
+    python benchmarks/report.py runs/comparison
 
-reads the runs in ``benchmarks/results/comparison`` (or another directory) and writes beside them
-Figs. 6, 7, 8 and 9 (mean over seeds and one standard deviation), ``tables.md`` with confidence
-intervals and the claims, and ``report.html`` with all of these, frames of test episodes and the
-runs' settings. Of runs named ``eight-ALGORITHM``, ``eight-reversed-ALGORITHM`` and
-``eight-concurrent-ALGORITHM`` (``python benchmarks/continual.py --tasks all``, the tasks in reverse
-order, ``benchmarks/concurrent_tasks.py --tasks all``) it makes the benchmark's table, heat maps of
-success after each phase, learning curves, and nodes, groups and cost by the number of tasks.
-Runs of other algorithms, such as ``eight-mine`` or ``continual-mine``, get rows of their own.
-Missing runs are listed; longer runs are cut to the length of the shortest in their table.
+reads the runs in a folder, or single runs, in any number and of any algorithms, and sorts them by
+tasks and the way these are presented. It prints and writes ``tables.md``: success, differences
+between algorithms, forgetting and transfer, learning times, groups of behaviors, cost, each run
+task by task, and the paper's claims as far as there are runs for them; beside it, figures and one
+page with all of these, ``report.html``. Of tasks presented one after the other there are heat maps
+of success after each phase. The report of a single run is written into its directory, with a figure
+of its groups. ``docs/benchmark.md`` defines the measures.
+
+    python benchmarks/report.py runs/comparison --archive benchmarks/results/comparison
+
+first copies what reports read of the runs, compressed, and writes the report beside the copies.
 """
 
 from __future__ import annotations
@@ -22,251 +24,257 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from bgpo_trl.analysis import eight_tasks
-from bgpo_trl.analysis.claims import LEVEL, additions, claims
+from bgpo_trl.analysis.claims import claims
 from bgpo_trl.analysis.comparison import (
-    Group,
     Run,
-    read_group,
-    with_own,
+    Setting,
+    read_settings,
+    reference_of,
+    run_directories,
 )
-from bgpo_trl.analysis.intervals import Statistics
-from bgpo_trl.analysis.paper_runs import GROUPS, SETTINGS
-from bgpo_trl.analysis.tables import Table, continual_table, groups_table, main_table, speed_table
+from bgpo_trl.analysis.scores import success_matrix
+from bgpo_trl.analysis.tables import (
+    COST_NOTE,
+    DIFFERENCE_NOTES,
+    SEQUENCE_NOTES,
+    SPEED_NOTE,
+    SUCCESS_NOTES,
+    Table,
+    cost_table,
+    difference_table,
+    groups_table,
+    markdown,
+    sequence_table,
+    speed_table,
+    success_table,
+    task_table,
+)
 from bgpo_trl.experiments.arguments import command_line
 from bgpo_trl.figures.counts import plot_counts, read_counts
 from bgpo_trl.figures.curves import plot_success_curves
 from bgpo_trl.figures.nodes import plot_gwr_pca
+from bgpo_trl.figures.of_run import draw_groups
 from bgpo_trl.figures.page import Section, write_page
-from bgpo_trl.figures.style import save_figure
+from bgpo_trl.figures.style import COLORS, save_figure
 from bgpo_trl.figures.success_matrix import plot_success_matrices
-from bgpo_trl.runs.results import read_rows
+from bgpo_trl.files.folders import make_folder
+from bgpo_trl.runs.archive import archive_run
+from bgpo_trl.runs.results import find_table, read_table
+
+# For a screen: figures of results are kept under version control.
+_DPI = 150
+# Curves that can be told apart in one figure.
+_CURVES = len(COLORS)
 
 
 @dataclass(frozen=True)
 class Arguments:
-    """Report on the runs in a directory."""
+    """Report on finished runs."""
 
-    runs: tyro.conf.Positional[Path] = Path("benchmarks/results/comparison")
-    """Parent of the run directories, which are named EXPERIMENT-ALGORITHM."""
+    runs: tyro.conf.Positional[tuple[Path, ...]]
+    """Folders of runs, or run directories."""
     out: Path | None = None
     """Folder of the report; by default that of the runs."""
+    archive: Path | None = None
+    """Folder for compact copies of the runs, on which the report is then made."""
+    anyway: bool = False
+    """Compare also runs under different conditions, such as other encoders or tests."""
 
 
-def draw(group: Group, runs: dict[str, Run], folder: Path) -> dict[str, Path]:
-    """Draw a group's learning curves.
+@dataclass(frozen=True)
+class Report:
+    """Sections of a report, and its runs by directory."""
 
-    Returns:
-        Paths of the figures by caption, without figures that lack all runs.
-    """
-    figures = {}
-    for picture in group.pictures:
-        shown = [runs[key] for key in picture.runs if key in runs]
-        if not shown:
-            continue
-        first, path = shown[0], folder / f"{picture.file}.png"
-        save_figure(
-            plot_success_curves(
-                {run.name: run.directory / "eval.csv" for run in shown},
-                presented=_presented(first),
-                random_success=first.summary.get("random_success"),
-                window=3 * first.eval_every,
-                last=int(first.curves.episodes[-1]),
-            ),
-            path,
+    sections: list[Section]
+    runs: dict[Path, Run]
+
+
+def presented(run: Run) -> dict[str, int]:
+    """Return the training episode from which each task of a run is presented."""
+    return dict(zip(run.tasks, run.starts, strict=True))
+
+
+def draw_curves(setting: Setting, out: Path) -> dict[str, Path]:
+    """Draw the learning curves of a setting, some runs to a figure; paths by caption."""
+    figures: dict[str, Path] = {}
+    for start in range(0, len(setting.runs), _CURVES):
+        names = list(setting.runs)[start : start + _CURVES]
+        path = out / f"{setting.slug}{f'-{1 + start // _CURVES}' if start else ''}.png"
+        first = setting.runs[names[0]]
+        figure = plot_success_curves(
+            {name: setting.runs[name].directory / "eval.csv" for name in names},
+            presented=presented(first),
+            random_success=first.summary.get("random_success"),
+            window=3 * first.eval_every,
+            last=first.last,
         )
-        figures[picture.caption] = path
+        save_figure(figure, path, _DPI)
+        figures[f"mean and one standard deviation over seeds: {', '.join(names)}"] = path
     return figures
 
 
-def _presented(run: Run) -> dict[str, int]:
-    return dict(zip(run.tasks, run.config["task_starts"], strict=True))
+def draw_sequence(setting: Setting, out: Path) -> dict[str, Path]:
+    """Draw success after each phase as heat maps; paths by caption."""
+    path = out / f"{setting.slug}-matrix.png"
+    matrices = {name: success_matrix(run).mean(0) for name, run in setting.runs.items()}
+    save_figure(plot_success_matrices(matrices, setting.first.tasks), path, _DPI)
+    return {"success on each task after each phase": path}
 
 
-def draw_nodes(path: Path, to: Path, names: Sequence[str]) -> Table:
-    """Draw Fig. 7 from a run's ``gwr.csv``, by task and, if it has groups, by group.
+def draw_counts(setting: Setting, out: Path) -> dict[str, Path]:
+    """Draw the numbers of nodes and groups over training; paths by caption, none without GWR-B."""
+    counts = {}
+    for name, run in setting.runs.items():
+        if find_table(run.directory / "train.csv") and run.summary.get("nodes") is not None:
+            counts[name] = read_counts(run.directory / "train.csv", run.last)
+    if not counts:
+        return {}
+    path = out / f"{setting.slug}-counts.png"
+    save_figure(plot_counts(counts, presented(setting.first)), path, _DPI)
+    return {"nodes and groups: mean over seeds, from the lowest to the highest seed": path}
 
-    Args:
-        path: The ``gwr.csv``.
-        to: Path of the figure.
-        names: Names of the run's tasks.
 
-    Returns:
-        A table of the distances between the tasks' mean nodes.
-    """
-    rows = read_rows(path)
-    tasks = np.array([int(row["task"]) for row in rows])
-    groups = [int(row["group"]) for row in rows] if "group" in rows[0] else None
-    weights = np.array([[float(v) for k, v in row.items() if k.startswith("w")] for row in rows])
-    save_figure(plot_gwr_pca(weights, tasks, names, groups), to)
-    numbers = [task for task in range(len(names)) if (tasks == task).any()]
+def draw_nodes(run: Run, path: Path) -> Table:
+    """Draw the nodes of a run's GWR-B (Fig. 7); return the distances of the tasks' mean nodes."""
+    table = read_table(run.directory / "gwr.csv")
+    tasks = table["task"].to_numpy(np.int64)
+    groups = table["group"].to_numpy(np.int64) if "group" in table else None
+    weights = table.filter(regex=r"^w\d+$").to_numpy(float)
+    save_figure(plot_gwr_pca(weights, tasks, run.tasks, groups), path, _DPI)
+    numbers = [task for task in range(len(run.tasks)) if (tasks == task).any()]
     means = {task: weights[tasks == task].mean(0) for task in numbers}
-    table: Table = [["distance of mean nodes", *(f"task {task + 1}" for task in numbers)]]
+    rows: Table = [["distance of mean nodes", *(f"task {task + 1}" for task in numbers)]]
     for task in numbers:
         apart = [float(np.linalg.norm(means[task] - means[other])) for other in numbers]
-        table.append([f"task {task + 1}", *(f"{distance:.2f}" for distance in apart)])
-    return table
+        rows.append([f"task {task + 1}", *(f"{distance:.2f}" for distance in apart)])
+    return rows
 
 
-def markdown(rows: Sequence[Sequence[str]]) -> str:
-    """Format a table in Markdown."""
-    head, *body = rows
-    lines = [head, ["---"] * len(head), *body]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
-
-
-def read_sections(directory: Path, out: Path) -> tuple[list[Section], dict[str, Run]]:
-    """Read the runs in a directory, draw the figures and compute the tables.
-
-    Args:
-        directory: Parent of the run directories.
-        out: Folder of the figures.
-
-    Returns:
-        The sections of the report, and the runs by directory name.
-
-    Raises:
-        ValueError: If there are no runs, or runs of different tasks.
-    """
-    statistics = Statistics()
-    paper, runs = paper_sections(directory, out, statistics)
-    eight, more = eight_sections(directory, out, statistics)
-    if not runs and not more:
-        raise ValueError(
-            f"{directory} holds none of the runs that the figures need: name their directories "
-            "EXPERIMENT-ALGORITHM, such as continual-bgpo"
+def setting_sections(setting: Setting, reference: Setting | None, out: Path) -> list[Section]:
+    """Return the sections of a setting and draw its figures."""
+    first, title = setting.first, setting.title
+    conditions = {name: first.config.get(name) for name in ("held_out", "eval_episodes")}
+    about = [
+        "Tasks: "
+        + ", ".join(
+            f"{number} {task} (from episode {start})"
+            for number, (task, start) in enumerate(presented(first).items(), 1)
         )
-    return paper + eight, runs | more
-
-
-def eight_sections(
-    directory: Path, out: Path, statistics: Statistics
-) -> tuple[list[Section], dict[str, Run]]:
-    """Return the sections of the benchmark of eight tasks and its runs; none without runs."""
-    groups = with_own(directory, eight_tasks.GROUPS)
-    read = {key: read_group(directory, group) for key, group in groups.items()}
-    runs = {name: run for found, _ in read.values() for name, run in found.items()}
-    references, sections = read[eight_tasks.CONCURRENT][0], list[Section]()
-    for key, (found, notes) in read.items() if runs else ():
-        title = groups[key].title
-        if not found:
-            sections.append(Section(title, notes=notes))
-            continue
-        if key in eight_tasks.SEQUENCES:
-            table = eight_tasks.benchmark_table(found, references, statistics)
-            figures, about = draw_sequence(found, out / key), list(eight_tasks.NOTES)
-            sections.append(Section(f"{title}: the benchmark", table, figures, about))
-        curves = draw(groups[key], found, out)
-        sections.append(Section(f"{title}: success", main_table(found, statistics), curves, notes))
-        table = eight_tasks.cost_table(found)
+        + f". {first.last:,} episodes, tests every {first.eval_every}"
+        + "".join(f", {name} {value}" for name, value in conditions.items() if value is not None)
+        + "."
+    ]
+    sections = [
+        Section(
+            title,
+            success_table(setting),
+            draw_curves(setting, out),
+            [*about, *setting.notes, *SUCCESS_NOTES],
+        )
+    ]
+    table = difference_table(setting)
+    if table:
+        sections.append(Section(f"Differences: {title}", table, notes=[*DIFFERENCE_NOTES]))
+    if setting.in_sequence:
+        name = f"Forgetting and transfer: {title}"
+        try:
+            table, figures = sequence_table(setting, reference), draw_sequence(setting, out)
+            sections.append(Section(name, table, figures, [*SEQUENCE_NOTES]))
+        except ValueError as error:  # tested too rarely
+            sections.append(Section(name, notes=[str(error)]))
+    for share in (0.5, 0.8):
+        table = speed_table(setting, share)
         if table:
-            title = f"{title}: cost of a training step of all seeds, by presented tasks"
-            sections.append(Section(title, table))
-    table = groups_table(runs[name] for name in sorted(runs))
+            name = f"Own episodes to {share:.0%}: {title}".replace("%", " %")
+            sections.append(Section(name, table, notes=[SPEED_NOTE]))
+    table = groups_table(setting)
     if table:
-        sections.append(Section("Eight tasks: groups and inferred tasks, by seed", table))
-    return sections, runs
+        sections.append(Section(f"GWR-B, by seed: {title}", table, draw_counts(setting, out)))
+    for name, run in setting.runs.items():
+        if find_table(run.directory / "gwr.csv"):
+            path = out / f"{setting.slug}-nodes.png"
+            table = draw_nodes(run, path)
+            caption = f"{name}, first seed: first two principal components"
+            sections.append(Section(f"Nodes of GWR-B: {title}", table, {caption: path}))
+            break
+    table = cost_table(setting)
+    if table:
+        sections.append(Section(f"Cost: {title}", table, notes=[COST_NOTE]))
+    for name, run in setting.runs.items():
+        notes = [f"`{run.summary[key]}`" for key in ("commit", "command") if run.summary.get(key)]
+        sections.append(Section(f"{name}: {title}", task_table(run), notes=[", ".join(notes)]))
+    return sections
 
 
-def draw_sequence(runs: dict[str, Run], path: Path) -> dict[str, Path]:
-    """Draw heat maps of success after each phase, and numbers of nodes and groups.
-
-    Args:
-        runs: Runs of tasks one after the other, by directory name.
-        path: Path of the figures, without their endings.
-
-    Returns:
-        Paths of the figures by caption.
-    """
-    first = next(iter(runs.values()))
-    matrices = {run.name: eight_tasks.success_matrix(run).mean(0) for run in runs.values()}
-    figures = {"success on each task after each phase": path.with_name(f"{path.name}-matrix.png")}
-    save_figure(plot_success_matrices(matrices, first.tasks), *figures.values())
-    last, counts = int(first.curves.episodes[-1]), {}
-    for run in runs.values():
-        train = run.directory / "train.csv"
-        of_run = read_counts(train, last) if train.exists() else {}
-        if of_run and of_run["num_nodes"].any():
-            counts[run.name] = of_run
-    if counts:
-        caption = "nodes and groups: mean over seeds, and from the lowest to the highest seed"
-        figures[caption] = path.with_name(f"{path.name}-counts.png")
-        save_figure(plot_counts(counts, _presented(first)), figures[caption])
-    return figures
-
-
-def paper_sections(
-    directory: Path, out: Path, statistics: Statistics
-) -> tuple[list[Section], dict[str, Run]]:
-    """Return the sections of the paper's experiments and their runs; none without runs.
+def make_report(directories: Sequence[Path], out: Path, *, anyway: bool = False) -> Report:
+    """Compute the tables and draw the figures of runs.
 
     Raises:
-        ValueError: If the runs are of different tasks.
+        ValueError: If a run is damaged, none is finished, or conditions differ.
     """
-    sections: list[Section] = []
-    known = with_own(directory, GROUPS)
-    read = {key: read_group(directory, group) for key, group in known.items()}
-    groups = {key: found for key, (found, _) in read.items()}
-    runs = {name: run for group in groups.values() for name, run in group.items()}
-    if not runs:
-        return [], {}
-    if len({run.tasks for run in runs.values()}) > 1:
-        raise ValueError(
-            f"{directory} holds runs of different tasks: name a directory for each choice of tasks"
-        )
-    for key, group in known.items():
-        notes = read[key][1]
-        section = Section(group.title, notes=notes)
-        # An ablation with only runs of other groups would repeat their tables.
-        if any(not key.startswith("ablation") or name.startswith(key) for name in groups[key]):
-            table = main_table(groups[key], statistics)
-            section = Section(group.title, table, draw(group, groups[key], out), notes)
-        sections.append(section)
-    if groups["continual"] and len(next(iter(runs.values())).tasks) > 1:
-        table = continual_table(groups["continual"], groups["concurrent"], statistics)
-        about = ["Means over seeds, in points, with 95 % intervals."]
-        sections.append(Section("Forgetting and transfer, continual", table, notes=about))
-    for setting, (_, about) in SETTINGS.items():
-        of_setting = groups[setting] | groups[f"{setting}-paper"]
-        if of_setting:
-            title = f"Training episodes of a task until half of its last 20 succeed, {about}"
-            sections.append(Section(title, speed_table(of_setting)))
-    table = groups_table(runs[name] for name in sorted(runs))
-    if table:
-        title = "Groups found and tasks inferred on held-out demonstrations, by seed"
-        sections.append(Section(title, table))
-    title, nodes = "Fig. 7: nodes of one GWR-B", directory / "concurrent-bgpo" / "gwr.csv"
-    if nodes.exists() and nodes.parent.name in runs:
-        table = draw_nodes(nodes, out / "fig7.png", runs[nodes.parent.name].tasks)
-        figures = {"first two principal components, first seed": out / "fig7.png"}
-        sections.append(Section(title, table, figures))
-    else:
-        missing = f"missing ({nodes.relative_to(directory)} is not there)"
-        sections.append(Section(title, notes=[missing]))
-    sections.append(Section("The paper's claims", claims(groups, statistics), notes=[LEVEL]))
-    table = additions(groups, statistics)
-    if table:
-        sections.append(Section("Additions to the paper's algorithm", table, notes=[LEVEL]))
-    return sections, runs
+    settings, notes = read_settings(directories, anyway=anyway)
+    references = [reference_of(setting, settings, anyway=anyway) for setting in settings]
+    # All that may be refused comes before the first file.
+    for setting in settings:
+        for run in setting.runs.values():
+            task_table(run)
+    make_folder(out)
+    sections = [Section("Left out", notes=notes)] if notes else []
+    for setting, reference in zip(settings, references, strict=True):
+        sections += setting_sections(setting, reference, out)
+    pairs = [(s, r) for s, r in zip(settings, references, strict=True) if s.in_sequence]
+    paired = [reference for _, reference in pairs]
+    pairs += [(None, s) for s in settings if s.from_start and s not in paired]
+    for continual, concurrent in pairs:
+        table, missing = claims(continual, concurrent)
+        if table:
+            number = len((continual or concurrent).first.tasks)
+            about = [f"{missing} further claims need runs that are not here."] if missing else []
+            sections.append(Section(f"The paper's claims, {number} tasks", table, notes=about))
+    runs = {run.directory: run for setting in settings for run in setting.runs.values()}
+    return Report(sections, runs)
+
+
+def text_of(sections: Sequence[Section], out: Path) -> str:
+    """Return sections in Markdown; figures are linked from the folder ``out``."""
+    text = []
+    for section in sections:
+        text.append(f"## {section.title}")
+        text += [markdown(section.table)] if section.table else []
+        text += [
+            f"![{caption}]({path.relative_to(out).as_posix()})"
+            for caption, path in section.figures.items()
+        ]
+        text += ["\n".join(f"- {note}" for note in section.notes if note)]
+    return "\n\n".join(filter(None, text)) + "\n"
 
 
 def main(arguments: Arguments) -> None:
     """Write the report."""
-    if not arguments.runs.is_dir():
-        raise ValueError(f"{arguments.runs} is not a directory: name the one that holds the runs")
-    out = arguments.out or arguments.runs
-    sections, runs = read_sections(arguments.runs, out)
-    text = []
-    for section in sections:
-        text += [f"## {section.title}", *([markdown(section.table)] if section.table else [])]
-        text += ["\n".join(f"- {note}" for note in section.notes)] if section.notes else []
-    (out / "tables.md").write_text("\n\n".join(text) + "\n")
-    write_page(
-        out / "report.html",
-        sections,
-        {key: (run.directory, run.config, run.summary) for key, run in runs.items()},
-    )
-    print("\n\n".join(text))
+    if not arguments.runs:
+        raise ValueError("name a run, or a folder of runs")
+    if arguments.out is None and arguments.archive is None and len(arguments.runs) > 1:
+        raise ValueError("--out: several folders are given, name that of the report")
+    directories = run_directories(arguments.runs)
+    if arguments.archive is not None:
+        if len({directory.name for directory in directories}) < len(directories):
+            raise ValueError("--archive: runs of the same name are given, use one folder for each")
+        read_settings(directories, anyway=arguments.anyway)  # refuses before copying
+        copies = [arguments.archive / directory.name for directory in directories]
+        for directory, copy in zip(directories, copies, strict=True):
+            archive_run(directory, copy)
+        directories = copies
+    out = arguments.out or arguments.archive or arguments.runs[0]
+    report = make_report(directories, out, anyway=arguments.anyway)
+    for directory in directories if directories == list(arguments.runs) else ():
+        run = report.runs.get(directory)
+        if run is not None and max(run.summary.get("groups") or [0]) > 1:
+            draw_groups(directory, presented(run), out / f"{directory.name}-groups.png")
+    text = text_of(report.sections, out)
+    (out / "tables.md").write_text(text)
+    settings = {str(path): (path, run.config, run.summary) for path, run in report.runs.items()}
+    write_page(out / "report.html", report.sections, settings)
+    print(text)
 
 
 if __name__ == "__main__":

@@ -45,7 +45,14 @@ except ImportError as error:
     sys.exit(f"error: {error}")
 
 Setting = Literal[
-    "concurrent", "continual", "ablation", "eight", "eight-reversed", "eight-concurrent"
+    "concurrent",
+    "continual",
+    "sequential",
+    "ablation",
+    "eight",
+    "eight-reversed",
+    "eight-sequential",
+    "eight-concurrent",
 ]
 
 
@@ -56,9 +63,10 @@ class Arguments(experiment.TaskArguments):
     algorithms: tuple[str, ...] = ("bgpo",)
     """Algorithms, as in concurrent_tasks.py."""
     settings: tuple[Setting, ...] = ("concurrent",)
-    """Tasks all from the start (concurrent), one after another (continual), or the variants of BGPO
-    instead of the algorithms (ablation). Or the suite's eight tasks instead of --tasks: one after
-    another, in reverse order, or all from the start."""
+    """Tasks all from the start (concurrent); one after another, with earlier ones practised
+    (continual) or not (sequential); or the variants of BGPO instead of the algorithms (ablation).
+    Or the suite's eight tasks instead of --tasks: one after another, in reverse order, without
+    practising earlier ones, or all from the start."""
     preset: Literal["quick", "desk", "paper"] = "desk"
     """Size of the runs."""
     seeds: tuple[int, ...] | None = None
@@ -134,12 +142,13 @@ def _config(arguments: Arguments, setting: Setting, name: str) -> RunConfig:
             eval_every=arguments.eval_every,
             held_out=arguments.held_out,
             tasks=tasks,
+            schedule="sequential" if setting.endswith("sequential") else "practised",
         )
     )
     config = replace(config, name=name)
     if setting == "ablation":
         config = replace(config, algorithm=ABLATIONS[name].config)
-    return config if setting in ("continual", "eight", "eight-reversed") else at_once(config)
+    return at_once(config) if setting.endswith(("concurrent", "ablation")) else config
 
 
 def check_directories(

@@ -1,9 +1,9 @@
-"""Detection of a task that was never shown, by the activity of the groups of behaviors.
+"""Detection of a task that was never shown, by its novelty to the groups of behaviors.
 
     python benchmarks/unknown_task.py
     python benchmarks/unknown_task.py --bank my_bank.safetensors --tasks all
 
-leaves out each task in turn: groups form from demonstrations of the others, and the activity of
+leaves out each task in turn: groups form from demonstrations of the others, and the novelty of
 held-out demonstrations says whether their task is known. It prints a table and writes
 ``unknown_task.json`` and the ROC curves, ``roc.png``.
 """
@@ -18,13 +18,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from bgpo_trl.analysis.novelty import Detection, leave_one_out, roc_curve
-from bgpo_trl.encoders.shipped import groups_config
-from bgpo_trl.experiments.arguments import (
-    BankArguments,
-    check_draws,
-    chosen_weights,
-    command_line,
-)
+from bgpo_trl.experiments.arguments import BankArguments, check_draws, command_line
 from bgpo_trl.experiments.run import bank_of
 from bgpo_trl.figures.style import COLORS, LINES, save_figure, style_axes
 
@@ -63,9 +57,8 @@ def main(arguments: Arguments) -> None:
     bank = bank_of(arguments)
     if len(bank.tasks) < 2:
         raise ValueError("--tasks: name at least two, of which each is left out in turn")
-    config = groups_config(chosen_weights(bank.tasks, arguments.bank))
     found = {
-        task: leave_one_out(bank, i, config, seeds=arguments.seeds, draws=arguments.draws)
+        task: leave_one_out(bank, i, seeds=arguments.seeds, draws=arguments.draws)
         for i, task in enumerate(bank.tasks)
     }
     print("| left out | area under the ROC curve, by seed | detected, % | false alarms, % |")
@@ -78,7 +71,7 @@ def main(arguments: Arguments) -> None:
         by_seed = " ".join(f"{value:.3f}" for value in area)
         print(f"| {task} | {by_seed} | {shares[0]:.1f} | {shares[1]:.1f} |")
     mean = np.mean([result["area"] for result in results.values()])
-    print(f"\nMean area {mean:.3f}; threshold of the activity {config.activity_threshold}.")
+    print(f"\nMean area {mean:.3f}.")
     save_figure(draw(found), arguments.out / "roc.png")
     (arguments.out / "unknown_task.json").write_text(json.dumps(results, indent=2) + "\n")
 

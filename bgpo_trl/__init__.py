@@ -30,5 +30,8 @@ else:
 
         return getattr(policy, name)
 
+    def __dir__():
+        return sorted({*globals(), *__all__})
+
 
 __all__ = ["TrainedPolicy", "__version__", "load_run"]

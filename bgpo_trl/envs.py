@@ -17,7 +17,13 @@ from bgpo_trl.machine import usable_cores
 from bgpo_trl.seeding import Seeding, random_state, row_seeds, set_random_state
 from bgpo_trl.threads import Threads
 from suites import nico
-from suites.nico.base import STATE_SIZE, Environment, Observation, check_observation
+from suites.nico.base import (
+    STATE_SIZE,
+    Environment,
+    Observation,
+    check_observation,
+    check_spread,
+)
 from suites.nico.rendering import FRAME_HEIGHT, FRAME_WIDTH, FrameRenderer
 
 
@@ -48,12 +54,14 @@ class NicoEnv(EnvBase):
         batch_size: Shape of the batch; an int is the length of a batch of one dimension.
         seed: Seed of the first simulation's starts, from which the others count up; or one for
             each; or None for seeds from the operating system.
+        spread: Share of the whole range of start states, from 0 (nominal places) to 1.
         observation: ``"pixels"``, ``"state"`` or ``"both"``.
         threads: Threads for physics, the caller's among them; None takes one for each core.
 
     Raises:
         ValueError: If a task is unknown or named twice, there are not as many seeds as
-            simulations, a seed is out of range, or there is to be no task, simulation or thread.
+            simulations, a seed or the spread is out of range, or there is to be no task,
+            simulation or thread.
 
     Example:
         >>> env = NicoEnv(batch_size=[2], seed=0)
@@ -67,11 +75,13 @@ class NicoEnv(EnvBase):
         *,
         batch_size: int | Sequence[int] = (),
         seed: int | Sequence[int] | None = 0,
+        spread: float = 1.0,
         observation: Observation = "pixels",
         threads: int | None = None,
     ) -> None:
         super().__init__(batch_size=as_shape(batch_size, "batch_size"), device="cpu")
         check_observation(observation)
+        check_spread(spread)
         if threads is not None and threads < 1:
             raise ValueError(f"threads must be at least 1, or None for all cores, got {threads}")
         if not tasks or isinstance(tasks, str):
@@ -90,6 +100,7 @@ class NicoEnv(EnvBase):
                     nico.load(
                         task,
                         seed=random,
+                        spread=spread,
                         observation="state",  # Frames are drawn here, in one thread.
                         time_limit=float("inf"),
                         physics=physics,

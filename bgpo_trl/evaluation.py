@@ -67,8 +67,9 @@ class Evaluator:
     number of the evaluation.
 
     Config, seeds, schedule and encoders are those of training; the bank has held-out
-    demonstrations. Each task is tested in ``episodes`` episodes. ``make_env`` makes the simulation,
-    with the arguments of `NicoEnv`, the default.
+    demonstrations. ``spread`` is the share of the whole range of start states. Each task is tested
+    in ``episodes`` episodes. ``make_env`` makes the simulation, with the arguments of `NicoEnv`,
+    the default.
 
     Raises:
         ValueError: If a task has no demonstration.
@@ -83,6 +84,7 @@ class Evaluator:
         episodes: int,
         bank: DemonstrationBank,
         encoders: Representation | None,
+        spread: float = 1.0,
         make_env: Callable[..., NicoEnv] | None = None,
     ) -> None:
         self.max_steps = config.max_steps
@@ -101,6 +103,7 @@ class Evaluator:
         self.simulation = (make_env or NicoEnv)(
             bank.tasks,
             batch_size=self.shape,
+            spread=spread,
             observation="pixels" if config.state == "latent" else "state",
         )
         self.env = observation_env(config, self.simulation, encoders)
@@ -234,12 +237,21 @@ def _rng(seed: int, number: int) -> np.random.Generator:
 
 @torch.no_grad()
 def evaluate_random_policy(
-    *, tasks: Sequence[str], episodes: int, seed: int = 0, max_steps: int = 50
+    *,
+    tasks: Sequence[str],
+    episodes: int,
+    seed: int = 0,
+    spread: float = 1.0,
+    max_steps: int = 50,
 ) -> Tensor:
     """Return the success rate of uniformly random actions on each task, float32 ``[T]``."""
     shape = (len(tasks), episodes)
     env = NicoEnv(
-        tasks, batch_size=shape, seed=stream_seed(seed, "random policy") // 2, observation="state"
+        tasks,
+        batch_size=shape,
+        seed=stream_seed(seed, "random policy") // 2,
+        spread=spread,
+        observation="state",
     )
     generator = torch.Generator().manual_seed(seed)
     task = torch.arange(len(tasks))[:, None].expand(shape).contiguous()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -40,9 +40,10 @@ class Recognition:
         node: Identity of that node.
         activity: Activity of that node in [0, 1]; 1 for a demonstration equal to it.
         group: Number of the group of behaviors; None without groups, as are the next two.
-        group_activity: Activity of the best match among the groups' nodes, in [0, 1].
-        known: Whether that reaches the threshold of a known group. It is reliable for encoders that
-            have seen the task; of a task new to them, most demonstrations count as known.
+        group_novelty: Distance to the group's demonstrations, relative to the group's own extent.
+        known: Whether it lies within that extent, so that the novelty is at most 1. It is reliable
+            for encoders that have seen the task; of a task new to them, most demonstrations count
+            as known.
         task: The label given with the demonstration.
     """
 
@@ -51,7 +52,7 @@ class Recognition:
     node: int | None = None
     activity: float | None = None
     group: int | None = None
-    group_activity: float | None = None
+    group_novelty: float | None = None
     known: bool | None = None
     task: str | None = None
 
@@ -65,6 +66,7 @@ class TrainedPolicy:
         encoders: The run's encoders.
         bank: The run's demonstrations, embedded.
         seed: One of the run's seeds.
+        episodes: Training episodes that the seed has learned from.
     """
 
     def __init__(
@@ -75,12 +77,13 @@ class TrainedPolicy:
         encoders: Representation,
         bank: DemonstrationBank,
         seed: int,
+        episodes: int,
     ) -> None:
         self.config = config
         self.algorithm = algorithm
         self.encoders = encoders
         self.bank = bank
-        self.seed = seed
+        self.seed, self.episodes = seed, episodes
         self.tasks = config.tasks
         self._observe = Compose([encode(config.algorithm, encoders), clip(config.algorithm)])
         self._index = config.seeds.index(seed)
@@ -141,10 +144,9 @@ class TrainedPolicy:
             recognized["activity"] = float(match.activity[index])
         if algorithm.groups is not None:
             member = algorithm.groups.lookup(shown)
-            activity = float(member.activity[index])
             recognized["group"] = int(member.group[index])
-            recognized["group_activity"] = activity
-            recognized["known"] = activity >= algorithm.groups.activity_threshold
+            recognized["group_novelty"] = float(member.novelty[index])
+            recognized["known"] = bool(member.known[index])
         return Recognition(embedding, **recognized, task=task)
 
     @torch.no_grad()
@@ -176,12 +178,14 @@ class LoadedRun(NamedTuple):
         algorithm: The algorithm of all seeds.
         encoders: The run's encoders.
         bank: The run's demonstrations, embedded.
+        episodes: Training episodes of each seed so far.
     """
 
     config: RunConfig
     algorithm: Algorithm
     encoders: Representation
     bank: DemonstrationBank
+    episodes: Sequence[int]
 
 
 def load_run(
@@ -215,9 +219,16 @@ def load_run(
         raise ValueError(f"{path} has no seed {seed!r}: choose one of {seeds}")
     if config.algorithm.state != "latent" or digests.encoders is None:
         raise ValueError(f"{path} learned from the ground truth: only runs from frames can watch")
-    config, algorithm, encoders, bank = load_all_seeds(path, make=make)
+    config, algorithm, encoders, bank, episodes = load_all_seeds(path, make=make)
     seed = config.seeds[0] if seed is None else seed
-    return TrainedPolicy(config, algorithm, encoders=encoders, bank=bank, seed=seed)
+    return TrainedPolicy(
+        config,
+        algorithm,
+        encoders=encoders,
+        bank=bank,
+        seed=seed,
+        episodes=episodes[config.seeds.index(seed)],
+    )
 
 
 def load_all_seeds(path: str | Path, *, make: Callable[..., Algorithm] | None = None) -> LoadedRun:
@@ -257,20 +268,21 @@ def load_all_seeds(path: str | Path, *, make: Callable[..., Algorithm] | None = 
             )
         raise ValueError(f"{path} has no checkpoint: let the run reach its first one, or keep it")
     encoders, bank = load_inputs(path, config.tasks, digests)
-    saved = load_checkpoint(path / "checkpoint", mmap=True)
+    saved = load_checkpoint(path / "checkpoint", mmap=True, newest=True)
     try:
         algorithm = make(config.algorithm, seeds=config.seeds, bank=bank.seen(), encoders=encoders)
         state = saved["algorithm"]
         if not algorithm.needs_replay:
             state["replay"] = algorithm.replay.state_dict()  # Avoids reading it.
         algorithm.load_state_dict(state)
+        episodes = saved["world"]["source"]["episode"].tolist()
     except (KeyError, IndexError, RuntimeError, TypeError, ValueError) as error:
         reason = str(error).splitlines()[-1].strip()
         raise ValueError(
             f"{path / 'checkpoint'} does not fit {path / 'config.json'} ({reason}): use the "
             "version of the code, and the make, of the run"
         ) from error
-    return LoadedRun(config, algorithm, encoders, bank)
+    return LoadedRun(config, algorithm, encoders, bank, episodes)
 
 
 def _frames(frames: ArrayLike, wanted: str, ndim: int) -> Tensor:

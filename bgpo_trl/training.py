@@ -94,14 +94,27 @@ class Trainer(Closing):
                 f"{used}: load both together (load_pretrained), or embed anew "
                 "(bgpo_trl.encoders.make_bank)"
             )
+        if bank.spread < config.spread:
+            raise ValueError(
+                f"the bank was recorded at spread {bank.spread}, the run is at {config.spread}: "
+                "lower the run's spread, or record at a larger one"
+            )
         bank = bank.for_tasks(config.tasks)
-        self._schedule = schedule = TaskSchedule(starts=config.task_starts)
+        self._schedule = schedule = TaskSchedule(
+            config.task_starts, cumulative=config.schedule == "practised"
+        )
         seeds = config.seeds
         make = entry(config.name).make if make is None else make
         self.algorithm = make(
             config.algorithm, seeds=seeds, bank=bank.seen(), encoders=encoders, device=device
         )
-        self.world = World(self.algorithm, seeds=seeds, schedule=schedule, bank=bank.seen())
+        self.world = World(
+            self.algorithm,
+            seeds=seeds,
+            schedule=schedule,
+            bank=bank.seen(),
+            spread=config.spread,
+        )
         self.evaluator = Evaluator(
             config.algorithm,
             seeds=seeds,
@@ -109,6 +122,7 @@ class Trainer(Closing):
             episodes=config.eval_episodes,
             bank=bank.held_out(config.held_out),
             encoders=encoders,
+            spread=config.spread,
         )
         self.env_steps = 0
         # For the progress bar: the latest training episodes, and the latest evaluation.
@@ -211,7 +225,7 @@ class Trainer(Closing):
     @property
     def _n_tasks(self) -> int:
         """Number of tasks that are presented to all seeds."""
-        return int(self._schedule.available(self.world.source.episode).sum(-1).min())
+        return int(self._schedule.presented(self.world.source.episode + 1).sum(-1).min())
 
     def _success_so_far(self) -> str:
         rate = sum(self._successes) / len(self._successes)

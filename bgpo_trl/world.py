@@ -25,6 +25,7 @@ class World:
         seeds: One for each element of the batch.
         schedule: Times at which tasks are presented.
         bank: Embedded demonstrations for training episodes.
+        spread: Share of the whole range of start states.
 
     Raises:
         TypeError: If the algorithm makes something else than an environment of all seeds.
@@ -42,6 +43,7 @@ class World:
         seeds: Sequence[int],
         schedule: TaskSchedule,
         bank: DemonstrationBank,
+        spread: float = 1.0,
     ) -> None:
         batch = torch.Size([len(seeds)])
         self.source = DemonstrationSource(
@@ -51,6 +53,7 @@ class World:
             bank.tasks,
             batch_size=batch,
             seed=[stream_seed(seed, "env") for seed in seeds],
+            spread=spread,
             observation="pixels" if algorithm.config.state == "latent" else "state",
         )
         self.env = algorithm.make_env(self.simulation, self.source)

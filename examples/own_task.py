@@ -12,7 +12,7 @@ from bgpo_trl.encoders.make_bank import make_bank
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.figures.curves import plot_success_curves
 from bgpo_trl.figures.style import save_figure
-from bgpo_trl.runs.results import read_rows
+from bgpo_trl.runs.results import TRAIN, read_table
 from bgpo_trl.training import Trainer
 from suites import nico
 from suites.nico import moves
@@ -21,7 +21,9 @@ OWN, OUT = "push_white_to_green", Path("runs/own-task")
 
 
 class PushWhiteToGreen(nico.NicoTask):
-    """Success: the white box touches the green box."""
+    """Success: the white box touches the green box for two steps."""
+
+    steady_steps = 2
 
     def succeeded(self, physics):
         return physics.touching("white_box", "green_box")
@@ -43,12 +45,11 @@ if __name__ == "__main__":
     with Trainer(config, OUT / "run", bank=bank, encoders=encoders, resume=True) as trainer:
         trainer.run()
     save_figure(plot_success_curves(OUT / "run" / "eval.csv"), OUT / "success.png")
+    train, test = (read_table(OUT / "run" / file, TRAIN) for file in ("train.csv", "eval.csv"))
     for task in tasks:
-        train, test = (
-            [int(row["success"]) for row in read_rows(OUT / "run" / file) if row["task"] == task]
-            for file in ("train.csv", "eval.csv")
-        )
-        print(f"{task}: {sum(train)} of {len(train)} in training, {sum(test)} of {len(test)} tests")
+        won, passed = (table.loc[table["task"] == task, "success"] for table in (train, test))
+        counts = f"{won.sum():.0f} of {len(won)} in training, {passed.sum():.0f} of {len(passed)}"
+        print(f"{task}: {counts} tests")
     gwr = trainer.algorithm.gwr
     inferred = task_inference_accuracy(gwr, bank.seen(), bank.held_out(), len(bank.tasks))
     print(f"GWR-B, {gwr.num_nodes.item()} nodes: task inferred for {inferred.item():.0%}, held out")

@@ -3,7 +3,12 @@
 import pytest
 import torch
 
-from bgpo_trl.configs import RepresentationConfig, SequenceAutoencoderConfig, VAEConfig
+from bgpo_trl.configs import (
+    InverseModelConfig,
+    RepresentationConfig,
+    SequenceAutoencoderConfig,
+    VAEConfig,
+)
 from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.encoders.train import train_encoders
 from bgpo_trl.training import Trainer
@@ -13,6 +18,7 @@ RECORDING = {"per_task": 2, "held_out_per_task": 1, "progress": False}
 ENCODERS = RepresentationConfig(
     vae=VAEConfig(batch_size=4, window=2, steps=20, warmup_steps=1),
     lae=SequenceAutoencoderConfig(batch_size=4, steps=20, warmup_steps=1),
+    inverse=InverseModelConfig(hidden_size=8, batch_size=8, steps=20, warmup_steps=1),
     checkpoint_every=3,
     log_every=1,
 )

@@ -18,7 +18,7 @@ from bgpo_trl.figures.style import save_figure
 from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
 from bgpo_trl.files.csv_file import CsvFile
 from bgpo_trl.runs.logger import EVAL_COLUMNS, RunLogger
-from bgpo_trl.runs.results import read_curves, read_json, read_rows
+from bgpo_trl.runs.results import read_curves, read_json, read_table
 from suites import nico
 
 HEADER = ",".join(EVAL_COLUMNS) + "\n"
@@ -116,7 +116,7 @@ CASES = {
     "table that talks to the terminal": (
         lambda f: curves(f / "terminal"),
         "is not a CSV file of a run (control", "name another run"),
-    "table that is a folder": (lambda f: read_rows(f), "is not a CSV file", "name another run"),
+    "table that is a folder": (lambda f: read_table(f), "is not a CSV file", "name another run"),
     "test of an unknown task": (
         lambda f: curves(f / "stranger"), "'juggle'", "none of grasp_glass"),
     "curves of a damaged table": (

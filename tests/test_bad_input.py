@@ -10,13 +10,12 @@ import math
 from functools import partial
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv
 
-from bgpo_trl.analysis import intervals, metrics
+from bgpo_trl.analysis import metrics, statistics
 from bgpo_trl.data.replay import ReplayBuffer
 from bgpo_trl.data.task_replay import TaskReplay
 from bgpo_trl.envs import NicoEnv
@@ -311,17 +310,10 @@ PARTS = {
         lambda: metrics.forgetting_since_best([0.1, 0.2]), "success [2]", "needs a training"),
     "transfer without phases": (
         lambda: metrics.backward_transfer([[1, 2]]), "got [1, 2]", "one phase per task"),
-    "quartiles of nothing": (lambda: intervals.interquartile_mean([]), "not empty", "leave out"),
-    "an interval of one": (lambda: intervals.t_interval([0.5]), "two seeds", "needs the values"),
-    "quartiles of NaN": (lambda: intervals.interquartile_mean([NAN]), "finite", "leave out"),
-    "bootstrap of NaN": (
-        lambda: intervals.stratified_bootstrap([[NAN]], rng=np.random.default_rng(0)),
-        "with NaN", "must be finite"),
-    "bootstrap of no draws": (
-        lambda: intervals.stratified_bootstrap([[1]], n_resamples=0, rng=np.random.default_rng(0)),
-        "got 0", "at least 1"),
+    "difference of NaN": (
+        lambda: statistics.difference([1.0], [NAN]), "with NaN", "must be finite"),
     "interval in percent": (
-        lambda: intervals.percentile_interval([1, 2], 95), "and 95", "must be in (0, 1)"),
+        lambda: statistics.contrast([[1, 2]], [1]).interval(95), "got 95", "between 0 and 1"),
 }  # fmt: skip
 
 

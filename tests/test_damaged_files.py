@@ -19,6 +19,7 @@ from bgpo_trl.encoders.representation import (
     load_representation,
     save_representation,
 )
+from bgpo_trl.modules.inverse_model import InverseModel
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
 
@@ -148,9 +149,13 @@ def test_wrong_statements_about_a_dataset(recorded, expected, n):
 @pytest.fixture(scope="module")
 def files(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("files")
-    config = {"vae": {"latent_size": 1}, "lae": {"embedding_size": 2}}
+    config = {
+        "vae": {"latent_size": 4},
+        "lae": {"embedding_size": 2},
+        "inverse": {"hidden_size": 512},
+    }
     metadata = {"scene_version": "some", "config": json.dumps(config), "seed": "0", "command": ""}
-    small = Representation(VAE(1), SequenceAutoencoder(1, 2), metadata)
+    small = Representation(VAE(4), SequenceAutoencoder(4, 2), InverseModel(4), metadata)
     save_representation(small, folder / "encoders")
     task, length = torch.arange(3), torch.tensor([0, 2, 3])
     steps = DemonstrationSteps.of(torch.rand(3, 3, 2), torch.rand(3, 2, 4), length)
@@ -163,6 +168,7 @@ def read_bank(path: Path) -> dict[str, torch.Tensor]:
     bank = dict(vars(DemonstrationBank.load(path, encoder_id="x")))
     bank |= vars(bank.pop("steps"))
     texts = {"tasks": ",".join(bank["tasks"]), "encoder_id": bank["encoder_id"]}
+    bank["spread"] = torch.tensor(bank["spread"])
     return bank | {key: torch.tensor(list(text.encode())) for key, text in texts.items()}
 
 

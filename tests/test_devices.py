@@ -12,7 +12,12 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
-from bgpo_trl.configs import RepresentationConfig, SequenceAutoencoderConfig, VAEConfig
+from bgpo_trl.configs import (
+    InverseModelConfig,
+    RepresentationConfig,
+    SequenceAutoencoderConfig,
+    VAEConfig,
+)
 from bgpo_trl.encoders.representation import (
     load_representation,
     save_representation,
@@ -106,7 +111,9 @@ def test_encoders_trained_elsewhere_come_back_to_the_cpu(device, tmp_path):
         [4],
     )
     config = RepresentationConfig(
-        vae=VAEConfig(steps=2, batch_size=4), lae=SequenceAutoencoderConfig(steps=2, batch_size=4)
+        vae=VAEConfig(steps=2, batch_size=4),
+        lae=SequenceAutoencoderConfig(steps=2, batch_size=4),
+        inverse=InverseModelConfig(steps=2, batch_size=4),
     )
     found = []
     for place in ("cpu", device):

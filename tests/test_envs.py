@@ -113,6 +113,62 @@ def test_each_row_of_a_batch_is_as_it_is_alone():
         assert_equal(run(alone, alone_start, steps[:, *index]), rollout[:, *index])
 
 
+@pytest.mark.parametrize("spread", [0.0, 0.4])
+def test_with_a_spread_each_row_is_the_suites_environment(spread):
+    tasks = (0, 2)
+    batch = NicoEnv(batch_size=[2], seed=6, spread=spread, observation="both")
+    td = batch.reset(task_td(*tasks))
+    alone = [
+        nico.load(nico.PAPER_TASKS[task], seed=6 + row, spread=spread, observation="both")
+        for row, task in enumerate(tasks)
+    ]
+    timesteps = [env.reset() for env in alone]
+    whole = NicoEnv(batch_size=[2], seed=6, observation="state").reset(task_td(*tasks))
+    assert (td["state"] != whole["state"]).any(dim=-1).all()
+
+    for action in actions(batch, 4):
+        for row, timestep in enumerate(timesteps):
+            np.testing.assert_array_equal(td["pixels"][row], timestep.observation["pixels"])
+            state = timestep.observation["privileged_state"].astype(np.float32)
+            np.testing.assert_array_equal(td["state"][row], state)
+        td = batch.step(td.set("action", action))["next"]
+        timesteps = [
+            env.step(of_row.double().numpy()) for env, of_row in zip(alone, action, strict=True)
+        ]
+
+
+class Patient(nico.NicoTask):
+    """Success: three steps have passed."""
+
+    steady_steps = 3
+
+    def succeeded(self, physics):
+        return physics.time() > 0
+
+
+def test_success_that_has_to_last_is_counted_row_by_row_and_saved():
+    nico.add_task("patient", Patient)
+
+    def make_env():
+        return NicoEnv(["patient"], batch_size=[2], seed=1, observation="state")
+
+    def step(env, *rows):
+        still = TensorDict({"action": torch.zeros(2, 4), "_step": torch.tensor(rows)}, [2])
+        return env.step(still)["next"]["terminated"].flatten().tolist()
+
+    env = make_env()
+    env.reset()
+    assert step(env, True, False) == [False, False]
+    assert step(env, True, True) == [False, False]
+    saved = env.simulation_state()
+    other = make_env()
+    other.load_simulation_state(saved)
+    for continued in (env, deepcopy(other), other):
+        assert step(continued, True, True) == [True, False]
+        continued.reset(TensorDict({"_reset": torch.tensor([[True], [False]])}, [2]))
+        assert step(continued, True, True) == [False, True]
+
+
 def test_seeds_can_be_given_one_by_one_and_set_again():
     env = NicoEnv(batch_size=[2], seed=[8, 3], observation="state")
     first = env.reset()
@@ -429,6 +485,8 @@ def test_wrong_arguments_are_refused_in_one_line():
         NicoEnv(["juggle"])
     with pytest.raises(ValueError, match=r"^observation is 'sound'; choose one of .*$"):
         NicoEnv(observation="sound")
+    with pytest.raises(ValueError, match=r"^spread is 2: choose a number from 0 .* to 1$"):
+        NicoEnv(spread=2)
 
 
 def test_a_state_of_another_environment_is_refused():

@@ -109,8 +109,8 @@ def test_own_baseline_acts_as_shown_and_is_tested_under_its_name(run):
     }
     assert len(tests) == 15
     assert out == f"knn {success}\n"
-    # Random actions succeed in 7 to 10 % of such episodes.
-    assert np.mean([*success.values()]) > 0.3
+    # Random actions succeed in 2 to 8 % of such episodes.
+    assert np.mean([*success.values()]) > 0.15
     assert run("own_baseline.py") == out  # resumed, though there is nothing learned to load
 
 

@@ -17,7 +17,7 @@ from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.policy import Policy
 from bgpo_trl.configs import RepresentationConfig
 from bgpo_trl.data.bank import DemonstrationBank
-from bgpo_trl.encoders.representation import Representation, save_representation
+from bgpo_trl.encoders.representation import save_representation
 from bgpo_trl.encoders.shipped import bank_path
 from bgpo_trl.evaluation import Evaluator
 from bgpo_trl.training import Trainer
@@ -76,7 +76,7 @@ def trainer_of(encoders, tested_bank, make_config, easy_world, tmp_path_factory)
             config = make_config(name=name, episodes=16)
             directory = tmp_path_factory.mktemp(name) / "run"
             weights = directory / "encoders" / "nico.safetensors"
-            save_representation(Representation(encoders.vae, encoders.lae, METADATA), weights)
+            save_representation(replace(encoders, metadata=METADATA), weights)
             replace(tested_bank, encoder_id=encoders.identity).save(bank_path(weights))
             trainers[name] = Trainer(
                 config,
@@ -190,8 +190,8 @@ def test_a_demonstration_may_have_any_length(trainer_of, load, encoders, length)
     assert seen.activity == pytest.approx(float(torch.exp(-scale * distance)))
     groups = trainer_of("bgpo").algorithm.groups
     member = groups.lookup(seen.embedding.expand(2, -1))[1]
-    assert (seen.group, seen.group_activity) == (int(member.group), float(member.activity))
-    assert seen.known == (seen.group_activity >= groups.activity_threshold)
+    assert (seen.group, seen.group_novelty) == (int(member.group), float(member.novelty))
+    assert seen.known == (seen.group_novelty <= 1)
     assert repr(seen).startswith(f"Recognition(node={seen.node}, activity=")
     assert policy.act(frames[-1]).shape == (4,)
 
@@ -305,7 +305,7 @@ def test_a_run_of_own_tasks_is_loaded_where_the_task_is_known(
     config = make_config(tasks=tasks, task_starts=(0, 2), episodes=4)
     run = tmp_path / "run"
     weights = run / "encoders" / "nico.safetensors"
-    save_representation(Representation(encoders.vae, encoders.lae, METADATA), weights)
+    save_representation(replace(encoders, metadata=METADATA), weights)
     with Trainer(config, run, bank=own, encoders=encoders, progress=False) as trainer:
         trainer.run()
     policy = bgpo_trl.load_run(run)
@@ -349,7 +349,7 @@ def see_the_truth(run):
     [
         (shutil.rmtree, r"run holds no run: there is no config.json$"),
         (lambda run: shutil.rmtree(run / "checkpoint"), "has no checkpoint: let the run reach"),
-        (spoil_checkpoints, "holds no intact checkpoint"),
+        (spoil_checkpoints, "is damaged, and older checkpoints have learned less: resume the run"),
         (spoil_encoders, r"was trained with the encoders \w{12}, not with those that come with"),
         (lambda run: rewrite(run, encoders="0" * 64), "trained with the encoders 000000000000, no"),
         (lambda run: rewrite(run, bank="0" * 64), "with the demonstrations 000000000000, not with"),
@@ -368,6 +368,10 @@ def test_what_cannot_be_loaded_is_refused_in_a_line(trainer_of, tmp_path, spoil,
     with pytest.raises(ValueError, match=said) as error:
         bgpo_trl.load_run(run)
     assert "\n" not in str(error.value)
+
+
+def test_a_policy_tells_how_long_it_has_learned(load):
+    assert min(load().episodes, load(seed=8).episodes) == 16
 
 
 @pytest.mark.parametrize("seed", [0, -1, 4, "3", 3.5])
@@ -397,7 +401,11 @@ def test_the_example_tells_what_the_policy_saw_and_how_it_went(trainer_of, capsy
 
 
 def test_the_package_is_cheap_to_import():
-    code = "import sys, bgpo_trl; assert not {'torch', 'numpy', 'mujoco'} & set(sys.modules)"
+    code = (
+        "import sys, bgpo_trl; names = dir(bgpo_trl)\n"
+        "assert not {'torch', 'numpy', 'mujoco'} & set(sys.modules)\n"
+        "assert {'TrainedPolicy', '__version__', 'load_run'} <= set(names)"
+    )
     subprocess.run([sys.executable, "-c", code], check=True)
     with pytest.raises(AttributeError, match="'bgpo_trl' has no attribute 'lode_run'"):
         _ = bgpo_trl.lode_run

@@ -464,6 +464,19 @@ def test_steps_are_counted_by_the_number_of_tasks_that_all_seeds_have(uninterrup
     assert sizes[2] == pytest.approx(n_bytes(state) / 1e6, abs=1e-6)
 
 
+def test_without_practice_only_the_newest_task_is_trained_and_all_are_tested(
+    make, make_config, tmp_path
+):
+    make(tmp_path, make_config(schedule="sequential")).run()
+    tasks = make_config().tasks
+    played = {(int(row["episode"]), row["task"]) for row in rows(tmp_path / "train.csv")}
+    newest = [tasks[(episode > 2) + (episode > 4)] for episode in range(1, 11)]
+    assert played == {*enumerate(newest, 1)}
+    tested = {(int(row["episode"]), row["task"]) for row in rows(tmp_path / "eval.csv")}
+    assert {task for episode, task in tested if episode == 10} == {*tasks}
+    assert list(read_costs(tmp_path / "cost.csv")) == [1, 2, 3]
+
+
 def test_the_time_of_a_step_is_that_of_training_without_tests_and_checkpoints(
     make, make_config, tmp_path, monkeypatch
 ):

@@ -32,27 +32,31 @@ class Entry:
     """The default hyperparameters."""
 
 
-_SINGLE = BGPOConfig(variant="published", experts=False, even_replay=False, demonstration_share=0.0)
+_ALONE: Any = {"demonstration_share": 0.0, "expert_batch_size": 64, "rl": DDPGConfig()}
+_SINGLE = BGPOConfig(variant="published", experts=False, even_replay=False, **_ALONE)
 _PAPER = DDPGConfig(
     hidden_sizes=(64,),
     critic_layer_norm=False,
     batch_size=256,
     clip_targets=False,
+    imitation=0.0,
     pre_tanh_penalty=0.0,
 )
 _PUBLISHED: Any = {"rl": _PAPER, "gwr": GWRBConfig(activity_scale=1.0), "behavior_scale": 1.0}
-_SHOWN = 0.25
+_SHOWN: Any = {"demonstration_share": 0.75, "rl": DDPGConfig(noise=0.1)}
+_SHOWN_TASKS: Any = {**_SHOWN, "task_batch_size": 128}
+_SHOWN_SINGLE: Any = {**_SHOWN, "rl": DDPGConfig(noise=0.1, batch_size=384)}  # three tasks' batches
 
 ALGORITHMS: dict[str, Entry] = {
-    "bgpo": Entry(BGPO, BGPOConfig(demonstration_share=_SHOWN)),
-    "bgpo-experts": Entry(BGPO, BGPOConfig(demonstration_share=0.0)),
+    "bgpo": Entry(BGPO, BGPOConfig(**_SHOWN)),
+    "bgpo-experts": Entry(BGPO, BGPOConfig(**_ALONE)),
     "bgpo-single": Entry(BGPO, _SINGLE),
     "bgpo-paper": Entry(BGPO, replace(_SINGLE, **_PUBLISHED)),
     "maml": Entry(MAML, MAMLConfig()),
-    "maml-demonstrations": Entry(MAML, MAMLConfig(demonstration_share=_SHOWN)),
+    "maml-demonstrations": Entry(MAML, MAMLConfig(**_SHOWN_TASKS)),
     "maml-paper": Entry(MAML, MAMLConfig(rl=_PAPER, task_batch_size=256, adaptation_size=256 * 50)),
     "dist-nll": Entry(DistNLL, DistNLLConfig()),
-    "dist-nll-demonstrations": Entry(DistNLL, DistNLLConfig(demonstration_share=_SHOWN)),
+    "dist-nll-demonstrations": Entry(DistNLL, DistNLLConfig(**_SHOWN_TASKS)),
     "dist-nll-paper": Entry(
         DistNLL, DistNLLConfig(rl=_PAPER, task_batch_size=256, distillation_batch_size=1_000)
     ),
@@ -71,7 +75,7 @@ ABLATIONS: dict[str, Entry] = {
     "none": Entry(BGPO, replace(_SINGLE, variant="without-both")),
     "even-replay": Entry(BGPO, replace(_SINGLE, variant="bgpo", even_replay=True)),
     "experts": ALGORITHMS["bgpo-experts"],
-    "demonstrations": Entry(BGPO, replace(_SINGLE, demonstration_share=_SHOWN)),
+    "demonstrations": Entry(BGPO, replace(_SINGLE, **_SHOWN_SINGLE)),
     "all": ALGORITHMS["bgpo"],
 }
 """The paper's ablations (Fig. 9): with GWR-B and the intrinsic reward, one of them, neither. Then

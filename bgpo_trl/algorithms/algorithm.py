@@ -130,10 +130,12 @@ class Algorithm(ABC):
         bank: DemonstrationBank,
         seeds: Sequence[int],
         constant_keys: Sequence[NestedKey] = (),
+        own_constants: bool = True,
     ) -> DemonstrationReplay | None:
         """Return the replay of shown demonstrations, or None without a ``demonstration_share``.
 
-        ``constant_keys`` are the policies' inputs that are constant within an episode.
+        ``constant_keys`` are the policies' inputs that are constant within an episode;
+        for these and ``own_constants``, see `DemonstrationReplay`.
 
         Raises:
             ValueError: If the state is not the latent, or the bank has no steps.
@@ -147,6 +149,8 @@ class Algorithm(ABC):
             generator=generators(seeds, "demonstration replay"),
             state_key=config.state,
             constant_keys=constant_keys,
+            own_constants=own_constants,
+            noise=config.demonstration_noise,
         )
 
     def learn(self, batch: TensorDictBase) -> dict[str, Tensor]:

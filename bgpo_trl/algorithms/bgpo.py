@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any, cast
 
 import torch
@@ -17,12 +17,12 @@ from bgpo_trl.algorithms.environments import VARIANTS
 from bgpo_trl.algorithms.experts import ActiveGroups, Experts
 from bgpo_trl.algorithms.policy import Policy
 from bgpo_trl.algorithms.rl import LearnerSpec, make_learner
+from bgpo_trl.algorithms.trials import GroupTrials
 from bgpo_trl.configs import BGPOConfig
-from bgpo_trl.data.bank import DemonstrationBank
+from bgpo_trl.data.bank import DemonstrationBank, DemonstrationSteps
 from bgpo_trl.data.demonstration_replay import DemonstrationReplay
 from bgpo_trl.data.group_replay import GroupReplay
 from bgpo_trl.encoders.representation import Representation
-from bgpo_trl.encoders.shipped import find_weights, groups_config
 from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.modules.gwr import GWRB
 from bgpo_trl.seeding import generators
@@ -42,6 +42,8 @@ class BGPO(Algorithm):
     Attributes:
         experts: The networks of each group; of a single group without ``config.experts``.
         shown: Replay of the demonstrations shown so far, or None.
+        trials: Trials by which groups of one task are joined; None without experts or
+            demonstrations.
 
     Raises:
         ValueError: If the variant is unknown, or does not fit ``experts`` and ``even_replay``.
@@ -78,39 +80,48 @@ class BGPO(Algorithm):
                 **asdict(config.gwr),
             )
         if variant.groups:
-            found_by = config.groups or groups_config(find_weights(bank.encoder_id))
             self.groups = BehaviorGroups(
-                embedding_size, batch_size=[len(seeds)], **asdict(found_by)
+                embedding_size,
+                batch_size=[len(seeds)],
+                smallest=config.group_size,
+                evidence=config.group_evidence,
             )
+        self._shown_embedding = bank.embedding
+        self._revision = torch.zeros(len(seeds), dtype=torch.int64)
         sizes = {"behavior": embedding_size, "label": self.n_tasks, None: 0}
         self.in_keys = [config.state, *(["context"] if variant.context else [])]
 
         rl, keys = config.rl, self.in_keys
-        n_slots = config.active_groups if config.grouped else 1
-        self.learner = make_learner(
-            rl,
-            LearnerSpec(
-                seeds=seeds,
-                in_keys=keys,
-                in_features=self.state_size + sizes[variant.context],
-                return_bounds=(0.0, self._highest_return()),
-                device=self.device,
-                experts=range(n_slots if config.experts else 1),
-            ),
+        spec = LearnerSpec(
+            seeds=seeds,
+            in_keys=keys,
+            in_features=self.state_size + sizes[variant.context],
+            return_bounds=(0.0, self._highest_return()),
+            device=self.device,
         )
-        self.test_actor = self.learner.actor
-        self._active = ActiveGroups(len(seeds), n_slots)
+        n_active = config.active_groups if config.grouped else 1
+        self._active = ActiveGroups(len(seeds), n_active, config.rest_after)
         self.experts = Experts(
-            self.learner,
+            lambda width: make_learner(rl, replace(spec, experts=range(width))),
             self._active if config.experts else ActiveGroups(len(seeds), 1),
             lambda seed, group: 0 if self.groups is None else self.groups.parent(seed, group),
         )
+        self.learner = self.experts.learner
+        self.test_actor = self.learner.actor
         self.replay = GroupReplay(
             rl.replay_size,
             generator=generators(seeds, "replay"),
             keys=[*keys, "action", *(("next", key) for key in (keys[0], "reward", "terminated"))],
+            source_key="demo_index" if variant.groups else None,
         )
-        self.shown = self.demonstrations(config, bank, seeds, constant_keys=keys[1:])
+        self.shown = self.demonstrations(
+            config, bank, seeds, constant_keys=keys[1:], own_constants=not config.experts
+        )
+        self.trials: GroupTrials | None = None
+        if self.shown is not None and config.experts:
+            steps = cast(DemonstrationSteps, bank.steps)
+            starts = steps.latents(steps.first)
+            self.trials = GroupTrials(starts, seeds=seeds, smallest=config.group_size)
 
     def make_env(self, base_env: EnvBase, source: DemonstrationSource) -> TransformedEnv:
         """Return the variant's environment (`bgpo_trl.algorithms.environments`)."""
@@ -132,30 +143,88 @@ class BGPO(Algorithm):
 
     @torch.no_grad()
     def act(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the ``action`` ``[S, 4]`` of the group's policy with exploration noise."""
-        groups = self._groups_of(tensordict)
+        """Write the ``action`` ``[S, 4]`` of the group's policy with exploration noise.
+
+        Where groups have just been joined, the ``group`` of an episode that begins is updated.
+        """
         if self.config.experts:
-            expert = self.experts.play(groups)
+            expert = self.experts.play(self._playing(tensordict))
+            self.learner = self.experts.learner
         else:
             expert = torch.zeros(self.n_seeds, dtype=torch.int64)
-            for seed, group in enumerate(groups):
+            for seed, group in enumerate(self._groups_of(tensordict)):
                 self._active.play(seed, group)
         seen = self.to_device(tensordict.select(*self.in_keys))
         return tensordict.set("action", self.learner.act(seen, self._noise, expert))
 
+    def _playing(self, tensordict: TensorDictBase) -> list[int]:
+        """Return the groups whose experts act; update the groups of episodes that begin."""
+        groups, trials = self._groups_of(tensordict), self.trials
+        if trials is None or self.groups is None:
+            return groups
+        begins = tensordict["step_count"].flatten() == 0
+        if begins.any():
+            # The end of the last episode may have joined groups after the lookup of this one.
+            match = self.groups.lookup(tensordict["demo_embedding"], begins)
+            tensordict["group"] = torch.where(begins, match.group, tensordict["group"])
+        for seed in begins.nonzero().flatten().tolist():
+            start, group = tensordict[self.config.state][seed], int(tensordict["group"][seed])
+            trials.begin(seed, start, group)
+        return [trials.playing(seed) for seed in range(self.n_seeds)]
+
     def store(self, transition: TensorDictBase) -> None:
-        """Store a transition of each seed and, at the end of an episode, its demonstration."""
+        """Store a transition of each seed and, at the end of an episode, its demonstration.
+
+        Where demonstrations have changed their groups, all that is stored follows.
+        """
         group = torch.tensor(self._groups_of(transition))
         self.replay.add(transition, group)
-        if self.shown is None:
-            return
+        if self.shown is not None:
+            self._store_demonstration(self.shown, transition, group)
+        self._join_groups(transition)
+        self._follow_groups()
+
+    def _store_demonstration(
+        self, shown: DemonstrationReplay, transition: TensorDictBase, group: Tensor
+    ) -> None:
         ended = transition.get(("next", "done")).flatten()
         if ended.any():
             reward = torch.ones(self.n_seeds)
             if self.beta:
                 error = transition["behavior"] - transition["demo_embedding"]
                 reward += self.beta * torch.exp(-torch.linalg.vector_norm(error, dim=-1))
-            self.shown.add(transition, reward, group, ended)
+            shown.add(transition, reward, group, ended)
+
+    def _join_groups(self, transition: TensorDictBase) -> None:
+        """Count the episodes that end; join groups that turn out to be one task."""
+        if self.trials is None or self.groups is None:
+            return
+        end = transition.get("next")
+        for seed in end["done"].flatten().nonzero().flatten().tolist():
+            success = bool(end["terminated"][seed])
+            self.trials.end(seed, int(transition["demo_index"][seed]), success)
+            pair = self.trials.same_task(seed)
+            if pair is not None and {*pair} <= {*self.groups.numbers(seed)}:
+                self.groups.join(seed, *pair)
+
+    def _follow_groups(self) -> None:
+        """Assign what is stored to the groups of today; put experts of former groups aside."""
+        if self.groups is None or (changed := self.groups.revision != self._revision).sum() == 0:
+            return
+        self._revision = self.groups.revision
+        shown = self._shown_embedding.expand(self.n_seeds, *self._shown_embedding.shape)
+        group_of = self.groups.lookup(shown, changed).group
+        for seed in changed.nonzero().flatten().tolist():
+            for replay in (self.replay, self.shown):
+                if replay is not None:
+                    replay.regroup(seed, group_of[seed])
+            known = self.groups.numbers(seed)
+            if self.trials is not None:
+                self.trials.regroup(seed, group_of[seed], known)
+            for group in self._active.group[seed].tolist():
+                if group >= 0 and group not in known:
+                    (self.experts if self.config.experts else self._active).rest(seed, group)
+        self.learner = self.experts.learner
 
     def update(self) -> dict[str, Tensor]:
         """Make one update of each seed."""
@@ -165,7 +234,7 @@ class BGPO(Algorithm):
 
     def _sample(self) -> TensorDictBase:
         """Sample the transitions of an update, ``[S, E, B]``."""
-        config, (_, n_experts) = self.config, self.experts.active.group.shape
+        config, n_experts = self.config, self.experts.width
         n_rows = config.expert_batch_size if config.experts else config.rl.batch_size
 
         def groups_of(n_rows: int) -> Tensor:
@@ -180,6 +249,7 @@ class BGPO(Algorithm):
             return draw(self.replay, n_rows)
         n_shown = round(config.demonstration_share * n_rows)
         played, shown = draw(self.replay, n_rows - n_shown), draw(self.shown, n_shown)
+        played["demonstrated"] = torch.zeros(played.shape, dtype=torch.bool)
         return cast(TensorDictBase, torch.cat([played, shown], -1))
 
     @torch.no_grad()
@@ -227,10 +297,18 @@ class BGPO(Algorithm):
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a `state_dict`."""
-        super().load_state_dict(state)
         self.experts.load_state_dict(state["experts"])
+        self.learner = self.experts.learner
+        super().load_state_dict(state)
         self._active.load_state_dict(state["active"])
+        if self.groups is not None:
+            self._revision = self.groups.revision
 
     def _learned(self) -> dict[str, Any]:
-        parts = {"gwr": self.gwr, "groups": self.groups, "shown": self.shown}
+        parts = {
+            "gwr": self.gwr,
+            "groups": self.groups,
+            "shown": self.shown,
+            "trials": self.trials,
+        }
         return super()._learned() | {key: part for key, part in parts.items() if part is not None}

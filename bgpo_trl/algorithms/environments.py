@@ -260,12 +260,12 @@ def behavior_as_context(config: BGPOConfig) -> ObservationNorm:
 
 
 def clip(config: AlgorithmConfig) -> ClipTransform:
-    """Return the transform that bounds the observed state to five standard deviations.
+    """Return the transform that bounds the observed state to ``config.state_limit``.
 
     An object knocked off the table is dozens of deviations away and would dominate. Clip after
     `BehaviorMatchingReward`, since demonstrations are embedded without clipping.
     """
-    return ClipTransform(in_keys=[config.state], low=-5.0, high=5.0)
+    return ClipTransform([config.state], low=-config.state_limit, high=config.state_limit)
 
 
 def sum_rewards(*keys: str) -> RewardSum:

@@ -2,97 +2,149 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from math import inf
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from bgpo_trl.algorithms.learner import Learner
+from bgpo_trl.objectives.noise import SeededNoise
 
 __all__ = ["ActiveGroups", "Experts"]
 
 State = dict[str, Tensor]
-_MOMENTS = "optimizer."
+_MOMENTS, _NOISE = "optimizer.", "noise."
 
 
 class ActiveGroups:
-    """Groups played most recently by each seed ``S``, in a fixed number ``E`` of slots.
+    """Groups that each seed ``S`` has played lately.
 
-    A group that is played takes a free slot, or that of the least recently played group.
+    A group is active from when it is played until it has not been played for ``rest_after`` steps,
+    or until another one is played when ``most`` are active, and it is the one played longest ago.
+
+    Args:
+        n_seeds: Number of seeds.
+        most: Largest number of active groups of a seed.
+        rest_after: Steps without being played after which a group is no longer active.
 
     Example:
-        >>> active = ActiveGroups(1, 2)
+        >>> active = ActiveGroups(1, most=2, rest_after=3)
         >>> for group in (0, 1, 0, 2):
-        ...     slot = active.play(0, group)
+        ...     active.play(0, group)
         >>> active.group
         tensor([[0, 2]])
+        >>> for _ in range(3):
+        ...     active.play(0, 2)
+        >>> active.group
+        tensor([[2]])
     """
 
-    def __init__(self, n_seeds: int, n_slots: int) -> None:
-        self._slots = [[-1] * n_slots for _ in range(n_seeds)]
-        self._order = [list(range(n_slots)) for _ in range(n_seeds)]  # most recent last
+    def __init__(self, n_seeds: int, most: int, rest_after: float = inf) -> None:
+        self.most, self.rest_after = most, rest_after
+        self.groups: list[list[int]] = [[] for _ in range(n_seeds)]
+        """Active groups of each seed, by slot."""
+        self._steps = [0] * n_seeds
+        self._played: list[dict[int, int]] = [{} for _ in range(n_seeds)]  # by group, its last step
 
     @property
     def group(self) -> Tensor:
-        """The group in each slot, int64 ``[S, E]``; -1 in a free slot."""
-        return torch.tensor(self._slots)
+        """The group in each slot, int64 ``[S, E]``; -1 for seeds with fewer than ``E`` groups.
 
-    def slot(self, seed: int, group: int) -> int | None:
-        """Return the slot of a group, or None if it is not active."""
-        slots = self._slots[seed]
-        return slots.index(group) if group in slots else None
+        ``E`` is the largest number of active groups of a seed, at least 1.
+        """
+        width = max(1, *map(len, self.groups))
+        return torch.tensor([groups + [-1] * (width - len(groups)) for groups in self.groups])
 
-    def play(self, seed: int, group: int) -> int:
-        """Mark a group as the most recent of a seed; return its slot."""
-        slot, order = self.slot(seed, group), self._order[seed]
-        if slot is None:
-            slot = order[0]
-            self._slots[seed][slot] = group
-        order.remove(slot)
-        order.append(slot)
-        return slot
+    def play(self, seed: int, group: int) -> None:
+        """Count a step of a seed that a group plays."""
+        groups, played = self.groups[seed], self._played[seed]
+        self._steps[seed] += 1
+        played[group] = step = self._steps[seed]
+        for other in [*groups]:
+            if step - played[other] >= self.rest_after:
+                self.rest(seed, other)
+        if group in groups:
+            return
+        if len(groups) < self.most:
+            groups.append(group)
+        else:
+            oldest = min(groups, key=played.__getitem__)
+            groups[groups.index(oldest)] = group
+            del played[oldest]
+
+    def rest(self, seed: int, group: int) -> None:
+        """End the activity of a group."""
+        self.groups[seed].remove(group)
+        del self._played[seed][group]
 
     def rows(self, n_rows: int) -> Tensor:
         """Assign the active groups in turn to ``n_rows`` rows, int64 ``[S, n_rows]``."""
-        active = [[group for group in slots if group >= 0] or [-1] for slots in self._slots]
+        active = [groups or [-1] for groups in self.groups]
         return torch.tensor([[groups[i % len(groups)] for i in range(n_rows)] for groups in active])
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the groups and the order in which they were played."""
-        return {"slots": [[*s] for s in self._slots], "order": [[*o] for o in self._order]}
+        """Return the active groups, and when each was played."""
+        return {
+            "groups": [[*groups] for groups in self.groups],
+            "steps": [*self._steps],
+            "played": [dict(played) for played in self._played],
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a `state_dict`."""
-        self._slots = [[*slots] for slots in state["slots"]]
-        self._order = [[*order] for order in state["order"]]
+        self.groups = [[*groups] for groups in state["groups"]]
+        self._steps = [*state["steps"]]
+        self._played = [dict(played) for played in state["played"]]
 
 
 class Experts:
     """Networks of a learner, one set for each group of behaviors of each seed.
 
-    The learner's networks are a stack ``[S, E]``, those of the active groups. When a group becomes
-    active, the networks, targets and optimizer moments of the least recently played group are put
-    aside until it is played again. An update thus costs the same for any number of groups and
-    leaves inactive groups unchanged. A new group starts from its parent's networks, without
-    moments.
+    The learner's networks are a stack ``[S, E]``, those of the active groups: ``E`` follows their
+    number, so that an update costs as much as groups are active. When a group rests, its networks,
+    targets, optimizer moments and random generators are put aside until it is played again, and do
+    not change until then. A new group starts from its parent's networks, without moments.
 
     Args:
-        learner: Learner of a stack ``[S, E]``.
-        active: The active groups, from now on changed only by `play`.
+        make: Makes a learner of a stack ``[S, E]``, given ``E``.
+        active: The active groups, from now on changed only by `play` and `rest`.
         parent: Returns the parent of a group, given the position of the seed; group 0 has none.
+
+    Attributes:
+        learner: The learner of today; another one when ``E`` changes.
     """
 
     def __init__(
-        self, learner: Learner, active: ActiveGroups, parent: Callable[[int, int], int]
+        self,
+        make: Callable[[int], Learner],
+        active: ActiveGroups,
+        parent: Callable[[int, int], int],
     ) -> None:
-        self.learner, self.active, self._parent = learner, active, parent
-        self._batch = active.group.shape
-        self._aside: list[dict[int, State]] = [{} for _ in range(self._batch[0])]
+        self._make, self.active, self._parent = make, active, parent
+        self.learner = make(1)
+        # By seed: whose networks are in each slot, and those put aside.
+        self._placed: list[list[int]] = [[] for _ in active.groups]
+        self._aside: list[dict[int, State]] = [{} for _ in active.groups]
+
+    @property
+    def width(self) -> int:
+        """Number ``E`` of slots."""
+        return self.learner.actor.batch_size[1]
 
     def play(self, groups: Sequence[int]) -> Tensor:
         """Activate the group of each seed's episode; return its slots, int64 ``[S]``."""
-        return torch.tensor([self._play(seed, group) for seed, group in enumerate(groups)])
+        for seed, group in enumerate(groups):
+            self.active.play(seed, group)
+        self._arrange()
+        pairs = zip(self._placed, groups, strict=True)
+        return torch.tensor([placed.index(group) for placed, group in pairs])
+
+    def rest(self, seed: int, group: int) -> None:
+        """Put the networks of an active group aside, until it is played again."""
+        self.active.rest(seed, group)
+        self._arrange()
 
     def actor_weights(self, seed: int, group: int) -> State:
         """Copy the weights of a group's policy to the CPU, given the position of the seed.
@@ -113,51 +165,88 @@ class Experts:
         return {"active": self.active.state_dict(), "aside": aside}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a `state_dict`; the learner is loaded separately."""
+        """Restore a `state_dict`; the state of the learner, whose ``E`` changes, is loaded next."""
         self.active.load_state_dict(state["active"])
+        self._placed = [[*groups] for groups in self.active.groups]
+        if self._wanted_width != self.width:
+            self.learner = self._make(self._wanted_width)
         device = next(self.learner.loss.parameters()).device
         self._aside = [
-            {group: {k: v.to(device) for k, v in s.items()} for group, s in row.items()}
+            {
+                group: {k: v if k.startswith(_NOISE) else v.to(device) for k, v in saved.items()}
+                for group, saved in row.items()
+            }
             for row in state["aside"]
         ]
 
-    def _play(self, seed: int, group: int) -> int:
-        slot = self.active.slot(seed, group)
-        if slot is not None:
-            return self.active.play(seed, group)
-        aside = self._aside[seed]
-        if group in aside:
-            state = aside.pop(group)
-        else:
-            inherited = self._state(seed, self._with_networks(seed, group)) if group else {}
-            state = {k: v.clone() for k, v in inherited.items() if not k.startswith(_MOMENTS)}
-        before = self.active.group[seed].tolist()
-        slot = self.active.play(seed, group)
-        if before[slot] >= 0:
-            aside[before[slot]] = {k: v.clone() for k, v in self._read(seed, slot).items()}
-        if group or state:
-            self._write(seed, slot, state)
-        return slot
+    @property
+    def _wanted_width(self) -> int:
+        return self.active.group.shape[1]
+
+    def _arrange(self) -> None:
+        """Move the networks of the active groups to their slots."""
+        changed = [
+            (seed, placed, now)
+            for seed, (placed, now) in enumerate(zip(self._placed, self.active.groups, strict=True))
+            if placed != now
+        ]
+        if not changed:
+            return
+        for seed, placed, now in changed:
+            for slot, group in enumerate(placed):
+                if group != (now[slot] if slot < len(now) else -1):
+                    state = self._read(seed, slot)
+                    self._aside[seed][group] = {key: value.clone() for key, value in state.items()}
+                    placed[slot] = -1
+        if self._wanted_width != self.width:
+            self.learner = _resized(self.learner, self._make(self._wanted_width))
+        for seed, placed, now in changed:
+            del placed[len(now) :]
+            placed += [-1] * (len(now) - len(placed))
+            for slot, group in enumerate(now):
+                if placed[slot] != group:
+                    self._write(seed, slot, self._start(seed, group))
+                    placed[slot] = group
+
+    def _start(self, seed: int, group: int) -> State:
+        """Return what a group that becomes active starts with, and take it from aside."""
+        origin = self._with_networks(seed, group)
+        if group == origin and group in self._aside[seed]:
+            return self._aside[seed].pop(group)
+        inherited = self._state(seed, origin)
+        return {k: v.clone() for k, v in inherited.items() if not k.startswith(_MOMENTS)}
 
     def _with_networks(self, seed: int, group: int) -> int:
         """Return the group, or its nearest ancestor that has networks."""
-        while group and group not in self._aside[seed] and self.active.slot(seed, group) is None:
+        while group and group not in self._aside[seed] and group not in self._placed[seed]:
             group = self._parent(seed, group)
         return group
 
     def _state(self, seed: int, group: int) -> State:
-        slot = self.active.slot(seed, group)
-        if slot is None and group in self._aside[seed]:
+        if group in self._aside[seed]:
             return self._aside[seed][group]
-        return self._read(seed, slot or 0)  # before the first step, group 0 has no slot
+        placed = self._placed[seed]
+        # Before the first step, the networks of group 0 are those of the first slot.
+        return self._read(seed, placed.index(group) if group in placed else 0)
 
     def _read(self, seed: int, slot: int) -> State:
-        tensors = _tensors(self.learner, self._batch)
-        return {key: value[seed, slot] for key, value in tensors.items()}
+        """Return all that makes up an expert: views of tensors, states of generators."""
+        tensors = _tensors(self.learner, self._shape)
+        noise = {
+            key: generators[seed * self.width + slot].get_state()
+            for key, generators in _generators(self.learner, self._shape)
+        }
+        return {key: value[seed, slot] for key, value in tensors.items()} | noise
 
     def _write(self, seed: int, slot: int, state: State) -> None:
-        for key, value in _tensors(self.learner, self._batch).items():
+        for key, value in _tensors(self.learner, self._shape).items():
             value[seed, slot] = state.get(key, 0.0)
+        for key, generators in _generators(self.learner, self._shape):
+            generators[seed * self.width + slot].set_state(state[key].clone())
+
+    @property
+    def _shape(self) -> torch.Size:
+        return torch.Size([len(self._placed), self.width])
 
 
 def _tensors(learner: Learner, batch: torch.Size) -> State:
@@ -173,3 +262,37 @@ def _tensors(learner: Learner, batch: torch.Size) -> State:
             if key != "step":
                 tensors[f"{_MOMENTS}{number}.{key}"] = value
     return tensors
+
+
+def _generators(learner: Learner, batch: torch.Size) -> Iterator[tuple[str, list[torch.Generator]]]:
+    """Yield the generators of a learner's losses, one for each expert in the order of the stack."""
+    for name, module in learner.loss.named_modules():
+        if isinstance(module, SeededNoise) and len(module.generators) == batch.numel():
+            yield f"{_NOISE}{name}", module.generators
+
+
+def _resized(learner: Learner, other: Learner) -> Learner:
+    """Give ``other`` the state of a learner, of which it has more or fewer columns ``E``."""
+    state, like = learner.state_dict(), other.state_dict()
+    n_seeds, width = learner.actor.batch_size
+    new_width = other.actor.batch_size[1]
+    kept = min(width, new_width)
+
+    def fitted(value: Any, to: Any) -> Any:
+        if not isinstance(value, Tensor) or value.shape == to.shape:
+            return value
+        columns = to.clone().reshape(n_seeds, new_width, -1)
+        columns[:, :kept] = value.reshape(n_seeds, width, -1)[:, :kept]
+        return columns.view(to.shape)
+
+    state["loss"] = {key: fitted(value, like["loss"][key]) for key, value in state["loss"].items()}
+    parameters = [p for group in other.optimizer.param_groups for p in group["params"]]
+    moments = {
+        number: {
+            key: fitted(value, value if key == "step" else torch.zeros_like(parameters[number]))
+            for key, value in of_parameter.items()
+        }
+        for number, of_parameter in state["optimizer"]["state"].items()
+    }
+    other.load_state_dict({**state, "optimizer": {**state["optimizer"], "state": moments}})
+    return other

@@ -66,6 +66,7 @@ class LearnerSpec:
         """Return the common arguments of the losses."""
         return {
             "return_bounds": self.return_bounds if config.clip_targets else None,
+            "imitation": config.imitation,
             "constant_keys": self.in_keys[1:],
         }
 

@@ -1,49 +1,51 @@
-"""Runs that are compared on equal terms: how they are read, and the scores they are compared on."""
+"""Finished runs, and the conditions under which they are compared."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
+from bgpo_trl.files.csv_file import has_rows
+from bgpo_trl.runs.results import Curves, find_table, read_curves, read_json
 
-from bgpo_trl.analysis import metrics
-from bgpo_trl.runs.results import Curves, read_curves, read_json, read_rows
-from suites import nico
+NAMES = {
+    "bgpo": "BGPO",
+    "dist-nll-demonstrations": "Dist-NLL + demonstrations",
+    "maml-demonstrations": "MAML + demonstrations",
+    "bgpo-experts": "BGPO without demonstrations",
+    "dist-nll": "Dist-NLL",
+    "maml": "MAML",
+    "bgpo-single": "BGPO, one policy",
+    "oracle": "DDPG, told the label",
+    "ddpg": "DDPG, told nothing",
+    "gwr": "one policy, without the intrinsic reward",
+    "r_int": "one policy, without GWR-B",
+    "none": "one policy, without both",
+    "even-replay": "one policy + even replay",
+    "demonstrations": "one policy + demonstrations",
+    "bgpo-paper": "BGPO as published",
+    "dist-nll-paper": "Dist-NLL as published",
+    "maml-paper": "MAML as published",
+}
+"""Names of algorithms and variants in tables and figures, in their order there."""
+SAME = {"gwr+r_int": "bgpo-single", "experts": "bgpo-experts", "all": "bgpo"}
+"""Variants of the ablation that are also algorithms."""
 
-Values = NDArray[np.float64]
-# Entries of a config.json that a comparison needs; those of runs that must be alike.
-_CONFIG = {"episodes": int, "seeds": list, "task_starts": list}
-_TESTS = ("held_out", "eval_every", "eval_episodes", "max_steps")
-_TERMS = ("seeds", "tasks", "task_starts", *_TESTS)
-
-
-@dataclass(frozen=True)
-class Picture:
-    """A figure of learning curves."""
-
-    file: str
-    """File name, without suffix."""
-    caption: str
-    """Subtitle, after the title of its group."""
-    runs: tuple[str, ...]
-    """Directories of the runs, in the order of the legend."""
-
-
-@dataclass(frozen=True)
-class Group:
-    """Runs under equal conditions, compared in one table."""
-
-    title: str
-    runs: dict[str, str]
-    """Names of the runs, by directory."""
-    pictures: tuple[Picture, ...]
-    own: tuple[str, ...] = ()
-    """Those of the runs that are not the package's, by directory."""
+# Entries of config.json that belong to an algorithm or to keeping its run. All others, such as
+# encoders, starts, and the half of the demonstrations to test on, are conditions of a comparison.
+_OF_THE_RUN = (
+    "name",
+    "algorithm",
+    "algorithm_class",
+    "seeds",
+    "checkpoint_minutes",
+    "task_modules",
+)
+_USUAL = "practised"
+_OF_THE_SETTING = ("tasks", "task_starts", "schedule", "episodes")
 
 
 @dataclass(frozen=True)
@@ -51,150 +53,269 @@ class Run:
     """Settings, summary and curves of one run."""
 
     directory: Path
-    name: str
     config: dict[str, Any]
     summary: dict[str, Any]
     curves: Curves
 
     @property
+    def algorithm(self) -> str:
+        """Name of the algorithm; the directory's where ``config.json`` has none."""
+        name = self.config.get("name") or self.directory.name
+        return SAME.get(name, name)
+
+    @property
     def tasks(self) -> tuple[str, ...]:
-        """Names of the tasks; runs of earlier versions saved none, theirs are the paper's."""
-        return _tasks(self.config)
+        """Names of the tasks, in the order of their presentation."""
+        return self.curves.tasks
+
+    @property
+    def starts(self) -> list[int]:
+        """Episode from which each task is presented."""
+        return self.config["task_starts"]
+
+    @property
+    def last(self) -> int:
+        """Training episodes before the last test."""
+        return int(self.curves.episodes[-1])
 
     @property
     def eval_every(self) -> int:
         """Training episodes between tests."""
-        return _eval_every(self.config, self.curves)
+        tested = [0, *self.curves.episodes.tolist()]
+        steps = min(after - before for before, after in pairwise(tested))
+        return self.config.get("eval_every") or steps
+
+    @property
+    def unfinished(self) -> str:
+        """In what the run is not finished; "" if it is."""
+        episodes = self.config["episodes"]
+        if self.summary.get("episodes", episodes) != episodes:
+            return "is being extended"
+        if episodes - self.last >= self.eval_every:
+            return f"has tests until episode {self.last} of {episodes}"
+        return ""
 
 
-def setting_of(name: str, settings: Iterable[str]) -> str | None:
-    """Return the longest of some settings that the name of a run begins with; None without one.
+@dataclass(frozen=True)
+class Setting:
+    """Runs of the same tasks, presented in the same way, that are compared with each other."""
 
-    Example:
-        >>> setting_of("eight-reversed-mine", ["eight", "eight-reversed"])
-        'eight-reversed'
-    """
-    fitting = [setting for setting in settings if name.startswith(f"{setting}-")]
-    return max(fitting, key=len, default=None)
+    runs: dict[str, Run]
+    """By their names in tables."""
+    notes: list[str] = field(default_factory=list)
+    """Runs that were cut, and differences that were let pass."""
+    order: str = ""
+    """Name of its order of tasks, where another setting has the same tasks in another order."""
+
+    @property
+    def first(self) -> Run:
+        """A run, for what all have in common."""
+        return next(iter(self.runs.values()))
+
+    @property
+    def in_sequence(self) -> bool:
+        """Whether tasks are presented one after the other."""
+        starts = self.first.starts
+        return len(starts) > 1 and all(start < end for start, end in pairwise(starts))
+
+    @property
+    def from_start(self) -> bool:
+        """Whether all tasks are presented from the start."""
+        return not any(self.first.starts)
+
+    @property
+    def schedule(self) -> str:
+        """Name of the schedule by which presented tasks are drawn, if it is not the usual one."""
+        schedule = self.first.config.get("schedule", _USUAL)
+        return "" if schedule == _USUAL else str(schedule)
+
+    @property
+    def title(self) -> str:
+        """Title of its tables."""
+        number = len(self.first.tasks)
+        how = (
+            "all from the start"
+            if self.from_start
+            else "one after the other"
+            if self.in_sequence
+            else f"from episodes {', '.join(map(str, self.first.starts))}"
+        )
+        more = "".join(f", {what}" for what in (self.schedule, self.order) if what)
+        return f"{number} task{'s' * (number > 1)}, {how}{more}"
+
+    @property
+    def slug(self) -> str:
+        """Beginning of its figures' file names."""
+        kind = "concurrent" if self.from_start else "continual" if self.in_sequence else "staggered"
+        number = str(len(self.first.tasks))
+        parts = (kind, number, self.schedule, self.order.replace(" ", "-"))
+        return "-".join(filter(None, parts))
+
+    def find(self, algorithm: str) -> tuple[str, Run] | None:
+        """Return the name and the first run of an algorithm; None without one."""
+        found = ((name, run) for name, run in self.runs.items() if run.algorithm == algorithm)
+        return next(found, None)
 
 
-def with_own(runs: Path, groups: Mapping[str, Group]) -> dict[str, Group]:
-    """Add the other runs in a directory to the groups that their names begin with.
+def read_run(directory: Path) -> Run:
+    """Read a run.
 
-    ``continual-mine`` joins the group ``continual``, under the name ``mine``, and its first figure.
-    """
-    ours = {name for group in groups.values() for name in group.runs}
-    extended = dict(groups)
-    for path in sorted(runs.glob("*/eval.csv")):
-        name = path.parent.name
-        key = setting_of(name, groups)
-        if name not in ours and key is not None:
-            group = extended[key]
-            first, *others = group.pictures
-            extended[key] = replace(
-                group,
-                runs={**group.runs, name: name.removeprefix(f"{key}-")},
-                pictures=(replace(first, runs=(*first.runs, name)), *others),
-                own=(*group.own, name),
-            )
-    return extended
-
-
-def _tasks(config: dict[str, Any]) -> tuple[str, ...]:
-    return tuple(config.get("tasks") or nico.PAPER_TASKS)
-
-
-def read_group(runs: Path, group: Group) -> tuple[dict[str, Run], list[str]]:
-    """Read the runs of a group in a directory and cut them to a common length.
-
-    Returns:
-        The runs found, by directory name, and notes on missing, unfinished or cut runs. Runs
-        without a test of their last task are left out, as are own runs that were trained or tested
-        otherwise than the first run.
+    Its directory needs ``config.json`` with seeds, tasks, their starts and the number of episodes,
+    and ``eval.csv``.
 
     Raises:
-        ValueError: If the package's runs of the group differ in seeds, tasks, task starts, test
-            episodes or the time limit of an episode.
+        ValueError: If a file is missing or damaged.
     """
-    found: dict[str, Run] = {}
+    entries = {"episodes": int, "seeds": list, "tasks": list, "task_starts": list}
+    config = read_json(directory / "config.json", entries)
+    tasks, starts = config["tasks"], config["task_starts"]
+    named = all(isinstance(task, str) for task in tasks)
+    if not named or len(tasks) != len(starts) or not all(type(start) is int for start in starts):
+        raise ValueError(
+            f"{directory / 'config.json'} does not say when each task starts: put it back as the "
+            "run left it"
+        )
+    path = directory / "summary.json"
+    lists: dict[str, Any] = dict.fromkeys(("nodes", "groups", "group_purity"), list | None)
+    summary = read_json(path, lists) if path.exists() else {}
+    return Run(directory, config, summary, read_curves(directory / "eval.csv", tasks))
+
+
+def run_directories(paths: Iterable[Path]) -> list[Path]:
+    """Return the run directories among some paths and, of other folders, directly in them.
+
+    Raises:
+        ValueError: If a path is not a directory, or holds no run.
+    """
+    found: list[Path] = []
+    for path in paths:
+        if not path.is_dir():
+            raise ValueError(f"{path} is not a directory: name a run, or a folder of runs")
+        inside = [path] if (path / "config.json").exists() else sorted(path.glob("*/"))
+        runs = [directory for directory in inside if (directory / "config.json").exists()]
+        if not runs:
+            raise ValueError(f"{path} holds no run: name a run, or a folder of runs")
+        found += runs
+    return found
+
+
+def read_settings(
+    directories: Sequence[Path], *, anyway: bool = False
+) -> tuple[list[Setting], list[str]]:
+    """Read runs and sort them by setting: their tasks, and how these are presented.
+
+    Runs that are not finished, or not begun, are left out.
+
+    Args:
+        directories: Run directories.
+        anyway: Compare runs under different conditions all the same; longer runs are then cut to
+            the length of the shortest.
+
+    Returns:
+        The settings that have runs, and notes on runs that were left out.
+
+    Raises:
+        ValueError: If a run is damaged, none is finished, or runs of a setting have other
+            conditions.
+    """
+    groups: dict[tuple, list[Run]] = {}
     notes: list[str] = []
-    for key, name in group.runs.items():
-        directory = runs / key
-        if not (directory / "eval.csv").exists() or not read_rows(directory / "eval.csv"):
-            notes.append(f"{name}: missing ({key}/eval.csv is not there, or empty)")
+    for directory in directories:
+        path = find_table(directory / "eval.csv")
+        if path is None or (path.suffix == ".csv" and not has_rows(path)):
+            notes.append(f"{directory} holds no test episode: let the run evaluate first")
             continue
-        config = read_json(directory / "config.json", _CONFIG)
-        path = directory / "summary.json"
-        summary = read_json(path) if path.exists() else {}
-        curves = read_curves(directory / "eval.csv", _tasks(config))
-        if np.isnan(curves.success[:, -1]).any():
-            episode = curves.episodes[-1]
-            notes.append(f"{name}: left out, no test of some task at episode {episode}")
-            continue
-        if config["episodes"] - int(curves.episodes[-1]) >= _eval_every(config, curves):
-            notes.append(
-                f"{name}: not finished, {curves.episodes[-1]} of {config['episodes']} episodes"
-            )
-        found[key] = Run(directory, name, config, summary, curves)
-    if not found:
-        return found, [f"missing: {', '.join(group.runs)}"]
-    first = next(iter(found.values()))
-    for key, run in list(found.items()):
-        other = _other_terms(run, first)
-        if other and key not in group.own:
-            raise ValueError(f"{other}: only runs on equal terms are compared")
-        if other:
-            notes.append(f"{run.name}: left out, since {other}")
-            del found[key]
-    last = min(int(run.curves.episodes[-1]) for run in found.values())
-    for key, run in found.items():
-        if run.curves.episodes[-1] > last:
-            notes.append(f"{run.name}: cut at {last} of {run.curves.episodes[-1]} episodes")
-        found[key] = replace(run, curves=run.curves.until(last))
-    return found, notes
+        run = read_run(directory)
+        if run.unfinished:
+            notes.append(f"{run.directory} {run.unfinished}: let the run finish")
+        else:
+            starts, schedule = run.starts, run.config.get("schedule", _USUAL)
+            rising = all(start < end for start, end in pairwise(starts))
+            kind = (run.tasks, not any(starts), rising, schedule)
+            groups.setdefault(kind, []).append(run)
+    if not groups:
+        raise ValueError(notes[0] if notes else "there are no runs: name a run")
+    found = [_setting(runs, anyway) for runs in groups.values()]
+    found.sort(key=lambda setting: (len(setting.first.tasks), setting.from_start))
+    settings: list[Setting] = []
+    for setting in found:
+        alike = [other for other in settings if replace(other, order="").slug == setting.slug]
+        if alike:
+            turned = alike[0].first.tasks[::-1] == setting.first.tasks
+            order = "in reverse" if turned else f"order {len(alike) + 1}"
+            setting = replace(setting, order=order)
+        settings.append(setting)
+    return settings, notes
 
 
-def _other_terms(run: Run, first: Run) -> str:
-    """Return in what a run was trained or tested otherwise than the first; "" if in nothing."""
-    for what in _TERMS:
-        ours, theirs = (_terms(of).get(what) for of in (run, first))
-        if ours != theirs and None not in (ours, theirs):
-            return f"{run.directory} has {what} {ours}, {first.directory} has {theirs}"
-    return ""
+def _setting(runs: list[Run], anyway: bool) -> Setting:
+    order = {name: place for place, name in enumerate(NAMES)}
+    runs = sorted(runs, key=lambda run: (order.get(run.algorithm, len(order)), run.directory))
+    notes = [differing for run in runs[1:] if (differing := differing_conditions(run, runs[0]))]
+    if notes and not anyway:
+        raise ValueError(_refused(notes[0]))
+    last = min(run.last for run in runs)
+    notes += [
+        f"{run.directory} is cut at {last} of {run.last} episodes"
+        for run in runs
+        if run.last > last
+    ]
+    runs = [replace(run, curves=run.curves.until(last)) for run in runs]
+    names = [NAMES.get(run.algorithm, run.algorithm) for run in runs]
+    return Setting(
+        {
+            name if names.count(name) == 1 else f"{name} ({run.directory.name})": run
+            for name, run in zip(names, runs, strict=True)
+        },
+        notes,
+    )
 
 
-def _eval_every(config: dict[str, Any], curves: Curves) -> int:
-    tested = [0, *curves.episodes.tolist()]
-    return config.get("eval_every") or min(after - before for before, after in pairwise(tested))
+def _refused(differing: str) -> str:
+    return f"{differing}: only runs under equal conditions are compared; --anyway compares them"
 
 
-def _terms(run: Run) -> dict[str, Any]:
-    limit = {"max_steps": (run.config.get("algorithm") or {}).get("max_steps")}
-    return {**run.config, **limit, "tasks": run.tasks}
+def reference_of(setting: Setting, settings: Iterable[Setting], *, anyway: bool) -> Setting | None:
+    """Return the setting with the same tasks from the start, for tasks one after the other.
+
+    None without one. With ``anyway``, differing conditions are noted in the setting.
+
+    Raises:
+        ValueError: If its runs have other conditions, beside the order and starts of tasks.
+    """
+    tasks = set(setting.first.tasks)
+    others = (other for other in settings if other.from_start)
+    found = next((other for other in others if set(other.first.tasks) == tasks), None)
+    if found is None or not setting.in_sequence:
+        return None
+    differing = differing_conditions(setting.first, found.first, _OF_THE_SETTING)
+    if differing and not anyway:
+        raise ValueError(_refused(differing))
+    setting.notes.extend([differing] if differing else [])
+    return found
 
 
-def starts(run: Run) -> list[int]:
-    """Return the episode from which each task is presented."""
-    return run.config["task_starts"]
+def differing_conditions(run: Run, other: Run, ignored: Sequence[str] = ()) -> str:
+    """Return in which conditions two runs differ, in one line; "" if in none.
+
+    Conditions are all entries of ``config.json`` but those of the algorithm, and the time limit of
+    an episode. Entries that only one of them has are passed over.
+    """
+    ours, theirs = _conditions(run), _conditions(other)
+    found = [
+        f"{name} ({_short(ours[name])} and {_short(theirs[name])})"
+        for name in ours
+        if name in theirs and name not in ignored and ours[name] != theirs[name]
+    ]
+    return f"{run.directory} and {other.directory} differ in {', '.join(found)}" if found else ""
 
 
-def late_scores(run: Run) -> Values:
-    """Return the mean success over the last 10 % of training, ``[S, T]``."""
-    return success_at(run, [int(run.curves.episodes[-1])])[:, 0]
+def _conditions(run: Run) -> dict[str, Any]:
+    algorithm = run.config.get("algorithm") or {}
+    limit = {"max_steps": algorithm["max_steps"]} if "max_steps" in algorithm else {}
+    return {k: v for k, v in run.config.items() if k not in _OF_THE_RUN} | limit
 
 
-def success_at(run: Run, ends: Sequence[int]) -> Values:
-    """Return the mean success over the 10 % of training before some episodes, ``[S, P, T]``."""
-    episodes = run.curves.episodes
-    window = max(run.eval_every, round(0.1 * int(episodes[-1])))
-    return metrics.evaluation_matrix(run.curves.success, episodes, ends, window=window)
-
-
-def area_scores(run: Run) -> Values:
-    """Return the area under each task's curve since its presentation, ``[S, T]``."""
-    episodes, areas = run.curves.episodes, []
-    for task, start in enumerate(starts(run)):
-        since = episodes > start
-        curve = run.curves.success[:, since, task]
-        areas.append(metrics.area_under_curve(curve, episodes[since] - start))
-    return np.stack(areas, axis=-1)
+def _short(value: Any) -> str:
+    text = str(value)
+    return text if len(text) <= 60 else f"{text[:12]}..."

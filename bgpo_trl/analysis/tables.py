@@ -1,100 +1,168 @@
-"""Tables of the report: success, forgetting and transfer, learning times, groups of GWR-B."""
+"""Tables of a comparison: success, differences, forgetting and transfer, learning times, groups."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Iterable
+from itertools import combinations
 
 import numpy as np
 
-from bgpo_trl.analysis import metrics
-from bgpo_trl.analysis.comparison import (
-    Run,
+from bgpo_trl.analysis import metrics, statistics
+from bgpo_trl.analysis.comparison import Run, Setting
+from bgpo_trl.analysis.scores import (
     Values,
     area_scores,
+    best_scores,
+    episodes_to_80,
+    final_shares,
     late_scores,
-    starts,
-    success_at,
+    own_episodes,
+    success_lengths,
+    success_matrix,
 )
-from bgpo_trl.analysis.intervals import Statistics, means, percent_cell
 from bgpo_trl.analysis.transfer import forward_transfer
-from bgpo_trl.runs.results import read_outcomes, read_rows
+from bgpo_trl.runs.cost import Cost, read_costs
+from bgpo_trl.runs.results import find_table
 
 Table = list[list[str]]
 """Rows of cells; the first row holds the column names."""
 
+SUCCESS_NOTES = (
+    "The seed is the unit: its score is the mean over tasks of the success in tests over the last "
+    "10 % of training, its area the mean height of the tasks' curves of test success since they "
+    "were presented. Given are means over seeds and 95 % intervals (Student's t), in percent.",
+    "Worst task: that with the lowest mean. Episodes to 80 %: until the mean over seeds and "
+    "presented tasks of three tests.",
+)
+DIFFERENCE_NOTES = (
+    "Differences of the seeds' scores in points, with 95 % intervals (Welch's t). Above, below: "
+    "the interval excludes 0. Equivalent: the 90 % interval lies within "
+    f"+-{100 * statistics.MARGIN:.0f} points, a margin set beforehand. Else it is not decided; the "
+    f"number of seeds a run that decides it with a probability of {100 * statistics.POWER:.0f} % "
+    "follows from the difference and the spread of seeds as measured, which are uncertain.",
+    "p: permutation test of seeds, two-sided; the next column adjusts it for the number of rows "
+    "(Holm). Verdicts are not adjusted.",
+)
+SEQUENCE_NOTES = (
+    "Means over seeds and 95 % intervals, in points. R[i, j]: success on task j over the last "
+    "fifth of the phase of task i. Forgetting: mean over tasks of R[j, j] minus R at the end; "
+    "backward transfer: the negative, without the last task; since best: a task's best mean of "
+    "three tests minus its last.",
+    "Forward transfer: (area - reference) / (1 - reference), areas under a task's curve over its "
+    "own episodes, from the first to the last test of its phase; reference: the same algorithm "
+    "with all tasks from the start, whose seeds count in the interval.",
+)
+SPEED_NOTE = (
+    "Training episodes of a task's own until so many of its last 20 succeed: median over seeds, in "
+    "which a seed that never gets there counts as longest; then the same relative to the first "
+    "task, median of the seeds' ratios."
+)
+COST_NOTE = "Of all seeds together, without tests: time of a training step, and memory."
+# Beside BGPO: its versions and the baselines on the same terms; with and without an addition.
+_PAIRS = (
+    *(("bgpo-experts", rival) for rival in ("dist-nll", "maml")),
+    *(("bgpo-single", rival) for rival in ("dist-nll", "maml")),
+    *(("bgpo-paper", rival) for rival in ("dist-nll-paper", "maml-paper")),
+    *(("bgpo-single", fewer) for fewer in ("gwr", "r_int", "none")),
+    *(("gwr", "none"), ("r_int", "none")),
+    *(("even-replay", "bgpo-single"), ("demonstrations", "bgpo-single")),
+    ("bgpo-experts", "even-replay"),
+)
 
-def main_table(runs: Mapping[str, Run], statistics: Statistics) -> Table:
-    """Return the table of success of a group's runs."""
-    tasks = _numbered(runs)
-    rows = [["", "last 10 %: IQM", "mean", *tasks, "area: IQM"]]
-    rows[0].append("episodes to 80 %")
-    for run in runs.values():
-        late = late_scores(run)
-        reached = "-"  # Among tasks one after the other, the first would be counted alone.
-        if not any(starts(run)):
-            episodes = metrics.overall_episodes_to(run.curves.success, run.curves.episodes)
-            reached = f"{episodes:.0f}" if np.isfinite(episodes) else "not reached"
+
+def success_table(setting: Setting) -> Table:
+    """Return the table of success of a setting's runs."""
+    numbers = range(1, len(setting.first.tasks) + 1)
+    rows = [["", "knows the label", "seeds", "success", "worst task"]]
+    rows[0] += [*(f"task {number}" for number in numbers), "area"]
+    rows[0] += ["episodes to 80 %"] if setting.from_start else []
+    for name, run in setting.runs.items():
+        late, area = late_scores(run), area_scores(run)
+        worst = int(late.mean(0).argmin())
+        row = [name, _knows_label(run), str(len(late)), statistics.mean(late.mean(1)).percent()]
+        row += [f"{statistics.mean(late[:, worst]).percent()}, task {worst + 1}"]
+        row += [f"{100 * share:.1f}" for share in late.mean(0)]
+        row += [statistics.mean(area.mean(1)).percent()]
+        if setting.from_start:
+            reached = episodes_to_80(run)
+            row += [f"{reached:.0f}" if np.isfinite(reached) else "not reached"]
+        rows.append(row)
+    return rows
+
+
+def _knows_label(run: Run) -> str:
+    """Return whether the algorithm is given the task's label, from ``summary.json``."""
+    told = run.summary.get("needs_label")
+    return "?" if told is None else "yes" if told else "no"
+
+
+def difference_table(setting: Setting) -> Table:
+    """Return the table of the differences from BGPO, or from the first run; empty for one run.
+
+    With it come the pairs that differ in one part, or are on the same terms.
+    """
+    named = {name: run.algorithm for name, run in setting.runs.items()}
+    first = next((name for name, key in named.items() if key == "bgpo"), next(iter(named)))
+    pairs = [(first, other) for other in named if other != first]
+    for ours, other in combinations(named, 2):
+        for pair in ((ours, other), (other, ours)):
+            if (named[pair[0]], named[pair[1]]) in _PAIRS and pair not in pairs:
+                pairs.append(pair)
+    found = [
+        [
+            statistics.difference(*(score(setting.runs[name]).mean(1) for name in pair))
+            for pair in pairs
+        ]
+        for score in (late_scores, area_scores)
+    ]
+    adjusted = statistics.holm([late.p for late in found[0]])
+    rows = [["", "success", "found", "p", "p, Holm", "area", "found"]]
+    for (ours, other), late, area, p in zip(pairs, *found, adjusted, strict=True):
         rows.append(
             [
-                run.name,
-                statistics.cell(late),
-                f"{100 * late.mean():.1f}",
-                *(f"{100 * share:.0f}" for share in late.mean(0)),
-                statistics.cell(area_scores(run)),
-                reached,
+                f"{ours} against {other}",
+                late.estimate.points(),
+                late.note,
+                *("-" if np.isnan(value) else f"{value:.3f}" for value in (late.p, p)),
+                area.estimate.points(),
+                area.note,
             ]
         )
-    return rows
+    return rows if pairs else []
 
 
-def _numbered(runs: Mapping[str, Run]) -> list[str]:
-    """Return the column names of the tasks, which all runs have in common."""
-    return [f"task {number}" for number, _ in enumerate(next(iter(runs.values())).tasks, 1)]
+def sequence_table(setting: Setting, reference: Setting | None) -> Table:
+    """Return the table of forgetting and transfer in a setting with tasks one after the other.
 
-
-def continual_table(
-    continual: Mapping[str, Run], concurrent: Mapping[str, Run], statistics: Statistics
-) -> Table:
-    """Return the table of forgetting and transfer of the continual runs."""
-    rows = [["", "backward transfer", "forgotten since best", "forward transfer"]]
-    for key, run in continual.items():
-        matrix = success_at(run, [*starts(run)[1:], int(run.curves.episodes[-1])])
-        best = metrics.forgetting_since_best(metrics.trailing_mean(run.curves.success, 3))
-        measured = (metrics.backward_transfer(matrix), best[:, None])
-        cells = [statistics.cell(scores, means) for scores in measured]
-        beside = concurrent.get(f"concurrent-{key.removeprefix('continual-')}")
-        forward = ""
-        if beside is not None:
-            forward = percent_cell(*forward_transfer(run, beside, statistics))
-        rows.append([run.name, *cells, forward])
-    return rows
-
-
-def own_episodes(path: Path, tasks: Sequence[str], last: int | None = None) -> Values | None:
-    """Return the training episodes of each task until 50 % of them succeed, ``[S, T]``.
-
-    Infinite where 50 % was not reached by episode ``last`` (the end of the run if ``None``);
-    ``None`` if ``path``, a ``train.csv``, is missing or has no episodes.
+    Args:
+        setting: The setting.
+        reference: That with all tasks from the start, for forward transfer.
     """
-    outcomes = read_outcomes(path, tasks, last) if path.exists() else []
-    if not outcomes:
-        return None
-    return np.array([[metrics.trials_to(task) for task in seed] for seed in outcomes])
-
-
-def speed_table(runs: Mapping[str, Run]) -> Table:
-    """Return the table of learning times: each task's training episodes to 50 % success."""
-    tasks = _numbered(runs)
-    rows = [["", *tasks, *(f"{task} : {tasks[0]}" for task in tasks[1:])]]
-    for run in runs.values():
-        last = int(run.curves.episodes[-1])
-        episodes = own_episodes(run.directory / "train.csv", run.tasks, last)
-        if episodes is None:
-            rows.append([run.name, *["no train.csv"] * len(tasks), *[""] * (len(tasks) - 1)])
-        else:
-            rows.append([run.name, *map(median_cell, episodes.T), *ratio_cells(episodes)])
+    rows = [["", "forgetting", "since best", "backward transfer", "forward transfer"]]
+    for name, run in setting.runs.items():
+        matrix = success_matrix(run)
+        best = metrics.forgetting_since_best(metrics.trailing_mean(run.curves.success, 3))
+        measured = (
+            -metrics.change_since_learned(matrix).mean(1),
+            best,
+            metrics.backward_transfer(matrix).mean(1),
+        )
+        beside = reference.find(run.algorithm) if reference is not None else None
+        forward = forward_transfer(run, beside[1]) if beside else None
+        cells = [statistics.mean(scores).points() for scores in measured]
+        rows.append([name, *cells, forward.points() if forward else "-"])
     return rows
+
+
+def speed_table(setting: Setting, share: float) -> Table:
+    """Return the table of learning times: each task's own training episodes to a success rate."""
+    tasks = [f"task {number}" for number, _ in enumerate(setting.first.tasks, 1)]
+    rows = [["", *tasks, *(f"{task} : {tasks[0]}" for task in tasks[1:])]]
+    for name, run in setting.runs.items():
+        episodes = own_episodes(run, share)
+        if episodes is not None:
+            rows.append([name, *map(median_cell, episodes.T), *ratio_cells(episodes)])
+    return rows if len(rows) > 1 else []
 
 
 def median_cell(episodes: Values) -> str:
@@ -113,42 +181,97 @@ def ratio_cells(episodes: Values) -> list[str]:
     learned = int(np.isfinite(episodes[:, 0]).sum())
     note = "" if learned == len(episodes) else f" ({learned} of {len(episodes)} seeds)"
     return [
-        "" if np.isnan(times) else ("not reached" if np.isinf(times) else f"{times:.2f}") + note
+        "-" if np.isnan(times) else ("not reached" if np.isinf(times) else f"{times:.2f}") + note
         for times in metrics.times_the_first(episodes).tolist()
     ]
 
 
-def groups_table(runs: Iterable[Run]) -> Table:
-    """Return the table of groups, purity and task inference; empty if no run has finished."""
+def groups_table(setting: Setting) -> Table:
+    """Return the table of nodes, groups, purity and task inference; empty without GWR-B."""
     rows = [["", "groups", "purity, %", "tasks inferred, %", "by seed", "nodes of GWR-B"]]
-    for run in runs:
+    for name, run in setting.runs.items():
         if run.summary.get("nodes") is None:
             continue
         groups, purity = run.summary.get("groups"), run.summary.get("group_purity")
-        inferred = _inferred(run)
+        inferred = final_shares(run, "held-out", "task_inference")
+        of_seeds = [] if inferred is None else (100 * inferred.mean(1)).tolist()
         rows.append(
             [
-                run.directory.name,
+                name,
                 "one for all" if groups is None else _numbers(groups),
-                "" if purity is None else _numbers([100 * share for share in purity], 1),
-                f"{100 * np.mean(inferred):.2f}" if inferred else "",
-                _numbers([100 * share for share in inferred], 1),
+                _numbers([100 * share for share in purity or ()], 1),
+                f"{np.mean(of_seeds):.2f}" if of_seeds else "",
+                _numbers(of_seeds, 1),
                 _numbers(run.summary["nodes"]),
             ]
         )
     return rows if len(rows) > 1 else []
 
 
-def _inferred(run: Run) -> list[float]:
-    """Return the share of held-out demonstrations whose task is inferred, by seed."""
-    path = run.directory / "final.csv"
-    shares: dict[int, list[float]] = {seed: [] for seed in run.config["seeds"]}
-    for row in read_rows(path) if path.exists() else []:
-        if row["demonstrations"] == "held-out" and row["task_inference"]:
-            shares[int(row["seed"])].append(float(row["task_inference"]))
-    return [float(np.mean(of_seed)) for of_seed in shares.values() if of_seed]
+def cost_table(setting: Setting) -> Table:
+    """Return the table of the cost of training by the number of presented tasks, of all seeds.
+
+    Empty if no run has a ``cost.csv``.
+    """
+    costs = {name: of_run for name, run in setting.runs.items() if (of_run := _costs(run))}
+    numbers = sorted({tasks for of_run in costs.values() for tasks in of_run})
+    rows = [["", "hours", *(f"{number} task{'s' * (number > 1)}" for number in numbers)]]
+    for name, of_run in costs.items():
+        hours = sum(cost.seconds for cost in of_run.values()) / 3600
+        cells = [_cost_cell(of_run.get(number)) for number in numbers]
+        rows.append([name, f"{hours:.1f}", *cells])
+    return rows if costs else []
+
+
+def _cost_cell(cost: Cost | None) -> str:
+    if cost is None or not cost.steps:
+        return "-"
+    return f"{1000 * cost.seconds / cost.steps:.1f} ms, {cost.megabytes:.0f} MB"
+
+
+def _costs(run: Run) -> dict[int, Cost]:
+    path = run.directory / "cost.csv"
+    return read_costs(path) if find_table(path) else {}
+
+
+def task_table(run: Run) -> Table:
+    """Return the table of a run, task by task."""
+    late, best, own = late_scores(run), best_scores(run), own_episodes(run)
+    seen, held_out = (final_shares(run, kind, "success") for kind in ("seen", "held-out"))
+    inferred, steps = final_shares(run, "held-out", "task_inference"), success_lengths(run)
+    rows = [["task", "last 10 %", "by seed", "best 10 %", "own episodes to 50 %"]]
+    rows[0] += ["trained, seen", "trained, held-out", "inferred", "steps to success"]
+    # The last row is the mean over tasks.
+    for index, task in enumerate([*run.tasks, None]):
+        chosen = slice(None) if task is None else slice(index, index + 1)
+        of_seeds = late[:, chosen].mean(1)
+        rows.append(
+            [
+                task or "all",
+                statistics.mean(of_seeds).percent(),
+                _numbers((100 * of_seeds).tolist()),
+                "" if task is None else f"{100 * best[index]:.1f}",
+                "" if task is None or own is None else median_cell(own[:, index]),
+                *(
+                    "" if shares is None else f"{100 * shares[:, chosen].mean():.{digits}f}"
+                    for shares, digits in ((seen, 1), (held_out, 1), (inferred, 2))
+                ),
+                f"{steps[task]:.1f}" if task in steps else "",
+            ]
+        )
+    return rows
 
 
 def _numbers(values: Iterable[float], digits: int = 0) -> str:
     """Join numbers with spaces, dropping a decimal of 0."""
     return " ".join(f"{value:.{digits}f}".removesuffix(".0") for value in values)
+
+
+def markdown(rows: Table) -> str:
+    """Format a table in Markdown; columns of numbers are aligned on the right."""
+    head, *body = rows
+    numbers = [
+        all(cell[:1] in "+-0123456789" for cell in cells) for cells in zip(*body, strict=True)
+    ]
+    lines = [head, ["---:" if number else "---" for number in numbers], *body]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)

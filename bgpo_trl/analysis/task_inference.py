@@ -65,7 +65,7 @@ def group_purity(groups: BehaviorGroups, bank: DemonstrationBank, n_tasks: int) 
     """
     batch = groups.batch_size
     group = groups.lookup(bank.embedding.expand(*batch, *bank.embedding.shape)).group
-    counts = torch.zeros(*batch, int(groups.num_groups.max()), n_tasks)
+    counts = torch.zeros(*batch, int(group.max()) + 1, n_tasks)
     for index in np.ndindex(*batch):
         counts[index].index_put_((group[index], bank.task), torch.tensor(1.0), accumulate=True)
     return _shares(counts).amax(-1).sum(-1) / len(bank.task.unique())

@@ -9,6 +9,7 @@ from bgpo_trl.configs.algorithms import (
 )
 from bgpo_trl.configs.encoders import (
     STAGE_PRESETS,
+    InverseModelConfig,
     RepresentationConfig,
     SequenceAutoencoderConfig,
     StageConfig,
@@ -25,6 +26,7 @@ __all__ = [
     "DDPGConfig",
     "DistNLLConfig",
     "GWRBConfig",
+    "InverseModelConfig",
     "MAMLConfig",
     "RLConfig",
     "RepresentationConfig",

@@ -18,11 +18,16 @@ class AlgorithmConfig:
     ground truth."""
     max_steps: int = 50
     """Steps of an episode (Sec. IV-B)."""
+    state_limit: float = 5.0
+    """Bound of the observed state, in standard deviations. Ours."""
     rl: RLConfig = field(default_factory=DDPGConfig)
     """The RL algorithm f_RL; DDPG in the paper."""
     demonstration_share: float = 0.0
     """Share of an update's transitions taken from the demonstrations shown so far in training, with
     actions inferred by the inverse model. Ours: the paper has none."""
+    demonstration_noise: float = 0.4
+    """Standard deviation of the noise added to demonstrated states when they are sampled. Ours:
+    keeps policies from learning a few demonstrations by heart (docs/learning.md)."""
 
     def __post_init__(self) -> None:
         known = self.state in ("latent", "state")
@@ -33,6 +38,8 @@ class AlgorithmConfig:
             ("demonstration_share", 0 <= share < 1, "at least 0 and below 1"),
         )
         whole(self, 1, "max_steps")
+        positive(self, "state_limit")
+        at_least(self, 0, "demonstration_noise")
         if share and self.rl.warmup_steps < self.max_steps:
             # Else, seeds would learn from demonstrations sooner or later than each would alone.
             raise ValueError(
@@ -57,7 +64,7 @@ def _refuse_all_but_ddpg(who: str, rl: RLConfig) -> None:
 
 @dataclass(frozen=True)
 class GWRBConfig:
-    """Growth of GWR-B; for the settings of Table 1 not listed here, see `GWRB`."""
+    """GWR-B (Table 1); see `GWRB`."""
 
     activity_threshold: float = 0.8
     """Activity below which a node is inserted (Table 1)."""
@@ -65,12 +72,39 @@ class GWRBConfig:
     """Habituation below which a best-matching node allows an insertion (Table 1)."""
     activity_scale: float = 0.25
     """Factor of distances in the activity. Ours: with 1, as in the paper, every third demonstration
-    becomes a node; with 0.25 there are about 300 nodes after 6,000 episodes."""
+    becomes a node; with 0.25 there are about 200 nodes after 1,800 demonstrations."""
+    lr_best: float = 0.1
+    """Learning rate eps_c of the best-matching node (Table 1)."""
+    lr_neighbor: float = 0.01
+    """Learning rate eps_n of its neighbors (Table 1)."""
+    initial_habituation: float = 1.0
+    """Habituation h_0 of a new node (Table 1)."""
+    alpha_best: float = 1.05
+    """Constant alpha of the habituation of the best-matching node (Table 1)."""
+    alpha_neighbor: float = 1.05
+    """Constant alpha of the habituation of its neighbors (Table 1)."""
+    tau_best: float = 3.3
+    """Time constant of the habituation of the best-matching node (Table 1)."""
+    tau_neighbor: float = 14.3
+    """Time constant of the habituation of its neighbors (Table 1)."""
+    max_age: int = 80
+    """Age kappa beyond which an edge is removed (Table 1)."""
 
     def __post_init__(self) -> None:
-        positive(self, "activity_scale")
+        positive(self, "activity_scale", "tau_best", "tau_neighbor")
+        at_least(self, 0, "lr_neighbor")
+        whole(self, 1, "max_age")
+        start, in_order = self.initial_habituation, self.lr_neighbor <= self.lr_best <= 1
         check(
             self,
+            ("lr_best", in_order, f"at least lr_neighbor ({self.lr_neighbor}), at most 1"),
+            ("initial_habituation", 0 < start <= 1, "above 0, at most 1"),
+            ("alpha_best", self.alpha_best * start >= 1, "at least 1 / initial_habituation"),
+            (
+                "alpha_neighbor",
+                self.alpha_neighbor * start >= 1,
+                "at least 1 / initial_habituation",
+            ),
             ("activity_threshold", 0 < self.activity_threshold < 1, "between 0 and 1"),
             ("habituation_threshold", 0 < self.habituation_threshold <= 1, "above 0, at most 1"),
         )
@@ -96,19 +130,27 @@ class BGPOConfig(AlgorithmConfig):
     even_replay: bool = True
     """Whether an update draws equally from the groups played last. Ours: the paper draws uniformly
     from all transitions."""
-    demonstration_share: float = 0.25
-    """See `AlgorithmConfig`. Ours: doubles to triples the success of a task's first hundred
-    episodes."""
-    active_groups: int = 3
+    demonstration_share: float = 0.75
+    """See `AlgorithmConfig`. Ours: what demonstrations show is rarely found by chance."""
+    rl: RLConfig = field(default_factory=lambda: DDPGConfig(noise=0.1))
+    """See `AlgorithmConfig`. Ours: exploration noise on the scale of demonstrated actions, since
+    what to explore is near them; without demonstrations it is larger."""
+    active_groups: int = 4
     """Largest number of groups per update, those played last. Ours: bounds the cost of an
     update."""
-    expert_batch_size: int = 64
+    rest_after: int = 500
+    """Training steps without being played after which a group rests: it has no part in updates and
+    its expert does not change until it is played again. Ours: from old transitions alone, an expert
+    gets worse (docs/learning.md)."""
+    expert_batch_size: int = 128
     """Transitions of each active group per update, with experts. Ours: as many as MAML and Dist-NLL
-    have per task; without experts, the RL algorithm's ``batch_size`` is shared by all groups."""
-    groups: GWRBConfig | None = None
-    """The coarse network that finds the groups, ours. By default one that finds one group, rarely
-    two, for each task of NICO with the encoders of the bank
-    (`bgpo_trl.encoders.shipped.groups_config`)."""
+    with demonstrations have per task; without experts, the RL algorithm's ``batch_size`` is shared
+    by all groups."""
+    group_size: int = 10
+    """Least number of different demonstrations of a group of behaviors. Ours."""
+    group_evidence: float = 1.0
+    """Standard errors by which the density between two groups must be lower than in them. Ours: a
+    low one, since trials can join groups of one task, and nothing splits one of several."""
 
     @property
     def grouped(self) -> bool:
@@ -118,8 +160,9 @@ class BGPOConfig(AlgorithmConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         at_least(self, 0, "beta")
-        whole(self, 1, "active_groups", "expert_batch_size")
-        positive(self, "behavior_scale")
+        whole(self, 1, "active_groups", "rest_after", "expert_batch_size")
+        positive(self, "behavior_scale", "group_evidence")
+        whole(self, 4, "group_size")
         holds = self.even_replay or not self.experts
         check(self, ("even_replay", holds, "set where there are experts"))
         _check_played(self, self.expert_batch_size if self.experts else self.rl.batch_size)

@@ -23,8 +23,10 @@ class VAEConfig:
     """Peak learning rate of Adam. Ours: 1e-4 in Sec. IV-A, too low for so few steps."""
     warmup_steps: int = 100
     """Steps of linear warm-up, before cosine decay to zero. Ours."""
-    steps: int = 2_500
+    steps: int = 4_000
     """Gradient steps. Ours: not given in the paper."""
+    bfloat16: bool = False
+    """Whether to compute in bfloat16, which halves the time on processors and GPUs that have it."""
     reconstruction_weight: float = 1.0
     """Factor of the squared error summed over a frame. Ours: the unit of the other weights."""
     kl_weight: float = 0.01
@@ -63,13 +65,41 @@ class SequenceAutoencoderConfig:
 
 
 @dataclass(frozen=True)
+class InverseModelConfig:
+    """Training of the inverse model on the latents of play (stage 1c). Ours."""
+
+    hidden_size: int = 512
+    """Units of each of the two hidden layers."""
+    noise: float = 0.1
+    """Standard deviation of the noise added to the standardized latents."""
+    largest_action: float = 0.6
+    """Actions with a larger component are left out: demonstrators move slowly, and errors of fast
+    movements would prevail in the loss."""
+    batch_size: int = 512
+    """Windows per step."""
+    learning_rate: float = 2e-3
+    """Peak learning rate of Adam."""
+    warmup_steps: int = 100
+    """Steps of linear warm-up, before cosine decay to zero."""
+    steps: int = 4_000
+    """Gradient steps."""
+
+    def __post_init__(self) -> None:
+        whole(self, 1, "hidden_size", "batch_size", "warmup_steps", "steps")
+        positive(self, "learning_rate", "largest_action")
+        at_least(self, 0, "noise")
+
+
+@dataclass(frozen=True)
 class RepresentationConfig:
-    """Stage 1: both encoders."""
+    """Stage 1: both encoders, and the inverse model."""
 
     vae: VAEConfig = field(default_factory=VAEConfig)
     """The frame encoder."""
     lae: SequenceAutoencoderConfig = field(default_factory=SequenceAutoencoderConfig)
     """The sequence encoder."""
+    inverse: InverseModelConfig = field(default_factory=InverseModelConfig)
+    """The inverse model."""
     seed: int = 0
     """Seed of initial weights, batches and sampling noise. Ours."""
     checkpoint_every: int = 250
@@ -101,6 +131,7 @@ STAGE_PRESETS: dict[str, StageConfig] = {
         config=RepresentationConfig(
             vae=VAEConfig(steps=20, batch_size=64),
             lae=SequenceAutoencoderConfig(steps=50, batch_size=32),
+            inverse=InverseModelConfig(steps=50, batch_size=32),
         ),
     )
 }

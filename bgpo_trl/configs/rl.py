@@ -14,9 +14,9 @@ class RLConfig:
 
     name: str = ""
     """Key in `bgpo_trl.algorithms.rl.RL`, which identifies the class in ``config.json``."""
-    hidden_sizes: tuple[int, ...] = (256,)
-    """Hidden layers of actor and critic. Ours: the 64 units of Sec. IV-A limit the success
-    (docs/learning.md)."""
+    hidden_sizes: tuple[int, ...] = (256, 256)
+    """Hidden layers of actor and critic. Ours: the 64 units of Sec. IV-A limit the success, and a
+    second layer helps to read places from latents (docs/learning.md)."""
     critic_layer_norm: bool = True
     """Whether the critic's hidden layers have layer norm. Ours: halves the episodes needed."""
     learning_rate: float = 1e-3
@@ -33,11 +33,16 @@ class RLConfig:
     clip_targets: bool = True
     """Whether bootstrapped targets are clipped to the attainable returns. Ours: otherwise Q grows
     to hundreds."""
+    imitation: float = 50.0
+    """Weight of the squared distance to demonstrated actions in the actor's loss, of no effect
+    without a ``demonstration_share``. Ours: with a tenth of it, the critic pulls the policy away
+    from what was demonstrated (docs/learning.md)."""
     warmup_steps: int = 256
     """Environment steps of each seed before the first update. Ours: not given in the paper."""
 
     def __post_init__(self) -> None:
         positive(self, "learning_rate")
+        at_least(self, 0, "imitation")
         whole(self, 1, "batch_size", "warmup_steps", "replay_size")
         # With a smaller replay, learning would never begin.
         least = max(self.batch_size, self.warmup_steps)

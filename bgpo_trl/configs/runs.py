@@ -23,6 +23,13 @@ class RunConfig:
     """Names of the tasks, as in the suite and the CSV files; by default the paper's three."""
     task_starts: tuple[int, ...] = (0, 7_000, 13_000)
     """Episode from which each task is presented (Sec. IV-C); all 0 is the concurrent setting."""
+    schedule: Literal["practised", "sequential"] = "practised"
+    """Tasks that training episodes are drawn from: ``"practised"``, all presented so far;
+    ``"sequential"``, only the newest, as in Continual World and COOM. Tests are of all presented so
+    far in both."""
+    spread: float = 1.0
+    """Share of the suite's range of start states, from 0 (objects at their nominal places) to 1.
+    Ours."""
     eval_every: int = 1
     """Training episodes between evaluations (1 in the paper)."""
     eval_episodes: int = 1
@@ -45,8 +52,11 @@ class RunConfig:
         whole(self, 1, "episodes", "eval_every", "eval_episodes")
         at_least(self, 0, "checkpoint_minutes")
         check(self, ("held_out", self.held_out in ("validation", "test"), "validation or test"))
+        schedules = ("practised", "sequential")
+        check(self, ("schedule", self.schedule in schedules, " or ".join(schedules)))
         check(self, ("tasks", not isinstance(self.tasks, str), "a tuple of names"))
         nico.check_tasks(self.tasks)
+        nico.check_spread(self.spread)
         starts = self.task_starts
         check(
             self,
@@ -60,7 +70,7 @@ PRESETS: dict[str, RunConfig] = {
         seeds=(0, 1), episodes=12, task_starts=(0, 4, 8), eval_every=6, eval_episodes=1
     ),
     "quick": RunConfig(
-        seeds=(0, 1, 2), episodes=1_200, task_starts=(0, 420, 780), eval_every=60, eval_episodes=4
+        seeds=(0, 1), episodes=1_200, task_starts=(0, 380, 700), eval_every=120, eval_episodes=10
     ),
     "desk": RunConfig(
         seeds=(0, 1, 2, 3, 4),
@@ -72,4 +82,4 @@ PRESETS: dict[str, RunConfig] = {
     "paper": RunConfig(),
 }
 """Runs by ``--preset``: ``smoke`` passes every stage in minutes, ``quick`` shows learning, ``desk``
-is five seeds in about an hour, ``paper`` is the paper's scale."""
+is five seeds in some hours, ``paper`` is the paper's scale."""

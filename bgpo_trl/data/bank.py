@@ -109,6 +109,7 @@ class DemonstrationBank:
         steps: Latents and actions along the demonstrations, or ``None`` if they are not stored.
         encoder_id: Identity of the encoders that embedded them (`Representation.identity`), or
             ``None`` if unknown.
+        spread: Share of the range of start states that the demonstrations were recorded over.
 
     Raises:
         ValueError: If a label has no name, or ``steps`` are of another number of demonstrations.
@@ -120,6 +121,7 @@ class DemonstrationBank:
     tasks: tuple[str, ...] = nico.PAPER_TASKS
     steps: DemonstrationSteps | None = None
     encoder_id: str | None = None
+    spread: float = 1.0
 
     def __post_init__(self) -> None:
         unknown = self.task[(self.task < 0) | (self.task >= len(self.tasks))]
@@ -201,6 +203,7 @@ class DemonstrationBank:
             tasks,
             None if self.steps is None or other.steps is None else self.steps + other.steps,
             self.encoder_id,
+            min(self.spread, other.spread),
         )
 
     def _select(self, rows: Tensor) -> DemonstrationBank:
@@ -225,6 +228,7 @@ class DemonstrationBank:
             "scene_version": nico.scene_version(),
             "encoder_id": self.encoder_id,
             "tasks": ",".join(self.tasks),
+            "spread": str(self.spread),
         }
         save_tensors(path, self._tensors(), meta)
 
@@ -255,10 +259,11 @@ class DemonstrationBank:
             rows = {key: tensor for key, tensor in tensors.items() if "." not in key}
             steps = DemonstrationSteps(**columns) if columns else None
             tasks = tuple(meta["tasks"].split(","))
-            bank = cls(**rows, tasks=tasks, steps=steps, encoder_id=encoder_id)
+            spread = float(meta["spread"])
+            bank = cls(**rows, tasks=tasks, steps=steps, encoder_id=encoder_id, spread=spread)
         except FileNotFoundError:
             raise ValueError(f"there is no demonstration bank at {path}; {remedy}") from None
-        except (ValueError, TypeError) as error:
+        except (ValueError, TypeError, KeyError) as error:
             raise ValueError(f"{path} is damaged or not a bank ({error}); {remedy}") from None
         embedding, task, train = bank.embedding, bank.task, bank.train
         if not (

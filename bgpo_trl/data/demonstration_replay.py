@@ -11,6 +11,7 @@ from torch import Tensor
 
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.group_replay import GroupReplay, draw_shares
+from bgpo_trl.seeding import normal
 
 __all__ = ["DemonstrationReplay"]
 
@@ -27,6 +28,9 @@ class DemonstrationReplay:
         generator: Random generators for sampling, one for each of ``S`` seeds.
         state_key: Name of the latent.
         constant_keys: Entries that are constant within an episode, stored with each demonstration.
+        own_constants: Whether a transition comes with the constant entries of its own
+            demonstration, or else with those of any one of its group.
+        noise: Standard deviation of Gaussian noise added to each sampled state, not to the next.
         capacity: Demonstrations kept for each seed; the oldest are overwritten.
 
     Raises:
@@ -40,6 +44,8 @@ class DemonstrationReplay:
         generator: Sequence[torch.Generator],
         state_key: NestedKey = "latent",
         constant_keys: Sequence[NestedKey] = (),
+        own_constants: bool = True,
+        noise: float = 0.0,
         capacity: int = 100_000,
     ) -> None:
         if bank.steps is None:
@@ -54,10 +60,14 @@ class DemonstrationReplay:
                 "`python -m bgpo_trl.encoders.make_bank`, or set demonstration_share to 0"
             )
         self._steps = bank.steps
-        self._generators = list(generator)
+        self._generators, self._noise = list(generator), noise
+        self._own_constants = own_constants
         self._state_key, self._constant_keys = state_key, list(constant_keys)
         self._shown = GroupReplay(
-            capacity, generator=generator, keys=["demo_index", "reward", *constant_keys]
+            capacity,
+            generator=generator,
+            keys=["demo_index", "reward", *constant_keys],
+            source_key="demo_index",
         )
 
     def __len__(self) -> int:
@@ -82,22 +92,27 @@ class DemonstrationReplay:
 
         Returns:
             Batch size ``[S, R]`` as in `GroupReplay.sample`, with the state, the constant entries,
-            ``"action"``, ``"priority_weight"`` and, under ``"next"``, the state, ``"reward"`` and
-            ``"terminated"``.
+            ``"action"``, ``"priority_weight"``, ``"demonstrated"`` (true) and, under ``"next"``,
+            the state, ``"reward"`` and ``"terminated"``.
         """
         shown = self._shown.sample(group)
         steps, share = self._steps, draw_shares(group, self._generators)
         number = shown["demo_index"]
+        constants = shown if self._own_constants else self._shown.sample(group)
         n_steps = steps.length[number] - 1
         step = (share * n_steps).long()
         frame = steps.first[number] + step
         ends = (step == n_steps - 1).unsqueeze(-1)
+        state = steps.latents(frame)
+        if self._noise:
+            state = state + self._noise * normal(self._generators, state.shape[1:])
         return TensorDict(
             {
-                self._state_key: steps.latents(frame),
+                self._state_key: state,
                 "action": steps.actions(frame),
                 "priority_weight": shown["priority_weight"],
-                **{key: shown[key] for key in self._constant_keys},
+                "demonstrated": torch.ones(group.shape, dtype=torch.bool),
+                **{key: constants[key] for key in self._constant_keys},
                 "next": {
                     self._state_key: steps.latents(frame + 1),
                     "reward": shown["reward"].unsqueeze(-1) * ends,
@@ -106,6 +121,10 @@ class DemonstrationReplay:
             },
             group.shape,
         )
+
+    def regroup(self, seed: int, group: Tensor) -> None:
+        """Assign demonstrations of a seed to groups anew, from the group of each in the bank."""
+        self._shown.regroup(seed, group)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the stored demonstrations and the states of the generators."""

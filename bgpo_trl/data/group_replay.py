@@ -28,6 +28,8 @@ class GroupReplay:
         capacity: Transitions kept for each seed; the oldest are overwritten.
         generator: Random generators for sampling, one for each of ``S`` seeds.
         keys: Entries to store.
+        source_key: Entry, int64 ``[S]``, that decides about the group of a transition, such as the
+            number of its demonstration; stored, but not sampled. Only `regroup` needs it.
 
     Example:
         >>> replay = GroupReplay(100, generator=[torch.Generator()], keys=["state"])
@@ -44,8 +46,13 @@ class GroupReplay:
         *,
         generator: Sequence[torch.Generator],
         keys: Sequence[NestedKey],
+        source_key: NestedKey | None = None,
     ) -> None:
-        self._buffer = ReplayBuffer(capacity, generator=list(generator), keys=[*keys, GROUP])
+        self._keys, self._source_key = list(keys), source_key
+        stored = [*keys, GROUP]
+        if source_key is not None and source_key not in keys:
+            stored.append(source_key)
+        self._buffer = ReplayBuffer(capacity, generator=list(generator), keys=stored)
         self._generators = list(generator)
         self._index = [_Index() for _ in self._generators]
 
@@ -126,8 +133,33 @@ class GroupReplay:
                     steps[i, rows] = held[(shares[rows] * len(held)).astype(np.int64)]
                 else:
                     steps[i, rows], weight[i, rows] = oldest[seed], 0.0
-        drawn = self._buffer.take(torch.from_numpy(steps), seeds=seeds).exclude(GROUP)
+        drawn = self._buffer.take(torch.from_numpy(steps), self._keys, seeds=seeds)
         return drawn.set("priority_weight", torch.from_numpy(weight))
+
+    def regroup(self, seed: int, group: Tensor) -> None:
+        """Assign the transitions of a seed to groups anew.
+
+        Args:
+            seed: Position of the seed.
+            group: Group of the transitions of each source, int64 ``[number of sources]``.
+
+        Raises:
+            ValueError: If the replay has no ``source_key``.
+        """
+        if self._source_key is None:
+            raise ValueError("to regroup what is stored, give the replay a source_key")
+        if not int(self._buffer.n_added[seed]):
+            return
+        source = self._buffer.read(seed, self._source_key)
+        self._buffer.write(seed, GROUP, group[source])
+        self._index[seed] = self._indexed(seed)
+
+    def _indexed(self, seed: int) -> _Index:
+        """Return the index of what the buffer holds of a seed."""
+        index = _Index()
+        if int(self._buffer.n_added[seed]):
+            index.extend(self._buffer.read(seed, GROUP).numpy(), int(self._buffer.oldest[seed]))
+        return index
 
     def state_dict(self) -> dict[str, Any]:
         """Return the filled part of the buffer (a copy) and the states of the generators."""
@@ -136,16 +168,7 @@ class GroupReplay:
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Restore a `state_dict`, so that the same samples follow."""
         self._buffer.load_state_dict(state_dict)
-        self._index = [_Index() for _ in self._generators]
-        for seed, (first, end) in enumerate(
-            zip(self._buffer.oldest.tolist(), self._buffer.n_added.tolist(), strict=True)
-        ):
-            if first == end:
-                continue
-            steps = torch.arange(first, end).unsqueeze(0)
-            groups = self._buffer.take(steps, [GROUP], seeds=[seed])[GROUP][0]
-            for step, group in zip(range(first, end), groups.tolist(), strict=True):
-                self._index[seed].append(group, step)
+        self._index = [self._indexed(seed) for seed in range(len(self._generators))]
 
 
 def draw_shares(group: Tensor, generator: Sequence[torch.Generator]) -> Tensor:
@@ -179,6 +202,12 @@ class _Index:
             first, end = 0, len(held)
         steps[end] = step
         self._span[group] = first, end + 1
+
+    def extend(self, groups: NDArray[np.int64], first: int) -> None:
+        """Append the steps from ``first`` on, of these groups, to an empty index."""
+        for group in np.unique(groups).tolist():
+            steps = self._steps[group] = first + np.flatnonzero(groups == group)
+            self._span[group] = 0, len(steps)
 
     def of(self, group: int, oldest: int) -> NDArray[np.int64]:
         """Return the steps of a group that have not been overwritten."""

@@ -37,6 +37,7 @@ def record_demonstrations(
     per_task: int = 1_200,
     held_out_per_task: int = 200,
     play: bool = False,
+    spread: float = 1.0,
     seed: int = 0,
     attempts: int = 100,
     progress: bool = True,
@@ -54,6 +55,7 @@ def record_demonstrations(
         per_task: Demonstrations of each task (1,200 in Sec. IV-B).
         held_out_per_task: How many of those are held out for test episodes.
         play: Record play instead of demonstrations.
+        spread: Share of the whole range of start states, see `suites.nico.load`.
         seed: Seed of the start states and of the demonstrator's noise.
         attempts: Consecutive failures of a demonstrator after which recording stops.
         progress: Whether to show a progress bar.
@@ -70,13 +72,13 @@ def record_demonstrations(
         RuntimeError: If there is no OpenGL to render with, or a demonstrator fails too often;
             earlier rows are kept.
     """
-    wanted = _settings(tasks, per_task, held_out_per_task, play, seed, attempts)
+    wanted = _settings(tasks, per_task, held_out_per_task, play, spread, seed, attempts)
     path = Path(path)
     started = is_dataset(path)
     if started and _is_complete(path, wanted):
         return load_demonstrations(path)
     # The renderer comes first, so that a machine without OpenGL fails before writing anything.
-    environments = _environments(tasks)
+    environments = _environments(tasks, spread)
     n = per_task * len(tasks)
     dataset = open_dataset(path, n) if started else make_dataset(path, n)
     if not started:
@@ -91,11 +93,13 @@ def _settings(
     per_task: int,
     held_out_per_task: int,
     play: bool,
+    spread: float,
     seed: int,
     attempts: int,
 ) -> dict[str, Any]:
     """Check the arguments and return the settings that identify a recording."""
     nico.check_tasks(tasks)
+    nico.check_spread(spread)
     if not tasks:
         raise ValueError("name at least one of the tasks")
     if seed < 0:
@@ -111,6 +115,7 @@ def _settings(
         "tasks": list(tasks),
         "per_task": per_task,
         "held_out_per_task": held_out_per_task,
+        "spread": float(spread),
         "seed": seed,
         **({"play": True} if play else {}),
     }
@@ -127,11 +132,11 @@ def _is_complete(path: Path, wanted: Mapping[str, Any]) -> bool:
     return bool(meta.get("checksum"))
 
 
-def _environments(tasks: Sequence[str]) -> list[Environment]:
+def _environments(tasks: Sequence[str], spread: float) -> list[Environment]:
     """Return an environment of each task, with one simulation and renderer for all."""
     physics = nico.Physics.from_xml_string(nico.scene_xml())
     shared = {"physics": physics, "renderer": FrameRenderer(physics.model.ptr)}
-    return [nico.load(task, observation="both", **shared) for task in tasks]
+    return [nico.load(task, spread=spread, observation="both", **shared) for task in tasks]
 
 
 def _record_rows(
@@ -240,6 +245,7 @@ def main(
     per_task: int = 1_200,
     held_out_per_task: int = 200,
     play: bool = False,
+    spread: float = 1.0,
     seed: int = 0,
 ) -> None:
     """Record the dataset of demonstrations; the same command resumes an interrupted recording.
@@ -251,6 +257,7 @@ def main(
         per_task: Demonstrations of each task.
         held_out_per_task: How many of those are held out for test episodes.
         play: Record random play instead of demonstrations.
+        spread: Share of the whole range of start states.
         seed: Seed of the start states and of the noise.
     """
     import_own(module)
@@ -260,6 +267,7 @@ def main(
         per_task=per_task,
         held_out_per_task=held_out_per_task,
         play=play,
+        spread=spread,
         seed=seed,
     )
 

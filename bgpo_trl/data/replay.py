@@ -158,6 +158,19 @@ class ReplayBuffer:
         rows = steps % self.capacity * len(self.generators) + columns.unsqueeze(-1)
         return self._read(rows.view(-1), steps.shape, keys)
 
+    def read(self, seed: int, key: NestedKey) -> Tensor:
+        """Copy an entry of all transitions held for a seed, oldest first, ``[N, ...]``."""
+        return self._rows[key].index_select(0, self._held(seed))
+
+    def write(self, seed: int, key: NestedKey, values: Tensor) -> None:
+        """Replace an entry of all transitions held for a seed, oldest first, ``[N, ...]``."""
+        self._rows[key].index_copy_(0, self._held(seed), values)
+
+    def _held(self, seed: int) -> Tensor:
+        end = int(self._n_added[seed])
+        steps = torch.arange(max(0, end - self.capacity), end)
+        return steps % self.capacity * len(self.generators) + seed
+
     def _read(
         self, rows: Tensor, batch_size: Sequence[int], keys: Sequence[NestedKey] | None = None
     ) -> TensorDict:

@@ -116,6 +116,7 @@ class TaskReplay:
             return self._draw(self._replay, task, self.batch_size)
         played = self._draw(self._replay, task, self.batch_size - self._n_shown)
         shown = self._draw(self._demonstrations, task, self._n_shown)
+        played["demonstrated"] = torch.zeros(played.shape, dtype=torch.bool)
         return cast(TensorDictBase, torch.cat([played, shown], -1))
 
     def sample_played(

@@ -10,7 +10,7 @@ from pathlib import Path
 from bgpo_trl.doctor.finding import Finding
 
 # Three checkpoints (two kept, one being written) of 10 seeds, 20,000 episodes of 22 steps and 662
-# bytes a transition take 9 GB; three of `--preset quick`, 3 seeds and 1,200 episodes, 0.2 GB.
+# bytes a transition take 9 GB; three of `--preset quick`, 3 seeds and 900 episodes, 0.2 GB.
 _ROOM_FOR_ALL, _ROOM_FOR_SOME = 10e9, 0.5e9
 
 

@@ -13,7 +13,12 @@ import torch
 from tensordict import TensorDict
 from torchrl.objectives import LossModule
 
-from bgpo_trl.configs import RepresentationConfig, SequenceAutoencoderConfig, VAEConfig
+from bgpo_trl.configs import (
+    InverseModelConfig,
+    RepresentationConfig,
+    SequenceAutoencoderConfig,
+    VAEConfig,
+)
 from bgpo_trl.files.checkpoint import has_checkpoint, load_checkpoint, save_checkpoint
 from bgpo_trl.files.progress import progress_bar
 
@@ -44,8 +49,9 @@ class Fit:
         stage: str,
         loss: LossModule,
         sample: Callable[[torch.Generator], TensorDict],
-        schedule: VAEConfig | SequenceAutoencoderConfig,
+        schedule: VAEConfig | SequenceAutoencoderConfig | InverseModelConfig,
         generator: torch.Generator,
+        bfloat16: bool = False,
     ) -> None:
         """Train ``loss.parameters()`` on the device, from the last checkpoint if there is one.
 
@@ -56,6 +62,7 @@ class Fit:
             schedule: Gradient steps and learning rate of the stage.
             generator: The only source of randomness of ``sample`` and ``loss``; saved in the
                 checkpoint, so that a resumed training gives the same weights.
+            bfloat16: Whether to compute the loss in bfloat16 where that is precise enough.
 
         Raises:
             ValueError: If the loss is no longer finite, or the checkpoints are damaged or belong to
@@ -77,7 +84,9 @@ class Fit:
             rate = schedule.learning_rate * _decay(step, schedule.steps, schedule.warmup_steps)
             for group in optimizer.param_groups:
                 group["lr"] = rate
-            losses = loss(sample(generator).to(self.device))
+            batch = sample(generator).to(self.device)
+            with torch.autocast(torch.device(self.device).type, torch.bfloat16, enabled=bfloat16):
+                losses = loss(batch)
             objective = [value for key, value in losses.items() if key.startswith("loss_")]
             optimizer.zero_grad()
             torch.stack(objective).sum().backward()

@@ -32,6 +32,7 @@ def make_bank(
     *,
     tasks: Sequence[str] = nico.PAPER_TASKS,
     actions: Literal["inferred", "recorded"] = "inferred",
+    spread: float = 1.0,
 ) -> DemonstrationBank:
     """Embed demonstrations; keep the latents and actions of the training ones.
 
@@ -40,16 +41,16 @@ def make_bank(
         dataset: Reads ``pixels`` ``[N, T, 32, 64, 3]``, ``length``, ``task`` and ``train`` ``[N]``,
             and ``action`` ``[N, T - 1, 4]``.
         tasks: Task names, in the order of their labels.
-        actions: ``"inferred"`` stores the actions that the VAE's inverse model infers from the
+        actions: ``"inferred"`` stores the actions that the inverse model infers from the
             frames, the only actions that an observer of a demonstration has; ``"recorded"`` stores
             the true ones, for comparison.
+        spread: Share of the range of start states that the dataset was recorded over.
     """
     vae, length = representation.vae, dataset["length"]
     latent = encode_frames(vae, dataset["pixels"], length)
     action = dataset["action"]
     if actions == "inferred":
-        mean = latent.to(vae.latent_std.device) * vae.latent_std + vae.latent_mean
-        action = vae.inverse(mean[:, :-1], mean[:, 1:]).cpu()
+        action = representation.inverse(latent, length)
     train = dataset["train"].clone()
     return DemonstrationBank(
         representation.lae.encode(latent, length),
@@ -58,6 +59,7 @@ def make_bank(
         tuple(tasks),
         DemonstrationSteps.of(latent, action, length * train),
         representation.identity,
+        spread,
     )
 
 
@@ -77,8 +79,14 @@ def main(
     """
     weights = default_weights() if weights is None else weights
     encoders = load_representation(weights, scene_version=nico.scene_version())
-    tasks = read_meta(dataset)["tasks"]
-    bank = make_bank(encoders, load_demonstrations(dataset), tasks=tasks, actions=actions)
+    meta = read_meta(dataset)
+    bank = make_bank(
+        encoders,
+        load_demonstrations(dataset),
+        tasks=meta["tasks"],
+        actions=actions,
+        spread=meta["spread"],
+    )
     bank.save(out)
 
 

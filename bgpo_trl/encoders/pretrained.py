@@ -52,6 +52,7 @@ def make_pretrained(
     progress: bool = True,
     device: torch.device | str = "cpu",
     tasks: Sequence[str] = nico.PAPER_TASKS,
+    spread: float = 1.0,
 ) -> tuple[Representation, DemonstrationBank]:
     """Record demonstrations and play, train both encoders, and embed the demonstrations.
 
@@ -70,11 +71,14 @@ def make_pretrained(
         progress: Whether to show progress bars.
         device: Device to train on.
         tasks: Tasks to demonstrate.
+        spread: Share of the whole range of start states.
 
     Raises:
         ValueError: If the dataset is damaged or was recorded in another scene.
     """
-    record = partial(record_demonstrations, tasks=tasks, seed=seed, progress=progress)
+    record = partial(
+        record_demonstrations, tasks=tasks, spread=spread, seed=seed, progress=progress
+    )
     demonstrations = record(dataset, per_task=per_task, held_out_per_task=held_out_per_task)
     play = record(
         Path(dataset).with_name(f"{Path(dataset).name}-play"),
@@ -92,4 +96,5 @@ def make_pretrained(
         device,
         progress=progress,
         tasks=tasks,
+        spread=spread,
     )

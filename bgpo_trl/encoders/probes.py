@@ -32,6 +32,7 @@ from bgpo_trl.encoders.representation import (
     valid_steps,
 )
 from bgpo_trl.encoders.shipped import default_weights
+from bgpo_trl.modules.inverse_model import InverseModel
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
 from bgpo_trl.objectives.representation import SequenceReconstructionLoss
@@ -60,11 +61,14 @@ def probe(
             frames with all objects on the table, as ``play_...``.
 
     Returns:
-        A flat dict: ``joint_<name>_rmse_rad`` and ``<object>_error_cm`` (linear probe of one
-        latent), ``inverse_rmse``, ``inverse_r2``, ``reconstruction`` (squared error per frame),
-        ``mean_frame_reconstruction`` (the same for the mean training frame, the level of an
-        untrained VAE), ``sequence_mse`` (of standardized latents, so 1 is the level of predicting
-        the mean), ``task_accuracy_linear``, ``task_accuracy_nearest`` and ``active_dimensions``.
+        A flat dict: ``joint_<name>_rmse_rad`` (linear probe of one latent),
+        ``<object>_error_cm`` and ``<object>_linear_error_cm`` (distance of a perceptron's and of a
+        linear probe's place from the true one, mean over frames), ``inverse_rmse``, ``inverse_r2``
+        and ``inverse_r2_<joint>`` (actions of the training demonstrations, as they are inferred for
+        the bank), ``reconstruction`` (squared error per frame), ``mean_frame_reconstruction`` (the
+        same for the mean training frame, the level of an untrained VAE), ``sequence_mse`` (of
+        standardized latents, so 1 is the level of predicting the mean), ``task_accuracy_linear``,
+        ``task_accuracy_nearest`` and ``active_dimensions``.
 
     Raises:
         ValueError: If the dataset has no training or no held-out demonstrations.
@@ -75,7 +79,7 @@ def probe(
     latent_held_out = encode_frames(vae, held_out.get("pixels"), held_out.get("length"))
     result = {
         **_probe_state(latent, train, latent_held_out, held_out),
-        **_probe_inverse(vae, latent_held_out, held_out),
+        **_probe_inverse(representation.inverse, latent, train),
         **_probe_reconstruction(vae, train, held_out),
         **_probe_sequences(lae, latent_held_out, held_out),
     }
@@ -111,6 +115,33 @@ def ridge_predict(x: Tensor, y: Tensor, x_new: Tensor, penalty: float = 1e-4) ->
     return (b @ weight + offset).float()
 
 
+def perceptron_predict(x: Tensor, y: Tensor, x_new: Tensor, steps: int = 4_000) -> Tensor:
+    """Predict ``y`` ``[M, k]`` for ``x_new`` ``[M, d]`` by a perceptron with 256 hidden units.
+
+    It is what a policy of the default size could read. It is fitted on ``x`` ``[N, d]`` and ``y``
+    ``[N, k]``, both standardized, by ``steps`` steps of Adam on 256 rows.
+    """
+    generator = torch.Generator().manual_seed(0)
+    (scale, center), (unit, offset) = torch.std_mean(x, 0), torch.std_mean(y, 0)
+    scale, unit = scale.clamp_min(1e-6), unit.clamp_min(1e-6)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        network = torch.nn.Sequential(
+            torch.nn.Linear(x.shape[1], 256), torch.nn.ReLU(), torch.nn.Linear(256, y.shape[1])
+        )
+    optimizer = torch.optim.Adam(network.parameters(), lr=3e-3)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
+    for _ in range(steps):
+        rows = torch.randint(len(x), (256,), generator=generator)
+        error = network((x[rows] - center) / scale) - (y[rows] - offset) / unit
+        optimizer.zero_grad()
+        error.square().mean().backward()
+        optimizer.step()
+        schedule.step()
+    with torch.no_grad():
+        return network((x_new - center) / scale) * unit + offset
+
+
 @torch.no_grad()
 def reconstruction_picture(vae: VAE, demonstrations: TensorDictBase, columns: int = 12) -> Tensor:
     """Return original frames above their reconstructions, each pixel enlarged to 4 x 4.
@@ -141,19 +172,18 @@ def _probe_state(
     if only is not None:
         valid = valid & only(train.get("state"))
         valid_held_out = valid_held_out & only(held_out.get("state"))
-    state = held_out.get("state")[valid_held_out]
-    error = (
-        ridge_predict(latent[valid], train.get("state")[valid], latent_held_out[valid_held_out])
-        - state
-    )
+    state, wanted = train.get("state")[valid], held_out.get("state")[valid_held_out]
+    error = ridge_predict(latent[valid], state, latent_held_out[valid_held_out]) - wanted
+    read = perceptron_predict(latent[valid], state, latent_held_out[valid_held_out]) - wanted
     joints = {
         f"joint_{name}_rmse_rad": _mean(error[:, i].square()) ** 0.5
         for i, name in enumerate(JOINTS)
     }
     first = {name: _FIRST_OBJECT + 3 * i for i, name in enumerate(OBJECTS)}
     return joints | {
-        f"{name}_error_cm": 100 * _mean(error[:, i : i + 2].norm(dim=-1))
+        f"{name}_{kind}_cm": 100 * _mean(of_kind[:, i : i + 2].norm(dim=-1))
         for name, i in first.items()
+        for kind, of_kind in (("error", read), ("linear_error", error))
     }
 
 
@@ -184,14 +214,20 @@ def _probe_tasks(
 
 
 @torch.no_grad()
-def _probe_inverse(vae: VAE, latent: Tensor, held_out: TensorDictBase) -> dict[str, float]:
-    mu = latent * vae.latent_std + vae.latent_mean
-    action = held_out.get("action")
-    valid = valid_steps(held_out.get("length") - 1, action.shape[1])
+def _probe_inverse(
+    inverse: InverseModel, latent: Tensor, shown: TensorDictBase
+) -> dict[str, float]:
+    action = shown.get("action")
+    valid = valid_steps(shown.get("length") - 1, action.shape[1])
     action = action[valid]
-    error = vae.inverse(mu[:, :-1], mu[:, 1:])[valid] - action
-    explained = 1 - error.square().sum() / (action - action.mean(0)).square().sum()
-    return {"inverse_rmse": _mean(error.square()) ** 0.5, "inverse_r2": explained.item()}
+    error = inverse(latent, shown.get("length"))[valid] - action
+    left, all_ = error.square().sum(0), (action - action.mean(0)).square().sum(0)
+    by_joint = zip(JOINTS, (1 - left / all_).tolist(), strict=True)
+    return {
+        "inverse_rmse": _mean(error.square()) ** 0.5,
+        "inverse_r2": 1 - (left.sum() / all_.sum()).item(),
+        **{f"inverse_r2_{name}": r2 for name, r2 in by_joint},
+    }
 
 
 @torch.no_grad()

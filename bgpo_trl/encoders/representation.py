@@ -19,26 +19,38 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from bgpo_trl.configs import RepresentationConfig, SequenceAutoencoderConfig, VAEConfig
+from bgpo_trl.configs import (
+    InverseModelConfig,
+    RepresentationConfig,
+    SequenceAutoencoderConfig,
+    VAEConfig,
+)
 from bgpo_trl.encoders.fitting import Fit, Log
 from bgpo_trl.files.tensor_file import digest, load_tensors, save_tensors
+from bgpo_trl.modules.inverse_model import InverseModel, window
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
-from bgpo_trl.objectives.representation import SequenceReconstructionLoss, VAEInverseLoss
+from bgpo_trl.objectives.representation import (
+    ActionInferenceLoss,
+    SequenceReconstructionLoss,
+    VAEInverseLoss,
+)
 
 
 @dataclass
 class Representation:
-    """The two trained encoders and the metadata of their training.
+    """The two trained encoders, the inverse model, and the metadata of their training.
 
     Attributes:
         vae: Frame encoder; ``vae.latent(pixels)`` is the latent used downstream.
         lae: Sequence encoder; ``lae.encode(latent, length)`` is the embedding phi.
-        metadata: ``scene_version``, ``config`` (JSON), ``seed``, ``command``.
+        inverse: Inverse model on latents; it infers the actions of demonstrations for a bank.
+        metadata: ``scene_version``, ``spread``, ``config`` (JSON), ``seed``, ``command``.
     """
 
     vae: VAE
     lae: SequenceAutoencoder
+    inverse: InverseModel
     metadata: dict[str, str]
 
     @property
@@ -53,6 +65,7 @@ def train_representation(
     *,
     play: TensorDictBase | None = None,
     scene_version: str,
+    spread: float = 1.0,
     command: str = "",
     checkpoint: str | Path | None = None,
     log: Log | None = None,
@@ -65,8 +78,11 @@ def train_representation(
         dataset: Demonstrations in the form given by the module; held-out ones are not read.
         config: Hyperparameters; ``RepresentationConfig()`` by default.
         play: Episodes of play in the same form, which train the frame encoder on states that
-            demonstrations never visit.
+            demonstrations never visit. The inverse model then learns from the actions of play
+            alone, so that it has seen none of the actions that it infers for demonstrations;
+            without play, it learns from those of demonstrations.
         scene_version: Version of the scene of the frames, stored with the weights.
+        spread: Share of the range of start states of the recordings, stored with the weights.
         command: Command line, stored with the weights.
         checkpoint: Folder for checkpoints, from which an interrupted training is resumed and then
             gives the same weights.
@@ -89,13 +105,18 @@ def train_representation(
     vae = _train_vae(seen, config.vae, fit, config.seed)
     latent = encode_frames(vae, train.get("pixels"), train.get("length"))
     lae = _train_lae(latent, train.get("length"), config.lae, fit, config.seed)
+    own = seen[-1]
+    if play is not None:
+        latent = encode_frames(vae, own.get("pixels"), own.get("length"))
+    inverse = _train_inverse(latent, own, config.inverse, fit, config.seed)
     metadata = {
         "scene_version": scene_version,
+        "spread": str(spread),
         "config": json.dumps(asdict(config)),
         "seed": str(config.seed),
         "command": command,
     }
-    return Representation(vae.cpu(), lae.cpu(), metadata)
+    return Representation(vae.cpu(), lae.cpu(), inverse.cpu(), metadata)
 
 
 @torch.no_grad()
@@ -150,7 +171,8 @@ def load_representation(path: str | Path, *, scene_version: str | None = None) -
         trained_on = metadata["scene_version"]
         vae = VAE(config["vae"]["latent_size"], len(tensors["vae.inverse_head.bias"]))
         lae = SequenceAutoencoder(vae.latent_size, config["lae"]["embedding_size"])
-        for name, module in (("vae.", vae), ("lae.", lae)):
+        inverse = InverseModel(vae.latent_size, vae.action_size, config["inverse"]["hidden_size"])
+        for name, module in (("vae.", vae), ("lae.", lae), ("inverse.", inverse)):
             module.load_state_dict(
                 {k.removeprefix(name): v for k, v in tensors.items() if k.startswith(name)}
             )
@@ -162,16 +184,16 @@ def load_representation(path: str | Path, *, scene_version: str | None = None) -
         raise ValueError(
             f"{path} was trained on scene {trained_on}, this is scene {scene_version}: {remedy}"
         )
-    return Representation(
-        vae.eval().requires_grad_(False), lae.eval().requires_grad_(False), metadata
-    )
+    for module in (vae, lae, inverse):
+        module.eval().requires_grad_(False)
+    return Representation(vae, lae, inverse, metadata)
 
 
 def _tensors(representation: Representation) -> dict[str, Tensor]:
     return {
         f"{name}.{key}": value
-        for name, module in (("vae", representation.vae), ("lae", representation.lae))
-        for key, value in module.state_dict().items()
+        for name in ("vae", "lae", "inverse")
+        for key, value in getattr(representation, name).state_dict().items()
     }
 
 
@@ -200,7 +222,9 @@ def valid_frames(dataset: TensorDictBase) -> Tensor:
 
 def mean_frame(frames: Tensor) -> Tensor:
     """Return the mean of uint8 ``[F, 32, 64, 3]`` as float32 ``[32, 64, 3]`` in [0, 1]."""
-    return frames.sum(0, dtype=torch.int64) / (255 * len(frames))
+    # In parts: a sum over all frames would first convert all of them to int64.
+    parts = [part.sum(0, dtype=torch.int64) for part in frames.split(1024)]
+    return torch.stack(parts).sum(0) / (255 * len(frames))
 
 
 def _train_vae(datasets: Sequence[TensorDictBase], config: VAEConfig, fit: Fit, seed: int) -> VAE:
@@ -212,6 +236,8 @@ def _train_vae(datasets: Sequence[TensorDictBase], config: VAEConfig, fit: Fit, 
     action = torch.cat([dataset.get("action") for dataset in datasets])
     padded = torch.nn.functional.pad(action, (0, 0, 0, 1))
     action = padded[valid_steps(length, padded.shape[1])]
+    # Demonstrations come first. Their actions are unknown, unless there is no play to learn from.
+    n_demonstrated = 0 if len(datasets) == 1 else int(datasets[0].get("length").sum())
     first = length.cumsum(0) - length
     starts = torch.cat(
         [
@@ -224,7 +250,8 @@ def _train_vae(datasets: Sequence[TensorDictBase], config: VAEConfig, fit: Fit, 
         n_windows = config.batch_size // config.window
         drawn = starts[torch.randint(len(starts), (n_windows,), generator=generator)]
         index = drawn.unsqueeze(-1) + torch.arange(config.window)
-        return TensorDict({"pixels": frames[index], "action": action[index]}, index.shape)
+        windows = {"pixels": frames[index], "action": action[index]}
+        return TensorDict({**windows, "action_known": drawn >= n_demonstrated}, [n_windows])
 
     generator = torch.Generator().manual_seed(seed)
     with torch.random.fork_rng(devices=[]):
@@ -238,11 +265,42 @@ def _train_vae(datasets: Sequence[TensorDictBase], config: VAEConfig, fit: Fit, 
         inverse_weight=config.inverse_weight,
         generator=generator,
     )
-    fit("vae", loss, sample, config, generator)
+    fit("vae", loss, sample, config, generator, config.bfloat16)
     vae.eval().requires_grad_(False)
     chunks = (chunk.to(fit.device) for chunk in frames.split(64))
     vae.set_latent_scale(torch.cat([vae.encode(chunk)[0] for chunk in chunks]))
     return vae
+
+
+def _train_inverse(
+    latent: Tensor,
+    episodes: TensorDictBase,
+    config: InverseModelConfig,
+    fit: Fit,
+    seed: int,
+) -> InverseModel:
+    """Train the inverse model on the latents ``[N, T, 64]`` and actions of episodes."""
+    length, action = episodes.get("length"), episodes.get("action")
+    slow = action.abs().amax(-1) <= config.largest_action
+    chosen = (slow & valid_steps(length - 1, action.shape[1])).nonzero()
+    if not len(chosen):
+        raise ValueError(
+            f"no recorded action is as small as largest_action {config.largest_action}"
+        )
+
+    def sample(generator: torch.Generator) -> TensorDict:
+        drawn = torch.randint(len(chosen), (config.batch_size,), generator=generator)
+        episode, step = chosen[drawn].unbind(-1)
+        windows = window(latent, length, episode, step)
+        windows = windows + config.noise * torch.randn(windows.shape, generator=generator)
+        return TensorDict({"window": windows, "action": action[episode, step]}, [len(drawn)])
+
+    generator = torch.Generator().manual_seed(seed)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        inverse = InverseModel(latent.shape[-1], action.shape[-1], config.hidden_size)
+    fit("inverse", ActionInferenceLoss(inverse), sample, config, generator)
+    return inverse.eval().requires_grad_(False)
 
 
 def _train_lae(

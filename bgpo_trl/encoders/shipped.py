@@ -11,7 +11,6 @@ from functools import cache
 from importlib import resources
 from pathlib import Path
 
-from bgpo_trl.configs import GWRBConfig
 from bgpo_trl.encoders.representation import load_representation
 from bgpo_trl.files.tensor_file import load_tensors
 from suites import nico
@@ -52,17 +51,6 @@ def weights_of_bank(bank: Path) -> Path:
     except (FileNotFoundError, ValueError):
         metadata = {}
     return find_weights(metadata.get("encoder_id"))
-
-
-def groups_config(weights: Path) -> GWRBConfig:
-    """Return the settings of the coarse network that finds groups, for encoders.
-
-    The embeddings of a task lie closer together with the shipped encoders of eight tasks, so that
-    groups are tasks at a higher threshold (``benchmarks/groups.py``). Other encoders get the
-    threshold of those of the paper's tasks.
-    """
-    threshold = 0.595 if weights == _path(_EIGHT) else 0.525
-    return GWRBConfig(activity_threshold=threshold, habituation_threshold=0.5)
 
 
 @cache

@@ -71,6 +71,7 @@ def train_encoders(
     device: torch.device | str = "cpu",
     progress: bool = True,
     tasks: Sequence[str] = nico.PAPER_TASKS,
+    spread: float = 1.0,
 ) -> tuple[Representation, DemonstrationBank]:
     """Train, save and probe both encoders, and embed the demonstrations with them.
 
@@ -86,6 +87,7 @@ def train_encoders(
         device: Device to train on.
         progress: Whether to show progress bars.
         tasks: Task names, in the order of their labels.
+        spread: Share of the range of start states of the recordings.
 
     Raises:
         ValueError: As `train_representation`.
@@ -98,6 +100,7 @@ def train_encoders(
             config,
             play=play,
             scene_version=nico.scene_version(),
+            spread=spread,
             command=command,
             checkpoint=folder / "checkpoint",
             log=_log_of(file),
@@ -105,7 +108,7 @@ def train_encoders(
             device=device,
         )
     save_representation(representation, weights)
-    bank = make_bank(representation, dataset, tasks=tasks)
+    bank = make_bank(representation, dataset, tasks=tasks, spread=spread)
     bank.save(bank_path(weights))
     probe(representation, dataset, folder, play=play)
     return representation, bank
@@ -125,18 +128,19 @@ def _log_of(file: CsvFile) -> Log:
 
 def main(arguments: Arguments) -> None:
     """Run the command line."""
-    dataset, tasks = load_demonstrations(arguments.dataset), read_meta(arguments.dataset)["tasks"]
+    dataset, meta = load_demonstrations(arguments.dataset), read_meta(arguments.dataset)
     play = None if arguments.play is None else load_demonstrations(arguments.play)
     command = shlex.join(["python", "-m", "bgpo_trl.encoders.train", *sys.argv[1:]])
     train_encoders(
         dataset,
         play,
-        default_weights(tasks) if arguments.weights is None else arguments.weights,
+        default_weights(meta["tasks"]) if arguments.weights is None else arguments.weights,
         arguments.folder,
         arguments.config,
         command,
         choose_device(arguments.device),
-        tasks=tasks,
+        tasks=meta["tasks"],
+        spread=meta["spread"],
     )
 
 

@@ -1,7 +1,7 @@
 """What a success is worth: the simulation continued from the states in which episodes succeeded.
 
-A task's criterion looks at one moment, and a learner finds the cheapest thing that pays. Here a
-grasped object is lifted, and what was pushed is left alone for two seconds.
+A task's condition has to hold for two or three steps, and a learner finds the cheapest thing that
+pays. Here a grasped object is lifted, and what was pushed is left alone for two seconds.
 """
 
 from __future__ import annotations
@@ -221,14 +221,19 @@ def policy_episodes(run: LoadedRun, episodes: int) -> list[Episode]:
 
 
 def scripted_episodes(
-    tasks: tuple[str, ...], seeds: Iterable[int], episodes: int, max_steps: int, actor: str
+    tasks: tuple[str, ...],
+    seeds: Iterable[int],
+    episodes: int,
+    max_steps: int,
+    actor: str,
+    spread: float = 1.0,
 ) -> list[Episode]:
     """Return the episodes of an entry of `SCRIPTED`, in the starts of `policy_episodes`."""
     starts = {seed: start_seeds(seed, _NUMBER, (len(tasks), episodes)) for seed in seeds}
     return [
         episode
         for seed, of_seed in starts.items()
-        for episode in play(tasks, of_seed, seed, SCRIPTED[actor], max_steps)
+        for episode in play(tasks, of_seed, seed, SCRIPTED[actor], max_steps, spread)
     ]
 
 

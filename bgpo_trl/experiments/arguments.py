@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import shlex
 import sys
+import sysconfig
+import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -70,12 +72,17 @@ class Arguments(TaskArguments):
     module of --import adds; DDPG by default."""
     preset: Literal["smoke", "quick", "desk", "paper"] = "quick"
     """Size of the run, with its time on two cores: smoke (12 episodes of 2 seeds, every stage in 2
-    minutes), quick (1,200 episodes of 3 seeds, 15 minutes), desk (6,000 episodes of 5 seeds, 70
-    minutes) or paper (20,000 episodes of 10 seeds, more than a day)."""
+    minutes), quick (1,200 episodes of 2 seeds, 20 minutes), desk (6,000 episodes of 5 seeds, some
+    five hours) or paper (20,000 episodes of 10 seeds, days)."""
     out: Path | None = None
     """Run directory; runs/EXPERIMENT-ALGORITHM[-RL]-PRESET by default."""
     seeds: tuple[int, ...] | None = None
     """Seeds; the preset's by default."""
+    schedule: Literal["practised", "sequential"] = "practised"
+    """Tasks of training episodes: all presented so far (practised) or only the newest (sequential,
+    as in Continual World and COOM)."""
+    spread: float = 1.0
+    """Share of the whole range of start states, from 0 (nominal places) to 1."""
     episodes: int | None = None
     """Training episodes; the preset's by default. The task starts are scaled in proportion. With
     --resume, a larger number extends the run, whose task starts are kept."""
@@ -119,6 +126,8 @@ def run_config(arguments: Arguments) -> RunConfig:
         name=arguments.algorithm,
         algorithm=algorithm,
         held_out=arguments.held_out,
+        schedule=arguments.schedule,
+        spread=arguments.spread,
     )
     if arguments.seeds is not None:
         config = replace(config, seeds=arguments.seeds)
@@ -213,6 +222,8 @@ def command_line(
 ) -> None:
     """Run ``main`` with the arguments of the command line; an expected error becomes one line.
 
+    An error of somebody else's code, such as a module named with ``--import``, keeps its traceback.
+
     Args:
         main: Called with the arguments.
         description: For ``--help``.
@@ -224,7 +235,23 @@ def command_line(
         kind: Any = Annotated[arguments, tyro.conf.OmitArgPrefixes]
         main(tyro.cli(kind, prog=program, description=description, args=options))
     except (ValueError, OSError, RuntimeError) as error:
+        if _is_of_others(error):
+            raise
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:
         again = ": the same command with --resume continues"
         sys.exit("interrupted" + again * hasattr(arguments, "resume"))
+
+
+def _is_of_others(error: BaseException) -> bool:
+    """Return whether code raised an error, or called the library that did, which is not ours."""
+    paths = [Path(frame.filename) for frame in traceback.extract_tb(error.__traceback__)]
+    libraries = [Path(sysconfig.get_path(name)) for name in ("stdlib", "purelib", "platlib")]
+    package = Path(__file__).parents[1]
+    ours = [package, package.parent / "suites", package.parent / "benchmarks"]
+    for path in reversed(paths):
+        if any(path.is_relative_to(folder) for folder in ours):
+            return False
+        if path.exists() and not any(path.is_relative_to(folder) for folder in libraries):
+            return True
+    return False

@@ -60,6 +60,7 @@ def evaluator_of(
         episodes=episodes,
         bank=run.bank.held_out(config.held_out),
         encoders=run.encoders,
+        spread=config.spread,
         make_env=make_env,
     )
 
@@ -97,6 +98,7 @@ def play(
     seed: int,
     make_actor: Callable[[Environment, int], Actor],
     max_steps: int,
+    spread: float = 1.0,
 ) -> list[Episode]:
     """Play an episode from each start with a scripted policy.
 
@@ -106,6 +108,7 @@ def play(
         seed: Seed of the run whose starts they are.
         make_actor: Called at each start with the environment and the start's seed.
         max_steps: Longest episode.
+        spread: Share of the whole range of start states.
     """
     physics, episodes = nico.Physics.from_xml_string(nico.scene_xml()), []
     for task, of_task in zip(tasks, starts.tolist(), strict=True):
@@ -113,6 +116,7 @@ def play(
             env = nico.load(
                 task,
                 seed=start_seed,
+                spread=spread,
                 observation="state",
                 time_limit=float("inf"),
                 physics=physics,

@@ -18,15 +18,13 @@ import numpy as np
 from dm_env import TimeStep
 from numpy.typing import NDArray
 
-from bgpo_trl.analysis.intervals import t_interval
+from bgpo_trl.analysis import statistics
 from bgpo_trl.envs import NicoEnv
 from bgpo_trl.evaluation import start_seeds
 from bgpo_trl.experiments.episodes import evaluator_of, play, random_actions, snapshots_of
 from bgpo_trl.policy import LoadedRun
 from suites import nico
-from suites.nico import kinematics
-from suites.nico.base import ARC_ANGLES, ARC_RADIUS
-from suites.nico.physics import OBJECT_HALF_HEIGHT, OBJECTS, TABLE_HEIGHT
+from suites.nico.physics import OBJECTS
 
 Hidden = Literal["places", "objects"]
 
@@ -53,16 +51,6 @@ class Row(NamedTuple):
     success: float
 
 
-def nominal_places() -> NDArray[np.float64]:
-    """Return the nominal place of each of `OBJECTS`, that of its center (m), ``[3, 3]``."""
-    return np.array(
-        [
-            [*kinematics.polar(ARC_RADIUS, angle), TABLE_HEIGHT + OBJECT_HALF_HEIGHT[name]]
-            for name, angle in zip(OBJECTS, ARC_ANGLES, strict=True)
-        ]
-    )
-
-
 class HidingEnv(NicoEnv):
     """`NicoEnv` whose observations hide where the objects are; the simulation is the same.
 
@@ -84,7 +72,7 @@ class HidingEnv(NicoEnv):
         self._shown = nico.Physics.from_xml_string(nico.scene_xml())
         joints = [self._shown.model.joint(name).qposadr[0] for name in OBJECTS]
         self._poses = np.add.outer(joints, np.arange(7))
-        self._nominal = np.hstack([nominal_places(), [[1.0, 0.0, 0.0, 0.0]] * len(OBJECTS)])
+        self._nominal = np.hstack([nico.nominal_places(), [[1.0, 0.0, 0.0, 0.0]] * len(OBJECTS)])
         self._starts = np.tile(self._nominal, (self.batch_size.numel(), 1, 1))
 
     def _record(self, row: int, timestep: TimeStep) -> None:
@@ -159,7 +147,7 @@ def _by_chance(run: LoadedRun, seed: int, episodes: int) -> NDArray[np.float64]:
     """Return the success of random actions from a seed's starts, ``[T]``."""
     tasks, max_steps = run.config.tasks, run.config.algorithm.max_steps
     starts = start_seeds(seed, _NUMBER, (len(tasks), episodes))
-    played = play(tasks, starts, seed, random_actions, max_steps)
+    played = play(tasks, starts, seed, random_actions, max_steps, run.config.spread)
     return np.reshape([episode.success for episode in played], starts.shape).mean(-1)
 
 
@@ -181,14 +169,6 @@ def looking_table(rows: Iterable[Row]) -> list[list[str]]:
     tasks, found = success_by_condition(rows)
     table = [["success, %", *found]]
     for column, task in enumerate(tasks):
-        table.append([task, *(_cell(success[:, column]) for success in found.values())])
-    table.append(["all", *(_cell(success.mean(1)) for success in found.values())])
+        table.append([task, *(statistics.mean(s[:, column]).percent() for s in found.values())])
+    table.append(["all", *(statistics.mean(s.mean(1)).percent() for s in found.values())])
     return table
-
-
-def _cell(of_seeds: NDArray) -> str:
-    mean = f"{100 * of_seeds.mean():.1f}"
-    if len(of_seeds) < 2:
-        return mean
-    low, high = np.clip(t_interval(of_seeds), 0.0, 1.0)
-    return f"{mean} [{100 * low:.0f}, {100 * high:.0f}]"

@@ -52,7 +52,10 @@ def measure(
         writer.writerow(FINAL_COLUMNS)
         writer.writerows(rows)
     random_success = evaluate_random_policy(
-        tasks=config.tasks, episodes=100, max_steps=config.algorithm.max_steps
+        tasks=config.tasks,
+        episodes=100,
+        spread=config.spread,
+        max_steps=config.algorithm.max_steps,
     )
     summary = {
         "command": shlex.join(["python", *sys.argv]),
@@ -85,6 +88,7 @@ def _final_tests(trainer: Trainer, bank: DemonstrationBank, *, episodes: int) ->
             episodes=episodes,
             bank=tested,
             encoders=trainer.encoders,
+            spread=config.spread,
         )
         snapshots = [
             evaluator.snapshot(algorithm, index, _LAST, episode=config.episodes)
@@ -166,6 +170,7 @@ def record_episodes(trainer: Trainer, bank: DemonstrationBank) -> dict[str, np.n
         episodes=1,
         bank=bank.held_out(config.held_out),
         encoders=trainer.encoders,
+        spread=config.spread,
     )
     algorithm, seeds = trainer.algorithm, range(len(config.seeds))
     snapshots = [evaluator.snapshot(algorithm, i, _LAST, episode=config.episodes) for i in seeds]

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import shlex
 import sys
-from collections import Counter
 from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
 
+import pandas as pd
+
 from bgpo_trl.files.folders import make_folder
 from bgpo_trl.files.whole_file import write_json, write_whole
 from bgpo_trl.runs.cost import read_costs, total_cost, write_costs
-from bgpo_trl.runs.results import read_json, read_rows
+from bgpo_trl.runs.results import read_json, read_table
 
 
 def merge(blocks: Sequence[Path], directory: Path) -> None:
@@ -23,7 +22,7 @@ def merge(blocks: Sequence[Path], directory: Path) -> None:
     Rows are sorted by seed and episode. Losses remain means over the seeds of a block; costs are
     sums over blocks, left out if a block has none. Files about the first seed alone (``gwr.csv``
     and figures) are copied from the first block, except ``success.png`` and ``groups.png``, which
-    ``summary.py`` draws.
+    ``report.py`` draws.
 
     Args:
         blocks: Run directories that differ only in their seeds.
@@ -39,27 +38,24 @@ def merge(blocks: Sequence[Path], directory: Path) -> None:
     summaries = [read_json(block / "summary.json") for block in blocks]
     seeds = [seed for config in configs for seed in config["seeds"]]
     tables = {
-        name: sorted(
-            (row for block in blocks for row in read_rows(block / name)),
-            key=lambda row: (int(row["seed"]), int(row.get("episode", 0))),
+        name: _merged([read_table(block / name) for block in blocks], by)
+        for name, by in (
+            ("train.csv", ["seed", "episode"]),
+            ("eval.csv", ["seed", "episode"]),
+            ("final.csv", ["seed"]),
         )
-        for name in ("train.csv", "eval.csv", "final.csv")
     }
-    played = Counter((int(row["seed"]), int(row["episode"])) for row in tables["train.csv"])
+    played = pd.MultiIndex.from_frame(tables["train.csv"][["seed", "episode"]].astype(int))
     episodes = range(1, configs[0]["episodes"] + 1)
-    if played != Counter((seed, episode) for seed in seeds for episode in episodes):
+    if not played.equals(pd.MultiIndex.from_product([sorted(seeds), episodes])):
         raise ValueError(
             f"{directory}: its blocks do not have each episode of each seed once; remove the "
             "blocks that were changed, and run them again"
         )
 
     make_folder(directory)
-    for name, rows in tables.items():
-        text = io.StringIO()
-        writer = csv.DictWriter(text, rows[0], lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-        write_whole(directory / name, text.getvalue())
+    for name, table in tables.items():
+        write_whole(directory / name, table.to_csv(index=False, lineterminator="\n"))
     if all((block / "cost.csv").exists() for block in blocks):
         costs = [read_costs(block / "cost.csv") for block in blocks]
         write_costs(directory / "cost.csv", total_cost(costs))
@@ -77,3 +73,9 @@ def merge(blocks: Sequence[Path], directory: Path) -> None:
         summary[key] = None if None in of_blocks else list(chain.from_iterable(of_blocks))
     write_json(directory / "summary.json", summary)
     write_json(directory / "config.json", {**configs[0], "seeds": seeds})
+
+
+def _merged(tables: Sequence[pd.DataFrame], by: list[str]) -> pd.DataFrame:
+    """Return the rows of tables of text, sorted by columns of whole numbers."""
+    rows = pd.concat(tables, ignore_index=True)
+    return rows.loc[rows[by].astype(int).sort_values(by, kind="stable").index]

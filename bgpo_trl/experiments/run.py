@@ -97,7 +97,7 @@ def run_experiment(
                 trainer.logger.log_media(f"figures/{path.stem}", path)
             # Written last, as the mark of a complete run.
             write_json(out / "summary.json", summary)
-    lines.append(f"curve and figures: {out}; in numbers: python benchmarks/summary.py {out}")
+    lines.append(f"curve and figures: {out}; in numbers: python benchmarks/report.py {out}")
     return "\n".join(lines)
 
 
@@ -139,6 +139,7 @@ def _encoders(
         command=shlex.join(["python", *sys.argv]),
         device=device,
         tasks=tasks,
+        spread=arguments.spread,
         **({} if stage is None else vars(stage)),
     )
     return encoders, bank.for_tasks(tasks)

@@ -70,11 +70,17 @@ class Episode:
         return f"{'success' if self.success else 'no success'} after {len(self.seen) - 1} steps"
 
 
-def demonstrate(tasks: Sequence[str], seed: int) -> dict[str, NDArray]:
+def demonstrate(tasks: Sequence[str], seed: int, spread: float = 1.0) -> dict[str, NDArray]:
     """Return a new demonstration of each task, uint8 ``[T, 32, 64, 3]``."""
     with tempfile.TemporaryDirectory() as folder:
         recorded = record_demonstrations(
-            folder, tasks=tasks, per_task=1, held_out_per_task=0, seed=seed, progress=False
+            folder,
+            tasks=tasks,
+            per_task=1,
+            held_out_per_task=0,
+            spread=spread,
+            seed=seed,
+            progress=False,
         ).to_tensordict()
     pixels, length = recorded.get("pixels").numpy(), recorded.get("length").tolist()
     return {task: pixels[row, : length[row]] for row, task in enumerate(tasks)}
@@ -83,7 +89,7 @@ def demonstrate(tasks: Sequence[str], seed: int) -> dict[str, NDArray]:
 def play(policy: TrainedPolicy, task: str, demonstration: NDArray, seed: int) -> Episode:
     """Show the policy a demonstration, and return its episode from the start with that seed."""
     policy.condition(demonstration, task=task)
-    env = nico.load(task, seed=seed)
+    env = nico.load(task, seed=seed, spread=policy.config.spread)
     renderer = FrameRenderer(env.physics.model.ptr, "room", height=480, width=640)
 
     def look() -> NDArray:
@@ -157,7 +163,7 @@ def watch(arguments: WatchArguments) -> str:
     run, out = arguments.run, arguments.out or arguments.run / "figures"
     import_own(arguments.module)
     policy = load_run(run, seed=arguments.run_seed)
-    shown = demonstrate(policy.tasks, arguments.scene_seed)
+    shown = demonstrate(policy.tasks, arguments.scene_seed, policy.config.spread)
     episodes = [play(policy, task, frames, arguments.scene_seed) for task, frames in shown.items()]
     out.mkdir(parents=True, exist_ok=True)
     save_gif(compose(episodes), out / "nico.gif", fps=_FPS, scale=1)
@@ -168,4 +174,5 @@ def watch(arguments: WatchArguments) -> str:
     save_figure(plot_frame_strips(strips), out / "nico.png")
     draw_growth(run, policy.config, policy.bank, out)
     outcomes = [f"{episode.task}: {episode.outcome}" for episode in episodes]
-    return "\n".join([*outcomes, f"pictures: {out}"])
+    learned = f"seed {policy.seed} after {policy.episodes:,} training episodes"
+    return "\n".join([learned, *outcomes, f"pictures: {out}"])

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 from numpy.typing import ArrayLike
 
-from bgpo_trl.analysis.intervals import t_interval
+from bgpo_trl.analysis import statistics
 from bgpo_trl.figures.style import COLORS, add_legend, readable, style_axes
 
 _WIDTH = 0.8  # of the bars of a task, whose centers are 1 apart
@@ -42,7 +42,7 @@ def plot_success_bars(success: Mapping[str, ArrayLike], tasks: Sequence[str]) ->
         color = COLORS[number % len(COLORS)]
         axes.bar(places, mean, slim * 0.9, color=color, alpha=0.75, label=name)
         if len(scores) > 1:
-            low, high = np.clip(np.transpose([t_interval(s) for s in scores.T]), 0.0, 1.0)
+            low, high = np.clip(np.transpose([statistics.mean(s)[1:] for s in scores.T]), 0.0, 1.0)
             axes.errorbar(
                 places, mean, [mean - low, high - mean], fmt="none", ecolor="0.2", elinewidth=0.9
             )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections import defaultdict
 from collections.abc import Mapping
 
 import numpy as np
@@ -13,7 +12,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from bgpo_trl.figures.style import COLORS, LINES, add_legend, mark_starts, style_axes
-from bgpo_trl.runs.results import count, read_rows
+from bgpo_trl.runs.results import COUNT, read_table
 
 _PANELS = {"num_nodes": "Nodes of GWR-B", "num_groups": "Groups of behaviors"}
 
@@ -33,15 +32,14 @@ def read_counts(
     Raises:
         ValueError: If the file is missing or damaged.
     """
-    columns = dict.fromkeys(("seed", "episode", *_PANELS), count)
-    seeds = defaultdict[int, list[tuple[int, ...]]](list)
-    for row in read_rows(path, columns):
-        seeds[int(row["seed"])].append(tuple(int(row[name]) for name in ("episode", *_PANELS)))
-    n_episodes = min([len(rows) for rows in seeds.values()], default=0)
-    n_episodes = n_episodes if last is None else min(n_episodes, last)
-    counts = np.array([sorted(seeds[seed])[:n_episodes] for seed in sorted(seeds)], np.int64)
-    counts = counts.reshape(len(seeds), n_episodes, 1 + len(_PANELS))
-    return {name: counts[..., column] for column, name in enumerate(_PANELS, 1)}
+    table = read_table(path, dict.fromkeys(("seed", "episode", *_PANELS), COUNT))
+    if last is not None:
+        table = table[table["episode"] <= last]
+    counts = {}
+    for name in _PANELS:
+        of_seeds = table.pivot(index="seed", columns="episode", values=name).dropna(axis="columns")
+        counts[name] = of_seeds.to_numpy(np.int64)
+    return counts
 
 
 def plot_counts(

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 import os
-from collections import defaultdict
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
@@ -22,8 +22,6 @@ _GRID_POINTS = 400
 _OVERALL = "All presented tasks"
 
 _Path = str | os.PathLike[str]
-_Tests = dict[str, dict[int, list[tuple[int, str, float]]]]
-"""Training episode, task and success of each test episode, by legend name and seed."""
 
 
 def plot_success_curves(
@@ -56,18 +54,24 @@ def plot_success_curves(
     """
     presented, random_success = presented or {}, random_success or {}
     tests = _read_tests([eval_csv] if isinstance(eval_csv, str | os.PathLike) else eval_csv)
-    rows = [row for seeds in tests.values() for rows in seeds.values() for row in rows]
-    tasks = [*presented, *sorted({task for _, task, _ in rows} - set(presented))]
-    last = max(episode for episode, _, _ in rows) if last is None else last
+    tasks = [*presented, *sorted(set(tests["task"]) - set(presented))]
+    last = int(tests["episode"].max()) if last is None else last
     window = max(1, round(last / 20)) if window is None else window
     if window < 1:
         raise ValueError(f"window must be at least 1 episode, not {window}.")
 
+    seeds_of = {
+        str(name): of_run.unique() for name, of_run in tests.groupby("name", sort=False)["seed"]
+    }
     figure, panels = _make_panels(len(tasks))
-    grid = _grid({episode for episode, _, _ in rows}, last)
+    grid = _grid(tests["episode"].unique(), last)
     for panel, task in zip(panels.flat, [None, *tasks], strict=False):
-        for index, (name, seeds) in enumerate(tests.items()):
-            curves = [_trailing_mean(of_seed, task, grid, window) for of_seed in seeds.values()]
+        of_panel = tests if task is None else tests[tests["task"] == task]
+        for index, (name, seeds) in enumerate(seeds_of.items()):
+            of_run = of_panel[of_panel["name"] == name]
+            curves = [
+                _trailing_mean(of_run[of_run["seed"] == seed], grid, window) for seed in seeds
+            ]
             _draw_curve(panel, grid, np.array(curves), name, index)
         starts = {name: episode for name, episode in presented.items() if task in (None, name)}
         mark_starts(panel, starts, tasks, last)
@@ -80,17 +84,15 @@ def plot_success_curves(
     return figure
 
 
-def _read_tests(paths: Sequence[_Path] | Mapping[str, _Path]) -> _Tests:
-    """Return the test episodes in files, by algorithm or by the names of the files."""
-    tests: _Tests = defaultdict(lambda: defaultdict(list))
-    named = paths.items() if isinstance(paths, Mapping) else [(None, path) for path in paths]
-    for name, path in named:
-        for row in read_tests(path):
-            test = (int(row["episode"]), row["task"], float(row["success"]))
-            tests[name or row["algorithm"]][int(row["seed"])].append(test)
-    if not tests:
+def _read_tests(paths: Sequence[_Path] | Mapping[str, _Path]) -> pd.DataFrame:
+    """Return the test episodes in files; ``name`` is that of the file or of the algorithm."""
+    if not paths:
         raise ValueError("there are no test episodes to plot: let the run evaluate first.")
-    return tests
+    if isinstance(paths, Mapping):
+        tables = [read_tests(path).assign(name=name) for name, path in paths.items()]
+    else:
+        tables = [table.assign(name=table["algorithm"]) for table in map(read_tests, paths)]
+    return pd.concat(tables, ignore_index=True)
 
 
 def _make_panels(n_tasks: int) -> tuple[Figure, NDArray]:
@@ -131,21 +133,19 @@ def _add_labels(figure: Figure, window: int, *, chance: bool) -> None:
     add_legend(figure, handles, labels, figure.get_figwidth())
 
 
-def _grid(tested: Set[int], last: int) -> NDArray:
+def _grid(tested: NDArray, last: int) -> NDArray:
     """Return the episodes at which curves are drawn: those with tests, or fewer."""
-    grid = np.array(sorted(episode for episode in tested if episode <= last))
+    grid = np.sort(tested[tested <= last])
     if len(grid) > _GRID_POINTS:
         grid = np.unique(np.linspace(0, last, _GRID_POINTS).round().astype(int))
     return grid
 
 
-def _trailing_mean(
-    rows: list[tuple[int, str, float]], task: str | None, grid: NDArray, window: int
-) -> NDArray:
+def _trailing_mean(tests: pd.DataFrame, grid: NDArray, window: int) -> NDArray:
     """Return a seed's success rate at each grid point; NaN without test episodes in the window."""
-    chosen = sorted((episode, success) for episode, name, success in rows if task in (None, name))
-    episodes = np.array([episode for episode, _ in chosen])
-    successes = np.cumsum([0.0, *(success for _, success in chosen)])
+    tests = tests.sort_values("episode")
+    episodes = tests["episode"].to_numpy()
+    successes = np.cumsum([0.0, *tests["success"]])
     stop = np.searchsorted(episodes, grid, side="right")
     start = np.searchsorted(episodes, grid - window, side="right")
     count = stop - start

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import math
 import os
-from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import MaxNLocator, MultipleLocator
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from bgpo_trl.figures.style import add_legend, mark_starts, style_axes, task_markers
-from bgpo_trl.runs.results import count, read_rows
+from bgpo_trl.runs.results import COUNT, Cells, read_table
 
 
 @dataclass(frozen=True)
@@ -27,13 +26,18 @@ class GroupedEpisodes:
         episode: Training episode, ``[E]``.
         task: Position of its task in the task names, ``[E]``.
         group: Group that acted, ``[E]``.
-        num_groups: Number of groups after the episode, ``[E]``.
+        num_groups: Number of groups after the episode, ``[E]``; groups may have merged before.
     """
 
     episode: NDArray[np.int64]
     task: NDArray[np.int64]
     group: NDArray[np.int64]
     num_groups: NDArray[np.int64]
+
+    @property
+    def numbers(self) -> list[int]:
+        """Numbers of the groups that have acted, ascending."""
+        return np.unique(self.group).tolist()
 
     @property
     def purity(self) -> float:
@@ -51,21 +55,23 @@ def read_groups(
     Raises:
         ValueError: If the file is missing or damaged, or its run has no groups.
     """
-    columns: dict[str, Callable[[str], object]] = {"task": task_names.index}
-    columns |= dict.fromkeys(("seed", "episode", "group", "num_groups"), count)
-    rows: dict[int, list[tuple[int, int, int, int]]] = defaultdict(list)
-    for row in read_rows(path, columns):
-        episode, group, num_groups = (int(row[name]) for name in ("episode", "group", "num_groups"))
-        rows[int(row["seed"])].append((episode, task_names.index(row["task"]), group, num_groups))
-    return {seed: GroupedEpisodes(*np.array(sorted(rows[seed])).T) for seed in sorted(rows)}
+    columns: dict[str, Cells] = {"task": task_names}
+    columns |= dict.fromkeys(("seed", "episode", "group", "num_groups"), COUNT)
+    table = read_table(path, columns).sort_values(["seed", "episode"])
+    table["task"] = table["task"].map(list(task_names).index)
+    shown = ["episode", "task", "group", "num_groups"]
+    return {
+        int(seed): GroupedEpisodes(*table.loc[table["seed"] == seed, shown].to_numpy(np.int64).T)
+        for seed in table["seed"].unique()
+    }
 
 
 def plot_groups(seeds: Mapping[int, GroupedEpisodes], presented: Mapping[str, int]) -> Figure:
     """Plot the number of groups over training and, for each seed, the episodes of each group.
 
-    Each group has a row, shaded from the episode in which it appeared, with a mark for each of its
-    episodes in the color of the task. Marks of rarer tasks are drawn on top; the panel titles give
-    the purity.
+    Each group that has acted has a row, shaded from its first to its last episode, with a mark for
+    each of its episodes in the color of the task. Marks of rarer tasks are drawn on top; the panel
+    titles give the purity.
 
     Args:
         seeds: Training episodes by seed, from `read_groups`.
@@ -78,7 +84,7 @@ def plot_groups(seeds: Mapping[int, GroupedEpisodes], presented: Mapping[str, in
         raise ValueError("there is no training episode to show: let the run train first.")
     tasks = list(presented)
     last = max(int(run.episode[-1]) for run in seeds.values())
-    heights = [int(run.num_groups.max()) for run in seeds.values()]
+    heights = [len(run.numbers) for run in seeds.values()]
     # Inches; rows get thinner so that all of them fit on a page.
     row = min(0.17, 7.0 / sum(heights))
     width = 7.0
@@ -116,19 +122,20 @@ def _draw_counts(axes: Axes, runs: Sequence[GroupedEpisodes]) -> None:
 
 
 def _draw_rows(axes: Axes, run: GroupedEpisodes, n_tasks: int, last: int, width: float) -> None:
-    n_groups = int(run.num_groups.max())
+    numbers = run.numbers
     colors = [color for _, _, color, _ in task_markers([""] * n_tasks)]
     # Points; the width of one episode on the axis, at least 0.4 to stay visible.
     line = max(0.4, 0.85 * 72 * width / last)
-    for group in range(n_groups):
-        known = run.episode[run.num_groups > group]
-        axes.barh(group, last - known[0], 0.8, known[0], color="0.94", zorder=0)
+    for row, group in enumerate(numbers):
+        played = run.episode[run.group == group]
+        axes.barh(row, played[-1] - played[0], 0.8, played[0], color="0.94", zorder=0)
         episodes = [run.episode[(run.group == group) & (run.task == t)] for t in range(n_tasks)]
         for task in sorted(range(n_tasks), key=lambda task: -len(episodes[task])):
-            marks = axes.vlines(episodes[task], group - 0.4, group + 0.4, colors[task], lw=line)
+            marks = axes.vlines(episodes[task], row - 0.4, row + 0.4, colors[task], lw=line)
             marks.set_snap(False)  # Snapping to pixels would leave gaps between neighbors.
-    axes.set(ylim=(n_groups - 0.4, -0.6))
-    axes.yaxis.set_major_locator(MultipleLocator(math.ceil(n_groups / 10)))
+    axes.set(ylim=(len(numbers) - 0.4, -0.6))
+    each = math.ceil(len(numbers) / 10)
+    axes.set_yticks(range(0, len(numbers), each), [str(group) for group in numbers[::each]])
     axes.tick_params(axis="y", length=0)
     axes.spines["left"].set_visible(False)
     axes.set_ylabel("Group", fontsize=8)

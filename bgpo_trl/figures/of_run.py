@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -19,7 +18,7 @@ from bgpo_trl.figures.growth import plot_gwr_growth
 from bgpo_trl.figures.nodes import plot_gwr_pca
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.runs.gwr_graphs import load_graphs
-from bgpo_trl.runs.results import count, read_rows
+from bgpo_trl.runs.results import COUNT, read_table
 from bgpo_trl.transforms import TaskSchedule
 
 
@@ -43,9 +42,9 @@ def draw_growth(
         presented = TaskSchedule(config.task_starts).presented(torch.tensor(episode))
         tasks = majority_task(match_counts(gwr, bank.seen(), n_tasks) * presented)
         graphs[episode] = (gwr.graph().weights, gwr.graph().edges, tasks)
-    path, nodes = run / "train.csv", defaultdict[int, list[int]](list)
-    for row in read_rows(path, {"seed": count, "num_nodes": count}):
-        nodes[int(row["seed"])].append(int(row["num_nodes"]))
+    path = run / "train.csv"
+    table = read_table(path, {"seed": COUNT, "num_nodes": COUNT})
+    nodes = {seed: of_seed.tolist() for seed, of_seed in table.groupby("seed")["num_nodes"]}
     if nodes.keys() != set(config.seeds):
         raise ValueError(f"{path} does not have the seeds of the run: resume it, or name another")
     figure = plot_gwr_growth(graphs, [nodes[seed] for seed in config.seeds], config.tasks)

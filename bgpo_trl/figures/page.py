@@ -42,12 +42,7 @@ def write_page(
     runs: Mapping[str, tuple[Path, dict[str, Any], dict[str, Any]]],
 ) -> None:
     """Write the page, given directory, settings and summary of each run by name."""
-    parts = ["<h1>bgpo_trl: experiments</h1>"]
-    parts.append(
-        "<p>Curves: mean over seeds, shaded by one standard deviation. Brackets: 95 % stratified "
-        "bootstrap intervals over seeds and tasks, of the interquartile mean (IQM) unless a note "
-        "says otherwise.</p>"
-    )
+    parts = ["<h1>bgpo_trl: report</h1>"]
     for section in sections:
         parts.append(f"<h2>{escape(section.title)}</h2>")
         parts += [f'<p class="note">{escape(note)}</p>' for note in section.notes]

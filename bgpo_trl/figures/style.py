@@ -32,14 +32,14 @@ LINES = ("-", "--", "-.", (0, (3, 1, 1, 1, 1, 1)), (0, (1, 1)), (0, (6, 2)))
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 """Markers that accompany them."""
 DPI = 300
-"""Resolution of saved figures."""
+"""Resolution of saved figures, for print."""
 
 
-def save_figure(figure: Figure, path: str | os.PathLike[str]) -> None:
-    """Save a figure as PNG at `DPI`; the same figure always gives the same bytes."""
+def save_figure(figure: Figure, path: str | os.PathLike[str], dpi: int = DPI) -> None:
+    """Save a figure as PNG; the same figure always gives the same bytes."""
     path = Path(path)
     make_folder(path.parent)
-    figure.savefig(path, format="png", dpi=DPI, metadata={"Software": None})
+    figure.savefig(path, format="png", dpi=dpi, metadata={"Software": None})
 
 
 def style_axes(axes: Axes) -> None:

@@ -42,7 +42,9 @@ def plot_success_matrices(matrices: Mapping[str, ArrayLike], tasks: Sequence[str
     n_columns = min(_COLUMNS, len(found))
     n_rows = math.ceil(len(found) / n_columns)
     side = 0.31 * n_tasks  # inches
-    figure = Figure(figsize=(side * n_columns + 2.9, (side + 0.45) * n_rows + 0.5))
+    # Titles of panels of few tasks are longer than these; a letter is about 0.08 wide.
+    width = max(side, 0.08 * max(map(len, found)))
+    figure = Figure(figsize=(width * n_columns + 2.9, (side + 0.45) * n_rows + 0.5))
     figure.set_layout_engine("constrained", w_pad=0.08, h_pad=0.08)
     panels = figure.subplots(n_rows, n_columns, squeeze=False).flat
     for number, (title, matrix) in enumerate(found.items()):

@@ -81,18 +81,25 @@ def load_checkpoint(
     *,
     map_location: str | torch.device = "cpu",
     mmap: bool = False,
+    newest: bool = False,
 ) -> dict[str, Any]:
     """Read the newest intact checkpoint; warn about each newer one that is damaged.
 
-    With ``mmap``, tensors are mapped from the file lazily, for reading only some of them.
+    With ``mmap``, tensors are mapped from the file lazily, for reading only some of them. With
+    ``newest``, only the newest one is read, for what is to be used as it is, not resumed.
 
     Raises:
-        ValueError: If there is no intact checkpoint.
+        ValueError: If there is no intact checkpoint, or, with ``newest``, it is not the newest.
     """
     directory = Path(directory)
     for path in _checkpoints(directory):
         if _is_intact(path):
             return torch.load(path, map_location=map_location, weights_only=True, mmap=mmap)
+        if newest:
+            raise ValueError(
+                f"{path} is damaged, and older checkpoints have learned less: resume the run, "
+                "which goes on from the one before"
+            )
         warnings.warn(f"{path} is damaged: resuming from the checkpoint before it.", stacklevel=2)
     raise ValueError(
         f"{directory} holds no intact checkpoint to resume from: start a new run in another "

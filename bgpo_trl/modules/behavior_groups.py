@@ -1,70 +1,84 @@
-"""Groups of behaviors, found without labels by a second, coarser GWR-B over the same embeddings."""
+"""Groups of behaviors, found without labels as clusters of the demonstrations shown so far."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 from tensordict import TensorClass
 from torch import Tensor, nn
 
 from bgpo_trl.errors import as_shape
-from bgpo_trl.modules.gwr import GWRB
-from bgpo_trl.modules.gwr_topology import read_state
+from bgpo_trl.modules.density_clusters import density_clusters
+from bgpo_trl.modules.gwr_tensors import as_mask
 
-_NEVER = 2**62  # an age that no edge reaches
+_KNOWN_SHARE = 0.99  # of a group's own demonstrations that are to count as known
+_ARRAYS = ("points", "shown", "group", "member", "cluster")
 
 
 class GroupMatch(TensorClass["tensor_only"]):
     """Group of each input.
 
     Attributes:
-        group: Number of the group within its network, int64 ``[*batch]``. Groups count up from 0 in
-            order of appearance and are never removed or renumbered.
-        activity: Activity of the best-matching node in [0, 1], ``[*batch]``; 0 in an empty network.
-            Below the activity threshold, the input belongs to no known group.
+        group: Number of the group within its network, int64 ``[*batch]``. Numbers count up from 0
+            in order of appearance and are never used again.
+        novelty: Distance to the group's demonstrations relative to the group's own extent,
+            float32 ``[*batch]``: above 1, the input lies farther out than 99 % of them and belongs
+            to no known group. Infinite as long as there are too few demonstrations for a group.
     """
 
     group: Tensor
-    activity: Tensor
+    novelty: Tensor
+
+    @property
+    def known(self) -> Tensor:
+        """Whether inputs belong to a known group, bool ``[*batch]``."""
+        return self.novelty <= 1.0
 
 
 class BehaviorGroups(nn.Module):
     """Groups of similar behaviors, for one network or a batch of independent ones.
 
-    A GWR-B with a low activity threshold inserts few nodes, each far from all earlier ones. Every
-    node belongs to a group:
+    A group is a cluster of the different demonstrations shown so far, separated from the others by
+    a valley of significantly lower density (`density_clusters`). No distance is given: the same
+    inputs at another scale form the same groups.
 
-    1. A node inserted for a new input (activity below the threshold) opens a group, whose parent is
-       the group of its best match. The node starts half-way between the two and moves towards the
-       inputs that it matches.
-    2. Any other node, such as the second of two similar first inputs, joins the group of its best
-       match.
-
-    Edges do not expire, so groups are kept however long their tasks are absent. The network starts
-    empty; until the first input, `lookup` returns group 0.
+    1. A demonstration that is shown again adds nothing. With every ``smallest`` new ones (beyond
+       ``100 * smallest``: with every hundredth part more), all are clustered anew; until the first
+       time, all are of group 0.
+    2. An input belongs to the group of the nearest clustered demonstration. Its novelty is the
+       distance to the group's ``k``-th nearest, ``k = smallest // 2``, divided by the 99 % quantile
+       of this distance among the group's own demonstrations.
+    3. Groups keep their number when they are clustered anew. Clusters and groups are matched in the
+       order of the number of times that the demonstrations they have in common were shown. So, of a
+       group that splits, the larger part keeps the number; of groups that merge, the result has
+       that of the group played most. A cluster that is left over becomes a new group, whose parent
+       is the group with which it has most in common.
+    4. Groups that turn out to be one behavior can be joined (`join`), and stay so: the clusters of
+       their densest demonstrations are one group from then on.
 
     Args:
         n_features: Size d of an input.
         batch_size: Shape of the batch (the seeds), or its length; ``()`` is a single set of groups.
-        activity_threshold: a_T of the coarse GWR-B, below which an input is new.
-        habituation_threshold: h_T, below which a best-matching node allows an insertion. With the
-            0.15 of the fine network, tasks that appear together get mixed before any node splits.
-        activity_scale: Factor of distances, as in `GWRB`. The defaults fit the embeddings of the
-            shipped encoders of three tasks.
-        max_groups: Largest number of groups. Once it is reached, a new node joins the group of its
-            best match. None: no limit.
+        smallest: Least number of different demonstrations of a group.
+        evidence: Standard errors by which a valley must be deeper than chance.
 
     Raises:
-        ValueError: If ``max_groups`` is below 1, or an argument of `GWRB` is out of range.
+        ValueError: If ``smallest`` is below 4 or ``evidence`` is not positive.
 
     Example:
-        >>> groups = BehaviorGroups(1, activity_threshold=0.5, activity_scale=1.0)
-        >>> for x in [0.0, 0.1] * 6 + [3.0] * 2:
-        ...     match = groups.adapt(torch.tensor([x]))
-        >>> groups.num_groups, groups.lookup(torch.tensor([[0.2], [2.9]])).group
-        (tensor(2), tensor([0, 1]))
+        >>> groups = BehaviorGroups(3)
+        >>> inputs = torch.randn(60, 3, generator=torch.Generator().manual_seed(0))
+        >>> inputs[1::2] += 10
+        >>> for x in inputs:
+        ...     match = groups.adapt(x)
+        >>> groups.num_groups, groups.lookup(torch.tensor([[0.0] * 3, [10.0] * 3, [5.0] * 3])).known
+        (tensor(2), tensor([ True,  True, False]))
     """
 
     def __init__(
@@ -72,135 +86,294 @@ class BehaviorGroups(nn.Module):
         n_features: int,
         *,
         batch_size: int | Sequence[int] = (),
-        activity_threshold: float = 0.525,
-        habituation_threshold: float = 0.5,
-        activity_scale: float = 0.25,
-        max_groups: int | None = None,
+        smallest: int = 10,
+        evidence: float = 3.0,
     ) -> None:
         super().__init__()
-        if max_groups is not None:
-            as_shape([max_groups], "max_groups")
-        self.gwr = GWRB(
-            n_features,
-            batch_size=batch_size,
-            activity_threshold=activity_threshold,
-            habituation_threshold=habituation_threshold,
-            activity_scale=activity_scale,
-            max_age=_NEVER,
-            init="data",
-        )
-        self.activity_threshold = activity_threshold
-        self.max_groups = max_groups
-        # By network: the group of each node, and the parent of each group.
-        n_networks = self.batch_size.numel()
-        self._group: list[list[int]] = [[] for _ in range(n_networks)]
-        self._parent: list[list[int]] = [[0] for _ in range(n_networks)]
-
-    @property
-    def batch_size(self) -> torch.Size:
-        """Shape of the batch of networks."""
-        return self.gwr.batch_size
+        (self.n_features,) = as_shape([n_features], "n_features")
+        self.batch_size = as_shape(batch_size, "batch_size")
+        if not (smallest >= 4 and smallest == int(smallest) and 0 < evidence < np.inf):
+            raise ValueError(
+                "smallest must be a whole number of at least 4 and evidence positive, got "
+                f"{smallest} and {evidence}"
+            )
+        self.smallest, self.evidence = int(smallest), float(evidence)
+        self._networks = [_Network.empty(self.n_features) for _ in range(self.batch_size.numel())]
 
     @property
     def num_groups(self) -> Tensor:
-        """Number of groups of each network, at least 1, int64 ``[*batch_size]``."""
-        counts = [len(parent) for parent in self._parent]
-        return torch.tensor(counts, device=self.gwr.num_nodes.device).view(self.batch_size)
+        """Number of groups of each network now, at least 1, int64 ``[*batch_size]``."""
+        return self._per_network([len(network.reach) or 1 for network in self._networks])
+
+    @property
+    def revision(self) -> Tensor:
+        """How often earlier demonstrations have changed their groups, int64 ``[*batch_size]``."""
+        return self._per_network([network.revision for network in self._networks])
+
+    def numbers(self, network: int) -> list[int]:
+        """Return the numbers of the groups of a network in the flattened batch, ascending."""
+        return sorted(self._networks[network].reach) or [0]
 
     def parent(self, network: int, group: int) -> int:
         """Return the parent of a group (0 for the first) of a network in the flattened batch."""
-        return self._parent[network][group]
+        return self._networks[network].parent[group]
+
+    def join(self, network: int, first: int, second: int) -> None:
+        """Join two groups of a network in the flattened batch, given their numbers.
+
+        Raises:
+            ValueError: If there is no such group, or both are the same.
+        """
+        missing = {first, second} - {*self.numbers(network)}
+        if missing or first == second:
+            raise ValueError(
+                f"groups to join must be two of {self.numbers(network)}, got {first} and {second}"
+            )
+        self._networks[network].join(first, second, self.smallest // 2)
 
     def forward(self, phi: Tensor) -> GroupMatch:
         """Call `lookup`."""
         return self.lookup(phi)
 
-    def lookup(self, phi: Tensor) -> GroupMatch:
+    def lookup(self, phi: Tensor, mask: Tensor | None = None) -> GroupMatch:
         """Return the groups ``[*batch_size, *extra]`` of inputs ``[*batch_size, *extra, d]``.
 
+        Args:
+            phi: Inputs.
+            mask: Networks that take part, bool ``[*batch_size]``; None: all. The others' groups are
+                -1, their novelties NaN.
+
         Raises:
-            ValueError: If phi has the wrong shape or holds NaN or Inf.
+            ValueError: If phi or mask has the wrong shape, or a phi that takes part holds NaN or
+                Inf.
         """
-        match = self.gwr.lookup(phi, mask=self.gwr.num_nodes > 0)
-        n_networks = self.batch_size.numel()
-        node = match.node.reshape(n_networks, -1)
-        group = torch.zeros_like(node)
-        for row, nodes, known in zip(group, node, self._group, strict=True):
-            if known:
-                row.copy_(torch.tensor(known, device=nodes.device)[nodes])
-        return GroupMatch(
-            group=group.view(match.node.shape),
-            activity=match.activity.nan_to_num(0.0),
-            batch_size=match.batch_size,
-        )
+        n_batch = len(self.batch_size)
+        if phi.shape[:n_batch] != self.batch_size or phi.ndim == n_batch:
+            raise ValueError(
+                f"phi must lead with {[*self.batch_size]}, one for each network, got {[*phi.shape]}"
+            )
+        inputs, active = self._checked(phi, mask)
+        inputs = inputs.reshape(len(active), -1, self.n_features)
+        group, novelty = np.full(inputs.shape[:2], -1), np.full(inputs.shape[:2], np.nan)
+        for i in np.flatnonzero(active):
+            group[i], novelty[i] = self._networks[i].lookup(inputs[i], self.smallest // 2)
+        return self._match(group, novelty, phi)
 
     def adapt(self, phi: Tensor, mask: Tensor | None = None) -> GroupMatch:
-        """Find the group of one input per network and learn from it; see `GWRB.adapt`.
+        """Find the group of one input per network and learn from it.
+
+        Args:
+            phi: Inputs ``[*batch_size, d]``.
+            mask: Networks that take part, bool ``[*batch_size]``; None: all.
 
         Returns:
             Matches ``[*batch_size]`` from before learning; -1 and NaN where ``mask`` is False.
+
+        Raises:
+            ValueError: If phi or mask has the wrong shape, or a phi that takes part holds NaN or
+                Inf.
         """
-        before = self.gwr.num_nodes
-        match = self.gwr.adapt(phi, mask)
-        grown = (self.gwr.num_nodes > before).flatten().tolist()
-        nodes, activity = match.node.flatten().tolist(), match.activity.flatten().tolist()
-        matched = []
-        for i, (node, grew) in enumerate(zip(nodes, grown, strict=True)):
-            of_node, parent = self._group[i], self._parent[i]
-            group = -1 if node < 0 else of_node[node] if of_node else 0
-            matched.append(group)
-            if not grew:
-                continue
-            full = self.max_groups is not None and len(parent) >= self.max_groups
-            if of_node and activity[i] < self.activity_threshold and not full:
-                of_node.append(len(parent))
-                parent.append(group)
-            else:
-                of_node.append(group)
-        return GroupMatch(
-            group=torch.tensor(matched, device=match.node.device).view(self.batch_size),
-            activity=match.activity,
-            batch_size=self.batch_size,
-        )
-
-    def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
-        # Checked together before either is loaded: nodes and their groups belong together.
-        own, gwr = (state_dict.get(f"{prefix}{part}_extra_state") for part in ("", "gwr."))
-        if own is not None and gwr is not None:
-            _, topologies = read_state(gwr, self.batch_size.numel(), self.gwr.n_features)
-            nodes = [topology.next_identity for topology in topologies]
-            if [len(numbers) for numbers in own["group"]] != nodes:
-                raise ValueError(
-                    f"the state has groups of {[len(numbers) for numbers in own['group']]} nodes, "
-                    f"but {nodes} nodes: load one that state_dict returned"
+        if phi.shape != (*self.batch_size, self.n_features):
+            raise ValueError(
+                f"phi must be {[*self.batch_size, self.n_features]}, got {[*phi.shape]}"
+            )
+        inputs, active = self._checked(phi, mask)
+        inputs = inputs.reshape(len(active), 1, self.n_features)
+        group, novelty = np.full(len(active), -1), np.full(len(active), np.nan)
+        for i in np.flatnonzero(active):
+            network = self._networks[i]
+            (group[i],), (novelty[i],) = network.lookup(inputs[i], self.smallest // 2)
+            is_new = network.show(inputs[i], int(group[i]))
+            due = network.clustered + max(self.smallest, network.clustered // 100)
+            if is_new and len(network.points) >= due:
+                labels = density_clusters(
+                    network.points, smallest=self.smallest, evidence=self.evidence
                 )
-        super()._load_from_state_dict(state_dict, prefix, *args)
+                network.regroup(labels, self.smallest // 2)
+        return self._match(group, novelty, phi)
 
-    def get_extra_state(self) -> dict[str, Any]:
-        """Return group and parent numbers, for ``state_dict``."""
-        return {
-            "group": [list(group) for group in self._group],
-            "parent": [list(parent) for parent in self._parent],
-        }
+    def get_extra_state(self) -> list[dict[str, Any]]:
+        """Return demonstrations and groups of each network, for ``state_dict``."""
+        return [network.state() for network in self._networks]
 
-    def set_extra_state(self, state: dict[str, Any]) -> None:
+    def set_extra_state(self, state: list[dict[str, Any]]) -> None:
         """Restore the result of `get_extra_state`.
 
         Raises:
-            ValueError: If it is of another number of networks, or a group is missing; nothing has
+            ValueError: If it is damaged, or of another number of networks or features; nothing has
                 changed then.
         """
-        group, parent = state["group"], state["parent"]
-        n_networks = self.batch_size.numel()
-        if not len(group) == len(parent) == n_networks:
+        sizes = [entry["points"].shape[-1] for entry in state]
+        if sizes != [self.n_features] * len(self._networks):
             raise ValueError(
-                f"the state has groups of {len(group)} networks, this BehaviorGroups "
-                f"{n_networks}: build it with the same sizes"
+                f"the state has groups of {len(sizes)} networks of {set(sizes)} features, this "
+                f"BehaviorGroups {len(self._networks)} of {self.n_features}: build it with the "
+                "same sizes"
             )
-        for numbers, parents in zip(group, parent, strict=True):
-            if not {*numbers, *parents} <= set(range(len(parents))):
-                raise ValueError(
-                    "a group is missing in the state: load one that state_dict returned"
-                )
-        self._group = [list(numbers) for numbers in group]
-        self._parent = [list(numbers) for numbers in parent]
+        self._networks = [_Network.of_state(entry, self.smallest // 2) for entry in state]
+
+    def _checked(
+        self, phi: Tensor, mask: Tensor | None
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Return inputs as an array, and which networks take part ``[networks]``."""
+        active = torch.ones(self.batch_size, dtype=torch.bool)
+        if mask is not None:
+            active = as_mask(mask, self.batch_size).cpu()
+        inputs = phi.detach().cpu().double().numpy()
+        if phi.shape[-1:] != (self.n_features,) or not np.isfinite(inputs[active.numpy()]).all():
+            raise ValueError(
+                f"phi must be {self.n_features} features without NaN and Inf, got {[*phi.shape]}"
+            )
+        return inputs, active.flatten().numpy()
+
+    def _match(
+        self, group: NDArray[np.int64], novelty: NDArray[np.float64], phi: Tensor
+    ) -> GroupMatch:
+        shape = phi.shape[:-1]
+        return GroupMatch(
+            group=torch.from_numpy(group).view(shape).to(phi.device),
+            novelty=torch.from_numpy(novelty).float().view(shape).to(phi.device),
+            batch_size=shape,
+        )
+
+    def _per_network(self, numbers: list[int]) -> Tensor:
+        return torch.tensor(numbers).view(self.batch_size)
+
+
+@dataclass
+class _Network:
+    """Groups of one network.
+
+    Attributes:
+        points: The different demonstrations, in the order in which they were first shown, [n, d].
+        shown: How often each was shown, [n].
+        group: Group of each, [n].
+        member: Whether it is in the cluster of the group, [n]; False for outliers, and for those
+            that have come since all were clustered.
+        parent: Parent of each group, by number.
+        cluster: Cluster of each of those that there were when they were last clustered; -1 for
+            outliers.
+        links: Pairs of demonstrations whose clusters are one group.
+        revision: See `BehaviorGroups.revision`.
+        reach: By group, the 99 % quantile of its members' distances to their k-th neighbor in it.
+        rows: Position of each demonstration, by its bytes.
+    """
+
+    points: NDArray[np.float64]
+    shown: NDArray[np.int64]
+    group: NDArray[np.int64]
+    member: NDArray[np.bool_]
+    parent: list[int]
+    cluster: NDArray[np.int64]
+    links: list[tuple[int, int]] = field(default_factory=list)
+    revision: int = 0
+    reach: dict[int, float] = field(default_factory=dict)
+    rows: dict[bytes, int] = field(default_factory=dict)
+
+    @classmethod
+    def empty(cls, n_features: int) -> _Network:
+        none = np.empty(0, np.int64)
+        return cls(np.empty((0, n_features)), none, none, none.astype(bool), [0], none)
+
+    @property
+    def clustered(self) -> int:
+        """How many demonstrations there were when they were last clustered."""
+        return len(self.cluster)
+
+    def lookup(
+        self, inputs: NDArray[np.float64], k: int
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Return group and novelty ``[m]`` of inputs ``[m, d]``."""
+        if not self.reach:
+            return np.zeros(len(inputs), np.int64), np.full(len(inputs), np.inf)
+        distances, of_member = cdist(inputs, self.points[self.member]), self.group[self.member]
+        group = of_member[distances.argmin(1)]
+        novelty = np.empty(len(inputs))
+        for number in np.unique(group):
+            to_group = distances[np.ix_(group == number, of_member == number)]
+            kth = np.partition(to_group, k - 1, axis=1)[:, k - 1]
+            novelty[group == number] = kth / self.reach[number]
+        return group, novelty
+
+    def show(self, point: NDArray[np.float64], group: int) -> bool:
+        """Count a demonstration ``[1, d]``; return whether it is new."""
+        row = self.rows.setdefault(point.tobytes(), len(self.points))
+        is_new = row == len(self.points)
+        if is_new:
+            self.points = np.concatenate([self.points, point])
+            self.shown, self.group = np.append(self.shown, 0), np.append(self.group, group)
+            self.member = np.append(self.member, False)
+        self.shown[row] += 1
+        return is_new
+
+    def regroup(self, cluster: NDArray[np.int64], k: int) -> None:
+        """Turn new clusters ``[n]`` into groups."""
+        self.cluster = cluster
+        self._arrange(k)
+
+    def join(self, first: int, second: int, k: int) -> None:
+        """Join two groups from now on."""
+        self.links.append((self._densest(first, k), self._densest(second, k)))
+        self._arrange(k)
+
+    def _densest(self, group: int, k: int) -> int:
+        rows = np.flatnonzero(self.member & (self.group == group))
+        distances = cdist(self.points[rows], self.points[rows])
+        return int(rows[np.partition(distances, k, axis=1)[:, k].argmin()])
+
+    def _arrange(self, k: int) -> None:
+        """Match linked clusters with the groups so far."""
+        before = self.group
+        labels = np.full(len(self.points), -1)
+        labels[: self.clustered] = self._linked()
+        common = np.zeros((labels.max() + 1, len(self.parent)), np.int64)
+        inside = labels >= 0
+        np.add.at(common, (labels[inside], before[inside]), self.shown[inside])
+        number: dict[int, int] = {}
+        for at in np.argsort(-common, axis=None, kind="stable").tolist():
+            cluster, group = divmod(at, common.shape[1])
+            if common[cluster, group] and cluster not in number and group not in number.values():
+                number[cluster] = group
+        for cluster in np.unique(labels[inside]).tolist():
+            if cluster not in number:
+                number[cluster] = len(self.parent)
+                self.parent.append(int(common[cluster].argmax()))
+        self.group = np.array([number.get(label, -1) for label in labels.tolist()])
+        self.member = inside
+        self._measure(k)
+        self.group[~inside] = self.lookup(self.points[~inside], k)[0]
+        self.revision += int((self.group != before).any())
+
+    def _linked(self) -> NDArray[np.int64]:
+        """Return the clusters, of which linked ones have the same label."""
+        labels, inside = self.cluster.copy(), np.flatnonzero(self.cluster >= 0)
+        for link in self.links:
+            nearest = cdist(self.points[[*link]], self.points[inside]).argmin(1)
+            one, other = labels[inside[nearest]]
+            labels[labels == other] = one
+        return labels
+
+    def _measure(self, k: int) -> None:
+        """Measure the reach of each group."""
+        self.reach = {}
+        for number in np.unique(self.group[self.member]).tolist():
+            members = self.points[self.member & (self.group == number)]
+            kth = np.partition(cdist(members, members), k, axis=1)[:, k]
+            self.reach[number] = float(np.quantile(kth, _KNOWN_SHARE))
+
+    def state(self) -> dict[str, Any]:
+        tensors = {name: torch.from_numpy(getattr(self, name).copy()) for name in _ARRAYS}
+        lists = {"parent": [*self.parent], "links": [*self.links]}
+        return {**tensors, **lists, "revision": self.revision}
+
+    @classmethod
+    def of_state(cls, state: dict[str, Any], k: int) -> _Network:
+        arrays: dict[str, Any] = {name: state[name].numpy().copy() for name in _ARRAYS}
+        rest: dict[str, Any] = {name: [*state[name]] for name in ("parent", "links")}
+        network = cls(**arrays, **rest, revision=state["revision"])
+        sizes = {len(arrays[name]) for name in ("points", "shown", "group", "member")}
+        if len(sizes) > 1 or not {*network.group.tolist()} <= {*range(len(network.parent))}:
+            raise ValueError("a group is missing in the state: load one that state_dict returned")
+        network.rows = {point.tobytes(): row for row, point in enumerate(network.points)}
+        network._measure(k)
+        return network

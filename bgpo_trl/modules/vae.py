@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 
 import torch
@@ -14,6 +15,13 @@ FRAME_SHAPE = (32, 64, 3)
 _CHANNELS = (3, 32, 64, 128)
 _COARSE_SHAPE = (128, 4, 8)
 _COARSE_SIZE = 4096
+_MAP_SHAPE = (16, 32)
+# Half the height and width of the map of keypoints, in the unit of its coordinates.
+_MAP_REACH = (1.0, 2.0)
+# Coordinates are multiplied by these, to have the scale of the other dimensions.
+_COORDINATE_SCALE = (3.0, 1.5)
+# Standard deviation of the blobs that the decoder draws at keypoints: a little more than a cell.
+_BLOB = 0.16
 # On a CPU, activations of more frames do not fit into the cache, and take twice as long.
 _FRAMES_AT_ONCE = 64
 
@@ -28,16 +36,22 @@ class VAE(nn.Module):
     frame: the fixed camera mostly shows the same table, which would take hundreds of steps to
     learn.
 
+    Half of the latent's dimensions are coordinates of keypoints: the mean of each is the expected
+    position under the softmax of a feature map (Finn et al., 2016), and the decoder draws a blob
+    there (Jakab et al., 2018). The paper has none; a dense layer alone encodes places in a way from
+    which a policy learns to read them more slowly (docs/learning.md).
+
     Frames are uint8 ``[..., 32, 64, 3]``, and tensors channels-last like them. Latents are
     ``[..., latent_size]``, on the scale of mu unless they come from `latent`.
 
     Args:
-        latent_size: Dimensions of z (paper: 64).
+        latent_size: Dimensions of z (paper: 64); a quarter of it, rounded down, is the number of
+            keypoints.
         action_size: Dimensions of an action (paper: 4).
 
     Raises:
-        ValueError: If a size is not positive; from methods, if frames have another dtype or shape,
-            or latents another size.
+        ValueError: If there is no action, or no keypoint; from methods, if frames have another
+            dtype or shape, or latents another size.
 
     Attributes:
         mean_frame: Buffer ``[32, 64, 3]`` in [0, 1], set before training; grey until then.
@@ -55,16 +69,19 @@ class VAE(nn.Module):
     latent_std: Tensor
 
     def __init__(self, latent_size: int = 64, action_size: int = 4) -> None:
-        if latent_size < 1 or action_size < 1:
+        if latent_size < 4 or action_size < 1:
             raise ValueError(
-                f"latent_size and action_size must be at least 1, got {latent_size} and "
+                f"latent_size must be at least 4 and action_size at least 1, got {latent_size} and "
                 f"{action_size}"
             )
         super().__init__()
         self.latent_size = latent_size
         self.action_size = action_size
         self.encoder = nn.ModuleList(nn.Conv2d(a, b, 3, padding=1) for a, b in pairwise(_CHANNELS))
-        self.mean_head = nn.Linear(_COARSE_SIZE, latent_size)
+        self.n_keypoints = latent_size // 4
+        self.keypoint_maps = nn.Conv2d(_CHANNELS[2], self.n_keypoints, 1)
+        self.log_sharpness = nn.Parameter(torch.full((self.n_keypoints, 1, 1), math.log(3.0)))
+        self.mean_head = nn.Linear(_COARSE_SIZE, latent_size - 2 * self.n_keypoints)
         self.log_variance_head = nn.Linear(_COARSE_SIZE, latent_size)
         # Little noise at first (sigma 0.14): with noise as large as the signal, the decoder would
         # learn to ignore z.
@@ -75,6 +92,7 @@ class VAE(nn.Module):
             nn.ConvTranspose2d(b, a, 4, stride=2, padding=1)
             for b, a in pairwise(reversed(_CHANNELS))
         )
+        self.place = nn.Conv2d(_CHANNELS[1] + self.n_keypoints, _CHANNELS[1], 3, padding=1)
         self.inverse_head = nn.Linear(2 * latent_size, action_size)
         self.register_buffer("mean_frame", torch.full(FRAME_SHAPE, 0.5))
         self.register_buffer("latent_mean", torch.zeros(latent_size))
@@ -83,19 +101,24 @@ class VAE(nn.Module):
 
     def encode(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and log-variance of the posterior, float32 ``[..., latent_size]`` each."""
-        coarse = self._coarse(pixels)
-        return self.mean_head(coarse), self.log_variance_head(coarse)
+        _check_frames(pixels)
+        mu, coarse = self._mean(pixels.reshape(-1, *FRAME_SHAPE))
+        shape = *pixels.shape[:-3], self.latent_size
+        return mu.reshape(shape), self.log_variance_head(coarse).float().reshape(shape)
 
     def decode(self, z: Tensor) -> Tensor:
         """Return reconstructed frames, float32 ``[..., 32, 64, 3]`` in [0, 1]."""
         self._check_latent(z)
-        x = F.relu(self.decoder_dense(z.reshape(-1, self.latent_size)))
+        flat = z.reshape(-1, self.latent_size)
+        x = F.relu(self.decoder_dense(flat))
         x = x.unflatten(-1, _COARSE_SHAPE).contiguous(memory_format=torch.channels_last)
         for convolution in self.decoder[:-1]:
             x = F.relu(convolution(x))
+        x = torch.cat([x, self._blobs(flat).to(x.dtype)], 1)
+        x = F.relu(self.place(x.contiguous(memory_format=torch.channels_last)))
         # eps: without it, pixels that are nearly always black or white could not change.
         x = self.decoder[-1](x).permute(0, 2, 3, 1) + torch.logit(self.mean_frame, eps=0.02)
-        return torch.sigmoid(x).reshape(*z.shape[:-1], *FRAME_SHAPE)
+        return torch.sigmoid(x.float()).reshape(*z.shape[:-1], *FRAME_SHAPE)
 
     def inverse(self, z: Tensor, z_next: Tensor) -> Tensor:
         """Predict the action between consecutive latents, ``[..., action_size]`` in (-1, 1)."""
@@ -109,7 +132,7 @@ class VAE(nn.Module):
         _check_frames(pixels)
         frames = pixels.reshape(-1, *FRAME_SHAPE)
         parts = frames.split(_FRAMES_AT_ONCE) if frames.device.type == "cpu" else (frames,)
-        mu = torch.cat([self.mean_head(self._coarse(part)) for part in parts])
+        mu = torch.cat([self._mean(part)[0] for part in parts])
         return self.standardize(mu).reshape(*pixels.shape[:-3], self.latent_size)
 
     def standardize(self, mu: Tensor) -> Tensor:
@@ -138,14 +161,37 @@ class VAE(nn.Module):
         if z.shape[-1:] != (self.latent_size,):
             raise ValueError(f"a latent must be [..., {self.latent_size}], got {[*z.shape]}")
 
-    def _coarse(self, pixels: Tensor) -> Tensor:
-        _check_frames(pixels)
-        x = pixels.reshape(-1, *FRAME_SHAPE).to(self.mean_frame.dtype) / 255 - self.mean_frame
-        x = x.permute(0, 3, 1, 2)
-        for convolution in self.encoder:
-            # Pooling before ReLU gives the same result (both are monotone), at a quarter the size.
-            x = F.relu(F.max_pool2d(convolution(x), 2))
-        return x.reshape(*pixels.shape[:-3], _COARSE_SIZE)
+    def _mean(self, frames: Tensor) -> tuple[Tensor, Tensor]:
+        """Return mu ``[N, latent_size]`` and the features ``[N, 4096]`` of frames ``[N, ...]``."""
+        x = frames.to(self.mean_frame.dtype) / 255 - self.mean_frame
+        first, second, third = self.encoder
+        # Pooling before ReLU gives the same result (both are monotone), at a quarter the size.
+        x = F.relu(F.max_pool2d(first(x.permute(0, 3, 1, 2)), 2))
+        fine = F.relu(second(x))
+        coarse = F.relu(F.max_pool2d(third(F.max_pool2d(fine, 2)), 2)).flatten(1)
+        maps = self.log_sharpness.exp() * self.keypoint_maps(fine)
+        weight = maps.flatten(2).to(self.mean_frame.dtype).softmax(-1).unflatten(2, _MAP_SHAPE)
+        row, column = self._grid()
+        x, y = (weight.sum(2) * column).sum(-1), (weight.sum(3) * row).sum(-1)
+        coordinates = torch.cat([_COORDINATE_SCALE[1] * x, _COORDINATE_SCALE[0] * y], -1)
+        return torch.cat([coordinates, self.mean_head(coarse).to(coordinates.dtype)], -1), coarse
+
+    def _blobs(self, z: Tensor) -> Tensor:
+        """Return a blob at each keypoint of latents ``[N, latent_size]``, ``[N, K, 16, 32]``."""
+        x, y = z[:, : 2 * self.n_keypoints].unsqueeze(-1).chunk(2, 1)
+        row, column = self._grid()
+        across = (x / _COORDINATE_SCALE[1] - column).square() / (2 * _BLOB**2)
+        along = (y / _COORDINATE_SCALE[0] - row).square() / (2 * _BLOB**2)
+        return (-along).exp().unsqueeze(-1) * (-across).exp().unsqueeze(-2)
+
+    def _grid(self) -> tuple[Tensor, Tensor]:
+        """Return the coordinates of the map's rows ``[16]`` and columns ``[32]``."""
+        like = {"dtype": self.mean_frame.dtype, "device": self.mean_frame.device}
+        row, column = (
+            torch.linspace(-reach, reach, size, **like)
+            for reach, size in zip(_MAP_REACH, _MAP_SHAPE, strict=True)
+        )
+        return row, column
 
 
 def _check_frames(pixels: Tensor) -> None:

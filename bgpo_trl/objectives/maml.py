@@ -113,6 +113,8 @@ class MAMLLoss(DDPGLoss):
         data = self.inputs.current(tensordict)
         functional_call(self.network("actor_network"), parameters, (data,))
         loss = -self.values(self.network("value_network", frozen=True), data)
+        if self.imitation:
+            loss = loss + self.imitation * self.imitation_loss(data, tensordict)
         if self.pre_tanh_penalty:
             square = data[self.tensor_keys.pre_tanh_action].square().mean(-1)
             loss = loss + self.pre_tanh_penalty * square

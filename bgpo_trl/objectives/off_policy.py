@@ -53,6 +53,7 @@ class OffPolicyLoss(LossModule):
         value_network: Q-function, or twin Q-functions.
         return_bounds: Lowest and highest attainable return; ``None`` for no clipping.
         pre_tanh_penalty: Weight of the penalty of `penalized`, 0 for none.
+        imitation: Weight of `imitation_loss` in the actor's loss, 0 for none.
         constant_keys: Entries of the networks' input that are constant within an episode.
         loss_function: ``"l2"``, ``"l1"`` or ``"smooth_l1"``, of prediction and target.
         delay_actor: Whether the actor has a target network, as the critics always have.
@@ -86,12 +87,15 @@ class OffPolicyLoss(LossModule):
         *,
         return_bounds: tuple[float, float] | None = None,
         pre_tanh_penalty: float = 0.0,
+        imitation: float = 0.0,
         constant_keys: Sequence[NestedKey] = (),
         loss_function: str = "l2",
         delay_actor: bool = True,
     ) -> None:
         if not (pre_tanh_penalty >= 0 and math.isfinite(pre_tanh_penalty)):
             raise ValueError(f"pre_tanh_penalty must be a number >= 0, got {pre_tanh_penalty}")
+        if not (imitation >= 0 and math.isfinite(imitation)):
+            raise ValueError(f"imitation must be a number >= 0, got {imitation}")
         if return_bounds is not None and not return_bounds[0] < return_bounds[1]:
             raise ValueError(f"return_bounds must be (low, high) with low < high: {return_bounds}")
         if loss_function not in ("l2", "l1", "smooth_l1"):
@@ -111,6 +115,7 @@ class OffPolicyLoss(LossModule):
         self.convert_to_functional(actor_network, "actor_network", create_target_params=delay_actor)
         self.convert_to_functional(value_network, "value_network", create_target_params=True)
         self.return_bounds, self.pre_tanh_penalty = return_bounds, pre_tanh_penalty
+        self.imitation = imitation
         self.loss_function, name = loss_function, type(self).__name__
         self.inputs = TransitionInputs(name, actor_network, value_network, constant_keys)
 
@@ -227,6 +232,9 @@ class OffPolicyLoss(LossModule):
             ValueError: If the actor wrote no ``"pre_tanh_action"`` to penalize.
         """
         loss = -self.mean_per_seed(value, tensordict)
+        if self.imitation:
+            imitated = self.imitation_loss(data, tensordict)
+            loss = loss + self.imitation * self.mean_per_seed(imitated, tensordict)
         pre_tanh = data.get(self.tensor_keys.pre_tanh_action, None)
         if pre_tanh is None:
             if self.pre_tanh_penalty:
@@ -240,6 +248,23 @@ class OffPolicyLoss(LossModule):
             loss = loss + self.pre_tanh_penalty * self.mean_per_seed(square, tensordict, features=1)
         magnitude = self.flatten_batch(square.detach()).mean(-1).sqrt()
         return loss.sum(), {"pre_tanh_magnitude": magnitude}
+
+    def imitation_loss(self, data: TensorDictBase, tensordict: TensorDictBase) -> Tensor:
+        """Return the squared distance ``[*S, *B]`` of the actor's actions to demonstrated ones.
+
+        It is 0 for transitions that are not ``"demonstrated"``, bool ``[*S, *B]``; without this
+        entry, none is.
+
+        Args:
+            data: Outputs of the actor in the states of the transitions.
+            tensordict: The transitions.
+        """
+        keys = self.tensor_keys
+        demonstrated = tensordict.get(keys.demonstrated, None)
+        if demonstrated is None:
+            return torch.zeros(tensordict.batch_size, device=tensordict.device)
+        distance = (data.get(keys.action) - tensordict.get(keys.action)).square().sum(-1)
+        return distance * demonstrated
 
     def mean_per_seed(
         self, loss: Tensor, tensordict: TensorDictBase, *, features: int = 0

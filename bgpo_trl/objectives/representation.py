@@ -1,4 +1,4 @@
-"""Losses of the VAE and the sequence autoencoder (paper, Sec. III-A)."""
+"""Losses of the VAE, the sequence autoencoder and the inverse model (paper, Sec. III-A)."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from tensordict.utils import NestedKey
 from torchrl.objectives import LossModule
 
 from bgpo_trl.errors import missing_key
+from bgpo_trl.modules.inverse_model import InverseModel
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
 
@@ -24,11 +25,13 @@ class VAEInverseLoss(LossModule):
       off the dimensions that encode it.
     - ``kl``: KL(N(mu, sigma^2) || N(0, 1)), summed over dimensions, mean over frames.
     - ``inverse``: ``1/2 ||a_hat_t - a_t||^2``, with a_hat_t predicted from z_t and z_t+1, mean over
-      the ``K - 1`` transitions of every window.
+      the ``K - 1`` transitions of the windows whose actions are known; 0 if there are none.
 
-    Reads ``pixels`` uint8 ``[*B, K, 32, 64, 3]`` and ``action`` ``[*B, K, A]``, in which action t
-    leads from frame t to t + 1 (the last one is ignored). Writes the terms ``[]``: detached, for
-    logging, and weighted as ``loss_*``, which add up to the objective.
+    Reads ``pixels`` uint8 ``[*B, K, 32, 64, 3]``, ``action`` ``[*B, K, A]``, in which action t
+    leads from frame t to t + 1 (the last one is ignored), and optionally ``action_known`` bool
+    ``[*B]``, by default true: the actions of somebody else's demonstration are unknown. Writes the
+    terms ``[]``: detached, for logging, and weighted as ``loss_*``, which add up to the
+    objective.
 
     Args:
         vae: Network to train.
@@ -53,6 +56,7 @@ class VAEInverseLoss(LossModule):
     class _AcceptedKeys:
         pixels: NestedKey = "pixels"
         action: NestedKey = "action"
+        action_known: NestedKey = "action_known"
 
     default_keys = _AcceptedKeys
     tensor_keys: _AcceptedKeys
@@ -102,19 +106,73 @@ class VAEInverseLoss(LossModule):
         noise = torch.randn(mu.shape, generator=self.generator).to(mu.device)
         z = mu + noise * (log_variance / 2).exp()
         residual = self.vae.decode(z) - pixels / 255
-        predicted = self.vae.inverse(z[..., :-1, :], z[..., 1:, :])
+        # Consecutive latents differ too little for the precision of autocast.
+        with torch.autocast(z.device.type, enabled=False):
+            predicted = self.vae.inverse(z[..., :-1, :], z[..., 1:, :])
         if action.shape != (*pixels.shape[:-3], predicted.shape[-1]):
             raise ValueError(
                 f"action must be {[*pixels.shape[:-3], predicted.shape[-1]]} for these pixels and "
                 f"this VAE, got {[*action.shape]}"
             )
+        known = tensordict.get(self.tensor_keys.action_known, None)
+        if known is None:
+            known = torch.ones(pixels.shape[:-4], dtype=torch.bool, device=pixels.device)
+        squared = (predicted - action[..., :-1, :]).square().sum(-1).mean(-1)
         terms = {
             "reconstruction": residual.square().sum((-3, -2, -1)).mean(),
             "kl": (mu.square() + log_variance.exp() - 1 - log_variance).sum(-1).mean() / 2,
-            "inverse": (predicted - action[..., :-1, :]).square().sum(-1).mean() / 2,
+            "inverse": (squared * known).sum() / known.sum().clamp_min(1) / 2,
         }
         weighted = {f"loss_{name}": self.weights[name] * term for name, term in terms.items()}
         return TensorDict({**weighted, **{name: term.detach() for name, term in terms.items()}}, [])
+
+
+class ActionInferenceLoss(LossModule):
+    """Squared error of the inverse model, summed over an action.
+
+    Reads ``window`` ``[*B, 4 * latent_size]`` and ``action`` ``[*B, action_size]``; writes
+    ``loss_inverse`` ``[]``, a mean. From ``forward``, a missing entry raises ``ValueError``.
+
+    Args:
+        inverse: Network to train.
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        window: NestedKey = "window"
+        action: NestedKey = "action"
+
+    default_keys = _AcceptedKeys
+    tensor_keys: _AcceptedKeys
+
+    def __init__(self, inverse: InverseModel) -> None:
+        super().__init__()
+        self.inverse = inverse
+
+    @property
+    def functional(self) -> bool:
+        """Whether parameters are passed to the network: no, they stay in it."""
+        return False
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """The keys that ``forward`` reads."""
+        return [self.tensor_keys.window, self.tensor_keys.action]
+
+    @property
+    def out_keys(self) -> list[NestedKey]:
+        """The keys that ``forward`` writes."""
+        return ["loss_inverse"]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """Return the loss for a batch of windows."""
+        window = tensordict.get(self.tensor_keys.window, None)
+        action = tensordict.get(self.tensor_keys.action, None)
+        if window is None or action is None:
+            raise missing_key("ActionInferenceLoss", tensordict, self.in_keys)
+        # Without the clamp of `infer`, beyond which there would be no gradient.
+        error = (self.inverse.network(window) - action).square().sum(-1).mean()
+        return TensorDict({"loss_inverse": error}, [])
 
 
 class SequenceReconstructionLoss(LossModule):

@@ -35,6 +35,8 @@ class TransitionKeys:
     """Squared error of the critics, written for prioritized replay."""
     priority_weight: NestedKey = "priority_weight"
     """Factor of each transition's loss."""
+    demonstrated: NestedKey = "demonstrated"
+    """Whether the action is that of a demonstration."""
 
 
 class TransitionInputs:

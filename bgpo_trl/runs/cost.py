@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass, fields
@@ -14,7 +13,7 @@ from typing import Any
 from torch import Tensor
 
 from bgpo_trl.files.whole_file import write_whole
-from bgpo_trl.runs.results import count, read_rows
+from bgpo_trl.runs.results import AMOUNT, COUNT, read_table
 
 
 @dataclass
@@ -85,13 +84,10 @@ def read_costs(path: str | os.PathLike[str]) -> dict[int, Cost]:
     Raises:
         ValueError: If the file is missing or damaged.
     """
-    checks = {"tasks": count, "steps": count, "seconds": _amount, "megabytes": _amount}
-    rows = read_rows(path, checks, "remove the file, and costs are counted anew")
-    found = {
-        int(row["tasks"]): Cost(int(row["steps"]), float(row["seconds"]), float(row["megabytes"]))
-        for row in rows
-    }
-    return dict(sorted(found.items()))
+    columns = {"tasks": COUNT, "steps": COUNT, "seconds": AMOUNT, "megabytes": AMOUNT}
+    table = read_table(path, columns, "remove the file, and costs are counted anew")
+    rows = table[list(columns)].sort_values("tasks").itertuples(index=False)
+    return {int(tasks): Cost(int(steps), *amounts) for tasks, steps, *amounts in rows}
 
 
 def write_costs(path: Path, costs: Mapping[int, Cost]) -> None:
@@ -120,8 +116,3 @@ def total_cost(costs: Sequence[Mapping[int, Cost]]) -> dict[int, Cost]:
         so_far = total.setdefault(tasks, Cost())
         total[tasks] = Cost(*map(sum, zip(astuple(so_far), astuple(cost), strict=True)))
     return total
-
-
-def _amount(cell: str) -> None:
-    if not (math.isfinite(float(cell)) and float(cell) >= 0):
-        raise ValueError

@@ -1,22 +1,56 @@
-"""Results of runs, read from their CSV and JSON files."""
+"""Results of runs, read from their CSV and JSON files.
+
+Tables are pandas data frames. A table may be compressed: where ``eval.csv`` is not there,
+``eval.csv.gz`` is read, as `bgpo_trl.runs.archive` writes it.
+"""
 
 from __future__ import annotations
 
-import csv
+import gzip
 import io
 import json
 import os
 import re
-from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+import warnings
+import zlib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 _CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f]")
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """Numbers that the cells of a column may hold."""
+
+    high: float = float(np.finfo(float).max)
+    """The largest; the smallest is 0."""
+    whole: bool = False
+    """Whether they are integers."""
+    may_be_empty: bool = False
+    """Whether a cell may be empty, which is read as NaN."""
+
+
+COUNT, SHARE, AMOUNT = Numbers(2**53 - 1, whole=True), Numbers(1), Numbers()
+TEXT = None
+"""Any text, even none."""
+Cells = Numbers | Sequence[str] | None
+"""What the cells of a column may hold: numbers, one of some names, or any text."""
+
+TRAIN = {"seed": COUNT, "episode": COUNT, "task": TEXT, "success": SHARE}
+"""Columns of ``train.csv`` that success is computed from."""
+TRAIN_COUNTS = dict.fromkeys(("num_nodes", "group", "num_groups"), COUNT)
+"""Columns of ``train.csv`` on GWR-B and groups."""
+EVAL = {"algorithm": TEXT, **TRAIN}
+"""Columns of ``eval.csv`` that every run has."""
+_FINAL = {"seed": COUNT, "demonstrations": TEXT, "task": TEXT, "success": SHARE}
+_FINAL["task_inference"] = replace(SHARE, may_be_empty=True)  # of algorithms without GWR-B
 
 
 @dataclass(frozen=True)
@@ -42,47 +76,88 @@ class Curves:
         return replace(self, episodes=self.episodes[kept], success=self.success[:, kept])
 
 
-def read_rows(
+def find_table(path: str | os.PathLike[str]) -> Path | None:
+    """Return the path of a CSV file or, where it is not there, of its compressed form, if any."""
+    path = Path(path)
+    found = (path, path.with_name(f"{path.name}.gz"))
+    return next((candidate for candidate in found if candidate.exists()), None)
+
+
+def read_table(
     path: str | os.PathLike[str],
-    columns: Mapping[str, Callable[[str], object]] | None = None,
+    columns: Mapping[str, Cells] | None = None,
     remedy: str = "resume the run, which writes it again, or take the line out",
-) -> list[dict[str, str]]:
-    """Return the rows of a CSV file of a run.
+) -> pd.DataFrame:
+    """Return a CSV file of a run, plain or compressed.
 
     Args:
-        path: The CSV file.
-        columns: Required columns, each with a function that raises ``ValueError`` for invalid
-            cells.
+        path: The CSV file; where it is not there, ``path`` with ``.gz`` is read.
+        columns: Required columns and what their cells may hold. Other columns are kept as text.
         remedy: Advice for a damaged line, the end of the error message.
 
     Raises:
         ValueError: If the file is missing or not CSV, lacks a column or has an invalid cell.
     """
-    path = Path(path)
+    path = find_table(path) or Path(path)
+    table = _read_text(path)
+    missing = sorted(set(columns or ()).difference(table.columns))
+    if len(table.columns) and missing:
+        raise ValueError(f"{path} lacks the columns {', '.join(missing)}: name another run")
+    if missing:
+        return pd.DataFrame(columns=pd.Index(columns or ()))
+    damaged = pd.Series(False, index=table.index)
+    for name, cells in (columns or {}).items():
+        if isinstance(cells, Numbers):
+            table[name], valid = _numbers(table[name], cells)
+            damaged |= ~valid
+        elif cells is not None:
+            damaged |= ~table[name].isin(list(cells))
+    if damaged.any():
+        line = 2 + int(damaged.to_numpy().argmax())
+        raise ValueError(f"{path}, line {line} is damaged: {remedy}")
+    for name, cells in (columns or {}).items():
+        if isinstance(cells, Numbers) and cells.whole and not cells.may_be_empty:
+            table[name] = table[name].astype(np.int64)
+    return table
+
+
+def _read_text(path: Path) -> pd.DataFrame:
+    """Return the cells of a CSV file as text."""
     try:
-        with path.open(newline="") as file:
-            text = file.read()
-            # Error messages quote the file, and a terminal would execute these as commands.
-            if _CONTROL.search(text):
-                raise ValueError("control characters")
-            reader = csv.DictReader(io.StringIO(text, newline=""))
-            rows, header = list(reader), reader.fieldnames or ()
+        content = path.read_bytes()
+        text = (gzip.decompress(content) if path.suffix == ".gz" else content).decode()
+        # Error messages quote the file, and a terminal would execute these as commands.
+        if _CONTROL.search(text):
+            raise ValueError("control characters")
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", pd.errors.ParserWarning)  # a line that is too long
+            return pd.read_csv(
+                io.StringIO(text),
+                dtype=str,
+                na_values=[],
+                keep_default_na=False,
+                index_col=False,
+                skip_blank_lines=True,
+            )
     except (FileNotFoundError, NotADirectoryError):
         raise _missing(path) from None
-    except (OSError, ValueError, csv.Error) as error:
-        raise ValueError(f"{path} is not a CSV file of a run ({error}): name another run") from None
-    missing = sorted(set(columns or ()).difference(header))
-    if header and missing:
-        raise ValueError(f"{path} lacks the columns {', '.join(missing)}: name another run")
-    for number, row in enumerate(rows, 2):
-        try:
-            for name, check in (columns or {}).items():
-                if row[name] is None:  # a line that was cut short
-                    raise ValueError
-                check(row[name])
-        except ValueError:
-            raise ValueError(f"{path}, line {number} is damaged: {remedy}") from None
-    return rows
+    except pd.errors.EmptyDataError:
+        return pd.DataFrame()
+    except (OSError, EOFError, zlib.error, ValueError, pd.errors.ParserWarning) as error:
+        raise ValueError(
+            f"{path} is not a CSV file of a run ({str(error).splitlines()[0]}): name another run"
+        ) from None
+
+
+def _numbers(cells: pd.Series, kind: Numbers) -> tuple[pd.Series, pd.Series]:
+    """Return the numbers in cells, NaN where there is none, and whether each is valid."""
+    numbers = pd.to_numeric(cells, errors="coerce").astype(float)
+    valid = numbers.between(0, kind.high)
+    if kind.whole:
+        valid &= numbers % 1 == 0
+    if kind.may_be_empty:
+        valid |= cells == ""
+    return numbers, valid
 
 
 def _missing(path: Path) -> ValueError:
@@ -91,28 +166,27 @@ def _missing(path: Path) -> ValueError:
     return ValueError(f"{path} is missing: let the run in {path.parent} finish")
 
 
-def read_tests(path: str | os.PathLike[str]) -> list[dict[str, str]]:
-    """Return the rows of an ``eval.csv``, one per test episode.
+def read_tests(path: str | os.PathLike[str]) -> pd.DataFrame:
+    """Return an ``eval.csv``, one row per test episode.
 
     Raises:
         ValueError: If the file is missing or empty, or a row is invalid.
     """
-    columns = {"algorithm": str, "seed": count, "episode": count, "task": str, "success": _share}
-    rows = read_rows(path, columns)
-    if not rows:
+    table = read_table(path, EVAL)
+    if table.empty:
         raise ValueError(f"{path} holds no test episode: let the run evaluate first")
-    return rows
+    return table
 
 
-def read_final_tests(path: str | os.PathLike[str]) -> list[dict[str, str]]:
-    """Return the rows of a ``final.csv``, one per seed, task and kind of demonstrations.
+def read_final_tests(path: str | os.PathLike[str]) -> pd.DataFrame:
+    """Return a ``final.csv``, one row per seed, task and kind of demonstrations.
+
+    ``task_inference`` is NaN for algorithms without GWR-B.
 
     Raises:
         ValueError: If the file is missing, or a row is invalid.
     """
-    columns = {"seed": count, "demonstrations": str, "task": str, "success": _share}
-    columns["task_inference"] = _share_or_nothing  # empty for algorithms without GWR-B
-    return read_rows(path, columns, "remove the file and resume the run, which tests again")
+    return read_table(path, _FINAL, "remove the file and resume the run, which tests again")
 
 
 def read_json(
@@ -141,22 +215,6 @@ def read_json(
     return found
 
 
-def count(cell: str) -> None:
-    """Raise ``ValueError`` unless a cell is a non-negative integer below 2^53."""
-    if not 0 <= int(cell) < 2**53:
-        raise ValueError
-
-
-def _share(cell: str) -> None:
-    if not 0 <= float(cell) <= 1:
-        raise ValueError
-
-
-def _share_or_nothing(cell: str) -> None:
-    if cell:
-        _share(cell)
-
-
 def read_curves(path: str | os.PathLike[str], tasks: Sequence[str]) -> Curves:
     """Read the test success of one run.
 
@@ -167,25 +225,20 @@ def read_curves(path: str | os.PathLike[str], tasks: Sequence[str]) -> Curves:
     Raises:
         ValueError: If the file is missing or empty, or tests another task.
     """
-    tests: dict[tuple[int, int, str], list[float]] = defaultdict(list)
-    for row in read_tests(path):
-        key = (int(row["seed"]), int(row["episode"]), row["task"])
-        tests[key].append(float(row["success"]))
-    unknown = sorted({task for _, _, task in tests} - set(tasks))
+    tests = read_tests(path)
+    unknown = sorted(set(tests["task"]) - set(tasks))
     if unknown:
         raise ValueError(f"{path} tests {unknown[0]!r}, which is none of {', '.join(tasks)}")
-    seeds = sorted({seed for seed, _, _ in tests})
-    episodes = sorted({episode for _, episode, _ in tests})
-    success = np.full((len(seeds), len(episodes), len(tasks)), np.nan)
-    for (seed, episode, task), successes in tests.items():
-        where = seeds.index(seed), episodes.index(episode), tasks.index(task)
-        success[where] = np.mean(successes)
-    return Curves(tuple(seeds), tuple(tasks), np.array(episodes), success)
+    means = tests.groupby(["seed", "episode", "task"])["success"].mean()
+    seeds, episodes = (sorted(set(tests[name])) for name in ("seed", "episode"))
+    every = pd.MultiIndex.from_product([seeds, episodes, list(tasks)])
+    success = means.reindex(every).to_numpy().reshape(len(seeds), len(episodes), len(tasks))
+    return Curves(tuple(map(int, seeds)), tuple(tasks), np.array(episodes), success)
 
 
 def read_outcomes(
     path: str | os.PathLike[str], tasks: Sequence[str], last: int | None = None
-) -> list[list[list[int]]]:
+) -> list[list[NDArray[np.float64]]]:
     """Read the outcomes of each task's training episodes.
 
     Args:
@@ -200,12 +253,10 @@ def read_outcomes(
     Raises:
         ValueError: If the file is missing or damaged.
     """
-    outcomes: dict[int, dict[str, list[tuple[int, int]]]] = defaultdict(lambda: defaultdict(list))
-    for row in read_rows(path, {"seed": count, "episode": count, "task": str, "success": _share}):
-        if last is None or int(row["episode"]) <= last:
-            outcome = int(row["episode"]), int(float(row["success"]))
-            outcomes[int(row["seed"])][row["task"]].append(outcome)
+    table = read_table(path, TRAIN).sort_values(["seed", "episode"])
+    if last is not None:
+        table = table[table["episode"] <= last]
     return [
-        [[success for _, success in sorted(of_seed[task])] for task in tasks]
-        for _, of_seed in sorted(outcomes.items())
+        [of_seed.loc[of_seed["task"] == task, "success"].to_numpy(float) for task in tasks]
+        for _, of_seed in table.groupby("seed")
     ]

@@ -16,11 +16,11 @@ from bgpo_trl.transforms._episode import DemonstrationLookup, unbounded
 class GroupLookup(DemonstrationLookup):
     """Finds the group of an episode's demonstration, which selects the expert and the replay.
 
-    For the arguments, see `DemonstrationLookup`, whose ``network`` is ``groups``. With an activity
-    below the groups' threshold, the demonstration belongs to no known group.
+    For the arguments, see `DemonstrationLookup`, whose ``network`` is ``groups``. With a novelty
+    above 1, the demonstration belongs to no known group and is played by the nearest.
 
     Reads ``demo_embedding`` float32 ``[*B, 32]`` and ``done``; writes ``group`` int64 ``[*B]`` and
-    ``group_activity`` float32 ``[*B]``, the activity of the best match.
+    ``group_novelty`` float32 ``[*B]``.
 
     Example:
         >>> from types import SimpleNamespace
@@ -40,7 +40,7 @@ class GroupLookup(DemonstrationLookup):
         *,
         learn: bool,
         in_keys: Sequence[NestedKey] = ("demo_embedding",),
-        out_keys: Sequence[NestedKey] = ("group", "group_activity"),
+        out_keys: Sequence[NestedKey] = ("group", "group_novelty"),
     ) -> None:
         super().__init__(groups, learn=learn, in_keys=in_keys, out_keys=out_keys)
 
@@ -50,14 +50,14 @@ class GroupLookup(DemonstrationLookup):
         return self.network
 
     def look_up(self, embedding: Tensor) -> tuple[Tensor, Tensor]:
-        """Return group and activity for embeddings ``[*B, 32]``."""
+        """Return group and novelty for embeddings ``[*B, 32]``."""
         match = self.groups.lookup(embedding)
-        return match.group, match.activity
+        return match.group, match.novelty
 
     def _entries(self, observation_spec: Composite) -> dict[NestedKey, TensorSpec]:
         demonstration = self._demonstration_spec(observation_spec)
-        group_key, activity_key = self.out_keys
+        group_key, novelty_key = self.out_keys
         return {
             group_key: unbounded(observation_spec, dtype=torch.int64),
-            activity_key: unbounded(observation_spec, dtype=demonstration.dtype),
+            novelty_key: unbounded(observation_spec, dtype=demonstration.dtype),
         }

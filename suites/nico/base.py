@@ -3,7 +3,7 @@
 import hashlib
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
-from typing import Literal, get_args
+from typing import ClassVar, Literal, get_args
 
 import numpy as np
 from dm_control.rl import control
@@ -21,9 +21,10 @@ TIME_LIMIT = 10.0  # (s), the paper's 50 steps
 STATE_SIZE = 16
 
 # Mean and spread, over demonstrations, of the state: joints (rad), grip, object positions (m).
-STATE_CENTER = (0.3, 0.9, 0.9, 0.45, 0.36, 0, 0.68, 0.4, 0.12, 0.655, 0.45, -0.05, 0.645)
-STATE_CENTER += (0.41, -0.21, 0.645)
-STATE_SCALE = (0.35, 0.25, 0.35, 0.3, 0.06, 0.15, 0.05, *(0.03, 0.05, 0.02) * 3)
+STATE_CENTER = (0.3, 0.9, 0.9, 0.45, 0.36, 0, 0.68, 0.4, -0.05, 0.655, 0.43, -0.05, 0.645)
+STATE_CENTER += (0.4, -0.05, 0.645)
+STATE_SCALE = (0.5, 0.25, 0.35, 0.3, 0.06, 0.15, 0.05, 0.04, 0.16, 0.02, 0.03, 0.05, 0.02)
+STATE_SCALE += (0.04, 0.16, 0.02)
 
 # Change of the joint targets at |action| = 1 (rad): three arm joints, then the hand.
 ACTION_SCALE = np.array([0.2, 0.2, 0.2, 0.4])
@@ -31,24 +32,30 @@ ACTION_SCALE = np.array([0.2, 0.2, 0.2, 0.4])
 _PART = [0, 1, 2, 3, 3, 3]  # action dimension of each actuator; the last moves all three digits
 _STEP = ACTION_SCALE[_PART]
 
-# Arc about the shoulder's yaw axis on which the objects stand; left is positive.
-ARC_RADIUS = 0.42  # (m)
-ARC_ANGLES = np.radians([22.0, 0.0, -22.0])  # glass, green box, white box
-ANGLE_JITTER = np.radians(2.5)
-RADIUS_JITTER = 0.012  # (m)
+# Arc about the shoulder's yaw axis along which the objects are spread; left is positive. The green
+# box stands between the other two, which swap sides at random.
+ARC_RADIUS = 0.40  # (m)
+SIDE_ANGLE = np.radians(22.0)  # nominal angle of the glass (left) and the white box (right)
+GREEN_JITTER = np.radians(9.5)
+SIDE_JITTER = np.radians(8.7)
+RADIUS_JITTER = 0.03  # (m)
+LARGEST_STEP = 0.03  # (m) between the radii of neighbors: farther inward, a box cannot be pushed
+LEAST_ANGLE = np.radians(20.0)  # between neighbors: the fist fits in
+NOMINAL_ANGLES = np.array([SIDE_ANGLE, 0.0, -SIDE_ANGLE])  # of `OBJECTS`
 
 # Range of the palm's start: in view, among or above the objects.
-START_ANGLE = np.radians(18.0)  # to both sides of the middle of the arc
-START_RADIUS = (0.36, 0.42)  # (m)
-START_HEIGHT = (0.05, 0.12)  # (m) above the table
+START_ANGLE = np.radians(30.0)  # to both sides of the middle of the arc
+START_RADIUS = (0.34, 0.42)  # (m)
+START_HEIGHT = (0.05, 0.12)  # (m) above the table; nominally the highest, over the green box
 
 
 def scene_version() -> str:
     """Return the version of scene, starts and action, on which datasets and encoders depend."""
-    layout = (ACTION_SCALE.tolist(), ARC_RADIUS, ARC_ANGLES.tolist(), ANGLE_JITTER, RADIUS_JITTER)
-    starts = (START_ANGLE, START_RADIUS, START_HEIGHT)
+    layout = (ARC_RADIUS, SIDE_ANGLE, GREEN_JITTER, SIDE_JITTER, RADIUS_JITTER, LEAST_ANGLE)
+    layout += (LARGEST_STEP,)
+    starts = (START_ANGLE, START_RADIUS, START_HEIGHT, ACTION_SCALE.tolist())
     described = f"{scene_xml()}{layout}{starts}".encode()
-    return "nico-1-" + hashlib.sha256(described).hexdigest()[:8]
+    return "nico-2-" + hashlib.sha256(described).hexdigest()[:8]
 
 
 def check_observation(observation: str) -> None:
@@ -56,6 +63,22 @@ def check_observation(observation: str) -> None:
     if observation not in get_args(Observation):
         choices = ", ".join(map(repr, get_args(Observation)))
         raise ValueError(f"observation is {observation!r}; choose one of {choices}")
+
+
+def check_spread(spread: float) -> None:
+    """Raise ``ValueError`` if there is no such spread of the start states."""
+    if not 0.0 <= spread <= 1.0:
+        raise ValueError(f"spread is {spread}: choose a number from 0 (nominal places) to 1")
+
+
+def nominal_places() -> np.ndarray:
+    """Return the place of the center of each of `OBJECTS` at spread 0 (m), ``[3, 3]``."""
+    return np.array(
+        [
+            [*kinematics.polar(ARC_RADIUS, angle), TABLE_HEIGHT + OBJECT_HALF_HEIGHT[name]]
+            for name, angle in zip(OBJECTS, NOMINAL_ANGLES, strict=True)
+        ]
+    )
 
 
 class Environment(control.Environment):
@@ -89,26 +112,45 @@ class NicoTask(control.Task):
     to 0.2 rad and of the hand by up to 0.4 rad per step. Before each action, a target is brought
     back to within one full step of its joint, so that the observation nearly determines the state.
 
+    `succeeded` tests a condition at one moment, at the end of each control step. The episode
+    succeeds, with reward 1, once the condition has held for `steady_steps` steps in a row. The
+    count is part of the simulation's state (``physics.get_state()``), and so is where the objects
+    stood at the start (``physics.start_position``), for conditions on how far something has moved.
+
+    Start states do not depend on the task: the same seed gives all tasks the same starts.
+
     Args:
         random: Random state of the start states, or its seed; ``None`` for a random seed.
+        spread: Share of the whole range of start states, from 0 to 1. At 0, objects are always at
+            `nominal_places`, unturned, and the half-open hand is above the green box. In between,
+            all deviations from that are scaled, and glass and white box swap sides with probability
+            ``spread / 2``.
         observation: ``"pixels"`` (uint8 ``[32, 64, 3]``), ``"state"`` (``privileged_state``,
             float64 ``[16]``) or ``"both"``.
         frame_size: Height and width of ``pixels``.
         renderer: Renderer shared with other environments; created on demand if ``None``.
 
+    Attributes:
+        steady_steps: Number of control steps in a row for which `succeeded` has to hold.
+
     Raises:
-        ValueError: If there is no such observation, or the renderer has another frame size.
+        ValueError: If there is no such observation, ``spread`` is not in [0, 1], or the renderer
+            has another frame size.
     """
+
+    steady_steps: ClassVar[int] = 1
 
     def __init__(
         self,
         *,
         random: int | np.random.RandomState | None = None,
+        spread: float = 1.0,
         observation: Observation = "pixels",
         frame_size: Sequence[int] = (FRAME_HEIGHT, FRAME_WIDTH),
         renderer: FrameRenderer | None = None,
     ) -> None:
         check_observation(observation)
+        check_spread(spread)
         if renderer is not None and renderer.frame_size != tuple(frame_size):
             raise ValueError(
                 f"frame_size is {tuple(frame_size)}, but the renderer's frames are "
@@ -119,6 +161,7 @@ class NicoTask(control.Task):
         self._random = (
             random if isinstance(random, np.random.RandomState) else np.random.RandomState(random)
         )
+        self.spread = float(spread)
         self._observation = observation
         self._frame_size = tuple(frame_size)
         self._renderer = renderer
@@ -130,7 +173,10 @@ class NicoTask(control.Task):
         return self._random
 
     def succeeded(self, physics: Physics) -> bool:
-        """Return whether the task is done."""
+        """Return whether the condition of success holds at this moment.
+
+        The episode succeeds once this has held for `steady_steps` control steps in a row.
+        """
         raise NotImplementedError
 
     def demonstration(self, physics: Physics, random: np.random.Generator) -> Sequence[Phase]:
@@ -145,29 +191,60 @@ class NicoTask(control.Task):
         raise NotImplementedError
 
     def initialize_episode(self, physics: Physics) -> None:
-        """Place the objects with jitter on their arc, and the hand at random in view."""
-        for name, angle in zip(OBJECTS, ARC_ANGLES, strict=True):
-            place = kinematics.polar(
-                ARC_RADIUS + self.random.uniform(-RADIUS_JITTER, RADIUS_JITTER),
-                angle + self.random.uniform(-ANGLE_JITTER, ANGLE_JITTER),
-            )
-            turn = self.random.uniform(-np.pi / 9, np.pi / 9) / 2
+        """Place the objects and the hand at random, within the spread."""
+        for name, place, turn in zip(OBJECTS, *self._object_places(), strict=True):
             height = TABLE_HEIGHT + OBJECT_HALF_HEIGHT[name]
-            physics.named.data.qpos[name] = [*place, height, np.cos(turn), 0, 0, np.sin(turn)]
+            half = turn / 2
+            physics.named.data.qpos[name] = [*place, height, np.cos(half), 0, 0, np.sin(half)]
         # Resamples until the hand touches nothing.
         touching = True
         while touching:
             self._place_arm(physics)
             physics.forward()
             touching = physics.robot_touches()
+        physics.begin_episode()
+
+    def _object_places(self) -> tuple[list[np.ndarray], np.ndarray]:
+        """Draw the places ``[x, y]`` (m) and turns (rad) of the objects, in the order `OBJECTS`.
+
+        The whole range is drawn from, whatever the spread, and scaled afterwards: what neighbors
+        have to keep between them holds for what is drawn and for the nominal places, hence for all
+        that lies in between.
+        """
+        swapped = self.random.uniform() < self.spread / 2
+        nominal = NOMINAL_ANGLES[::-1] if swapped else NOMINAL_ANGLES
+        green = self.random.uniform(-GREEN_JITTER, GREEN_JITTER)
+        left, right = (
+            self.random.uniform(
+                max(SIDE_ANGLE - SIDE_JITTER, LEAST_ANGLE + inward), SIDE_ANGLE + SIDE_JITTER
+            )
+            for inward in (green, -green)
+        )
+        drawn = np.array([-right, green, left] if swapped else [left, green, -right])
+        angles = nominal + self.spread * (drawn - nominal)
+        jitter = self.random.uniform(-RADIUS_JITTER, RADIUS_JITTER, 3)
+        while np.abs(np.diff(jitter)).max() > LARGEST_STEP:
+            jitter = self.random.uniform(-RADIUS_JITTER, RADIUS_JITTER, 3)
+        radii: np.ndarray = ARC_RADIUS + self.spread * jitter
+        turns = self.spread * self.random.uniform(-np.pi, np.pi, 3)
+        return [kinematics.polar(r, a) for r, a in zip(radii, angles, strict=True)], turns
 
     def _place_arm(self, physics: Physics) -> None:
-        palm = kinematics.polar(
-            self.random.uniform(*START_RADIUS), self.random.uniform(-START_ANGLE, START_ANGLE)
+        lowest, highest = np.transpose(
+            [
+                (-START_ANGLE, START_ANGLE),
+                START_RADIUS,
+                START_HEIGHT,
+                physics.named.model.jnt_range["thumb_1"],
+            ]
         )
-        height = TABLE_HEIGHT + self.random.uniform(*START_HEIGHT)
-        arm = kinematics.inverse(np.append(palm, height), kinematics.PALM)
-        curl = self.random.uniform(0.0, physics.named.model.jnt_range["thumb_1"][1])
+        middle = (lowest + highest) / 2
+        drawn = middle + (highest - lowest) / 2 * self.random.uniform(-1.0, 1.0, 4)
+        # Of the middle of the range, the hand would touch the green box at its nominal place.
+        nominal = np.array([middle[0], middle[1], highest[2], middle[3]])
+        angle, radius, height, curl = (1.0 - self.spread) * nominal + self.spread * drawn
+        palm = np.append(kinematics.polar(radius, angle), TABLE_HEIGHT + height)
+        arm = kinematics.inverse(palm, kinematics.PALM)
         physics.data.qpos[:12] = [*arm, *[curl] * 9]
         physics.data.ctrl[:] = [*arm, curl, curl, curl]
 
@@ -184,6 +261,10 @@ class NicoTask(control.Task):
         target = np.minimum(np.maximum(physics.data.ctrl, joints - _STEP), joints + _STEP)
         target += _STEP * np.minimum(np.maximum(action, -1.0), 1.0)[_PART]
         physics.set_control(np.minimum(np.maximum(target, lowest), highest))
+
+    def after_step(self, physics: Physics) -> None:
+        """Count the steps in a row for which `succeeded` has held."""
+        physics.count_steady(self.succeeded(physics))
 
     def action_spec(self, physics: Physics) -> specs.BoundedArray:
         """Return the spec of the action: float64 ``[4]`` in [-1, 1]."""
@@ -215,12 +296,12 @@ class NicoTask(control.Task):
         return observation
 
     def get_reward(self, physics: Physics) -> float:
-        """Return 1 on success, else 0."""
-        return float(self.succeeded(physics))
+        """Return 1 if `succeeded` has held for `steady_steps` steps, else 0."""
+        return float(physics.steady_steps >= self.steady_steps)
 
     def get_termination(self, physics: Physics) -> float | None:
-        """Return discount 0 on success, else ``None``."""
-        return 0.0 if self.succeeded(physics) else None
+        """Return discount 0 if `succeeded` has held for `steady_steps` steps, else ``None``."""
+        return 0.0 if physics.steady_steps >= self.steady_steps else None
 
     def close(self) -> None:
         """Free the renderer if it was created on demand."""

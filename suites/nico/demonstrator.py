@@ -13,8 +13,8 @@ from suites.nico.base import ACTION_SCALE, NicoTask
 from suites.nico.moves import CLEAR_HEIGHT, FIST, Phase
 from suites.nico.physics import Physics
 
-_SPEED = (0.032, 0.048)  # (rad a step) range of an episode's speed
-_HAND_SPEED = 0.08  # (rad a step)
+_SPEED = (0.045, 0.065)  # (rad a step) range of an episode's speed
+_HAND_SPEED = 0.1  # (rad a step)
 _TREMOR = 0.06  # standard deviation of noise on the action
 
 
@@ -57,15 +57,20 @@ class Demonstrator:
         self._random = np.random.default_rng(seed)
         self._phases: list[Phase] = []
         self._speed = 0.0
+        self._steps = 0  # of the current phase
 
     def reset(self) -> None:
         """Plan a new demonstration from the current state of the environment."""
         self._speed = self._random.uniform(*_SPEED)
+        self._plan()
+
+    def _plan(self) -> None:
         palm = self._physics.palm_position()
         palm[2] = CLEAR_HEIGHT
         lifted = kinematics.inverse(palm, kinematics.PALM)
         plan = self._task.demonstration(self._physics, self._random)
         self._phases = [Phase(lambda _: lifted, FIST / 2), *plan]
+        self._steps = 0
 
     def __call__(self, timestep: TimeStep) -> np.ndarray:
         """Return the next action, ``[4]`` in [-1, 1].
@@ -75,17 +80,27 @@ class Demonstrator:
         """
         if not self._phases:
             raise RuntimeError("call the demonstrator's reset() after the environment's reset()")
-        physics = self._physics
-        phase = self._phases[0]
-        targets = physics.data.ctrl[:4]
-        arm = phase.place(physics) - targets[:3]
-        hand = phase.curl - targets[3]
-        reached = np.abs(arm).max() < phase.tolerance
-        if len(self._phases) > 1 and reached and (phase.until is None or phase.until(physics)):
+        physics, targets = self._physics, self._physics.data.ctrl[:4]
+        arm = self._phases[0].place(physics) - targets[:3]
+        while self._ends(arm):
             self._phases.pop(0)
-            return self(timestep)
-        arm *= min(1.0, self._speed / max(np.abs(arm).max(), 1e-6))
+            self._steps = 0
+            if not self._phases:
+                self._plan()
+            arm = self._phases[0].place(physics) - targets[:3]
+        self._steps += 1
+        hand = self._phases[0].curl - targets[3]
+        speed = self._speed * self._phases[0].pace
+        arm *= min(1.0, speed / max(np.abs(arm).max(), 1e-6))
         hand = np.clip(hand, -_HAND_SPEED, _HAND_SPEED)
         action = np.append(arm, hand) / ACTION_SCALE
         action[:3] += _TREMOR * self._random.standard_normal(3)
         return np.clip(action, -1.0, 1.0)
+
+    def _ends(self, arm: np.ndarray) -> bool:
+        """Return whether the current phase ends, given the way of the joints to its place (rad)."""
+        phase, is_last = self._phases[0], len(self._phases) == 1
+        if self._steps >= phase.limit:
+            return True
+        near = bool(np.abs(arm).max() < phase.tolerance)
+        return near and not is_last and (phase.until is None or phase.until(self._physics))

@@ -2,7 +2,8 @@
 
 A movement leads the hand by inverse kinematics through a few noisy waypoints: above the start
 of the sweep, down to the table and sideways into the object, where it may close, or from above
-onto the object. The waypoints follow the objects as they move.
+onto the object. The waypoints follow the objects as they move. Phases that may get stuck, against
+the table or a neighbor, end after some steps; a movement that has failed is planned anew.
 """
 
 from collections.abc import Callable, Sequence
@@ -14,24 +15,37 @@ import numpy as np
 from suites.nico import kinematics
 from suites.nico.physics import OBJECT_HALF_HEIGHT, OBJECTS, TABLE_HEIGHT, Physics
 
-CLEAR_HEIGHT: Final = TABLE_HEIGHT + 0.125  # (m) of the palm while it travels over the objects
-SWEEP_HEIGHT: Final = TABLE_HEIGHT + 0.045  # (m) of the palm while it sweeps
-OPEN: Final = 0.05  # (rad) curl of a segment
-FIST: Final = 0.85  # (rad) curl of a segment
+# Height of the palm (m) while it travels: the lowest digit passes over the glass, 7 cm high.
+CLEAR_HEIGHT: Final = TABLE_HEIGHT + 0.125
+# Height of the palm (m) while it sweeps: the digits clear the table and meet the boxes, 5 cm high.
+SWEEP_HEIGHT: Final = TABLE_HEIGHT + 0.045
+OPEN: Final = 0.05  # (rad) curl of a segment, just off the joint's stop
+FIST: Final = 0.85  # (rad) curl of a segment, just short of the joint's other stop
 GRIP: Final = 1.2  # (rad) curl of a segment, beyond what the joints reach, for a firm grip
 
 # Contact point of a pushed box, as (left of the arm's plane, beyond the wrist) (m): the fist's
-# knuckles when pushed left, the back of the hand when pushed right.
-_BEFORE_KNUCKLES, _BEHIND_BACK = (0.078, 0.105), (-0.043, 0.075)
+# knuckles when pushed left, the back of the hand when pushed right. Both lie outside of the hand by
+# about half a box, so that the point is where the box's center should be.
+_BEFORE_KNUCKLES, _BEHIND_BACK = (0.078, 0.09), (-0.043, 0.045)
 _FRONT = (0.02, 0.12)  # front of the fist, between palm and fingers
-_LEAD = 0.07  # (m) by which the hand aims ahead of the box it pushes
-_OUTWARD = 0.03  # (m) by which it aims beyond the arc
+# Lead of the hand's target over the box it pushes (m), more than the arm moves in a step: the speed
+# is then the demonstrator's, and the direction that of the goal.
+_LEAD = 0.14
+# Radius (m) beyond which the fingers, not the middle of the hand, push a box to the right: with the
+# middle, the arm would have to be nearly straight.
+_MIDDLE_REACH = 0.415
+# Goal of a push aside, from the object: ahead on the arc (rad), and beyond the radius at which the
+# object started (m). It is the direction that counts: along the arc, and back to the radius.
+_AHEAD, _OUT = 0.08, 0.02
 # Distance from the grip at which the descending palm just misses the center of a box (m).
-_PALM = 0.076
+_PALM = 0.094
 _LIFT_HEIGHT = TABLE_HEIGHT + 0.039  # (m) of the grip around a box to lift; higher, it slips
-_FIRM = 0.25  # (rad) lead of the targets over the curls with which it holds what it lifts
-_RISE = np.array([0.0, 0.0, 0.04])  # (m) from the grip to the place at which a lift aims
-_NOISE = 0.006  # (m) standard deviation of the waypoints
+# Mean lead of the targets over the curls (rad) from which on the hand is closed firmly enough to
+# lift: the object holds the digits back, whose targets go on.
+_FIRM = 0.25
+# From the grip to the place at which a lift aims (m): always ahead, so that the arm rises on.
+_RISE = np.array([0.0, 0.0, 0.04])
+_NOISE = 0.006  # (m) standard deviation of the waypoints, so that no two demonstrations are alike
 
 
 Place = Callable[[Physics], np.ndarray]
@@ -50,6 +64,11 @@ class Phase:
     """Largest distance of a joint from the target at which the phase ends (rad)."""
     until: Callable[[Physics], bool] | None = None
     """Further condition for the end of the phase."""
+    pace: float = 1.0
+    """Factor of the demonstrator's speed."""
+    limit: int = 50
+    """Steps after which the phase ends in any case, as long as an episode by default. After the
+    last phase, the movement is planned anew."""
 
 
 def grasp(physics: Physics, random: np.random.Generator, name: str) -> Sequence[Phase]:
@@ -60,7 +79,7 @@ def grasp(physics: Physics, random: np.random.Generator, name: str) -> Sequence[
         random: Source of the noise.
         name: The object.
     """
-    return [*_reach(physics, random, name), Phase(_stay, GRIP)]
+    return [*_reach(physics, random, name), Phase(_stay, GRIP, limit=14)]
 
 
 def lift(physics: Physics, random: np.random.Generator, name: str) -> Sequence[Phase]:
@@ -79,7 +98,11 @@ def lift(physics: Physics, random: np.random.Generator, name: str) -> Sequence[P
         return kinematics.inverse(physics.grip_position() + _RISE, kinematics.GRIP)
 
     reach = _reach(physics, random, name, _LIFT_HEIGHT)
-    return [*reach, Phase(_stay, GRIP, until=is_firm), Phase(up, GRIP)]
+    return [
+        *reach,
+        Phase(_stay, GRIP, until=is_firm, limit=14),
+        Phase(up, GRIP, limit=12),
+    ]
 
 
 def _reach(
@@ -87,8 +110,8 @@ def _reach(
 ) -> Sequence[Phase]:
     """Return a sweep of the open hand to the left that ends with an object in it."""
     noise = random.normal(0.0, _NOISE, 3)
-    # The palm would otherwise come down on a near neighbor.
-    right = min(random.uniform(0.065, 0.085), _room_on_the_right(physics, name) - _PALM)
+    # The palm would otherwise come down on a near neighbor; but 3 cm to the object have to remain.
+    right = min(random.uniform(0.065, 0.085), max(_room_on_the_right(physics, name) - _PALM, 0.03))
 
     def beside(height: float) -> Place:
         return lambda physics: beside_object(
@@ -100,8 +123,8 @@ def _reach(
 
     return [
         Phase(beside(CLEAR_HEIGHT), OPEN),
-        Phase(beside(sweep_height), OPEN),
-        Phase(around, OPEN, tolerance=0.014),
+        Phase(beside(sweep_height), OPEN, limit=8),
+        Phase(around, OPEN, tolerance=0.014, limit=9),
     ]
 
 
@@ -115,7 +138,7 @@ def push(physics: Physics, random: np.random.Generator, box: str, target: str) -
         target: The object to push it to.
     """
     side = np.sign(_angle(physics, box) - _angle(physics, target))
-    return _sweep(random, box, side, lambda physics: _radius(physics, target))
+    return _sweep(physics, random, box, side, lambda physics: physics.object_position(target)[:2])
 
 
 def push_aside(
@@ -130,23 +153,35 @@ def push_aside(
         side: 1 to push from the left to the right, -1 to push from the right to the left.
     """
     start = _radius(physics, name)
-    return _sweep(random, name, side, lambda _: start)
+
+    def ahead(physics: Physics) -> np.ndarray:
+        return kinematics.polar(start + _OUT, _angle(physics, name) - side * _AHEAD)
+
+    return _sweep(physics, random, name, side, ahead)
 
 
 def _sweep(
-    random: np.random.Generator, name: str, side: float, goal: Callable[[Physics], float]
+    physics: Physics,
+    random: np.random.Generator,
+    name: str,
+    side: float,
+    goal: Callable[[Physics], np.ndarray],
 ) -> Sequence[Phase]:
     """Return a sweep of the fist along the arc that takes an object with it.
 
     Args:
+        physics: The simulation at the start of the episode.
         random: Source of the noise.
         name: The object.
         side: 1 to start on the object's left, -1 on its right.
-        goal: Radius (m) to which the sweep leads, evaluated at each step.
+        goal: Place ``[x, y]`` (m) to which the sweep leads, evaluated at each step.
     """
     noise = random.normal(0.0, _NOISE, 3)
-    away = side * random.uniform(0.025, 0.04)
-    point = _BEFORE_KNUCKLES if side < 0 else _BEHIND_BACK
+    away = side * random.uniform(0.012, 0.025)
+    left, beyond = _BEFORE_KNUCKLES if side < 0 else _BEHIND_BACK
+    if side > 0:  # A far box would be out of reach of the middle of the hand.
+        beyond += max(0.0, _radius(physics, name) - _MIDDLE_REACH)
+    point = left, beyond
 
     def behind(height: float) -> Place:
         return lambda physics: beside_object(
@@ -154,16 +189,16 @@ def _sweep(
         )
 
     def through(physics: Physics) -> np.ndarray:
-        # An object pushed along the arc drifts outwards along the hand, so the hand follows.
-        radius, angle = kinematics.to_polar(physics.object_position(name))
-        radius = (radius + goal(physics)) / 2
-        place = kinematics.polar(radius + _OUTWARD, angle - side * _LEAD / radius)
+        # The hand's rough skin takes the object along in the direction in which the hand moves.
+        box = physics.object_position(name)[:2]
+        way = goal(physics) - box
+        place = box + _LEAD * way / max(np.linalg.norm(way), 1e-6)
         return kinematics.inverse(np.append(place, SWEEP_HEIGHT), point)
 
     return [
         Phase(behind(CLEAR_HEIGHT), FIST),
-        Phase(behind(SWEEP_HEIGHT), FIST),
-        Phase(through, FIST),
+        Phase(behind(SWEEP_HEIGHT), FIST, limit=8),
+        Phase(through, FIST, limit=20),
     ]
 
 
@@ -184,7 +219,10 @@ def press(physics: Physics, random: np.random.Generator, name: str) -> Sequence[
             physics, name, 0.0, top + height + noise[2], _FRONT, noise[:2]
         )
 
-    return [Phase(over(0.16), FIST, tolerance=0.014), Phase(over(-0.03), FIST)]
+    return [
+        Phase(over(0.15), FIST, tolerance=0.014, limit=24, pace=0.85),
+        Phase(over(-0.03), FIST, limit=16, pace=0.85),
+    ]
 
 
 def beside_object(

@@ -10,16 +10,18 @@ from dm_control import suite
 from dm_control.utils import containers
 
 from suites.nico.base import CONTROL_TIMESTEP, TIME_LIMIT, Environment, NicoTask, Observation
-from suites.nico.grasp_glass import GraspGlass
-from suites.nico.lift_green import LiftGreen
 from suites.nico.physics import Physics, scene_xml
-from suites.nico.press_white import PressWhite
-from suites.nico.push_glass_right import PushGlassRight
-from suites.nico.push_green_to_glass import PushGreenToGlass
-from suites.nico.push_green_to_white import PushGreenToWhite
-from suites.nico.push_white_left import PushWhiteLeft
-from suites.nico.push_white_right import PushWhiteRight
 from suites.nico.rendering import FRAME_HEIGHT, FRAME_WIDTH, FrameRenderer, check_frame_size
+from suites.nico.tasks import (
+    GraspGlass,
+    LiftGreen,
+    PressWhite,
+    PushGlassRight,
+    PushGreenToGlass,
+    PushGreenToWhite,
+    PushWhiteLeft,
+    PushWhiteRight,
+)
 
 _TASKS: dict[str, type[NicoTask]] = {
     "grasp_glass": GraspGlass,
@@ -47,7 +49,7 @@ def add_task(name: str, task: type[NicoTask]) -> None:
 
     Args:
         name: Name of the task in `load`, datasets, settings and CSV files.
-        task: Class that defines success and, for recording, a demonstration.
+        task: Class that defines the condition of success and, for recording, a demonstration.
 
     Raises:
         ValueError: If the name is taken by one of the suite's tasks, is "all" or not an identifier,
@@ -88,6 +90,7 @@ def load(
     task: str,
     *,
     seed: int | np.random.RandomState | None = None,
+    spread: float = 1.0,
     observation: Observation = "pixels",
     frame_size: Sequence[int] = (FRAME_HEIGHT, FRAME_WIDTH),
     time_limit: float = TIME_LIMIT,
@@ -100,6 +103,8 @@ def load(
     Args:
         task: One of `TASKS`.
         seed: Seed or random state of the start states; ``None`` for a random seed.
+        spread: Share of the whole range of start states, from 0 (nominal places) to 1, see
+            `NicoTask`.
         observation: ``"pixels"`` (uint8 ``[32, 64, 3]``), ``"state"`` (``privileged_state``, the
             ground truth, float64 ``[16]``: joints (rad), grip and object positions (m)) or
             ``"both"``.
@@ -111,8 +116,8 @@ def load(
         environment_kwargs: Further arguments of ``dm_control.rl.control.Environment``.
 
     Raises:
-        ValueError: If the task, the observation or the frame size is invalid, or ``time_limit`` is
-            not positive.
+        ValueError: If the task, the spread, the observation or the frame size is invalid, or
+            ``time_limit`` is not positive.
 
     Example:
         >>> from suites import nico
@@ -127,7 +132,13 @@ def load(
     check_frame_size(physics.model.ptr, frame_size)
     return Environment(
         physics,
-        TASKS[task](random=seed, observation=observation, frame_size=frame_size, renderer=renderer),
+        TASKS[task](
+            random=seed,
+            spread=spread,
+            observation=observation,
+            frame_size=frame_size,
+            renderer=renderer,
+        ),
         time_limit=time_limit,
         control_timestep=CONTROL_TIMESTEP,
         **(environment_kwargs or {}),

@@ -114,6 +114,31 @@ class Physics(dm_mujoco.Physics):
         """
         return self.data.xpos[self._object_id("body", name)].copy()
 
+    def start_position(self, name: str) -> np.ndarray:
+        """Return where an object's center was at the start of the episode (m), ``[3]``.
+
+        Raises:
+            ValueError: If ``name`` is not one of `OBJECTS`.
+        """
+        self._object_id("body", name)
+        return self.data.userdata[1:].reshape(-1, 3)[OBJECTS.index(name)].copy()
+
+    # What an episode remembers is in MuJoCo's user data, hence in `get_state`.
+
+    def begin_episode(self) -> None:
+        """Store where the objects are, for `start_position`, and set `steady_steps` to 0."""
+        self.data.userdata[0] = 0.0
+        self.data.userdata[1:] = np.concatenate([self.object_position(name) for name in OBJECTS])
+
+    @property
+    def steady_steps(self) -> int:
+        """Number of latest control steps in a row for which the condition of success has held."""
+        return int(self.data.userdata[0])
+
+    def count_steady(self, holds: bool) -> None:
+        """Add a control step to `steady_steps`, or set it to 0 if the condition does not hold."""
+        self.data.userdata[0] = self.data.userdata[0] + 1.0 if holds else 0.0
+
     def privileged_state(self) -> np.ndarray:
         """Return joint angles (rad) ``[4]``, grip (m) ``[3]`` and object positions (m) ``[9]``."""
         objects = [self.object_position(name) for name in OBJECTS]
@@ -197,6 +222,21 @@ class Physics(dm_mujoco.Physics):
             if geom in pair and pair & set(self._hand) and up > _VERTICAL:
                 return True
         return False
+
+    def stands(self, name: str) -> bool:
+        """Return whether an object stands upright on the table, not on another of its sides.
+
+        It may be moving.
+
+        Args:
+            name: One of `OBJECTS`.
+
+        Raises:
+            ValueError: If ``name`` is not one of `OBJECTS`.
+        """
+        body = self._object_id("body", name)
+        low = self.data.xpos[body, 2] - TABLE_HEIGHT < OBJECT_HALF_HEIGHT[name] + _TOUCH_GAP
+        return bool(self.data.xmat[body, 8] > _VERTICAL and low)
 
     def held(self, name: str) -> bool:
         """Return whether an object is between thumb and finger side of a closing hand.

@@ -1,6 +1,5 @@
 """Variants of BGPO, by what their policies read."""
 
-from bgpo_trl.configs import GWRBConfig
 from bgpo_trl.transforms import TaskSchedule
 
 # By name: state, meaning of the context, variant, and the algorithm whose settings it has.
@@ -14,7 +13,7 @@ VARIANTS = {
     "experts": ("latent", "b", "bgpo", "bgpo-experts"),
     "all": ("latent", "b", "bgpo", "bgpo"),
 }
-# Many groups, and few of them active.
-GROUPS = {"groups": GWRBConfig(activity_threshold=0.9), "active_groups": 2}
+# More groups than are active.
+GROUPS = {"group_size": 4, "group_evidence": 0.5, "active_groups": 2}
 CHANGES = {"even replay": {"even_replay": True, **GROUPS}, "experts": GROUPS, "all": GROUPS}
 SCHEDULE = TaskSchedule((0, 2, 4))

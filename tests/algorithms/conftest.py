@@ -10,6 +10,8 @@ from tests.algorithms.bgpo_variants import CHANGES, SCHEDULE, VARIANTS
 
 @pytest.fixture
 def make_bgpo(bank, encoders, make_config, in_world):
+    """Makes BGPO; its groups have seen the first ``known`` demonstrations, from each seed's on."""
+
     def make(
         variant="latent, b",
         seeds=(3, 8),
@@ -17,6 +19,7 @@ def make_bgpo(bank, encoders, make_config, in_world):
         bank=bank,
         rl=None,
         config=None,
+        known=0,
         **changes,
     ):
         state, _, kind, name = VARIANTS[variant]
@@ -25,6 +28,10 @@ def make_bgpo(bank, encoders, make_config, in_world):
         config = replace(config, **{**CHANGES.get(variant, {}), **changes})
         bank = bank.for_tasks(bank.tasks[: schedule.n_tasks])
         algorithm = BGPO(config, seeds=seeds, bank=bank.seen(), encoders=encoders)
+        if algorithm.groups is not None:
+            for row in range(known):
+                shown = [(seed + row) % len(bank.seen().task) for seed in seeds]
+                algorithm.groups.adapt(bank.seen().embedding[shown])
         return in_world(algorithm, seeds, schedule, bank)
 
     return make

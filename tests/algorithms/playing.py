@@ -14,7 +14,7 @@ def play(algorithm, n_steps, state=None, hidden=(), watch=lambda chosen: None):
     """
     state, transitions = algorithm.world.env.reset() if state is None else state, []
     for _ in range(n_steps):
-        state["action"] = algorithm.act(state.exclude(*hidden))["action"]
+        state.update(algorithm.act(state.exclude(*hidden)))
         watch(state)
         algorithm.update()
         transition, state = algorithm.world.env.step_and_maybe_reset(state)

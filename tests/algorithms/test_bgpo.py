@@ -103,7 +103,7 @@ def test_a_label_is_the_task_of_the_episode(make_bgpo):
 @pytest.mark.parametrize("variant", [v for v in VARIANTS if VARIANTS[v][1] != "label"])
 def test_bgpo_never_reads_the_label(make_bgpo, variant):
     label = ("task",)
-    algorithm, blind = make_bgpo(variant), make_bgpo(variant)
+    algorithm, blind = (make_bgpo(variant, known=15) for _ in range(2))
     learner = algorithm.learner
     for keys in (learner.actor.in_keys, learner.loss.in_keys, algorithm.in_keys):
         names = {name for key in keys for name in ([key] if isinstance(key, str) else key)}
@@ -217,7 +217,7 @@ def test_snapshots_have_the_context_of_training_and_learn_nothing(make_bgpo, var
 
 def test_test_episodes_are_played_by_the_expert_of_their_demonstration(make_bgpo, bank):
     """By hand: the group of each demonstration, its expert's weights, what they do."""
-    algorithm = make_bgpo("experts", schedule=TaskSchedule((0, 0, 0)))
+    algorithm = make_bgpo("experts", schedule=TaskSchedule((0, 0, 0)), known=15)
     play(algorithm, 60)
     assert algorithm.groups.num_groups.min() > 2
     shown = bank.held_out()
@@ -340,11 +340,11 @@ ALONE += [("even replay", None), *(("all", rl) for rl in ("ddpg", "td3", "sac"))
 @pytest.mark.parametrize(("variant", "rl"), ALONE)
 def test_each_seed_of_a_batch_learns_as_it_would_alone(make_bgpo, variant, rl):
     seeds = (1, 2)  # no pixel of theirs is so near an edge that rounding moves it across
-    batch = make_bgpo(variant, seeds=seeds, rl=rl)
+    batch = make_bgpo(variant, seeds=seeds, rl=rl, known=15)
     together = play(batch, 60)[0]
     losses = []
     for index, seed in enumerate(seeds):
-        alone = make_bgpo(variant, seeds=(seed,), rl=rl)
+        alone = make_bgpo(variant, seeds=(seed,), rl=rl, known=15)
         data = play(alone, 60)[0][0]
         whole = ["task", "demo_index", "step_count", ("next", "terminated")]
         for key in [*whole, *(["group"] if alone.groups is not None else [])]:

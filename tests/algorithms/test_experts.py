@@ -23,28 +23,29 @@ PARENTS = {0: 0, 1: 0, 2: 1, 3: 1, 4: 3, 5: 4}
 
 @settings(max_examples=60)
 @given(
-    n_slots=st.integers(1, 4),
+    most=st.integers(1, 4),
+    rest_after=st.integers(1, 9),
     played=st.lists(st.integers(0, 6), max_size=40),
     n_rows=st.integers(0, 9),
     restored=st.booleans(),
 )
-def test_the_groups_played_last_are_active(n_slots, played, n_rows, restored):
-    active, other, latest, slots = ActiveGroups(2, n_slots), ActiveGroups(2, n_slots), [], {}
-    for group in played:
-        slot = active.play(1, group)
-        assert slots.setdefault(group, slot) == slot  # it keeps its slot while it is active
-        latest = [*(g for g in latest if g != group), group][-n_slots:]
-        slots = {g: slots[g] for g in latest}
-        assert len(set(slots.values())) == len(slots)  # which is its own
+def test_the_groups_played_last_are_active(most, rest_after, played, n_rows, restored):
+    active, other = (ActiveGroups(2, most, rest_after) for _ in range(2))
+    slots, latest = {}, []
+    for step, group in enumerate(played):
+        active.play(1, group)
+        within = played[max(0, step + 1 - rest_after) : step + 1][::-1]
+        latest = list(dict.fromkeys(within))[:most]
+        now = active.groups[1]
+        assert sorted(now) == sorted(latest)
+        if [*slots] and {*slots} <= {*now}:  # without a rest, all keep their slots
+            assert all(now.index(group) == slot for group, slot in slots.items())
+        slots = {group: slot for slot, group in enumerate(now)}
         if restored:
             other.load_state_dict(active.state_dict())
-            active, other = other, ActiveGroups(2, n_slots)
-    expected = [-1] * n_slots
-    for group, slot in slots.items():
-        expected[slot] = group
-    assert active.group.tolist() == [[-1] * n_slots, expected]  # the other seed has played none
-    for group in range(7):
-        assert active.slot(1, group) == slots.get(group)
+            active, other = other, ActiveGroups(2, most, rest_after)
+    width = max(1, len(latest))
+    assert active.group.tolist() == [[-1] * width, [*slots] or [-1]]  # the other has played none
     rows = active.rows(n_rows)
     assert rows[0].tolist() == [-1] * n_rows
     counts = [rows[1].tolist().count(group) for group in latest]
@@ -56,16 +57,19 @@ def test_the_groups_played_last_are_active(n_slots, played, n_rows, restored):
 # ---- their networks
 
 
-def make(name="ddpg", n_slots=2, seeds=SEEDS):
+def make(name="ddpg", most=2, seeds=SEEDS, rest_after=99):
     config = replace(RL[name].config, hidden_sizes=(8,))
-    spec = LearnerSpec(seeds, ["state"], 6, (0.0, 1.1), torch.device("cpu"), experts=range(n_slots))
-    learner = make_learner(config, spec)
-    return Experts(learner, ActiveGroups(len(seeds), n_slots), lambda seed, group: PARENTS[group])
+    spec = LearnerSpec(seeds, ["state"], 6, (0.0, 1.1), torch.device("cpu"))
+    return Experts(
+        lambda width: make_learner(config, replace(spec, experts=range(width))),
+        ActiveGroups(len(seeds), most, rest_after),
+        lambda seed, group: PARENTS[group],
+    )
 
 
-def make_batch(n_slots, seed):
+def make_batch(seed):
     generator = torch.Generator().manual_seed(seed)
-    shape = (2, n_slots, 8)
+    shape = (2, 6, 8)
     terminated = torch.rand(*shape, 1, generator=generator) < 0.2
     following = {"state": torch.randn(*shape, 6, generator=generator), "terminated": terminated}
     data = {"state": torch.randn(*shape, 6, generator=generator)}
@@ -74,8 +78,17 @@ def make_batch(n_slots, seed):
     return TensorDict(data, shape)
 
 
-def learn(experts, seed):
-    experts.learner.learn(make_batch(experts.active.group.shape[1], seed))
+def learn(experts, seed, rows=slice(None)):
+    """An update in which what a group sees depends on nothing but the seed and the group."""
+    group = experts.active.group
+    data = make_batch(seed)[rows]
+    batch = data[torch.arange(len(group)).unsqueeze(1), group.clamp(min=0)].clone()
+    weight = (group >= 0).float().unsqueeze(-1).expand(-1, -1, 8)
+    experts.learner.learn(batch.set("priority_weight", weight))
+
+
+def slot_of(experts, seed, group):
+    return experts.active.groups[seed].index(group)
 
 
 def tensors_of(experts, seed, slot):
@@ -157,7 +170,7 @@ def test_a_parent_that_is_put_aside_is_inherited_from_too():
     for step, group in enumerate((0, 2, 3)):  # two slots: 0 is put aside
         experts.play([group, group])
         learn(experts, step)
-    assert experts.active.slot(0, 0) is None
+    assert 0 not in experts.active.groups[0]
     parent = experts.actor_weights(0, 0)
     (slot, _) = experts.play([1, 3]).tolist()
     child = tensors_of(experts, 0, slot)
@@ -181,7 +194,7 @@ def test_tests_see_the_weights_of_a_group_wherever_they_are(name):
         kept[group] = tensors_of(experts, 1, slot)
         for other in experts.active.group[1].tolist():
             if other >= 0:
-                kept[other] = tensors_of(experts, 1, experts.active.slot(1, other))
+                kept[other] = tensors_of(experts, 1, slot_of(experts, 1, other))
     copies = {group: experts.actor_weights(1, group) for group in (*kept, 3, 5)}
     for group, like in {0: 0, 1: 1, 2: 2, 3: 1, 4: 4, 5: 4}.items():
         for key, value in copies[group].items():
@@ -194,37 +207,78 @@ def test_tests_see_the_weights_of_a_group_wherever_they_are(name):
 
 
 @every_rl
-def test_an_update_is_of_the_same_size_however_many_groups_there_are(name):
-    def sizes(experts):
-        state = experts.learner.optimizer.state
-        shapes = {k: v.shape for k, v in experts.learner.loss.state_dict().items()}
-        return (
-            shapes,
-            len(state),
-            [len(g["params"]) for g in experts.learner.optimizer.param_groups],
-        )
-
-    experts, few = make(name), make(name)
-    for step in range(6):
-        few.play([0, 0])
-        learn(few, step)
-    for step in range(6):
-        experts.play([step, step])
+def test_a_stack_is_as_wide_as_groups_are_active(name):
+    experts = make(name, most=3, rest_after=4)
+    widths = []
+    for step, groups in enumerate([(0, 0), (0, 1), (2, 1), (3, 1), (4, 1), *[(4, 1)] * 3]):
+        experts.play(groups)
         learn(experts, step)
-    assert sizes(experts) == sizes(few)
+        widths.append(experts.width)
+        assert {p.shape[:2] for p in experts.learner.loss.parameters()} == {(2, experts.width)}
+        for state in experts.learner.optimizer.state.values():
+            assert state["exp_avg"].shape[:2] == (2, experts.width)
+            assert int(state["step"]) == step + 1 if name != "td3" else True
+    assert widths == [1, 2, 2, 3, 3, 3, 2, 1]
+
+
+@every_rl
+def test_an_expert_that_rests_is_left_as_it_is_and_one_that_does_not_is_not(name):
+    experts = make(name, most=3, rest_after=5)
+    for step, group in enumerate([0, 1, 1]):
+        experts.play([group, 0])
+        learn(experts, step)
+    before = experts.actor_weights(0, 0)
+    for step in (3, 4):  # since TD3 updates the actor every other time
+        experts.play([1, 0])
+        learn(experts, step)
+    learnt = experts.actor_weights(0, 0)
+    assert differing(before, learnt)
+    for step in range(5, 12):
+        experts.play([1, 0])
+        learn(experts, step)
+        assert experts.active.groups == [[1], [0]]
+        assert not differing(experts.actor_weights(0, 0), learnt)
+    for step in (12, 13):
+        experts.play([0, 0])
+        learn(experts, step)
+    assert differing(experts.actor_weights(0, 0), learnt)
+
+
+@every_rl
+def test_a_group_that_ends_is_put_aside_and_comes_back_as_it_was(name):
+    experts = make(name, most=3)
+    for step, group in enumerate([0, 1, 2, 1]):
+        experts.play([group, 0])
+        learn(experts, step)
+    kept = {group: tensors_of(experts, 0, slot_of(experts, 0, group)) for group in (0, 1, 2)}
+    experts.rest(0, 1)
+    assert experts.active.groups[0] == [0, 2]
+    assert not differing(tensors_of(experts, 0, 1), kept[2])
+    for group, like in {**kept, 3: kept[1]}.items():  # 3 parted from 1
+        for key, value in experts.actor_weights(0, group).items():
+            assert value.equal(like[f"actor_network_params.{key}"])
+    experts.play([1, 0])
+    for group, tensors in kept.items():
+        assert not differing(tensors_of(experts, 0, slot_of(experts, 0, group)), tensors)
 
 
 @every_rl
 def test_a_seed_of_a_batch_is_that_seed_alone(name):
-    together, alone = make(name), make(name, seeds=SEEDS[1:])
+    """Also where the other has more active groups, or its groups rest."""
+    together = make(name, most=3, rest_after=7)
+    alone = make(name, most=3, rest_after=7, seeds=SEEDS[1:])
     generator = torch.Generator().manual_seed(2)
-    for step in range(30):
+    widths = set()
+    for step in range(40):
         first, second = torch.randint(6, (2,), generator=generator).tolist() if step else (0, 0)
+        if step % 16 > 8:
+            second = 2
         slots = together.play([first, second])
         assert alone.play([second]).tolist() == slots[1:].tolist()
-        data = make_batch(2, step)
-        together.learner.learn(data.clone())
-        alone.learner.learn(data[1:].clone())
+        widths.add((together.width, alone.width))
+        learn(together, step)
+        learn(alone, step, slice(1, 2))
+    assert len(widths) > 3
     for group in range(6):
         ours = together.actor_weights(1, group)
         for key, value in alone.actor_weights(0, group).items():
@@ -246,13 +300,13 @@ def test_restored_experts_go_on_bit_for_bit(name, n_steps):
     torch.save({"learner": experts.learner.state_dict(), "experts": experts.state_dict()}, file)
     file.seek(0)
     state = torch.load(file, weights_only=True)
-    restored.learner.load_state_dict(state["learner"])
     restored.load_state_dict(state["experts"])
+    restored.learner.load_state_dict(state["learner"])
     for one in (experts, restored):
         play(one, range(n_steps, n_steps + 12))
     assert restored.active.group.equal(experts.active.group)
     for seed in range(2):
-        for slot in range(2):
+        for slot in range(len(experts.active.groups[seed])):
             ours, theirs = (tensors_of(one, seed, slot) for one in (experts, restored))
             assert not differing(ours, theirs)
         for group in range(6):

@@ -4,20 +4,19 @@ import pytest
 import torch
 
 from bgpo_trl.analysis.novelty import Detection, leave_one_out, roc_area, roc_curve
-from bgpo_trl.configs import GWRBConfig
 from bgpo_trl.data.bank import DemonstrationBank
 
 
 def test_the_area_counts_pairs_in_the_right_order():
-    known, unknown = torch.tensor([0.9, 0.5, 0.4]), torch.tensor([0.1, 0.5])
-    # Right: all three above 0.1, one above 0.5; equal: one.
+    known, unknown = torch.tensor([0.1, 0.5, 0.6]), torch.tensor([0.9, 0.5])
+    # Right: all three below 0.9, one below 0.5; equal: one.
     assert roc_area(known, unknown).item() == pytest.approx((4 + 0.5) / 6)
 
 
 def test_the_area_is_that_under_the_curve():
     generator = torch.Generator().manual_seed(0)
     known = torch.rand(50, generator=generator).round(decimals=1)  # with ties
-    unknown = torch.rand(30, generator=generator).round(decimals=1) * 0.8
+    unknown = torch.rand(30, generator=generator).round(decimals=1) * 1.2
     false_alarms, detected = roc_curve(known, unknown)
     assert (false_alarms[0], detected[0]) == (0, 0)
     assert (false_alarms[-1], detected[-1]) == (1, 1)
@@ -25,10 +24,10 @@ def test_the_area_is_that_under_the_curve():
     torch.testing.assert_close(roc_area(known, unknown), expected)
 
 
-def test_shares_are_counted_at_the_threshold_by_network():
-    known = torch.tensor([[0.9, 0.6, 0.6, 0.2], [0.9, 0.9, 0.9, 0.5]])
-    unknown = torch.tensor([[0.1, 0.7], [0.4, 0.2]])
-    found = Detection(known, unknown, threshold=0.5)
+def test_shares_are_counted_by_network():
+    known = torch.tensor([[0.2, 0.8, 0.8, 1.4], [0.2, 0.2, 0.2, 1.0]])
+    unknown = torch.tensor([[1.5, 0.7], [1.2, 1.4]])
+    found = Detection(known, unknown)
     assert found.false_alarms.tolist() == [0.25, 0.0]
     assert found.detected.tolist() == [0.5, 1.0]
     assert found.area.tolist() == [5 / 8, 1.0]
@@ -45,27 +44,24 @@ def places(*centers, n=40, spread=0.05):
     return DemonstrationBank(embedding, task, train, names)
 
 
-CONFIG = GWRBConfig(activity_threshold=0.5, habituation_threshold=0.5, activity_scale=1.0)
-
-
 def test_a_task_elsewhere_is_detected_and_one_at_the_same_place_is_not():
     apart = places((0.0, 0.0), (3.0, 0.0), (0.0, 3.0))
-    found = leave_one_out(apart, 2, CONFIG, seeds=[0, 1], draws=100)
+    found = leave_one_out(apart, 2, seeds=[0, 1], draws=100)
     assert found.known.shape == (2, 20) and found.unknown.shape == (2, 10)
     assert found.area.tolist() == [1.0, 1.0]
     assert found.detected.tolist() == [1.0, 1.0] and found.false_alarms.tolist() == [0.0, 0.0]
     same = places((0.0, 0.0), (3.0, 0.0), (3.0, 0.0))
-    found = leave_one_out(same, 2, CONFIG, seeds=[0], draws=100)
+    found = leave_one_out(same, 2, seeds=[0], draws=100)
     assert 0.2 < found.area.item() < 0.8 and found.detected.item() == 0.0
 
 
 def test_a_network_is_that_of_its_seed_alone():
     bank = places((0.0, 0.0), (3.0, 0.0), (0.0, 3.0), spread=0.5)
-    both = leave_one_out(bank, 0, CONFIG, seeds=[3, 4], draws=50)
-    alone = leave_one_out(bank, 0, CONFIG, seeds=[4], draws=50)
+    both = leave_one_out(bank, 0, seeds=[3, 4], draws=50)
+    alone = leave_one_out(bank, 0, seeds=[4], draws=50)
     torch.testing.assert_close(both.known[1:], alone.known)
 
 
 def test_a_bank_of_a_single_task_is_refused():
     with pytest.raises(ValueError, match="leaving out task 0 takes demonstrations of it"):
-        leave_one_out(places((0.0, 0.0)), 0, CONFIG, seeds=[0])
+        leave_one_out(places((0.0, 0.0)), 0, seeds=[0])

@@ -33,8 +33,8 @@ def tiny(monkeypatch, encoders, bank, make_config):
     chance = torch.tensor([0.1, 0.2, 0.3])
     limit = config.algorithm.max_steps
 
-    def of_random_policy(*, tasks, episodes, max_steps):
-        assert max_steps == limit
+    def of_random_policy(*, tasks, episodes, max_steps, spread):
+        assert (max_steps, spread) == (limit, config.spread)
         return chance
 
     monkeypatch.setattr(measure, "evaluate_random_policy", of_random_policy)

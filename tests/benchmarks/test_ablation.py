@@ -13,9 +13,10 @@ from torchrl.envs import check_env_specs
 from benchmarks import ablation
 from bgpo_trl.algorithms import ABLATIONS
 from bgpo_trl.algorithms.bgpo import BGPO
+from bgpo_trl.configs.rl import DDPGConfig
 from bgpo_trl.experiments.arguments import Arguments, command_line
 from bgpo_trl.files.checkpoint import load_checkpoint
-from bgpo_trl.runs.results import read_rows
+from bgpo_trl.runs.results import read_table
 from bgpo_trl.transforms import BehaviorLookup, GroupLookup, TaskSchedule
 
 pytestmark = pytest.mark.usefixtures("easy_world")
@@ -76,7 +77,7 @@ COMMON = {
     *("episode_reward", "done", "terminated", "truncated"),
 }
 FROM_GWR = {"behavior_node"}
-FROM_GROUPS = {"group", "group_activity"}
+FROM_GROUPS = {"group", "group_novelty"}
 FROM_REWARD = {"lae_h", "lae_c", "episode_extrinsic_reward", "episode_intrinsic_reward"}
 
 
@@ -214,15 +215,17 @@ def test_the_command_line_knows_every_variant():
 def test_the_variants_beyond_the_paper_add_one_thing_at_a_time(make):
     published = ABLATIONS["gwr+r_int"].config
     assert not (published.experts or published.even_replay or published.demonstration_share)
+    alone = {"demonstration_share": 0.75, "rl": DDPGConfig(noise=0.1, batch_size=384)}
+    shown = {**alone, "rl": DDPGConfig(noise=0.1), "expert_batch_size": 128}
     for variant, added in {
         "even-replay": {"variant": "bgpo", "even_replay": True},
         "experts": {"variant": "bgpo", "even_replay": True, "experts": True},
-        "demonstrations": {"demonstration_share": 0.25},
+        "demonstrations": alone,
         "all": {
             "variant": "bgpo",
             "even_replay": True,
             "experts": True,
-            "demonstration_share": 0.25,
+            **shown,
         },
     }.items():
         assert ABLATIONS[variant].config == replace(published, **added)
@@ -243,10 +246,10 @@ def test_the_command_line_runs_a_variant_under_its_name(
     config = json.loads((run / "config.json").read_text())
     assert (config["name"], config["task_starts"]) == (variant, [0, 0, 0])
     for file in ("train.csv", "eval.csv"):
-        assert {row["algorithm"] for row in read_rows(run / file)} == {variant}
-    for row in read_rows(run / "train.csv"):
-        assert (int(row["num_nodes"]) > 1) == has_gwr(variant)
-        assert (float(row["intrinsic_return"]) > 0) == has_reward(variant)
+        assert set(read_table(run / file)["algorithm"]) == {variant}
+    train = read_table(run / "train.csv")
+    assert ((train["num_nodes"].astype(int) > 1) == has_gwr(variant)).all()
+    assert ((train["intrinsic_return"].astype(float) > 0) == has_reward(variant)).all()
     learner = load_checkpoint(run / "checkpoint")["algorithm"]
     assert ("gwr" in learner) == has_gwr(variant)
     assert ("groups" in learner) == has_groups(variant)

@@ -1,44 +1,53 @@
 """Two runs are compared seed by seed, against numbers worked out by hand."""
 
-import numpy as np
 import pytest
 
 from benchmarks import compare
+from bgpo_trl.analysis import statistics
+from tests.analysis.runs import TASKS, edit, write_run
 
 
-def write(path, rows):
-    path.mkdir()
-    lines = ["algorithm,seed,episode,task,success"]
-    lines += [",".join(map(str, ("bgpo", *row))) for row in rows]
-    (path / "eval.csv").write_text("\n".join(lines) + "\n")
-    return path
+@pytest.fixture
+def runs(tmp_path):
+    """A run at 40, 50 and 40 %, and one of eight tenths of its length at 90, 80 and 100 %."""
+    first = write_run(tmp_path, "oracle", [4, 5, 4], starts=(0, 14, 26))
+    second = write_run(tmp_path, "bgpo", [9, 8, 10], starts=(0, 14, 26), episodes=32)
+    return first, second
 
 
-def test_p_is_the_share_of_deals_as_far_apart():
-    # Of the 6 ways to deal 0, 0, 1, 1 into pairs, 2 are as far apart as (0, 0) and (1, 1).
-    assert compare.permutation_p(np.array([0.0, 0]), np.array([1.0, 1])) == pytest.approx(2 / 6)
-    assert compare.permutation_p(np.array([0.0, 1]), np.array([1.0, 0])) == 1
-    five = compare.permutation_p(np.zeros(5), np.ones(5))
-    assert five == pytest.approx(2 / 252)
+def table(capsys):
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("|")]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:]]
 
 
-def test_success_is_averaged_within_a_seed_first(tmp_path):
-    rows = [(0, 10, "grasp", 1), (0, 20, "grasp", 0), (1, 20, "grasp", 1), (1, 21, "grasp", 0)]
-    found = compare.success_by_seed(write(tmp_path / "a", rows) / "eval.csv", every=20)
-    assert found["grasp", 20].tolist() == [0.5, 1.0]
-    assert found["grasp", 40].tolist() == [0.0]
-
-
-def test_the_table_has_what_both_runs_have(tmp_path, capsys):
-    # The second run was cut short after episode 5: what comes later in the first does not count.
-    first = write(
-        tmp_path / "a",
-        [(0, 5, "grasp", 0), (1, 5, "grasp", 0), (0, 5, "push", 1), (0, 9, "grasp", 1)],
-    )
-    second = write(tmp_path / "b", [(0, 5, "grasp", 1), (1, 5, "grasp", 1)])
-    compare.main(compare.Arguments(first, second, every=10))
-    assert capsys.readouterr().out.splitlines()[2:] == [
-        "| grasp | 10 | 0.00 | 1.00 | +1.00 | 0.33 |"
+def test_seeds_are_compared_on_what_both_runs_have(runs, capsys):
+    compare.main(compare.Arguments(*runs))
+    *tasks, mean = table(capsys)
+    assert [row[1] for row in tasks] == list(TASKS)
+    # At episode 32, the first run is at half of its level, rounded down: 20 % in each seed.
+    by_hand = statistics.difference([0.9, 0.8, 1.0], [0.2, 0.2, 0.2])
+    assert mean == [
+        *("last 10 %", "all", "20.0", "90.0"),
+        *(by_hand.estimate.points(), "0.100", by_hand.note),
     ]
-    with pytest.raises(ValueError, match="share no task and part of training"):
-        compare.main(compare.Arguments(first, write(tmp_path / "c", [(0, 5, "pull", 1)])))
+    assert [row[2:] for row in tasks] == [mean[2:]] * 3
+
+
+def test_parts_of_training_leave_out_tasks_that_were_not_presented(runs, capsys):
+    compare.main(compare.Arguments(*runs, every=14))
+    rows = table(capsys)
+    assert [row[0] for row in rows] == ["to 14"] * 2 + ["to 28"] * 4 + ["last 10 %"] * 4
+    # To 28, tests at 26 and 28 of the second run are in its last fifth, five before are not.
+    halves = [(2 * late + 5 * half) / 7 for late, half in ((9, 4), (8, 4), (10, 5))]
+    assert rows[2][2:4] == ["20.0", f"{10 * sum(halves) / 3:.1f}"]
+
+
+def test_other_conditions_and_tasks_are_refused(runs, capsys, tmp_path):
+    edit(runs[0] / "config.json", held_out="test")
+    with pytest.raises(ValueError, match=r"differ in held_out \(test and validation\): only"):
+        compare.main(compare.Arguments(*runs))
+    compare.main(compare.Arguments(*runs, anyway=True))
+    assert "differ in held_out (test and validation)" in capsys.readouterr().out
+    other = write_run(tmp_path, "ddpg", 3, tasks=("pull",), starts=(0,))
+    with pytest.raises(ValueError, match="only runs of the same tasks in the same order"):
+        compare.main(compare.Arguments(runs[0], other, anyway=True))

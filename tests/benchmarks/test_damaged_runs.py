@@ -8,14 +8,14 @@ import warnings
 import looking
 import one_shot
 import pytest
-import summary
+import report
 
 from bgpo_trl.experiments.watch import WatchArguments, watch
 from bgpo_trl.figures.of_run import draw_growth
 from bgpo_trl.files.checkpoint import save_checkpoint
 from bgpo_trl.runs.config_file import read_config
-from bgpo_trl.runs.results import read_rows
 from suites import nico
+from tests.folders import contents
 
 TASKS = nico.PAPER_TASKS
 RUBBISH = bytes(range(1, 128)) * 3  # which is text, as far as UTF-8 goes
@@ -107,7 +107,7 @@ def of_the_settings(name):
     }
 
 
-SUMMARY = {
+REPORT = {
     **of_the_file("eval.csv"),
     **of_the_file("final.csv"),
     **of_the_settings("config.json"),
@@ -117,7 +117,6 @@ SUMMARY = {
     "starts in words": having("config.json", "task_starts", ["now", 1, 2]),
     "tasks by number": having("config.json", "tasks", [1, 2, 3]),
     "no nodes": having("summary.json", "nodes", "many"),
-    "no commit": without("summary.json", "commit"),
     "training of a longer run": having("config.json", "episodes", 20),
     "table of something else": content("eval.csv", b"date,temperature\nmonday,21\n"),
     "final table of something else": content("final.csv", b"date,temperature\nmonday,21\n"),
@@ -125,7 +124,6 @@ SUMMARY = {
     "inference that is none": replaced("final.csv", "0.25", "perhaps"),
     "final row cut short": replaced("final.csv", ",20,0.5,0.25", ""),
     "final tests of one task": lines("final.csv", lambda number, line: TASKS[0] in line),
-    "final tests of none": lines("final.csv", lambda number, line: False),
     "no held-out ones": lines("final.csv", lambda number, line: "seen" in line),
     "a seed without late tests": lines(
         "eval.csv", lambda number, line: not line.startswith("bgpo,8,10")),
@@ -138,38 +136,37 @@ SUMMARY = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("damage", SUMMARY.values(), ids=SUMMARY.keys())
-def test_a_damaged_run_is_not_summed_up(run, capsys, damage):
+# Final tests and a summary come after training, and nothing in the summary is needed.
+for _name in ("final.csv missing", "summary.json missing", "summary.json of something else"):
+    del REPORT[_name]
+
+
+@pytest.mark.parametrize("damage", REPORT.values(), ids=REPORT.keys())
+def test_a_damaged_run_is_not_reported(run, capsys, damage):
     damage(run)
-    refusal(lambda: summary.main(summary.Arguments((run,))))
+    before = contents(run)
+    refusal(lambda: report.main(report.Arguments((run,))))
     assert capsys.readouterr().out == ""
-    assert not (run / "success.png").exists()
+    assert contents(run) == before
 
 
-def test_a_run_that_is_all_there_is_summed_up(run, capsys):
-    summary.main(summary.Arguments((run,)))
+def test_a_run_that_is_all_there_is_reported(run, capsys):
+    report.main(report.Arguments((run,)))
     told = capsys.readouterr().out
     assert "nan" not in told
-    assert "GWR-B nodes: [3, 4]. Commit c: `python`." in told
-    assert "Episodes to 80 %" not in told  # with one task presented, it would be of that alone
+    assert "| one for all |  | 25.00 | 25 25 | 3 4 |" in told
+    assert "- `c`, `python`" in told
+    assert "| episodes to 80 % |" not in told  # with one task presented, it would be of that alone
 
 
-def test_what_trainer_alone_writes_is_summed_up(run, capsys):
+def test_what_trainer_alone_writes_is_reported(run, capsys):
     """Without final tests, and without what they and a command line leave."""
     for name in ("final.csv", "summary.json"):
         (run / name).unlink()
-    summary.main(summary.Arguments((run,)))
-    table, facts = capsys.readouterr().out.split("\n\n")[1:3]
-    rows = [line.split("|")[1:-1] for line in table.splitlines()[2:]]
-    assert [row[0].strip() for row in rows] == [*TASKS, "all"]
-    assert all(row[1].strip() and not "".join(row[5:]).strip() for row in rows)
-    assert facts.startswith("A training step takes")
-    assert (run / "success.png").exists()
-    assert (run / "groups.png").exists() == (max(n_groups(run)) > 1)
-
-
-def n_groups(run):
-    return [int(row["num_groups"]) for row in read_rows(run / "train.csv")]
+    report.main(report.Arguments((run,)))
+    told = capsys.readouterr().out
+    assert "## GWR-B" not in told and "## Cost" in told
+    assert (run / "continual-3.png").exists()
 
 
 def foreign_checkpoint(state):

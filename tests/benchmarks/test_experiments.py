@@ -14,13 +14,13 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import concurrent_tasks, continual, summary
+from benchmarks import concurrent_tasks, continual, report
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.experiments import measure
 from bgpo_trl.experiments import run as experiment
 from bgpo_trl.experiments.arguments import Arguments
 from bgpo_trl.files.checkpoint import load_checkpoint
-from bgpo_trl.runs.results import read_rows
+from bgpo_trl.runs.results import read_final_tests, read_table, read_tests
 from suites import nico
 from tests.folders import contents
 
@@ -51,35 +51,33 @@ def test_concurrent_presents_all_tasks_from_the_start(tiny, tmp_path, capsys, mo
     concurrent_tasks.main(Arguments(out=run))
     assert asked == [{"episodes": 20}]  # of which `tiny` leaves two
     assert json.loads((run / "config.json").read_text())["task_starts"] == [0, 0, 0]
-    assert {row["task"] for row in read_rows(run / "eval.csv")} == set(TASKS)
+    assert set(read_tests(run / "eval.csv")["task"]) == set(TASKS)
 
-    rows = read_rows(run / "final.csv")
-    assert sorted((int(r["seed"]), r["demonstrations"], r["task"]) for r in rows) == sorted(
+    tests = read_final_tests(run / "final.csv")
+    keys = tests[["seed", "demonstrations", "task"]].itertuples(index=False, name=None)
+    assert sorted(keys) == sorted(
         (seed, kind, task) for seed in (3, 8) for kind in ("seen", "held-out") for task in TASKS
     )
-    for row in rows:
-        assert row["episodes"] == "2"
-        assert 2 * float(row["success"]) in range(3)
-        assert 0 <= float(row["task_inference"]) <= 1
+    assert set(tests["episodes"]) == {"2"}
+    assert set(2 * tests["success"]) <= {0, 1, 2}
+    assert tests["task_inference"].between(0, 1).all()
     told = json.loads((run / "summary.json").read_text())
     assert re.fullmatch(r"|[0-9a-f]{7,}(-dirty)?", told["commit"])
     assert len(told["nodes"]) == 2
     assert told["random_success"] == pytest.approx(dict(zip(TASKS, [0.1, 0.2, 0.3], strict=True)))
-    nodes = read_rows(run / "gwr.csv")
-    assert len(nodes) == told["nodes"][0]
-    assert {node["task"] for node in nodes} <= {"-1", "0", "1", "2"}
-    assert {int(node["group"]) for node in nodes} <= set(range(told["groups"][0]))
-    assert [len(node) for node in nodes] == [34] * len(nodes)
+    nodes = read_table(run / "gwr.csv")
+    assert nodes.shape == (told["nodes"][0], 34)
+    assert set(nodes["task"]) <= {"-1", "0", "1", "2"}
+    assert set(nodes["group"].astype(int)) <= set(range(told["groups"][0]))
     assert (run / "figures" / "episodes.png").read_bytes().startswith(b"\x89PNG")
 
     capsys.readouterr()
-    summary.main(summary.Arguments((run,)))
+    report.main(report.Arguments((run,)))
     printed = capsys.readouterr().out
-    late = summary.summarize(run / "eval.csv")
+    late = read_tests(run / "eval.csv").groupby("task")["success"].mean()  # tested once
     for task in TASKS:
-        assert f"| {task} | {100 * late[task]:.1f} |" in printed
-    for name in ("success.png", "groups.png"):
-        assert (run / name).read_bytes().startswith(b"\x89PNG")
+        assert f"| {task} | {100 * late[task]:.1f}" in printed
+    assert (run / "concurrent-3.png").read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
@@ -98,9 +96,9 @@ def test_the_command_line_runs_every_algorithm_and_says_its_name(
         None if name.startswith(("maml", "dist-nll")) else 0.1
     )
     for file in ("train.csv", "eval.csv"):
-        rows = read_rows(run / file)
-        assert {row["algorithm"] for row in rows} == {name}
-        assert {row["task"] for row in rows} == set(TASKS)
+        table = read_table(run / file)
+        assert set(table["algorithm"]) == {name}
+        assert set(table["task"]) == set(TASKS)
 
     # Lines on GWR-B appear only with algorithms that have one.
     with_gwr = name.startswith("bgpo")
@@ -112,23 +110,23 @@ def test_the_command_line_runs_every_algorithm_and_says_its_name(
     with_groups = name in ("bgpo", "bgpo-experts")
     assert (told["groups"] is not None) == (run / "figures/groups.png").exists() == with_groups
     if with_gwr:
-        assert ("group" in read_rows(run / "gwr.csv")[0]) == with_groups
+        assert ("group" in read_table(run / "gwr.csv")) == with_groups
     assert ("GWR-B" in printed) == ("task inference" in printed) == with_gwr
-    rows = read_rows(run / "final.csv")
-    assert len(rows) == 2 * 2 * 3
-    assert all((row["task_inference"] != "") == with_gwr for row in rows)
-    summed_up = summary.describe(run)
-    assert ("GWR-B nodes: [" in summed_up) == with_gwr
-    assert ("Groups: [" in summed_up) == with_groups
-    assert "Own episodes to 50 %, relative to grasp_glass: push" in summed_up
-    table = [line.split("|") for line in summed_up.splitlines() if line.startswith("|")]
-    assert [row[1].strip() for row in table[2:]] == [*TASKS, "all"]
-    inferred = [cell.strip() for cell in table[0]].index("inferred")
-    assert all((row[inferred].strip() != "") == with_gwr for row in table[2:])
-    for task, row in zip(TASKS, table[2:], strict=False):
-        shares = [float(r["success"]) for r in rows if r["task"] == task]
-        for cell, of_kind in zip(row[6:8], (shares[:2], shares[2:]), strict=True):
-            assert float(cell) == pytest.approx(100 * sum(of_kind) / 2, abs=0.05)
+    tests = read_final_tests(run / "final.csv")
+    assert len(tests) == 2 * 2 * 3
+    assert (tests["task_inference"].notna() == with_gwr).all()
+    report.main(report.Arguments((run,)))
+    reported = capsys.readouterr().out
+    assert ("## GWR-B, by seed" in reported) == with_gwr
+    assert ("one for all" in reported) == (with_gwr and not with_groups)
+    assert "nan" not in reported
+    trained = tests.groupby(["task", "demonstrations"])["success"].mean()
+    lines = [line.split(" | ") for line in reported.splitlines() if line.startswith("| ")]
+    for task in TASKS:
+        (row,) = (line for line in lines if line[0] == f"| {task}")
+        assert (row[7] != "") == with_gwr
+        for cell, kind in ((row[5], "seen"), (row[6], "held-out")):
+            assert float(cell) == pytest.approx(100 * trained[task, kind], abs=0.05)
 
 
 def test_a_finished_run_only_says_so_until_it_is_made_longer(
@@ -230,8 +228,8 @@ def test_a_dashboard_gets_the_figures_before_it_is_closed(tiniest, monkeypatch, 
     shown = [(f"figures/{Path(n).stem}", run / "figures" / n) for n in sorted(figures)]
     arguments = Arguments(out=run, wandb="offline")
     continual.main(arguments)
-    rows = [read_rows(run / name) for name in ("train.csv", "eval.csv")]
-    assert events == ["row"] * sum(map(len, rows)) + [*shown, "shutdown"]
+    tables = [read_table(run / name) for name in ("train.csv", "eval.csv")]
+    assert events == ["row"] * sum(map(len, tables)) + [*shown, "shutdown"]
     for task in TASKS:
         assert (run / "figures" / f"{task}.gif").read_bytes().startswith(b"GIF89a")
 
@@ -259,7 +257,7 @@ def test_smoke_goes_through_every_stage_from_nothing(tmp_path):
 
     result = subprocess.run([*command, "--resume"], capture_output=True, **options)
     assert result.returncode == 0, result.stderr
-    told = "curve and figures: run; in numbers: python benchmarks/summary.py run\n"
+    told = "curve and figures: run; in numbers: python benchmarks/report.py run\n"
     assert result.stdout.endswith(told)
     for name in (
         *("config.json", "train.csv", "eval.csv", "figures/success.png", "figures/gwr.png"),

@@ -13,7 +13,7 @@ from benchmarks import ladder
 from bgpo_trl.algorithms.rl import RL
 from bgpo_trl.configs import DDPGConfig
 from bgpo_trl.files.checkpoint import load_checkpoint
-from bgpo_trl.runs.results import read_rows
+from bgpo_trl.runs.results import read_table
 from suites import nico
 from tests.folders import contents
 
@@ -34,7 +34,7 @@ def test_the_ladder_has_a_row_and_a_run_for_each_rung(tiny, tmp_path, capsys):
     ladder.main(arguments)
     printed = capsys.readouterr().out
     lines = printed.splitlines()
-    assert lines[0] == "| rung | " + " | ".join([*TASKS, "overall", "episodes to 80 %"]) + " |"
+    assert lines[0] == "| rung | " + " | ".join([*TASKS, "all", "episodes to 80 %"]) + " |"
     assert [line[:5] for line in lines[2:]] == ["| (a)", "| (b)", "| (c)", "| (d)"]
     assert all(re.search(r"\| (\d+|not reached) \|$", line) for line in lines[2:])
     seen = {}
@@ -46,9 +46,9 @@ def test_the_ladder_has_a_row_and_a_run_for_each_rung(tiny, tmp_path, capsys):
         assert (config["task_starts"], config["eval_every"]) == ([0, 0, 0], 2)
         assert config["algorithm"]["rl"]["hidden_sizes"] == [7]
         assert (tmp_path / rung / "figures" / "success.png").exists()
-        train = read_rows(tmp_path / rung / "train.csv")
-        assert {row["algorithm"] for row in train} == {config["name"]} == {f"rung {rung}"}
-        assert all((float(row["intrinsic_return"]) > 0) == (rung in "cd") for row in train)
+        train = read_table(tmp_path / rung / "train.csv")
+        assert set(train["algorithm"]) == {config["name"]} == {f"rung {rung}"}
+        assert ((train["intrinsic_return"].astype(float) > 0) == (rung in "cd")).all()
     assert seen == {
         "a": ("state", {"state", "context"}, False),
         "b": ("latent", {"latent", "context"}, False),

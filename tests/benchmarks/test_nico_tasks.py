@@ -37,31 +37,72 @@ def test_chance_is_counted_for_each_task_in_the_same_episodes(judged):
 
 def test_chance_is_that_of_episodes_of_the_task_alone():
     tasks = ("push_glass_right", "push_white_right")
-    together = nico_tasks.chance(tasks, episodes=6, seed=3)
+    together = nico_tasks.chance(tasks, episodes=12, seed=3)
 
     for task in tasks:
-        judge = nico.TASKS[task](random=0)
-        env = nico.load("grasp_glass", seed=3, observation="state")
-        env.task.succeeded = lambda _: False
+        env = nico.load(task, seed=3, observation="state")
         random, solved = np.random.default_rng(3), 0
-        for _ in range(6):
-            timestep, success = env.reset(), False
-            while not timestep.last():
-                timestep = env.step(random.uniform(-1.0, 1.0, 4))
-                success |= judge.succeeded(env.physics)
-            solved += success
-        assert together[task] == solved / 6
+        for _ in range(12):
+            timestep, actions = env.reset(), random.uniform(-1.0, 1.0, (50, 4))
+            for action in actions:
+                timestep = env.step(action)
+                if timestep.last():
+                    break
+            solved += bool(timestep.reward)
+        assert together[task] == solved / 12
+    assert any(together.values())
 
 
-def test_table_and_picture_have_a_row_for_each_task(monkeypatch, tmp_path, capsys):
+def test_a_condition_has_to_last_in_each_task_for_itself(monkeypatch):
+    class Odd(nico.NicoTask):
+        """Condition: the step is an odd one."""
+
+        def succeeded(self, physics):
+            return round(physics.time() / 0.2) % 2 == 1
+
+    class TwoOdd(Odd):
+        steady_steps = 2
+
+    class Late(nico.NicoTask):
+        """Condition: one of the last three steps."""
+
+        steady_steps = 3
+
+        def succeeded(self, physics):
+            return physics.time() > 9.5
+
+    class TooLate(Late):
+        steady_steps = 4
+
+    tasks = {"odd": Odd, "two odd": TwoOdd, "late": Late, "too late": TooLate}
+    monkeypatch.setattr(nico_tasks.nico, "TASKS", tasks)
+
+    found = nico_tasks.chance(tuple(tasks), episodes=2, seed=0)
+
+    assert found == {"odd": 1.0, "two odd": 0.0, "late": 1.0, "too late": 0.0}
+
+
+def test_tables_and_pictures_have_a_row_for_each_task_and_object(monkeypatch, tmp_path, capsys):
     tasks = ("push_green_to_white", "press_white")
     monkeypatch.setattr(nico_tasks.nico, "ALL_TASKS", tasks)
-    path = tmp_path / "tasks.png"
 
-    nico_tasks.main(nico_tasks.Arguments(starts=1, seed=1, picture=path))
+    nico_tasks.main(nico_tasks.Arguments(starts=2, seed=1, pictures=tmp_path))
 
-    header, _, *rows, last = capsys.readouterr().out.splitlines()
-    assert header == "| task | chance | demonstrator | steps |"
+    header, _, *rows, _, deviation, _, glass, green, white, _, alike, first, second = (
+        capsys.readouterr().out.splitlines()
+    )
+    assert header == "| task | random actions | demonstrator | steps |"
     assert [row.split("`")[1] for row in rows] == list(tasks)
-    assert last == f"picture: {path}"
-    assert Image.open(path).size[1] == 2 * (64 + 14 + 4)
+    assert deviation == "| standard deviation of the start, cm | x | y |"
+    env = nico.load("grasp_glass", seed=1, observation="state")
+    places = []
+    for _ in range(2):
+        env.reset()
+        places.append([env.physics.object_position(name)[:2] for name in nico.OBJECTS])
+    apart = 100 * np.abs(np.diff(places, axis=0)[0]) / np.sqrt(2)  # deviation of two numbers
+    for row, name, (x, y) in zip((glass, green, white), nico.OBJECTS, apart, strict=True):
+        assert row == f"| {name} | {x:.2f} | {y:.2f} |"
+    assert alike == "The starts of all tasks are the same."
+    for line, name, count in ((first, "tasks.png", 2), (second, "starts.png", 3)):
+        assert line == f"picture: {tmp_path / name}"
+        assert Image.open(tmp_path / name).size[1] == count * (64 + 14 + 4)

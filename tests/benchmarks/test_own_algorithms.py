@@ -7,12 +7,14 @@ from dataclasses import replace
 import continual
 import pytest
 import sweep
+import torch
 
 from bgpo_trl.algorithms import ALGORITHMS, entry
 from bgpo_trl.algorithms.rl import RL
-from bgpo_trl.experiments.arguments import Arguments, run_config
+from bgpo_trl.configs import BGPOConfig
+from bgpo_trl.experiments.arguments import Arguments, command_line, run_config
 from bgpo_trl.experiments.watch import WatchArguments, watch
-from bgpo_trl.runs.results import read_rows
+from bgpo_trl.runs.results import read_table
 from suites import nico
 
 OWN = """
@@ -77,7 +79,7 @@ def test_an_algorithm_of_a_module_runs_and_is_filmed(
     continual.main(Arguments(algorithm="mine", module="my_algorithm"))
     run = folder / "runs" / "continual-mine-quick"
     assert str(run.relative_to(folder)) in capsys.readouterr().out
-    assert {row["algorithm"] for row in read_rows(run / "eval.csv")} == {"mine"}
+    assert set(read_table(run / "eval.csv")["algorithm"]) == {"mine"}
     told = json.loads((run / "config.json").read_text())
     assert told["algorithm"]["share"] == 0.25
 
@@ -121,3 +123,20 @@ def test_the_name_of_a_variant_is_not_free(monkeypatch):
     monkeypatch.setitem(ALGORITHMS, "experts", ALGORITHMS["maml"])
     with pytest.raises(ValueError, match="'experts' is a variant of BGPO: add your algorithm"):
         entry("experts")
+
+
+def test_an_error_of_own_code_keeps_its_traceback_unless_it_misuses_the_package():
+    def broken(arguments):
+        raise ValueError("mine is broken")
+
+    def of_a_library(arguments):
+        torch.zeros(2) @ torch.zeros(3)
+
+    def misuse(arguments):
+        BGPOConfig(beta=-1.0)
+
+    for main, message in ((broken, "mine is broken"), (of_a_library, "size")):
+        with pytest.raises((ValueError, RuntimeError), match=message):
+            command_line(main, None, options=[])
+    with pytest.raises(SystemExit, match=r"^error: beta must be at least 0"):
+        command_line(misuse, None, options=[])

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import one_shot
 import pytest
-import summary
+import report
 
 from bgpo_trl.experiments.watch import WatchArguments, watch
 from bgpo_trl.own_module import import_own
@@ -51,11 +51,13 @@ def run(bank, encoders, make_config, tmp_path, monkeypatch):
 def test_a_run_is_filmed_tested_and_summed_up_where_its_module_is_named(run, capsys):
     with pytest.raises(ValueError, match="'at_once', added by the module 'at_once_tasks': name"):
         watch(WatchArguments(run))
-    summary.main(summary.Arguments((run,)))  # Needs no module.
+    report.main(report.Arguments((run,)))  # Needs no module.
     assert "| at_once |" in capsys.readouterr().out
 
     told = watch(WatchArguments(run, module="at_once_tasks"))
-    assert told == f"at_once: success after 1 steps\npictures: {run / 'figures'}"
+    learned, *told = told.splitlines()
+    assert learned == "seed 3 after 4 training episodes"
+    assert told == ["at_once: success after 1 steps", f"pictures: {run / 'figures'}"]
 
     one_shot.main(one_shot.Arguments(run, (1.0,), episodes=2, module="at_once_tasks"))
     with (run / "one_shot.csv").open(newline="") as file:

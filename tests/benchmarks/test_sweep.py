@@ -12,13 +12,9 @@ from types import SimpleNamespace
 import pytest
 import sweep
 
-from benchmarks import report, summary
-from benchmarks.report import markdown
+from benchmarks import report
 from bgpo_trl.algorithms import ABLATIONS
-from bgpo_trl.analysis.comparison import read_group
-from bgpo_trl.analysis.intervals import Statistics
-from bgpo_trl.analysis.paper_runs import GROUPS
-from bgpo_trl.analysis.tables import main_table
+from bgpo_trl.analysis.comparison import NAMES
 from bgpo_trl.configs import PRESETS
 from bgpo_trl.experiments import merge
 from bgpo_trl.experiments import ray_jobs as jobs
@@ -61,11 +57,11 @@ def write_run(job):
     (folder / "figures").mkdir(exist_ok=True)
     for name in ("episodes.png", "success.png"):
         (folder / "figures" / name).write_text(str(config.seeds[0]))
-    train, tests, final = [HEAD + ",loss_actor"], [HEAD], ["seed,demonstrations,task,success"]
-    final[0] += ",task_inference"
+    train, tests = [HEAD + ",loss_actor,num_nodes,num_groups"], [HEAD]
+    final = ["seed,demonstrations,task,success,task_inference"]
     for episode, seed in product(range(1, config.episodes + 1), config.seeds):
         row = f"{config.name},{seed},{episode},{7 * episode},{{}},{(seed + episode) % 2},0.1,5"
-        train.append(row.format(nico.PAPER_TASKS[episode % 3]) + f",{sum(config.seeds)}.25")
+        train.append(row.format(nico.PAPER_TASKS[episode % 3]) + f",{sum(config.seeds)}.25,9,3")
         if episode % config.eval_every == 0:
             tests += [row.format(task) for task in nico.PAPER_TASKS] * 2
     for kind, task, seed in product(("seen", "held-out"), nico.PAPER_TASKS, config.seeds):
@@ -94,8 +90,7 @@ def test_a_job_is_a_block_of_seeds_of_an_algorithm_in_a_setting(tmp_path):
         *("ablation-gwr", "ablation-r_int", "ablation-none"),
         *("ablation-even-replay", "ablation-demonstrations"),
     ]
-    known = {name for group in GROUPS.values() for name in group.runs}
-    assert known >= {merged.name for merged in grid}
+    assert {group[0].config.name for group in grid.values()} <= set(NAMES)
     for merged, group in grid.items():
         assert [job.config.seeds for job in group] == [(0, 1), (2, 5), (9,)]
         assert [job.directory.name for job in group] == ["seeds-0-1", "seeds-2-5", "seeds-9"]
@@ -135,9 +130,10 @@ def test_workers_are_told_the_tasks_and_where_they_come_from(tmp_path, monkeypat
     assert events == ["my_tasks", tmp_path / bank]
 
 
-def test_the_eight_tasks_come_in_two_orders_or_at_once(tmp_path):
+def test_the_eight_tasks_come_in_two_orders_unpractised_or_at_once(tmp_path):
+    settings = ("sequential", "eight", "eight-reversed", "eight-sequential", "eight-concurrent")
     arguments = sweep.Arguments(
-        settings=("continual", "eight", "eight-reversed", "eight-concurrent"),
+        settings=settings,
         episodes=4_000,
         eval_every=50,
         held_out="test",
@@ -146,11 +142,13 @@ def test_the_eight_tasks_come_in_two_orders_or_at_once(tmp_path):
     grid = {path.name: group[0].config for path, group in sweep.make_jobs(arguments).items()}
     assert list(grid) == [f"{setting}-bgpo" for setting in arguments.settings]
     assert [config.tasks for config in grid.values()] == [
-        *(nico.PAPER_TASKS, nico.ALL_TASKS, nico.ALL_TASKS[::-1], nico.ALL_TASKS)
+        *(nico.PAPER_TASKS, nico.ALL_TASKS, nico.ALL_TASKS[::-1], nico.ALL_TASKS, nico.ALL_TASKS)
     ]
+    unpractised = [config.schedule == "sequential" for config in grid.values()]
+    assert unpractised == [True, False, False, True, False]
     each_500 = tuple(range(0, 4_000, 500))
     assert [config.task_starts for config in grid.values()] == [
-        *((0, 1_400, 2_600), each_500, each_500, (0,) * 8)
+        *((0, 1_400, 2_600), each_500, each_500, each_500, (0,) * 8)
     ]
     for config in grid.values():
         assert (config.episodes, config.eval_every, config.held_out) == (4_000, 50, "test")
@@ -249,16 +247,13 @@ def test_merged_blocks_are_what_one_run_of_all_seeds_would_be(few, tmp_path, mon
         assert {path.name for path in (merged / "figures").iterdir()} == {"episodes.png"}
         assert (merged / "figures" / "episodes.png").read_text() == "4"
         assert (merged / "gwr.csv").read_text() == "task,w0,w1\n0,1,2\n1,2,5\n2,0,4\n"
-        described = summary.describe(whole.directory).split("\n\n")[0]
-        assert summary.describe(merged).split("\n\n")[0] == described
-    tables = []
+    texts = []
     for folder in ("blocks", "whole"):
-        found, _ = read_group(tmp_path / folder, GROUPS["concurrent"])
-        assert list(found) == ["concurrent-bgpo", "concurrent-maml"]
-        tables.append(main_table(found, Statistics()))
-    assert tables[0] == tables[1]
-    report.main(report.Arguments(tmp_path / "blocks"))
-    assert markdown(tables[1]) in (tmp_path / "blocks" / "tables.md").read_text()
+        report.main(report.Arguments((tmp_path / folder,)))
+        text = (tmp_path / folder / "tables.md").read_text()
+        texts.append("".join(text.partition("## GWR-B, by seed")[:1]))
+        assert "| BGPO | ? | 3 |" in text and "| BGPO against MAML |" in text
+    assert texts[0] == texts[1]
 
 
 def test_merging_again_changes_nothing_and_a_gap_is_not_merged(few, tmp_path):

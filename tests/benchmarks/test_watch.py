@@ -1,6 +1,7 @@
 """Pictures of what a run has learned."""
 
 import hashlib
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -26,7 +27,7 @@ def files(folder):
 def undemonstrated(monkeypatch):
     """Demonstrations that take no time and show nothing; films without a long last frame."""
     frames = np.random.default_rng(0).integers(256, size=(7, 32, 64, 3), dtype=np.uint8)
-    monkeypatch.setattr(watch, "demonstrate", lambda tasks, seed: dict.fromkeys(tasks, frames))
+    monkeypatch.setattr(watch, "demonstrate", lambda tasks, *_: dict.fromkeys(tasks, frames))
     monkeypatch.setattr(watch, "_FPS", 1)
 
 
@@ -38,7 +39,8 @@ def test_a_run_is_shown_and_left_as_it_is(run_of, undemonstrated, tmp_path, name
     assert files(run) == before
     expected = {"nico.gif", "nico.png"} | ({"gwr_growth.png"} if name == "bgpo" else set())
     assert {path.name for path in out.iterdir()} == expected
-    *outcomes, last = told.splitlines()
+    first, *outcomes, last = told.splitlines()
+    assert re.fullmatch(r"seed 8 after \d+ training episodes", first)
     for task, line in zip(nico.PAPER_TASKS, outcomes, strict=True):
         assert line.startswith((f"{task}: no success after 6 steps", f"{task}: success after "))
     assert last == f"pictures: {out}"
@@ -72,7 +74,7 @@ def test_an_episode_is_what_the_policy_does_from_that_start():
     policy = SimpleNamespace(
         condition=lambda demonstration, task: watched.append((demonstration, task)),
         act=act,
-        config=SimpleNamespace(algorithm=SimpleNamespace(max_steps=50)),
+        config=SimpleNamespace(algorithm=SimpleNamespace(max_steps=50), spread=1.0),
     )
     episode = watch.play(policy, "push_green_to_white", frames[:2], 3)
     ((demonstration, task),) = watched

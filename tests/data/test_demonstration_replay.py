@@ -109,6 +109,7 @@ def test_entries_have_the_shapes_and_types_of_played_transitions(shown):
         "behavior": ((2,), torch.float32),
         "label": ((), torch.int64),
         "priority_weight": ((), torch.float32),
+        "demonstrated": ((), torch.bool),
         ("next", "latent"): ((64,), torch.float32),
         ("next", "reward"): ((1,), torch.float32),
         ("next", "terminated"): ((1,), torch.bool),

@@ -7,7 +7,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bgpo_trl.configs import RepresentationConfig, SequenceAutoencoderConfig, VAEConfig
+from bgpo_trl.configs import (
+    InverseModelConfig,
+    RepresentationConfig,
+    SequenceAutoencoderConfig,
+    VAEConfig,
+)
 from bgpo_trl.data.dataset import load_demonstrations
 from bgpo_trl.encoders.pretrained import load_pretrained, make_pretrained
 from bgpo_trl.encoders.representation import save_representation
@@ -17,6 +22,7 @@ from suites import nico
 TINY = RepresentationConfig(
     vae=VAEConfig(steps=2, batch_size=4, warmup_steps=1),
     lae=SequenceAutoencoderConfig(steps=2, batch_size=4, warmup_steps=1),
+    inverse=InverseModelConfig(hidden_size=8, batch_size=8, steps=4, warmup_steps=1),
 )
 TASKS = nico.PAPER_TASKS[::-1]
 ARGUMENTS = {

@@ -12,6 +12,7 @@ from bgpo_trl.encoders.probes import (
     ridge_predict,
 )
 from bgpo_trl.encoders.representation import Representation
+from bgpo_trl.modules.inverse_model import InverseModel
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
 
@@ -35,7 +36,7 @@ def demonstrations(n: int = 6) -> TensorDict:
 @pytest.fixture
 def untrained() -> Representation:
     torch.manual_seed(0)
-    return Representation(VAE(), SequenceAutoencoder(), {})
+    return Representation(VAE(), SequenceAutoencoder(), InverseModel(), {})
 
 
 def test_ridge_finds_a_linear_map_whatever_the_scale() -> None:

@@ -24,7 +24,7 @@ def added():
         ((TWO,), None, (0,)),
         ((TWO, "juggle"), None, (0, 600)),
         ((TWO, "juggle"), 100, (0, 50)),
-        (("juggle", ONE, TWO), None, (0, 420, 780)),  # as many as the preset has
+        (("juggle", ONE, TWO), None, (0, 380, 700)),  # as many as the preset has
         ((ONE, TWO, THREE, "juggle"), None, (0, 300, 600, 900)),
     ],
 )

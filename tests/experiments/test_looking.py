@@ -25,7 +25,7 @@ class Turn(nico.NicoTask):
     def initialize_episode(self, physics):
         super().initialize_episode(physics)
         self._yaw = physics.arm_angles()[0]
-        y = physics.object_position("glass")[1] - looking.nominal_places()[0, 1]
+        y = physics.object_position("glass")[1] - nico.nominal_places()[0, 1]
         self._side = self.side or np.sign(y)
 
     def succeeded(self, physics):
@@ -44,7 +44,7 @@ def turn(yaw):
 
 def look(state):
     """Turns to the glass, as far as it is displaced."""
-    return turn((30 * (state[..., GLASS_Y] - looking.nominal_places()[0, 1])).clamp(-1, 1))
+    return turn((30 * (state[..., GLASS_Y] - nico.nominal_places()[0, 1])).clamp(-1, 1))
 
 
 def remember(state):
@@ -107,7 +107,7 @@ def check(env, row, expected):
 def test_what_is_shown_is_a_scene_with_nominal_places(hidden):
     env = HidingEnv(batch_size=[2], seed=4, observation="both", hidden=hidden)
     state = env.reset()
-    nominal = [(place, Rotation.identity()) for place in looking.nominal_places()]
+    nominal = [(place, Rotation.identity()) for place in nico.nominal_places()]
     for row in range(2):
         check(env, row, nominal)
     starts = [poses(tasks[0].physics) for tasks in env._environments]

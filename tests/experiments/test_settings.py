@@ -25,7 +25,9 @@ def test_another_algorithm_changes_nothing_else(name):
         expected = replace(config, name=name, algorithm=entry.config)
         assert run_config(arguments) == expected
         published = name.endswith("-paper")
-        assert (entry.config.rl == DDPGConfig()) is not published  # else the same learner for all
+        noise = 0.1 if entry.config.demonstration_share else 0.3
+        # The same learner for all, but those as published.
+        assert (entry.config.rl == DDPGConfig(noise=noise)) is not published
 
 
 def test_the_command_line_names_every_algorithm(capsys):
@@ -42,7 +44,9 @@ def test_the_command_line_names_every_algorithm(capsys):
 def test_another_rl_algorithm_changes_nothing_else(name, rl):
     plain = run_config(Arguments(algorithm=name))
     config = run_config(Arguments(algorithm=name, rl=rl))
-    assert config == replace(plain, algorithm=replace(plain.algorithm, rl=RL[rl].config))
+    own = plain.algorithm.rl
+    expected = own if rl == own.name else RL[rl].config
+    assert config == replace(plain, algorithm=replace(plain.algorithm, rl=expected))
     assert dataclasses.asdict(config)["algorithm"]["rl"]["name"] == rl
 
 
@@ -50,15 +54,17 @@ def test_another_rl_algorithm_changes_nothing_else(name, rl):
 def test_tasks_of_every_preset_start_when_the_paper_has_them_start(preset):
     config = PRESETS[preset]
     shares = [start / config.episodes for start in config.task_starts]
-    assert shares == pytest.approx([0, 7_000 / 20_000, 13_000 / 20_000], abs=0.02)
+    # The quick run leaves its last task more of its few episodes.
+    paper, near = [0, 7_000 / 20_000, 13_000 / 20_000], 0.07 if preset == "quick" else 0.02
+    assert shares == pytest.approx(paper, abs=near)
 
 
 @pytest.mark.parametrize(
     ("preset", "episodes", "starts", "eval_every"),
     [
         ("paper", 10_000, (0, 3_500, 6_500), 1),
-        ("quick", 2_400, (0, 840, 1_560), 60),
-        ("quick", 20, (0, 7, 13), 20),  # tested once at least
+        ("quick", 2_400, (0, 760, 1_400), 120),
+        ("quick", 20, (0, 6, 12), 20),  # tested once at least
     ],
 )
 def test_another_length_keeps_the_proportions(preset, episodes, starts, eval_every):
@@ -70,9 +76,10 @@ def test_another_length_keeps_the_proportions(preset, episodes, starts, eval_eve
     )
 
 
-def test_other_seeds_change_nothing_else():
-    config = run_config(Arguments(preset="desk", seeds=(7, 9)))
-    assert config == replace(PRESETS["desk"], seeds=(7, 9))
+@pytest.mark.parametrize("change", [{"seeds": (7, 9)}, {"schedule": "sequential"}])
+def test_other_seeds_or_another_schedule_change_nothing_else(change):
+    config = run_config(Arguments(preset="desk", **change))
+    assert config == replace(PRESETS["desk"], **change)
 
 
 @pytest.mark.parametrize(

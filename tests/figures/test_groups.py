@@ -65,12 +65,13 @@ def test_a_group_has_a_row_with_a_mark_for_each_episode(path):
     row = [(0, BLUE, episode) for episode in (1, 2, 3, 6, 8)] + [(0, ORANGE, 4)]
     assert marks(first) == [*row, (1, ORANGE, 5), (1, ORANGE, 7)]
     row = [(0, BLUE, episode) for episode in (1, 2, 3, 6)]
-    assert marks(second) == [*row, *((0, ORANGE, e) for e in (4, 5, 7)), (2, BLUE, 8)]
+    assert marks(second) == [*row, *((0, ORANGE, e) for e in (4, 5, 7)), (1, BLUE, 8)]
     assert first.get_title(loc="left") == "seed 3: 2 groups, 87.5 % pure"
     assert second.get_title(loc="left") == "seed 8: 3 groups, 62.5 % pure"
-    # Rows are shaded from when their group is known.
-    assert [bar.get_x() for bar in first.patches] == [1, 4]
-    assert [bar.get_x() for bar in second.patches] == [1, 7, 7]
+    # Rows are shaded from the first to the last episode of their group, whose number they have.
+    assert [(bar.get_x(), bar.get_width()) for bar in first.patches] == [(1, 7), (5, 2)]
+    assert [(bar.get_x(), bar.get_width()) for bar in second.patches] == [(1, 6), (8, 0)]
+    assert [text.get_text() for text in second.get_yticklabels()] == ["0", "2"]
     labels = [text.get_text() for text in figure.legends[0].get_texts()]
     assert labels == ["task 1: grasp glass", "task 2: push green to white"]
 

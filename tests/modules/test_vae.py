@@ -29,9 +29,25 @@ def test_encoder_is_the_papers(vae: VAE) -> None:
         x = F.max_pool2d(F.relu(F.conv2d(x, layer.weight.contiguous(), layer.bias, padding=1)), 2)
     assert x.shape[1:] == (128, 4, 8)
     mu, log_variance = vae.encode(pixels)
-    torch.testing.assert_close(mu, vae.mean_head(x.flatten(1)))
+    torch.testing.assert_close(mu[:, 32:], vae.mean_head(x.flatten(1)))
     torch.testing.assert_close(log_variance, vae.log_variance_head(x.flatten(1)))
     assert mu.shape == log_variance.shape == (5, 64)
+
+
+def test_keypoints_are_expected_places_and_the_decoders_blobs_lie_there(vae: VAE) -> None:
+    """One bright cell in a map of keypoint k: its place in the latent, and the blob's maximum."""
+    for cell in [(0, 0), (15, 31), (4, 20)]:
+        maps = torch.zeros(1, 16, 16, 32)
+        maps[0, 5][cell] = 100.0
+        vae.keypoint_maps.forward = lambda _, maps=maps: maps  # type: ignore[method-assign]
+        mu = vae.encode(frames(1))[0]
+        row, column = -1 + 2 * cell[0] / 15, -2 + 4 * cell[1] / 31
+        torch.testing.assert_close(mu[0, [5, 21]], torch.tensor([1.5 * column, 3.0 * row]))
+        others = [i for i in range(32) if i not in (5, 21)]
+        torch.testing.assert_close(mu[0, others], torch.zeros(30), rtol=0, atol=1e-5)
+        blob = vae._blobs(mu)[0, 5]
+        assert divmod(int(blob.argmax()), 32) == cell
+        torch.testing.assert_close(blob.max(), torch.tensor(1.0))
 
 
 def test_decoder_layer_can_be_upsampling_and_convolution(vae: VAE) -> None:

@@ -120,6 +120,18 @@ def test_gamma_is_set_by_the_value_estimator():
         loss.make_value_estimator(objectives.ValueEstimators.TDLambda)
 
 
+def test_demonstrated_actions_alone_are_imitated():
+    """With a flat Q, the actor's loss is -Q plus the weighted distance, by hand."""
+    batch = make_batch(6)
+    loss = make_loss(pre_tanh_penalty=0.0, imitation=2.0)
+    constant_critic(loss, online=0.3, target=0.3)
+    torch.testing.assert_close(loss(batch)["loss_actor"], torch.tensor(-0.3))
+    batch["demonstrated"] = torch.arange(6) >= 4
+    action = loss.actor_network(batch.clone())["action"]
+    distance = (action - batch["action"])[4:].square().sum()
+    torch.testing.assert_close(loss(batch)["loss_actor"], -0.3 + 2.0 * distance / 6)
+
+
 def test_penalty_is_the_gradient_left_when_q_is_flat():
     batch = make_batch(8)
     for penalty in (0.01, 0.0):
@@ -464,7 +476,7 @@ def test_seeds_of_weight_zero_have_no_gradient_and_change_no_others(layer_norm):
     everything, _ = stack_with_weights(4, None, layer_norm=layer_norm)
     weights = torch.tensor([1.0, 0.0, 1.0, 0.0])
     weighted, told = stack_with_weights(4, weights, layer_norm=layer_norm)
-    assert len(weighted) == 8  # weight and bias of two layers of both networks
+    assert len(weighted) == 12  # weight and bias of three layers of both networks
     for grad, unweighted in zip(weighted, everything, strict=True):
         assert not grad[[1, 3]].any()
         assert grad[[0, 2]].equal(unweighted[[0, 2]])

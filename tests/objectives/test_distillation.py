@@ -96,7 +96,7 @@ def test_what_is_read_is_what_the_student_sees_and_what_the_teachers_did():
     assert loss.out_keys == ["loss_distillation"]
     assert [id(p) for p in loss.parameters()] == [id(p) for p in actor.parameters()]
     actor.add_head()  # what comes later is learned, too
-    assert len(list(loss.parameters())) == 8
+    assert len(list(loss.parameters())) == 10
 
 
 def test_a_student_learns_what_each_teacher_does():

@@ -5,9 +5,14 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
+from bgpo_trl.modules.inverse_model import InverseModel
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
-from bgpo_trl.objectives.representation import SequenceReconstructionLoss, VAEInverseLoss
+from bgpo_trl.objectives.representation import (
+    ActionInferenceLoss,
+    SequenceReconstructionLoss,
+    VAEInverseLoss,
+)
 
 
 class HandVAE(nn.Module):
@@ -71,6 +76,27 @@ def test_z_is_sampled_with_the_posteriors_width() -> None:
     data = windows(4, 3, 1000)
     data["action"].zero_()
     assert loss(data)["inverse"].item() == pytest.approx(1000 * 0.3**2, rel=0.05)
+
+
+def test_only_known_actions_train_the_inverse_model() -> None:
+    """Zeros in and out: the loss is half the squared norm of the known actions, on average."""
+    mu = torch.zeros(3, 3, 4)
+    vae = HandVAE(mu, torch.full((3, 3, 4), -100.0))
+    known = torch.tensor([True, False, True])
+    data = TensorDict({**windows(3), "action_known": known}, [3])
+    expected = data["action"][[0, 2], :2].square().sum(-1).mean() / 2
+    assert VAEInverseLoss(vae)(data)["inverse"] == pytest.approx(expected.item())  # type: ignore[arg-type]
+    data["action_known"][:] = False
+    assert VAEInverseLoss(vae)(data)["inverse"] == 0  # type: ignore[arg-type]
+
+
+def test_action_inference_is_judged_by_the_squared_error() -> None:
+    torch.manual_seed(0)
+    inverse = InverseModel(2, 3, hidden_size=4)
+    data = TensorDict({"window": torch.randn(5, 8), "action": torch.rand(5, 3)}, [5])
+    error = inverse.network(data["window"]) - data["action"]
+    loss = ActionInferenceLoss(inverse)(data)["loss_inverse"]
+    assert loss.item() == pytest.approx(float(error.square().sum() / 5))
 
 
 def test_noise_comes_from_the_generator_alone() -> None:

@@ -46,12 +46,18 @@ def test_ablations_are_read(tmp_path, name):
     assert read_config(path) == (config, (None, "def"))
 
 
-@pytest.mark.parametrize("groups", [None, GWRBConfig(activity_threshold=0.7)])
-def test_a_setting_that_may_be_absent_is_read(tmp_path, groups):
-    path = write(tmp_path / "config.json", RunConfig(algorithm=BGPOConfig(groups=groups)))
-    assert read_config(path)[0].algorithm.groups == groups
-    path.write_text(path.read_text().replace("null", "7").replace("0.7", '"high"'))
-    with pytest.raises(ValueError, match=r"algorithm\.groups"):
+@dataclass(frozen=True)
+class CoarseConfig(BGPOConfig):
+    coarse: GWRBConfig | None = None
+
+
+@pytest.mark.parametrize("coarse", [None, GWRBConfig(activity_threshold=0.777)])
+def test_a_setting_that_may_be_absent_is_read(tmp_path, coarse):
+    config = RunConfig(name="mine", algorithm=CoarseConfig(coarse=coarse))
+    path = write(tmp_path / "config.json", config)
+    assert read_config(path)[0].algorithm.coarse == coarse
+    path.write_text(path.read_text().replace("null", "7").replace("0.777", '"high"'))
+    with pytest.raises(ValueError, match=r"algorithm\.coarse"):
         read_config(path)
 
 

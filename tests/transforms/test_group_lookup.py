@@ -13,9 +13,7 @@ from bgpo_trl.transforms import BehaviorLookup, DemonstrationSource, GroupLookup
 def make(MockEnv, make_bank, generators):
     def make(seeds=None, lengths=3, learn=True):
         batch_size = [] if seeds is None else [len(seeds)]
-        groups = BehaviorGroups(
-            32, batch_size=batch_size, activity_threshold=0.25, activity_scale=1.0
-        )
+        groups = BehaviorGroups(32, batch_size=batch_size, smallest=4)
         source = DemonstrationSource(
             make_bank(),
             TaskSchedule((0, 0, 0)),
@@ -29,10 +27,16 @@ def make(MockEnv, make_bank, generators):
     return make
 
 
+def show(groups, count):
+    """Shows each of some rows the demonstrations around three places, ``count`` in all."""
+    generator = torch.Generator().manual_seed(0)
+    for number in range(count):
+        noise = torch.rand(*groups.batch_size, 32, generator=generator)
+        groups.adapt(noise + 5 * (number % 3))
+
+
 def copy_of(groups):
-    copy = BehaviorGroups(
-        32, batch_size=groups.batch_size, activity_threshold=0.25, activity_scale=1.0
-    )
+    copy = BehaviorGroups(32, batch_size=groups.batch_size, smallest=4)
     copy.load_state_dict(groups.state_dict())
     return copy
 
@@ -43,25 +47,27 @@ def test_the_group_is_there_at_reset_and_stays_for_the_episode(make, play, seeds
     env, groups = make(seeds, learn=False)
     check_env_specs(env)
     env.transform[-1].learn = learn
+    show(groups, 15)
+    assert (groups.revision == 0).all()
     start = env.reset()
     assert start["group"].equal(torch.zeros(env.batch_size, dtype=torch.int64))
-    assert not start["group_activity"].any()
+    assert start["group_novelty"].isfinite().all()
     for _ in range(6):
         expected = groups.lookup(start["demo_embedding"])
         assert start["group"].equal(expected.group)
-        assert start["group_activity"].equal(expected.activity)
+        assert start["group_novelty"].equal(expected.novelty)
         steps, following = play(env, 3, start.clone())  # one episode
-        for key in ("group", "group_activity"):
+        for key in ("group", "group_novelty"):
             for data in (steps, steps["next"]):
                 assert (data[key] == start[key].unsqueeze(-1)).all()
         start = following
     assert bool((groups.num_groups > 1).all()) == learn
-    assert bool((groups.gwr.num_nodes > 0).all()) == learn
 
 
 def test_groups_learn_from_the_episodes_that_end_and_from_no_others(make, play):
     """Seeds whose episodes end at different times, against groups that are shown the same."""
     env, groups = make([4, 2, 3], lengths=[2, 3, 5])
+    show(groups, 15)
     plain = copy_of(groups)
     state = env.reset()
     for _ in range(30):
@@ -73,11 +79,11 @@ def test_groups_learn_from_the_episodes_that_end_and_from_no_others(make, play):
         again = plain.lookup(following["demo_embedding"])
         assert following["group"][ended].equal(again.group[ended])
         assert following["group"][~ended].equal(state["group"][~ended])
-        assert following["group_activity"][~ended].equal(state["group_activity"][~ended])
+        assert following["group_novelty"][~ended].equal(state["group_novelty"][~ended])
         state = following
-    for i in range(3):
-        for ours, theirs in zip(groups.gwr.graph(i), plain.gwr.graph(i), strict=True):
-            assert ours.equal(theirs)
+    for ours, theirs in zip(groups.get_extra_state(), plain.get_extra_state(), strict=True):
+        assert ours["points"].equal(theirs["points"]) and ours["group"].equal(theirs["group"])
+        assert len(ours["points"]) > 14
     assert groups.num_groups.min() > 1
 
 
@@ -103,20 +109,21 @@ def test_it_goes_with_the_lookup_of_behaviors_in_either_order(make, make_modules
         else:
             env.insert_transform(2, lookup)
         seen.append(play(env, 20)[0])
-    for key in ("group", "group_activity", "behavior", "behavior_node"):
+    for key in ("group", "group_novelty", "behavior", "behavior_node"):
         assert seen[0][key].equal(seen[1][key])
 
 
 def test_on_its_own_it_only_looks_up(make):
     _, groups = make([4, 2])
     phi = torch.rand(2, 5, 32)
-    groups.adapt(phi[:, 0])
+    show(groups, 15)
     lookup = GroupLookup(groups, learn=True)
     found = lookup(TensorDict({"demo_embedding": phi}, [2, 5]))
     expected = groups.lookup(phi)
     assert found["group"].equal(expected.group)
-    assert found["group_activity"].equal(expected.activity)
-    assert groups.gwr.num_nodes.tolist() == [1, 1]
+    assert found["group_novelty"].equal(expected.novelty)
+    assert found["group_novelty"].isfinite().all()
+    assert all(len(state["points"]) == 15 for state in groups.get_extra_state())
     assert lookup.groups is groups
 
 
@@ -125,7 +132,7 @@ def test_refuses_what_cannot_work(make, MockEnv):
     with pytest.raises(ValueError, match=r"BehaviorGroups was made for batch_size=\(3,\)"):
         env.append_transform(
             GroupLookup(
-                BehaviorGroups(32, batch_size=[3]), learn=True, out_keys=("other", "activity")
+                BehaviorGroups(32, batch_size=[3]), learn=True, out_keys=("other", "novelty")
             )
         )
         env.reset()
@@ -146,8 +153,7 @@ def test_refuses_what_cannot_work(make, MockEnv):
         endless.reset()
 
 
-def test_its_activity_has_the_dtype_of_the_embedding():
-    lookup = GroupLookup(BehaviorGroups(4).double(), learn=False)
-    lookup.groups.adapt(torch.zeros(4).double())
-    found = lookup(TensorDict({"demo_embedding": torch.rand(5, 4)}, [5]))
-    assert found["group_activity"].dtype == torch.float32
+def test_its_novelty_has_the_dtype_of_the_embedding():
+    lookup = GroupLookup(BehaviorGroups(4), learn=False)
+    found = lookup(TensorDict({"demo_embedding": torch.rand(5, 4).double()}, [5]))
+    assert found["group_novelty"].dtype == torch.float64

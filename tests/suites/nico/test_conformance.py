@@ -102,6 +102,7 @@ def test_time_out_is_after_50_steps_and_keeps_the_discount(load, task):
 @pytest.mark.parametrize("steps", [1, 2])
 def test_success_has_discount_0_even_on_the_last_step(load, monkeypatch, task, steps):
     env = load(task, seed=0, observation="state", time_limit=0.4)
+    monkeypatch.setattr(env.task, "steady_steps", 1)
     monkeypatch.setattr(env.task, "succeeded", lambda _: False)
     env.reset()
     for _ in range(steps - 1):
@@ -112,6 +113,46 @@ def test_success_has_discount_0_even_on_the_last_step(load, monkeypatch, task, s
 
     assert timestep.last()
     assert (timestep.reward, timestep.discount) == (1.0, 0.0)
+
+
+@all_tasks
+def test_success_has_to_last(load, monkeypatch, task):
+    env = load(task, seed=0, observation="state")
+    needed = env.task.steady_steps
+    assert needed == (3 if task in ("grasp_glass", "lift_green") else 2)
+    now = iter([True] * (needed - 1) + [False] + [True] * needed)
+    monkeypatch.setattr(env.task, "succeeded", lambda _: next(now))
+    env.reset()
+
+    timesteps = [env.step(np.zeros(4)) for _ in range(2 * needed)]
+
+    assert [timestep.reward for timestep in timesteps] == [0.0] * (2 * needed - 1) + [1.0]
+    assert [timestep.last() for timestep in timesteps] == [False] * (2 * needed - 1) + [True]
+
+
+@all_tasks
+def test_how_long_success_has_lasted_is_in_the_state(load, monkeypatch, task):
+    env = load(task, seed=0, observation="state")
+    holds = True
+    monkeypatch.setattr(env.task, "succeeded", lambda _: holds)
+    env.reset()
+    for _ in range(env.task.steady_steps - 1):
+        env.step(np.zeros(4))
+    state = env.physics.get_state()
+    holds = False
+    env.step(np.zeros(4))
+    assert env.physics.steady_steps == 0
+
+    other = load(task, seed=1, observation="state")
+    monkeypatch.setattr(other.task, "succeeded", lambda _: True)
+    other.reset()
+    other.physics.set_state(state)
+    timestep = other.step(np.zeros(4))
+
+    assert (timestep.reward, timestep.discount) == (1.0, 0.0)
+    # A new episode counts from the beginning.
+    other.reset()
+    assert other.step(np.zeros(4)).reward == 0.0
 
 
 @all_tasks
@@ -159,27 +200,114 @@ def test_observations_share_no_memory(load, task):
         np.testing.assert_array_equal(observation["privileged_state"], copy["privileged_state"])
 
 
-@all_tasks
-def test_starts_are_as_promised(load, task):
-    env = load(task, seed=0, observation="state")
+def polar_places(physics: Physics) -> np.ndarray:
+    """Returns radius (m), angle (rad) and turn (rad) of each object, ``[3, 3]``."""
+    poses = [physics.named.data.qpos[name] for name in OBJECTS]
+    return np.array(
+        [[*kinematics.to_polar(pose[:2]), 2 * np.arctan2(pose[6], pose[3])] for pose in poses]
+    )
+
+
+@pytest.mark.parametrize("spread", [1.0, 0.3, 0.0])
+def test_starts_are_as_promised(load, spread):
+    env = load("grasp_glass", seed=0, spread=spread, observation="state")
     physics = env.physics
-    for _ in range(100):
+    low, high = physics.model.jnt_range[:12].T
+    tasks = [task(random=0) for task in nico.TASKS.values()]
+    for _ in range(200):
         env.reset()
-        angles = {}
         for name in OBJECTS:
             position = physics.object_position(name)
             bottom = position[2] - OBJECT_HALF_HEIGHT[name]
             assert bottom == pytest.approx(TABLE_HEIGHT, abs=1e-3)
-            assert 0.25 < position[0] < 0.85 and abs(position[1]) < 0.55  # on the table
+            assert 0.305 < position[0] < 0.85 and abs(position[1]) < 0.55  # on the table
             assert physics.named.data.xmat[name, "zz"] > 0.999  # upright
-            angles[name] = kinematics.to_polar(position)[1]
-        assert angles["glass"] > angles["green_box"] > angles["white_box"]  # left to right
-        assert not physics.robot_touches()
         for first, second in itertools.combinations(OBJECTS, 2):
             assert physics.gap(first, second) > 0.05
-        assert not env.task.succeeded(physics)
-        low, high = physics.model.jnt_range[:12].T
+        assert not physics.robot_touches()
+        assert not any(task.succeeded(physics) for task in tasks)
         assert (physics.data.qpos[:12] >= low).all() and (physics.data.qpos[:12] <= high).all()
+
+
+def test_starts_are_spread_over_the_table(load):
+    env = load("grasp_glass", seed=0, observation="state")
+    places, polar = [], []
+    for _ in range(200):
+        env.reset()
+        places.append([env.physics.object_position(name)[:2] for name in OBJECTS])
+        polar.append(polar_places(env.physics))
+    deviation = 100 * np.std(places, axis=0)  # (cm)
+    for name, (x, y) in zip(OBJECTS, deviation, strict=True):
+        # Of the green box 1.44 cm in the long run, since its radius is near to two others.
+        assert x >= (1.3 if name == "green_box" else 1.5)
+        assert y >= (3.5 if name == "green_box" else 6.0)
+
+    radii, angles, turns = np.moveaxis(polar, -1, 0)
+    glass, green, white = angles.T
+    is_left = glass > white
+    assert 70 < is_left.sum() < 130
+    neighbors = np.sort(angles, axis=1)
+    np.testing.assert_array_equal(neighbors[:, 1], green)
+    assert np.diff(neighbors).min() >= np.radians(20) - 1e-9
+    assert np.abs(np.diff(radii)).max() <= 0.03 + 1e-9
+    # Also on one and the same side.
+    assert 100 * np.std(0.4 * glass[is_left]) > 1.5
+    assert np.std(turns, axis=0).min() > 1.5  # (rad), of any turn
+
+
+@all_tasks
+def test_starts_do_not_tell_the_task(load, task):
+    env, other = (load(name, seed=4, observation="state") for name in (task, "grasp_glass"))
+    states = []
+    for environment in (env, other):
+        episodes = []
+        for _ in range(5):
+            environment.reset()
+            episodes.append(environment.physics.get_state())
+        states.append(episodes)
+    np.testing.assert_array_equal(*states)
+
+
+def test_without_spread_objects_are_at_their_nominal_places(load):
+    env = load("grasp_glass", seed=0, spread=0.0, observation="state")
+    for _ in range(3):
+        env.reset()
+        places = [env.physics.object_position(name) for name in OBJECTS]
+        np.testing.assert_allclose(places, nico.nominal_places(), atol=1e-12)
+        np.testing.assert_allclose(polar_places(env.physics)[:, 1], np.radians([22, 0, -22]))
+        np.testing.assert_array_equal(polar_places(env.physics)[:, 2], 0)
+    state = env.physics.get_state()
+    env.reset()
+    np.testing.assert_array_equal(env.physics.get_state(), state)
+
+
+def test_a_spread_in_between_scales_what_is_drawn(load):
+    nominal = np.array([[0.4, angle, 0.0] for angle in np.radians([22, 0, -22])])
+    swapped = nominal[::-1]
+    sides = []
+    for seed in range(300):
+        found = []
+        for spread in (1.0, 0.5):
+            env = load("grasp_glass", seed=seed, spread=spread, observation="state")
+            env.reset()
+            places = polar_places(env.physics)
+            is_swapped = places[0, 1] < places[2, 1]
+            found.append((is_swapped, places - (swapped if is_swapped else nominal)))
+        (whole_side, whole), (half_side, half) = found
+        np.testing.assert_allclose(half[:, [0, 2]], whole[:, [0, 2]] / 2, atol=1e-9)
+        if half_side == whole_side:
+            np.testing.assert_allclose(half[:, 1], whole[:, 1] / 2, atol=1e-9)
+        sides.append((whole_side, half_side))
+    whole_side, half_side = np.array(sides).T
+    assert 0.42 < whole_side.mean() < 0.58
+    assert 0.18 < half_side.mean() < 0.32
+    assert not (half_side & ~whole_side).any()
+
+
+@pytest.mark.parametrize("spread", [-0.01, 1.01, np.nan])
+def test_a_spread_out_of_range_is_refused(load, spread):
+    with pytest.raises(ValueError, match=r"^spread is .*: choose a number from 0 \(nominal places"):
+        load("grasp_glass", spread=spread)
 
 
 @all_tasks
@@ -269,10 +397,10 @@ def test_unknown_names_are_refused_in_one_line():
         nico.load("grasp_glass", observation="sound")
 
 
-@pytest.mark.parametrize("name", ["ACTION_SCALE", "ARC_ANGLES", "ANGLE_JITTER", "START_ANGLE"])
+@pytest.mark.parametrize("name", ["ACTION_SCALE", "ARC_RADIUS", "GREEN_JITTER", "SIDE_JITTER"])
 def test_scene_version_follows_what_frames_depend_on(monkeypatch, name):
     version = nico.scene_version()
-    assert re.fullmatch(r"nico-1-[0-9a-f]{8}", version)
+    assert re.fullmatch(r"nico-2-[0-9a-f]{8}", version)
     assert nico.scene_version() == version
 
     monkeypatch.setattr(base, name, getattr(base, name) * 1.01)

@@ -28,9 +28,31 @@ def test_a_simulation_continues_bit_for_bit_from_its_state(load, task):
         timestep = env.step(demonstrator(timestep))
         other.set_control(env.physics.data.ctrl)
         other.step(20)
+        other.count_steady(env.task.succeeded(other))
         np.testing.assert_array_equal(env.physics.get_state(), other.get_state())
         contacts += env.physics.robot_touches()
     assert contacts
+
+
+def test_a_state_holds_where_objects_stood_at_the_start(load, physics):
+    env = load("push_green_to_white", seed=0, observation="state")
+    env.reset()
+    start = {name: physics.object_position(name) for name in nico.OBJECTS}
+    demonstrator = Demonstrator(env, seed=0)
+    demonstrator.reset()
+    timestep = env.step(np.zeros(4))
+    while not timestep.last():
+        timestep = env.step(demonstrator(timestep))
+    state = physics.get_state()
+    assert np.abs(physics.object_position("green_box") - start["green_box"]).max() > 0.03
+
+    env.reset()
+    for name in nico.OBJECTS:
+        np.testing.assert_array_equal(physics.start_position(name), physics.object_position(name))
+    physics.set_state(state)
+
+    for name in nico.OBJECTS:
+        np.testing.assert_array_equal(physics.start_position(name), start[name])
 
 
 @pytest.mark.parametrize("within_reset", [False, True])
@@ -66,7 +88,7 @@ def test_parts_of_the_state_can_be_chosen(physics):
 
 
 def test_a_state_of_another_length_is_refused(physics):
-    with pytest.raises(ValueError, match=r"^the state is a vector of 256 numbers, got \[33\]: .*$"):
+    with pytest.raises(ValueError, match=r"^the state is a vector of 266 numbers, got \[33\]: .*$"):
         physics.set_state(np.zeros(33))
 
 
@@ -136,8 +158,13 @@ def test_the_gap_to_the_hand_is_that_to_its_nearest_part(physics):
             lambda physics: physics.object_position("cup"),
             "no object 'cup' .* one of glass, .*, white_box",
         ),
+        (
+            lambda physics: physics.start_position("palm"),
+            "no object 'palm' .* one of glass, .*, white_box",
+        ),
+        (lambda physics: physics.stands("cup"), "no object 'cup' .* one of glass, .*, white_box"),
     ],
-    ids=["gap", "touching", "held", "pressed", "held palm", "position"],
+    ids=["gap", "touching", "held", "pressed", "held palm", "position", "start", "stands"],
 )
 def test_what_is_not_there_cannot_be_asked_for(physics, ask, refusal):
     with pytest.raises(ValueError, match=rf"^{refusal}$"):

@@ -1,4 +1,4 @@
-"""Each task's success, in states made for it."""
+"""The condition of each task's success, in states made for it."""
 
 from collections.abc import Sequence
 
@@ -16,11 +16,7 @@ AWAY = {"glass": (0.45, 0.4), "green_box": (0.45, 0.1), "white_box": (0.45, -0.4
 
 
 def succeeded(task: str, physics: Physics) -> bool:
-    instance = TASKS[task](random=np.random.RandomState(0))
-    success = instance.succeeded(physics)
-    assert instance.get_reward(physics) == float(success)
-    assert instance.get_termination(physics) == (0.0 if success else None)
-    return success
+    return TASKS[task](random=0).succeeded(physics)
 
 
 def place(
@@ -43,6 +39,13 @@ def place(
             physics.named.data.qpos[name][: len(pose)] = pose
         physics.data.qpos[:12] = [*arm, *np.repeat(curls, 3)]
         physics.data.ctrl[:] = [*arm, *(np.array(curls) + closing)]
+    physics.begin_episode()
+
+
+def move(physics: Physics, name: str, pose: Sequence[float] | np.ndarray) -> None:
+    """Moves an object, to a pose as for `place`, as in the course of an episode."""
+    physics.named.data.qpos[name][: len(pose)] = pose
+    physics.forward()
 
 
 @pytest.mark.parametrize("target", ["glass", "white_box"])
@@ -147,22 +150,44 @@ def test_a_glass_that_was_knocked_over_can_be_held(physics):
     assert succeeded("grasp_glass", physics)
 
 
-@pytest.mark.parametrize("radius", [0.40, 0.44])
+@pytest.mark.parametrize(("radius", "degrees"), [(0.38, 25.0), (0.42, -13.0)])
 @pytest.mark.parametrize(
-    ("task", "name", "degrees", "moved"),
+    ("task", "name", "side"),
     [
-        ("push_glass_right", "glass", 14.5, False),
-        ("push_glass_right", "glass", 13.5, True),
-        ("push_white_right", "white_box", -33.5, False),
-        ("push_white_right", "white_box", -34.5, True),
-        ("push_white_left", "white_box", -14.5, False),
-        ("push_white_left", "white_box", -13.5, True),
+        ("push_glass_right", "glass", -1),
+        ("push_white_right", "white_box", -1),
+        ("push_white_left", "white_box", 1),
     ],
 )
-def test_a_push_aside_counts_degrees_on_the_arc(physics, task, name, degrees, moved, radius):
+def test_a_push_aside_counts_5_cm_along_the_arc_from_the_start(
+    physics, task, name, side, radius, degrees
+):
     place(physics, {name: kinematics.polar(radius, np.radians(degrees))})
 
-    assert succeeded(task, physics) is moved
+    def moves(left: float, outward: float = 0.0) -> bool:
+        there = radius + outward
+        move(physics, name, kinematics.polar(there, np.radians(degrees) + left / there))
+        return succeeded(task, physics)
+
+    assert not moves(side * 0.049)
+    assert moves(side * 0.051)
+    assert moves(side * 0.051, outward=0.03)
+    assert not moves(side * -0.051)
+    assert not moves(0.0, outward=0.06)
+
+
+@pytest.mark.parametrize(
+    ("task", "name"), [("push_glass_right", "glass"), ("push_white_right", "white_box")]
+)
+def test_what_was_pushed_aside_stands_upright_on_the_table(physics, task, name):
+    place(physics, {name: (0.42, 0.0)})
+    height = TABLE_HEIGHT + OBJECT_HALF_HEIGHT[name]
+    move(physics, name, (0.42, -0.08, height, *STANDING))
+    assert succeeded(task, physics)
+    move(physics, name, (0.42, -0.08, height + 0.01, *STANDING))
+    assert not succeeded(task, physics)
+    move(physics, name, (0.42, -0.08, TABLE_HEIGHT + 0.025, *LYING))
+    assert not succeeded(task, physics)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,103 @@
+"""Clusters that a valley of low density separates, by a test of its depth."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.cluster.hierarchy import linkage
+from scipy.spatial.distance import pdist, squareform
+
+__all__ = ["density_clusters", "intrinsic_dimension"]
+
+Points = NDArray[np.float64]
+
+
+def density_clusters(
+    points: Points, *, smallest: int = 10, evidence: float = 3.0
+) -> NDArray[np.int64]:
+    """Cluster points by density; one cluster unless there is evidence of a valley.
+
+    The hierarchy is that of HDBSCAN (Campello et al., 2013): single linkage of mutual reachability
+    distances, with the distance ``r`` to the ``k``-th neighbor, ``k = smallest // 2``, as the core
+    distance. From the bottom up, two branches of at least ``smallest`` points that meet at a
+    distance ``s`` are different clusters if the valley between them is significant on both sides
+    (cf. Burman and Polonik, 2009, "Multivariate mode hunting"): the density at a point is
+    proportional to ``r ** -m`` for data of `intrinsic_dimension` ``m``, and the logarithm of an
+    estimate from ``k`` neighbors has a standard error of ``1 / sqrt(k)``. So the branches differ by
+    ``m log(s / median(r)) / sqrt(2 / k)`` standard errors. Distances enter as ratios only: points
+    that are scaled form the same clusters.
+
+    Time and memory are quadratic in the number of points; 2,000 of 32 features take 0.1 s.
+
+    Args:
+        points: ``[n, d]``, all different.
+        smallest: Least number of points of a cluster.
+        evidence: Standard errors that make a valley significant.
+
+    Returns:
+        Cluster of each point, int64 ``[n]``, numbered in the order of their first points; -1 for
+        outliers, which no branch had absorbed when it became a cluster of its own. All 0 if there
+        is one cluster.
+
+    Example:
+        >>> points = np.random.default_rng(0).normal(size=(60, 4))
+        >>> np.bincount(density_clusters(points))
+        array([60])
+        >>> points[20:] += 8
+        >>> np.bincount(density_clusters(points))
+        array([20, 40])
+    """
+    n_points, k = len(points), smallest // 2
+    labels = np.zeros(n_points, np.int64)
+    if n_points < 2 * smallest:
+        return labels
+    square = squareform(pdist(points))
+    near = np.sort(np.partition(square, smallest)[:, : smallest + 1])[:, 1:]
+    core = near[:, k - 1]
+    reach = np.maximum(square, np.maximum(core, core[:, None]), out=square)
+    np.fill_diagonal(reach, 0.0)
+    merges = linkage(squareform(reach, checks=False), "single")
+    dimension = intrinsic_dimension(near, points.shape[1])
+    # A valley at distance s is significant for branches with a median core distance below s / gap.
+    gap = np.exp(evidence * np.sqrt(2 / k) / dimension)
+
+    def is_cluster(branch: list[list[int]], distance: float) -> bool:
+        if len(branch) > 1:
+            return True
+        (members,) = branch
+        return len(members) >= smallest and gap * np.median(core[members]) <= distance
+
+    branches = {point: [[point]] for point in range(n_points)}
+    for new, (left, right, distance, _) in enumerate(merges, n_points):
+        small, large = sorted((branches.pop(int(left)), branches.pop(int(right))), key=_size)
+        if is_cluster(small, distance) and is_cluster(large, distance):
+            branches[new] = small + large
+        elif len(small) == len(large) == 1:
+            large[0] += small[0]
+            branches[new] = large
+        else:
+            branches[new] = max(small, large, key=len)
+    (found,) = branches.values()
+    if len(found) > 1:
+        labels[:] = -1
+        for number, members in enumerate(sorted(found, key=min)):
+            labels[members] = number
+    return labels
+
+
+def intrinsic_dimension(near: Points, most: int) -> float:
+    """Return the dimension of data from the distances of each point to its neighbors.
+
+    The maximum-likelihood estimate of Levina and Bickel (2004), with inverses averaged over the
+    points (MacKay and Ghahramani, 2005).
+
+    Args:
+        near: Distances to the nearest neighbors, ascending, ``[n, k]``.
+        most: Upper bound, such as the number of features.
+    """
+    inverse = np.log(near[:, -1:] / near[:, :-1]).mean()
+    return min(1 / inverse, most) if inverse > 0 else most
+
+
+def _size(branch: list[list[int]]) -> int:
+    return sum(map(len, branch))

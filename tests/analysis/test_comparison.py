@@ -1,0 +1,159 @@
+"""Which runs are compared, and which are not."""
+
+import re
+
+import numpy as np
+import pytest
+
+from bgpo_trl.analysis.comparison import (
+    differing_conditions,
+    read_run,
+    read_settings,
+    reference_of,
+    run_directories,
+)
+from tests.analysis.runs import HEAD, TASKS, edit, write_run
+
+SEQUENCE = (0, 14, 26)
+
+
+def settings_in(folder, **options):
+    settings, notes = read_settings(run_directories([folder]), **options)
+    return {setting.title: setting for setting in settings}, notes
+
+
+def test_runs_are_sorted_by_tasks_and_how_these_are_presented(tmp_path):
+    eight = tuple("abcdefgh")
+    for name in ("oracle", "mine", "bgpo"):
+        write_run(tmp_path, name, 5, starts=SEQUENCE)
+    write_run(tmp_path, "bgpo", 5)
+    write_run(tmp_path, "bgpo", 5, tasks=eight, starts=range(0, 40, 5), directory="a")
+    write_run(tmp_path, "bgpo", 5, tasks=eight[::-1], starts=range(0, 40, 5), directory="b")
+    write_run(tmp_path, "bgpo", 5, starts=(0, 0, 20), directory="c")
+    write_run(tmp_path, "bgpo", 5, starts=SEQUENCE, directory="0", schedule="sequential")
+    (tmp_path / "no-run").mkdir()
+    found, notes = settings_in(tmp_path)
+    assert {title: setting.slug for title, setting in found.items()} == {
+        "3 tasks, one after the other, sequential": "continual-3-sequential",
+        "3 tasks, one after the other": "continual-3",
+        "3 tasks, from episodes 0, 0, 20": "staggered-3",
+        "3 tasks, all from the start": "concurrent-3",
+        "8 tasks, one after the other": "continual-8",
+        "8 tasks, one after the other, in reverse": "continual-8-in-reverse",
+    }
+    three = found["3 tasks, one after the other"]
+    assert list(three.runs) == ["BGPO", "DDPG, told the label", "mine"]
+    assert three.in_sequence and not three.from_start and not notes
+    reference = reference_of(three, found.values(), anyway=False)
+    assert reference is found["3 tasks, all from the start"]
+    assert reference_of(found["8 tasks, one after the other"], found.values(), anyway=False) is None
+
+
+def test_runs_of_one_algorithm_are_told_apart_by_their_directories(tmp_path):
+    write_run(tmp_path, "bgpo", 5, directory="plain")
+    write_run(tmp_path, "bgpo", 5, directory="beta")
+    (setting,) = settings_in(tmp_path)[0].values()
+    assert list(setting.runs) == ["BGPO (beta)", "BGPO (plain)"]
+
+
+@pytest.mark.parametrize(
+    ("what", "ours", "theirs"),
+    [
+        ("task_starts", [0, 14, 26], [0, 12, 26]),
+        ("held_out", "validation", "test"),
+        ("eval_episodes", 10, 77),
+        ("eval_every", 2, 4),
+        ("episodes", 40, 41),
+        ("encoders", "eeeeeeeeeeee...", "f" * 12),
+        ("spread", 1.0, 0.5),  # whatever else a version stores of the world
+    ],
+)
+def test_runs_under_other_conditions_are_refused_in_one_line(tmp_path, what, ours, theirs):
+    write_run(tmp_path, "bgpo", 5, starts=SEQUENCE, spread=1.0)
+    other = write_run(tmp_path, "oracle", 5, starts=SEQUENCE, spread=1.0)
+    edit(other / "config.json", **{what: theirs})
+    told = rf"oracle and .*bgpo differ in {what} \({re.escape(f'{theirs} and {ours}')}\): only runs"
+    with pytest.raises(ValueError, match=told) as refused:
+        settings_in(tmp_path)
+    assert str(refused.value).isprintable()
+    found, _ = settings_in(tmp_path, anyway=True)
+    (setting,) = found.values()
+    assert len(setting.runs) == 2
+    assert len(setting.notes) == 1 and f"differ in {what}" in setting.notes[0]
+
+
+def test_seeds_algorithms_and_what_a_run_does_not_say_are_no_conditions(tmp_path):
+    first = write_run(tmp_path, "bgpo", [5, 5], checkpoint_minutes=10)
+    second = write_run(tmp_path, "oracle", [5, 5, 5], checkpoint_minutes=5)
+    edit(second / "config.json", algorithm={"max_steps": 50, "beta": 0}, world="a", encoders="x")
+    config = (first / "config.json").read_text()
+    (first / "config.json").write_text(config.replace('"encoders"', '"colour"'))
+    assert not differing_conditions(read_run(second), read_run(first))
+    edit(second / "config.json", algorithm={"max_steps": 30})
+    told = differing_conditions(read_run(second), read_run(first))
+    assert told.endswith("differ in max_steps (30 and 50)")
+
+
+def test_the_reference_of_transfer_is_checked_too(tmp_path):
+    write_run(tmp_path, "bgpo", 5, starts=SEQUENCE)
+    other = write_run(tmp_path, "bgpo", 5, tasks=TASKS[::-1], held_out="test", episodes=50)
+    found, _ = settings_in(tmp_path)
+    continual, _ = found.values()
+    with pytest.raises(ValueError, match=r"differ in held_out \(validation and test\): only runs"):
+        reference_of(continual, found.values(), anyway=False)
+    assert reference_of(continual, found.values(), anyway=True) is not None
+    assert "differ in held_out" in continual.notes[0]
+    edit(other / "config.json", held_out="validation")
+    found, _ = settings_in(tmp_path)
+    continual, concurrent = found.values()
+    assert reference_of(continual, found.values(), anyway=False) is concurrent
+
+
+def test_longer_runs_are_cut_if_they_are_compared_anyway(tmp_path):
+    write_run(tmp_path, "bgpo", 5, episodes=30)
+    whole = read_run(write_run(tmp_path, "oracle", 8, episodes=40))
+    (setting,) = settings_in(tmp_path, anyway=True)[0].values()
+    cut = setting.find("oracle")[1]
+    assert cut.last == 30 and setting.notes[-1].endswith("oracle is cut at 30 of 40 episodes")
+    np.testing.assert_array_equal(cut.curves.success, whole.curves.success[:, :15])
+
+
+def test_a_run_is_finished_when_no_test_is_left_to_come(tmp_path):
+    write_run(tmp_path, "oracle", 5)
+    path = write_run(tmp_path, "bgpo", 5)
+    for episodes, unfinished in ((40, ""), (41, ""), (42, "has tests until episode 40 of 42")):
+        edit(path / "config.json", episodes=episodes)
+        assert read_run(path).unfinished == unfinished
+    found, notes = settings_in(tmp_path)
+    assert [list(setting.runs) for setting in found.values()] == [["DDPG, told the label"]]
+    assert notes == [f"{path} has tests until episode 40 of 42: let the run finish"]
+    edit(path / "config.json", episodes=40)
+    edit(path / "summary.json", episodes=30)  # continued, and its summary not yet written
+    assert read_run(path).unfinished == "is being extended"
+    with pytest.raises(ValueError, match="is being extended: let the run finish"):
+        read_settings([path])
+
+
+def test_the_least_that_a_run_must_write_is_enough(tmp_path):
+    path = write_run(tmp_path, "mine", 5)
+    (path / "summary.json").unlink()
+    keep = ("seeds", "tasks", "task_starts", "episodes")
+    config = {name: read_run(path).config[name] for name in keep}
+    (path / "config.json").write_text(str(config).replace("'", '"').replace("None", "null"))
+    run = read_run(path)
+    assert (run.algorithm, run.eval_every, run.unfinished) == ("concurrent-mine", 2, "")
+
+
+def test_what_is_no_folder_of_runs_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="none is not a directory: name a run"):
+        run_directories([tmp_path / "none"])
+    with pytest.raises(ValueError, match="holds no run: name a run, or a folder of runs"):
+        run_directories([tmp_path])
+    path = write_run(tmp_path, "bgpo", 5)
+    assert run_directories([path]) == run_directories([tmp_path]) == [path]
+    (path / "eval.csv").write_text(HEAD)  # begun, not yet tested
+    with pytest.raises(ValueError, match="holds no test episode"):
+        read_settings([path])
+    write_run(tmp_path, "oracle", 5)
+    found, notes = settings_in(tmp_path)
+    assert len(found) == 1 and notes[0].startswith(f"{path} holds no test episode")

@@ -1,0 +1,174 @@
+"""Intervals, tests and verdicts against SciPy, enumeration and simulation."""
+
+import itertools
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from bgpo_trl.analysis import statistics
+
+RNG = np.random.default_rng(0)
+FIRST, SECOND = RNG.normal(0.8, 0.05, 5), RNG.normal(0.7, 0.1, 7)
+
+
+def test_a_mean_has_students_interval():
+    by_hand = statistics.mean([0.7, 0.8, 0.9])
+    # Standard error 0.1 / sqrt(3), quantile of t with two degrees of freedom 4.3027.
+    assert by_hand == pytest.approx((0.8, 0.8 - 0.2484, 0.8 + 0.2484), abs=1e-4)
+    of_scipy = stats.ttest_1samp(FIRST, 0).confidence_interval()
+    assert statistics.mean(FIRST)[1:] == pytest.approx(tuple(of_scipy))
+
+
+def test_a_difference_has_welchs_intervals():
+    found = statistics.difference(FIRST, SECOND)
+    test = stats.ttest_ind(FIRST, SECOND, equal_var=False)
+    assert found.estimate.value == pytest.approx(FIRST.mean() - SECOND.mean())
+    assert found.estimate[1:] == pytest.approx(tuple(test.confidence_interval(0.95)))
+    assert found.narrow[1:] == pytest.approx(tuple(test.confidence_interval(0.90)))
+
+
+def test_a_difference_of_differences_adds_the_variances_of_four_runs():
+    runs = [FIRST, SECOND, FIRST[:4] + 0.1, SECOND[:3]]
+    value = runs[0].mean() - runs[1].mean() - (runs[2].mean() - runs[3].mean())
+    variances = np.array([run.var(ddof=1) / len(run) for run in runs])
+    freedom = variances.sum() ** 2 / (variances**2 / [len(run) - 1 for run in runs]).sum()
+    half = stats.t.ppf(0.975, freedom) * np.sqrt(variances.sum())
+    found = statistics.difference(*runs)
+    assert found.estimate == pytest.approx((value, value - half, value + half))
+    assert np.isnan(found.p)
+    with pytest.raises(ValueError, match="two runs or two pairs"):
+        statistics.difference(FIRST)
+
+
+def test_a_weight_scales_mean_and_error():
+    single, half = (statistics.contrast([FIRST], [weight]) for weight in (1.0, -0.5))
+    assert half.value == pytest.approx(-single.value / 2)
+    assert half.error == pytest.approx(single.error / 2)
+    assert half.freedom == pytest.approx(4)
+
+
+def test_runs_without_spread_have_points_for_intervals():
+    found = statistics.difference([0.9, 0.9], [0.8, 0.8, 0.8])
+    assert found.estimate == pytest.approx((0.1, 0.1, 0.1))
+    assert (found.verdict, found.seeds) == ("above", 2)
+    assert statistics.difference([0.5, 0.5], [0.5, 0.5]).verdict == "equivalent"
+
+
+def test_a_single_seed_decides_nothing():
+    found = statistics.difference([0.9], [0.1, 0.2])
+    assert found.estimate.points() == "+75.0"
+    assert (found.note, found.seeds) == ("not decided", None)
+    assert np.isnan(found.p)
+    assert statistics.mean([0.5]).percent() == "50.0"
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "narrow", "verdict"),
+    [
+        (0.01, 0.2, (0.02, 0.19), "above"),
+        (-0.2, -0.01, (-0.19, -0.02), "below"),
+        (-0.06, 0.03, (-0.049, 0.02), "equivalent"),
+        (-0.03, 0.06, (-0.02, 0.05), "not decided"),
+        (-0.2, 0.3, (-0.1, 0.2), "not decided"),
+        (0.001, 0.04, (0.005, 0.035), "equivalent (above)"),
+        (-0.04, -0.001, (-0.035, -0.005), "equivalent (below)"),
+    ],
+)
+def test_the_verdict_follows_from_the_intervals(low, high, narrow, verdict):
+    middle = (low + high) / 2
+    estimate = statistics.Estimate(middle, low, high)
+    found = statistics.Difference(estimate, statistics.Estimate(middle, *narrow), 0.5, 33)
+    assert found.verdict == verdict
+    assert found.note == {"not decided": "not decided (about 33 seeds would)"}.get(verdict, verdict)
+
+
+def test_p_is_the_share_of_assignments_as_far_apart():
+    assert statistics.permutation_p([0, 0], [1, 1]) == pytest.approx(2 / 6)
+    assert statistics.permutation_p(np.zeros(5), np.ones(5)) == pytest.approx(2 / 252)
+    assert statistics.permutation_p([0, 1], [1, 0]) == 1
+    rng = np.random.default_rng(1)
+    first, second = rng.random(4), rng.random(4) + 0.3
+    both, apart = np.concatenate([first, second]), abs(first.mean() - second.mean())
+    deals = [list(deal) for deal in itertools.combinations(range(8), 4)]
+    gaps = [abs(both[deal].mean() - np.delete(both, deal).mean()) for deal in deals]
+    expected = np.mean([gap >= apart - 1e-12 for gap in gaps])
+    assert statistics.permutation_p(first, second) == pytest.approx(expected)
+
+
+def test_many_seeds_are_dealt_at_random_from_the_generator():
+    rng = np.random.default_rng(2)
+    first, second = rng.normal(size=12), rng.normal(size=12) + 1
+    found = [statistics.permutation_p(first, second, rng=seed) for seed in (0, 0, 1)]
+    assert found[0] == found[1] != found[2]
+    assert found[0] == pytest.approx(stats.ttest_ind(first, second).pvalue, abs=0.01)
+
+
+def test_the_seeds_needed_decide_with_the_promised_probability():
+    """In a simulation of runs with the difference and the spread that the samples have."""
+    rng = np.random.default_rng(3)
+    for gap in (0.0, 0.15):
+        noise = np.array([-1, 0, 1.0])
+        n = statistics.seeds_needed(0.8 + gap + 0.08 * noise, 0.8 + 0.08 * noise)
+        draws = rng.normal(size=(2, 2_000, n)) * 0.08 + np.array([gap, 0])[:, None, None]
+        value = draws[0].mean(1) - draws[1].mean(1)
+        error = np.sqrt(draws.var(2, ddof=1).sum(0) / n)
+        t = [stats.t.ppf(quantile, 2 * n - 2) for quantile in (0.95, 0.975)]
+        decided = np.abs(value) + t[0] * error < statistics.MARGIN
+        decided |= np.abs(value) > t[1] * error
+        assert decided.mean() == pytest.approx(0.8, abs=0.05)
+
+
+def test_more_spread_takes_more_seeds():
+    noise = np.array([-1, 0, 1.0])
+    needed = [statistics.seeds_needed(0.5 + s * noise, 0.5 + s * noise) for s in (0.02, 0.05, 1)]
+    assert needed[0] < needed[1] < needed[2] == 1_001
+    wild = statistics.difference(0.5 + noise, 0.5 + noise)
+    assert wild.note == "not decided (more than 1,000 seeds would)"
+
+
+def test_holm_by_hand():
+    assert statistics.holm([0.01, 0.04, 0.03]) == pytest.approx([0.03, 0.06, 0.06])
+    assert statistics.holm([0.5, 0.6]) == [1, 1]
+    found = statistics.holm([0.02, np.nan, 0.01])
+    assert found[::2] == pytest.approx([0.02, 0.02]) and np.isnan(found[1])
+    assert statistics.holm([]) == []
+
+
+def test_cells_are_rounded_once_and_clipped():
+    assert statistics.Estimate(0.98, 0.94, 1.02).percent() == "98.0 [94, 100]"
+    assert statistics.Estimate(-0.0001, -0.1, 0.104).points() == "+0.0 [-10, +10]"
+    assert statistics.Estimate(0.0123, -0.001, 0.02).points() == "+1.2 [+0, +2]"
+
+
+@pytest.mark.parametrize("scores", [[], [[0.5]], [0.5, np.nan], [np.inf], 0.5])
+def test_scores_that_are_not_there_are_refused(scores):
+    for call in (statistics.mean, lambda s: statistics.difference([0.1, 0.2], s)):
+        with pytest.raises(ValueError, match="scores must be finite, one for each"):
+            call(scores)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("n_tasks", [3, 8])
+def test_intervals_cover_what_they_promise(n_tasks):
+    """Of two algorithms whose seeds have a level of their own, in addition to noise by task."""
+    rng, n = np.random.default_rng(4), 4_000
+    covered = np.zeros(2)
+    for _ in range(n):
+        runs = []
+        for level, spread in ((0.8, 0.05), (0.7, 0.1)):
+            of_seed = level + spread * rng.normal(size=(5, 1))
+            share = np.clip(of_seed + 0.08 * rng.normal(size=(5, n_tasks)), 0, 1)
+            runs.append((rng.binomial(15, share) / 15).mean(1))
+        truth = [_expected(level, spread) for level, spread in ((0.8, 0.05), (0.7, 0.1))]
+        mean = statistics.mean(runs[0])
+        gap = statistics.contrast(runs, [1, -1]).interval()
+        covered += mean.low <= truth[0] <= mean.high, gap.low <= truth[0] - truth[1] <= gap.high
+    assert covered / n == pytest.approx([0.95, 0.95], abs=0.015), covered / n
+
+
+def _expected(level, spread):
+    """Expected success of a clipped normal share."""
+    width = np.hypot(spread, 0.08)
+    x = np.linspace(level - 8 * width, level + 8 * width, 20_001)
+    return np.trapezoid(np.clip(x, 0, 1) * stats.norm.pdf(x, level, width), x)

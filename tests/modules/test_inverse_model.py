@@ -1,0 +1,43 @@
+import pytest
+import torch
+
+from bgpo_trl.modules.inverse_model import InverseModel, window
+
+
+@pytest.fixture
+def model() -> InverseModel:
+    torch.manual_seed(0)
+    return InverseModel(3, 2, hidden_size=8)
+
+
+def test_a_window_holds_the_latents_around_a_step_within_the_episode() -> None:
+    """Plain reference: lists; before the first and after the last latent, that one repeats."""
+    generator = torch.Generator().manual_seed(0)
+    z, length = torch.randn(3, 6, 2, generator=generator), torch.tensor([6, 4, 2])
+    for episode, step in [(0, 0), (0, 2), (0, 4), (1, 0), (1, 2), (2, 0)]:
+        latents = z[episode, : length[episode]].tolist()
+        places = [max(step - 1, 0), step, step + 1, min(step + 2, len(latents) - 1)]
+        expected = [value for place in places for value in latents[place]]
+        found = window(z, length, torch.tensor(episode), torch.tensor(step))
+        assert found.tolist() == expected
+
+
+def test_episodes_are_inferred_as_their_windows_are(model: InverseModel) -> None:
+    generator = torch.Generator().manual_seed(0)
+    z, length = torch.randn(2, 5, 3, generator=generator), torch.tensor([5, 3])
+    action = model(z, length)
+    assert action.shape == (2, 4, 2)
+    for episode, step in [(0, 0), (0, 3), (1, 1)]:
+        alone = model.infer(window(z, length, torch.tensor(episode), torch.tensor(step)))
+        torch.testing.assert_close(action[episode, step], alone)
+
+
+def test_actions_do_not_depend_on_what_follows_the_episode(model: InverseModel) -> None:
+    z, length = torch.zeros(1, 6, 3), torch.tensor([3])
+    other = z.clone()
+    other[:, 3:] = 100.0
+    assert torch.equal(model(z, length)[:, :2], model(other, length)[:, :2])
+
+
+def test_actions_are_bounded(model: InverseModel) -> None:
+    assert model.infer(1e6 * torch.randn(50, 12)).abs().max() == 1
