@@ -30,7 +30,6 @@ from bgpo_trl.analysis.tables import markdown
 from bgpo_trl.configs import PRESETS, BGPOConfig, DDPGConfig, SACConfig, TD3Config
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.experiments.arguments import command_line
-from bgpo_trl.experiments.resuming import check_resumable
 from bgpo_trl.figures.curves import plot_success_curves
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.machine import choose_device, set_threads
@@ -84,8 +83,6 @@ def main(arguments: Arguments) -> None:
         raise ValueError(f"--rungs: name each once, got {' '.join(arguments.rungs)}")
     set_threads(arguments.threads)
     device = choose_device(arguments.device)
-    if arguments.resume:
-        check_resumable([arguments.out / rung for rung in arguments.rungs])
     encoders, bank = load_pretrained()
     base = replace(
         PRESETS["desk"],

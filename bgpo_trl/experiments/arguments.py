@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 import sys
 import sysconfig
@@ -92,7 +93,7 @@ class Arguments(TaskArguments):
     """Half of the held-out demonstrations to test on: validation to choose settings, test to report
     results."""
     resume: bool = False
-    """Continue the run in the directory."""
+    """Continue the run in the directory, or begin it if there is none."""
     train_encoders: bool = False
     """Record demonstrations and train new encoders instead of using the pretrained ones."""
     wandb: Literal["online", "offline"] | None = None
@@ -222,7 +223,8 @@ def command_line(
 ) -> None:
     """Run ``main`` with the arguments of the command line; an expected error becomes one line.
 
-    An error of somebody else's code, such as a module named with ``--import``, keeps its traceback.
+    Ctrl-C and SIGTERM exit with 75 (``os.EX_TEMPFAIL``) if ``--resume`` can continue. An error of
+    somebody else's code, such as a module named with ``--import``, keeps its traceback.
 
     Args:
         main: Called with the arguments.
@@ -239,8 +241,10 @@ def command_line(
             raise
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:
-        again = ": the same command with --resume continues"
-        sys.exit("interrupted" + again * hasattr(arguments, "resume"))
+        if not hasattr(arguments, "resume"):
+            sys.exit("interrupted")
+        sys.stderr.write("interrupted: the same command with --resume continues\n")
+        sys.exit(os.EX_TEMPFAIL)
 
 
 def _is_of_others(error: BaseException) -> bool:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from bgpo_trl.configs import RunConfig
 from bgpo_trl.runs.config_file import read_config
-from bgpo_trl.runs.directory import holds_run
 from bgpo_trl.runs.results import read_json
 
 
@@ -40,14 +38,3 @@ def is_finished(directory: Path, config: RunConfig) -> bool:
         return False
     tested = (directory / "final.csv").exists()
     return tested and saved == config and summary.get("episodes") == config.episodes
-
-
-def check_resumable(directories: Sequence[Path]) -> None:
-    """Check that at least one of some directories holds a run, for ``--resume``.
-
-    Raises:
-        ValueError: If none does, for example because ``--out`` is mistyped.
-    """
-    if not any(holds_run(directory) for directory in directories):
-        named = " or ".join(map(str, directories))
-        raise ValueError(f"{named} holds no run to resume: check --out, or begin without --resume")

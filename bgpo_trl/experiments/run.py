@@ -22,7 +22,7 @@ from bgpo_trl.experiments.arguments import (
     chosen_weights,
 )
 from bgpo_trl.experiments.measure import draw, measure
-from bgpo_trl.experiments.resuming import as_begun, check_resumable, is_finished
+from bgpo_trl.experiments.resuming import as_begun, is_finished
 from bgpo_trl.files.locking import DirectoryLock
 from bgpo_trl.files.whole_file import write_json
 from bgpo_trl.machine import choose_device, set_threads
@@ -114,14 +114,17 @@ def _makes_encoders(arguments: Arguments, out: Path) -> bool:
 
 
 def _continued(arguments: Arguments, config: RunConfig, out: Path) -> RunConfig:
-    """Return the settings with which the run in a directory continues.
+    """Return the settings with which the run in a directory continues, or begins.
 
     Raises:
-        ValueError: If the directory holds neither a run nor the beginning of its encoders.
+        ValueError: If the directory holds the beginning of new encoders that are not asked for.
     """
     begun = any((out / folder).exists() for folder in (_DATASET, _ENCODERS))
-    if not (_makes_encoders(arguments, out) and begun):
-        check_resumable([out])
+    if begun and not holds_run(out) and not _makes_encoders(arguments, out):
+        raise ValueError(
+            f"{out} holds the beginning of new encoders: add --train-encoders, or name another "
+            "directory"
+        )
     return as_begun(config, out, keep_eval_every=arguments.eval_every is not None)
 
 

@@ -88,13 +88,6 @@ CASES = [
     ("continual.py --out run", "run holds a run", "--resume continues it, --out names another"),
     ("continual.py --out run --resume", "other settings (episodes is 50 there", "the same sett"),
     ("continual.py --out damaged --resume", "config.json is damaged", "put it back as the run"),
-    ("continual.py --out nowhere --resume", "nowhere holds no run to resume", "check --out, or"),
-    (
-        "concurrent_tasks.py --out empty --resume",
-        "empty holds no run to resume",
-        "begin without --resume",
-    ),
-    ("ladder.py --rungs a b --out new --resume", "new/a or new/b holds no run", "check --out, or"),
     ("ladder.py --rungs a --out file", "cannot make the folder file/a", "choose another"),
     # runs that are read
     ("compare.py nowhere empty", "there is no run at nowhere", "name another"),

@@ -18,7 +18,7 @@ from benchmarks import concurrent_tasks, continual, report
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.experiments import measure
 from bgpo_trl.experiments import run as experiment
-from bgpo_trl.experiments.arguments import Arguments
+from bgpo_trl.experiments.arguments import Arguments, command_line
 from bgpo_trl.files.checkpoint import load_checkpoint
 from bgpo_trl.runs.results import read_final_tests, read_table, read_tests
 from suites import nico
@@ -173,13 +173,32 @@ def test_a_finished_run_only_says_so_until_it_is_made_longer(
     assert capsys.readouterr().out.startswith(f"{run} is finished, all 9 episodes")
 
 
+def test_what_is_not_there_yet_begins_when_it_is_resumed(undrawn, tmp_path, monkeypatch):
+    again = Arguments(out=tmp_path / "run", resume=True, episodes=4)
+    continual.main(again)
+    begun = (tmp_path / "run" / "train.csv").read_text()
+    assert begun.count("\n") == 1 + 2 * 4
+    continual.main(again)
+    assert (tmp_path / "run" / "train.csv").read_text() == begun
+
+
+def test_an_interrupted_run_exits_with_a_code_of_its_own(capsys):
+    def interrupted(arguments):
+        raise KeyboardInterrupt
+
+    with pytest.raises(SystemExit) as left:
+        command_line(interrupted, None, options=[])
+    assert left.value.code == 75
+    assert capsys.readouterr().err == "interrupted: the same command with --resume continues\n"
+
+
 def test_a_run_that_was_interrupted_before_its_training_is_resumed(
     undrawn, tmp_path, monkeypatch, encoders, bank
 ):
     monkeypatch.setattr(experiment, "make_pretrained", lambda *_, **__: (encoders, bank))
     (tmp_path / "demonstrations").mkdir()
     arguments = Arguments(out=tmp_path, resume=True, episodes=2)
-    with pytest.raises(ValueError, match="holds no run to resume"):
+    with pytest.raises(ValueError, match="beginning of new encoders: add --train-encoders"):
         continual.main(arguments)
     assert [path.name for path in tmp_path.iterdir()] == ["demonstrations"]
     continual.main(replace(arguments, train_encoders=True))
@@ -252,7 +271,7 @@ def test_smoke_goes_through_every_stage_from_nothing(tmp_path):
             time.sleep(0.05)
         process.send_signal(signal.SIGINT)
         assert process.stderr.read().endswith("the same command with --resume continues\n")
-    assert process.returncode == 1
+    assert process.returncode == os.EX_TEMPFAIL
     assert load_checkpoint(tmp_path / "run" / "checkpoint")["evaluator"]["next"] < 2
 
     result = subprocess.run([*command, "--resume"], capture_output=True, **options)
