@@ -1,4 +1,4 @@
-"""What a success is worth: what becomes of it when the episode goes on.
+"""The aftermath of successes: whether they last when the episode goes on.
 
     python benchmarks/aftermath.py runs/continual-bgpo-quick
     python benchmarks/aftermath.py --demonstrators

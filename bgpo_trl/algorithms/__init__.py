@@ -48,7 +48,7 @@ _SHOWN_TASKS: Any = {**_SHOWN, "task_batch_size": 128}
 _SHOWN_SINGLE: Any = {**_SHOWN, "rl": DDPGConfig(noise=0.1, batch_size=384)}  # three tasks' batches
 
 ALGORITHMS: dict[str, Entry] = {
-    "bgpo": Entry(BGPO, BGPOConfig(**_SHOWN)),
+    "bgpo": Entry(BGPO, BGPOConfig()),
     "bgpo-experts": Entry(BGPO, BGPOConfig(**_ALONE)),
     "bgpo-single": Entry(BGPO, _SINGLE),
     "bgpo-paper": Entry(BGPO, replace(_SINGLE, **_PUBLISHED)),

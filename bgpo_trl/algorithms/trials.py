@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -15,8 +17,7 @@ from bgpo_trl.seeding import stream_seed
 __all__ = ["GroupTrials"]
 
 _FITTING_SHARE = 0.9  # of a group's own demonstrations whose starts are to count as fitting
-_COUNTS = ("after_own", "after_others")
-_Counts = dict[tuple[int, int], list[int]]  # successes and episodes, by groups shown and played
+_Counts = dict[int, dict[int, list[int]]]  # successes and episodes, by groups shown and played
 
 
 class GroupTrials:
@@ -62,7 +63,8 @@ class GroupTrials:
         if not fits:
             others = sorted({*state.shown.values()} - {group})
             arms = [group, *(other for other in others if self.fits(seed, start, other))]
-            counts = np.array([state.after_others.get((group, arm), (0, 0)) for arm in arms])
+            paid = state.after_others.get(group, {})
+            counts = np.array([paid.get(arm, (0, 0)) for arm in arms])
             rng = np.random.default_rng((self._streams[seed], state.n_trials))
             state.n_trials += 1
             won, episodes = counts.T
@@ -79,7 +81,7 @@ class GroupTrials:
         state = self._state[seed]
         group, played, fits = state.episode
         counts = state.after_own if fits else state.after_others
-        entry = counts.setdefault((group, played), [0, 0])
+        entry = counts.setdefault(group, {}).setdefault(played, [0, 0])
         entry[0] += success
         entry[1] += 1
         state.shown[demonstration] = group
@@ -91,9 +93,14 @@ class GroupTrials:
         """
         state, known = self._state[seed], {*numbers}
         state.shown = {row: int(group[row]) for row in state.shown}
-        for counts in (state.after_own, state.after_others):
-            for pair in [pair for pair in counts if not {*pair} <= known]:
-                del counts[pair]
+        state.after_own, state.after_others = (
+            {
+                shown: {played: entry for played, entry in of_shown.items() if played in known}
+                for shown, of_shown in counts.items()
+                if shown in known
+            }
+            for counts in (state.after_own, state.after_others)
+        )
 
     def fits(self, seed: int, start: Tensor, group: int) -> bool:
         """Return whether a start ``[64]`` fits a group."""
@@ -106,10 +113,12 @@ class GroupTrials:
 
     def same_task(self, seed: int) -> tuple[int, int] | None:
         """Return two groups that are one task, or None."""
-        counts, none = self._state[seed].after_others, (0, 0)
-        for one, other in counts:
-            (won, n), (won_back, n_back) = counts[one, other], counts.get((other, one), none)
-            tried = one < other and min(n, n_back, won + won_back) >= self.successes
+        counts = self._state[seed].after_others
+        for one, other in combinations(sorted(counts), 2):
+            (won, n), (won_back, n_back) = (
+                counts[shown].get(played, (0, 0)) for shown, played in ((one, other), (other, one))
+            )
+            tried = min(n, n_back, won + won_back) >= self.successes
             if tried and self._pays(seed, one, other) and self._pays(seed, other, one):
                 return one, other
         return None
@@ -117,23 +126,23 @@ class GroupTrials:
     def _pays(self, seed: int, shown: int, played: int) -> bool:
         """Return whether a group is not much worse after another's demonstrations than its own."""
         state = self._state[seed]
-        won, episodes = state.after_others[shown, played]
-        own, of = state.after_own.get((played, played), (0, 1))
+        won, episodes = state.after_others[shown][played]
+        own, of = state.after_own.get(played, {}).get(played, (0, 1))
         half = episodes * own / of / 2
         return won >= half - half**0.5
 
     def state_dict(self) -> dict[str, Any]:
         """Return what is counted, and the present episodes."""
-        return {"seeds": [state.saved() for state in self._state]}
+        return {"seeds": [deepcopy(vars(state)) for state in self._state]}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a `state_dict`."""
-        self._state = [_Seed.of(saved) for saved in state["seeds"]]
+        self._state = [_Seed(**deepcopy(saved)) for saved in state["seeds"]]
 
 
 @dataclass
 class _Seed:
-    """What is counted of a seed.
+    """Counts of a seed.
 
     Attributes:
         shown: Group of each demonstration shown, by its position.
@@ -148,23 +157,3 @@ class _Seed:
     after_others: _Counts = field(default_factory=dict)
     n_trials: int = 0
     episode: tuple[int, int, bool] = (0, 0, True)
-
-    def saved(self) -> dict[str, Any]:
-        """Return a copy without keys that are pairs, which a checkpoint does not take."""
-        counts = {
-            name: [(*pair, *entry) for pair, entry in getattr(self, name).items()]
-            for name in _COUNTS
-        }
-        rest = {"n_trials": self.n_trials, "episode": self.episode}
-        return {"shown": dict(self.shown), **counts, **rest}
-
-    @classmethod
-    def of(cls, saved: dict[str, Any]) -> _Seed:
-        """Return the state that was saved."""
-        counts: dict[str, _Counts] = {
-            name: {(shown, played): [won, n] for shown, played, won, n in saved[name]}
-            for name in _COUNTS
-        }
-        group, played, fits = saved["episode"]
-        rest: dict[str, Any] = {"n_trials": saved["n_trials"], "episode": (group, played, fits)}
-        return cls(dict(saved["shown"]), **counts, **rest)

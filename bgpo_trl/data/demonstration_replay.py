@@ -11,7 +11,6 @@ from torch import Tensor
 
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.group_replay import GroupReplay, draw_shares
-from bgpo_trl.seeding import normal
 
 __all__ = ["DemonstrationReplay"]
 
@@ -105,7 +104,7 @@ class DemonstrationReplay:
         ends = (step == n_steps - 1).unsqueeze(-1)
         state = steps.latents(frame)
         if self._noise:
-            state = state + self._noise * normal(self._generators, state.shape[1:])
+            state = state + self._noise * self._normal(group, state.shape[-1])
         return TensorDict(
             {
                 self._state_key: state,
@@ -121,6 +120,16 @@ class DemonstrationReplay:
             },
             group.shape,
         )
+
+    def _normal(self, group: Tensor, n_features: int) -> Tensor:
+        """Draw standard normals ``[S, R, n_features]``, 0 for rows without a group.
+
+        As in `draw_shares`, these consume no random numbers.
+        """
+        drawn = torch.zeros(*group.shape, n_features)
+        for row, wanted, source in zip(drawn, group >= 0, self._generators, strict=True):
+            row[wanted] = torch.randn(int(wanted.sum()), n_features, generator=source)
+        return drawn
 
     def regroup(self, seed: int, group: Tensor) -> None:
         """Assign demonstrations of a seed to groups anew, from the group of each in the bank."""

@@ -1,4 +1,4 @@
-"""What a success is worth: the simulation continued from the states in which episodes succeeded.
+"""The aftermath of successes: simulations continued from the states in which episodes succeed.
 
 A task's condition has to hold for two or three steps, and a learner finds the cheapest thing that
 pays. Here a grasped object is lifted, and what was pushed is left alone for two seconds.
@@ -61,7 +61,7 @@ _NUMBER = 2**31 + 3
 
 
 class Outcome(NamedTuple):
-    """What became of a success.
+    """The outcome of a success.
 
     Attributes:
         holds: Whether it is one in earnest.
@@ -179,7 +179,7 @@ CRITERIA: dict[str, Criterion] = {
     "push_white_left": Criterion("displacement", partial(stays_aside, "white_box", 1)),
     "push_white_right": Criterion("displacement", partial(stays_aside, "white_box", -1)),
 }
-"""What is asked of a success, by task. Modules of own tasks may add entries."""
+"""The criterion for a success to last, by task. Modules of own tasks may add entries."""
 
 
 class Row(NamedTuple):

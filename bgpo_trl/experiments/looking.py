@@ -33,7 +33,7 @@ VIEWS: dict[str, Hidden | None] = {
     "places hidden": "places",
     "objects hidden": "objects",
 }
-"""What is hidden from the policy, by the name of the condition."""
+"""The part of the scene hidden from the policy, by the name of the condition."""
 RANDOM = "random actions"
 """Name of the condition without a policy."""
 
@@ -68,7 +68,7 @@ class HidingEnv(NicoEnv):
     ) -> None:
         super().__init__(tasks, **arguments)
         self._hides_movement = hidden == "objects"
-        # What is shown has a simulation of its own, so that the true one is only read.
+        # The shown scene has a simulation of its own, so that the true one is only read.
         self._shown = nico.Physics.from_xml_string(nico.scene_xml())
         joints = [self._shown.model.joint(name).qposadr[0] for name in OBJECTS]
         self._poses = np.add.outer(joints, np.arange(7))

@@ -41,7 +41,7 @@ COUNT, SHARE, AMOUNT = Numbers(2**53 - 1, whole=True), Numbers(1), Numbers()
 TEXT = None
 """Any text, even none."""
 Cells = Numbers | Sequence[str] | None
-"""What the cells of a column may hold: numbers, one of some names, or any text."""
+"""The cells that a column may hold: numbers, one of some names, or any text."""
 
 TRAIN = {"seed": COUNT, "episode": COUNT, "task": TEXT, "success": SHARE}
 """Columns of ``train.csv`` that success is computed from."""

@@ -118,6 +118,38 @@ def test_entries_have_the_shapes_and_types_of_played_transitions(shown):
     assert found == expected
 
 
+def test_noise_is_on_states_alone_and_a_seeds_own_however_many_slots_are_free(bank):
+    quiet, noisy, wide = (make(bank.seen(), noise=noise) for noise in (0.0, 0.4, 0.4))
+    for replay in (quiet, noisy, wide):
+        show(replay, [(3, 1.0, 0), (5, 1.0, 0)], [(4, 1.0, 0), (6, 1.0, 0)])
+    group = torch.zeros(2, 4_000, dtype=torch.int64)
+    plain, drawn = quiet.sample(group), noisy.sample(group)
+    for key in ("action", ("next", "latent"), ("next", "reward"), "behavior"):
+        assert plain[key].equal(drawn[key])
+    noise = drawn["latent"] - plain["latent"]
+    assert float(noise.mean()) == pytest.approx(0.0, abs=0.01)
+    assert float(noise.std()) == pytest.approx(0.4, abs=0.01)
+    free = torch.full([2, 4_000], -1)
+    spread = wide.sample(torch.stack([group, free], -1).view(2, -1))
+    assert spread[:, ::2]["latent"].equal(drawn["latent"])
+
+
+def test_constants_are_of_any_demonstration_of_the_group_if_not_its_own(bank):
+    replay = make(bank.seen(), own_constants=False)
+    show(replay, [(3, 1.0, 0), (5, 1.0, 0)], [(4, 1.0, 0), (6, 1.0, 0)], [(7, 1.0, 1), (8, 1.0, 1)])
+    steps = bank.seen().steps
+    drawn = replay.sample(torch.tensor([[0, 1]]).expand(2, 2).repeat_interleave(300, 1))
+    frames = torch.stack([steps.latents(steps.first), steps.latents(steps.first + 1)], 1)
+    for seed, members in enumerate(((3, 4), (5, 6))):
+        told = drawn["behavior"][seed, :300, 0].long()
+        pairs = set()
+        for number in members:
+            of = (drawn["latent"][seed, :300, None] == frames[number]).all(-1).any(-1)
+            pairs |= {(number, one) for one in told[of].tolist()}
+        assert pairs == {(one, other) for one in members for other in members}
+        assert drawn["behavior"][seed, 300:, 0].unique().tolist() == [7 + seed]
+
+
 def test_demonstrations_and_their_steps_are_drawn_equally_often(bank):
     """A long demonstration is drawn no more often than a short one."""
     replay = make(bank.seen(), n_seeds=1)
