@@ -21,14 +21,16 @@ class AdvantageWeightedLoss(OffPolicyLoss):
     """Regression to replayed actions, weighted by their advantage (AWAC; Nair et al., 2020)."""
 
     def next_value(self, successor: TensorDictBase) -> Tensor:
-        data = self.network("target_actor_network")(successor)
-        return self.values(self.network("target_value_network"), data)
+        with self.network("target_actor_network") as actor:
+            data = actor(successor)
+        return self.values("target_value_network", data)
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        data = self.network("actor_network")(self.inputs.current(tensordict))
+        with self.network("actor_network") as actor:
+            data = actor(self.inputs.current(tensordict))
         error = (data["action"] - tensordict["action"]).square().mean(-1)
-        critic = self.network("value_network")
-        advantage = self.values(critic, tensordict.copy()) - self.values(critic, data)
+        replayed = self.values("value_network", tensordict.copy())
+        advantage = replayed - self.values("value_network", data)
         weight = (advantage.detach() / 0.1).exp().clamp(max=20)
         return self.mean_per_seed(weight * error, tensordict).sum(), {}
 

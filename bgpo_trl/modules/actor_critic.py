@@ -23,7 +23,7 @@ __all__ = ["Actor", "Critic", "StackedNetwork"]
 class StackedNetwork(TensorDictModuleBase):
     """Base of policies and Q-functions: a perceptron on entries of a TensorDict.
 
-    A subclass makes its `StackedMLP`, the first of its submodules, and calls it with `inputs`.
+    A subclass makes its `StackedMLP`, the first of its submodules, and calls it with `input`.
 
     Args:
         in_keys: Entries to read, side by side in this order, ``[*S, *B, features]`` each.
@@ -48,10 +48,11 @@ class StackedNetwork(TensorDictModuleBase):
         """Leading dimensions ``S`` of the weights."""
         return cast(StackedMLP, next(self.children())).batch_size
 
-    def inputs(self, tensordict: TensorDictBase) -> list[Tensor]:
-        """Return the values of ``in_keys``; raise ``ValueError`` if one is missing."""
+    def input(self, tensordict: TensorDictBase) -> Tensor:
+        """Return the values of ``in_keys`` side by side; raise ``ValueError`` if one is missing."""
         try:
-            return [tensordict[key] for key in self.in_keys]
+            values = [tensordict[key] for key in self.in_keys]
+            return values[0] if len(values) == 1 else torch.cat(values, -1)
         except KeyError:
             raise missing_key(type(self).__name__, tensordict, self.in_keys) from None
 
@@ -90,7 +91,7 @@ class Actor(StackedNetwork):
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the actions of states; return the same tensordict."""
-        pre_tanh = self.mlp(*self.inputs(tensordict))
+        pre_tanh = self.mlp(self.input(tensordict))
         tensordict.set("pre_tanh_action", pre_tanh)
         return tensordict.set("action", pre_tanh.tanh())
 
@@ -123,5 +124,5 @@ class Critic(StackedNetwork):
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the values of states and actions; return the same tensordict."""
-        value = self.mlp(*self.inputs(tensordict))
+        value = self.mlp(self.input(tensordict))
         return tensordict.set("state_action_value", value)

@@ -51,7 +51,7 @@ class GaussianActor(StackedNetwork):
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the actions without noise; return the same tensordict."""
-        loc, log_scale = self.mlp(*self.inputs(tensordict)).chunk(2, dim=-1)
+        loc, log_scale = self.mlp(self.input(tensordict)).chunk(2, dim=-1)
         tensordict.set("loc", loc)
         tensordict.set("scale", log_scale.clamp(*LOG_SCALE_BOUNDS).exp())
         return tensordict.set("action", loc.tanh())

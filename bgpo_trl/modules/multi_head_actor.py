@@ -75,7 +75,7 @@ class MultiHeadActor(StackedNetwork):
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the distributions of actions; return the same tensordict."""
-        hidden = self.trunk(*self.inputs(tensordict)).relu()
+        hidden = self.trunk(self.input(tensordict)).relu()
         task_dim = len(self.batch_size)
         if hidden.shape[task_dim] != len(self.heads):
             raise ValueError(

@@ -94,47 +94,38 @@ class StackedLinear(nn.Module):
             weight.uniform_(-bound, bound, generator=stream)
             bias.uniform_(-bound, bound, generator=stream)
 
-    def forward(self, *inputs: Tensor) -> Tensor:
-        """Apply each layer to its own slice of the inputs, side by side along the last dimension.
-
-        Each input is multiplied with its own rows of the weights. This saves concatenating the
-        inputs, and the gradient of an input that needs none.
+    def forward(self, input: Tensor) -> Tensor:
+        """Apply each layer to its own slice of the input.
 
         Args:
-            *inputs: ``[*S, *B, features]`` each, ``in_features`` together; ``B`` may be of any
-                length.
+            input: ``[*S, *B, in_features]``; ``B`` may be of any length.
 
         Returns:
             ``[*S, *B, out_features]``.
 
         Raises:
-            ValueError: If an input does not lead with ``S``, batches differ, or the features do not
-                add up.
+            ValueError: If the input does not lead with ``S`` or has another number of features.
         """
-        sizes = [input.shape[-1] for input in inputs]
         stack = self.batch_size
-        batches = {input.shape[:-1] for input in inputs}
-        if (
-            sum(sizes) != self.in_features
-            or len(batches) != 1
-            or inputs[0].shape[: len(stack)] != stack
-        ):
+        if input.shape[-1] != self.in_features or input.shape[: len(stack)] != stack:
             raise ValueError(
-                f"the inputs must have one leading index per layer and {self.in_features} features "
-                f"together, shape {[*stack]} + [*B, {self.in_features}], got "
-                f"{' and '.join(str([*input.shape]) for input in inputs)}"
+                "the input must have one leading index per layer and "
+                f"{self.in_features} features, shape {[*stack]} + [*B, {self.in_features}], got "
+                f"{[*input.shape]}"
             )
         n_layers = stack.numel()
+        x = input.reshape(n_layers, -1, self.in_features)
         weight = self.weight.reshape(n_layers, self.in_features, self.out_features)
-        output = self.bias.reshape(n_layers, 1, self.out_features)
-        for i, (input, rows) in enumerate(zip(inputs, weight.split(sizes, -2), strict=True)):
-            # In place is faster, but autocast does not support it.
-            in_place = i and not torch.is_autocast_enabled(input.device.type)
-            multiply_add = torch.Tensor.baddbmm_ if in_place else torch.Tensor.baddbmm
-            output = multiply_add(output, input.reshape(n_layers, -1, input.shape[-1]), rows)
-        shape = torch.Size([*inputs[0].shape[:-1], self.out_features])
-        # A view only where needed: autograd is slow when a view is then changed in place.
-        return output if output.shape == shape else output.view(shape)
+        bias = self.bias.reshape(n_layers, 1, self.out_features)
+        # Products with few columns are slow: one column is a weighted sum, and few are faster as
+        # rows, each several times with its gradients.
+        if self.out_features == 1:
+            output = (x * weight.mT).sum(-1, keepdim=True) + bias
+        elif self.out_features <= 16:
+            output = torch.baddbmm(bias.mT, weight.mT, x.mT).mT
+        else:
+            output = torch.baddbmm(bias, x, weight)
+        return output.reshape(*input.shape[:-1], self.out_features)
 
 
 class StackedMLP(nn.Module):
@@ -146,7 +137,7 @@ class StackedMLP(nn.Module):
     Data").
 
     Args:
-        in_features: Size of the last dimension of all inputs together.
+        in_features: Size of the last input dimension.
         out_features: Size of the last output dimension.
         hidden_sizes: Width of each hidden layer.
         layer_norm: Whether to normalize the hidden layers.
@@ -155,7 +146,7 @@ class StackedMLP(nn.Module):
 
     Example:
         >>> mlp = StackedMLP(96, 4)
-        >>> mlp(torch.zeros(256, 64), torch.zeros(256, 32)).shape
+        >>> mlp(torch.zeros(256, 96)).shape
         torch.Size([256, 4])
     """
 
@@ -181,10 +172,10 @@ class StackedMLP(nn.Module):
         """Leading dimensions ``S`` of the weights."""
         return cast(StackedLinear, self.layers[0]).batch_size
 
-    def forward(self, *inputs: Tensor) -> Tensor:
-        """Return the output ``[*S, *B, out_features]``; inputs as for `StackedLinear`."""
+    def forward(self, input: Tensor) -> Tensor:
+        """Return the output ``[*S, *B, out_features]``; input as for `StackedLinear`."""
         first, *others = self.layers
-        x = first(*inputs)
+        x = first(input)
         for layer in others:
             if self.layer_norm:
                 x = F.layer_norm(x, x.shape[-1:])

@@ -66,11 +66,13 @@ class DDPGLoss(OffPolicyLoss):
 
     def next_value(self, successor: TensorDictBase) -> Tensor:
         """Return the values ``[*S, *B]`` of the target policy's actions."""
-        data = self.network("target_actor_network")(successor)
-        return self.values(self.network("target_value_network"), data)
+        with self.network("target_actor_network") as actor:
+            data = actor(successor)
+        return self.values("target_value_network", data)
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Compute the actor's loss ``[]`` and ``"pre_tanh_magnitude"``."""
-        data = self.network("actor_network")(self.inputs.current(tensordict))
-        value = self.values(self.network("value_network", frozen=True), data)
+        with self.network("actor_network") as actor:
+            data = actor(self.inputs.current(tensordict))
+        value = self.values("value_network", data, frozen=True)
         return self.penalized(value, data, tensordict)

@@ -111,8 +111,8 @@ class MAMLLoss(DDPGLoss):
     def policy_loss(self, parameters: Parameters, tensordict: TensorDictBase) -> Tensor:
         """Return ``L_i`` ``[*S, T]`` of policies with parameters ``[*S, T, ...]``, one per task."""
         data = self.inputs.current(tensordict)
-        functional_call(self.network("actor_network"), parameters, (data,))
-        loss = -self.values(self.network("value_network", frozen=True), data)
+        functional_call(self.actor_network, parameters, (data,))
+        loss = -self.values("value_network", data, frozen=True)
         if self.imitation:
             loss = loss + self.imitation * self.imitation_loss(data, tensordict)
         if self.pre_tanh_penalty:

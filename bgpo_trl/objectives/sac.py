@@ -85,7 +85,7 @@ class SACLoss(OffPolicyLoss):
     def next_value(self, successor: TensorDictBase) -> Tensor:
         """Return the smaller values ``[*S, *B]`` of drawn actions, perhaps with their entropy."""
         data, log_prob = self._sample(successor)
-        value = self.values(self.network("target_value_network"), data).amin(len(self.batch_size))
+        value = self.values("target_value_network", data).amin(len(self.batch_size))
         if self.entropy_in_target:
             value = value - self._each(self.log_alpha.detach().exp(), log_prob) * log_prob
         return value
@@ -93,7 +93,7 @@ class SACLoss(OffPolicyLoss):
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Compute the actor's loss ``[]``, and the temperature's loss and entries."""
         data, log_prob = self._sample(self.inputs.current(tensordict))
-        values = self.values(self.network("value_network", frozen=True), data)
+        values = self.values("value_network", data, frozen=True)
         alpha = self.log_alpha.detach().exp()
         loss = self._each(alpha, log_prob) * log_prob - values.amin(len(self.batch_size))
         log_prob = log_prob.detach()
@@ -109,7 +109,8 @@ class SACLoss(OffPolicyLoss):
         # A TensorDict without a batch size is read as one of vectors.
         batch = data.batch_size or data.get(self.inputs.keys[0]).shape[:-1]
         noise = self.noise(self.log_alpha.new_empty(*batch, self.actor_network.action_dim))
-        data = self.network("actor_network").sample(data, noise)
+        with self.network("actor_network") as actor:
+            data = actor.sample(data, noise)
         return data, data.get(self.tensor_keys.log_prob)
 
     def _each(self, of_seed: Tensor, like: Tensor) -> Tensor:

@@ -70,14 +70,16 @@ class TD3Loss(OffPolicyLoss):
 
     def next_value(self, successor: TensorDictBase) -> Tensor:
         """Return the smaller values ``[*S, *B]`` of the smoothed target actions."""
-        data = self.network("target_actor_network")(successor)
+        with self.network("target_actor_network") as actor:
+            data = actor(successor)
         action = data.get(self.tensor_keys.action)
         noise = (self.noise(action) * self.policy_noise).clamp(-self.noise_clip, self.noise_clip)
         data.set(self.tensor_keys.action, (action + noise).clamp(-1.0, 1.0))
-        return self.values(self.network("target_value_network"), data).amin(len(self.batch_size))
+        return self.values("target_value_network", data).amin(len(self.batch_size))
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Compute the actor's loss ``[]`` and ``"pre_tanh_magnitude"``."""
-        data = self.network("actor_network")(self.inputs.current(tensordict))
-        values = self.values(self.network("value_network", frozen=True), data)
+        with self.network("actor_network") as actor:
+            data = actor(self.inputs.current(tensordict))
+        values = self.values("value_network", data, frozen=True)
         return self.penalized(values.select(len(self.batch_size), 0), data, tensordict)

@@ -182,3 +182,11 @@ def test_it_runs_under_autocast(kind):
     with torch.autocast("cpu", torch.bfloat16):
         rounded = loss(batch.clone())["pred_value"]
     torch.testing.assert_close(rounded.float(), exact, atol=0.02, rtol=0.02)
+
+
+def test_a_frozen_network_has_no_parameters_to_differentiate():
+    networks = {"in_keys": ["state"], "batch_size": (2,)}
+    loss = DDPGLoss(Actor(3, **networks), Critic(3, **networks))
+    for frozen in (False, True):
+        with loss.network("value_network", frozen=frozen) as critic:
+            assert [p.requires_grad for p in critic.parameters()] == 4 * [not frozen]
