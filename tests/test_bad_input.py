@@ -16,8 +16,6 @@ from tensordict import TensorDict
 from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv
 
 from bgpo_trl.analysis import metrics, statistics
-from bgpo_trl.data.replay import ReplayBuffer
-from bgpo_trl.data.task_replay import TaskReplay
 from bgpo_trl.envs import NicoEnv
 from bgpo_trl.files.checkpoint import load_checkpoint
 from bgpo_trl.machine import choose_device, set_threads
@@ -85,17 +83,6 @@ def windows(*shape, action=4):
     return TensorDict({"pixels": pixels, "action": torch.zeros(*shape, action)}, shape)
 
 
-def replay(capacity=5, **options):
-    return ReplayBuffer(capacity, generator=torch.Generator(), **options)
-
-
-def task_replay(task=None, capacity=5, batch_size=2):
-    options = {"n_tasks": 3, "batch_size": batch_size, "keys": ["x"]}
-    made = TaskReplay(capacity, generator=[torch.Generator()], **options)
-    entries = {"x": torch.zeros(1)} | ({} if task is None else {"task": torch.tensor([task])})
-    made.add(TensorDict(entries, [1]))
-
-
 def filled(value):
     """Return the state of a GWR-B with one thing changed."""
     gwr = GWRB(2)
@@ -147,7 +134,7 @@ PARTS = {
     "actor without its state": (
         lambda: actor()(row({"z": torch.zeros(6)})), "Actor found no 'state'", "write it before"),
     "actor with a short state": (
-        lambda: actor()(row({"state": torch.zeros(5)})), "got [5]", "6 features together"),
+        lambda: actor()(row({"state": torch.zeros(5)})), "got [5]", "6 features"),
     "actor of other seeds": (
         lambda: actor(batch_size=[5])(TensorDict({"state": torch.zeros(3, 6)}, [3])),
         "got [3, 6]", "one leading index per layer"),
@@ -191,16 +178,6 @@ PARTS = {
     "sequences without lengths": (
         lambda: SequenceReconstructionLoss(lae)(TensorDict({"latent": z}, [2])),
         "no 'length'", "write it"),
-    # replay
-    "replay of nothing": (lambda: replay(0), "got 0", "must be at least 1"),
-    "replay without a transition": (lambda: replay().sample(), "got [0]", "needs a transition"),
-    "replay of an empty batch": (lambda: replay().sample(0), "got 0", "batch_size must be"),
-    "replay without an entry": (
-        lambda: replay(keys=["b"]).add(row({"a": torch.zeros(1)})), "['b']", "are to be stored"),
-    "replay smaller than a batch": (
-        lambda: task_replay(0, 5, 20), "got 5", "at least batch_size 20"),
-    "replay of an unknown task": (lambda: task_replay(7), "got [7]", "task must lie in 0..2"),
-    "replay without the task": (lambda: task_replay(), "TaskReplay found no 'task'", "write it"),
     # the world
     "unknown task": (
         lambda: NicoEnv(["juggle"], observation="state"), "'juggle'", "choose one of grasp_glass"),

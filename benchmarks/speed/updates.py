@@ -22,7 +22,7 @@ from torchrl.data.replay_buffers.samplers import RandomSampler
 from torchrl.data.replay_buffers.storages import Storage
 from torchrl.modules import MLP, TanhModule, ValueOperator
 
-from bgpo_trl.data.replay import ReplayBuffer
+from bgpo_trl.data.replay import GroupReplay
 from bgpo_trl.modules.actor_critic import Actor, Critic
 from bgpo_trl.objectives.ddpg import DDPGLoss
 from bgpo_trl.objectives.target_update import ForeachSoftUpdate
@@ -50,7 +50,7 @@ def contenders(seeds: int = 10, transitions: int = 50_000) -> dict[str, Contende
     """
     stack, single = Ours(seeds, transitions), Ours(1, transitions)
     fixed, fixed_single = Ours(seeds, BATCH), Ours(1, BATCH)
-    batch, batch_single = fixed.replay.sample(), fixed_single.replay.sample()
+    batch, batch_single = fixed.sample(), fixed_single.sample()
     floor = Floor(fixed.loss)
     found: dict[str, Contender] = {
         f"ours, {seeds} seeds": (stack.update, seeds),
@@ -109,17 +109,21 @@ class Ours:
         self.optimizer = torch.optim.Adam(
             list(self.loss.parameters()), lr=LEARNING_RATE, fused=True
         )
-        self.replay = ReplayBuffer(
-            transitions, batch_size=BATCH, generator=generators(numbers, "replay")
-        )
         generator = torch.Generator().manual_seed(0)
-        for start in range(0, transitions, 1000):
-            steps = min(1000, transitions - start)
-            self.replay.extend(random_transitions(steps, seeds, generator=generator))
+        stored = random_transitions(transitions, seeds, generator=generator)
+        keys = [key for key in stored.keys(True, True) if isinstance(key, str | tuple)]
+        self.replay = GroupReplay(transitions, generator=generators(numbers, "replay"), keys=keys)
+        self._group = torch.zeros(seeds, dtype=torch.int64)
+        for transition in stored:
+            self.replay.add(transition, self._group)
 
     def update(self) -> None:
         """Make one update of every seed."""
-        self.learn(self.replay.sample())
+        self.learn(self.sample())
+
+    def sample(self) -> TensorDict:
+        """Draw a batch ``[S, B]``."""
+        return self.replay.sample(self._group.unsqueeze(-1).expand(-1, BATCH))
 
     def learn(self, batch: TensorDict) -> None:
         """Make one update of every seed from a batch ``[S, B]``."""

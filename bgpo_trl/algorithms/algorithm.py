@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, cast
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -17,8 +17,7 @@ from bgpo_trl.algorithms.policy import Policy
 from bgpo_trl.configs import AlgorithmConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.demonstration_replay import DemonstrationReplay
-from bgpo_trl.data.group_replay import GroupReplay
-from bgpo_trl.data.task_replay import TaskReplay
+from bgpo_trl.data.replay import GroupReplay
 from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.modules.gwr import GWRB
@@ -46,7 +45,9 @@ class Algorithm(ABC):
         groups: Groups of behaviors, or None.
         state_size: Number of features of the state.
         learner: The RL algorithm: losses of actor and critic, optimizer, target networks.
-        replay: The replay buffer.
+        replay: Transitions of training episodes.
+        shown: Transitions of the demonstrations shown so far, or None without a
+            ``demonstration_share``.
         test_actor: Network of test episodes, called with the parameters of a `Policy`.
         needs_label: Whether policies depend on the task label of a test episode.
         needs_replay: Whether `snapshot` depends on the replay buffer.
@@ -57,7 +58,8 @@ class Algorithm(ABC):
     needs_label: bool = True
     needs_replay: bool = True
     learner: Learner
-    replay: GroupReplay | TaskReplay
+    replay: GroupReplay
+    shown: DemonstrationReplay | None = None
     test_actor: TensorDictModuleBase
 
     def __init__(
@@ -153,6 +155,24 @@ class Algorithm(ABC):
             noise=config.demonstration_noise,
         )
 
+    def sample(self, groups: Callable[[int], Tensor], n_rows: int) -> TensorDictBase:
+        """Draw transitions ``[S, E, B]`` for an update, a share of demonstrated ones last.
+
+        Until a demonstration was shown to each seed, all are from training episodes.
+
+        Args:
+            groups: Returns the group of each of ``n`` transitions, int64 ``[S, E, n]``, given
+                ``n``; -1 for none.
+            n_rows: Number of transitions ``B``.
+        """
+        if self.shown is None or not len(self.shown):
+            return self.replay.sample(groups(n_rows))
+        n_shown = round(self.config.demonstration_share * n_rows)
+        played = self.replay.sample(groups(n_rows - n_shown))
+        shown = self.shown.sample(groups(n_shown))
+        played["demonstrated"] = torch.zeros(played.shape, dtype=torch.bool)
+        return cast(TensorDictBase, torch.cat([played, shown], -1))
+
     def learn(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """Take a gradient step on a batch and update the targets; return the losses of `update`."""
         losses = self.learner.learn(self.to_device(batch))
@@ -178,5 +198,5 @@ class Algorithm(ABC):
 
     def _learned(self) -> dict[str, Any]:
         """Return the parts that learning changes."""
-        parts = ("learner", "replay")
-        return {name: getattr(self, name) for name in parts if hasattr(self, name)}
+        parts = {name: getattr(self, name, None) for name in ("learner", "replay", "shown")}
+        return {name: part for name, part in parts.items() if part is not None}

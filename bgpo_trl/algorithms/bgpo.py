@@ -7,7 +7,7 @@ from dataclasses import asdict, replace
 from typing import Any, cast
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn.functional import one_hot
 from torchrl.envs import EnvBase, TransformedEnv
@@ -21,7 +21,7 @@ from bgpo_trl.algorithms.trials import GroupTrials
 from bgpo_trl.configs import BGPOConfig
 from bgpo_trl.data.bank import DemonstrationBank, DemonstrationSteps
 from bgpo_trl.data.demonstration_replay import DemonstrationReplay
-from bgpo_trl.data.group_replay import GroupReplay
+from bgpo_trl.data.replay import GroupReplay
 from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.modules.gwr import GWRB
@@ -41,7 +41,6 @@ class BGPO(Algorithm):
 
     Attributes:
         experts: The networks of each group; of a single group without ``config.experts``.
-        shown: Replay of the demonstrations shown so far, or None.
         trials: Trials by which groups of one task are joined; None without experts or
             demonstrations.
 
@@ -51,7 +50,6 @@ class BGPO(Algorithm):
 
     config: BGPOConfig
     needs_replay = False
-    replay: GroupReplay
 
     def __init__(
         self,
@@ -230,27 +228,14 @@ class BGPO(Algorithm):
         """Make one update of each seed."""
         if len(self.replay) < self.config.rl.warmup_steps:
             return {}
-        return self.learn(self._sample())
-
-    def _sample(self) -> TensorDictBase:
-        """Sample the transitions of an update, ``[S, E, B]``."""
-        config, n_experts = self.config, self.experts.width
-        n_rows = config.expert_batch_size if config.experts else config.rl.batch_size
-
-        def groups_of(n_rows: int) -> Tensor:
-            if config.experts:
-                return self._active.group.repeat_interleave(n_rows, 1)
-            return self._active.rows(n_rows)
-
-        def draw(replay: GroupReplay | DemonstrationReplay, n_rows: int) -> TensorDict:
-            return replay.sample(groups_of(n_rows)).view(self.n_seeds, n_experts, n_rows)
-
-        if self.shown is None or not len(self.shown):
-            return draw(self.replay, n_rows)
-        n_shown = round(config.demonstration_share * n_rows)
-        played, shown = draw(self.replay, n_rows - n_shown), draw(self.shown, n_shown)
-        played["demonstrated"] = torch.zeros(played.shape, dtype=torch.bool)
-        return cast(TensorDictBase, torch.cat([played, shown], -1))
+        config, active = self.config, self._active
+        if config.experts:
+            return self.learn(
+                self.sample(
+                    lambda n: active.group.unsqueeze(-1).expand(-1, -1, n), config.expert_batch_size
+                )
+            )
+        return self.learn(self.sample(lambda n: active.rows(n).unsqueeze(1), config.rl.batch_size))
 
     @torch.no_grad()
     def snapshot(
@@ -305,10 +290,5 @@ class BGPO(Algorithm):
             self._revision = self.groups.revision
 
     def _learned(self) -> dict[str, Any]:
-        parts = {
-            "gwr": self.gwr,
-            "groups": self.groups,
-            "shown": self.shown,
-            "trials": self.trials,
-        }
+        parts = {"gwr": self.gwr, "groups": self.groups, "trials": self.trials}
         return super()._learned() | {key: part for key, part in parts.items() if part is not None}

@@ -67,7 +67,7 @@ class DistNLL(TaskAlgorithm):
             for stream in streams
         ]
         # By seed: the task of each head, in order of appearance.
-        self._tasks: list[list[int]] = [[] for _ in seeds]
+        self._head_tasks: list[list[int]] = [[] for _ in seeds]
         self._heads = generators(seeds, "heads")
         self._distillation = [DistillationLoss(student) for student in self.students]
         self._student_optimizers = [
@@ -91,21 +91,22 @@ class DistNLL(TaskAlgorithm):
         """Update each seed's teachers, and distill them for seeds whose episode has just ended."""
         if not self.ready():
             return {}
-        losses = self.learn(self.replay.sample())
+        losses = self.learn(self.sample_tasks())
         for index in self._ended.nonzero().flatten().tolist():
             self._distill(index)
         return losses
 
     def _distill(self, index: int) -> None:
         """Train the multi-task policy of a seed on its teachers' current actions."""
-        tasks, student = self._tasks[index], self.students[index]
+        tasks, student = self._head_tasks[index], self.students[index]
         optimizer = self._student_optimizers[index]
-        for task in self.replay.ready[index].nonzero().flatten().tolist():
-            if task not in tasks:
+        for task in self.ready_tasks()[index].tolist():
+            if task >= 0 and task not in tasks:
                 tasks.append(task)
                 head = student.add_head(self._heads[index])
                 optimizer.add_param_group({"params": list(head.parameters())})
-        drawn = self.replay.sample_seed(index, tasks, self.config.samples)
+        rows = torch.tensor([tasks]).unsqueeze(-1).expand(-1, -1, self.config.samples)
+        drawn = self.replay.sample(rows, seeds=[index]).squeeze(0)
         # The weights are 0 where the replay holds no transition of a task any more.
         batch = self.to_device(drawn.select(self.config.state, "priority_weight"))
         teachers = networks_of(
@@ -134,7 +135,7 @@ class DistNLL(TaskAlgorithm):
         for key, value in self.students[index].state_dict().items():
             if key.startswith("heads."):
                 _, head, name = key.split(".")
-                key = f"heads.{self._tasks[index][int(head)]}.{name}"
+                key = f"heads.{self._head_tasks[index][int(head)]}.{name}"
             weights[key] = value.to("cpu", copy=True)
         return self.policy(weights)
 
@@ -142,7 +143,7 @@ class DistNLL(TaskAlgorithm):
         """Return everything that future actions, updates and snapshots depend on."""
         return {
             **super().state_dict(),
-            "tasks": [list(tasks) for tasks in self._tasks],
+            "tasks": [list(tasks) for tasks in self._head_tasks],
             "heads": [generator.get_state() for generator in self._heads],
             "students": [dict(student.state_dict()) for student in self.students],
             "student_optimizers": [o.state_dict() for o in self._student_optimizers],
@@ -155,9 +156,9 @@ class DistNLL(TaskAlgorithm):
         self._ended = state["ended"].clone()
         for index, tasks in enumerate(state["tasks"]):
             student, optimizer = self.students[index], self._student_optimizers[index]
-            for _ in tasks[len(self._tasks[index]) :]:
+            for _ in tasks[len(self._head_tasks[index]) :]:
                 optimizer.add_param_group({"params": list(student.add_head().parameters())})
-            self._tasks[index] = list(tasks)
+            self._head_tasks[index] = list(tasks)
             student.load_state_dict(state["students"][index])
             optimizer.load_state_dict(state["student_optimizers"][index])
             self._heads[index].set_state(state["heads"][index])

@@ -74,7 +74,7 @@ class MAML(TaskAlgorithm):
         """Make one update of each seed."""
         if not self.ready():
             return {}
-        batch = self.replay.sample()
+        batch = self.sample_tasks()
         # Demonstrations come last; interleaving gives each half the same share of them.
         order = torch.arange(self.config.task_batch_size).view(-1, 2).T.flatten()
         return self.learn(batch[..., order])
@@ -92,10 +92,12 @@ class MAML(TaskAlgorithm):
             key: value.detach().unsqueeze(1).expand(-1, self.n_tasks, *value.shape[1:])
             for key, value in meta.items()
         }
-        if self.replay.ready.any():
+        tasks = self.ready_tasks()
+        if (tasks >= 0).any():
             draw = int(torch.randint(2**63 - 1, (), generator=generator))
             streams = [torch.Generator().manual_seed(draw) for _ in range(self.n_seeds)]
-            data = self.replay.sample_played(self.config.adaptation_size, generator=streams)
+            rows = tasks.unsqueeze(-1).expand(-1, -1, self.config.adaptation_size)
+            data = self.replay.sample(rows, generator=streams)
             adapted = self.loss.adapt(self.to_device(data))
         parameters = {
             key: value[index].detach().to("cpu", copy=True) for key, value in adapted.items()

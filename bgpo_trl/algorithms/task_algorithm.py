@@ -16,7 +16,7 @@ from bgpo_trl.algorithms.environments import no_context_env
 from bgpo_trl.algorithms.rl import LearnerSpec
 from bgpo_trl.configs import DistNLLConfig, MAMLConfig
 from bgpo_trl.data.bank import DemonstrationBank
-from bgpo_trl.data.task_replay import TaskReplay
+from bgpo_trl.data.replay import GroupReplay
 from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.objectives.off_policy import OffPolicyLoss
 from bgpo_trl.seeding import generators
@@ -38,7 +38,6 @@ class TaskAlgorithm(Algorithm):
     """
 
     config: MAMLConfig | DistNLLConfig
-    replay: TaskReplay
     loss: OffPolicyLoss
     training_actor: TensorDictModuleBase
 
@@ -61,18 +60,19 @@ class TaskAlgorithm(Algorithm):
             experts=range(self.n_tasks),
         )
         keys = [config.state, "action"]
-        self.replay = TaskReplay(
+        self.replay = GroupReplay(
             config.rl.replay_size,
-            n_tasks=self.n_tasks,
-            batch_size=config.task_batch_size,
             generator=generators(seeds, "replay"),
-            demonstrations=self.demonstrations(config, bank, seeds),
-            demonstration_share=config.demonstration_share,
             keys=[*keys, *(("next", key) for key in (config.state, "reward", "terminated"))],
         )
-        if config.rl.replay_size < self.replay.enough:
+        self.shown = self.demonstrations(config, bank, seeds)
+        self._tasks = torch.arange(self.n_tasks).expand(self.n_seeds, -1)
+        # As many transitions as guarantee a full batch of some task. Waiting for them makes
+        # learning start at the same step for all seeds, as each would alone.
+        self._enough = self.n_tasks * (config.task_batch_size - 1) + 1
+        if config.rl.replay_size < self._enough:
             raise ValueError(
-                f"replay_size must be at least {self.replay.enough}, so that a batch of one of "
+                f"replay_size must be at least {self._enough}, so that a batch of one of "
                 f"{self.n_tasks} tasks is full and learning begins, got {config.rl.replay_size}"
             )
 
@@ -91,12 +91,26 @@ class TaskAlgorithm(Algorithm):
         return tensordict.set("action", self.learner.explore(seen["action"], self._noise))
 
     def store(self, transition: TensorDictBase) -> None:
-        """Add a transition of each seed to the replay of its task."""
-        self.replay.add(transition)
+        """Store a transition of each seed and, at the end of an episode, its demonstration."""
+        task: Tensor = transition["task"]
+        self.replay.add(transition, task)
+        if self.shown is not None:
+            ended = transition.get(("next", "done")).flatten()
+            self.shown.add(transition, torch.ones(self.n_seeds), task, ended)
 
     def ready(self) -> bool:
         """Return whether there are enough transitions for an update."""
-        return len(self.replay) >= max(self.config.rl.warmup_steps, self.replay.enough)
+        return len(self.replay) >= max(self.config.rl.warmup_steps, self._enough)
+
+    def ready_tasks(self) -> Tensor:
+        """Return the tasks ``[S, T]`` that hold at least a batch of transitions, -1 for others."""
+        full = self.replay.sizes(self._tasks) >= self.config.task_batch_size
+        return torch.where(full, self._tasks, -1)
+
+    def sample_tasks(self) -> TensorDictBase:
+        """Draw transitions ``[S, T, B]`` for an update, none of tasks that are not ready."""
+        tasks = self.ready_tasks().unsqueeze(-1)
+        return self.sample(lambda n: tasks.expand(-1, -1, n), self.config.task_batch_size)
 
 
 def networks_of(parameters: TensorDictBase, seed: Tensor, task: Tensor) -> dict[str, Tensor]:

@@ -10,7 +10,7 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 
 from bgpo_trl.data.bank import DemonstrationBank
-from bgpo_trl.data.group_replay import GroupReplay, draw_shares
+from bgpo_trl.data.replay import GroupReplay, draw_for_rows
 
 __all__ = ["DemonstrationReplay"]
 
@@ -90,12 +90,13 @@ class DemonstrationReplay:
         """Draw, for each row, a demonstration of the row's group and one of its transitions.
 
         Returns:
-            Batch size ``[S, R]`` as in `GroupReplay.sample`, with the state, the constant entries,
+            Batch size ``[S, *R]`` as in `GroupReplay.sample`, with the state, the constant entries,
             ``"action"``, ``"priority_weight"``, ``"demonstrated"`` (true) and, under ``"next"``,
             the state, ``"reward"`` and ``"terminated"``.
         """
         shown = self._shown.sample(group)
-        steps, share = self._steps, draw_shares(group, self._generators)
+        steps = self._steps
+        share = draw_for_rows(torch.rand, group, self._generators, dtype=torch.float64)
         number = shown["demo_index"]
         constants = shown if self._own_constants else self._shown.sample(group)
         n_steps = steps.length[number] - 1
@@ -104,7 +105,8 @@ class DemonstrationReplay:
         ends = (step == n_steps - 1).unsqueeze(-1)
         state = steps.latents(frame)
         if self._noise:
-            state = state + self._noise * self._normal(group, state.shape[-1])
+            noise = draw_for_rows(torch.randn, group, self._generators, state.shape[-1])
+            state = state + self._noise * noise
         return TensorDict(
             {
                 self._state_key: state,
@@ -120,16 +122,6 @@ class DemonstrationReplay:
             },
             group.shape,
         )
-
-    def _normal(self, group: Tensor, n_features: int) -> Tensor:
-        """Draw standard normals ``[S, R, n_features]``, 0 for rows without a group.
-
-        As in `draw_shares`, these consume no random numbers.
-        """
-        drawn = torch.zeros(*group.shape, n_features)
-        for row, wanted, source in zip(drawn, group >= 0, self._generators, strict=True):
-            row[wanted] = torch.randn(int(wanted.sum()), n_features, generator=source)
-        return drawn
 
     def regroup(self, seed: int, group: Tensor) -> None:
         """Assign demonstrations of a seed to groups anew, from the group of each in the bank."""

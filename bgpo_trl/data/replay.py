@@ -1,273 +1,331 @@
-"""Replay buffer for one seed, or for a stack of seeds that step together."""
+"""Replay buffer of transitions by group, separately for each seed."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 
-__all__ = ["ReplayBuffer"]
+from bgpo_trl.errors import missing_key
+
+__all__ = ["GroupReplay", "draw_for_rows"]
+
+_GROUP = "_group"  # entry of a saved state
 
 
-class ReplayBuffer:
-    """Ring buffer of transitions, sampled uniformly with replacement, each seed from its own.
+class GroupReplay:
+    """Ring buffer of transitions by group for ``S`` seeds, sampled row by row from a given group.
 
-    The interface follows ``torchrl.data.ReplayBuffer``. That class, with a sampler per seed, takes
-    0.27 ms longer for each seed and update, 6 % of a training step of ten seeds
-    (``benchmarks/speed/updates.py``).
+    A group is a group of behaviors or a task. All groups of a seed share its capacity, so memory
+    does not grow with their number. The first transition reserves address space for the whole
+    capacity; the operating system commits memory as the buffer fills: 670 bytes per transition and
+    seed with latents of 64, behaviors of 32, 4 actions, a reward and two flags, so 6.7 GB for 10
+    full seeds of 10^6.
 
-    The first transition reserves address space for the whole capacity; the operating system commits
-    memory as the buffer fills: 662 bytes per transition and seed with latents of 64, behaviors of
-    32, 4 actions, a reward and two flags, so 6.6 GB for 10 full seeds of 10^6.
+    ``torchrl.data.ReplayBuffer`` with a sampler per seed takes 0.27 ms longer for each seed and
+    update, 6 % of a training step of ten seeds (``benchmarks/speed/updates.py``).
 
     Args:
-        capacity: Transitions kept for each seed, 10^6 in the paper; the oldest are overwritten.
-        batch_size: Transitions ``B`` that `sample` draws for each seed, 256 in the paper.
-        generator: Source of the sampled indices. One generator gives a single buffer, a sequence of
-            ``S`` a stack of buffers, each of which draws as a single one would.
-        keys: Entries to store; ``None`` for all entries of the first transition.
+        capacity: Transitions kept for each seed; the oldest are overwritten.
+        generator: Random generators for sampling, one for each of ``S`` seeds.
+        keys: Entries to store.
+        source_key: Entry, int64 ``[S]``, that determines the group of a transition, such as the
+            number of its demonstration; only `regroup` needs it.
 
     Raises:
-        ValueError: If ``capacity``, ``batch_size`` or the number of generators is not positive.
+        ValueError: If ``capacity`` or the number of generators is not positive.
 
     Example:
-        >>> generators = [torch.Generator().manual_seed(seed) for seed in range(10)]
-        >>> replay = ReplayBuffer(1000, batch_size=256, generator=generators)
-        >>> replay.add(TensorDict({"state": torch.zeros(10, 3), "action": torch.zeros(10, 2)}, 10))
-        >>> len(replay), replay.sample().shape
-        (1, torch.Size([10, 256]))
+        >>> replay = GroupReplay(100, generator=[torch.Generator()], keys=["state"])
+        >>> for i in range(6):
+        ...     replay.add(TensorDict({"state": torch.tensor([i])}, [1]), torch.tensor([i % 2]))
+        >>> drawn = replay.sample(torch.tensor([[1, 1, 1, 7]]))
+        >>> (drawn["state"][0, :3] % 2 == 1).all(), drawn["priority_weight"][0]
+        (tensor(True), tensor([1., 1., 1., 0.]))
     """
 
     def __init__(
         self,
         capacity: int,
         *,
-        batch_size: int = 256,
-        generator: torch.Generator | Sequence[torch.Generator],
-        keys: Sequence[NestedKey] | None = None,
+        generator: Sequence[torch.Generator],
+        keys: Sequence[NestedKey],
+        source_key: NestedKey | None = None,
     ) -> None:
-        stacked = not isinstance(generator, torch.Generator)
-        self.generators = list(generator) if stacked else [generator]
-        if capacity < 1 or batch_size < 1 or not self.generators:
-            raise ValueError(
-                "capacity, batch_size and the number of generators must be at least 1, got "
-                f"{capacity}, {batch_size} and {len(self.generators)}"
-            )
         self.capacity = capacity
-        self.batch_size = batch_size
-        self.keys = None if keys is None else list(keys)
-        n_seeds = len(self.generators)
-        self._shape = torch.Size([n_seeds] if stacked else [])
+        self._generators = list(generator)
+        self._keys, self._source_key = list(keys), source_key
+        n_seeds = len(self._generators)
+        if capacity < 1 or not n_seeds:
+            raise ValueError(
+                "capacity and the number of generators must be at least 1, got "
+                f"{capacity} and {n_seeds}"
+            )
         self._seed = torch.arange(n_seeds)
         self._n_added = torch.zeros(n_seeds, dtype=torch.int64)
         # Transition t of seed i is row (t % capacity) * n_seeds + i, so that a step of all seeds is
         # one block and a row has a single index, for which torch has its fastest kernels.
-        self._rows: dict[NestedKey, Tensor] = {}
-
-    @property
-    def n_added(self) -> Tensor:
-        """Number of transitions added so far for each seed, int64 ``[*S]``."""
-        return self._n_added.view(self._shape).clone()
-
-    @property
-    def oldest(self) -> Tensor:
-        """Step of the oldest transition held for each seed, counted from 0, int64 ``[*S]``."""
-        return (self._n_added - self.capacity).clamp(min=0).view(self._shape)
-
-    @property
-    def sizes(self) -> Tensor:
-        """Number of transitions held for each seed, int64 ``[*S]``."""
-        return self._n_added.clamp(max=self.capacity).view(self._shape)
+        self._rows: dict[Any, Tensor] = {}  # by key
+        self._group = self._allocate(torch.Size(), torch.int64)
+        self._index = [_GroupIndex() for _ in self._generators]
 
     def __len__(self) -> int:
         """Return the smallest number of transitions held for a seed."""
-        return int(self.sizes.min())
+        return min(int(self._n_added.min()), self.capacity)
 
-    def add(self, transition: TensorDictBase, mask: Tensor | None = None) -> None:
+    def sizes(self, group: Tensor) -> Tensor:
+        """Return the number of transitions held of each of the groups ``[S, G]``."""
+        oldest = self._oldest()
+        return torch.tensor(
+            [
+                [len(index.steps_of(number, first)) for number in row]
+                for index, first, row in zip(self._index, oldest, group.tolist(), strict=True)
+            ]
+        ).view(group.shape)
+
+    @torch.no_grad()
+    def add(self, transition: TensorDictBase, group: Tensor, mask: Tensor | None = None) -> None:
         """Store one transition of each seed.
 
         Args:
-            transition: Batch size ``[*S]``, with the entries to store.
-            mask: Seeds that store theirs, bool ``[*S]``; ``None`` for all.
+            transition: Batch size ``[S]``, with the entries to store.
+            group: Group of each transition, int64 ``[S]``, at least 0.
+            mask: Seeds that store theirs, bool ``[S]``; ``None`` for all.
 
         Raises:
-            ValueError: If an entry is missing, or its shape or dtype differs from those stored.
+            ValueError: If an entry is missing, or differs in shape or dtype from those stored; if a
+                group is negative.
         """
-        if transition.batch_size != self._shape:
-            raise ValueError(
-                f"the transition must have batch size {[*self._shape]}, one for each seed, got "
-                f"{[*transition.batch_size]}"
-            )
-        self._write(transition, 1, mask)
+        entries = self._checked(transition, group, mask)
+        for key, entry in entries.items():
+            if key not in self._rows:
+                self._rows[key] = self._allocate(entry.shape[1:], entry.dtype)
+        rows = self._n_added % self.capacity * len(self._generators) + self._seed
+        chosen = self._seed if mask is None else mask.nonzero().flatten()
+        self._group[rows[chosen]] = group[chosen]
+        for key, stored in self._rows.items():
+            stored.index_copy_(0, rows[chosen], entries[key][chosen])
+        for seed in chosen.tolist():
+            self._index[seed].append(int(group[seed]), int(self._n_added[seed]))
+        self._n_added[chosen] += 1
 
-    def extend(self, transitions: TensorDictBase, mask: Tensor | None = None) -> None:
-        """Store ``T`` successive transitions of each seed.
-
-        Args:
-            transitions: Batch size ``[T, *S]``, with ``T`` at most the capacity.
-            mask: Transitions to store, bool ``[T, *S]``; ``None`` for all.
-
-        Raises:
-            ValueError: If an entry is missing, or its shape or dtype differs from those stored.
-        """
-        n_steps, *shape = transitions.batch_size or [0]
-        if not 1 <= n_steps <= self.capacity or shape != [*self._shape]:
-            raise ValueError(
-                f"transitions must have batch size [T, *{[*self._shape]}] with 1 <= T <= "
-                f"{self.capacity}, got {[*transitions.batch_size]}"
-            )
-        self._write(transitions, n_steps, mask)
-
-    def sample(self, batch_size: int | None = None) -> TensorDict:
-        """Draw transitions ``[*S, B]`` of each seed, uniformly and with replacement, as copies.
-
-        Raises:
-            ValueError: If a seed holds no transition, or ``batch_size`` is less than 1.
-        """
-        batch_size = self.batch_size if batch_size is None else batch_size
-        if batch_size < 1:
-            raise ValueError(f"batch_size must be at least 1, got {batch_size}")
-        sizes = self.sizes.view(-1).tolist()
-        if not all(sizes):
-            raise ValueError(f"every seed needs a transition before the first sample, got {sizes}")
-        steps = torch.stack(
-            [
-                torch.randint(size, (batch_size,), generator=generator)
-                for size, generator in zip(sizes, self.generators, strict=True)
-            ]
-        )
-        rows = (steps * len(self.generators) + self._seed.unsqueeze(-1)).view(-1)
-        return self._read(rows, [*self._shape, batch_size])
-
-    def take(
+    def sample(
         self,
-        steps: Tensor,
-        keys: Sequence[NestedKey] | None = None,
+        group: Tensor,
         *,
         seeds: Sequence[int] | None = None,
+        generator: Sequence[torch.Generator] | None = None,
     ) -> TensorDict:
-        """Copy the transitions ``[S, R]`` that seeds stored at the given steps, int64 ``[S, R]``.
+        """Copy a transition for each row, drawn uniformly and with replacement from its group.
 
-        Steps are at least `oldest` and less than `n_added`. ``keys`` are the entries to return and
-        ``seeds`` the positions of the seeds; ``None`` is all.
+        Args:
+            group: Group of each row, int64 ``[S, *R]``; -1 leaves a row empty and draws nothing.
+            seeds: Positions of the ``S`` seeds to draw for; ``None`` for all.
+            generator: Random generators of these seeds, in place of the replay's.
+
+        Returns:
+            Batch size ``[S, *R]``, with ``"priority_weight"``, the weight of a transition in
+            TorchRL's losses: 1, or 0 for rows without a group or of an empty group, whose other
+            entries are undefined.
+
+        Raises:
+            ValueError: If one of these seeds holds no transition.
         """
-        columns = self._seed if seeds is None else self._seed[list(seeds)]
-        rows = steps % self.capacity * len(self.generators) + columns.unsqueeze(-1)
-        return self._read(rows.view(-1), steps.shape, keys)
+        seeds = range(len(self._generators)) if seeds is None else seeds
+        if not all(self._n_added[seed] for seed in seeds):
+            raise ValueError("every seed needs a transition before the first sample")
+        sources = [self._generators[seed] for seed in seeds] if generator is None else generator
+        flat = group.flatten(1)
+        steps, weight = np.empty(flat.shape, np.int64), np.ones(flat.shape, np.float32)
+        shares_of_all = draw_for_rows(torch.rand, flat, sources, dtype=torch.float64).numpy()
+        wanted = flat.numpy()
+        oldest = self._oldest()
+        for i, (seed, shares) in enumerate(zip(seeds, shares_of_all, strict=True)):
+            for number in np.unique(wanted[i]).tolist():
+                rows = wanted[i] == number
+                held = self._index[seed].steps_of(number, oldest[seed])
+                if len(held):
+                    steps[i, rows] = held[(shares[rows] * len(held)).astype(np.int64)]
+                else:
+                    steps[i, rows], weight[i, rows] = oldest[seed], 0.0
+        columns = self._seed[list(seeds)].unsqueeze(-1)
+        rows = (torch.from_numpy(steps) % self.capacity * len(self._generators) + columns).view(-1)
+        batch = TensorDict(batch_size=group.shape)
+        for key, stored in self._rows.items():
+            if key != self._source_key or key in self._keys:
+                drawn = stored.index_select(0, rows)
+                batch.set(key, drawn.view(*group.shape, *stored.shape[1:]))
+        return batch.set("priority_weight", torch.from_numpy(weight).view(group.shape))
 
-    def read(self, seed: int, key: NestedKey) -> Tensor:
-        """Copy an entry of all transitions held for a seed, oldest first, ``[N, ...]``."""
-        return self._rows[key].index_select(0, self._held(seed))
+    def contents(self, seed: int) -> tuple[TensorDict, Tensor]:
+        """Copy all transitions held for a seed, oldest first, and the group of each, ``[N]``."""
+        rows = self._held(seed)
+        entries = TensorDict(batch_size=[len(rows)])
+        for key, stored in self._rows.items():
+            entries.set(key, stored[rows])
+        return entries, self._group[rows]
 
-    def write(self, seed: int, key: NestedKey, values: Tensor) -> None:
-        """Replace an entry of all transitions held for a seed, oldest first, ``[N, ...]``."""
-        self._rows[key].index_copy_(0, self._held(seed), values)
+    def regroup(self, seed: int, group: Tensor) -> None:
+        """Assign the transitions of a seed to groups anew.
 
-    def _held(self, seed: int) -> Tensor:
-        end = int(self._n_added[seed])
-        steps = torch.arange(max(0, end - self.capacity), end)
-        return steps % self.capacity * len(self.generators) + seed
+        Args:
+            seed: Position of the seed.
+            group: Group of the transitions of each source, int64 ``[number of sources]``.
 
-    def _read(
-        self, rows: Tensor, batch_size: Sequence[int], keys: Sequence[NestedKey] | None = None
-    ) -> TensorDict:
-        batch = TensorDict(batch_size=batch_size)
-        for key in self._rows if keys is None else keys:
-            stored = self._rows[key]
-            drawn = stored.index_select(0, rows)
-            batch.set(key, drawn.view(*batch.batch_size, *stored.shape[1:]))
-        return batch
+        Raises:
+            ValueError: If the replay has no ``source_key``.
+        """
+        if self._source_key is None:
+            raise ValueError("to regroup what is stored, give the replay a source_key")
+        rows = self._held(seed)
+        if len(rows):
+            self._group[rows] = group[self._rows[self._source_key][rows]]
+            self._index[seed] = self._indexed(seed)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the filled part of the buffer (a copy) and the states of the generators."""
-        return self._state().clone().to_dict()
+        sizes = self._n_added.clamp(max=self.capacity)
+        longest, n_seeds = int(sizes.max()), len(self._generators)
+        # Zeros replace the uninitialized rows of seeds that hold fewer transitions.
+        empty = (torch.arange(longest).unsqueeze(-1) >= sizes).view(-1)
+        rows = TensorDict({}, [longest * n_seeds])
+        for key, stored in {**self._rows, _GROUP: self._group}.items():
+            filled = stored[: longest * n_seeds].clone()
+            filled[empty] = 0
+            rows.set(key, filled)
+        return {
+            "capacity": self.capacity,
+            "n_added": self._n_added.clone(),
+            "generators": torch.stack([g.get_state() for g in self._generators]),
+            "rows": rows.to_dict(),
+        }
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Restore a `state_dict`, so that the same samples follow.
 
         Raises:
-            ValueError: If it comes from a buffer of another capacity or number of seeds.
+            ValueError: If it comes from a replay of another capacity or number of seeds.
         """
-        n_added, capacity = state_dict["n_added"], int(state_dict["capacity"])
+        n_added, capacity = state_dict["n_added"], state_dict["capacity"]
         if capacity != self.capacity or len(n_added) != len(self._n_added):
             raise ValueError(
                 f"the saved replay has capacity {capacity} and {len(n_added)} seeds, this one "
                 f"{self.capacity} and {len(self._n_added)}: build it with the saved sizes"
             )
         self._rows = {}
-        for key, saved in TensorDict(dict(state_dict.get("rows", {}))).items(True, True):
+        for key, saved in TensorDict(state_dict["rows"]).items(True, True):
             self._rows[key] = self._allocate(saved.shape[1:], saved.dtype)
             self._rows[key][: len(saved)] = saved
+        self._group = self._rows.pop(_GROUP)
         self._n_added = n_added.clone()
-        for generator, state in zip(self.generators, state_dict["generators"], strict=True):
+        for generator, state in zip(self._generators, state_dict["generators"], strict=True):
             generator.set_state(state.clone())
+        self._index = [self._indexed(seed) for seed in range(len(self._generators))]
 
-    def _state(self) -> TensorDict:
-        state = TensorDict(
-            {
-                "capacity": torch.tensor(self.capacity),
-                "n_added": self._n_added,
-                "generators": torch.stack([g.get_state() for g in self.generators]),
-            }
-        )
-        longest = int(self.sizes.max())
-        filled = longest * len(self.generators)
-        # Zeros replace the uninitialized rows of seeds that hold fewer transitions.
-        empty = (torch.arange(longest).unsqueeze(-1) >= self.sizes.view(-1)).view(-1)
+    def _oldest(self) -> list[int]:
+        """Return the step of the oldest transition held for each seed, counted from 0."""
+        return (self._n_added - self.capacity).clamp(min=0).tolist()
+
+    def _held(self, seed: int) -> Tensor:
+        """Return the rows of all transitions held for a seed, oldest first."""
+        end = int(self._n_added[seed])
+        steps = torch.arange(max(0, end - self.capacity), end)
+        return steps % self.capacity * len(self._generators) + seed
+
+    def _indexed(self, seed: int) -> _GroupIndex:
+        """Return the index of what the buffer holds of a seed."""
+        index = _GroupIndex()
+        index.extend(self._group[self._held(seed)].numpy(), self._oldest()[seed])
+        return index
+
+    def _checked(
+        self, transition: TensorDictBase, group: Tensor, mask: Tensor | None
+    ) -> dict[Any, Tensor]:
+        """Return the entries to store; raise ``ValueError`` if one does not fit."""
+        n_seeds = len(self._generators)
+        if transition.batch_size != (n_seeds,):
+            raise ValueError(
+                f"the transition must have batch size [{n_seeds}], one for each seed, got "
+                f"{[*transition.batch_size]}"
+            )
+        if mask is not None and (mask.shape != (n_seeds,) or mask.dtype != torch.bool):
+            raise ValueError(f"mask must be bool [{n_seeds}], got {mask.dtype} {[*mask.shape]}")
+        if not (group if mask is None else group[mask]).ge(0).all():
+            raise ValueError(f"a group must be at least 0, got {group.tolist()}")
+        keys = [*self._keys, *([] if self._source_key is None else [self._source_key])]
+        if any(key not in transition.keys(True) for key in keys):
+            raise missing_key("GroupReplay", transition, keys)
+        entries: dict[Any, Tensor] = dict(transition.select(*keys).items(True, True))
         for key, stored in self._rows.items():
-            if empty.any():
-                stored[:filled][empty] = 0
-            state.set(("rows", *key) if isinstance(key, tuple) else ("rows", key), stored[:filled])
-        return state
-
-    @torch.no_grad()
-    def _write(self, transitions: TensorDictBase, n_steps: int, mask: Tensor | None) -> None:
-        shape, n_seeds = transitions.batch_size, len(self.generators)
-        if mask is not None and (mask.shape != shape or mask.dtype != torch.bool):
-            raise ValueError(f"mask must be bool {[*shape]}, got {mask.dtype} {[*mask.shape]}")
-        entries = self._checked_entries(transitions)
-        if not self._rows:
-            self._rows = {
-                key: self._allocate(entry.shape[len(shape) :], entry.dtype)
-                for key, entry in entries.items()
-            }
-
-        if mask is None:
-            step = self._n_added + torch.arange(n_steps).unsqueeze(-1)
-        else:
-            mask = mask.view(n_steps, n_seeds)
-            step = self._n_added + mask.cumsum(0) - 1
-        rows = step % self.capacity * n_seeds + self._seed
-        rows = rows.view(-1) if mask is None else rows[mask]
-        for key, stored in self._rows.items():
-            entry = entries[key].reshape(-1, *stored.shape[1:])
-            stored.index_copy_(0, rows, entry if mask is None else entry[mask.view(-1)])
-        self._n_added += n_steps if mask is None else mask.sum(0)
-
-    def _checked_entries(self, transitions: TensorDictBase) -> dict[NestedKey, Tensor]:
-        if not self._rows:
-            if self.keys is not None:
-                missing = [key for key in self.keys if key not in transitions.keys(True)]
-                if missing:
-                    raise ValueError(f"the transition lacks {missing}, which are to be stored")
-                transitions = transitions.select(*self.keys)
-            return dict(transitions.items(True, True))
-
-        entries, n_dims = {}, len(transitions.batch_size)
-        for key, stored in self._rows.items():
-            entry = entries[key] = transitions.get(key, None)
-            if entry is None:
-                raise ValueError(f"the transition lacks {key!r}, which was stored before")
-            if entry.shape[n_dims:] != stored.shape[1:] or entry.dtype != stored.dtype:
+            entry = entries.get(key)
+            if entry is None or entry.shape[1:] != stored.shape[1:] or entry.dtype != stored.dtype:
+                got = "nothing" if entry is None else f"{entry.dtype} {[*entry.shape[1:]]}"
                 raise ValueError(
                     f"{key!r} must be {stored.dtype} {[*stored.shape[1:]]} as stored before, got "
-                    f"{entry.dtype} {[*entry.shape[n_dims:]]}"
+                    f"{got}"
                 )
         return entries
 
     def _allocate(self, shape: torch.Size, dtype: torch.dtype) -> Tensor:
         # Not torch.zeros, which would commit the memory of the whole capacity at once.
-        return torch.empty(self.capacity * len(self.generators), *shape, dtype=dtype)
+        return torch.empty(self.capacity * len(self._generators), *shape, dtype=dtype)
+
+
+def draw_for_rows(
+    draw: Callable[..., Tensor],
+    group: Tensor,
+    generator: Sequence[torch.Generator],
+    *shape: int,
+    dtype: torch.dtype = torch.float32,
+) -> Tensor:
+    """Draw random numbers ``[S, *R, *shape]`` for each row ``[S, *R]`` that has a group.
+
+    Rows without a group (-1) get 0 and consume no random numbers, so a seed's draws do not depend
+    on how many slots are free. ``draw`` is :func:`torch.rand` or :func:`torch.randn`.
+    """
+    numbers = torch.zeros(*group.shape, *shape, dtype=dtype)
+    for of_seed, wanted, source in zip(numbers, group >= 0, generator, strict=True):
+        of_seed[wanted] = draw(int(wanted.sum()), *shape, generator=source, dtype=dtype)
+    return numbers
+
+
+class _GroupIndex:
+    """Steps at which a seed stored transitions of each group, in order of time."""
+
+    def __init__(self) -> None:
+        self._steps: dict[int, NDArray[np.int64]] = {}
+        self._span: dict[int, tuple[int, int]] = {}
+
+    def append(self, group: int, step: int) -> None:
+        steps = self._steps.get(group)
+        first, end = self._span.get(group, (0, 0))
+        if steps is None:
+            steps = self._steps[group] = np.empty(1024, np.int64)
+        elif end == len(steps):
+            held = steps[first:end]
+            steps = self._steps[group] = np.empty(2 * len(held) + 1024, np.int64)
+            steps[: len(held)] = held
+            first, end = 0, len(held)
+        steps[end] = step
+        self._span[group] = first, end + 1
+
+    def extend(self, groups: NDArray[np.int64], first: int) -> None:
+        """Append the steps from ``first`` on, of these groups, to an empty index."""
+        for group in np.unique(groups).tolist():
+            steps = self._steps[group] = first + np.flatnonzero(groups == group)
+            self._span[group] = 0, len(steps)
+
+    def steps_of(self, group: int, oldest: int) -> NDArray[np.int64]:
+        """Return the steps of a group that have not been overwritten."""
+        if group not in self._steps:
+            return np.empty(0, np.int64)
+        steps, (first, end) = self._steps[group], self._span[group]
+        if first < end and steps[first] < oldest:
+            first += int(np.searchsorted(steps[first:end], oldest))
+            self._span[group] = first, end
+        return steps[first:end]

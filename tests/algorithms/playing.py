@@ -1,10 +1,7 @@
 """Steps of training, and comparisons of what was learned."""
 
-from copy import deepcopy
-
 import numpy as np
 import torch
-from tensordict import TensorDict
 
 
 def play(algorithm, n_steps, state=None, hidden=(), watch=lambda chosen: None):
@@ -25,17 +22,6 @@ def play(algorithm, n_steps, state=None, hidden=(), watch=lambda chosen: None):
 
 def weights(algorithm):
     return list(algorithm.learner.loss.parameters())
-
-
-def kept(algorithm):
-    """A copy of its state, without the memory that its replay has not filled yet."""
-    state = deepcopy(algorithm.state_dict())
-    played = state["replay"]["played"]
-    added, rows = played["n_added"].tolist(), TensorDict(played.pop("rows"))
-    for key, value in rows.items(True, True):
-        value = value.unflatten(0, (-1, len(added)))
-        state[key] = [value[:count, column] for column, count in enumerate(added)]
-    return state
 
 
 def assert_same(first, second):

@@ -68,8 +68,8 @@ def test_joined_groups_have_one_expert_and_one_replay(make_bgpo, bank):
     assert other not in algorithm.groups.numbers(1)
     assert other not in algorithm._active.group[1]
     for replay in (algorithm.replay, algorithm.shown._shown):
-        group = replay._buffer.read(1, "group")
-        assert group.equal(after[replay._buffer.read(1, "demo_index")])
+        entries, group = replay.contents(1)
+        assert group.equal(after[entries["demo_index"]])
         assert joined in group
 
 
@@ -148,9 +148,8 @@ def test_what_is_stored_is_of_the_group_that_its_demonstration_has_today(make_bg
             played[seed] |= {*data["group"][seed].tolist()}
             if not len(replay):
                 continue
-            buffer = replay._buffer
-            group = buffer.read(seed, "group")
-            assert group.equal(group_of[seed][buffer.read(seed, "demo_index")])
+            entries, group = replay.contents(seed)
+            assert group.equal(group_of[seed][entries["demo_index"]])
             counts = replay.sizes(torch.arange(9).expand(2, 9))[seed]
             assert counts.equal(group.bincount(minlength=9))
             known = {*algorithm.groups.numbers(seed), -1}

@@ -34,7 +34,7 @@ def test_the_floor_is_our_arithmetic_without_clipping_and_penalty(monkeypatch):
     floor = Floor(ours.loss)
     start = [tensor.detach().clone() for tensor in weights(ours)]
     for _ in range(3):
-        batch = ours.replay.sample()
+        batch = ours.sample()
         floor.learn(*floor_batch(batch))
         ours.learn(batch)
     for mine, theirs, before in zip(weights(ours), floor_weights(floor), start, strict=True):

@@ -1,4 +1,4 @@
-"""The buffer against a plain list of transitions, and each seed of a stack against itself alone."""
+"""Replay by group against plain lists, and each seed of a stack against itself alone."""
 
 import io
 import resource
@@ -10,147 +10,275 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
-from bgpo_trl.data.replay import ReplayBuffer
+from bgpo_trl.data.replay import GroupReplay, draw_for_rows
+
+KEYS = ["latent", ("next", "terminated")]
 
 
-def generators(n: int) -> list[torch.Generator]:
-    return [torch.Generator().manual_seed(seed) for seed in range(n)]
+def generators(n, first=0):
+    return [torch.Generator().manual_seed(first + seed) for seed in range(n)]
 
 
-def transition(value: float, *shape: int) -> TensorDict:
-    """A transition of each seed whose every entry says ``value`` and which seed it is."""
-    seed = torch.arange(torch.Size(shape).numel()).view(shape)
+def transition(value, n_seeds):
+    """Return a transition of each seed whose latent is the step, plus the seed in hundredths."""
+    seed = torch.arange(n_seeds)
     number = (value + seed / 100).unsqueeze(-1)
-    next_data = {"latent": number + torch.zeros(3), "terminated": seed.unsqueeze(-1) % 2 == 1}
-    return TensorDict({"latent": number, "task": seed, "next": next_data}, shape)
+    ends = seed.unsqueeze(-1) % 2 == 1
+    return TensorDict({"latent": number, "other": seed, "next": {"terminated": ends}}, [n_seeds])
 
 
-@settings(deadline=None, max_examples=40)
+def make(capacity=100, n_seeds=2, first=0):
+    return GroupReplay(capacity, generator=generators(n_seeds, first), keys=KEYS)
+
+
+def fill(replay, groups):
+    """Store a transition of each seed per step, given the groups of each step."""
+    for step, of_step in enumerate(groups):
+        replay.add(transition(step, len(of_step)), torch.tensor(of_step))
+
+
+def through_a_file(state):
+    file = io.BytesIO()
+    torch.save(state, file)
+    file.seek(0)
+    return torch.load(file, weights_only=True)
+
+
+@settings(max_examples=60)
 @given(
-    capacity=st.integers(1, 7),
-    writes=st.lists(
-        st.tuples(st.integers(1, 7), st.lists(st.booleans(), min_size=21, max_size=21)),
-        min_size=1,
-        max_size=6,
+    capacity=st.integers(1, 9),
+    stored=st.lists(
+        st.tuples(st.integers(0, 3), st.integers(0, 3), st.booleans()), min_size=1, max_size=30
     ),
-    masked=st.booleans(),
+    asked=st.lists(st.integers(-1, 5), min_size=1, max_size=12),
+    given_generators=st.booleans(),
+    restored=st.booleans(),
 )
-def test_holds_the_last_transitions_of_each_seed(capacity, writes, masked):
-    n_seeds = 3
-    replay = ReplayBuffer(capacity, batch_size=20, generator=generators(n_seeds))
-    rings: list[list[float]] = [[] for _ in range(n_seeds)]
-    added, value = [0] * n_seeds, 0.0
-    for n_steps, choices in writes:
-        n_steps = min(n_steps, capacity)
-        steps = [transition(value + step, n_seeds) for step in range(n_steps)]
-        mask = torch.tensor(choices).view(7, n_seeds)[:n_steps]
-        if not masked:
-            mask = torch.ones_like(mask)
-        if n_steps == 1:
-            replay.add(steps[0], mask[0] if masked else None)
-        else:
-            replay.extend(torch.stack(steps), mask if masked else None)
-        for step, seed in mask.nonzero().tolist():
-            ring, position = rings[seed], added[seed] % capacity
-            ring[position : position + 1] = [value + step + seed / 100]
-            added[seed] += 1
-        value += n_steps
-    assert replay.sizes.tolist() == [len(ring) for ring in rings]
-    assert len(replay) == min(len(ring) for ring in rings)
-    if not len(replay):
-        with pytest.raises(ValueError, match="every seed needs a transition"):
-            replay.sample()
-        return
-    batch = replay.sample()
-    assert batch.batch_size == (n_seeds, 20)
-    for seed, (ring, generator) in enumerate(zip(rings, generators(n_seeds), strict=True)):
-        index = torch.randint(len(ring), (20,), generator=generator)
-        expected = torch.tensor(ring)[index].unsqueeze(-1)
-        torch.testing.assert_close(batch["latent"][seed], expected)
-        torch.testing.assert_close(batch["next", "latent"][seed], expected.expand(-1, 3))
-        assert (batch["task"][seed] == seed).all()
-        assert (batch["next", "terminated"][seed] == (seed % 2 == 1)).all()
+def test_a_row_is_drawn_from_what_is_left_of_its_group(
+    capacity, stored, asked, given_generators, restored
+):
+    replay, kept = make(capacity), [[], []]
+    for step, (first, second, both) in enumerate(stored):
+        both = both or step == 0  # so that each seed has something
+        replay.add(transition(step, 2), torch.tensor([first, second]), torch.tensor([True, both]))
+        kept[0] = [*kept[0], (first, step)][-capacity:]
+        if both:
+            kept[1] = [*kept[1], (second, step + 0.01)][-capacity:]
+    if restored:
+        state, replay = through_a_file(replay.state_dict()), make(capacity, first=7)
+        replay.load_state_dict(state)
+    group = torch.tensor([asked, asked[::-1]])
+    held = [[[value for g, value in kept[s] if g == n] for n in group[s].tolist()] for s in (0, 1)]
+    assert replay.sizes(group).tolist() == [[len(values) for values in rows] for rows in held]
+    assert len(replay) == min(len(kept[0]), len(kept[1]))
+
+    source = generators(2, 40) if given_generators else None
+    drawn = replay.sample(group, generator=source)
+    assert set(drawn.keys(True, True)) == {*KEYS, "priority_weight"}
+    for seed, stream in enumerate(generators(2, 40 if given_generators else 0)):
+        wanted = [number >= 0 for number in group[seed].tolist()]
+        shares = iter(torch.rand(sum(wanted), generator=stream, dtype=torch.float64).tolist())
+        for row, values in enumerate(held[seed]):
+            share = next(shares) if wanted[row] else 0.0
+            assert float(drawn["priority_weight"][seed, row]) == bool(values)
+            if values:
+                expected = values[int(share * len(values))]
+                assert float(drawn["latent"][seed, row]) == pytest.approx(expected, abs=1e-5)
+                assert bool(drawn["next", "terminated"][seed, row]) == (seed == 1)
 
 
-def test_seed_of_a_stack_is_that_seed_alone():
-    stacked = ReplayBuffer(5, batch_size=16, generator=generators(3))
-    alone = [ReplayBuffer(5, batch_size=16, generator=g) for g in generators(3)]
-    for step in range(8):
-        data = transition(step, 3)
-        stacked.add(data)
-        for replay, row in zip(alone, data.unbind(0), strict=True):
-            replay.add(row)
-        batches = [replay.sample() for replay in alone]
-        assert batches[0].batch_size == (16,)
-        assert (stacked.sample() == torch.stack(batches)).all()
+def test_all_that_a_group_holds_is_drawn_equally_often():
+    replay = make(20)
+    fill(replay, [(step % 3, 0) for step in range(30)])
+    drawn = replay.sample(torch.tensor([[2] * 30_000, [0] * 30_000]))["latent"].squeeze(-1)
+    count = drawn[0].round().long().bincount(minlength=30)
+    held = torch.arange(11, 30, 3)  # of the last 20 steps, every third
+    assert count.nonzero().flatten().equal(held)
+    expected = 30_000 / len(held)
+    assert ((count[held] - expected).abs() < 5 * expected**0.5).all()
+    assert drawn[1].round().long().unique().equal(torch.arange(10, 30))
 
 
-def test_every_transition_is_drawn_equally_often():
-    replay = ReplayBuffer(10, batch_size=1, generator=generators(2))
-    replay.extend(torch.stack([transition(step, 2) for step in range(10)]))
-    drawn = replay.sample(20_000)["latent"].squeeze(-1)
-    for seed in range(2):
-        count = drawn[seed].round().long().bincount(minlength=10)
-        assert ((count - 2000).abs() < 5 * 2000**0.5).all()
-    assert (drawn[0].round() != drawn[1].round()).any()
+def test_a_seed_of_a_stack_is_that_seed_alone():
+    together = make(7, n_seeds=3)
+    alone = [GroupReplay(7, generator=[stream], keys=KEYS) for stream in generators(3)]
+    groups = torch.randint(3, (20, 3), generator=torch.Generator().manual_seed(5))
+    asked = torch.tensor([[0, 1, 2, 0, -1]])
+    for step, group in enumerate(groups):
+        data, mask = transition(step, 3), torch.tensor([True, step % 2 == 0, True])
+        together.add(data, group, mask)
+        for seed, replay in enumerate(alone):
+            rows = slice(seed, seed + 1)
+            replay.add(data[rows], group[rows], mask[rows])
+        drawn = together.sample(asked.expand(3, -1))
+        for seed, replay in enumerate(alone):
+            assert (replay.sample(asked)[0] == drawn[seed]).all()
+
+
+def test_some_seeds_draw_what_they_would_draw_with_all():
+    some, every = make(n_seeds=3), make(n_seeds=3)
+    for replay in (some, every):
+        fill(replay, [(step % 2, 1, 0) for step in range(9)])
+    asked = torch.tensor([[0, 1, 1, 0]])
+    whole = every.sample(asked.expand(3, -1))
+    drawn = some.sample(asked.expand(2, -1), seeds=[2, 0])
+    has = whole["priority_weight"][[2, 0]] > 0
+    assert drawn["priority_weight"].equal(whole["priority_weight"][[2, 0]])
+    assert drawn["latent"][has].equal(whole["latent"][[2, 0]][has])
+    # They alone have drawn, so that the other draws now what it did then.
+    assert (some.sample(asked, seeds=[1])[0] == whole[1]).all()
+
+
+def test_rows_without_a_group_draw_nothing():
+    asked = torch.tensor([[0, -1, 1, -1], [-1, -1, -1, -1]])
+    ours, theirs = generators(2), generators(2)
+    shares = draw_for_rows(torch.rand, asked, ours, dtype=torch.float64)
+    assert shares[0, [0, 2]].equal(torch.rand(2, generator=theirs[0], dtype=torch.float64))
+    assert not shares[0, [1, 3]].any()
+    assert not shares[1].any()
+    for one, other in zip(ours, theirs, strict=True):
+        assert one.get_state().equal(other.get_state())
+
+
+@pytest.mark.parametrize("n_first", [5, 1024, 2500])
+def test_a_group_is_forgotten_when_overwritten_and_can_return(n_first):
+    replay = GroupReplay(3000, generator=generators(1), keys=["latent"])
+
+    def store(group, n, first):
+        for step in range(n):
+            replay.add(TensorDict({"latent": torch.full([1, 1], first + step)}, [1]), group)
+
+    old, new = torch.tensor([0]), torch.tensor([1])
+    store(old, n_first, 0.0)
+    store(new, 3000 - n_first // 2, 10_000.0)
+    assert replay.sizes(torch.tensor([[0, 1]])).tolist() == [[n_first // 2, 3000 - n_first // 2]]
+    drawn = replay.sample(torch.zeros(1, 500, dtype=torch.int64))["latent"]
+    assert drawn.min() >= n_first - n_first // 2
+    assert drawn.max() < n_first
+    store(new, 3000, 20_000.0)
+    for _ in range(2):  # the second time, nothing is left to forget
+        assert replay.sizes(torch.tensor([[0, 1]])).tolist() == [[0, 3000]]
+        assert not replay.sample(torch.zeros(1, 9, dtype=torch.int64))["priority_weight"].any()
+    store(old, 2, 30_000.0)
+    drawn = replay.sample(torch.zeros(1, 99, dtype=torch.int64))
+    assert drawn["latent"].unique().tolist() == [30_000.0, 30_001.0]
+    assert (drawn["priority_weight"] == 1).all()
+
+
+@pytest.mark.parametrize("n_steps", [0, 1, 6, 25])
+def test_a_restored_replay_continues_as_the_saved_one(n_steps):
+    replay, restored = make(10), make(10, first=9)
+    groups = [(step % 3, step % 2) for step in range(n_steps)]
+    fill(replay, groups)
+    fill(restored, [(4, 4)] * 3)
+    asked = torch.tensor([[0, 1, 2, 1], [1, 0, 1, -1]])
+    if n_steps:
+        replay.sample(asked)
+    restored.load_state_dict(through_a_file(replay.state_dict()))
+    for step in range(4):
+        for one in (replay, restored):
+            one.add(transition(50 + step, 2), torch.tensor([step % 2, 1]))
+        assert restored.sizes(asked).equal(replay.sizes(asked))
+        assert (restored.sample(asked) == replay.sample(asked)).all()
+
+
+def test_a_seed_is_restored_though_another_has_stored_nothing_yet():
+    replay, restored = make(10), make(10)
+    only_first = torch.tensor([True, False])
+    replay.add(transition(4, 2), torch.tensor([3, 3]), only_first)
+    restored.load_state_dict(through_a_file(replay.state_dict()))
+    asked = torch.tensor([[3], [3]])
+    assert restored.sizes(asked).tolist() == [[1], [0]]
+    with pytest.raises(ValueError, match="every seed needs a transition"):
+        restored.sample(asked)
+    restored.add(transition(5, 2), torch.tensor([0, 0]), ~only_first)
+    drawn = restored.sample(asked)
+    assert drawn["priority_weight"].tolist() == [[1.0], [0.0]]
+    assert drawn["latent"][0].item() == 4
+
+
+BAD = {
+    "batch size": (transition(0, 3), None),
+    "found no 'latent'": (transition(0, 2).exclude("latent"), None),
+    "latent.*as stored before": (transition(0, 2).set("latent", torch.zeros(2, 5)), None),
+    "terminated.*bool": (
+        transition(0, 2).set(("next", "terminated"), torch.zeros(2, 1)),
+        None,
+    ),
+    "mask": (transition(0, 2), torch.ones(2)),
+}
+
+
+@pytest.mark.parametrize("message", BAD)
+def test_bad_transitions_change_nothing(message):
+    replay = make(2)
+    fill(replay, [(0, 1)] * 2)
+    before = replay.state_dict()
+    data, mask = BAD[message]
+    with pytest.raises(ValueError, match=message):
+        replay.add(data, torch.zeros(len(data), dtype=torch.int64), mask)
+    after = replay.state_dict()
+    assert (TensorDict(after) == TensorDict(before)).all()
+    assert replay.sizes(torch.tensor([[0, 1], [0, 1]])).tolist() == [[2, 0], [0, 2]]
+
+
+def test_a_negative_group_is_refused_where_it_would_be_stored():
+    replay = make(10)
+    with pytest.raises(ValueError, match=r"a group must be at least 0, got \[-1, 1\]"):
+        replay.add(transition(4, 2), torch.tensor([-1, 1]))
+    assert replay.sizes(torch.tensor([[1], [1]])).tolist() == [[0], [0]]
+    replay.add(transition(4, 2), torch.tensor([-1, 1]), torch.tensor([False, True]))
+    drawn = replay.sample(torch.tensor([[1]]), seeds=[1])  # of seed 0 there is nothing to draw
+    assert drawn["latent"].item() == transition(4, 2)["latent"][1].item()
+
+
+def test_rows_may_have_several_dimensions():
+    one, other = make(), make()
+    for replay in (one, other):
+        fill(replay, [(step % 2, step % 3) for step in range(9)])
+    group = torch.tensor([[[0, 0, 1], [1, -1, 0]], [[2, 1, 0], [0, 0, 5]]])
+    flat = other.sample(group.flatten(1))
+    drawn = one.sample(group)
+    assert drawn.batch_size == (2, 2, 3)
+    assert (drawn.reshape(2, 6) == flat).all()
 
 
 def test_samples_share_nothing_with_the_buffer():
-    replay = ReplayBuffer(4, batch_size=4, generator=torch.Generator())
-    data = TensorDict({"action": torch.ones(2, requires_grad=True)}, [])
-    replay.add(data)
+    replay = GroupReplay(4, generator=generators(1), keys=["action"])
+    data = TensorDict({"action": torch.ones(1, 2, requires_grad=True)}, [1])
+    replay.add(data, torch.tensor([0]))
     data["action"].data.zero_()
-    replay.sample()["action"].zero_()
-    batch = replay.sample()
-    assert (batch["action"] == 1).all()
-    assert not batch["action"].requires_grad
+    rows = torch.zeros(1, 4, dtype=torch.int64)
+    replay.sample(rows)["action"].zero_()
+    drawn = replay.sample(rows)["action"]
+    assert (drawn == 1).all()
+    assert not drawn.requires_grad
 
 
-def test_only_chosen_entries_are_stored():
-    keys = ["latent", ("next", "terminated")]
-    replay = ReplayBuffer(4, generator=generators(2), keys=keys)
-    replay.add(transition(0, 2))
-    assert set(replay.sample().keys(True, True)) == set(keys)
-    whole = ReplayBuffer(4, generator=generators(2), keys=["next"])
-    whole.add(transition(0, 2))
-    assert set(whole.sample().keys(True, True)) == {("next", "latent"), ("next", "terminated")}
+def test_transitions_follow_their_source_to_another_group():
+    replay = GroupReplay(5, generator=generators(2), keys=["latent"], source_key="source")
+    for step in range(7):
+        source = torch.tensor([step % 3, 0])
+        replay.add(transition(step, 2).set("source", source), torch.tensor([0, 0]))
+    replay.regroup(0, torch.tensor([4, 2, 4]))
+    assert replay.sizes(torch.tensor([[0, 2, 4], [0, 2, 4]])).tolist() == [[0, 1, 4], [5, 0, 0]]
+    drawn = replay.sample(torch.tensor([[2] * 20 + [4] * 80, [0] * 100]))
+    assert set(drawn.keys()) == {"latent", "priority_weight"}
+    steps = drawn["latent"][0, :, 0].round()
+    assert steps[:20].unique().tolist() == [4]
+    assert steps[20:].unique().tolist() == [2, 3, 5, 6]
+    with pytest.raises(ValueError, match="source_key"):
+        make().regroup(0, torch.tensor([0]))
 
 
-def restored_by_torch(replay: ReplayBuffer, restored: ReplayBuffer) -> int:
-    """Restores one buffer from another by way of a file; returns its size."""
-    file = io.BytesIO()
-    torch.save(replay.state_dict(), file)
-    file.seek(0)
-    restored.load_state_dict(torch.load(file, weights_only=True))
-    return len(file.getvalue())
-
-
-@pytest.mark.parametrize("capacity", [3, 100_000])
-def test_a_restored_buffer_continues_as_the_saved_one(capacity):
-    replay = ReplayBuffer(capacity, batch_size=8, generator=generators(2))
-    for n_steps in (2, 3):
-        for step in range(n_steps):
-            replay.add(transition(step, 2))
-        replay.sample()
-        restored = ReplayBuffer(capacity, batch_size=8, generator=generators(2))
-        restored.add(transition(99, 2))
-        assert restored_by_torch(replay, restored) < 100_000
-    assert restored.sizes.tolist() == replay.sizes.tolist()
-    for step in range(3):
-        assert (restored.sample() == replay.sample()).all()
-        for buffer in (restored, replay):
-            buffer.add(transition(10 + step, 2))
-    assert (restored.sample() == replay.sample()).all()
-
-
-def test_what_was_never_stored_is_saved_as_zeros(monkeypatch):
-    """Not as what happened to lie in memory, which differs from run to run."""
+def test_rows_never_stored_are_saved_as_zeros(monkeypatch):
+    """Uninitialized memory would differ from run to run."""
     monkeypatch.setattr(torch, "empty", lambda *shape, **kw: torch.ones(*shape, **kw))
-    replay = ReplayBuffer(9, batch_size=4, generator=generators(3))
+    replay = make(9, n_seeds=3)
     for step in range(5):
-        replay.add(transition(7 + step, 3), torch.tensor([step < 2, step < 5, step < 4]))
+        mask = torch.tensor([step < 2, step < 5, step < 4])
+        replay.add(transition(7 + step, 3), torch.zeros(3, dtype=torch.int64), mask)
     saved = TensorDict(replay.state_dict()["rows"], [15])
-    assert saved["latent"].shape == (15, 1)
     stored = saved["latent"].view(5, 3).T
     for seed, size in enumerate((2, 5, 4)):
         torch.testing.assert_close(stored[seed, :size], 7 + torch.arange(size) + seed / 100)
@@ -158,82 +286,24 @@ def test_what_was_never_stored_is_saved_as_zeros(monkeypatch):
             assert (rows == 0).all()
 
 
-def test_an_empty_buffer_can_be_saved():
-    replay = ReplayBuffer(3, generator=generators(2))
-    restored = ReplayBuffer(3, generator=generators(2))
-    restored.add(transition(0, 2))
-    restored_by_torch(replay, restored)
-    assert len(restored) == 0
-    restored.add(TensorDict({"other": torch.zeros(2, 1)}, [2]))
-
-
 def test_capacity_costs_no_memory_until_it_is_filled():
     unit = 1 if sys.platform == "darwin" else 1024
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    replay = ReplayBuffer(1_000_000, generator=generators(10))
-    replay.add(TensorDict({"latent": torch.zeros(10, 128)}, [10]))
-    replay.sample()
+    replay = GroupReplay(1_000_000, generator=generators(10), keys=["latent"])
+    group = torch.zeros(10, dtype=torch.int64)
+    replay.add(TensorDict({"latent": torch.zeros(10, 128)}, [10]), group)
+    replay.sample(group.unsqueeze(-1))
     growth = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
     assert growth * unit < 100e6  # the whole is 5 GB
 
 
-BAD = {
-    "batch size": (transition(0, 3), None),
-    "lacks": (transition(0, 2).exclude("latent"), None),
-    "latent.*as stored before": (transition(0, 2).set("latent", torch.zeros(2, 5)), None),
-    "task.*int64": (transition(0, 2).set("task", torch.zeros(2)), None),
-    "mask": (transition(0, 2), torch.ones(2)),
-}
-
-
-@pytest.mark.parametrize("message", BAD)
-def test_bad_transitions_change_nothing(message):
-    replay = ReplayBuffer(2, batch_size=16, generator=generators(2))
-    for step in range(2):
-        replay.add(transition(step, 2))
-    before = replay.state_dict()
-    with pytest.raises(ValueError, match=message):
-        replay.add(*BAD[message])
-    after = replay.state_dict()
-    assert (TensorDict(after) == TensorDict(before)).all()
-
-
-def test_steps_are_taken_as_they_were_stored():
-    """Each seed stores at its own pace: the third stored every second of nine, six are kept."""
-    replay = ReplayBuffer(6, generator=generators(3))
-    stored = [[], [], []]
-    for step in range(9):
-        mask = torch.tensor([True, step < 4, step % 2 == 0])
-        replay.add(transition(step, 3), mask)
-        for seed in mask.nonzero().flatten().tolist():
-            stored[seed].append(step)
-    assert replay.n_added.tolist() == [9, 4, 5]
-    assert replay.oldest.tolist() == [3, 0, 0]
-    steps = torch.tensor([[3, 8, 8, 5], [0, 3, 2, 1], [4, 0, 0, 2]])
-    taken = replay.take(steps)
-    assert taken.batch_size == (3, 4)
-    for seed in range(3):
-        for row, step in enumerate(steps[seed].tolist()):
-            assert (taken[seed, row] == transition(stored[seed][step], 3)[seed]).all()
-    some = replay.take(steps[[2, 0]], ["latent"], seeds=[2, 0])
-    assert list(some.keys()) == ["latent"]
-    assert some["latent"].equal(taken["latent"][[2, 0]])
-
-
-def test_bad_arguments_are_refused():
-    with pytest.raises(ValueError, match="at least 1"):
-        ReplayBuffer(0, generator=torch.Generator())
+def test_bad_sizes_are_refused():
+    with pytest.raises(ValueError, match="capacity"):
+        make(0)
     with pytest.raises(ValueError, match="number of generators"):
-        ReplayBuffer(3, generator=[])
-    with pytest.raises(ValueError, match=r"lacks \['reward'\]"):
-        ReplayBuffer(3, generator=generators(2), keys=["reward"]).add(transition(0, 2))
-    with pytest.raises(ValueError, match="1 <= T <= 3"):
-        ReplayBuffer(3, generator=generators(2)).extend(torch.stack([transition(0, 2)] * 4))
-    saved, other = (
-        ReplayBuffer(4, generator=generators(2)),
-        ReplayBuffer(3, generator=generators(2)),
-    )
-    other.add(transition(7, 2))
+        make(n_seeds=0)
+    other = make(3)
+    fill(other, [(0, 0)])
     with pytest.raises(ValueError, match="capacity 4 and 2 seeds"):
-        other.load_state_dict(saved.state_dict())
+        other.load_state_dict(make(4).state_dict())
     assert len(other) == 1

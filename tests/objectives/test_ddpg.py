@@ -506,7 +506,7 @@ def test_weights_count_in_the_actors_loss_and_in_its_penalty():
 
 
 def test_rows_of_zeros_and_weight_zero_learn_nothing_under_layer_norm():
-    """As `TaskReplay` gives them for tasks without data: no NaN may come of them."""
+    """`GroupReplay` returns such rows for tasks without data."""
     networks = {"in_keys": ["state"], "batch_size": (2,)}
     loss = DDPGLoss(
         Actor(STATE, ACTION, **networks), Critic(STATE, ACTION, layer_norm=True, **networks)
