@@ -57,7 +57,7 @@ from bgpo_trl.figures.of_run import draw_groups
 from bgpo_trl.figures.page import Section, write_page
 from bgpo_trl.figures.style import COLORS, save_figure
 from bgpo_trl.figures.success_matrix import plot_success_matrices
-from bgpo_trl.files.folders import make_folder
+from bgpo_trl.files.writing import make_folder
 from bgpo_trl.runs.archive import archive_run
 from bgpo_trl.runs.results import find_table, read_table
 

@@ -32,7 +32,7 @@ from bgpo_trl.experiments import arguments as experiment
 from bgpo_trl.experiments.arguments import at_once
 from bgpo_trl.experiments.merge import merge
 from bgpo_trl.experiments.run import pretrained_for, run_experiment
-from bgpo_trl.files.locking import DirectoryLock
+from bgpo_trl.files.locking import lock_directory
 from bgpo_trl.own_module import import_own
 from bgpo_trl.runs.config_file import Digests, settings_of
 from bgpo_trl.runs.directory import check_settings, holds_run
@@ -206,7 +206,7 @@ def main(arguments: Arguments) -> None:
             sys.exit("interrupted: the same command continues")
     for directory, group in jobs.items():
         if failed.keys().isdisjoint(group):
-            with DirectoryLock(directory, wait=True):
+            with lock_directory(directory, wait=True):
                 merge([job.directory for job in group], directory)
             print(f"{directory}: blocks of seeds: {len(group)}")
     if failed:

@@ -12,7 +12,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from bgpo_trl.files.folders import make_folder
+from bgpo_trl.files.writing import make_folder
 
 
 def digest(tensors: Mapping[str, Tensor]) -> str:

@@ -12,7 +12,7 @@ from typing import Any
 
 from torch import Tensor
 
-from bgpo_trl.files.whole_file import write_whole
+from bgpo_trl.files.writing import write_whole
 from bgpo_trl.runs.results import AMOUNT, COUNT, read_table
 
 

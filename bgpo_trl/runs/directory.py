@@ -11,8 +11,7 @@ from typing import Any
 
 from bgpo_trl.files.checkpoint import has_checkpoint, load_checkpoint
 from bgpo_trl.files.csv_file import check_position, has_rows
-from bgpo_trl.files.folders import make_folder
-from bgpo_trl.files.whole_file import write_json
+from bgpo_trl.files.writing import make_folder, write_json
 from bgpo_trl.runs.results import read_json
 
 CSV_FILES = ("train.csv", "eval.csv")

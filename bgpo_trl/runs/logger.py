@@ -14,12 +14,11 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 from torchrl.record.loggers import Logger
 from torchrl.record.loggers.wandb import WandbLogger
 
-from bgpo_trl.files.closing import Closing
 from bgpo_trl.files.csv_file import CsvFile, plain_value
 from bgpo_trl.runs.directory import claim_directory, plain_settings
 
@@ -47,7 +46,7 @@ TRAIN_COLUMNS = (
 """Columns of ``train.csv``, one row per training episode."""
 
 
-class RunLogger(Closing):
+class RunLogger:
     """Write the log of a run into its directory, and mirror it to dashboards.
 
     A mirror gets each row as one ``log_metrics`` call with the row's numbers, named
@@ -161,6 +160,12 @@ class RunLogger(Closing):
         for mirror in list(self._mirrors):
             self._try(mirror, mirror.shutdown)
         self._mirrors.clear()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
     def _mirror(self, group: str, row: Mapping[str, Any]) -> None:
         values = {name: plain_value(value) for name, value in row.items()}
