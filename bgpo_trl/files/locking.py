@@ -39,19 +39,23 @@ def lock_directory(directory: str | os.PathLike[str], *, wait: bool = False) -> 
     """
     absolute = Path(directory).resolve()
     made = [folder for folder in (absolute, *absolute.parents) if not folder.exists()]
-    make_folder(absolute)
     # One instance per path and process, which counts how often it is held.
     lock = FileLock(absolute / "lock", thread_local=False, is_singleton=True)
-    try:
-        lock.acquire(timeout=-1 if wait else 0, poll_interval=0.5)
-    except Timeout:
-        raise BlockingIOError(
-            f"{directory} is in use by another process: let it finish, or stop it"
-        ) from None
-    except OSError as error:
-        raise OSError(
-            f"cannot lock {directory} ({error.strerror}): choose another directory"
-        ) from None
+    while True:
+        make_folder(absolute)
+        try:
+            lock.acquire(timeout=-1 if wait else 0, poll_interval=0.5)
+            break
+        except FileNotFoundError:  # The last holder has just removed the folder.
+            continue
+        except Timeout:
+            raise BlockingIOError(
+                f"{directory} is in use by another process: let it finish, or stop it"
+            ) from None
+        except OSError as error:
+            raise OSError(
+                f"cannot lock {directory} ({error.strerror}): choose another directory"
+            ) from None
     try:
         yield
     finally:
