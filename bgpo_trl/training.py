@@ -144,7 +144,7 @@ class Trainer:
             opened.enter_context(self.logger)
             if saved is not None:
                 self.logger.truncate_to(saved["position"])
-                for row in saved.get("later", []):
+                for row in saved["later"]:
                     self._log(row)
             if encoders is not None:  # Others cannot be loaded to watch demonstrations.
                 keep_bank(self.directory, bank, encoders)

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import pytest
 
-from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
+from bgpo_trl.files.checkpoint import load_checkpoint
 from bgpo_trl.runs.directory import check_settings, holds_run
 from bgpo_trl.training import Trainer
 from tests.test_training import assert_equal, at_step
@@ -56,7 +56,7 @@ def interrupt(trainer, step):
         trainer.run()
 
 
-def test_one_process_at_a_time_is_in_a_runs_directory(run, make, other_process, refused):
+def test_one_process_at_a_time_uses_a_run_directory(run, make, other_process, refused):
     first = other_process(run)
     assert first.stdout.readline() == "has it\n"
     for resume in (False, True):
@@ -99,14 +99,14 @@ DAMAGES = {
 
 
 @pytest.mark.parametrize(("damage", "cause", "remedy"), DAMAGES.values(), ids=DAMAGES.keys())
-def test_a_run_that_lacks_something_is_refused_as_it_is(run, make, refused, damage, cause, remedy):
+def test_a_run_that_lacks_a_file_is_refused_unchanged(run, make, refused, damage, cause, remedy):
     damage(run)
     refused(lambda: make(run, resume=True), cause, remedy)
     if (run / "config.json").exists():
         refused(lambda: make(run), "already holds a run", "choose another run directory")
 
 
-def test_a_checkpoint_knows_the_settings_of_its_run(run, make, make_config, refused):
+def test_the_settings_in_the_checkpoint_are_compared(run, make, make_config, refused):
     edit_settings(run)
     config = make_config(task_starts=(0, 1, 2))
     refused(
@@ -116,16 +116,7 @@ def test_a_checkpoint_knows_the_settings_of_its_run(run, make, make_config, refu
     )
 
 
-def test_a_checkpoint_without_settings_goes_by_those_beside_it(run, make):
-    """As runs have it that were begun before checkpoints had them."""
-    state = load_checkpoint(run / "checkpoint")
-    del state["settings"], state["later"]
-    save_checkpoint(run / "checkpoint", state)
-    with make(run, resume=True) as trainer:
-        assert trainer.env_steps == 25
-
-
-def test_what_has_logged_nothing_is_begun(make, make_config, tmp_path):
+def test_resuming_a_directory_without_rows_starts_the_run(make, make_config, tmp_path):
     config = make_config("state", "ddpg", episodes=2)
     assert not holds_run(tmp_path)
     for _ in range(2):
@@ -138,7 +129,7 @@ def test_what_has_logged_nothing_is_begun(make, make_config, tmp_path):
     assert len(rows(tmp_path / "train.csv")) == 4
 
 
-def test_a_run_made_longer_is_the_longer_run(make, make_config, tmp_path):
+def test_a_run_extended_in_steps_equals_a_longer_run(make, make_config, tmp_path):
     """Seeds that were done early have gone on, and nothing of that is lost."""
     run, straight = tmp_path / "longer", tmp_path / "straight"
     config = make_config(episodes=16)
@@ -165,7 +156,7 @@ def test_a_run_made_longer_is_the_longer_run(make, make_config, tmp_path):
         make(run, replace(config, episodes=13), resume=True)
 
 
-def test_settings_are_compared_one_by_one(make, make_config, tmp_path):
+def test_only_the_number_of_episodes_may_grow(make, make_config, tmp_path):
     with make(tmp_path):
         pass
     settings = json.loads((tmp_path / "config.json").read_text())
