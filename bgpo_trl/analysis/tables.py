@@ -15,12 +15,12 @@ from bgpo_trl.analysis.scores import (
     best_scores,
     episodes_to_80,
     final_shares,
+    forward_transfer,
     late_scores,
     own_episodes,
     success_lengths,
     success_matrix,
 )
-from bgpo_trl.analysis.transfer import forward_transfer
 from bgpo_trl.runs.cost import Cost, read_costs
 from bgpo_trl.runs.results import find_table
 

@@ -234,29 +234,3 @@ def read_curves(path: str | os.PathLike[str], tasks: Sequence[str]) -> Curves:
     every = pd.MultiIndex.from_product([seeds, episodes, list(tasks)])
     success = means.reindex(every).to_numpy().reshape(len(seeds), len(episodes), len(tasks))
     return Curves(tuple(map(int, seeds)), tuple(tasks), np.array(episodes), success)
-
-
-def read_outcomes(
-    path: str | os.PathLike[str], tasks: Sequence[str], last: int | None = None
-) -> list[list[NDArray[np.float64]]]:
-    """Read the outcomes of each task's training episodes.
-
-    Args:
-        path: The ``train.csv`` of the run.
-        tasks: Task names.
-        last: Last training episode to include; ``None`` for all.
-
-    Returns:
-        For each seed, in increasing order, and each task: 1 (success) or 0 for each of its
-        training episodes, in order.
-
-    Raises:
-        ValueError: If the file is missing or damaged.
-    """
-    table = read_table(path, TRAIN).sort_values(["seed", "episode"])
-    if last is not None:
-        table = table[table["episode"] <= last]
-    return [
-        [of_seed.loc[of_seed["task"] == task, "success"].to_numpy(float) for task in tasks]
-        for _, of_seed in table.groupby("seed")
-    ]

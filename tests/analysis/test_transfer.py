@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bgpo_trl.analysis.transfer import expected_own_episodes, forward_transfer, own_areas
+from bgpo_trl.analysis.scores import expected_own_episodes, forward_transfer, own_areas
 from tests.analysis.runs import STARTS, SUCCESS, make_run
 
 
