@@ -24,7 +24,6 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from bgpo_trl.analysis.claims import claims
 from bgpo_trl.analysis.comparison import (
     Run,
     Setting,
@@ -40,6 +39,7 @@ from bgpo_trl.analysis.tables import (
     SPEED_NOTE,
     SUCCESS_NOTES,
     Table,
+    claims,
     cost_table,
     difference_table,
     groups_table,
