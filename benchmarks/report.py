@@ -50,9 +50,9 @@ from bgpo_trl.analysis.tables import (
     task_table,
 )
 from bgpo_trl.experiments.arguments import command_line
-from bgpo_trl.figures.counts import plot_counts, read_counts
 from bgpo_trl.figures.curves import plot_success_curves
-from bgpo_trl.figures.nodes import plot_gwr_pca
+from bgpo_trl.figures.groups import plot_counts, read_counts
+from bgpo_trl.figures.gwr import plot_gwr_pca
 from bgpo_trl.figures.of_run import draw_groups
 from bgpo_trl.figures.page import Section, write_page
 from bgpo_trl.figures.style import COLORS, save_figure

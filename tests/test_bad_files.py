@@ -13,7 +13,7 @@ from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.encoders.representation import load_representation
 from bgpo_trl.encoders.shipped import default_weights
 from bgpo_trl.figures.curves import plot_success_curves
-from bgpo_trl.figures.frame_strips import plot_frame_strips
+from bgpo_trl.figures.frames import plot_frame_strips
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
 from bgpo_trl.files.csv_file import CsvFile

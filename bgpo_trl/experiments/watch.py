@@ -14,10 +14,9 @@ from PIL import Image, ImageDraw, ImageFont, ImageOps
 
 from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.experiments.arguments import ImportArguments
-from bgpo_trl.figures.frame_strips import plot_frame_strips
+from bgpo_trl.figures.frames import plot_frame_strips, save_gif
 from bgpo_trl.figures.of_run import draw_growth
 from bgpo_trl.figures.style import save_figure
-from bgpo_trl.figures.video import save_gif
 from bgpo_trl.own_module import import_own
 from bgpo_trl.policy import TrainedPolicy, load_run
 from suites import nico

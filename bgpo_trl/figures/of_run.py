@@ -14,8 +14,7 @@ from bgpo_trl.analysis.task_inference import majority_task, match_counts
 from bgpo_trl.configs import RunConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.figures.groups import plot_groups, read_groups
-from bgpo_trl.figures.growth import plot_gwr_growth
-from bgpo_trl.figures.nodes import plot_gwr_pca
+from bgpo_trl.figures.gwr import plot_gwr_growth, plot_gwr_pca
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.runs.gwr_graphs import load_graphs
 from bgpo_trl.runs.results import COUNT, read_table

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bgpo_trl.figures.counts import plot_counts, read_counts
+from bgpo_trl.figures.groups import plot_counts, read_counts
 
 HEAD = "seed,episode,num_nodes,num_groups\n"
 # Nodes and groups after each episode; seed 8 has played one episode more.

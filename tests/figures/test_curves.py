@@ -14,7 +14,7 @@ from PIL import Image
 
 from bgpo_trl.figures import style
 from bgpo_trl.figures.curves import plot_success_curves
-from bgpo_trl.figures.nodes import plot_gwr_pca
+from bgpo_trl.figures.gwr import plot_gwr_pca
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.runs.logger import RunLogger
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from bgpo_trl.figures.frame_strips import plot_frame_strips
+from bgpo_trl.figures.frames import plot_frame_strips
 
 
 def test_frame_strips_go_from_the_first_to_the_last_frame():

@@ -5,7 +5,7 @@ import pytest
 import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from bgpo_trl.figures.growth import plot_gwr_growth
+from bgpo_trl.figures.gwr import plot_gwr_growth
 
 TASKS = ["grasp_glass", "push_green_to_white"]
 # In a plane of four dimensions: the last graph's spread is largest along the second axis.

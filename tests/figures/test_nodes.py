@@ -6,7 +6,7 @@ import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
 
-from bgpo_trl.figures.nodes import plot_gwr_pca
+from bgpo_trl.figures.gwr import plot_gwr_pca
 
 TASKS = ["grasp_glass", "push_green_to_glass", "push_green_to_white"]
 

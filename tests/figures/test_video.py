@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from bgpo_trl.figures.video import save_gif
+from bgpo_trl.figures.frames import save_gif
 
 
 def test_frames_come_back_at_their_pace_and_enlarged(tmp_path):
