@@ -17,13 +17,12 @@ def write(path, config, **changes):
     return path
 
 
-@pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("name", ALGORITHMS)
-def test_what_was_written_is_read(tmp_path, preset, name):
+def test_settings_are_read_as_they_were_written(tmp_path, name):
     algorithm = replace(
         ALGORITHMS[name].config, state="state", rl=DDPGConfig(hidden_sizes=(5, 7), gamma=0.5)
     )
-    config = replace(PRESETS[preset], name=name, algorithm=algorithm, checkpoint_minutes=3)
+    config = replace(PRESETS["quick"], name=name, algorithm=algorithm, checkpoint_minutes=3)
     read, digests = read_config(write(tmp_path / "config.json", config))
     assert (read, digests) == (config, Digests(encoders="abc", bank="def"))
     assert type(read.algorithm) is type(algorithm)
@@ -31,7 +30,7 @@ def test_what_was_written_is_read(tmp_path, preset, name):
 
 
 @pytest.mark.parametrize("name", RL)
-def test_an_rl_algorithm_is_known_by_its_name(tmp_path, name):
+def test_the_rl_algorithm_is_found_by_its_name(tmp_path, name):
     rl = replace(RL[name].config, gamma=0.5)
     config = RunConfig(algorithm=BGPOConfig(rl=rl))
     read, _ = read_config(write(tmp_path / "config.json", config))
@@ -52,7 +51,7 @@ class CoarseConfig(BGPOConfig):
 
 
 @pytest.mark.parametrize("coarse", [None, GWRBConfig(activity_threshold=0.777)])
-def test_a_setting_that_may_be_absent_is_read(tmp_path, coarse):
+def test_an_optional_setting_is_read(tmp_path, coarse):
     config = RunConfig(name="mine", algorithm=CoarseConfig(coarse=coarse))
     path = write(tmp_path / "config.json", config)
     assert read_config(path)[0].algorithm.coarse == coarse
@@ -66,7 +65,7 @@ class OwnConfig(BGPOConfig):
     curiosity: float = 0.5
 
 
-def test_hyperparameters_of_an_unknown_algorithm_are_of_the_class_that_is_stored(tmp_path):
+def test_hyperparameters_of_an_unknown_algorithm_have_the_stored_class(tmp_path):
     config = RunConfig(name="mine", algorithm=OwnConfig(curiosity=2.0))
     read, _ = read_config(write(tmp_path / "config.json", config))
     assert read == config
@@ -87,12 +86,12 @@ class MixedConfig(BGPOConfig):
     ("algorithm", "said"),
     [(ListConfig(), r"algorithm.widths is \[1, 2\]"), (MixedConfig(), "algorithm.rate is 0.5")],
 )
-def test_what_could_not_be_read_back_is_not_written(algorithm, said):
+def test_settings_that_could_not_be_read_are_not_written(algorithm, said):
     with pytest.raises(ValueError, match=rf"^config.json cannot hold the setting {said}: annotate"):
         settings_of(RunConfig(algorithm=algorithm), Digests("abc", "def"))
 
 
-def test_what_an_earlier_version_did_not_know_has_its_default(tmp_path):
+def test_missing_settings_get_their_defaults(tmp_path):
     settings = asdict(RunConfig())
     del settings["checkpoint_minutes"], settings["algorithm"]["rl"]["critic_layer_norm"]
     (tmp_path / "config.json").write_text(json.dumps(settings))
@@ -124,7 +123,7 @@ def nested(**rl):
         ({"name": "mine", "algorithm_class": "os.path"}, "of 'mine', whose hyperparameters no im"),
     ],
 )
-def test_what_is_no_run_of_this_version_is_refused(tmp_path, changes, said):
+def test_invalid_settings_are_refused(tmp_path, changes, said):
     path = write(tmp_path / "config.json", RunConfig(), **changes)
     with pytest.raises(ValueError, match=said) as error:
         read_config(path)
@@ -146,7 +145,7 @@ class Juggle(nico.NicoTask):
         ([], "a script or notebook"),
     ],
 )
-def test_the_module_of_a_task_is_named_but_not_imported(tmp_path, modules, where):
+def test_the_module_of_an_unknown_task_is_reported_not_imported(tmp_path, modules, where):
     nico.add_task("juggle", Juggle)
     config = RunConfig(tasks=("grasp_glass", "juggle"), task_starts=(0, 2))
     changes = {} if modules is None else {"task_modules": modules}
@@ -159,7 +158,7 @@ def test_the_module_of_a_task_is_named_but_not_imported(tmp_path, modules, where
 
 
 @pytest.mark.parametrize("text", ["", "[]", '{"seeds":', "\x00", "null"])
-def test_what_is_not_json_of_settings_is_refused(tmp_path, text):
+def test_a_file_without_json_settings_is_refused(tmp_path, text):
     (tmp_path / "config.json").write_text(text)
     with pytest.raises(ValueError, match=r"config.json cannot be read \(.*\): use the version"):
         read_config(tmp_path / "config.json")
