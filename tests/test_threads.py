@@ -6,12 +6,12 @@ import threading
 
 import pytest
 
-from bgpo_trl.threads import Threads
+from bgpo_trl.threads import RowPool
 
 
 @pytest.fixture(params=[1, 3, 20])
 def threads(request):
-    threads = Threads(request.param, "test")
+    threads = RowPool(request.param, "test")
     yield threads
     threads.close()
 
