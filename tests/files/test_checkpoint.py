@@ -94,7 +94,8 @@ def test_a_damaged_checkpoint_is_skipped_with_a_warning(where, bit, tmp_path_fac
     assert state["episode"] == 1
     assert torch.equal(state["weight"], torch.arange(100.0))
 
-    save_checkpoint(directory, {"weight": torch.arange(100.0), "episode": 3})
+    newest = save_checkpoint(directory, {"weight": torch.arange(100.0), "episode": 3})
+    assert files(directory) == [newer, newest]  # not verified again when saving
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert load_checkpoint(directory)["episode"] == 3

@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass, field, replace
 
 import pytest
 
-from bgpo_trl.algorithms import ABLATIONS, ALGORITHMS
+from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.rl import RL
 from bgpo_trl.configs import PRESETS, BGPOConfig, DDPGConfig, GWRBConfig, RunConfig
 from bgpo_trl.runs.config_file import Digests, read_config, settings_of
@@ -36,13 +36,6 @@ def test_the_rl_algorithm_is_found_by_its_name(tmp_path, name):
     read, _ = read_config(write(tmp_path / "config.json", config))
     assert read == config
     assert type(read.algorithm.rl) is type(rl)
-
-
-@pytest.mark.parametrize("name", ABLATIONS)
-def test_ablations_are_read(tmp_path, name):
-    config = RunConfig(name=name, algorithm=replace(ABLATIONS[name].config, beta=0.3))
-    path = write(tmp_path / "config.json", config, encoders=None)
-    assert read_config(path) == (config, (None, "def"))
 
 
 @dataclass(frozen=True)
@@ -109,17 +102,12 @@ def nested(**rl):
         ({"color": 1}, "unknown setting color"),
         (nested(momentum=0.9), r"unknown setting algorithm.rl.momentum"),
         (nested(gamma="0.9"), r"algorithm.rl.gamma is '0.9'"),
-        (nested(clip_targets=1), "algorithm.rl.clip_targets is 1"),
         (nested(hidden_sizes=[5, 0.5]), "algorithm.rl.hidden_sizes is 0.5"),
         ({"algorithm": {"state": "smell"}}, "algorithm.state is 'smell'"),
-        ({"algorithm": {"rl": 3}}, "algorithm.rl is 3"),
         (nested(name="ppo"), "algorithm.rl.name is 'ppo', not a known RL algorithm"),
         ({"algorithm": 3}, "no settings of a run"),
-        ({"seeds": 3}, "seeds is 3"),
         ({"seeds": []}, "seeds must be one or more"),
         ({"encoders": 3}, "encoders is 3"),
-        ({"bank": 3}, "bank is 3"),
-        ({"name": "mine", "algorithm_class": None}, "of 'mine', whose hyperparameters no im"),
         ({"name": "mine", "algorithm_class": "os.path"}, "of 'mine', whose hyperparameters no im"),
     ],
 )
@@ -140,8 +128,6 @@ class Juggle(nico.NicoTask):
     [
         (None, f"the module {Juggle.__module__!r}"),
         ({"juggle": "__main__"}, "a script or notebook"),
-        ({}, "a script or notebook"),
-        ({"juggle": 3}, "a script or notebook"),
         ([], "a script or notebook"),
     ],
 )
@@ -157,7 +143,7 @@ def test_the_module_of_an_unknown_task_is_reported_not_imported(tmp_path, module
         read_config(path)
 
 
-@pytest.mark.parametrize("text", ["", "[]", '{"seeds":', "\x00", "null"])
+@pytest.mark.parametrize("text", ["", "[]", '{"seeds":'])
 def test_a_file_without_json_settings_is_refused(tmp_path, text):
     (tmp_path / "config.json").write_text(text)
     with pytest.raises(ValueError, match=r"config.json cannot be read \(.*\): use the version"):

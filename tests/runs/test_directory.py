@@ -14,7 +14,6 @@ from bgpo_trl.training import Trainer
 from tests.test_training import assert_equal, at_step
 
 pytestmark = pytest.mark.usefixtures("easy_world")
-ELSEWHERE = "put it back as the run left it, or begin a new run in another directory"
 
 
 @pytest.fixture(scope="module")
@@ -86,22 +85,18 @@ def edit_settings(run):
 
 
 DAMAGES = {
-    "no checkpoint": (remove("checkpoint"), "has rows of a run, but no checkpoint", ELSEWHERE),
-    "rows alone": (
-        remove("checkpoint", "config.json"), "has rows of a run, but no checkpoint", ELSEWHERE),
-    "no settings": (remove("config.json"), "has a checkpoint, but no config.json", ELSEWHERE),
-    "checkpoint alone": (
-        remove("config.json", "train.csv", "eval.csv"), "but no config.json", ELSEWHERE),
-    "no training episodes": (remove("train.csv"), "train.csv has 0 bytes and no", "put the file"),
-    "no tests": (remove("eval.csv"), "eval.csv has 0 bytes and no row that", "put the file back"),
-    "fewer tests": (cut("eval.csv"), "bytes and no row that ends at", "put the file back as"),
-}  # fmt: skip
+    "no checkpoint": (remove("checkpoint"), "has rows of a run, but no checkpoint"),
+    "no settings": (remove("config.json"), "has a checkpoint, but no config.json"),
+    "checkpoint alone": (remove("config.json", "train.csv", "eval.csv"), "but no config.json"),
+    "no training episodes": (remove("train.csv"), "train.csv has 0 bytes and no"),
+    "fewer tests": (cut("eval.csv"), "bytes and no row that ends at"),
+}
 
 
-@pytest.mark.parametrize(("damage", "cause", "remedy"), DAMAGES.values(), ids=DAMAGES.keys())
-def test_a_run_that_lacks_a_file_is_refused_unchanged(run, make, refused, damage, cause, remedy):
+@pytest.mark.parametrize(("damage", "cause"), DAMAGES.values(), ids=DAMAGES.keys())
+def test_a_run_that_lacks_a_file_is_refused_unchanged(run, make, refused, damage, cause):
     damage(run)
-    refused(lambda: make(run, resume=True), cause, remedy)
+    refused(lambda: make(run, resume=True), cause, "as the run left it")
     if (run / "config.json").exists():
         refused(lambda: make(run), "already holds a run", "choose another run directory")
 
