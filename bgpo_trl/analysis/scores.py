@@ -113,9 +113,11 @@ def own_episodes(run: Run, threshold: float = 0.5) -> Values | None:
     if not find_table(path):
         return None
     table = read_table(path, TRAIN).sort_values(["seed", "episode"])
-    outcomes = table[table["episode"] <= run.last].groupby(["seed", "task"])["success"]
-    times = outcomes.agg(metrics.trials_to, threshold).unstack("task", np.inf)
-    return times.reindex(columns=list(run.tasks), fill_value=np.inf).to_numpy()
+    table = table[table["episode"] <= run.last]
+    if table.empty:
+        return None
+    times = table.groupby(["seed", "task"])["success"].agg(metrics.trials_to, threshold)
+    return times.unstack("task").reindex(columns=list(run.tasks)).fillna(np.inf).to_numpy()
 
 
 def success_lengths(run: Run) -> dict[str, float]:

@@ -38,7 +38,7 @@ class Job:
     Attributes:
         directory: Directory of the run.
         config: The run.
-        module: Module that adds its tasks or algorithm, see `bgpo_trl.own_module.import_own`.
+        module: Module that adds its tasks or algorithm, see `bgpo_trl.plugins.import_plugin`.
         bank: Demonstrations of tasks that are not the paper's.
     """
 

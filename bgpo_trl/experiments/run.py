@@ -26,7 +26,7 @@ from bgpo_trl.experiments.resuming import as_begun, is_finished
 from bgpo_trl.files.locking import lock_directory
 from bgpo_trl.files.writing import write_json
 from bgpo_trl.machine import choose_device, set_threads
-from bgpo_trl.own_module import import_own
+from bgpo_trl.plugins import import_plugin
 from bgpo_trl.runs.demonstrations import BANK
 from bgpo_trl.runs.directory import holds_run
 from bgpo_trl.training import Trainer
@@ -174,9 +174,9 @@ def bank_of(arguments: TaskArguments) -> DemonstrationBank:
     """Load the demonstrations that a command line names, embedded by the pretrained encoders.
 
     Raises:
-        ValueError: As for `import_own`, `chosen_tasks` and `pretrained_for`.
+        ValueError: As for `import_plugin`, `chosen_tasks` and `pretrained_for`.
     """
-    import_own(arguments.module)
+    import_plugin(arguments.module)
     return pretrained_for(chosen_tasks(arguments.tasks, nico.PAPER_TASKS), arguments.bank)[1]
 
 

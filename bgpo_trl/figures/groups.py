@@ -137,7 +137,7 @@ def plot_groups(episodes: pd.DataFrame, presented: Mapping[str, int]) -> Figure:
     if episodes.empty:
         raise ValueError("there is no training episode to show: let the run train first.")
     tasks, last = list(presented), int(episodes["episode"].max())
-    seeds = {int(seed): of_seed for seed, of_seed in episodes.groupby("seed")}
+    seeds = dict(iter(episodes.groupby("seed")))
     heights = [of_seed["group"].nunique() for of_seed in seeds.values()]
     # Inches; rows get thinner so that all of them fit on a page.
     row = min(0.17, 7.0 / sum(heights))
