@@ -98,15 +98,15 @@ def read_table(
     Raises:
         ValueError: If the file is missing or not CSV, lacks a column or has an invalid cell.
     """
-    path = find_table(path) or Path(path)
+    path, columns = find_table(path) or Path(path), columns or {}
     table = _read_text(path)
-    missing = sorted(set(columns or ()).difference(table.columns))
+    missing = sorted(set(columns).difference(table.columns))
     if len(table.columns) and missing:
         raise ValueError(f"{path} lacks the columns {', '.join(missing)}: name another run")
     if missing:
-        return pd.DataFrame(columns=pd.Index(columns or ()))
+        return pd.DataFrame(columns=pd.Index(columns))
     damaged = pd.Series(False, index=table.index)
-    for name, cells in (columns or {}).items():
+    for name, cells in columns.items():
         if isinstance(cells, Numbers):
             table[name], valid = _numbers(table[name], cells)
             damaged |= ~valid
@@ -115,10 +115,8 @@ def read_table(
     if damaged.any():
         line = 2 + int(damaged.to_numpy().argmax())
         raise ValueError(f"{path}, line {line} is damaged: {remedy}")
-    for name, cells in (columns or {}).items():
-        if isinstance(cells, Numbers) and cells.whole and not cells.may_be_empty:
-            table[name] = table[name].astype(np.int64)
-    return table
+    whole = [n for n, cells in columns.items() if isinstance(cells, Numbers) and cells.whole]
+    return table.astype(dict.fromkeys(whole, np.int64))
 
 
 def _read_text(path: Path) -> pd.DataFrame:
