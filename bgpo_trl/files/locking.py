@@ -42,7 +42,7 @@ def lock_directory(directory: str | os.PathLike[str], *, wait: bool = False) -> 
     # One instance per path and process, which counts how often it is held.
     lock = FileLock(absolute / "lock", thread_local=False, is_singleton=True)
     while True:
-        make_folder(absolute)
+        make_folder(directory)
         try:
             lock.acquire(timeout=-1 if wait else 0, poll_interval=0.5)
             break
