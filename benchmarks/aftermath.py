@@ -34,7 +34,7 @@ from bgpo_trl.experiments.arguments import ImportArguments, command_line
 from bgpo_trl.experiments.episodes import Episode, load_blocks
 from bgpo_trl.experiments.run import commit_of_code
 from bgpo_trl.machine import set_threads
-from bgpo_trl.own_module import import_own
+from bgpo_trl.plugins import import_plugin
 from suites import nico
 from suites.nico.base import CONTROL_TIMESTEP, TIME_LIMIT
 
@@ -89,7 +89,7 @@ def episodes_of(arguments: Arguments) -> dict[str, list[Episode]]:
 def main(arguments: Arguments) -> None:
     """Run the tests, print the table and write the files."""
     commit = commit_of_code()
-    import_own(arguments.module)
+    import_plugin(arguments.module)
     set_threads(arguments.threads)
     episodes = episodes_of(arguments)
     rows = [row for actor, of_actor in episodes.items() for row in judge(actor, of_actor)]

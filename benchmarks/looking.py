@@ -34,7 +34,7 @@ from bgpo_trl.figures.bars import plot_success_bars
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.files.progress import progress_bar
 from bgpo_trl.machine import set_threads
-from bgpo_trl.own_module import import_own
+from bgpo_trl.plugins import import_plugin
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Arguments(ImportArguments):
 def main(arguments: Arguments) -> None:
     """Run the tests, print the table and write the files."""
     commit, out = commit_of_code(), arguments.out or arguments.run
-    import_own(arguments.module)
+    import_plugin(arguments.module)
     set_threads(arguments.threads)
     rows: list[Row] = []
     for run in load_blocks(arguments.run):

@@ -34,7 +34,7 @@ from bgpo_trl.evaluation import Evaluator, Snapshot
 from bgpo_trl.experiments.arguments import ImportArguments, command_line
 from bgpo_trl.experiments.run import commit_of_code
 from bgpo_trl.figures.style import COLORS, save_figure
-from bgpo_trl.own_module import import_own
+from bgpo_trl.plugins import import_plugin
 from bgpo_trl.seeding import stream_seed
 from bgpo_trl.transforms import TaskSchedule
 
@@ -207,7 +207,7 @@ def plot(table: Mapping[str, Mapping[float, np.ndarray]]) -> Figure:
 def main(arguments: Arguments) -> None:
     """Run the tests and write the files."""
     commit = commit_of_code()
-    import_own(arguments.module)
+    import_plugin(arguments.module)
     torch.set_num_threads(arguments.threads)
     run, out = arguments.run, arguments.out or arguments.run
     rows = measure(load_run(run), arguments.shares, arguments.episodes, arguments.seed)

@@ -24,7 +24,6 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from bgpo_trl.analysis.claims import claims
 from bgpo_trl.analysis.comparison import (
     Run,
     Setting,
@@ -40,6 +39,7 @@ from bgpo_trl.analysis.tables import (
     SPEED_NOTE,
     SUCCESS_NOTES,
     Table,
+    claims,
     cost_table,
     difference_table,
     groups_table,
@@ -50,14 +50,14 @@ from bgpo_trl.analysis.tables import (
     task_table,
 )
 from bgpo_trl.experiments.arguments import command_line
-from bgpo_trl.figures.counts import plot_counts, read_counts
 from bgpo_trl.figures.curves import plot_success_curves
-from bgpo_trl.figures.nodes import plot_gwr_pca
+from bgpo_trl.figures.groups import plot_counts, read_counts
+from bgpo_trl.figures.gwr import plot_gwr_pca
 from bgpo_trl.figures.of_run import draw_groups
 from bgpo_trl.figures.page import Section, write_page
 from bgpo_trl.figures.style import COLORS, save_figure
 from bgpo_trl.figures.success_matrix import plot_success_matrices
-from bgpo_trl.files.folders import make_folder
+from bgpo_trl.files.writing import make_folder
 from bgpo_trl.runs.archive import archive_run
 from bgpo_trl.runs.results import find_table, read_table
 

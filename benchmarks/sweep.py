@@ -32,8 +32,8 @@ from bgpo_trl.experiments import arguments as experiment
 from bgpo_trl.experiments.arguments import at_once
 from bgpo_trl.experiments.merge import merge
 from bgpo_trl.experiments.run import pretrained_for, run_experiment
-from bgpo_trl.files.locking import DirectoryLock
-from bgpo_trl.own_module import import_own
+from bgpo_trl.files.locking import lock_directory
+from bgpo_trl.plugins import import_plugin
 from bgpo_trl.runs.config_file import Digests, settings_of
 from bgpo_trl.runs.directory import check_settings, holds_run
 from bgpo_trl.runs.results import read_json
@@ -178,7 +178,7 @@ def check_directories(
 
 def play(job: Job) -> None:
     """Play a job to its end, from its last checkpoint if there is one, and measures."""
-    import_own(job.module)
+    import_plugin(job.module)
     arguments = experiment.Arguments(
         out=job.directory, resume=holds_run(job.directory), bank=job.bank
     )
@@ -187,7 +187,7 @@ def play(job: Job) -> None:
 
 def main(arguments: Arguments) -> None:
     """Run the unfinished jobs, and merge the blocks."""
-    import_own(arguments.module)
+    import_plugin(arguments.module)
     jobs = make_jobs(arguments)
     digests = {
         tasks: Digests(*(part.identity for part in pretrained_for(tasks, arguments.bank)))
@@ -206,7 +206,7 @@ def main(arguments: Arguments) -> None:
             sys.exit("interrupted: the same command continues")
     for directory, group in jobs.items():
         if failed.keys().isdisjoint(group):
-            with DirectoryLock(directory, wait=True):
+            with lock_directory(directory, wait=True):
                 merge([job.directory for job in group], directory)
             print(f"{directory}: blocks of seeds: {len(group)}")
     if failed:

@@ -15,7 +15,7 @@ from torchrl.envs import EnvBase
 from bgpo_trl.errors import as_shape, missing_key
 from bgpo_trl.machine import usable_cores
 from bgpo_trl.seeding import Seeding, random_state, row_seeds, set_random_state
-from bgpo_trl.threads import Threads
+from bgpo_trl.threads import RowPool
 from suites import nico
 from suites.nico.base import (
     STATE_SIZE,
@@ -112,7 +112,7 @@ class NicoEnv(EnvBase):
         if observation != "state":
             self._renderer = FrameRenderer(self._environments[0][0].physics.model.ptr)
         threads = usable_cores() if threads is None else threads
-        self._threads = Threads(min(count, threads), "physics")
+        self._threads = RowPool(min(count, threads), "physics")
         self._task = np.zeros(count, dtype=np.int64)
         self._current: dict[str, np.ndarray] = {}
         self._done = np.zeros(count, dtype=bool)

@@ -11,15 +11,15 @@ from typing import TypeVar
 T = TypeVar("T")
 
 
-class Threads:
+class RowPool:
     """Threads that share the rows of a batch; the caller's is one of ``n``.
 
     ``name`` is the prefix of the others' names. A copy, also in another process, starts threads of
     its own.
 
     Example:
-        >>> threads, results = Threads(3, "squares"), [0] * 5
-        >>> threads.each(range(5), lambda row: row**2, results.__setitem__)
+        >>> pool, results = RowPool(3, "squares"), [0] * 5
+        >>> pool.each(range(5), lambda row: row**2, results.__setitem__)
         >>> results
         [0, 1, 4, 9, 16]
     """
@@ -29,8 +29,8 @@ class Threads:
         self._name = name
         self._pool = ThreadPoolExecutor(max(1, self._helpers), name)
 
-    def __reduce__(self) -> tuple[type[Threads], tuple[int, str]]:
-        return Threads, (self._helpers + 1, self._name)
+    def __reduce__(self) -> tuple[type[RowPool], tuple[int, str]]:
+        return RowPool, (self._helpers + 1, self._name)
 
     def each(
         self, rows: Iterable[int], work: Callable[[int], T], arrived: Callable[[int, T], object]

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -20,9 +20,8 @@ from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.evaluation import Evaluator
 from bgpo_trl.files.checkpoint import save_checkpoint
-from bgpo_trl.files.closing import Closing
 from bgpo_trl.files.interrupts import interrupts_wait
-from bgpo_trl.files.locking import DirectoryLock
+from bgpo_trl.files.locking import lock_directory
 from bgpo_trl.files.progress import progress_bar
 from bgpo_trl.runs.config_file import Digests, settings_of
 from bgpo_trl.runs.cost import CostLog
@@ -34,7 +33,7 @@ from bgpo_trl.transforms import TaskSchedule
 from bgpo_trl.world import World
 
 
-class Trainer(Closing):
+class Trainer:
     """One run: an algorithm, its evaluations and its files.
 
     Each seed of the batch plays ``config.episodes`` training episodes. Seeds that finish early go
@@ -134,7 +133,7 @@ class Trainer(Closing):
         self._settings = settings_of(config, Digests(used, bank.identity))
         self._state: TensorDictBase | None = None
         with ExitStack() as opened:
-            opened.enter_context(DirectoryLock(self.directory))
+            opened.enter_context(lock_directory(self.directory))
             saved = load_last(self.directory, self._settings) if resume else None
             if saved is not None:
                 self._load(saved)
@@ -145,7 +144,7 @@ class Trainer(Closing):
             opened.enter_context(self.logger)
             if saved is not None:
                 self.logger.truncate_to(saved["position"])
-                for row in saved.get("later", []):
+                for row in saved["later"]:
                     self._log(row)
             if encoders is not None:  # Others cannot be loaded to watch demonstrations.
                 keep_bank(self.directory, bank, encoders)
@@ -212,6 +211,12 @@ class Trainer(Closing):
     def close(self) -> None:
         """Close files and mirrors, and unlock the directory for other processes."""
         self._opened.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
     def _act(self, state: TensorDictBase) -> TensorDictBase:
         acted = self.algorithm.act(state)

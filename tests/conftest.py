@@ -216,14 +216,12 @@ def _files(folder) -> dict[str, str]:
 
 _OTHER_PROCESS = """
 import sys
-from bgpo_trl.files import locking
+from bgpo_trl.files.locking import lock_directory
 
-def sleep(seconds, sleep=locking.time.sleep):
+directory, wait = sys.argv[1], sys.argv[2] == "True"
+if wait:
     print("waits", flush=True)
-    sleep(0.01)
-
-locking.time.sleep = sleep
-with locking.DirectoryLock(sys.argv[1], wait=sys.argv[2] == "True"):
+with lock_directory(directory, wait=wait):
     print("has it", flush=True)
     input()
 """
@@ -233,7 +231,7 @@ with locking.DirectoryLock(sys.argv[1], wait=sys.argv[2] == "True"):
 def other_process() -> Iterator[Callable[..., subprocess.Popen[str]]]:
     """Starts processes that hold a directory until they read a line.
 
-    They print ``has it``, or ``waits`` again and again; or they are refused.
+    They print ``has it``, before it ``waits`` if they may wait; or they are refused.
     """
     started: list[subprocess.Popen[str]] = []
 

@@ -20,13 +20,13 @@ CORES = len(os.sched_getaffinity(0))
         ("nonsense", CORES),
     ],
 )
-def test_a_containers_quota_bounds_the_cores(tmp_path, quota, cores):
+def test_a_container_quota_bounds_the_number_of_cores(tmp_path, quota, cores):
     file = tmp_path / "cpu.max"
     file.write_text(quota)
     assert usable_cores(file) == cores
 
 
-def test_without_a_quota_affinity_decides(tmp_path):
+def test_affinity_bounds_the_number_of_cores(tmp_path):
     assert usable_cores(tmp_path / "missing") == CORES
     before = os.sched_getaffinity(0)
     try:
@@ -37,12 +37,12 @@ def test_without_a_quota_affinity_decides(tmp_path):
 
 
 @pytest.mark.parametrize(("gpu", "device"), [(True, "cuda"), (False, "cpu")])
-def test_auto_takes_a_gpu_where_there_is_one(monkeypatch, gpu, device):
+def test_auto_chooses_an_available_gpu(monkeypatch, gpu, device):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: gpu)
     assert choose_device() == torch.device(device)
 
 
-def test_a_device_that_is_not_there_is_refused_in_one_line():
+def test_an_unavailable_device_is_refused():
     with pytest.raises(ValueError, match=r"^no device 'abacus' here \(.*\): use auto or cpu$"):
         choose_device("abacus")
     if not torch.cuda.is_available():

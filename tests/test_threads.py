@@ -6,17 +6,17 @@ import threading
 
 import pytest
 
-from bgpo_trl.threads import Threads
+from bgpo_trl.threads import RowPool
 
 
 @pytest.fixture(params=[1, 3, 20])
 def threads(request):
-    threads = Threads(request.param, "test")
+    threads = RowPool(request.param, "test")
     yield threads
     threads.close()
 
 
-def test_each_row_is_worked_on_once_and_its_result_is_handed_over_by_the_caller(threads):
+def test_each_row_is_computed_once_and_received_by_the_calling_thread(threads):
     rows, places = list(range(3, 15)), set()
 
     def arrived(row, result):
@@ -31,7 +31,7 @@ def test_each_row_is_worked_on_once_and_its_result_is_handed_over_by_the_caller(
     assert places == {threading.current_thread()}
 
 
-def test_an_error_in_any_thread_reaches_the_caller_when_all_have_ended(threads):
+def test_an_error_in_a_thread_is_raised_after_all_have_ended(threads):
     interval, working = sys.getswitchinterval(), []
 
     def work(row):
@@ -48,7 +48,7 @@ def test_an_error_in_any_thread_reaches_the_caller_when_all_have_ended(threads):
     assert sys.getswitchinterval() == interval
 
 
-def test_a_copy_works_in_threads_of_its_own(threads):
+def test_a_copy_has_its_own_threads(threads):
     copy, results = pickle.loads(pickle.dumps(threads)), {}
     threads.close()
     copy.each(range(5), lambda row: row**2, results.__setitem__)

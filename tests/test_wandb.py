@@ -16,8 +16,8 @@ from PIL import Image
 from wandb.proto.wandb_internal_pb2 import Record
 
 from bgpo_trl.figures.curves import plot_success_curves
+from bgpo_trl.figures.frames import save_gif
 from bgpo_trl.figures.style import save_figure
-from bgpo_trl.figures.video import save_gif
 from bgpo_trl.runs.logger import RunLogger
 from bgpo_trl.training import Trainer
 

@@ -15,6 +15,12 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 
 
+def in_window(episodes: ArrayLike, end: int, window: int) -> NDArray[np.bool_]:
+    """Return which ``episodes`` ``[E]`` are among the last ``window`` until ``end``, ``[E]``."""
+    episodes = np.asarray(episodes)
+    return (episodes > end - window) & (episodes <= end)
+
+
 def evaluation_matrix(
     success: ArrayLike, episodes: ArrayLike, ends: ArrayLike, *, window: int
 ) -> Array:
@@ -31,7 +37,7 @@ def evaluation_matrix(
     _check_episodes(success, episodes, -2)
     phases = []
     for end in np.asarray(ends).tolist():
-        chosen = (episodes > end - window) & (episodes <= end)
+        chosen = in_window(episodes, end, window)
         if not chosen.any():
             raise ValueError(
                 f"there is no evaluation in the {window} episodes before episode {end}: test "
@@ -68,7 +74,9 @@ def forgetting_since_best(success: ArrayLike) -> Array:
     """
     success = np.asarray(success, float)
     _check_episodes(success, np.arange(success.shape[-2] if success.ndim > 1 else 0), -2)
-    return _mean(_max(success, axis=-2) - success[..., -1, :], axis=-1)
+    # Unlike np.nanmax, it does not warn of tasks without a test.
+    best = np.fmax.reduce(success, axis=-2)
+    return _mean(best - success[..., -1, :], axis=-1)
 
 
 def backward_transfer(matrix: ArrayLike) -> Array:
@@ -192,12 +200,4 @@ def _check_episodes(success: Array, episodes: NDArray, axis: int) -> None:
 
 def _mean(values: Array, axis: int) -> Array:
     """Return the mean of the values that are not NaN; NaN where all are."""
-    valid = ~np.isnan(values)
-    count = valid.sum(axis)
-    total = np.where(valid, values, 0.0).sum(axis)
-    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
-
-
-def _max(values: Array, axis: int) -> Array:
-    highest = np.where(np.isnan(values), -np.inf, values).max(axis)
-    return np.where(np.isfinite(highest), highest, np.nan)
+    return np.ma.filled(np.ma.masked_invalid(values).mean(axis), np.nan)

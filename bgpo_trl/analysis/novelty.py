@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
+from scipy import stats
 from torch import Tensor
 
 from bgpo_trl.data.bank import DemonstrationBank
@@ -52,8 +53,8 @@ def roc_area(known: Tensor, unknown: Tensor) -> Tensor:
         known: Novelties ``[K]``.
         unknown: Novelties ``[U]``.
     """
-    difference = unknown - known.unsqueeze(-1)
-    return (difference > 0).float().mean() + 0.5 * (difference == 0).float().mean()
+    wins = stats.mannwhitneyu(unknown, known).statistic
+    return torch.tensor(wins / (len(known) * len(unknown)))
 
 
 def roc_curve(known: Tensor, unknown: Tensor) -> tuple[Tensor, Tensor]:

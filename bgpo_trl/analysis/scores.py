@@ -1,16 +1,22 @@
-"""Scores of a run: arrays by seed and task, from which tables and comparisons are made."""
+"""Scores of a run: arrays by seed and task, from which tables and comparisons are made.
+
+Among them is the forward transfer between tasks that are presented one after the other.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from bgpo_trl.analysis import metrics
 from bgpo_trl.analysis.comparison import Run
-from bgpo_trl.runs.results import find_table, read_final_tests, read_outcomes, read_tests
+from bgpo_trl.analysis.statistics import Estimate, contrast
+from bgpo_trl.runs.results import TRAIN, find_table, read_final_tests, read_table, read_tests
 
 Values = NDArray[np.float64]
 
@@ -60,7 +66,7 @@ def best_scores(run: Run) -> Values:
         episodes, success = curves.episodes[tested], curves.success[:, tested, task]
         whole = episodes[episodes >= episodes[0] + window - 1]
         for end in whole if len(whole) else episodes[-1:]:
-            inside = (episodes > end - window) & (episodes <= end)
+            inside = metrics.in_window(episodes, end, window)
             best[task] = max(best[task], np.nanmean(success[:, inside]))
     return best
 
@@ -104,10 +110,14 @@ def own_episodes(run: Run, threshold: float = 0.5) -> Values | None:
     ``train.csv``.
     """
     path = run.directory / "train.csv"
-    outcomes = read_outcomes(path, run.tasks, run.last) if find_table(path) else []
-    if not outcomes:
+    if not find_table(path):
         return None
-    return np.array([[metrics.trials_to(task, threshold) for task in seed] for seed in outcomes])
+    table = read_table(path, TRAIN).sort_values(["seed", "episode"])
+    table = table[table["episode"] <= run.last]
+    if table.empty:
+        return None
+    times = table.groupby(["seed", "task"])["success"].agg(metrics.trials_to, threshold)
+    return times.unstack("task").reindex(columns=list(run.tasks)).fillna(np.inf).to_numpy()
 
 
 def success_lengths(run: Run) -> dict[str, float]:
@@ -118,7 +128,7 @@ def success_lengths(run: Run) -> dict[str, float]:
     tests = read_tests(run.directory / "eval.csv")
     if "steps" not in tests:
         return {}
-    late = tests["episode"].between(run.last - late_window(run), run.last, inclusive="right")
+    late = metrics.in_window(tests["episode"], run.last, late_window(run))
     won = tests[late & (tests["success"] == 1)]
     steps = pd.to_numeric(won["steps"], errors="coerce").groupby(won["task"]).mean()
     return {str(task): float(length) for task, length in steps.dropna().items()}
@@ -149,3 +159,82 @@ def final_shares(run: Run, kind: str, column: str) -> Values | None:
     shares = found[column].mean().reindex(every).to_numpy(float)
     shape = len(run.curves.seeds), len(run.tasks)
     return None if np.isnan(shares).any() else shares.reshape(shape)
+
+
+def expected_own_episodes(
+    begun: Sequence[int], task: int, episodes: ArrayLike, *, practised: bool = True
+) -> Values:
+    """Return the expected number of a task's own training episodes after ``episodes`` ``[E]``.
+
+    An episode is of each task presented so far with equal probability; if earlier tasks are not
+    ``practised``, of each of the newest. ``begun`` are the episodes from which tasks are presented.
+    """
+    later = sorted({start for start in begun if start >= begun[task]})
+    played = np.zeros(np.shape(episodes))
+    for start, end in pairwise([*later, np.inf]):
+        newest = max(other for other in begun if other <= start)
+        drawn = [other <= start if practised else other == newest for other in begun]
+        if drawn[task]:
+            played += (np.clip(episodes, start, end) - start) / sum(drawn)
+    return played
+
+
+def forward_transfer(run: Run, reference: Run) -> Estimate | None:
+    """Return the mean forward transfer to all tasks but the first, with its 95 % interval.
+
+    Computed as in Continual World (`metrics.forward_transfer`), from the areas of `own_areas`,
+    means over seeds. The interval is Welch's of the seeds' contributions to first order (the delta
+    method), so that the seeds of the reference count, too. None if the reference leaves nothing to
+    gain on a task.
+    """
+    ours, theirs = own_areas(run, reference)
+    area, height = ours.mean(0), theirs.mean(0)
+    left = 1 - height
+    if (left == 0).any():
+        return None
+    gained = contrast(
+        [(ours / left).mean(-1), (theirs * (1 - area) / left**2).mean(-1)], [1.0, -1.0]
+    )
+    value = float(metrics.forward_transfer(area, height).mean())
+    return replace(gained, value=value).interval()
+
+
+def own_areas(run: Run, reference: Run) -> tuple[Values, Values]:
+    """Return the areas under each task's curves of a run and a reference, ``[S, T - 1]`` each.
+
+    The mean height of a task's curve from the first to the last test of its own phase. As an
+    episode is of any of the presented tasks, curves are over the expected number of the task's own
+    episodes, and the reference's is read off at the tests of the run: learners with the same curve
+    have the same area. The first task is left out, since nothing precedes it. Tasks of the
+    reference may have another order.
+    """
+    begun, areas = run.starts, []
+    for task, end in enumerate([*begun[2:], run.last], 1):
+        own, curves = _own_curves(run, task)
+        of_reference, others = _own_curves(reference, reference.tasks.index(run.tasks[task]))
+        last = min(float(_own_episodes(run, task, end)), of_reference[-1])
+        first = min(max(own[0], of_reference[0]), last)
+        tests = np.array([first, *own[(own > first) & (own < last)], last])
+        areas.append((_mean_height(tests, own, curves), _mean_height(tests, of_reference, others)))
+    ours, theirs = zip(*areas, strict=True)
+    return np.stack(ours, axis=-1), np.stack(theirs, axis=-1)
+
+
+def _own_curves(run: Run, task: int) -> tuple[Values, Values]:
+    """Return a task's expected own episodes at its tests, ``[E]``, and the curves, ``[S, E]``."""
+    own = _own_episodes(run, task, run.curves.episodes)
+    played = np.diff(own, prepend=0.0) > 0
+    return own[played], run.curves.success[:, played, task]
+
+
+def _own_episodes(run: Run, task: int, episodes: ArrayLike) -> Values:
+    practised = run.config.get("schedule", "practised") == "practised"
+    return expected_own_episodes(run.starts, task, episodes, practised=practised)
+
+
+def _mean_height(tests: Values, episodes: Values, curves: Values) -> Values:
+    """Return the mean height of curves between the first and the last of some episodes, ``[S]``."""
+    heights = np.stack([np.interp(tests, episodes, curve) for curve in curves])
+    if tests[0] == tests[-1]:  # a single test
+        return heights[:, -1]
+    return np.trapezoid(heights, tests, axis=-1) / (tests[-1] - tests[0])

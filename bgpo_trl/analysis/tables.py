@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from itertools import combinations
+from itertools import combinations, product
 
 import numpy as np
 
 from bgpo_trl.analysis import metrics, statistics
-from bgpo_trl.analysis.comparison import Run, Setting
+from bgpo_trl.analysis.comparison import NAMES, Run, Setting
 from bgpo_trl.analysis.scores import (
     Values,
     area_scores,
     best_scores,
     episodes_to_80,
     final_shares,
+    forward_transfer,
     late_scores,
     own_episodes,
     success_lengths,
     success_matrix,
 )
-from bgpo_trl.analysis.transfer import forward_transfer
 from bgpo_trl.runs.cost import Cost, read_costs
 from bgpo_trl.runs.results import find_table
 
@@ -58,16 +58,31 @@ SPEED_NOTE = (
     "task, median of the seeds' ratios."
 )
 COST_NOTE = "Of all seeds together, without tests: time of a training step, and memory."
+_CLAIM_VERDICTS = {"above": "reproduced", "below": "the opposite"}
+_MEASURES = {"success": late_scores, "area": area_scores}
+# Each BGPO with the baselines on the same terms (demonstrations, stabilizers).
+_BASELINES = {
+    "bgpo": ("maml-demonstrations", "dist-nll-demonstrations"),
+    "bgpo-experts": ("maml", "dist-nll"),
+    "bgpo-single": ("maml", "dist-nll"),
+    "bgpo-paper": ("maml-paper", "dist-nll-paper"),
+}
+_BASELINE_NAMES = ("MAML", "Dist-NLL")
+# Fig. 9, from the best to the worst.
+_ABLATION = (
+    ("bgpo-single", "gwr"),
+    ("gwr", "r_int"),
+    ("r_int", "none"),
+    ("bgpo-single", "none"),
+)
 # Beside BGPO: its versions and the baselines on the same terms; with and without an addition.
-_PAIRS = (
-    *(("bgpo-experts", rival) for rival in ("dist-nll", "maml")),
-    *(("bgpo-single", rival) for rival in ("dist-nll", "maml")),
-    *(("bgpo-paper", rival) for rival in ("dist-nll-paper", "maml-paper")),
+_PAIRS = {
+    *((ours, rival) for ours in list(_BASELINES)[1:] for rival in _BASELINES[ours]),
     *(("bgpo-single", fewer) for fewer in ("gwr", "r_int", "none")),
     *(("gwr", "none"), ("r_int", "none")),
     *(("even-replay", "bgpo-single"), ("demonstrations", "bgpo-single")),
     ("bgpo-experts", "even-replay"),
-)
+}
 
 
 def success_table(setting: Setting) -> Table:
@@ -92,8 +107,8 @@ def success_table(setting: Setting) -> Table:
 
 def _knows_label(run: Run) -> str:
     """Return whether the algorithm is given the task's label, from ``summary.json``."""
-    told = run.summary.get("needs_label")
-    return "?" if told is None else "yes" if told else "no"
+    needed = run.summary.get("needs_label")
+    return "?" if needed is None else "yes" if needed else "no"
 
 
 def difference_table(setting: Setting) -> Table:
@@ -104,10 +119,12 @@ def difference_table(setting: Setting) -> Table:
     named = {name: run.algorithm for name, run in setting.runs.items()}
     first = next((name for name, key in named.items() if key == "bgpo"), next(iter(named)))
     pairs = [(first, other) for other in named if other != first]
-    for ours, other in combinations(named, 2):
-        for pair in ((ours, other), (other, ours)):
-            if (named[pair[0]], named[pair[1]]) in _PAIRS and pair not in pairs:
-                pairs.append(pair)
+    pairs += [
+        pair
+        for both in combinations(named, 2)
+        for pair in (both, both[::-1])
+        if (named[pair[0]], named[pair[1]]) in _PAIRS and pair not in pairs
+    ]
     found = [
         [
             statistics.difference(*(score(setting.runs[name]).mean(1) for name in pair))
@@ -129,6 +146,47 @@ def difference_table(setting: Setting) -> Table:
             ]
         )
     return rows if pairs else []
+
+
+def claims(continual: Setting | None, concurrent: Setting | None) -> tuple[Table, int]:
+    """Return the table of the paper's claims, and how many lack runs.
+
+    Args:
+        continual: Runs with tasks one after the other, if there are any.
+        concurrent: Runs of the same tasks from the start.
+    """
+    settings = {"one after the other": continual, "from the start": concurrent}
+    against = [
+        (name, ours, rival)
+        for ours, rivals in _BASELINES.items()
+        for name, rival in zip(_BASELINE_NAMES, rivals, strict=True)
+    ]
+    # Claim, compared runs, measure, and the two or four runs whose scores are subtracted.
+    tests: list[tuple[str, str, str, list[tuple[Setting | None, str]]]] = []
+    for how, setting in settings.items():
+        for (name, ours, rival), what in product(against, _MEASURES):
+            tested = f"{NAMES[ours]} against {NAMES[rival]}"
+            runs = [(setting, ours), (setting, rival)]
+            tests.append((f"BGPO above {name}, {how}", tested, what, runs))
+    for name, ours, rival in against:
+        runs = [(setting, key) for setting in settings.values() for key in (ours, rival)]
+        claim = f"the lead over {name} is larger one after the other"
+        tests.append((claim, f"{NAMES[ours]} against {NAMES[rival]}", "success", runs))
+    for better, worse in _ABLATION:
+        claim = f"{NAMES[better]} converges faster than {NAMES[worse]}"
+        runs = [(concurrent, better), (concurrent, worse)]
+        tests.append((claim, "from the start", "area", runs))
+
+    rows = [["the paper's claim", "tested", "measured", "difference", "found"]]
+    for claim, tested, what, runs in tests:
+        found = [setting.find(key) if setting else None for setting, key in runs]
+        scores = [_MEASURES[what](run).mean(1) for _, run in filter(None, found)]
+        if len(scores) == len(runs):
+            difference = statistics.difference(*scores)
+            verdict = _CLAIM_VERDICTS.get(difference.verdict, difference.note)
+            rows.append([claim, tested, what, difference.estimate.points(), verdict])
+    missing = len(tests) + 1 - len(rows)
+    return (rows if len(rows) > 1 else []), missing
 
 
 def sequence_table(setting: Setting, reference: Setting | None) -> Table:

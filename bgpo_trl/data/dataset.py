@@ -10,8 +10,7 @@ from pathlib import Path
 import torch
 from tensordict import MemoryMappedTensor, TensorDict
 
-from bgpo_trl.files.folders import make_folder
-from bgpo_trl.files.whole_file import write_json
+from bgpo_trl.files.writing import make_folder, write_json
 from suites import nico
 from suites.nico.base import STATE_SIZE
 from suites.nico.rendering import FRAME_HEIGHT, FRAME_WIDTH

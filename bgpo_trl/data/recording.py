@@ -23,7 +23,7 @@ from bgpo_trl.data.dataset import (
     write_meta,
 )
 from bgpo_trl.files.progress import progress_bar
-from bgpo_trl.own_module import import_own
+from bgpo_trl.plugins import import_plugin
 from suites import nico
 from suites.nico.base import Environment
 from suites.nico.demonstrator import Demonstrator
@@ -260,7 +260,7 @@ def main(
         spread: Share of the whole range of start states.
         seed: Seed of the start states and of the noise.
     """
-    import_own(module)
+    import_plugin(module)
     record_demonstrations(
         path,
         tasks=tasks,

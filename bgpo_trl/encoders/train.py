@@ -26,7 +26,7 @@ from bgpo_trl.encoders.representation import (
 )
 from bgpo_trl.encoders.shipped import bank_path, default_weights
 from bgpo_trl.files.csv_file import CsvFile
-from bgpo_trl.files.folders import make_folder
+from bgpo_trl.files.writing import make_folder
 from bgpo_trl.machine import choose_device
 from suites import nico
 

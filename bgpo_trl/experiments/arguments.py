@@ -19,7 +19,7 @@ from bgpo_trl.algorithms.rl import RL
 from bgpo_trl.configs import PRESETS, RunConfig
 from bgpo_trl.configs.checks import check_seeds
 from bgpo_trl.encoders.shipped import default_weights, weights_of_bank
-from bgpo_trl.own_module import import_own
+from bgpo_trl.plugins import import_plugin
 from suites import nico
 
 _Entry = TypeVar("_Entry")
@@ -113,7 +113,7 @@ def run_config(arguments: Arguments) -> RunConfig:
     Raises:
         ValueError: If the settings are invalid, or a task or algorithm does not exist.
     """
-    import_own(arguments.module)
+    import_plugin(arguments.module)
     config = _with_tasks(PRESETS[arguments.preset], arguments.tasks)
     algorithm = chosen(ALGORITHMS, arguments.algorithm, "--algorithm").config
     rl = algorithm.rl.name if arguments.rl is None else arguments.rl

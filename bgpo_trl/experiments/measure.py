@@ -15,10 +15,9 @@ from bgpo_trl.analysis.task_inference import group_purity, task_inference_accura
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.evaluation import Evaluator, evaluate_random_policy
 from bgpo_trl.figures.curves import plot_success_curves
-from bgpo_trl.figures.frame_strips import plot_frame_strips
+from bgpo_trl.figures.frames import plot_frame_strips, save_gif
 from bgpo_trl.figures.of_run import draw_groups, draw_growth, draw_nodes
 from bgpo_trl.figures.style import save_figure
-from bgpo_trl.figures.video import save_gif
 from bgpo_trl.files.progress import progress_bar
 from bgpo_trl.training import Trainer
 from bgpo_trl.transforms import TaskSchedule

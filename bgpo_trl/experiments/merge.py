@@ -10,8 +10,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from bgpo_trl.files.folders import make_folder
-from bgpo_trl.files.whole_file import write_json, write_whole
+from bgpo_trl.files.writing import make_folder, write_json, write_whole
 from bgpo_trl.runs.cost import read_costs, total_cost, write_costs
 from bgpo_trl.runs.results import read_json, read_table
 

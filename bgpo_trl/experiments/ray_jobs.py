@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from bgpo_trl.configs import RunConfig
-from bgpo_trl.files.locking import DirectoryLock
+from bgpo_trl.files.locking import lock_directory
 from bgpo_trl.files.progress import progress_bar
 
 try:
@@ -38,7 +38,7 @@ class Job:
     Attributes:
         directory: Directory of the run.
         config: The run.
-        module: Module that adds its tasks or algorithm, see `bgpo_trl.own_module.import_own`.
+        module: Module that adds its tasks or algorithm, see `bgpo_trl.plugins.import_plugin`.
         bank: Demonstrations of tasks that are not the paper's.
     """
 
@@ -96,7 +96,7 @@ def work(job: Job, play: Callable[[Job], None], command: Sequence[str]) -> None:
     """
     sys.argv = list(command)
     with (
-        DirectoryLock(job.directory, wait=True),  # A worker that Ray lost may still be writing.
+        lock_directory(job.directory, wait=True),  # A worker that Ray lost may still be writing.
         (job.directory / "log.txt").open("a", buffering=1) as log,
         contextlib.redirect_stdout(log),
         contextlib.redirect_stderr(log),

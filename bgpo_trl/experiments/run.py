@@ -23,10 +23,10 @@ from bgpo_trl.experiments.arguments import (
 )
 from bgpo_trl.experiments.measure import draw, measure
 from bgpo_trl.experiments.resuming import as_begun, is_finished
-from bgpo_trl.files.locking import DirectoryLock
-from bgpo_trl.files.whole_file import write_json
+from bgpo_trl.files.locking import lock_directory
+from bgpo_trl.files.writing import write_json
 from bgpo_trl.machine import choose_device, set_threads
-from bgpo_trl.own_module import import_own
+from bgpo_trl.plugins import import_plugin
 from bgpo_trl.runs.demonstrations import BANK
 from bgpo_trl.runs.directory import holds_run
 from bgpo_trl.training import Trainer
@@ -78,7 +78,7 @@ def run_experiment(
             return f"{out} is finished, all {config.episodes} episodes: --episodes makes it longer"
     elif holds_run(out):
         raise ValueError(f"{out} holds a run: --resume continues it, --out names another directory")
-    with DirectoryLock(out):
+    with lock_directory(out):
         encoders, bank = _encoders(arguments, config.tasks, out, device)
         with Trainer(
             config,
@@ -174,9 +174,9 @@ def bank_of(arguments: TaskArguments) -> DemonstrationBank:
     """Load the demonstrations that a command line names, embedded by the pretrained encoders.
 
     Raises:
-        ValueError: As for `import_own`, `chosen_tasks` and `pretrained_for`.
+        ValueError: As for `import_plugin`, `chosen_tasks` and `pretrained_for`.
     """
-    import_own(arguments.module)
+    import_plugin(arguments.module)
     return pretrained_for(chosen_tasks(arguments.tasks, nico.PAPER_TASKS), arguments.bank)[1]
 
 

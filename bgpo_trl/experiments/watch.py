@@ -14,11 +14,10 @@ from PIL import Image, ImageDraw, ImageFont, ImageOps
 
 from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.experiments.arguments import ImportArguments
-from bgpo_trl.figures.frame_strips import plot_frame_strips
+from bgpo_trl.figures.frames import plot_frame_strips, save_gif
 from bgpo_trl.figures.of_run import draw_growth
 from bgpo_trl.figures.style import save_figure
-from bgpo_trl.figures.video import save_gif
-from bgpo_trl.own_module import import_own
+from bgpo_trl.plugins import import_plugin
 from bgpo_trl.policy import TrainedPolicy, load_run
 from suites import nico
 from suites.nico.rendering import FrameRenderer
@@ -161,7 +160,7 @@ def watch(arguments: WatchArguments) -> str:
         ValueError: If the directory holds no run that can be loaded, or the run has no such seed.
     """
     run, out = arguments.run, arguments.out or arguments.run / "figures"
-    import_own(arguments.module)
+    import_plugin(arguments.module)
     policy = load_run(run, seed=arguments.run_seed)
     shown = demonstrate(policy.tasks, arguments.scene_seed, policy.config.spread)
     episodes = [play(policy, task, frames, arguments.scene_seed) for task, frames in shown.items()]

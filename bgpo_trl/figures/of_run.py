@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import pandas as pd
 import torch
 from torch import Tensor
 
@@ -14,8 +14,7 @@ from bgpo_trl.analysis.task_inference import majority_task, match_counts
 from bgpo_trl.configs import RunConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.figures.groups import plot_groups, read_groups
-from bgpo_trl.figures.growth import plot_gwr_growth
-from bgpo_trl.figures.nodes import plot_gwr_pca
+from bgpo_trl.figures.gwr import plot_gwr_growth, plot_gwr_pca
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.runs.gwr_graphs import load_graphs
 from bgpo_trl.runs.results import COUNT, read_table
@@ -82,9 +81,8 @@ def draw_nodes(
 
 def write_nodes(path: Path, weights: Tensor, tasks: Tensor, groups: Tensor | None = None) -> None:
     """Write nodes ``[N]`` as CSV: majority task (-1: none), group if given, weights ``[N, d]``."""
-    columns = {"task": tasks.tolist()} | ({} if groups is None else {"group": groups.tolist()})
-    with path.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow((*columns, *(f"w{i}" for i in range(weights.shape[1]))))
-        for *numbers, row in zip(*columns.values(), weights.tolist(), strict=True):
-            writer.writerow((*numbers, *(f"{value:.6g}" for value in row)))
+    table = pd.DataFrame(weights.numpy()).add_prefix("w")
+    if groups is not None:
+        table.insert(0, "group", groups.numpy())
+    table.insert(0, "task", tasks.numpy())
+    table.to_csv(path, index=False, float_format="%.6g", lineterminator="\r\n")

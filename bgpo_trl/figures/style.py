@@ -14,7 +14,7 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from bgpo_trl.files.folders import make_folder
+from bgpo_trl.files.writing import make_folder
 
 COLORS = (
     "#0072B2",

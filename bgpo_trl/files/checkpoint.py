@@ -18,15 +18,16 @@ from typing import Any, BinaryIO
 import torch
 from torch import Tensor, nn
 
-_NAME = re.compile(r"checkpoint-(\d+)-([0-9a-f]{16})\.pt")
+_NAME = re.compile(r"checkpoint-\d+-[0-9a-f]{16}\.pt")
 _PLAIN_TYPES = (bool, int, float, str, type(None), Tensor, nn.Parameter)
 
 
 def save_checkpoint(directory: str | os.PathLike[str], state: dict[str, Any]) -> Path:
-    """Write a checkpoint, keep the newest intact one before it, and remove older ones.
+    """Write a checkpoint, keep the one before it, and remove older ones.
 
     The file gets its name once it is complete on disk, so that a kill or a power cut at any moment
-    leaves the previous checkpoint.
+    leaves the previous checkpoint. Checkpoints are verified when they are loaded, not here: they
+    may have gigabytes.
 
     Args:
         directory: Checkpoint folder of the run; made if it does not exist.
@@ -52,14 +53,18 @@ def save_checkpoint(directory: str | os.PathLike[str], state: dict[str, Any]) ->
     directory = Path(directory)
     temporary = directory / "checkpoint.tmp"
     earlier = _checkpoints(directory)
-    number = _parse(earlier[0])[0] + 1 if earlier else 1
+    number = _number(earlier[0]) + 1 if earlier else 1
     try:
         directory.mkdir(parents=True, exist_ok=True)
         with open(temporary, "wb") as file:
             digest = _write(state, file)
         path = directory / f"checkpoint-{number:06d}-{digest}.pt"
         temporary.replace(path)
-        _sync_directory(directory)
+        descriptor = os.open(directory, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
     except OSError as error:
         with contextlib.suppress(OSError):  # The directory may be missing or a file.
             temporary.unlink()
@@ -68,11 +73,8 @@ def save_checkpoint(directory: str | os.PathLike[str], state: dict[str, Any]) ->
             f"cannot save a checkpoint in {directory} ({error.strerror}), earlier ones are kept: "
             "make room, then resume the run",
         ) from error
-    # Skips damaged checkpoints, so that the intact one just resumed from is kept.
-    kept = next((candidate for candidate in earlier if _is_intact(candidate)), None)
-    for old in earlier:
-        if old != kept:
-            old.unlink()
+    for old in earlier[1:]:
+        old.unlink()
     return path
 
 
@@ -146,29 +148,20 @@ def _write(state: dict[str, Any], file: BinaryIO) -> str:
     return hashing_file.sha256.hexdigest()[:16]
 
 
-def _sync_directory(directory: Path) -> None:
-    descriptor = os.open(directory, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def _parse(path: Path) -> tuple[int, str]:
-    match = _NAME.fullmatch(path.name)
-    assert match is not None
-    return int(match[1]), match[2]
+def _number(path: Path) -> int:
+    return int(path.stem.split("-")[1])
 
 
 def _checkpoints(directory: Path) -> list[Path]:
     """Return the checkpoints in a directory, newest first."""
     found = [path for path in directory.glob("checkpoint-*.pt") if _NAME.fullmatch(path.name)]
-    return sorted(found, key=_parse, reverse=True)
+    return sorted(found, key=_number, reverse=True)
 
 
 def _is_intact(path: Path) -> bool:
     with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest().startswith(_parse(path)[1])
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    return digest.startswith(path.stem.split("-")[2])
 
 
 def _check_state(value: Any, where: str) -> None:

@@ -8,12 +8,10 @@ import io
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
-
-from bgpo_trl.files.closing import Closing
+from typing import Any, Self
 
 
-class CsvFile(Closing):
+class CsvFile:
     r"""Append-only CSV file with fixed columns that can be truncated to an earlier position.
 
     An existing file is continued. Rows are written unbuffered and whole: killing the process loses
@@ -101,6 +99,12 @@ class CsvFile(Closing):
     def close(self) -> None:
         """Close the file."""
         self._file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
     def _append(self, line: bytes) -> None:
         start = self._file.seek(0, os.SEEK_END)

@@ -8,11 +8,11 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors import safe_open
+from safetensors.torch import save
 from torch import Tensor
 
-from bgpo_trl.files.folders import make_folder
+from bgpo_trl.files.writing import make_folder, write_whole
 
 
 def digest(tensors: Mapping[str, Tensor]) -> str:
@@ -39,15 +39,14 @@ def save_tensors(
     """
     path = Path(path)
     make_folder(path.parent)
-    # Written to a temporary file, so that an interrupted save keeps the existing file.
-    partial = path.with_suffix(".partial")
     contiguous = {key: value.contiguous() for key, value in tensors.items()}
+    content = save(contiguous, {**metadata, "sha256": _checksum(contiguous, metadata)})
     try:
-        save_file(contiguous, partial, {**metadata, "sha256": _checksum(contiguous, metadata)})
-        os.replace(partial, path)
-    except (SafetensorError, OSError) as error:
-        partial.unlink(missing_ok=True)
-        raise OSError(f"cannot write {path} ({error}): make room, or choose another path") from None
+        write_whole(path, content)
+    except OSError as error:
+        raise OSError(
+            f"cannot write {path} ({error.strerror}): make room, or choose another path"
+        ) from None
 
 
 def load_tensors(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], dict[str, str]]:

@@ -6,8 +6,7 @@ import gzip
 from collections.abc import Mapping
 from pathlib import Path
 
-from bgpo_trl.files.folders import make_folder
-from bgpo_trl.files.whole_file import write_whole
+from bgpo_trl.files.writing import make_folder, write_whole
 from bgpo_trl.runs.results import EVAL, TRAIN, TRAIN_COUNTS, find_table, read_json, read_table
 
 _WHOLE = ("summary.json", "final.csv", "cost.csv")

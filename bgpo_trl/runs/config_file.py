@@ -11,7 +11,6 @@ from typing import Any, Literal, NamedTuple, get_args, get_origin, get_type_hint
 from bgpo_trl.algorithms import ABLATIONS, ALGORITHMS
 from bgpo_trl.algorithms.rl import RL
 from bgpo_trl.configs import AlgorithmConfig, RLConfig, RunConfig
-from bgpo_trl.runs.directory import plain_settings
 from suites import nico
 
 
@@ -94,14 +93,13 @@ def settings_of(config: RunConfig, digests: Digests) -> dict[str, Any]:
     """
     kind = type(config.algorithm)
     added = {name: nico.TASKS[name].__module__ for name in config.tasks}
-    settings = plain_settings(
-        {
-            **asdict(config),
-            "algorithm_class": f"{kind.__module__}.{kind.__qualname__}",
-            "task_modules": {name: added[name] for name in added if name not in nico.ALL_TASKS},
-            **digests._asdict(),
-        }
-    )
+    settings = {
+        **asdict(config),
+        "algorithm_class": f"{kind.__module__}.{kind.__qualname__}",
+        "task_modules": {name: added[name] for name in added if name not in nico.ALL_TASKS},
+        **digests._asdict(),
+    }
+    settings = json.loads(json.dumps(settings, default=str))  # tuples become lists
     try:
         _read(kind, settings["algorithm"], "algorithm.")
     except ValueError as error:

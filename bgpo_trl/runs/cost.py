@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass, fields
@@ -12,7 +10,7 @@ from typing import Any
 
 from torch import Tensor
 
-from bgpo_trl.files.whole_file import write_whole
+from bgpo_trl.files.writing import write_whole
 from bgpo_trl.runs.results import AMOUNT, COUNT, read_table
 
 
@@ -96,13 +94,12 @@ def write_costs(path: Path, costs: Mapping[int, Cost]) -> None:
     Raises:
         OSError: If it cannot be written.
     """
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(COST_COLUMNS)
-    for tasks, cost in sorted(costs.items()):
-        writer.writerow((tasks, cost.steps, f"{cost.seconds:.3f}", f"{cost.megabytes:.6f}"))
+    rows = (
+        f"{tasks},{cost.steps},{cost.seconds:.3f},{cost.megabytes:.6f}"
+        for tasks, cost in sorted(costs.items())
+    )
     try:
-        write_whole(path, text.getvalue())
+        write_whole(path, "\n".join([",".join(COST_COLUMNS), *rows, ""]))
     except OSError as error:
         raise OSError(
             error.errno, f"cannot write {path} ({error.strerror}): make room, then resume the run"
@@ -112,7 +109,7 @@ def write_costs(path: Path, costs: Mapping[int, Cost]) -> None:
 def total_cost(costs: Sequence[Mapping[int, Cost]]) -> dict[int, Cost]:
     """Return the sums of the costs of runs, by the number of presented tasks."""
     total: dict[int, Cost] = {}
-    for tasks, cost in (row for of_run in costs for row in sorted(of_run.items())):
-        so_far = total.setdefault(tasks, Cost())
-        total[tasks] = Cost(*map(sum, zip(astuple(so_far), astuple(cost), strict=True)))
+    for tasks, cost in (row for of_run in costs for row in of_run.items()):
+        sums = zip(astuple(total.get(tasks, Cost())), astuple(cost), strict=True)
+        total[tasks] = Cost(*map(sum, sums))
     return total

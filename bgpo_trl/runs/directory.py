@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from bgpo_trl.files.checkpoint import has_checkpoint, load_checkpoint
 from bgpo_trl.files.csv_file import check_position, has_rows
-from bgpo_trl.files.folders import make_folder
-from bgpo_trl.files.whole_file import write_json
+from bgpo_trl.files.writing import make_folder, write_json
 from bgpo_trl.runs.results import read_json
 
 CSV_FILES = ("train.csv", "eval.csv")
@@ -25,23 +22,14 @@ def holds_run(directory: str | os.PathLike[str]) -> bool:
     return any((Path(directory) / name).exists() for name in names)
 
 
-def plain_settings(config: Any) -> Any:
-    """Return settings as JSON stores them, so that they compare equal when read back.
-
-    Args:
-        config: A dataclass instance or a mapping.
-    """
-    if dataclasses.is_dataclass(config) and not isinstance(config, type):
-        config = dataclasses.asdict(config)
-    return json.loads(json.dumps(config, default=str))
-
-
-def check_settings(directory: str | os.PathLike[str], config: Any, *, longer: bool = False) -> None:
+def check_settings(
+    directory: str | os.PathLike[str], settings: Mapping[str, Any], *, longer: bool = False
+) -> None:
     """Check that a directory holds no run, or one with the given settings.
 
     Args:
         directory: A run directory, which may be missing.
-        config: Settings of a run, a dataclass instance or a mapping.
+        settings: Settings of a run, as JSON stores them.
         longer: Whether the existing run may have fewer ``episodes``.
 
     Raises:
@@ -49,15 +37,15 @@ def check_settings(directory: str | os.PathLike[str], config: Any, *, longer: bo
     """
     path = Path(directory) / "config.json"
     if path.exists():
-        _compare(directory, read_json(path), config, longer)
+        _compare(directory, read_json(path), settings, longer)
 
 
-def claim_directory(directory: Path, config: Any, *, resume: bool) -> None:
+def claim_directory(directory: Path, settings: Mapping[str, Any], *, resume: bool) -> None:
     """Write ``config.json``, unless the directory holds a run that must not be continued.
 
     Args:
         directory: The run directory, made if missing.
-        config: Settings of the run, a dataclass instance or a mapping.
+        settings: Settings of the run, as JSON stores them.
         resume: Whether the directory may hold this run, possibly with fewer ``episodes``.
 
     Raises:
@@ -65,7 +53,7 @@ def claim_directory(directory: Path, config: Any, *, resume: bool) -> None:
             ``resume``.
         OSError: If the directory cannot be written.
     """
-    check_settings(directory, config, longer=resume)
+    check_settings(directory, settings, longer=resume)
     if not resume and holds_run(directory):
         raise ValueError(
             f"{directory} already holds a run: resume it, or choose another run directory."
@@ -73,19 +61,19 @@ def claim_directory(directory: Path, config: Any, *, resume: bool) -> None:
     make_folder(directory)
     path = directory / "config.json"
     try:
-        write_json(path, plain_settings(config))
+        write_json(path, settings)
     except OSError as error:
         raise OSError(
             f"cannot write {path} ({error.strerror}): make room, or choose another run directory"
         ) from None
 
 
-def load_last(directory: Path, config: Any) -> dict[str, Any] | None:
+def load_last(directory: Path, settings: Mapping[str, Any]) -> dict[str, Any] | None:
     """Read the checkpoint that a run resumes from, without changing any file.
 
     Args:
         directory: The run directory.
-        config: Settings of the run, a dataclass instance or a mapping; ``episodes`` may have grown.
+        settings: Settings of the run, as JSON stores them; ``episodes`` may have grown.
 
     Returns:
         The state saved by `Trainer`; ``None`` if nothing has been logged yet.
@@ -93,7 +81,7 @@ def load_last(directory: Path, config: Any) -> dict[str, Any] | None:
     Raises:
         ValueError: If settings, rows or checkpoint are missing, damaged or of another run.
     """
-    check_settings(directory, config, longer=True)
+    check_settings(directory, settings, longer=True)
     folder = directory / "checkpoint"
     remedy = "put it back as the run left it, or begin a new run in another directory"
     if not has_checkpoint(folder):
@@ -103,18 +91,22 @@ def load_last(directory: Path, config: Any) -> dict[str, Any] | None:
     if not (directory / "config.json").exists():
         raise ValueError(f"{directory} has a checkpoint, but no config.json: {remedy}")
     state = load_checkpoint(folder)
-    # Checkpoints of earlier versions hold no settings; for those config.json has been compared.
-    _compare(folder, state.get("settings", config), config, longer=True)
+    _compare(folder, state["settings"], settings, longer=True)
     for name, position in state["position"].items():
         check_position(directory / name, position)
     return state
 
 
-def _compare(where: str | os.PathLike[str], saved: Any, config: Any, longer: bool) -> None:
+def _compare(
+    where: str | os.PathLike[str],
+    saved: Mapping[str, Any],
+    settings: Mapping[str, Any],
+    longer: bool,
+) -> None:
+    # A module that was renamed adds the same tasks.
     old, new = (
-        # A module that was renamed adds the same tasks.
-        {name: v for name, v in _flatten(settings) if not name.startswith("task_modules")}
-        for settings in (saved, plain_settings(config))
+        dict(_flatten({name: value for name, value in given.items() if name != "task_modules"}))
+        for given in (saved, settings)
     )
     if longer and type(old.get("episodes")) is type(new.get("episodes")) is int:
         old["episodes"] = max(old["episodes"], new["episodes"])

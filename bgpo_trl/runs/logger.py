@@ -1,9 +1,9 @@
-"""Run logger: writes settings and CSV files, and mirrors rows to a dashboard.
+"""Run logger: writes settings and CSV files, and mirrors rows to Weights & Biases.
 
 A run directory holds ``config.json``, ``train.csv`` and ``eval.csv`` (other modules add
 ``checkpoint/`` and ``figures/``). The CSV files are the record of a run: they are always
-written, row by row, and a resumed run continues them byte for byte. Dashboards such as Weights
-& Biases are optional mirrors whose failure does not affect the run.
+written, row by row, and a resumed run continues them byte for byte. Weights & Biases is an optional
+mirror whose failure does not affect the run.
 """
 
 from __future__ import annotations
@@ -11,17 +11,14 @@ from __future__ import annotations
 import os
 import uuid
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
-from torchrl.record.loggers import Logger
 from torchrl.record.loggers.wandb import WandbLogger
 
-from bgpo_trl.files.closing import Closing
 from bgpo_trl.files.csv_file import CsvFile, plain_value
-from bgpo_trl.runs.directory import claim_directory, plain_settings
+from bgpo_trl.runs.directory import claim_directory
 
 EVAL_COLUMNS = (
     "algorithm",
@@ -47,22 +44,21 @@ TRAIN_COLUMNS = (
 """Columns of ``train.csv``, one row per training episode."""
 
 
-class RunLogger(Closing):
-    """Write the log of a run into its directory, and mirror it to dashboards.
+class RunLogger:
+    """Write the log of a run into its directory, and mirror it to Weights & Biases.
 
-    A mirror gets each row as one ``log_metrics`` call with the row's numbers, named
-    ``{train,eval}/{task}/seed_{seed}/{column}``, at step ``episode``. A mirror that raises is
-    disabled for the rest of the run, with one warning. Rows rewritten by a resumed run reach it
-    twice, with the same values and steps.
+    The mirror gets each row as one ``log_metrics`` call with the row's numbers, named
+    ``{train,eval}/{task}/seed_{seed}/{column}``, at step ``episode``. If it raises, it is disabled
+    for the rest of the run, with one warning. Rows rewritten by a resumed run reach it twice, with
+    the same values and steps.
 
     Args:
         directory: The run directory; made if missing.
-        config: Settings of the run, a dataclass instance or a mapping, written to ``config.json``.
+        config: Settings of the run, as JSON stores them, written to ``config.json``.
         wandb: Also log to Weights & Biases, ``"online"``, or ``"offline"`` into
             ``directory/wandb`` for a later ``wandb sync``. Needs the extra ``wandb``.
         resume: Continue the run in the directory, which may have had fewer ``episodes``; call
             `truncate_to` next.
-        mirrors: TorchRL loggers that get every row as well.
 
     Raises:
         ValueError: If the directory holds a run with other settings or columns, or any run without
@@ -82,21 +78,17 @@ class RunLogger(Closing):
         self,
         directory: str | os.PathLike[str],
         *,
-        config: Any,
+        config: Mapping[str, Any],
         wandb: Literal["online", "offline"] | None = None,
         resume: bool = False,
-        mirrors: Sequence[Logger] = (),
     ) -> None:
         self.directory = Path(directory)
         if wandb not in (None, "online", "offline"):
             raise ValueError(f'wandb must be "online", "offline" or None, not {wandb!r}.')
-        settings = plain_settings(config)
-        claim_directory(self.directory, settings, resume=resume)
+        claim_directory(self.directory, config, resume=resume)
         self._train = CsvFile(self.directory / "train.csv", TRAIN_COLUMNS)
         self._eval = CsvFile(self.directory / "eval.csv", EVAL_COLUMNS)
-        self._mirrors = list(mirrors)
-        if wandb is not None:
-            self._mirrors += _wandb_logger(self.directory, settings, wandb)
+        self._wandb = None if wandb is None else _wandb_logger(self.directory, config, wandb)
 
     def log_train(self, row: Mapping[str, Any]) -> None:
         """Write a training episode.
@@ -109,7 +101,7 @@ class RunLogger(Closing):
             OSError: If the row cannot be written.
         """
         self._train.write(row)
-        self._mirror("train", row)
+        self._mirror_row("train", row)
 
     def log_eval(self, row: Mapping[str, Any]) -> None:
         """Write a test episode.
@@ -124,7 +116,7 @@ class RunLogger(Closing):
             OSError: If the row cannot be written.
         """
         self._eval.write(row)
-        self._mirror("eval", row)
+        self._mirror_row("eval", row)
 
     def log_media(self, name: str, path: str | os.PathLike[str]) -> None:
         """Upload a finished figure or video to Weights & Biases, if it is in use.
@@ -133,9 +125,7 @@ class RunLogger(Closing):
             name: Name on the dashboard.
             path: A picture, or a video as GIF or MP4.
         """
-        for mirror in list(self._mirrors):
-            if isinstance(mirror, WandbLogger):
-                self._try(mirror, partial(_log_wandb_media, mirror, name, Path(path)))
+        self._mirror(lambda wandb: _log_wandb_media(wandb, name, Path(path)))
 
     def position(self) -> dict[str, int]:
         """Flush the CSV files to disk and return their sizes, for the checkpoint."""
@@ -155,14 +145,19 @@ class RunLogger(Closing):
             file.truncate_to(position.get(file.path.name, 0))
 
     def close(self) -> None:
-        """Close the CSV files and the mirrors."""
+        """Close the CSV files and the mirror."""
         self._train.close()
         self._eval.close()
-        for mirror in list(self._mirrors):
-            self._try(mirror, mirror.shutdown)
-        self._mirrors.clear()
+        self._mirror(lambda wandb: wandb.shutdown())
+        self._wandb = None
 
-    def _mirror(self, group: str, row: Mapping[str, Any]) -> None:
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _mirror_row(self, group: str, row: Mapping[str, Any]) -> None:
         values = {name: plain_value(value) for name, value in row.items()}
         prefix = f"{group}/{values.pop('task', 'all')}/seed_{values.pop('seed', 0)}"
         step = values.pop("episode", None)
@@ -171,22 +166,23 @@ class RunLogger(Closing):
             for name, value in values.items()
             if isinstance(value, int | float)
         }
-        for mirror in list(self._mirrors):
-            self._try(mirror, partial(mirror.log_metrics, numbers, step=step))
+        self._mirror(lambda wandb: wandb.log_metrics(numbers, step=step))
 
-    def _try(self, mirror: Logger, report: Callable[[], object]) -> None:
+    def _mirror(self, report: Callable[[WandbLogger], object]) -> None:
+        if self._wandb is None:
+            return
         try:
-            report()
+            report(self._wandb)
         except Exception as error:
-            self._mirrors.remove(mirror)
+            self._wandb = None
             warnings.warn(
-                f"{type(mirror).__name__} failed ({_reason(error)}) and is disabled for the rest "
-                "of this run: the CSV files are complete.",
+                f"WandbLogger failed ({_reason(error)}) and is disabled for the rest of this run: "
+                "the CSV files are complete.",
                 stacklevel=4,
             )
 
 
-def _wandb_logger(directory: Path, settings: Any, mode: str) -> list[Logger]:
+def _wandb_logger(directory: Path, settings: Mapping[str, Any], mode: str) -> WandbLogger | None:
     """Return a Weights & Biases logger, falling back to offline mode, then to none."""
     identity = directory / "wandb" / "run_id"
     for attempt in dict.fromkeys((mode, "offline")):
@@ -194,23 +190,21 @@ def _wandb_logger(directory: Path, settings: Any, mode: str) -> list[Logger]:
             identity.parent.mkdir(exist_ok=True)
             if not identity.exists() or not identity.read_text():  # killed before it was written
                 identity.write_text(uuid.uuid4().hex)
-            return [
-                WandbLogger(
-                    directory.name,
-                    project="bgpo_trl",
-                    save_dir=str(directory),
-                    id=identity.read_text(),  # so that a resumed run continues its curves
-                    log_env_packages=False,  # would reveal paths of this machine
-                    config=settings,
-                    mode=attempt,  # not `offline=`, which changes os.environ for good
-                    settings={
-                        "init_timeout": 30,
-                        "finish_timeout": 60,
-                        "console": "off",  # would upload every redraw of the progress bar
-                        "x_disable_meta": True,  # command, program and folders of this machine
-                    },
-                )
-            ]
+            return WandbLogger(
+                directory.name,
+                project="bgpo_trl",
+                save_dir=str(directory),
+                id=identity.read_text(),  # so that a resumed run continues its curves
+                log_env_packages=False,  # would reveal paths of this machine
+                config=dict(settings),
+                mode=attempt,  # not `offline=`, which changes os.environ for good
+                settings={
+                    "init_timeout": 30,
+                    "finish_timeout": 60,
+                    "console": "off",  # would upload every redraw of the progress bar
+                    "x_disable_meta": True,  # command, program and folders of this machine
+                },
+            )
         except ImportError:
             warnings.warn(
                 "wandb is not installed, so this run is kept in its CSV files only: "
@@ -225,7 +219,7 @@ def _wandb_logger(directory: Path, settings: Any, mode: str) -> list[Logger]:
                 else "the run is kept in its CSV files only"
             )
             warnings.warn(f"wandb does not answer ({_reason(error)}): {instead}.", stacklevel=3)
-    return []
+    return None
 
 
 def _log_wandb_media(mirror: WandbLogger, name: str, path: Path) -> None:

@@ -98,15 +98,15 @@ def read_table(
     Raises:
         ValueError: If the file is missing or not CSV, lacks a column or has an invalid cell.
     """
-    path = find_table(path) or Path(path)
+    path, columns = find_table(path) or Path(path), columns or {}
     table = _read_text(path)
-    missing = sorted(set(columns or ()).difference(table.columns))
+    missing = sorted(set(columns).difference(table.columns))
     if len(table.columns) and missing:
         raise ValueError(f"{path} lacks the columns {', '.join(missing)}: name another run")
     if missing:
-        return pd.DataFrame(columns=pd.Index(columns or ()))
+        return pd.DataFrame(columns=pd.Index(columns))
     damaged = pd.Series(False, index=table.index)
-    for name, cells in (columns or {}).items():
+    for name, cells in columns.items():
         if isinstance(cells, Numbers):
             table[name], valid = _numbers(table[name], cells)
             damaged |= ~valid
@@ -115,10 +115,8 @@ def read_table(
     if damaged.any():
         line = 2 + int(damaged.to_numpy().argmax())
         raise ValueError(f"{path}, line {line} is damaged: {remedy}")
-    for name, cells in (columns or {}).items():
-        if isinstance(cells, Numbers) and cells.whole and not cells.may_be_empty:
-            table[name] = table[name].astype(np.int64)
-    return table
+    whole = [n for n, cells in columns.items() if isinstance(cells, Numbers) and cells.whole]
+    return table.astype(dict.fromkeys(whole, np.int64))
 
 
 def _read_text(path: Path) -> pd.DataFrame:
@@ -234,29 +232,3 @@ def read_curves(path: str | os.PathLike[str], tasks: Sequence[str]) -> Curves:
     every = pd.MultiIndex.from_product([seeds, episodes, list(tasks)])
     success = means.reindex(every).to_numpy().reshape(len(seeds), len(episodes), len(tasks))
     return Curves(tuple(map(int, seeds)), tuple(tasks), np.array(episodes), success)
-
-
-def read_outcomes(
-    path: str | os.PathLike[str], tasks: Sequence[str], last: int | None = None
-) -> list[list[NDArray[np.float64]]]:
-    """Read the outcomes of each task's training episodes.
-
-    Args:
-        path: The ``train.csv`` of the run.
-        tasks: Task names.
-        last: Last training episode to include; ``None`` for all.
-
-    Returns:
-        For each seed, in increasing order, and each task: 1 (success) or 0 for each of its
-        training episodes, in order.
-
-    Raises:
-        ValueError: If the file is missing or damaged.
-    """
-    table = read_table(path, TRAIN).sort_values(["seed", "episode"])
-    if last is not None:
-        table = table[table["episode"] <= last]
-    return [
-        [of_seed.loc[of_seed["task"] == task, "success"].to_numpy(float) for task in tasks]
-        for _, of_seed in table.groupby("seed")
-    ]

@@ -1,19 +1,12 @@
 """Detection of unknown tasks, against counts by hand and on tasks at known places."""
 
-import pytest
 import torch
 
 from bgpo_trl.analysis.novelty import Detection, leave_one_out, roc_area, roc_curve
 from bgpo_trl.data.bank import DemonstrationBank
 
 
-def test_the_area_counts_pairs_in_the_right_order():
-    known, unknown = torch.tensor([0.1, 0.5, 0.6]), torch.tensor([0.9, 0.5])
-    # Right: all three below 0.9, one below 0.5; equal: one.
-    assert roc_area(known, unknown).item() == pytest.approx((4 + 0.5) / 6)
-
-
-def test_the_area_is_that_under_the_curve():
+def test_the_roc_area_equals_the_integral_of_the_roc_curve():
     generator = torch.Generator().manual_seed(0)
     known = torch.rand(50, generator=generator).round(decimals=1)  # with ties
     unknown = torch.rand(30, generator=generator).round(decimals=1) * 1.2
@@ -24,7 +17,7 @@ def test_the_area_is_that_under_the_curve():
     torch.testing.assert_close(roc_area(known, unknown), expected)
 
 
-def test_shares_are_counted_by_network():
+def test_detections_are_counted_by_network():
     known = torch.tensor([[0.2, 0.8, 0.8, 1.4], [0.2, 0.2, 0.2, 1.0]])
     unknown = torch.tensor([[1.5, 0.7], [1.2, 1.4]])
     found = Detection(known, unknown)
@@ -44,7 +37,7 @@ def places(*centers, n=40, spread=0.05):
     return DemonstrationBank(embedding, task, train, names)
 
 
-def test_a_task_elsewhere_is_detected_and_one_at_the_same_place_is_not():
+def test_only_a_task_with_other_embeddings_is_detected():
     apart = places((0.0, 0.0), (3.0, 0.0), (0.0, 3.0))
     found = leave_one_out(apart, 2, seeds=[0, 1], draws=100)
     assert found.known.shape == (2, 20) and found.unknown.shape == (2, 10)
@@ -55,13 +48,8 @@ def test_a_task_elsewhere_is_detected_and_one_at_the_same_place_is_not():
     assert 0.2 < found.area.item() < 0.8 and found.detected.item() == 0.0
 
 
-def test_a_network_is_that_of_its_seed_alone():
+def test_a_seed_in_a_batch_equals_the_seed_alone():
     bank = places((0.0, 0.0), (3.0, 0.0), (0.0, 3.0), spread=0.5)
     both = leave_one_out(bank, 0, seeds=[3, 4], draws=50)
     alone = leave_one_out(bank, 0, seeds=[4], draws=50)
     torch.testing.assert_close(both.known[1:], alone.known)
-
-
-def test_a_bank_of_a_single_task_is_refused():
-    with pytest.raises(ValueError, match="leaving out task 0 takes demonstrations of it"):
-        leave_one_out(places((0.0, 0.0)), 0, seeds=[0])

@@ -1,7 +1,5 @@
 """Intervals, tests and verdicts against SciPy, enumeration and simulation."""
 
-import itertools
-
 import numpy as np
 import pytest
 from scipy import stats
@@ -12,7 +10,7 @@ RNG = np.random.default_rng(0)
 FIRST, SECOND = RNG.normal(0.8, 0.05, 5), RNG.normal(0.7, 0.1, 7)
 
 
-def test_a_mean_has_students_interval():
+def test_the_interval_of_a_mean_is_students():
     by_hand = statistics.mean([0.7, 0.8, 0.9])
     # Standard error 0.1 / sqrt(3), quantile of t with two degrees of freedom 4.3027.
     assert by_hand == pytest.approx((0.8, 0.8 - 0.2484, 0.8 + 0.2484), abs=1e-4)
@@ -41,21 +39,14 @@ def test_a_difference_of_differences_adds_the_variances_of_four_runs():
         statistics.difference(FIRST)
 
 
-def test_a_weight_scales_mean_and_error():
-    single, half = (statistics.contrast([FIRST], [weight]) for weight in (1.0, -0.5))
-    assert half.value == pytest.approx(-single.value / 2)
-    assert half.error == pytest.approx(single.error / 2)
-    assert half.freedom == pytest.approx(4)
-
-
-def test_runs_without_spread_have_points_for_intervals():
+def test_the_interval_of_equal_scores_is_a_point():
     found = statistics.difference([0.9, 0.9], [0.8, 0.8, 0.8])
     assert found.estimate == pytest.approx((0.1, 0.1, 0.1))
     assert (found.verdict, found.seeds) == ("above", 2)
     assert statistics.difference([0.5, 0.5], [0.5, 0.5]).verdict == "equivalent"
 
 
-def test_a_single_seed_decides_nothing():
+def test_a_single_seed_gives_no_interval_and_no_verdict():
     found = statistics.difference([0.9], [0.1, 0.2])
     assert found.estimate.points() == "+75.0"
     assert (found.note, found.seeds) == ("not decided", None)
@@ -83,28 +74,13 @@ def test_the_verdict_follows_from_the_intervals(low, high, narrow, verdict):
     assert found.note == {"not decided": "not decided (about 33 seeds would)"}.get(verdict, verdict)
 
 
-def test_p_is_the_share_of_assignments_as_far_apart():
+def test_permutation_p_by_hand():
     assert statistics.permutation_p([0, 0], [1, 1]) == pytest.approx(2 / 6)
     assert statistics.permutation_p(np.zeros(5), np.ones(5)) == pytest.approx(2 / 252)
     assert statistics.permutation_p([0, 1], [1, 0]) == 1
-    rng = np.random.default_rng(1)
-    first, second = rng.random(4), rng.random(4) + 0.3
-    both, apart = np.concatenate([first, second]), abs(first.mean() - second.mean())
-    deals = [list(deal) for deal in itertools.combinations(range(8), 4)]
-    gaps = [abs(both[deal].mean() - np.delete(both, deal).mean()) for deal in deals]
-    expected = np.mean([gap >= apart - 1e-12 for gap in gaps])
-    assert statistics.permutation_p(first, second) == pytest.approx(expected)
 
 
-def test_many_seeds_are_dealt_at_random_from_the_generator():
-    rng = np.random.default_rng(2)
-    first, second = rng.normal(size=12), rng.normal(size=12) + 1
-    found = [statistics.permutation_p(first, second, rng=seed) for seed in (0, 0, 1)]
-    assert found[0] == found[1] != found[2]
-    assert found[0] == pytest.approx(stats.ttest_ind(first, second).pvalue, abs=0.01)
-
-
-def test_the_seeds_needed_decide_with_the_promised_probability():
+def test_the_seeds_needed_reach_the_stated_power():
     """In a simulation of runs with the difference and the spread that the samples have."""
     rng = np.random.default_rng(3)
     for gap in (0.0, 0.15):
@@ -119,14 +95,6 @@ def test_the_seeds_needed_decide_with_the_promised_probability():
         assert decided.mean() == pytest.approx(0.8, abs=0.05)
 
 
-def test_more_spread_takes_more_seeds():
-    noise = np.array([-1, 0, 1.0])
-    needed = [statistics.seeds_needed(0.5 + s * noise, 0.5 + s * noise) for s in (0.02, 0.05, 1)]
-    assert needed[0] < needed[1] < needed[2] == 1_001
-    wild = statistics.difference(0.5 + noise, 0.5 + noise)
-    assert wild.note == "not decided (more than 1,000 seeds would)"
-
-
 def test_holm_by_hand():
     assert statistics.holm([0.01, 0.04, 0.03]) == pytest.approx([0.03, 0.06, 0.06])
     assert statistics.holm([0.5, 0.6]) == [1, 1]
@@ -135,14 +103,14 @@ def test_holm_by_hand():
     assert statistics.holm([]) == []
 
 
-def test_cells_are_rounded_once_and_clipped():
+def test_estimates_are_rounded_and_clipped():
     assert statistics.Estimate(0.98, 0.94, 1.02).percent() == "98.0 [94, 100]"
     assert statistics.Estimate(-0.0001, -0.1, 0.104).points() == "+0.0 [-10, +10]"
     assert statistics.Estimate(0.0123, -0.001, 0.02).points() == "+1.2 [+0, +2]"
 
 
 @pytest.mark.parametrize("scores", [[], [[0.5]], [0.5, np.nan], [np.inf], 0.5])
-def test_scores_that_are_not_there_are_refused(scores):
+def test_missing_scores_are_refused(scores):
     for call in (statistics.mean, lambda s: statistics.difference([0.1, 0.2], s)):
         with pytest.raises(ValueError, match="scores must be finite, one for each"):
             call(scores)
@@ -150,7 +118,7 @@ def test_scores_that_are_not_there_are_refused(scores):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("n_tasks", [3, 8])
-def test_intervals_cover_what_they_promise(n_tasks):
+def test_intervals_have_their_nominal_coverage(n_tasks):
     """Of two algorithms whose seeds have a level of their own, in addition to noise by task."""
     rng, n = np.random.default_rng(4), 4_000
     covered = np.zeros(2)

@@ -47,7 +47,7 @@ def test_matches_are_counted_by_node_and_task():
     assert match_counts(network((0, 1, 2)), SEEN, 2).tolist() == [[2, 1], [1, 2], [0, 0]]
 
 
-def test_networks_of_a_batch_are_counted_each_by_itself():
+def test_matches_are_counted_for_each_network_of_a_batch():
     gwr = network((0, 1, 2), (2, 1), batch_size=[2])
     assert match_counts(gwr, SEEN, 3).tolist() == [
         [[2, 1, 0], [1, 2, 0], [0, 0, 0]],
@@ -55,14 +55,7 @@ def test_networks_of_a_batch_are_counted_each_by_itself():
     ]
 
 
-def test_counting_learns_nothing():
-    gwr = network((0, 1))
-    before = gwr.graph()
-    match_counts(gwr, SEEN, 2)
-    assert all(a.equal(b) for a, b in zip(gwr.graph(), before, strict=True))
-
-
-def test_the_majority_of_no_match_is_none_and_of_a_tie_the_first():
+def test_the_majority_task_without_matches_is_none_and_of_a_tie_the_first():
     counts = torch.tensor([[[2, 1], [1, 3], [0, 0]], [[2, 2], [0, 1], [4, 0]]])
     assert majority_task(counts).tolist() == [[0, 1, -1], [1, 1, 0]]  # shares, not counts
     assert majority_task(torch.tensor([[1, 1], [2, 2]])).tolist() == [0, 0]
@@ -77,19 +70,12 @@ def test_the_majority_of_no_match_is_none_and_of_a_tie_the_first():
         ([(0, 0), (2, 0)], 0.5),  # a node that nothing seen has matched tells no task
     ],
 )
-def test_accuracy_is_the_share_of_demonstrations_whose_node_tells_their_task(tested, accuracy):
+def test_accuracy_is_the_share_of_demonstrations_whose_node_has_their_task(tested, accuracy):
     gwr = network((0, 1, 2))
     assert task_inference_accuracy(gwr, SEEN, bank(*tested), 2).tolist() == accuracy
 
 
-def test_accuracy_of_each_network_of_a_batch():
-    gwr = network((0, 1, 2), (1, 0), batch_size=[2])
-    tested = bank((0, 0), (2, 0), (1, 1))  # the second network takes place 2 for place 0
-    accuracy = task_inference_accuracy(gwr, SEEN, tested, 2)
-    torch.testing.assert_close(accuracy, torch.tensor([3 / 4, 1.0]))
-
-
-def test_a_task_counts_the_same_however_many_demonstrations_it_has():
+def test_tasks_count_equally_whatever_their_number_of_demonstrations():
     # One group for two tasks, of which one has nine times as many demonstrations.
     groups = BehaviorGroups(2)
     for _ in range(3):

@@ -9,7 +9,7 @@ import pytest
 import report
 
 from bgpo_trl.experiments.watch import WatchArguments, watch
-from bgpo_trl.own_module import import_own
+from bgpo_trl.plugins import import_plugin
 from bgpo_trl.training import Trainer
 from suites import nico
 from suites.nico import nico as suite_nico
@@ -37,7 +37,7 @@ def run(bank, encoders, make_config, tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "path", [path for path in sys.path if path])
     place = "bgpo_trl.runs.demonstrations.load_representation"
     monkeypatch.setattr(place, lambda path, scene_version: encoders)
-    import_own("at_once_tasks")
+    import_plugin("at_once_tasks")
     config = make_config(tasks=("at_once",), task_starts=(0,), episodes=4)
     own = replace(bank.for_tasks(nico.PAPER_TASKS[:1]), tasks=("at_once",))
     with Trainer(config, tmp_path / "run", bank=own, encoders=encoders, progress=False) as trainer:

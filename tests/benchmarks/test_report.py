@@ -11,7 +11,7 @@ from benchmarks import report
 from bgpo_trl.algorithms import ABLATIONS, ALGORITHMS
 from bgpo_trl.analysis import statistics
 from bgpo_trl.analysis.comparison import NAMES, SAME, read_run
-from bgpo_trl.analysis.transfer import forward_transfer
+from bgpo_trl.analysis.scores import forward_transfer
 from bgpo_trl.runs.archive import archive_run
 from bgpo_trl.runs.cost import Cost, write_costs
 from tests.analysis.runs import TASKS, edit, write_run, write_training

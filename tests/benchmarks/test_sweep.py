@@ -124,7 +124,7 @@ def test_workers_are_told_the_tasks_and_where_they_come_from(tmp_path, monkeypat
         assert job.config.tasks == tasks
         assert (job.module, job.bank) == ("my_tasks", tmp_path / bank)
     events = []
-    monkeypatch.setattr(sweep, "import_own", events.append)
+    monkeypatch.setattr(sweep, "import_plugin", events.append)
     monkeypatch.setattr(sweep, "run_experiment", lambda told, *_: events.append(told.bank))
     sweep.play(continual)
     assert events == ["my_tasks", tmp_path / bank]

@@ -4,7 +4,6 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 import pytest
-import torch
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -14,9 +13,8 @@ from PIL import Image
 
 from bgpo_trl.figures import style
 from bgpo_trl.figures.curves import plot_success_curves
-from bgpo_trl.figures.nodes import plot_gwr_pca
+from bgpo_trl.figures.gwr import plot_gwr_pca
 from bgpo_trl.figures.style import save_figure
-from bgpo_trl.runs.logger import RunLogger
 
 TASKS = ["grasp_glass", "push_green_to_glass", "push_green_to_white"]
 
@@ -76,7 +74,7 @@ def test_mean_and_spread_over_seeds_by_hand(tmp_path):
     assert band(overall, 3) == (0.5, 0.5)
 
 
-def test_each_panel_shows_its_task_and_the_window_never_looks_ahead(tmp_path):
+def test_each_panel_shows_its_task_with_a_trailing_window(tmp_path):
     rows = [("bgpo", 0, 1, "a", 1), ("bgpo", 0, 2, "b", 0), ("bgpo", 0, 3, "a", 0)]
     rows += [("bgpo", 0, 6, "b", 1), ("bgpo", 1, 6, "b", 0)]
     path = write_eval_csv(tmp_path / "eval.csv", rows)
@@ -93,14 +91,7 @@ def test_each_panel_shows_its_task_and_the_window_never_looks_ahead(tmp_path):
     assert curve(b) == {2: 0, 3: 0, 6: 1 / 2}
 
 
-def test_curves_may_end_early(run):
-    whole, cut = plot_success_curves(run), plot_success_curves(run, last=50, window=5)
-    for index in range(3):
-        expected = {x: y for x, y in curve(whole.axes[0], index).items() if x <= 50}
-        assert curve(cut.axes[0], index) == expected != {}
-
-
-def test_two_runs_of_one_algorithm_have_their_own_names_and_curves(tmp_path):
+def test_named_files_of_one_algorithm_have_separate_curves(tmp_path):
     files = {
         name: write_eval_csv(tmp_path / f"{number}.csv", [("bgpo", 0, 1, "a", number)])
         for number, name in enumerate(("failed", "solved"))
@@ -111,7 +102,7 @@ def test_two_runs_of_one_algorithm_have_their_own_names_and_curves(tmp_path):
     assert [curve(figure.axes[0], index) for index in (0, 1)] == [{1: 0}, {1: 1}]
 
 
-def test_runs_may_be_spread_over_files_with_rows_in_any_order(run, tmp_path):
+def test_curves_do_not_depend_on_the_order_of_rows_or_files(run, tmp_path):
     header, *lines = run.read_text().splitlines()
     parts = []
     for algorithm in ("BGPO", "MAML", "Dist-NLL"):
@@ -124,15 +115,7 @@ def test_runs_may_be_spread_over_files_with_rows_in_any_order(run, tmp_path):
             assert curve(axes, index) == curve(expected, index) != {}
 
 
-def test_window_is_a_twentieth_of_the_training_and_is_told(run):
-    figure = plot_success_curves(run)
-    assert figure.get_supxlabel() == "Training episode (success: mean over the last 5)"
-    expected = plot_success_curves(run, window=5)
-    assert curve(figure.axes[0]) == curve(expected.axes[0])
-    assert curve(figure.axes[0]) != curve(plot_success_curves(run, window=6).axes[0])
-
-
-def test_presentation_and_chance_are_marked(run):
+def test_task_starts_and_random_success_are_marked(run):
     presented = {TASKS[2]: 0, TASKS[0]: 35, TASKS[1]: 65}
     figure = plot_success_curves(run, presented=presented, random_success={TASKS[0]: 0.05})
     assert [vertical_lines(axes) for axes in figure.axes] == [[35, 65], [], [35], [65]]
@@ -152,15 +135,7 @@ def test_presentation_and_chance_are_marked(run):
     assert labels == ["BGPO (2 seeds)", "MAML (2 seeds)", "Dist-NLL (2 seeds)", "random policy"]
 
 
-def test_reads_what_a_run_logger_writes(tmp_path):
-    with RunLogger(tmp_path, config={}) as logger:
-        for episode, success in enumerate([True, False], 1):
-            row = {"algorithm": "bgpo", "seed": 0, "episode": episode, "task": "a"}
-            logger.log_eval({**row, "success": torch.tensor([success])})
-    assert curve(plot_success_curves(tmp_path / "eval.csv").axes[0]) == {1: 1, 2: 0}
-
-
-def test_bad_curves_are_refused(tmp_path, run):
+def test_files_without_curves_are_refused(tmp_path, run):
     empty = write_eval_csv(tmp_path / "empty.csv", [])
     with pytest.raises(ValueError, match=r"empty\.csv holds no test episode: let the run evaluate"):
         plot_success_curves(empty)
@@ -182,7 +157,7 @@ def figures(run: Path) -> list[Figure]:
     ]
 
 
-def test_the_same_data_gives_the_same_file_and_leaves_no_trace(run, tmp_path):
+def test_the_same_data_gives_the_same_file_without_global_state(run, tmp_path):
     before = dict(mpl.rcParams)
     for number, figure in enumerate(figures(run) + figures(run)):
         save_figure(figure, tmp_path / "figures" / f"{number}.png")
@@ -219,6 +194,19 @@ def visible_texts(figure: Figure) -> list[Text]:
     ]
 
 
+def check_labels(figure: Figure) -> None:
+    """Check that each label lies within the figure and overlaps no other."""
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    texts = visible_texts(figure)
+    boxes = [text.get_window_extent(canvas.get_renderer()) for text in texts]
+    for text, box in zip(texts, boxes, strict=True):
+        assert figure.bbox.x0 <= box.x0 and box.x1 <= figure.bbox.x1, text
+        assert figure.bbox.y0 <= box.y0 and box.y1 <= figure.bbox.y1, text
+    for (i, one), (j, other) in itertools.combinations(enumerate(boxes), 2):
+        assert not one.overlaps(other), (texts[i], texts[j])
+
+
 @pytest.mark.parametrize("n_tasks", [1, 3, 8])
 @pytest.mark.parametrize(
     "algorithms", [("bgpo",), ("GWR-B + intrinsic reward", "GWR-B", "no", "x")]
@@ -237,12 +225,4 @@ def test_no_label_is_cut_off_or_overlaps_another(n_tasks, algorithms, tmp_path):
     pca = plot_gwr_pca(nodes, np.arange(50) % (n_tasks + 1) - 1, tasks)
     both = plot_gwr_pca(nodes, np.arange(50) % (n_tasks + 1) - 1, tasks, np.arange(50) % n_tasks)
     for figure in (curves, pca, both):
-        canvas = FigureCanvasAgg(figure)
-        canvas.draw()
-        texts = visible_texts(figure)
-        boxes = [text.get_window_extent(canvas.get_renderer()) for text in texts]
-        for text, box in zip(texts, boxes, strict=True):
-            assert figure.bbox.x0 <= box.x0 and box.x1 <= figure.bbox.x1, text
-            assert figure.bbox.y0 <= box.y0 and box.y1 <= figure.bbox.y1, text
-        for (i, one), (j, other) in itertools.combinations(enumerate(boxes), 2):
-            assert not one.overlaps(other), (texts[i], texts[j])
+        check_labels(figure)

@@ -1,12 +1,13 @@
-"""Content of the figure of groups, from a train.csv written by hand; not its looks."""
+"""Content of the figures of nodes and groups, from a train.csv written by hand."""
 
 import numpy as np
+import pandas as pd
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.colors import to_hex
 
-from bgpo_trl.figures.groups import plot_groups, read_groups
+from bgpo_trl.figures.groups import plot_counts, plot_groups, read_counts, read_groups
 
 TASKS = ["grasp_glass", "push_green_to_white"]
 PRESENTED = {"grasp_glass": 0, "push_green_to_white": 3}
@@ -14,22 +15,24 @@ BLUE, ORANGE = "#0072b2", "#d55e00"
 # Task, group and groups known afterwards, of seeds 3 and 8: task 2 is first played by group 0.
 FIRST = [(0, 0, 1), (0, 0, 1), (0, 0, 1), (1, 0, 2), (1, 1, 2), (0, 0, 2), (1, 1, 2), (0, 0, 2)]
 SECOND = [(0, 0, 1), (0, 0, 1), (0, 0, 1), (1, 0, 1), (1, 0, 1), (0, 0, 1), (1, 0, 3), (0, 2, 3)]
+HEAD = "seed,episode,task,group,num_groups,num_nodes\n"
 
 
 @pytest.fixture
 def path(tmp_path):
+    """Seeds 8 and 3 with rows in reverse order; seed 8 has played one episode more."""
     rows = [
-        f"{seed},{episode},{TASKS[task]},{group},{num_groups}"
-        for seed, run in ((8, SECOND), (3, FIRST))
+        f"{seed},{episode},{TASKS[task]},{group},{num_groups},{2 * episode + seed}"
+        for seed, run in ((8, [*SECOND, (1, 0, 3)]), (3, FIRST))
         for episode, (task, group, num_groups) in enumerate(run, 1)
     ]
     path = tmp_path / "train.csv"
-    path.write_text("seed,episode,task,group,num_groups\n" + "\n".join(rows[::-1]) + "\n")
+    path.write_text(HEAD + "\n".join(rows[::-1]) + "\n")
     return path
 
 
 def marks(axes):
-    """Returns row, colors and episodes of the marks, in the order in which they are drawn."""
+    """Return row, color and episode of the marks, in the order in which they are drawn."""
     found = []
     for lines in axes.collections:
         assert isinstance(lines, LineCollection)
@@ -40,32 +43,45 @@ def marks(axes):
     return found
 
 
-def test_episodes_are_read_by_seed_and_in_order(path):
-    seeds = read_groups(path, TASKS)
-    assert list(seeds) == [3, 8]
-    assert seeds[8].episode.tolist() == list(range(1, 9))
-    assert [*zip(seeds[3].task, seeds[3].group, seeds[3].num_groups, strict=True)] == FIRST
-    assert seeds[3].purity == 7 / 8  # group 0 played one episode of task 2
-    assert seeds[8].purity == 5 / 8  # four of group 0 are of task 1, and the one of group 2
+def test_counts_are_read_up_to_the_last_episode_of_the_slowest_seed(path):
+    counts = read_counts(path)
+    nodes = [[2 * episode + seed for episode in range(1, 9)] for seed in (3, 8)]
+    assert counts["num_nodes"].tolist() == nodes
+    assert counts["num_groups"].tolist() == [[row[2] for row in run] for run in (FIRST, SECOND)]
+    assert read_counts(path, last=2)["num_groups"].tolist() == [[1, 1], [1, 1]]
 
 
-def test_the_number_of_groups_is_drawn_for_each_seed_the_first_above(path):
-    counts = plot_groups(read_groups(path, TASKS), PRESENTED).axes[0]
-    start, other, first = [np.array(line.get_data()).T.tolist() for line in counts.lines]
-    assert {x for x, _ in start} == {3}
-    assert [text.get_text() for text in counts.texts] == ["task 2"]
-    assert [y for _, y in first] == [1, 1, 1, 2, 2, 2, 2, 2]
-    assert [y for _, y in other] == [1, 1, 1, 1, 1, 1, 3, 3]
+def test_counts_are_drawn_as_means_shaded_from_the_lowest_to_the_highest_seed(path):
+    figure = plot_counts({"BGPO": read_counts(path)}, PRESENTED)
+    nodes, groups = figure.axes
+    assert nodes.lines[0].get_xdata().tolist() == [*range(1, 9)]
+    assert nodes.lines[0].get_ydata().tolist() == [2 * episode + 5.5 for episode in range(1, 9)]
+    assert groups.lines[0].get_ydata().tolist() == [1, 1, 1, 1.5, 1.5, 1.5, 2.5, 2.5]
+    edges = np.concatenate([part.vertices for part in nodes.collections[0].get_paths()])
+    assert set(edges[edges[:, 0] == 3, 1]) == {9, 14}
+    for panel in figure.axes:
+        assert [text.get_text() for text in panel.texts] == ["task 2"]
+        assert list(panel.lines[1].get_xdata()) == [3, 3]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["BGPO"]
+
+
+def test_the_number_of_groups_is_drawn_for_each_seed(path):
+    start, other, first = plot_groups(read_groups(path, TASKS), PRESENTED).axes[0].lines
+    assert set(start.get_xdata()) == {3}
+    assert first.get_ydata().tolist() == [1, 1, 1, 2, 2, 2, 2, 2]
+    assert other.get_ydata().tolist() == [1, 1, 1, 1, 1, 1, 3, 3, 3]
 
 
 def test_a_group_has_a_row_with_a_mark_for_each_episode(path):
-    figure = plot_groups(read_groups(path, TASKS), PRESENTED)
+    table = read_groups(path, TASKS)
+    figure = plot_groups(table[table["episode"] < 9], PRESENTED)
     _, first, second = figure.axes
     # The one episode of task 2 is drawn over those of task 1.
     row = [(0, BLUE, episode) for episode in (1, 2, 3, 6, 8)] + [(0, ORANGE, 4)]
     assert marks(first) == [*row, (1, ORANGE, 5), (1, ORANGE, 7)]
     row = [(0, BLUE, episode) for episode in (1, 2, 3, 6)]
     assert marks(second) == [*row, *((0, ORANGE, e) for e in (4, 5, 7)), (1, BLUE, 8)]
+    # Purity: group 0 played one episode of task 2; three of group 0 are not of task 1.
     assert first.get_title(loc="left") == "seed 3: 2 groups, 87.5 % pure"
     assert second.get_title(loc="left") == "seed 8: 3 groups, 62.5 % pure"
     # Rows are shaded from the first to the last episode of their group, whose number they have.
@@ -77,19 +93,25 @@ def test_a_group_has_a_row_with_a_mark_for_each_episode(path):
 
 
 def test_many_groups_of_many_seeds_fit_on_a_page(path):
-    run = read_groups(path, TASKS)[8]
-    for n_seeds in (1, 10):
-        figure = plot_groups(dict.fromkeys(range(n_seeds), run), PRESENTED)
+    run = read_groups(path, TASKS).query("seed == 8")
+    seeds = pd.concat([run.assign(seed=seed) for seed in range(10)])
+    for episodes in (run, seeds):
+        figure = plot_groups(episodes, PRESENTED)
         assert figure.get_figheight() < 14
         FigureCanvasAgg(figure).draw()
 
 
-def test_what_tells_no_groups_is_refused(path, tmp_path):
-    with pytest.raises(ValueError, match="no training episode to show"):
-        plot_groups({}, PRESENTED)
-    with pytest.raises(ValueError, match=r"line 3 is damaged"):
+def test_runs_without_episodes_or_groups_are_refused(path):
+    with pytest.raises(ValueError, match="is damaged"):
         read_groups(path, TASKS[:1])
-    old = tmp_path / "old.csv"
-    old.write_text("seed,episode,task\n0,1,grasp_glass\n")
+    path.write_text(HEAD)
+    for call in (
+        lambda: plot_groups(read_groups(path, TASKS), PRESENTED),
+        lambda: plot_counts({}, PRESENTED),
+        lambda: plot_counts({"BGPO": read_counts(path)}, PRESENTED),
+    ):
+        with pytest.raises(ValueError, match="no training episode to show"):
+            call()
+    path.write_text("seed,episode,task\n0,1,grasp_glass\n")
     with pytest.raises(ValueError, match="lacks the columns group, num_groups"):
-        read_groups(old, TASKS)
+        read_groups(path, TASKS)

@@ -1,14 +1,12 @@
 """Content of the heat maps of success after each phase."""
 
-import itertools
-
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from bgpo_trl.figures.success_matrix import plot_success_matrices
 from suites import nico
-from tests.figures.test_curves import visible_texts
+from tests.figures.test_curves import check_labels, visible_texts
 
 NAN = np.nan
 FIRST, SECOND = [[0.75, NAN], [0.5, 1.0]], [[0.25, NAN], [0.0, 0.125]]
@@ -19,7 +17,7 @@ def heat_maps(figure):
     return [axes for axes in figure.axes if axes.images]
 
 
-def test_a_panel_shows_the_matrix_in_color_and_in_numbers():
+def test_a_panel_shows_the_matrix_as_colors_and_numbers():
     figure = plot_success_matrices({"one": FIRST, "two": SECOND}, ["grasp_glass", "lift_green"])
     one, two = heat_maps(figure)
     assert (one.get_title(), two.get_title()) == ("one", "two")
@@ -45,13 +43,6 @@ def test_no_label_of_eight_tasks_overlaps_another(n_panels):
     matrix = np.where(np.tri(8) == 1, np.linspace(0, 1, 64).reshape(8, 8), NAN)
     panels = {f"Dist-NLL + demonstrations {number}": matrix for number in range(n_panels)}
     figure = plot_success_matrices(panels, nico.ALL_TASKS)
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    texts = visible_texts(figure)
-    boxes = [text.get_window_extent(canvas.get_renderer()) for text in texts]
-    assert len(texts) > 36 * n_panels
-    for text, box in zip(texts, boxes, strict=True):
-        assert figure.bbox.x0 <= box.x0 and box.x1 <= figure.bbox.x1, text
-        assert figure.bbox.y0 <= box.y0 and box.y1 <= figure.bbox.y1, text
-    for (i, one), (j, other) in itertools.combinations(enumerate(boxes), 2):
-        assert not one.overlaps(other), (texts[i], texts[j])
+    FigureCanvasAgg(figure).draw()
+    assert len(visible_texts(figure)) > 36 * n_panels
+    check_labels(figure)

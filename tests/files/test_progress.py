@@ -13,7 +13,7 @@ class Stream(io.StringIO):
 
 
 @pytest.mark.parametrize(("terminal", "drawn"), [(True, range(95, 110)), (False, range(3, 9))])
-def test_a_bar_is_drawn_often_at_a_terminal_and_rarely_in_a_log(monkeypatch, terminal, drawn):
+def test_a_bar_is_redrawn_more_often_on_a_terminal_than_in_a_log(monkeypatch, terminal, drawn):
     """A hundred seconds, an update in each."""
     stream, seconds = Stream(), [0.0]
     stream.terminal = terminal
@@ -32,7 +32,7 @@ def test_a_bar_is_drawn_often_at_a_terminal_and_rarely_in_a_log(monkeypatch, ter
     assert all("<" in line for line in lines[1:])  # elapsed<left
 
 
-def test_no_bar_is_shown_where_none_is_wanted(monkeypatch):
+def test_a_hidden_bar_prints_nothing(monkeypatch):
     stream = Stream()
     monkeypatch.setattr("sys.stderr", stream)
     assert list(progress_bar("train", range(3), shown=False)) == [0, 1, 2]

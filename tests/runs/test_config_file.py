@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass, field, replace
 
 import pytest
 
-from bgpo_trl.algorithms import ABLATIONS, ALGORITHMS
+from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.rl import RL
 from bgpo_trl.configs import PRESETS, BGPOConfig, DDPGConfig, GWRBConfig, RunConfig
 from bgpo_trl.runs.config_file import Digests, read_config, settings_of
@@ -17,13 +17,12 @@ def write(path, config, **changes):
     return path
 
 
-@pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("name", ALGORITHMS)
-def test_what_was_written_is_read(tmp_path, preset, name):
+def test_settings_are_read_as_they_were_written(tmp_path, name):
     algorithm = replace(
         ALGORITHMS[name].config, state="state", rl=DDPGConfig(hidden_sizes=(5, 7), gamma=0.5)
     )
-    config = replace(PRESETS[preset], name=name, algorithm=algorithm, checkpoint_minutes=3)
+    config = replace(PRESETS["quick"], name=name, algorithm=algorithm, checkpoint_minutes=3)
     read, digests = read_config(write(tmp_path / "config.json", config))
     assert (read, digests) == (config, Digests(encoders="abc", bank="def"))
     assert type(read.algorithm) is type(algorithm)
@@ -31,19 +30,12 @@ def test_what_was_written_is_read(tmp_path, preset, name):
 
 
 @pytest.mark.parametrize("name", RL)
-def test_an_rl_algorithm_is_known_by_its_name(tmp_path, name):
+def test_the_rl_algorithm_is_found_by_its_name(tmp_path, name):
     rl = replace(RL[name].config, gamma=0.5)
     config = RunConfig(algorithm=BGPOConfig(rl=rl))
     read, _ = read_config(write(tmp_path / "config.json", config))
     assert read == config
     assert type(read.algorithm.rl) is type(rl)
-
-
-@pytest.mark.parametrize("name", ABLATIONS)
-def test_ablations_are_read(tmp_path, name):
-    config = RunConfig(name=name, algorithm=replace(ABLATIONS[name].config, beta=0.3))
-    path = write(tmp_path / "config.json", config, encoders=None)
-    assert read_config(path) == (config, (None, "def"))
 
 
 @dataclass(frozen=True)
@@ -52,7 +44,7 @@ class CoarseConfig(BGPOConfig):
 
 
 @pytest.mark.parametrize("coarse", [None, GWRBConfig(activity_threshold=0.777)])
-def test_a_setting_that_may_be_absent_is_read(tmp_path, coarse):
+def test_an_optional_setting_is_read(tmp_path, coarse):
     config = RunConfig(name="mine", algorithm=CoarseConfig(coarse=coarse))
     path = write(tmp_path / "config.json", config)
     assert read_config(path)[0].algorithm.coarse == coarse
@@ -66,7 +58,7 @@ class OwnConfig(BGPOConfig):
     curiosity: float = 0.5
 
 
-def test_hyperparameters_of_an_unknown_algorithm_are_of_the_class_that_is_stored(tmp_path):
+def test_hyperparameters_of_an_unknown_algorithm_have_the_stored_class(tmp_path):
     config = RunConfig(name="mine", algorithm=OwnConfig(curiosity=2.0))
     read, _ = read_config(write(tmp_path / "config.json", config))
     assert read == config
@@ -87,12 +79,12 @@ class MixedConfig(BGPOConfig):
     ("algorithm", "said"),
     [(ListConfig(), r"algorithm.widths is \[1, 2\]"), (MixedConfig(), "algorithm.rate is 0.5")],
 )
-def test_what_could_not_be_read_back_is_not_written(algorithm, said):
+def test_settings_that_could_not_be_read_are_not_written(algorithm, said):
     with pytest.raises(ValueError, match=rf"^config.json cannot hold the setting {said}: annotate"):
         settings_of(RunConfig(algorithm=algorithm), Digests("abc", "def"))
 
 
-def test_what_an_earlier_version_did_not_know_has_its_default(tmp_path):
+def test_missing_settings_get_their_defaults(tmp_path):
     settings = asdict(RunConfig())
     del settings["checkpoint_minutes"], settings["algorithm"]["rl"]["critic_layer_norm"]
     (tmp_path / "config.json").write_text(json.dumps(settings))
@@ -110,21 +102,16 @@ def nested(**rl):
         ({"color": 1}, "unknown setting color"),
         (nested(momentum=0.9), r"unknown setting algorithm.rl.momentum"),
         (nested(gamma="0.9"), r"algorithm.rl.gamma is '0.9'"),
-        (nested(clip_targets=1), "algorithm.rl.clip_targets is 1"),
         (nested(hidden_sizes=[5, 0.5]), "algorithm.rl.hidden_sizes is 0.5"),
         ({"algorithm": {"state": "smell"}}, "algorithm.state is 'smell'"),
-        ({"algorithm": {"rl": 3}}, "algorithm.rl is 3"),
         (nested(name="ppo"), "algorithm.rl.name is 'ppo', not a known RL algorithm"),
         ({"algorithm": 3}, "no settings of a run"),
-        ({"seeds": 3}, "seeds is 3"),
         ({"seeds": []}, "seeds must be one or more"),
         ({"encoders": 3}, "encoders is 3"),
-        ({"bank": 3}, "bank is 3"),
-        ({"name": "mine", "algorithm_class": None}, "of 'mine', whose hyperparameters no im"),
         ({"name": "mine", "algorithm_class": "os.path"}, "of 'mine', whose hyperparameters no im"),
     ],
 )
-def test_what_is_no_run_of_this_version_is_refused(tmp_path, changes, said):
+def test_invalid_settings_are_refused(tmp_path, changes, said):
     path = write(tmp_path / "config.json", RunConfig(), **changes)
     with pytest.raises(ValueError, match=said) as error:
         read_config(path)
@@ -141,12 +128,10 @@ class Juggle(nico.NicoTask):
     [
         (None, f"the module {Juggle.__module__!r}"),
         ({"juggle": "__main__"}, "a script or notebook"),
-        ({}, "a script or notebook"),
-        ({"juggle": 3}, "a script or notebook"),
         ([], "a script or notebook"),
     ],
 )
-def test_the_module_of_a_task_is_named_but_not_imported(tmp_path, modules, where):
+def test_the_module_of_an_unknown_task_is_reported_not_imported(tmp_path, modules, where):
     nico.add_task("juggle", Juggle)
     config = RunConfig(tasks=("grasp_glass", "juggle"), task_starts=(0, 2))
     changes = {} if modules is None else {"task_modules": modules}
@@ -158,8 +143,8 @@ def test_the_module_of_a_task_is_named_but_not_imported(tmp_path, modules, where
         read_config(path)
 
 
-@pytest.mark.parametrize("text", ["", "[]", '{"seeds":', "\x00", "null"])
-def test_what_is_not_json_of_settings_is_refused(tmp_path, text):
+@pytest.mark.parametrize("text", ["", "[]", '{"seeds":'])
+def test_a_file_without_json_settings_is_refused(tmp_path, text):
     (tmp_path / "config.json").write_text(text)
     with pytest.raises(ValueError, match=r"config.json cannot be read \(.*\): use the version"):
         read_config(tmp_path / "config.json")

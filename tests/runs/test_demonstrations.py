@@ -36,7 +36,7 @@ def test_shipped_demonstrations_are_not_copied(shipped, tmp_path, tasks):
     assert (found.tasks, found.identity) == (tasks, bank.identity)
 
 
-def test_others_are_found_where_the_run_was_moved(shipped, mixed, tmp_path):
+def test_own_demonstrations_move_with_the_run(shipped, mixed, tmp_path):
     encoders, _ = shipped
     (tmp_path / "run").mkdir()
     keep_bank(tmp_path / "run", mixed, encoders)
@@ -50,7 +50,7 @@ def test_others_are_found_where_the_run_was_moved(shipped, mixed, tmp_path):
     shutil.rmtree(tmp_path / "moved")
 
 
-def test_other_demonstrations_than_the_runs_are_refused(shipped, mixed, tmp_path):
+def test_demonstrations_of_another_run_are_refused(shipped, mixed, tmp_path):
     encoders, bank = shipped
     digests = Digests(encoders.identity, mixed.identity)
     with pytest.raises(ValueError, match=r"^the bank has no demonstration of 'juggle'"):

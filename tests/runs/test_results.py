@@ -11,7 +11,6 @@ from bgpo_trl.runs.results import (
     COUNT,
     SHARE,
     read_curves,
-    read_outcomes,
     read_table,
     read_tests,
 )
@@ -25,13 +24,13 @@ def write(path, rows):
     return path
 
 
-def test_success_by_seed_evaluation_and_task(tmp_path):
+def test_curves_hold_success_by_seed_evaluation_and_task(tmp_path):
     rows = [(7, 20, "b", 1), (7, 20, "b", 0), (7, 20, "a", 0), (7, 10, "a", 1)]
     rows += [(2, 10, "a", 0), (2, 20, "a", 1), (2, 20, "b", 1), (2, 20, "b", 1)]
     curves = read_curves(write(tmp_path / "eval.csv", rows), ["a", "b"])
     assert (curves.seeds, curves.tasks) == ((2, 7), ("a", "b"))
     assert curves.episodes.tolist() == [10, 20]
-    # Task b was not tested after 10 episodes, which is not the same as never done.
+    # Task b was not tested after 10 episodes, which is not a success of 0.
     expected = [[[0, np.nan], [1, 1]], [[1, np.nan], [0, 0.5]]]
     np.testing.assert_array_equal(curves.success, expected)
 
@@ -40,35 +39,7 @@ def test_success_by_seed_evaluation_and_task(tmp_path):
     np.testing.assert_array_equal(cut.success, np.array(expected)[:, :1])
 
 
-def test_the_order_of_tasks_is_the_one_asked_for(tmp_path):
-    path = write(tmp_path / "eval.csv", [(0, 10, "a", 1), (0, 10, "b", 0)])
-    assert read_curves(path, ["b", "a"]).success.tolist() == [[[0, 1]]]
-
-
-def test_what_is_no_record_of_these_tasks_is_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"eval.csv is missing: let the run"):
-        read_table(tmp_path / "eval.csv")
-    with pytest.raises(ValueError, match="holds no test episode"):
-        read_curves(write(tmp_path / "eval.csv", []), ["a"])
-    with pytest.raises(ValueError, match="tests 'b', which is none of a"):
-        read_curves(write(tmp_path / "eval.csv", [(0, 10, "b", 1)]), ["a"])
-
-
-def outcomes(*arguments, **options):
-    return [[task.tolist() for task in seed] for seed in read_outcomes(*arguments, **options)]
-
-
-def test_outcomes_of_each_tasks_own_training_episodes(tmp_path):
-    rows = [(7, 1, "a", 0), (2, 1, "a", 1), (2, 3, "b", 0), (2, 2, "b", 1), (7, 2, "a", 1)]
-    path = write(tmp_path / "train.csv", rows)
-    assert outcomes(path, ["a", "b"]) == [[[1], [1, 0]], [[0, 1], []]]
-    assert outcomes(path, ["b"], last=2) == [[[1]], [[]]]
-    path.write_text(path.read_text().replace("bgpo,2,3", "bgpo,2,x"))
-    with pytest.raises(ValueError, match=r"train.csv, line 4 is damaged"):
-        read_outcomes(path, ["a", "b"])
-
-
-def test_a_compressed_table_is_read_where_the_plain_one_is_not_there(tmp_path):
+def test_a_compressed_table_is_read_in_place_of_a_missing_one(tmp_path):
     rows = [(0, 10, "a", 1), (0, 20, "a", 0), (1, 10, "b", 1)]
     path = write(tmp_path / "eval.csv", rows)
     plain = read_tests(path)
@@ -94,7 +65,7 @@ def test_a_compressed_table_is_read_where_the_plain_one_is_not_there(tmp_path):
         (("a", "b"), ["b", "c"], 3),
     ],
 )
-def test_the_first_invalid_cell_is_named_by_its_line(tmp_path, kind, cells, line):
+def test_an_invalid_cell_is_reported_with_its_line(tmp_path, kind, cells, line):
     path = tmp_path / "x.csv"
     path.write_text("other,cell\n" + "".join(f"1,{cell}\n" for cell in cells))
     with pytest.raises(ValueError, match=rf"x\.csv, line {line} is damaged"):
@@ -103,7 +74,7 @@ def test_the_first_invalid_cell_is_named_by_its_line(tmp_path, kind, cells, line
     assert len(read_table(path, {"cell": kind})) == line - 2
 
 
-def test_a_line_of_too_many_cells_is_refused(tmp_path):
+def test_a_line_with_too_many_cells_is_refused(tmp_path):
     for rows in ("1,2\n1,2,3\n", "1,2,3\n1,2,3\n"):
         (tmp_path / "x.csv").write_text("a,b\n" + rows)
         with pytest.raises(ValueError, match=r"x\.csv is not a CSV file of a run"):

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from bgpo_trl.own_module import import_own
+from bgpo_trl.plugins import import_plugin
 from suites import nico
 
 OWN = """
@@ -30,9 +30,9 @@ def folder(tmp_path, monkeypatch):
 
 
 def test_a_module_of_the_current_folder_adds_its_tasks(folder):
-    import_own(None)
+    import_plugin(None)
     assert "juggle" not in nico.TASKS
-    import_own("juggling")
+    import_plugin("juggling")
     assert nico.TASKS["juggle"].__module__ == "juggling"
     assert sys.modules["juggling"].__file__ == str(folder / "juggling.py")
 
@@ -40,19 +40,19 @@ def test_a_module_of_the_current_folder_adds_its_tasks(folder):
 @pytest.mark.parametrize(
     "name", ["juggle", "juggling.py", "juggling.tasks", "no.such", "./juggling", ".juggling", ""]
 )
-def test_a_module_that_is_not_there_is_named_with_the_remedy(folder, name):
-    said = rf"^--import {re.escape(name)}: there is no such module in {folder}"
-    with pytest.raises(ValueError, match=said):
-        import_own(name)
+def test_a_missing_module_is_refused(folder, name):
+    message = rf"^--import {re.escape(name)}: there is no such module in {folder}"
+    with pytest.raises(ValueError, match=message):
+        import_plugin(name)
 
 
-def test_what_a_module_lacks_itself_is_told_as_python_does():
+def test_an_import_error_within_the_module_is_raised_unchanged():
     with pytest.raises(ModuleNotFoundError, match="no_such_library"):
-        import_own("astray")
+        import_plugin("astray")
 
 
-def test_a_module_that_another_one_hides_is_named(folder):
+def test_a_module_hidden_by_another_one_is_refused(folder):
     (folder / "json.py").write_text(OWN)
     with pytest.raises(ValueError, match=r"^--import json: .*json.* has the same name: rename "):
-        import_own("json")
+        import_plugin("json")
     assert "juggle" not in nico.TASKS

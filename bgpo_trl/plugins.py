@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 
-def import_own(module: str | None) -> None:
+def import_plugin(module: str | None) -> None:
     """Import the user's module, from the current folder or installed.
 
     It may add tasks with `suites.nico.add_task`, and entries to `bgpo_trl.algorithms.ALGORITHMS`

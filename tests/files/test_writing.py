@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from bgpo_trl.files.whole_file import write_json, write_whole
+from bgpo_trl.files.writing import write_json, write_whole
 
 
 def test_a_file_is_written_and_replaced(tmp_path):
@@ -17,7 +17,7 @@ def test_a_file_is_written_and_replaced(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
-def test_what_cannot_be_written_leaves_the_old_file_alone(tmp_path, monkeypatch):
+def test_a_failed_write_keeps_the_old_file(tmp_path, monkeypatch):
     def half(path, content):
         with path.open("wb") as file:
             file.write(content[:1])

@@ -1,0 +1,63 @@
+"""Frames of episodes as strips and as GIFs."""
+
+import numpy as np
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from PIL import Image
+
+from bgpo_trl.figures.frames import plot_frame_strips, save_gif
+
+
+def test_strips_show_evenly_spaced_frames():
+    short = np.arange(3, dtype=np.uint8)[:, None, None, None].repeat(3, -1) * 9
+    long = np.arange(40, dtype=np.uint8)[:, None, None, None].repeat(3, -1)
+    figure = plot_frame_strips({"short": short, "long " * 20: long}, n_frames=4)
+    shown = [[int(np.asarray(i.get_array())[0, 0, 0]) for i in a.images] for a in figure.axes]
+    assert shown == [[0], [9], [18], [], [0], [13], [26], [39]]
+    assert [a.get_title() for a in figure.axes[4:]] == ["step 0", "step 13", "step 26", "step 39"]
+    assert [a.texts[0].get_text() for a in figure.axes[::4]] == [
+        "short",
+        "long " * 20,
+    ]
+    FigureCanvasAgg(figure).draw()
+    gaps = np.diff([axes.get_position().x0 for axes in figure.axes[4:]])
+    assert np.allclose(gaps, gaps[0])  # However long a title is.
+
+
+@pytest.mark.parametrize("episodes", [{}, {"none": np.zeros((0, 2, 2, 3), np.uint8)}])
+def test_episodes_without_frames_are_refused(episodes):
+    with pytest.raises(ValueError, match="nothing to show"):
+        plot_frame_strips(episodes)
+
+
+def test_a_gif_keeps_frames_and_duration_and_enlarges_them(tmp_path):
+    frames = np.zeros((4, 2, 3, 3), np.uint8)
+    for index, color in enumerate([(255, 0, 0), (0, 255, 0), (0, 0, 255), (90, 90, 90)]):
+        frames[index] = color
+        frames[index, 0, 1] = 255
+    save_gif(frames, tmp_path / "videos" / "colors.gif", fps=4.0, scale=2)
+    with Image.open(tmp_path / "videos" / "colors.gif") as video:
+        assert video.n_frames == 4
+        assert video.info["loop"] == 0
+        for index, frame in enumerate(frames):
+            video.seek(index)
+            assert video.info["duration"] == 250
+            shown = np.asarray(video.convert("RGB"))
+            assert shown.shape == (4, 6, 3)
+            for row, column in np.ndindex(4, 6):
+                assert (shown[row, column] == frame[row // 2, column // 2]).all()
+
+
+@pytest.mark.parametrize(
+    "frames",
+    [
+        np.zeros((0, 2, 3, 3), np.uint8),
+        np.zeros((2, 3, 3), np.uint8),
+        np.zeros((1, 2, 3, 4), np.uint8),
+        np.zeros((1, 2, 3, 3)),
+    ],
+)
+def test_other_arrays_than_frames_are_refused(frames, tmp_path):
+    with pytest.raises(ValueError, match=r"frames must be uint8 \[T, H, W, 3\]"):
+        save_gif(frames, tmp_path / "videos" / "none.gif")
+    assert not list(tmp_path.iterdir())

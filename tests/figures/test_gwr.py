@@ -1,0 +1,148 @@
+"""Content of the figures of GWR-B's nodes and growth."""
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_hex
+
+from bgpo_trl.figures.gwr import plot_gwr_growth, plot_gwr_pca
+
+TASKS = ["grasp_glass", "push_green_to_white"]
+
+
+def test_components_keep_distances_within_a_plane():
+    generator = np.random.default_rng(0)
+    plane = np.linalg.qr(generator.normal(size=(32, 2)))[0].T
+    weights = generator.normal(size=(40, 2)) @ plane + generator.normal(size=32)
+    figure = plot_gwr_pca(torch.from_numpy(weights), torch.zeros(40, dtype=torch.long), ["a"])
+    (axes,) = figure.axes
+    points = np.asarray(axes.collections[0].get_offsets())
+    for i, j in itertools.combinations(range(40), 2):
+        assert np.linalg.norm(points[i] - points[j]) == pytest.approx(
+            np.linalg.norm(weights[i] - weights[j])
+        )
+    assert points.var(axis=0)[0] > points.var(axis=0)[1]
+    np.testing.assert_allclose(points.mean(axis=0), 0, atol=1e-9)
+    np.testing.assert_allclose(np.cov(points.T)[0, 1], 0, atol=1e-9)
+
+
+def test_axes_are_labeled_with_the_share_of_variance():
+    # Variances 9 and 1 along two axes of three.
+    weights = np.array([[3, 0, 5], [-3, 0, 5], [0, 1, 5], [0, -1, 5]])
+    (axes,) = plot_gwr_pca(weights, np.zeros(4, dtype=int), ["a"]).axes
+    assert axes.get_xlabel() == "Principal component 1 (90% of variance)"
+    assert axes.get_ylabel() == "Principal component 2 (10% of variance)"
+    np.testing.assert_allclose(
+        np.asarray(axes.collections[0].get_offsets()), weights[:, :2], atol=1e-12
+    )
+
+
+def test_nodes_are_colored_by_task():
+    weights = np.array([[3.0, 0], [-3, 0], [0, 1], [0, -1], [0, 0]])
+    (axes,) = plot_gwr_pca(weights, [1, 0, 1, -1, 0], TASKS).axes
+    nodes = {
+        group.get_label(): np.asarray(group.get_offsets()).round(9).tolist()
+        for group in axes.collections
+    }
+    assert nodes == {
+        "task 1: grasp glass (2)": [[-3, 0], [0, 0]],
+        "task 2: push green to white (2)": [[3, 0], [0, 1]],
+        "no demonstration (1)": [[0, -1]],
+    }
+    assert len({to_hex(group.get_facecolor()[0]) for group in axes.collections}) == 3
+
+
+def test_groups_are_shown_in_a_second_panel():
+    weights = np.array([[3.0, 0], [-3, 0], [0, 1], [0, -1], [0, 0]])
+    figure = plot_gwr_pca(weights, [1, 0, 1, -1, 0], TASKS, torch.tensor([2, 0, 2, 0, 0]))
+    by_task, by_group = figure.axes
+    nodes = {
+        group.get_label(): np.asarray(group.get_offsets()).round(9).tolist()
+        for group in by_group.collections
+    }
+    assert nodes == {
+        "group 0 (3)": [[-3, 0], [0, -1], [0, 0]],
+        "group 2 (2)": [[3, 0], [0, 1]],
+    }
+    colors = [to_hex(c.get_facecolor()[0]) for a in figure.axes for c in a.collections]
+    assert len(set(colors)) == 5  # groups are no tasks
+    legends = [[text.get_text() for text in a.get_legend().get_texts()] for a in figure.axes]
+    assert legends == [[c.get_label() for c in a.collections] for a in figure.axes]
+    FigureCanvasAgg(figure).draw()
+    heights = [axes.get_position().bounds[1::2] for axes in (by_task, by_group)]
+    assert heights[0] == pytest.approx(heights[1])
+    assert by_task.get_xlim() == by_group.get_xlim()
+
+
+@pytest.mark.parametrize(
+    ("weights", "node_task", "message"),
+    [
+        (np.zeros((1, 4)), [0], r"N, d >= 2, not \[1, 4\]"),
+        (np.zeros(4), [0] * 4, "N, d >= 2"),
+        (np.full((3, 4), np.nan), [0] * 3, "must be finite"),
+        (np.zeros((3, 4)), [0] * 2, "one task for each of the 3 nodes"),
+        (np.zeros((3, 4)), [0, 1, 2], "position in the 2 task_names, not 0 to 2"),
+        (np.zeros((3, 4)), [0, 1, -2], "not -2 to 1"),
+    ],
+)
+def test_bad_nodes_are_refused(weights, node_task, message):
+    with pytest.raises(ValueError, match=message):
+        plot_gwr_pca(weights, node_task, ["a", "b"])
+
+
+# In a plane of four dimensions: the last graph's spread is largest along the second axis.
+LAST = np.array([[0, 0, 0, 0], [0, 4, 0, 0], [1, 0, 0, 0], [1, 4, 0, 0], [0.5, 90, 0, 0]])
+GRAPHS = {
+    20: (LAST, [[0, 1], [2, 3], [0, 4]], [0, 1, 0, 1, -1]),
+    10: (LAST[:2] + np.array([0.5, 1, 0, 0]), [[0, 1]], [0, -1]),
+}
+
+
+def places(axes):
+    """Returns the nodes drawn, those of one kind after those of another."""
+    return np.concatenate([np.asarray(c.get_offsets()) for c in axes.collections[1:]])
+
+
+def test_growth_panels_share_the_components_of_the_last_graph():
+    early, late, _ = plot_gwr_growth(GRAPHS, [[1, 2]], TASKS).axes
+    # Of the four that match, the mean is (0.5, 2); components are the second and the first axis.
+    expected = {"late": [(-2, -0.5), (-2, 0.5), (2, -0.5), (2, 0.5), (88, 0)]}
+    expected["early"] = [(-1, 0), (3, 0)]
+    assert places(late) == pytest.approx(np.array(expected["late"]))
+    assert places(early) == pytest.approx(np.array(expected["early"]))
+    assert (early.get_xlim(), early.get_ylim()) == (late.get_xlim(), late.get_ylim())
+    assert late.get_xlabel() == "component 1 (94% of variance)"  # 16 of 17
+    assert early.get_title() == "episode 10: 2 nodes, 1 outside"
+    assert late.get_title() == "episode 20: 5 nodes, 1 outside"
+
+
+def test_growth_draws_edges_and_colored_nodes():
+    figure = plot_gwr_growth(GRAPHS, [[1, 2]], TASKS)
+    early, late, _ = figure.axes
+    assert [len(c.get_offsets()) for c in early.collections[1:]] == [1, 0, 1]
+    assert [len(c.get_offsets()) for c in late.collections[1:]] == [2, 2, 1]
+    colors = [tuple(c.get_facecolor()[0]) for c in late.collections[1:]]
+    assert len(set(colors)) == 3
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert labels == ["task 1: grasp glass", "task 2: push green to white", "no demonstration"]
+    edges = [segment.tolist() for segment in late.collections[0].get_segments()]
+    ends = [[(-2, -0.5), (2, -0.5)], [(-2, 0.5), (2, 0.5)], [(-2, -0.5), (88, 0)]]
+    assert np.array(edges) == pytest.approx(np.array(ends))
+
+
+def test_growth_draws_the_number_of_nodes_of_each_seed():
+    counts = plot_gwr_growth(GRAPHS, [[2, 3, 5], [2, 2, 2]], TASKS).axes[-1]
+    other, first, moments = [np.array(line.get_data()).T.tolist() for line in counts.lines]
+    assert first == [[1, 2], [2, 3], [3, 5]]
+    assert other == [[1, 2], [2, 2], [3, 2]]
+    assert moments == [[10, 2], [20, 5]]
+
+
+def test_growth_draws_tensors_and_graphs_without_edges():
+    start = (torch.rand(2, 32), torch.tensor([[0, 1]]), torch.tensor([-1, -1]))
+    no_edge = (torch.rand(2, 32), torch.zeros(0, 2, dtype=torch.int64), torch.tensor([0, -1]))
+    for graph in (start, no_edge):
+        FigureCanvasAgg(plot_gwr_growth({1: graph}, [[2]], TASKS)).draw()
