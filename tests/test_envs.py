@@ -30,13 +30,13 @@ observations = pytest.mark.parametrize("observation", ["pixels", "state", "both"
 
 
 def actions(env: NicoEnv, steps: int, seed: int = 0) -> torch.Tensor:
-    """Returns actions ``[steps, *B, 4]``."""
+    """Return actions ``[steps, *B, 4]``."""
     generator = torch.Generator().manual_seed(seed)
     return torch.rand(steps, *env.batch_size, 4, generator=generator) * 2 - 1
 
 
 def run(env: NicoEnv, td: TensorDictBase, actions: torch.Tensor) -> TensorDict:
-    """Returns what the steps give, stacked along the first dimension."""
+    """Return what the steps give, stacked along the first dimension."""
     steps = []
     for action in actions:
         td = env.step(td.set("action", action))
@@ -208,7 +208,7 @@ def test_the_task_is_chosen_at_reset_and_kept():
 
 
 def succeed(env: NicoEnv, row: int, td: TensorDictBase) -> TensorDictBase:
-    """Demonstrates in one row, while others rest, until it succeeds; returns the last step."""
+    """Demonstrate in one row, while others rest, until it succeeds; return the last step."""
     simulation = env._environments[row][int(env._task[row])]
     demonstrator = Demonstrator(simulation, seed=0)
     demonstrator.reset()
@@ -235,7 +235,7 @@ def test_success_terminates_only_its_row(task):
 
 
 def loaded(env: NicoEnv) -> NicoEnv:
-    """Returns a new environment with the state of another."""
+    """Return a new environment with the state of another."""
     fresh = NicoEnv(batch_size=env.batch_size, observation=env.observation)
     fresh.load_simulation_state(env.simulation_state())
     return fresh

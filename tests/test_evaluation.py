@@ -29,7 +29,7 @@ every_algorithm = pytest.mark.parametrize("name", ALGORITHMS)
 
 @pytest.fixture
 def make(bank, encoders, make_config, in_world):
-    """Makes an algorithm that has played a little, and an evaluator for it."""
+    """Make an algorithm that has played a little, and an evaluator for it."""
 
     def make(
         state="latent",

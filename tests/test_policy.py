@@ -45,7 +45,7 @@ DEMONSTRATIONS = [noise(seed, length) for seed, length in ((1, 9), (2, 14), (3, 
 
 
 def embed(encoders, frames):
-    """Returns phi of frames, by the encoders alone."""
+    """Return phi of frames, by the encoders alone."""
     latent = encoders.vae.latent(torch.from_numpy(frames))
     with torch.no_grad():
         return encoders.lae.encode(latent, torch.tensor(len(frames)))
