@@ -3,7 +3,8 @@
 Actor, critic, replay, DDPG and the training loop in plain PyTorch, for one seed; transforms of this
 package encode the frames, draw the demonstrations, infer the behavior and add the intrinsic reward.
 It computes what ``--algorithm bgpo-single`` computes: `tests/test_bgpo_minimal.py` compares the two
-step by step.
+step by step. Minutes are enough to see it run, not to see it learn: the paper trains for 20,000
+episodes.
 
 Algorithm, equations and sections are those of Hafez & Wermter (2021). What they do not have is
 marked "ours"; `docs/deviations.md` gives the reasons.
