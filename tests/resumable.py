@@ -25,7 +25,7 @@ ENCODERS = RepresentationConfig(
 
 
 def play(directory, parts):
-    """Begins or continues a run; in a process of its own."""
+    """Begin or continue a run, in a process of its own."""
     torch.set_num_threads(1)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("bgpo_trl.world.NicoEnv", EasyNicoEnv)
@@ -37,8 +37,8 @@ def play(directory, parts):
             trainer.run()
 
 
-def learn_to_see(directory):
-    """Begins or continues stage 1; in a process of its own."""
+def train_small_encoders(directory):
+    """Begin or continue the training of encoders, in a process of its own."""
     torch.set_num_threads(1)
     dataset = record_demonstrations(directory / "demonstrations", **RECORDING)
     weights = directory / "encoders.safetensors"

@@ -1,9 +1,8 @@
 """Wrong values in Python: each is refused in one line that says what to do.
 
-A case is what is done, what the message says of the cause, and what of the remedy. Settings are in
-`test_configs.py`, files in `test_bad_files.py`, command lines in
-`benchmarks/test_bad_command_lines.py`. Values of a wrong Python type are not here: the types are
-annotated, and their errors are Python's own.
+A case is a call and what its message says of the cause. Settings are in `test_configs.py`, files in
+`test_bad_files.py`, command lines in `benchmarks/test_bad_command_lines.py`. Values of a wrong
+Python type are not here: the types are annotated, and their errors are Python's own.
 """
 
 import math
@@ -16,6 +15,7 @@ from tensordict import TensorDict
 from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv
 
 from bgpo_trl.analysis import metrics, statistics
+from bgpo_trl.configs import RunConfig
 from bgpo_trl.envs import NicoEnv
 from bgpo_trl.files.checkpoint import load_checkpoint
 from bgpo_trl.machine import choose_device, set_threads
@@ -91,212 +91,160 @@ def filled(value):
 
 row, z = partial(TensorDict, batch_size=[]), torch.zeros(2, 5, 64)
 lae, lengths = SequenceAutoencoder(), torch.tensor([5, 5])
-PARTS = {
+WRONG = {
     # GWR-B
-    "gwr of no features": (lambda: GWRB(0), "n_features", "a whole number, at least 1"),
-    "gwr threshold": (lambda: GWRB(2, activity_threshold=3.0), "3.0", "<= activity_threshold <= 1"),
-    "gwr scale": (lambda: GWRB(2, activity_scale=0.0), "activity_scale=0.0", "activity_scale > 0"),
-    "gwr NaN rate": (lambda: GWRB(2, lr_best=NAN), "lr_best=nan", "lr_best <= 1"),
-    "gwr NaN habituation": (
-        lambda: GWRB(2, habituation_threshold=NAN), "nan", "habituation_threshold >= 0"),
-    "gwr endless tau": (lambda: GWRB(2, tau_best=math.inf), "inf", "tau_best > 0"),
-    "gwr NaN input": (lambda: GWRB(2).adapt(torch.tensor([NAN, 0])), "NaN", "must be free of"),
-    "gwr wrong size": (lambda: GWRB(2).lookup(torch.zeros(3)), "got [3]", "end with 2"),
-    "gwr empty": (lambda: GWRB(2, init="data").lookup(torch.zeros(2)), "empty", "adapt() it"),
-    "gwr part of a node": (lambda: GWRB(2, max_nodes=2.5), "got 2.5", "a whole number, or None"),
-    "gwr no state": (lambda: GWRB(2).set_extra_state([None]), "state of a network", "get_extra_st"),
-    "gwr half a state": (
-        lambda: GWRB(2).set_extra_state([{"weights": torch.zeros(2, 2)}]),
-        "the state of a network needs", "see get_extra_state"),
-    "gwr edge to nowhere": (
-        lambda: filled({"edges": torch.tensor([[0, 7]])}), "damaged", "load one that"),
-    "gwr ages below 0": (lambda: filled({"ages": torch.tensor([-5])}), "damaged", "load one that"),
+    "gwr threshold": (lambda: GWRB(2, activity_threshold=3.0), "3.0"),
+    "gwr NaN habituation": (lambda: GWRB(2, habituation_threshold=NAN), "nan"),
+    "gwr wrong size": (lambda: GWRB(2).lookup(torch.zeros(3)), "got [3]"),
+    "gwr empty": (lambda: GWRB(2, init="data").lookup(torch.zeros(2)), "empty"),
+    "gwr edge to nowhere": (lambda: filled({"edges": torch.tensor([[0, 7]])}), "damaged"),
+    "gwr ages below 0": (lambda: filled({"ages": torch.tensor([-5])}), "damaged"),
     "gwr habituation above 1": (
-        lambda: filled({"habituation": torch.tensor([1.0, 3.0])}), "damaged", "load one that"),
+        lambda: filled({"habituation": torch.tensor([1.0, 3.0])}), "damaged"),
     "gwr an edge twice": (
         lambda: filled({"edges": torch.tensor([[0, 1], [1, 0]]), "ages": torch.tensor([0, 0])}),
-        "damaged", "load one that"),
-    "gwr NaN weights": (
-        lambda: filled({"weights": torch.full((2, 2), NAN)}), "damaged", "load one that"),
+        "damaged"),
+    "gwr NaN weights": (lambda: filled({"weights": torch.full((2, 2), NAN)}), "damaged"),
     # networks
-    "vae of nothing": (lambda: VAE(0), "latent_size", "at least 1, got 0"),
-    "vae float frames": (lambda: VAE().latent(torch.zeros(32, 64, 3)), "float32", "must be uint8"),
-    "vae channels first": (
-        lambda: VAE().latent(torch.zeros(3, 32, 64).byte()), "(3, 32, 64)", "[..., 32, 64, 3]"),
-    "vae short latent": (lambda: VAE().decode(torch.zeros(2, 32)), "got [2, 32]", "[..., 64]"),
-    "vae inverse": (lambda: VAE().inverse(z, z[..., :32]), "got [2, 5, 32]", "[..., 64]"),
-    "lae of nothing": (lambda: SequenceAutoencoder(64, 0), "got 64 and 0", "at least 1"),
-    "lae short latents": (lambda: lae.encode(z[..., :9], lengths), "[2, 5, 9]", "[..., T, 64]"),
-    "lae lengths as floats": (lambda: lae.encode(z, lengths.float()), "float32", "lengths int64"),
-    "lae empty sequence": (lambda: lae.encode(z, 0 * lengths), "in 1..5", "drop empty sequences"),
-    "lae other state": (
-        lambda: lae.step(z[:, 0], z[:, 0, :16], z[:, 0, :16]), "[2, 16]", "h [..., 32]"),
+    "vae of nothing": (lambda: VAE(0), "latent_size"),
+    "vae float frames": (lambda: VAE().latent(torch.zeros(32, 64, 3)), "float32"),
+    "vae channels first": (lambda: VAE().latent(torch.zeros(3, 32, 64).byte()), "(3, 32, 64)"),
+    "vae short latent": (lambda: VAE().decode(torch.zeros(2, 32)), "got [2, 32]"),
+    "vae inverse": (lambda: VAE().inverse(z, z[..., :32]), "got [2, 5, 32]"),
+    "lae of nothing": (lambda: SequenceAutoencoder(64, 0), "got 64 and 0"),
+    "lae short latents": (lambda: lae.encode(z[..., :9], lengths), "[2, 5, 9]"),
+    "lae lengths as floats": (lambda: lae.encode(z, lengths.float()), "float32"),
+    "lae empty sequence": (lambda: lae.encode(z, 0 * lengths), "in 1..5"),
+    "lae other state": (lambda: lae.step(z[:, 0], z[:, 0, :16], z[:, 0, :16]), "[2, 16]"),
     "actor without its state": (
-        lambda: actor()(row({"z": torch.zeros(6)})), "Actor found no 'state'", "write it before"),
-    "actor with a short state": (
-        lambda: actor()(row({"state": torch.zeros(5)})), "got [5]", "6 features"),
+        lambda: actor()(row({"z": torch.zeros(6)})), "Actor found no 'state'"),
+    "actor with a short state": (lambda: actor()(row({"state": torch.zeros(5)})), "got [5]"),
     "actor of other seeds": (
-        lambda: actor(batch_size=[5])(TensorDict({"state": torch.zeros(3, 6)}, [3])),
-        "got [3, 6]", "one leading index per layer"),
-    "heads without a trunk": (
-        lambda: MultiHeadActor(6, hidden_sizes=()), "hidden_sizes is empty", "at least one layer"),
+        lambda: actor(batch_size=[5])(TensorDict({"state": torch.zeros(3, 6)}, [3])), "got [3, 6]"),
+    "heads without a trunk": (lambda: MultiHeadActor(6, hidden_sizes=()), "hidden_sizes is empty"),
     "tasks without heads": (
         lambda: MultiHeadActor(4, in_keys=["x"])(TensorDict({"x": torch.zeros(2, 5, 4)}, [2, 5])),
-        "2 tasks for 0 heads", "add a head"),
+        "2 tasks for 0 heads"),
     # losses
     "ddpg with other weights": (
         lambda: loss()(transitions().set("priority_weight", torch.ones(8, 1))),
-        "'priority_weight' must be one weight", "[8], got [8, 1]"),
-    "ddpg without action": (lambda: loss()(transitions("action")), "found no 'action'", "write it"),
-    "ddpg without next": (lambda: loss()(transitions("next")), "('next', 'reward')", "write it"),
-    "ddpg without reward": (
-        lambda: loss()(transitions(("next", "reward"))), "('next', 'reward')", "write it"),
+        "'priority_weight' must be one weight"),
+    "ddpg without action": (lambda: loss()(transitions("action")), "found no 'action'"),
+    "ddpg without reward": (lambda: loss()(transitions(("next", "reward"))), "('next', 'reward')"),
     "ddpg without termination": (
-        lambda: loss()(transitions(("next", "terminated"))), "lacks ('next'", "store it"),
+        lambda: loss()(transitions(("next", "terminated"))), "lacks ('next'"),
     "ddpg without next state": (
-        lambda: loss()(transitions(("next", "state"))), "under 'next', found no 'state'", "write"),
-    "ddpg flat reward": (
-        lambda: loss()(transitions(reward=(8,))), "got [8]", "the reward must be [8, 1]"),
-    "ddpg bounds": (lambda: loss(return_bounds=(1, 0)), "(1, 0)", "low < high"),
-    "ddpg penalty": (lambda: loss(pre_tanh_penalty=NAN), "got nan", "a number >= 0"),
-    "ddpg distance": (lambda: loss(loss_function="huber"), "'huber'", "l2, l1 or smooth_l1"),
-    "ddpg gamma": (
-        lambda: loss().make_value_estimator(gamma=95), "gamma must", "between 0 and 1, got 95"),
-    "targets that never move": (lambda: ForeachSoftUpdate(loss(), tau=0.0), "tau=0.0", "(0, 1]"),
-    "targets without a rate": (lambda: ForeachSoftUpdate(loss()), "tau=None", "give tau"),
+        lambda: loss()(transitions(("next", "state"))), "under 'next', found no 'state'"),
+    "ddpg flat reward": (lambda: loss()(transitions(reward=(8,))), "got [8]"),
+    "ddpg bounds": (lambda: loss(return_bounds=(1, 0)), "(1, 0)"),
+    "ddpg penalty": (lambda: loss(pre_tanh_penalty=NAN), "got nan"),
+    "ddpg distance": (lambda: loss(loss_function="huber"), "'huber'"),
+    "ddpg gamma": (lambda: loss().make_value_estimator(gamma=95), "gamma must"),
+    "targets that never move": (lambda: ForeachSoftUpdate(loss(), tau=0.0), "tau=0.0"),
+    "targets without a rate": (lambda: ForeachSoftUpdate(loss()), "tau=None"),
     "distillation without teacher": (
-        lambda: DistillationLoss(actor())(transitions()), "no 'teacher_action'", "write it"),
+        lambda: DistillationLoss(actor())(transitions()), "no 'teacher_action'"),
     "distillation without spread": (
         lambda: DistillationLoss(actor())(transitions().set("teacher_action", torch.zeros(8, 4))),
-        "from its actor, found no 'loc', 'scale'", "write it"),
-    "windows of one frame": (
-        lambda: VAEInverseLoss(VAE())(windows(2, 1)), "(2, 1, 32", "at least 2 frames"),
+        "from its actor, found no 'loc', 'scale'"),
+    "windows of one frame": (lambda: VAEInverseLoss(VAE())(windows(2, 1)), "(2, 1, 32"),
     "windows without actions": (
-        lambda: VAEInverseLoss(VAE())(windows(2, 2).exclude("action")), "no 'action'", "write it"),
+        lambda: VAEInverseLoss(VAE())(windows(2, 2).exclude("action")), "no 'action'"),
     "actions of another robot": (
-        lambda: VAEInverseLoss(VAE())(windows(2, 2, action=7)), "got [2, 2, 7]", "[2, 2, 4]"),
+        lambda: VAEInverseLoss(VAE())(windows(2, 2, action=7)), "got [2, 2, 7]"),
     "sequences without lengths": (
-        lambda: SequenceReconstructionLoss(lae)(TensorDict({"latent": z}, [2])),
-        "no 'length'", "write it"),
+        lambda: SequenceReconstructionLoss(lae)(TensorDict({"latent": z}, [2])), "no 'length'"),
     # the world
-    "unknown task": (
-        lambda: NicoEnv(["juggle"], observation="state"), "'juggle'", "choose one of grasp_glass"),
-    "no task": (lambda: NicoEnv([]), "got []", "must be names such as"),
-    "a name for a list": (lambda: NicoEnv("grasp_glass"), "'grasp_glass'", "must be names such as"),
-    "a task twice": (lambda: NicoEnv(["grasp_glass"] * 2), "'grasp_glass'", "name each once"),
-    "no simulation": (lambda: NicoEnv(batch_size=[0]), "got 0", "at least 1"),
-    "no row": (lambda: source(batch_size=0), "got 0", "at least 1"),
-    "no thread": (lambda: NicoEnv(threads=0), "got 0", "at least 1, or None"),
-    "too few seeds": (lambda: NicoEnv(batch_size=[2], seed=[1]), "1 seeds for 2", "give one each"),
-    "seed below 0": (lambda: NicoEnv(seed=-1), "got -1", "must lie in 0..2**32 - 1"),
-    "seed too large": (
-        lambda: NicoEnv(batch_size=2, seed=[0, 2**32]), "4294967296", "must lie in 0..2**32 - 1"),
-    "seed set below 0": (
-        lambda: NicoEnv(observation="state").set_seed(-1), "got -1", "must lie in 0..2**32 - 1"),
-    "negative seed": (lambda: nico.load("grasp_glass", seed=-1), "Seed", "between 0 and 2**32"),
-    "unknown observation": (
-        lambda: NicoEnv(observation="pixel"), "'pixel'", "choose one of 'pixels'"),
-    "frames that are not drawn": (
-        lambda: NicoEnv(observation="state").frames(), "no frames", "observe 'both'"),
-    "NaN action": (
-        lambda: step_with(torch.full((4,), NAN)), "nan", "diverged, lower its learning rate"),
-    "action of another robot": (lambda: step_with(torch.zeros(7)), "got [7]", "must be [4]"),
-    "no action": (lambda: step_with(None), "NicoEnv found no 'action'", "write it before"),
+    "a run of no seed": (lambda: RunConfig(seeds=()), "seeds must be one or more"),
+    "a run of a seed twice": (lambda: RunConfig(seeds=(1, 1)), "all different"),
+    "a run of a negative seed": (lambda: RunConfig(seeds=(-1,)), "none negative"),
+    "unknown task": (lambda: NicoEnv(["juggle"], observation="state"), "'juggle'"),
+    "no task": (lambda: NicoEnv([]), "got []"),
+    "a name for a list": (lambda: NicoEnv("grasp_glass"), "'grasp_glass'"),
+    "a task twice": (lambda: NicoEnv(["grasp_glass"] * 2), "'grasp_glass'"),
+    "no simulation": (lambda: NicoEnv(batch_size=[0]), "got 0"),
+    "no row": (lambda: source(batch_size=0), "got 0"),
+    "no thread": (lambda: NicoEnv(threads=0), "got 0"),
+    "too few seeds": (lambda: NicoEnv(batch_size=[2], seed=[1]), "1 seeds for 2"),
+    "seed below 0": (lambda: NicoEnv(seed=-1), "got -1"),
+    "seed too large": (lambda: NicoEnv(batch_size=2, seed=[0, 2**32]), "4294967296"),
+    "negative seed": (lambda: nico.load("grasp_glass", seed=-1), "Seed"),
+    "frames that are not drawn": (lambda: NicoEnv(observation="state").frames(), "no frames"),
+    "NaN action": (lambda: step_with(torch.full((4,), NAN)), "nan"),
+    "action of another robot": (lambda: step_with(torch.zeros(7)), "got [7]"),
+    "no action": (lambda: step_with(None), "NicoEnv found no 'action'"),
     "task out of range": (
-        lambda: NicoEnv(observation="state").reset(row({"task": torch.tensor(9)})),
-        "got [9]", "must lie in 0..2"),
-    "misspelt task": (lambda: nico.load("grasp_glas"), "'grasp_glas'", "choose one of grasp_glass"),
-    "a task called all": (
-        lambda: nico.add_task("all", nico.NicoTask), "called 'all'", "and none of grasp_glass"),
-    "no time": (lambda: nico.load("grasp_glass", time_limit=NAN), "got nan", "above 0 s"),
+        lambda: NicoEnv(observation="state").reset(row({"task": torch.tensor(9)})), "got [9]"),
+    "misspelt task": (lambda: nico.load("grasp_glas"), "'grasp_glas'"),
+    "a task called all": (lambda: nico.add_task("all", nico.NicoTask), "called 'all'"),
+    "no time": (lambda: nico.load("grasp_glass", time_limit=NAN), "got nan"),
     "demonstrator of a stranger": (
-        lambda: Demonstrator(SimpleNamespace(task=None, physics=None)),
-        "NoneType", "no demonstration is known"),
+        lambda: Demonstrator(SimpleNamespace(task=None, physics=None)), "NoneType"),
     "demonstrator in mid-air": (
-        lambda: Demonstrator(nico.load("grasp_glass", observation="state"))(None),
-        "reset()", "call the demonstrator's reset() after"),
-    "no GPU": (lambda: choose_device("cuda:99"), "no device 'cuda:99'", "use auto or cpu"),
-    "no such device": (lambda: choose_device("gpu"), "no device 'gpu'", "use auto or cpu"),
-    "no threads": (lambda: set_threads(0), "threads", "at least 1, got 0"),
+        lambda: Demonstrator(nico.load("grasp_glass", observation="state"))(None), "reset()"),
+    "no GPU": (lambda: choose_device("cuda:99"), "no device 'cuda:99'"),
+    "no threads": (lambda: set_threads(0), "threads"),
     # transforms
-    "schedule of nothing": (lambda: TaskSchedule(()), "()", "must hold a 0"),
-    "schedule without a start": (lambda: TaskSchedule((5, 9)), "(5, 9)", "must hold a 0"),
-    "schedule in parts": (lambda: TaskSchedule((0, 0.5)), "0.5", "whole numbers"),
+    "schedule of nothing": (lambda: TaskSchedule(()), "()"),
+    "schedule without a start": (lambda: TaskSchedule((5, 9)), "(5, 9)"),
+    "schedule in parts": (lambda: TaskSchedule((0, 0.5)), "0.5"),
     "task without demonstrations": (
-        lambda: DemonstrationSource(bank(), TaskSchedule((0,) * 4)), "task 3", "record some, or"),
-    "NaN demonstration": (
-        lambda: DemonstrationSource(bank(value=NAN), TaskSchedule()), "NaN", "embed the demo"),
+        lambda: DemonstrationSource(bank(), TaskSchedule((0,) * 4)), "task 3"),
+    "NaN demonstration": (lambda: DemonstrationSource(bank(value=NAN), TaskSchedule()), "NaN"),
     "source of other rows": (
-        lambda: world(source(batch_size=[3]), batch_size=[2]).reset(),
-        "batch_size=(3,)", "the environment has (2,)"),
+        lambda: world(source(batch_size=[3]), batch_size=[2]).reset(), "batch_size=(3,)"),
     "lookup without a source": (
-        lambda: world(BehaviorLookup(GWRB(32), learn=True)).reset(),
-        "found no 'demo_embedding'", "put DemonstrationSource before it"),
+        lambda: world(BehaviorLookup(GWRB(32), learn=True)).reset(), "found no 'demo_embedding'"),
     "lookup in another size": (
-        lambda: world(source(), BehaviorLookup(GWRB(16), learn=True)).reset(),
-        "got [32]", "end with 16"),
+        lambda: world(source(), BehaviorLookup(GWRB(16), learn=True)).reset(), "got [32]"),
     "lookup of nothing": (
         lambda: BehaviorLookup(GWRB(32), learn=False)(row({"x": torch.zeros(32)})),
-        "found no 'demo_embedding'", "write it before"),
+        "found no 'demo_embedding'"),
     "learning for other rows": (
         lambda: world(
             source(batch_size=[2]), BehaviorLookup(GWRB(32), learn=True), batch_size=[2]
-        ).reset(),
-        "batch_size=()", "environment to learn from has (2,)"),
+        ).reset(), "batch_size=()"),
     "bonus without latents": (
         lambda: world(
             source(), BehaviorLookup(GWRB(32), learn=True), BehaviorMatchingReward(lae)
-        ).reset(),
-        "found no 'latent'", "put FrameEncoder before it"),
+        ).reset(), "found no 'latent'"),
     "bonus by another encoder": (
         lambda: world(
             FrameEncoder(VAE(16)), source(), BehaviorLookup(GWRB(32), learn=True),
             BehaviorMatchingReward(lae), observation="pixels",
-        ).reset(),
-        "have sizes (16, 32)", "use a pair trained together"),
-    "NaN bonus": (lambda: BehaviorMatchingReward(lae, beta=NAN), "got nan", "must not be negative"),
-    "encoder without frames": (
-        lambda: world(FrameEncoder(VAE())).reset(), "no 'pixels'", "observe pixels"),
-    "keys that do not pair": (
-        lambda: FrameEncoder(VAE(), out_keys=("a", "b")), "got 2 for 1", "one of out_keys for"),
-    "time limit too late": (
-        lambda: world(source(), StepCounter(5)).reset(), "DemonstrationSource", "put StepCounter"),
+        ).reset(), "have sizes (16, 32)"),
+    "NaN bonus": (lambda: BehaviorMatchingReward(lae, beta=NAN), "got nan"),
+    "encoder without frames": (lambda: world(FrameEncoder(VAE())).reset(), "no 'pixels'"),
+    "keys that do not pair": (lambda: FrameEncoder(VAE(), out_keys=("a", "b")), "got 2 for 1"),
+    "time limit too late": (lambda: world(source(), StepCounter(5)).reset(), "DemonstrationSource"),
     "learning without an end": (
         lambda: TransformedEnv(
             NicoEnv(observation="state"), Compose(source(), BehaviorLookup(GWRB(32), learn=True))
-        ).reset(),
-        "BehaviorLookup learns when episodes end", "put StepCounter(50) before it"),
+        ).reset(), "BehaviorLookup learns when episodes end"),
     "sum of half the reward": (
         lambda: world(source(), RewardSum(), BehaviorMatchingReward(lae)).reset(),
-        "BehaviorMatchingReward", "put RewardSum after"),
+        "BehaviorMatchingReward"),
     # measures
-    "area of nothing": (lambda: metrics.area_under_curve([], []), "success [0]", "a training"),
-    "area of unequal lists": (
-        lambda: metrics.area_under_curve([0.1, 0.2], [1]), "episodes [1", "evaluation needs"),
-    "area back in time": (
-        lambda: metrics.area_under_curve([0.1, 0.2], [2, 1]), "[2.0, 1.0]", "increasing"),
-    "threshold of unequal lists": (
-        lambda: metrics.episodes_to([0.1, 0.9], [1]), "episodes [1]", "evaluation needs"),
+    "area of nothing": (lambda: metrics.area_under_curve([], []), "success [0]"),
+    "area back in time": (lambda: metrics.area_under_curve([0.1, 0.2], [2, 1]), "[2.0, 1.0]"),
     "matrix of unequal lists": (
-        lambda: metrics.evaluation_matrix([[0.1]], [1, 2], [2], window=2), "[1, 2]", "each eval"),
+        lambda: metrics.evaluation_matrix([[0.1]], [1, 2], [2], window=2), "[1, 2]"),
     "matrix without a test": (
-        lambda: metrics.evaluation_matrix([[0.1]], [1], [9], window=2), "no evaluation", "longer"),
-    "mean of no evaluations": (
-        lambda: metrics.trailing_mean([[0.1]], 0), "got (1, 1), 0", "n at least 1"),
-    "best of a single list": (
-        lambda: metrics.forgetting_since_best([0.1, 0.2]), "success [2]", "needs a training"),
-    "transfer without phases": (
-        lambda: metrics.backward_transfer([[1, 2]]), "got [1, 2]", "one phase per task"),
-    "difference of NaN": (
-        lambda: statistics.difference([1.0], [NAN]), "with NaN", "must be finite"),
-    "interval in percent": (
-        lambda: statistics.contrast([[1, 2]], [1]).interval(95), "got 95", "between 0 and 1"),
+        lambda: metrics.evaluation_matrix([[0.1]], [1], [9], window=2), "no evaluation"),
+    "mean of no evaluations": (lambda: metrics.trailing_mean([[0.1]], 0), "got (1, 1), 0"),
+    "best of a single list": (lambda: metrics.forgetting_since_best([0.1, 0.2]), "success [2]"),
+    "transfer without phases": (lambda: metrics.backward_transfer([[1, 2]]), "got [1, 2]"),
+    "difference of NaN": (lambda: statistics.difference([1.0], [NAN]), "with NaN"),
+    "interval in percent": (lambda: statistics.contrast([[1, 2]], [1]).interval(95), "got 95"),
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(("call", "cause", "remedy"), PARTS.values(), ids=PARTS.keys())
-def test_parts(refused, call, cause, remedy):
-    refused(call, cause, remedy)
+@pytest.mark.parametrize(("call", "cause"), WRONG.values(), ids=WRONG.keys())
+def test_a_wrong_value_is_refused_in_one_line(call, cause):
+    with pytest.raises((ValueError, RuntimeError)) as raised:
+        call()
+    assert str(raised.value).isprintable()
+    assert cause in str(raised.value)
 
 
 def test_a_policy_that_has_diverged_ends_the_run_in_one_line(make_config, bank, tmp_path, encoders):
@@ -304,9 +252,7 @@ def test_a_policy_that_has_diverged_ends_the_run_in_one_line(make_config, bank, 
     trainer = Trainer(config, tmp_path / "run", bank=bank, encoders=encoders, progress=False)
     for parameter in trainer.algorithm.learner.loss.parameters():
         parameter.data.fill_(NAN)
-    with pytest.raises(
-        ValueError, match=r"^an action is 4 finite numbers .* diverged, lower its .*$"
-    ):
+    with pytest.raises(ValueError, match="diverged"):
         trainer.run()
     assert load_checkpoint(tmp_path / "run" / "checkpoint")["env_steps"] == 0  # none since
     # The files can be read: headers without a row.

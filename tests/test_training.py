@@ -2,7 +2,6 @@
 
 import csv
 import itertools
-import re
 import signal
 from collections import Counter, defaultdict
 from dataclasses import replace
@@ -20,6 +19,7 @@ from bgpo_trl.files.checkpoint import load_checkpoint
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.runs.cost import n_bytes, read_costs
 from bgpo_trl.training import Trainer
+from tests.algorithms.playing import assert_same
 from tests.conftest import of_name
 from tests.folders import contents
 
@@ -29,7 +29,7 @@ TASKS = ("grasp_glass", "push_green_to_glass", "push_green_to_white")
 LOSSES = ("loss_actor", "loss_value")
 every_algorithm = pytest.mark.parametrize("name", ALGORITHMS)
 every_learner = pytest.mark.parametrize("name", [*ALGORITHMS, "bgpo+td3", "bgpo+sac"])
-# Those whose tasks each need data of their own begin to learn later, and are given more.
+# Algorithms that need data of each task begin to learn later.
 LONGER = {"maml": {"episodes": 16}, "dist-nll": {"episodes": 16}}
 
 
@@ -44,7 +44,7 @@ def make(bank, encoders, make_config):
 
 @pytest.fixture(scope="module")
 def run_of(make, make_config, easy_world, tmp_path_factory):
-    """Plays a run of an algorithm to its end, once."""
+    """Play a run of each algorithm once."""
     directories = {}
 
     def run_of(name):
@@ -66,23 +66,6 @@ def rows(path):
         return list(csv.DictReader(file))
 
 
-def assert_equal(first, second, where="state"):
-    """Compares nested containers bit for bit."""
-    assert type(first) is type(second), where
-    if isinstance(first, dict):
-        assert list(first) == list(second), where
-        for key in first:
-            assert_equal(first[key], second[key], f"{where}[{key!r}]")
-    elif isinstance(first, list | tuple):
-        assert len(first) == len(second), where
-        for index, pair in enumerate(zip(first, second, strict=True)):
-            assert_equal(*pair, f"{where}[{index}]")
-    elif isinstance(first, torch.Tensor):
-        assert first.equal(second), where
-    else:
-        assert first == second, where
-
-
 def assert_same_run(first, second):
     for name in CSV_FILES:
         # Line by line: pytest would take minutes to show where long byte strings differ.
@@ -91,11 +74,11 @@ def assert_same_run(first, second):
     graphs = [{p.name: p.read_bytes() for p in run.glob("gwr/*")} for run in (first, second)]
     assert graphs[0] == graphs[1]
     # Weights, optimizer, replay, GWR-B, simulations, random numbers and the tensordict in flight.
-    assert_equal(load_checkpoint(first / "checkpoint"), load_checkpoint(second / "checkpoint"))
+    assert_same(load_checkpoint(first / "checkpoint"), load_checkpoint(second / "checkpoint"))
 
 
 def at_step(trainer, n, do):
-    """Calls `do` in the midst of the n-th step: the simulation has moved, the replay has not."""
+    """Call `do` during the n-th step, when the simulation has moved and the replay has not."""
     store, steps = trainer.algorithm.store, []
 
     def store_or_not(transition):
@@ -111,19 +94,16 @@ def at_step(trainer, n, do):
 def test_every_seed_plays_every_episode_once(run_of, make_config, name):
     config = make_config(name=name, **of_name(LONGER, name))
     train = rows(run_of(name) / "train.csv")
-    seeds = defaultdict(list)
-    for row in train:
-        seeds[int(row["seed"])].append(row)
-    assert set(seeds) == set(config.seeds)
-    for played in seeds.values():
+    assert {int(row["seed"]) for row in train} == {*config.seeds}
+    for seed in config.seeds:
+        played = [row for row in train if row["seed"] == str(seed)]
         assert [int(row["episode"]) for row in played] == list(range(1, config.episodes + 1))
-        total = 0
-        for row in played:
-            total += int(row["steps"])
-            assert int(row["env_steps"]) == total
-            assert 1 <= int(row["steps"]) <= config.algorithm.max_steps
+        lengths = [int(row["steps"]) for row in played]
+        assert [int(row["env_steps"]) for row in played] == [*itertools.accumulate(lengths)]
+        for row, length in zip(played, lengths, strict=True):
+            assert 1 <= length <= config.algorithm.max_steps
             assert int(row["success"]) == float(row["return"])
-            assert int(row["success"]) or int(row["steps"]) == config.algorithm.max_steps
+            assert int(row["success"]) or length == config.algorithm.max_steps
             assert 0 <= float(row["intrinsic_return"]) <= 1
             assert (float(row["intrinsic_return"]) > 0) == name.startswith("bgpo")
             assert (int(row["num_nodes"]) > 0) == name.startswith("bgpo")
@@ -133,13 +113,11 @@ def test_every_seed_plays_every_episode_once(run_of, make_config, name):
         assert {row["algorithm"] for row in rows(run_of(name) / file)} == {name}
     if name.startswith("bgpo"):
         assert int(train[-1]["num_nodes"]) > 2
-    if name not in ("bgpo", "bgpo-experts"):
-        assert {row["num_groups"] for row in train} == {"1"}
     assert (float(train[0]["loss_value"]), float(train[-1]["loss_value"]) > 0) == (0, True)
 
 
 @pytest.mark.parametrize("starts", [(0, 5, 10), (4, 0, 8), (0, 0, 0)])
-def test_a_task_is_presented_from_its_start_on(make, make_config, tmp_path, starts):
+def test_tasks_are_presented_from_their_starts_on(make, make_config, tmp_path, starts):
     config = make_config("state", "oracle", seeds=(0, 1, 2), episodes=16, task_starts=starts)
     make(tmp_path, config).run()
     first = defaultdict(lambda: 99)
@@ -156,23 +134,17 @@ def test_all_presented_tasks_are_tested_every_few_episodes(make, make_config, tm
     make(tmp_path, config).run()
     tests = rows(tmp_path / "eval.csv")
     counts = Counter((int(row["seed"]), int(row["episode"]), row["task"]) for row in tests)
-    tasks_at = {2: TASKS[:1], 4: TASKS[:2]}
-    assert counts == {
-        (seed, episode, task): 3
-        for seed in config.seeds
-        for episode, tasks in tasks_at.items()
-        for task in tasks
-    }
-    steps = {
-        (row["seed"], row["episode"]): row["env_steps"] for row in rows(tmp_path / "train.csv")
-    }
+    due = [(2, TASKS[0]), (4, TASKS[0]), (4, TASKS[1])]
+    assert counts == {(seed, *test): 3 for seed in config.seeds for test in due}
+    train = rows(tmp_path / "train.csv")
+    steps = {(row["seed"], row["episode"]): row["env_steps"] for row in train}
     for row in tests:
         assert row["env_steps"] == steps[row["seed"], row["episode"]]
         assert int(row["success"]) == float(row["return"])
 
 
 @every_learner
-def test_a_seed_writes_what_it_would_write_alone(run_of, make, make_config, tmp_path, name):
+def test_rows_of_a_seed_equal_those_of_the_seed_alone(run_of, make, make_config, tmp_path, name):
     for seed in make_config().seeds:
         config = make_config(name=name, seeds=(seed,), **of_name(LONGER, name))
         make(tmp_path / str(seed), config).run()
@@ -195,85 +167,63 @@ def test_training_draws_seen_demonstrations_and_tests_held_out_ones(
     store, test = trainer.algorithm.store, trainer.evaluator.run
     trained_on, tested_on = [], []
 
-    def spy_store(transition):
+    def recorded_store(transition):
         trained_on.append(transition["behavior"])
         store(transition)
 
-    def spy_test(snapshots, *args):
+    def recorded_test(snapshots, *args):
         tested_on.extend(4 * snapshot.policy.context.flatten(0, 1) for snapshot in snapshots)
         return test(snapshots, *args)
 
-    monkeypatch.setattr(trainer.algorithm, "store", spy_store)
-    monkeypatch.setattr(trainer.evaluator, "run", spy_test)
+    monkeypatch.setattr(trainer.algorithm, "store", recorded_store)
+    monkeypatch.setattr(trainer.evaluator, "run", recorded_test)
     trainer.run()
     for given, allowed in ((trained_on, bank.seen()), (tested_on, bank.held_out("validation"))):
-        rows = torch.cat(given).unique(dim=0)
-        assert len(rows) > 3
-        assert (rows.unsqueeze(1) == allowed.embedding).all(-1).any(1).all()
+        shown = torch.cat(given).unique(dim=0)
+        assert len(shown) > 3
+        assert (shown.unsqueeze(1) == allowed.embedding).all(-1).any(1).all()
 
 
 @pytest.mark.parametrize("name", [n for n in ALGORITHMS if not n.startswith("bgpo")])
-def test_ground_truth_in_place_of_encoders(make, make_config, tmp_path, name):
+def test_policies_may_learn_from_the_true_state_without_encoders(make, make_config, tmp_path, name):
     make(tmp_path, make_config("state", name, episodes=6), encoders=None).run()
     train = rows(tmp_path / "train.csv")
     assert {(row["num_nodes"], row["intrinsic_return"]) for row in train} == {("0", "0.0")}
     assert {row["success"] for row in train} == {"0", "1"}
-    assert all(int(row["success"]) == float(row["return"]) for row in train)
 
 
 def test_an_algorithm_may_be_made_under_another_name(make, make_config, tmp_path):
-    made = []
-
-    def make_it(*args, **kwargs):
-        made.append((args, kwargs))
-        return ALGORITHMS["ddpg"].make(*args, **kwargs)
-
-    config = make_config("state", "ddpg", episodes=2)
-    trainer = make(tmp_path, replace(config, name="no such algorithm"), make=make_it)
+    config = replace(make_config("state", "ddpg", episodes=2), name="mine")
+    with pytest.raises(ValueError, match="no algorithm 'mine'"):
+        make(tmp_path / "refused", config)
+    trainer = make(tmp_path, config, make=ALGORITHMS["ddpg"].make)
     trainer.run()
-    ((args, kwargs),) = made
-    assert args == (config.algorithm,)
-    assert kwargs["seeds"] == config.seeds
-    assert trainer.algorithm.variant.context is None
+    assert trainer.algorithm.config == config.algorithm
     for file in CSV_FILES:
-        assert {row["algorithm"] for row in rows(tmp_path / file)} == {"no such algorithm"}
-    with pytest.raises(ValueError, match="no algorithm 'no such algorithm': choose one of bgpo"):
-        make(tmp_path / "other", trainer.config)
+        assert {row["algorithm"] for row in rows(tmp_path / file)} == {"mine"}
 
 
 @pytest.mark.parametrize(
-    ("method", "wrong", "said"),
+    ("method", "wrong"),
     [
-        (
-            "make_env",
-            lambda *_: None,
-            r"^make_env of BGPO must return the simulations \[2\]",
-        ),
-        ("make_env", lambda env, source: NicoEnv(env.tasks), r"^make_env .* got NicoEnv$"),
-        (
-            "act",
-            lambda td: None,
-            "^act of BGPO must return the tensordict with an action, got N",
-        ),
-        ("act", lambda td: td, "^act of BGPO must return .* with an action, got TensorDict$"),
-        ("snapshot", lambda *_: None, r"^snapshot of BGPO must return a Policy .*, got NoneType$"),
-        (
-            "snapshot",
-            lambda *_: Policy(None, "state", {}, torch.zeros(3, 32)),  # pyright: ignore
-            r"^the context of a Policy of BGPO must be \[3, 1\] and its features, got \[3, 32\]$",
-        ),
+        ("make_env", lambda *_: None),
+        ("make_env", lambda env, source: NicoEnv(env.tasks)),
+        ("act", lambda td: None),
+        ("act", lambda td: td),
+        ("snapshot", lambda *_: None),
+        ("snapshot", lambda *_: Policy(None, "state", {}, torch.zeros(3, 32))),  # pyright: ignore
     ],
 )
-def test_what_an_algorithm_must_return_is_said_in_a_line(
-    make, make_config, tmp_path, monkeypatch, method, wrong, said
+def test_wrong_results_of_an_algorithm_are_refused(
+    make, make_config, tmp_path, monkeypatch, method, wrong
 ):
     monkeypatch.setattr(BGPO, method, staticmethod(wrong))
-    with pytest.raises(TypeError, match=said):
+    with pytest.raises(TypeError, match=r"BGPO must (return|be)"):
         make(tmp_path, make_config("state", "ddpg", episodes=2)).run()
 
 
 @pytest.mark.parametrize(("number", "step"), [("SIGINT", 1), ("SIGTERM", 20)])
-def test_a_signal_waits_for_the_step_and_the_run_goes_on_from_it(
+def test_a_signal_waits_for_the_step_and_the_resumed_run_is_the_same(
     uninterrupted, make, tmp_path, number, step
 ):
     trainer = make(tmp_path)
@@ -292,7 +242,7 @@ def test_a_signal_waits_for_the_step_and_the_run_goes_on_from_it(
 
 
 @every_learner
-def test_a_run_can_be_interrupted_again_and_again(run_of, make, make_config, tmp_path, name):
+def test_a_run_interrupted_several_times_is_the_same(run_of, make, make_config, tmp_path, name):
     config = make_config(name=name, **of_name(LONGER, name))
     steps = (3, 1, 9, 22) if of_name(LONGER, name) else (3, 1, 9)
     for step in steps:
@@ -312,39 +262,39 @@ def test_a_run_can_be_interrupted_again_and_again(run_of, make, make_config, tmp
 
 
 def crash(*args, **kwargs):
-    raise RuntimeError("the lights went out")
+    raise RuntimeError("a failure")
 
 
-MOMENTS = {
-    "before the simulation moves": ("algorithm", "act"),
-    "while the networks are updated": ("algorithm", "update"),
-    "before the transition is stored": ("algorithm", "store"),
-    "while an episode is logged": ("logger", "log_train"),
-    "while a snapshot is taken": ("evaluator", "take"),
-    "while a test is played": ("evaluator", "run"),
-    "while a test is logged": ("logger", "log_eval"),
-}
+METHODS = (
+    "algorithm.act",
+    "algorithm.update",
+    "algorithm.store",
+    "logger.log_train",
+    "evaluator.take",
+    "evaluator.run",
+    "logger.log_eval",
+)
 
 
 @pytest.mark.parametrize(
-    ("moment", "saved"),
-    [*((moment, 11) for moment in MOMENTS), ("while the networks are updated", 0)],
+    ("method", "saved"), [*((method, 11) for method in METHODS), ("algorithm.update", 0)]
 )
-def test_a_run_that_dies_goes_on_from_its_last_checkpoint(
-    uninterrupted, make, tmp_path, monkeypatch, moment, saved
+def test_a_run_that_fails_is_resumed_from_its_last_checkpoint(
+    uninterrupted, make, tmp_path, monkeypatch, method, saved
 ):
-    """It dies some steps after the checkpoint, and its rows are written again."""
+    """Rows written after the checkpoint are written again."""
     trainer = make(tmp_path)
     trainer.config = replace(trainer.config, checkpoint_minutes=0.0)
-    part, method = MOMENTS[moment]
-    alive, save = getattr(getattr(trainer, part), method), trainer.save
+    part, name = method.split(".")
+    owner, save = getattr(trainer, part), trainer.save
+    intact = getattr(owner, name)
 
-    def live_or_die(*args):
-        return crash() if trainer.env_steps >= 20 else alive(*args)
+    def failing(*args):
+        return crash() if trainer.env_steps >= 20 else intact(*args)
 
-    monkeypatch.setattr(getattr(trainer, part), method, live_or_die)
+    monkeypatch.setattr(owner, name, failing)
     monkeypatch.setattr(trainer, "save", lambda: trainer.env_steps == saved and save())
-    with pytest.raises(RuntimeError, match="the lights went out"):
+    with pytest.raises(RuntimeError, match="a failure"):
         trainer.run()
 
     state = load_checkpoint(tmp_path / "checkpoint")
@@ -370,7 +320,7 @@ def test_a_second_signal_ends_the_run_at_once(make, tmp_path, first):
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_ctrl_c_that_is_ignored_stays_so(make, make_config, tmp_path):
+def test_an_ignored_interrupt_stays_ignored(make, make_config, tmp_path):
     trainer = make(tmp_path, make_config(episodes=2))
     at_step(trainer, 1, lambda: signal.raise_signal(signal.SIGINT))
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -383,32 +333,22 @@ def test_ctrl_c_that_is_ignored_stays_so(make, make_config, tmp_path):
     assert len(rows(tmp_path / "train.csv")) == 4
 
 
-def test_checkpoints_are_written_as_often_as_asked(make, make_config, tmp_path):
+def test_checkpoints_are_written_at_the_configured_interval(make, make_config, tmp_path):
     trainer = make(tmp_path, make_config(episodes=2, checkpoint_minutes=0.0))
     trainer.run()
     numbers = [path.name.split("-")[1] for path in (tmp_path / "checkpoint").glob("*.pt")]
     assert max(int(number) for number in numbers) == 1 + trainer.env_steps  # one before the first
 
 
-@pytest.mark.parametrize(
-    ("settings", "tests"),
-    [
-        ({"eval_every": 99}, ""),
-        ({"eval_every": 2}, r", in tests( [01]\.\d\d){3}"),
-        ({"eval_every": 2, "task_starts": (0, 2, 99)}, r", in tests( [01]\.\d\d){2} -"),
-    ],
-)
-def test_the_progress_bar_tells_the_success_so_far(
-    make, make_config, tmp_path, capsys, settings, tests
-):
-    make(tmp_path, make_config(**settings), progress=True).run()
+def test_the_progress_bar_shows_episodes_and_success(make, make_config, tmp_path, capsys):
+    make(tmp_path, make_config(task_starts=(0, 2, 99)), progress=True).run()
     won = [int(row["success"]) for row in rows(tmp_path / "train.csv")]
     last = capsys.readouterr().err.split("\r")[-1]
-    expected = rf"train: 100%\|.*\| 20/20 .*, success {sum(won) / len(won):.2f}{tests}\]\n"
-    assert re.fullmatch(expected, last)
+    assert "20/20" in last
+    assert f"success {sum(won) / len(won):.2f}" in last
 
 
-def test_a_finished_run_is_left_as_it_is(uninterrupted, make):
+def test_resuming_a_finished_run_changes_nothing(uninterrupted, make):
     before = contents(uninterrupted)
     with make(uninterrupted, resume=True) as trainer:
         trainer.algorithm.act = crash
@@ -417,40 +357,23 @@ def test_a_finished_run_is_left_as_it_is(uninterrupted, make):
     assert trainer.env_steps == load_checkpoint(uninterrupted / "checkpoint")["env_steps"]
 
 
-def test_a_directory_with_another_run_is_refused(uninterrupted, make, make_config):
-    with pytest.raises(ValueError, match="already holds a run: resume it"):
+def test_a_directory_with_another_run_is_refused(uninterrupted, make, make_config, encoders):
+    before = contents(uninterrupted)
+    with pytest.raises(ValueError, match="already holds a run"):
         make(uninterrupted)
-    shorter, later = make_config(episodes=9), make_config(task_starts=(0, 2, 5))
-    for config in (shorter, later, make_config(seeds=(1, 2)), make_config(name="ddpg")):
-        with pytest.raises(ValueError, match="holds a run with other settings"):
-            make(uninterrupted, config, resume=True)
-
-
-def test_a_run_with_other_encoders_is_another_run(uninterrupted, make, encoders):
+    changes = {"episodes": 9}, {"task_starts": (0, 2, 5)}, {"seeds": (1, 2)}, {"name": "ddpg"}
+    for change in changes:
+        with pytest.raises(ValueError, match="other settings"):
+            make(uninterrupted, make_config(**change), resume=True)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(1)
         other = replace(encoders, lae=SequenceAutoencoder())
-    with pytest.raises(ValueError, match=r"other settings \(encoders is [0-9a-f]+ there and"):
+    with pytest.raises(ValueError, match="other settings"):
         make(uninterrupted, encoders=other, resume=True)
+    assert contents(uninterrupted) == before
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"seeds": ()}, "seeds must be one or more, all different"),
-        ({"seeds": (1, 1)}, "seeds must be one or more, all different"),
-        ({"seeds": (-1,)}, "none negative"),
-        ({"episodes": 0}, "episodes must be at least 1, got 0"),
-        ({"eval_every": 0}, "eval_every must be at least 1, got 0"),
-        ({"eval_episodes": -2}, "eval_episodes must be at least 1, got -2"),
-    ],
-)
-def test_runs_that_cannot_be_are_refused(make_config, changes, message):
-    with pytest.raises(ValueError, match=message):
-        make_config(**changes)
-
-
-def test_steps_are_counted_by_the_number_of_tasks_that_all_seeds_have(uninterrupted):
+def test_costs_are_counted_by_the_number_of_presented_tasks(uninterrupted):
     train, costs = rows(uninterrupted / "train.csv"), read_costs(uninterrupted / "cost.csv")
     ends = [
         max(int(row["env_steps"]) for row in train if int(row["episode"]) == end)
@@ -464,9 +387,7 @@ def test_steps_are_counted_by_the_number_of_tasks_that_all_seeds_have(uninterrup
     assert sizes[2] == pytest.approx(n_bytes(state) / 1e6, abs=1e-6)
 
 
-def test_without_practice_only_the_newest_task_is_trained_and_all_are_tested(
-    make, make_config, tmp_path
-):
+def test_the_sequential_schedule_trains_the_newest_task_and_tests_all(make, make_config, tmp_path):
     make(tmp_path, make_config(schedule="sequential")).run()
     tasks = make_config().tasks
     played = {(int(row["episode"]), row["task"]) for row in rows(tmp_path / "train.csv")}
@@ -477,9 +398,7 @@ def test_without_practice_only_the_newest_task_is_trained_and_all_are_tested(
     assert list(read_costs(tmp_path / "cost.csv")) == [1, 2, 3]
 
 
-def test_the_time_of_a_step_is_that_of_training_without_tests_and_checkpoints(
-    make, make_config, tmp_path, monkeypatch
-):
+def test_step_times_exclude_tests_and_checkpoints(make, make_config, tmp_path, monkeypatch):
     clock = [0.0]
     monkeypatch.setattr(training, "time", SimpleNamespace(monotonic=lambda: clock[0]))
     trainer = make(tmp_path, make_config(episodes=4, checkpoint_minutes=0.0))
@@ -503,7 +422,7 @@ def test_the_time_of_a_step_is_that_of_training_without_tests_and_checkpoints(
     assert all(cost.seconds == 0.25 * cost.steps for cost in costs.values())
 
 
-def test_a_bank_that_cannot_be_kept_leaves_nothing_open(make, tmp_path, monkeypatch):
+def test_a_failure_to_write_the_bank_closes_the_run(make, tmp_path, monkeypatch):
     def refuse(*args):
         raise OSError("cannot write the bank: make room")
 
@@ -517,8 +436,8 @@ def test_a_bank_that_cannot_be_kept_leaves_nothing_open(make, tmp_path, monkeypa
     assert not (tmp_path / "run" / "lock").exists()
 
 
-def test_encoders_and_a_bank_of_other_encoders_are_refused(make_config, encoders, bank, tmp_path):
+def test_a_bank_of_other_encoders_is_refused(make_config, encoders, bank, tmp_path):
     foreign = replace(bank, encoder_id="of others")
-    with pytest.raises(ValueError, match=r"embedded by the encoders of others, these are .* anew"):
+    with pytest.raises(ValueError, match="of others"):
         Trainer(make_config(), tmp_path / "run", bank=foreign, encoders=encoders)
     assert not (tmp_path / "run").exists()

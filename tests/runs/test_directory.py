@@ -11,7 +11,8 @@ import pytest
 from bgpo_trl.files.checkpoint import load_checkpoint
 from bgpo_trl.runs.directory import check_settings, holds_run
 from bgpo_trl.training import Trainer
-from tests.test_training import assert_equal, at_step
+from tests.algorithms.playing import assert_same
+from tests.test_training import at_step
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 
@@ -145,7 +146,7 @@ def test_a_run_extended_in_steps_equals_a_longer_run(make, make_config, tmp_path
         # Episodes that were played early are logged late.
         assert sorted(rows(run / file)) == sorted(rows(straight / file))
     assert (run / "config.json").read_text() == (straight / "config.json").read_text()
-    assert_equal(*(load_checkpoint(folder / "checkpoint") for folder in (run, straight)))
+    assert_same(*(load_checkpoint(folder / "checkpoint") for folder in (run, straight)))
 
     with pytest.raises(ValueError, match="episodes is 16 there and 13 here"):
         make(run, replace(config, episodes=13), resume=True)

@@ -1,0 +1,186 @@
+"""`examples/bgpo_minimal.py` computes what the library's `bgpo-single` computes, step by step."""
+
+import importlib.util
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from bgpo_trl.algorithms import entry
+from bgpo_trl.configs import RunConfig
+from bgpo_trl.training import Trainer
+
+EXAMPLE = Path(__file__).parents[1] / "examples" / "bgpo_minimal.py"
+STORED = {  # entries of the example's replay, by their keys in the library
+    "latent": "latent",
+    "behavior": "behavior",
+    "action": "action",
+    "reward": ("next", "reward"),
+    "next_latent": ("next", "latent"),
+    "terminated": ("next", "terminated"),
+}
+
+
+@pytest.fixture(scope="module")
+def example(easy_world):
+    spec = importlib.util.spec_from_file_location("bgpo_minimal", EXAMPLE)
+    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    module.NicoEnv = easy_world
+    yield module
+    del sys.modules[spec.name]
+
+
+@pytest.fixture(scope="module")
+def small(example):
+    """Settings in which a hundred steps fill the replay, grow GWR-B and clip states and targets."""
+    return example.Settings(
+        seed=3,
+        episodes=60,
+        task_starts=(0, 15, 30),
+        test_every=10,
+        test_episodes=2,
+        max_steps=4,
+        state_limit=0.01,
+        activity_scale=4.0,
+        hidden_sizes=(32, 16),
+        batch_size=16,
+        replay_size=60,
+        warmup_steps=20,
+    )
+
+
+@pytest.fixture(scope="module")
+def minimal(example, small, encoders, bank):
+    """The example after training, with its calls of these methods."""
+    bgpo = example.MinimalBGPO(small, encoders, bank)
+    record(bgpo, "store", "update", "inputs", "test")
+    bgpo.train()
+    return bgpo
+
+
+@pytest.fixture(scope="module")
+def library(small, encoders, bank, tmp_path_factory):
+    """A run of `bgpo-single` with the same settings."""
+    defaults = entry("bgpo-single").config
+    config = replace(
+        defaults,
+        max_steps=small.max_steps,
+        state_limit=small.state_limit,
+        gwr=replace(defaults.gwr, activity_scale=small.activity_scale),
+        rl=replace(
+            defaults.rl,
+            hidden_sizes=small.hidden_sizes,
+            batch_size=small.batch_size,
+            replay_size=small.replay_size,
+            warmup_steps=small.warmup_steps,
+        ),
+    )
+    run = RunConfig(
+        seeds=(small.seed,),
+        episodes=small.episodes,
+        task_starts=small.task_starts,
+        eval_every=small.test_every,
+        eval_episodes=small.test_episodes,
+        name="bgpo-single",
+        algorithm=config,
+    )
+    directory = tmp_path_factory.mktemp("library")
+    with Trainer(run, directory, bank=bank, encoders=encoders, progress=False) as trainer:
+        record(trainer.algorithm, "store", "update")
+        record(trainer.evaluator, "run")
+        trainer.run()
+    return trainer
+
+
+def record(owner, *names):
+    """Keep arguments and results of an object's methods in its attribute ``calls``."""
+    owner.calls = {name: [] for name in names}
+
+    def recorded(name, method):
+        def call(*arguments, **options):
+            copies = [a.clone() if hasattr(a, "clone") else a for a in arguments]
+            owner.calls[name].append((copies, method(*arguments, **options)))
+            return owner.calls[name][-1][1]
+
+        return call
+
+    for name in names:
+        setattr(owner, name, recorded(name, getattr(owner, name)))
+
+
+def assert_close(ours, theirs):
+    torch.testing.assert_close(ours, theirs, rtol=1e-6, atol=1e-6)
+
+
+def test_defaults_are_those_of_bgpo_single(example):
+    settings, config = example.Settings(), entry("bgpo-single").config
+    for name in ("max_steps", "beta", "behavior_scale", "state_limit"):
+        assert getattr(settings, name) == getattr(config, name), name
+    for name in ("hidden_sizes", "learning_rate", "batch_size", "replay_size", "warmup_steps"):
+        assert getattr(settings, name) == getattr(config.rl, name), name
+    for name in ("noise", "gamma", "tau", "pre_tanh_penalty"):
+        assert getattr(settings, name) == getattr(config.rl, name), name
+    assert settings.activity_scale == config.gwr.activity_scale
+
+
+def test_transitions_are_those_of_the_library(minimal, library, small):
+    ours = torch.stack([arguments[0] for arguments, _ in minimal.calls["store"]])
+    theirs = torch.cat([arguments[0] for arguments, _ in library.algorithm.calls["store"]])
+    assert len(ours) == len(theirs) > 100
+    for key in STORED.values():
+        assert_close(ours[key], theirs[key])
+    clipped = ours["latent"].abs() == torch.tensor(small.state_limit)
+    assert 0 < clipped.float().mean() < 1
+    assert ours["next", "terminated"].any()
+    assert (ours["next", "done"] & ~ours["next", "terminated"]).any()  # time-outs
+    for name, key in STORED.items():  # the latest are in the ring, in the order of time
+        held = minimal.replay.rows[name].roll(-len(ours), 0)
+        assert held.equal(ours[key][-len(held) :].view_as(held))
+
+
+def test_losses_of_every_update_are_those_of_the_library(minimal, library):
+    ours = torch.stack([torch.stack(result) for _, result in minimal.calls["update"]])
+    updates = [result for _, result in library.algorithm.calls["update"] if result]
+    theirs = torch.stack(
+        [torch.stack([losses["loss_actor"], losses["loss_value"]]) for losses in updates]
+    )
+    assert len(ours) > 80
+    assert_close(ours, theirs)
+    assert minimal.highest_return == library.algorithm.learner.loss.return_bounds[1]
+
+
+@pytest.mark.parametrize("network", ["actor", "critic", "target_actor", "target_critic"])
+def test_weights_are_those_of_the_library(minimal, library, network):
+    name = network.replace("actor", "actor_network").replace("critic", "value_network")
+    theirs = library.algorithm.learner.loss.get_submodule(f"{name}_params")
+    theirs = dict(theirs.flatten_keys(".").items())
+    linear = [layer for layer in getattr(minimal, network) if isinstance(layer, torch.nn.Linear)]
+    assert len(theirs) == 2 * len(linear)
+    for number, layer in enumerate(linear):
+        assert_close(layer.weight.T, theirs[f"mlp.layers.{number}.weight"][0, 0])
+        assert_close(layer.bias, theirs[f"mlp.layers.{number}.bias"][0, 0])
+
+
+def test_behaviors_are_those_of_the_library(minimal, library):
+    ours, theirs = minimal.gwr.graph(), library.algorithm.gwr.graph(0)
+    assert len(ours.node) > 4
+    for mine, other in zip(ours, theirs, strict=True):
+        assert mine.equal(other)
+
+
+def test_tests_are_those_of_the_library(minimal, library, small):
+    results = [result for _, result in library.evaluator.calls["run"]]
+    inputs = [given for given, _ in minimal.calls["inputs"] if given[0].ndim == 3]  # of tests
+    assert max(latent.abs().max() for latent, _ in inputs) <= torch.tensor(small.state_limit)
+    contexts = torch.stack([result.snapshots[0].policy.context for result in results])
+    behaviors = torch.stack([behavior for _, behavior in inputs[:: small.max_steps]])
+    assert_close(small.behavior_scale * behaviors, contexts)
+
+    ours = torch.tensor([[*rates.values()] for _, rates in minimal.calls["test"]])
+    theirs = torch.stack([result.success[0].float().mean(-1) for result in results])
+    presented = torch.stack([result.snapshots[0].presented for result in results])
+    assert_close(ours[presented], theirs[presented])
+    assert 0 < ours[presented].mean() < 1
