@@ -128,12 +128,12 @@ class OffPolicyLoss(LossModule):
     @property
     def out_keys(self) -> list[NestedKey]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Entries that `forward` returns."""
-        told = ["pred_value", "target_value", "pred_value_max", "target_value_max", "td_error_max"]
-        # As in `penalized`: there is nothing to tell of an actor that does not write it.
-        silent = self.tensor_keys.pre_tanh_action not in self.actor_network.out_keys
-        left_out = {"pre_tanh_magnitude"} if silent else set()
-        of_actor = [key for key in self.actor_keys if key not in left_out]
-        return ["loss_actor", "loss_value", *told, *of_actor]
+        of_value = ["pred_value", "target_value", "pred_value_max", "target_value_max"]
+        of_actor = list(self.actor_keys)
+        # `penalized` returns no magnitude for an actor that does not write this entry.
+        if self.tensor_keys.pre_tanh_action not in self.actor_network.out_keys:
+            of_actor = [key for key in of_actor if key != "pre_tanh_magnitude"]
+        return ["loss_actor", "loss_value", *of_value, "td_error_max", *of_actor]
 
     def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> None:
         """Set the estimator of the target.
@@ -159,10 +159,10 @@ class OffPolicyLoss(LossModule):
     @dispatch()
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Compute all losses of a batch of transitions ``[*S, *B]``; see the class."""
-        loss_value, told = self.loss_value(tensordict)
-        loss_actor, told_of_actor = self.loss_actor(tensordict)
+        loss_value, of_value = self.loss_value(tensordict)
+        loss_actor, of_actor = self.loss_actor(tensordict)
         losses = {"loss_actor": loss_actor, "loss_value": loss_value}
-        return TensorDict({**losses, **told, **told_of_actor})
+        return TensorDict({**losses, **of_value, **of_actor})
 
     def next_value(self, successor: TensorDictBase) -> Tensor:
         """Return the values ``[*S, *B]`` of the input at next states; called without gradients."""

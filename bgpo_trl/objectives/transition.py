@@ -105,8 +105,8 @@ class TransitionInputs:
         if successor.get(names.terminated, None) is None:
             # The estimator would read "done" in its place, and stop at truncation too.
             raise ValueError(
-                f"the batch lacks ('next', {names.terminated!r}): store it, since only it tells a "
-                "success from a time-out"
+                f"the batch lacks ('next', {names.terminated!r}): store it, since only it "
+                "distinguishes a success from a time-out"
             )
         data = self.select(successor, self.moving_keys, ", under 'next',")
         for key in self.constant_keys:

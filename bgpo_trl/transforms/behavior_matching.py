@@ -62,7 +62,7 @@ class BehaviorMatchingReward(EpisodeTransform):
         True
     """
 
-    pays = True
+    changes_reward = True
 
     def __init__(
         self,

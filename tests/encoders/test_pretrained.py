@@ -14,8 +14,9 @@ from bgpo_trl.configs import (
     VAEConfig,
 )
 from bgpo_trl.data.dataset import load_demonstrations
-from bgpo_trl.encoders.pretrained import load_pretrained, make_pretrained
+from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.encoders.representation import save_representation
+from bgpo_trl.encoders.train import make_pretrained
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from suites import nico
 

@@ -137,7 +137,7 @@ def test_latents_are_standardized_and_frames_beyond_the_length_ignored(
     trained: Representation, dataset: TensorDict
 ) -> None:
     train, _ = split(dataset)
-    latent = encode_frames(trained.vae, train["pixels"], train["length"], batch_size=50)
+    latent = encode_frames(trained.vae, train, batch_size=50)
     valid = torch.arange(51) < train["length"].unsqueeze(-1)
     assert (latent[~valid] == 0).all()
     torch.testing.assert_close(latent[valid].mean(0), torch.zeros(64), atol=1e-3, rtol=0)

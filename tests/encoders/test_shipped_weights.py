@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from bgpo_trl.encoders import shipped, train
+from bgpo_trl.encoders import pretrained, train
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.encoders.representation import load_representation
 from bgpo_trl.experiments.run import pretrained_for
@@ -26,7 +26,7 @@ from suites import nico
     ],
 )
 def test_tasks_outside_the_paper_use_the_encoders_of_eight_tasks(tasks, name):
-    path = shipped.default_weights(tasks)
+    path = pretrained.default_weights(tasks)
     assert path.parts[-3:] == ("bgpo_trl", "weights", f"{name}.safetensors")
     encoders, bank = load_pretrained(tasks=tasks)
     assert encoders.identity == load_representation(path).identity
@@ -45,7 +45,7 @@ def test_training_writes_the_encoders_of_the_datasets_tasks(monkeypatch, tasks, 
         lambda dataset, play, weights, *_, tasks, spread: written.append((weights, tasks, spread)),
     )
     train.main(train.Arguments(Path("data"), weights=given))
-    assert written == [(given or shipped.default_weights(tasks), tasks, 0.5)]
+    assert written == [(given or pretrained.default_weights(tasks), tasks, 0.5)]
 
 
 def test_a_run_finds_its_encoders_by_their_digest(tmp_path):
@@ -63,15 +63,15 @@ def test_a_run_finds_its_encoders_by_their_digest(tmp_path):
 def test_a_bank_is_used_with_the_encoders_that_embedded_it(tmp_path):
     path = tmp_path / "bank.safetensors"
     for tasks in (nico.PAPER_TASKS, nico.ALL_TASKS):
-        weights = shipped.default_weights(tasks)
-        shutil.copy(shipped.bank_path(weights), path)
-        assert shipped.weights_of_bank(path) == weights
+        weights = pretrained.default_weights(tasks)
+        shutil.copy(pretrained.bank_path(weights), path)
+        assert pretrained.weights_of_bank(path) == weights
         encoders, bank = pretrained_for(nico.PAPER_TASKS, path)
         assert encoders.identity == load_representation(weights).identity
         assert bank.tasks == nico.PAPER_TASKS
 
 
 def test_an_unreadable_bank_gets_the_default_encoders(tmp_path: Path):
-    assert shipped.weights_of_bank(tmp_path / "nothing") == shipped.default_weights()
+    assert pretrained.weights_of_bank(tmp_path / "nothing") == pretrained.default_weights()
     (tmp_path / "rubbish").write_bytes(b"rubbish")
-    assert shipped.weights_of_bank(tmp_path / "rubbish") == shipped.default_weights()
+    assert pretrained.weights_of_bank(tmp_path / "rubbish") == pretrained.default_weights()
