@@ -170,4 +170,4 @@ def test_sacs_noise_is_floating_point_for_observations_of_integers():
     loss.make_value_estimator()
     batch = make_batch(8)
     batch["state"] = batch["state"].long()
-    assert loss.next_value(loss.inputs.following(batch, loss.tensor_keys)).shape == (8,)
+    assert loss.next_value(loss.following(batch)).shape == (8,)
