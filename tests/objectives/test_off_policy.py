@@ -289,19 +289,6 @@ def test_soft_updates_are_torchrls_also_after_a_cast(name):
 
 
 @every_loss
-def test_it_computes_with_the_parameters_put_into_it(name):
-    batch, loss, other = make_batch(4), make_loss(name), make_loss(name, (1,))
-    own = TensorDict.from_module(loss)
-    for _ in range(2):  # before the first call and after it
-        with own.apply(torch.zeros_like).to_module(loss):
-            assert not loss(batch.clone())["pred_value"].any()
-        assert loss(batch.clone())["pred_value"].abs().amax() > 0
-    loss.value_network_params = other.value_network_params
-    predicted = loss(batch.clone())["pred_value"]
-    assert predicted.equal(other(batch.clone())["pred_value"])
-
-
-@every_loss
 def test_bad_arguments_are_refused(name):
     kind, actor = LOSSES[name]
     policy = actor(3, 2, in_keys=["state"], batch_size=(3,))

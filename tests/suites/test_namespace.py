@@ -33,13 +33,6 @@ def imported_from(*folders: Path) -> str:
     return process.stdout
 
 
-@pytest.mark.parametrize("first", [True, False])
-def test_sources_of_two_projects_are_merged(other, first):
-    folders = [ROOT, other] if first else [other, ROOT]
-    found = imported_from(*folders)
-    assert all(str(folder / "suites") in found for folder in folders)
-
-
 @pytest.mark.parametrize("files", [[], ["notes.txt"], ["__init__.py"]])
 def test_a_folder_of_that_name_in_the_working_directory(tmp_path, files):
     """Only a package of that name hides ours, which ends in one line with the remedy."""

@@ -73,15 +73,6 @@ def test_behaviors_are_those_of_algorithm_1():
     assert gwr.num_nodes[0] > 5  # it has grown; fixed points would agree in any order
 
 
-def test_learns_from_the_rows_whose_episodes_end():
-    env, gwr = make([0, 1, 2], [2, 3, 4])
-    before, data = snapshot(gwr), env.reset()
-    for ended in ([], [0], [1], [0, 2]):
-        _, data = play(env, 1, data)
-        assert unchanged(gwr, before) == [row not in ended for row in range(3)]
-        before = snapshot(gwr)
-
-
 def test_learns_only_from_whole_episodes_and_while_learn_is_set():
     env, gwr = make([0, 1], lengths=4)
     before = snapshot(gwr)

@@ -4,7 +4,6 @@ import copy
 
 import pytest
 import torch
-from tensordict.nn import TensorDictModule
 from torchrl.envs import SerialEnv, check_env_specs
 
 from tests.transforms.environment import make_env, make_modules, play
@@ -71,14 +70,6 @@ def test_each_worker_can_have_a_composition_of_its_own(use_buffers):
     alone, _ = play(make_env(lengths=4), 12)
     for key, value in together[1].items(True, True):
         torch.testing.assert_close(alone[key], value)
-
-
-def test_rollout_and_step_and_maybe_reset_agree():
-    stepped, _ = play(make_env([0, 1], [2, 4]), 20)
-    policy = TensorDictModule(lambda z: torch.full((len(z), 4), 0.5), ["latent"], ["action"])
-    rolled = make_env([0, 1], [2, 4]).rollout(20, policy, break_when_any_done=False)
-    for key, value in stepped.items(True, True):
-        torch.testing.assert_close(rolled[key], value)
 
 
 def test_collected_data_is_not_overwritten():
