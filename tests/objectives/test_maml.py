@@ -208,7 +208,7 @@ def gradients(loss):
 
 
 def weighted(batch, *weights):
-    """Gives each task of all seeds one weight."""
+    """Return the batch with one weight for each task of all seeds."""
     weight = torch.tensor(weights).double().view(len(weights), 1)
     return batch.clone().set("priority_weight", weight.expand(batch.batch_size).contiguous())
 

@@ -24,7 +24,7 @@ def other(tmp_path):
 
 
 def imported_from(*folders: Path) -> str:
-    """Returns where the parts of ``suites`` were found, with some folders on the path."""
+    """Return the paths of the parts of ``suites``, with given folders on the path."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, folders))}
     process = subprocess.run(
         [sys.executable, "-c", USE], cwd="/", env=environment, capture_output=True, text=True

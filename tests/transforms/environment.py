@@ -126,7 +126,7 @@ def make_env(seeds=None, lengths=4, max_steps=5, beta=0.1, vae=None, del_keys=Fa
 
 
 def play(env, n_steps, data=None):
-    """Steps with partial resets and a fixed action; returns the steps and what follows them."""
+    """Step with partial resets and a fixed action; return the steps and the data after them."""
     data = env.reset() if data is None else data
     steps = []
     for _ in range(n_steps):

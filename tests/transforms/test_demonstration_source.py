@@ -87,11 +87,13 @@ def test_every_row_follows_the_schedule_by_its_own_count():
 
 def test_partial_reset_draws_for_the_rows_it_resets(monkeypatch):
     env, source = make([0, 1, 2], [2, 3, 4])
-    asked = []
+    drawn_rows = []
     draw = source._draw
-    monkeypatch.setattr(source, "_draw", lambda rows: (asked.append(rows.tolist()), draw(rows)))
+    monkeypatch.setattr(
+        source, "_draw", lambda rows: (drawn_rows.append(rows.tolist()), draw(rows))
+    )
     steps, _ = play(env, 4)
-    assert asked == [
+    assert drawn_rows == [
         [True, True, True],
         [True, False, False],
         [False, True, False],

@@ -33,7 +33,7 @@ def compose(batch_size=(), max_steps=50):
 
 
 def rollout(env, n_steps=3):
-    """Rests for some steps, within one episode unless the limit is shorter."""
+    """Return a rollout of zero actions, within one episode unless the limit is shorter."""
     action = torch.zeros(*env.batch_size, 4)
 
     def rest(tensordict):

@@ -172,7 +172,7 @@ def test_observations_share_no_memory(load):
 
 
 def polar_places(physics: Physics) -> np.ndarray:
-    """Returns radius (m), angle (rad) and turn (rad) of each object, ``[3, 3]``."""
+    """Return radius (m), angle (rad) and turn (rad) of each object, ``[3, 3]``."""
     poses = [physics.named.data.qpos[name] for name in OBJECTS]
     return np.array(
         [[*kinematics.to_polar(pose[:2]), 2 * np.arctan2(pose[6], pose[3])] for pose in poses]

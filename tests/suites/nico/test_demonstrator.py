@@ -13,7 +13,7 @@ all_tasks = pytest.mark.parametrize("task", nico.ALL_TASKS)
 
 
 def demonstrate(env, demonstrator) -> tuple[np.ndarray, bool]:
-    """Returns the actions ``[T, 4]`` of an episode and whether it succeeded."""
+    """Return the actions ``[T, 4]`` of an episode and whether it succeeded."""
     timestep, actions = env.reset(), []
     demonstrator.reset()
     while not timestep.last():
@@ -89,11 +89,11 @@ def test_a_grasp_starts_closer_to_a_glass_with_a_near_neighbor(physics, degrees,
 def test_a_phase_with_a_further_condition_lasts_until_it_holds(physics, monkeypatch):
     # The hand is half open at the start.
     env = nico.load("grasp_glass", seed=0, spread=0.0, observation="state", physics=physics)
-    asked = []
+    calls = []
 
     def fourth_time(_) -> bool:
-        asked.append(len(asked))
-        return len(asked) == 4
+        calls.append(len(calls))
+        return len(calls) == 4
 
     def stay(physics) -> np.ndarray:
         return physics.data.ctrl[:3].copy()
@@ -105,13 +105,13 @@ def test_a_phase_with_a_further_condition_lasts_until_it_holds(physics, monkeypa
     demonstrator = Demonstrator(env, seed=0)
     timestep = env.reset()
     demonstrator.reset()
-    while len(asked) < 4 and not timestep.last():
+    while len(calls) < 4 and not timestep.last():
         action = demonstrator(timestep)
-        if 0 < len(asked) < 4:
+        if 0 < len(calls) < 4:
             assert action[3] > 0  # closes
         timestep = env.step(action)
 
-    assert len(asked) == 4
+    assert len(calls) == 4
     assert action[3] < 0  # opens
 
 

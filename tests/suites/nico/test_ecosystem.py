@@ -147,7 +147,7 @@ def test_torchrl_finds_registered_tasks(registered, renderer):
 
 @pytest.fixture
 def make_gym(renderer) -> Iterator[Callable[..., gymnasium.Env]]:
-    """Makes tasks as environments of gymnasium's registry, of which it checks more."""
+    """Make tasks through Gymnasium's registry, since it checks registered environments further."""
 
     def make(task: str, **options) -> gymnasium.Env:
         shared = None if "frame_size" in options else renderer

@@ -7,7 +7,7 @@ from suites import nico
 
 
 def middle_of_glass(frame: np.ndarray) -> float:
-    """Returns where in a frame the glass is, from 0 at the left to 1 at the right."""
+    """Return the horizontal position of the glass in a frame, from 0 (left) to 1 (right)."""
     red, green, blue = np.moveaxis(frame.astype(int), -1, 0)
     return np.nonzero((red > 2 * green) & (red > 2 * blue))[1].mean() / frame.shape[1]
 

@@ -96,7 +96,7 @@ GRIP = np.array([0.42, 0.05, TABLE_HEIGHT + 0.045])
 
 
 def put(physics: Physics, name: str, position: np.ndarray, curl: float) -> None:
-    """Puts an object somewhere, the others out of reach, and the hand at `GRIP`, closing."""
+    """Put an object at a position, the others out of reach, and the closing hand at `GRIP`."""
     with physics.reset_context():
         for number, other in enumerate(nico.OBJECTS):
             physics.named.data.qpos[other] = [0.45, 0.3 + 0.1 * number, 0.7, 1, 0, 0, 0]

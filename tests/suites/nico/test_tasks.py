@@ -27,7 +27,7 @@ def place(
     curls: Sequence[float] = (0.0, 0.0, 0.0),
     closing: float = 0.0,
 ) -> None:
-    """Puts objects at ``[x, y]`` or ``[x, y, z, *quaternion]``, the others apart from each other.
+    """Put objects at ``[x, y]`` or ``[x, y, z, *quaternion]``, the others apart from each other.
 
     Thumb, upper and lower finger take their curls (rad); targets lie ``closing`` (rad) beyond.
     """
@@ -43,7 +43,7 @@ def place(
 
 
 def move(physics: Physics, name: str, pose: Sequence[float] | np.ndarray) -> None:
-    """Moves an object, to a pose as for `place`, as in the course of an episode."""
+    """Move an object during an episode, to a pose as for `place`."""
     physics.named.data.qpos[name][: len(pose)] = pose
     physics.forward()
 
