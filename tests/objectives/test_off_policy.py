@@ -1,4 +1,4 @@
-"""What all off-policy losses share: numbers by hand, TorchRL's own losses, seeds, conventions."""
+"""Shared behavior of the off-policy losses: numbers by hand, TorchRL's own losses, seeds, conventions."""
 
 import copy
 import math

@@ -23,7 +23,7 @@ def spans(n_steps, length):
 
 
 @pytest.mark.parametrize("seeds", [None, [4, 2, 3]])
-def test_streams_the_embedding_of_the_trajectory(seeds):
+def test_the_lstm_state_is_the_embedding_of_the_trajectory_so_far(seeds):
     lengths = 4 if seeds is None else [2, 4, 9]  # the last one is cut off after 5
     env = make_env(seeds, lengths)
     check_env_specs(env)
@@ -61,7 +61,7 @@ def test_reward_by_hand_at_success_and_at_time_out():
     assert (after["intrinsic_reward"][1, 4::5] > 1e-4).all()
 
 
-def test_reward_sum_behind_it_sums_all_three():
+def test_reward_sum_after_it_sums_all_three_rewards():
     env = make_env([0, 1], lengths=[3, 9], max_steps=5)
     after = play(env, 15)[0]["next"]
     for part in ("reward", "extrinsic_reward", "intrinsic_reward"):

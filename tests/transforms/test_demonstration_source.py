@@ -42,7 +42,7 @@ def test_schedule_refuses_to_start_with_no_task(starts):
 
 
 @pytest.mark.parametrize("seeds", [None, [5, 6, 7]])
-def test_the_demonstration_is_of_the_task_that_the_environment_does(seeds):
+def test_the_demonstration_is_of_the_task_of_the_environment(seeds):
     env, _ = make(seeds)
     check_env_specs(env)
     start = env.reset()
@@ -108,7 +108,7 @@ def test_partial_reset_draws_for_the_rows_it_resets(monkeypatch):
     assert env.base_env.task_resets[1].tolist()[1:] == steps["task"][1:, 0].tolist()
 
 
-def test_an_episode_that_is_not_played_to_its_end_is_started_again():
+def test_an_unfinished_episode_starts_again():
     env, source = make([0, 1], lengths=4)
     first = env.reset()["demo_index"]
     check_env_specs(env)
