@@ -1,4 +1,4 @@
-"""Shared behavior of the off-policy losses: numbers by hand, TorchRL's own losses, seeds, conventions."""
+"""Shared behavior of the off-policy losses, by hand and beside TorchRL's own losses."""
 
 import copy
 import math
