@@ -27,7 +27,7 @@ class AdvantageWeightedLoss(OffPolicyLoss):
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         with self.network("actor_network") as actor:
-            data = actor(self.inputs.current(tensordict))
+            data = actor(self.current(tensordict))
         error = (data["action"] - tensordict["action"]).square().mean(-1)
         replayed = self.values("value_network", tensordict.copy())
         advantage = replayed - self.values("value_network", data)

@@ -31,12 +31,12 @@ from bgpo_trl.modules.vae import VAE
 from bgpo_trl.world import World
 from suites.nico import nico
 
-# How long an example takes says more about the other processes of the machine than about the code.
+# Without a deadline, since the duration of an example depends on the load of the machine.
 settings.register_profile("bgpo_trl", deadline=None)
 settings.load_profile("bgpo_trl")
 torch.set_num_threads(1)
 
-# Of the algorithms that learn each task from data of its own.
+# Settings of the algorithms that learn each task from its own data.
 SMALL = {
     "maml": {"task_batch_size": 8, "adaptation_size": 12},
     "dist-nll": {"task_batch_size": 8, "samples": 24, "distillation_batch_size": 12},
@@ -44,20 +44,20 @@ SMALL = {
 
 
 def pytest_collection_finish():
-    """Take what was imported from the garbage collector, which would walk it again and again."""
+    """Exclude imported modules from garbage collection, which would slow down the tests."""
     gc.collect()
     gc.freeze()
     gc.set_threshold(10_000)
 
 
 def of_name(settings, name):
-    """Settings of an algorithm, which those named after it share, such as ``maml-paper``."""
+    """Return the settings of an algorithm, also of those named after it, such as ``maml-paper``."""
     return next((s for start, s in settings.items() if name.startswith(start)), {})
 
 
 @pytest.fixture(scope="session")
 def encoders():
-    """Untrained encoders: what latents mean does not matter to what is tested with them."""
+    """Untrained encoders."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         vae, lae = VAE(), SequenceAutoencoder()
@@ -82,7 +82,7 @@ def bank():
 
 @pytest.fixture(scope="session")
 def make_config():
-    """Makes the settings of a run of two seeds and 10 episodes, with some of them changed.
+    """Make the settings of a run of two seeds and 10 episodes, with some of them changed.
 
     ``bgpo+td3`` is BGPO with TD3.
     """
@@ -92,7 +92,7 @@ def make_config():
         small = {"hidden_sizes": (64,), "batch_size": 16, "warmup_steps": 8, "replay_size": 200}
         rl = replace(RL[rl or "ddpg"].config, **small)
         settings = {"state": state, "max_steps": 6, "rl": rl, **of_name(SMALL, name)}
-        # Demonstrations are latents; without noise, a test can tell them from what was played.
+        # Demonstrations are latents; without noise, a test can identify them among other data.
         share = 0.25 if entry(name).config.demonstration_share and state == "latent" else 0.0
         settings |= {"demonstration_share": share, "demonstration_noise": 0.0}
         if isinstance(entry(name).config, BGPOConfig):
@@ -113,7 +113,7 @@ def make_config():
 
 @pytest.fixture
 def in_world(bank):
-    """Puts an algorithm into a `World`, which becomes its attribute ``world``."""
+    """Give an algorithm a `World`, its attribute ``world``."""
 
     def enter(algorithm, seeds, schedule, bank=bank):
         algorithm.world = World(algorithm, seeds=seeds, schedule=schedule, bank=bank.seen())
@@ -123,7 +123,7 @@ def in_world(bank):
 
 
 class EasyNicoEnv(NicoEnv):
-    """Ends episodes with success, too, where the arm is turned far enough to one side.
+    """An environment in which episodes also end, with success, once the arm is turned to one side.
 
     Nothing collides or falls: a contact would make the rounding of a batch, which differs from that
     of a seed alone, a hundred thousand times larger within two steps.
@@ -159,7 +159,7 @@ def easy_world():
 
 
 @pytest.fixture(autouse=True)
-def own_entries_are_forgotten() -> Iterator[None]:
+def restored_registries() -> Iterator[None]:
     """Remove tasks and RL algorithms that a test has added."""
     registries: list[dict[str, Any]] = [nico._TASKS, RL]
     before = [dict(registry) for registry in registries]
@@ -171,7 +171,7 @@ def own_entries_are_forgotten() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def usual_dpi() -> Iterator[int]:
-    """The resolution of figures, which are saved with fewer pixels here: these take the time."""
+    """Save figures with fewer pixels, which is faster; return the usual resolution."""
     usual = style.DPI
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(style, "DPI", 60)
@@ -180,9 +180,9 @@ def usual_dpi() -> Iterator[int]:
 
 @pytest.fixture(scope="session", autouse=True)
 def interruptible() -> Iterator[None]:
-    """Ctrl-C is answered as at a terminal, though a job in the background starts deaf to it.
+    """Handle Ctrl-C as at a terminal, since a background job ignores it.
 
-    From the first on, since what fixtures start, such as Ray, would be deaf to it too.
+    Processes that fixtures start, such as Ray, inherit this.
     """
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
@@ -191,7 +191,7 @@ def interruptible() -> Iterator[None]:
 
 @pytest.fixture
 def refused(tmp_path) -> Callable[..., None]:
-    """Checks that a call ends in a line with cause and remedy, and leaves no trace on the disk."""
+    """Check that a call raises one line with cause and remedy, and changes no file."""
 
     def check(call: Callable[[], object], cause: str, remedy: str) -> None:
         before = _files(tmp_path)
@@ -229,7 +229,7 @@ with lock_directory(directory, wait=wait):
 
 @pytest.fixture
 def other_process() -> Iterator[Callable[..., subprocess.Popen[str]]]:
-    """Starts processes that hold a directory until they read a line.
+    """Start processes that hold a directory until they read a line.
 
     They print ``has it``, before it ``waits`` if they may wait; or they are refused.
     """

@@ -9,9 +9,8 @@ import torch
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.dataset import load_demonstrations
 from bgpo_trl.data.recording import record_demonstrations
-from bgpo_trl.encoders.pretrained import load_pretrained
+from bgpo_trl.encoders.pretrained import default_weights, load_pretrained
 from bgpo_trl.encoders.representation import load_representation
-from bgpo_trl.encoders.shipped import default_weights
 from bgpo_trl.figures.frames import plot_frame_strips
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.files.checkpoint import save_checkpoint

@@ -17,8 +17,8 @@ from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.policy import Policy
 from bgpo_trl.configs import RepresentationConfig
 from bgpo_trl.data.bank import DemonstrationBank
+from bgpo_trl.encoders.pretrained import bank_path
 from bgpo_trl.encoders.representation import save_representation
-from bgpo_trl.encoders.shipped import bank_path
 from bgpo_trl.training import Trainer
 from suites import nico
 from suites.nico import nico as suite_nico

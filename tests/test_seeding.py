@@ -1,4 +1,4 @@
-"""Streams of random numbers: the same in any batch, and each different from all others."""
+"""Named streams of random numbers: reproducible, distinct, and the same in any batch."""
 
 import itertools
 
@@ -17,7 +17,7 @@ names = st.sampled_from(
 
 
 @given(seeds, names)
-def test_a_stream_is_determined_by_seed_and_name_and_suits_every_generator(seed, name):
+def test_seed_and_name_determine_a_stream_for_any_generator(seed, name):
     number = stream_seed(seed, name)
     assert number == stream_seed(seed, name)
     np.random.RandomState(number)
@@ -25,7 +25,7 @@ def test_a_stream_is_determined_by_seed_and_name_and_suits_every_generator(seed,
 
 
 def test_streams_are_those_of_earlier_versions():
-    """Changing them would change every run: results would not be reproduced any more."""
+    """Other numbers would change every run, so that no result could be reproduced."""
     assert [stream_seed(0, "env"), stream_seed(7, "exploration")] == [643454646, 2305761175]
 
 
@@ -44,31 +44,16 @@ def test_a_seed_has_the_same_generator_in_any_batch(batch, name):
         assert torch.rand(3, generator=together).equal(torch.rand(3, generator=alone))
 
 
-def test_generators_share_nothing():
-    first, second = generators([1, 1], "env")
-    torch.rand(10, generator=first)
-    (fresh,) = generators([1], "env")
-    assert torch.rand(3, generator=second).equal(torch.rand(3, generator=fresh))
-
-
-def test_a_negative_seed_is_refused():
-    with pytest.raises(ValueError, match="non-negative"):
-        stream_seed(-1, "env")
-
-
 @pytest.mark.parametrize("seed", [3, np.int64(3), np.uint8(3)])
 def test_rows_count_up_from_one_seed(seed):
     assert row_seeds(seed, 3) == [3, 4, 5]
-
-
-def test_rows_count_on_from_0_after_the_largest_seed():
     assert row_seeds(2**32 - 2, 4) == [2**32 - 2, 2**32 - 1, 0, 1]
 
 
 @pytest.mark.parametrize("seeds", [[8, 3], (8, 3), np.array([8, 3]), torch.tensor([8, 3])])
 def test_rows_take_the_seeds_given(seeds):
     assert row_seeds(seeds, 2) == [8, 3]
-    with pytest.raises(ValueError, match=r"^2 seeds for 3 simulations: give one each$"):
+    with pytest.raises(ValueError, match="2 seeds for 3 simulations"):
         row_seeds(seeds, 3)
 
 
@@ -80,5 +65,5 @@ def test_without_a_seed_rows_have_fresh_ones():
 
 @pytest.mark.parametrize("seed", [-1, 2**32, [0, -1], [2**32, 0]])
 def test_a_seed_out_of_range_is_refused(seed):
-    with pytest.raises(ValueError, match=r"^a seed must lie in 0\.\.2\*\*32 - 1, got .*$"):
+    with pytest.raises(ValueError, match="a seed must lie in"):
         row_seeds(seed, 2)

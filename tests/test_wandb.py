@@ -1,4 +1,4 @@
-"""Files that wandb writes in its offline mode. Nothing here goes online."""
+"""Files that wandb writes in its offline mode."""
 
 import csv
 import hashlib
@@ -27,7 +27,7 @@ NOT_IN_THE_CURVE = {"algorithm", "seed", "task", "episode", ""}
 
 @pytest.fixture(scope="module", autouse=True)
 def own_wandb(tmp_path_factory):
-    """A wandb that is of this module alone and cannot reach anything."""
+    """Isolate wandb from its other users and from any server."""
     home = tmp_path_factory.mktemp("home")
     with pytest.MonkeyPatch.context() as patch:
         for name in [name for name in os.environ if name.startswith("WANDB_")]:
@@ -42,10 +42,10 @@ def own_wandb(tmp_path_factory):
 
 
 def records(file: Path) -> list[Record]:
-    """Reads a ``.wandb`` file: LevelDB's log format after a header of 7 bytes.
+    """Read a ``.wandb`` file: LevelDB's log format after a header of 7 bytes.
 
     Pieces of records, each after its checksum, size and kind (1: whole, 2: first, 3: middle,
-    4: last), in blocks of 32 KiB. wandb has no reader in Python any more.
+    4: last), in blocks of 32 KiB. wandb has no reader in Python.
     """
     data = file.read_bytes()
     assert data.startswith(b":W&B")
@@ -65,7 +65,7 @@ def records(file: Path) -> list[Record]:
 
 
 def sessions(directory: Path) -> list[list[Record]]:
-    """Returns what each process that worked on the run has recorded, first to last."""
+    """Return the records of each process that worked on the run, first to last."""
     files = directory.glob("wandb/offline-run-*/*.wandb")
     return [records(file) for file in sorted(files, key=lambda file: file.stat().st_mtime_ns)]
 
@@ -82,7 +82,7 @@ def history(session: list[Record]) -> list[dict]:
 
 
 def curve(session: list[Record], group: str) -> list[tuple]:
-    """Returns the rows of ``train.csv`` or ``eval.csv``, as wandb has them."""
+    """Return the rows of ``train.csv`` or ``eval.csv``, as wandb has them."""
     rows = []
     for row in history(session):
         shown = {key: value for key, value in row.items() if key.startswith(f"{group}/")}
@@ -106,7 +106,7 @@ def curve_in_csv(directory: Path, group: str) -> list[tuple]:
 
 
 def step_metrics(session: list[Record]) -> dict[str, str]:
-    """Returns over which other one each curve is drawn."""
+    """Return the step metric of each curve."""
     metrics = [r.metric for r in session if r.WhichOneof("record_type") == "metric"]
     return {metric.name: metric.step_metric for metric in metrics if metric.step_metric}
 
@@ -158,25 +158,25 @@ def test_every_curve_is_drawn_over_the_episodes_of_its_seed_and_task(run):
                 assert {drawn_over[f"{prefix}/{name}"] for name in values} == {f"{prefix}/step"}
 
 
-def test_settings_are_there_and_both_sessions_are_of_the_same_run(run):
+def test_both_sessions_belong_to_the_same_run_with_its_settings(run):
     settings = json.loads((run / "config.json").read_text())
     started = [r.run for session in sessions(run) for r in session if r.HasField("run")]
     assert len({record.run_id for record in started}) == 1
     assert [record.resume for record in started] == [True, True]
     for record in started:
-        told = {item.key: json.loads(item.value_json) for item in record.config.update}
-        del told["_wandb"]
-        assert told == settings
+        saved = {item.key: json.loads(item.value_json) for item in record.config.update}
+        del saved["_wandb"]
+        assert saved == settings
 
 
-def test_figures_and_videos_are_there(run):
+def test_figures_and_videos_are_uploaded_as_they_are(run):
     media = {}
     for row in history(sessions(run)[-1]):
         for key, value in row.items():
             name, _, part = key.rpartition("/")
             if name.startswith("figures/"):
                 media.setdefault(name, {})[part] = value
-    assert {name: told["_type"] for name, told in media.items()} == {
+    assert {name: entry["_type"] for name, entry in media.items()} == {
         "figures/success": "image-file",
         "figures/grasp_glass": "video-file",
     }
@@ -189,7 +189,7 @@ def test_figures_and_videos_are_there(run):
         assert video.n_frames == 6
 
 
-def test_all_of_it_lies_in_the_run_and_tells_nothing_of_this_machine(run):
+def test_all_files_are_in_the_run_and_name_no_place_of_this_machine(run):
     assert {path.name for path in run.parent.iterdir()} == {"run"}
     assert {path.name for path in run.iterdir()} >= {"wandb", "train.csv"}
     uploaded = [*run.glob("wandb/offline-run-*/*.wandb")]
@@ -201,8 +201,8 @@ def test_all_of_it_lies_in_the_run_and_tells_nothing_of_this_machine(run):
             assert len(str(place)) < 2 or str(place).encode() not in content
 
 
-def test_rows_in_any_order_arrive_and_those_written_again_are_the_same(tmp_path):
-    """wandb's own step must never go back; ours does, whenever another seed is further."""
+def test_rows_arrive_in_any_order_and_again_after_a_crash(tmp_path):
+    """wandb's own step must never decrease; episodes do, when another seed is ahead."""
 
     def write(logger, rows):
         for seed, episode in rows:
@@ -226,7 +226,7 @@ def test_rows_in_any_order_arrive_and_those_written_again_are_the_same(tmp_path)
         assert second == expected[3 * n :]
 
 
-def test_a_figure_that_cannot_be_shown_is_one_warning_and_no_end(tmp_path):
+def test_an_unreadable_figure_gives_one_warning_and_the_run_goes_on(tmp_path):
     with RunLogger(tmp_path, config={}, wandb="offline") as logger:
         (tmp_path / "broken.png").write_bytes(b"no picture")
         with pytest.warns(

@@ -16,12 +16,12 @@ from tensordict import TensorDictBase
 
 from bgpo_trl.data.bank import DemonstrationBank, DemonstrationSteps
 from bgpo_trl.data.dataset import load_demonstrations, read_meta
+from bgpo_trl.encoders.pretrained import default_weights
 from bgpo_trl.encoders.representation import (
     Representation,
     encode_frames,
     load_representation,
 )
-from bgpo_trl.encoders.shipped import default_weights
 from suites import nico
 
 
@@ -46,8 +46,8 @@ def make_bank(
             the true ones, for comparison.
         spread: Share of the range of start states that the dataset was recorded over.
     """
-    vae, length = representation.vae, dataset["length"]
-    latent = encode_frames(vae, dataset["pixels"], length)
+    length = dataset["length"]
+    latent = encode_frames(representation.vae, dataset)
     action = dataset["action"]
     if actions == "inferred":
         action = representation.inverse(latent, length)

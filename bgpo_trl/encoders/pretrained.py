@@ -1,23 +1,22 @@
-"""Trained encoders with their demonstration bank: load the pretrained ones, or train new ones."""
+"""Encoders with their demonstration bank, in files beside each other; the shipped ones by default.
+
+Two pairs come with the package: that of the paper's three tasks, with which all results on these
+tasks were made, and that of the suite's eight tasks.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
+from functools import cache
+from importlib import resources
 from pathlib import Path
 
-import torch
-
-from bgpo_trl.configs import RepresentationConfig
 from bgpo_trl.data.bank import DemonstrationBank
-from bgpo_trl.data.recording import record_demonstrations
-from bgpo_trl.encoders.representation import (
-    Representation,
-    load_representation,
-)
-from bgpo_trl.encoders.shipped import bank_path, default_weights
-from bgpo_trl.encoders.train import train_encoders
+from bgpo_trl.encoders.representation import Representation, load_representation
+from bgpo_trl.files.tensor_file import load_tensors
 from suites import nico
+
+_PAPER, _EIGHT = "nico.safetensors", "nico_eight.safetensors"
 
 
 def load_pretrained(
@@ -27,7 +26,7 @@ def load_pretrained(
 
     Args:
         weights: File of the encoders; by default the shipped ones for ``tasks``, see
-            `bgpo_trl.encoders.shipped.default_weights`.
+            `default_weights`.
         tasks: Names of tasks.
 
     Raises:
@@ -39,62 +38,47 @@ def load_pretrained(
     return encoders, bank
 
 
-def make_pretrained(
-    weights: str | Path,
-    dataset: str | Path,
-    *,
-    folder: str | Path,
-    config: RepresentationConfig | None = None,
-    per_task: int = 1_200,
-    held_out_per_task: int = 200,
-    seed: int = 0,
-    command: str = "",
-    progress: bool = True,
-    device: torch.device | str = "cpu",
-    tasks: Sequence[str] = nico.PAPER_TASKS,
-    spread: float = 1.0,
-) -> tuple[Representation, DemonstrationBank]:
-    """Record demonstrations and play, train both encoders, and embed the demonstrations.
+def default_weights(tasks: Sequence[str] = nico.PAPER_TASKS) -> Path:
+    """Return the path of the shipped encoders for some tasks.
 
-    Each interrupted stage is resumed.
-
-    Args:
-        weights: File to write the encoders to; the bank is written beside it.
-        dataset: Folder of the demonstrations, recorded if missing. Half as many episodes of play go
-            to the folder of the same name plus ``-play``.
-        folder: Folder for the training log, checkpoints and probes.
-        config: Hyperparameters of the encoders.
-        per_task: Demonstrations of each task.
-        held_out_per_task: How many of those are held out.
-        seed: Seed of the recording.
-        command: Command line, stored with the weights.
-        progress: Whether to show progress bars.
-        device: Device to train on.
-        tasks: Tasks to demonstrate.
-        spread: Share of the whole range of start states.
-
-    Raises:
-        ValueError: If the dataset is damaged or was recorded in another scene.
+    These are the encoders of eight tasks if one of the suite's further five is among them, and
+    otherwise, also for custom tasks, those of the paper's three.
     """
-    record = partial(
-        record_demonstrations, tasks=tasks, spread=spread, seed=seed, progress=progress
-    )
-    demonstrations = record(dataset, per_task=per_task, held_out_per_task=held_out_per_task)
-    play = record(
-        Path(dataset).with_name(f"{Path(dataset).name}-play"),
-        per_task=max(2, per_task // 2),
-        held_out_per_task=max(1, held_out_per_task // 4),
-        play=True,
-    )
-    return train_encoders(
-        demonstrations,
-        play,
-        Path(weights),
-        Path(folder),
-        config or RepresentationConfig(),
-        command,
-        device,
-        progress=progress,
-        tasks=tasks,
-        spread=spread,
-    )
+    further = set(nico.ALL_TASKS) - set(nico.PAPER_TASKS)
+    return _path(_PAPER if further.isdisjoint(tasks) else _EIGHT)
+
+
+def bank_path(weights: Path) -> Path:
+    """Return the path of the bank beside encoder weights, such as ``nico_bank.safetensors``."""
+    return weights.with_name(f"{weights.stem}_bank{weights.suffix}")
+
+
+def find_weights(identity: str | None) -> Path:
+    """Return the path of the shipped encoders with an identity.
+
+    Falls back to the encoders of the paper's tasks if no shipped ones have this identity.
+    """
+    return _path(_EIGHT if identity is not None and identity == _identity(_EIGHT) else _PAPER)
+
+
+def weights_of_bank(bank: Path) -> Path:
+    """Return the path of the shipped encoders that embedded a bank.
+
+    Falls back to the encoders of the paper's tasks if others embedded it, or it cannot be read.
+    """
+    try:
+        metadata = load_tensors(bank)[1]
+    except (FileNotFoundError, ValueError):
+        metadata = {}
+    return find_weights(metadata.get("encoder_id"))
+
+
+@cache
+def _identity(name: str) -> str | None:
+    """Return the identity of shipped encoders; None if they are not there."""
+    path = _path(name)
+    return load_representation(path).identity if path.exists() else None
+
+
+def _path(name: str) -> Path:
+    return Path(str(resources.files("bgpo_trl") / "weights" / name))

@@ -22,6 +22,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from bgpo_trl.data.dataset import load_demonstrations, read_meta
+from bgpo_trl.encoders.pretrained import default_weights
 from bgpo_trl.encoders.representation import (
     Representation,
     encode_frames,
@@ -31,7 +32,6 @@ from bgpo_trl.encoders.representation import (
     valid_frames,
     valid_steps,
 )
-from bgpo_trl.encoders.shipped import default_weights
 from bgpo_trl.modules.inverse_model import InverseModel
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
@@ -75,8 +75,7 @@ def probe(
     """
     vae, lae = representation.vae, representation.lae
     train, held_out = split(dataset)
-    latent = encode_frames(vae, train.get("pixels"), train.get("length"))
-    latent_held_out = encode_frames(vae, held_out.get("pixels"), held_out.get("length"))
+    latent, latent_held_out = encode_frames(vae, train), encode_frames(vae, held_out)
     result = {
         **_probe_state(latent, train, latent_held_out, held_out),
         **_probe_inverse(representation.inverse, latent, train),
@@ -189,9 +188,7 @@ def _probe_state(
 
 def _probe_play(vae: VAE, play: TensorDictBase) -> dict[str, float]:
     train, held_out = split(play)
-    latent, latent_held_out = (
-        encode_frames(vae, part.get("pixels"), part.get("length")) for part in (train, held_out)
-    )
+    latent, latent_held_out = encode_frames(vae, train), encode_frames(vae, held_out)
     errors = _probe_state(latent, train, latent_held_out, held_out, only=_objects_on_table)
     return {f"play_{name}": error for name, error in errors.items()}
 

@@ -14,10 +14,11 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 
 from bgpo_trl.configs import (
     InverseModelConfig,
@@ -35,6 +36,8 @@ from bgpo_trl.objectives.representation import (
     SequenceReconstructionLoss,
     VAEInverseLoss,
 )
+
+Network = TypeVar("Network", bound=nn.Module)
 
 
 @dataclass
@@ -103,11 +106,11 @@ def train_representation(
     fit = Fit(config, folder, log, progress, device)
     seen = [train] if play is None else [train, split(play)[0]]
     vae = _train_vae(seen, config.vae, fit, config.seed)
-    latent = encode_frames(vae, train.get("pixels"), train.get("length"))
+    latent = encode_frames(vae, train)
     lae = _train_lae(latent, train.get("length"), config.lae, fit, config.seed)
     own = seen[-1]
     if play is not None:
-        latent = encode_frames(vae, own.get("pixels"), own.get("length"))
+        latent = encode_frames(vae, own)
     inverse = _train_inverse(latent, own, config.inverse, fit, config.seed)
     metadata = {
         "scene_version": scene_version,
@@ -120,13 +123,15 @@ def train_representation(
 
 
 @torch.no_grad()
-def encode_frames(vae: VAE, pixels: Tensor, length: Tensor, batch_size: int = 64) -> Tensor:
-    """Encode the valid frames of demonstrations, uint8 ``[N, T, 32, 64, 3]``, in batches.
+def encode_frames(vae: VAE, dataset: TensorDictBase, batch_size: int = 64) -> Tensor:
+    """Encode the valid frames of demonstrations in batches.
+
+    Reads ``pixels`` uint8 ``[N, T, 32, 64, 3]`` and ``length`` ``[N]``.
 
     Returns:
-        Standardized latents, float32 ``[N, T, latent_size]``; zeros at and beyond ``length``
-        ``[N]``.
+        Standardized latents, float32 ``[N, T, latent_size]``; zeros at and beyond ``length``.
     """
+    pixels, length = dataset.get("pixels"), dataset.get("length")
     latent = torch.zeros(*pixels.shape[:2], vae.latent_size)
     demonstration, time = valid_steps(length, pixels.shape[1]).nonzero(as_tuple=True)
     for d, t in zip(demonstration.split(batch_size), time.split(batch_size), strict=True):
@@ -140,7 +145,7 @@ def embed_demonstrations(representation: Representation, dataset: TensorDictBase
 
     Reads ``pixels`` ``[N, T, 32, 64, 3]`` and ``length`` ``[N]``.
     """
-    latent = encode_frames(representation.vae, dataset.get("pixels"), dataset.get("length"))
+    latent = encode_frames(representation.vae, dataset)
     return representation.lae.encode(latent, dataset.get("length"))
 
 
@@ -227,6 +232,13 @@ def mean_frame(frames: Tensor) -> Tensor:
     return torch.stack(parts).sum(0) / (255 * len(frames))
 
 
+def _initialized(seed: int, network: type[Network], *sizes: int) -> Network:
+    """Return a network with initial weights drawn from a seed, without use of global state."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return network(*sizes)
+
+
 def _train_vae(datasets: Sequence[TensorDictBase], config: VAEConfig, fit: Fit, seed: int) -> VAE:
     length = torch.cat([dataset.get("length") for dataset in datasets])
     if length.max() < config.window:
@@ -254,9 +266,7 @@ def _train_vae(datasets: Sequence[TensorDictBase], config: VAEConfig, fit: Fit, 
         return TensorDict({**windows, "action_known": drawn >= n_demonstrated}, [n_windows])
 
     generator = torch.Generator().manual_seed(seed)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        vae = VAE(config.latent_size, action.shape[-1])
+    vae = _initialized(seed, VAE, config.latent_size, action.shape[-1])
     vae.mean_frame.copy_(mean_frame(frames))
     loss = VAEInverseLoss(
         vae,
@@ -296,9 +306,8 @@ def _train_inverse(
         return TensorDict({"window": windows, "action": action[episode, step]}, [len(drawn)])
 
     generator = torch.Generator().manual_seed(seed)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        inverse = InverseModel(latent.shape[-1], action.shape[-1], config.hidden_size)
+    sizes = (latent.shape[-1], action.shape[-1], config.hidden_size)
+    inverse = _initialized(seed, InverseModel, *sizes)
     fit("inverse", ActionInferenceLoss(inverse), sample, config, generator)
     return inverse.eval().requires_grad_(False)
 
@@ -311,8 +320,6 @@ def _train_lae(
         return TensorDict({"latent": latent[index], "length": length[index]}, [config.batch_size])
 
     generator = torch.Generator().manual_seed(seed)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        lae = SequenceAutoencoder(latent.shape[-1], config.embedding_size)
+    lae = _initialized(seed, SequenceAutoencoder, latent.shape[-1], config.embedding_size)
     fit("lae", SequenceReconstructionLoss(lae), sample, config, generator)
     return lae.eval().requires_grad_(False)

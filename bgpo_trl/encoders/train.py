@@ -1,4 +1,4 @@
-"""Command line for training the encoders: ``python -m bgpo_trl.encoders.train data/nico``."""
+"""Train encoders on recordings: ``python -m bgpo_trl.encoders.train data/nico``."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import shlex
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,15 +17,16 @@ from tensordict import TensorDictBase
 from bgpo_trl.configs import RepresentationConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.dataset import load_demonstrations, read_meta
+from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.encoders.fitting import Log
 from bgpo_trl.encoders.make_bank import make_bank
+from bgpo_trl.encoders.pretrained import bank_path, default_weights
 from bgpo_trl.encoders.probes import probe
 from bgpo_trl.encoders.representation import (
     Representation,
     save_representation,
     train_representation,
 )
-from bgpo_trl.encoders.shipped import bank_path, default_weights
 from bgpo_trl.files.csv_file import CsvFile
 from bgpo_trl.files.writing import make_folder
 from bgpo_trl.machine import choose_device
@@ -112,6 +114,67 @@ def train_encoders(
     bank.save(bank_path(weights))
     probe(representation, dataset, folder, play=play)
     return representation, bank
+
+
+def make_pretrained(
+    weights: str | Path,
+    dataset: str | Path,
+    *,
+    folder: str | Path,
+    config: RepresentationConfig | None = None,
+    per_task: int = 1_200,
+    held_out_per_task: int = 200,
+    seed: int = 0,
+    command: str = "",
+    progress: bool = True,
+    device: torch.device | str = "cpu",
+    tasks: Sequence[str] = nico.PAPER_TASKS,
+    spread: float = 1.0,
+) -> tuple[Representation, DemonstrationBank]:
+    """Record demonstrations and play, train both encoders, and embed the demonstrations.
+
+    Each interrupted stage is resumed.
+
+    Args:
+        weights: File to write the encoders to; the bank is written beside it.
+        dataset: Folder of the demonstrations, recorded if missing. Half as many episodes of play go
+            to the folder of the same name plus ``-play``.
+        folder: Folder for the training log, checkpoints and probes.
+        config: Hyperparameters of the encoders.
+        per_task: Demonstrations of each task.
+        held_out_per_task: How many of those are held out.
+        seed: Seed of the recording.
+        command: Command line, stored with the weights.
+        progress: Whether to show progress bars.
+        device: Device to train on.
+        tasks: Tasks to demonstrate.
+        spread: Share of the whole range of start states.
+
+    Raises:
+        ValueError: If the dataset is damaged or was recorded in another scene.
+    """
+    record = partial(
+        record_demonstrations, tasks=tasks, spread=spread, seed=seed, progress=progress
+    )
+    demonstrations = record(dataset, per_task=per_task, held_out_per_task=held_out_per_task)
+    play = record(
+        Path(dataset).with_name(f"{Path(dataset).name}-play"),
+        per_task=max(2, per_task // 2),
+        held_out_per_task=max(1, held_out_per_task // 4),
+        play=True,
+    )
+    return train_encoders(
+        demonstrations,
+        play,
+        Path(weights),
+        Path(folder),
+        config or RepresentationConfig(),
+        command,
+        device,
+        progress=progress,
+        tasks=tasks,
+        spread=spread,
+    )
 
 
 def _log_of(file: CsvFile) -> Log:

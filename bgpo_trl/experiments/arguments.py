@@ -18,7 +18,7 @@ from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.rl import RL
 from bgpo_trl.configs import PRESETS, RunConfig
 from bgpo_trl.configs.checks import check_seeds
-from bgpo_trl.encoders.shipped import default_weights, weights_of_bank
+from bgpo_trl.encoders.pretrained import default_weights, weights_of_bank
 from bgpo_trl.plugins import import_plugin
 from suites import nico
 

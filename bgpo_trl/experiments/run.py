@@ -13,8 +13,9 @@ import torch
 from bgpo_trl.algorithms import ABLATIONS, ALGORITHMS, Algorithm
 from bgpo_trl.configs import STAGE_PRESETS, RunConfig
 from bgpo_trl.data.bank import DemonstrationBank
-from bgpo_trl.encoders.pretrained import load_pretrained, make_pretrained
+from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.encoders.representation import Representation
+from bgpo_trl.encoders.train import make_pretrained
 from bgpo_trl.experiments.arguments import (
     Arguments,
     TaskArguments,

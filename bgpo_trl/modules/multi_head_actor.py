@@ -82,10 +82,10 @@ class MultiHeadActor(StackedNetwork):
                 f"states of {hidden.shape[task_dim]} tasks for {len(self.heads)} heads: add a head "
                 "for each task"
             )
-        told: list[Tensor] = [
+        outputs: list[Tensor] = [
             head(of_task) for head, of_task in zip(self.heads, hidden.unbind(task_dim), strict=True)
         ]
-        loc, scale = torch.stack(told, task_dim).chunk(2, -1)
+        loc, scale = torch.stack(outputs, task_dim).chunk(2, -1)
         loc, share = loc.tanh(), scale.sigmoid()
         scale = _MIN_SCALE * (_MAX_SCALE / _MIN_SCALE) ** share
         return tensordict.set("loc", loc).set("scale", scale).set("action", loc)

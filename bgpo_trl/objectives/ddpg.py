@@ -73,6 +73,6 @@ class DDPGLoss(OffPolicyLoss):
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Compute the actor's loss ``[]`` and ``"pre_tanh_magnitude"``."""
         with self.network("actor_network") as actor:
-            data = actor(self.inputs.current(tensordict))
+            data = actor(self.current(tensordict))
         value = self.values("value_network", data, frozen=True)
         return self.penalized(value, data, tensordict)

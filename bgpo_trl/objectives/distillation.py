@@ -46,7 +46,7 @@ class DistillationLoss(LossModule):
 
     @property
     def functional(self) -> bool:
-        """Whether parameters are passed to the network: no, they stay in it."""
+        """False, since the parameters stay in the network."""
         return False
 
     @property

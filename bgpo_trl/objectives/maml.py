@@ -110,7 +110,7 @@ class MAMLLoss(DDPGLoss):
 
     def policy_loss(self, parameters: Parameters, tensordict: TensorDictBase) -> Tensor:
         """Return ``L_i`` ``[*S, T]`` of policies with parameters ``[*S, T, ...]``, one per task."""
-        data = self.inputs.current(tensordict)
+        data = self.current(tensordict)
         functional_call(self.actor_network, parameters, (data,))
         loss = -self.values("value_network", data, frozen=True)
         if self.imitation:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
@@ -16,9 +17,35 @@ from torchrl.objectives.utils import distance_loss
 from torchrl.objectives.value import TD0Estimator
 
 from bgpo_trl.configs import RLConfig
-from bgpo_trl.objectives.transition import TransitionInputs, TransitionKeys
+from bgpo_trl.errors import missing_key
 
-__all__ = ["OffPolicyLoss"]
+__all__ = ["OffPolicyLoss", "TransitionKeys"]
+
+
+@dataclass
+class TransitionKeys:
+    """Names of the entries of an off-policy loss, to be changed with its ``set_keys``."""
+
+    action: NestedKey = "action"
+    """Action of a transition, and of the actor."""
+    pre_tanh_action: NestedKey = "pre_tanh_action"
+    """Output of the actor before its tanh."""
+    log_prob: NestedKey = "action_log_prob"
+    """Log-probability of an action drawn from the actor."""
+    state_action_value: NestedKey = "state_action_value"
+    """Output of the critics."""
+    reward: NestedKey = "reward"
+    """Reward, under ``"next"``."""
+    done: NestedKey = "done"
+    """Whether the episode is over, under ``"next"``; accepted and not needed."""
+    terminated: NestedKey = "terminated"
+    """Whether nothing can follow, under ``"next"``: ends the bootstrap."""
+    priority: NestedKey = "td_error"
+    """Squared error of the critics, written for prioritized replay."""
+    priority_weight: NestedKey = "priority_weight"
+    """Factor of each transition's loss."""
+    demonstrated: NestedKey = "demonstrated"
+    """Whether the action is that of a demonstration."""
 
 
 class OffPolicyLoss(LossModule):
@@ -114,26 +141,32 @@ class OffPolicyLoss(LossModule):
         self.convert_to_functional(value_network, "value_network", create_target_params=True)
         self.return_bounds, self.pre_tanh_penalty = return_bounds, pre_tanh_penalty
         self.imitation = imitation
-        self.loss_function, name = loss_function, type(self).__name__
-        self.inputs = TransitionInputs(name, actor_network, value_network, constant_keys)
+        self.loss_function = loss_function
+        written = set(actor_network.out_keys)
+        read = [*actor_network.in_keys, *(k for k in value_network.in_keys if k not in written)]
+        self.input_keys = [*dict.fromkeys(unravel_key(key) for key in read)]
+        self.constant_keys = [unravel_key(key) for key in constant_keys]
+        unknown = [key for key in self.constant_keys if key not in self.input_keys]
+        if unknown:
+            raise ValueError(f"constant_keys must be among {self.input_keys}, got {unknown}")
 
     @property
     def in_keys(self) -> list[NestedKey]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Entries that `forward` accepts."""
-        keys, inputs = self.tensor_keys, self.inputs.keys
-        read = [*inputs, *self.value_network.in_keys, keys.priority_weight]
-        following = [*inputs, keys.reward, keys.done, keys.terminated]
+        keys = self.tensor_keys
+        read = [*self.input_keys, *self.value_network.in_keys, keys.priority_weight]
+        following = [*self.input_keys, keys.reward, keys.done, keys.terminated]
         return [*dict.fromkeys(read), *(unravel_key(("next", key)) for key in following)]
 
     @property
     def out_keys(self) -> list[NestedKey]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Entries that `forward` returns."""
-        told = ["pred_value", "target_value", "pred_value_max", "target_value_max", "td_error_max"]
-        # As in `penalized`: there is nothing to tell of an actor that does not write it.
-        silent = self.tensor_keys.pre_tanh_action not in self.actor_network.out_keys
-        left_out = {"pre_tanh_magnitude"} if silent else set()
-        of_actor = [key for key in self.actor_keys if key not in left_out]
-        return ["loss_actor", "loss_value", *told, *of_actor]
+        of_value = ["pred_value", "target_value", "pred_value_max", "target_value_max"]
+        of_actor = list(self.actor_keys)
+        # `penalized` returns no magnitude for an actor that does not write this entry.
+        if self.tensor_keys.pre_tanh_action not in self.actor_network.out_keys:
+            of_actor = [key for key in of_actor if key != "pre_tanh_magnitude"]
+        return ["loss_actor", "loss_value", *of_value, "td_error_max", *of_actor]
 
     def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> None:
         """Set the estimator of the target.
@@ -159,10 +192,10 @@ class OffPolicyLoss(LossModule):
     @dispatch()
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Compute all losses of a batch of transitions ``[*S, *B]``; see the class."""
-        loss_value, told = self.loss_value(tensordict)
-        loss_actor, told_of_actor = self.loss_actor(tensordict)
+        loss_value, of_value = self.loss_value(tensordict)
+        loss_actor, of_actor = self.loss_actor(tensordict)
         losses = {"loss_actor": loss_actor, "loss_value": loss_value}
-        return TensorDict({**losses, **told, **told_of_actor})
+        return TensorDict({**losses, **of_value, **of_actor})
 
     def next_value(self, successor: TensorDictBase) -> Tensor:
         """Return the values ``[*S, *B]`` of the input at next states; called without gradients."""
@@ -176,7 +209,7 @@ class OffPolicyLoss(LossModule):
         """Compute the critics' loss ``[]`` and their further entries; write ``"td_error"``."""
         with torch.no_grad():
             target = self.target(tensordict)
-        data = self.inputs.select(tensordict, self.value_network.in_keys)
+        data = self._select(tensordict, self.value_network.in_keys)
         prediction = self.values("value_network", data)
         twin_dim = len(self.batch_size)
         of_each = target.unsqueeze(twin_dim).expand_as(prediction) if self.twin_critics else target
@@ -196,7 +229,7 @@ class OffPolicyLoss(LossModule):
 
     def target(self, tensordict: TensorDictBase) -> Tensor:
         """Return the clipped bootstrapped targets of transitions, ``[*S, *B]``."""
-        successor = self.inputs.following(tensordict, self.tensor_keys)
+        successor = self.following(tensordict)
         next_value = self.next_value(successor).unsqueeze(-1)
         reward = tensordict.get(("next", self.tensor_keys.reward))
         if reward.shape != next_value.shape:
@@ -205,6 +238,39 @@ class OffPolicyLoss(LossModule):
             )
         target = self.value_estimator.value_estimate(tensordict, next_value=next_value).squeeze(-1)
         return target if self.return_bounds is None else target.clamp(*self.return_bounds)
+
+    def current(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return the networks' input, detached, in the states of transitions ``[*S, *B]``."""
+        return self._select(tensordict, self.input_keys)
+
+    def following(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return the networks' input, detached, in the next states of transitions ``[*S, *B]``.
+
+        Raises:
+            ValueError: If the reward, the termination or an entry is missing under ``"next"``.
+        """
+        names, successor = self.tensor_keys, tensordict.get("next", None)
+        if successor is None or successor.get(names.reward, None) is None:
+            raise missing_key(type(self).__name__, tensordict, [("next", names.reward)])
+        if successor.get(names.terminated, None) is None:
+            # The estimator would read "done" in its place, and stop at truncation too.
+            raise ValueError(
+                f"the batch lacks ('next', {names.terminated!r}): store it, since only it "
+                "distinguishes a success from a time-out"
+            )
+        moving = [key for key in self.input_keys if key not in self.constant_keys]
+        data = self._select(successor, moving, ", under 'next',")
+        for key in self.constant_keys:
+            data.set(key, tensordict[key])
+        return data
+
+    def _select(
+        self, tensordict: TensorDictBase, keys: Iterable[NestedKey], where: str = ""
+    ) -> TensorDictBase:
+        try:
+            return tensordict.select(*keys).detach()
+        except KeyError:
+            raise missing_key(type(self).__name__ + where, tensordict, keys) from None
 
     def values(self, name: str, data: TensorDictBase, *, frozen: bool = False) -> Tensor:
         """Return a critic's values ``[*S, *B]``, or ``[*S, 2, *B]`` of twin critics.

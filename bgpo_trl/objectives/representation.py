@@ -81,7 +81,7 @@ class VAEInverseLoss(LossModule):
 
     @property
     def functional(self) -> bool:
-        """Whether parameters are passed to the network: no, they stay in it."""
+        """False, since the parameters stay in the network."""
         return False
 
     @property
@@ -151,7 +151,7 @@ class ActionInferenceLoss(LossModule):
 
     @property
     def functional(self) -> bool:
-        """Whether parameters are passed to the network: no, they stay in it."""
+        """False, since the parameters stay in the network."""
         return False
 
     @property
@@ -209,7 +209,7 @@ class SequenceReconstructionLoss(LossModule):
 
     @property
     def functional(self) -> bool:
-        """Whether parameters are passed to the network: no, ``nn.LSTM`` caches its weights."""
+        """False, since ``nn.LSTM`` caches its weights."""
         return False
 
     @property

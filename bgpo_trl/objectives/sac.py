@@ -92,7 +92,7 @@ class SACLoss(OffPolicyLoss):
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Compute the actor's loss ``[]``, and the temperature's loss and entries."""
-        data, log_prob = self._sample(self.inputs.current(tensordict))
+        data, log_prob = self._sample(self.current(tensordict))
         values = self.values("value_network", data, frozen=True)
         alpha = self.log_alpha.detach().exp()
         loss = self._each(alpha, log_prob) * log_prob - values.amin(len(self.batch_size))
@@ -107,7 +107,7 @@ class SACLoss(OffPolicyLoss):
     def _sample(self, data: TensorDictBase) -> tuple[TensorDictBase, Tensor]:
         """Return the data with actions drawn, and their log-probabilities ``[*S, *B]``."""
         # A TensorDict without a batch size is read as one of vectors.
-        batch = data.batch_size or data.get(self.inputs.keys[0]).shape[:-1]
+        batch = data.batch_size or data.get(self.input_keys[0]).shape[:-1]
         noise = self.noise(self.log_alpha.new_empty(*batch, self.actor_network.action_dim))
         with self.network("actor_network") as actor:
             data = actor.sample(data, noise)

@@ -80,6 +80,6 @@ class TD3Loss(OffPolicyLoss):
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Compute the actor's loss ``[]`` and ``"pre_tanh_magnitude"``."""
         with self.network("actor_network") as actor:
-            data = actor(self.inputs.current(tensordict))
+            data = actor(self.current(tensordict))
         values = self.values("value_network", data, frozen=True)
         return self.penalized(values.select(len(self.batch_size), 0), data, tensordict)

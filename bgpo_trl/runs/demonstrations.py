@@ -6,11 +6,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from bgpo_trl.data.bank import DemonstrationBank
+from bgpo_trl.encoders.pretrained import bank_path, find_weights
 from bgpo_trl.encoders.representation import (
     Representation,
     load_representation,
 )
-from bgpo_trl.encoders.shipped import bank_path, find_weights
 from bgpo_trl.runs.config_file import Digests
 from suites import nico
 

@@ -55,11 +55,11 @@ class EpisodeTransform(Transform):
 
     Attributes:
         learn: Whether it learns at the end of an episode.
-        pays: Whether it changes the reward.
+        changes_reward: Whether it changes the reward.
     """
 
     learn: bool = False
-    pays: bool = False
+    changes_reward: bool = False
     _seeding: Seeding | None = None
 
     def __init__(self, in_keys: Sequence[NestedKey], out_keys: Sequence[NestedKey]) -> None:
@@ -128,7 +128,7 @@ class EpisodeTransform(Transform):
             raise ValueError(
                 f"put StepCounter before {type(self).__name__}, which has to see where episodes end"
             )
-        if self.pays and any(isinstance(t, RewardSum) for t in before):
+        if self.changes_reward and any(isinstance(t, RewardSum) for t in before):
             raise ValueError(f"put RewardSum after {type(self).__name__}, which changes the reward")
 
     def _check_limit(self, observation_spec: Composite) -> None:

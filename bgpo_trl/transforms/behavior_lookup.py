@@ -15,7 +15,7 @@ from bgpo_trl.transforms._episode import DemonstrationLookup, unbounded
 
 
 class BehaviorLookup(DemonstrationLookup):
-    """Infers the task of an episode with GWR-B: its behavior ``b`` (Alg. 1).
+    """Task inference by GWR-B: the behavior ``b`` of an episode (Alg. 1).
 
     At reset, ``b = w_c``, the weights of the node that best matches the demonstration. At the end
     of an episode GWR-B adapts to its demonstration. For the arguments, see `DemonstrationLookup`,

@@ -15,7 +15,7 @@ from bgpo_trl.transforms._episode import EpisodeTransform, ending
 
 
 class BehaviorMatchingReward(EpisodeTransform):
-    """Rewards an episode, at its end, for how well it matches its behavior ``b`` (Eq. 7).
+    """Intrinsic reward at the end of an episode for matching its behavior ``b`` (Eq. 7).
 
     1. At reset, the encoder of the LSTM autoencoder reads the first latent ``z_0``, from a zero
        state.
@@ -62,7 +62,7 @@ class BehaviorMatchingReward(EpisodeTransform):
         True
     """
 
-    pays = True
+    changes_reward = True
 
     def __init__(
         self,

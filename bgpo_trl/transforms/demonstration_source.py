@@ -97,7 +97,7 @@ class Bank(Protocol):
 
 
 class DemonstrationSource(EpisodeTransform):
-    """Draws the task and the demonstration of each episode (Alg. 1, "Sample demonstration d").
+    """Task and demonstration of each episode, drawn at random (Alg. 1, "Sample demonstration d").
 
     1. Before the environment is reset, each row whose episode starts gets one of the tasks
        available to it, and one demonstration of that task, both drawn uniformly. The environment

@@ -15,7 +15,7 @@ from bgpo_trl.transforms._episode import starting, unbounded
 
 
 class FrameEncoder(Transform):
-    """Encodes every frame with a frozen encoder, ``z = f_V(s)`` (Alg. 1), without gradient.
+    """Latents of all frames by a frozen encoder, ``z = f_V(s)`` (Alg. 1), without gradient.
 
     1. At reset, only the frames of the rows that are reset are encoded: with one environment per
        seed, episodes end one at a time, and the encoder is the most expensive part.

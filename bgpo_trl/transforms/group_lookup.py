@@ -14,7 +14,7 @@ from bgpo_trl.transforms._episode import DemonstrationLookup, unbounded
 
 
 class GroupLookup(DemonstrationLookup):
-    """Finds the group of an episode's demonstration, which selects the expert and the replay.
+    """Group of an episode's demonstration, which selects the expert and the replay.
 
     For the arguments, see `DemonstrationLookup`, whose ``network`` is ``groups``. With a novelty
     above 1, the demonstration belongs to no known group and is played by the nearest.

@@ -72,7 +72,7 @@ def _release() -> Callable[[], object]:
 
 
 def _leave() -> None:
-    """Make no context current in the calling thread, and tell dm_control.
+    """Make no context current in the calling thread, and update dm_control's records.
 
     dm_control notes which of its contexts is current in a thread, and does not make it current
     again: its next image would be black, of whatever environment.

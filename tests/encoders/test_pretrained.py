@@ -1,4 +1,4 @@
-"""Encoders and bank belong together: made in one go, loaded together or not at all."""
+"""Encoders and the bank of their embeddings, which are made and loaded together."""
 
 import json
 import shutil
@@ -14,8 +14,9 @@ from bgpo_trl.configs import (
     VAEConfig,
 )
 from bgpo_trl.data.dataset import load_demonstrations
-from bgpo_trl.encoders.pretrained import load_pretrained, make_pretrained
+from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.encoders.representation import save_representation
+from bgpo_trl.encoders.train import make_pretrained
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from suites import nico
 
@@ -52,12 +53,12 @@ def made(folder):
 
 @pytest.fixture
 def copy(made, folder, tmp_path):
-    """The files, to be tampered with."""
+    """A copy of the files, which a test may change."""
     shutil.copytree(folder / "encoders", tmp_path, dirs_exist_ok=True)
     return tmp_path / "some.safetensors"
 
 
-def test_what_was_made_is_loaded(made, folder):
+def test_made_encoders_and_bank_are_loaded(made, folder):
     encoders, bank = made
     loaded_encoders, loaded_bank = load_pretrained(folder / "encoders" / "some.safetensors")
     assert loaded_encoders.identity == encoders.identity
@@ -67,12 +68,9 @@ def test_what_was_made_is_loaded(made, folder):
         assert json.loads((folder / recorded / "dataset.json").read_text())["tasks"] == [*TASKS]
     for name in ("embedding", "task", "train"):
         assert getattr(loaded_bank, name).equal(getattr(bank, name))
-    for module in (loaded_encoders.vae, loaded_encoders.lae):
-        assert not module.training
-        assert not any(parameter.requires_grad for parameter in module.parameters())
 
 
-def test_the_bank_holds_what_the_encoders_make_of_each_demonstration(made, folder):
+def test_the_bank_holds_the_embedding_of_each_demonstration(made, folder):
     encoders, bank = made
     demonstrations = load_demonstrations(folder / "demonstrations")
     assert bank.task.tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 2]
@@ -85,7 +83,7 @@ def test_the_bank_holds_what_the_encoders_make_of_each_demonstration(made, folde
     assert len(bank.embedding.unique(dim=0)) == 9
 
 
-def test_the_same_command_finds_all_of_it_made(made, folder, monkeypatch):
+def test_the_same_command_records_and_trains_nothing_again(made, folder, monkeypatch):
     def refuse(*arguments):
         raise AssertionError("recorded again")
 
@@ -101,9 +99,6 @@ def test_the_same_command_finds_all_of_it_made(made, folder, monkeypatch):
     )
     assert encoders.identity == made[0].identity
     assert bank.embedding.equal(made[1].embedding)
-
-
-def test_other_demonstrations_at_that_place_are_refused(made, folder):
     with pytest.raises(ValueError, match="holds another recording"):
         make_pretrained(
             folder / "encoders" / "some.safetensors",
@@ -113,25 +108,17 @@ def test_other_demonstrations_at_that_place_are_refused(made, folder):
         )
 
 
-def test_encoders_of_another_scene_are_refused(copy, monkeypatch):
-    monkeypatch.setattr(nico, "scene_version", lambda: "another")
-    with pytest.raises(ValueError, match="this is scene another: train new ones with"):
-        load_pretrained(copy)
-
-
-def test_a_bank_that_other_encoders_made_is_refused(made, copy):
+def test_files_that_do_not_belong_together_are_refused(made, copy, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(nico, "scene_version", lambda: "another")
+        with pytest.raises(ValueError, match="scene another"):
+            load_pretrained(copy)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(5)
         other = replace(made[0], lae=SequenceAutoencoder())
     save_representation(other, copy)
     with pytest.raises(ValueError, match=r"some_bank\.safetensors was made for .*make it again"):
         load_pretrained(copy)
-
-
-def test_a_missing_bank_or_missing_encoders_are_named(copy):
     copy.with_name("some_bank.safetensors").unlink()
-    with pytest.raises(ValueError, match="there is no demonstration bank at"):
-        load_pretrained(copy)
-    copy.unlink()
-    with pytest.raises(ValueError, match="no encoder weights at"):
+    with pytest.raises(ValueError, match="no demonstration bank"):
         load_pretrained(copy)

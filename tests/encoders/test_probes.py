@@ -1,7 +1,5 @@
-import json
-from pathlib import Path
+"""Probes against known maps, and which frames they read."""
 
-import matplotlib.image
 import pytest
 import torch
 from tensordict import TensorDict
@@ -39,7 +37,7 @@ def untrained() -> Representation:
     return Representation(VAE(), SequenceAutoencoder(), InverseModel(), {})
 
 
-def test_ridge_finds_a_linear_map_whatever_the_scale() -> None:
+def test_ridge_regression_finds_a_linear_map_at_any_scale() -> None:
     x, x_new = torch.randn(500, 5), torch.randn(40, 5)
     scale, weight = torch.tensor([1e-3, 1.0, 1e3, 1.0, 0.0]), torch.randn(5, 3)
 
@@ -48,12 +46,6 @@ def test_ridge_finds_a_linear_map_whatever_the_scale() -> None:
 
     predicted = ridge_predict(x * scale, truth(x), x_new * scale, penalty=1e-8)
     torch.testing.assert_close(predicted, truth(x_new), rtol=1e-3, atol=1e-3)
-
-
-def test_ridge_finds_nothing_in_noise() -> None:
-    y = torch.randn(5000, 1) + 3
-    predicted = ridge_predict(torch.randn(5000, 2), y, torch.randn(100, 2))
-    assert (predicted - 3).abs().max() < 0.3
 
 
 def test_picture_shows_frames_over_reconstructions(untrained: Representation) -> None:
@@ -67,14 +59,7 @@ def test_picture_shows_frames_over_reconstructions(untrained: Representation) ->
     assert (last == data["pixels"][5, :7]).flatten(1).all(-1).any(), "of a valid step"
 
 
-def test_writes_numbers_and_picture(untrained: Representation, tmp_path: Path) -> None:
-    result = probe(untrained, demonstrations(), tmp_path / "new")
-    assert json.loads((tmp_path / "new" / "probes.json").read_text()) == result
-    picture = matplotlib.image.imread(tmp_path / "new" / "reconstructions.png")
-    assert picture.shape[:2] == (256, 3072)
-
-
-def test_probes_read_held_out_demonstrations_only_to_measure(untrained: Representation) -> None:
+def test_probes_are_not_fitted_on_held_out_demonstrations(untrained: Representation) -> None:
     """Two held-out demonstrations of three: measuring on one alone is fitting on the same four."""
     data = demonstrations()
     data["state"][data["train"]] = 0.5
@@ -95,7 +80,7 @@ def test_frames_beyond_the_length_do_not_count(untrained: Representation) -> Non
     assert probe(untrained, data) == pytest.approx(expected)
 
 
-def test_play_is_measured_where_all_objects_are_on_the_table(untrained: Representation) -> None:
+def test_frames_of_play_with_a_fallen_object_are_left_out(untrained: Representation) -> None:
     play = demonstrations(9)
     play["state"][..., 7:] = 0.7
     play["state"][:, 1, 15] = 0.1  # the white box has just fallen

@@ -40,11 +40,11 @@ def test_the_actor_imitates_good_actions_most(registry):
     batch = TensorDict({"state": state, "action": action, "next": successor}, [2, 1, 16])
     losses = learner.loss(batch.clone())
 
-    network = learner.loss.network
-    acted = network("actor_network")(batch.select("state"))
+    with learner.loss.network("actor_network") as actor:
+        acted = actor(batch.select("state"))
     q = [
-        network("value_network")(data)["state_action_value"].squeeze(-1)
-        for data in (batch.select("state", "action"), acted)
+        learner.loss.values("value_network", data)
+        for data in (batch.select("state", "action"), acted.clone())
     ]
     weight = ((q[0] - q[1]) / 0.1).exp().clamp(max=20).detach()
     assert weight.std() > 0

@@ -1,11 +1,11 @@
-"""The perceptrons compute what plain ones compute, and a seed in a stack is that seed alone."""
+"""Perceptrons against plain ones, and each seed of a stack against that seed alone."""
 
+import itertools
 import math
 
 import pytest
 import torch
 from tensordict import TensorDict
-from torch import nn
 from torch.func import functional_call
 
 from bgpo_trl.modules.actor_critic import Actor, Critic
@@ -18,27 +18,16 @@ def generators(n: int) -> list[torch.Generator]:
     return [torch.Generator().manual_seed(seed) for seed in range(n)]
 
 
-def test_single_layer_is_nn_linear():
-    layer, reference = StackedLinear(3, 5), nn.Linear(3, 5)
-    with torch.no_grad():
-        reference.weight.copy_(layer.weight.T)
-        reference.bias.copy_(layer.bias)
-    x = torch.randn(4, 7, 3)
-    torch.testing.assert_close(layer(x), reference(x))
-
-
-@pytest.mark.parametrize("batch_size", [(4,), (2, 3)])
+@pytest.mark.parametrize("batch_size", [(), (4,), (2, 3)])
 @pytest.mark.parametrize("batch", [(), (7,), (5, 7)])
-@pytest.mark.parametrize("out_features", [1, 5, 32])  # each multiplied in a way of its own
+@pytest.mark.parametrize("out_features", [1, 5, 32])  # sizes with different kernels
 def test_stacked_layer_applies_each_matrix_to_its_own_slice(batch_size, batch, out_features):
     layer = StackedLinear(3, out_features, batch_size)
     x = torch.randn(*batch_size, *batch, 3, requires_grad=True)
     y = layer(x)
     assert y.shape == (*batch_size, *batch, out_features)
-    indices = torch.cartesian_prod(*map(torch.arange, batch_size)).view(-1, len(batch_size))
-    reference = torch.stack(
-        [x[i] @ layer.weight[i] + layer.bias[i] for i in map(tuple, indices.tolist())]
-    ).view(y.shape)
+    indices = itertools.product(*map(range, batch_size))
+    reference = torch.stack([x[i] @ layer.weight[i] + layer.bias[i] for i in indices]).view(y.shape)
     torch.testing.assert_close(y, reference)
     wrt = x, layer.weight, layer.bias
     upstream = torch.randn(y.shape)
@@ -67,47 +56,36 @@ def test_initial_weights_are_uniform_within_one_over_root_of_inputs():
     assert not torch.equal(layer.weight[0], layer.weight[1])
 
 
-def test_seeds_do_not_share_gradients():
-    mlp = StackedMLP(3, 2, batch_size=(4,))
-    mlp(torch.randn(4, 5, 3))[2].sum().backward()
-    for parameter in mlp.parameters():
-        assert parameter.grad is not None
-        assert parameter.grad[2].abs().sum() > 0
-        assert parameter.grad[[0, 1, 3]].abs().sum() == 0
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: StackedLinear(2, 2, (3,), generators(2)), "needs 3, got 2"),
+        (lambda: StackedLinear(0, 2), "at least 1"),
+        (lambda: Actor(6, batch_size=0), "at least 1"),
+        (lambda: StackedLinear(2, 2, (3,))(torch.zeros(5, 3, 2)), "one leading index per layer"),
+        (lambda: StackedLinear(2, 2)(torch.zeros(4, 1)), "2 features"),
+    ],
+)
+def test_bad_sizes_are_refused(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
 
 
-def test_bad_sizes_are_refused():
-    with pytest.raises(ValueError, match="needs 3, got 2"):
-        StackedLinear(2, 2, (3,), generators(2))
-    with pytest.raises(ValueError, match="at least 1"):
-        StackedLinear(0, 2)
-    with pytest.raises(ValueError, match="one leading index per layer"):
-        StackedLinear(2, 2, (3,))(torch.zeros(5, 3, 2))
-    with pytest.raises(ValueError, match=r"2 features"):
-        StackedLinear(2, 2)(torch.zeros(4, 1))
-
-
-def test_actor_is_the_network_of_the_paper():
-    actor = Actor(96, hidden_sizes=(64,))
-    weights = [tuple(parameter.shape) for parameter in actor.parameters()]
-    assert weights == [(96, 64), (64,), (64, 4), (4,)]
+def test_actor_and_critic_are_the_networks_of_the_paper():
+    actor, critic = Actor(96, hidden_sizes=(64,)), Critic(96, hidden_sizes=(64,))
+    assert [tuple(w.shape) for w in actor.parameters()] == [(96, 64), (64,), (64, 4), (4,)]
+    assert [tuple(w.shape) for w in critic.parameters()] == [(100, 64), (64,), (64, 1), (1,)]
     latent, behavior = torch.randn(5, 64), torch.randn(5, 32)
-    data = actor(TensorDict({"latent": latent, "behavior": behavior}, [5]))
-    w1, b1, w2, b2 = actor.parameters()
-    pre_tanh = (torch.cat([latent, behavior], -1) @ w1 + b1).clamp(min=0) @ w2 + b2
+    data = critic(actor(TensorDict({"latent": latent, "behavior": behavior}, [5])))
+
+    def plain(x, network):
+        w1, b1, w2, b2 = network.parameters()
+        return (x @ w1 + b1).clamp(min=0) @ w2 + b2
+
+    pre_tanh = plain(torch.cat([latent, behavior], -1), actor)
     torch.testing.assert_close(data["pre_tanh_action"], pre_tanh)
     torch.testing.assert_close(data["action"], pre_tanh.tanh())
-
-
-def test_critic_is_the_network_of_the_paper():
-    critic = Critic(96, hidden_sizes=(64,))
-    weights = [tuple(parameter.shape) for parameter in critic.parameters()]
-    assert weights == [(100, 64), (64,), (64, 1), (1,)]
-    parts = {"latent": torch.randn(5, 64), "behavior": torch.randn(5, 32)}
-    parts["action"] = torch.rand(5, 4)
-    data = critic(TensorDict(parts, [5]))
-    w1, b1, w2, b2 = critic.parameters()
-    value = (torch.cat(list(parts.values()), -1) @ w1 + b1).clamp(min=0) @ w2 + b2
+    value = plain(torch.cat([latent, behavior, pre_tanh.tanh()], -1), critic)
     torch.testing.assert_close(data["state_action_value"], value)
 
 
@@ -124,18 +102,7 @@ def test_layer_norm_is_the_textbook_one_before_each_relu():
     torch.testing.assert_close(output, x @ last.weight + last.bias.unsqueeze(1))
 
 
-def test_normalized_critic_does_not_see_the_scale_of_its_input():
-    critic = Critic(6, 2, in_keys=["state"], layer_norm=True)
-    with torch.no_grad():
-        critic.mlp.layers[0].bias.zero_()
-    state, action = torch.randn(9, 6), torch.randn(9, 2)
-    value = critic(state=state, action=action)
-    torch.testing.assert_close(
-        critic(state=100 * state, action=100 * action), value, rtol=1e-3, atol=1e-3
-    )
-
-
-def test_other_inputs_widths_and_depths_are_configuration():
+def test_inputs_widths_and_depths_can_be_configured():
     keys = [("observation", "state"), "task_one_hot"]
     options = {"in_keys": keys, "hidden_sizes": (16, 8), "batch_size": (3,)}
     actor, critic = Actor(9, 2, **options), Critic(9, 2, **options)
@@ -149,19 +116,10 @@ def test_other_inputs_widths_and_depths_are_configuration():
     assert [p.shape[-1] for p in actor.parameters() if p.ndim == 3] == [16, 8, 2]
 
 
-def test_stacked_actor_is_each_actor_alone_also_while_acting():
-    actor = Actor(96, batch_size=(3,), generator=generators(3))
-    latent, behavior = torch.randn(3, 64), torch.randn(3, 32)
-    action = actor(TensorDict({"latent": latent, "behavior": behavior}, [3]))["action"]
-    for i, generator in enumerate(generators(3)):
-        data = TensorDict({"latent": latent[i], "behavior": behavior[i]}, [])
-        torch.testing.assert_close(action[i], Actor(96, generator=generator)(data)["action"])
-
-
 @pytest.mark.parametrize("stack", [(), (3,), (2, 5)])
 @pytest.mark.parametrize("network", [Actor, Critic, GaussianActor, MultiHeadActor])
 def test_a_network_can_be_called_with_the_weights_of_any_stack(network, stack):
-    """Of one, of more seeds than its own, and of seeds with several tasks each."""
+    """Weights of one seed, of other seeds than its own, and of seeds with several tasks each."""
 
     def make(batch_size):
         made = network(3, 2, in_keys=["state"], hidden_sizes=(8,), batch_size=batch_size)
@@ -179,20 +137,12 @@ def test_a_network_can_be_called_with_the_weights_of_any_stack(network, stack):
         assert called[key].equal(expected[key])
 
 
-def test_works_without_tensordict_and_names_a_missing_entry():
-    actor = Actor(3, 2, in_keys=["state"])
+def test_networks_can_be_called_with_keywords_and_name_a_missing_entry():
+    actor = Actor(3, 2, in_keys=["state"], batch_size=5)  # a number for a shape
     state = torch.randn(5, 3)
     expected = actor(TensorDict({"state": state}, [5]))
     pre_tanh, action = actor(state=state)
     assert torch.equal(action, expected["action"])
     assert torch.equal(pre_tanh, expected["pre_tanh_action"])
-    with pytest.raises(
-        ValueError, match=r"^Actor found no 'state' in a .* with \['latent'\]: write"
-    ):
+    with pytest.raises(ValueError, match="Actor found no 'state'"):
         actor(TensorDict({"latent": state}, [5]))
-
-
-def test_a_batch_size_may_be_a_number():
-    assert Actor(6, batch_size=10).batch_size == (10,)
-    with pytest.raises(ValueError, match="batch_size must be a whole number, at least 1; got 0"):
-        Actor(6, batch_size=0)

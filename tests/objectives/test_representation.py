@@ -1,3 +1,5 @@
+"""Losses of the encoders against numbers by hand, and the noise, padding and gradients."""
+
 import math
 
 import pytest
@@ -68,7 +70,7 @@ def test_kl_of_the_prior_is_zero() -> None:
     assert loss(windows(1))["kl"].item() == 0
 
 
-def test_z_is_sampled_with_the_posteriors_width() -> None:
+def test_latents_are_sampled_with_the_posteriors_standard_deviation() -> None:
     """With actions zero the inverse loss is half the variance of z_next - z: sigma^2 a number."""
     mu, log_variance = torch.zeros(4, 3, 1000), torch.full((4, 3, 1000), 2 * math.log(0.3))
     generator = torch.Generator().manual_seed(0)
@@ -90,13 +92,13 @@ def test_only_known_actions_train_the_inverse_model() -> None:
     assert VAEInverseLoss(vae)(data)["inverse"] == 0  # type: ignore[arg-type]
 
 
-def test_action_inference_is_judged_by_the_squared_error() -> None:
+def test_action_inference_loss_is_the_squared_error() -> None:
     torch.manual_seed(0)
     inverse = InverseModel(2, 3, hidden_size=4)
     data = TensorDict({"window": torch.randn(5, 8), "action": torch.rand(5, 3)}, [5])
     error = inverse.network(data["window"]) - data["action"]
     loss = ActionInferenceLoss(inverse)(data)["loss_inverse"]
-    assert loss.item() == pytest.approx(float(error.square().sum() / 5))
+    assert loss.item() == pytest.approx(error.square().sum().item() / 5)
 
 
 def test_noise_comes_from_the_generator_alone() -> None:
@@ -120,11 +122,6 @@ def test_every_term_trains_the_encoder(term: str) -> None:
     assert gradient.abs().sum() > 0
 
 
-def test_parameters_are_the_networks_own() -> None:
-    vae = VAE()
-    assert {id(p) for p in VAEInverseLoss(vae).parameters()} == {id(p) for p in vae.parameters()}
-
-
 def test_leading_dimensions_and_other_keys() -> None:
     torch.manual_seed(0)
     vae, data = VAE(), windows(4)
@@ -137,13 +134,8 @@ def test_leading_dimensions_and_other_keys() -> None:
         torch.testing.assert_close(result[key], expected[key])
 
 
-def test_refuses_windows_without_a_transition() -> None:
-    with pytest.raises(ValueError, match="2 frames"):
-        VAEInverseLoss(VAE())(windows(2, 1))
-
-
-class Parrot(nn.Module):
-    """Reconstructs what it is told to."""
+class GivenReconstruction(nn.Module):
+    """Reconstructs given latents, whatever the code."""
 
     def __init__(self, reversed_latent: Tensor) -> None:
         super().__init__()
@@ -161,13 +153,13 @@ def test_sequence_loss_by_hand() -> None:
     data = TensorDict({"latent": latent, "length": torch.tensor([2, 1])}, [2])
     backwards = torch.tensor([[[3.0, 4.0], [1.0, 2.0]], [[5.0, 6.0], [-7.0, 7.0]]])
     key = "loss_reconstruction"
-    assert SequenceReconstructionLoss(Parrot(backwards))(data)[key] == 0  # type: ignore[arg-type]
+    assert SequenceReconstructionLoss(GivenReconstruction(backwards))(data)[key] == 0  # type: ignore[arg-type]
     backwards[0, 1] += torch.tensor([3.0, 0.0])
     backwards[1, 0] += torch.tensor([0.0, 1.0])
     # Squares 9 and 1 over three valid steps of two numbers.
-    loss = SequenceReconstructionLoss(Parrot(backwards))  # type: ignore[arg-type]
+    loss = SequenceReconstructionLoss(GivenReconstruction(backwards))  # type: ignore[arg-type]
     assert loss(data)[key].item() == pytest.approx(10 / 6)
-    loss = SequenceReconstructionLoss(Parrot(backwards[:1]))  # type: ignore[arg-type]
+    loss = SequenceReconstructionLoss(GivenReconstruction(backwards[:1]))  # type: ignore[arg-type]
     assert loss(data[:1])[key].item() == pytest.approx(9 / 4)
 
 
@@ -185,18 +177,3 @@ def test_sequence_loss_and_gradient_ignore_padding(filler: float) -> None:
         value.backward()
         gradients.append([value.detach(), *(p.grad.clone() for p in loss.parameters())])
     torch.testing.assert_close(*gradients)
-
-
-def test_sequence_loss_learns_sequences() -> None:
-    torch.manual_seed(0)
-    loss = SequenceReconstructionLoss(SequenceAutoencoder(latent_size=4))
-    phase = torch.rand(64, 1, 1) * 6.28
-    latent = torch.sin(phase + torch.arange(12).reshape(1, 12, 1) / 3 + torch.arange(4.0))
-    data = TensorDict({"latent": latent, "length": torch.randint(6, 13, (64,))}, [64])
-    optimizer = torch.optim.Adam(loss.parameters(), 0.02)
-    for _ in range(150):
-        value = loss(data)["loss_reconstruction"]
-        optimizer.zero_grad()
-        value.backward()
-        optimizer.step()
-    assert value.item() < 0.1 * latent.var().item()

@@ -1,4 +1,4 @@
-"""``suites`` belongs to no project: another one's suites lie beside NICO's."""
+"""``suites`` is a namespace package, which several projects can share."""
 
 import os
 import shutil
@@ -24,7 +24,7 @@ def other(tmp_path):
 
 
 def imported_from(*folders: Path) -> str:
-    """Returns where the parts of ``suites`` were found, with some folders on the path."""
+    """Return the paths of the parts of ``suites``, with given folders on the path."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, folders))}
     process = subprocess.run(
         [sys.executable, "-c", USE], cwd="/", env=environment, capture_output=True, text=True
@@ -33,16 +33,9 @@ def imported_from(*folders: Path) -> str:
     return process.stdout
 
 
-@pytest.mark.parametrize("first", [True, False])
-def test_sources_of_two_projects_are_merged(other, first):
-    folders = [ROOT, other] if first else [other, ROOT]
-    found = imported_from(*folders)
-    assert all(str(folder / "suites") in found for folder in folders)
-
-
 @pytest.mark.parametrize("files", [[], ["notes.txt"], ["__init__.py"]])
 def test_a_folder_of_that_name_in_the_working_directory(tmp_path, files):
-    """It does no harm, unless it claims the name for itself; then the remedy is told."""
+    """Only a package of that name hides ours, which ends in one line with the remedy."""
     (tmp_path / "suites").mkdir()
     for name in files:
         (tmp_path / "suites" / name).touch()
@@ -54,14 +47,14 @@ def test_a_folder_of_that_name_in_the_working_directory(tmp_path, files):
         text=True,
     )
     if "__init__.py" in files:
-        told = process.stderr.splitlines()[-1]
-        assert told.startswith("ImportError: cannot import name 'opengl' from 'suites' (")
-        assert told.endswith("hides ours: remove its __init__.py, or start elsewhere")
+        line = process.stderr.splitlines()[-1]
+        assert line.startswith("ImportError: cannot import name 'opengl' from 'suites' (")
+        assert line.endswith("hides ours: remove its __init__.py, or start elsewhere")
     else:
         assert (process.stdout, process.stderr) == ("suites.opengl\n", "")
 
 
-def test_the_wheel_has_no_file_that_another_projects_suites_would_have(other, tmp_path):
+def test_the_wheel_leaves_room_for_suites_of_other_projects(other, tmp_path):
     copy, wheels = tmp_path / "copy", tmp_path / "wheels"
     for name in ("bgpo_trl", "suites"):
         shutil.copytree(ROOT / name, copy / name, ignore=shutil.ignore_patterns("__pycache__"))

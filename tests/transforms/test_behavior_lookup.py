@@ -7,7 +7,6 @@ from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import (
     Compose,
-    RenameTransform,
     SerialEnv,
     StepCounter,
     TransformedEnv,
@@ -15,23 +14,20 @@ from torchrl.envs import (
 )
 
 from bgpo_trl.transforms import BehaviorLookup, DemonstrationSource, TaskSchedule
+from tests.transforms.environment import MockEnv, generators, make_bank, make_modules, play
 
 
-@pytest.fixture
-def make(MockEnv, make_bank, make_modules, generators):
-    def make(seeds=None, lengths=3, learn=True, behavior=None):
-        gwr = make_modules(seeds)[2]
-        source = DemonstrationSource(
-            make_bank(),
-            TaskSchedule((0, 0, 0)),
-            batch_size=gwr.batch_size,
-            generator=generators(seeds or [0]),
-        )
-        behavior = behavior or BehaviorLookup(gwr, learn=learn)
-        env = MockEnv(seeds, lengths)
-        return TransformedEnv(env, Compose(StepCounter(50), source, behavior)), gwr
-
-    return make
+def make(seeds=None, lengths=3, learn=True, behavior=None):
+    gwr = make_modules(seeds)[2]
+    source = DemonstrationSource(
+        make_bank(),
+        TaskSchedule((0, 0, 0)),
+        batch_size=gwr.batch_size,
+        generator=generators(seeds or [0]),
+    )
+    behavior = behavior or BehaviorLookup(gwr, learn=learn)
+    env = MockEnv(seeds, lengths)
+    return TransformedEnv(env, Compose(StepCounter(50), source, behavior)), gwr
 
 
 def snapshot(gwr):
@@ -48,7 +44,7 @@ def unchanged(gwr, before):
 
 @pytest.mark.parametrize("seeds", [None, [4, 2, 3]])
 @pytest.mark.parametrize("learn", [True, False])
-def test_behavior_is_there_at_reset_and_stays_for_the_episode(make, play, seeds, learn):
+def test_the_behavior_is_set_at_reset_and_constant_in_the_episode(seeds, learn):
     env, gwr = make(seeds, learn=learn)
     check_env_specs(env)
     start = env.reset()
@@ -62,7 +58,7 @@ def test_behavior_is_there_at_reset_and_stays_for_the_episode(make, play, seeds,
             assert data[key].equal(start[key].unsqueeze(dim).expand_as(data[key]))
 
 
-def test_behaviors_are_those_of_algorithm_1(make, make_modules, play):
+def test_behaviors_are_those_of_algorithm_1():
     seeds, lengths, n_steps = [4, 2, 3], [1, 2, 5], 120
     env, gwr = make(seeds, lengths)
     steps, _ = play(env, n_steps)
@@ -77,16 +73,7 @@ def test_behaviors_are_those_of_algorithm_1(make, make_modules, play):
     assert gwr.num_nodes[0] > 5  # it has grown; fixed points would agree in any order
 
 
-def test_learns_from_the_episodes_that_end_and_leaves_other_rows_alone(make, play):
-    env, gwr = make([0, 1, 2], [2, 3, 4])
-    before, data = snapshot(gwr), env.reset()
-    for ended in ([], [0], [1], [0, 2]):
-        _, data = play(env, 1, data)
-        assert unchanged(gwr, before) == [row not in ended for row in range(3)]
-        before = snapshot(gwr)
-
-
-def test_learns_nothing_while_being_made_or_checked_or_told_not_to(make, play):
+def test_learns_only_from_whole_episodes_and_while_learn_is_set():
     env, gwr = make([0, 1], lengths=4)
     before = snapshot(gwr)
     check_env_specs(env, break_when_any_done="both")
@@ -104,7 +91,7 @@ def test_learns_nothing_while_being_made_or_checked_or_told_not_to(make, play):
     assert not any(unchanged(gwr, before))
 
 
-def test_the_same_network_tests_many_episodes_a_seed(MockEnv, make_bank, make_modules, play):
+def test_a_network_serves_several_episodes_of_its_seed():
     gwr = make_modules([0, 1])[2]
     source = DemonstrationSource(make_bank(), TaskSchedule((0, 0, 0)), batch_size=[2, 4])
     lookup = BehaviorLookup(gwr, learn=False)
@@ -113,53 +100,23 @@ def test_the_same_network_tests_many_episodes_a_seed(MockEnv, make_bank, make_mo
     assert data["behavior"].equal(gwr.lookup(data["demo_embedding"]).embedding)
 
 
-def test_ablation_takes_the_demonstration_for_the_behavior(make, play):
-    rename = RenameTransform(["demo_embedding"], ["behavior"], create_copy=True)
-    env, _ = make([0, 1], behavior=rename)
-    check_env_specs(env)
-    steps, _ = play(env, 12, env.reset())
-    assert steps["behavior"].equal(steps["demo_embedding"])
-    assert steps["next", "behavior"].equal(steps["demo_embedding"])
-
-
-def test_on_its_own_it_only_looks_up(make_modules):
-    gwr = make_modules([0, 1])[2]
-    before, phi = snapshot(gwr), torch.rand(2, 5, 32)
-    data = BehaviorLookup(gwr, learn=True)(TensorDict({"demo_embedding": phi}, [2, 5]))
-    assert data["behavior"].equal(gwr.lookup(phi).embedding)
-    assert all(unchanged(gwr, before))
-
-
-def test_refuses_what_cannot_work(MockEnv, make_bank, make_modules):
-    gwr = make_modules([0, 1])[2]
-    source = DemonstrationSource(make_bank(), TaskSchedule((0, 0, 0)), batch_size=[3])
-    lookup = BehaviorLookup(gwr, learn=True)
-    with pytest.raises(ValueError, match=r"batch_size=\(2,\), but the environment .* \(3,\)"):
-        TransformedEnv(MockEnv([0, 1, 2]), Compose(source, lookup)).reset()
-    with pytest.raises(ValueError, match="no 'demo_embedding': put DemonstrationSource before it"):
-        TransformedEnv(MockEnv([0, 1]), BehaviorLookup(gwr, learn=True)).reset()
-    with pytest.raises(ValueError, match="put StepCounter before"):
-        source = DemonstrationSource(make_bank(), TaskSchedule((0, 0, 0)), batch_size=[2])
-        lookup = BehaviorLookup(gwr, learn=True)
-        TransformedEnv(MockEnv([0, 1]), Compose(source, lookup, StepCounter(5))).reset()
-
-
-def test_learns_only_where_episodes_end(MockEnv, make_bank, make_modules):
+def test_learning_needs_a_step_counter_before_it():
     def make(*transforms, learn=True, base=None):
         source = DemonstrationSource(make_bank(), TaskSchedule((0, 0, 0)))
         lookup = BehaviorLookup(make_modules()[2], learn=learn)
-        env = TransformedEnv(
-            base or MockEnv(), Compose(*transforms, source, lookup), auto_unwrap=False
-        )
-        return env, lookup
+        parts = Compose(*transforms, source, lookup)
+        return TransformedEnv(base or MockEnv(), parts, auto_unwrap=False), lookup
 
-    refusal = r"learns when episodes end: put StepCounter\(50\) before it"
-    with pytest.raises(ValueError, match=refusal):
+    with pytest.raises(ValueError, match=r"put StepCounter\(50\) before"):
         make()[0].reset()
     env, lookup = make(learn=False)
     env.reset()
     lookup.learn = True
-    with pytest.raises(ValueError, match=refusal):
+    with pytest.raises(ValueError, match="StepCounter"):
+        env.reset()
+    env, _ = make()
+    env.append_transform(StepCounter(5))
+    with pytest.raises(ValueError, match="put StepCounter before"):
         env.reset()
 
     make(StepCounter())[0].reset()  # the environment has a limit of its own
@@ -167,14 +124,14 @@ def test_learns_only_where_episodes_end(MockEnv, make_bank, make_modules):
     make(base=TransformedEnv(MockEnv(), StepCounter(50)))[0].reset()
 
 
-def test_a_time_limit_within_workers_will_do(MockEnv, make_bank, make_modules):
+def test_a_time_limit_within_workers_suffices():
     base = SerialEnv(2, lambda: TransformedEnv(MockEnv(), StepCounter(50)))
     source = DemonstrationSource(make_bank(), TaskSchedule((0, 0, 0)), batch_size=[2])
     lookup = BehaviorLookup(make_modules([0, 1])[2], learn=True)
     assert "behavior" in TransformedEnv(base, Compose(source, lookup)).reset()
 
 
-def test_a_replay_buffer_with_a_lookup_is_saved_and_loaded(make_modules):
+def test_a_replay_buffer_with_a_lookup_is_saved_and_loaded():
     def buffer():
         lookup = BehaviorLookup(make_modules()[2], learn=False)
         return TensorDictReplayBuffer(storage=LazyTensorStorage(4), transform=lookup, batch_size=4)

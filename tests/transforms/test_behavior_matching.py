@@ -1,4 +1,4 @@
-"""BehaviorMatchingReward: the trajectory's embedding as it grows, and what its end is worth."""
+"""BehaviorMatchingReward: the trajectory's embedding and the intrinsic reward at its end."""
 
 import pytest
 import torch
@@ -14,6 +14,7 @@ from torchrl.envs import (
 
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.transforms import BehaviorMatchingReward, FrameEncoder
+from tests.transforms.environment import MockEnv, make_env, make_modules, play
 
 
 def spans(n_steps, length):
@@ -22,7 +23,7 @@ def spans(n_steps, length):
 
 
 @pytest.mark.parametrize("seeds", [None, [4, 2, 3]])
-def test_streams_the_embedding_of_the_trajectory(make_env, make_modules, play, seeds):
+def test_the_lstm_state_is_the_embedding_of_the_trajectory_so_far(seeds):
     lengths = 4 if seeds is None else [2, 4, 9]  # the last one is cut off after 5
     env = make_env(seeds, lengths)
     check_env_specs(env)
@@ -39,7 +40,7 @@ def test_streams_the_embedding_of_the_trajectory(make_env, make_modules, play, s
             torch.testing.assert_close(row["lae_h"][start], at_start)
 
 
-def test_reward_by_hand_at_success_and_at_time_out(make_env, play):
+def test_reward_by_hand_at_success_and_at_time_out():
     env = make_env([0, 1], lengths=[3, 9], max_steps=5, beta=0.1)
     steps, _ = play(env, 15)
     after = steps["next"]
@@ -56,11 +57,11 @@ def test_reward_by_hand_at_success_and_at_time_out(make_env, play):
             torch.testing.assert_close(
                 data["reward"], data["extrinsic_reward"] + 0.1 * data["intrinsic_reward"]
             )
-    assert after["terminated"][1].sum() == 0  # row 1 never succeeds, and is paid all the same
+    assert after["terminated"][1].sum() == 0  # row 1 never succeeds, yet is rewarded
     assert (after["intrinsic_reward"][1, 4::5] > 1e-4).all()
 
 
-def test_reward_sum_behind_it_sums_all_three(make_env, play):
+def test_reward_sum_after_it_sums_all_three_rewards():
     env = make_env([0, 1], lengths=[3, 9], max_steps=5)
     after = play(env, 15)[0]["next"]
     for part in ("reward", "extrinsic_reward", "intrinsic_reward"):
@@ -70,25 +71,25 @@ def test_reward_sum_behind_it_sums_all_three(make_env, play):
                 torch.testing.assert_close(after[f"episode_{part}"][row, end], total)
 
 
-def test_without_beta_the_match_is_still_measured(make_env, play):
+def test_with_beta_zero_the_intrinsic_reward_is_measured_only():
     plain, weighted = (play(make_env(beta=beta), 8)[0]["next"] for beta in (0.0, 0.5))
     assert plain["reward"].equal(plain["extrinsic_reward"])
     assert plain["intrinsic_reward"].equal(weighted["intrinsic_reward"])
     assert (weighted["reward"] > plain["reward"]).sum() == 2  # the two ends
 
 
-def test_an_end_is_paid_once(make_env):
+def test_an_end_is_rewarded_once():
     env = make_env([0, 1], [2, 4])
     data = env.reset()
-    paid = torch.zeros(2, 1)
+    rewarded = torch.zeros(2, 1)
     for _ in range(7):  # stepping on without a reset
         data = env.step(data.set("action", torch.zeros(2, 4)))
-        paid += data["next", "intrinsic_reward"] > 0
+        rewarded += data["next", "intrinsic_reward"] > 0
         data = env.step_mdp(data)
-    assert paid.tolist() == [[1], [1]]
+    assert rewarded.tolist() == [[1], [1]]
 
 
-def test_nested_keys_and_rewards_of_float64(MockEnv, make_modules, play):
+def test_nested_keys_and_rewards_of_float64():
     vae, lae, _ = make_modules()
     behavior = torch.linspace(-0.5, 0.5, 32)
 
@@ -126,21 +127,19 @@ def test_nested_keys_and_rewards_of_float64(MockEnv, make_modules, play):
     assert after["intrinsic_reward"].dtype == torch.float64
 
 
-def test_refuses_what_cannot_work(MockEnv, make_env, make_modules):
+def test_bad_arguments_and_wrong_orders_are_refused():
     vae, lae, _ = make_modules()
-    with pytest.raises(ValueError, match=r"beta must not be negative, got -0\.1"):
+    with pytest.raises(ValueError, match="beta"):
         BehaviorMatchingReward(lae, -0.1)
-    with pytest.raises(ValueError, match="no 'latent': put FrameEncoder before it"):
-        TransformedEnv(MockEnv(), BehaviorMatchingReward(lae)).reset()
-    with pytest.raises(ValueError, match="no 'behavior': put BehaviorLookup before it"):
-        TransformedEnv(MockEnv(), Compose(FrameEncoder(vae), BehaviorMatchingReward(lae))).reset()
-    env = make_env()
-    env.append_transform(StepCounter(3, step_count_key="later"))
-    with pytest.raises(ValueError, match="put StepCounter before"):
-        env.reset()
+    for transforms, message in (
+        ([], "put FrameEncoder before it"),
+        ([FrameEncoder(vae)], "put BehaviorLookup before it"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            TransformedEnv(MockEnv(), Compose(*transforms, BehaviorMatchingReward(lae))).reset()
 
 
-def test_refuses_to_come_after_the_sum_of_rewards(MockEnv, make_modules):
+def test_a_sum_of_rewards_before_it_is_refused():
     vae = make_modules()[0]
 
     def reset(*transforms):
@@ -163,7 +162,7 @@ def test_refuses_to_come_after_the_sum_of_rewards(MockEnv, make_modules):
     reset(behavior(), Compose(bonus(), RewardSum()))
 
 
-def test_rows_that_are_not_stepped_keep_their_embedding(make_env):
+def test_rows_that_are_not_stepped_keep_their_embedding():
     env = make_env([0, 1], lengths=9)
     before = env.reset()
     before["action"] = torch.full((2, 4), 0.5)

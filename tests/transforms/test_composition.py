@@ -4,8 +4,9 @@ import copy
 
 import pytest
 import torch
-from tensordict.nn import TensorDictModule
 from torchrl.envs import SerialEnv, check_env_specs
+
+from tests.transforms.environment import make_env, make_modules, play
 
 AT_START = {
     "latent",
@@ -24,7 +25,7 @@ AT_START = {
 
 
 @pytest.mark.parametrize("seeds", [None, [0], [0, 1, 2]])
-def test_all_keys_are_there_from_the_start(make_env, make_modules, seeds):
+def test_all_entries_exist_from_the_start(seeds):
     env = make_env(seeds, vae=make_modules()[0], del_keys=True)
     check_env_specs(env, break_when_any_done="both")
     start = env.reset()
@@ -36,7 +37,7 @@ def test_all_keys_are_there_from_the_start(make_env, make_modules, seeds):
         assert env.full_observation_spec.get(key, env.full_reward_spec.get(key)).is_in(after[key])
 
 
-def test_partial_reset_changes_the_rows_it_resets_only(make_env):
+def test_a_partial_reset_changes_only_its_rows():
     env = make_env([0, 1, 2], lengths=9)
     running = env.step_mdp(env.rand_step(env.reset()))
     before = running.clone()
@@ -49,8 +50,8 @@ def test_partial_reset_changes_the_rows_it_resets_only(make_env):
     assert not before["lae_h"][1].equal(fresh["lae_h"][1])
 
 
-@pytest.mark.parametrize(("real", "n_steps"), [(False, 40), (True, 10)])
-def test_a_row_of_a_batch_is_that_seed_alone(make_env, make_modules, play, real, n_steps):
+@pytest.mark.parametrize(("real", "n_steps"), [(False, 30), (True, 6)])
+def test_a_row_of_a_batch_is_that_seed_alone(real, n_steps):
     vae = make_modules()[0] if real else None
     seeds, lengths = [4, 2, 3], [1, 3, 9]
     together, _ = play(make_env(seeds, lengths, vae=vae), n_steps)
@@ -61,7 +62,7 @@ def test_a_row_of_a_batch_is_that_seed_alone(make_env, make_modules, play, real,
 
 
 @pytest.mark.parametrize("use_buffers", [True, False])
-def test_each_worker_can_have_a_composition_of_its_own(make_env, play, use_buffers):
+def test_each_worker_can_have_a_composition_of_its_own(use_buffers):
     workers = [lambda: make_env(lengths=9), lambda: make_env(lengths=4)]
     env = SerialEnv(2, workers, use_buffers=use_buffers)
     check_env_specs(env)
@@ -71,15 +72,7 @@ def test_each_worker_can_have_a_composition_of_its_own(make_env, play, use_buffe
         torch.testing.assert_close(alone[key], value)
 
 
-def test_rollout_and_step_and_maybe_reset_agree(make_env, play):
-    stepped, _ = play(make_env([0, 1], [2, 4]), 20)
-    policy = TensorDictModule(lambda z: torch.full((len(z), 4), 0.5), ["latent"], ["action"])
-    rolled = make_env([0, 1], [2, 4]).rollout(20, policy, break_when_any_done=False)
-    for key, value in stepped.items(True, True):
-        torch.testing.assert_close(rolled[key], value)
-
-
-def test_what_was_collected_is_not_overwritten(make_env):
+def test_collected_data_is_not_overwritten():
     env = make_env([0, 1], [2, 4])
     data, kept, copies = env.reset(), [], []
     for _ in range(9):
@@ -90,18 +83,8 @@ def test_what_was_collected_is_not_overwritten(make_env):
     assert (torch.stack(kept) == torch.stack(copies)).all()
 
 
-def test_single_environment_played_by_rollouts(make_env):
-    env = make_env(lengths=3)
-    source, gwr = env.transform[2], env.transform[3].gwr
-    before = gwr.graph().weights
-    drawn = [env.rollout(50)["demo_index"].unique().item() for _ in range(6)]
-    assert source.episode == 6
-    assert len(set(drawn)) > 2
-    assert not gwr.graph().weights.equal(before)
-
-
-@pytest.mark.parametrize("n_steps", [6, 7])  # at the start and in the midst of an episode
-def test_resumes_from_a_state_dict(make_env, play, n_steps):
+@pytest.mark.parametrize("n_steps", [6, 7])  # at the start and in the middle of an episode
+def test_resumes_from_a_state_dict(n_steps):
     env = make_env([0, 1], [2, 3])
     _, data = play(env, n_steps)
     saved, state, base = data.clone(), copy.deepcopy(env.state_dict()), copy.copy(env.base_env)
@@ -115,7 +98,7 @@ def test_resumes_from_a_state_dict(make_env, play, n_steps):
         torch.testing.assert_close(steps[key], value)
 
 
-def test_a_reset_of_no_row_changes_nothing(make_env, make_modules):
+def test_a_reset_of_no_row_changes_nothing():
     env = make_env([0, 1], vae=make_modules()[0])
     before = env.reset()
     data = before.clone().set("_reset", torch.zeros(2, 1, dtype=torch.bool))

@@ -10,43 +10,29 @@ from torchrl.collectors import Collector
 from torchrl.envs import Compose, RewardSum, SerialEnv, StepCounter, TransformedEnv, check_env_specs
 
 from bgpo_trl.transforms import DemonstrationSource, TaskSchedule
+from tests.transforms.environment import MockEnv, generators, make_bank, play
 
 CONCURRENT = TaskSchedule((0, 0, 0))
 
 
-def episodes_of(steps, row=None):
-    """Index of the demonstration of each episode played, by where step_count starts anew."""
-    steps = steps if row is None else steps[row]
-    return steps["demo_index"][steps["step_count"].squeeze(-1) == 0].tolist()
-
-
-@pytest.fixture
-def make(MockEnv, make_bank, generators):
-    def make(seeds=None, lengths=3, schedule=CONCURRENT, base=None, **kwargs):
-        batch_size = [] if seeds is None else [len(seeds)]
-        kwargs.setdefault("generator", generators(seeds or [0]))
-        source = DemonstrationSource(make_bank(), schedule, batch_size=batch_size, **kwargs)
-        base = base or MockEnv(seeds, lengths)
-        return TransformedEnv(base, Compose(StepCounter(50), source)), source
-
-    return make
+def make(seeds=None, lengths=3, schedule=CONCURRENT, base=None, **kwargs):
+    batch_size = [] if seeds is None else [len(seeds)]
+    kwargs.setdefault("generator", generators(seeds or [0]))
+    source = DemonstrationSource(make_bank(), schedule, batch_size=batch_size, **kwargs)
+    base = base or MockEnv(seeds, lengths)
+    return TransformedEnv(base, Compose(StepCounter(50), source)), source
 
 
 @pytest.mark.parametrize("cumulative", [True, False])
-def test_schedule_presents_a_task_after_exactly_that_many_episodes(cumulative):
+def test_the_schedule_presents_each_task_from_its_first_episode_on(cumulative):
     schedule = TaskSchedule(cumulative=cumulative)
     episode = torch.tensor([[0, 6_999], [7_000, 12_999], [13_000, 20_000]])
     first, second, third = [1, 0, 0], [int(cumulative), 1, 0], [int(cumulative)] * 2 + [1]
     expected = torch.tensor([[first, first], [second, second], [third, third]]).bool()
     assert schedule.available(episode).equal(expected)
     assert schedule.available(episode[1, 0]).equal(expected[1, 0])
-
-
-@pytest.mark.parametrize("cumulative", [True, False])
-def test_tasks_presented_together_are_all_available(cumulative):
-    schedule = TaskSchedule((0, 0, 5), cumulative)
-    assert schedule.available(torch.tensor(4)).tolist() == [True, True, False]
-    assert CONCURRENT.available(torch.tensor(0)).all()
+    together = TaskSchedule((0, 0, 5), cumulative)
+    assert together.available(torch.tensor(4)).tolist() == [True, True, False]
 
 
 @pytest.mark.parametrize("starts", [(), (1, 2), (0, -1)])
@@ -56,14 +42,14 @@ def test_schedule_refuses_to_start_with_no_task(starts):
 
 
 @pytest.mark.parametrize("seeds", [None, [5, 6, 7]])
-def test_the_demonstration_is_of_the_task_that_the_environment_does(make, make_bank, play, seeds):
+def test_the_demonstration_is_of_the_task_of_the_environment(seeds):
     env, _ = make(seeds)
     check_env_specs(env)
     start = env.reset()
     assert {"task", "demo_embedding", "demo_index"} <= set(start.keys())
     steps, _ = play(env, 40, start)
     bank = make_bank()
-    # The environment reports its task itself; that it agrees means that it was told in time.
+    # The environment reports the task that it received at the reset.
     for data in (steps, steps["next"]):
         assert data["task"].equal(bank.task[data["demo_index"]])
         assert data["demo_embedding"].equal(bank.embedding[data["demo_index"]])
@@ -71,11 +57,11 @@ def test_the_demonstration_is_of_the_task_that_the_environment_does(make, make_b
     assert steps["demo_index"].equal(steps["next", "demo_index"])  # the same up to the end
 
 
-def test_draws_tasks_uniformly_then_their_demonstrations(make, MockEnv):
+def test_draws_tasks_uniformly_then_their_demonstrations():
     bank = SimpleNamespace(  # task 0 has 8 demonstrations, task 1 has 2, task 2 is not presented
         embedding=torch.zeros(12, 32), task=torch.tensor([0] * 8 + [1] * 2 + [2] * 2)
     )
-    n = 2000
+    n = 1000
     source = DemonstrationSource(
         bank,
         TaskSchedule((0, 0, 1)),
@@ -90,7 +76,7 @@ def test_draws_tasks_uniformly_then_their_demonstrations(make, MockEnv):
     assert deviation.abs().max() < 3.5
 
 
-def test_every_row_follows_the_schedule_by_its_own_count(make, play):
+def test_every_row_follows_the_schedule_by_its_own_count():
     env, source = make([0, 1], [2, 6], TaskSchedule((0, 3, 5), cumulative=False))
     steps, _ = play(env, 36)
     assert source.episode.tolist() == [18, 6]
@@ -99,13 +85,15 @@ def test_every_row_follows_the_schedule_by_its_own_count(make, play):
         assert steps["task"][row].equal((episode >= 3).long() + (episode >= 5).long())
 
 
-def test_partial_reset_draws_for_the_rows_it_resets(make, play, monkeypatch):
+def test_partial_reset_draws_for_the_rows_it_resets(monkeypatch):
     env, source = make([0, 1, 2], [2, 3, 4])
-    asked = []
+    drawn_rows = []
     draw = source._draw
-    monkeypatch.setattr(source, "_draw", lambda rows: (asked.append(rows.tolist()), draw(rows)))
+    monkeypatch.setattr(
+        source, "_draw", lambda rows: (drawn_rows.append(rows.tolist()), draw(rows))
+    )
     steps, _ = play(env, 4)
-    assert asked == [
+    assert drawn_rows == [
         [True, True, True],
         [True, False, False],
         [False, True, False],
@@ -120,30 +108,7 @@ def test_partial_reset_draws_for_the_rows_it_resets(make, play, monkeypatch):
     assert env.base_env.task_resets[1].tolist()[1:] == steps["task"][1:, 0].tolist()
 
 
-def test_a_row_of_a_batch_is_that_row_alone(make, play):
-    together, _ = play(make([3, 8, 5], [2, 3, 7])[0], 30)
-    for row, (seed, length) in enumerate([(3, 2), (8, 3), (5, 7)]):
-        alone, _ = play(make([seed], [length])[0], 30)
-        single, _ = play(make(None, length, generator=torch.Generator().manual_seed(seed))[0], 30)
-        assert episodes_of(together, row) == episodes_of(alone, 0) == episodes_of(single)
-        assert len(set(episodes_of(together, row))) > 3
-
-
-def test_continues_from_a_state_dict(make, play):
-    env, source = make([0, 1], [2, 3])
-    _, data = play(env, 6)  # both rows have just started an episode
-    state = copy.deepcopy(source.state_dict())
-    expected, _ = play(env, 12, data)
-    resumed, other = make([0, 1], [2, 3], generator=torch.Generator().manual_seed(99))
-    play(resumed, 5)  # whatever it did before
-    other.load_state_dict(state)
-    assert other.episode.tolist() == [3, 2]
-    steps, _ = play(resumed, 12)
-    for row in range(2):
-        assert episodes_of(steps, row) == episodes_of(expected, row)
-
-
-def test_an_episode_that_is_not_played_to_its_end_is_started_again(make, play):
+def test_an_unfinished_episode_starts_again():
     env, source = make([0, 1], lengths=4)
     first = env.reset()["demo_index"]
     check_env_specs(env)
@@ -159,7 +124,7 @@ def test_an_episode_that_is_not_played_to_its_end_is_started_again(make, play):
     collector.shutdown(close_env=False)
 
 
-def test_an_episode_ends_once(make):
+def test_an_episode_ends_once():
     env, source = make([0, 1], [2, 4])
     env.rollout(4, break_when_any_done=False, break_when_all_done=True)  # row 0 waits for row 1
     assert source.episode.tolist() == [1, 1]
@@ -169,7 +134,7 @@ def test_an_episode_ends_once(make):
     assert source.episode.tolist() == [2, 2]
 
 
-def test_follows_what_training_has_presented(make, make_bank, MockEnv, play):
+def test_evaluation_follows_the_schedule_of_training():
     training, source = make([0, 1], [2, 50], TaskSchedule((0, 3), cumulative=False))
     testing = DemonstrationSource(
         make_bank(), source.schedule, batch_size=[2, 4], generator=None, follow=source
@@ -187,7 +152,7 @@ def test_follows_what_training_has_presented(make, make_bank, MockEnv, play):
 
 
 @pytest.mark.parametrize("wrapped", [False, True])
-def test_reaches_environments_inside_a_serial_env(make, make_bank, MockEnv, play, wrapped):
+def test_reaches_environments_inside_a_serial_env(wrapped):
     def single(length):
         return (
             TransformedEnv(MockEnv(None, length), RewardSum()) if wrapped else MockEnv(None, length)
@@ -201,40 +166,39 @@ def test_reaches_environments_inside_a_serial_env(make, make_bank, MockEnv, play
     assert source.episode.tolist() == [6, 4]
 
 
-def test_tells_when_the_environment_does_not_take_the_task(make, MockEnv):
+def test_an_environment_that_ignores_the_task_is_refused():
     class Stubborn(MockEnv):
         def _reset(self, tensordict, **kwargs):
             return super()._reset(tensordict.exclude("task"), **kwargs)
 
     env, _ = make(list(range(9)), base=Stubborn([0] * 9))
-    with pytest.raises(ValueError, match="did not take the task drawn for it: it must read 'task'"):
+    with pytest.raises(ValueError, match="did not take the task"):
         env.reset()
 
 
-def test_refuses_what_cannot_work(make_bank, MockEnv, generators, make):
-    bank = make_bank(n_tasks=2)
-    with pytest.raises(ValueError, match="no demonstration of task 2"):
-        DemonstrationSource(bank, CONCURRENT)
-    with pytest.raises(ValueError, match=r"task \[N\], got shapes \(40, 32\) and \(39,\)"):
-        DemonstrationSource(
-            SimpleNamespace(embedding=bank.embedding, task=bank.task[1:]), TaskSchedule((0, 0))
-        )
-    with pytest.raises(ValueError, match="one or 3, one a row; got 2"):
-        DemonstrationSource(
-            bank, TaskSchedule((0, 0)), batch_size=[3], generator=generators([0, 1])
-        )
+def test_bad_arguments_and_wrong_orders_are_refused():
+    bank, both = make_bank(n_tasks=2), TaskSchedule((0, 0))
+    one_missing = SimpleNamespace(embedding=bank.embedding, task=bank.task[1:])
     _, source = make([0, 1])
-    with pytest.raises(ValueError, match="must start with that of the source to follow"):
-        DemonstrationSource(bank, TaskSchedule((0, 0)), batch_size=[3], follow=source)
-    with pytest.raises(ValueError, match=r"batch_size=\(2,\), but the environment has \(3,\)"):
-        make([0, 1], base=MockEnv([0, 1, 2]))[0].reset()
-    with pytest.raises(ValueError, match="put StepCounter before DemonstrationSource"):
-        source = DemonstrationSource(make_bank(), CONCURRENT)
-        TransformedEnv(MockEnv(), Compose(source, StepCounter(50))).reset()
+    for call, message in (
+        (lambda: DemonstrationSource(bank, CONCURRENT), "no demonstration of task 2"),
+        (lambda: DemonstrationSource(one_missing, both), "shapes"),
+        (
+            lambda: DemonstrationSource(bank, both, batch_size=[3], generator=generators([0, 1])),
+            "one or 3",
+        ),
+        (lambda: DemonstrationSource(bank, both, batch_size=[3], follow=source), "follow"),
+        (lambda: make([0, 1], base=MockEnv([0, 1, 2]))[0].reset(), "batch_size"),
+        (lambda: source.seed_rows([1]), "1 seeds for 2 simulations"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            call()
+    with pytest.raises(TypeError, match="append it to an environment"):
+        source(TensorDict(batch_size=[2]))
 
 
 @pytest.mark.parametrize("seeds", [None, [4, 2]])
-def test_changes_of_an_observation_do_not_reach_the_bank(make, seeds):
+def test_changes_of_an_observation_do_not_reach_the_bank(seeds):
     env, source = make(seeds)
     bank = source._embedding.clone(), source._task.clone()
     data = env.reset()
@@ -243,7 +207,7 @@ def test_changes_of_an_observation_do_not_reach_the_bank(make, seeds):
     assert source._embedding.equal(bank[0]) and source._task.equal(bank[1])
 
 
-def test_a_bank_of_other_dtypes_is_converted(make_bank, MockEnv):
+def test_a_bank_of_other_dtypes_is_converted():
     bank = make_bank()
     other = SimpleNamespace(embedding=bank.embedding.double(), task=bank.task.int())
     source = DemonstrationSource(other, CONCURRENT)
@@ -253,7 +217,7 @@ def test_a_bank_of_other_dtypes_is_converted(make_bank, MockEnv):
     assert data["demo_embedding"].dtype == torch.float32 and data["task"].dtype == torch.int64
 
 
-def test_a_clone_counts_and_draws_by_itself(make, MockEnv):
+def test_a_clone_counts_and_draws_by_itself():
     env, source = make([3, 4])
     env.rollout(7, break_when_any_done=False)
     assert source.episode.tolist() == [2, 2]
@@ -263,11 +227,3 @@ def test_a_clone_counts_and_draws_by_itself(make, MockEnv):
     clone.seed_rows([7, 8])
     assert clone.episode.tolist() == [0, 0]
     assert source.episode.tolist() == [2, 2]
-
-
-def test_it_needs_a_seed_a_row_and_an_environment(make):
-    _, source = make([3, 4])
-    with pytest.raises(ValueError, match="1 seeds for 2 simulations"):
-        source.seed_rows([1])
-    with pytest.raises(TypeError, match="DemonstrationSource needs episodes: append it to an"):
-        source(TensorDict(batch_size=[2]))

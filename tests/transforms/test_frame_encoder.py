@@ -1,20 +1,18 @@
-"""FrameEncoder: frames to latents, at reset and at every step, for no more rows than needed."""
+"""FrameEncoder: latents at reset and at every step, only of the rows that need them."""
 
 import pytest
 import torch
-from tensordict import TensorDict
 from torchrl.envs import Compose, Transform, TransformedEnv, check_env_specs
 
 from bgpo_trl.modules.vae import VAE
 from bgpo_trl.transforms import FrameEncoder
+from tests.transforms.environment import MockEnv, TopRow, make_modules, play
 
 
 @pytest.mark.parametrize("seeds", [None, [4, 2, 3]])
 @pytest.mark.parametrize("keys", [("pixels", "latent"), (("agent", "pixels"), ("agent", "latent"))])
 @pytest.mark.parametrize("del_keys", [False, True])
-def test_latents_of_all_frames_from_the_reset_on(
-    MockEnv, make_modules, play, seeds, keys, del_keys
-):
+def test_every_frame_is_encoded_from_the_reset_on(seeds, keys, del_keys):
     vae, in_key, out_key = make_modules()[0], *keys
     encoder = FrameEncoder(vae, [in_key], [out_key], del_keys=del_keys)
     env = TransformedEnv(MockEnv(seeds, 3, in_key), encoder)
@@ -27,7 +25,7 @@ def test_latents_of_all_frames_from_the_reset_on(
     assert frames[in_key].float().std() > 5  # frames that show nothing would prove nothing
 
 
-def test_partial_reset_encodes_the_rows_that_are_reset_only(MockEnv, TopRow, play):
+def test_partial_reset_encodes_the_rows_that_are_reset_only():
     vae = TopRow()
     env = TransformedEnv(MockEnv([0, 1, 2], [2, 3, 3]), FrameEncoder(vae))
     data = env.reset()
@@ -38,7 +36,7 @@ def test_partial_reset_encodes_the_rows_that_are_reset_only(MockEnv, TopRow, pla
     assert steps["latent"].equal(vae.latent(steps["pixels"]))
 
 
-def test_later_transforms_see_the_latents_of_rows_that_are_not_reset(MockEnv, TopRow, play):
+def test_later_transforms_see_the_latents_of_rows_that_are_not_reset():
     class Witness(Transform):
         def _reset(self, tensordict, tensordict_reset):
             seen.append(tensordict_reset["latent"].clone())
@@ -60,7 +58,7 @@ def test_later_transforms_see_the_latents_of_rows_that_are_not_reset(MockEnv, To
     assert reset[0].equal(start["latent"][0])
 
 
-def test_partial_step_encodes_the_rows_that_are_stepped_only(MockEnv, TopRow):
+def test_partial_step_encodes_the_rows_that_are_stepped_only():
     vae = TopRow()
     env = TransformedEnv(MockEnv([0, 1, 2], 9), FrameEncoder(vae))
     data = env.rand_step(env.reset())["next"]
@@ -73,7 +71,7 @@ def test_partial_step_encodes_the_rows_that_are_stepped_only(MockEnv, TopRow):
     assert after["latent"][~stepped].equal(before[~stepped])
 
 
-def test_records_no_gradient_and_leaves_the_encoder_trainable(MockEnv):
+def test_records_no_gradient_and_leaves_the_encoder_trainable():
     class Trainable(torch.nn.Linear):
         def latent(self, pixels):
             return self(pixels[..., 0, :, 0].float())
@@ -87,15 +85,7 @@ def test_records_no_gradient_and_leaves_the_encoder_trainable(MockEnv):
     assert encoder.weight.requires_grad
 
 
-def test_encodes_stored_frames_of_any_shape(make_modules):
-    vae = make_modules()[0]
-    frames = torch.randint(256, (2, 3, 32, 64, 3), dtype=torch.uint8)
-    data = FrameEncoder(vae, del_keys=True)(TensorDict({"pixels": frames}, [2, 3]))
-    assert set(data.keys()) == {"latent"}
-    assert data["latent"].equal(vae.latent(frames))
-
-
-def test_refuses_what_it_cannot_encode(MockEnv, make_modules):
+def test_bad_keys_are_refused():
     vae = make_modules()[0]
     with pytest.raises(ValueError, match="one of out_keys for each of in_keys"):
         FrameEncoder(vae, ["left", "right"])
@@ -103,6 +93,6 @@ def test_refuses_what_it_cannot_encode(MockEnv, make_modules):
         _ = TransformedEnv(MockEnv(), FrameEncoder(vae, ["left"])).observation_spec
 
 
-def test_the_spec_has_the_dtype_of_the_encoder(MockEnv):
+def test_the_spec_has_the_dtype_of_the_encoder():
     env = TransformedEnv(MockEnv([0, 1]), FrameEncoder(VAE().double()))
     assert env.observation_spec["latent"].dtype == env.reset()["latent"].dtype == torch.float64

@@ -7,28 +7,25 @@ from torchrl.envs import Compose, StepCounter, TransformedEnv, check_env_specs
 
 from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.transforms import BehaviorLookup, DemonstrationSource, GroupLookup, TaskSchedule
+from tests.transforms.environment import MockEnv, generators, make_bank, make_modules, play
 
 
-@pytest.fixture
-def make(MockEnv, make_bank, generators):
-    def make(seeds=None, lengths=3, learn=True):
-        batch_size = [] if seeds is None else [len(seeds)]
-        groups = BehaviorGroups(32, batch_size=batch_size, smallest=4)
-        source = DemonstrationSource(
-            make_bank(),
-            TaskSchedule((0, 0, 0)),
-            batch_size=batch_size,
-            generator=generators(seeds or [0]),
-        )
-        lookup = GroupLookup(groups, learn=learn)
-        env = TransformedEnv(MockEnv(seeds, lengths), Compose(StepCounter(50), source, lookup))
-        return env, groups
-
-    return make
+def make(seeds=None, lengths=3, learn=True):
+    batch_size = [] if seeds is None else [len(seeds)]
+    groups = BehaviorGroups(32, batch_size=batch_size, smallest=4)
+    source = DemonstrationSource(
+        make_bank(),
+        TaskSchedule((0, 0, 0)),
+        batch_size=batch_size,
+        generator=generators(seeds or [0]),
+    )
+    lookup = GroupLookup(groups, learn=learn)
+    env = TransformedEnv(MockEnv(seeds, lengths), Compose(StepCounter(50), source, lookup))
+    return env, groups
 
 
-def show(groups, count):
-    """Shows each of some rows the demonstrations around three places, ``count`` in all."""
+def adapt(groups, count):
+    """Adapt all rows to ``count`` demonstrations around three places."""
     generator = torch.Generator().manual_seed(0)
     for number in range(count):
         noise = torch.rand(*groups.batch_size, 32, generator=generator)
@@ -43,11 +40,11 @@ def copy_of(groups):
 
 @pytest.mark.parametrize("seeds", [None, [4, 2, 3]])
 @pytest.mark.parametrize("learn", [True, False])
-def test_the_group_is_there_at_reset_and_stays_for_the_episode(make, play, seeds, learn):
+def test_the_group_is_set_at_reset_and_constant_in_the_episode(seeds, learn):
     env, groups = make(seeds, learn=False)
     check_env_specs(env)
     env.transform[-1].learn = learn
-    show(groups, 15)
+    adapt(groups, 15)
     assert (groups.revision == 0).all()
     start = env.reset()
     assert start["group"].equal(torch.zeros(env.batch_size, dtype=torch.int64))
@@ -64,10 +61,10 @@ def test_the_group_is_there_at_reset_and_stays_for_the_episode(make, play, seeds
     assert bool((groups.num_groups > 1).all()) == learn
 
 
-def test_groups_learn_from_the_episodes_that_end_and_from_no_others(make, play):
-    """Seeds whose episodes end at different times, against groups that are shown the same."""
+def test_groups_learn_from_episodes_that_end_only():
+    """Seeds whose episodes end at different times, against groups adapted by hand."""
     env, groups = make([4, 2, 3], lengths=[2, 3, 5])
-    show(groups, 15)
+    adapt(groups, 15)
     plain = copy_of(groups)
     state = env.reset()
     for _ in range(30):
@@ -87,7 +84,7 @@ def test_groups_learn_from_the_episodes_that_end_and_from_no_others(make, play):
     assert groups.num_groups.min() > 1
 
 
-def test_a_row_of_a_batch_is_that_seed_alone(make, play):
+def test_a_row_of_a_batch_is_that_seed_alone():
     seeds, lengths = [4, 2, 3], [2, 3, 5]
     env, groups = make(seeds, lengths)
     together, _ = play(env, 30)
@@ -99,7 +96,7 @@ def test_a_row_of_a_batch_is_that_seed_alone(make, play):
         assert groups.num_groups[i] == groups_alone.num_groups[0]
 
 
-def test_it_goes_with_the_lookup_of_behaviors_in_either_order(make, make_modules, play):
+def test_the_order_of_the_two_lookups_does_not_matter():
     seen = []
     for group_first in (True, False):
         env, _ = make([4, 2])
@@ -113,10 +110,10 @@ def test_it_goes_with_the_lookup_of_behaviors_in_either_order(make, make_modules
         assert seen[0][key].equal(seen[1][key])
 
 
-def test_on_its_own_it_only_looks_up(make):
+def test_outside_an_environment_it_only_looks_up():
     _, groups = make([4, 2])
     phi = torch.rand(2, 5, 32)
-    show(groups, 15)
+    adapt(groups, 15)
     lookup = GroupLookup(groups, learn=True)
     found = lookup(TensorDict({"demo_embedding": phi}, [2, 5]))
     expected = groups.lookup(phi)
@@ -127,30 +124,17 @@ def test_on_its_own_it_only_looks_up(make):
     assert lookup.groups is groups
 
 
-def test_refuses_what_cannot_work(make, MockEnv):
+def test_bad_batch_sizes_and_missing_entries_are_refused():
     env, _ = make([4, 2])
-    with pytest.raises(ValueError, match=r"BehaviorGroups was made for batch_size=\(3,\)"):
-        env.append_transform(
-            GroupLookup(
-                BehaviorGroups(32, batch_size=[3]), learn=True, out_keys=("other", "novelty")
-            )
-        )
+    other = BehaviorGroups(32, batch_size=[3])
+    env.append_transform(GroupLookup(other, learn=True, out_keys=("other", "novelty")))
+    with pytest.raises(ValueError, match="batch_size"):
         env.reset()
-    lonely = TransformedEnv(
-        MockEnv(), Compose(StepCounter(5), GroupLookup(BehaviorGroups(32), learn=True))
-    )
-    with pytest.raises(ValueError, match=r"GroupLookup found no 'demo_embedding'"):
-        lonely.reset()
-    with pytest.raises(ValueError, match="GroupLookup found no 'demo_embedding'"):
-        GroupLookup(BehaviorGroups(32), learn=False)(TensorDict(batch_size=[]))
-    source = DemonstrationSource(
-        type("Bank", (), {"embedding": torch.rand(3, 32), "task": torch.arange(3)}), TaskSchedule()
-    )
-    endless = TransformedEnv(
-        MockEnv(), Compose(source, GroupLookup(BehaviorGroups(32), learn=True))
-    )
-    with pytest.raises(ValueError, match="put StepCounter"):
-        endless.reset()
+    lookup = GroupLookup(BehaviorGroups(32), learn=True)
+    with pytest.raises(ValueError, match="'demo_embedding'"):
+        lookup(TensorDict(batch_size=[]))
+    with pytest.raises(ValueError, match="put DemonstrationSource before it"):
+        TransformedEnv(MockEnv(), Compose(StepCounter(5), lookup)).reset()
 
 
 def test_its_novelty_has_the_dtype_of_the_embedding():

@@ -21,5 +21,5 @@ def renderer(physics: nico.Physics) -> FrameRenderer:
 
 @pytest.fixture
 def load(physics: nico.Physics, renderer: FrameRenderer) -> Callable[..., Environment]:
-    """Loads environments that share a simulation, so use one at a time."""
+    """Load environments that share a simulation, to be used one at a time."""
     return lambda task, **kwargs: nico.load(task, physics=physics, renderer=renderer, **kwargs)

@@ -1,4 +1,7 @@
-"""Rules that every task of the suite keeps, after ``dm_control.suite.tests.suite_test``."""
+"""Rules that every task of the suite keeps, after ``dm_control.suite.tests.suite_test``.
+
+What the base class does for all tasks alike is tested in one.
+"""
 
 import itertools
 import re
@@ -19,15 +22,14 @@ def random_actions(count: int, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).uniform(-1.0, 1.0, (count, 4))
 
 
-def test_the_tasks_are_the_three_of_the_paper_and_five_more():
-    paper = ("grasp_glass", "push_green_to_glass", "push_green_to_white")
-    more = ("push_glass_right", "lift_green", "press_white", "push_white_left", "push_white_right")
-    assert paper == nico.PAPER_TASKS
-    assert (*paper, *more) == nico.ALL_TASKS == tuple(nico.TASKS)[:8]
+def test_the_first_tasks_are_those_of_the_paper():
+    assert nico.PAPER_TASKS == ("grasp_glass", "push_green_to_glass", "push_green_to_white")
+    assert nico.ALL_TASKS[:3] == nico.PAPER_TASKS
+    assert len(nico.ALL_TASKS) == len(set(nico.ALL_TASKS)) == 8
 
 
 @all_tasks
-def test_what_is_emitted_matches_the_specs(load, task):
+def test_observations_and_rewards_match_their_specs(load, task):
     env = load(task, seed=0, observation="both")
     specs = env.observation_spec()
     assert (specs["pixels"].shape, specs["pixels"].dtype) == ((32, 64, 3), np.uint8)
@@ -50,31 +52,8 @@ def test_what_is_emitted_matches_the_specs(load, task):
             assert timestep.reward in (0.0, 1.0)
 
 
-@all_tasks
-@pytest.mark.parametrize(
-    ("observation", "keys"), [("pixels", ["pixels"]), ("state", ["privileged_state"])]
-)
-def test_only_what_was_asked_for_is_observed(load, task, observation, keys):
-    env = load(task, seed=0, observation=observation)
-
-    assert list(env.observation_spec()) == keys
-    assert list(env.reset().observation) == keys
-
-
-@all_tasks
-def test_frames_show_the_scene(load, task):
-    pixels = load(task, seed=0).reset().observation["pixels"].reshape(-1, 3).astype(int)
-    red, green, blue = pixels.T
-
-    assert ((red > 2 * green) & (red > 2 * blue)).sum() >= 8
-    assert ((green > 2 * red) & (green > 2 * blue)).sum() >= 8
-    assert (pixels.min(axis=1) > 150).sum() >= 8
-    assert pixels.std() > 20
-
-
-@all_tasks
-def test_state_is_joints_grip_and_objects(load, task):
-    env = load(task, seed=0, observation="state")
+def test_state_is_joints_grip_and_objects(load):
+    env = load("grasp_glass", seed=0, observation="state")
     state = env.reset().observation["privileged_state"]
 
     angles, positions = env.physics.named.data.qpos, env.physics.named.data
@@ -85,9 +64,8 @@ def test_state_is_joints_grip_and_objects(load, task):
     np.testing.assert_array_equal(state, expected)
 
 
-@all_tasks
-def test_time_out_is_after_50_steps_and_keeps_the_discount(load, task):
-    env = load(task, seed=0, observation="state")
+def test_time_out_is_after_50_steps_and_keeps_the_discount(load):
+    env = load("grasp_glass", seed=0, observation="state")
     env.reset()
 
     timesteps = [env.step(np.zeros(4)) for _ in range(50)]
@@ -116,7 +94,7 @@ def test_success_has_discount_0_even_on_the_last_step(load, monkeypatch, task, s
 
 
 @all_tasks
-def test_success_has_to_last(load, monkeypatch, task):
+def test_success_must_hold_for_consecutive_steps(load, monkeypatch, task):
     env = load(task, seed=0, observation="state")
     needed = env.task.steady_steps
     assert needed == (3 if task in ("grasp_glass", "lift_green") else 2)
@@ -130,9 +108,8 @@ def test_success_has_to_last(load, monkeypatch, task):
     assert [timestep.last() for timestep in timesteps] == [False] * (2 * needed - 1) + [True]
 
 
-@all_tasks
-def test_how_long_success_has_lasted_is_in_the_state(load, monkeypatch, task):
-    env = load(task, seed=0, observation="state")
+def test_the_duration_of_success_is_part_of_the_state(load, monkeypatch):
+    env = load("grasp_glass", seed=0, observation="state")
     holds = True
     monkeypatch.setattr(env.task, "succeeded", lambda _: holds)
     env.reset()
@@ -143,7 +120,7 @@ def test_how_long_success_has_lasted_is_in_the_state(load, monkeypatch, task):
     env.step(np.zeros(4))
     assert env.physics.steady_steps == 0
 
-    other = load(task, seed=1, observation="state")
+    other = load("grasp_glass", seed=1, observation="state")
     monkeypatch.setattr(other.task, "succeeded", lambda _: True)
     other.reset()
     other.physics.set_state(state)
@@ -155,10 +132,9 @@ def test_how_long_success_has_lasted_is_in_the_state(load, monkeypatch, task):
     assert other.step(np.zeros(4)).reward == 0.0
 
 
-@all_tasks
-def test_same_seed_same_pixels_and_trajectory(load, task):
+def test_same_seed_same_pixels_and_trajectory(load):
     def run() -> tuple[np.ndarray, np.ndarray]:
-        env = load(task, seed=np.random.RandomState(7), observation="both")
+        env = load("grasp_glass", seed=np.random.RandomState(7), observation="both")
         pixels, states = [], []
         for episode in range(2):
             timesteps = [env.reset(), *map(env.step, random_actions(6, seed=episode))]
@@ -171,37 +147,32 @@ def test_same_seed_same_pixels_and_trajectory(load, task):
 
 
 @all_tasks
-def test_starts_differ_between_episodes_and_seeds(load, task):
-    env, other = load(task, seed=0, observation="both"), load(task, seed=1, observation="both")
-    starts = [env.reset().observation for _ in range(5)] + [other.reset().observation]
+def test_starts_depend_on_episode_and_seed_and_not_on_the_task(load, task):
+    def starts(name: str, seed: int, count: int) -> list[np.ndarray]:
+        env = load(name, seed=seed, observation="state")
+        return [env.reset().observation["privileged_state"] for _ in range(count)]
 
-    for first, second in itertools.combinations(starts, 2):
-        difference = np.abs(first["privileged_state"] - second["privileged_state"])
-        table_heights = [9, 12, 15]
-        assert (np.delete(difference, table_heights) > 0).all()
-        assert (first["pixels"] != second["pixels"]).any()
+    found = [*starts(task, 0, 5), *starts(task, 1, 1)]
+    table_heights = [9, 12, 15]
+    for first, second in itertools.combinations(found, 2):
+        assert (np.delete(first - second, table_heights) != 0).all()
+    np.testing.assert_array_equal(found[:5], starts("grasp_glass", 0, 5))
 
 
-@all_tasks
-def test_observations_share_no_memory(load, task):
-    env = load(task, seed=0, observation="both")
+def test_observations_share_no_memory(load):
+    env = load("grasp_glass", seed=0, observation="both")
     observations = [env.reset().observation]
     observations += [env.step(action).observation for action in random_actions(3)]
-    kept = [{key: value.copy() for key, value in o.items()} for o in observations]
-
     for first, second in itertools.combinations(observations, 2):
-        assert not np.shares_memory(first["pixels"], second["pixels"])
-        assert not np.shares_memory(first["privileged_state"], second["privileged_state"])
+        for key in first:
+            assert not np.shares_memory(first[key], second[key])
     before = env.physics.get_state()
     observations[-1]["privileged_state"][:] = 0
     np.testing.assert_array_equal(env.physics.get_state(), before)
-    for observation, copy in zip(observations[:-1], kept[:-1], strict=True):
-        np.testing.assert_array_equal(observation["pixels"], copy["pixels"])
-        np.testing.assert_array_equal(observation["privileged_state"], copy["privileged_state"])
 
 
 def polar_places(physics: Physics) -> np.ndarray:
-    """Returns radius (m), angle (rad) and turn (rad) of each object, ``[3, 3]``."""
+    """Return radius (m), angle (rad) and turn (rad) of each object, ``[3, 3]``."""
     poses = [physics.named.data.qpos[name] for name in OBJECTS]
     return np.array(
         [[*kinematics.to_polar(pose[:2]), 2 * np.arctan2(pose[6], pose[3])] for pose in poses]
@@ -209,7 +180,7 @@ def polar_places(physics: Physics) -> np.ndarray:
 
 
 @pytest.mark.parametrize("spread", [1.0, 0.3, 0.0])
-def test_starts_are_as_promised(load, spread):
+def test_objects_start_apart_and_upright_on_the_table(load, spread):
     env = load("grasp_glass", seed=0, spread=spread, observation="state")
     physics = env.physics
     low, high = physics.model.jnt_range[:12].T
@@ -255,19 +226,6 @@ def test_starts_are_spread_over_the_table(load):
     assert np.std(turns, axis=0).min() > 1.5  # (rad), of any turn
 
 
-@all_tasks
-def test_starts_do_not_tell_the_task(load, task):
-    env, other = (load(name, seed=4, observation="state") for name in (task, "grasp_glass"))
-    states = []
-    for environment in (env, other):
-        episodes = []
-        for _ in range(5):
-            environment.reset()
-            episodes.append(environment.physics.get_state())
-        states.append(episodes)
-    np.testing.assert_array_equal(*states)
-
-
 def test_without_spread_objects_are_at_their_nominal_places(load):
     env = load("grasp_glass", seed=0, spread=0.0, observation="state")
     for _ in range(3):
@@ -281,11 +239,11 @@ def test_without_spread_objects_are_at_their_nominal_places(load):
     np.testing.assert_array_equal(env.physics.get_state(), state)
 
 
-def test_a_spread_in_between_scales_what_is_drawn(load):
+def test_a_smaller_spread_scales_the_draws(load):
     nominal = np.array([[0.4, angle, 0.0] for angle in np.radians([22, 0, -22])])
     swapped = nominal[::-1]
     sides = []
-    for seed in range(300):
+    for seed in range(200):
         found = []
         for spread in (1.0, 0.5):
             env = load("grasp_glass", seed=seed, spread=spread, observation="state")
@@ -299,20 +257,13 @@ def test_a_spread_in_between_scales_what_is_drawn(load):
             np.testing.assert_allclose(half[:, 1], whole[:, 1] / 2, atol=1e-9)
         sides.append((whole_side, half_side))
     whole_side, half_side = np.array(sides).T
-    assert 0.42 < whole_side.mean() < 0.58
-    assert 0.18 < half_side.mean() < 0.32
+    assert 0.40 < whole_side.mean() < 0.60
+    assert 0.16 < half_side.mean() < 0.34
     assert not (half_side & ~whole_side).any()
 
 
-@pytest.mark.parametrize("spread", [-0.01, 1.01, np.nan])
-def test_a_spread_out_of_range_is_refused(load, spread):
-    with pytest.raises(ValueError, match=r"^spread is .*: choose a number from 0 \(nominal places"):
-        load("grasp_glass", spread=spread)
-
-
-@all_tasks
-def test_starts_are_at_rest(load, task):
-    env = load(task, seed=3, observation="state")
+def test_starts_are_at_rest(load):
+    env = load("grasp_glass", seed=3, observation="state")
     for _ in range(5):
         start = env.reset().observation["privileged_state"]
         for _ in range(5):
@@ -321,9 +272,8 @@ def test_starts_are_at_rest(load, task):
         np.testing.assert_allclose(end[4:], start[4:], atol=0.002)  # (m)
 
 
-@all_tasks
-def test_objects_are_within_reach(load, task):
-    env = load(task, seed=0, observation="state")
+def test_objects_are_within_reach(load):
+    env = load("grasp_glass", seed=0, observation="state")
     physics = env.physics
     limits = np.radians([100, 100, 85])
     for _ in range(10):
@@ -379,9 +329,8 @@ def test_the_hand_stays_in_view_in_demonstrations(load, segmentation, task):
     assert np.mean(in_view) >= 0.98
 
 
-@all_tasks
-def test_objects_are_at_least_4_pixels_wide(load, segmentation, task):
-    env = load(task, seed=0, observation="state")
+def test_objects_are_at_least_4_pixels_wide(load, segmentation):
+    env = load("grasp_glass", seed=0, observation="state")
     for _ in range(20):
         env.reset()
         set_arm(env.physics, np.array([0.0, -1.5, 0.0]))  # out of the way
@@ -390,15 +339,23 @@ def test_objects_are_at_least_4_pixels_wide(load, segmentation, task):
             assert (shown == name).any(axis=0).sum() >= 4
 
 
-def test_unknown_names_are_refused_in_one_line():
-    with pytest.raises(ValueError, match=r"^no NICO task 'juggle'; choose one of grasp_glass, .*$"):
-        nico.load("juggle")
-    with pytest.raises(ValueError, match=r"^observation is 'sound'; choose one of 'pixels', .*$"):
-        nico.load("grasp_glass", observation="sound")
+@pytest.mark.parametrize(
+    ("task", "options", "message"),
+    [
+        ("juggle", {}, r"^no NICO task 'juggle'; choose one of grasp_glass, .*$"),
+        ("grasp_glass", {"observation": "sound"}, "observation"),
+        ("grasp_glass", {"spread": -0.01}, "spread"),
+        ("grasp_glass", {"spread": 1.01}, "spread"),
+        ("grasp_glass", {"spread": np.nan}, "spread"),
+    ],
+)
+def test_bad_arguments_are_refused(task, options, message):
+    with pytest.raises(ValueError, match=message):
+        nico.load(task, **options)
 
 
 @pytest.mark.parametrize("name", ["ACTION_SCALE", "ARC_RADIUS", "GREEN_JITTER", "SIDE_JITTER"])
-def test_scene_version_follows_what_frames_depend_on(monkeypatch, name):
+def test_the_scene_version_changes_with_the_constants_of_the_scene(monkeypatch, name):
     version = nico.scene_version()
     assert re.fullmatch(r"nico-2-[0-9a-f]{8}", version)
     assert nico.scene_version() == version

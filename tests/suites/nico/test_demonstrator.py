@@ -1,4 +1,4 @@
-"""The demonstrator: it succeeds, in the policy's own action space, as long as the paper's."""
+"""The demonstrator: success, length, seeds and the order of its phases."""
 
 import sys
 
@@ -13,7 +13,7 @@ all_tasks = pytest.mark.parametrize("task", nico.ALL_TASKS)
 
 
 def demonstrate(env, demonstrator) -> tuple[np.ndarray, bool]:
-    """Returns the actions ``[T, 4]`` of an episode and whether it succeeded."""
+    """Return the actions ``[T, 4]`` of an episode and whether it succeeded."""
     timestep, actions = env.reset(), []
     demonstrator.reset()
     while not timestep.last():
@@ -23,7 +23,7 @@ def demonstrate(env, demonstrator) -> tuple[np.ndarray, bool]:
 
 
 @all_tasks
-def test_it_succeeds_with_actions_in_range(physics, task):
+def test_demonstrations_succeed_with_actions_in_range(physics, task):
     env = nico.load(task, seed=0, observation="state", physics=physics)
     demonstrator = Demonstrator(env, seed=0)
 
@@ -49,24 +49,12 @@ def test_equal_seeds_give_equal_demonstrations(physics, task):
         assert len(other) != len(first) or (other != first).any()
 
 
-def test_it_must_be_reset_first(physics):
+def test_it_needs_a_reset_and_a_task_with_a_demonstration(physics):
     env = nico.load("grasp_glass", seed=0, observation="state", physics=physics)
-    timestep = env.reset()
-
-    with pytest.raises(RuntimeError, match=r"^call the demonstrator's reset\(\) after .*$"):
-        Demonstrator(env)(timestep)
-
-
-def test_a_task_it_does_not_know_is_refused(physics):
-    class Juggle(nico.NicoTask):
-        pass
-
-    env = nico.load("grasp_glass", seed=0, observation="state", physics=physics)
-    env._task = Juggle(random=np.random.RandomState(0))
-
-    with pytest.raises(
-        ValueError, match=r"^no demonstration is known for the task Juggle: give it"
-    ):
+    with pytest.raises(RuntimeError, match="reset"):
+        Demonstrator(env)(env.reset())
+    env._task = type("Juggle", (nico.NicoTask,), {})(random=np.random.RandomState(0))
+    with pytest.raises(ValueError, match="Juggle"):
         Demonstrator(env)
 
 
@@ -101,11 +89,11 @@ def test_a_grasp_starts_closer_to_a_glass_with_a_near_neighbor(physics, degrees,
 def test_a_phase_with_a_further_condition_lasts_until_it_holds(physics, monkeypatch):
     # The hand is half open at the start.
     env = nico.load("grasp_glass", seed=0, spread=0.0, observation="state", physics=physics)
-    asked = []
+    calls = []
 
     def fourth_time(_) -> bool:
-        asked.append(len(asked))
-        return len(asked) == 4
+        calls.append(len(calls))
+        return len(calls) == 4
 
     def stay(physics) -> np.ndarray:
         return physics.data.ctrl[:3].copy()
@@ -117,17 +105,17 @@ def test_a_phase_with_a_further_condition_lasts_until_it_holds(physics, monkeypa
     demonstrator = Demonstrator(env, seed=0)
     timestep = env.reset()
     demonstrator.reset()
-    while len(asked) < 4 and not timestep.last():
+    while len(calls) < 4 and not timestep.last():
         action = demonstrator(timestep)
-        if 0 < len(asked) < 4:
+        if 0 < len(calls) < 4:
             assert action[3] > 0  # closes
         timestep = env.step(action)
 
-    assert len(asked) == 4
+    assert len(calls) == 4
     assert action[3] < 0  # opens
 
 
-def test_a_phase_ends_after_so_many_steps_and_the_last_leads_to_a_new_plan(physics, monkeypatch):
+def test_a_phase_ends_at_its_limit_and_the_last_phase_leads_to_a_new_plan(physics, monkeypatch):
     env = nico.load("grasp_glass", seed=0, spread=0.0, observation="state", physics=physics)
     planned = []
 

@@ -1,4 +1,4 @@
-"""The tasks in others' hands: dm_env, dm_control's suite, TorchRL, Gymnasium, Stable-Baselines3."""
+"""The tasks in dm_env, dm_control's suite, TorchRL, Gymnasium and Stable-Baselines3."""
 
 import importlib
 import sys
@@ -31,27 +31,28 @@ all_observations = pytest.mark.parametrize(
 
 
 def failures(tests: type[unittest.TestCase]) -> list[str]:
-    """Runs the tests of a case; there must be some."""
+    """Return the failures of a test case, which must have tests."""
     result = unittest.TestResult()
     unittest.defaultTestLoader.loadTestsFromTestCase(tests).run(result)
     assert result.testsRun
     return [trace for _, trace in result.failures + result.errors]
 
 
-@all_tasks
 @all_observations
 @pytest.mark.parametrize("flat", [False, True])
-def test_dm_envs_own_tests_pass(load, task, observation, keys, flat):
+def test_dm_envs_own_tests_pass(load, observation, keys, flat):
     class Checks(test_utils.EnvironmentTestMixin, unittest.TestCase):
         def make_object_under_test(self):
             options = {"time_limit": 1.0, "environment_kwargs": {"flat_observation": flat}}
-            return load(task, seed=0, observation=observation, **options)
+            return load("push_white_left", seed=0, observation=observation, **options)
 
         def make_action_sequence(self):  # Long enough to come to the end of two episodes.
             yield from np.random.default_rng(0).uniform(-1.0, 1.0, (13, 4))
 
     assert failures(Checks) == []
-    env = load(task, observation=observation, environment_kwargs={"flat_observation": flat})
+    env = load(
+        "push_white_left", observation=observation, environment_kwargs={"flat_observation": flat}
+    )
     assert set(env.observation_spec()) == ({"observations"} if flat else keys)
 
 
@@ -88,16 +89,12 @@ def test_registered_tasks_load_by_dm_control(registered, task):
     env = suite.load(
         "nico", task, {"random": 5, "observation": "state"}, {"flat_observation": True}
     )
-    direct = nico.load(task, seed=5, observation="state")
-
-    np.testing.assert_array_equal(
-        env.reset().observation["observations"],
-        direct.reset().observation["privileged_state"],
-    )
-    assert env.control_timestep() == pytest.approx(0.2)
+    direct = nico.load(task, seed=5, observation="state").reset().observation
+    observation = env.reset().observation["observations"]
+    np.testing.assert_array_equal(observation, direct["privileged_state"])
 
 
-def test_registered_tasks_are_listed_once_and_others_stay_as_they_are(registered):
+def test_registered_tasks_are_listed_once_and_other_suites_stay_unchanged(registered):
     def others(name: str) -> list:
         return [pair for pair in getattr(suite, name) if pair[0] != "nico"]
 
@@ -118,10 +115,9 @@ def test_registered_tasks_are_listed_once_and_others_stay_as_they_are(registered
     assert {**domains, "nico": tasks} == suite.TASKS_BY_DOMAIN
 
 
-@all_tasks
 @all_observations
-def test_torchrl_wraps_seeds_and_checks(load, task, observation, keys):
-    env = DMControlWrapper(load(task, observation=observation))
+def test_torchrl_wraps_seeds_and_checks(load, observation, keys):
+    env = DMControlWrapper(load("push_white_left", observation=observation))
 
     def play(seed: int) -> dict[str, torch.Tensor]:
         env.set_seed(seed)
@@ -138,21 +134,20 @@ def test_torchrl_wraps_seeds_and_checks(load, task, observation, keys):
         assert not torch.equal(first[key], other[key])
 
 
-@all_tasks
-def test_torchrl_finds_registered_tasks(registered, renderer, task):
-    env = DMControlEnv("nico", task, renderer=renderer)
+def test_torchrl_finds_registered_tasks(registered, renderer):
+    env = DMControlEnv("nico", "push_white_left", renderer=renderer)
     env.set_seed(0)
 
     rollout = env.rollout(3)
 
     assert rollout["pixels"].shape == (3, 32, 64, 3)
     assert rollout["next", "reward"].shape == (3, 1)
-    assert task in dict(DMControlEnv.available_envs)["nico"]
+    assert {*nico.ALL_TASKS} <= {*dict(DMControlEnv.available_envs)["nico"]}
 
 
 @pytest.fixture
 def make_gym(renderer) -> Iterator[Callable[..., gymnasium.Env]]:
-    """Makes tasks as environments of gymnasium's registry, of which it checks more."""
+    """Make tasks through Gymnasium's registry, since it checks registered environments further."""
 
     def make(task: str, **options) -> gymnasium.Env:
         shared = None if "frame_size" in options else renderer
@@ -165,24 +160,13 @@ def make_gym(renderer) -> Iterator[Callable[..., gymnasium.Env]]:
 
 # An unbounded state is no mistake; the windows it would open are not ours.
 @pytest.mark.filterwarnings("ignore:.*A Box observation space m.*imum value is:UserWarning")
-@all_tasks
 @all_observations
-def test_gymnasiums_checks_pass_through_shimmy(make_gym, task, observation, keys):
-    env = make_gym(task, observation=observation)
+def test_gymnasiums_checks_pass_through_shimmy(make_gym, observation, keys):
+    env = make_gym("push_white_left", observation=observation)
 
     check_env(env, skip_render_check=True)
 
     assert set(env.observation_space) == keys
-
-
-def test_shimmy_seeds_starts(make_gym):
-    env = make_gym("grasp_glass", observation="state")
-    starts = [env.reset(seed=seed)[0]["privileged_state"] for seed in (3, 3, 4)]
-    plain = nico.load("grasp_glass", seed=3, observation="state").reset()
-
-    np.testing.assert_array_equal(starts[0], starts[1])
-    np.testing.assert_array_equal(starts[0], plain.observation["privileged_state"])
-    assert (starts[0] != starts[2]).any()
 
 
 def test_stable_baselines3_learns_from_larger_frames(make_gym):

@@ -1,9 +1,10 @@
+"""Pictures of episodes."""
+
 import itertools
 from pathlib import Path
 
 import numpy as np
 import pytest
-import tyro
 from PIL import Image
 
 from suites.nico import explore
@@ -27,21 +28,20 @@ def test_an_episode_is_pictured_step_by_step(pictures):
         assert all((first != second).any() for first, second in itertools.pairwise(view))
 
 
-def test_a_strip_shows_the_episode_from_first_to_last(pictures, tmp_path):
+def test_pictures_become_a_strip_or_an_animation(pictures, tmp_path):
     write_pictures(tmp_path / "strip.png", pictures)
-
     strip = np.asarray(Image.open(tmp_path / "strip.png"))
     assert strip.shape == (400, 6 * 320, 3)
     np.testing.assert_array_equal(strip[:, :320], np.asarray(pictures[0]))
     np.testing.assert_array_equal(strip[:, -320:], np.asarray(pictures[-1]))
 
-
-def test_an_animation_shows_each_step_for_its_0_2_seconds(pictures, tmp_path):
     write_pictures(tmp_path / "episode.gif", pictures)
-
     with Image.open(tmp_path / "episode.gif") as animation:
         assert animation.n_frames == len(pictures)
-        assert animation.info["duration"] == 200
+        assert animation.info["duration"] == 200  # (ms), the time of a step
+
+    with pytest.raises(ValueError, match="png"):
+        write_pictures(tmp_path / "episode.jpg", pictures)
 
 
 def test_random_actions_and_demonstrations_differ(pictures):
@@ -49,11 +49,6 @@ def test_random_actions_and_demonstrations_differ(pictures):
 
     assert np.asarray(random[0]).tolist() == np.asarray(pictures[0]).tolist()
     assert np.asarray(random[8]).tolist() != np.asarray(pictures[8]).tolist()
-
-
-def test_other_kinds_of_file_are_refused(pictures, tmp_path):
-    with pytest.raises(ValueError, match=r"episode\.jpg: give a name that ends in \.png or \.gif$"):
-        write_pictures(tmp_path / "episode.jpg", pictures)
 
 
 @pytest.mark.parametrize(
@@ -74,10 +69,3 @@ def test_a_window_opens_only_on_a_screen(tmp_path, monkeypatch, out, screen, sho
 
     assert viewed == ([("grasp_glass",)] if shown else [])
     assert [path.name for path in tmp_path.iterdir()] == ([written] if written else [])
-
-
-@pytest.mark.parametrize(
-    ("flags", "random"), [([], False), (["--demonstrate"], False), (["--random"], True)]
-)
-def test_flags_choose_who_acts(flags, random):
-    assert tyro.cli(Arguments, args=flags).random is random

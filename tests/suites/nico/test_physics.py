@@ -1,4 +1,4 @@
-"""The state of a simulation, and what can be asked of it."""
+"""State of a simulation, contacts and gaps."""
 
 import itertools
 
@@ -22,7 +22,7 @@ def test_a_simulation_continues_bit_for_bit_from_its_state(load, task):
     timestep = env.reset()
     demonstrator.reset()
     contacts = 0
-    # From each state anew, so that those in which the hand touches an object are among them.
+    # From every state, those with contacts of the hand included.
     while not timestep.last():
         other.set_state(env.physics.get_state())
         timestep = env.step(demonstrator(timestep))
@@ -56,7 +56,7 @@ def test_a_state_holds_where_objects_stood_at_the_start(load, physics):
 
 
 @pytest.mark.parametrize("within_reset", [False, True])
-def test_a_planner_that_goes_back_meets_the_same_future(load, within_reset):
+def test_the_same_actions_from_a_restored_state_give_the_same_observations(load, within_reset):
     env = load("push_green_to_white", seed=0, observation="state")
     env.reset()
     actions = np.random.default_rng(0).uniform(-1.0, 1.0, (20, 4))
@@ -88,7 +88,7 @@ def test_parts_of_the_state_can_be_chosen(physics):
 
 
 def test_a_state_of_another_length_is_refused(physics):
-    with pytest.raises(ValueError, match=r"^the state is a vector of 266 numbers, got \[33\]: .*$"):
+    with pytest.raises(ValueError, match="266 numbers"):
         physics.set_state(np.zeros(33))
 
 
@@ -96,7 +96,7 @@ GRIP = np.array([0.42, 0.05, TABLE_HEIGHT + 0.045])
 
 
 def put(physics: Physics, name: str, position: np.ndarray, curl: float) -> None:
-    """Puts an object somewhere, the others out of reach, and the hand at `GRIP`, closing."""
+    """Put an object at a position, the others out of reach, and the closing hand at `GRIP`."""
     with physics.reset_context():
         for number, other in enumerate(nico.OBJECTS):
             physics.named.data.qpos[other] = [0.45, 0.3 + 0.1 * number, 0.7, 1, 0, 0, 0]
@@ -111,7 +111,7 @@ def put(physics: Physics, name: str, position: np.ndarray, curl: float) -> None:
     [(0.7, 0.0, True, True), (0.0, 0.0, True, False), (0.7, 0.1, False, False)],
     ids=["in the fist", "at the palm of the open hand", "beside the fist"],
 )
-def test_only_what_is_in_the_hand_is_touched_and_held(physics, name, curl, left, touched, held):
+def test_only_an_object_in_the_hand_is_touched_and_held(physics, name, curl, left, touched, held):
     # The palm and an object at the grip point just meet; the boxes are no less wide than the glass.
     put(physics, name, np.array([GRIP[0], GRIP[1] + left, TABLE_HEIGHT + 0.03]), curl)
 
@@ -121,7 +121,7 @@ def test_only_what_is_in_the_hand_is_touched_and_held(physics, name, curl, left,
 
 
 @pytest.mark.parametrize("name", nico.OBJECTS)
-def test_what_the_palm_touches_from_the_side_is_not_pressed(physics, name):
+def test_an_object_touched_by_the_palm_from_the_side_is_not_pressed(physics, name):
     put(physics, name, np.array([GRIP[0], GRIP[1], TABLE_HEIGHT + 0.03]), 0.0)
 
     assert physics.touching("palm", name)
@@ -147,25 +147,17 @@ def test_the_gap_to_the_hand_is_that_to_its_nearest_part(physics):
 
 
 @pytest.mark.parametrize(
-    ("ask", "refusal"),
+    "query",
     [
-        (lambda physics: physics.gap("hand", "cup"), "no 'cup' .* one of hand, .*, white_box"),
-        (lambda physics: physics.touching("cup", "hand"), "no 'cup' .* one of hand, .*, white_box"),
-        (lambda physics: physics.held("cup"), "no object 'cup' .* one of glass, .*, white_box"),
-        (lambda physics: physics.pressed("cup"), "no object 'cup' .* one of glass, .*, white_box"),
-        (lambda physics: physics.held("palm"), "no object 'palm' .* one of glass, .*, white_box"),
-        (
-            lambda physics: physics.object_position("cup"),
-            "no object 'cup' .* one of glass, .*, white_box",
-        ),
-        (
-            lambda physics: physics.start_position("palm"),
-            "no object 'palm' .* one of glass, .*, white_box",
-        ),
-        (lambda physics: physics.stands("cup"), "no object 'cup' .* one of glass, .*, white_box"),
+        lambda physics: physics.gap("hand", "cup"),
+        lambda physics: physics.touching("cup", "hand"),
+        lambda physics: physics.held("palm"),  # a part of the robot, not an object
+        lambda physics: physics.pressed("cup"),
+        lambda physics: physics.object_position("cup"),
+        lambda physics: physics.start_position("palm"),
+        lambda physics: physics.stands("cup"),
     ],
-    ids=["gap", "touching", "held", "pressed", "held palm", "position", "start", "stands"],
 )
-def test_what_is_not_there_cannot_be_asked_for(physics, ask, refusal):
-    with pytest.raises(ValueError, match=rf"^{refusal}$"):
-        ask(physics)
+def test_unknown_names_are_refused(physics, query):
+    with pytest.raises(ValueError, match=r"^no .*'(cup|palm)' .* one of .*white_box$"):
+        query(physics)

@@ -1,11 +1,10 @@
-"""Says whether a rebuilding of the code has changed what runs compute.
+"""Check whether a refactoring has changed the results of runs.
 
-It makes some short runs and writes a digest of what each has learned: of the values in its CSV
-files, whatever their columns are called, and of the tensors in its checkpoint, whatever their names
-are. Run it before a change and after it, and compare:
+Short runs are made before and after the change. Runs are equal if the values in their CSV files and
+the tensors in their checkpoints are; names of columns and of tensors may differ.
 
-    python scripts/guard.py runs/before
-    python scripts/guard.py runs/after --against runs/before
+    python scripts/regression_check.py runs/before
+    python scripts/regression_check.py runs/after --against runs/before
 """
 
 from __future__ import annotations
@@ -67,7 +66,7 @@ def _tensors(state: Any) -> Iterator[torch.Tensor]:
 
 
 def main() -> None:
-    """Make the runs that are not there yet, and compares."""
+    """Make the missing runs and compare them with the earlier ones."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path, help="folder for the runs")
     parser.add_argument("--against", type=Path, help="folder of earlier runs")

@@ -1,11 +1,11 @@
-"""Encoders of the package, by the tasks, the run or the bank they are wanted for."""
+"""Which of the shipped encoders serve which tasks, runs and banks."""
 
 import shutil
 from pathlib import Path
 
 import pytest
 
-from bgpo_trl.encoders import shipped, train
+from bgpo_trl.encoders import pretrained, train
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.encoders.representation import load_representation
 from bgpo_trl.experiments.run import pretrained_for
@@ -25,8 +25,8 @@ from suites import nico
         (("juggle", "press_white"), "nico_eight"),
     ],
 )
-def test_encoders_of_eight_serve_the_tasks_that_the_paper_lacks(tasks, name):
-    path = shipped.default_weights(tasks)
+def test_tasks_outside_the_paper_use_the_encoders_of_eight_tasks(tasks, name):
+    path = pretrained.default_weights(tasks)
     assert path.parts[-3:] == ("bgpo_trl", "weights", f"{name}.safetensors")
     encoders, bank = load_pretrained(tasks=tasks)
     assert encoders.identity == load_representation(path).identity
@@ -35,24 +35,17 @@ def test_encoders_of_eight_serve_the_tasks_that_the_paper_lacks(tasks, name):
 
 @pytest.mark.parametrize("tasks", [nico.PAPER_TASKS, nico.ALL_TASKS])
 @pytest.mark.parametrize("given", [None, Path("other.safetensors")])
-def test_training_replaces_the_encoders_of_the_datasets_tasks_alone(monkeypatch, tasks, given):
-    asked = []
+def test_training_writes_the_encoders_of_the_datasets_tasks(monkeypatch, tasks, given):
+    written = []
     monkeypatch.setattr(train, "load_demonstrations", lambda path: path)
     monkeypatch.setattr(train, "read_meta", lambda path: {"tasks": tasks, "spread": 0.5})
     monkeypatch.setattr(
         train,
         "train_encoders",
-        lambda dataset, play, weights, *_, tasks, spread: asked.append((weights, tasks, spread)),
+        lambda dataset, play, weights, *_, tasks, spread: written.append((weights, tasks, spread)),
     )
     train.main(train.Arguments(Path("data"), weights=given))
-    assert asked == [(given or shipped.default_weights(tasks), tasks, 0.5)]
-
-
-def test_files_are_at_most_16_megabytes():
-    for tasks in (nico.PAPER_TASKS, nico.ALL_TASKS):
-        weights = shipped.default_weights(tasks)
-        for path in (weights, shipped.bank_path(weights)):
-            assert path.stat().st_size < 16e6
+    assert written == [(given or pretrained.default_weights(tasks), tasks, 0.5)]
 
 
 def test_a_run_finds_its_encoders_by_their_digest(tmp_path):
@@ -67,18 +60,18 @@ def test_a_run_finds_its_encoders_by_their_digest(tmp_path):
     assert not any(tmp_path.iterdir())  # Both come with the package.
 
 
-def test_a_bank_brings_the_encoders_that_embedded_it(tmp_path):
+def test_a_bank_is_used_with_the_encoders_that_embedded_it(tmp_path):
     path = tmp_path / "bank.safetensors"
     for tasks in (nico.PAPER_TASKS, nico.ALL_TASKS):
-        weights = shipped.default_weights(tasks)
-        shutil.copy(shipped.bank_path(weights), path)
-        assert shipped.weights_of_bank(path) == weights
+        weights = pretrained.default_weights(tasks)
+        shutil.copy(pretrained.bank_path(weights), path)
+        assert pretrained.weights_of_bank(path) == weights
         encoders, bank = pretrained_for(nico.PAPER_TASKS, path)
         assert encoders.identity == load_representation(weights).identity
         assert bank.tasks == nico.PAPER_TASKS
 
 
-def test_a_bank_that_cannot_be_read_is_left_for_its_reader_to_refuse(tmp_path: Path):
-    assert shipped.weights_of_bank(tmp_path / "nothing") == shipped.default_weights()
+def test_an_unreadable_bank_gets_the_default_encoders(tmp_path: Path):
+    assert pretrained.weights_of_bank(tmp_path / "nothing") == pretrained.default_weights()
     (tmp_path / "rubbish").write_bytes(b"rubbish")
-    assert shipped.weights_of_bank(tmp_path / "rubbish") == shipped.default_weights()
+    assert pretrained.weights_of_bank(tmp_path / "rubbish") == pretrained.default_weights()

@@ -1,8 +1,7 @@
-"""A tiny deterministic environment, and what the transforms need around it."""
+"""A tiny deterministic environment, and the transforms around it."""
 
 from types import SimpleNamespace
 
-import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.data import Bounded, Composite, Unbounded
@@ -71,7 +70,7 @@ class MockEnv(EnvBase):
 
 
 class TopRow(torch.nn.Module):
-    """Stands in for the VAE where frames need no more than a fast look: their topmost pixels."""
+    """A fast replacement of the VAE, whose latents are the topmost pixels."""
 
     def __init__(self):
         super().__init__()
@@ -127,7 +126,7 @@ def make_env(seeds=None, lengths=4, max_steps=5, beta=0.1, vae=None, del_keys=Fa
 
 
 def play(env, n_steps, data=None):
-    """Steps with partial resets and a fixed action; returns the steps and what follows them."""
+    """Step with partial resets and a fixed action; return the steps and the data after them."""
     data = env.reset() if data is None else data
     steps = []
     for _ in range(n_steps):
@@ -135,10 +134,3 @@ def play(env, n_steps, data=None):
         step, data = env.step_and_maybe_reset(data)
         steps.append(step.clone())
     return torch.stack(steps, -1), data
-
-
-# Test files cannot import this one, so they ask for its functions by name.
-for function in (MockEnv, TopRow, make_bank, generators, make_modules, make_env, play):
-    globals()[f"_{function.__name__}"] = pytest.fixture(name=function.__name__)(
-        lambda function=function: function
-    )

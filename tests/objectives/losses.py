@@ -1,0 +1,92 @@
+"""Small losses of every kind, with batches of transitions for them."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from bgpo_trl.modules.actor_critic import Actor, Critic
+from bgpo_trl.modules.gaussian_actor import GaussianActor
+from bgpo_trl.objectives.ddpg import DDPGLoss
+from bgpo_trl.objectives.sac import SACLoss
+from bgpo_trl.objectives.target_update import ForeachSoftUpdate
+from bgpo_trl.objectives.td3 import TD3Loss
+
+SIZES = {"state": 6, "label": 2}
+STATE, ACTION = SIZES["state"], 4
+LOSSES = {"ddpg": (DDPGLoss, Actor), "td3": (TD3Loss, Actor), "sac": (SACLoss, GaussianActor)}
+every_loss = pytest.mark.parametrize("name", LOSSES)
+twin_losses = pytest.mark.parametrize("name", ["td3", "sac"])
+
+
+def stream(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def make_loss(name, seeds=(0,), *, stacked=False, in_keys=("state",), layer_norm=False, **options):
+    """Make a loss of one seed, or of a stack of seeds; a seed starts the same in either."""
+    kind, actor = LOSSES[name]
+    shape = [len(seeds)] if stacked else []
+    twins = [2] if kind.twin_critics else []
+    if kind.twin_critics:
+        noise = [stream(seed + 50) for seed in seeds]
+        options["generator"] = noise if stacked else noise[0]
+    if name == "sac":
+        options = {"entropy_in_target": True, **options}
+    size = sum(SIZES[key] for key in in_keys)
+    network = {"in_keys": list(in_keys), "hidden_sizes": (16,)}
+    of_critics = [stream(100 * (seed + 1) + i) for seed in seeds for i in range(len(twins) + 1)]
+    loss = kind(
+        actor(size, ACTION, batch_size=shape, generator=[*map(stream, seeds)], **network),
+        Critic(
+            size,
+            ACTION,
+            layer_norm=layer_norm,
+            batch_size=[*shape, *twins],
+            generator=of_critics,
+            **network,
+        ),
+        **options,
+    )
+    loss.make_value_estimator(gamma=0.98)
+    ForeachSoftUpdate(loss, tau=0.005)
+    return loss
+
+
+def make_batch(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float32) -> TensorDict:
+    generator = stream(seed)
+
+    def normal(size: int) -> Tensor:
+        return torch.randn(*shape, size, generator=generator).to(dtype)
+
+    def inputs() -> dict[str, Tensor]:
+        return {key: normal(size) for key, size in SIZES.items()}
+
+    terminated = torch.rand(*shape, 1, generator=generator) < 0.2
+    truncated = torch.rand(*shape, 1, generator=generator) < 0.2
+    reward = torch.rand(*shape, 1, generator=generator).to(dtype) * terminated
+    following = {"reward": reward, "done": terminated | truncated, "terminated": terminated}
+    transition = {**inputs(), "action": normal(ACTION).clamp(-1, 1)}
+    return TensorDict({**transition, "next": {**inputs(), **following}}, shape)
+
+
+def total(losses: TensorDict) -> Tensor:
+    return sum(value for key, value in losses.items() if key.startswith("loss_"))
+
+
+def gradients(loss, batch: TensorDict) -> list[Tensor]:
+    loss.zero_grad()
+    total(loss(batch)).backward()
+    return [parameter.grad.clone() for parameter in loss.parameters()]
+
+
+def constant_critics(loss, online, target) -> None:
+    """Make Q equal to ``online`` and target Q to ``target`` everywhere; pairs for twin critics."""
+    for parameters, values in (
+        (loss.value_network_params, online),
+        (loss.target_value_network_params, target),
+    ):
+        for tensor in parameters.values(True, True):
+            tensor.data.zero_()
+        bias = parameters["mlp", "layers", "1", "bias"]
+        bias.data.copy_(torch.tensor(values).unsqueeze(-1))
