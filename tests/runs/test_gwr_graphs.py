@@ -11,9 +11,9 @@ from bgpo_trl.training import Trainer
 from tests.files.test_checkpoint import largest_file
 
 
-def grown(seed=0, n=30, **arguments):
+def grown(seed=0, n=30):
     generator = torch.Generator().manual_seed(seed)
-    gwr = GWRB(3, batch_size=[2], generator=[generator] * 2, **arguments)
+    gwr = GWRB(3, batch_size=[2], generator=[generator] * 2)
     for _ in range(n):
         gwr.adapt(torch.rand(2, 3, generator=generator))
     return gwr
