@@ -37,11 +37,6 @@ def rows(path):
         return list(csv.DictReader(file))
 
 
-@pytest.mark.parametrize("example", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.name)
-def test_an_example_is_short(example):
-    assert len(example.read_text().splitlines()) < 60
-
-
 def test_own_task_is_recorded_learned_and_counted_under_its_name(run):
     out = run("own_task.py")
 

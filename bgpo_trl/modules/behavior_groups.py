@@ -227,8 +227,8 @@ class BehaviorGroups(nn.Module):
         if state is None:
             none = np.empty(0, np.int64)
             return _Network(k, np.empty((0, self.n_features)), none, none, none.astype(bool), none)
-        arrays = {name: state[name].numpy().copy() for name in _ARRAYS}
-        lists = {name: [*state[name]] for name in _LISTS}
+        arrays: dict[str, Any] = {name: state[name].numpy().copy() for name in _ARRAYS}
+        lists: dict[str, Any] = {name: [*state[name]] for name in _LISTS}
         network = _Network(k, **arrays, **lists, revision=state["revision"])
         sizes = {len(arrays[name]) for name in ("points", "shown", "group", "member")}
         if len(sizes) > 1 or not {*network.group.tolist()} <= {*range(len(network.parent))}:
@@ -329,7 +329,7 @@ class _Network:
         rows = np.flatnonzero(self.member & (self.group == group))
         return int(rows[self._kth_distances(rows).argmin()])
 
-    def _kth_distances(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:
+    def _kth_distances(self, rows: NDArray[np.int64]) -> NDArray[np.floating]:
         """Return the distance of each of some demonstrations to its k-th neighbor among them."""
         points = self.points[rows]
         return np.partition(cdist(points, points), self.k, axis=1)[:, self.k]

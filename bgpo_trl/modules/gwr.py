@@ -567,19 +567,19 @@ def _is_sound(network: object) -> bool:
     """Return whether an entry of a state is a graph of GWR-B."""
     if not isinstance(network, dict):
         return False
-    tensors = [network.get(name) for name in BehaviorGraph._fields]
+    entries = [network.get(name) for name in BehaviorGraph._fields]
+    tensors = [entry for entry in entries if isinstance(entry, Tensor)]
     next_node = network.get("next_node")
-    if not isinstance(next_node, int) or not all(isinstance(x, Tensor) for x in tensors):
+    if len(tensors) < len(entries) or not isinstance(next_node, int):
         return False
-    weights, habituation, edges, ages, node = tensors
-    n = len(node) if node.ndim else 0
+    weights, habituation, edges, ages, node = BehaviorGraph(*tensors)
+    n = len(weights) if weights.ndim == 2 else -1
     return (
-        {edges.dtype, ages.dtype, node.dtype} == {torch.int64}
+        node.shape == habituation.shape == (n,)
+        and edges.shape == (ages.numel(), 2)
+        and ages.ndim == 1
+        and node.dtype == edges.dtype == ages.dtype == torch.int64
         and weights.is_floating_point()
-        and (weights.ndim, ages.ndim) == (2, 1)
-        and len(weights) == n
-        and node.shape == habituation.shape == (n,)
-        and edges.shape == (len(ages), 2)
         and bool(weights.isfinite().all())
         # With alpha = 1 / h_0, habituation decays to 0, or by rounding to just below.
         and bool(((habituation >= -1e-9) & (habituation <= 1)).all())
