@@ -13,14 +13,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from bgpo_trl.analysis.task_inference import group_purity, task_inference_accuracy
-from bgpo_trl.configs import BGPOConfig, GWRBConfig
+from bgpo_trl.configs import BGPOConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.experiments.arguments import BankArguments, check_draws, command_line, even_starts
 from bgpo_trl.experiments.run import bank_of
@@ -36,7 +36,7 @@ class Arguments(BankArguments):
 
     draws: int = 1_800
     """Demonstrations that each network is shown."""
-    activity_scale: float = GWRBConfig.activity_scale
+    activity_scale: float = BGPOConfig().gwr.activity_scale
     """Factor of distances in the activity of GWR-B."""
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
     """Seeds of the draws."""
@@ -114,7 +114,7 @@ def main(arguments: Arguments) -> None:
             rows = [*draw(seen, schedule, arguments.draws, seed)]
             groups, needed, seconds = form(seen, rows, config)
             (random,) = generators([seed], "gwr")
-            gwr = GWRB(seen.embedding.shape[-1], generator=random, **asdict(fine))
+            gwr = GWRB(seen.embedding.shape[-1], fine, generator=random)
             for row in rows:
                 gwr.adapt(seen.embedding[row])
             inferred = task_inference_accuracy(gwr, seen, held_out, n_tasks)

@@ -23,6 +23,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs import ClipTransform, Compose, StepCounter, TransformedEnv
 
+from bgpo_trl.configs import GWRBConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.encoders.representation import Representation
@@ -132,7 +133,7 @@ class MinimalBGPO:
         self.replay = Replay(settings.replay_size, stream["replay"])
         self.gwr = GWRB(
             bank.embedding.shape[-1],
-            activity_scale=settings.activity_scale,
+            GWRBConfig(activity_scale=settings.activity_scale),
             generator=stream["gwr"],
         )
 

@@ -9,6 +9,7 @@ import networkx as nx
 import torch
 from matplotlib.figure import Figure
 
+from bgpo_trl.configs import GWRBConfig
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.modules.gwr import GWRB
 
@@ -27,7 +28,7 @@ if __name__ == "__main__":
     points, ring = point_cloud(4_000, generator)
     # A point farther than -log(0.8) = 0.22 from all nodes adds a node. Clusters separate because
     # an edge is removed once one of its nodes has won 15 times without renewing it.
-    gwr = GWRB(2, activity_threshold=0.8, max_age=15, init="data")
+    gwr = GWRB(2, GWRBConfig(activity_threshold=0.8, max_age=15), init="data")
     for point in points:
         gwr.adapt(point)
 

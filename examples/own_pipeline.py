@@ -10,6 +10,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import Compose, StepCounter, Transform, TransformedEnv
 from torchrl.modules import AdditiveGaussianModule
 
+from bgpo_trl.configs import GWRBConfig
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.envs import NicoEnv
 from bgpo_trl.modules.actor_critic import Actor, Critic
@@ -35,7 +36,7 @@ class NoveltyReward(Transform):
 if __name__ == "__main__":
     torch.manual_seed(0)
     encoders, bank = load_pretrained()
-    behaviors, places = GWRB(32), GWRB(64, init="data", activity_threshold=0.6)
+    behaviors, places = GWRB(32), GWRB(64, GWRBConfig(activity_threshold=0.6), init="data")
     encode = FrameEncoder(encoders.vae, del_keys=True)  # pixels -> latent
     source = DemonstrationSource(bank.seen(), TaskSchedule(starts=(0, 2, 4)))
     infer = BehaviorLookup(behaviors, learn=True)  # demo_embedding -> behavior

@@ -93,18 +93,12 @@ row, z = partial(TensorDict, batch_size=[]), torch.zeros(2, 5, 64)
 lae, lengths = SequenceAutoencoder(), torch.tensor([5, 5])
 WRONG = {
     # GWR-B
-    "gwr threshold": (lambda: GWRB(2, activity_threshold=3.0), "3.0"),
-    "gwr NaN habituation": (lambda: GWRB(2, habituation_threshold=NAN), "nan"),
+    "gwr of no features": (lambda: GWRB(0), "n_features"),
+    "gwr NaN input": (lambda: GWRB(2).adapt(torch.tensor([NAN, 0])), "NaN"),
     "gwr wrong size": (lambda: GWRB(2).lookup(torch.zeros(3)), "got [3]"),
     "gwr empty": (lambda: GWRB(2, init="data").lookup(torch.zeros(2)), "empty"),
+    "gwr part of a node": (lambda: GWRB(2, max_nodes=2.5), "got 2.5"),
     "gwr edge to nowhere": (lambda: filled({"edges": torch.tensor([[0, 7]])}), "damaged"),
-    "gwr ages below 0": (lambda: filled({"ages": torch.tensor([-5])}), "damaged"),
-    "gwr habituation above 1": (
-        lambda: filled({"habituation": torch.tensor([1.0, 3.0])}), "damaged"),
-    "gwr an edge twice": (
-        lambda: filled({"edges": torch.tensor([[0, 1], [1, 0]]), "ages": torch.tensor([0, 0])}),
-        "damaged"),
-    "gwr NaN weights": (lambda: filled({"weights": torch.full((2, 2), NAN)}), "damaged"),
     # networks
     "vae of nothing": (lambda: VAE(0), "latent_size"),
     "vae float frames": (lambda: VAE().latent(torch.zeros(32, 64, 3)), "float32"),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import Any, cast
 
 import torch
@@ -73,9 +73,9 @@ class BGPO(Algorithm):
         if variant.gwr:
             self.gwr = GWRB(
                 embedding_size,
+                config.gwr,
                 batch_size=[len(seeds)],
                 generator=generators(seeds, "gwr"),
-                **asdict(config.gwr),
             )
         if variant.groups:
             self.groups = BehaviorGroups(

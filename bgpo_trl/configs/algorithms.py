@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from math import inf
 from typing import Literal
 
 from bgpo_trl.configs.checks import at_least, check, positive, whole
@@ -64,49 +65,51 @@ def _refuse_all_but_ddpg(who: str, rl: RLConfig) -> None:
 
 @dataclass(frozen=True)
 class GWRBConfig:
-    """GWR-B (Table 1); see `GWRB`."""
+    """Constants of GWR-B, by default those of Table 1; see `GWRB` for the learning rule."""
 
     activity_threshold: float = 0.8
-    """Activity below which a node is inserted (Table 1)."""
+    """Activity a_T in [0, 1] below which a node is inserted (Table 1)."""
     habituation_threshold: float = 0.15
-    """Habituation below which a best-matching node allows an insertion (Table 1)."""
-    activity_scale: float = 0.25
-    """Factor of distances in the activity. Ours: with 1, as in the paper, every third demonstration
-    becomes a node; with 0.25 there are about 200 nodes after 1,800 demonstrations."""
+    """Habituation h_T below which a best-matching node allows an insertion (Table 1)."""
+    activity_scale: float = 1.0
+    """Factor s of distances in the activity (Eq. 2 has none). Inputs and random weights multiplied
+    by s have the same effect."""
     lr_best: float = 0.1
-    """Learning rate eps_c of the best-matching node (Table 1)."""
+    """Learning rate eps_c of the best-matching node, at most 1 (Table 1)."""
     lr_neighbor: float = 0.01
-    """Learning rate eps_n of its neighbors (Table 1)."""
+    """Learning rate eps_n of its neighbors, at most eps_c (Table 1)."""
     initial_habituation: float = 1.0
-    """Habituation h_0 of a new node (Table 1)."""
+    """Habituation h_0 of a new node, in (0, 1] (Table 1)."""
     alpha_best: float = 1.05
-    """Constant alpha of the habituation of the best-matching node (Table 1)."""
+    """Constant alpha of the habituation of the best-matching node (Table 1); at least 1 / h_0, so
+    that h stays positive."""
     alpha_neighbor: float = 1.05
-    """Constant alpha of the habituation of its neighbors (Table 1)."""
+    """Constant alpha of the habituation of its neighbors (Table 1); at least 1 / h_0."""
     tau_best: float = 3.3
-    """Time constant of the habituation of the best-matching node (Table 1)."""
+    """Time constant tau of the habituation of the best-matching node (Table 1); the larger, the
+    slower it habituates."""
     tau_neighbor: float = 14.3
-    """Time constant of the habituation of its neighbors (Table 1)."""
+    """Time constant tau of the habituation of its neighbors (Table 1)."""
     max_age: int = 80
     """Age kappa beyond which an edge is removed (Table 1)."""
 
     def __post_init__(self) -> None:
         positive(self, "activity_scale", "tau_best", "tau_neighbor")
-        at_least(self, 0, "lr_neighbor")
+        at_least(self, 0, "habituation_threshold", "lr_neighbor")
         whole(self, 1, "max_age")
-        start, in_order = self.initial_habituation, self.lr_neighbor <= self.lr_best <= 1
+        ordered = self.lr_neighbor <= self.lr_best <= 1
         check(
             self,
-            ("lr_best", in_order, f"at least lr_neighbor ({self.lr_neighbor}), at most 1"),
-            ("initial_habituation", 0 < start <= 1, "above 0, at most 1"),
-            ("alpha_best", self.alpha_best * start >= 1, "at least 1 / initial_habituation"),
-            (
-                "alpha_neighbor",
-                self.alpha_neighbor * start >= 1,
-                "at least 1 / initial_habituation",
-            ),
-            ("activity_threshold", 0 < self.activity_threshold < 1, "between 0 and 1"),
-            ("habituation_threshold", 0 < self.habituation_threshold <= 1, "above 0, at most 1"),
+            ("activity_threshold", 0 <= self.activity_threshold <= 1, "between 0 and 1"),
+            ("lr_best", ordered, f"at least lr_neighbor ({self.lr_neighbor}), at most 1"),
+            ("initial_habituation", 0 < self.initial_habituation <= 1, "above 0, at most 1"),
+        )
+        least = 1 / self.initial_habituation
+        best, neighbor = (least <= x < inf for x in (self.alpha_best, self.alpha_neighbor))
+        check(
+            self,
+            ("alpha_best", best, "at least 1 / initial_habituation"),
+            ("alpha_neighbor", neighbor, "at least 1 / initial_habituation"),
         )
 
 
@@ -122,8 +125,10 @@ class BGPOConfig(AlgorithmConfig):
     behavior_scale: float = 0.25
     """Factor of b in the context. Ours: 1 in the paper slows down the first task
     (docs/learning.md)."""
-    gwr: GWRBConfig = field(default_factory=GWRBConfig)
-    """The network whose nodes are behaviors."""
+    gwr: GWRBConfig = field(default_factory=lambda: GWRBConfig(activity_scale=0.25))
+    """The network whose nodes are behaviors. Ours: with an activity_scale of 1, as in the paper,
+    every third demonstration becomes a node; with 0.25 there are about 200 nodes after 1,800
+    demonstrations."""
     experts: bool = True
     """Whether each group of behaviors has its own actor and critic. Ours: with the paper's single
     pair, a new task is learned slowly (docs/learning.md)."""

@@ -15,10 +15,11 @@ from torch import Tensor, nn
 
 from bgpo_trl.errors import as_shape
 from bgpo_trl.modules.density_clusters import density_clusters
-from bgpo_trl.modules.gwr_tensors import as_mask
+from bgpo_trl.modules.gwr import as_mask
 
 _KNOWN_SHARE = 0.99  # of a group's own demonstrations that are to count as known
-_ARRAYS = ("points", "shown", "group", "member", "cluster")
+_ARRAYS = ("points", "shown", "group", "member", "cluster")  # of the state
+_LISTS = ("parent", "links")
 
 
 class GroupMatch(TensorClass["tensor_only"]):
@@ -98,7 +99,7 @@ class BehaviorGroups(nn.Module):
                 f"{smallest} and {evidence}"
             )
         self.smallest, self.evidence = int(smallest), float(evidence)
-        self._networks = [_Network.empty(self.n_features) for _ in range(self.batch_size.numel())]
+        self._networks = [self._network() for _ in range(self.batch_size.numel())]
 
     @property
     def num_groups(self) -> Tensor:
@@ -129,7 +130,7 @@ class BehaviorGroups(nn.Module):
             raise ValueError(
                 f"groups to join must be two of {self.numbers(network)}, got {first} and {second}"
             )
-        self._networks[network].join(first, second, self.smallest // 2)
+        self._networks[network].join(first, second)
 
     def forward(self, phi: Tensor) -> GroupMatch:
         """Call `lookup`."""
@@ -156,7 +157,7 @@ class BehaviorGroups(nn.Module):
         inputs = inputs.reshape(len(active), -1, self.n_features)
         group, novelty = np.full(inputs.shape[:2], -1), np.full(inputs.shape[:2], np.nan)
         for i in np.flatnonzero(active):
-            group[i], novelty[i] = self._networks[i].lookup(inputs[i], self.smallest // 2)
+            group[i], novelty[i] = self._networks[i].lookup(inputs[i])
         return self._match(group, novelty, phi)
 
     def adapt(self, phi: Tensor, mask: Tensor | None = None) -> GroupMatch:
@@ -182,19 +183,27 @@ class BehaviorGroups(nn.Module):
         group, novelty = np.full(len(active), -1), np.full(len(active), np.nan)
         for i in np.flatnonzero(active):
             network = self._networks[i]
-            (group[i],), (novelty[i],) = network.lookup(inputs[i], self.smallest // 2)
+            (group[i],), (novelty[i],) = network.lookup(inputs[i])
             is_new = network.show(inputs[i], int(group[i]))
-            due = network.clustered + max(self.smallest, network.clustered // 100)
+            n_clustered = len(network.cluster)
+            due = n_clustered + max(self.smallest, n_clustered // 100)
             if is_new and len(network.points) >= due:
-                labels = density_clusters(
+                network.cluster = density_clusters(
                     network.points, smallest=self.smallest, evidence=self.evidence
                 )
-                network.regroup(labels, self.smallest // 2)
+                network.arrange()
         return self._match(group, novelty, phi)
 
     def get_extra_state(self) -> list[dict[str, Any]]:
         """Return demonstrations and groups of each network, for ``state_dict``."""
-        return [network.state() for network in self._networks]
+        return [
+            {
+                **{name: torch.from_numpy(getattr(network, name).copy()) for name in _ARRAYS},
+                **{name: [*getattr(network, name)] for name in _LISTS},
+                "revision": network.revision,
+            }
+            for network in self._networks
+        ]
 
     def set_extra_state(self, state: list[dict[str, Any]]) -> None:
         """Restore the result of `get_extra_state`.
@@ -210,7 +219,22 @@ class BehaviorGroups(nn.Module):
                 f"BehaviorGroups {len(self._networks)} of {self.n_features}: build it with the "
                 "same sizes"
             )
-        self._networks = [_Network.of_state(entry, self.smallest // 2) for entry in state]
+        self._networks = [self._network(entry) for entry in state]
+
+    def _network(self, state: dict[str, Any] | None = None) -> _Network:
+        """Return a network in the given state, or an empty one."""
+        k = self.smallest // 2
+        if state is None:
+            none = np.empty(0, np.int64)
+            return _Network(k, np.empty((0, self.n_features)), none, none, none.astype(bool), none)
+        arrays: dict[str, Any] = {name: state[name].numpy().copy() for name in _ARRAYS}
+        lists: dict[str, Any] = {name: [*state[name]] for name in _LISTS}
+        network = _Network(k, **arrays, **lists, revision=state["revision"])
+        sizes = {len(arrays[name]) for name in ("points", "shown", "group", "member")}
+        if len(sizes) > 1 or not {*network.group.tolist()} <= {*range(len(network.parent))}:
+            raise ValueError("a group is missing in the state: load one that state_dict returned")
+        network.measure()
+        return network
 
     def _checked(
         self, phi: Tensor, mask: Tensor | None
@@ -245,44 +269,32 @@ class _Network:
     """Groups of one network.
 
     Attributes:
+        k: Neighbors by which distances to a group are measured.
         points: The different demonstrations, in the order in which they were first shown, [n, d].
         shown: How often each was shown, [n].
         group: Group of each, [n].
         member: Whether it is in the cluster of the group, [n]; False for outliers, and for those
             that have come since all were clustered.
-        parent: Parent of each group, by number.
         cluster: Cluster of each of those that there were when they were last clustered; -1 for
             outliers.
+        parent: Parent of each group, by number.
         links: Pairs of demonstrations whose clusters are one group.
         revision: See `BehaviorGroups.revision`.
         reach: By group, the 99 % quantile of its members' distances to their k-th neighbor in it.
-        rows: Position of each demonstration, by its bytes.
     """
 
+    k: int
     points: NDArray[np.float64]
     shown: NDArray[np.int64]
     group: NDArray[np.int64]
     member: NDArray[np.bool_]
-    parent: list[int]
     cluster: NDArray[np.int64]
+    parent: list[int] = field(default_factory=lambda: [0])
     links: list[tuple[int, int]] = field(default_factory=list)
     revision: int = 0
     reach: dict[int, float] = field(default_factory=dict)
-    rows: dict[bytes, int] = field(default_factory=dict)
 
-    @classmethod
-    def empty(cls, n_features: int) -> _Network:
-        none = np.empty(0, np.int64)
-        return cls(np.empty((0, n_features)), none, none, none.astype(bool), [0], none)
-
-    @property
-    def clustered(self) -> int:
-        """How many demonstrations there were when they were last clustered."""
-        return len(self.cluster)
-
-    def lookup(
-        self, inputs: NDArray[np.float64], k: int
-    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    def lookup(self, inputs: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return group and novelty ``[m]`` of inputs ``[m, d]``."""
         if not self.reach:
             return np.zeros(len(inputs), np.int64), np.full(len(inputs), np.inf)
@@ -291,41 +303,42 @@ class _Network:
         novelty = np.empty(len(inputs))
         for number in np.unique(group):
             to_group = distances[np.ix_(group == number, of_member == number)]
-            kth = np.partition(to_group, k - 1, axis=1)[:, k - 1]
+            kth = np.partition(to_group, self.k - 1, axis=1)[:, self.k - 1]
             novelty[group == number] = kth / self.reach[number]
         return group, novelty
 
     def show(self, point: NDArray[np.float64], group: int) -> bool:
         """Count a demonstration ``[1, d]``; return whether it is new."""
-        row = self.rows.setdefault(point.tobytes(), len(self.points))
-        is_new = row == len(self.points)
+        same = (self.points == point).all(1)
+        is_new = not same.any()
         if is_new:
+            same = np.append(same, True)
             self.points = np.concatenate([self.points, point])
             self.shown, self.group = np.append(self.shown, 0), np.append(self.group, group)
             self.member = np.append(self.member, False)
-        self.shown[row] += 1
+        self.shown[same] += 1
         return is_new
 
-    def regroup(self, cluster: NDArray[np.int64], k: int) -> None:
-        """Turn new clusters ``[n]`` into groups."""
-        self.cluster = cluster
-        self._arrange(k)
-
-    def join(self, first: int, second: int, k: int) -> None:
+    def join(self, first: int, second: int) -> None:
         """Join two groups from now on."""
-        self.links.append((self._densest(first, k), self._densest(second, k)))
-        self._arrange(k)
+        self.links.append((self._densest(first), self._densest(second)))
+        self.arrange()
 
-    def _densest(self, group: int, k: int) -> int:
+    def _densest(self, group: int) -> int:
+        """Return the demonstration of a group whose k-th neighbor in it is the nearest."""
         rows = np.flatnonzero(self.member & (self.group == group))
-        distances = cdist(self.points[rows], self.points[rows])
-        return int(rows[np.partition(distances, k, axis=1)[:, k].argmin()])
+        return int(rows[self._kth_distances(rows).argmin()])
 
-    def _arrange(self, k: int) -> None:
-        """Match linked clusters with the groups so far."""
+    def _kth_distances(self, rows: NDArray[np.int64]) -> NDArray[np.floating]:
+        """Return the distance of each of some demonstrations to its k-th neighbor among them."""
+        points = self.points[rows]
+        return np.partition(cdist(points, points), self.k, axis=1)[:, self.k]
+
+    def arrange(self) -> None:
+        """Turn the clusters into groups, matched with the groups so far."""
         before = self.group
         labels = np.full(len(self.points), -1)
-        labels[: self.clustered] = self._linked()
+        labels[: len(self.cluster)] = self._linked()
         common = np.zeros((labels.max() + 1, len(self.parent)), np.int64)
         inside = labels >= 0
         np.add.at(common, (labels[inside], before[inside]), self.shown[inside])
@@ -340,8 +353,8 @@ class _Network:
                 self.parent.append(int(common[cluster].argmax()))
         self.group = np.array([number.get(label, -1) for label in labels.tolist()])
         self.member = inside
-        self._measure(k)
-        self.group[~inside] = self.lookup(self.points[~inside], k)[0]
+        self.measure()
+        self.group[~inside] = self.lookup(self.points[~inside])[0]
         self.revision += int((self.group != before).any())
 
     def _linked(self) -> NDArray[np.int64]:
@@ -353,27 +366,9 @@ class _Network:
             labels[labels == other] = one
         return labels
 
-    def _measure(self, k: int) -> None:
+    def measure(self) -> None:
         """Measure the reach of each group."""
         self.reach = {}
         for number in np.unique(self.group[self.member]).tolist():
-            members = self.points[self.member & (self.group == number)]
-            kth = np.partition(cdist(members, members), k, axis=1)[:, k]
-            self.reach[number] = float(np.quantile(kth, _KNOWN_SHARE))
-
-    def state(self) -> dict[str, Any]:
-        tensors = {name: torch.from_numpy(getattr(self, name).copy()) for name in _ARRAYS}
-        lists = {"parent": [*self.parent], "links": [*self.links]}
-        return {**tensors, **lists, "revision": self.revision}
-
-    @classmethod
-    def of_state(cls, state: dict[str, Any], k: int) -> _Network:
-        arrays: dict[str, Any] = {name: state[name].numpy().copy() for name in _ARRAYS}
-        rest: dict[str, Any] = {name: [*state[name]] for name in ("parent", "links")}
-        network = cls(**arrays, **rest, revision=state["revision"])
-        sizes = {len(arrays[name]) for name in ("points", "shown", "group", "member")}
-        if len(sizes) > 1 or not {*network.group.tolist()} <= {*range(len(network.parent))}:
-            raise ValueError("a group is missing in the state: load one that state_dict returned")
-        network.rows = {point.tobytes(): row for row, point in enumerate(network.points)}
-        network._measure(k)
-        return network
+            members = np.flatnonzero(self.member & (self.group == number))
+            self.reach[number] = float(np.quantile(self._kth_distances(members), _KNOWN_SHARE))

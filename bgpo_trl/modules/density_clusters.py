@@ -7,8 +7,6 @@ from numpy.typing import NDArray
 from scipy.cluster.hierarchy import linkage
 from scipy.spatial.distance import pdist, squareform
 
-__all__ = ["density_clusters", "intrinsic_dimension"]
-
 Points = NDArray[np.float64]
 
 

@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from bgpo_trl.modules.gwr import GWRB
-from bgpo_trl.modules.gwr_tensors import checked
+from bgpo_trl.configs import GWRBConfig
+from bgpo_trl.modules.gwr import GWRB, checked
 
 try:
     from sklearn.base import BaseEstimator, ClusterMixin, OneToOneFeatureMixin, TransformerMixin
@@ -22,10 +22,15 @@ except ImportError:
 class GWRBEstimator(OneToOneFeatureMixin, TransformerMixin, ClusterMixin, BaseEstimator):
     """GWR-B network that learns the rows of a table, once and in their order.
 
-    It starts from the first two rows and computes in float64. For the arguments, see `GWRB`. A row
-    belongs to the nearest node: `predict` returns its identity, `transform` its weights. Identities
-    have gaps where nodes were removed or are nearest to no row; this is why scikit-learn's
-    ``check_clustering`` can fail. Its ``check_estimator`` passes.
+    It starts from the first two rows and computes in float64. A row belongs to the nearest node:
+    `predict` returns its identity, `transform` its weights. Identities have gaps where nodes were
+    removed or are nearest to no row; this is why scikit-learn's ``check_clustering`` can fail. Its
+    ``check_estimator`` passes.
+
+    Args:
+        config: The constants, as for `GWRB`. A grid search is over ``{"config": [GWRBConfig(...),
+            ...]}``.
+        max_nodes: Largest number of nodes; None: no limit.
 
     Attributes:
         gwr_: The network; its ``graph()`` has the nodes and their edges.
@@ -34,51 +39,26 @@ class GWRBEstimator(OneToOneFeatureMixin, TransformerMixin, ClusterMixin, BaseEs
         feature_names_in_: Names of the columns, if X had any.
 
     Example:
-        >>> model = GWRBEstimator(activity_scale=4).fit([[0.0, 0.0], [1.0, 1.0]])
+        >>> model = GWRBEstimator(GWRBConfig(activity_scale=4)).fit([[0.0, 0.0], [1.0, 1.0]])
         >>> model.partial_fit([[0.1, 0.0]]).predict([[0.0, 0.2], [0.9, 1.0]])
         array([0, 1])
         >>> model.transform([[0.0, 0.2]]).round(2)
         array([[0.01, 0.  ]])
     """
 
-    def __init__(
-        self,
-        *,
-        activity_threshold: float = 0.8,
-        activity_scale: float = 1.0,
-        habituation_threshold: float = 0.15,
-        lr_best: float = 0.1,
-        lr_neighbor: float = 0.01,
-        initial_habituation: float = 1.0,
-        alpha_best: float = 1.05,
-        alpha_neighbor: float = 1.05,
-        tau_best: float = 3.3,
-        tau_neighbor: float = 14.3,
-        max_age: int = 80,
-        max_nodes: int | None = None,
-    ) -> None:
+    def __init__(self, config: GWRBConfig | None = None, max_nodes: int | None = None) -> None:
         # scikit-learn requires each argument to be stored unchanged under its own name.
-        self.activity_threshold = activity_threshold
-        self.activity_scale = activity_scale
-        self.habituation_threshold = habituation_threshold
-        self.lr_best = lr_best
-        self.lr_neighbor = lr_neighbor
-        self.initial_habituation = initial_habituation
-        self.alpha_best = alpha_best
-        self.alpha_neighbor = alpha_neighbor
-        self.tau_best = tau_best
-        self.tau_neighbor = tau_neighbor
-        self.max_age = max_age
+        self.config = config
         self.max_nodes = max_nodes
 
     def fit(self, X: npt.ArrayLike, y: object = None) -> Self:
         """Learn the rows of X ``[n, d]`` with a new network; ``y`` is ignored.
 
         Raises:
-            ValueError: If an argument of the estimator is out of range, or X holds NaN or Inf.
+            ValueError: If X holds NaN or Inf, or ``max_nodes`` is below 2.
         """
         rows = _to_tensor(self._validated(X))
-        gwr = GWRB(rows.shape[1], init="data", **self.get_params(deep=False))
+        gwr = GWRB(rows.shape[1], self.config, max_nodes=self.max_nodes, init="data")
         return self._learn(gwr.double(), rows)
 
     def partial_fit(self, X: npt.ArrayLike, y: object = None) -> Self:

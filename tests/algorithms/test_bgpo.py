@@ -240,10 +240,9 @@ def test_episodes_follow_algorithm_1(make_bgpo, bank, encoders, variant):
     """Behavior, growth of GWR-B and reward, worked out anew from latents and demonstrations."""
     seeds, phi = (3, 8), bank.seen().embedding
     algorithm = make_bgpo(variant, seeds=seeds)
-    scale = algorithm.config.gwr.activity_scale
     data, _ = play(algorithm, 90)
     for index, seed in enumerate(seeds):
-        gwr = GWRB(32, generator=generators([seed], "gwr"), activity_scale=scale)
+        gwr = GWRB(32, algorithm.config.gwr, generator=generators([seed], "gwr"))
         trajectory = []
         for step in data[index]:
             b = gwr.lookup(phi[step["demo_index"]]).embedding

@@ -1,6 +1,6 @@
 """BGPO with groups of behaviors: experts, even replay, and demonstrations as experience."""
 
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import pytest
 import torch
@@ -263,7 +263,7 @@ def test_the_bonus_tells_right_from_wrong_on_the_shipped_bank():
     """For a trajectory just like a demonstration, by what GWR-B says of another one."""
     bank = load_pretrained()[1]
     seen, held_out = bank.seen(), bank.held_out()
-    gwr = GWRB(32, generator=torch.Generator().manual_seed(0), **asdict(BGPOConfig().gwr))
+    gwr = GWRB(32, BGPOConfig().gwr, generator=torch.Generator().manual_seed(0))
     order = torch.randperm(len(seen.task), generator=torch.Generator().manual_seed(1))[:300]
     for phi in seen.embedding[order]:
         gwr.adapt(phi)

@@ -86,7 +86,7 @@ def test_policies_are_shown_the_beginning_of_new_demonstrations(run_of, tmp_path
                     ]
                     majority = max(range(3), key=tasks.count) if tasks else -1
                     inferred.append(majority == label)
-                    activity.append(float(torch.exp(-0.25 * distance)))  # GWRBConfig's scale
+                    activity.append(float(torch.exp(-0.25 * distance)))  # activity_scale
                 (found,) = [
                     row
                     for row in rows

@@ -1,4 +1,4 @@
-"""Groups of behaviors: who is of which group as demonstrations come, and on the shipped banks."""
+"""Groups of behaviors: which group an input belongs to as demonstrations are shown."""
 
 import io
 
@@ -30,7 +30,7 @@ def group_of(groups, demonstrations):
     return groups.lookup(demonstrations).group.unique().tolist()
 
 
-def test_until_there_are_enough_demonstrations_all_is_group_0_and_nothing_is_known():
+def test_inputs_are_unknown_and_of_group_0_before_the_first_clustering():
     groups = BehaviorGroups(4, batch_size=[3])
     match = groups.lookup(torch.rand(3, 5, 4))
     assert match.group.equal(torch.zeros(3, 5, dtype=torch.int64))
@@ -45,7 +45,7 @@ def test_until_there_are_enough_demonstrations_all_is_group_0_and_nothing_is_kno
     assert int(one.num_groups) == 1
 
 
-def test_a_new_behavior_has_its_group_within_thirty_demonstrations_of_its_own():
+def test_new_behavior_gets_its_group_within_thirty_demonstrations():
     groups = BehaviorGroups(4)
     assert set(show(groups, around(0, 120))) == {0}
     played = show(groups, around(1, 30))
@@ -58,7 +58,7 @@ def test_a_new_behavior_has_its_group_within_thirty_demonstrations_of_its_own():
     assert show(groups, around(2, 30))[-1] == 2
 
 
-def test_a_demonstration_that_is_shown_again_adds_nothing_but_its_play():
+def test_repeated_demonstrations_form_no_group():
     groups = BehaviorGroups(4)
     few = around(0, 9)
     show(groups, few.repeat(10, 1))
@@ -66,7 +66,7 @@ def test_a_demonstration_that_is_shown_again_adds_nothing_but_its_play():
     assert int(groups.revision) == 0
 
 
-def test_novelty_is_relative_to_the_groups_own_extent():
+def test_novelty_is_relative_to_the_extent_of_the_group():
     groups = BehaviorGroups(4)
     wide = 4 * (around(1, 100) - PLACES[1])
     show(groups, torch.cat([around(0, 100), wide - 60]))
@@ -81,7 +81,7 @@ def test_novelty_is_relative_to_the_groups_own_extent():
     assert (along.diff() > 0).all()
 
 
-def test_scale_has_no_effect():
+def test_groups_do_not_depend_on_the_scale_of_inputs():
     inputs = torch.cat([around(place, 40) for place in range(3)]).double()
     found = []
     for scale in (0.1, 0.3, 1, 3, 10):
@@ -93,7 +93,7 @@ def test_scale_has_no_effect():
 
 
 @pytest.mark.parametrize("sizes", [(45, 75), (75, 45)])
-def test_of_a_group_that_splits_the_larger_part_keeps_the_number(sizes):
+def test_larger_part_of_a_split_group_keeps_the_number(sizes):
     inputs = torch.cat([around(place, size) for place, size in enumerate(sizes)])
     order = torch.randperm(120, generator=torch.Generator().manual_seed(0))
     groups = BehaviorGroups(4, smallest=40)
@@ -106,7 +106,7 @@ def test_of_a_group_that_splits_the_larger_part_keeps_the_number(sizes):
 
 
 @pytest.mark.parametrize("often", [0, 1])
-def test_groups_that_merge_keep_the_number_of_the_one_played_most(often):
+def test_merged_groups_keep_the_number_of_the_one_shown_most(often):
     """Two clusters, until demonstrations fill the valley between them."""
     rng = torch.Generator().manual_seed(3)
 
@@ -132,7 +132,7 @@ def test_groups_that_merge_keep_the_number_of_the_one_played_most(often):
     assert groups.parent(0, 2) == numbers[often]
 
 
-def test_groups_are_the_clusters_of_what_was_shown():
+def test_groups_are_the_density_clusters_of_all_demonstrations():
     inputs = torch.cat([around(place, 50) for place in range(4)]).double()
     inputs = inputs[torch.randperm(200, generator=torch.Generator().manual_seed(0))]
     groups = BehaviorGroups(4)
@@ -143,7 +143,7 @@ def test_groups_are_the_clusters_of_what_was_shown():
     assert len([pair for pair in pairs if pair[0] >= 0]) == 4
 
 
-def test_networks_that_are_masked_out_stay_as_they_are_and_each_is_as_alone():
+def test_masked_networks_in_a_batch_equal_networks_alone():
     generator = torch.Generator().manual_seed(0)
     places = torch.randint(4, (160, 3), generator=generator)
     inputs = PLACES[places] + torch.randn(160, 3, 4, generator=generator)
@@ -176,17 +176,15 @@ def test_networks_that_are_masked_out_stay_as_they_are_and_each_is_as_alone():
     assert (part.group[1] == -1).all() and part.novelty[1].isnan().all()
 
 
-def test_looking_up_changes_nothing():
+def test_lookup_changes_nothing():
     groups = BehaviorGroups(4)
     show(groups, torch.cat([around(0, 30), around(1, 25)]))
     before = groups.get_extra_state()
     groups.lookup(around(2, 50))
-    for now, then in zip(groups.get_extra_state(), before, strict=True):
-        for key, value in then.items():
-            assert value.equal(now[key]) if isinstance(value, torch.Tensor) else value == now[key]
+    torch.testing.assert_close(groups.get_extra_state(), before, rtol=0, atol=0)
 
 
-def test_saved_groups_continue_as_the_others():
+def test_loaded_groups_continue_identically():
     groups, restored = (BehaviorGroups(4, batch_size=[2]) for _ in range(2))
     inputs = torch.stack([torch.cat([around(p, 40, seed=s) for p in (0, 1, 2)]) for s in (0, 1)], 1)
     only_first = torch.tensor([True, False])
@@ -200,12 +198,7 @@ def test_saved_groups_continue_as_the_others():
     for phi in inputs[55:]:
         ours, theirs = groups.adapt(phi), restored.adapt(phi)
         assert ours.group.equal(theirs.group)
-        assert (
-            ours.novelty.equal(
-                theirs.novelty,
-            )
-            or ours.novelty.isinf().any()
-        )
+        assert ours.novelty.equal(theirs.novelty)
     assert restored.num_groups.equal(groups.num_groups)
     assert restored.revision.equal(groups.revision)
     assert groups.num_groups.tolist() == [3, 2]
@@ -215,40 +208,47 @@ def test_saved_groups_continue_as_the_others():
 
 
 @pytest.mark.parametrize("options", [{"smallest": 3}, {"smallest": 4.5}, {"evidence": 0}])
-def test_settings_out_of_range_are_refused(options):
-    with pytest.raises(ValueError, match="smallest must be a whole number of at least 4"):
+def test_settings_out_of_range_are_rejected(options):
+    with pytest.raises(ValueError, match="smallest must be"):
         BehaviorGroups(2, **options)
 
 
 @pytest.mark.parametrize(
-    ("phi", "message"),
-    [
-        (torch.zeros(3, 5), "phi must be "),
-        (torch.full((3, 4), torch.nan), "without NaN"),
-        (torch.zeros(2, 4), r"phi must .*\[3"),
-    ],
+    "phi", [torch.zeros(3, 5), torch.full((3, 4), torch.nan), torch.zeros(2, 4)], ids=str
 )
-def test_inputs_that_are_none_are_refused_and_change_nothing(phi, message):
+def test_bad_inputs_are_rejected_and_change_nothing(phi):
     groups = BehaviorGroups(4, batch_size=[3])
     for call in (groups.lookup, groups.adapt):
-        with pytest.raises(ValueError, match=message):
+        with pytest.raises(ValueError, match="phi must"):
             call(phi)
     assert all(len(state["points"]) == 0 for state in groups.get_extra_state())
 
 
-def test_a_state_of_other_networks_is_refused_and_changes_nothing():
+@pytest.mark.parametrize("pair", [(0, 0), (0, 5), (-1, 0)])
+def test_only_two_different_groups_can_be_joined(pair):
+    groups = BehaviorGroups(4)
+    show(groups, torch.cat([around(0, 40), around(1, 60)]))
+    with pytest.raises(ValueError, match="groups to join must be"):
+        groups.join(0, *pair)
+    assert int(groups.num_groups) == 2
+
+
+def test_damaged_states_and_those_of_other_sizes_are_rejected_and_change_nothing():
     groups = BehaviorGroups(4)
     show(groups, around(0, 12))
-    for other, message in (
-        (BehaviorGroups(4, batch_size=2), "groups of 2 networks"),
-        (BehaviorGroups(3), r"1 networks of \{3\} features, this BehaviorGroups 1 of 4"),
+    (state,) = before = groups.get_extra_state()
+    for bad in (
+        BehaviorGroups(4, batch_size=2).get_extra_state(),
+        BehaviorGroups(3).get_extra_state(),
+        [{**state, "group": state["group"] + 1}],
+        [{**state, "member": state["member"][1:]}],
     ):
-        with pytest.raises(ValueError, match=message):
-            groups.set_extra_state(other.get_extra_state())
-    assert groups.lookup(around(0, 1)).known.all()
+        with pytest.raises(ValueError, match="state"):
+            groups.set_extra_state(bad)
+    torch.testing.assert_close(groups.get_extra_state(), before, rtol=0, atol=0)
 
 
-def test_joined_groups_stay_one_whatever_is_shown_next():
+def test_joined_groups_stay_joined_when_clustered_anew():
     groups = BehaviorGroups(4, batch_size=[2])
     inputs = torch.cat([around(place, 60) for place in range(3)])
     for phi in inputs:
@@ -276,7 +276,7 @@ def test_joined_groups_stay_one_whatever_is_shown_next():
     assert restored.numbers(0) == groups.numbers(0)
 
 
-def test_of_joined_groups_the_one_shown_most_keeps_its_number():
+def test_joined_groups_keep_the_number_of_the_one_shown_most():
     groups = BehaviorGroups(4)
     show(groups, torch.cat([around(0, 40), around(1, 60)]))
     groups.join(0, 0, 1)
@@ -284,30 +284,11 @@ def test_of_joined_groups_the_one_shown_most_keeps_its_number():
     assert group_of(groups, around(0, 9, seed=2)) == [1]
 
 
-@pytest.mark.parametrize("pair", [(0, 0), (0, 5), (-1, 0)])
-def test_only_two_groups_that_there_are_can_be_joined(pair):
-    groups = BehaviorGroups(4)
-    show(groups, torch.cat([around(0, 40), around(1, 60)]))
-    with pytest.raises(ValueError, match=r"groups to join must be two of \[0, 1\], got"):
-        groups.join(0, *pair)
-    assert int(groups.num_groups) == 2
-
-
-def test_a_state_that_names_a_missing_group_is_refused():
-    groups = BehaviorGroups(4)
-    show(groups, around(0, 12))
-    (state,) = groups.get_extra_state()
-    with pytest.raises(ValueError, match="a group is missing in the state"):
-        groups.set_extra_state([{**state, "group": state["group"] + 1}])
-    with pytest.raises(ValueError, match="a group is missing in the state"):
-        groups.set_extra_state([{**state, "member": state["member"][1:]}])
-
-
 # ---- the shipped banks
 
 
 @pytest.mark.parametrize("order", ["forward", "reversed", "from the start"])
-def test_groups_of_nicos_demonstrations_are_of_one_task_each(order):
+def test_groups_of_shipped_demonstrations_contain_one_task_each(order):
     """Draws as in a run; labels are used for the draws and the count alone.
 
     A task looks different from either side of the table, so that it may have two groups.

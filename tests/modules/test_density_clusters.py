@@ -1,4 +1,4 @@
-"""Clusters by density: what is one cluster and what is several, whatever scale and dimension."""
+"""Density clusters: which points are one cluster and which are several, at any scale."""
 
 import numpy as np
 import pytest
@@ -47,11 +47,11 @@ def shapes():
 
 
 @pytest.mark.parametrize(("name", "points"), [*shapes()], ids=lambda value: value)
-def test_one_cluster_stays_one(name, points):
+def test_unimodal_points_are_one_cluster(name, points):
     assert not density_clusters(points).any()
 
 
-def test_a_cluster_is_found_as_soon_as_it_has_the_least_number_of_points():
+def test_cluster_needs_the_least_number_of_points_and_the_evidence():
     points, _ = blobs([90, 14])
     assert density_clusters(points).max() == 1
     few = points[:-5]  # nine points of the second
@@ -60,14 +60,14 @@ def test_a_cluster_is_found_as_soon_as_it_has_the_least_number_of_points():
     assert not density_clusters(points, evidence=50.0).any()
 
 
-def test_points_far_from_two_clusters_are_outliers_and_far_from_one_are_not():
+def test_far_points_are_outliers_only_beside_several_clusters():
     points, labels = blobs([40, 40])
     far = points.mean(0) + 30 * np.eye(6)[[4, 5]]
     assert density_clusters(np.vstack([points, far])).tolist() == [*labels, -1, -1]
     assert not density_clusters(np.vstack([points[:40], far])).any()
 
 
-def test_the_order_of_points_does_not_matter():
+def test_clusters_do_not_depend_on_the_order_of_points():
     points, _ = blobs([30, 50, 20])
     order = np.random.default_rng(1).permutation(len(points))
     ours, theirs = density_clusters(points)[order], density_clusters(points[order])
@@ -75,7 +75,7 @@ def test_the_order_of_points_does_not_matter():
 
 
 @pytest.mark.parametrize("d", [1, 2, 5])
-def test_the_dimension_of_a_ball_is_that_of_its_space(d):
+def test_intrinsic_dimension_of_a_cube_is_that_of_its_space(d):
     points = np.zeros((1_500, 7))
     points[:, :d] = np.random.default_rng(0).uniform(size=(1_500, d))
     distances = np.sort(np.linalg.norm(points[:, None] - points, axis=-1))[:, 1:11]

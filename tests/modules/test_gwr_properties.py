@@ -1,114 +1,145 @@
-"""Properties of GWR-B that hold for any input."""
+"""Properties of GWR-B that hold for any sizes, constants and inputs."""
 
-import itertools
+import io
+import math
 
+import numpy as np
+import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from bgpo_trl.configs import GWRBConfig
 from bgpo_trl.modules.gwr import GWRB
-from tests.modules.gwr_networks import assert_same_state, state_of
 
-# On so coarse a grid inputs repeat and distances tie.
-coordinate = st.integers(-4, 4).map(lambda x: x / 4)
-sequences = st.lists(st.tuples(*[coordinate] * 4), min_size=3, max_size=40).map(
-    lambda inputs: torch.tensor(inputs).view(-1, 2, 2)  # two networks of two features
-)
-rules = st.fixed_dictionaries(
+
+@st.composite
+def configs(draw):
+    """Any constants that GWR-B takes."""
+    best = draw(st.floats(0, 1))
+    start = draw(st.floats(0.05, 1))
+    alpha = st.floats(1 / start, 20 / start)
+    tau = st.floats(0.05, 50)
+    return GWRBConfig(
+        activity_threshold=draw(st.floats(0, 1)),
+        activity_scale=draw(st.floats(1e-3, 1e3)),
+        habituation_threshold=draw(st.floats(0, 2)),
+        lr_best=best,
+        lr_neighbor=draw(st.floats(0, best)),
+        initial_habituation=start,
+        alpha_best=draw(alpha),
+        alpha_neighbor=draw(alpha),
+        tau_best=draw(tau),
+        tau_neighbor=draw(tau),
+        max_age=draw(st.integers(1, 6)),
+    )
+
+
+options = st.fixed_dictionaries(
     {
-        "activity_threshold": st.floats(0, 1),
-        "habituation_threshold": st.floats(0, 2),
-        "lr_best": st.floats(0.1, 1),
-        "lr_neighbor": st.floats(0, 0.1),
-        "max_age": st.integers(1, 5),
-        "max_nodes": st.none() | st.integers(2, 8),
+        "config": configs(),
+        "max_nodes": st.none() | st.integers(2, 6),
         "init": st.sampled_from(["random", "data"]),
     }
 )
-examples = settings(max_examples=25, deadline=None)
+
+NUMBERS = [0.0, 0.25, 0.5, 1.0, -1.0]  # few, so that inputs repeat and distances tie
+SCALES = [1.0, 1.0, 1.0, 1e-30, 1e-6, 1e6, 1e17]  # and some are far from all the others
+EVENTS = ["save and load", "look up", math.nan, math.inf, -math.inf, 3e38]
 
 
-def new(rule, seed=0, batch_size=(2,)):
-    return GWRB(2, batch_size=batch_size, generator=torch.Generator().manual_seed(seed), **rule)
+@st.composite
+def histories(draw):
+    """Batch size, and steps: inputs ``[n, d]``, who takes part ``[n]``, and what comes before."""
+    d, batch = draw(st.integers(1, 4)), draw(st.sampled_from([(), (1,), (3,), (2, 2)]))
+    count, n_steps = math.prod(batch), draw(st.integers(1, 150))
+    # Drawn here and not by hypothesis, which would not make them long enough for edges to expire.
+    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
+    scales = draw(st.sampled_from([SCALES, [1.0]]))
+    steps = []
+    for _ in range(n_steps):
+        numbers = rng.choice([*NUMBERS, rng.normal()], (count, d))
+        points = torch.from_numpy(numbers * rng.choice(scales, (count, 1))).float()
+        event = EVENTS[rng.integers(len(EVENTS))] if rng.random() < 0.2 else ""
+        steps.append((points, torch.from_numpy(rng.random(count) < 0.8), event))
+    return batch, steps
 
 
-@examples
-@given(inputs=sequences, rule=rules)
-def test_graph_stays_sound(inputs, rule):
-    gwr = new(rule)
-    start = torch.cat([gwr.graph(i).weights.view(-1, 2) for i in range(2)])
-    seen = torch.cat([start, inputs.view(-1, 2)])
-    for phi in inputs:
-        gwr.adapt(phi)
-        for i in range(2):
-            graph = gwr.graph(i)
-            n = len(graph.weights)
-            assert n == len(graph.habituation) == len(graph.node) == gwr.num_nodes[i]
-            assert graph.node.tolist() == sorted(set(graph.node.tolist()))
-            assert n <= (rule["max_nodes"] or n)
-            pairs = [tuple(edge) for edge in graph.edges.tolist()]
-            assert len(pairs) == len(set(pairs)) == len(graph.ages)
-            assert all(0 <= a < b < n for a, b in pairs)  # neither loops nor both directions
-            if n >= 2:
-                assert set(itertools.chain(*pairs)) == set(range(n))
-            assert all(0 <= age <= rule["max_age"] for age in graph.ages.tolist())
-            assert graph.habituation.min() >= 1 - 1 / 1.05
-            assert graph.habituation.max() <= 1
-            assert (graph.weights >= seen.amin(0) - 1e-6).all()
-            assert (graph.weights <= seen.amax(0) + 1e-6).all()
+def assert_same(a, b):
+    torch.testing.assert_close(a, b, rtol=0, atol=0)
 
 
-@examples
-@given(inputs=sequences, rule=rules)
-def test_lookup_is_pure_and_says_what_adapt_will(inputs, rule):
-    gwr = new(rule)
-    gwr.adapt(inputs[0])
-    for phi in inputs[1:]:
-        before = state_of(gwr)
-        match = gwr.lookup(phi)
-        assert_same_state(state_of(gwr), before)
-        many = gwr.lookup(inputs.movedim(0, 1))
-        assert many.batch_size == (2, len(inputs))
-        for i in range(2):
-            graph = gwr.graph(i)
-            row = (graph.node == match.node[i]).nonzero().item()
-            assert torch.equal(match.embedding[i], graph.weights[row])
-            assert torch.equal(
-                many.embedding[i], graph.weights[torch.searchsorted(graph.node, many.node[i])]
-            )
-        torch.testing.assert_close(gwr.adapt(phi), match, rtol=0, atol=0)
+def assert_sound(gwr, largest):
+    """Assert the invariants of Sec. III-B, of all networks; ``largest`` bounds all inputs."""
+    c, d = gwr.config, gwr.n_features
+    floor = c.initial_habituation - 1 / min(c.alpha_best, c.alpha_neighbor)
+    for network, n_nodes in zip(gwr.get_extra_state(), gwr.num_nodes.flatten(), strict=True):
+        n = len(network["node"])
+        assert n == n_nodes <= (gwr.max_nodes or n)
+        assert n == len(network["habituation"])
+        assert network["weights"].shape == (n, d)
+        assert (network["weights"].abs() <= largest * (1 + 1e-6)).all()
+        assert network["habituation"].ge(floor - 1e-9).all()
+        assert network["habituation"].le(c.initial_habituation + 1e-9).all()
+        assert (network["node"].diff() > 0).all()
+        assert (network["node"] < network["next_node"]).all()
+        edges = [tuple(edge) for edge in network["edges"].tolist()]
+        assert len(set(edges)) == len(edges) == len(network["ages"])
+        assert all(0 <= a < b < n for a, b in edges)  # each once, and no loops
+        assert ((network["ages"] >= 0) & (network["ages"] <= c.max_age)).all()
+        assert n < 2 or {node for edge in edges for node in edge} == set(range(n))
 
 
-@examples
-@given(inputs=sequences, rule=rules, data=st.data())
-def test_networks_left_out_keep_their_state(inputs, rule, data):
-    gwr = new(rule)
-    masks = data.draw(
-        st.lists(
-            st.tuples(st.booleans(), st.booleans()), min_size=len(inputs), max_size=len(inputs)
-        )
-    )
-    for phi, chosen in zip(inputs, masks, strict=True):
-        before = state_of(gwr)
-        mask = torch.tensor(chosen)
-        match = gwr.adapt(phi.where(mask.unsqueeze(-1), torch.nan), mask)
-        after = state_of(gwr)
-        for i in range(2):
-            left_out = {k: v for k, v in before.items() if k.startswith(f"{i}.")}
-            if not chosen[i]:
-                assert_same_state({k: after[k] for k in left_out}, left_out)
-                assert match.node[i] == -1
+def saved_and_loaded(gwr):
+    file = io.BytesIO()
+    torch.save(gwr.state_dict(), file)
+    file.seek(0)
+    loaded = GWRB(gwr.n_features, gwr.config, batch_size=gwr.batch_size, max_nodes=gwr.max_nodes)
+    loaded.load_state_dict(torch.load(file, weights_only=True))
+    return loaded
 
 
-@examples
-@given(inputs=sequences, rule=rules)
-def test_networks_share_nothing_but_the_batch(inputs, rule):
-    gwr, swapped = new(rule), new(rule)
-    state = gwr.state_dict()
-    state["_extra_state"].reverse()
-    swapped.load_state_dict(state)
-    for phi in inputs:
-        match, other = gwr.adapt(phi), swapped.adapt(phi.flip(0))
-        torch.testing.assert_close(other.flip(0), match, rtol=0, atol=0)
-    for i in range(2):
-        torch.testing.assert_close(swapped.graph(1 - i), gwr.graph(i), rtol=0, atol=0)
+@pytest.mark.parametrize("n", [20, pytest.param(500, marks=pytest.mark.slow)])
+def test_networks_stay_sound_and_each_learns_in_a_batch_as_it_does_alone(n):
+    removed = 0
+
+    @settings(max_examples=n)
+    @given(options=options, history=histories(), seed=st.integers(0, 99))
+    def holds(options, history, seed):
+        nonlocal removed
+        batch, steps = history
+        count, d = steps[0][0].shape
+        streams = [torch.Generator().manual_seed(seed + i) for i in range(count)]
+        gwr = GWRB(d, batch_size=batch, generator=streams, **options)
+        alone = [
+            GWRB(d, generator=torch.Generator().manual_seed(seed + i), **options)
+            for i in range(count)
+        ]
+        largest = max(1.0, *(float(points.abs().max()) for points, _, _ in steps))
+        for points, chosen, event in steps:
+            phi, mask, looked_up = points.view(*batch, d), chosen.view(batch), None
+            if event == "save and load":
+                gwr = saved_and_loaded(gwr)
+            elif event == "look up" and gwr.num_nodes.all():
+                before = gwr.get_extra_state()
+                looked_up = gwr.lookup(phi)
+                assert_same(gwr.get_extra_state(), before)
+            elif isinstance(event, float):  # is refused for all, if one network is to learn it
+                before, spoilt = gwr.get_extra_state(), points.clone()
+                spoilt[-1, 0] = event
+                with pytest.raises(ValueError, match="NaN, Inf"):
+                    gwr.adapt(spoilt.view(*batch, d))
+                assert_same(gwr.get_extra_state(), before)
+            match = gwr.adapt(phi, mask)
+            if looked_up is not None:
+                assert_same(match[mask], looked_up[mask])
+            assert_sound(gwr, largest)
+            matches = match.view(-1) if batch else match.unsqueeze(0)
+            for i in chosen.nonzero().flatten().tolist():
+                assert alone[i].adapt(points[i]).node == matches.node[i]
+        for network, state in zip(alone, gwr.get_extra_state(), strict=True):
+            assert_same(network.get_extra_state()[0], state)
+            removed += state["next_node"] - len(state["node"])
+
+    holds()
+    assert removed > 0  # else, no edge of any example has expired

@@ -11,9 +11,9 @@ from bgpo_trl.training import Trainer
 from tests.files.test_checkpoint import largest_file
 
 
-def grown(seed=0, n=30, **arguments):
+def grown(seed=0, n=30):
     generator = torch.Generator().manual_seed(seed)
-    gwr = GWRB(3, batch_size=[2], generator=[generator] * 2, **arguments)
+    gwr = GWRB(3, batch_size=[2], generator=[generator] * 2)
     for _ in range(n):
         gwr.adapt(torch.rand(2, 3, generator=generator))
     return gwr
@@ -23,11 +23,11 @@ def grown(seed=0, n=30, **arguments):
     ("episodes", "moments"),
     [(1, [1]), (6, [1, 2, 3, 4, 5, 6]), (10, [2, 4, 5, 7, 9, 10]), (600, [*range(100, 601, 100)])],
 )
-def test_moments_are_spread_over_the_run(episodes, moments):
+def test_growth_moments_are_evenly_spaced(episodes, moments):
     assert growth_moments(episodes) == moments
 
 
-def test_a_graph_comes_back_as_it_was(tmp_path):
+def test_loaded_graphs_equal_the_saved_ones(tmp_path):
     early, late = grown(n=5), grown(n=30)
     save_graph(tmp_path, 30, late)
     save_graph(tmp_path, 5, early)
@@ -43,7 +43,7 @@ def test_a_graph_comes_back_as_it_was(tmp_path):
         assert loaded.get_extra_state()[0]["next_node"] == gwr.get_extra_state()[0]["next_node"]
 
 
-def test_a_run_keeps_its_first_seeds_graph(tmp_path, bank, encoders, make_config):
+def test_run_saves_the_graphs_of_its_first_seed(tmp_path, bank, encoders, make_config):
     config = make_config(episodes=8)
     with Trainer(config, tmp_path, bank=bank, encoders=encoders, progress=False) as trainer:
         trainer.run()
@@ -62,7 +62,7 @@ def test_a_run_keeps_its_first_seeds_graph(tmp_path, bank, encoders, make_config
     assert not last.weights.equal(trainer.algorithm.gwr.graph(1).weights)
 
 
-def test_algorithms_without_a_graph_keep_none(tmp_path, bank, encoders, make_config):
+def test_run_without_gwr_saves_no_graphs(tmp_path, bank, encoders, make_config):
     config = make_config(name="ddpg", episodes=2)
     with Trainer(config, tmp_path, bank=bank, encoders=encoders, progress=False) as trainer:
         trainer.run()
@@ -70,7 +70,7 @@ def test_algorithms_without_a_graph_keep_none(tmp_path, bank, encoders, make_con
     assert load_graphs(tmp_path / "gwr") == {}
 
 
-def test_a_full_disk_leaves_the_graph_that_was_there(tmp_path):
+def test_full_disk_leaves_the_earlier_graph(tmp_path):
     before = save_graph(tmp_path, 5, grown(n=5)).read_bytes()
     with (
         largest_file(100),
@@ -83,7 +83,7 @@ def test_a_full_disk_leaves_the_graph_that_was_there(tmp_path):
 
 
 @pytest.mark.parametrize("content", [b"", b"\x00" * 100, None])
-def test_a_damaged_graph_is_refused(tmp_path, content):
+def test_damaged_graph_is_rejected(tmp_path, content):
     path = save_graph(tmp_path, 5, grown())
     path.write_bytes(path.read_bytes()[:-9] if content is None else content)
     with pytest.raises(ValueError, match=r"episode-000005.safetensors is damaged or not a graph"):
