@@ -77,7 +77,7 @@ SETTINGS = [
     (BGPOConfig, {"active_groups": 0}, "at least 1"),
     (BGPOConfig, {"expert_batch_size": 0}, "at least 1"),
     (BGPOConfig, {"behavior_scale": 0.0}, "a number above 0"),
-    (BGPOConfig, {"even_replay": False}, "set where there are experts"),
+    (BGPOConfig, {"group_balanced_replay": False}, "set where there are experts"),
     (BGPOConfig, {"beta": -0.1}, "at least 0"),
     (BGPOConfig, {"beta": NAN}, "at least 0"),
     (MAMLConfig, {"inner_learning_rate": NAN}, "at least 0"),

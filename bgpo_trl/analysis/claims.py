@@ -20,10 +20,10 @@ _PAIRS = {
 _RIVALS = ("MAML", "Dist-NLL")
 # Fig. 9, from the best to the worst.
 _ABLATION = (
-    ("bgpo-single", "gwr"),
-    ("gwr", "r_int"),
-    ("r_int", "none"),
-    ("bgpo-single", "none"),
+    ("bgpo-single", "without-bonus"),
+    ("without-bonus", "without-gwr"),
+    ("without-gwr", "without-both"),
+    ("bgpo-single", "without-both"),
 )
 _WORDS = {"above": "reproduced", "below": "the opposite"}
 

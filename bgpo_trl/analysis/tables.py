@@ -63,10 +63,10 @@ _PAIRS = (
     *(("bgpo-experts", rival) for rival in ("dist-nll", "maml")),
     *(("bgpo-single", rival) for rival in ("dist-nll", "maml")),
     *(("bgpo-paper", rival) for rival in ("dist-nll-paper", "maml-paper")),
-    *(("bgpo-single", fewer) for fewer in ("gwr", "r_int", "none")),
-    *(("gwr", "none"), ("r_int", "none")),
-    *(("even-replay", "bgpo-single"), ("demonstrations", "bgpo-single")),
-    ("bgpo-experts", "even-replay"),
+    *(("bgpo-single", fewer) for fewer in ("without-bonus", "without-gwr", "without-both")),
+    *((fewer, "without-both") for fewer in ("without-bonus", "without-gwr")),
+    *(("group-balanced-replay", "bgpo-single"), ("demonstrations", "bgpo-single")),
+    ("bgpo-experts", "group-balanced-replay"),
 )
 
 

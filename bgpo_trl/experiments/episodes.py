@@ -10,12 +10,10 @@ import numpy as np
 from dm_env import TimeStep
 from numpy.typing import NDArray
 
-from bgpo_trl.algorithms.bgpo import BGPO
 from bgpo_trl.envs import NicoEnv
 from bgpo_trl.evaluation import Evaluator, Snapshot
 from bgpo_trl.files.checkpoint import has_checkpoint
 from bgpo_trl.policy import LoadedRun, load_all_seeds
-from bgpo_trl.runs.config_file import read_config
 from bgpo_trl.transforms import TaskSchedule
 from suites import nico
 from suites.nico.base import Environment
@@ -33,13 +31,7 @@ def load_blocks(run: Path) -> list[LoadedRun]:
     blocks = sorted(path for path in run.glob("seeds-*") if has_checkpoint(path / "checkpoint"))
     if not blocks or has_checkpoint(run / "checkpoint"):
         blocks = [run]
-    return [_load(block) for block in blocks]
-
-
-def _load(run: Path) -> LoadedRun:
-    # Rungs of benchmarks/ladder.py are variants of BGPO that ALGORITHMS does not list.
-    is_rung = read_config(run / "config.json")[0].name.startswith("rung ")
-    return load_all_seeds(run, make=BGPO if is_rung else None)
+    return [load_all_seeds(block) for block in blocks]
 
 
 def evaluator_of(

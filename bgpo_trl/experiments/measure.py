@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import csv
-import shlex
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,6 +12,7 @@ import numpy as np
 from bgpo_trl.analysis.task_inference import group_purity, task_inference_accuracy
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.evaluation import Evaluator, evaluate_random_policy
+from bgpo_trl.experiments.records import command
 from bgpo_trl.figures.curves import plot_success_curves
 from bgpo_trl.figures.frame_strips import plot_frame_strips
 from bgpo_trl.figures.of_run import draw_groups, draw_growth, draw_nodes
@@ -58,7 +57,7 @@ def measure(
         max_steps=config.algorithm.max_steps,
     )
     summary = {
-        "command": shlex.join(["python", *sys.argv]),
+        "command": command(),
         "episodes": config.episodes,
         "random_success": dict(zip(config.tasks, random_success.tolist(), strict=True)),
         "needs_label": algorithm.needs_label,

@@ -2,32 +2,27 @@
 
 from __future__ import annotations
 
-import shlex
-import subprocess
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
 
-from bgpo_trl.algorithms import ABLATIONS, ALGORITHMS, Algorithm
+from bgpo_trl.algorithms import ALGORITHMS, Algorithm
 from bgpo_trl.configs import STAGE_PRESETS, RunConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.encoders.pretrained import load_pretrained, make_pretrained
 from bgpo_trl.encoders.representation import Representation
-from bgpo_trl.experiments.arguments import (
-    Arguments,
-    TaskArguments,
-    chosen_tasks,
-    chosen_weights,
-)
+from bgpo_trl.encoders.shipped import default_weights, weights_of_bank
+from bgpo_trl.experiments.arguments import Arguments, BankArguments
 from bgpo_trl.experiments.measure import draw, measure
-from bgpo_trl.experiments.resuming import as_begun, is_finished
+from bgpo_trl.experiments.records import command, commit_of_code
+from bgpo_trl.experiments.settings import as_begun, chosen_tasks, is_finished
 from bgpo_trl.files.locking import DirectoryLock
 from bgpo_trl.files.whole_file import write_json
 from bgpo_trl.machine import choose_device, set_threads
 from bgpo_trl.own_module import import_own
-from bgpo_trl.runs.demonstrations import BANK
+from bgpo_trl.runs.config_file import read_config
+from bgpo_trl.runs.demonstrations import BANK, load_inputs
 from bgpo_trl.runs.directory import holds_run
 from bgpo_trl.training import Trainer
 from suites import nico
@@ -68,10 +63,11 @@ def run_experiment(
     commit = commit_of_code()  # read first, since commits may follow during training
     set_threads(arguments.threads)
     device = choose_device(arguments.device)
-    registered = (ALGORITHMS | ABLATIONS).get(config.name)
+    registered = ALGORITHMS.get(config.name)
     usual = registered is None or registered.config.rl.name == config.algorithm.rl.name
     rl = "" if usual else f"-{config.algorithm.rl.name}"
-    out = arguments.out or Path("runs") / f"{name}-{config.name}{rl}-{arguments.preset}"
+    size = arguments.preset or (arguments.config.stem if arguments.config else "quick")
+    out = arguments.out or Path("runs") / f"{name}-{config.name}{rl}-{size}"
     if arguments.resume:
         config = _continued(arguments, config, out)
         if is_finished(out, config):
@@ -97,7 +93,7 @@ def run_experiment(
                 trainer.logger.log_media(f"figures/{path.stem}", path)
             # Written last, as the mark of a complete run.
             write_json(out / "summary.json", summary)
-    lines.append(f"curve and figures: {out}; in numbers: python benchmarks/report.py {out}")
+    lines.append(f"curve and figures: {out}; in numbers: bgpo report {out}")
     return "\n".join(lines)
 
 
@@ -132,6 +128,9 @@ def _encoders(
     arguments: Arguments, tasks: tuple[str, ...], out: Path, device: torch.device
 ) -> tuple[Representation, DemonstrationBank]:
     """Return the pretrained encoders and a bank, or new ones made in the run directory."""
+    begun = arguments.resume and arguments.bank is None and (out / "config.json").exists()
+    if begun and (out / _ENCODERS / "nico.safetensors").exists():
+        return load_inputs(out, tasks, read_config(out / "config.json")[1])
     if not _makes_encoders(arguments, out):
         return pretrained_for(tasks, _bank(arguments, out))
     stage = STAGE_PRESETS.get(arguments.preset)
@@ -139,7 +138,7 @@ def _encoders(
         out / _ENCODERS / "nico.safetensors",
         out / _DATASET,
         folder=out / _ENCODERS,
-        command=shlex.join(["python", *sys.argv]),
+        command=command(),
         device=device,
         tasks=tasks,
         spread=arguments.spread,
@@ -162,7 +161,8 @@ def pretrained_for(
         ValueError: If the bank is missing, damaged or of other encoders, or a task has no
             demonstrations.
     """
-    encoders, found = load_pretrained(chosen_weights(tasks, bank))
+    weights = default_weights(tasks) if bank is None else weights_of_bank(bank)
+    encoders, found = load_pretrained(weights)
     if bank is not None:
         own = DemonstrationBank.load(bank, encoder_id=encoders.identity)
         lacking = [task for task in tasks if task not in own.tasks]
@@ -170,7 +170,7 @@ def pretrained_for(
     return encoders, found.for_tasks(tasks)
 
 
-def bank_of(arguments: TaskArguments) -> DemonstrationBank:
+def bank_of(arguments: BankArguments) -> DemonstrationBank:
     """Load the demonstrations that a command line names, embedded by the pretrained encoders.
 
     Raises:
@@ -178,16 +178,3 @@ def bank_of(arguments: TaskArguments) -> DemonstrationBank:
     """
     import_own(arguments.module)
     return pretrained_for(chosen_tasks(arguments.tasks, nico.PAPER_TASKS), arguments.bank)[1]
-
-
-def commit_of_code() -> str:
-    """Return the commit of this code, with ``-dirty`` if it was modified; ``""`` if unknown."""
-    root = Path(__file__).parents[2]
-    if not (root / ".git").exists():  # An installed package may lie in another repository.
-        return ""
-    command = ["git", "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
-    try:
-        result = subprocess.run(command, cwd=root, capture_output=True, text=True, check=True)
-    except (OSError, subprocess.CalledProcessError):
-        return ""
-    return result.stdout.strip()

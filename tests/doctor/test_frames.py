@@ -1,10 +1,10 @@
 import os
 
 import numpy as np
+from bgpo_trl.doctor.finding import Finding
 from PIL import Image
 
 from bgpo_trl.doctor import frames
-from bgpo_trl.doctor.finding import Finding
 
 
 def told(finding: Finding) -> tuple[str, str]:

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 import torch
+from bgpo_trl.doctor.finding import Finding
 
 from bgpo_trl.doctor import machine
-from bgpo_trl.doctor.finding import Finding
 
 GB = 10**9
 

@@ -6,10 +6,10 @@ import sys
 from pathlib import Path
 
 import pytest
-
-from bgpo_trl.doctor import __main__ as command
 from bgpo_trl.doctor.finding import Finding
 from bgpo_trl.doctor.speed import check_update_rate
+
+from bgpo_trl.doctor import __main__ as command
 from bgpo_trl.encoders import pretrained
 
 ROOT = Path(__file__).parents[2]

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
+from bgpo_trl.doctor.finding import Finding
 
 from bgpo_trl.doctor import speed
-from bgpo_trl.doctor.finding import Finding
 
 
 def told(finding: Finding) -> tuple[str, str]:

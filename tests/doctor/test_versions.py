@@ -3,9 +3,9 @@
 import importlib.metadata
 
 import pytest
+from bgpo_trl.doctor.finding import Finding
 
 from bgpo_trl.doctor import versions
-from bgpo_trl.doctor.finding import Finding
 
 
 def told(finding: Finding) -> tuple[str, str]:

@@ -41,7 +41,7 @@ def test_an_rl_algorithm_is_known_by_its_name(tmp_path, name):
 
 @pytest.mark.parametrize("name", ABLATIONS)
 def test_ablations_are_read(tmp_path, name):
-    config = RunConfig(name=name, algorithm=replace(ABLATIONS[name].config, beta=0.3))
+    config = RunConfig(name=name, algorithm=replace(ALGORITHMS[name].config, beta=0.3))
     path = write(tmp_path / "config.json", config, encoders=None)
     assert read_config(path) == (config, (None, "def"))
 

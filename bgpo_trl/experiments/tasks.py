@@ -1,9 +1,4 @@
-"""Measure the tasks of the suite: demonstrators, random actions, and the spread of the starts.
-
-    python benchmarks/nico_tasks.py
-
-Prints tables, and with ``--pictures`` draws a demonstration of each task and some start states.
-"""
+"""Tasks of the suite: demonstrators, random actions, and the spread of the starts."""
 
 from __future__ import annotations
 
@@ -16,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from bgpo_trl.experiments.arguments import command_line
+from bgpo_trl.analysis.tables import Table, markdown
 from suites import nico
 from suites.nico.base import CONTROL_TIMESTEP, TIME_LIMIT, Environment
 from suites.nico.demonstrator import Demonstrator
@@ -26,8 +21,8 @@ _SPREADS = (0.0, 0.5, 1.0)  # of which start states are drawn
 
 
 @dataclass(frozen=True)
-class Arguments:
-    """Measure the tasks of the suite."""
+class TasksArguments:
+    """Start states of the tasks."""
 
     starts: int = 200
     """Start states of each task, and episodes of random actions."""
@@ -158,42 +153,45 @@ def _draw(rows: Sequence[tuple[str, Sequence[NDArray[np.uint8]]]]) -> Image.Imag
     return picture
 
 
-def main(arguments: Arguments) -> None:
-    """Run the command line."""
+def tasks(arguments: TasksArguments) -> str:
+    """Measure the tasks of the suite: demonstrators, random actions, and the spread of the starts.
+
+    Prints tables, and with --pictures draws a demonstration of each task and some start states.
+
+    Raises:
+        ValueError: If there are too few starts, or there is no such folder.
+    """
     if arguments.starts < 2:
         raise ValueError(f"--starts must be at least 2, got {arguments.starts}")
     if arguments.pictures is not None and not arguments.pictures.is_dir():
         raise ValueError(f"there is no folder {arguments.pictures}: make it first")
-    tasks = nico.ALL_TASKS
-    by_chance = chance(tasks, arguments.starts, arguments.seed)
+    names = nico.ALL_TASKS
+    by_chance = chance(names, arguments.starts, arguments.seed)
     starts: dict[str, NDArray[np.float64]] = {}
-    print("| task | random actions | demonstrator | steps |\n|---|---:|---:|---:|")
-    for name in tasks:
+    table: Table = [["task", "random actions", "demonstrator", "steps"]]
+    for name in names:
         env = nico.load(name, seed=arguments.seed, observation="state")
         demonstrator = Demonstrator(env, seed=arguments.seed)
         episodes = [demonstrate(env, demonstrator) for _ in range(arguments.starts)]
         starts[name] = np.stack([episode.start for episode in episodes])
         success = np.mean([episode.success for episode in episodes])
         steps = np.mean([episode.steps for episode in episodes if episode.success] or [np.nan])
-        print(f"| `{name}` | {by_chance[name]:.1%} | {success:.1%} | {steps:.1f} |", flush=True)
+        table.append([f"`{name}`", f"{by_chance[name]:.1%}", f"{success:.1%}", f"{steps:.1f}"])
 
-    first = starts[tasks[0]]
+    first = starts[names[0]]
     deviation = 100 * first.std(0, ddof=1)  # (cm)
-    print("\n| standard deviation of the start, cm | x | y |\n|---|---:|---:|")
+    spread: Table = [["standard deviation of the start, cm", "x", "y"]]
     for name, (x, y) in zip(nico.OBJECTS, deviation, strict=True):
-        print(f"| {name} | {x:.2f} | {y:.2f} |")
+        spread.append([name, f"{x:.2f}", f"{y:.2f}"])
     alike = all(np.array_equal(first, of_task) for of_task in starts.values())
-    print(f"\nThe starts of all tasks are {'the same' if alike else 'NOT the same'}.")
+    found = f"The starts of all tasks are {'the same' if alike else 'NOT the same'}."
 
     if arguments.pictures is not None:
         for name, picture in (
-            ("tasks.png", draw_demonstrations(tasks, arguments.seed)),
+            ("tasks.png", draw_demonstrations(names, arguments.seed)),
             ("starts.png", draw_starts(arguments.seed)),
         ):
             path = arguments.pictures / name
             picture.save(path, optimize=True)
-            print(f"picture: {path}")
-
-
-if __name__ == "__main__":
-    command_line(main, __doc__, Arguments)
+            found += f"\npicture: {path}"
+    return "\n\n".join([markdown(table), markdown(spread), found])

@@ -1,16 +1,7 @@
-"""Detection of a task that was never shown, by its novelty to the groups of behaviors.
-
-    python benchmarks/unknown_task.py
-    python benchmarks/unknown_task.py --bank my_bank.safetensors --tasks all
-
-leaves out each task in turn: groups form from demonstrations of the others, and the novelty of
-held-out demonstrations says whether their task is known. It prints a table and writes
-``unknown_task.json`` and the ROC curves, ``roc.png``.
-"""
+"""Detection of a task that was never shown, by its novelty to the groups of behaviors."""
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,14 +9,17 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from bgpo_trl.analysis.novelty import Detection, leave_one_out, roc_curve
-from bgpo_trl.experiments.arguments import BankArguments, check_draws, command_line
+from bgpo_trl.analysis.tables import Table, markdown
+from bgpo_trl.experiments.arguments import BankArguments
 from bgpo_trl.experiments.run import bank_of
+from bgpo_trl.experiments.settings import check_draws
 from bgpo_trl.figures.style import COLORS, LINES, save_figure, style_axes
+from bgpo_trl.files.whole_file import write_json
 
 
 @dataclass(frozen=True)
-class Arguments(BankArguments):
-    """Measure how well demonstrations of an unknown task are detected."""
+class UnknownTaskArguments(BankArguments):
+    """Demonstrations to leave out."""
 
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
     """Seeds of the draws of demonstrations."""
@@ -51,8 +45,16 @@ def draw(found: dict[str, Detection]) -> Figure:
     return figure
 
 
-def main(arguments: Arguments) -> None:
-    """Print the table and write the results."""
+def unknown_task(arguments: UnknownTaskArguments) -> str:
+    """Measure how well demonstrations of a task that was never shown are detected.
+
+    Leaves out each task in turn: groups form from demonstrations of the others, and the novelty of
+    held-out demonstrations says whether their task is known. Prints a table and writes
+    unknown_task.json and the ROC curves, roc.png.
+
+    Raises:
+        ValueError: If there is nothing to draw, or a bank or task does not exist.
+    """
     check_draws(arguments.seeds, arguments.draws)
     bank = bank_of(arguments)
     if len(bank.tasks) < 2:
@@ -61,20 +63,16 @@ def main(arguments: Arguments) -> None:
         task: leave_one_out(bank, i, seeds=arguments.seeds, draws=arguments.draws)
         for i, task in enumerate(bank.tasks)
     }
-    print("| left out | area under the ROC curve, by seed | detected, % | false alarms, % |")
-    print("|---|---|---:|---:|")
+    table: Table = [["left out", "area under the ROC curve, by seed", "detected, %"]]
+    table[0].append("false alarms, %")
     results = {}
     for task, detection in found.items():
         area = detection.area.tolist()
         shares = [100 * float(s.mean()) for s in (detection.detected, detection.false_alarms)]
         results[task] = {"area": area, "detected": shares[0], "false_alarms": shares[1]}
         by_seed = " ".join(f"{value:.3f}" for value in area)
-        print(f"| {task} | {by_seed} | {shares[0]:.1f} | {shares[1]:.1f} |")
+        table.append([task, by_seed, *(f"{share:.1f}" for share in shares)])
     mean = np.mean([result["area"] for result in results.values()])
-    print(f"\nMean area {mean:.3f}.")
     save_figure(draw(found), arguments.out / "roc.png")
-    (arguments.out / "unknown_task.json").write_text(json.dumps(results, indent=2) + "\n")
-
-
-if __name__ == "__main__":
-    command_line(main, __doc__, Arguments)
+    write_json(arguments.out / "unknown_task.json", results)
+    return f"{markdown(table)}\n\nMean area {mean:.3f}."

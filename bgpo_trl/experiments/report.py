@@ -1,38 +1,26 @@
-"""Report of finished runs: tables and figures.
-
-    python benchmarks/report.py runs/comparison
-
-reads the runs in a folder, or single runs, in any number and of any algorithms, and sorts them by
-tasks and the way these are presented. It prints and writes ``tables.md``: success, differences
-between algorithms, forgetting and transfer, learning times, groups of behaviors, cost, each run
-task by task, and the paper's claims as far as there are runs for them; beside it, figures and one
-page with all of these, ``report.html``. Of tasks presented one after the other there are heat maps
-of success after each phase. The report of a single run is written into its directory, with a figure
-of its groups. ``docs/benchmark.md`` defines the measures.
-
-    python benchmarks/report.py runs/comparison --archive benchmarks/results/comparison
-
-first copies what reports read of the runs, compressed, and writes the report beside the copies.
-"""
+"""Report of finished runs: tables and figures, or the difference between two runs."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import tyro
 
+from bgpo_trl.analysis import metrics, statistics
 from bgpo_trl.analysis.claims import claims
 from bgpo_trl.analysis.comparison import (
     Run,
     Setting,
+    differing_conditions,
+    read_run,
     read_settings,
     reference_of,
     run_directories,
 )
-from bgpo_trl.analysis.scores import success_matrix
+from bgpo_trl.analysis.scores import Values, late_scores, success_matrix
 from bgpo_trl.analysis.tables import (
     COST_NOTE,
     DIFFERENCE_NOTES,
@@ -49,7 +37,6 @@ from bgpo_trl.analysis.tables import (
     success_table,
     task_table,
 )
-from bgpo_trl.experiments.arguments import command_line
 from bgpo_trl.figures.counts import plot_counts, read_counts
 from bgpo_trl.figures.curves import plot_success_curves
 from bgpo_trl.figures.nodes import plot_gwr_pca
@@ -68,8 +55,8 @@ _CURVES = len(COLORS)
 
 
 @dataclass(frozen=True)
-class Arguments:
-    """Report on finished runs."""
+class ReportArguments:
+    """Finished runs."""
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
     """Folders of runs, or run directories."""
@@ -79,6 +66,10 @@ class Arguments:
     """Folder for compact copies of the runs, on which the report is then made."""
     anyway: bool = False
     """Compare also runs under different conditions, such as other encoders or tests."""
+    compare: bool = False
+    """Only print the differences between two runs, task by task."""
+    every: int | None = None
+    """With --compare, also over each part of training of so many episodes."""
 
 
 @dataclass(frozen=True)
@@ -249,8 +240,21 @@ def text_of(sections: Sequence[Section], out: Path) -> str:
     return "\n\n".join(filter(None, text)) + "\n"
 
 
-def main(arguments: Arguments) -> None:
-    """Write the report."""
+def report(arguments: ReportArguments) -> str:
+    """Write tables and figures of runs: those in a folder, or single ones, of any algorithms.
+
+    Prints and writes tables.md: success, differences between algorithms, forgetting and transfer,
+    learning times, groups of behaviors, cost, each run task by task, and the paper's claims as far
+    as there are runs for them; beside it, figures, and report.html with all of these. The report of
+    a single run is written into its directory. With --archive, first copies what reports read of
+    the runs, compressed, and writes the report beside the copies. docs/benchmark.md defines the
+    measures.
+
+    Raises:
+        ValueError: If a run is damaged, none is finished, or conditions differ.
+    """
+    if arguments.compare:
+        return compare(arguments.runs, every=arguments.every, anyway=arguments.anyway)
     if not arguments.runs:
         raise ValueError("name a run, or a folder of runs")
     if arguments.out is None and arguments.archive is None and len(arguments.runs) > 1:
@@ -265,17 +269,71 @@ def main(arguments: Arguments) -> None:
             archive_run(directory, copy)
         directories = copies
     out = arguments.out or arguments.archive or arguments.runs[0]
-    report = make_report(directories, out, anyway=arguments.anyway)
+    made = make_report(directories, out, anyway=arguments.anyway)
     for directory in directories if directories == list(arguments.runs) else ():
-        run = report.runs.get(directory)
+        run = made.runs.get(directory)
         if run is not None and max(run.summary.get("groups") or [0]) > 1:
             draw_groups(directory, presented(run), out / f"{directory.name}-groups.png")
-    text = text_of(report.sections, out)
+    text = text_of(made.sections, out)
     (out / "tables.md").write_text(text)
-    settings = {str(path): (path, run.config, run.summary) for path, run in report.runs.items()}
-    write_page(out / "report.html", report.sections, settings)
-    print(text)
+    settings = {str(path): (path, run.config, run.summary) for path, run in made.runs.items()}
+    write_page(out / "report.html", made.sections, settings)
+    return text
 
 
-if __name__ == "__main__":
-    command_line(main, __doc__, Arguments)
+def compare(paths: Sequence[Path], *, every: int | None = None, anyway: bool = False) -> str:
+    """Return the table of differences between two runs, of each task and their mean.
+
+    It has the success of both over the last 10 % of training, the second's lead with its 95 %
+    interval (Welch), the p value of a permutation test of seeds, and what is found. If one run is
+    shorter, only the part that both have is compared.
+
+    Args:
+        paths: Directories of the two runs.
+        every: Also compare over each part of training of so many episodes.
+        anyway: Compare also runs under different conditions.
+
+    Raises:
+        ValueError: If there are not two runs of the same tasks, a run is damaged, or conditions
+            differ.
+    """
+    if len(paths) != 2:
+        raise ValueError(f"--compare: name two run directories, got {len(paths)}")
+    if every is not None and every < 1:
+        raise ValueError(f"--every must be at least 1 episode, got {every}")
+    first, second = map(read_run, paths)
+    differing = differing_conditions(first, second, ("episodes",))
+    if first.tasks != second.tasks:
+        raise ValueError(f"{differing}: only runs of the same tasks in the same order are compared")
+    if differing and not anyway:
+        raise ValueError(f"{differing}: only runs under equal conditions are compared; --anyway")
+    last = min(first.last, second.last)
+    runs = [replace(run, curves=run.curves.until(last)) for run in (first, second)]
+    rows: Table = [["episodes", "task", "first", "second", "second - first", "p", "found"]]
+    for end in range(every, last + 1, every) if every else ():
+        matrices = [
+            metrics.evaluation_matrix(run.curves.success, run.curves.episodes, [end], window=every)
+            for run in runs
+        ]
+        rows += _differences(f"to {end}", first.tasks, *(matrix[:, 0] for matrix in matrices))
+    rows += _differences("last 10 %", first.tasks, *map(late_scores, runs))
+    return "\n\n".join([*([differing] if differing else []), markdown(rows)])
+
+
+def _differences(period: str, tasks: tuple[str, ...], first: Values, second: Values) -> Table:
+    """Return a row for each task and their mean, from scores ``[S, T]``.
+
+    Tasks that were not tested are left out.
+    """
+    tested = [index for index in range(len(tasks)) if not np.isnan(first[:, index]).any()]
+    tested = [index for index in tested if not np.isnan(second[:, index]).any()]
+    rows = []
+    for what, chosen in [*((tasks[index], [index]) for index in tested), ("all", tested)]:
+        if not chosen:
+            continue
+        ours, theirs = first[:, chosen].mean(1), second[:, chosen].mean(1)
+        found = statistics.difference(theirs, ours)
+        p = "-" if np.isnan(found.p) else f"{found.p:.3f}"
+        cells = [f"{100 * scores.mean():.1f}" for scores in (ours, theirs)]
+        rows.append([period, what, *cells, found.estimate.points(), p, found.note])
+    return rows

@@ -1,13 +1,4 @@
-"""Groups of behaviors that form from the demonstrations of a bank, without learning a policy.
-
-    python benchmarks/groups.py
-    python benchmarks/groups.py --bank my_bank.safetensors --tasks all --draws 4000
-
-shows demonstrations in the order of training episodes, in four schedules, and prints by seed: how
-many groups there are at the end; how pure they are on held-out demonstrations; how many different
-demonstrations of its own each task needed before it had a group (the most demanding task); how long
-grouping took; the nodes of GWR-B, and in how many held-out demonstrations it infers the task.
-"""
+"""Groups of behaviors that form from the demonstrations of a bank, without learning a policy."""
 
 from __future__ import annotations
 
@@ -19,11 +10,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from bgpo_trl.analysis.tables import Table, markdown
 from bgpo_trl.analysis.task_inference import group_purity, task_inference_accuracy
 from bgpo_trl.configs import BGPOConfig, GWRBConfig
 from bgpo_trl.data.bank import DemonstrationBank
-from bgpo_trl.experiments.arguments import BankArguments, check_draws, command_line, even_starts
+from bgpo_trl.experiments.arguments import BankArguments
 from bgpo_trl.experiments.run import bank_of
+from bgpo_trl.experiments.settings import check_draws, even_starts
 from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.modules.gwr import GWRB
 from bgpo_trl.seeding import generators
@@ -31,8 +24,8 @@ from bgpo_trl.transforms import TaskSchedule
 
 
 @dataclass(frozen=True)
-class Arguments(BankArguments):
-    """Measure the groups of behaviors that form from demonstrations."""
+class GroupsArguments(BankArguments):
+    """Demonstrations that groups form from."""
 
     draws: int = 1_800
     """Demonstrations that each network is shown."""
@@ -91,8 +84,18 @@ def form(
     return groups, needed, seconds
 
 
-def main(arguments: Arguments) -> None:
-    """Print the table."""
+def groups(arguments: GroupsArguments) -> str:
+    """Measure the groups of behaviors that form from demonstrations, without learning a policy.
+
+    Shows demonstrations in the order of training episodes, in four schedules, and prints by seed:
+    how many groups there are at the end; how pure they are on held-out demonstrations; how many
+    different demonstrations of its own each task needed before it had a group (the most demanding
+    task); how long grouping took; the nodes of GWR-B, and in how many held-out demonstrations it
+    infers the task.
+
+    Raises:
+        ValueError: If there is nothing to draw, or a bank or task does not exist.
+    """
     torch.set_num_threads(1)
     check_draws(arguments.seeds, arguments.draws)
     bank, config = bank_of(arguments), BGPOConfig()
@@ -106,13 +109,14 @@ def main(arguments: Arguments) -> None:
         "the newest only": TaskSchedule(forward, cumulative=False),
         "from the start": TaskSchedule((0,) * n_tasks),
     }
-    print("| order | groups, by seed | purity, % | needed | seconds | nodes | inferred, % |")
-    print("|---|---|---|---|---|---|---|")
+    table: Table = [
+        ["order", "groups, by seed", "purity, %", "needed", "seconds", "nodes", "inferred, %"]
+    ]
     for order, schedule in schedules.items():
         columns: list[list[str]] = []
         for seed in arguments.seeds:
             rows = [*draw(seen, schedule, arguments.draws, seed)]
-            groups, needed, seconds = form(seen, rows, config)
+            formed, needed, seconds = form(seen, rows, config)
             (random,) = generators([seed], "gwr")
             gwr = GWRB(seen.embedding.shape[-1], generator=random, **asdict(fine))
             for row in rows:
@@ -120,17 +124,13 @@ def main(arguments: Arguments) -> None:
             inferred = task_inference_accuracy(gwr, seen, held_out, n_tasks)
             columns.append(
                 [
-                    f"{int(groups.num_groups)}",
-                    f"{100 * float(group_purity(groups, held_out, n_tasks)):.4g}",
+                    f"{int(formed.num_groups)}",
+                    f"{100 * float(group_purity(formed, held_out, n_tasks)):.4g}",
                     f"{max(needed.values())}" if len(needed) == n_tasks else "never",
                     f"{seconds:.1f}",
                     f"{int(gwr.num_nodes)}",
                     f"{100 * float(inferred):.4g}",
                 ]
             )
-        cells = (" ".join(column) for column in zip(*columns, strict=True))
-        print(f"| {order} | {' | '.join(cells)} |", flush=True)
-
-
-if __name__ == "__main__":
-    command_line(main, __doc__, Arguments)
+        table.append([order, *(" ".join(column) for column in zip(*columns, strict=True))])
+    return markdown(table)

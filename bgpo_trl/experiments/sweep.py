@@ -1,12 +1,12 @@
-"""Run algorithms in settings over many seeds on Ray, and merge the blocks of seeds.
+"""Sweeps on Ray: algorithms in settings over many seeds, in blocks of seeds that are merged.
 
-    python benchmarks/sweep.py --algorithms bgpo maml dist-nll --settings concurrent continual \
+    bgpo sweep --algorithms bgpo maml dist-nll --settings concurrent continual \
         --seeds 0 1 2 3 4 5 6 7 8 9 --block 5 --preset desk
 
 runs twelve jobs, as many at a time as there are cores. A job is a block of seeds of one algorithm
 in one setting, with a run directory such as ``runs/sweep/concurrent-bgpo/seeds-0-1-2-3-4``.
 Finished blocks are merged into ``runs/sweep/concurrent-bgpo``, which holds the files of one run of
-all seeds: ``python benchmarks/report.py runs/sweep`` reads it.
+all seeds: ``bgpo report runs/sweep`` reads it.
 
 The same command resumes an interrupted sweep without repeating finished jobs, and seeds may be
 added. A job whose worker or machine is lost continues elsewhere from its last checkpoint. A job
@@ -28,21 +28,17 @@ from typing import Literal
 
 from bgpo_trl.algorithms import ABLATIONS
 from bgpo_trl.configs import RunConfig
-from bgpo_trl.experiments import arguments as experiment
-from bgpo_trl.experiments.arguments import at_once
+from bgpo_trl.experiments.arguments import Arguments, BankArguments
 from bgpo_trl.experiments.merge import merge
+from bgpo_trl.experiments.ray_jobs import Job, connected, play_jobs
 from bgpo_trl.experiments.run import pretrained_for, run_experiment
+from bgpo_trl.experiments.settings import run_config
 from bgpo_trl.files.locking import DirectoryLock
 from bgpo_trl.own_module import import_own
 from bgpo_trl.runs.config_file import Digests, settings_of
 from bgpo_trl.runs.directory import check_settings, holds_run
 from bgpo_trl.runs.results import read_json
 from suites import nico
-
-try:
-    from bgpo_trl.experiments.ray_jobs import Job, connected, play_jobs
-except ImportError as error:
-    sys.exit(f"error: {error}")
 
 Setting = Literal[
     "concurrent",
@@ -57,11 +53,11 @@ Setting = Literal[
 
 
 @dataclass(frozen=True)
-class Arguments(experiment.TaskArguments):
-    """Run a grid of experiments on Ray."""
+class SweepArguments(BankArguments):
+    """A grid of runs."""
 
     algorithms: tuple[str, ...] = ("bgpo",)
-    """Algorithms, as in concurrent_tasks.py."""
+    """Algorithms, as in `bgpo concurrent`."""
     settings: tuple[Setting, ...] = ("concurrent",)
     """Tasks all from the start (concurrent); one after another, with earlier ones practised
     (continual) or not (sequential); or the variants of BGPO instead of the algorithms (ablation).
@@ -90,7 +86,7 @@ class Arguments(experiment.TaskArguments):
     """GPUs per run, or a share of one; with 0, networks are on the CPU."""
 
 
-def make_jobs(arguments: Arguments) -> dict[Path, list[Job]]:
+def make_jobs(arguments: SweepArguments) -> dict[Path, list[Job]]:
     """Return the jobs of the grid, by the directory that they are merged into.
 
     Raises:
@@ -100,8 +96,7 @@ def make_jobs(arguments: Arguments) -> dict[Path, list[Job]]:
         raise ValueError(f"block must be at least 1, got {arguments.block}")
     if arguments.cpus_per_run <= 0 or arguments.gpus_per_run < 0:
         raise ValueError("--cpus-per-run must be above 0 and --gpus-per-run at least 0")
-    # Those that are not an algorithm by a name of its own.
-    ablation = [v for v in ABLATIONS if v not in ("gwr+r_int", "experts", "all")]
+    ablation = [name for name in ABLATIONS if not name.startswith("bgpo")]
     jobs: dict[Path, list[Job]] = {}
     for setting in arguments.settings:
         for name in ablation if setting == "ablation" else arguments.algorithms:
@@ -126,16 +121,16 @@ def make_jobs(arguments: Arguments) -> dict[Path, list[Job]]:
     return jobs
 
 
-def _config(arguments: Arguments, setting: Setting, name: str) -> RunConfig:
-    """Return the settings of an algorithm's runs, or of a variant's in the setting "ablation"."""
+def _config(arguments: SweepArguments, setting: Setting, name: str) -> RunConfig:
+    """Return the settings of an algorithm's runs."""
     tasks = arguments.tasks
     if setting.startswith("eight"):
         if tasks is not None:
             raise ValueError(f"--tasks: the setting {setting} has the suite's eight: leave it out")
         tasks = nico.ALL_TASKS[::-1] if setting == "eight-reversed" else nico.ALL_TASKS
-    config = experiment.run_config(
-        experiment.Arguments(
-            algorithm="bgpo" if setting == "ablation" else name,
+    return run_config(
+        Arguments(
+            algorithm=name,
             preset=arguments.preset,
             seeds=arguments.seeds,
             episodes=arguments.episodes,
@@ -143,12 +138,9 @@ def _config(arguments: Arguments, setting: Setting, name: str) -> RunConfig:
             held_out=arguments.held_out,
             tasks=tasks,
             schedule="sequential" if setting.endswith("sequential") else "practised",
-        )
+        ),
+        from_start=setting.endswith(("concurrent", "ablation")),
     )
-    config = replace(config, name=name)
-    if setting == "ablation":
-        config = replace(config, algorithm=ABLATIONS[name].config)
-    return at_once(config) if setting.endswith(("concurrent", "ablation")) else config
 
 
 def check_directories(
@@ -164,29 +156,36 @@ def check_directories(
         ValueError: If a directory holds another run.
     """
     for merged, group in jobs.items():
-        told = digests[group[0].config.tasks]
+        of_tasks = digests[group[0].config.tasks]
         for job in group:
-            check_settings(job.directory, settings_of(job.config, told))
+            check_settings(job.directory, settings_of(job.config, of_tasks))
         path = merged / "config.json"
         if path.exists():  # merged before, possibly from other blocks
             if not any(merged.glob("seeds-*")):
                 raise ValueError(f"{merged} is not a run of a sweep: choose another --out")
             seeds = read_json(path)["seeds"]
-            settings = {**settings_of(group[0].config, told), "seeds": seeds}
+            settings = {**settings_of(group[0].config, of_tasks), "seeds": seeds}
             check_settings(merged, settings)
 
 
 def play(job: Job) -> None:
-    """Play a job to its end, from its last checkpoint if there is one, and measures."""
+    """Play a job to its end, from its last checkpoint if there is one."""
     import_own(job.module)
-    arguments = experiment.Arguments(
-        out=job.directory, resume=holds_run(job.directory), bank=job.bank
-    )
+    arguments = Arguments(out=job.directory, resume=holds_run(job.directory), bank=job.bank)
     run_experiment(arguments, "sweep", job.config)
 
 
-def main(arguments: Arguments) -> None:
-    """Run the unfinished jobs, and merge the blocks."""
+def sweep(arguments: SweepArguments) -> str:
+    """Run algorithms in settings over many seeds on Ray, in blocks that are merged at the end.
+
+    The same command resumes an interrupted sweep without repeating finished jobs, and seeds may be
+    added. A job whose worker or machine is lost continues elsewhere from its last checkpoint. On a
+    cluster, all machines need Ray and bgpo_trl, and must see --out at the same path.
+
+    Raises:
+        ValueError: If the settings are invalid, or a directory holds another run.
+        RuntimeError: If a job fails, such as on a full disk, after the others have finished.
+    """
     import_own(arguments.module)
     jobs = make_jobs(arguments)
     digests = {
@@ -195,7 +194,7 @@ def main(arguments: Arguments) -> None:
     }
     check_directories(jobs, digests)
     todo = [job for group in jobs.values() for job in group if not job.finished]
-    print(f"jobs: {sum(map(len, jobs.values()))}, to run: {len(todo)}")
+    lines = [f"jobs: {sum(map(len, jobs.values()))}, to run: {len(todo)}"]
     failed: dict[Job, str] = {}
     if todo:
         resources = {"cpus": arguments.cpus_per_run, "gpus": arguments.gpus_per_run}
@@ -208,10 +207,42 @@ def main(arguments: Arguments) -> None:
         if failed.keys().isdisjoint(group):
             with DirectoryLock(directory, wait=True):
                 merge([job.directory for job in group], directory)
-            print(f"{directory}: blocks of seeds: {len(group)}")
+            lines.append(f"{directory}: blocks of seeds: {len(group)}")
     if failed:
-        sys.exit("\n".join(f"error: {job} failed: {why}" for job, why in failed.items()))
+        raise RuntimeError("; ".join(f"{job} failed: {why}" for job, why in failed.items()))
+    return "\n".join(lines)
 
 
-if __name__ == "__main__":
-    experiment.command_line(main, __doc__, Arguments)
+@dataclass(frozen=True)
+class EightTasksArguments(SweepArguments):
+    """The grid of the benchmark of eight tasks, or a part of it."""
+
+    algorithms: tuple[str, ...] = (
+        "bgpo",
+        "bgpo-experts",
+        "bgpo-single",
+        "maml",
+        "maml-demonstrations",
+        "dist-nll",
+        "dist-nll-demonstrations",
+        "oracle",
+    )
+    settings: tuple[Setting, ...] = ("eight", "eight-reversed", "eight-concurrent")
+    seeds: tuple[int, ...] | None = (10, 11, 12, 13, 14)
+    """Seeds."""
+    episodes: int | None = 4_000
+    """Training episodes. The task starts are scaled in proportion."""
+    eval_every: int | None = None
+    """Training episodes between evaluations; by default 50, or fewer in shorter runs."""
+    held_out: Literal["validation", "test"] = "test"
+    out: Path = Path("runs/eight")
+
+
+def eight_tasks(arguments: EightTasksArguments) -> str:
+    """Run the benchmark of eight tasks (docs/benchmark.md) as a sweep; `bgpo report runs/eight`.
+
+    The same command resumes an interrupted grid.
+    """
+    if arguments.eval_every is None:
+        arguments = replace(arguments, eval_every=min(50, arguments.episodes or 50))
+    return sweep(arguments)

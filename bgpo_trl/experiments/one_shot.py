@@ -1,40 +1,29 @@
-"""Success and task inference against the share of the demonstration that is shown.
-
-    python benchmarks/one_shot.py runs/concurrent-bgpo-desk
-
-Shows new demonstrations, cut short, to the policies of all seeds of a run and tests them. Writes
-``one_shot.csv``, ``one_shot.png`` and ``one_shot.json`` (commit and command) into the run
-directory.
-"""
+"""Success and task inference against the share of the demonstration that is shown."""
 
 from __future__ import annotations
 
-import csv
-import json
-import shlex
-import sys
 import tempfile
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
-import tyro
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
-from bgpo_trl import TrainedPolicy, load_run
+from bgpo_trl.analysis.tables import Table, markdown
 from bgpo_trl.analysis.task_inference import task_inference_accuracy
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.encoders.representation import embed_demonstrations
 from bgpo_trl.evaluation import Evaluator, Snapshot
-from bgpo_trl.experiments.arguments import ImportArguments, command_line
-from bgpo_trl.experiments.run import commit_of_code
+from bgpo_trl.experiments.arguments import TrainedArguments
+from bgpo_trl.experiments.records import commit_of_code, write_measurement
 from bgpo_trl.figures.style import COLORS, save_figure
+from bgpo_trl.machine import set_threads
 from bgpo_trl.own_module import import_own
+from bgpo_trl.policy import TrainedPolicy, load_run
 from bgpo_trl.seeding import stream_seed
 from bgpo_trl.transforms import TaskSchedule
 
@@ -46,22 +35,16 @@ Row = tuple[float, int, str, int, float, float, float]
 """Row of the CSV file; the last two values are NaN for algorithms without GWR-B."""
 
 
-@dataclass(frozen=True)
-class Arguments(ImportArguments):
-    """Test the policies of a run with demonstrations cut short."""
+@dataclass(frozen=True, kw_only=True)
+class OneShotArguments(TrainedArguments):
+    """Tests with demonstrations that are cut short."""
 
-    run: tyro.conf.Positional[Path]
-    """Run directory."""
     shares: tuple[float, ...] = (0.25, 0.5, 0.75, 1.0)
     """Shares of each demonstration to show, from its start."""
     episodes: int = 20
     """Demonstrations and test episodes per task and seed."""
     seed: int = 1
     """Seed of the demonstrations; the pretrained encoders were trained on seed 0."""
-    out: Path | None = None
-    """Folder to write to; the run directory by default."""
-    threads: int = 1
-    """Threads of PyTorch."""
 
 
 def show(
@@ -114,7 +97,7 @@ def show(
 
 
 def measure(policy: TrainedPolicy, shares: Sequence[float], episodes: int, seed: int) -> list[Row]:
-    """Return the rows of the CSV file; for the arguments see `Arguments`.
+    """Return the rows of the CSV file; for the arguments see `OneShotArguments`.
 
     Raises:
         ValueError: If a share is not in (0, 1], or ``episodes`` is less than 1.
@@ -204,32 +187,29 @@ def plot(table: Mapping[str, Mapping[float, np.ndarray]]) -> Figure:
     return figure
 
 
-def main(arguments: Arguments) -> None:
-    """Run the tests and write the files."""
-    commit = commit_of_code()
+def one_shot(arguments: OneShotArguments) -> str:
+    """Test the policies of a run with new demonstrations that are cut short.
+
+    Prints a table and writes one_shot.csv, one_shot.png and one_shot.json (commit and command) into
+    the run directory.
+
+    Raises:
+        ValueError: If the run cannot be loaded, or a share is not in (0, 1].
+    """
+    commit, out = commit_of_code(), arguments.out or arguments.run
     import_own(arguments.module)
-    torch.set_num_threads(arguments.threads)
-    run, out = arguments.run, arguments.out or arguments.run
-    rows = measure(load_run(run), arguments.shares, arguments.episodes, arguments.seed)
-    out.mkdir(parents=True, exist_ok=True)
-    with (out / "one_shot.csv").open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(COLUMNS)
-        for *what, success, inferred, activity in rows:
-            values = ["" if np.isnan(x) else round(x, 4) for x in (success, inferred, activity)]
-            writer.writerow((*what, *values))
-    record = {"commit": commit, "command": shlex.join(["python", *sys.argv])}
-    (out / "one_shot.json").write_text(json.dumps(record, indent=2) + "\n")
-    table = means(rows)
-    save_figure(plot(table), out / "one_shot.png")
-    print("| task | seen | success | inferred | activity |\n|---|---:|---:|---:|---:|")
-    for task, shares in table.items():
+    set_threads(arguments.threads)
+    policy = load_run(arguments.run)
+    rows = measure(policy, arguments.shares, arguments.episodes, arguments.seed)
+    rounded = [(*row[:4], *(round(value, 4) for value in row[4:])) for row in rows]
+    write_measurement(out, "one_shot", COLUMNS, rounded, commit)
+    found = means(rows)
+    save_figure(plot(found), out / "one_shot.png")
+    table: Table = [["task", "seen", "success", "inferred", "activity"]]
+    for task, shares in found.items():
         for share, seeds in shares.items():
             success, inferred, activity = seeds.mean(0)
-            # NaN: an algorithm without GWR-B infers no task.
-            from_gwr = " | |" if np.isnan(inferred) else f" {inferred:.1%} | {activity:.2f} |"
-            print(f"| {task} | {share:.0%} | {success:.1%} |{from_gwr}")
-
-
-if __name__ == "__main__":
-    command_line(main, __doc__, Arguments)
+            without_gwr = bool(np.isnan(inferred))
+            from_gwr = ["", ""] if without_gwr else [f"{inferred:.1%}", f"{activity:.2f}"]
+            table.append([task, f"{share:.0%}", f"{success:.1%}", *from_gwr])
+    return markdown(table)
