@@ -33,16 +33,16 @@ def blocks(page, language):
 def commands(page):
     """Returns the commands shown in blocks and in running text, without comments, in one line."""
     text = page.read_text()
-    indented = re.findall(r"^    ((?:python|make) (?:.*\\\n)*.*)$", text, re.MULTILINE)
+    indented = re.findall(r"^    ((?:python|bgpo|make) (?:.*\\\n)*.*)$", text, re.MULTILINE)
     fenced = "\n".join(blocks(page, "bash")).replace("\\\n", " ").splitlines()
     text = re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
-    inline = re.findall(r"`((?:python|make|pytest) [^`]+)`", text)
+    inline = re.findall(r"`((?:python|bgpo|make|pytest) [^`]+)`", text)
     shown = [*(block.replace("\\\n", " ") for block in indented), *fenced, *inline]
     return [shlex.join(shlex.split(line, comments=True)) for line in shown]
 
 
 COMMANDS = sorted({command for page in PAGES for command in commands(page) if command})
-OF_PYTHON = [command for command in COMMANDS if command.startswith("python ")]
+OF_PYTHON = [command for command in COMMANDS if command.startswith(("python ", "bgpo "))]
 
 
 class Parsed(BaseException):
@@ -64,8 +64,10 @@ def parse_only(monkeypatch):
 
 
 def script_of(command):
-    """Returns what a `python` command runs, file or module, and its arguments."""
-    _, *words = shlex.split(command)
+    """Returns what a `python` or `bgpo` command runs, file or module, and its arguments."""
+    program, *words = shlex.split(command)
+    if program == "bgpo":
+        return "bgpo_trl", words
     if words[0] == "-m":
         return words[1], words[2:]
     return words[0], words[1:]

@@ -6,6 +6,7 @@ import tempfile
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -27,12 +28,20 @@ from bgpo_trl.policy import TrainedPolicy, load_run
 from bgpo_trl.seeding import stream_seed
 from bgpo_trl.transforms import TaskSchedule
 
-COLUMNS = ("share", "seed", "task", "episodes", "success", "task_inference", "activity")
 # Number of the evaluation; it seeds start states that neither training nor final tests used.
 _NUMBER = 2**31 + 1
 
-Row = tuple[float, int, str, int, float, float, float]
-"""Row of the CSV file; the last two values are NaN for algorithms without GWR-B."""
+
+class Row(NamedTuple):
+    """Row of ``one_shot.csv``; the last two values are NaN for algorithms without GWR-B."""
+
+    share: float
+    seed: int
+    task: str
+    episodes: int
+    success: float
+    task_inference: float
+    activity: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,7 +99,13 @@ def show(
             )
             inferred[:, number] = task_inference_accuracy(algorithm.gwr, seen, tested, n_tasks)
     return [
-        (seed, number, *(float(x[index, number]) for x in (success, inferred, activity)))
+        (
+            seed,
+            number,
+            float(success[index, number]),
+            float(inferred[index, number]),
+            float(activity[index, number]),
+        )
         for index, seed in enumerate(seeds)
         for number in range(n_tasks)
     ]
@@ -132,7 +147,7 @@ def measure(policy: TrainedPolicy, shares: Sequence[float], episodes: int, seed:
         shown["length"] = (share * length).round().long().clamp(min=1)
         embedding = embed_demonstrations(policy.encoders, shown).view(len(tasks), episodes, -1)
         tested = show(policy, embedding, shown["task"].view(len(tasks), episodes), evaluator)
-        rows += [(share, s, tasks[task], episodes, *found) for s, task, *found in tested]
+        rows += [Row(share, s, tasks[task], episodes, *found) for s, task, *found in tested]
     return rows
 
 
@@ -201,8 +216,15 @@ def one_shot(arguments: OneShotArguments) -> str:
     set_threads(arguments.threads)
     policy = load_run(arguments.run)
     rows = measure(policy, arguments.shares, arguments.episodes, arguments.seed)
-    rounded = [(*row[:4], *(round(value, 4) for value in row[4:])) for row in rows]
-    write_measurement(out, "one_shot", COLUMNS, rounded, commit)
+    rounded = [
+        row._replace(
+            success=round(row.success, 4),
+            task_inference=round(row.task_inference, 4),
+            activity=round(row.activity, 4),
+        )
+        for row in rows
+    ]
+    write_measurement(out, "one_shot", Row._fields, rounded, commit)
     found = means(rows)
     save_figure(plot(found), out / "one_shot.png")
     table: Table = [["task", "seen", "success", "inferred", "activity"]]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import tyro
@@ -58,7 +59,7 @@ _CURVES = len(COLORS)
 class ReportArguments:
     """Finished runs."""
 
-    runs: tyro.conf.Positional[tuple[Path, ...]]
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """Folders of runs, or run directories."""
     out: Path | None = None
     """Folder of the report; by default that of the runs."""
@@ -213,13 +214,16 @@ def make_report(directories: Sequence[Path], out: Path, *, anyway: bool = False)
     sections = [Section("Left out", notes=notes)] if notes else []
     for setting, reference in zip(settings, references, strict=True):
         sections += setting_sections(setting, reference, out)
-    pairs = [(s, r) for s, r in zip(settings, references, strict=True) if s.in_sequence]
+    pairs: list[tuple[Setting | None, Setting | None]] = [
+        (s, r) for s, r in zip(settings, references, strict=True) if s.in_sequence
+    ]
     paired = [reference for _, reference in pairs]
     pairs += [(None, s) for s in settings if s.from_start and s not in paired]
     for continual, concurrent in pairs:
         table, missing = claims(continual, concurrent)
-        if table:
-            number = len((continual or concurrent).first.tasks)
+        some = continual or concurrent
+        if table and some is not None:
+            number = len(some.first.tasks)
             about = [f"{missing} further claims need runs that are not here."] if missing else []
             sections.append(Section(f"The paper's claims, {number} tasks", table, notes=about))
     runs = {run.directory: run for setting in settings for run in setting.runs.values()}
@@ -310,9 +314,10 @@ def compare(paths: Sequence[Path], *, every: int | None = None, anyway: bool = F
     last = min(first.last, second.last)
     runs = [replace(run, curves=run.curves.until(last)) for run in (first, second)]
     rows: Table = [["episodes", "task", "first", "second", "second - first", "p", "found"]]
-    for end in range(every, last + 1, every) if every else ():
+    part = last + 1 if every is None else every
+    for end in range(part, last + 1, part):
         matrices = [
-            metrics.evaluation_matrix(run.curves.success, run.curves.episodes, [end], window=every)
+            metrics.evaluation_matrix(run.curves.success, run.curves.episodes, [end], window=part)
             for run in runs
         ]
         rows += _differences(f"to {end}", first.tasks, *(matrix[:, 0] for matrix in matrices))

@@ -75,7 +75,7 @@ def run_experiment(
     elif holds_run(out):
         raise ValueError(f"{out} holds a run: --resume continues it, --out names another directory")
     with DirectoryLock(out):
-        encoders, bank = _encoders(arguments, config.tasks, out, device)
+        encoders, bank = _encoders(arguments, config, out, device)
         with Trainer(
             config,
             out,
@@ -125,26 +125,26 @@ def _continued(arguments: Arguments, config: RunConfig, out: Path) -> RunConfig:
 
 
 def _encoders(
-    arguments: Arguments, tasks: tuple[str, ...], out: Path, device: torch.device
+    arguments: Arguments, config: RunConfig, out: Path, device: torch.device
 ) -> tuple[Representation, DemonstrationBank]:
     """Return the pretrained encoders and a bank, or new ones made in the run directory."""
     begun = arguments.resume and arguments.bank is None and (out / "config.json").exists()
     if begun and (out / _ENCODERS / "nico.safetensors").exists():
-        return load_inputs(out, tasks, read_config(out / "config.json")[1])
+        return load_inputs(out, config.tasks, read_config(out / "config.json")[1])
     if not _makes_encoders(arguments, out):
-        return pretrained_for(tasks, _bank(arguments, out))
-    stage = STAGE_PRESETS.get(arguments.preset)
+        return pretrained_for(config.tasks, _bank(arguments, out))
+    stage = STAGE_PRESETS.get(arguments.preset or "")
     encoders, bank = make_pretrained(
         out / _ENCODERS / "nico.safetensors",
         out / _DATASET,
         folder=out / _ENCODERS,
         command=command(),
         device=device,
-        tasks=tasks,
-        spread=arguments.spread,
+        tasks=config.tasks,
+        spread=config.spread,
         **({} if stage is None else vars(stage)),
     )
-    return encoders, bank.for_tasks(tasks)
+    return encoders, bank.for_tasks(config.tasks)
 
 
 def pretrained_for(

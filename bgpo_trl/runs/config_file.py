@@ -146,8 +146,9 @@ def _algorithm_config(name: object, stored: object) -> type[AlgorithmConfig] | N
         kind = getattr(sys.modules.get(module), attribute, None)
         if isinstance(kind, type) and issubclass(kind, AlgorithmConfig):
             return kind
-    known = isinstance(name, str) and name in ALGORITHMS
-    return type(ALGORITHMS[name].config) if known else None
+    if not isinstance(name, str) or name not in ALGORITHMS:
+        return None
+    return type(ALGORITHMS[name].config)
 
 
 def _read(hint: Any, value: Any, where: str) -> Any:

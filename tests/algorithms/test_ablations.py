@@ -1,22 +1,14 @@
-"""The ablation: variants of BGPO that differ by what their transforms write and nothing else."""
+"""The ablations: variants of BGPO that differ by what their transforms write and nothing else."""
 
-import json
-import sys
-from dataclasses import fields, replace
-from pathlib import Path
-from typing import get_args, get_type_hints
+from dataclasses import replace
 
 import pytest
 import torch
 from torchrl.envs import check_env_specs
 
-from benchmarks import ablation
-from bgpo_trl.algorithms import ABLATIONS
+from bgpo_trl.algorithms import ABLATIONS, ALGORITHMS
 from bgpo_trl.algorithms.bgpo import BGPO
 from bgpo_trl.configs.rl import DDPGConfig
-from bgpo_trl.experiments.arguments import Arguments, command_line
-from bgpo_trl.files.checkpoint import load_checkpoint
-from bgpo_trl.runs.results import read_table
 from bgpo_trl.transforms import BehaviorLookup, GroupLookup, TaskSchedule
 
 pytestmark = pytest.mark.usefixtures("easy_world")
@@ -61,15 +53,15 @@ def assert_same(first, second, where):
 
 
 def has_gwr(variant):
-    return variant not in ("r_int", "none")
+    return variant not in ("without-gwr", "without-both")
 
 
 def has_reward(variant):
-    return variant not in ("gwr", "none")
+    return variant not in ("without-bonus", "without-both")
 
 
 def has_groups(variant):
-    return variant in ("even-replay", "experts", "all")
+    return variant in ("group-balanced-replay", "bgpo-experts", "bgpo")
 
 
 COMMON = {
@@ -125,7 +117,7 @@ def test_the_behavior_is_that_of_gwr_or_the_demonstration_itself(make, bank, var
 
 
 @variants
-def test_only_what_is_paid_for_is_in_the_reward(make, encoders, variant):
+def test_the_reward_has_the_bonus_in_variants_with_it_alone(make, encoders, variant):
     data = play(make(variant, beta=0.3), 30)
     ended, reward = data["next", "done"], data["next", "reward"]
     extrinsic = data["next", "terminated"].float()
@@ -151,35 +143,18 @@ def test_only_what_is_paid_for_is_in_the_reward(make, encoders, variant):
 
 @pytest.mark.parametrize("beta", [0.1, 0.3])
 @variants
-def test_targets_are_bounded_by_what_can_be_earned(make, variant, beta):
+def test_targets_are_bounded_by_the_attainable_return(make, variant, beta):
     success = 1 + beta if has_reward(variant) else 1.0
-    # Now, or after a time-out that was paid for.
+    # A success now, or after a time-out with a bonus.
     highest = max(success, beta + 0.95 * success) if has_reward(variant) else 1.0
     low, high = make(variant, beta=beta).learner.loss.return_bounds
     assert (low, high) == (0.0, pytest.approx(highest))
 
 
-def test_the_variant_with_both_is_bgpo_bit_for_bit(make):
-    bgpo, variant = make("bgpo-single"), make("gwr+r_int")
-    ours, theirs = play(bgpo, 30), play(variant, 30)
-    assert set(ours.keys(True, True)) == set(theirs.keys(True, True))
-    assert (ours == theirs).all()
-    start = make("bgpo-single").learner.loss.state_dict()
-    for key, value in bgpo.learner.loss.state_dict().items():
-        assert value.equal(variant.learner.loss.state_dict()[key]), key
-        if "target_" not in key and key.endswith("weight"):
-            assert not value.equal(start[key]), key
-    for index in range(2):
-        for mine, other in zip(bgpo.gwr.graph(index), variant.gwr.graph(index), strict=True):
-            assert mine.equal(other)
-
-
-def test_variants_differ_by_transforms_only(make):
-    """The paper's four."""
-    paper = ("gwr+r_int", "gwr", "r_int", "none")
-    algorithms = {variant: make(variant) for variant in paper}
+def test_the_four_variants_of_the_paper_differ_by_transforms_only(make):
+    algorithms = {variant: make(variant) for variant in ABLATIONS[:4]}
     starts = {variant: algorithm.world.env.reset() for variant, algorithm in algorithms.items()}
-    reference, start = algorithms["none"], starts["none"]
+    reference, start = algorithms["without-both"], starts["without-both"]
     transforms = [type(transform).__name__ for transform in reference.world.env.transform]
     assert transforms == [
         *("FrameEncoder", "StepCounter", "DemonstrationSource"),
@@ -204,62 +179,25 @@ def test_variants_differ_by_transforms_only(make):
         assert [type(transform).__name__ for transform in algorithm.world.env.transform] == expected
 
 
-def test_the_command_line_knows_every_variant():
-    choices = get_type_hints(ablation.Arguments)["variant"]
-    assert set(get_args(choices)) == set(ABLATIONS)
-    assert ablation.Arguments().variant == "gwr+r_int"
-    own = {field.name for field in fields(ablation.Arguments)}
-    assert own - {field.name for field in fields(Arguments)} == {"variant", "continual"}
-
-
 def test_the_variants_beyond_the_paper_add_one_thing_at_a_time(make):
-    published = ABLATIONS["gwr+r_int"].config
-    assert not (published.experts or published.even_replay or published.demonstration_share)
+    published = ALGORITHMS["bgpo-single"].config
+    assert not (
+        published.experts or published.group_balanced_replay or published.demonstration_share
+    )
     alone = {"demonstration_share": 0.75, "rl": DDPGConfig(noise=0.1, batch_size=384)}
     shown = {**alone, "rl": DDPGConfig(noise=0.1), "expert_batch_size": 128}
     for variant, added in {
-        "even-replay": {"variant": "bgpo", "even_replay": True},
-        "experts": {"variant": "bgpo", "even_replay": True, "experts": True},
+        "group-balanced-replay": {"variant": "bgpo", "group_balanced_replay": True},
+        "bgpo-experts": {"variant": "bgpo", "group_balanced_replay": True, "experts": True},
         "demonstrations": alone,
-        "all": {
+        "bgpo": {
             "variant": "bgpo",
-            "even_replay": True,
+            "group_balanced_replay": True,
             "experts": True,
             **shown,
         },
     }.items():
-        assert ABLATIONS[variant].config == replace(published, **added)
+        assert ALGORITHMS[variant].config == replace(published, **added)
         algorithm = make(variant)
         assert (algorithm.groups is not None) == has_groups(variant)
-        assert (algorithm.shown is not None) == (variant in ("demonstrations", "all"))
-
-
-@variants
-def test_the_command_line_runs_a_variant_under_its_name(
-    tiniest, monkeypatch, tmp_path, capsys, variant
-):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["ablation.py", "--variant", variant])
-    command_line(ablation.main, "", ablation.Arguments)
-    run = Path("runs") / f"ablation-{variant}-quick"
-    assert f"curve and figures: {run}" in capsys.readouterr().out
-    config = json.loads((run / "config.json").read_text())
-    assert (config["name"], config["task_starts"]) == (variant, [0, 0, 0])
-    for file in ("train.csv", "eval.csv"):
-        assert set(read_table(run / file)["algorithm"]) == {variant}
-    train = read_table(run / "train.csv")
-    assert ((train["num_nodes"].astype(int) > 1) == has_gwr(variant)).all()
-    assert ((train["intrinsic_return"].astype(float) > 0) == has_reward(variant)).all()
-    learner = load_checkpoint(run / "checkpoint")["algorithm"]
-    assert ("gwr" in learner) == has_gwr(variant)
-    assert ("groups" in learner) == has_groups(variant)
-    assert (run / "figures" / "gwr.png").exists() == has_gwr(variant)
-
-
-def test_another_algorithm_has_no_variants(monkeypatch, tmp_path, capsys):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["ablation.py", "--algorithm", "maml"])
-    with pytest.raises(SystemExit) as ended:
-        command_line(ablation.main, "", ablation.Arguments)
-    assert ended.value.code == "error: --algorithm: the variants are BGPO's"
-    assert not list(tmp_path.iterdir())
+        assert (algorithm.shown is not None) == (variant in ("demonstrations", "bgpo"))

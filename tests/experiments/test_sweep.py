@@ -1,4 +1,4 @@
-"""The grid of a sweep, and what comes of its blocks of seeds; without Ray."""
+"""The grid of a sweep and the merging of its blocks of seeds, without Ray."""
 
 import contextlib
 import csv
@@ -10,15 +10,15 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-import sweep
 
-from benchmarks import report
-from bgpo_trl.algorithms import ABLATIONS
+from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.analysis.comparison import NAMES
 from bgpo_trl.configs import PRESETS
-from bgpo_trl.experiments import merge
+from bgpo_trl.experiments import merge, sweep
 from bgpo_trl.experiments import ray_jobs as jobs
 from bgpo_trl.experiments.ray_jobs import Job
+from bgpo_trl.experiments.report import ReportArguments, report
+from bgpo_trl.experiments.sweep import EightTasksArguments, SweepArguments
 from bgpo_trl.runs.config_file import Digests, settings_of
 from bgpo_trl.runs.cost import Cost, read_costs, write_costs
 from bgpo_trl.training import Trainer
@@ -45,12 +45,12 @@ def write_run(job):
     folder.mkdir(parents=True, exist_ok=True)
     settings = settings_of(config, SOME)
     (folder / "config.json").write_text(json.dumps(settings))
-    told = {"commit": f"c{config.seeds[0] // 2}", "command": "a", "random_success": {"x": 0.5}}
-    told["nodes"] = [100 + seed for seed in config.seeds] if config.name == "bgpo" else None
-    told["groups"] = [3 + seed for seed in config.seeds] if config.name == "bgpo" else None
+    summary = {"commit": f"c{config.seeds[0] // 2}", "command": "a", "random_success": {"x": 0.5}}
+    summary["nodes"] = [100 + seed for seed in config.seeds] if config.name == "bgpo" else None
+    summary["groups"] = [3 + seed for seed in config.seeds] if config.name == "bgpo" else None
     if config.name == "bgpo":
-        told["group_purity"] = [1 - seed / 8 for seed in config.seeds]
-    (folder / "summary.json").write_text(json.dumps(told))
+        summary["group_purity"] = [1 - seed / 8 for seed in config.seeds]
+    (folder / "summary.json").write_text(json.dumps(summary))
     (folder / "gwr.csv").write_text(f"task,w0,w1\n0,1,2\n1,2,5\n2,0,{config.seeds[0]}\n")
     n_seeds = len(config.seeds)
     write_costs(folder / "cost.csv", {3: Cost(7, 0.5 * n_seeds, 2.0 * n_seeds)})
@@ -77,7 +77,7 @@ def few():
 
 
 def test_a_job_is_a_block_of_seeds_of_an_algorithm_in_a_setting(tmp_path):
-    arguments = sweep.Arguments(
+    arguments = SweepArguments(
         algorithms=("bgpo", "dist-nll"),
         settings=("continual", "concurrent", "ablation"),
         seeds=(0, 1, 2, 5, 9),
@@ -87,8 +87,8 @@ def test_a_job_is_a_block_of_seeds_of_an_algorithm_in_a_setting(tmp_path):
     grid = sweep.make_jobs(arguments)
     assert [merged.relative_to(tmp_path).as_posix() for merged in grid] == [
         *("continual-bgpo", "continual-dist-nll", "concurrent-bgpo", "concurrent-dist-nll"),
-        *("ablation-gwr", "ablation-r_int", "ablation-none"),
-        *("ablation-even-replay", "ablation-demonstrations"),
+        *("ablation-without-bonus", "ablation-without-gwr", "ablation-without-both"),
+        *("ablation-group-balanced-replay", "ablation-demonstrations"),
     ]
     assert {group[0].config.name for group in grid.values()} <= set(NAMES)
     for merged, group in grid.items():
@@ -101,8 +101,7 @@ def test_a_job_is_a_block_of_seeds_of_an_algorithm_in_a_setting(tmp_path):
             assert job.config.name == name
             assert job.config.task_starts == starts
             algorithm = job.config.algorithm
-            if setting == "ablation":
-                assert algorithm == ABLATIONS[name].config
+            assert algorithm == ALGORITHMS[name].config
             assert replace(PRESETS["desk"], algorithm=algorithm) == replace(
                 job.config,
                 seeds=PRESETS["desk"].seeds,
@@ -112,10 +111,10 @@ def test_a_job_is_a_block_of_seeds_of_an_algorithm_in_a_setting(tmp_path):
             assert hasattr(algorithm, "beta") == (name != "dist-nll")
 
 
-def test_workers_are_told_the_tasks_and_where_they_come_from(tmp_path, monkeypatch):
+def test_jobs_carry_tasks_module_and_bank(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     bank, tasks = Path("own.safetensors"), nico.PAPER_TASKS[:2]
-    arguments = sweep.Arguments(
+    arguments = SweepArguments(
         settings=("continual", "concurrent"), tasks=tasks, module="my_tasks", bank=bank
     )
     (continual,), (concurrent,) = sweep.make_jobs(arguments).values()
@@ -125,14 +124,16 @@ def test_workers_are_told_the_tasks_and_where_they_come_from(tmp_path, monkeypat
         assert (job.module, job.bank) == ("my_tasks", tmp_path / bank)
     events = []
     monkeypatch.setattr(sweep, "import_own", events.append)
-    monkeypatch.setattr(sweep, "run_experiment", lambda told, *_: events.append(told.bank))
+    monkeypatch.setattr(
+        sweep, "run_experiment", lambda arguments, *_: events.append(arguments.bank)
+    )
     sweep.play(continual)
     assert events == ["my_tasks", tmp_path / bank]
 
 
-def test_the_eight_tasks_come_in_two_orders_unpractised_or_at_once(tmp_path):
+def test_settings_of_eight_tasks_differ_by_order_and_schedule(tmp_path):
     settings = ("sequential", "eight", "eight-reversed", "eight-sequential", "eight-concurrent")
-    arguments = sweep.Arguments(
+    arguments = SweepArguments(
         settings=settings,
         episodes=4_000,
         eval_every=50,
@@ -154,44 +155,47 @@ def test_the_eight_tasks_come_in_two_orders_unpractised_or_at_once(tmp_path):
         assert (config.episodes, config.eval_every, config.held_out) == (4_000, 50, "test")
 
 
-def test_blocks_are_of_the_presets_seeds_and_length_unless_told():
-    (group,) = sweep.make_jobs(sweep.Arguments(preset="paper")).values()
-    assert [job.config.seeds for job in group] == [(0, 1, 2, 3, 4), (5, 6, 7, 8, 9)]
-    assert group[0].config.episodes == 20_000
-    arguments = sweep.Arguments(preset="paper", episodes=2_000, settings=("continual",))
-    (group,) = sweep.make_jobs(arguments).values()
-    assert group[0].config.task_starts == (0, 700, 1_300)
+def test_the_benchmark_of_eight_tasks_is_a_grid_with_tests_every_50_episodes(monkeypatch):
+    asked = []
+    monkeypatch.setattr(sweep, "sweep", lambda arguments: asked.append(arguments) or "done")
+    for episodes in (4_000, 20):
+        assert sweep.eight_tasks(EightTasksArguments(episodes=episodes)) == "done"
+    assert [arguments.eval_every for arguments in asked] == [50, 20]
+    grid = sweep.make_jobs(asked[0])
+    assert len(grid) == 3 * 8
+    for group in grid.values():
+        (job,) = group
+        assert job.config.seeds == (10, 11, 12, 13, 14)
+        assert (job.config.held_out, len(job.config.tasks)) == ("test", 8)
 
 
 @pytest.mark.parametrize(
-    ("wrong", "message"),
+    "wrong",
     [
-        ({"block": 0}, "block must be at least 1, got 0"),
-        ({"seeds": (1, 2, 1)}, "all different"),
-        ({"settings": ("eight",), "tasks": ("grasp_glass",)}, "--tasks: .* leave it out"),
-        ({"seeds": ()}, "seeds must be one or more"),
-        ({"episodes": 0}, "episodes must be at least 1"),
-        ({"algorithms": ()}, "name at least one of --algorithms"),
-        ({"settings": ()}, "one of --settings"),
-        ({"cpus_per_run": 0}, "--cpus-per-run must be above 0"),
-        ({"gpus_per_run": -1}, "--gpus-per-run at least 0"),
+        {"block": 0},
+        {"seeds": (1, 2, 1)},
+        {"settings": ("eight",), "tasks": ("grasp_glass",)},
+        {"algorithms": ()},
+        {"settings": ()},
+        {"cpus_per_run": 0},
+        {"gpus_per_run": -1},
     ],
 )
-def test_grids_that_cannot_be_are_refused(tmp_path, wrong, message):
-    with pytest.raises(ValueError, match=message):
-        sweep.main(sweep.Arguments(out=tmp_path / "out", **wrong))
+def test_wrong_grids_are_refused(tmp_path, wrong):
+    with pytest.raises(ValueError):
+        sweep.sweep(SweepArguments(out=tmp_path / "out", **wrong))
     assert not (tmp_path / "out").exists()
 
 
-def test_directories_with_something_else_are_refused(few, tmp_path):
-    grid = sweep.make_jobs(sweep.Arguments(out=tmp_path, **few))
+def test_directories_of_other_runs_are_refused(few, tmp_path):
+    grid = sweep.make_jobs(SweepArguments(out=tmp_path, **few))
     sweep.check_directories(grid, BY_TASKS)  # there is nothing yet
     for group in grid.values():
         write_run(group[1])
     sweep.check_directories(grid, BY_TASKS)
     with pytest.raises(ValueError, match="encoders is some there and others here"):
         sweep.check_directories(grid, {nico.PAPER_TASKS: Digests("others", "bank")})
-    longer = sweep.make_jobs(sweep.Arguments(out=tmp_path, episodes=7, **few))
+    longer = sweep.make_jobs(SweepArguments(out=tmp_path, episodes=7, **few))
     with pytest.raises(ValueError, match=r"seeds-2 holds a run with other settings .*episodes is"):
         sweep.check_directories(longer, BY_TASKS)
 
@@ -201,22 +205,22 @@ def test_directories_with_something_else_are_refused(few, tmp_path):
     (folder / "config.json").write_text(json.dumps({**config, "seeds": [7, 8, 9]}))
     sweep.check_directories(grid, BY_TASKS)
     others = sweep.make_jobs(
-        sweep.Arguments(out=tmp_path, episodes=7, **{**few, "algorithms": ("maml",), "block": 3})
+        SweepArguments(out=tmp_path, episodes=7, **{**few, "algorithms": ("maml",), "block": 3})
     )
     with pytest.raises(ValueError, match="concurrent-maml holds a run with other settings"):
         sweep.check_directories(others, BY_TASKS)
 
-    alone = sweep.make_jobs(sweep.Arguments(out=tmp_path / "alone", **few))
+    alone = sweep.make_jobs(SweepArguments(out=tmp_path / "alone", **few))
     write_run(Job(tmp_path / "alone" / "concurrent-maml", alone.popitem()[1][0].config))
     before = contents(tmp_path)
     with pytest.raises(ValueError, match="concurrent-maml is not a run of a sweep"):
-        sweep.main(sweep.Arguments(out=tmp_path / "alone", **few))
+        sweep.sweep(SweepArguments(out=tmp_path / "alone", **few))
     assert contents(tmp_path) == before
 
 
-def test_merged_blocks_are_what_one_run_of_all_seeds_would_be(few, tmp_path, monkeypatch):
-    monkeypatch.setattr(sys, "argv", ["benchmarks/sweep.py", "--block", "2"])
-    arguments = sweep.Arguments(out=tmp_path / "blocks", episodes=6, **few)
+def test_merged_blocks_equal_one_run_of_all_seeds(few, tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["-m", "bgpo_trl", "sweep", "--block", "2"])
+    arguments = SweepArguments(out=tmp_path / "blocks", episodes=6, **few)
     for merged, group in sweep.make_jobs(arguments).items():
         whole = Job(tmp_path / "whole" / merged.name, replace(group[0].config, seeds=(4, 0, 2)))
         for job in (*group, whole):
@@ -234,12 +238,12 @@ def test_merged_blocks_are_what_one_run_of_all_seeds_would_be(few, tmp_path, mon
         config = json.loads((merged / "config.json").read_text())
         assert config == json.loads((whole.directory / "config.json").read_text())
         assert read_costs(merged / "cost.csv") == {3: Cost(14, 1.5, 6.0)}  # of two blocks
-        told = json.loads((merged / "summary.json").read_text())
+        summary = json.loads((merged / "summary.json").read_text())
         found = merged.name.endswith("bgpo")
-        assert told.pop("group_purity", None) == ([0.5, 1.0, 0.75] if found else None)
-        assert told == {
+        assert summary.pop("group_purity", None) == ([0.5, 1.0, 0.75] if found else None)
+        assert summary == {
             "commit": "c2 c1",
-            "command": "python benchmarks/sweep.py --block 2",
+            "command": "python -m bgpo_trl sweep --block 2",
             "random_success": {"x": 0.5},
             "nodes": [104, 100, 102] if found else None,
             "groups": [7, 3, 5] if found else None,
@@ -249,7 +253,7 @@ def test_merged_blocks_are_what_one_run_of_all_seeds_would_be(few, tmp_path, mon
         assert (merged / "gwr.csv").read_text() == "task,w0,w1\n0,1,2\n1,2,5\n2,0,4\n"
     texts = []
     for folder in ("blocks", "whole"):
-        report.main(report.Arguments((tmp_path / folder,)))
+        report(ReportArguments((tmp_path / folder,)))
         text = (tmp_path / folder / "tables.md").read_text()
         texts.append("".join(text.partition("## GWR-B, by seed")[:1]))
         assert "| BGPO | ? | 3 |" in text and "| BGPO against MAML |" in text
@@ -257,7 +261,7 @@ def test_merged_blocks_are_what_one_run_of_all_seeds_would_be(few, tmp_path, mon
 
 
 def test_merging_again_changes_nothing_and_a_gap_is_not_merged(few, tmp_path):
-    merged, group = sweep.make_jobs(sweep.Arguments(out=tmp_path, episodes=4, **few)).popitem()
+    merged, group = sweep.make_jobs(SweepArguments(out=tmp_path, episodes=4, **few)).popitem()
     for job in group:
         write_run(job)
     blocks = [job.directory for job in group]
@@ -279,7 +283,9 @@ def test_merging_again_changes_nothing_and_a_gap_is_not_merged(few, tmp_path):
 
 
 @pytest.mark.usefixtures("easy_world")
-def test_blocks_of_real_runs_are_a_run_of_all_seeds(encoders, bank, make_config, tmp_path):
+def test_merged_blocks_of_real_runs_equal_one_run_of_all_seeds(
+    encoders, bank, make_config, tmp_path
+):
     def train(folder, seeds):
         job = Job(tmp_path / folder, make_config(seeds=seeds, episodes=6))
         write_run(job)
@@ -331,34 +337,32 @@ def without_ray(monkeypatch):
     return SimpleNamespace(played=played, broken=broken)
 
 
-def test_a_sweep_plays_what_is_missing_and_nothing_twice(without_ray, few, tmp_path, capsys):
+def test_a_sweep_runs_each_job_once(without_ray, few, tmp_path):
     played, broken = without_ray.played, without_ray.broken
-    arguments = sweep.Arguments(out=tmp_path, episodes=4, **few)
+    arguments = SweepArguments(out=tmp_path, episodes=4, **few)
     bgpo = ["concurrent-bgpo/seeds-4-0", "concurrent-bgpo/seeds-2"]
     maml = ["concurrent-maml/seeds-4-0", "concurrent-maml/seeds-2"]
     broken.add(bgpo[0])
-    with pytest.raises(SystemExit) as ended:
-        sweep.main(arguments)
-    assert ended.value.code == f"error: {bgpo[0]} failed: no space left"
+    with pytest.raises(RuntimeError, match=f"^{bgpo[0]} failed: no space left$"):
+        sweep.sweep(arguments)
     assert played == bgpo + maml
     assert not (tmp_path / "concurrent-bgpo" / "eval.csv").exists()
     assert (tmp_path / "concurrent-maml" / "eval.csv").exists()
     assert "OSError: no space left" in (tmp_path / bgpo[0] / "log.txt").read_text()
 
     broken.clear(), played.clear()
-    sweep.main(arguments)
+    sweep.sweep(arguments)
     assert played == bgpo[:1]
-    told = json.loads((tmp_path / "concurrent-bgpo" / "config.json").read_text())
-    assert told["seeds"] == [4, 0, 2]
+    config = json.loads((tmp_path / "concurrent-bgpo" / "config.json").read_text())
+    assert config["seeds"] == [4, 0, 2]
 
-    played.clear(), capsys.readouterr()
+    played.clear()
     before = contents(tmp_path)
-    sweep.main(arguments)
+    assert sweep.sweep(arguments).startswith("jobs: 4, to run: 0\n")
     assert contents(tmp_path) == before
     assert not played
-    assert capsys.readouterr().out.startswith("jobs: 4, to run: 0\n")
 
-    sweep.main(replace(arguments, algorithms=("maml",), seeds=(4, 0, 2, 5, 3, 1), block=2))
+    sweep.sweep(replace(arguments, algorithms=("maml",), seeds=(4, 0, 2, 5, 3, 1), block=2))
     assert played == [f"concurrent-maml/seeds-{block}" for block in ("2-5", "3-1")]
     seeds = [row["seed"] for row in rows(tmp_path / "concurrent-maml" / "train.csv")]
     assert seeds == sorted(4 * "012345")

@@ -1,18 +1,13 @@
-"""The report against runs whose success is made up by hand."""
-
-import gzip
-import json
-import shutil
+"""Reports and comparisons of runs with success written by hand."""
 
 import numpy as np
 import pytest
 
-from benchmarks import report
-from bgpo_trl.algorithms import ABLATIONS, ALGORITHMS
+from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.analysis import statistics
-from bgpo_trl.analysis.comparison import NAMES, SAME, read_run
+from bgpo_trl.analysis.comparison import NAMES, read_run
 from bgpo_trl.analysis.transfer import forward_transfer
-from bgpo_trl.runs.archive import archive_run
+from bgpo_trl.experiments.report import ReportArguments, report
 from bgpo_trl.runs.cost import Cost, write_costs
 from tests.analysis.runs import TASKS, edit, write_run, write_training
 from tests.folders import contents
@@ -26,8 +21,8 @@ def complete(run, seeds, tasks=TASKS):
     seeds, tasks = range(seeds), tuple(tasks)
     turns = 40 // len(tasks)
     write_training(run, [[[0] * (turns - 3) + [1] * 3] * len(tasks) for _ in seeds], tasks)
-    told = {"nodes": [90 - seed for seed in seeds], "groups": [3] * len(seeds)}
-    edit(run / "summary.json", **told, group_purity=[1.0, *[0.985] * (len(seeds) - 1)])
+    found = {"nodes": [90 - seed for seed in seeds], "groups": [3] * len(seeds)}
+    edit(run / "summary.json", **found, group_purity=[1.0, *[0.985] * (len(seeds) - 1)])
     rows = ["seed,demonstrations,task,episodes,success,task_inference"]
     rows += [
         f"{seed},{kind},{task},20,{success},{1 - seed / 100}"
@@ -61,7 +56,7 @@ def write_runs(folder):
 def reported(tmp_path_factory):
     """The report on those runs, made once: only to be read."""
     folder = write_runs(tmp_path_factory.mktemp("runs"))
-    report.main(report.Arguments((folder,)))
+    report(ReportArguments((folder,)))
     return folder
 
 
@@ -77,7 +72,7 @@ def text_of(folder):
     return (folder / "tables.md").read_text()
 
 
-def test_success_has_seeds_as_its_unit(reported):
+def test_success_is_a_mean_over_seeds(reported):
     table = rows_of(text_of(reported), ONE_AFTER_THE_OTHER)
     # 80, 90 and 100 % by seed: a standard error of 5.77, times 4.303.
     assert table["BGPO"][:4] == ["no", "3", "90.0 [65, 100]", "90.0 [65, 100], task 1"]
@@ -93,7 +88,7 @@ def test_success_has_seeds_as_its_unit(reported):
     assert from_start["BGPO"][-2].startswith(f"{100 * area:.1f} [")
 
 
-def test_differences_have_verdicts_of_their_intervals(reported):
+def test_differences_are_judged_by_their_intervals(reported):
     table = rows_of(text_of(reported), f"Differences: {ONE_AFTER_THE_OTHER}")
     assert list(table) == [
         "BGPO against Dist-NLL + demonstrations",
@@ -110,7 +105,7 @@ def test_differences_have_verdicts_of_their_intervals(reported):
     assert wide[1].startswith("not decided (about ") and wide[2:4] == ["1.000", "1.000"]
 
 
-def test_claims_follow_for_which_there_are_runs(reported):
+def test_claims_of_the_runs_that_exist_are_listed(reported):
     text = text_of(reported)
     title = "The paper's claims, 3 tasks"
     lines = [line for line in text.split(f"## {title}")[1].splitlines() if line[:2] == "| "]
@@ -125,7 +120,7 @@ def test_claims_follow_for_which_there_are_runs(reported):
     assert text.count("missing") == 0
 
 
-def test_forgetting_and_transfer_by_hand(reported):
+def test_forgetting_and_transfer_equal_those_by_hand(reported):
     table = rows_of(text_of(reported), f"Forgetting and transfer: {ONE_AFTER_THE_OTHER}")
     # After their phases, tasks 1 and 2 are at 40, 40 and 50 % by seed; all end at 90, 80, 100.
     changes = np.array([[0.5, 0.5, 0], [0.4, 0.4, 0], [0.5, 0.5, 0]])
@@ -138,7 +133,7 @@ def test_forgetting_and_transfer_by_hand(reported):
     assert table["BGPO"][3] == forward_transfer(*runs).points()
 
 
-def test_what_a_run_with_groups_leaves_is_shown(reported):
+def test_groups_nodes_and_costs_of_a_run_are_listed(reported):
     text = text_of(reported)
     groups = rows_of(text, f"GWR-B, by seed: {ONE_AFTER_THE_OTHER}")
     assert groups == {"BGPO": ["3 3 3", "100 98.5 98.5", "99.00", "100 99 98", "90 89 88"]}
@@ -161,7 +156,7 @@ def test_what_a_run_with_groups_leaves_is_shown(reported):
     assert by_task["all"][:3] == ["90.0 [65, 100]", "90 80 100", ""]
 
 
-def test_figures_stand_beside_the_tables(reported):
+def test_figures_are_written_beside_the_tables(reported):
     text, page = text_of(reported), (reported / "report.html").read_text()
     figures = ["continual-3", "continual-3-counts", "continual-3-matrix", "continual-3-nodes"]
     for name in (*figures, "concurrent-3"):
@@ -177,7 +172,7 @@ def test_any_number_of_tasks_is_reported(tasks, tmp_path):
         write_run(tmp_path, name, level, tasks=tasks, starts=(0,) * len(tasks))
         if len(tasks) > 1:
             write_run(tmp_path, name, level, tasks=tasks, starts=starts)
-    report.main(report.Arguments((tmp_path,)))
+    report(ReportArguments((tmp_path,)))
     text = text_of(tmp_path)
     assert "nan" not in text
     kinds = ["all from the start"] + ["one after the other"] * (len(tasks) > 1)
@@ -191,7 +186,7 @@ def test_any_number_of_tasks_is_reported(tasks, tmp_path):
 def test_a_single_seed_has_no_interval(tmp_path):
     for name, level in {"bgpo": [9], "oracle": [2]}.items():
         write_run(tmp_path, name, level)
-    report.main(report.Arguments((tmp_path,)))
+    report(ReportArguments((tmp_path,)))
     text = text_of(tmp_path)
     assert rows_of(text, "3 tasks, all from the start")["BGPO"][1:3] == ["1", "90.0"]
     (row,) = rows_of(text, "Differences: 3 tasks, all from the start").values()
@@ -199,42 +194,30 @@ def test_a_single_seed_has_no_interval(tmp_path):
     assert "nan" not in text
 
 
-def test_a_run_alone_is_reported_in_its_directory(tmp_path, capsys):
+def test_a_run_alone_is_reported_in_its_directory(tmp_path):
     run = write_run(tmp_path, "bgpo", 9, starts=STARTS)
     complete(run, seeds=3)
-    report.main(report.Arguments((run,)))
-    assert capsys.readouterr().out.strip() == text_of(run).strip()
+    assert report(ReportArguments((run,))).strip() == text_of(run).strip()
     assert "## Differences" not in text_of(run)
     assert (run / "continual-bgpo-groups.png").exists()
     assert list(rows_of(text_of(run), f"BGPO: {ONE_AFTER_THE_OTHER}")) == [*TASKS, "all"]
 
 
-def test_what_trainer_alone_writes_is_reported(run_of, tmp_path):
-    """Without what final tests and a command line leave."""
-    folder = tmp_path / "reported"
-    shutil.copytree(run_of("bgpo"), folder / "continual-bgpo")
-    assert not {"final.csv", "summary.json"} & {path.name for path in folder.rglob("*")}
-    report.main(report.Arguments((folder,)))
-    (success,) = rows_of(text_of(folder), ONE_AFTER_THE_OTHER)["BGPO"][2:3]
-    assert 0 <= float(success.split()[0]) <= 100
-    assert "nan" not in text_of(folder)
-
-
 def test_tests_too_rare_for_phases_leave_that_table_out(tmp_path):
     write_run(tmp_path, "bgpo", 9, starts=(0, 1, 20))
-    report.main(report.Arguments((tmp_path,)))
+    report(ReportArguments((tmp_path,)))
     assert "there is no evaluation in the 2 episodes before episode 1" in text_of(tmp_path)
 
 
-def test_other_conditions_are_refused_before_a_file_is_written(tmp_path):
+def test_other_conditions_are_refused_before_anything_is_written(tmp_path):
     write_run(tmp_path, "bgpo", 9)
     write_run(tmp_path, "oracle", 5, held_out="test")
     before = contents(tmp_path)
     for archive in (None, tmp_path / "archive"):
         with pytest.raises(ValueError, match=r"differ in held_out \(test and validation\)"):
-            report.main(report.Arguments((tmp_path,), archive=archive))
+            report(ReportArguments((tmp_path,), archive=archive))
         assert contents(tmp_path) == before
-    report.main(report.Arguments((tmp_path,), anyway=True))
+    report(ReportArguments((tmp_path,), anyway=True))
     assert "differ in held_out (test and validation)" in text_of(tmp_path)
 
 
@@ -242,7 +225,7 @@ def test_unfinished_runs_are_named_and_left_out(tmp_path):
     write_run(tmp_path, "bgpo", 9)
     path = write_run(tmp_path, "oracle", 5)
     edit(path / "config.json", episodes=50)
-    report.main(report.Arguments((tmp_path,)))
+    report(ReportArguments((tmp_path,)))
     text = text_of(tmp_path)
     assert f"- {path} has tests until episode 40 of 50: let the run finish" in text
     assert "DDPG" not in text
@@ -251,58 +234,67 @@ def test_unfinished_runs_are_named_and_left_out(tmp_path):
 def test_several_folders_need_one_for_the_report(tmp_path):
     runs = tuple(write_run(tmp_path, name, 9) for name in ("bgpo", "oracle"))
     with pytest.raises(ValueError, match="--out: several folders are given"):
-        report.main(report.Arguments(runs))
-    report.main(report.Arguments(runs, out=tmp_path / "out"))
+        report(ReportArguments(runs))
+    report(ReportArguments(runs, out=tmp_path / "out"))
     assert len(rows_of(text_of(tmp_path / "out"), "3 tasks, all from the start")) == 2
     with pytest.raises(ValueError, match="name a run, or a folder of runs"):
-        report.main(report.Arguments(()))
+        report(ReportArguments(()))
 
 
 def test_the_report_on_an_archive_is_the_same_to_the_digit(reported, tmp_path):
-    report.main(report.Arguments((reported,), archive=tmp_path / "archive"))
+    report(ReportArguments((reported,), archive=tmp_path / "archive"))
     assert text_of(tmp_path / "archive") == text_of(reported)
-    report.main(report.Arguments((tmp_path / "archive",), out=tmp_path / "again"))
+    report(ReportArguments((tmp_path / "archive",), out=tmp_path / "again"))
     assert text_of(tmp_path / "again") == text_of(reported)
     for path in (tmp_path / "again").glob("*.png"):
         assert path.read_bytes() == (reported / path.name).read_bytes()
 
 
-def test_an_archive_is_small_and_always_the_same(reported, tmp_path):
-    run = reported / "continual-bgpo"
-    for name in ("a", "b"):
-        archive_run(run, tmp_path / name)
-    archive_run(tmp_path / "a", tmp_path / "c")  # from the compact form
-    bytes_of = [{p.name: p.read_bytes() for p in (tmp_path / n).iterdir()} for n in "abc"]
-    assert bytes_of[0] == bytes_of[1] == bytes_of[2]
-    whole = {"config.json", "summary.json", "final.csv", "cost.csv"}
-    packed = {"train.csv.gz", "eval.csv.gz", "gwr.csv.gz"}
-    assert {path.name for path in (tmp_path / "a").iterdir()} == whole | packed
-    for name in whole:
-        assert (tmp_path / "a" / name).read_bytes() == (run / name).read_bytes()
-    head = gzip.decompress((tmp_path / "a" / "train.csv.gz").read_bytes()).decode().split("\n")[0]
-    assert head == "seed,episode,task,success,num_nodes,group,num_groups"
-    head = gzip.decompress((tmp_path / "a" / "eval.csv.gz").read_bytes()).decode().split("\n")[0]
-    assert head == "algorithm,seed,episode,task,success,steps"
+def test_every_algorithm_has_a_name_in_tables():
+    assert set(NAMES) == set(ALGORITHMS)
 
 
-def test_an_archive_is_not_written_over_another_run(tmp_path):
-    run, other = (write_run(tmp_path, name, 9) for name in ("bgpo", "oracle"))
-    before = contents(tmp_path)
-    with pytest.raises(ValueError, match="is the run itself: name another folder"):
-        archive_run(run, run)
-    with pytest.raises(ValueError, match="holds another run: name another folder"):
-        archive_run(run, other)
-    assert contents(tmp_path) == before
+@pytest.fixture
+def pair(tmp_path):
+    """A run at 40, 50 and 40 %, and one of eight tenths of its length at 90, 80 and 100 %."""
+    first = write_run(tmp_path, "oracle", [4, 5, 4], starts=STARTS)
+    second = write_run(tmp_path, "bgpo", [9, 8, 10], starts=STARTS, episodes=32)
+    return first, second
 
 
-def test_variants_that_are_algorithms_are_the_same_in_all():
-    for variant, algorithm in SAME.items():
-        assert ABLATIONS[variant].config == ALGORITHMS[algorithm].config
-    assert set(NAMES) == (set(ALGORITHMS) | set(ABLATIONS)) - set(SAME)
+def compared(*runs, **options):
+    text = report(ReportArguments(runs, compare=True, **options))
+    lines = [line for line in text.splitlines() if line.startswith("|")]
+    return text, [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:]]
 
 
-def test_summaries_that_are_damaged_are_refused(tmp_path):
-    run = write_run(tmp_path, "bgpo", 9)
-    (run / "summary.json").write_text(json.dumps({"nodes": "many"}))
-    with pytest.raises(ValueError, match=r"summary\.json is damaged"):
-        report.main(report.Arguments((tmp_path,)))
+def test_two_runs_are_compared_seed_by_seed_on_the_episodes_of_both(pair):
+    before = contents(pair[0].parent)
+    _, (*tasks, mean) = compared(*pair)
+    assert [row[1] for row in tasks] == list(TASKS)
+    # At episode 32, the first run is at half of its level, rounded down: 20 % in each seed.
+    by_hand = statistics.difference([0.9, 0.8, 1.0], [0.2, 0.2, 0.2])
+    assert mean == [
+        *("last 10 %", "all", "20.0", "90.0"),
+        *(by_hand.estimate.points(), "0.100", by_hand.note),
+    ]
+    assert [row[2:] for row in tasks] == [mean[2:]] * 3
+    assert contents(pair[0].parent) == before
+
+
+def test_parts_of_training_leave_out_tasks_that_were_not_presented(pair):
+    _, rows = compared(*pair, every=14)
+    assert [row[0] for row in rows] == ["to 14"] * 2 + ["to 28"] * 4 + ["last 10 %"] * 4
+    # To 28, tests at 26 and 28 of the second run are in its last fifth, five before are not.
+    halves = [(2 * late + 5 * half) / 7 for late, half in ((9, 4), (8, 4), (10, 5))]
+    assert rows[2][2:4] == ["20.0", f"{10 * sum(halves) / 3:.1f}"]
+
+
+def test_runs_under_other_conditions_or_of_other_tasks_are_not_compared(pair, tmp_path):
+    edit(pair[0] / "config.json", held_out="test")
+    with pytest.raises(ValueError, match=r"differ in held_out \(test and validation\)"):
+        compared(*pair)
+    assert "differ in held_out (test and validation)" in compared(*pair, anyway=True)[0]
+    other = write_run(tmp_path, "ddpg", 3, tasks=("pull",), starts=(0,))
+    with pytest.raises(ValueError, match="only runs of the same tasks"):
+        compared(pair[0], other, anyway=True)

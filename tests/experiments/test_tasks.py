@@ -1,10 +1,10 @@
-"""The table and the picture of the suite's tasks."""
+"""The tables and the pictures of the suite's tasks."""
 
-import nico_tasks
 import numpy as np
 import pytest
 from PIL import Image
 
+from bgpo_trl.experiments import tasks as nico_tasks
 from suites import nico
 
 
@@ -28,14 +28,14 @@ def judged(monkeypatch):
     monkeypatch.setattr(nico_tasks.nico, "TASKS", {"always": Reward, "never": Never})
 
 
-def test_chance_is_counted_for_each_task_in_the_same_episodes(judged):
+def test_random_actions_are_counted_for_each_task(judged):
     assert nico_tasks.chance(("always", "never"), episodes=2, seed=0) == {
         "always": 1.0,
         "never": 0.0,
     }
 
 
-def test_chance_is_that_of_episodes_of_the_task_alone():
+def test_success_of_random_actions_equals_that_in_the_task_alone():
     tasks = ("push_glass_right", "push_white_right")
     together = nico_tasks.chance(tasks, episodes=12, seed=3)
 
@@ -53,7 +53,7 @@ def test_chance_is_that_of_episodes_of_the_task_alone():
     assert any(together.values())
 
 
-def test_a_condition_has_to_last_in_each_task_for_itself(monkeypatch):
+def test_each_task_counts_the_steps_of_its_own_condition(monkeypatch):
     class Odd(nico.NicoTask):
         """Condition: the step is an odd one."""
 
@@ -82,18 +82,13 @@ def test_a_condition_has_to_last_in_each_task_for_itself(monkeypatch):
     assert found == {"odd": 1.0, "two odd": 0.0, "late": 1.0, "too late": 0.0}
 
 
-def test_tables_and_pictures_have_a_row_for_each_task_and_object(monkeypatch, tmp_path, capsys):
+def test_tables_and_pictures_have_a_row_for_each_task_and_object(monkeypatch, tmp_path):
     tasks = ("push_green_to_white", "press_white")
     monkeypatch.setattr(nico_tasks.nico, "ALL_TASKS", tasks)
 
-    nico_tasks.main(nico_tasks.Arguments(starts=2, seed=1, pictures=tmp_path))
-
-    header, _, *rows, _, deviation, _, glass, green, white, _, alike, first, second = (
-        capsys.readouterr().out.splitlines()
-    )
-    assert header == "| task | random actions | demonstrator | steps |"
+    printed = nico_tasks.tasks(nico_tasks.TasksArguments(starts=2, seed=1, pictures=tmp_path))
+    _, _, *rows, _, _, _, glass, green, white, _, alike, first, second = printed.splitlines()
     assert [row.split("`")[1] for row in rows] == list(tasks)
-    assert deviation == "| standard deviation of the start, cm | x | y |"
     env = nico.load("grasp_glass", seed=1, observation="state")
     places = []
     for _ in range(2):

@@ -1,10 +1,9 @@
-"""The paper's experiments: what they run and what they leave behind."""
+"""The paper's experiments: what they run and which files they write."""
 
 import csv
 import json
 import os
 import re
-import runpy
 import signal
 import subprocess
 import sys
@@ -14,11 +13,11 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import concurrent_tasks, continual, report
-from bgpo_trl.algorithms import ALGORITHMS
-from bgpo_trl.experiments import measure
+from bgpo_trl.algorithms import ABLATIONS, ALGORITHMS
 from bgpo_trl.experiments import run as experiment
-from bgpo_trl.experiments.arguments import Arguments, command_line
+from bgpo_trl.experiments.arguments import AblationArguments, Arguments
+from bgpo_trl.experiments.paper import ablation, concurrent, continual
+from bgpo_trl.experiments.report import ReportArguments, report
 from bgpo_trl.files.checkpoint import load_checkpoint
 from bgpo_trl.runs.results import read_final_tests, read_table, read_tests
 from suites import nico
@@ -26,30 +25,17 @@ from tests.folders import contents
 
 ROOT = Path(__file__).parents[2]
 TASKS = nico.PAPER_TASKS
+WITH_GROUPS = ("bgpo", "bgpo-experts", "group-balanced-replay")
+WITHOUT_GWR = ("maml", "dist-nll", "oracle", "ddpg", "without-gwr", "without-both")
 
 
-def test_continual_leaves_curve_and_figures(tiny, tmp_path, capsys):
-    continual.main(Arguments(out=tmp_path / "run"))
-    run_directory = tmp_path / "run"
-    for name in ("success.png", "gwr.png", "gwr_growth.png", "groups.png"):
-        assert (run_directory / "figures" / name).read_bytes().startswith(b"\x89PNG")
-    assert json.loads((run_directory / "config.json").read_text())["episodes"] == 6
-    printed = capsys.readouterr().out
-    assert "GWR-B nodes: [" in printed
-    assert "groups of behaviors: [" in printed
-    assert f"curve and figures: {run_directory}" in printed
-
-    before = contents(run_directory)
-    with pytest.raises(ValueError, match="holds a run: --resume continues it, --out names another"):
-        continual.main(Arguments(out=run_directory))
-    assert contents(run_directory) == before
-
-
-def test_concurrent_presents_all_tasks_from_the_start(tiny, tmp_path, capsys, monkeypatch):
-    run, asked, test = tmp_path / "run", [], measure._final_tests
-    monkeypatch.setattr(measure, "_final_tests", lambda *a, **b: asked.append(b) or test(*a, **b))
-    concurrent_tasks.main(Arguments(out=run))
-    assert asked == [{"episodes": 20}]  # of which `tiny` leaves two
+def test_an_experiment_writes_curves_figures_and_a_summary(tiny, tmp_path):
+    run = tmp_path / "run"
+    printed = concurrent(Arguments(out=run))
+    assert "GWR-B nodes: [" in printed and "groups of behaviors: [" in printed
+    assert f"curve and figures: {run}" in printed
+    for name in ("success.png", "gwr.png", "gwr_growth.png", "groups.png", "episodes.png"):
+        assert (run / "figures" / name).read_bytes().startswith(b"\x89PNG")
     assert json.loads((run / "config.json").read_text())["task_starts"] == [0, 0, 0]
     assert set(read_tests(run / "eval.csv")["task"]) == set(TASKS)
 
@@ -58,65 +44,51 @@ def test_concurrent_presents_all_tasks_from_the_start(tiny, tmp_path, capsys, mo
     assert sorted(keys) == sorted(
         (seed, kind, task) for seed in (3, 8) for kind in ("seen", "held-out") for task in TASKS
     )
-    assert set(tests["episodes"]) == {"2"}
     assert set(2 * tests["success"]) <= {0, 1, 2}
     assert tests["task_inference"].between(0, 1).all()
-    told = json.loads((run / "summary.json").read_text())
-    assert re.fullmatch(r"|[0-9a-f]{7,}(-dirty)?", told["commit"])
-    assert len(told["nodes"]) == 2
-    assert told["random_success"] == pytest.approx(dict(zip(TASKS, [0.1, 0.2, 0.3], strict=True)))
+    summary = json.loads((run / "summary.json").read_text())
+    assert re.fullmatch(r"|[0-9a-f]{7,}(-dirty)?", summary["commit"])
+    assert summary["random_success"] == pytest.approx(
+        dict(zip(TASKS, [0.1, 0.2, 0.3], strict=True))
+    )
     nodes = read_table(run / "gwr.csv")
-    assert nodes.shape == (told["nodes"][0], 34)
+    assert nodes.shape == (summary["nodes"][0], 34)
     assert set(nodes["task"]) <= {"-1", "0", "1", "2"}
-    assert set(nodes["group"].astype(int)) <= set(range(told["groups"][0]))
-    assert (run / "figures" / "episodes.png").read_bytes().startswith(b"\x89PNG")
+    assert set(nodes["group"].astype(int)) <= set(range(summary["groups"][0]))
 
-    capsys.readouterr()
-    report.main(report.Arguments((run,)))
-    printed = capsys.readouterr().out
-    late = read_tests(run / "eval.csv").groupby("task")["success"].mean()  # tested once
-    for task in TASKS:
-        assert f"| {task} | {100 * late[task]:.1f}" in printed
-    assert (run / "concurrent-3.png").read_bytes().startswith(b"\x89PNG")
+    before = contents(run)
+    with pytest.raises(ValueError, match="holds a run: --resume continues it, --out names another"):
+        concurrent(Arguments(out=run))
+    assert contents(run) == before
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
-def test_the_command_line_runs_every_algorithm_and_says_its_name(
-    tiniest, monkeypatch, tmp_path, capsys, name
-):
+def test_every_algorithm_runs_and_is_reported_under_its_name(tiniest, tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["concurrent_tasks.py", "--algorithm", name])
-    runpy.run_path(str(ROOT / "benchmarks" / "concurrent_tasks.py"), run_name="__main__")
-    run = Path("runs") / f"concurrent-{name}-quick"
-    printed = capsys.readouterr().out
+    if name in ABLATIONS:
+        printed, run = ablation(AblationArguments(variant=name)), f"runs/ablation-{name}-quick"
+    else:
+        printed, run = concurrent(Arguments(algorithm=name)), f"runs/concurrent-{name}-quick"
+    run = Path(run)
     assert f"curve and figures: {run}" in printed
     config = json.loads((run / "config.json").read_text())
-    assert config["name"] == name
-    assert config["algorithm"].get("beta") == (
-        None if name.startswith(("maml", "dist-nll")) else 0.1
-    )
+    assert (config["name"], config["task_starts"]) == (name, [0, 0, 0])
     for file in ("train.csv", "eval.csv"):
         table = read_table(run / file)
-        assert set(table["algorithm"]) == {name}
-        assert set(table["task"]) == set(TASKS)
-
-    # Lines on GWR-B appear only with algorithms that have one.
-    with_gwr = name.startswith("bgpo")
-    told = json.loads((run / "summary.json").read_text())
-    assert (told["nodes"] is not None) == with_gwr
+        assert (set(table["algorithm"]), set(table["task"])) == ({name}, set(TASKS))
+    learner = load_checkpoint(run / "checkpoint")["algorithm"]
+    with_gwr, with_groups = not name.startswith(WITHOUT_GWR), name in WITH_GROUPS
+    summary = json.loads((run / "summary.json").read_text())
+    assert (summary["nodes"] is not None) == ("gwr" in learner) == with_gwr
+    assert (summary["groups"] is not None) == ("groups" in learner) == with_groups
     for file in ("gwr.csv", "figures/gwr.png"):
         assert (run / file).exists() == with_gwr
-    # And of groups, where behaviors are told apart.
-    with_groups = name in ("bgpo", "bgpo-experts")
-    assert (told["groups"] is not None) == (run / "figures/groups.png").exists() == with_groups
-    if with_gwr:
-        assert ("group" in read_table(run / "gwr.csv")) == with_groups
+    assert (run / "figures/groups.png").exists() == with_groups
     assert ("GWR-B" in printed) == ("task inference" in printed) == with_gwr
     tests = read_final_tests(run / "final.csv")
-    assert len(tests) == 2 * 2 * 3
     assert (tests["task_inference"].notna() == with_gwr).all()
-    report.main(report.Arguments((run,)))
-    reported = capsys.readouterr().out
+
+    reported = report(ReportArguments((run,)))
     assert ("## GWR-B, by seed" in reported) == with_gwr
     assert ("one for all" in reported) == (with_gwr and not with_groups)
     assert "nan" not in reported
@@ -124,45 +96,55 @@ def test_the_command_line_runs_every_algorithm_and_says_its_name(
     lines = [line.split(" | ") for line in reported.splitlines() if line.startswith("| ")]
     for task in TASKS:
         (row,) = (line for line in lines if line[0] == f"| {task}")
-        assert (row[7] != "") == with_gwr
         for cell, kind in ((row[5], "seen"), (row[6], "held-out")):
             assert float(cell) == pytest.approx(100 * trained[task, kind], abs=0.05)
 
 
-def test_a_finished_run_only_says_so_until_it_is_made_longer(
-    undrawn, tmp_path, monkeypatch, capsys
+@pytest.mark.parametrize(
+    ("experiment", "arguments", "name"),
+    [
+        (continual, Arguments(rl="sac"), "continual-bgpo-sac-quick"),
+        (ablation, AblationArguments(rl="sac", continual=True), "ablation-continual-bgpo-single"),
+    ],
+)
+def test_the_default_directory_names_experiment_algorithm_and_rl_algorithm(
+    tiny, tmp_path, monkeypatch, experiment, arguments, name
 ):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "taken").touch()
+    monkeypatch.setattr("bgpo_trl.experiments.run.holds_run", lambda out: True)
+    with pytest.raises(ValueError, match=f"runs/{name}.* holds a run"):
+        experiment(arguments)
+
+
+def test_a_finished_run_is_only_changed_by_making_it_longer(undrawn, tmp_path, monkeypatch):
     run = tmp_path / "run"
     arguments = Arguments(out=run)
-    continual.main(arguments)
+    continual(arguments)
     before, played = contents(run), (run / "train.csv").read_text()
     again = replace(arguments, resume=True)
     with monkeypatch.context() as patch:
         for name in ("load_pretrained", "make_pretrained", "Trainer", "measure", "draw"):
             patch.delattr(experiment, name)
         for same in (again, replace(again, episodes=6), replace(again, train_encoders=True)):
-            capsys.readouterr()
-            continual.main(same)
-            told = f"{run} is finished, all 6 episodes: --episodes makes it longer\n"
-            assert capsys.readouterr() == (told, "")
+            assert continual(same).startswith(f"{run} is finished, all 6 episodes")
     assert contents(run) == before
 
     others = [{"episodes": 5}, {"seeds": (3,)}, {"eval_every": 3}, {"episodes": 9, "eval_every": 3}]
     for other in others:
         with pytest.raises(ValueError, match="holds a run with other settings"):
-            continual.main(replace(again, **other))
+            continual(replace(again, **other))
     with pytest.raises(ValueError, match=r"with other settings .*task_starts is \[0, 2, 4\] there"):
-        concurrent_tasks.main(replace(again, episodes=9))
+        concurrent(replace(again, episodes=9))
     assert contents(run) == before
 
     (run / "final.csv").unlink()  # as if it had been interrupted in its last tests
-    continual.main(again)
+    continual(again)
     assert (run / "final.csv").exists()
     assert (run / "train.csv").read_text() == played
 
     for _ in range(2):
-        capsys.readouterr()
-        continual.main(replace(again, episodes=9))
+        printed = continual(replace(again, episodes=9))
         settings = json.loads((run / "config.json").read_text())
         assert (settings["episodes"], settings["task_starts"]) == (9, [0, 2, 4])
         assert settings["eval_every"] == 2
@@ -170,45 +152,60 @@ def test_a_finished_run_only_says_so_until_it_is_made_longer(
         train = (run / "train.csv").read_text()
         assert train.startswith(played)
         assert train.count("\n") == 1 + 2 * 9
-    assert capsys.readouterr().out.startswith(f"{run} is finished, all 9 episodes")
+    assert printed.startswith(f"{run} is finished, all 9 episodes")
 
 
-def test_what_is_not_there_yet_begins_when_it_is_resumed(undrawn, tmp_path, monkeypatch):
+def test_resume_with_the_directory_alone_takes_the_settings_of_the_run(undrawn, tmp_path):
+    """A run of other settings than the preset's, also when it is extended."""
+    run = tmp_path / "run"
+    begun = Arguments(
+        out=run, algorithm="bgpo-single", episodes=4, settings=("--algorithm.beta", "0.3")
+    )
+    continual(begun)
+    played = (run / "train.csv").read_text()
+    alone = Arguments(out=run, resume=True)
+    assert continual(alone).startswith(f"{run} is finished, all 4 episodes")
+    continual(replace(alone, episodes=5))
+    config = json.loads((run / "config.json").read_text())
+    assert (config["name"], config["algorithm"]["beta"]) == ("bgpo-single", 0.3)
+    assert (run / "train.csv").read_text().startswith(played)
+    assert (run / "train.csv").read_text().count("\n") == 1 + 2 * 5
+    before = contents(run)
+    with pytest.raises(ValueError, match="holds a run with other settings"):
+        continual(replace(alone, algorithm="bgpo"))
+    assert contents(run) == before
+
+
+def test_a_run_that_does_not_exist_begins_when_it_is_resumed(undrawn, tmp_path):
     again = Arguments(out=tmp_path / "run", resume=True, episodes=4)
-    continual.main(again)
-    begun = (tmp_path / "run" / "train.csv").read_text()
-    assert begun.count("\n") == 1 + 2 * 4
-    continual.main(again)
-    assert (tmp_path / "run" / "train.csv").read_text() == begun
+    continual(again)
+    assert (tmp_path / "run" / "train.csv").read_text().count("\n") == 1 + 2 * 4
 
 
-def test_an_interrupted_run_exits_with_a_code_of_its_own(capsys):
-    def interrupted(arguments):
-        raise KeyboardInterrupt
-
-    with pytest.raises(SystemExit) as left:
-        command_line(interrupted, None, options=[])
-    assert left.value.code == 75
-    assert capsys.readouterr().err == "interrupted: the same command with --resume continues\n"
+def test_the_config_of_a_run_repeats_it(undrawn, tmp_path):
+    first, second = tmp_path / "first", tmp_path / "second"
+    continual(Arguments(out=first, episodes=4, seeds=(8,), settings=("--algorithm.beta", "0.3")))
+    continual(Arguments(out=second, config=first))
+    for name in ("config.json", "train.csv", "eval.csv"):
+        assert (second / name).read_bytes() == (first / name).read_bytes()
 
 
-def test_a_run_that_was_interrupted_before_its_training_is_resumed(
+def test_a_run_that_was_interrupted_while_it_made_encoders_is_resumed(
     undrawn, tmp_path, monkeypatch, encoders, bank
 ):
     monkeypatch.setattr(experiment, "make_pretrained", lambda *_, **__: (encoders, bank))
     (tmp_path / "demonstrations").mkdir()
     arguments = Arguments(out=tmp_path, resume=True, episodes=2)
     with pytest.raises(ValueError, match="beginning of new encoders: add --train-encoders"):
-        continual.main(arguments)
+        continual(arguments)
     assert [path.name for path in tmp_path.iterdir()] == ["demonstrations"]
-    continual.main(replace(arguments, train_encoders=True))
+    continual(replace(arguments, train_encoders=True))
     assert (tmp_path / "summary.json").exists()
 
 
-def test_another_process_is_kept_off_all_of_an_experiment(
+def test_the_directory_is_locked_from_the_encoders_to_the_figures(
     undrawn, tmp_path, monkeypatch, other_process
 ):
-    """Also while it makes its encoders, and while it is tested and drawn."""
     events, steps = [], ["load_pretrained", "measure", "draw"]
     for name in steps:
         function = getattr(experiment, name)
@@ -220,12 +217,12 @@ def test_another_process_is_kept_off_all_of_an_experiment(
             return function(*args, **kwargs)
 
         monkeypatch.setattr(experiment, name, do)
-    continual.main(Arguments(out=tmp_path / "run"))
+    continual(Arguments(out=tmp_path / "run"))
     assert events == steps
     assert not (tmp_path / "run" / "lock").exists()
 
 
-def test_a_dashboard_gets_the_figures_before_it_is_closed(tiniest, monkeypatch, tmp_path):
+def test_a_dashboard_gets_rows_and_figures_before_it_is_closed(tiniest, monkeypatch, tmp_path):
     events = []
 
     class Dashboard:
@@ -246,7 +243,7 @@ def test_a_dashboard_gets_the_figures_before_it_is_closed(tiniest, monkeypatch, 
     figures += [f"{task}.gif" for task in TASKS]
     shown = [(f"figures/{Path(n).stem}", run / "figures" / n) for n in sorted(figures)]
     arguments = Arguments(out=run, wandb="offline")
-    continual.main(arguments)
+    continual(arguments)
     tables = [read_table(run / name) for name in ("train.csv", "eval.csv")]
     assert events == ["row"] * sum(map(len, tables)) + [*shown, "shutdown"]
     for task in TASKS:
@@ -254,13 +251,12 @@ def test_a_dashboard_gets_the_figures_before_it_is_closed(tiniest, monkeypatch, 
 
     events.clear()
     (run / "summary.json").unlink()  # as if it had been killed when training was over
-    continual.main(replace(arguments, resume=True))
+    continual(replace(arguments, resume=True))
     assert events == [*shown, "shutdown"]
 
 
 @pytest.mark.slow
-def test_smoke_goes_through_every_stage_from_nothing(tmp_path):
-    """Interrupted once on the way, like a person would: the same command goes on."""
+def test_the_smoke_preset_passes_every_stage_although_it_is_interrupted(tmp_path):
     script = str(ROOT / "benchmarks" / "continual.py")
     command = [sys.executable, script, "--preset", "smoke", "--out", "run"]
     options = {"cwd": tmp_path, "env": {**os.environ, "PYTHONPATH": str(ROOT)}, "text": True}
@@ -274,10 +270,11 @@ def test_smoke_goes_through_every_stage_from_nothing(tmp_path):
     assert process.returncode == os.EX_TEMPFAIL
     assert load_checkpoint(tmp_path / "run" / "checkpoint")["evaluator"]["next"] < 2
 
-    result = subprocess.run([*command, "--resume"], capture_output=True, **options)
+    result = subprocess.run(
+        [sys.executable, script, "--out", "run", "--resume"], capture_output=True, **options
+    )
     assert result.returncode == 0, result.stderr
-    told = "curve and figures: run; in numbers: python benchmarks/report.py run\n"
-    assert result.stdout.endswith(told)
+    assert result.stdout.endswith("curve and figures: run; in numbers: bgpo report run\n")
     for name in (
         *("config.json", "train.csv", "eval.csv", "figures/success.png", "figures/gwr.png"),
         *("encoders/nico.safetensors", "encoders/nico_bank.safetensors", "encoders/probes.json"),
