@@ -96,14 +96,15 @@ def check_versions() -> Iterator[Finding]:
         wanted = Requirement(line)
         if wanted.marker is not None and not wanted.marker.evaluate({"extra": ""}):
             continue
+        remedy = f"pip install '{wanted.name}{wanted.specifier}'"
         try:
             found = importlib.metadata.version(wanted.name)
         except importlib.metadata.PackageNotFoundError:
-            found = "not installed"
-        if found != "not installed" and wanted.specifier.contains(found, prereleases=True):
+            yield Finding("wrong", wanted.name, f"not installed: {remedy}")
+            continue
+        if wanted.specifier.contains(found, prereleases=True):
             yield Finding("ok", wanted.name, found)
         else:
-            remedy = f"pip install '{wanted.name}{wanted.specifier}'"
             yield Finding("wrong", wanted.name, f"{found}: {remedy}")
 
 

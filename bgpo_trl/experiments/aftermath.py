@@ -204,7 +204,8 @@ class Row(NamedTuple):
 
 def policy_episodes(run: LoadedRun, episodes: int) -> list[Episode]:
     """Return the test episodes of all seeds' trained policies, as many of each task and seed."""
-    evaluator, first = evaluator_of(run, episodes), list[NDArray]()
+    held_out = run.bank.held_out(run.config.held_out)
+    evaluator, first = evaluator_of(run, held_out, episodes), list[NDArray]()
 
     def states() -> NDArray:
         found = evaluator.simulation.simulation_state()["physics"].numpy()

@@ -101,7 +101,7 @@ class Arguments(BankArguments):
     threads: int = 1
     """Threads of PyTorch; more than one slows these small networks down. Physics always uses all
     cores."""
-    settings: tyro.conf.Suppress[tuple[str, ...]] = ()
+    hyperparameters: tyro.conf.Suppress[tuple[str, ...]] = ()
     """Flags of single hyperparameters, which `run_config` reads."""
 
 

@@ -61,11 +61,11 @@ def _parse(
     unprefixed: Any = Annotated[kind, tyro.conf.OmitArgPrefixes]
     description = re.split(_SECTIONS, inspect.getdoc(command) or "")[0]
     settings: dict[str, Any] = {"prog": program, "description": description, "args": options}
-    if hasattr(kind, "settings"):
+    if hasattr(kind, "hyperparameters"):
         arguments, rest = tyro.cli(unprefixed, **settings, return_unknown_args=True)
         flags = [word for word in rest if word.startswith("--")]
         if not rest or (rest[0] in flags and all(f.startswith("--algorithm.") for f in flags)):
-            return replace(arguments, settings=tuple(rest))
+            return replace(arguments, hyperparameters=tuple(rest))
     return tyro.cli(unprefixed, **settings)
 
 

@@ -141,9 +141,10 @@ def measure_looking(
     if episodes < 1:
         raise ValueError(f"--episodes must be at least 1, got {episodes}")
     config, found = run.config, {}
+    held_out = run.bank.held_out(config.held_out)
     for name, hidden in VIEWS.items():
         make_env = None if hidden is None else partial(HidingEnv, hidden=hidden)
-        evaluator = evaluator_of(run, episodes, make_env)
+        evaluator = evaluator_of(run, held_out, episodes, make_env=make_env)
         snapshots = snapshots_of(run, evaluator, _NUMBER)
         success = evaluator.run(snapshots, run.algorithm.device, watch).success
         found[name] = success.double().mean(-1).numpy()

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import tempfile
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 import torch
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
@@ -20,13 +20,13 @@ from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.encoders.representation import embed_demonstrations
 from bgpo_trl.evaluation import Evaluator, Snapshot
 from bgpo_trl.experiments.arguments import TrainedArguments
+from bgpo_trl.experiments.episodes import evaluator_of
 from bgpo_trl.experiments.records import commit_of_code, write_measurement
 from bgpo_trl.figures.style import COLORS, save_figure
 from bgpo_trl.machine import set_threads
 from bgpo_trl.own_module import import_own
 from bgpo_trl.policy import TrainedPolicy, load_run
 from bgpo_trl.seeding import stream_seed
-from bgpo_trl.transforms import TaskSchedule
 
 # Number of the evaluation; it seeds start states that neither training nor final tests used.
 _NUMBER = 2**31 + 1
@@ -122,15 +122,7 @@ def measure(policy: TrainedPolicy, shares: Sequence[float], episodes: int, seed:
     if episodes < 1:
         raise ValueError(f"--episodes must be at least 1, got {episodes}")
     tasks, config = policy.tasks, policy.config
-    evaluator = Evaluator(
-        config.algorithm,
-        seeds=config.seeds,
-        schedule=TaskSchedule((0,) * len(tasks)),
-        episodes=episodes,
-        bank=policy.bank.held_out(),
-        encoders=policy.encoders,
-        spread=config.spread,
-    )
+    evaluator = evaluator_of(policy, policy.bank.held_out(), episodes)
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         shown = record_demonstrations(
@@ -142,7 +134,7 @@ def measure(policy: TrainedPolicy, shares: Sequence[float], episodes: int, seed:
             seed=seed,
             progress=False,
         ).to_tensordict()
-    length = shown["length"].clone()
+    length = shown.get("length").clone()
     for share in shares:
         shown["length"] = (share * length).round().long().clamp(min=1)
         embedding = embed_demonstrations(policy.encoders, shown).view(len(tasks), episodes, -1)
@@ -156,16 +148,17 @@ def means(rows: Sequence[Row]) -> dict[str, dict[float, np.ndarray]]:
 
     The key ``"all"`` holds the means over tasks.
     """
-    found: dict[str, dict[float, dict[int, list]]] = defaultdict(lambda: defaultdict(dict))
-    for share, seed, task, _, *values in rows:
-        for name in ("all", task):
-            found[name][share].setdefault(seed, []).append(values)
+    table = pd.DataFrame(rows)
+    measures, shares = ["success", "task_inference", "activity"], table["share"].unique()
     return {
         task: {
-            share: np.array([np.mean(values, axis=0) for values in seeds.values()])
-            for share, seeds in shares.items()
+            share: of_task[of_task["share"] == share]
+            .groupby("seed", sort=False)[measures]
+            .mean()
+            .to_numpy()
+            for share in shares
         }
-        for task, shares in found.items()
+        for task, of_task in [("all", table), *table.groupby("task", sort=False)]
     }
 
 

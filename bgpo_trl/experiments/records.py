@@ -45,6 +45,11 @@ def write_measurement(
         commit: Result of `commit_of_code` when the measurement began.
     """
     make_folder(folder)
-    table = pd.DataFrame([*rows], columns=[*columns])
-    write_whole(folder / f"{name}.csv", table.to_csv(index=False, lineterminator="\r\n"))
+    write_rows(folder / f"{name}.csv", columns, rows)
     write_json(folder / f"{name}.json", {"commit": commit, "command": command()})
+
+
+def write_rows(path: Path, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    """Write a CSV file; NaN becomes an empty cell."""
+    table = pd.DataFrame([*rows], columns=[*columns])
+    write_whole(path, table.to_csv(index=False, lineterminator="\r\n"))

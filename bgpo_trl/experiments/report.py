@@ -259,11 +259,12 @@ def report(arguments: ReportArguments) -> str:
     """
     if arguments.compare:
         return compare(arguments.runs, every=arguments.every, anyway=arguments.anyway)
-    if not arguments.runs:
+    named = list(arguments.runs)
+    if not named:
         raise ValueError("name a run, or a folder of runs")
-    if arguments.out is None and arguments.archive is None and len(arguments.runs) > 1:
+    if arguments.out is None and arguments.archive is None and len(named) > 1:
         raise ValueError("--out: several folders are given, name that of the report")
-    directories = run_directories(arguments.runs)
+    directories = run_directories(named)
     if arguments.archive is not None:
         if len({directory.name for directory in directories}) < len(directories):
             raise ValueError("--archive: runs of the same name are given, use one folder for each")
@@ -272,9 +273,9 @@ def report(arguments: ReportArguments) -> str:
         for directory, copy in zip(directories, copies, strict=True):
             archive_run(directory, copy)
         directories = copies
-    out = arguments.out or arguments.archive or arguments.runs[0]
+    out = arguments.out or arguments.archive or named[0]
     made = make_report(directories, out, anyway=arguments.anyway)
-    for directory in directories if directories == list(arguments.runs) else ():
+    for directory in directories if directories == named else ():
         run = made.runs.get(directory)
         if run is not None and max(run.summary.get("groups") or [0]) > 1:
             draw_groups(directory, presented(run), out / f"{directory.name}-groups.png")

@@ -63,8 +63,8 @@ def run_config(
     config = replace(config, **{name: value for name, value in given.items() if value is not None})
     if from_start:
         config = at_once(config)
-    if arguments.settings:
-        config = tyro.cli(RunConfig, default=config, args=arguments.settings)
+    if arguments.hyperparameters:
+        config = tyro.cli(RunConfig, default=config, args=arguments.hyperparameters)
     if config.eval_every > config.episodes:
         raise ValueError(
             f"eval_every must be at most the {config.episodes} episodes of the run, got "

@@ -7,15 +7,6 @@ runs twelve jobs, as many at a time as there are cores. A job is a block of seed
 in one setting, with a run directory such as ``runs/sweep/concurrent-bgpo/seeds-0-1-2-3-4``.
 Finished blocks are merged into ``runs/sweep/concurrent-bgpo``, which holds the files of one run of
 all seeds: ``bgpo report runs/sweep`` reads it.
-
-The same command resumes an interrupted sweep without repeating finished jobs, and seeds may be
-added. A job whose worker or machine is lost continues elsewhere from its last checkpoint. A job
-that fails with an error (such as a full disk or a damaged file) is reported after the others have
-finished.
-
-On a cluster (``--address auto`` on one of its machines, or ``HOST:6379``) all machines need Ray and
-bgpo_trl with its dependencies, and must see this checkout and ``--out`` at the same path of a
-shared file system. Its file locks must hold across machines, as they do on NFS.
 """
 
 from __future__ import annotations

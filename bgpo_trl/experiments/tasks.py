@@ -17,6 +17,7 @@ from suites.nico.base import CONTROL_TIMESTEP, TIME_LIMIT, Environment
 from suites.nico.demonstrator import Demonstrator
 
 _COLUMNS, _WIDTH, _HEIGHT, _TITLE, _GAP = 6, 128, 64, 14, 4
+_STEPS = round(TIME_LIMIT / CONTROL_TIMESTEP)
 _SPREADS = (0.0, 0.5, 1.0)  # of which start states are drawn
 
 
@@ -66,54 +67,21 @@ def places(physics: nico.Physics) -> NDArray[np.float64]:
     return np.stack([physics.object_position(name)[:2] for name in nico.OBJECTS])
 
 
-class _Judge(nico.NicoTask):
-    """Task that never ends and notes which of the others are solved.
+def chance(name: str, episodes: int, seed: int) -> float:
+    """Return the share of episodes of 50 uniformly random actions that solve a task.
 
-    Each of them counts the steps for which its condition holds, as it would alone.
+    Episodes of all tasks have the same starts and actions.
     """
-
-    def __init__(self, tasks: Sequence[str], seed: int) -> None:
-        super().__init__(random=seed, observation="state")
-        self._tasks = {name: nico.TASKS[name](random=0) for name in tasks}
-        self._counts = dict.fromkeys(tasks, 0)
-        self.solved: set[str] = set()
-
-    def initialize_episode(self, physics: nico.Physics) -> None:
-        super().initialize_episode(physics)
-        self._counts = dict.fromkeys(self._tasks, 0)
-        self.solved = set()
-
-    def after_step(self, physics: nico.Physics) -> None:
-        for name, task in self._tasks.items():
-            self._counts[name] = self._counts[name] + 1 if task.succeeded(physics) else 0
-            if self._counts[name] >= task.steady_steps:
-                self.solved.add(name)
-
-    def get_reward(self, physics: nico.Physics) -> float:
-        del physics
-        return 0.0
-
-    def get_termination(self, physics: nico.Physics) -> None:
-        del physics
-
-
-def chance(tasks: Sequence[str], episodes: int, seed: int) -> dict[str, float]:
-    """Return the share of episodes of 50 uniformly random actions that solve each task.
-
-    The same episodes serve all tasks, which differ only in their rewards.
-    """
-    judge = _Judge(tasks, seed)
-    physics = nico.Physics.from_xml_string(nico.scene_xml())
-    env = Environment(physics, judge, time_limit=TIME_LIMIT, control_timestep=CONTROL_TIMESTEP)
-    random = np.random.default_rng(seed)
-    counts = dict.fromkeys(tasks, 0)
+    env, random = nico.load(name, seed=seed, observation="state"), np.random.default_rng(seed)
+    solved = 0
     for _ in range(episodes):
         timestep = env.reset()
-        while not timestep.last():
-            timestep = env.step(random.uniform(-1.0, 1.0, 4))
-        for name in judge.solved:
-            counts[name] += 1
-    return {name: count / episodes for name, count in counts.items()}
+        for action in random.uniform(-1.0, 1.0, (_STEPS, 4)):
+            timestep = env.step(action)
+            if timestep.last():
+                break
+        solved += bool(timestep.reward)
+    return solved / episodes
 
 
 def draw_demonstrations(tasks: Sequence[str], seed: int) -> Image.Image:
@@ -166,7 +134,6 @@ def tasks(arguments: TasksArguments) -> str:
     if arguments.pictures is not None and not arguments.pictures.is_dir():
         raise ValueError(f"there is no folder {arguments.pictures}: make it first")
     names = nico.ALL_TASKS
-    by_chance = chance(names, arguments.starts, arguments.seed)
     starts: dict[str, NDArray[np.float64]] = {}
     table: Table = [["task", "random actions", "demonstrator", "steps"]]
     for name in names:
@@ -176,7 +143,8 @@ def tasks(arguments: TasksArguments) -> str:
         starts[name] = np.stack([episode.start for episode in episodes])
         success = np.mean([episode.success for episode in episodes])
         steps = np.mean([episode.steps for episode in episodes if episode.success] or [np.nan])
-        table.append([f"`{name}`", f"{by_chance[name]:.1%}", f"{success:.1%}", f"{steps:.1f}"])
+        by_chance = chance(name, arguments.starts, arguments.seed)
+        table.append([f"`{name}`", f"{by_chance:.1%}", f"{success:.1%}", f"{steps:.1f}"])
 
     first = starts[names[0]]
     deviation = 100 * first.std(0, ddof=1)  # (cm)

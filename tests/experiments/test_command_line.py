@@ -170,7 +170,7 @@ def test_without_opengl_neither_recording_nor_run_begins(folder, monkeypatch):
         message = exit_code(monkeypatch, "bgpo concurrent --out new")
     assert "(no display)" in message and "\n" not in message
     monkeypatch.setattr(opengl, "refusal", "MUJOCO_GL is 'vulkan': do not set it")
-    message = exit_code(monkeypatch, "bgpo_trl.data.recording new --per-task 2")
+    message = exit_code(monkeypatch, "bgpo_trl.data.recording new")
     assert message == "error: MUJOCO_GL is 'vulkan': do not set it"
     assert contents(folder) == before
 

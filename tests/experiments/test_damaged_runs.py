@@ -49,10 +49,10 @@ def check_refused(call):
     assert re.search(r": (let|put|name|resume|remove|use|choose|give|only|there is no)", message)
 
 
-def edit(name, **changes):
+def edit(file, **changes):
     def do(run):
-        content = json.loads((run / name).read_text())
-        (run / name).write_text(json.dumps({**content, **changes}))
+        content = json.loads((run / file).read_text())
+        (run / file).write_text(json.dumps({**content, **changes}))
 
     return do
 

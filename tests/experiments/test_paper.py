@@ -159,7 +159,7 @@ def test_resume_with_the_directory_alone_takes_the_settings_of_the_run(undrawn, 
     """A run of other settings than the preset's, also when it is extended."""
     run = tmp_path / "run"
     begun = Arguments(
-        out=run, algorithm="bgpo-single", episodes=4, settings=("--algorithm.beta", "0.3")
+        out=run, algorithm="bgpo-single", episodes=4, hyperparameters=("--algorithm.beta", "0.3")
     )
     continual(begun)
     played = (run / "train.csv").read_text()
@@ -184,7 +184,9 @@ def test_a_run_that_does_not_exist_begins_when_it_is_resumed(undrawn, tmp_path):
 
 def test_the_config_of_a_run_repeats_it(undrawn, tmp_path):
     first, second = tmp_path / "first", tmp_path / "second"
-    continual(Arguments(out=first, episodes=4, seeds=(8,), settings=("--algorithm.beta", "0.3")))
+    continual(
+        Arguments(out=first, episodes=4, seeds=(8,), hyperparameters=("--algorithm.beta", "0.3"))
+    )
     continual(Arguments(out=second, config=first))
     for name in ("config.json", "train.csv", "eval.csv"):
         assert (second / name).read_bytes() == (first / name).read_bytes()

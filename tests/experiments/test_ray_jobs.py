@@ -1,6 +1,5 @@
 """Jobs on a Ray of this machine, and on two machines of which one is lost."""
 
-import csv
 import os
 import signal
 import sys
@@ -18,6 +17,7 @@ from bgpo_trl.configs import BGPOConfig, RunConfig
 from bgpo_trl.experiments import merge
 from bgpo_trl.experiments import ray_jobs as jobs
 from bgpo_trl.experiments.ray_jobs import Job
+from bgpo_trl.runs.results import read_table
 from bgpo_trl.training import Trainer
 
 # Otherwise Ray starts a worker on every core, in vain.
@@ -25,8 +25,7 @@ SMALL = {"include_dashboard": False, "object_store_memory": 80_000_000}
 
 
 def rows(path):
-    with open(path, newline="") as file:
-        return list(csv.DictReader(file))
+    return read_table(path).to_dict("records")
 
 
 def processes_of(folder):

@@ -95,7 +95,7 @@ def test_a_flag_changes_its_setting_alone(changes):
 
 def test_hyperparameters_are_flags():
     flags = ("--algorithm.beta", "0.2", "--algorithm.rl.hidden-sizes", "32", "16")
-    config = run_config(Arguments(algorithm="bgpo-single", settings=flags))
+    config = run_config(Arguments(algorithm="bgpo-single", hyperparameters=flags))
     expected = run_config(Arguments(algorithm="bgpo-single"))
     rl = replace(expected.algorithm.rl, hidden_sizes=(32, 16))
     assert config == replace(expected, algorithm=replace(expected.algorithm, beta=0.2, rl=rl))
@@ -138,7 +138,7 @@ def test_a_file_changes_the_preset_and_flags_change_the_file(tmp_path):
     expected = replace(PRESETS["desk"], name="bgpo-single", eval_every=6, algorithm=algorithm)
     assert run_config(Arguments(config=path, preset="desk")) == expected
     flags = Arguments(
-        config=path, preset="desk", eval_every=9, settings=("--algorithm.beta", "0.7")
+        config=path, preset="desk", eval_every=9, hyperparameters=("--algorithm.beta", "0.7")
     )
     algorithm = replace(algorithm, beta=0.7)
     assert run_config(flags) == replace(expected, eval_every=9, algorithm=algorithm)

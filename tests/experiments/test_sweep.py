@@ -1,7 +1,6 @@
 """The grid of a sweep and the merging of its blocks of seeds, without Ray."""
 
 import contextlib
-import csv
 import json
 import sys
 from dataclasses import replace
@@ -21,22 +20,18 @@ from bgpo_trl.experiments.report import ReportArguments, report
 from bgpo_trl.experiments.sweep import EightTasksArguments, SweepArguments
 from bgpo_trl.runs.config_file import Digests, settings_of
 from bgpo_trl.runs.cost import Cost, read_costs, write_costs
+from bgpo_trl.runs.results import read_table
 from bgpo_trl.training import Trainer
 from suites import nico
+from tests.folders import contents
 
 SOME = Digests("some", "bank")
 BY_TASKS = {nico.PAPER_TASKS: SOME}
 HEAD = "algorithm,seed,episode,env_steps,task,success,return,steps"
 
 
-def contents(folder):
-    files = (path for path in folder.rglob("*") if path.is_file())
-    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
-
-
 def rows(path):
-    with open(path, newline="") as file:
-        return list(csv.DictReader(file))
+    return read_table(path).to_dict("records")
 
 
 def write_run(job):
