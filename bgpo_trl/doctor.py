@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 # Three checkpoints (two kept, one being written) of 10 seeds and 20,000 episodes take 9 GB; three
 # of `--preset quick` 0.2 GB.
@@ -33,22 +33,12 @@ class DoctorArguments:
     """PNG file to write what the robot sees to."""
 
 
-@dataclass(frozen=True)
-class Finding:
-    """Result of one check.
-
-    Attributes:
-        level: ``"ok"``; ``"note"`` for usable with a limitation; ``"wrong"`` for unusable.
-        subject: What was checked.
-        message: Result in one line, with a remedy if something is wrong.
-    """
+class Finding(NamedTuple):
+    """Result of one check: its level, its subject and a line, with a remedy if it is not ok."""
 
     level: Literal["ok", "note", "wrong"]
     subject: str
     message: str
-
-    def __str__(self) -> str:
-        return f"{self.level:<7}{self.subject:<14}{self.message}"
 
 
 def doctor(arguments: DoctorArguments) -> None:
@@ -66,7 +56,7 @@ def doctor(arguments: DoctorArguments) -> None:
     }
     wrong = 0
     for finding in examine(checks):
-        sys.stdout.write(f"{finding}\n")
+        sys.stdout.write(f"{finding.level:<7}{finding.subject:<14}{finding.message}\n")
         sys.stdout.flush()
         wrong += finding.level == "wrong"
     if wrong:
@@ -128,10 +118,8 @@ def check_frame(path: Path | None = None) -> Iterator[Finding]:
     colors = len(np.unique(still.reshape(-1, still.shape[-1]), axis=0))
     changed = int((still != moved).any(-1).sum())
     seen = f"{colors} colors, {changed} pixels change as the arm moves"
-    if colors < _FEWEST_COLORS or not changed:
-        yield Finding("wrong", "frame", f"{seen}: {_OPENGL}")
-    else:
-        yield Finding("ok", "frame", seen)
+    blank = colors < _FEWEST_COLORS or not changed
+    yield Finding("wrong", "frame", f"{seen}: {_OPENGL}") if blank else Finding("ok", "frame", seen)
     if path is not None:
         Image.fromarray(still).resize((640, 320), Image.Resampling.NEAREST).save(path)
 
@@ -150,11 +138,9 @@ def check_frame_rate(seconds: float = 0.5) -> Iterator[Finding]:
         steps += 1
     rate = 10 * steps / (time.perf_counter() - start)
     env.close()
-    if rate < _FEW_FRAMES:
-        remedy = "few; is the machine busy, or MUJOCO_GL another than egl?"
-        yield Finding("note", "frames/s", f"{rate:.0f}: {remedy}")
-    else:
-        yield Finding("ok", "frames/s", f"{rate:.0f}")
+    few = rate < _FEW_FRAMES
+    remedy = ": few; is the machine busy, or MUJOCO_GL another than egl?" if few else ""
+    yield Finding("note" if few else "ok", "frames/s", f"{rate:.0f}{remedy}")
 
 
 def check_threads() -> Iterator[Finding]:

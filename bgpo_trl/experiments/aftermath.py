@@ -73,7 +73,7 @@ class Outcome(NamedTuple):
     """The outcome of a success.
 
     Attributes:
-        holds: Whether it is one in earnest.
+        holds: Whether it lasts.
         distance: Lift, gap or displacement (m), by the task's `Criterion`.
     """
 
@@ -106,7 +106,7 @@ Judge = Callable[[Continuation, Episode], Outcome]
 
 @dataclass(frozen=True)
 class Criterion:
-    """How to find out whether the successes of a task are in earnest."""
+    """Test of whether the successes of a task last."""
 
     distance: str
     """Name of the distance that is measured."""

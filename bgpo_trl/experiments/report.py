@@ -51,7 +51,7 @@ from bgpo_trl.runs.results import find_table, read_table
 
 # For a screen: figures of results are kept under version control.
 _DPI = 150
-# Curves that can be told apart in one figure.
+# Curves that can be distinguished in one figure.
 _CURVES = len(COLORS)
 
 
