@@ -1,41 +1,67 @@
-"""Command line of the installed package: ``python -m bgpo_trl continual --preset quick``."""
+"""The command ``bgpo``, also ``python -m bgpo_trl``.
+
+A sub-command is imported when it is chosen: the list of all is there at once.
+"""
 
 from __future__ import annotations
 
+import importlib
 import sys
+from collections.abc import Callable
 
-USAGE = """usage: python -m bgpo_trl COMMAND [OPTIONS]
+import tyro
 
-  continual   learn the tasks one after the other
-  concurrent  learn all tasks from the start
-  ablation    learn with a variant of BGPO
-  watch       film what a run has learned
-  doctor      check this installation
+COMMANDS = {
+    "continual": ("experiments.paper", "Train on tasks presented one after the other (Fig. 8)."),
+    "concurrent": ("experiments.paper", "Train on all tasks from the start (Fig. 6)."),
+    "ablation": ("experiments.paper", "Train BGPO without some of its parts (Fig. 9)."),
+    "sweep": ("experiments.sweep", "Run algorithms in settings over many seeds on Ray."),
+    "eight-tasks": ("experiments.sweep", "Run the benchmark of eight tasks, as a sweep."),
+    "report": ("experiments.report", "Write tables and figures of runs, or compare two."),
+    "watch": ("experiments.watch", "Film what a run has learned."),
+    "looking": ("experiments.looking", "Test a run with the objects' places hidden."),
+    "aftermath": ("experiments.aftermath", "Test whether the successes of a run last."),
+    "one-shot": ("experiments.one_shot", "Test a run with demonstrations cut short."),
+    "unknown-task": ("experiments.unknown_task", "Measure how well new tasks are detected."),
+    "groups": ("experiments.groups", "Measure the groups that form from demonstrations."),
+    "privileged-information": (
+        "experiments.privileged_information",
+        "Train with less and less given information.",
+    ),
+    "tasks": ("experiments.tasks", "Measure the suite's tasks and their demonstrators."),
+    "doctor": ("doctor", "Check this machine and installation."),
+}
+"""Module of each sub-command, whose function has its name, and a line about it."""
 
-python -m bgpo_trl COMMAND --help shows the options."""
+
+def main() -> None:
+    """Run the sub-command that the command line names."""
+    name, *options = sys.argv[1:] or ["--help"]
+    sys.argv = ["-m", "bgpo_trl", *sys.argv[1:]]  # stored with results, to repeat them
+    if name not in COMMANDS:
+        listed = {command: _listed(line) for command, (_, line) in COMMANDS.items()}
+        description = "BGPO: behavior self-organization for continual robot learning."
+        tyro.extras.subcommand_cli_from_dict(
+            listed, prog="bgpo", description=description, args=[name, *options]
+        )
+        return
+    try:
+        from bgpo_trl.experiments.command_line import command_line
+
+        module = importlib.import_module(f"bgpo_trl.{COMMANDS[name][0]}")
+    except KeyboardInterrupt:
+        sys.exit("interrupted")
+    command = getattr(module, name.replace("-", "_"))
+    command_line(command, options, program=f"bgpo {name}")
 
 
-def main(arguments: list[str]) -> None:
-    """Run a command, given its name and options."""
-    name, *options = arguments or ["--help"]
-    if name == "doctor":
-        from bgpo_trl.doctor.__main__ import main as examine
+def _listed(line: str) -> Callable[[], None]:
+    def command() -> None:
+        pass
 
-        sys.exit(examine(options))
-    if name not in ("continual", "concurrent", "ablation", "watch"):
-        sys.exit(USAGE if name in ("-h", "--help") else f"error: no command {name!r}\n{USAGE}")
-    # Imported late, since the other commands do without TorchRL, which takes seconds to import.
-    from bgpo_trl.experiments import paper, watch
-    from bgpo_trl.experiments.arguments import Arguments, command_line
-
-    kinds = {"ablation": paper.AblationArguments, "watch": watch.WatchArguments}
-    run = watch.watch if name == "watch" else getattr(paper, name)
-    sys.argv = ["-m", "bgpo_trl", name, *options]  # stored in a run's summary.json
-    command_line(lambda asked: print(run(asked)), run.__doc__, kinds.get(name, Arguments), options)
+    command.__doc__ = line
+    return command
 
 
 if __name__ == "__main__":
-    try:
-        main(sys.argv[1:])
-    except KeyboardInterrupt:  # while it imports
-        sys.exit("interrupted")
+    main()

@@ -18,7 +18,7 @@ import pytest
 import torch
 from hypothesis import settings
 
-from bgpo_trl.algorithms import ABLATIONS, entry
+from bgpo_trl.algorithms import entry
 from bgpo_trl.algorithms.rl import RL
 from bgpo_trl.configs import BGPOConfig, RunConfig
 from bgpo_trl.data.bank import DemonstrationBank, DemonstrationSteps
@@ -88,7 +88,7 @@ def make_config():
     """
 
     def make(state="latent", name="bgpo", **changes):
-        name, _, rl = (name, "", "") if name in ABLATIONS else name.partition("+")
+        name, _, rl = name.partition("+")
         small = {"hidden_sizes": (64,), "batch_size": 16, "warmup_steps": 8, "replay_size": 200}
         rl = replace(RL[rl or "ddpg"].config, **small)
         settings = {"state": state, "max_steps": 6, "rl": rl, **of_name(SMALL, name)}

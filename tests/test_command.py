@@ -1,97 +1,108 @@
-"""The command line of the installed package."""
+"""The command ``bgpo``: its list of sub-commands, and how each is called."""
 
-import importlib.abc
 import importlib.metadata
-import re
-import runpy
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
 
 import bgpo_trl
 from bgpo_trl import __main__ as command
-from bgpo_trl.configs import PRESETS
 from bgpo_trl.experiments.watch import WatchArguments
 
+ROOT = Path(__file__).parents[1]
+LOADED = """
+import resource, sys
+from bgpo_trl.__main__ import main
+sys.argv = ["bgpo", *sys.argv[1:]]
+try:
+    main()
+except SystemExit as ended:
+    assert not ended.code
+assert not {"torch", "torchrl", "mujoco"} & sys.modules.keys()
+used = resource.getrusage(resource.RUSAGE_SELF)
+assert used.ru_utime + used.ru_stime < 3
+"""
 
-def test_the_version_is_that_of_the_package():
+
+def call(monkeypatch, *options):
+    monkeypatch.setattr(sys, "argv", ["bgpo", *options])
+    command.main()
+
+
+def test_the_version_is_that_of_the_distribution():
     assert bgpo_trl.__version__ == importlib.metadata.version("bgpo_trl")
 
 
-@pytest.mark.parametrize("options", [[], ["--help"]])
-def test_without_a_command_it_lists_them(options):
-    with pytest.raises(SystemExit, match="usage: python -m bgpo_trl COMMAND") as ended:
-        command.main(options)
-    for name in ("continual", "concurrent", "ablation", "watch", "doctor"):
-        assert f"  {name} " in str(ended.value)
+def test_pyproject_names_the_command():
+    scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+    assert scripts == {"bgpo": "bgpo_trl.__main__:main"}
 
 
-def test_an_unknown_command_is_refused():
-    with pytest.raises(SystemExit, match=r"^error: no command 'continul'\nusage: "):
-        command.main(["continul"])
+def test_help_lists_every_command(monkeypatch, capsys):
+    with pytest.raises(SystemExit) as ended:
+        call(monkeypatch)
+    assert not ended.value.code
+    printed = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    for name, (_, line) in command.COMMANDS.items():
+        assert f"• {name} {line}" in printed
 
 
-def test_errors_are_one_line(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit, match=r"^error: --algorithm: the variants"):
-        command.main(["ablation", "--algorithm", "maml"])
+@pytest.mark.parametrize("options", [["--help"], ["continual", "--help"]])
+def test_help_imports_neither_torch_nor_mujoco(options):
+    process = subprocess.run(
+        [sys.executable, "-c", LOADED, *options], capture_output=True, text=True, cwd=ROOT
+    )
+    assert process.returncode == 0, process.stderr
+
+
+def test_an_unknown_command_is_refused(monkeypatch, capsys):
+    with pytest.raises(SystemExit) as ended:
+        call(monkeypatch, "continul")
+    assert ended.value.code == 2
+    assert "continul" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", command.COMMANDS)
+def test_every_command_has_a_function_and_a_help_page(monkeypatch, capsys, name):
+    with pytest.raises(SystemExit) as ended:
+        call(monkeypatch, name, "--help")
+    assert not ended.value.code
+    assert f"usage: bgpo {name} " in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(("name", "tasks"), [("continual", (0, 4, 8)), ("concurrent", (0, 0, 0))])
-def test_commands_run_their_experiment_in_any_folder(tmp_path, monkeypatch, name, tasks):
+def test_experiments_keep_the_command_that_repeats_them(tmp_path, monkeypatch, name, tasks):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["ignored"])
     ran = []
 
     def run_experiment(arguments, experiment, config):
-        ran.append((sys.argv, experiment, config.task_starts))
-        return "done"
+        ran.append((list(sys.argv), experiment, config.task_starts))
 
-    monkeypatch.setattr("bgpo_trl.experiments.paper.run_experiment", run_experiment)
-    command.main([name, "--preset", "smoke"])
+    monkeypatch.setattr("bgpo_trl.experiments.run.run_experiment", run_experiment)
+    call(monkeypatch, name, "--preset", "smoke")
     assert ran == [(["-m", "bgpo_trl", name, "--preset", "smoke"], name, tasks)]
 
 
-def test_a_run_can_be_watched(tmp_path, monkeypatch, capsys):
+def test_what_a_command_returns_is_printed(monkeypatch, capsys):
     asked = []
 
-    def watch(arguments):
+    def watch(arguments: WatchArguments) -> str:
         asked.append(arguments)
         return "pictures"
 
     monkeypatch.setattr("bgpo_trl.experiments.watch.watch", watch)
-    command.main(["watch", "runs/own", "--import", "my_tasks"])
-    assert asked == [WatchArguments(Path("runs/own"), module="my_tasks")]
+    call(monkeypatch, "watch", "runs/own", "--import", "my_tasks")
+    assert asked == [WatchArguments(run=Path("runs/own"), module="my_tasks")]
     assert capsys.readouterr().out == "pictures\n"
 
 
-def test_help_tells_how_large_each_preset_is(capsys):
-    with pytest.raises(SystemExit):
-        command.main(["continual", "--help"])
-    told = " ".join(capsys.readouterr().out.replace("\u2502", " ").split())
-    for name, config in PRESETS.items():
-        size = rf"{name} \({config.episodes:,} episodes of {len(config.seeds)} seeds, [^)]*"
-        assert re.search(size + r"(minutes|hours|day)", told), told
+def test_ctrl_c_during_the_imports_ends_in_one_line(monkeypatch):
+    def interrupt(name):
+        raise KeyboardInterrupt
 
-
-def test_ctrl_c_while_it_imports_ends_it_in_one_line(monkeypatch):
-    class Interrupt(importlib.abc.MetaPathFinder):
-        def find_spec(self, fullname, path=None, target=None):
-            if fullname == "bgpo_trl.experiments.paper":
-                raise KeyboardInterrupt
-
-    monkeypatch.setattr(sys, "meta_path", [Interrupt(), *sys.meta_path])
-    monkeypatch.delitem(sys.modules, "bgpo_trl.experiments.paper", raising=False)
-    monkeypatch.delattr("bgpo_trl.experiments.paper", raising=False)
-    monkeypatch.delitem(sys.modules, "bgpo_trl.__main__")  # which runpy would warn of
-    monkeypatch.setattr(sys, "argv", ["bgpo_trl", "continual"])
+    monkeypatch.setattr(command.importlib, "import_module", interrupt)
     with pytest.raises(SystemExit, match=r"^interrupted$"):
-        runpy.run_module("bgpo_trl", run_name="__main__")
-
-
-def test_the_module_is_a_command():
-    told = subprocess.run([sys.executable, "-m", "bgpo_trl"], capture_output=True, text=True)
-    assert told.returncode == 1
-    assert told.stderr.startswith("usage: python -m bgpo_trl COMMAND")
+        call(monkeypatch, "continual")

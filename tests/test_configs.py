@@ -92,8 +92,8 @@ def test_experts_and_demonstrations_restrict_other_settings():
     with pytest.raises(ValueError, match=r"warmup_steps \(49\) must be at least max_steps"):
         BGPOConfig(rl=DDPGConfig(warmup_steps=49))
     BGPOConfig(rl=DDPGConfig(warmup_steps=49), experts=False, demonstration_share=0.0)
-    with pytest.raises(ValueError, match="even_replay must be "):
-        BGPOConfig(even_replay=False)
+    with pytest.raises(ValueError, match="group_balanced_replay must be "):
+        BGPOConfig(group_balanced_replay=False)
 
 
 def test_config_files_hold_every_number_that_acts():

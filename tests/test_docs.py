@@ -15,6 +15,7 @@ import torch
 import tyro
 
 from bgpo_trl.algorithms import ALGORITHMS
+from bgpo_trl.algorithms.environments import bgpo_env
 from bgpo_trl.algorithms.rl import RL
 
 ROOT = Path(__file__).parents[1]
@@ -25,53 +26,57 @@ every_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 
 
 def blocks(page, language):
-    """Return the fenced blocks of a language."""
+    """Returns the fenced blocks of a language."""
     return re.findall(rf"^```{language}\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE)
 
 
 def commands(page):
-    """Return the commands in blocks and in running text, each in one line without comments."""
+    """Returns the commands shown in blocks and in running text, without comments, in one line."""
     text = page.read_text()
-    indented = re.findall(r"^    ((?:python|make) (?:.*\\\n)*.*)$", text, re.MULTILINE)
+    indented = re.findall(r"^    ((?:python|bgpo|make) (?:.*\\\n)*.*)$", text, re.MULTILINE)
     fenced = "\n".join(blocks(page, "bash")).replace("\\\n", " ").splitlines()
     text = re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
-    inline = re.findall(r"`((?:python|make|pytest) [^`]+)`", text)
+    inline = re.findall(r"`((?:python|bgpo|make|pytest) [^`]+)`", text)
     shown = [*(block.replace("\\\n", " ") for block in indented), *fenced, *inline]
     return [shlex.join(shlex.split(line, comments=True)) for line in shown]
 
 
 COMMANDS = sorted({command for page in PAGES for command in commands(page) if command})
-OF_PYTHON = [command for command in COMMANDS if command.startswith("python ")]
+OF_PYTHON = [command for command in COMMANDS if command.startswith(("python ", "bgpo "))]
 
 
 class Parsed(BaseException):
-    """Raised in place of running a command."""
+    """Raised in place of doing what a command asks for."""
 
 
 @pytest.fixture
 def parse_only(monkeypatch):
-    """Make commands end when their arguments are parsed."""
+    """Commands end as soon as their arguments are understood."""
     parse = tyro.cli
 
     def cli(f, *args, **kwargs):
         if inspect.isfunction(f):  # which tyro would call
             f = functools.wraps(f)(lambda *_, **__: None)
-        parse(f, *args, **kwargs)
+        parsed = parse(f, *args, **kwargs)
+        if kwargs.get("return_unknown_args") and parsed[1]:
+            return parsed  # the rest is for another parser
         raise Parsed
 
     monkeypatch.setattr(tyro, "cli", cli)
 
 
 def script_of(command):
-    """Return the file or module that a `python` command runs, and its arguments."""
-    _, *words = shlex.split(command)
+    """Returns what a `python` or `bgpo` command runs, file or module, and its arguments."""
+    program, *words = shlex.split(command)
+    if program == "bgpo":
+        return "bgpo_trl", words
     if words[0] == "-m":
         return words[1], words[2:]
     return words[0], words[1:]
 
 
 def run(script, arguments, monkeypatch):
-    """Run a script as `python script arguments` would."""
+    """Runs a script as `python script arguments` would."""
     monkeypatch.setattr(sys, "argv", [script, *arguments])
     if script.endswith(".py"):
         runpy.run_path(str(ROOT / script), run_name="__main__")
@@ -79,14 +84,14 @@ def run(script, arguments, monkeypatch):
         runpy.run_module(script, run_name="__main__", alter_sys=True)
 
 
-def test_code_and_commands_are_found():
+def test_there_is_something_to_run():
     assert blocks(PAGES[0], "python")
     assert {"make run", "make test"} <= {*COMMANDS}
     assert len(OF_PYTHON) > 5
 
 
 @every_page
-def test_python_blocks_of_a_page_run_in_order(page, tmp_path, monkeypatch):
+def test_the_python_of_a_page_runs_from_top_to_bottom(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     namespace = {}
     # Restores the registries to which pages add entries.
@@ -98,14 +103,14 @@ def test_python_blocks_of_a_page_run_in_order(page, tmp_path, monkeypatch):
 
 
 @every_page
-def test_all_blocks_are_of_tested_languages(page):
+def test_no_block_is_of_a_kind_that_is_not_tested(page):
     fences = re.findall(r"^```(.*)$", page.read_text(), re.MULTILINE)
     assert {*fences[::2]} <= {"python", "bash", "text"}
     assert {*fences[1::2]} <= {""}
 
 
 @pytest.mark.parametrize("command", OF_PYTHON)
-def test_python_commands_can_be_parsed(command, monkeypatch, parse_only):
+def test_a_command_is_understood(command, monkeypatch, parse_only):
     script, arguments = script_of(command)
     if script == "pytest":
         return check_pytest(arguments)
@@ -113,7 +118,9 @@ def test_python_commands_can_be_parsed(command, monkeypatch, parse_only):
         assert (ROOT / script).is_file()
     else:
         assert importlib.util.find_spec(script)
-    if arguments:  # without, it may be the program's name rather than a command
+    if script.startswith("examples/"):
+        assert not arguments  # and what they do is tested in test_examples.py
+    elif arguments[script == "bgpo_trl" :]:  # without, it may be a name rather than a command
         with pytest.raises(Parsed):
             run(script, arguments, monkeypatch)
 
@@ -127,13 +134,13 @@ def test_python_commands_can_be_parsed(command, monkeypatch, parse_only):
         "python -m bgpo_trl.data.recording --per-task 3",
     ],
 )
-def test_wrong_commands_cannot_be_parsed(command, monkeypatch, parse_only):
+def test_a_command_that_is_wrong_is_not_understood(command, monkeypatch, parse_only):
     with pytest.raises(SystemExit):
         run(*script_of(command), monkeypatch)
 
 
 @pytest.mark.parametrize("command", sorted({*COMMANDS} - {*OF_PYTHON}))
-def test_make_targets_and_tools_exist(command):
+def test_a_verb_or_tool_is_there(command):
     tool, *words = shlex.split(command)
     if tool == "pytest":
         return check_pytest(words)
@@ -148,7 +155,7 @@ def check_pytest(words):
 
 
 @every_page
-def test_files_named_on_a_page_exist(page):
+def test_the_files_it_names_exist(page):
     text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
     named = re.findall(
         r"`((?:suites|bgpo_trl|benchmarks|examples|tests|docs|scripts)/[\w/.-]*)`", text
@@ -157,3 +164,12 @@ def test_files_named_on_a_page_exist(page):
     missing = [name for name in named if not (ROOT / name).exists()]
     missing += [name for name in linked if not (page.parent / name).exists()]
     assert missing == []
+
+
+def test_the_composition_in_readme_is_the_one_that_is_trained():
+    def composition(text):
+        return [line.strip() for line in text.split("Compose(\n")[1].splitlines()]
+
+    shown = next(block for block in blocks(ROOT / "README.md", "python") if "Compose(\n" in block)
+    trained = composition(inspect.getsource(bgpo_env))
+    assert composition(shown)[: len(trained) - 1] == trained[:-1]

@@ -23,7 +23,7 @@ from timing import interleave
 
 from bgpo_trl.algorithms import Algorithm, entry
 from bgpo_trl.encoders.pretrained import load_pretrained
-from bgpo_trl.experiments.arguments import command_line
+from bgpo_trl.experiments.command_line import command_line
 from bgpo_trl.machine import set_threads
 from bgpo_trl.transforms import TaskSchedule
 from bgpo_trl.world import World
@@ -117,4 +117,4 @@ def main(arguments: Arguments) -> None:
 
 
 if __name__ == "__main__":
-    command_line(main, __doc__, Arguments)
+    command_line(main)

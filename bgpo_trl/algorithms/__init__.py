@@ -33,7 +33,7 @@ class Entry:
 
 
 _ALONE: Any = {"demonstration_share": 0.0, "expert_batch_size": 64, "rl": DDPGConfig()}
-_SINGLE = BGPOConfig(variant="published", experts=False, even_replay=False, **_ALONE)
+_SINGLE = BGPOConfig(variant="published", experts=False, group_balanced_replay=False, **_ALONE)
 _PAPER = DDPGConfig(
     hidden_sizes=(64,),
     critic_layer_norm=False,
@@ -62,35 +62,37 @@ ALGORITHMS: dict[str, Entry] = {
     ),
     "oracle": Entry(BGPO, replace(_SINGLE, variant="label")),
     "ddpg": Entry(BGPO, replace(_SINGLE, variant="no-context")),
+    "without-bonus": Entry(BGPO, replace(_SINGLE, variant="without-bonus")),
+    "without-gwr": Entry(BGPO, replace(_SINGLE, variant="without-gwr")),
+    "without-both": Entry(BGPO, replace(_SINGLE, variant="without-both")),
+    "group-balanced-replay": Entry(
+        BGPO, replace(_SINGLE, variant="bgpo", group_balanced_replay=True)
+    ),
+    "demonstrations": Entry(BGPO, replace(_SINGLE, **_SHOWN_SINGLE)),
 }
 """BGPO; ``bgpo-experts``, BGPO without demonstrations; ``bgpo-single``, which in addition has only
 one actor and one critic; the paper's baselines, without and with demonstrations; two references,
 DDPG with the task's label (``oracle``) and without context (``ddpg``). Names in ``-paper`` follow
-the publication: networks of 64 units, batches of 256, no stabilizers."""
+the publication: networks of 64 units, batches of 256, no stabilizers. The others are
+``bgpo-single`` without GWR-B, the intrinsic reward or both, or with one addition of this package.
+Modules of own algorithms may add entries."""
 
-ABLATIONS: dict[str, Entry] = {
-    "gwr+r_int": ALGORITHMS["bgpo-single"],
-    "gwr": Entry(BGPO, replace(_SINGLE, variant="without-bonus")),
-    "r_int": Entry(BGPO, replace(_SINGLE, variant="without-gwr")),
-    "none": Entry(BGPO, replace(_SINGLE, variant="without-both")),
-    "even-replay": Entry(BGPO, replace(_SINGLE, variant="bgpo", even_replay=True)),
-    "experts": ALGORITHMS["bgpo-experts"],
-    "demonstrations": Entry(BGPO, replace(_SINGLE, **_SHOWN_SINGLE)),
-    "all": ALGORITHMS["bgpo"],
-}
+ABLATIONS = (
+    "bgpo-single",
+    "without-bonus",
+    "without-gwr",
+    "without-both",
+    "group-balanced-replay",
+    "demonstrations",
+    "bgpo-experts",
+    "bgpo",
+)
 """The paper's ablations (Fig. 9): with GWR-B and the intrinsic reward, one of them, neither. Then
 each addition of this package to the published algorithm, and all of them together."""
 
 
 def entry(name: str) -> Entry:
-    """Return the entry of an algorithm or an ablation.
-
-    Raises:
-        ValueError: If the name is unknown, or that of an algorithm and an ablation.
-    """
-    known = ALGORITHMS | ABLATIONS
-    if name in ALGORITHMS and name in ABLATIONS:
-        raise ValueError(f"{name!r} is a variant of BGPO: add your algorithm under another name")
-    if name not in known:
-        raise ValueError(f"no algorithm {name!r}: choose one of {', '.join(known)}")
-    return known[name]
+    """Return the entry of an algorithm; raise ``ValueError`` if the name is unknown."""
+    if name not in ALGORITHMS:
+        raise ValueError(f"no algorithm {name!r}: choose one of {', '.join(ALGORITHMS)}")
+    return ALGORITHMS[name]

@@ -32,10 +32,10 @@ from bgpo_trl.transforms import DemonstrationSource
 class BGPO(Algorithm):
     """BGPO, its ablations and its references, selected by ``config.variant``.
 
-    With ``experts``, each group of behaviors has its own actor and critic; with ``even_replay``, an
-    update draws equally from the groups played last; with a ``demonstration_share``, it also draws
-    from demonstrations. The variant ``"published"`` without these three is the paper's algorithm,
-    in `bgpo-paper` with the paper's settings too.
+    With ``experts``, each group of behaviors has its own actor and critic; with
+    ``group_balanced_replay``, an update draws equally from the groups played last; with a
+    ``demonstration_share``, it also draws from demonstrations. The variant ``"published"`` without
+    these three is the paper's algorithm, in `bgpo-paper` with the paper's settings too.
 
     Arguments as for `Algorithm`; encoders may be None if neither latents nor embeddings are used.
 
@@ -45,7 +45,8 @@ class BGPO(Algorithm):
             demonstrations.
 
     Raises:
-        ValueError: If the variant is unknown, or does not fit ``experts`` and ``even_replay``.
+        ValueError: If the variant is unknown, or does not fit ``experts`` and
+            ``group_balanced_replay``.
     """
 
     config: BGPOConfig
@@ -66,7 +67,7 @@ class BGPO(Algorithm):
             fitting = ", ".join(name for name, v in VARIANTS.items() if v.groups == config.grouped)
             raise ValueError(
                 f"variant {config.variant!r} does not go with experts={config.experts} and "
-                f"even_replay={config.even_replay}: choose one of {fitting}"
+                f"group_balanced_replay={config.group_balanced_replay}: choose one of {fitting}"
             )
         self.variant, embedding_size = variant, bank.embedding.shape[-1]
         self.needs_label = variant.context == "label"

@@ -285,7 +285,7 @@ class Variant:
     gwr: bool = False
     """Whether GWR-B infers the behavior."""
     groups: bool = False
-    """Whether behaviors are grouped, as experts and even replay require."""
+    """Whether behaviors are grouped, as experts and replay balanced by group require."""
     bonus: bool = False
     """Whether the intrinsic reward is added."""
 

@@ -21,18 +21,16 @@ NAMES = {
     "bgpo-single": "BGPO, one policy",
     "oracle": "DDPG, told the label",
     "ddpg": "DDPG, told nothing",
-    "gwr": "one policy, without the intrinsic reward",
-    "r_int": "one policy, without GWR-B",
-    "none": "one policy, without both",
-    "even-replay": "one policy + even replay",
+    "without-bonus": "one policy, without the intrinsic reward",
+    "without-gwr": "one policy, without GWR-B",
+    "without-both": "one policy, without both",
+    "group-balanced-replay": "one policy + replay balanced by group",
     "demonstrations": "one policy + demonstrations",
     "bgpo-paper": "BGPO as published",
     "dist-nll-paper": "Dist-NLL as published",
     "maml-paper": "MAML as published",
 }
 """Names of algorithms and variants in tables and figures, in their order there."""
-SAME = {"gwr+r_int": "bgpo-single", "experts": "bgpo-experts", "all": "bgpo"}
-"""Variants of the ablation that are also algorithms."""
 
 # Entries of config.json that belong to an algorithm or to keeping its run. All others, such as
 # encoders, starts, and the half of the demonstrations to test on, are conditions of a comparison.
@@ -60,8 +58,7 @@ class Run:
     @property
     def algorithm(self) -> str:
         """Name of the algorithm; the directory's where ``config.json`` has none."""
-        name = self.config.get("name") or self.directory.name
-        return SAME.get(name, name)
+        return self.config.get("name") or self.directory.name
 
     @property
     def tasks(self) -> tuple[str, ...]:

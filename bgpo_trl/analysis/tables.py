@@ -70,18 +70,18 @@ _BASELINES = {
 _BASELINE_NAMES = ("MAML", "Dist-NLL")
 # Fig. 9, from the best to the worst.
 _ABLATION = (
-    ("bgpo-single", "gwr"),
-    ("gwr", "r_int"),
-    ("r_int", "none"),
-    ("bgpo-single", "none"),
+    ("bgpo-single", "without-bonus"),
+    ("without-bonus", "without-gwr"),
+    ("without-gwr", "without-both"),
+    ("bgpo-single", "without-both"),
 )
 # Beside BGPO: its versions and the baselines on the same terms; with and without an addition.
 _PAIRS = {
     *((ours, rival) for ours in list(_BASELINES)[1:] for rival in _BASELINES[ours]),
-    *(("bgpo-single", fewer) for fewer in ("gwr", "r_int", "none")),
-    *(("gwr", "none"), ("r_int", "none")),
-    *(("even-replay", "bgpo-single"), ("demonstrations", "bgpo-single")),
-    ("bgpo-experts", "even-replay"),
+    *(("bgpo-single", fewer) for fewer in ("without-bonus", "without-gwr", "without-both")),
+    *(("without-bonus", "without-both"), ("without-gwr", "without-both")),
+    *(("group-balanced-replay", "bgpo-single"), ("demonstrations", "bgpo-single")),
+    ("bgpo-experts", "group-balanced-replay"),
 }
 
 

@@ -15,8 +15,8 @@ class AlgorithmConfig:
     """Hyperparameters common to all algorithms, which are thus compared on equal terms."""
 
     state: Literal["latent", "state"] = "latent"
-    """Observation of the policy: the latent z of a frame (Alg. 1) or, for benchmarks/ladder.py, the
-    ground truth."""
+    """Observation of the policy: the latent z of a frame (Alg. 1) or, for
+    `bgpo privileged-information`, the ground truth."""
     max_steps: int = 50
     """Steps of an episode (Sec. IV-B)."""
     state_limit: float = 5.0
@@ -132,7 +132,7 @@ class BGPOConfig(AlgorithmConfig):
     experts: bool = True
     """Whether each group of behaviors has its own actor and critic. Ours: with the paper's single
     pair, a new task is learned slowly (docs/learning.md)."""
-    even_replay: bool = True
+    group_balanced_replay: bool = True
     """Whether an update draws equally from the groups played last. Ours: the paper draws uniformly
     from all transitions."""
     demonstration_share: float = 0.75
@@ -160,7 +160,7 @@ class BGPOConfig(AlgorithmConfig):
     @property
     def grouped(self) -> bool:
         """Whether behaviors are grouped."""
-        return self.experts or self.even_replay
+        return self.experts or self.group_balanced_replay
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -168,8 +168,8 @@ class BGPOConfig(AlgorithmConfig):
         whole(self, 1, "active_groups", "rest_after", "expert_batch_size")
         positive(self, "behavior_scale", "group_evidence")
         whole(self, 4, "group_size")
-        holds = self.even_replay or not self.experts
-        check(self, ("even_replay", holds, "set where there are experts"))
+        holds = self.group_balanced_replay or not self.experts
+        check(self, ("group_balanced_replay", holds, "set where there are experts"))
         _check_played(self, self.expert_batch_size if self.experts else self.rl.batch_size)
 
 

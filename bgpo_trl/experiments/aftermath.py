@@ -7,26 +7,35 @@ pays. Here a grasped object is lifted, and what was pushed is left alone for two
 from __future__ import annotations
 
 import itertools
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import tyro
 from numpy.typing import NDArray
 
+from bgpo_trl.analysis.tables import Table, markdown
 from bgpo_trl.evaluation import start_seeds
+from bgpo_trl.experiments.arguments import TrainedArguments
 from bgpo_trl.experiments.episodes import (
     Episode,
     evaluator_of,
+    load_blocks,
     play,
     random_actions,
     snapshots_of,
 )
+from bgpo_trl.experiments.records import commit_of_code, write_measurement
+from bgpo_trl.machine import set_threads
+from bgpo_trl.plugins import import_plugin
 from bgpo_trl.policy import LoadedRun
 from suites import nico
 from suites.nico import kinematics
-from suites.nico.base import CONTROL_TIMESTEP, Environment
+from suites.nico.base import CONTROL_TIMESTEP, TIME_LIMIT, Environment
 from suites.nico.demonstrator import Demonstrator
 from suites.nico.physics import HAND, OBJECT_HALF_HEIGHT, TABLE_HEIGHT
 
@@ -64,7 +73,7 @@ class Outcome(NamedTuple):
     """The outcome of a success.
 
     Attributes:
-        holds: Whether it is one in earnest.
+        holds: Whether it lasts.
         distance: Lift, gap or displacement (m), by the task's `Criterion`.
     """
 
@@ -97,7 +106,7 @@ Judge = Callable[[Continuation, Episode], Outcome]
 
 @dataclass(frozen=True)
 class Criterion:
-    """How to find out whether the successes of a task are in earnest."""
+    """Test of whether the successes of a task last."""
 
     distance: str
     """Name of the distance that is measured."""
@@ -195,7 +204,8 @@ class Row(NamedTuple):
 
 def policy_episodes(run: LoadedRun, episodes: int) -> list[Episode]:
     """Return the test episodes of all seeds' trained policies, as many of each task and seed."""
-    evaluator, first = evaluator_of(run, episodes), list[NDArray]()
+    held_out = run.bank.held_out(run.config.held_out)
+    evaluator, first = evaluator_of(run, held_out, episodes), list[NDArray]()
 
     def states() -> NDArray:
         found = evaluator.simulation.simulation_state()["physics"].numpy()
@@ -275,9 +285,7 @@ def judge(actor: str, episodes: Iterable[Episode]) -> list[Row]:
     return rows
 
 
-def aftermath_table(
-    rows: Iterable[Row], played: Mapping[str, Mapping[str, int]]
-) -> list[list[str]]:
+def aftermath_table(rows: Iterable[Row], played: Mapping[str, Mapping[str, int]]) -> Table:
     """Return the table by actor and task: successes, the share that holds, the median distance.
 
     Args:
@@ -285,7 +293,7 @@ def aftermath_table(
         played: Number of episodes by actor and task.
     """
     rows = list(rows)
-    table = [["actor", "task", "successes", "of them hold, %", "median, cm"]]
+    table: Table = [["actor", "task", "successes", "of them hold, %", "median, cm"]]
     for actor, counts in played.items():
         for task, episodes in counts.items():
             found = [row for row in rows if (row.actor, row.task) == (actor, task)]
@@ -297,3 +305,67 @@ def aftermath_table(
                 cells = [f"{share:.1f}", f"{distance:.1f} ({found[0].measure})"]
             table.append([actor, task, f"{len(found)} of {episodes}", *cells])
     return table
+
+
+@dataclass(frozen=True, kw_only=True)
+class AftermathArguments(TrainedArguments):
+    """Continuations of successes."""
+
+    run: tyro.conf.Positional[Path | None] = None
+    """Run directory."""
+    demonstrators: bool = False
+    """Also test the demonstrators; without a run, those of all tasks."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Seeds of the starts without a run, which has its own."""
+    out: Path | None = None
+    """Folder to write to; the run directory, or runs/aftermath, by default."""
+
+
+def episodes_of(arguments: AftermathArguments) -> dict[str, list[Episode]]:
+    """Return the test episodes by actor.
+
+    Raises:
+        ValueError: If nobody is to act, in no episode, or there is no criterion for a task.
+    """
+    if arguments.run is None and not arguments.demonstrators:
+        raise ValueError("nobody acts: name a run directory, or give --demonstrators")
+    if arguments.episodes < 1:
+        raise ValueError(f"--episodes must be at least 1, got {arguments.episodes}")
+    tasks, seeds, spread = nico.ALL_TASKS, arguments.seeds, 1.0
+    max_steps = round(TIME_LIMIT / CONTROL_TIMESTEP)
+    episodes: dict[str, list[Episode]] = {}
+    if arguments.run is not None:
+        runs = load_blocks(arguments.run)
+        config = runs[0].config
+        tasks, max_steps, spread = config.tasks, config.algorithm.max_steps, config.spread
+        seeds = [seed for run in runs for seed in run.config.seeds]
+        check_criteria(tasks)
+        played = [policy_episodes(run, arguments.episodes) for run in runs]
+        episodes["policy"] = [episode for of_run in played for episode in of_run]
+    for actor in ("demonstrators", "random actions")[not arguments.demonstrators :]:
+        episodes[actor] = scripted_episodes(
+            tasks, seeds, arguments.episodes, max_steps, actor, spread
+        )
+    return episodes
+
+
+def aftermath(arguments: AftermathArguments) -> str:
+    """Test whether the successes of a run's policies, or of demonstrators, last.
+
+    Continues the simulation from each success: what was grasped is lifted, in the best of fourteen
+    ways; what was pushed together, aside or pressed is left alone for two seconds. Beside them it
+    plays random actions from the same starts. Prints a table and writes aftermath.csv, one row per
+    success, and aftermath.json (commit and command).
+
+    Raises:
+        ValueError: As for `episodes_of`, or if the run cannot be loaded.
+    """
+    commit = commit_of_code()
+    import_plugin(arguments.module)
+    set_threads(arguments.threads)
+    episodes = episodes_of(arguments)
+    rows = [row for actor, of_actor in episodes.items() for row in judge(actor, of_actor)]
+    out = arguments.out or arguments.run or Path("runs/aftermath")
+    write_measurement(out, "aftermath", Row._fields, rows, commit)
+    counts = {actor: Counter(e.task for e in of_actor) for actor, of_actor in episodes.items()}
+    return markdown(aftermath_table(rows, counts))

@@ -10,12 +10,12 @@ import numpy as np
 from dm_env import TimeStep
 from numpy.typing import NDArray
 
-from bgpo_trl.algorithms.bgpo import BGPO
+from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.envs import NicoEnv
 from bgpo_trl.evaluation import Evaluator, Snapshot
 from bgpo_trl.files.checkpoint import has_checkpoint
-from bgpo_trl.policy import LoadedRun, load_all_seeds
-from bgpo_trl.runs.config_file import read_config
+from bgpo_trl.policy import LoadedRun, TrainedPolicy, load_all_seeds
+from bgpo_trl.training import Trainer
 from bgpo_trl.transforms import TaskSchedule
 from suites import nico
 from suites.nico.base import Environment
@@ -33,39 +33,40 @@ def load_blocks(run: Path) -> list[LoadedRun]:
     blocks = sorted(path for path in run.glob("seeds-*") if has_checkpoint(path / "checkpoint"))
     if not blocks or has_checkpoint(run / "checkpoint"):
         blocks = [run]
-    return [_load(block) for block in blocks]
-
-
-def _load(run: Path) -> LoadedRun:
-    # Rungs of benchmarks/ladder.py are variants of BGPO that ALGORITHMS does not list.
-    is_rung = read_config(run / "config.json")[0].name.startswith("rung ")
-    return load_all_seeds(run, make=BGPO if is_rung else None)
+    return [load_all_seeds(block) for block in blocks]
 
 
 def evaluator_of(
-    run: LoadedRun, episodes: int, make_env: Callable[..., NicoEnv] | None = None
+    run: LoadedRun | Trainer | TrainedPolicy,
+    bank: DemonstrationBank,
+    episodes: int,
+    *,
+    starts: tuple[int, ...] | None = None,
+    make_env: Callable[..., NicoEnv] | None = None,
 ) -> Evaluator:
-    """Return an evaluator of all tasks of a run with its held-out demonstrations.
+    """Return an evaluator of the tasks of a run.
 
     Args:
         run: The run.
+        bank: Demonstrations to show.
         episodes: Test episodes of each task and seed.
+        starts: Episode from which each task is presented; by default all are.
         make_env: Constructor of the simulation, `NicoEnv` if None.
     """
     config = run.config
     return Evaluator(
         config.algorithm,
         seeds=config.seeds,
-        schedule=TaskSchedule((0,) * len(config.tasks)),
+        schedule=TaskSchedule((0,) * len(config.tasks) if starts is None else starts),
         episodes=episodes,
-        bank=run.bank.held_out(config.held_out),
+        bank=bank,
         encoders=run.encoders,
         spread=config.spread,
         make_env=make_env,
     )
 
 
-def snapshots_of(run: LoadedRun, evaluator: Evaluator, number: int) -> list[Snapshot]:
+def snapshots_of(run: LoadedRun | Trainer, evaluator: Evaluator, number: int) -> list[Snapshot]:
     """Return the trained policy of each seed, conditioned for evaluation ``number``."""
     return [
         evaluator.snapshot(run.algorithm, index, number, episode=run.config.episodes)

@@ -19,9 +19,23 @@ from dm_env import TimeStep
 from numpy.typing import NDArray
 
 from bgpo_trl.analysis import statistics
+from bgpo_trl.analysis.tables import Table, markdown
 from bgpo_trl.envs import NicoEnv
 from bgpo_trl.evaluation import start_seeds
-from bgpo_trl.experiments.episodes import evaluator_of, play, random_actions, snapshots_of
+from bgpo_trl.experiments.arguments import TrainedArguments
+from bgpo_trl.experiments.episodes import (
+    evaluator_of,
+    load_blocks,
+    play,
+    random_actions,
+    snapshots_of,
+)
+from bgpo_trl.experiments.records import commit_of_code, write_measurement
+from bgpo_trl.figures.bars import plot_success_bars
+from bgpo_trl.figures.style import save_figure
+from bgpo_trl.files.progress import progress_bar
+from bgpo_trl.machine import set_threads
+from bgpo_trl.plugins import import_plugin
 from bgpo_trl.policy import LoadedRun
 from suites import nico
 from suites.nico.physics import OBJECTS
@@ -127,9 +141,10 @@ def measure_looking(
     if episodes < 1:
         raise ValueError(f"--episodes must be at least 1, got {episodes}")
     config, found = run.config, {}
+    held_out = run.bank.held_out(config.held_out)
     for name, hidden in VIEWS.items():
         make_env = None if hidden is None else partial(HidingEnv, hidden=hidden)
-        evaluator = evaluator_of(run, episodes, make_env)
+        evaluator = evaluator_of(run, held_out, episodes, make_env=make_env)
         snapshots = snapshots_of(run, evaluator, _NUMBER)
         success = evaluator.run(snapshots, run.algorithm.device, watch).success
         found[name] = success.double().mean(-1).numpy()
@@ -161,14 +176,40 @@ def success_by_condition(rows: Iterable[Row]) -> tuple[tuple[str, ...], dict[str
     return tuple(tasks), {name: np.array([*seeds.values()]) for name, seeds in found.items()}
 
 
-def looking_table(rows: Iterable[Row]) -> list[list[str]]:
+def looking_table(rows: Iterable[Row]) -> Table:
     """Return the table of success (%) by task and condition: mean over seeds, 95 % t interval.
 
     The last row holds the means over tasks. A single seed has no interval.
     """
     tasks, found = success_by_condition(rows)
-    table = [["success, %", *found]]
+    table: Table = [["success, %", *found]]
     for column, task in enumerate(tasks):
         table.append([task, *(statistics.mean(s[:, column]).percent() for s in found.values())])
     table.append(["all", *(statistics.mean(s.mean(1)).percent() for s in found.values())])
     return table
+
+
+def looking(arguments: TrainedArguments) -> str:
+    """Test the policies of a run with the places of the objects hidden from them.
+
+    They are tested as they are; with places hidden, where each object is shown at its nominal place
+    plus how far it has moved since the start; and with objects hidden, where each is always shown
+    at its nominal place. Beside them it plays random actions from the same starts. Prints a table
+    and writes looking.csv, looking.png and looking.json (commit and command) into the run
+    directory.
+
+    Raises:
+        ValueError: If the run cannot be loaded, or ``episodes`` is less than 1.
+    """
+    commit, out = commit_of_code(), arguments.out or arguments.run
+    import_plugin(arguments.module)
+    set_threads(arguments.threads)
+    rows: list[Row] = []
+    for run in load_blocks(arguments.run):
+        steps = len(VIEWS) * (run.config.algorithm.max_steps + 1)
+        with progress_bar("looking", total=steps, unit="step") as bar:
+            rows += measure_looking(run, arguments.episodes, bar.update)
+    write_measurement(out, "looking", Row._fields, rows, commit)
+    tasks, success = success_by_condition(rows)
+    save_figure(plot_success_bars(success, tasks), out / "looking.png")
+    return markdown(looking_table(rows))

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import shlex
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,14 +10,15 @@ import numpy as np
 
 from bgpo_trl.analysis.task_inference import group_purity, task_inference_accuracy
 from bgpo_trl.data.bank import DemonstrationBank
-from bgpo_trl.evaluation import Evaluator, evaluate_random_policy
+from bgpo_trl.evaluation import evaluate_random_policy
+from bgpo_trl.experiments.episodes import evaluator_of, snapshots_of
+from bgpo_trl.experiments.records import command, write_rows
 from bgpo_trl.figures.curves import plot_success_curves
 from bgpo_trl.figures.frames import plot_frame_strips, save_gif
 from bgpo_trl.figures.of_run import draw_groups, draw_growth, draw_nodes
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.files.progress import progress_bar
 from bgpo_trl.training import Trainer
-from bgpo_trl.transforms import TaskSchedule
 
 # Number of the evaluation after training; it seeds start states that training never tested.
 _LAST = 2**31
@@ -46,10 +44,7 @@ def measure(
     """
     algorithm, config = trainer.algorithm, trainer.config
     gwr, rows = algorithm.gwr, _final_tests(trainer, bank, episodes=episodes)
-    with (out / "final.csv").open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(FINAL_COLUMNS)
-        writer.writerows(rows)
+    write_rows(out / "final.csv", FINAL_COLUMNS, rows)
     random_success = evaluate_random_policy(
         tasks=config.tasks,
         episodes=100,
@@ -57,7 +52,7 @@ def measure(
         max_steps=config.algorithm.max_steps,
     )
     summary = {
-        "command": shlex.join(["python", *sys.argv]),
+        "command": command(),
         "episodes": config.episodes,
         "random_success": dict(zip(config.tasks, random_success.tolist(), strict=True)),
         "needs_label": algorithm.needs_label,
@@ -74,25 +69,14 @@ def measure(
 def _final_tests(trainer: Trainer, bank: DemonstrationBank, *, episodes: int) -> list[_Row]:
     """Return the rows of ``final.csv``, after as many test episodes of each task and kind."""
     algorithm, config, seen = trainer.algorithm, trainer.config, bank.seen()
-    gwr, rows, schedule = algorithm.gwr, list[_Row](), TaskSchedule(config.task_starts)
+    gwr, rows = algorithm.gwr, list[_Row]()
     n_steps = config.algorithm.max_steps + 1
     bar = progress_bar("final tests", shown=trainer.progress, total=2 * n_steps, unit="step")
     for half, (kind, tested) in enumerate(
         (("seen", seen), ("held-out", bank.held_out(config.held_out))), 1
     ):
-        evaluator = Evaluator(
-            config.algorithm,
-            seeds=config.seeds,
-            schedule=schedule,
-            episodes=episodes,
-            bank=tested,
-            encoders=trainer.encoders,
-            spread=config.spread,
-        )
-        snapshots = [
-            evaluator.snapshot(algorithm, index, _LAST, episode=config.episodes)
-            for index in range(len(config.seeds))
-        ]
+        evaluator = evaluator_of(trainer, tested, episodes, starts=config.task_starts)
+        snapshots = snapshots_of(trainer, evaluator, _LAST)
         success = evaluator.run(snapshots, algorithm.device, watch=bar.update).success
         bar.set_postfix_str(f"success {success.float().mean():.2f}, {kind}", refresh=False)
         bar.update(half * n_steps - bar.n)  # episodes may all end earlier
@@ -162,20 +146,11 @@ def record_episodes(trainer: Trainer, bank: DemonstrationBank) -> dict[str, np.n
         ValueError: If the run observes ground truth instead of frames.
     """
     config, frames = trainer.config, []
-    evaluator = Evaluator(
-        config.algorithm,
-        seeds=config.seeds,
-        schedule=TaskSchedule(config.task_starts),
-        episodes=1,
-        bank=bank.held_out(config.held_out),
-        encoders=trainer.encoders,
-        spread=config.spread,
-    )
-    algorithm, seeds = trainer.algorithm, range(len(config.seeds))
-    snapshots = [evaluator.snapshot(algorithm, i, _LAST, episode=config.episodes) for i in seeds]
+    held_out = bank.held_out(config.held_out)
+    evaluator = evaluator_of(trainer, held_out, 1, starts=config.task_starts)
     result = evaluator.run(
-        snapshots,
-        algorithm.device,
+        snapshots_of(trainer, evaluator, _LAST),
+        trainer.algorithm.device,
         watch=lambda: frames.append(evaluator.simulation.frames()[0, :, 0]),
     )
     return {

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import shlex
-import sys
 from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
 
 import pandas as pd
 
+from bgpo_trl.experiments.records import command
 from bgpo_trl.files.writing import make_folder, write_json, write_whole
 from bgpo_trl.runs.cost import read_costs, total_cost, write_costs
 from bgpo_trl.runs.results import read_json, read_table
@@ -21,7 +20,7 @@ def merge(blocks: Sequence[Path], directory: Path) -> None:
     Rows are sorted by seed and episode. Losses remain means over the seeds of a block; costs are
     sums over blocks, left out if a block has none. Files about the first seed alone (``gwr.csv``
     and figures) are copied from the first block, except ``success.png`` and ``groups.png``, which
-    ``report.py`` draws.
+    `bgpo_trl.experiments.report` draws.
 
     Args:
         blocks: Run directories that differ only in their seeds.
@@ -65,7 +64,7 @@ def merge(blocks: Sequence[Path], directory: Path) -> None:
     summary = {
         **summaries[0],
         "commit": " ".join(dict.fromkeys(block["commit"] for block in summaries)),
-        "command": shlex.join(["python", *sys.argv]),
+        "command": command(),
     }
     for key in summary.keys() & {"nodes", "groups", "group_purity"}:  # a value per seed, or None
         of_blocks = [block[key] for block in summaries]

@@ -1,57 +1,53 @@
 """The paper's three experiments: tasks in sequence, all tasks from the start, the ablation.
 
-Each trains to the end and returns its results as text.
+Each trains to the end and returns its results as text. What trains is imported when it is called,
+so that ``--help`` need not wait for TorchRL.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Literal
-
-from bgpo_trl.algorithms import ABLATIONS
-from bgpo_trl.experiments.arguments import Arguments, at_once, run_config
-from bgpo_trl.experiments.run import run_experiment
-
-__all__ = ["AblationArguments", "ablation", "concurrent", "continual"]
+from bgpo_trl.experiments.arguments import AblationArguments, Arguments
 
 
 def continual(arguments: Arguments) -> str:
-    """Train an algorithm on tasks presented one after the other (Fig. 8)."""
+    """Train an algorithm on tasks that are presented one after the other (Fig. 8).
+
+    Writes a run directory: config.json, train.csv, eval.csv, final.csv, gwr.csv, cost.csv,
+    summary.json, checkpoint/ and figures/, among them success.png (success on each task against
+    training episodes), gwr.png (nodes of GWR-B in behavior space, Fig. 7) and groups.png.
+    """
+    from bgpo_trl.experiments.run import run_experiment
+    from bgpo_trl.experiments.settings import run_config
+
     return run_experiment(arguments, "continual", run_config(arguments))
 
 
 def concurrent(arguments: Arguments) -> str:
-    """Train an algorithm on tasks that are all presented from the start (Fig. 6)."""
-    config = at_once(run_config(arguments))
-    return run_experiment(arguments, "concurrent", config)
+    """Train an algorithm on tasks that are all presented from the start (Fig. 6).
 
+    Writes the same files as the continual experiment, and differs from it only in the schedule.
+    """
+    from bgpo_trl.experiments.run import run_experiment
+    from bgpo_trl.experiments.settings import run_config
 
-@dataclass(frozen=True)
-class AblationArguments(Arguments):
-    """Trains a variant of BGPO and draws its success."""
-
-    variant: Literal[
-        "gwr+r_int", "gwr", "r_int", "none", "even-replay", "experts", "demonstrations", "all"
-    ] = "gwr+r_int"
-    """gwr+r_int: the paper's algorithm, with our stabilizers; gwr, r_int: with GWR-B or the
-    intrinsic reward only; none: with neither. even-replay, demonstrations: gwr+r_int with that
-    addition; experts: with even replay and experts; all: with all three."""
-    continual: bool = False
-    """Tasks one after the other instead of all from the start."""
+    return run_experiment(arguments, "concurrent", run_config(arguments, from_start=True))
 
 
 def ablation(arguments: AblationArguments) -> str:
-    """Train a variant of BGPO (Fig. 9).
+    """Train BGPO without GWR-B, the intrinsic reward, or both (Fig. 9), or with our additions.
+
+    The paper's variants differ by transforms alone. All tasks are presented from the start, with
+    --continual one after the other.
 
     Raises:
         ValueError: If ``--algorithm`` is given.
     """
-    if arguments.algorithm != "bgpo":
-        raise ValueError("--algorithm: the variants are BGPO's")
-    config = run_config(arguments)
-    algorithm = replace(ABLATIONS[arguments.variant].config, rl=config.algorithm.rl)
-    config = replace(config, name=arguments.variant, algorithm=algorithm)
-    if not arguments.continual:
-        config = at_once(config)
-    name = "ablation-continual" if arguments.continual else "ablation"
+    from bgpo_trl.experiments.run import run_experiment
+    from bgpo_trl.experiments.settings import run_config
+
+    if arguments.algorithm is not None:
+        raise ValueError("--algorithm: the variants are BGPO's, name one with --variant")
+    from_start = not arguments.continual
+    config = run_config(arguments, variant=arguments.variant, from_start=from_start)
+    name = "ablation" if from_start else "ablation-continual"
     return run_experiment(arguments, name, config)

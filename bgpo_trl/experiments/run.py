@@ -2,33 +2,31 @@
 
 from __future__ import annotations
 
-import shlex
-import subprocess
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
 
-from bgpo_trl.algorithms import ABLATIONS, ALGORITHMS, Algorithm
+from bgpo_trl.algorithms import ALGORITHMS, Algorithm
 from bgpo_trl.configs import STAGE_PRESETS, RunConfig
 from bgpo_trl.data.bank import DemonstrationBank
-from bgpo_trl.encoders.pretrained import load_pretrained
+from bgpo_trl.encoders.pretrained import (
+    default_weights,
+    load_pretrained,
+    weights_of_bank,
+)
 from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.encoders.train import make_pretrained
-from bgpo_trl.experiments.arguments import (
-    Arguments,
-    TaskArguments,
-    chosen_tasks,
-    chosen_weights,
-)
+from bgpo_trl.experiments.arguments import Arguments, BankArguments
 from bgpo_trl.experiments.measure import draw, measure
-from bgpo_trl.experiments.resuming import as_begun, is_finished
+from bgpo_trl.experiments.records import command, commit_of_code
+from bgpo_trl.experiments.settings import as_begun, chosen_tasks, is_finished
 from bgpo_trl.files.locking import lock_directory
 from bgpo_trl.files.writing import write_json
 from bgpo_trl.machine import choose_device, set_threads
 from bgpo_trl.plugins import import_plugin
-from bgpo_trl.runs.demonstrations import BANK
+from bgpo_trl.runs.config_file import read_config
+from bgpo_trl.runs.demonstrations import BANK, load_inputs
 from bgpo_trl.runs.directory import holds_run
 from bgpo_trl.training import Trainer
 from suites import nico
@@ -69,10 +67,11 @@ def run_experiment(
     commit = commit_of_code()  # read first, since commits may follow during training
     set_threads(arguments.threads)
     device = choose_device(arguments.device)
-    registered = (ALGORITHMS | ABLATIONS).get(config.name)
+    registered = ALGORITHMS.get(config.name)
     usual = registered is None or registered.config.rl.name == config.algorithm.rl.name
     rl = "" if usual else f"-{config.algorithm.rl.name}"
-    out = arguments.out or Path("runs") / f"{name}-{config.name}{rl}-{arguments.preset}"
+    size = arguments.preset or (arguments.config.stem if arguments.config else "quick")
+    out = arguments.out or Path("runs") / f"{name}-{config.name}{rl}-{size}"
     if arguments.resume:
         config = _continued(arguments, config, out)
         if is_finished(out, config):
@@ -80,7 +79,7 @@ def run_experiment(
     elif holds_run(out):
         raise ValueError(f"{out} holds a run: --resume continues it, --out names another directory")
     with lock_directory(out):
-        encoders, bank = _encoders(arguments, config.tasks, out, device)
+        encoders, bank = _encoders(arguments, config, out, device)
         with Trainer(
             config,
             out,
@@ -98,7 +97,7 @@ def run_experiment(
                 trainer.logger.log_media(f"figures/{path.stem}", path)
             # Written last, as the mark of a complete run.
             write_json(out / "summary.json", summary)
-    lines.append(f"curve and figures: {out}; in numbers: python benchmarks/report.py {out}")
+    lines.append(f"curve and figures: {out}; in numbers: bgpo report {out}")
     return "\n".join(lines)
 
 
@@ -130,23 +129,26 @@ def _continued(arguments: Arguments, config: RunConfig, out: Path) -> RunConfig:
 
 
 def _encoders(
-    arguments: Arguments, tasks: tuple[str, ...], out: Path, device: torch.device
+    arguments: Arguments, config: RunConfig, out: Path, device: torch.device
 ) -> tuple[Representation, DemonstrationBank]:
     """Return the pretrained encoders and a bank, or new ones made in the run directory."""
+    begun = arguments.resume and arguments.bank is None and (out / "config.json").exists()
+    if begun and (out / _ENCODERS / "nico.safetensors").exists():
+        return load_inputs(out, config.tasks, read_config(out / "config.json")[1])
     if not _makes_encoders(arguments, out):
-        return pretrained_for(tasks, _bank(arguments, out))
-    stage = STAGE_PRESETS.get(arguments.preset)
+        return pretrained_for(config.tasks, _bank(arguments, out))
+    stage = STAGE_PRESETS.get(arguments.preset or "")
     encoders, bank = make_pretrained(
         out / _ENCODERS / "nico.safetensors",
         out / _DATASET,
         folder=out / _ENCODERS,
-        command=shlex.join(["python", *sys.argv]),
+        command=command(),
         device=device,
-        tasks=tasks,
-        spread=arguments.spread,
+        tasks=config.tasks,
+        spread=config.spread,
         **({} if stage is None else vars(stage)),
     )
-    return encoders, bank.for_tasks(tasks)
+    return encoders, bank.for_tasks(config.tasks)
 
 
 def pretrained_for(
@@ -163,7 +165,8 @@ def pretrained_for(
         ValueError: If the bank is missing, damaged or of other encoders, or a task has no
             demonstrations.
     """
-    encoders, found = load_pretrained(chosen_weights(tasks, bank))
+    weights = default_weights(tasks) if bank is None else weights_of_bank(bank)
+    encoders, found = load_pretrained(weights)
     if bank is not None:
         own = DemonstrationBank.load(bank, encoder_id=encoders.identity)
         lacking = [task for task in tasks if task not in own.tasks]
@@ -171,7 +174,7 @@ def pretrained_for(
     return encoders, found.for_tasks(tasks)
 
 
-def bank_of(arguments: TaskArguments) -> DemonstrationBank:
+def bank_of(arguments: BankArguments) -> DemonstrationBank:
     """Load the demonstrations that a command line names, embedded by the pretrained encoders.
 
     Raises:
@@ -179,16 +182,3 @@ def bank_of(arguments: TaskArguments) -> DemonstrationBank:
     """
     import_plugin(arguments.module)
     return pretrained_for(chosen_tasks(arguments.tasks, nico.PAPER_TASKS), arguments.bank)[1]
-
-
-def commit_of_code() -> str:
-    """Return the commit of this code, with ``-dirty`` if it was modified; ``""`` if unknown."""
-    root = Path(__file__).parents[2]
-    if not (root / ".git").exists():  # An installed package may lie in another repository.
-        return ""
-    command = ["git", "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
-    try:
-        result = subprocess.run(command, cwd=root, capture_output=True, text=True, check=True)
-    except (OSError, subprocess.CalledProcessError):
-        return ""
-    return result.stdout.strip()

@@ -33,7 +33,7 @@ _FPS = 10  # twice as fast as NICO
 
 @dataclass(frozen=True)
 class WatchArguments(ImportArguments):
-    """Film the trained policies of a run beside the demonstrations that they were shown."""
+    """A film of a run."""
 
     run: tyro.conf.Positional[Path]
     """Run directory."""
@@ -148,13 +148,12 @@ def _draw(picture: Image.Image, episode: Episode, step: int, top: int) -> None:
 
 
 def watch(arguments: WatchArguments) -> str:
-    """Film an episode of each task after a new demonstration; return the outcomes as text.
+    """Film the trained policies of a run beside new demonstrations that they are shown.
 
-    Writes ``nico.gif``, and its frames as a strip ``nico.png``, into the run's ``figures/``: for
-    each task the demonstration, the policy's observations and a view of the room, framed green on
-    success and red on timeout. NICO starts from the same scene in every task, so only the
-    demonstration makes the difference. If the run saved graphs, also writes ``gwr_growth.png``, the
-    growth of GWR-B.
+    Writes nico.gif, and its frames as a strip nico.png, into the run's figures/: for each task the
+    demonstration, the policy's observations and a view of the room, framed green on success and red
+    on timeout. NICO starts from the same scene in every task, so only the demonstration makes the
+    difference. If the run saved graphs, also writes gwr_growth.png, the growth of GWR-B.
 
     Raises:
         ValueError: If the directory holds no run that can be loaded, or the run has no such seed.

@@ -8,7 +8,7 @@ from dataclasses import asdict, is_dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
 
-from bgpo_trl.algorithms import ABLATIONS, ALGORITHMS
+from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.rl import RL
 from bgpo_trl.configs import AlgorithmConfig, RLConfig, RunConfig
 from suites import nico
@@ -26,13 +26,15 @@ class Digests(NamedTuple):
     bank: str | None
 
 
-def read_config(path: str | Path) -> tuple[RunConfig, Digests]:
+def read_config(path: str | Path, defaults: RunConfig | None = None) -> tuple[RunConfig, Digests]:
     """Read the settings that `Trainer` wrote: the inverse of ``dataclasses.asdict``.
 
     Settings missing from a run of an earlier version get their defaults.
 
     Args:
         path: The ``config.json`` of a run.
+        defaults: Settings that the file may lack, also all of the algorithm; by default, those of
+            the classes.
 
     Returns:
         The settings, and the digests of the encoders and demonstrations.
@@ -44,6 +46,8 @@ def read_config(path: str | Path) -> tuple[RunConfig, Digests]:
     path = Path(path)
     try:
         settings = json.loads(path.read_text())
+        if defaults is not None and isinstance(settings, dict):
+            settings = _merged(_as_json(asdict(defaults)), settings)
         if not isinstance(settings, dict) or not isinstance(settings.get("algorithm"), dict):
             raise ValueError("it holds no settings of a run")
         digests = Digests(*(settings.pop(name, None) for name in Digests._fields))
@@ -99,7 +103,7 @@ def settings_of(config: RunConfig, digests: Digests) -> dict[str, Any]:
         "task_modules": {name: added[name] for name in added if name not in nico.ALL_TASKS},
         **digests._asdict(),
     }
-    settings = json.loads(json.dumps(settings, default=str))  # tuples become lists
+    settings = _as_json(settings)
     try:
         _read(kind, settings["algorithm"], "algorithm.")
     except ValueError as error:
@@ -108,6 +112,22 @@ def settings_of(config: RunConfig, digests: Digests) -> dict[str, Any]:
             "bool, a dataclass of these, a tuple of one of them (tuple[int, ...]), or one or None"
         ) from None
     return settings
+
+
+def _as_json(settings: dict[str, Any]) -> dict[str, Any]:
+    """Return settings as JSON stores them, tuples as lists."""
+    return json.loads(json.dumps(settings, default=str))
+
+
+def _merged(defaults: dict[str, Any], settings: dict[str, Any]) -> dict[str, Any]:
+    """Return settings, with those of ``defaults`` that they lack and that have the same name."""
+    if defaults.get("name") != settings.get("name", defaults.get("name")):
+        return settings  # of another algorithm
+    merged = {**defaults, **settings}
+    for name, old in defaults.items():
+        if isinstance(old, dict) and isinstance(merged[name], dict):
+            merged[name] = _merged(old, merged[name])
+    return merged
 
 
 def _unknown_task(tasks: object) -> str | None:
@@ -129,8 +149,9 @@ def _algorithm_config(name: object, stored: object) -> type[AlgorithmConfig] | N
         kind = getattr(sys.modules.get(module), attribute, None)
         if isinstance(kind, type) and issubclass(kind, AlgorithmConfig):
             return kind
-    known = ALGORITHMS | ABLATIONS
-    return type(known[name].config) if isinstance(name, str) and name in known else None
+    if not isinstance(name, str) or name not in ALGORITHMS:
+        return None
+    return type(ALGORITHMS[name].config)
 
 
 def _read(hint: Any, value: Any, where: str) -> Any:

@@ -9,11 +9,15 @@ VARIANTS = {
     "latent, nothing": ("latent", "nothing", "no-context", "ddpg"),
     "latent, phi": ("latent", "phi", "without-gwr", "bgpo-single"),
     "latent, b": ("latent", "b", "published", "bgpo-single"),
-    "even replay": ("latent", "b", "bgpo", "bgpo-single"),
+    "group-balanced replay": ("latent", "b", "bgpo", "bgpo-single"),
     "experts": ("latent", "b", "bgpo", "bgpo-experts"),
     "all": ("latent", "b", "bgpo", "bgpo"),
 }
 # More groups than are active.
 GROUPS = {"group_size": 4, "group_evidence": 0.5, "active_groups": 2}
-CHANGES = {"even replay": {"even_replay": True, **GROUPS}, "experts": GROUPS, "all": GROUPS}
+CHANGES = {
+    "group-balanced replay": {"group_balanced_replay": True, **GROUPS},
+    "experts": GROUPS,
+    "all": GROUPS,
+}
 SCHEDULE = TaskSchedule((0, 2, 4))

@@ -333,7 +333,7 @@ def test_the_first_update_comes_after_the_warm_up_and_with_the_step_that_follows
 
 
 ALONE = [("ground truth, label", None), ("latent, nothing", None), ("latent, b", None)]
-ALONE += [("even replay", None), *(("all", rl) for rl in ("ddpg", "td3", "sac"))]
+ALONE += [("group-balanced replay", None), *(("all", rl) for rl in ("ddpg", "td3", "sac"))]
 
 
 @pytest.mark.parametrize(("variant", "rl"), ALONE)

@@ -1,4 +1,4 @@
-"""BGPO with groups of behaviors: experts, even replay, and demonstrations as experience."""
+"""BGPO with groups of behaviors: experts, balanced replay, and demonstrations as experience."""
 
 from dataclasses import replace
 
@@ -101,7 +101,7 @@ def batches_of(algorithm):
     return batches
 
 
-@pytest.mark.parametrize("variant", ["even replay", "experts", "all"])
+@pytest.mark.parametrize("variant", ["group-balanced replay", "experts", "all"])
 def test_an_update_sees_as_much_of_each_group_played_last(make_bgpo, bank, variant):
     algorithm = make_bgpo(variant, schedule=TaskSchedule((0, 0, 0)), known=15)
     batches = batches_of(algorithm)
@@ -132,7 +132,7 @@ def test_an_update_sees_as_much_of_each_group_played_last(make_bgpo, bank, varia
     assert n_full > 20
 
 
-@pytest.mark.parametrize("variant", ["even replay", "experts", "all"])
+@pytest.mark.parametrize("variant", ["group-balanced replay", "experts", "all"])
 def test_what_is_stored_is_of_the_group_that_its_demonstration_has_today(make_bgpo, bank, variant):
     """Groups split while they are played."""
     algorithm = make_bgpo(variant, schedule=TaskSchedule((0, 0, 0)), known=9)

@@ -1,20 +1,99 @@
-"""Runs whose policy is written by hand, on a task of their own."""
+"""Experiments that are small enough to run in a second, and runs of scripted policies."""
 
+import shutil
 from dataclasses import replace
 
 import pytest
 import torch
 from tensordict.nn import TensorDictModule
 
+from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.policy import Policy
 from bgpo_trl.data.bank import DemonstrationBank
+from bgpo_trl.experiments import measure, privileged_information, settings
+from bgpo_trl.experiments import run as experiment
+from bgpo_trl.figures import of_run
 from bgpo_trl.policy import LoadedRun
+from bgpo_trl.training import Trainer
 from suites import nico
 from suites.nico.base import STATE_CENTER, STATE_SCALE
 
 
+@pytest.fixture
+def tiny(monkeypatch, encoders, bank, make_config):
+    """Untrained encoders, runs of a second and two final test episodes of each task."""
+    config = make_config(episodes=6)
+    for module in (experiment, privileged_information):
+        monkeypatch.setattr(module, "load_pretrained", lambda *_, **__: (encoders, bank))
+    for module in (settings, privileged_information):
+        monkeypatch.setattr(module, "PRESETS", {"quick": config, "desk": config})
+    for name, entry in ALGORITHMS.items():
+        small = replace(entry, config=make_config(name=name).algorithm)
+        monkeypatch.setitem(ALGORITHMS, name, small)
+    chance = torch.tensor([0.1, 0.2, 0.3])
+    monkeypatch.setattr(measure, "evaluate_random_policy", lambda **_: chance)
+    test = measure._final_tests
+    monkeypatch.setattr(measure, "_final_tests", lambda *run, episodes: test(*run, episodes=2))
+
+
+@pytest.fixture
+def tiniest(tiny, monkeypatch):
+    """As `tiny`, with empty files in place of figures."""
+
+    def touch(figure, path):
+        path.parent.mkdir(exist_ok=True)
+        path.touch()
+
+    for module in (measure, of_run):
+        monkeypatch.setattr(module, "save_figure", touch)
+        for name in dir(module):
+            if name.startswith("plot_"):
+                monkeypatch.setattr(module, name, lambda *data, **options: None)
+
+
+@pytest.fixture
+def undrawn(tiny, monkeypatch):
+    """As `tiny`, without figures."""
+
+    def draw(trainer, bank, out, random_success):
+        (out / "figures").mkdir(exist_ok=True)
+        return []
+
+    monkeypatch.setattr(experiment, "draw", draw)
+
+
+@pytest.fixture(scope="session")
+def finished_runs(bank, encoders, make_config, tmp_path_factory):
+    """Trains an algorithm once, and returns the run directory."""
+    directories = {}
+
+    def finished(name):
+        if name not in directories:
+            directories[name] = tmp_path_factory.mktemp(name)
+            config = make_config(name=name)
+            parts = {"bank": bank, "encoders": encoders, "progress": False}
+            with Trainer(config, directories[name], **parts) as trainer:
+                trainer.run()
+        return directories[name]
+
+    return finished
+
+
+@pytest.fixture
+def shipped(encoders, monkeypatch):
+    """Untrained encoders in place of those that come with the package."""
+    place = "bgpo_trl.runs.demonstrations.load_representation"
+    monkeypatch.setattr(place, lambda path, scene_version: encoders)
+
+
+@pytest.fixture
+def run_of(finished_runs, shipped, tmp_path):
+    """Returns a copy of a finished run of an algorithm."""
+    return lambda name: shutil.copytree(finished_runs(name), tmp_path / "runs" / name)
+
+
 class Scripted:
-    """An algorithm of which nothing is used but a policy, a function of the ground truth."""
+    """Algorithm that has only a policy, a function of the ground truth."""
 
     device = torch.device("cpu")
 

@@ -1,5 +1,6 @@
-"""What becomes of successes: of those in earnest, and of touches, throws and falls."""
+"""Whether successes last: those of demonstrators, and touches, throws and falls."""
 
+import json
 from dataclasses import replace
 from functools import cache
 
@@ -9,8 +10,9 @@ import torch
 
 from bgpo_trl.evaluation import start_seeds
 from bgpo_trl.experiments import aftermath
-from bgpo_trl.experiments.aftermath import CRITERIA, Continuation, Row
+from bgpo_trl.experiments.aftermath import CRITERIA, AftermathArguments, Continuation, Row
 from bgpo_trl.experiments.episodes import play
+from bgpo_trl.runs.results import read_table
 from suites import nico
 
 NUMBER = aftermath._NUMBER
@@ -36,7 +38,7 @@ def ending(episode, change):
 
 
 @in_every_task
-def test_what_a_demonstrator_does_is_in_earnest(task):
+def test_successes_of_demonstrators_last(task):
     holds, distance = outcome(task, demonstrated(task))
     assert holds
     if CRITERIA[task].distance == "gap":
@@ -48,7 +50,7 @@ def test_what_a_demonstrator_does_is_in_earnest(task):
 @pytest.mark.parametrize(
     ("other", "task"), [("push_glass_right", "grasp_glass"), ("push_green_to_white", "lift_green")]
 )
-def test_what_is_merely_touched_is_not_lifted(other, task):
+def test_an_object_that_is_only_touched_is_not_lifted(other, task):
     pushed = demonstrated(other)
     name = "glass" if task == "grasp_glass" else "green_box"
     assert Continuation().begin(pushed.end).touching("hand", name)
@@ -57,7 +59,7 @@ def test_what_is_merely_touched_is_not_lifted(other, task):
     assert lift < 0.01
 
 
-def test_what_is_thrown_up_is_not_lifted():
+def test_an_object_that_is_thrown_up_is_not_lifted():
     def throw(physics):
         physics.named.data.qpos["glass"][:3] += [0.0, 0.3, 0.2]  # out of the hand's reach
         physics.named.data.qvel["glass"][2] = 12.0  # in the air until 2.4 s later
@@ -93,7 +95,7 @@ def apart(velocity, distance=0.0):
         (apart(1.0), False),  # They touch, and part.
     ],
 )
-def test_what_is_together_has_to_stay_so(change, together):
+def test_objects_pushed_together_have_to_stay_together(change, together):
     pushed = demonstrated("push_green_to_glass")
     holds, gap = outcome("push_green_to_glass", pushed, end=ending(pushed, change))
     assert holds == together
@@ -112,19 +114,19 @@ def slide(physics):
 
 
 @pytest.mark.parametrize("change", [topple, slide])
-def test_what_was_pushed_aside_has_to_stand_there(change):
+def test_an_object_that_falls_or_slides_is_not_pushed_aside(change):
     pushed = demonstrated("push_glass_right")
     assert not outcome("push_glass_right", pushed, end=ending(pushed, change)).holds
 
 
-def test_what_moves_does_not_stand():
+def test_a_moving_object_does_not_stand():
     physics = Continuation().begin(demonstrated("press_white").start)
     assert all(aftermath.stands(physics, name) for name in nico.OBJECTS)
     physics.named.data.qvel["glass"][1] = 0.03
     assert [aftermath.stands(physics, name) for name in nico.OBJECTS] == [False, True, True]
 
 
-def test_what_was_pushed_to_the_other_side_was_not_pushed_aside():
+def test_a_push_to_the_other_side_does_not_count():
     pushed = demonstrated("push_white_left")
     left = outcome("push_white_left", pushed)
     right = outcome("push_white_right", pushed)
@@ -133,7 +135,7 @@ def test_what_was_pushed_to_the_other_side_was_not_pushed_aside():
     assert not outcome("push_white_left", pushed, end=pushed.start).holds
 
 
-def test_what_comes_back_was_not_pushed_aside():
+def test_an_object_that_comes_back_is_not_pushed_aside():
     pushed, then = demonstrated("push_white_left"), Continuation()
 
     def pull(physics):
@@ -151,7 +153,7 @@ def test_what_comes_back_was_not_pushed_aside():
     assert not holds and displacement > 0
 
 
-def test_a_fist_in_the_air_presses_nothing():
+def test_a_raised_fist_does_not_press():
     pressed = demonstrated("press_white")
 
     def rise(physics):
@@ -162,7 +164,7 @@ def test_a_fist_in_the_air_presses_nothing():
     assert not holds and gap > 0.05
 
 
-def test_a_simulation_is_continued_as_in_the_environment():
+def test_a_continuation_equals_the_environment():
     env = nico.load("press_white", seed=5, observation="state")
     env.reset()
     then = Continuation()
@@ -180,7 +182,7 @@ class Close(nico.NicoTask):
         return bool(physics.joint_angles()[3] > 0.6)
 
 
-def test_episodes_of_a_policy_are_those_of_its_actions(scripted_run):
+def test_episodes_of_a_policy_equal_those_of_its_actions(scripted_run):
     action = [0.0, 0.1, 0.0, 0.2]
     run = scripted_run(
         "close", Close, lambda state: torch.tensor(action).expand(*state[..., :4].shape)
@@ -206,7 +208,7 @@ def test_episodes_of_a_policy_are_those_of_its_actions(scripted_run):
 
 def test_own_tasks_need_a_criterion(monkeypatch):
     episode = replace(demonstrated("press_white"), task="juggle")
-    with pytest.raises(ValueError, match="success of juggle is worth: add a Criterion to"):
+    with pytest.raises(ValueError, match="juggle"):
         aftermath.judge("policy", [episode])
     assert aftermath.judge("policy", [replace(episode, success=False)]) == []
     monkeypatch.setitem(CRITERIA, "juggle", CRITERIA["press_white"])
@@ -214,7 +216,7 @@ def test_own_tasks_need_a_criterion(monkeypatch):
     assert row[:5] == ("policy", episode.seed, "juggle", True, "gap")
 
 
-def test_the_table_by_hand():
+def test_the_table_equals_that_by_hand():
     rows = [
         Row("policy", 0, "a", True, "lift", 0.3),
         Row("policy", 0, "a", False, "lift", 0.01),
@@ -229,3 +231,36 @@ def test_the_table_by_hand():
         ["random", "a", "0 of 4", "", ""],
         ["random", "b", "1 of 5", "100.0", "1.0 (gap)"],
     ]
+
+
+def test_the_command_has_a_row_for_each_success(run_of, tmp_path):
+    """Of the demonstrators' successes, since untrained policies have none."""
+    run, out = run_of("oracle"), tmp_path / "out"
+    config = json.loads((run / "config.json").read_text())
+    config["algorithm"]["max_steps"] = 50
+    (run / "config.json").write_text(json.dumps(config))
+    printed = aftermath.aftermath(
+        AftermathArguments(run=run, demonstrators=True, episodes=1, out=out)
+    )
+    table = [[cell.strip() for cell in x.split("|")[1:-1]] for x in printed.splitlines()[2:]]
+    actors = ("policy", "demonstrators", "random actions")
+    assert [cells[:2] for cells in table] == [
+        [actor, task] for actor in actors for task in nico.PAPER_TASKS
+    ]
+    rows = read_table(out / "aftermath.csv")
+    for actor, task, successes, *_ in table:
+        found = rows[(rows["actor"] == actor) & (rows["task"] == task)]
+        assert successes == f"{len(found)} of 2"
+    assert (rows["actor"] == "demonstrators").sum() >= 4
+    assert set(rows["holds"]) <= {"True", "False"}
+    assert set(json.loads((out / "aftermath.json").read_text())) == {"commit", "command"}
+
+
+def test_demonstrators_and_random_actions_start_alike_without_a_run(monkeypatch, tmp_path):
+    monkeypatch.setattr(nico, "ALL_TASKS", ("press_white",))
+    arguments = AftermathArguments(demonstrators=True, episodes=1, seeds=(4,), out=tmp_path)
+    episodes = aftermath.episodes_of(arguments)
+    assert list(episodes) == ["demonstrators", "random actions"]
+    (first,), (second,) = episodes.values()
+    assert (first.start == second.start).all()
+    assert first.seed == 4

@@ -1,4 +1,7 @@
-"""What is hidden from a policy, and what that does to one that looks and one that does not."""
+"""Tests with the places of the objects hidden from the policy."""
+
+import json
+import shutil
 
 import numpy as np
 import pytest
@@ -8,7 +11,11 @@ from tensordict import TensorDict
 
 from bgpo_trl.envs import NicoEnv
 from bgpo_trl.experiments import looking
+from bgpo_trl.experiments.arguments import TrainedArguments
+from bgpo_trl.experiments.episodes import load_blocks
 from bgpo_trl.experiments.looking import HidingEnv, Row
+from bgpo_trl.runs.results import read_table
+from bgpo_trl.training import Trainer
 from suites import nico
 from suites.nico.rendering import FrameRenderer
 
@@ -62,13 +69,13 @@ def by_condition(run, episodes=8):
     }
 
 
-def test_a_policy_that_looks_is_lost_without_seeing(scripted_run):
+def test_a_policy_that_uses_the_places_fails_without_them(scripted_run):
     found = by_condition(scripted_run("turn", Turn, look))
     assert min(found["seen"]) > 0.5
     assert found["places hidden"] == found["objects hidden"] == [0, 0]
 
 
-def test_a_remembered_movement_needs_no_eyes(scripted_run):
+def test_a_remembered_movement_succeeds_in_all_conditions(scripted_run):
     found = by_condition(scripted_run("turn_left", TurnLeft, remember))
     assert found["seen"] == found["places hidden"] == found["objects hidden"]
     assert min(found["seen"]) > 0.5 > max(found["random actions"])
@@ -104,7 +111,7 @@ def check(env, row, expected):
 
 
 @every_kind
-def test_what_is_shown_is_a_scene_with_nominal_places(hidden):
+def test_observations_show_objects_at_nominal_places(hidden):
     env = HidingEnv(batch_size=[2], seed=4, observation="both", hidden=hidden)
     state = env.reset()
     nominal = [(place, Rotation.identity()) for place in nico.nominal_places()]
@@ -140,7 +147,7 @@ def test_what_is_shown_is_a_scene_with_nominal_places(hidden):
 
 
 @every_kind
-def test_the_simulation_is_untouched(hidden):
+def test_the_simulation_is_that_of_the_plain_environment(hidden):
     envs = [NicoEnv(batch_size=[2], seed=4), HidingEnv(batch_size=[2], seed=4, hidden=hidden)]
     states = [env.reset(TensorDict({"task": torch.tensor([0, 2])}, [2])) for env in envs]
     assert not states[0]["pixels"].equal(states[1]["pixels"])
@@ -158,7 +165,7 @@ def test_the_simulation_is_untouched(hidden):
         env.close()
 
 
-def test_the_table_by_hand():
+def test_the_table_equals_that_by_hand():
     success = {
         "seen": [[0.5, 1.0], [0.7, 1.0], [0.6, 1.0]],
         "hidden": [[0.0, 0.2], [0.0, 0.2], [0.0, 0.5]],
@@ -180,6 +187,56 @@ def test_the_table_by_hand():
     assert looking.looking_table(one)[3] == ["all", "85.0", "10.0"]
 
 
-def test_no_episodes_are_refused(scripted_run):
-    with pytest.raises(ValueError, match="--episodes must be at least 1, got 0"):
-        looking.measure_looking(scripted_run("turn", Turn, look), 0)
+@pytest.mark.parametrize("name", ["bgpo", "maml", "dist-nll"])
+def test_the_command_tests_every_seed_in_every_condition(run_of, tmp_path, name):
+    out, conditions = tmp_path / "out", [*VIEWS, looking.RANDOM]
+    printed = looking.looking(TrainedArguments(run=run_of(name), episodes=1, out=out))
+    rows = read_table(out / "looking.csv")
+    assert rows[["condition", "seed", "task"]].to_numpy().tolist() == [
+        [condition, seed, task]
+        for condition in conditions
+        for seed in "38"
+        for task in nico.PAPER_TASKS
+    ]
+    assert set(rows["success"]) <= {"0.0", "1.0"}
+    assert (out / "looking.png").exists()
+    assert set(json.loads((out / "looking.json").read_text())) == {"commit", "command"}
+    lines = [[cell.strip() for cell in x.split("|")[1:-1]] for x in printed.splitlines()]
+    assert lines[0] == ["success, %", *conditions]
+    assert [cells[0] for cells in lines[2:]] == [*nico.PAPER_TASKS, "all"]
+
+
+@pytest.fixture
+def trained(bank, shipped, make_config, tmp_path):
+    """Trains a run on the ground truth."""
+
+    def train(encoders):
+        config = make_config("state", "oracle", episodes=4)
+        with Trainer(
+            config, tmp_path / "run", bank=bank, encoders=encoders, progress=False
+        ) as trainer:
+            trainer.run()
+        return tmp_path / "run"
+
+    return train
+
+
+def test_a_run_on_the_ground_truth_is_tested_too(trained, encoders):
+    run = trained(encoders)
+    looking.looking(TrainedArguments(run=run, episodes=1))
+    assert len(read_table(run / "looking.csv")) == 4 * 2 * 3
+
+
+def test_a_run_without_encoders_is_refused(trained, refused):
+    arguments = TrainedArguments(run=trained(None), episodes=1)
+    refused(lambda: looking.looking(arguments), "was trained without encoders", "give its Trainer")
+
+
+def test_a_merged_run_is_tested_by_its_blocks(run_of):
+    run = run_of("bgpo")
+    assert [loaded.config.seeds for loaded in load_blocks(run)] == [(3, 8)]
+    merged = run.parent / "merged"
+    for block in ("seeds-3-8", "seeds-3-8-again"):
+        shutil.copytree(run, merged / block)
+    shutil.copy(run / "config.json", merged)
+    assert [loaded.config.seeds for loaded in load_blocks(merged)] == [(3, 8), (3, 8)]

@@ -1,6 +1,5 @@
 """Jobs on a Ray of this machine, and on two machines of which one is lost."""
 
-import csv
 import os
 import signal
 import sys
@@ -18,6 +17,7 @@ from bgpo_trl.configs import BGPOConfig, RunConfig
 from bgpo_trl.experiments import merge
 from bgpo_trl.experiments import ray_jobs as jobs
 from bgpo_trl.experiments.ray_jobs import Job
+from bgpo_trl.runs.results import read_table
 from bgpo_trl.training import Trainer
 
 # Otherwise Ray starts a worker on every core, in vain.
@@ -25,8 +25,7 @@ SMALL = {"include_dashboard": False, "object_store_memory": 80_000_000}
 
 
 def rows(path):
-    with open(path, newline="") as file:
-        return list(csv.DictReader(file))
+    return read_table(path).to_dict("records")
 
 
 def processes_of(folder):
@@ -107,14 +106,14 @@ def make_play():
     return play
 
 
-def test_jobs_outlive_their_workers_but_not_their_mistakes(ray, tmp_path, monkeypatch, capsys):
+def test_jobs_survive_lost_workers_but_not_their_own_errors(ray, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(jobs, "RETRIES", 1)
     todo = make_jobs(tmp_path, ["dies", "fails", "dies always"])
     failed = jobs.play_jobs(todo, make_play(), cpus=0.5)
-    told = {job.directory.name: reason for job, reason in failed.items()}
-    assert told.pop("fails") == "ValueError: a mistake"
-    assert told.pop("dies always").startswith("WorkerCrashedError: ")
-    assert not told
+    reasons = {job.directory.name: reason for job, reason in failed.items()}
+    assert reasons.pop("fails") == "ValueError: a mistake"
+    assert reasons.pop("dies always").startswith("WorkerCrashedError: ")
+    assert not reasons
     printed = capsys.readouterr().out.splitlines()  # among what Ray says of workers that died
     for job in todo:
         state = "finished" if job.finished else "failed"
@@ -131,7 +130,7 @@ def test_jobs_outlive_their_workers_but_not_their_mistakes(ray, tmp_path, monkey
     assert "ValueError: a mistake\nof two lines" in (tmp_path / "fails" / "log.txt").read_text()
 
 
-def test_ctrl_c_reaches_the_runs(ray, tmp_path):
+def test_ctrl_c_interrupts_the_runs(ray, tmp_path):
     todo = make_jobs(tmp_path, ["waits"])
 
     def interrupt():
@@ -146,12 +145,15 @@ def test_ctrl_c_reaches_the_runs(ray, tmp_path):
     assert not todo[0].finished
 
 
-def test_a_run_is_played_when_no_other_process_holds_it(make_config, tmp_path, other_process):
+def test_a_job_waits_for_the_lock_and_skips_a_finished_run(
+    make_config, tmp_path, monkeypatch, other_process
+):
     """It goes on once the other process is gone, and does not play again what that one ended."""
     job = Job(tmp_path / "run", make_config())
-    played = []
+    waiting, played = threading.Event(), []
+    monkeypatch.setattr("bgpo_trl.files.locking.time.sleep", lambda _: waiting.set())
     for ended_by_other in (False, True):
-        played.clear()
+        waiting.clear(), played.clear()
         other = other_process(job.directory)
         assert other.stdout.readline() == "has it\n"
         (job.directory / "finished").unlink(missing_ok=True)
@@ -159,8 +161,8 @@ def test_a_run_is_played_when_no_other_process_holds_it(make_config, tmp_path, o
             target=jobs.work, args=(job, lambda _: played.append(job), sys.argv)
         )
         thread.start()
-        thread.join(0.3)
-        assert thread.is_alive() and not played
+        assert waiting.wait(20)
+        assert not played
         if ended_by_other:
             (job.directory / "finished").touch()
         other.communicate("\n")
@@ -170,7 +172,7 @@ def test_a_run_is_played_when_no_other_process_holds_it(make_config, tmp_path, o
     assert (job.directory / "log.txt").read_text().count(f"process {os.getpid()} on") == 1
 
 
-def test_a_machine_that_is_too_small_is_told(monkeypatch):
+def test_a_machine_without_enough_cores_or_gpus_is_refused(monkeypatch):
     ended = []
     stub = SimpleNamespace(
         init=lambda *_, **__: None,
@@ -178,15 +180,18 @@ def test_a_machine_that_is_too_small_is_told(monkeypatch):
         shutdown=lambda: ended.append(1),
     )
     monkeypatch.setattr(jobs, "ray", stub)
-    for cpus, gpus, told in ((3, 0, "--cpus-per-run 3: Ray finds 2"), (2, 0.5, "--gpus-per-run")):
-        with pytest.raises(ValueError, match=told), jobs.connected("local", cpus, gpus):
+    for cpus, gpus, message in (
+        (3, 0, "--cpus-per-run 3: Ray finds 2"),
+        (2, 0.5, "--gpus-per-run"),
+    ):
+        with pytest.raises(ValueError, match=message), jobs.connected("local", cpus, gpus):
             raise AssertionError("went on")
     with jobs.connected("auto", 8, 1):  # a cluster may grow
         assert len(ended) == 2
     assert len(ended) == 3
 
 
-def test_a_missing_ray_is_told_with_what_to_install(monkeypatch):
+def test_a_missing_ray_names_the_extra_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     monkeypatch.delitem(sys.modules, "bgpo_trl.experiments.ray_jobs")
     with pytest.raises(ImportError, match=r"pip install 'bgpo_trl\[ray\]'"):
@@ -212,7 +217,9 @@ def cluster(folder):
 
 
 @pytest.mark.slow
-def test_a_lost_machine_costs_nothing(cluster, bank, make_config, tmp_path):
+def test_jobs_of_a_lost_machine_continue_identically_elsewhere(
+    cluster, bank, make_config, tmp_path
+):
     """It is lost half-way through its run, and the other machine plays what is left."""
     config = make_config(state="state", name="ddpg", episodes=40, checkpoint_minutes=0.0)
     todo = [
@@ -263,7 +270,7 @@ def test_a_lost_machine_costs_nothing(cluster, bank, make_config, tmp_path):
     }
 
 
-def test_jobs_need_no_hyperparameters_that_can_be_hashed(tmp_path):
+def test_jobs_are_hashable_with_any_hyperparameters(tmp_path):
     @dataclass
     class Part:
         size: int = 1

@@ -1,57 +1,62 @@
-"""The settings of a run that the command line asks for."""
+"""Settings of a run: presets, flags on top, and files of settings."""
 
-import dataclasses
-import re
+import json
 from dataclasses import replace
 
 import pytest
 
-from bgpo_trl.algorithms import ALGORITHMS
+from bgpo_trl.algorithms import ABLATIONS, ALGORITHMS
 from bgpo_trl.algorithms.rl import RL
-from bgpo_trl.configs import PRESETS, DDPGConfig
-from bgpo_trl.experiments.arguments import Arguments, command_line, run_config
+from bgpo_trl.configs import PRESETS, DDPGConfig, SACConfig
+from bgpo_trl.experiments.arguments import Arguments
+from bgpo_trl.experiments.settings import at_once, run_config
+from bgpo_trl.runs.config_file import Digests, settings_of
+from suites import nico
+
+ONE, TWO, THREE = nico.PAPER_TASKS
 
 
-def test_a_preset_is_taken_as_it_is():
+def test_a_preset_alone_is_not_changed():
     for name, preset in PRESETS.items():
         assert run_config(Arguments(preset=name)) == preset
+    assert run_config(Arguments()) == PRESETS["quick"]
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_another_algorithm_changes_nothing_else(name):
+    entry = ALGORITHMS[name]
     for preset, config in PRESETS.items():
-        arguments = Arguments(algorithm=name, preset=preset)
-        entry = ALGORITHMS[name]
         expected = replace(config, name=name, algorithm=entry.config)
-        assert run_config(arguments) == expected
-        published = name.endswith("-paper")
+        assert run_config(Arguments(algorithm=name, preset=preset)) == expected
+
+
+def test_algorithms_share_their_learner_except_as_published():
+    for name, entry in ALGORITHMS.items():
         noise = 0.1 if entry.config.demonstration_share else 0.3
-        # The same learner for all, but those as published.
-        assert (entry.config.rl == DDPGConfig(noise=noise)) is not published
+        size = 384 if name == "demonstrations" else 128
+        shared = entry.config.rl == DDPGConfig(noise=noise, batch_size=size)
+        assert shared is not name.endswith("-paper")
 
 
-def test_the_command_line_names_every_algorithm(capsys):
-    with pytest.raises(SystemExit):
-        command_line(print, None, options=["--help"])
-    told = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    for name in [*ALGORITHMS, *RL]:
-        # "-demonstrations" is told once, of both baselines.
-        assert re.search(rf"\b{name.removesuffix('-demonstrations')}\b", told), name
+@pytest.mark.parametrize("name", ABLATIONS)
+def test_a_variant_has_the_rl_settings_of_bgpo(name):
+    config = run_config(Arguments(rl="sac"), variant=name, from_start=True)
+    algorithm = replace(ALGORITHMS[name].config, rl=SACConfig())
+    assert config == at_once(replace(PRESETS["quick"], name=name, algorithm=algorithm))
 
 
 @pytest.mark.parametrize("rl", RL)
-@pytest.mark.parametrize("name", ["bgpo", "oracle", "ddpg"])
+@pytest.mark.parametrize("name", ["bgpo", "oracle"])
 def test_another_rl_algorithm_changes_nothing_else(name, rl):
     plain = run_config(Arguments(algorithm=name))
-    config = run_config(Arguments(algorithm=name, rl=rl))
     own = plain.algorithm.rl
     expected = own if rl == own.name else RL[rl].config
+    config = run_config(Arguments(algorithm=name, rl=rl))
     assert config == replace(plain, algorithm=replace(plain.algorithm, rl=expected))
-    assert dataclasses.asdict(config)["algorithm"]["rl"]["name"] == rl
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-def test_tasks_of_every_preset_start_when_the_paper_has_them_start(preset):
+def test_tasks_of_every_preset_start_about_when_they_do_in_the_paper(preset):
     config = PRESETS[preset]
     shares = [start / config.episodes for start in config.task_starts]
     # The quick run leaves its last task more of its few episodes.
@@ -67,24 +72,113 @@ def test_tasks_of_every_preset_start_when_the_paper_has_them_start(preset):
         ("quick", 20, (0, 6, 12), 20),  # tested once at least
     ],
 )
-def test_another_length_keeps_the_proportions(preset, episodes, starts, eval_every):
+def test_another_length_scales_the_task_starts(preset, episodes, starts, eval_every):
     config = run_config(Arguments(preset=preset, episodes=episodes))
-    assert (config.episodes, config.task_starts) == (episodes, starts)
-    assert config.eval_every == eval_every
     assert config == replace(
         PRESETS[preset], episodes=episodes, task_starts=starts, eval_every=eval_every
     )
 
 
-@pytest.mark.parametrize("change", [{"seeds": (7, 9)}, {"schedule": "sequential"}])
-def test_other_seeds_or_another_schedule_change_nothing_else(change):
-    config = run_config(Arguments(preset="desk", **change))
-    assert config == replace(PRESETS["desk"], **change)
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"seeds": (7, 9)},
+        {"schedule": "sequential"},
+        {"spread": 0.5, "held_out": "test"},
+        {"eval_every": 7, "eval_episodes": 3, "checkpoint_minutes": 1.0},
+    ],
+)
+def test_a_flag_changes_its_setting_alone(changes):
+    config = run_config(Arguments(preset="desk", **changes))
+    assert config == replace(PRESETS["desk"], **changes)
+
+
+def test_hyperparameters_are_flags():
+    flags = ("--algorithm.beta", "0.2", "--algorithm.rl.hidden-sizes", "32", "16")
+    config = run_config(Arguments(algorithm="bgpo-single", hyperparameters=flags))
+    expected = run_config(Arguments(algorithm="bgpo-single"))
+    rl = replace(expected.algorithm.rl, hidden_sizes=(32, 16))
+    assert config == replace(expected, algorithm=replace(expected.algorithm, beta=0.2, rl=rl))
 
 
 @pytest.mark.parametrize(
-    "arguments", [{"episodes": 0}, {"episodes": -3}, {"seeds": ()}, {"seeds": (2, 2)}]
+    ("tasks", "episodes", "starts"),
+    [
+        ((TWO,), None, (0,)),
+        ((TWO, ONE), None, (0, 600)),
+        ((TWO, ONE), 100, (0, 50)),
+        ((THREE, ONE, TWO), None, (0, 380, 700)),  # as many as the preset has
+        (("all",), 4_000, tuple(range(0, 4_000, 500))),
+    ],
 )
-def test_lengths_and_seeds_that_cannot_be_are_refused(arguments):
-    with pytest.raises(ValueError, match=r"must be at least 1|seeds must be one or more"):
-        run_config(Arguments(**arguments))
+def test_tasks_start_in_their_order_at_even_intervals(tasks, episodes, starts):
+    config = run_config(Arguments(tasks=tasks, episodes=episodes))
+    assert config.tasks == (nico.ALL_TASKS if tasks == ("all",) else tasks)
+    assert config.task_starts == starts
+    assert at_once(config).task_starts == (0,) * len(starts)
+
+
+def write(path, content):
+    path.write_text(json.dumps(content))
+    return path
+
+
+def test_the_config_of_a_run_is_read_whole(tmp_path):
+    stored = run_config(Arguments(preset="desk", algorithm="maml", seeds=(4,), tasks=(TWO, ONE)))
+    write(tmp_path / "config.json", settings_of(stored, Digests("some", "bank")))
+    for path in (tmp_path, tmp_path / "config.json"):
+        assert run_config(Arguments(config=path)) == stored
+
+
+def test_a_file_changes_the_preset_and_flags_change_the_file(tmp_path):
+    content = {"name": "bgpo-single", "eval_every": 6, "algorithm": {"beta": 0.2, "rl": {"tau": 1}}}
+    path = write(tmp_path / "mine.json", content)
+    single = ALGORITHMS["bgpo-single"].config
+    algorithm = replace(single, beta=0.2, rl=replace(single.rl, tau=1.0))
+    expected = replace(PRESETS["desk"], name="bgpo-single", eval_every=6, algorithm=algorithm)
+    assert run_config(Arguments(config=path, preset="desk")) == expected
+    flags = Arguments(
+        config=path, preset="desk", eval_every=9, hyperparameters=("--algorithm.beta", "0.7")
+    )
+    algorithm = replace(algorithm, beta=0.7)
+    assert run_config(flags) == replace(expected, eval_every=9, algorithm=algorithm)
+    other = run_config(Arguments(config=path, preset="desk", algorithm="maml"))
+    assert (other.name, other.algorithm) == ("maml", ALGORITHMS["maml"].config)
+
+
+def test_a_file_can_name_another_rl_algorithm(tmp_path):
+    path = write(tmp_path / "mine.json", {"algorithm": {"rl": {"name": "sac", "gamma": 0.5}}})
+    assert run_config(Arguments(config=path)).algorithm.rl == SACConfig(gamma=0.5)
+
+
+@pytest.mark.parametrize(
+    "content", ["", "[]", '{"colour": 1}', '{"episodes": "many"}', '{"algorithm": {"beta": -1}}']
+)
+def test_a_file_that_is_damaged_or_has_wrong_settings_is_refused(tmp_path, content):
+    path = tmp_path / "mine.json"
+    path.write_text(content)
+    with pytest.raises(ValueError, match=r"mine\.json") as raised:
+        run_config(Arguments(config=path))
+    assert str(raised.value).isprintable()
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"episodes": 0},
+        {"seeds": ()},
+        {"seeds": (2, 2)},
+        {"episodes": 10, "eval_every": 50},
+        {"tasks": ()},
+        {"tasks": ("dance",)},
+        {"tasks": (ONE, ONE)},
+        {"algorithm": "ppo"},
+        {"rl": "ppo"},
+        {"algorithm": "bgpo-paper", "rl": "sac"},
+        {"algorithm": "maml", "rl": "td3"},
+        {"preset": "quick", "module": "no_such_module"},
+    ],
+)
+def test_wrong_settings_are_refused(wrong):
+    with pytest.raises(ValueError):
+        run_config(Arguments(**wrong))

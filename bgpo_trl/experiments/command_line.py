@@ -1,0 +1,83 @@
+"""Command lines: a function of one dataclass of arguments, called with those that are given.
+
+Nothing here imports TorchRL or MuJoCo, so that ``--help`` is quick.
+"""
+
+from __future__ import annotations
+
+import inspect
+import os
+import re
+import sys
+import sysconfig
+import traceback
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any, get_type_hints
+
+import tyro
+
+_SECTIONS = r"\n(?:Args|Returns|Raises):"
+
+
+def command_line(
+    command: Callable[..., str | None],
+    options: Sequence[str] | None = None,
+    *,
+    program: str | None = None,
+) -> None:
+    """Call a function with the arguments of the command line, and print what it returns.
+
+    An expected error becomes one line. Ctrl-C and SIGTERM exit with 75 (``os.EX_TEMPFAIL``) if
+    ``--resume`` can continue. An error of somebody else's code, such as a module named with
+    ``--import``, keeps its traceback.
+
+    Args:
+        command: Function of one dataclass, ``arguments``. Its docstring is shown by ``--help``.
+        options: Arguments; by default those of the process.
+        program: Name of the program in messages; by default that of the process.
+    """
+    kind = get_type_hints(command)["arguments"]
+    try:
+        text = command(_parse(kind, command, options, program))
+    except (ValueError, OSError, RuntimeError) as error:
+        if _is_of_others(error):
+            raise
+        sys.exit(f"error: {error}")
+    except KeyboardInterrupt:
+        if not hasattr(kind, "resume"):
+            sys.exit("interrupted")
+        sys.stderr.write("interrupted: the same command with --resume continues\n")
+        sys.exit(os.EX_TEMPFAIL)
+    if text is not None:
+        sys.stdout.write(f"{text}\n")
+
+
+def _parse(
+    kind: type, command: Callable[..., Any], options: Sequence[str] | None, program: str | None
+) -> Any:
+    """Return the arguments; flags ``--algorithm.*`` are left to `run_config` where it is used."""
+    unprefixed: Any = Annotated[kind, tyro.conf.OmitArgPrefixes]
+    description = re.split(_SECTIONS, inspect.getdoc(command) or "")[0]
+    settings: dict[str, Any] = {"prog": program, "description": description, "args": options}
+    if hasattr(kind, "hyperparameters"):
+        arguments, rest = tyro.cli(unprefixed, **settings, return_unknown_args=True)
+        flags = [word for word in rest if word.startswith("--")]
+        if not rest or (rest[0] in flags and all(f.startswith("--algorithm.") for f in flags)):
+            return replace(arguments, hyperparameters=tuple(rest))
+    return tyro.cli(unprefixed, **settings)
+
+
+def _is_of_others(error: BaseException) -> bool:
+    """Return whether code raised an error, or called the library that did, which is not ours."""
+    paths = [Path(frame.filename) for frame in traceback.extract_tb(error.__traceback__)]
+    libraries = [Path(sysconfig.get_path(name)) for name in ("stdlib", "purelib", "platlib")]
+    package = Path(__file__).parents[1]
+    ours = [package, package.parent / "suites", package.parent / "benchmarks"]
+    for path in reversed(paths):
+        if any(path.is_relative_to(folder) for folder in ours):
+            return False
+        if path.exists() and not any(path.is_relative_to(folder) for folder in libraries):
+            return True
+    return False

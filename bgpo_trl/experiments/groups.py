@@ -1,0 +1,136 @@
+"""Groups of behaviors that form from the demonstrations of a bank, without learning a policy."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bgpo_trl.analysis.tables import Table, markdown
+from bgpo_trl.analysis.task_inference import group_purity, task_inference_accuracy
+from bgpo_trl.configs import BGPOConfig
+from bgpo_trl.data.bank import DemonstrationBank
+from bgpo_trl.experiments.arguments import BankArguments
+from bgpo_trl.experiments.run import bank_of
+from bgpo_trl.experiments.settings import check_draws, even_starts
+from bgpo_trl.modules.behavior_groups import BehaviorGroups
+from bgpo_trl.modules.gwr import GWRB
+from bgpo_trl.seeding import generators
+from bgpo_trl.transforms import TaskSchedule
+
+
+@dataclass(frozen=True)
+class GroupsArguments(BankArguments):
+    """Demonstrations that groups form from."""
+
+    draws: int = 1_800
+    """Demonstrations that each network is shown."""
+    activity_scale: float = BGPOConfig().gwr.activity_scale
+    """Factor of distances in the activity of GWR-B."""
+    seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
+    """Seeds of the draws."""
+    scale: float = 1.0
+    """Factor of the embeddings, on which groups do not depend."""
+
+
+def draw(bank: DemonstrationBank, schedule: TaskSchedule, draws: int, seed: int) -> Iterator[int]:
+    """Draw demonstrations as training episodes do: rows of the bank."""
+    of_task = [np.flatnonzero(bank.task == task) for task in range(schedule.n_tasks)]
+    rng = np.random.default_rng(seed)
+    for available in schedule.available(torch.arange(draws)):
+        yield int(rng.choice(of_task[rng.choice(available.nonzero().flatten())]))
+
+
+def own_groups(group: Tensor, task: Tensor) -> set[int]:
+    """Return the tasks most of whose demonstrations are in a group that holds mostly theirs."""
+    counts = torch.zeros(int(group.max()) + 1, int(task.max()) + 1)
+    counts.index_put_((group, task), torch.tensor(1.0), accumulate=True)
+    largest = counts.argmax(0)
+    is_own = counts[largest].argmax(-1) == torch.arange(len(largest))
+    return {*(is_own & (counts.sum(0) > 0)).nonzero().flatten().tolist()}
+
+
+def form(
+    bank: DemonstrationBank, rows: Sequence[int], config: BGPOConfig
+) -> tuple[BehaviorGroups, dict[int, int], float]:
+    """Let groups form.
+
+    Returns:
+        The groups; by task, the number of its different demonstrations when it first had a group of
+        its own; seconds.
+    """
+    groups = BehaviorGroups(
+        bank.embedding.shape[-1], smallest=config.group_size, evidence=config.group_evidence
+    )
+    shown: dict[int, None] = {}
+    needed: dict[int, int] = {}
+    seconds, revision = 0.0, -1
+    for row in rows:
+        shown[row] = None
+        begun = time.perf_counter()
+        groups.adapt(bank.embedding[row])
+        seconds += time.perf_counter() - begun
+        if int(groups.revision) == revision:
+            continue
+        revision = int(groups.revision)
+        so_far = torch.tensor([*shown])
+        task = bank.task[so_far]
+        for own in own_groups(groups.lookup(bank.embedding[so_far]).group, task) - needed.keys():
+            needed[own] = int((task == own).sum())
+    return groups, needed, seconds
+
+
+def groups(arguments: GroupsArguments) -> str:
+    """Measure the groups of behaviors that form from demonstrations, without learning a policy.
+
+    Shows demonstrations in the order of training episodes, in four schedules, and prints by seed:
+    how many groups there are at the end; how pure they are on held-out demonstrations; how many
+    different demonstrations of its own each task needed before it had a group (the most demanding
+    task); how long grouping took; the nodes of GWR-B, and in how many held-out demonstrations it
+    infers the task.
+
+    Raises:
+        ValueError: If there is nothing to draw, or a bank or task does not exist.
+    """
+    torch.set_num_threads(1)
+    check_draws(arguments.seeds, arguments.draws)
+    bank, config = bank_of(arguments), BGPOConfig()
+    bank = replace(bank, embedding=arguments.scale * bank.embedding)
+    fine = replace(config.gwr, activity_scale=arguments.activity_scale / arguments.scale)
+    n_tasks, seen, held_out = len(bank.tasks), bank.seen(), bank.held_out()
+    forward = even_starts(n_tasks, arguments.draws)
+    schedules = {
+        "one after the other": TaskSchedule(forward),
+        "in reverse": TaskSchedule(forward[::-1]),
+        "the newest only": TaskSchedule(forward, cumulative=False),
+        "from the start": TaskSchedule((0,) * n_tasks),
+    }
+    table: Table = [
+        ["order", "groups, by seed", "purity, %", "needed", "seconds", "nodes", "inferred, %"]
+    ]
+    for order, schedule in schedules.items():
+        columns: list[list[str]] = []
+        for seed in arguments.seeds:
+            rows = [*draw(seen, schedule, arguments.draws, seed)]
+            formed, needed, seconds = form(seen, rows, config)
+            (random,) = generators([seed], "gwr")
+            gwr = GWRB(seen.embedding.shape[-1], fine, generator=random)
+            for row in rows:
+                gwr.adapt(seen.embedding[row])
+            inferred = task_inference_accuracy(gwr, seen, held_out, n_tasks)
+            columns.append(
+                [
+                    f"{int(formed.num_groups)}",
+                    f"{100 * float(group_purity(formed, held_out, n_tasks)):.4g}",
+                    f"{max(needed.values())}" if len(needed) == n_tasks else "never",
+                    f"{seconds:.1f}",
+                    f"{int(gwr.num_nodes)}",
+                    f"{100 * float(inferred):.4g}",
+                ]
+            )
+        table.append([order, *(" ".join(column) for column in zip(*columns, strict=True))])
+    return markdown(table)

@@ -1,0 +1,230 @@
+"""Success and task inference against the share of the demonstration that is shown."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+import torch
+from matplotlib.figure import Figure
+from matplotlib.ticker import PercentFormatter
+
+from bgpo_trl.analysis.tables import Table, markdown
+from bgpo_trl.analysis.task_inference import task_inference_accuracy
+from bgpo_trl.data.bank import DemonstrationBank
+from bgpo_trl.data.recording import record_demonstrations
+from bgpo_trl.encoders.representation import embed_demonstrations
+from bgpo_trl.evaluation import Evaluator, Snapshot
+from bgpo_trl.experiments.arguments import TrainedArguments
+from bgpo_trl.experiments.episodes import evaluator_of
+from bgpo_trl.experiments.records import commit_of_code, write_measurement
+from bgpo_trl.figures.style import COLORS, save_figure
+from bgpo_trl.machine import set_threads
+from bgpo_trl.plugins import import_plugin
+from bgpo_trl.policy import TrainedPolicy, load_run
+from bgpo_trl.seeding import stream_seed
+
+# Number of the evaluation; it seeds start states that neither training nor final tests used.
+_NUMBER = 2**31 + 1
+
+
+class Row(NamedTuple):
+    """Row of ``one_shot.csv``; the last two values are NaN for algorithms without GWR-B."""
+
+    share: float
+    seed: int
+    task: str
+    episodes: int
+    success: float
+    task_inference: float
+    activity: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class OneShotArguments(TrainedArguments):
+    """Tests with demonstrations that are cut short."""
+
+    shares: tuple[float, ...] = (0.25, 0.5, 0.75, 1.0)
+    """Shares of each demonstration to show, from its start."""
+    episodes: int = 20
+    """Demonstrations and test episodes per task and seed."""
+    seed: int = 1
+    """Seed of the demonstrations; the pretrained encoders were trained on seed 0."""
+
+
+def show(
+    policy: TrainedPolicy, embedding: torch.Tensor, task: torch.Tensor, evaluator: Evaluator
+) -> list[tuple[int, int, float, float, float]]:
+    """Test the policies of all seeds, each with the same demonstrations.
+
+    Args:
+        policy: Policy of one of the seeds.
+        embedding: Embeddings phi of the demonstrations, ``[T, M, 32]``.
+        task: Task labels, ``[T, M]``.
+        evaluator: Evaluator for ``M`` episodes of ``T`` tasks.
+
+    Returns:
+        Tuples of seed, task, success, share of demonstrations whose task was inferred, and mean
+        activity.
+    """
+    algorithm, seeds = policy.algorithm, policy.config.seeds
+    n_tasks, n_seeds = len(task), len(seeds)
+    snapshots = [
+        Snapshot(
+            number=_NUMBER,
+            episode=0,
+            env_steps=0,
+            presented=torch.ones(n_tasks, dtype=torch.bool),
+            policy=algorithm.snapshot(
+                index,
+                embedding,
+                task,
+                torch.Generator().manual_seed(stream_seed(seed, "one-shot")),
+            ),
+        )
+        for index, seed in enumerate(seeds)
+    ]
+    success = evaluator.run(snapshots, algorithm.device).success.double().mean(-1)
+    inferred, activity = torch.full((2, n_seeds, n_tasks), torch.nan, dtype=torch.double)
+    if algorithm.gwr is not None:
+        activity = algorithm.gwr.lookup(embedding.expand(n_seeds, *embedding.shape)).activity
+        activity, seen = activity.mean(-1), policy.bank.seen()
+        for number, (phi, label) in enumerate(zip(embedding, task, strict=True)):
+            tested = DemonstrationBank(
+                phi, label, torch.zeros_like(label, dtype=torch.bool), policy.tasks
+            )
+            inferred[:, number] = task_inference_accuracy(algorithm.gwr, seen, tested, n_tasks)
+    return [
+        (
+            seed,
+            number,
+            float(success[index, number]),
+            float(inferred[index, number]),
+            float(activity[index, number]),
+        )
+        for index, seed in enumerate(seeds)
+        for number in range(n_tasks)
+    ]
+
+
+def measure(policy: TrainedPolicy, shares: Sequence[float], episodes: int, seed: int) -> list[Row]:
+    """Return the rows of the CSV file; for the arguments see `OneShotArguments`.
+
+    Raises:
+        ValueError: If a share is not in (0, 1], or ``episodes`` is less than 1.
+    """
+    if not shares or not all(0 < share <= 1 for share in shares):
+        raise ValueError(f"--shares are in (0, 1], got {', '.join(map(str, shares)) or 'none'}")
+    if episodes < 1:
+        raise ValueError(f"--episodes must be at least 1, got {episodes}")
+    tasks, config = policy.tasks, policy.config
+    evaluator = evaluator_of(policy, policy.bank.held_out(), episodes)
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        shown = record_demonstrations(
+            folder,
+            tasks=tasks,
+            per_task=episodes,
+            held_out_per_task=0,
+            spread=config.spread,
+            seed=seed,
+            progress=False,
+        ).to_tensordict()
+    length = shown.get("length").clone()
+    for share in shares:
+        shown["length"] = (share * length).round().long().clamp(min=1)
+        embedding = embed_demonstrations(policy.encoders, shown).view(len(tasks), episodes, -1)
+        tested = show(policy, embedding, shown["task"].view(len(tasks), episodes), evaluator)
+        rows += [Row(share, s, tasks[task], episodes, *found) for s, task, *found in tested]
+    return rows
+
+
+def means(rows: Sequence[Row]) -> dict[str, dict[float, np.ndarray]]:
+    """Return each seed's mean success, task inference and activity, ``[S, 3]``, by task and share.
+
+    The key ``"all"`` holds the means over tasks.
+    """
+    table = pd.DataFrame(rows)
+    measures, shares = ["success", "task_inference", "activity"], table["share"].unique()
+    return {
+        task: {
+            share: of_task[of_task["share"] == share]
+            .groupby("seed", sort=False)[measures]
+            .mean()
+            .to_numpy()
+            for share in shares
+        }
+        for task, of_task in [("all", table), *table.groupby("task", sort=False)]
+    }
+
+
+def plot(table: Mapping[str, Mapping[float, np.ndarray]]) -> Figure:
+    """Plot success and task inference against the share of the demonstration shown.
+
+    Lines are means over seeds, by task and over all tasks, the latter shaded by one standard
+    deviation. Algorithms without GWR-B have no task inference.
+    """
+    names = ["Success rate", "Task inferred"]
+    if all(np.isnan(seeds[:, 1]).all() for shares in table.values() for seeds in shares.values()):
+        names.pop()
+    figure = Figure(figsize=(7.0, 3.2), layout="constrained")
+    panels = figure.subplots(1, len(names), sharex=True, sharey=True, squeeze=False)[0]
+    for column, (axes, name) in enumerate(zip(panels, names, strict=True)):
+        for number, (task, shares) in enumerate(table.items(), -1):  # "all" is the first
+            color = "#222222" if task == "all" else COLORS[number % len(COLORS)]
+            shown = sorted(shares)
+            seeds = np.stack([shares[share][:, column] for share in shown])
+            mean, spread = seeds.mean(1), seeds.std(1)
+            axes.plot(shown, mean, "o-", color=color, markersize=4, label=task.replace("_", " "))
+            if task == "all":
+                low, high = np.clip(mean - spread, 0, 1), np.clip(mean + spread, 0, 1)
+                axes.fill_between(shown, low, high, color=color, alpha=0.15, linewidth=0)
+        axes.set(xticks=sorted(next(iter(table.values()))), ylim=(0, 1.02))
+        axes.set_title(name, fontsize=9)
+        axes.xaxis.set_major_formatter(PercentFormatter(1, decimals=0))
+        axes.tick_params(labelsize=8)
+        axes.grid(color="0.9", linewidth=0.6)
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.supxlabel("Share of the demonstration seen", fontsize=9)
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=4, fontsize=8, frameon=False)
+    return figure
+
+
+def one_shot(arguments: OneShotArguments) -> str:
+    """Test the policies of a run with new demonstrations that are cut short.
+
+    Prints a table and writes one_shot.csv, one_shot.png and one_shot.json (commit and command) into
+    the run directory.
+
+    Raises:
+        ValueError: If the run cannot be loaded, or a share is not in (0, 1].
+    """
+    commit, out = commit_of_code(), arguments.out or arguments.run
+    import_plugin(arguments.module)
+    set_threads(arguments.threads)
+    policy = load_run(arguments.run)
+    rows = measure(policy, arguments.shares, arguments.episodes, arguments.seed)
+    rounded = [
+        row._replace(
+            success=round(row.success, 4),
+            task_inference=round(row.task_inference, 4),
+            activity=round(row.activity, 4),
+        )
+        for row in rows
+    ]
+    write_measurement(out, "one_shot", Row._fields, rounded, commit)
+    found = means(rows)
+    save_figure(plot(found), out / "one_shot.png")
+    table: Table = [["task", "seen", "success", "inferred", "activity"]]
+    for task, shares in found.items():
+        for share, seeds in shares.items():
+            success, inferred, activity = seeds.mean(0)
+            without_gwr = bool(np.isnan(inferred))
+            from_gwr = ["", ""] if without_gwr else [f"{inferred:.1%}", f"{activity:.2f}"]
+            table.append([task, f"{share:.0%}", f"{success:.1%}", *from_gwr])
+    return markdown(table)

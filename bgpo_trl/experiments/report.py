@@ -1,0 +1,345 @@
+"""Report of finished runs: tables and figures, or the difference between two runs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+
+from bgpo_trl.analysis import metrics, statistics
+from bgpo_trl.analysis.comparison import (
+    Run,
+    Setting,
+    differing_conditions,
+    read_run,
+    read_settings,
+    reference_of,
+    run_directories,
+)
+from bgpo_trl.analysis.scores import Values, late_scores, success_matrix
+from bgpo_trl.analysis.tables import (
+    COST_NOTE,
+    DIFFERENCE_NOTES,
+    SEQUENCE_NOTES,
+    SPEED_NOTE,
+    SUCCESS_NOTES,
+    Table,
+    claims,
+    cost_table,
+    difference_table,
+    groups_table,
+    markdown,
+    sequence_table,
+    speed_table,
+    success_table,
+    task_table,
+)
+from bgpo_trl.figures.curves import plot_success_curves
+from bgpo_trl.figures.groups import plot_counts, read_counts
+from bgpo_trl.figures.gwr import plot_gwr_pca
+from bgpo_trl.figures.of_run import draw_groups
+from bgpo_trl.figures.page import Section, write_page
+from bgpo_trl.figures.style import COLORS, save_figure
+from bgpo_trl.figures.success_matrix import plot_success_matrices
+from bgpo_trl.files.writing import make_folder
+from bgpo_trl.runs.archive import archive_run
+from bgpo_trl.runs.results import find_table, read_table
+
+# For a screen: figures of results are kept under version control.
+_DPI = 150
+# Curves that can be distinguished in one figure.
+_CURVES = len(COLORS)
+
+
+@dataclass(frozen=True)
+class ReportArguments:
+    """Finished runs."""
+
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Folders of runs, or run directories."""
+    out: Path | None = None
+    """Folder of the report; by default that of the runs."""
+    archive: Path | None = None
+    """Folder for compact copies of the runs, on which the report is then made."""
+    anyway: bool = False
+    """Compare also runs under different conditions, such as other encoders or tests."""
+    compare: bool = False
+    """Only print the differences between two runs, task by task."""
+    every: int | None = None
+    """With --compare, also over each part of training of so many episodes."""
+
+
+@dataclass(frozen=True)
+class Report:
+    """Sections of a report, and its runs by directory."""
+
+    sections: list[Section]
+    runs: dict[Path, Run]
+
+
+def presented(run: Run) -> dict[str, int]:
+    """Return the training episode from which each task of a run is presented."""
+    return dict(zip(run.tasks, run.starts, strict=True))
+
+
+def draw_curves(setting: Setting, out: Path) -> dict[str, Path]:
+    """Draw the learning curves of a setting, some runs to a figure; paths by caption."""
+    figures: dict[str, Path] = {}
+    for start in range(0, len(setting.runs), _CURVES):
+        names = list(setting.runs)[start : start + _CURVES]
+        path = out / f"{setting.slug}{f'-{1 + start // _CURVES}' if start else ''}.png"
+        first = setting.runs[names[0]]
+        figure = plot_success_curves(
+            {name: setting.runs[name].directory / "eval.csv" for name in names},
+            presented=presented(first),
+            random_success=first.summary.get("random_success"),
+            window=3 * first.eval_every,
+            last=first.last,
+        )
+        save_figure(figure, path, _DPI)
+        figures[f"mean and one standard deviation over seeds: {', '.join(names)}"] = path
+    return figures
+
+
+def draw_sequence(setting: Setting, out: Path) -> dict[str, Path]:
+    """Draw success after each phase as heat maps; paths by caption."""
+    path = out / f"{setting.slug}-matrix.png"
+    matrices = {name: success_matrix(run).mean(0) for name, run in setting.runs.items()}
+    save_figure(plot_success_matrices(matrices, setting.first.tasks), path, _DPI)
+    return {"success on each task after each phase": path}
+
+
+def draw_counts(setting: Setting, out: Path) -> dict[str, Path]:
+    """Draw the numbers of nodes and groups over training; paths by caption, none without GWR-B."""
+    counts = {}
+    for name, run in setting.runs.items():
+        if find_table(run.directory / "train.csv") and run.summary.get("nodes") is not None:
+            counts[name] = read_counts(run.directory / "train.csv", run.last)
+    if not counts:
+        return {}
+    path = out / f"{setting.slug}-counts.png"
+    save_figure(plot_counts(counts, presented(setting.first)), path, _DPI)
+    return {"nodes and groups: mean over seeds, from the lowest to the highest seed": path}
+
+
+def draw_nodes(run: Run, path: Path) -> Table:
+    """Draw the nodes of a run's GWR-B (Fig. 7); return the distances of the tasks' mean nodes."""
+    table = read_table(run.directory / "gwr.csv")
+    tasks = table["task"].to_numpy(np.int64)
+    groups = table["group"].to_numpy(np.int64) if "group" in table else None
+    weights = table.filter(regex=r"^w\d+$").to_numpy(float)
+    save_figure(plot_gwr_pca(weights, tasks, run.tasks, groups), path, _DPI)
+    numbers = [task for task in range(len(run.tasks)) if (tasks == task).any()]
+    means = {task: weights[tasks == task].mean(0) for task in numbers}
+    rows: Table = [["distance of mean nodes", *(f"task {task + 1}" for task in numbers)]]
+    for task in numbers:
+        apart = [float(np.linalg.norm(means[task] - means[other])) for other in numbers]
+        rows.append([f"task {task + 1}", *(f"{distance:.2f}" for distance in apart)])
+    return rows
+
+
+def setting_sections(setting: Setting, reference: Setting | None, out: Path) -> list[Section]:
+    """Return the sections of a setting and draw its figures."""
+    first, title = setting.first, setting.title
+    conditions = {name: first.config.get(name) for name in ("held_out", "eval_episodes")}
+    about = [
+        "Tasks: "
+        + ", ".join(
+            f"{number} {task} (from episode {start})"
+            for number, (task, start) in enumerate(presented(first).items(), 1)
+        )
+        + f". {first.last:,} episodes, tests every {first.eval_every}"
+        + "".join(f", {name} {value}" for name, value in conditions.items() if value is not None)
+        + "."
+    ]
+    sections = [
+        Section(
+            title,
+            success_table(setting),
+            draw_curves(setting, out),
+            [*about, *setting.notes, *SUCCESS_NOTES],
+        )
+    ]
+    table = difference_table(setting)
+    if table:
+        sections.append(Section(f"Differences: {title}", table, notes=[*DIFFERENCE_NOTES]))
+    if setting.in_sequence:
+        name = f"Forgetting and transfer: {title}"
+        try:
+            table, figures = sequence_table(setting, reference), draw_sequence(setting, out)
+            sections.append(Section(name, table, figures, [*SEQUENCE_NOTES]))
+        except ValueError as error:  # tested too rarely
+            sections.append(Section(name, notes=[str(error)]))
+    for share in (0.5, 0.8):
+        table = speed_table(setting, share)
+        if table:
+            name = f"Own episodes to {share:.0%}: {title}".replace("%", " %")
+            sections.append(Section(name, table, notes=[SPEED_NOTE]))
+    table = groups_table(setting)
+    if table:
+        sections.append(Section(f"GWR-B, by seed: {title}", table, draw_counts(setting, out)))
+    for name, run in setting.runs.items():
+        if find_table(run.directory / "gwr.csv"):
+            path = out / f"{setting.slug}-nodes.png"
+            table = draw_nodes(run, path)
+            caption = f"{name}, first seed: first two principal components"
+            sections.append(Section(f"Nodes of GWR-B: {title}", table, {caption: path}))
+            break
+    table = cost_table(setting)
+    if table:
+        sections.append(Section(f"Cost: {title}", table, notes=[COST_NOTE]))
+    for name, run in setting.runs.items():
+        notes = [f"`{run.summary[key]}`" for key in ("commit", "command") if run.summary.get(key)]
+        sections.append(Section(f"{name}: {title}", task_table(run), notes=[", ".join(notes)]))
+    return sections
+
+
+def make_report(directories: Sequence[Path], out: Path, *, anyway: bool = False) -> Report:
+    """Compute the tables and draw the figures of runs.
+
+    Raises:
+        ValueError: If a run is damaged, none is finished, or conditions differ.
+    """
+    settings, notes = read_settings(directories, anyway=anyway)
+    references = [reference_of(setting, settings, anyway=anyway) for setting in settings]
+    # All that may be refused comes before the first file.
+    for setting in settings:
+        for run in setting.runs.values():
+            task_table(run)
+    make_folder(out)
+    sections = [Section("Left out", notes=notes)] if notes else []
+    for setting, reference in zip(settings, references, strict=True):
+        sections += setting_sections(setting, reference, out)
+    pairs: list[tuple[Setting | None, Setting | None]] = [
+        (s, r) for s, r in zip(settings, references, strict=True) if s.in_sequence
+    ]
+    paired = [reference for _, reference in pairs]
+    pairs += [(None, s) for s in settings if s.from_start and s not in paired]
+    for continual, concurrent in pairs:
+        table, missing = claims(continual, concurrent)
+        some = continual or concurrent
+        if table and some is not None:
+            number = len(some.first.tasks)
+            about = [f"{missing} further claims need runs that are not here."] if missing else []
+            sections.append(Section(f"The paper's claims, {number} tasks", table, notes=about))
+    runs = {run.directory: run for setting in settings for run in setting.runs.values()}
+    return Report(sections, runs)
+
+
+def text_of(sections: Sequence[Section], out: Path) -> str:
+    """Return sections in Markdown; figures are linked from the folder ``out``."""
+    text = []
+    for section in sections:
+        text.append(f"## {section.title}")
+        text += [markdown(section.table)] if section.table else []
+        text += [
+            f"![{caption}]({path.relative_to(out).as_posix()})"
+            for caption, path in section.figures.items()
+        ]
+        text += ["\n".join(f"- {note}" for note in section.notes if note)]
+    return "\n\n".join(filter(None, text)) + "\n"
+
+
+def report(arguments: ReportArguments) -> str:
+    """Write tables and figures of runs: those in a folder, or single ones, of any algorithms.
+
+    Prints and writes tables.md: success, differences between algorithms, forgetting and transfer,
+    learning times, groups of behaviors, cost, each run task by task, and the paper's claims as far
+    as there are runs for them; beside it, figures, and report.html with all of these. The report of
+    a single run is written into its directory. With --archive, first copies what reports read of
+    the runs, compressed, and writes the report beside the copies. docs/benchmark.md defines the
+    measures.
+
+    Raises:
+        ValueError: If a run is damaged, none is finished, or conditions differ.
+    """
+    if arguments.compare:
+        return compare(arguments.runs, every=arguments.every, anyway=arguments.anyway)
+    named = list(arguments.runs)
+    if not named:
+        raise ValueError("name a run, or a folder of runs")
+    if arguments.out is None and arguments.archive is None and len(named) > 1:
+        raise ValueError("--out: several folders are given, name that of the report")
+    directories = run_directories(named)
+    if arguments.archive is not None:
+        if len({directory.name for directory in directories}) < len(directories):
+            raise ValueError("--archive: runs of the same name are given, use one folder for each")
+        read_settings(directories, anyway=arguments.anyway)  # refuses before copying
+        copies = [arguments.archive / directory.name for directory in directories]
+        for directory, copy in zip(directories, copies, strict=True):
+            archive_run(directory, copy)
+        directories = copies
+    out = arguments.out or arguments.archive or named[0]
+    made = make_report(directories, out, anyway=arguments.anyway)
+    for directory in directories if directories == named else ():
+        run = made.runs.get(directory)
+        if run is not None and max(run.summary.get("groups") or [0]) > 1:
+            draw_groups(directory, presented(run), out / f"{directory.name}-groups.png")
+    text = text_of(made.sections, out)
+    (out / "tables.md").write_text(text)
+    settings = {str(path): (path, run.config, run.summary) for path, run in made.runs.items()}
+    write_page(out / "report.html", made.sections, settings)
+    return text
+
+
+def compare(paths: Sequence[Path], *, every: int | None = None, anyway: bool = False) -> str:
+    """Return the table of differences between two runs, of each task and their mean.
+
+    It has the success of both over the last 10 % of training, the second's lead with its 95 %
+    interval (Welch), the p value of a permutation test of seeds, and what is found. If one run is
+    shorter, only the part that both have is compared.
+
+    Args:
+        paths: Directories of the two runs.
+        every: Also compare over each part of training of so many episodes.
+        anyway: Compare also runs under different conditions.
+
+    Raises:
+        ValueError: If there are not two runs of the same tasks, a run is damaged, or conditions
+            differ.
+    """
+    if len(paths) != 2:
+        raise ValueError(f"--compare: name two run directories, got {len(paths)}")
+    if every is not None and every < 1:
+        raise ValueError(f"--every must be at least 1 episode, got {every}")
+    first, second = map(read_run, paths)
+    differing = differing_conditions(first, second, ("episodes",))
+    if first.tasks != second.tasks:
+        raise ValueError(f"{differing}: only runs of the same tasks in the same order are compared")
+    if differing and not anyway:
+        raise ValueError(f"{differing}: only runs under equal conditions are compared; --anyway")
+    last = min(first.last, second.last)
+    runs = [replace(run, curves=run.curves.until(last)) for run in (first, second)]
+    rows: Table = [["episodes", "task", "first", "second", "second - first", "p", "found"]]
+    part = last + 1 if every is None else every
+    for end in range(part, last + 1, part):
+        matrices = [
+            metrics.evaluation_matrix(run.curves.success, run.curves.episodes, [end], window=part)
+            for run in runs
+        ]
+        rows += _differences(f"to {end}", first.tasks, *(matrix[:, 0] for matrix in matrices))
+    rows += _differences("last 10 %", first.tasks, *map(late_scores, runs))
+    return "\n\n".join([*([differing] if differing else []), markdown(rows)])
+
+
+def _differences(period: str, tasks: tuple[str, ...], first: Values, second: Values) -> Table:
+    """Return a row for each task and their mean, from scores ``[S, T]``.
+
+    Tasks that were not tested are left out.
+    """
+    tested = [index for index in range(len(tasks)) if not np.isnan(first[:, index]).any()]
+    tested = [index for index in tested if not np.isnan(second[:, index]).any()]
+    rows = []
+    for what, chosen in [*((tasks[index], [index]) for index in tested), ("all", tested)]:
+        if not chosen:
+            continue
+        ours, theirs = first[:, chosen].mean(1), second[:, chosen].mean(1)
+        found = statistics.difference(theirs, ours)
+        p = "-" if np.isnan(found.p) else f"{found.p:.3f}"
+        cells = [f"{100 * scores.mean():.1f}" for scores in (ours, theirs)]
+        rows.append([period, what, *cells, found.estimate.points(), p, found.note])
+    return rows

@@ -1,0 +1,190 @@
+"""Settings of a run: those of a preset, of a file, and of the flags on top."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TypeVar
+
+import tyro
+
+from bgpo_trl.algorithms import ABLATIONS, ALGORITHMS
+from bgpo_trl.algorithms.rl import RL
+from bgpo_trl.configs import PRESETS, RunConfig
+from bgpo_trl.configs.checks import check_seeds
+from bgpo_trl.experiments.arguments import Arguments
+from bgpo_trl.plugins import import_plugin
+from bgpo_trl.runs.config_file import read_config
+from bgpo_trl.runs.results import read_json
+from suites import nico
+
+_Entry = TypeVar("_Entry")
+# Flags of the settings of the same name.
+_PLAIN = (
+    "seeds",
+    "schedule",
+    "spread",
+    "eval_every",
+    "eval_episodes",
+    "checkpoint_minutes",
+    "held_out",
+)
+
+
+def run_config(
+    arguments: Arguments, *, variant: str | None = None, from_start: bool = False
+) -> RunConfig:
+    """Return the settings that a command line asks for.
+
+    Imports the module of own tasks and algorithms first.
+
+    Args:
+        arguments: The command line.
+        variant: One of `ABLATIONS`, with the RL settings of ``arguments.algorithm``.
+        from_start: Whether all tasks are presented from the start.
+
+    Raises:
+        ValueError: If the settings are invalid, or a file, task or algorithm does not exist.
+    """
+    import_plugin(arguments.module)
+    config = _with_algorithm(_begin(arguments), arguments)
+    if variant is not None:
+        if variant not in ABLATIONS:
+            known = ", ".join(ABLATIONS)
+            raise ValueError(f"--variant: there is no {variant!r}; name one of {known}")
+        algorithm = replace(ALGORITHMS[variant].config, rl=config.algorithm.rl)
+        config = replace(config, name=variant, algorithm=algorithm)
+    if arguments.tasks is not None:
+        config = _with_tasks(config, chosen_tasks(arguments.tasks, config.tasks))
+    if arguments.episodes is not None:
+        config = _with_episodes(config, arguments.episodes)
+    given = {name: getattr(arguments, name) for name in _PLAIN}
+    config = replace(config, **{name: value for name, value in given.items() if value is not None})
+    if from_start:
+        config = at_once(config)
+    if arguments.hyperparameters:
+        config = tyro.cli(RunConfig, default=config, args=arguments.hyperparameters)
+    if config.eval_every > config.episodes:
+        raise ValueError(
+            f"eval_every must be at most the {config.episodes} episodes of the run, got "
+            f"{config.eval_every}: its tests are its results"
+        )
+    return config
+
+
+def _begin(arguments: Arguments) -> RunConfig:
+    """Return the settings that flags change: of a run to be resumed, of a file, or a preset's."""
+    path, preset = arguments.config, PRESETS[arguments.preset or "quick"]
+    if path is None:
+        stored = arguments.resume and arguments.preset is None and arguments.out is not None
+        path = arguments.out / "config.json" if stored and arguments.out is not None else None
+        if path is None or not path.exists():
+            return replace(preset, algorithm=ALGORITHMS[preset.name].config)
+    path = path / "config.json" if path.is_dir() else path
+    if not path.exists():
+        raise ValueError(f"--config: there is no file {path}: name one, or a run directory")
+    settings = read_json(path)
+    name = settings.get("name", preset.name)
+    if isinstance(name, str) and name in ALGORITHMS:
+        preset = replace(preset, name=name, algorithm=ALGORITHMS[name].config)
+    return read_config(path, defaults=preset)[0]
+
+
+def _with_algorithm(config: RunConfig, arguments: Arguments) -> RunConfig:
+    if arguments.algorithm is not None:
+        entry = chosen(ALGORITHMS, arguments.algorithm, "--algorithm")
+        config = replace(config, name=arguments.algorithm, algorithm=entry.config)
+    if arguments.rl in (None, config.algorithm.rl.name):
+        return config
+    rl = chosen(RL, arguments.rl, "--rl").config
+    if config.name.endswith("-paper"):
+        raise ValueError(f"--rl: {config.name} uses DDPG, as published: leave --rl out")
+    return replace(config, algorithm=replace(config.algorithm, rl=rl))
+
+
+def _with_tasks(config: RunConfig, tasks: tuple[str, ...]) -> RunConfig:
+    same = len(tasks) == len(config.task_starts)
+    starts = config.task_starts if same else even_starts(len(tasks), config.episodes)
+    return replace(config, tasks=tasks, task_starts=starts)
+
+
+def _with_episodes(config: RunConfig, episodes: int) -> RunConfig:
+    share, last = episodes / config.episodes, episodes - 1
+    starts = tuple(min(round(start * share), last) for start in config.task_starts)
+    every = max(1, min(config.eval_every, episodes))
+    return replace(config, episodes=episodes, task_starts=starts, eval_every=every)
+
+
+def chosen(entries: Mapping[str, _Entry], name: str, flag: str) -> _Entry:
+    """Return the entry that a flag names; raise ``ValueError`` if there is none."""
+    if name not in entries:
+        raise ValueError(
+            f"{flag}: there is no {name!r}; name one of {', '.join(entries)}, or with --import "
+            "MODULE one that a module adds"
+        )
+    return entries[name]
+
+
+def chosen_tasks(tasks: tuple[str, ...] | None, default: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the tasks that ``--tasks`` names.
+
+    Raises:
+        ValueError: If it is empty or a task does not exist.
+    """
+    if tasks is None:
+        return default
+    if tasks == ("all",):
+        return nico.ALL_TASKS
+    if not tasks:
+        raise ValueError(f"--tasks: it is empty; name some of {', '.join(nico.TASKS)}")
+    for name in tasks:
+        chosen(nico.TASKS, name, "--tasks")
+    return tasks
+
+
+def at_once(config: RunConfig) -> RunConfig:
+    """Return a run whose tasks are all presented from the start."""
+    return replace(config, task_starts=(0,) * len(config.tasks))
+
+
+def even_starts(n_tasks: int, episodes: int) -> tuple[int, ...]:
+    """Return the episodes from which tasks are presented at even intervals."""
+    return tuple(position * episodes // n_tasks for position in range(n_tasks))
+
+
+def check_draws(seeds: Sequence[int], draws: int) -> None:
+    """Raise ``ValueError`` if there is nothing to draw, or seeds are missing or repeated."""
+    if draws < 1:
+        raise ValueError(f"--draws must be at least 1, got {draws}")
+    check_seeds(seeds)
+
+
+def as_begun(config: RunConfig, directory: Path, *, keep_eval_every: bool = False) -> RunConfig:
+    """Return a run with the task starts and evaluation interval of the shorter run in a directory.
+
+    Args:
+        config: The run; both settings depend on its length by default.
+        directory: The run directory.
+        keep_eval_every: Whether to keep the evaluation interval of ``config``.
+    """
+    try:
+        saved, _ = read_config(directory / "config.json")
+    except ValueError:  # reported by the next reader of the file
+        return config
+    from_start = [[start == 0 for start in run.task_starts] for run in (saved, config)]
+    if from_start[0] != from_start[1]:  # another experiment
+        return config
+    every = config.eval_every if keep_eval_every else saved.eval_every
+    return replace(config, task_starts=saved.task_starts, eval_every=every)
+
+
+def is_finished(directory: Path, config: RunConfig) -> bool:
+    """Return whether a directory holds a complete run: training, final tests and figures."""
+    try:
+        saved, _ = read_config(directory / "config.json")
+        summary = read_json(directory / "summary.json")
+    except ValueError:
+        return False
+    tested = (directory / "final.csv").exists()
+    return tested and saved == config and summary.get("episodes") == config.episodes

@@ -1,0 +1,239 @@
+"""Sweeps on Ray: algorithms in settings over many seeds, in blocks of seeds that are merged.
+
+    bgpo sweep --algorithms bgpo maml dist-nll --settings concurrent continual \
+        --seeds 0 1 2 3 4 5 6 7 8 9 --block 5 --preset desk
+
+runs twelve jobs, as many at a time as there are cores. A job is a block of seeds of one algorithm
+in one setting, with a run directory such as ``runs/sweep/concurrent-bgpo/seeds-0-1-2-3-4``.
+Finished blocks are merged into ``runs/sweep/concurrent-bgpo``, which holds the files of one run of
+all seeds: ``bgpo report runs/sweep`` reads it.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+from bgpo_trl.algorithms import ABLATIONS
+from bgpo_trl.configs import RunConfig
+from bgpo_trl.experiments.arguments import Arguments, BankArguments
+from bgpo_trl.experiments.merge import merge
+from bgpo_trl.experiments.ray_jobs import Job, connected, play_jobs
+from bgpo_trl.experiments.run import pretrained_for, run_experiment
+from bgpo_trl.experiments.settings import run_config
+from bgpo_trl.files.locking import lock_directory
+from bgpo_trl.plugins import import_plugin
+from bgpo_trl.runs.config_file import Digests, settings_of
+from bgpo_trl.runs.directory import check_settings, holds_run
+from bgpo_trl.runs.results import read_json
+from suites import nico
+
+Setting = Literal[
+    "concurrent",
+    "continual",
+    "sequential",
+    "ablation",
+    "eight",
+    "eight-reversed",
+    "eight-sequential",
+    "eight-concurrent",
+]
+
+
+@dataclass(frozen=True)
+class SweepArguments(BankArguments):
+    """A grid of runs."""
+
+    algorithms: tuple[str, ...] = ("bgpo",)
+    """Algorithms, as in `bgpo concurrent`."""
+    settings: tuple[Setting, ...] = ("concurrent",)
+    """Tasks all from the start (concurrent); one after another, with earlier ones practised
+    (continual) or not (sequential); or the variants of BGPO instead of the algorithms (ablation).
+    Or the suite's eight tasks instead of --tasks: one after another, in reverse order, without
+    practising earlier ones, or all from the start."""
+    preset: Literal["quick", "desk", "paper"] = "desk"
+    """Size of the runs."""
+    seeds: tuple[int, ...] | None = None
+    """Seeds; the preset's by default."""
+    block: int = 5
+    """Seeds per job. Another number makes other runs."""
+    episodes: int | None = None
+    """Training episodes; the preset's by default. The task starts are scaled in proportion."""
+    eval_every: int | None = None
+    """Training episodes between evaluations; the preset's by default."""
+    held_out: Literal["validation", "test"] = "validation"
+    """Half of the held-out demonstrations to test on: validation to choose settings, test to report
+    results."""
+    out: Path = Path("runs/sweep")
+    """Parent of the run directories."""
+    address: str = "local"
+    """Address of a Ray cluster; "local" starts Ray on this machine."""
+    cpus_per_run: float = 1
+    """Cores that Ray reserves per run."""
+    gpus_per_run: float = 0
+    """GPUs per run, or a share of one; with 0, networks are on the CPU."""
+
+
+def make_jobs(arguments: SweepArguments) -> dict[Path, list[Job]]:
+    """Return the jobs of the grid, by the directory that they are merged into.
+
+    Raises:
+        ValueError: If the settings are invalid, or the grid is empty.
+    """
+    if arguments.block < 1:
+        raise ValueError(f"block must be at least 1, got {arguments.block}")
+    if arguments.cpus_per_run <= 0 or arguments.gpus_per_run < 0:
+        raise ValueError("--cpus-per-run must be above 0 and --gpus-per-run at least 0")
+    ablation = [name for name in ABLATIONS if not name.startswith("bgpo")]
+    jobs: dict[Path, list[Job]] = {}
+    for setting in arguments.settings:
+        for name in ablation if setting == "ablation" else arguments.algorithms:
+            config = _config(arguments, setting, name)
+            merged = arguments.out.absolute() / f"{setting}-{name}"
+            blocks = [
+                config.seeds[first : first + arguments.block]
+                for first in range(0, len(config.seeds), arguments.block)
+            ]
+            bank = None if arguments.bank is None else arguments.bank.absolute()
+            jobs[merged] = [
+                Job(
+                    merged / "-".join(["seeds", *map(str, block)]),
+                    replace(config, seeds=block),
+                    module=arguments.module,
+                    bank=bank,
+                )
+                for block in blocks
+            ]
+    if not jobs:
+        raise ValueError("name at least one of --algorithms and one of --settings")
+    return jobs
+
+
+def _config(arguments: SweepArguments, setting: Setting, name: str) -> RunConfig:
+    """Return the settings of an algorithm's runs."""
+    tasks = arguments.tasks
+    if setting.startswith("eight"):
+        if tasks is not None:
+            raise ValueError(f"--tasks: the setting {setting} has the suite's eight: leave it out")
+        tasks = nico.ALL_TASKS[::-1] if setting == "eight-reversed" else nico.ALL_TASKS
+    return run_config(
+        Arguments(
+            algorithm=name,
+            preset=arguments.preset,
+            seeds=arguments.seeds,
+            episodes=arguments.episodes,
+            eval_every=arguments.eval_every,
+            held_out=arguments.held_out,
+            tasks=tasks,
+            schedule="sequential" if setting.endswith("sequential") else "practised",
+        ),
+        from_start=setting.endswith(("concurrent", "ablation")),
+    )
+
+
+def check_directories(
+    jobs: dict[Path, list[Job]], digests: Mapping[tuple[str, ...], Digests]
+) -> None:
+    """Check that the directories of the jobs hold no other runs.
+
+    Args:
+        jobs: Result of `make_jobs`.
+        digests: Digests of the encoders and demonstrations, by the tasks of a job.
+
+    Raises:
+        ValueError: If a directory holds another run.
+    """
+    for merged, group in jobs.items():
+        of_tasks = digests[group[0].config.tasks]
+        for job in group:
+            check_settings(job.directory, settings_of(job.config, of_tasks))
+        path = merged / "config.json"
+        if path.exists():  # merged before, possibly from other blocks
+            if not any(merged.glob("seeds-*")):
+                raise ValueError(f"{merged} is not a run of a sweep: choose another --out")
+            seeds = read_json(path)["seeds"]
+            settings = {**settings_of(group[0].config, of_tasks), "seeds": seeds}
+            check_settings(merged, settings)
+
+
+def play(job: Job) -> None:
+    """Play a job to its end, from its last checkpoint if there is one."""
+    import_plugin(job.module)
+    arguments = Arguments(out=job.directory, resume=holds_run(job.directory), bank=job.bank)
+    run_experiment(arguments, "sweep", job.config)
+
+
+def sweep(arguments: SweepArguments) -> str:
+    """Run algorithms in settings over many seeds on Ray, in blocks that are merged at the end.
+
+    The same command resumes an interrupted sweep without repeating finished jobs, and seeds may be
+    added. A job whose worker or machine is lost continues elsewhere from its last checkpoint. On a
+    cluster, all machines need Ray and bgpo_trl, and must see --out at the same path.
+
+    Raises:
+        ValueError: If the settings are invalid, or a directory holds another run.
+        RuntimeError: If a job fails, such as on a full disk, after the others have finished.
+    """
+    import_plugin(arguments.module)
+    jobs = make_jobs(arguments)
+    digests = {
+        tasks: Digests(*(part.identity for part in pretrained_for(tasks, arguments.bank)))
+        for tasks in {group[0].config.tasks for group in jobs.values()}
+    }
+    check_directories(jobs, digests)
+    todo = [job for group in jobs.values() for job in group if not job.finished]
+    lines = [f"jobs: {sum(map(len, jobs.values()))}, to run: {len(todo)}"]
+    failed: dict[Job, str] = {}
+    if todo:
+        resources = {"cpus": arguments.cpus_per_run, "gpus": arguments.gpus_per_run}
+        try:
+            with connected(arguments.address, **resources):
+                failed = play_jobs(todo, play, **resources)
+        except KeyboardInterrupt:
+            sys.exit("interrupted: the same command continues")
+    for directory, group in jobs.items():
+        if failed.keys().isdisjoint(group):
+            with lock_directory(directory, wait=True):
+                merge([job.directory for job in group], directory)
+            lines.append(f"{directory}: blocks of seeds: {len(group)}")
+    if failed:
+        raise RuntimeError("; ".join(f"{job} failed: {why}" for job, why in failed.items()))
+    return "\n".join(lines)
+
+
+@dataclass(frozen=True)
+class EightTasksArguments(SweepArguments):
+    """The grid of the benchmark of eight tasks, or a part of it."""
+
+    algorithms: tuple[str, ...] = (
+        "bgpo",
+        "bgpo-experts",
+        "bgpo-single",
+        "maml",
+        "maml-demonstrations",
+        "dist-nll",
+        "dist-nll-demonstrations",
+        "oracle",
+    )
+    settings: tuple[Setting, ...] = ("eight", "eight-reversed", "eight-concurrent")
+    seeds: tuple[int, ...] | None = (10, 11, 12, 13, 14)
+    """Seeds."""
+    episodes: int | None = 4_000
+    """Training episodes. The task starts are scaled in proportion."""
+    eval_every: int | None = None
+    """Training episodes between evaluations; by default 50, or fewer in shorter runs."""
+    held_out: Literal["validation", "test"] = "test"
+    out: Path = Path("runs/eight")
+
+
+def eight_tasks(arguments: EightTasksArguments) -> str:
+    """Run the benchmark of eight tasks (docs/benchmark.md) as a sweep; `bgpo report runs/eight`.
+
+    The same command resumes an interrupted grid.
+    """
+    if arguments.eval_every is None:
+        arguments = replace(arguments, eval_every=min(50, arguments.episodes or 50))
+    return sweep(arguments)

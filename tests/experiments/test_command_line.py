@@ -1,0 +1,219 @@
+"""Wrong command lines: one line or tyro's box, and nothing is written."""
+
+import os
+import runpy
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import mujoco
+import pytest
+import torch
+
+from bgpo_trl import __main__ as bgpo
+from bgpo_trl.configs import BGPOConfig
+from bgpo_trl.experiments.arguments import Arguments
+from bgpo_trl.experiments.command_line import command_line
+from bgpo_trl.runs.logger import EVAL_COLUMNS
+from suites import opengl
+from tests.folders import contents
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture
+def folder(tiny, tmp_path, monkeypatch):
+    """The current folder, with a file, an empty folder and runs that are not whole."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("empty", "run", "damaged", "unevaluated"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "file").touch()
+    (tmp_path / "run" / "config.json").write_text('{"episodes": 50, "name": "bgpo"}')
+    (tmp_path / "damaged" / "config.json").write_text('{"episodes": ')
+    header = ",".join(EVAL_COLUMNS) + "\n"
+    (tmp_path / "damaged" / "eval.csv").write_text(header + "bgpo,0,ten,5,grasp_glass,1,1,5\n")
+    (tmp_path / "unevaluated" / "eval.csv").write_text(header)
+    return tmp_path
+
+
+def exit_code(monkeypatch, command):
+    """Runs a sub-command, script or module in this process; returns its exit code or message."""
+    name, *arguments = command.split()
+    monkeypatch.setattr(sys, "argv", [name, *arguments])
+    with pytest.raises(SystemExit) as ended, warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # that a module was imported before
+        if name == "bgpo":
+            bgpo.main()
+        elif name.endswith(".py"):
+            runpy.run_path(str(ROOT / "benchmarks" / name), run_name="__main__")
+        else:
+            runpy.run_module(name, run_name="__main__", alter_sys=True)
+    return ended.value.code
+
+
+CASES = [
+    # settings of a run
+    ("continual.py --episodes 0", "episodes"),
+    ("bgpo continual --seeds 1 1", "seeds"),
+    ("bgpo continual --threads 0", "threads"),
+    ("concurrent_tasks.py --device cuda:99", "cuda:99"),
+    ("bgpo continual --config new", "--config"),
+    ("bgpo continual --config damaged", "config.json is damaged"),
+    ("ablation.py --algorithm maml", "--algorithm"),
+    ("bgpo ablation --variant any", "--variant"),
+    ("bgpo continual --algorithm maml --rl td3", "MAML"),
+    ("bgpo eight-tasks --eval-every 0", "eval_every"),
+    ("bgpo privileged-information --inputs", "--inputs"),
+    ("bgpo privileged-information --inputs smell", "--inputs"),
+    ("bgpo privileged-information --threads 0", "threads"),
+    ("speed/steps.py ppo", "no algorithm 'ppo'"),
+    # tasks and their demonstrations
+    ("bgpo continual --tasks juggle", "'juggle'"),
+    ("bgpo continual --import juggling", "--import juggling"),
+    ("bgpo continual --bank file", "file is damaged or not a bank"),
+    ("bgpo continual --bank new --train-encoders", "--bank"),
+    ("bgpo watch run --import juggling", "--import juggling"),
+    # where results go
+    ("continual.py --out file/run", "cannot make the folder file/run"),
+    ("bgpo continual --out unevaluated", "unevaluated holds a run"),
+    ("bgpo continual --preset quick --out run --resume", "other settings"),
+    ("bgpo continual --out damaged --resume", "config.json is damaged"),
+    ("bgpo privileged-information --out file", "cannot make the folder"),
+    # runs that are read
+    ("bgpo report", "name a run"),
+    ("bgpo report file", "file is not a directory"),
+    ("bgpo report run", "run holds no test episode"),
+    ("bgpo report damaged", "config.json is damaged"),
+    ("bgpo report run --compare", "--compare"),
+    ("bgpo report empty nowhere --compare", "empty/config.json is missing"),
+    ("bgpo report run run --compare --every 0", "--every"),
+    ("bgpo looking empty", "empty holds no run"),
+    ("bgpo one-shot empty", "empty holds no run"),
+    ("bgpo watch empty", "empty holds no run"),
+    ("bgpo aftermath empty", "empty holds no run"),
+    ("bgpo aftermath", "nobody acts"),
+    # measurements
+    ("bgpo aftermath --demonstrators --episodes 0", "--episodes"),
+    ("bgpo groups --draws 0", "--draws"),
+    ("bgpo unknown-task --seeds 0 0", "seeds"),
+    ("bgpo unknown-task --tasks grasp_glass", "--tasks"),
+    ("bgpo tasks --starts 1", "--starts"),
+    ("bgpo tasks --pictures no-such-folder", "no-such-folder"),
+    ("speed/throughput.py --parts", "--parts"),
+    ("speed/gwr.py --networks 0", "--networks"),
+    # encoders
+    ("bgpo_trl.data.recording file", "cannot make the folder file"),
+    ("bgpo_trl.data.recording new --per-task 0", "held_out_per_task"),
+    ("bgpo_trl.encoders.make_bank absent new", "there is no dataset at absent"),
+    ("bgpo_trl.encoders.train empty", "empty is not a dataset"),
+    ("bgpo_trl.encoders.probes empty --weights file", "file is damaged"),
+    ("suites.nico.explore --out a.jpeg", "cannot write a.jpeg"),
+]
+
+
+@pytest.mark.parametrize(("command", "cause"), CASES, ids=[case[0] for case in CASES])
+def test_a_wrong_command_line_ends_in_one_line_and_writes_nothing(
+    folder, monkeypatch, capsys, command, cause
+):
+    before = contents(folder)
+    message = exit_code(monkeypatch, command)
+    assert isinstance(message, str), capsys.readouterr().err
+    assert message.startswith("error: ") and "\n" not in message
+    assert cause in message
+    assert capsys.readouterr() == ("", "")
+    assert contents(folder) == before
+
+
+@pytest.mark.parametrize(
+    ("command", "named"),
+    [
+        ("bgpo continual --presett quick", "--presett"),
+        ("bgpo continual --algorithm.beta 0.2 --presett quick", "--presett"),
+        ("bgpo continual --algorithm.betta 0.2", "--algorithm.betta"),
+        ("bgpo continual --algorithm.beta -1", "beta must be at least 0"),
+        ("continual.py --preset huge", "desk"),
+        ("bgpo continual --episodes 1.5", "--episodes"),
+        ("bgpo privileged-information ddpg --gamma 1.5", "gamma must be between 0 and 1"),
+        ("bgpo watch", "Run directory"),
+        ("bgpo_trl.encoders.train empty --config.vae.batch-size 0", "batch_size must be at least"),
+    ],
+)
+def test_a_wrong_flag_is_named(folder, monkeypatch, capsys, command, named):
+    before = contents(folder)
+    assert exit_code(monkeypatch, command) == 2
+    out, message = capsys.readouterr()
+    assert named in " ".join(message.replace("│", " ").split())
+    assert "Traceback" not in message
+    assert not out
+    assert contents(folder) == before
+
+
+def test_a_folder_without_permission_is_refused(folder, monkeypatch):
+    def refuse(path, *args, **kwargs):
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "mkdir", refuse)
+    before = contents(folder)
+    message = exit_code(monkeypatch, "bgpo continual --out elsewhere/run")
+    assert "elsewhere/run (Permission denied)" in message
+    assert contents(folder) == before
+
+
+def test_without_opengl_neither_recording_nor_run_begins(folder, monkeypatch):
+    def refuse(*args, **kwargs):
+        raise ValueError("no display\nof any kind")
+
+    before = contents(folder)
+    with monkeypatch.context() as patch:
+        patch.setattr(mujoco, "Renderer", refuse)
+        message = exit_code(monkeypatch, "bgpo concurrent --out new")
+    assert "(no display)" in message and "\n" not in message
+    monkeypatch.setattr(opengl, "refusal", "MUJOCO_GL is 'vulkan': do not set it")
+    message = exit_code(monkeypatch, "bgpo_trl.data.recording new")
+    assert message == "error: MUJOCO_GL is 'vulkan': do not set it"
+    assert contents(folder) == before
+
+
+def test_an_unknown_opengl_backend_is_refused_before_a_run_begins(tmp_path):
+    """In a process of its own, since MuJoCo reads the variable when it is imported."""
+    process = subprocess.run(
+        [sys.executable, str(ROOT / "benchmarks" / "concurrent_tasks.py"), "--out", "run"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "MUJOCO_GL": "vulkan"},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert process.returncode == 1
+    assert process.stderr.startswith("error: MUJOCO_GL is 'vulkan', ")
+    assert process.stderr.count("\n") == 1
+    assert not process.stdout
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_interrupted_run_exits_with_the_status_for_another_try(capsys):
+    def interrupted(arguments: Arguments):
+        raise KeyboardInterrupt
+
+    with pytest.raises(SystemExit) as ended:
+        command_line(interrupted, [])
+    assert ended.value.code == os.EX_TEMPFAIL
+    assert "--resume" in capsys.readouterr().err
+
+
+def test_an_error_of_own_code_keeps_its_traceback_unless_it_misuses_the_package():
+    def broken(arguments: Arguments):
+        raise ValueError("mine is broken")
+
+    def of_a_library(arguments: Arguments):
+        torch.zeros(2) @ torch.zeros(3)
+
+    def misuse(arguments: Arguments):
+        BGPOConfig(beta=-1.0)
+
+    for command, message in ((broken, "mine is broken"), (of_a_library, "size")):
+        with pytest.raises((ValueError, RuntimeError), match=message):
+            command_line(command, [])
+    with pytest.raises(SystemExit, match=r"^error: beta must be at least 0"):
+        command_line(misuse, [])

@@ -1,0 +1,177 @@
+"""Damaged run directories: one line each, from every command that reads them, and no change."""
+
+import json
+import re
+import shutil
+import warnings
+
+import pytest
+
+from bgpo_trl.experiments.arguments import TrainedArguments
+from bgpo_trl.experiments.looking import looking
+from bgpo_trl.experiments.one_shot import OneShotArguments, one_shot
+from bgpo_trl.experiments.report import ReportArguments, report
+from bgpo_trl.experiments.watch import WatchArguments, watch
+from bgpo_trl.figures.of_run import draw_growth
+from bgpo_trl.files.checkpoint import save_checkpoint
+from bgpo_trl.runs.config_file import read_config
+from suites import nico
+from tests.folders import contents
+
+TASKS = nico.PAPER_TASKS
+FINAL = "seed,demonstrations,task,episodes,success,task_inference\n"
+
+
+@pytest.fixture
+def run(run_of):
+    """A finished run with final tests and a summary."""
+    run = run_of("bgpo")
+    rows = [
+        f"{seed},{kind},{task},20,0.5,0.25\n"
+        for kind in ("seen", "held-out")
+        for task in TASKS
+        for seed in (3, 8)
+    ]
+    (run / "final.csv").write_text(FINAL + "".join(rows))
+    summary = {"commit": "c", "command": "python", "episodes": 10, "nodes": [3, 4]}
+    (run / "summary.json").write_text(json.dumps(summary))
+    return run
+
+
+def check_refused(call):
+    """Checks that a call ends in one line with a remedy, and without a warning."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        with pytest.raises((ValueError, OSError, RuntimeError)) as raised:
+            call()
+    message = str(raised.value)
+    assert message.isprintable() and len(message) < 900
+    assert re.search(r": (let|put|name|resume|remove|use|choose|give|only|there is no)", message)
+
+
+def edit(file, **changes):
+    def do(run):
+        content = json.loads((run / file).read_text())
+        (run / file).write_text(json.dumps({**content, **changes}))
+
+    return do
+
+
+def write(name, content):
+    return lambda run: (run / name).write_bytes(content)
+
+
+def replaced(name, old, new):
+    return lambda run: (run / name).write_text((run / name).read_text().replace(old, new, 1))
+
+
+def without_lines(name, text):
+    def do(run):
+        lines = (run / name).read_text().splitlines(keepends=True)
+        (run / name).write_text("".join(line for line in lines if text not in line))
+
+    return do
+
+
+def damages(name):
+    """Kinds of damage that any file may have."""
+    return {
+        f"{name} missing": lambda run: (run / name).unlink(),
+        f"{name} empty": write(name, b""),
+        f"{name} not text": write(name, b"\xff\xfe\x00" * 20),
+        f"{name} a folder": lambda run: ((run / name).unlink(), (run / name).mkdir()),
+        f"{name} of something else": write(name, b'{"port": 80}'),
+    }
+
+
+REPORTED = {
+    **damages("eval.csv"),
+    **damages("final.csv"),
+    **damages("config.json"),
+    **damages("summary.json"),
+    "starts of other tasks": edit("config.json", task_starts=[0, 1]),
+    "tasks by number": edit("config.json", tasks=[1, 2, 3]),
+    "nodes in words": edit("summary.json", nodes="many"),
+    "training of a longer run": edit("config.json", episodes=20),
+    "success that is no number": replaced("final.csv", "0.5", "nan"),
+    "inference that is no number": replaced("final.csv", "0.25", "perhaps"),
+    "a row cut short": replaced("final.csv", ",20,0.5,0.25", ""),
+    "no held-out tests": without_lines("final.csv", "held-out"),
+    "a seed without late tests": without_lines("eval.csv", "bgpo,8,10"),
+    "control characters": lambda run: (run / "eval.csv").write_text(
+        (run / "eval.csv").read_text().replace(TASKS[0], "\x1b[31mred")
+    ),
+}
+# These files are optional, and nothing in the summary is required.
+for _name in ("final.csv missing", "summary.json missing", "summary.json of something else"):
+    del REPORTED[_name]
+
+
+@pytest.mark.parametrize("damage", REPORTED.values(), ids=REPORTED.keys())
+def test_a_damaged_run_is_not_reported(run, damage):
+    damage(run)
+    before = contents(run)
+    check_refused(lambda: report(ReportArguments((run,))))
+    assert contents(run) == before
+
+
+def test_final_tests_and_summary_are_optional_in_a_report(run):
+    text = report(ReportArguments((run,)))
+    assert "nan" not in text
+    assert "| one for all |  | 25.00 | 25 25 | 3 4 |" in text
+    assert "- `c`, `python`" in text
+    for name in ("final.csv", "summary.json"):
+        (run / name).unlink()
+    text = report(ReportArguments((run,)))
+    assert "## GWR-B" not in text and "## Cost" in text
+
+
+def checkpoint(state):
+    def do(run):
+        shutil.rmtree(run / "checkpoint")
+        save_checkpoint(run / "checkpoint", state)
+
+    return do
+
+
+LOADED = {
+    **damages("config.json"),
+    "no folder": shutil.rmtree,
+    "no checkpoint": lambda run: shutil.rmtree(run / "checkpoint"),
+    "a checkpoint of something else": checkpoint({"step": 3, "loss": {}}),
+    "half a checkpoint": checkpoint({"algorithm": {"source": {}, "learner": {}}}),
+    "no starts": edit("config.json", task_starts=[]),
+    "unknown tasks": edit("config.json", tasks=["juggle", "sleep", "dance"]),
+    "an unknown setting": edit("config.json", colour="red"),
+    "an unknown algorithm": edit("config.json", name="ppo", algorithm_class=None),
+    "other encoders": edit("config.json", encoders="0" * 64),
+}
+
+
+@pytest.mark.parametrize(
+    ("command", "arguments"),
+    [(watch, WatchArguments), (one_shot, OneShotArguments), (looking, TrainedArguments)],
+    ids=["watch", "one_shot", "looking"],
+)
+@pytest.mark.parametrize("damage", LOADED.values(), ids=LOADED.keys())
+def test_a_damaged_run_is_neither_filmed_nor_tested(run, damage, command, arguments, tmp_path):
+    damage(run)
+    check_refused(lambda: command(arguments(run=run, out=tmp_path / "out")))
+    assert not (tmp_path / "out").exists()
+
+
+GROWTH = {
+    **damages("train.csv"),
+    "a damaged graph": write("gwr/episode-000010.safetensors", b"\xff\xfe\x00" * 20),
+    "no column of nodes": replaced("train.csv", "num_nodes", "leaves"),
+    "another seed": replaced("train.csv", "bgpo,3,", "bgpo,4,"),
+    "no episode of a seed": without_lines("train.csv", "bgpo,3"),
+}
+
+
+@pytest.mark.parametrize("damage", GROWTH.values(), ids=GROWTH.keys())
+def test_growth_is_not_drawn_from_damaged_files(run, bank, damage, tmp_path):
+    config = read_config(run / "config.json")[0]
+    damage(run)
+    check_refused(lambda: draw_growth(run, config, bank, tmp_path / "out"))
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,158 @@
+"""Success against the share of the demonstration that is shown."""
+
+import csv
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from bgpo_trl import load_run
+from bgpo_trl.data.recording import record_demonstrations
+from bgpo_trl.experiments import one_shot
+from bgpo_trl.experiments.one_shot import OneShotArguments, Row
+from suites import nico
+
+TASKS = nico.PAPER_TASKS
+
+
+def test_every_seed_is_tested_with_every_share_of_every_task(run_of, tmp_path):
+    arguments = OneShotArguments(
+        run=run_of("bgpo"), shares=(0.5, 1.0), episodes=2, out=tmp_path / "out"
+    )
+    printed = one_shot.one_shot(arguments)
+    with (tmp_path / "out" / "one_shot.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["share"], row["seed"], row["task"]) for row in rows] == [
+        (share, seed, task) for share in ("0.5", "1.0") for seed in "38" for task in TASKS
+    ]
+    for row in rows:
+        assert row["episodes"] == "2"
+        assert float(row["success"]) in (0, 0.5, 1)
+        assert float(row["task_inference"]) in (0, 0.5, 1)
+        assert 0 < float(row["activity"]) < 1
+    assert (tmp_path / "out" / "one_shot.png").exists()
+    assert set(json.loads((tmp_path / "out" / "one_shot.json").read_text())) == {
+        "commit",
+        "command",
+    }
+    lines = printed.splitlines()
+    assert [line.split("|")[1:3] for line in lines[2:]] == [
+        [f" {task} ", f" {share} "] for task in ("all", *TASKS) for share in ("50%", "100%")
+    ]
+
+
+@pytest.mark.parametrize("name", ["oracle", "without-both"])
+def test_cells_of_gwr_are_empty_without_it(run_of, tmp_path, name):
+    printed = one_shot.one_shot(
+        OneShotArguments(run=run_of(name), shares=(1.0,), episodes=1, out=tmp_path)
+    )
+    with (tmp_path / "one_shot.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 6
+    assert {(row["task_inference"], row["activity"]) for row in rows} == {("", "")}
+    for line in printed.splitlines()[2:]:
+        assert [cell.strip() for cell in line.split("|")[4:]] == ["", "", ""]
+
+
+def test_policies_are_shown_the_beginning_of_new_demonstrations(run_of, tmp_path, monkeypatch):
+    policy = load_run(run_of("bgpo"))
+    shown_to = []
+    snapshot = policy.algorithm.snapshot
+
+    def spy(index, embedding, task, generator):
+        shown_to.append((index, embedding, task))
+        return snapshot(index, embedding, task, generator)
+
+    monkeypatch.setattr(policy.algorithm, "snapshot", spy)
+    rows = one_shot.measure(policy, (0.3, 1.0), 2, 4)
+    shown = record_demonstrations(
+        tmp_path / "again", per_task=2, held_out_per_task=0, seed=4, progress=False
+    )
+    monkeypatch.undo()
+    assert [index for index, _, _ in shown_to] == [0, 1, 0, 1]
+    gwr, seen = policy.algorithm.gwr, policy.bank.seen()
+    for share, (_, embedding, task) in zip((0.3, 1.0), shown_to[::2], strict=True):
+        assert task.tolist() == [[0, 0], [1, 1], [2, 2]]
+        for row in range(6):
+            n_frames = round(share * int(shown["length"][row]))
+            expected = policy.condition(shown["pixels"][row, :n_frames].numpy()).embedding
+            assert torch.allclose(embedding[row // 2, row % 2], expected, atol=1e-5)
+        for index in range(2):
+            weights = gwr.graph(index).weights
+            nearest = [int((weights - phi).norm(dim=-1).argmin()) for phi in seen.embedding]
+            for label in range(3):
+                inferred, activity = [], []
+                for phi in embedding[label]:
+                    distance, node = (weights - phi).norm(dim=-1).min(0)
+                    tasks = [
+                        t for n, t in zip(nearest, seen.task.tolist(), strict=True) if n == node
+                    ]
+                    majority = max(range(3), key=tasks.count) if tasks else -1
+                    inferred.append(majority == label)
+                    activity.append(float(torch.exp(-0.25 * distance)))  # activity_scale
+                (found,) = [
+                    row
+                    for row in rows
+                    if row[:3] == (share, policy.config.seeds[index], TASKS[label])
+                ]
+                assert found[5:] == pytest.approx((np.mean(inferred), np.mean(activity)), abs=1e-5)
+
+
+def test_all_shares_are_tested_from_the_same_starts(run_of, monkeypatch):
+    policy, numbers = load_run(run_of("bgpo")), []
+
+    def run(self, snapshots, device):
+        numbers.extend({snapshot.number for snapshot in snapshots})
+        assert all(snapshot.presented.all() for snapshot in snapshots)
+        return SimpleNamespace(success=torch.ones(2, 3, 1, dtype=torch.bool))
+
+    monkeypatch.setattr(one_shot.Evaluator, "run", run)
+    rows = one_shot.measure(policy, (0.5, 0.7, 1.0), 1, 1)
+    assert len(numbers) == 3 and len(set(numbers)) == 1
+    assert {row[4] for row in rows} == {1.0}
+
+
+def table():
+    rows = [
+        (0.5, 0, "a", 4, 0.25, 1.0, 0.5),
+        (0.5, 0, "b", 4, 0.75, 0.0, 0.7),
+        (0.5, 1, "a", 4, 0.0, 0.5, 0.5),
+        (0.5, 1, "b", 4, 0.5, 0.5, 0.5),
+        (1.0, 0, "a", 4, 1.0, 1.0, 1.0),
+        (1.0, 1, "a", 4, 0.5, 1.0, 1.0),
+        (1.0, 0, "b", 4, 1.0, 1.0, 1.0),
+        (1.0, 1, "b", 4, 1.0, 1.0, 1.0),
+    ]
+    return one_shot.means([Row(*row) for row in rows])
+
+
+def test_means_equal_those_by_hand():
+    means = table()
+    assert list(means) == ["all", "a", "b"]
+    assert means["all"][0.5] == pytest.approx(np.array([[0.5, 0.5, 0.6], [0.25, 0.5, 0.5]]))
+    assert means["a"][1.0] == pytest.approx(np.array([[1, 1, 1], [0.5, 1, 1]]))
+
+
+def test_the_figure_shows_the_means():
+    success, inferred = one_shot.plot(table()).axes
+    curves = {line.get_label(): np.array(line.get_data()).T.tolist() for line in success.lines}
+    assert curves == {
+        "all": [[0.5, 0.375], [1.0, 0.875]],
+        "a": [[0.5, 0.125], [1.0, 0.75]],
+        "b": [[0.5, 0.625], [1.0, 1.0]],
+    }
+    assert inferred.lines[1].get_ydata().tolist() == [0.75, 1.0]
+    (band,) = success.collections
+    edges = band.get_paths()[0].vertices
+    assert sorted(set(edges[edges[:, 0] == 0.5, 1])) == pytest.approx([0.25, 0.5])
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"shares": (0.5, 1.2)}, {"shares": (float("nan"),)}, {"shares": ()}, {"episodes": 0}]
+)
+def test_wrong_shares_and_numbers_of_episodes_are_refused(run_of, tmp_path, wrong):
+    with pytest.raises(ValueError, match=r"--(shares|episodes)"):
+        one_shot.one_shot(OneShotArguments(run=run_of("bgpo"), out=tmp_path / "out", **wrong))
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,56 @@
+"""The experiment with less and less given information: its settings, its runs and its table."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import pytest
+import tyro
+
+from bgpo_trl.algorithms.rl import RL
+from bgpo_trl.configs import DDPGConfig
+from bgpo_trl.experiments.privileged_information import (
+    INPUTS,
+    InformationArguments,
+    privileged_information,
+)
+from bgpo_trl.files.checkpoint import load_checkpoint
+from bgpo_trl.runs.results import read_table
+from suites import nico
+from tests.folders import contents
+
+
+@pytest.mark.parametrize("rl", RL)
+def test_the_settings_of_the_rl_algorithm_are_flags(rl):
+    kind = Annotated[InformationArguments, tyro.conf.OmitArgPrefixes]
+    arguments = tyro.cli(kind, args=["--out", "here", rl, "--learning-rate", "0.5"])
+    assert arguments.rl == replace(RL[rl].config, learning_rate=0.5)
+    assert arguments.out == Path("here")
+
+
+def test_each_input_has_a_run_and_a_row(tiny, tmp_path):
+    ddpg = DDPGConfig(hidden_sizes=(7,), batch_size=16, warmup_steps=8, replay_size=200)
+    arguments = InformationArguments(episodes=2, seeds=(1,), out=tmp_path, rl=ddpg)
+    printed = privileged_information(arguments)
+    head, _, *rows = [[cell.strip() for cell in x.split("|")[1:-1]] for x in printed.splitlines()]
+    assert head == ["policy observes", *nico.PAPER_TASKS, "all", "episodes to 80 %"]
+    assert [row[0] for row in rows] == list(INPUTS)
+    for name in INPUTS:
+        config = json.loads((tmp_path / name / "config.json").read_text())
+        learner = load_checkpoint(tmp_path / name / "checkpoint")["algorithm"]
+        observed = "state" if name == "state+label" else "latent"
+        stored = set(learner["replay"]["rows"]) - {"action", "next", "group"}
+        assert stored == {observed, "context"}
+        assert ("gwr" in learner) == (name == "latent+behavior")
+        assert (config["task_starts"], config["eval_every"]) == ([0, 0, 0], 2)
+        assert config["algorithm"]["rl"]["hidden_sizes"] == [7]
+        assert (tmp_path / name / "figures" / "success.png").exists()
+        bonus = read_table(tmp_path / name / "train.csv")["intrinsic_return"].astype(float) > 0
+        assert (bonus == (name in ("latent+phi", "latent+behavior"))).all()
+
+    before = contents(tmp_path)
+    assert privileged_information(replace(arguments, resume=True)) == printed
+    with pytest.raises(ValueError, match="already holds a run"):
+        privileged_information(arguments)
+    assert contents(tmp_path) == before
