@@ -85,7 +85,10 @@ def load_checkpoint(
     mmap: bool = False,
     newest: bool = False,
 ) -> dict[str, Any]:
-    """Read the newest intact checkpoint; warn about each newer one that is damaged.
+    """Read the newest intact checkpoint; warn about newer ones that are damaged.
+
+    A damaged file gets the suffix ``.damaged``, so that the next checkpoint does not replace the
+    intact one.
 
     With ``mmap``, tensors are mapped from the file lazily, for reading only some of them. With
     ``newest``, only the newest one is read, for what is to be used as it is, not resumed.
@@ -103,6 +106,8 @@ def load_checkpoint(
                 "which goes on from the one before"
             )
         warnings.warn(f"{path} is damaged: resuming from the checkpoint before it.", stacklevel=2)
+        with contextlib.suppress(OSError):  # such as in a directory that is read only
+            path.rename(path.with_suffix(".damaged"))
     raise ValueError(
         f"{directory} holds no intact checkpoint to resume from: start a new run in another "
         "directory."
