@@ -6,7 +6,7 @@ import torch
 from tensordict.nn import TensorDictModule
 
 from bgpo_trl.algorithms import Algorithm
-from bgpo_trl.algorithms.environments import no_context_env
+from bgpo_trl.algorithms.environments import training_env
 from bgpo_trl.configs import RunConfig
 from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.encoders.pretrained import load_pretrained
@@ -24,7 +24,7 @@ class NearestNeighbors(Algorithm):
         self.test_actor = TensorDictModule(self.choose, ["latent", "context"], ["action"])
 
     def make_env(self, base_env, source):  # pixels -> latent, and the demonstrations
-        return no_context_env(self.config, base_env, source, self.encoders)
+        return training_env(self.config, base_env, source, self.encoders)
 
     def choose(self, latent, demonstration):
         state = torch.cat([latent, demonstration], -1) / self.scale

@@ -15,8 +15,10 @@ import torch
 import tyro
 
 from bgpo_trl.algorithms import ALGORITHMS
-from bgpo_trl.algorithms.environments import bgpo_env
+from bgpo_trl.algorithms.bgpo import BGPO
 from bgpo_trl.algorithms.rl import RL
+from bgpo_trl.envs import NicoEnv
+from bgpo_trl.transforms import DemonstrationSource
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "suites/nico/README.md")]
@@ -166,10 +168,13 @@ def test_the_files_it_names_exist(page):
     assert missing == []
 
 
-def test_the_composition_in_readme_is_the_one_that_is_trained():
-    def composition(text):
-        return [line.strip() for line in text.split("Compose(\n")[1].splitlines()]
-
-    shown = next(block for block in blocks(ROOT / "README.md", "python") if "Compose(\n" in block)
-    trained = composition(inspect.getsource(bgpo_env))
-    assert composition(shown)[: len(trained) - 1] == trained[:-1]
+def test_readme_composes_the_environment_in_which_bgpo_is_trained():
+    block = next(block for block in blocks(ROOT / "README.md", "python") if "Compose(" in block)
+    shown = {}
+    exec(block, shown)
+    bank, encoders = shown["bank"].seen(), shown["encoders"]
+    algorithm = BGPO(shown["config"], seeds=[0, 1], bank=bank, encoders=encoders)
+    source = DemonstrationSource(bank, shown["schedule"], batch_size=[2])
+    trained = algorithm.make_env(NicoEnv(batch_size=[2]), source)
+    kinds = [[type(part) for part in env.transform] for env in (shown["env"], trained)]
+    assert kinds[0] == kinds[1]

@@ -100,7 +100,7 @@ def plain_policy(algorithm, snapshot, index, task, episode, phi):
         student = algorithm.students[index]
         policy = MultiHeadActor(algorithm.state_size, **size)
         policy.trunk = student.trunk
-        policy.heads.append(student.heads[algorithm._tasks[index].index(task)])
+        policy.heads.append(student.heads[algorithm._head_tasks[index].index(task)])
         return lambda seen: policy(TensorDict({state: seen[None]}, [1]))["action"][0].detach()
     if hasattr(algorithm, "meta_actor"):  # weights for each task
         policy = Actor(algorithm.state_size, **size)

@@ -33,7 +33,7 @@ class Entry:
 
 
 _ALONE: Any = {"demonstration_share": 0.0, "expert_batch_size": 64, "rl": DDPGConfig()}
-_SINGLE = BGPOConfig(variant="published", experts=False, group_balanced_replay=False, **_ALONE)
+_SINGLE = BGPOConfig(experts=False, group_balanced_replay=False, **_ALONE)
 _PAPER = DDPGConfig(
     hidden_sizes=(64,),
     critic_layer_norm=False,
@@ -60,14 +60,12 @@ ALGORITHMS: dict[str, Entry] = {
     "dist-nll-paper": Entry(
         DistNLL, DistNLLConfig(rl=_PAPER, task_batch_size=256, distillation_batch_size=1_000)
     ),
-    "oracle": Entry(BGPO, replace(_SINGLE, variant="label")),
-    "ddpg": Entry(BGPO, replace(_SINGLE, variant="no-context")),
-    "without-bonus": Entry(BGPO, replace(_SINGLE, variant="without-bonus")),
-    "without-gwr": Entry(BGPO, replace(_SINGLE, variant="without-gwr")),
-    "without-both": Entry(BGPO, replace(_SINGLE, variant="without-both")),
-    "group-balanced-replay": Entry(
-        BGPO, replace(_SINGLE, variant="bgpo", group_balanced_replay=True)
-    ),
+    "oracle": Entry(BGPO, replace(_SINGLE, context="label")),
+    "ddpg": Entry(BGPO, replace(_SINGLE, context=None)),
+    "without-bonus": Entry(BGPO, replace(_SINGLE, beta=0.0)),
+    "without-gwr": Entry(BGPO, replace(_SINGLE, context="embedding")),
+    "without-both": Entry(BGPO, replace(_SINGLE, context="embedding", beta=0.0)),
+    "group-balanced-replay": Entry(BGPO, replace(_SINGLE, group_balanced_replay=True)),
     "demonstrations": Entry(BGPO, replace(_SINGLE, **_SHOWN_SINGLE)),
 }
 """BGPO; ``bgpo-experts``, BGPO without demonstrations; ``bgpo-single``, which in addition has only

@@ -13,7 +13,7 @@ from torch.nn.functional import one_hot
 from torchrl.envs import EnvBase, TransformedEnv
 
 from bgpo_trl.algorithms.algorithm import Algorithm
-from bgpo_trl.algorithms.environments import VARIANTS
+from bgpo_trl.algorithms.environments import training_env
 from bgpo_trl.algorithms.experts import ActiveGroups, Experts
 from bgpo_trl.algorithms.policy import Policy
 from bgpo_trl.algorithms.rl import LearnerSpec, make_learner
@@ -30,12 +30,12 @@ from bgpo_trl.transforms import DemonstrationSource
 
 
 class BGPO(Algorithm):
-    """BGPO, its ablations and its references, selected by ``config.variant``.
+    """BGPO, its ablations and its references, which differ by ``config`` alone.
 
-    With ``experts``, each group of behaviors has its own actor and critic; with
-    ``group_balanced_replay``, an update draws equally from the groups played last; with a
-    ``demonstration_share``, it also draws from demonstrations. The variant ``"published"`` without
-    these three is the paper's algorithm, in `bgpo-paper` with the paper's settings too.
+    ``context`` is what policies know of the task. With ``experts``, each group of behaviors has its
+    own actor and critic; with ``group_balanced_replay``, an update draws equally from the groups
+    played last; with a ``demonstration_share``, it also draws from demonstrations. Without these
+    three, it is the paper's algorithm; ``bgpo-paper`` has the paper's settings too.
 
     Arguments as for `Algorithm`; encoders may be None if neither latents nor embeddings are used.
 
@@ -43,10 +43,6 @@ class BGPO(Algorithm):
         experts: The networks of each group; of a single group without ``config.experts``.
         trials: Trials by which groups of one task are joined; None without experts or
             demonstrations.
-
-    Raises:
-        ValueError: If the variant is unknown, or does not fit ``experts`` and
-            ``group_balanced_replay``.
     """
 
     config: BGPOConfig
@@ -62,23 +58,16 @@ class BGPO(Algorithm):
         device: torch.device | str = "cpu",
     ) -> None:
         super().__init__(config, seeds=seeds, bank=bank, encoders=encoders, device=device)
-        variant = VARIANTS.get(config.variant)
-        if variant is None or variant.groups != config.grouped:
-            fitting = ", ".join(name for name, v in VARIANTS.items() if v.groups == config.grouped)
-            raise ValueError(
-                f"variant {config.variant!r} does not go with experts={config.experts} and "
-                f"group_balanced_replay={config.group_balanced_replay}: choose one of {fitting}"
-            )
-        self.variant, embedding_size = variant, bank.embedding.shape[-1]
-        self.needs_label = variant.context == "label"
-        if variant.gwr:
+        embedding_size = bank.embedding.shape[-1]
+        self.needs_label = config.context == "label"
+        if config.context == "behavior":
             self.gwr = GWRB(
                 embedding_size,
                 config.gwr,
                 batch_size=[len(seeds)],
                 generator=generators(seeds, "gwr"),
             )
-        if variant.groups:
+        if config.grouped:
             self.groups = BehaviorGroups(
                 embedding_size,
                 batch_size=[len(seeds)],
@@ -87,14 +76,15 @@ class BGPO(Algorithm):
             )
         self._shown_embedding = bank.embedding
         self._revision = torch.zeros(len(seeds), dtype=torch.int64)
-        sizes = {"behavior": embedding_size, "label": self.n_tasks, None: 0}
-        self.in_keys = [config.state, *(["context"] if variant.context else [])]
+        sizes = {None: 0, "label": self.n_tasks}
+        context_size = sizes.get(config.context, embedding_size)
+        self.in_keys = [config.state, *(["context"] if context_size else [])]
 
         rl, keys = config.rl, self.in_keys
         spec = LearnerSpec(
             seeds=seeds,
             in_keys=keys,
-            in_features=self.state_size + sizes[variant.context],
+            in_features=self.state_size + context_size,
             return_bounds=(0.0, self._highest_return()),
             device=self.device,
         )
@@ -111,7 +101,7 @@ class BGPO(Algorithm):
             rl.replay_size,
             generator=generators(seeds, "replay"),
             keys=[*keys, "action", *(("next", key) for key in (keys[0], "reward", "terminated"))],
-            source_key="demo_index" if variant.groups else None,
+            source_key="demo_index" if config.grouped else None,
         )
         self.shown = self.demonstrations(
             config, bank, seeds, constant_keys=keys[1:], own_constants=not config.experts
@@ -123,14 +113,23 @@ class BGPO(Algorithm):
             self.trials = GroupTrials(starts, seeds=seeds, smallest=config.group_size)
 
     def make_env(self, base_env: EnvBase, source: DemonstrationSource) -> TransformedEnv:
-        """Return the variant's environment (`bgpo_trl.algorithms.environments`)."""
-        modules = self.encoders, self.gwr, self.groups
-        return self.variant.make_env(self.config, base_env, source, *modules)
+        """Return the environment of training episodes, see `training_env`."""
+        return training_env(
+            self.config,
+            base_env,
+            source,
+            self.encoders,
+            context=self.config.context,
+            behavior_scale=self.config.behavior_scale,
+            gwr=self.gwr,
+            groups=self.groups,
+            beta=self.beta,
+        )
 
     @property
     def beta(self) -> float:
-        """Weight of the intrinsic reward, 0 in variants without it."""
-        return self.config.beta if self.variant.bonus else 0.0
+        """Weight of the intrinsic reward; 0 where there is no behavior to match."""
+        return self.config.beta if self.config.context in ("behavior", "embedding") else 0.0
 
     def _highest_return(self) -> float:
         """Return the highest attainable return: a success now, or after the bonus of a time-out."""
@@ -262,11 +261,11 @@ class BGPO(Algorithm):
     def context(self, index: int, embedding: Tensor, task: Tensor) -> Tensor | None:
         """Return the context of test episodes, ``[*B, C]``; None for a policy without context.
 
-        ``embedding`` is ``[*B, 32]``. The labels ``[*B]`` are read by the variant ``"label"`` only.
+        ``embedding`` is ``[*B, 32]``. The labels ``[*B]`` are read if they are the context.
         """
-        if self.variant.context is None:
+        if self.config.context is None:
             return None
-        if self.variant.context == "label":
+        if self.needs_label:
             return one_hot(task, self.n_tasks).float()
         behavior = embedding
         if self.gwr is not None:

@@ -1,9 +1,7 @@
-"""Environments of BGPO and its variants: transforms from frames to latents and ``context``."""
+"""Environments of training and of tests: what an algorithm's policies observe, and their reward."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Literal
 
 import torch
@@ -22,7 +20,7 @@ from torchrl.envs import (
     UnaryTransform,
 )
 
-from bgpo_trl.configs import AlgorithmConfig, BGPOConfig
+from bgpo_trl.configs import AlgorithmConfig
 from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.modules.gwr import GWRB
@@ -35,188 +33,61 @@ from bgpo_trl.transforms import (
 )
 from suites.nico.base import STATE_CENTER, STATE_SCALE
 
-__all__ = ["VARIANTS", "Variant"]
+__all__ = ["observation_env", "training_env"]
 
 
-def bgpo_env(
-    config: BGPOConfig,
-    base_env: EnvBase,
-    source: DemonstrationSource,
-    encoders: Representation | None,
-    gwr: GWRB,
-    groups: BehaviorGroups,
-) -> TransformedEnv:
-    """Return the environment of BGPO, in which the inferred group selects the expert."""
-    return TransformedEnv(
-        base_env,
-        Compose(
-            [
-                encode(config, encoders),  # pixels -> latent
-                StepCounter(config.max_steps),
-                source,  # -> task, demo_embedding
-                BehaviorLookup(gwr, learn=True),  # demo_embedding -> behavior
-                GroupLookup(groups, learn=True),  # demo_embedding -> group
-                match_behavior(config, encoders),  # reward + beta * exp(-||behavior - phi_g||)
-                behavior_as_context(config),  # behavior -> context
-                clip(config),
-                sum_rewards("reward", "extrinsic_reward", "intrinsic_reward"),
-            ]
-        ),
-    )
-
-
-def published_env(
-    config: BGPOConfig,
-    base_env: EnvBase,
-    source: DemonstrationSource,
-    encoders: Representation | None,
-    gwr: GWRB,
-    groups: None,
-) -> TransformedEnv:
-    """Return the environment of BGPO as published (Alg. 1), with one policy for all behaviors."""
-    return TransformedEnv(
-        base_env,
-        Compose(
-            [
-                encode(config, encoders),
-                StepCounter(config.max_steps),
-                source,
-                BehaviorLookup(gwr, learn=True),
-                match_behavior(config, encoders),
-                behavior_as_context(config),
-                clip(config),
-                sum_rewards("reward", "extrinsic_reward", "intrinsic_reward"),
-            ]
-        ),
-    )
-
-
-def without_bonus_env(
-    config: BGPOConfig,
-    base_env: EnvBase,
-    source: DemonstrationSource,
-    encoders: Representation | None,
-    gwr: GWRB,
-    groups: None,
-) -> TransformedEnv:
-    """Return the environment of the ablation with GWR-B, without intrinsic reward (Fig. 9)."""
-    return TransformedEnv(
-        base_env,
-        Compose(
-            [
-                encode(config, encoders),
-                StepCounter(config.max_steps),
-                source,
-                BehaviorLookup(gwr, learn=True),
-                behavior_as_context(config),
-                clip(config),
-                sum_rewards("reward"),
-            ]
-        ),
-    )
-
-
-def without_gwr_env(
-    config: BGPOConfig,
-    base_env: EnvBase,
-    source: DemonstrationSource,
-    encoders: Representation | None,
-    gwr: None,
-    groups: None,
-) -> TransformedEnv:
-    """Return the environment of the ablation whose behavior is the demonstration (Fig. 9)."""
-    return TransformedEnv(
-        base_env,
-        Compose(
-            [
-                encode(config, encoders),
-                StepCounter(config.max_steps),
-                source,
-                RenameTransform(["demo_embedding"], ["behavior"], create_copy=True),
-                match_behavior(config, encoders),
-                behavior_as_context(config),
-                clip(config),
-                sum_rewards("reward", "extrinsic_reward", "intrinsic_reward"),
-            ]
-        ),
-    )
-
-
-def without_both_env(
-    config: BGPOConfig,
-    base_env: EnvBase,
-    source: DemonstrationSource,
-    encoders: Representation | None,
-    gwr: None,
-    groups: None,
-) -> TransformedEnv:
-    """Return the environment of the ablation without GWR-B and intrinsic reward (Fig. 9)."""
-    return TransformedEnv(
-        base_env,
-        Compose(
-            [
-                encode(config, encoders),
-                StepCounter(config.max_steps),
-                source,
-                RenameTransform(["demo_embedding"], ["behavior"], create_copy=True),
-                behavior_as_context(config),
-                clip(config),
-                sum_rewards("reward"),
-            ]
-        ),
-    )
-
-
-def label_env(
-    config: BGPOConfig,
-    base_env: EnvBase,
-    source: DemonstrationSource,
-    encoders: Representation | None,
-    gwr: None,
-    groups: None,
-) -> TransformedEnv:
-    """Return the environment of DDPG whose context is the one-hot label of the task."""
-    n_tasks = source.schedule.n_tasks
-
-    def label(task: Tensor) -> Tensor:
-        return one_hot(task, n_tasks).float()
-
-    return TransformedEnv(
-        base_env,
-        Compose(
-            [
-                encode(config, encoders),
-                StepCounter(config.max_steps),
-                source,
-                UnaryTransform(["task"], ["context"], fn=label),
-                clip(config),
-                sum_rewards("reward"),
-            ]
-        ),
-    )
-
-
-def no_context_env(
+def training_env(
     config: AlgorithmConfig,
     base_env: EnvBase,
     source: DemonstrationSource,
     encoders: Representation | None,
-    gwr: None = None,
-    groups: None = None,
+    *,
+    context: Literal["behavior", "embedding", "label"] | None = None,
+    behavior_scale: float = 1.0,
+    gwr: GWRB | None = None,
+    groups: BehaviorGroups | None = None,
+    beta: float = 0.0,
 ) -> TransformedEnv:
-    """Return the environment of MAML, Dist-NLL and plain DDPG, without context."""
-    return TransformedEnv(
-        base_env,
-        Compose(
-            [
-                encode(config, encoders),
-                StepCounter(config.max_steps),
-                source,
-                clip(config),
-                sum_rewards("reward"),
-            ]
-        ),
-    )
+    """Return the environment of training episodes: simulations ``[S]`` within transforms.
+
+    BGPO has all parts; each ablation and baseline omits some.
+
+    Args:
+        config: State and its bound, length of an episode.
+        base_env: Simulations.
+        source: Draws the task and the demonstration of each episode.
+        encoders: Trained encoders; None if neither latents nor the intrinsic reward are used.
+        context: What the policy's ``"context"`` is: the behavior b of ``gwr``, the demonstration's
+            embedding phi in its place, the task's label one-hot, or nothing.
+        behavior_scale: Factor of behavior or embedding in the context.
+        gwr: GWR-B, which learns each demonstration.
+        groups: Groups of behaviors, which learn each demonstration; None for none.
+        beta: Weight of the intrinsic reward; with 0, it is neither added nor measured.
+
+    Raises:
+        ValueError: If encoders are needed and missing.
+    """
+    transforms: list[Transform] = [
+        encode(config, encoders),  # pixels -> latent
+        StepCounter(config.max_steps),
+        source,  # -> task, demo_embedding
+    ]
+    if gwr is not None:
+        transforms.append(BehaviorLookup(gwr, learn=True))  # demo_embedding -> behavior
+    elif context == "embedding":
+        transforms.append(RenameTransform(["demo_embedding"], ["behavior"], create_copy=True))
+    if groups is not None:
+        transforms.append(GroupLookup(groups, learn=True))  # demo_embedding -> group
+    if beta:
+        transforms.append(match_behavior(beta, encoders))  # reward + beta * exp(-||b - phi_g||)
+    if context == "label":
+        transforms.append(label_as_context(source.schedule.n_tasks))
+    elif context is not None:
+        transforms.append(behavior_as_context(behavior_scale))  # behavior -> context
+    transforms.append(clip(config))
+    rewards = ["reward", "extrinsic_reward", "intrinsic_reward"] if beta else ["reward"]
+    transforms.append(sum_rewards(*rewards))
+    return TransformedEnv(base_env, Compose(transforms))
 
 
 def observation_env(
@@ -240,23 +111,32 @@ def encode(config: AlgorithmConfig, encoders: Representation | None) -> Transfor
     return ObservationNorm(loc, scale, in_keys=["state"], standard_normal=True)
 
 
-def match_behavior(config: BGPOConfig, encoders: Representation | None) -> BehaviorMatchingReward:
-    """Return the transform that adds the intrinsic reward.
+def match_behavior(beta: float, encoders: Representation | None) -> BehaviorMatchingReward:
+    """Return the transform that adds the intrinsic reward, of weight ``beta``.
 
     Raises:
         ValueError: If ``encoders`` is None.
     """
     if encoders is None:
         raise ValueError("matching behaviors needs trained encoders")
-    return BehaviorMatchingReward(encoders.lae, beta=config.beta)
+    return BehaviorMatchingReward(encoders.lae, beta=beta)
 
 
-def behavior_as_context(config: BGPOConfig) -> ObservationNorm:
+def label_as_context(n_tasks: int) -> UnaryTransform:
+    """Return the transform that makes the one-hot label of the task the context."""
+
+    def label(task: Tensor) -> Tensor:
+        return one_hot(task, n_tasks).float()
+
+    return UnaryTransform(["task"], ["context"], fn=label)
+
+
+def behavior_as_context(scale: float) -> ObservationNorm:
     """Return the transform that scales the behavior to the context.
 
     Beside latents of unit scale, an unscaled behavior slows the first task down.
     """
-    return ObservationNorm(0.0, config.behavior_scale, ["behavior"], ["context"])
+    return ObservationNorm(0.0, scale, ["behavior"], ["context"])
 
 
 def clip(config: AlgorithmConfig) -> ClipTransform:
@@ -271,32 +151,3 @@ def clip(config: AlgorithmConfig) -> ClipTransform:
 def sum_rewards(*keys: str) -> RewardSum:
     """Return the transform that sums each reward over the episode, as ``episode_...``."""
     return RewardSum(in_keys=list(keys), out_keys=[f"episode_{key}" for key in keys])
-
-
-@dataclass(frozen=True)
-class Variant:
-    """A variant of BGPO: its environment and the modules it needs."""
-
-    make_env: Callable[..., TransformedEnv]
-    """Called with a config, the simulation, a `DemonstrationSource`, the encoders, GWR-B and the
-    groups of behaviors; the last three may be None."""
-    context: Literal["behavior", "label"] | None = "behavior"
-    """Meaning of the policy's ``context``; None for no context."""
-    gwr: bool = False
-    """Whether GWR-B infers the behavior."""
-    groups: bool = False
-    """Whether behaviors are grouped, as experts and replay balanced by group require."""
-    bonus: bool = False
-    """Whether the intrinsic reward is added."""
-
-
-VARIANTS: dict[str, Variant] = {
-    "bgpo": Variant(bgpo_env, gwr=True, groups=True, bonus=True),
-    "published": Variant(published_env, gwr=True, bonus=True),
-    "without-bonus": Variant(without_bonus_env, gwr=True),
-    "without-gwr": Variant(without_gwr_env, bonus=True),
-    "without-both": Variant(without_both_env),
-    "label": Variant(label_env, context="label"),
-    "no-context": Variant(no_context_env, context=None),
-}
-"""Variants by ``BGPOConfig.variant``; a new entry can be trained and its runs loaded."""

@@ -12,7 +12,7 @@ from torch.func import functional_call
 from torchrl.envs import EnvBase, TransformedEnv
 
 from bgpo_trl.algorithms.algorithm import Algorithm
-from bgpo_trl.algorithms.environments import no_context_env
+from bgpo_trl.algorithms.environments import training_env
 from bgpo_trl.algorithms.rl import LearnerSpec
 from bgpo_trl.configs import DistNLLConfig, MAMLConfig
 from bgpo_trl.data.bank import DemonstrationBank
@@ -78,7 +78,7 @@ class TaskAlgorithm(Algorithm):
 
     def make_env(self, base_env: EnvBase, source: DemonstrationSource) -> TransformedEnv:
         """Return an environment without context."""
-        return no_context_env(self.config, base_env, source, self.encoders)
+        return training_env(self.config, base_env, source, self.encoders)
 
     @torch.no_grad()
     def act(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -6,6 +6,8 @@ so that ``--help`` need not wait for TorchRL.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from bgpo_trl.experiments.arguments import AblationArguments, Arguments
 
 
@@ -40,14 +42,19 @@ def ablation(arguments: AblationArguments) -> str:
     --continual one after the other.
 
     Raises:
-        ValueError: If ``--algorithm`` is given.
+        ValueError: If ``--algorithm`` is given, or the variant is none of `ABLATIONS`.
     """
+    from bgpo_trl.algorithms import ABLATIONS
     from bgpo_trl.experiments.run import run_experiment
     from bgpo_trl.experiments.settings import run_config
 
     if arguments.algorithm is not None:
         raise ValueError("--algorithm: the variants are BGPO's, name one with --variant")
+    if arguments.variant not in ABLATIONS:
+        known = ", ".join(ABLATIONS)
+        raise ValueError(f"--variant: there is no {arguments.variant!r}; name one of {known}")
     from_start = not arguments.continual
-    config = run_config(arguments, variant=arguments.variant, from_start=from_start)
+    arguments = replace(arguments, algorithm=arguments.variant)
+    config = run_config(arguments, from_start=from_start)
     name = "ablation" if from_start else "ablation-continual"
     return run_experiment(arguments, name, config)

@@ -9,7 +9,7 @@ from typing import TypeVar
 
 import tyro
 
-from bgpo_trl.algorithms import ABLATIONS, ALGORITHMS
+from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.rl import RL
 from bgpo_trl.configs import PRESETS, RunConfig
 from bgpo_trl.configs.checks import check_seeds
@@ -32,16 +32,13 @@ _PLAIN = (
 )
 
 
-def run_config(
-    arguments: Arguments, *, variant: str | None = None, from_start: bool = False
-) -> RunConfig:
+def run_config(arguments: Arguments, *, from_start: bool = False) -> RunConfig:
     """Return the settings that a command line asks for.
 
     Imports the module of own tasks and algorithms first.
 
     Args:
         arguments: The command line.
-        variant: One of `ABLATIONS`, with the RL settings of ``arguments.algorithm``.
         from_start: Whether all tasks are presented from the start.
 
     Raises:
@@ -49,12 +46,6 @@ def run_config(
     """
     import_plugin(arguments.module)
     config = _with_algorithm(_begin(arguments), arguments)
-    if variant is not None:
-        if variant not in ABLATIONS:
-            known = ", ".join(ABLATIONS)
-            raise ValueError(f"--variant: there is no {variant!r}; name one of {known}")
-        algorithm = replace(ALGORITHMS[variant].config, rl=config.algorithm.rl)
-        config = replace(config, name=variant, algorithm=algorithm)
     if arguments.tasks is not None:
         config = _with_tasks(config, chosen_tasks(arguments.tasks, config.tasks))
     if arguments.episodes is not None:

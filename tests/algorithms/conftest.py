@@ -22,8 +22,8 @@ def make_bgpo(bank, encoders, make_config, in_world):
         known=0,
         **changes,
     ):
-        state, _, kind, name = VARIANTS[variant]
-        changes = {"variant": kind, **({} if config is None else {"rl": config}), **changes}
+        state, _, name = VARIANTS[variant]
+        changes = {**({} if config is None else {"rl": config}), **changes}
         config = make_config(state, name if rl is None else f"{name}+{rl}").algorithm
         config = replace(config, **{**CHANGES.get(variant, {}), **changes})
         bank = bank.for_tasks(bank.tasks[: schedule.n_tasks])

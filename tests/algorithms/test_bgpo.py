@@ -55,7 +55,7 @@ def test_each_variant_is_an_environment_with_the_input_it_is_named_after(
             transform.learn = False
     check_env_specs(algorithm.world.env)
 
-    state, told, _, _ = VARIANTS[variant]
+    state, told, _ = VARIANTS[variant]
     sizes = {"state": 16, "latent": 64, "context": n_tasks if told == "label" else 32}
     keys = [] if told == "nothing" else ["context"]
     start = algorithm.act(algorithm.world.env.reset())
@@ -371,9 +371,9 @@ def test_each_seed_of_a_batch_learns_as_it_would_alone(make_bgpo, variant, rl):
 
 @variants
 def test_missing_encoders_are_refused(make_config, bank, in_world, variant):
-    state, _, kind, name = VARIANTS[variant]
+    state, _, name = VARIANTS[variant]
     config = make_config(state, name).algorithm
-    config = replace(config, **{"variant": kind, **CHANGES.get(variant, {})})
+    config = replace(config, **CHANGES.get(variant, {}))
     if state == "state":
         in_world(BGPO(config, seeds=(0,), bank=bank.seen()), (0,), SCHEDULE)
         assert encode(config, None)
@@ -384,8 +384,7 @@ def test_missing_encoders_are_refused(make_config, bank, in_world, variant):
 
 @pytest.mark.parametrize("told", ["phi", "b"])
 def test_matching_behaviors_on_ground_truth_is_refused(make_config, bank, encoders, in_world, told):
-    config = make_config("state", "bgpo-single").algorithm
-    config = replace(config, variant=VARIANTS[f"latent, {told}"][2])
+    config = make_config("state", VARIANTS[f"latent, {told}"][2]).algorithm
 
     def enter(encoders):
         algorithm = BGPO(config, seeds=(0,), bank=bank.seen(), encoders=encoders)
@@ -395,16 +394,3 @@ def test_matching_behaviors_on_ground_truth_is_refused(make_config, bank, encode
         enter(None)
     with pytest.raises(ValueError, match="found no 'latent'"):
         enter(encoders)
-
-
-@pytest.mark.parametrize(
-    ("name", "variant", "message"),
-    [
-        ("bgpo-single", "unheard-of", "'unheard-of' .* choose one of published, without-bonus"),
-        ("bgpo", "published", "'published' does not go with experts=True"),
-    ],
-)
-def test_a_variant_that_does_not_exist_or_fit_is_refused(make_config, bank, name, variant, message):
-    config = replace(make_config(name=name).algorithm, variant=variant)
-    with pytest.raises(ValueError, match=message):
-        BGPO(config, seeds=(0,), bank=bank.seen())

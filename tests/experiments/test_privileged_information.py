@@ -40,7 +40,7 @@ def test_each_input_has_a_run_and_a_row(tiny, tmp_path):
         config = json.loads((tmp_path / name / "config.json").read_text())
         learner = load_checkpoint(tmp_path / name / "checkpoint")["algorithm"]
         observed = "state" if name == "state+label" else "latent"
-        stored = set(learner["replay"]["rows"]) - {"action", "next", "group"}
+        stored = set(learner["replay"]["rows"]) - {"action", "next", "_group"}
         assert stored == {observed, "context"}
         assert ("gwr" in learner) == (name == "latent+behavior")
         assert (config["task_starts"], config["eval_every"]) == ([0, 0, 0], 2)

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from bgpo_trl.algorithms import ABLATIONS, ALGORITHMS
+from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.rl import RL
 from bgpo_trl.configs import PRESETS, DDPGConfig, SACConfig
 from bgpo_trl.experiments.arguments import Arguments
@@ -38,15 +38,8 @@ def test_algorithms_share_their_learner_except_as_published():
         assert shared is not name.endswith("-paper")
 
 
-@pytest.mark.parametrize("name", ABLATIONS)
-def test_a_variant_has_the_rl_settings_of_bgpo(name):
-    config = run_config(Arguments(rl="sac"), variant=name, from_start=True)
-    algorithm = replace(ALGORITHMS[name].config, rl=SACConfig())
-    assert config == at_once(replace(PRESETS["quick"], name=name, algorithm=algorithm))
-
-
 @pytest.mark.parametrize("rl", RL)
-@pytest.mark.parametrize("name", ["bgpo", "oracle"])
+@pytest.mark.parametrize("name", ["bgpo", "oracle", "without-gwr"])
 def test_another_rl_algorithm_changes_nothing_else(name, rl):
     plain = run_config(Arguments(algorithm=name))
     own = plain.algorithm.rl
