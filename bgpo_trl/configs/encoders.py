@@ -81,7 +81,7 @@ class InverseModelConfig:
     """Peak learning rate of Adam."""
     warmup_steps: int = 100
     """Steps of linear warm-up, before cosine decay to zero."""
-    steps: int = 4_000
+    steps: int = 6_000
     """Gradient steps."""
 
     def __post_init__(self) -> None:

@@ -122,6 +122,38 @@ def train_representation(
     return Representation(vae.cpu(), lae.cpu(), inverse.cpu(), metadata)
 
 
+def retrain_inverse(
+    representation: Representation,
+    play: TensorDictBase,
+    config: RepresentationConfig | None = None,
+    *,
+    command: str = "",
+    checkpoint: str | Path | None = None,
+    log: Log | None = None,
+    progress: bool = True,
+    device: torch.device | str = "cpu",
+) -> Representation:
+    """Train the inverse model of encoders anew, on the training part of ``play``; keep the rest.
+
+    What limits the inverse model is the amount of play (docs/learning.md), which costs little to
+    record, whereas the other encoders would take longer to train on it. Of ``config``, the seed,
+    the intervals and ``inverse`` are used. Other arguments, the result and errors are as for
+    `train_representation`.
+    """
+    config = config or RepresentationConfig()
+    folder = Path(checkpoint) if checkpoint else None
+    own, _ = split(play)
+    vae = representation.vae.to(device)
+    latent = encode_frames(vae, own)
+    fit = Fit(config, folder, log, progress, device)
+    inverse = _train_inverse(latent, own, config.inverse, fit, config.seed)
+    metadata = representation.metadata
+    kept = {**json.loads(metadata["config"]), "inverse": asdict(config.inverse)}
+    commands = "; ".join(part for part in (metadata["command"], command) if part)
+    metadata = {**metadata, "config": json.dumps(kept), "command": commands}
+    return Representation(vae.cpu(), representation.lae, inverse.cpu(), metadata)
+
+
 @torch.no_grad()
 def encode_frames(vae: VAE, dataset: TensorDictBase, batch_size: int = 64) -> Tensor:
     """Encode the valid frames of demonstrations in batches.

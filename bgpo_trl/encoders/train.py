@@ -24,6 +24,8 @@ from bgpo_trl.encoders.pretrained import bank_path, default_weights
 from bgpo_trl.encoders.probes import probe
 from bgpo_trl.encoders.representation import (
     Representation,
+    load_representation,
+    retrain_inverse,
     save_representation,
     train_representation,
 )
@@ -55,6 +57,8 @@ class Arguments:
     """Folder of recorded play; without it, the frame encoder learns from demonstrations only."""
     weights: Path | None = None
     """File to write; by default the pretrained weights of the package for the dataset's tasks."""
+    keep: Path | None = None
+    """Encoders to keep: only their inverse model is trained anew, on play."""
     folder: Path = Path("runs/encoders")
     """Folder for checkpoints, log and probes; the same folder resumes an interrupted training."""
     config: RepresentationConfig = field(default_factory=RepresentationConfig)
@@ -74,6 +78,7 @@ def train_encoders(
     progress: bool = True,
     tasks: Sequence[str] = nico.PAPER_TASKS,
     spread: float = 1.0,
+    keep: Representation | None = None,
 ) -> tuple[Representation, DemonstrationBank]:
     """Train, save and probe both encoders, and embed the demonstrations with them.
 
@@ -90,29 +95,32 @@ def train_encoders(
         progress: Whether to show progress bars.
         tasks: Task names, in the order of their labels.
         spread: Share of the range of start states of the recordings.
+        keep: Encoders of which only the inverse model is trained anew, on play.
 
     Raises:
-        ValueError: As `train_representation`.
+        ValueError: As `train_representation`; if there are encoders to keep, but no play.
         OSError: If a file cannot be written.
     """
+    if keep is not None and play is None:
+        raise ValueError("to train the inverse model alone, give the folder of recorded play")
     make_folder(folder)
     with CsvFile(folder / "train.csv", _COLUMNS) as file:
-        representation = train_representation(
-            dataset,
-            config,
-            play=play,
-            scene_version=nico.scene_version(),
-            spread=spread,
-            command=command,
-            checkpoint=folder / "checkpoint",
-            log=_log_of(file),
-            progress=progress,
-            device=device,
-        )
+        fit = {
+            "command": command,
+            "checkpoint": folder / "checkpoint",
+            "log": _log_of(file),
+            "progress": progress,
+            "device": device,
+        }
+        if keep is not None and play is not None:
+            representation = retrain_inverse(keep, play, config, **fit)
+        else:
+            scene = {"scene_version": nico.scene_version(), "spread": spread}
+            representation = train_representation(dataset, config, play=play, **scene, **fit)
     save_representation(representation, weights)
     bank = make_bank(representation, dataset, tasks=tasks, spread=spread)
     bank.save(bank_path(weights))
-    probe(representation, dataset, folder, play=play)
+    probe(representation, dataset, folder, play=None if keep else play)
     return representation, bank
 
 
@@ -194,6 +202,9 @@ def main(arguments: Arguments) -> None:
     dataset, meta = load_demonstrations(arguments.dataset), read_meta(arguments.dataset)
     play = None if arguments.play is None else load_demonstrations(arguments.play)
     command = shlex.join(["python", "-m", "bgpo_trl.encoders.train", *sys.argv[1:]])
+    keep = None
+    if arguments.keep is not None:
+        keep = load_representation(arguments.keep, scene_version=nico.scene_version())
     train_encoders(
         dataset,
         play,
@@ -204,6 +215,7 @@ def main(arguments: Arguments) -> None:
         choose_device(arguments.device),
         tasks=meta["tasks"],
         spread=meta["spread"],
+        keep=keep,
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-_BEFORE, _AFTER = 1, 2  # latents of a window before and after the one in which the action is taken
+_BEFORE, _AFTER = 3, 4  # latents of a window before and after the one in which the action is taken
 
 
 class InverseModel(nn.Module):
@@ -13,8 +13,8 @@ class InverseModel(nn.Module):
 
     The VAE's own one-layer model (Sec. III-A) shapes the latents; from a pair of them it explains
     little of a slow movement, whose steps are hardly larger than the noise of a latent. This one,
-    trained on frozen latents, reads windows of four: the latent before, the two between which the
-    action leads, and the one after. At the ends of an episode, the first and last latent repeat.
+    trained on frozen latents, reads windows of eight: the two between which the action leads, three
+    before and three after. At the ends of an episode, the first and last latent repeat.
 
     Args:
         latent_size: Dimensions of a latent.
@@ -49,12 +49,12 @@ class InverseModel(nn.Module):
         return self.infer(window(z, length, episode, step))
 
     def infer(self, windows: Tensor) -> Tensor:
-        """Infer the actions of windows ``[..., 4 * latent_size]``, ``[..., action_size]``."""
+        """Infer the actions of windows ``[..., 8 * latent_size]``, ``[..., action_size]``."""
         return self.network(windows).clamp(-1.0, 1.0)
 
 
 def window(z: Tensor, length: Tensor, episode: Tensor, step: Tensor) -> Tensor:
-    """Return the latents around steps of episodes, ``[..., 4 * latent_size]``.
+    """Return the latents around steps of episodes, ``[..., 8 * latent_size]``.
 
     Args:
         z: Latents ``[N, T, latent_size]``.

@@ -130,7 +130,7 @@ class VAEInverseLoss(LossModule):
 class ActionInferenceLoss(LossModule):
     """Squared error of the inverse model, summed over an action.
 
-    Reads ``window`` ``[*B, 4 * latent_size]`` and ``action`` ``[*B, action_size]``; writes
+    Reads ``window`` ``[*B, 8 * latent_size]`` and ``action`` ``[*B, action_size]``; writes
     ``loss_inverse`` ``[]``, a mean. From ``forward``, a missing entry raises ``ValueError``.
 
     Args:

@@ -3,6 +3,7 @@
 import csv
 import json
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ from bgpo_trl.encoders.representation import (
     encode_frames,
     load_representation,
     mean_frame,
+    retrain_inverse,
     save_representation,
     split,
     train_representation,
@@ -109,7 +111,7 @@ def tiny() -> Representation:
 def same(a: Representation, b: Representation) -> bool:
     return all(
         torch.equal(x, y)
-        for m, n in ((a.vae, b.vae), (a.lae, b.lae))
+        for m, n in ((a.vae, b.vae), (a.lae, b.lae), (a.inverse, b.inverse))
         for x, y in zip(m.state_dict().values(), n.state_dict().values(), strict=True)
     )
 
@@ -209,6 +211,26 @@ def test_the_frame_encoder_learns_from_the_training_part_of_play(
     torch.testing.assert_close(trained.vae.mean_frame, mean_frame(together))
     held_out_changed["pixels"][~play["train"]] = 0
     assert same(trained, train(held_out_changed))
+
+
+def test_the_inverse_model_alone_is_trained_as_with_the_other_encoders(tmp_path: Path) -> None:
+    play, more = squares(10), squares(14)
+    trained = train_representation(
+        squares(8), TINY, play=play, scene_version="squares", command="first", progress=False
+    )
+    assert same(trained, retrain_inverse(trained, play, TINY, progress=False))
+    with_more = retrain_inverse(trained, more, TINY, command="then", progress=False)
+    assert not same(trained, with_more)
+    assert same(trained, replace(with_more, inverse=trained.inverse))
+    assert with_more.metadata == {**trained.metadata, "command": "first; then"}
+
+    weights = tmp_path / "weights.safetensors"
+    train = partial(train_encoders, squares(8), weights=weights, config=TINY, keep=trained)
+    written, _ = train(more, folder=tmp_path / "more")
+    assert same(written, with_more) and same(load_representation(weights), with_more)
+    with pytest.raises(ValueError, match="give the folder of recorded play"):
+        train(None, folder=tmp_path / "nothing")
+    assert not (tmp_path / "nothing").exists()
 
 
 def test_training_writes_weights_log_and_probes(tmp_path: Path) -> None:

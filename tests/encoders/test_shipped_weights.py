@@ -42,7 +42,9 @@ def test_training_writes_the_encoders_of_the_datasets_tasks(monkeypatch, tasks, 
     monkeypatch.setattr(
         train,
         "train_encoders",
-        lambda dataset, play, weights, *_, tasks, spread: written.append((weights, tasks, spread)),
+        lambda dataset, play, weights, *_, tasks, spread, keep: written.append(
+            (weights, tasks, spread)
+        ),
     )
     train.main(train.Arguments(Path("data"), weights=given))
     assert written == [(given or pretrained.default_weights(tasks), tasks, 0.5)]

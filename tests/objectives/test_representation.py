@@ -95,7 +95,7 @@ def test_only_known_actions_train_the_inverse_model() -> None:
 def test_action_inference_loss_is_the_squared_error() -> None:
     torch.manual_seed(0)
     inverse = InverseModel(2, 3, hidden_size=4)
-    data = TensorDict({"window": torch.randn(5, 8), "action": torch.rand(5, 3)}, [5])
+    data = TensorDict({"window": torch.randn(5, 16), "action": torch.rand(5, 3)}, [5])
     error = inverse.network(data["window"]) - data["action"]
     loss = ActionInferenceLoss(inverse)(data)["loss_inverse"]
     assert loss.item() == pytest.approx(error.square().sum().item() / 5)
