@@ -400,6 +400,54 @@ def test_the_sequential_schedule_trains_the_newest_task_and_tests_all(make, make
     assert list(read_costs(tmp_path / "cost.csv")) == [1, 2, 3]
 
 
+class Attentive(BGPO):
+    """DDPG that notes the tasks that begin and those that it plays, for each seed."""
+
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.notes = [[] for _ in range(self.n_seeds)]
+
+    def begin_task(self, index, task):
+        self.notes[index].append(("begin", task))
+
+    def store(self, transition):
+        super().store(transition)
+        for index in transition["next", "done"].flatten().nonzero().flatten().tolist():
+            self.notes[index].append(("played", int(transition["task"][index])))
+
+    def state_dict(self):
+        return {**super().state_dict(), "notes": self.notes}
+
+    def load_state_dict(self, state):
+        super().load_state_dict(state)
+        self.notes = state["notes"]
+
+
+@pytest.mark.parametrize("interrupted", [False, True])
+def test_tasks_begin_for_each_seed_before_they_are_played(make, make_config, tmp_path, interrupted):
+    config = make_config("state", "ddpg", task_starts=(3, 0, 3), schedule="sequential")
+    config = replace(config, name="attentive", episodes=6)
+
+    def go_on(stop):
+        with make(tmp_path, config, make=Attentive, resume=True) as trainer:
+            if stop:
+                at_step(trainer, 1, lambda: signal.raise_signal(signal.SIGINT))
+            trainer.run()
+            return trainer.algorithm
+
+    for _ in range(20 if interrupted else 0):  # each step, hence also where an episode has ended
+        with pytest.raises(KeyboardInterrupt):
+            go_on(stop=True)
+    for notes in go_on(stop=False).notes:
+        assert notes[:5] == [*[("played", 1)] * 3, ("begin", 0), ("begin", 2)]
+        assert {kind for kind, _ in notes[5:]} == {"played"}
+        assert {task for _, task in notes[5:]} <= {0, 2}
+    boundary = [row for row in rows(tmp_path / "train.csv") if row["episode"] == "3"]
+    steps = [int(row["env_steps"]) for row in boundary]
+    assert steps[0] != steps[1]
+    assert max(steps) < 20
+
+
 def test_step_times_exclude_tests_and_checkpoints(make, make_config, tmp_path, monkeypatch):
     clock = [0.0]
     monkeypatch.setattr(training, "time", SimpleNamespace(monotonic=lambda: clock[0]))
