@@ -75,9 +75,9 @@ def text_of(folder):
 def test_success_is_a_mean_over_seeds(reported):
     table = rows_of(text_of(reported), ONE_AFTER_THE_OTHER)
     # 80, 90 and 100 % by seed: a standard error of 5.77, times 4.303.
-    assert table["BGPO"][:4] == ["no", "3", "90.0 [65, 100]", "90.0 [65, 100], task 1"]
+    assert table["BGPO"][:4] == ["nothing", "3", "90.0 [65, 100]", "90.0 [65, 100], task 1"]
     assert table["BGPO"][4:7] == ["90.0"] * 3
-    assert table["MAML + demonstrations"][:3] == ["yes", "3", "16.7 [2, 31]"]
+    assert table["MAML + demonstrations"][:3] == ["label", "3", "16.7 [2, 31]"]
     from_start = rows_of(text_of(reported), "3 tasks, all from the start")
     # Four tests at 90 % end at 34, 36, ..., 40: the mean of three is there at 38.
     assert from_start["BGPO"][-1] == "38"
