@@ -448,6 +448,42 @@ def test_tasks_begin_for_each_seed_before_they_are_played(make, make_config, tmp
     assert max(steps) < 20
 
 
+def test_only_fine_tuning_and_ewc_are_given_boundaries(make, make_config, tmp_path):
+    given = set()
+    for name in ALGORITHMS:
+        with make(tmp_path / name, make_config(name=name)) as trainer:
+            given |= {name} if trainer.algorithm.needs_boundaries else set()
+    assert given == {"fine-tuning", "ewc"}
+
+
+@pytest.mark.parametrize("name", ["bgpo", "maml", "dist-nll", "ewc"])
+def test_only_algorithms_that_need_boundaries_depend_on_them(
+    run_of, make, make_config, tmp_path, monkeypatch, name
+):
+    usual = run_of(name)
+    monkeypatch.setattr(Trainer, "_begin_tasks", lambda trainer, index: None)
+    make(tmp_path, make_config(name=name, **of_name(LONGER, name))).run()
+    if name == "ewc":
+        assert (tmp_path / "train.csv").read_text() != (usual / "train.csv").read_text()
+    else:
+        assert_same_run(tmp_path, usual)
+
+
+@pytest.mark.parametrize("before", [0, 1])
+def test_ewc_is_resumed_across_a_boundary_bit_for_bit(run_of, make, make_config, tmp_path, before):
+    config = make_config(name="ewc")
+    played = rows(run_of("ewc") / "train.csv")
+    row = next(row for row in played if row["episode"] == "4")  # the last before the third task
+    trainer, end = make(tmp_path, config), int(row["env_steps"])
+    at_step(trainer, end - before, lambda: signal.raise_signal(signal.SIGINT))
+    with pytest.raises(KeyboardInterrupt):
+        trainer.run()
+    held = load_checkpoint(tmp_path / "checkpoint")["algorithm"]["replay"]["n_added"]
+    assert (held[config.seeds.index(int(row["seed"]))] == 0) == (before == 0)
+    make(tmp_path, config, resume=True).run()
+    assert_same_run(tmp_path, run_of("ewc"))
+
+
 def test_step_times_exclude_tests_and_checkpoints(make, make_config, tmp_path, monkeypatch):
     clock = [0.0]
     monkeypatch.setattr(training, "time", SimpleNamespace(monotonic=lambda: clock[0]))
