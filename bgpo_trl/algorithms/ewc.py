@@ -65,8 +65,8 @@ class EWC(FineTuning):
         if self.n_held()[index]:
             stream = generators([self._seeds[index]], f"fisher {task}")
             rows = torch.zeros(1, self.config.fisher_samples, dtype=torch.int64)
-            drawn = self.replay.sample(rows, seeds=[index], generator=stream)[0]
-            self.learner.consolidate(index, self.to_device(drawn.select(*self.in_keys)))
+            drawn = self.replay.sample(rows, seeds=[index], generator=stream)
+            self.learner.consolidate(index, self.to_device(drawn.select(*self.in_keys).squeeze(0)))
         super().begin_task(index, task)
 
 

@@ -23,7 +23,7 @@ class FineTuning(BGPO):
     still learns from the transitions of earlier tasks.
 
     After a boundary, a seed rests until its replay holds ``warmup_steps`` transitions again, as
-    before its first update: it acts, and its networks do not change.
+    before its first update: it acts, and its actor and critic do not change.
     """
 
     config: FineTuningConfig
@@ -35,7 +35,7 @@ class FineTuning(BGPO):
         self._n_steps += 1
 
     def update(self) -> dict[str, Tensor]:
-        """Make one update of each seed whose replay holds enough; all others stay as they are."""
+        """Make one update of each seed whose replay holds ``warmup_steps`` transitions."""
         rl = self.config.rl
         # All seeds share the optimizer's count of updates, so these begin by the number of steps.
         if self._n_steps < rl.warmup_steps:

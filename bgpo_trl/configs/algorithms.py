@@ -205,6 +205,9 @@ class EWCConfig(FineTuningConfig):
     fisher_samples: int = 2_560
     """Transitions from which the Fisher information of a task is estimated (Continual World)."""
 
+    rl: DDPGConfig = field(default_factory=DDPGConfig)
+    """DDPG, whose learner it uses."""
+
     def __post_init__(self) -> None:
         super().__post_init__()
         _refuse_all_but_ddpg("EWC", self.rl)

@@ -48,9 +48,8 @@ def write_run(
     config |= {"tasks": list(tasks), "episodes": episodes, "eval_every": 2, "eval_episodes": 10}
     config |= {"held_out": "validation", "encoders": "e" * 64, "algorithm": {"max_steps": 50}}
     (path / "config.json").write_text(json.dumps(config | changes))
-    summary = {"commit": "abc", "command": "python x", "needs_label": name.startswith("maml")}
-    summary["needs_boundaries"] = name == "ewc"
-    (path / "summary.json").write_text(json.dumps(summary))
+    told = {"commit": "abc", "command": "python x", "needs_label": name.startswith("maml")}
+    (path / "summary.json").write_text(json.dumps(told))
     lines = []
     for seed, level in enumerate(levels):
         for episode in range(2, episodes + 1, 2):

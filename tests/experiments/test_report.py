@@ -5,11 +5,12 @@ import pytest
 
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.analysis import statistics
-from bgpo_trl.analysis.comparison import NAMES, read_run
+from bgpo_trl.analysis.comparison import NAMES, Setting, read_run
 from bgpo_trl.analysis.scores import forward_transfer
+from bgpo_trl.analysis.tables import success_table
 from bgpo_trl.experiments.report import ReportArguments, report
 from bgpo_trl.runs.cost import Cost, write_costs
-from tests.analysis.runs import TASKS, edit, write_run, write_training
+from tests.analysis.runs import TASKS, edit, make_run, write_run, write_training
 from tests.folders import contents
 
 STARTS = (0, 14, 26)
@@ -86,6 +87,21 @@ def test_success_is_a_mean_over_seeds(reported):
     half, late = (4 + 4 + 5) / 30, 0.9
     area = (2 * half / 2 + 30 * half + 2 * (half + late) / 2 + 6 * late) / 40
     assert from_start["BGPO"][-2].startswith(f"{100 * area:.1f} [")
+
+
+@pytest.mark.parametrize(
+    ("summary", "shown"),
+    [
+        ({"needs_label": False, "needs_boundaries": False}, "nothing"),
+        ({"needs_label": False, "needs_boundaries": True}, "boundaries"),
+        ({"needs_label": True, "needs_boundaries": True}, "label, boundaries"),
+        ({"needs_label": True}, "label"),
+        ({}, "?"),
+    ],
+)
+def test_what_an_algorithm_knows_of_tasks_is_shown(summary, shown):
+    head, row = success_table(Setting({"a run": make_run(**summary)}))
+    assert dict(zip(head, row, strict=True))["knows of tasks"] == shown
 
 
 def test_differences_are_judged_by_their_intervals(reported):
