@@ -193,6 +193,7 @@ class Trainer:
                         n_tasks = self._n_tasks
                     for index in torch.nonzero(episodes > before).flatten().tolist():
                         self._end_of_episode(index, transition, losses)
+                        self._begin_tasks(index)
                         if before[index] < n_episodes:
                             bar.set_postfix_str(self._success_so_far(), refresh=False)
                             bar.update()
@@ -267,6 +268,13 @@ class Trainer:
             save_graph(self.directory / "gwr", episode, algorithm.gwr)
         if episode % self.config.eval_every == 0:
             self.evaluator.take(algorithm, index, episode, self.env_steps)
+
+    def _begin_tasks(self, index: int) -> None:
+        """Announce the tasks that a seed's next episode is the first to present."""
+        episode = self.world.source.episode[index]
+        new = self._schedule.presented(episode + 1) & ~self._schedule.presented(episode)
+        for task in torch.nonzero(new).flatten().tolist():
+            self.algorithm.begin_task(index, task)
 
     def _log(self, row: dict[str, Any]) -> None:
         """Log an episode, or keep it if only a longer run would log it."""

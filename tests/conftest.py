@@ -36,10 +36,11 @@ settings.register_profile("bgpo_trl", deadline=None)
 settings.load_profile("bgpo_trl")
 torch.set_num_threads(1)
 
-# Settings of the algorithms that learn each task from its own data.
+# Further settings of small runs.
 SMALL = {
     "maml": {"task_batch_size": 8, "adaptation_size": 12},
     "dist-nll": {"task_batch_size": 8, "samples": 24, "distillation_batch_size": 12},
+    "ewc": {"fisher_samples": 10},
 }
 
 

@@ -29,6 +29,7 @@ ROOT = Path(__file__).parents[1]
 TASKS = nico.PAPER_TASKS
 NAMES = [name for name in ALGORITHMS if name not in ("without-bonus", "without-both")]
 LABELED = [name for name in NAMES if name.startswith(("maml", "dist-nll", "oracle"))]
+UNCONDITIONED = ("ddpg", "fine-tuning", "ewc")  # by any demonstration
 METADATA = {
     "scene_version": nico.scene_version(),
     "config": json.dumps(asdict(RepresentationConfig())),
@@ -115,7 +116,7 @@ def test_actions_equal_those_of_a_snapshot_bit_for_bit(trainer_of, load, encoder
             torch.testing.assert_close(torch.from_numpy(policy.act(frame)), expected)
 
 
-@pytest.mark.parametrize("name", [name for name in NAMES if name not in ("ddpg", *LABELED)])
+@pytest.mark.parametrize("name", [name for name in NAMES if name not in (*UNCONDITIONED, *LABELED)])
 def test_actions_depend_on_the_demonstration(load, encoders, name):
     policy, (frame,) = load(name), noise(0, 1)
     dark, bright = (np.full((20, 32, 64, 3), shade, np.uint8) for shade in (0, 255))

@@ -400,6 +400,90 @@ def test_the_sequential_schedule_trains_the_newest_task_and_tests_all(make, make
     assert list(read_costs(tmp_path / "cost.csv")) == [1, 2, 3]
 
 
+class Attentive(BGPO):
+    """DDPG that notes the tasks that begin and those that it plays, for each seed."""
+
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.notes = [[] for _ in range(self.n_seeds)]
+
+    def begin_task(self, index, task):
+        self.notes[index].append(("begin", task))
+
+    def store(self, transition):
+        super().store(transition)
+        for index in transition["next", "done"].flatten().nonzero().flatten().tolist():
+            self.notes[index].append(("played", int(transition["task"][index])))
+
+    def state_dict(self):
+        return {**super().state_dict(), "notes": self.notes}
+
+    def load_state_dict(self, state):
+        super().load_state_dict(state)
+        self.notes = state["notes"]
+
+
+@pytest.mark.parametrize("interrupted", [False, True])
+def test_tasks_begin_for_each_seed_before_they_are_played(make, make_config, tmp_path, interrupted):
+    config = make_config("state", "ddpg", task_starts=(3, 0, 3), schedule="sequential")
+    config = replace(config, name="attentive", episodes=6)
+
+    def go_on(stop):
+        with make(tmp_path, config, make=Attentive, resume=True) as trainer:
+            if stop:
+                at_step(trainer, 1, lambda: signal.raise_signal(signal.SIGINT))
+            trainer.run()
+            return trainer.algorithm
+
+    for _ in range(20 if interrupted else 0):  # each step, hence also where an episode has ended
+        with pytest.raises(KeyboardInterrupt):
+            go_on(stop=True)
+    for notes in go_on(stop=False).notes:
+        assert notes[:5] == [*[("played", 1)] * 3, ("begin", 0), ("begin", 2)]
+        assert {kind for kind, _ in notes[5:]} == {"played"}
+        assert {task for _, task in notes[5:]} <= {0, 2}
+    boundary = [row for row in rows(tmp_path / "train.csv") if row["episode"] == "3"]
+    steps = [int(row["env_steps"]) for row in boundary]
+    assert steps[0] != steps[1]
+    assert max(steps) < 20
+
+
+def test_only_fine_tuning_and_ewc_are_given_boundaries(make, make_config, tmp_path):
+    given = set()
+    for name in ALGORITHMS:
+        with make(tmp_path / name, make_config(name=name)) as trainer:
+            given |= {name} if trainer.algorithm.needs_boundaries else set()
+    assert given == {"fine-tuning", "ewc"}
+
+
+@pytest.mark.parametrize("name", ["bgpo", "maml", "dist-nll", "ewc"])
+def test_only_algorithms_that_need_boundaries_depend_on_them(
+    run_of, make, make_config, tmp_path, monkeypatch, name
+):
+    usual = run_of(name)
+    monkeypatch.setattr(Trainer, "_begin_tasks", lambda trainer, index: None)
+    make(tmp_path, make_config(name=name, **of_name(LONGER, name))).run()
+    if name == "ewc":
+        assert (tmp_path / "train.csv").read_text() != (usual / "train.csv").read_text()
+    else:
+        assert_same_run(tmp_path, usual)
+
+
+@pytest.mark.parametrize("before", [0, 1])
+def test_ewc_is_resumed_across_a_boundary_bit_for_bit(run_of, make, make_config, tmp_path, before):
+    config = make_config(name="ewc")
+    played = rows(run_of("ewc") / "train.csv")
+    row = next(row for row in played if row["episode"] == "4")  # the last before the third task
+    trainer, end = make(tmp_path, config), int(row["env_steps"])
+    at_step(trainer, end - before, lambda: signal.raise_signal(signal.SIGINT))
+    with pytest.raises(KeyboardInterrupt):
+        trainer.run()
+    held = load_checkpoint(tmp_path / "checkpoint")["algorithm"]["replay"]["n_added"]
+    assert (held[config.seeds.index(int(row["seed"]))] == 0) == (before == 0)
+    make(tmp_path, config, resume=True).run()
+    assert_same_run(tmp_path, run_of("ewc"))
+
+
 def test_step_times_exclude_tests_and_checkpoints(make, make_config, tmp_path, monkeypatch):
     clock = [0.0]
     monkeypatch.setattr(training, "time", SimpleNamespace(monotonic=lambda: clock[0]))

@@ -9,12 +9,16 @@ from typing import Any
 from bgpo_trl.algorithms.algorithm import Algorithm
 from bgpo_trl.algorithms.bgpo import BGPO
 from bgpo_trl.algorithms.dist_nll import DistNLL
+from bgpo_trl.algorithms.ewc import EWC
+from bgpo_trl.algorithms.fine_tuning import FineTuning
 from bgpo_trl.algorithms.maml import MAML
 from bgpo_trl.configs import (
     AlgorithmConfig,
     BGPOConfig,
     DDPGConfig,
     DistNLLConfig,
+    EWCConfig,
+    FineTuningConfig,
     GWRBConfig,
     MAMLConfig,
 )
@@ -62,6 +66,8 @@ ALGORITHMS: dict[str, Entry] = {
     ),
     "oracle": Entry(BGPO, replace(_SINGLE, context="label")),
     "ddpg": Entry(BGPO, replace(_SINGLE, context=None)),
+    "fine-tuning": Entry(FineTuning, FineTuningConfig()),
+    "ewc": Entry(EWC, EWCConfig()),
     "without-bonus": Entry(BGPO, replace(_SINGLE, beta=0.0)),
     "without-gwr": Entry(BGPO, replace(_SINGLE, context="embedding")),
     "without-both": Entry(BGPO, replace(_SINGLE, context="embedding", beta=0.0)),
@@ -70,10 +76,11 @@ ALGORITHMS: dict[str, Entry] = {
 }
 """BGPO; ``bgpo-experts``, BGPO without demonstrations; ``bgpo-single``, which in addition has only
 one actor and one critic; the paper's baselines, without and with demonstrations; two references,
-DDPG with the task's label (``oracle``) and without context (``ddpg``). Names in ``-paper`` follow
-the publication: networks of 64 units, batches of 256, no stabilizers. The others are
-``bgpo-single`` without GWR-B, the intrinsic reward or both, or with one addition of this package.
-Modules of own algorithms may add entries."""
+DDPG with the task's label (``oracle``) and without context (``ddpg``); two baselines of continual
+learning, which are given the boundaries of tasks. Names in ``-paper`` follow the publication:
+networks of 64 units, batches of 256, no stabilizers. The others are ``bgpo-single`` without GWR-B,
+the intrinsic reward or both, or with one addition of this package. Modules of own algorithms may
+add entries."""
 
 ABLATIONS = (
     "bgpo-single",

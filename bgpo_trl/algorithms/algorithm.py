@@ -97,6 +97,26 @@ class Algorithm(ABC):
     def store(self, transition: TensorDictBase) -> None:
         """Add a transition of each seed, ``[S]``, to the replay buffer."""
 
+    def begin_task(self, index: int, task: int) -> None:  # noqa: B027 - most do not use it
+        """Prepare for a further task of one seed; by default, do nothing.
+
+        `Trainer` calls it between `store` and `act`, after the last episode in which the task could
+        not be drawn. The tasks of the first episode do not begin in this sense. If several begin at
+        once, they do so in the order of their numbers.
+
+        To know when a task begins is to know more than the demonstrations show. Algorithms that
+        define this method are reported as such, see `needs_boundaries`; BGPO does not.
+
+        Args:
+            index: Position of the seed in the batch.
+            task: Number of the task, its label.
+        """
+
+    @property
+    def needs_boundaries(self) -> bool:
+        """Whether the algorithm is given the boundaries of tasks, by `begin_task`."""
+        return type(self).begin_task is not Algorithm.begin_task
+
     @abstractmethod
     def update(self) -> dict[str, Tensor]:
         """Make one update of each seed from the transitions stored so far.

@@ -15,6 +15,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 from bgpo_trl.algorithms.algorithm import Algorithm
 from bgpo_trl.algorithms.environments import training_env
 from bgpo_trl.algorithms.experts import ActiveGroups, Experts
+from bgpo_trl.algorithms.learner import Learner
 from bgpo_trl.algorithms.policy import Policy
 from bgpo_trl.algorithms.rl import LearnerSpec, make_learner
 from bgpo_trl.algorithms.trials import GroupTrials
@@ -91,7 +92,7 @@ class BGPO(Algorithm):
         n_active = config.active_groups if config.grouped else 1
         self._active = ActiveGroups(len(seeds), n_active, config.rest_after)
         self.experts = Experts(
-            lambda width: make_learner(rl, replace(spec, experts=range(width))),
+            lambda width: self._make_learner(replace(spec, experts=range(width))),
             self._active if config.experts else ActiveGroups(len(seeds), 1),
             lambda seed, group: 0 if self.groups is None else self.groups.parent(seed, group),
         )
@@ -111,6 +112,9 @@ class BGPO(Algorithm):
             steps = cast(DemonstrationSteps, bank.steps)
             starts = steps.latents(steps.first)
             self.trials = GroupTrials(starts, seeds=seeds, smallest=config.group_size)
+
+    def _make_learner(self, spec: LearnerSpec) -> Learner:
+        return make_learner(self.config.rl, spec)
 
     def make_env(self, base_env: EnvBase, source: DemonstrationSource) -> TransformedEnv:
         """Return the environment of training episodes, see `training_env`."""

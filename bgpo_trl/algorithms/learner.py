@@ -77,6 +77,15 @@ class Learner:
         """Return the losses to minimize on transitions ``[S, E, B]``."""
         return {str(k): v for k, v in self.loss(batch).items() if str(k).startswith("loss_")}
 
+    def clear_momentum(self, index: int) -> None:
+        """Forget the direction of the latest steps of one seed, given its position.
+
+        Without gradients, its weights then stay as they are. The second moments, by which Adam
+        scales its steps, are kept.
+        """
+        for moments in self.optimizer.state.values():
+            moments["exp_avg"][index] = 0.0
+
     @property
     def actor_is_due(self) -> bool:
         """Whether the next update also updates the actor and the target networks."""

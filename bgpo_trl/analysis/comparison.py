@@ -21,6 +21,8 @@ NAMES = {
     "bgpo-single": "BGPO, one policy",
     "oracle": "DDPG, told the label",
     "ddpg": "DDPG, told nothing",
+    "fine-tuning": "DDPG, fine-tuned",
+    "ewc": "DDPG with EWC",
     "without-bonus": "one policy, without the intrinsic reward",
     "without-gwr": "one policy, without GWR-B",
     "without-both": "one policy, without both",

@@ -88,13 +88,13 @@ _PAIRS = {
 def success_table(setting: Setting) -> Table:
     """Return the table of success of a setting's runs."""
     numbers = range(1, len(setting.first.tasks) + 1)
-    rows = [["", "knows the label", "seeds", "success", "worst task"]]
+    rows = [["", "knows of tasks", "seeds", "success", "worst task"]]
     rows[0] += [*(f"task {number}" for number in numbers), "area"]
     rows[0] += ["episodes to 80 %"] if setting.from_start else []
     for name, run in setting.runs.items():
         late, area = late_scores(run), area_scores(run)
         worst = int(late.mean(0).argmin())
-        row = [name, _knows_label(run), str(len(late)), statistics.mean(late.mean(1)).percent()]
+        row = [name, _knows(run), str(len(late)), statistics.mean(late.mean(1)).percent()]
         row += [f"{statistics.mean(late[:, worst]).percent()}, task {worst + 1}"]
         row += [f"{100 * share:.1f}" for share in late.mean(0)]
         row += [statistics.mean(area.mean(1)).percent()]
@@ -105,10 +105,11 @@ def success_table(setting: Setting) -> Table:
     return rows
 
 
-def _knows_label(run: Run) -> str:
-    """Return whether the algorithm is given the task's label, from ``summary.json``."""
-    needed = run.summary.get("needs_label")
-    return "?" if needed is None else "yes" if needed else "no"
+def _knows(run: Run) -> str:
+    """Return what the algorithm is given of the tasks, from ``summary.json``."""
+    given = {"label": "needs_label", "boundaries": "needs_boundaries"}
+    known = [name for name, key in given.items() if run.summary.get(key)]
+    return ", ".join(known) or ("nothing" if "needs_label" in run.summary else "?")
 
 
 def difference_table(setting: Setting) -> Table:

@@ -4,6 +4,8 @@ from bgpo_trl.configs.algorithms import (
     AlgorithmConfig,
     BGPOConfig,
     DistNLLConfig,
+    EWCConfig,
+    FineTuningConfig,
     GWRBConfig,
     MAMLConfig,
 )
@@ -25,6 +27,8 @@ __all__ = [
     "BGPOConfig",
     "DDPGConfig",
     "DistNLLConfig",
+    "EWCConfig",
+    "FineTuningConfig",
     "GWRBConfig",
     "InverseModelConfig",
     "MAMLConfig",

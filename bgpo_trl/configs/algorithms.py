@@ -175,6 +175,47 @@ class BGPOConfig(AlgorithmConfig):
 
 
 @dataclass(frozen=True)
+class FineTuningConfig(BGPOConfig):
+    """Fine-tuning: one policy, by default without context."""
+
+    context: Literal["behavior", "embedding", "label"] | None = None
+    """See `BGPOConfig`."""
+    experts: bool = False
+    """See `BGPOConfig`; only False."""
+    group_balanced_replay: bool = False
+    """See `BGPOConfig`; only False."""
+    demonstration_share: float = 0.0
+    """See `AlgorithmConfig`; only 0."""
+    rl: RLConfig = field(default_factory=DDPGConfig)
+    """See `AlgorithmConfig`."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        # Else, old transitions would return from other stores than the replay that is emptied.
+        for name in ("experts", "group_balanced_replay", "demonstration_share"):
+            check(self, (name, not getattr(self, name), "off, as in fine-tuning"))
+
+
+@dataclass(frozen=True)
+class EWCConfig(FineTuningConfig):
+    """Elastic weight consolidation (Kirkpatrick et al., 2017)."""
+
+    ewc_weight: float = 1e4
+    """Weight lambda of the penalty. Ours: as in an example of Continual World, and not tuned."""
+    fisher_samples: int = 2_560
+    """Transitions from which the Fisher information of a task is estimated (Continual World)."""
+
+    rl: DDPGConfig = field(default_factory=DDPGConfig)
+    """DDPG, whose learner it uses."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _refuse_all_but_ddpg("EWC", self.rl)
+        at_least(self, 0, "ewc_weight")
+        whole(self, 1, "fisher_samples")
+
+
+@dataclass(frozen=True)
 class MAMLConfig(AlgorithmConfig):
     """Model-agnostic meta-learning over DDPG (Sec. IV-B; Finn et al., 2017)."""
 

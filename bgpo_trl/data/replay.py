@@ -134,10 +134,11 @@ class GroupReplay:
             entries are undefined.
 
         Raises:
-            ValueError: If one of these seeds holds no transition.
+            ValueError: If one of these seeds holds no transition and has a row with a group.
         """
         seeds = range(len(self._generators)) if seeds is None else seeds
-        if not all(self._n_added[seed] for seed in seeds):
+        empty = [i for i, seed in enumerate(seeds) if not self._n_added[seed]]
+        if group[empty].ge(0).any():
             raise ValueError("every seed needs a transition before the first sample")
         sources = [self._generators[seed] for seed in seeds] if generator is None else generator
         flat = group.flatten(1)
@@ -160,6 +161,8 @@ class GroupReplay:
             if key != self._source_key or key in self._keys:
                 drawn = stored.index_select(0, rows)
                 batch.set(key, drawn.view(*group.shape, *stored.shape[1:]))
+        for i in empty:
+            batch[i].zero_()  # the NaN of uninitialized memory would outlast a weight of 0
         return batch.set("priority_weight", torch.from_numpy(weight).view(group.shape))
 
     def contents(self, seed: int) -> tuple[TensorDict, Tensor]:
@@ -186,6 +189,11 @@ class GroupReplay:
         if len(rows):
             self._group[rows] = group[self._rows[self._source_key][rows]]
             self._index[seed] = self._indexed(seed)
+
+    def clear(self, seed: int) -> None:
+        """Discard the transitions of a seed, given its position."""
+        self._n_added[seed] = 0
+        self._index[seed] = _GroupIndex()
 
     def state_dict(self) -> dict[str, Any]:
         """Return the filled part of the buffer (a copy) and the states of the generators."""

@@ -56,6 +56,7 @@ def measure(
         "episodes": config.episodes,
         "random_success": dict(zip(config.tasks, random_success.tolist(), strict=True)),
         "needs_label": algorithm.needs_label,
+        "needs_boundaries": algorithm.needs_boundaries,
         "nodes": None if gwr is None else gwr.num_nodes.tolist(),
         "groups": None,
     }

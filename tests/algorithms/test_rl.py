@@ -218,7 +218,7 @@ def test_test_episodes_are_without_noise(make_bgpo, bank, name):
     torch.testing.assert_close(first, expected)
 
 
-@pytest.mark.parametrize("name", ["maml", "dist-nll"])
+@pytest.mark.parametrize("name", ["maml", "dist-nll", "ewc"])
 def test_what_is_defined_over_ddpg_takes_nothing_else(name):
     config = ALGORITHMS[name].config
     assert config.rl == DDPGConfig()

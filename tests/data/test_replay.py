@@ -197,6 +197,47 @@ def test_a_seed_is_restored_though_another_has_stored_nothing_yet():
     assert drawn["latent"][0].item() == 4
 
 
+@pytest.mark.parametrize("restored", [False, True])
+def test_a_cleared_seed_draws_nothing_and_then_only_what_it_stores_anew(restored):
+    replay, untouched = make(10), make(10)
+    for one in (replay, untouched):
+        fill(one, [(0, 0)] * 13)
+    replay.clear(1)
+    if restored:
+        state = through_a_file(replay.state_dict())
+        replay = make(10, first=9)
+        replay.load_state_dict(state)
+    assert replay.sizes(torch.zeros(2, 1).long()).tolist() == [[10], [0]]
+    with pytest.raises(ValueError, match="every seed needs a transition"):
+        replay.sample(torch.zeros(2, 5).long())
+    asked = torch.tensor([[0] * 5, [-1] * 5])
+    drawn = replay.sample(asked)
+    assert (drawn[0] == untouched.sample(asked)[0]).all()
+    assert not any(value.any() for value in drawn[1].values(True, True))
+    for one in (replay, untouched):
+        fill(one, [(1, 0)] * 2)
+    kept, group = replay.contents(1)
+    assert kept["latent"].equal(transition(0, 2)["latent"][[1]].add(torch.tensor([[0], [1]])))
+    assert group.tolist() == [0, 0]
+    asked = torch.tensor([[0, 1, 0, 1], [0, 0, 0, 1]])
+    drawn = replay.sample(asked)
+    assert (drawn[0] == untouched.sample(asked)[0]).all()
+    assert set(drawn["latent"][1, :3].flatten().tolist()) <= set(kept["latent"].flatten().tolist())
+    assert drawn["priority_weight"][1].tolist() == [1, 1, 1, 0]
+
+
+@pytest.mark.parametrize("memory", [float("nan"), float("inf")])
+def test_rows_of_the_only_seed_are_zeros_where_memory_is_not(monkeypatch, memory):
+    replay = make(10, n_seeds=1)
+    fill(replay, [(0,)])
+    replay.clear(0)
+    state = through_a_file(replay.state_dict())
+    restored = make(10, n_seeds=1)
+    monkeypatch.setattr(torch, "empty", lambda *shape, dtype: torch.full(shape, memory).to(dtype))
+    restored.load_state_dict(state)
+    assert not restored.sample(torch.tensor([[-1]]))["latent"].any()
+
+
 BAD = {
     "batch size": (transition(0, 3), None),
     "found no 'latent'": (transition(0, 2).exclude("latent"), None),

@@ -26,7 +26,8 @@ from tests.folders import contents
 ROOT = Path(__file__).parents[2]
 TASKS = nico.PAPER_TASKS
 WITH_GROUPS = ("bgpo", "bgpo-experts", "group-balanced-replay")
-WITHOUT_GWR = ("maml", "dist-nll", "oracle", "ddpg", "without-gwr", "without-both")
+WITHOUT_GWR = ("maml", "dist-nll", "oracle", "ddpg", "fine-tuning", "ewc")
+WITHOUT_GWR += ("without-gwr", "without-both")
 
 
 def test_an_experiment_writes_curves_figures_and_a_summary(tiny, tmp_path):

@@ -5,11 +5,12 @@ import pytest
 
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.analysis import statistics
-from bgpo_trl.analysis.comparison import NAMES, read_run
+from bgpo_trl.analysis.comparison import NAMES, Setting, read_run
 from bgpo_trl.analysis.scores import forward_transfer
+from bgpo_trl.analysis.tables import success_table
 from bgpo_trl.experiments.report import ReportArguments, report
 from bgpo_trl.runs.cost import Cost, write_costs
-from tests.analysis.runs import TASKS, edit, write_run, write_training
+from tests.analysis.runs import TASKS, edit, make_run, write_run, write_training
 from tests.folders import contents
 
 STARTS = (0, 14, 26)
@@ -75,9 +76,9 @@ def text_of(folder):
 def test_success_is_a_mean_over_seeds(reported):
     table = rows_of(text_of(reported), ONE_AFTER_THE_OTHER)
     # 80, 90 and 100 % by seed: a standard error of 5.77, times 4.303.
-    assert table["BGPO"][:4] == ["no", "3", "90.0 [65, 100]", "90.0 [65, 100], task 1"]
+    assert table["BGPO"][:4] == ["nothing", "3", "90.0 [65, 100]", "90.0 [65, 100], task 1"]
     assert table["BGPO"][4:7] == ["90.0"] * 3
-    assert table["MAML + demonstrations"][:3] == ["yes", "3", "16.7 [2, 31]"]
+    assert table["MAML + demonstrations"][:3] == ["label", "3", "16.7 [2, 31]"]
     from_start = rows_of(text_of(reported), "3 tasks, all from the start")
     # Four tests at 90 % end at 34, 36, ..., 40: the mean of three is there at 38.
     assert from_start["BGPO"][-1] == "38"
@@ -86,6 +87,21 @@ def test_success_is_a_mean_over_seeds(reported):
     half, late = (4 + 4 + 5) / 30, 0.9
     area = (2 * half / 2 + 30 * half + 2 * (half + late) / 2 + 6 * late) / 40
     assert from_start["BGPO"][-2].startswith(f"{100 * area:.1f} [")
+
+
+@pytest.mark.parametrize(
+    ("summary", "shown"),
+    [
+        ({"needs_label": False, "needs_boundaries": False}, "nothing"),
+        ({"needs_label": False, "needs_boundaries": True}, "boundaries"),
+        ({"needs_label": True, "needs_boundaries": True}, "label, boundaries"),
+        ({"needs_label": True}, "label"),
+        ({}, "?"),
+    ],
+)
+def test_what_an_algorithm_knows_of_tasks_is_shown(summary, shown):
+    head, row = success_table(Setting({"a run": make_run(**summary)}))
+    assert dict(zip(head, row, strict=True))["knows of tasks"] == shown
 
 
 def test_differences_are_judged_by_their_intervals(reported):

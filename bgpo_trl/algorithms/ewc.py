@@ -1,0 +1,159 @@
+"""Elastic weight consolidation: a penalty on changing weights that earlier tasks depend on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torch.func import functional_call
+
+from bgpo_trl.algorithms.fine_tuning import FineTuning
+from bgpo_trl.algorithms.learner import Learner
+from bgpo_trl.algorithms.rl import LearnerSpec, make_learner
+from bgpo_trl.configs import DDPGConfig, EWCConfig
+from bgpo_trl.data.bank import DemonstrationBank
+from bgpo_trl.encoders.representation import Representation
+from bgpo_trl.objectives.off_policy import OffPolicyLoss
+from bgpo_trl.seeding import generators
+
+__all__ = ["EWC", "EWCLearner", "diagonal_fisher"]
+
+_CHUNK = 64  # samples whose gradients are held at once
+
+
+class EWC(FineTuning):
+    """Fine-tuning with elastic weight consolidation (EWC; Kirkpatrick et al., 2017).
+
+    When a task begins, it estimates how much the seed's policy depends on each weight of its actor
+    (`diagonal_fisher`), from transitions of the task that ends, and adds this to the estimates of
+    earlier boundaries. From then on, `EWCLearner` keeps the actor near its present weights. This
+    is the online form (Schwarz et al., 2018), with one penalty for all earlier tasks; estimates do
+    not decay. As by default in Continual World (Wolczyk et al., 2021), the critic is free to
+    change and the replay is emptied.
+
+    Arguments as for `BGPO`.
+    """
+
+    config: EWCConfig
+    learner: EWCLearner
+
+    def __init__(
+        self,
+        config: EWCConfig,
+        *,
+        seeds: Sequence[int],
+        bank: DemonstrationBank,
+        encoders: Representation | None = None,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        super().__init__(config, seeds=seeds, bank=bank, encoders=encoders, device=device)
+        self._seeds = seeds
+
+    def _make_learner(self, spec: LearnerSpec) -> Learner:
+        ddpg = make_learner(self.config.rl, spec)
+        return EWCLearner(ddpg.actor, ddpg.loss, self.config.rl, weight=self.config.ewc_weight)
+
+    def begin_task(self, index: int, task: int) -> None:
+        """Consolidate the policy of the seed in the task that ends, and empty its replay.
+
+        If the replay is empty already, since several tasks begin at once, nothing changes.
+        """
+        if self.n_held()[index]:
+            stream = generators([self._seeds[index]], f"fisher {task}")
+            rows = torch.zeros(1, self.config.fisher_samples, dtype=torch.int64)
+            drawn = self.replay.sample(rows, seeds=[index], generator=stream)
+            self.learner.consolidate(index, self.to_device(drawn.select(*self.in_keys).squeeze(0)))
+        super().begin_task(index, task)
+
+
+class EWCLearner(Learner):
+    """DDPG learner with the penalty of EWC on its actor (Kirkpatrick et al., 2017, Eq. 3).
+
+    For each seed, it is ``weight / 2`` times the sum over the actor's weights of the Fisher
+    information times the squared distance from the anchor, the weights at the latest boundary. It
+    is 0 before the first one.
+
+    Arguments as for `Learner`, with the ``weight`` lambda of the penalty.
+
+    Attributes:
+        anchor: The actors' weights at the latest boundary of each seed, by name, ``[S, E, ...]``.
+        fisher: Diagonal of the Fisher information, summed over boundaries, in the same form.
+    """
+
+    def __init__(self, actor: Any, loss: OffPolicyLoss, config: DDPGConfig, *, weight: float):
+        super().__init__(actor, loss, config, noise=config.noise)
+        self.weight = weight
+        self.anchor = {key: value.detach().clone() for key, value in self._weights().items()}
+        self.fisher = {key: torch.zeros_like(value) for key, value in self.anchor.items()}
+
+    def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        """Return the losses of DDPG and the penalty, the sum over seeds."""
+        return {**super().losses(batch), "loss_ewc": self.penalty()}
+
+    def penalty(self) -> Tensor:
+        """Return the penalty, the sum over seeds ``[]``."""
+        of_each = [
+            (self.fisher[key] * (value - self.anchor[key]).square()).sum()
+            for key, value in self._weights().items()
+        ]
+        return self.weight / 2 * torch.stack(of_each).sum()
+
+    def consolidate(self, index: int, inputs: TensorDictBase) -> None:
+        """Anchor the actor of one seed where it is.
+
+        Args:
+            index: Position of the seed.
+            inputs: The actor's inputs ``[N]`` in states of the task that ends.
+        """
+        weights = {key: value[index, 0].detach() for key, value in self._weights().items()}
+        for key, value in diagonal_fisher(self.actor, weights, inputs).items():
+            self.anchor[key][index, 0] = weights[key]
+            self.fisher[key][index, 0] += value
+
+    def _weights(self) -> dict[str, Tensor]:
+        params = self.loss.actor_network_params.flatten_keys(".")
+        return {str(key): value for key, value in params.items()}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the states of loss and optimizer, and what the penalty depends on."""
+        return {**super().state_dict(), "anchor": {**self.anchor}, "fisher": {**self.fisher}}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore a `state_dict`."""
+        super().load_state_dict(state)
+        for name in ("anchor", "fisher"):
+            for key, value in getattr(self, name).items():
+                value.copy_(state[name][key])
+
+
+def diagonal_fisher(
+    actor: TensorDictModuleBase, weights: dict[str, Tensor], inputs: TensorDictBase
+) -> dict[str, Tensor]:
+    """Return the diagonal of the Fisher information of a deterministic policy, by weight.
+
+    The policy is taken as the mean of a Gaussian of unit variance, whose Fisher information is the
+    mean over the states of the squared gradients of the action's components, summed over these
+    (the Gauss-Newton form). Another variance would be another factor of the penalty.
+
+    Args:
+        actor: Writes the ``action``; stacked networks of any batch size.
+        weights: Weights of one policy, by name in the actor.
+        inputs: Its inputs ``[N]``.
+    """
+    fisher = {key: torch.zeros_like(value) for key, value in weights.items()}
+    for chunk in inputs.split(_CHUNK):
+        # One copy of the network per sample, so that a sum has the gradients of each sample.
+        copies = {
+            key: value.expand(len(chunk), *value.shape).clone().requires_grad_()
+            for key, value in weights.items()
+        }
+        action = functional_call(actor, copies, (chunk.clone(),))["action"]
+        for component in action.unbind(-1):
+            gradients = torch.autograd.grad(component.sum(), [*copies.values()], retain_graph=True)
+            for key, gradient in zip(fisher, gradients, strict=True):
+                fisher[key] += gradient.square().sum(0)
+    return {key: value / len(inputs) for key, value in fisher.items()}

@@ -1,0 +1,118 @@
+"""Elastic weight consolidation: Fisher information and penalty against plain computations."""
+
+import torch
+from tensordict import TensorDict
+from torch.func import functional_call
+
+from bgpo_trl.algorithms.ewc import EWCLearner, diagonal_fisher
+from bgpo_trl.algorithms.rl import LearnerSpec, make_ddpg
+from bgpo_trl.configs import DDPGConfig
+from bgpo_trl.modules.actor_critic import Actor
+
+N_STATE = 6
+
+
+def make_learner(weight=1.0, seeds=(3, 8)):
+    config = DDPGConfig(hidden_sizes=(16,))
+    ddpg = make_ddpg(
+        config, LearnerSpec(seeds, ["state"], N_STATE, (0.0, 1.0), torch.device("cpu"))
+    )
+    return EWCLearner(ddpg.actor, ddpg.loss, config, weight=weight)
+
+
+def make_batch(*shape, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    terminated = torch.rand(*shape, 1, generator=generator) < 0.2
+    following = {"state": torch.randn(*shape, N_STATE, generator=generator)}
+    following |= {"terminated": terminated, "reward": terminated.float()}
+    data = {"state": torch.randn(*shape, N_STATE, generator=generator), "next": following}
+    data["action"] = torch.rand(*shape, 4, generator=generator) * 2 - 1
+    return TensorDict(data, shape)
+
+
+def actor_weights(learner):
+    return dict(learner.loss.actor_network_params.flatten_keys(".").items())
+
+
+def test_the_fisher_information_is_that_of_a_plain_loop():
+    actor = Actor(5, 3, in_keys=["latent", "context"], hidden_sizes=(4,), batch_size=(2, 1))
+    weights = {key: value[1, 0].detach() for key, value in actor.named_parameters()}
+    inputs = TensorDict({"latent": torch.randn(70, 3), "context": torch.randn(70, 2)}, [70])
+    plain = {key: value.clone().requires_grad_() for key, value in weights.items()}
+    expected = {key: torch.zeros_like(value) for key, value in weights.items()}
+    for sample in inputs:
+        for component in functional_call(actor, plain, (sample.clone(),))["action"]:
+            gradients = torch.autograd.grad(component, [*plain.values()], retain_graph=True)
+            for key, gradient in zip(expected, gradients, strict=True):
+                expected[key] += gradient**2 / 70
+    torch.testing.assert_close(diagonal_fisher(actor, weights, inputs), expected)
+    assert set(inputs.keys()) == {"latent", "context"}
+
+
+def test_the_fisher_information_of_a_bias_is_the_squared_slope_of_tanh():
+    actor = Actor(2, 1, in_keys=["state"], hidden_sizes=(3,))
+    states = torch.tensor([[0.5, -1.0], [2.0, 0.3]])
+    inputs = TensorDict({"state": states}, [2])
+    weights = {key: value.detach() for key, value in actor.named_parameters()}
+    slope = 1 - actor(inputs.clone())["action"].square()
+    fisher = diagonal_fisher(actor, weights, inputs)["mlp.layers.1.bias"]
+    torch.testing.assert_close(fisher, slope.square().mean(0).detach())
+
+
+def test_the_penalty_is_that_of_equation_3_for_each_seed():
+    learner, inputs = make_learner(weight=5.0), make_batch(30).select("state")
+    assert learner.penalty() == 0
+    learner.consolidate(1, inputs)
+    assert learner.penalty() == 0
+    anchor = {key: value.detach().clone() for key, value in actor_weights(learner).items()}
+    fisher = diagonal_fisher(learner.actor, {k: v[1, 0] for k, v in anchor.items()}, inputs)
+    with torch.no_grad():
+        for value in actor_weights(learner).values():
+            value.add_(torch.randn(value.shape, generator=torch.Generator().manual_seed(4)))
+    penalty = learner.penalty()
+    moved = {k: (v.detach() - anchor[k])[1, 0] for k, v in actor_weights(learner).items()}
+    expected = 5 / 2 * sum((fisher[key] * moved[key] ** 2).sum() for key in fisher)
+    torch.testing.assert_close(penalty.detach(), expected)
+    learner.optimizer.zero_grad()
+    penalty.backward()
+    for key, value in actor_weights(learner).items():
+        assert value.grad is not None
+        torch.testing.assert_close(value.grad[1, 0], 5 * fisher[key] * moved[key])
+        assert not value.grad[0].any()
+    assert all(p.grad is None for p in learner.loss.value_network_params.values(True, True))
+
+
+def test_a_second_boundary_adds_its_information_and_moves_the_anchor():
+    learner, inputs = make_learner(), make_batch(30).select("state")
+    learner.consolidate(0, inputs)
+    first = {key: value.clone() for key, value in learner.fisher.items()}
+    for seed in range(5):
+        learner.learn(make_batch(2, 1, 32, seed=seed))
+    assert learner.penalty() > 0
+    weights = {key: value.detach().clone() for key, value in actor_weights(learner).items()}
+    learner.consolidate(0, inputs)
+    assert learner.penalty() == 0
+    second = diagonal_fisher(learner.actor, {k: v[0, 0] for k, v in weights.items()}, inputs)
+    for key, value in learner.fisher.items():
+        torch.testing.assert_close(value[0, 0], first[key][0, 0] + second[key])
+        assert learner.anchor[key][0].equal(weights[key][0])
+        assert not value[1].any()
+
+
+def test_weights_of_high_fisher_information_move_less():
+    """States of the old task lack the first feature, whose weights are thus free to change."""
+    free, held = make_learner(weight=0.0), make_learner(weight=1e4)
+    inputs = make_batch(200).select("state")
+    inputs["state"][:, 0] = 0.0
+    for index in range(2):
+        held.consolidate(index, inputs)
+    assert not held.fisher["mlp.layers.0.weight"][..., 0, :].any()
+    start = actor_weights(held)["mlp.layers.0.weight"].detach().clone()
+    moved = []
+    for learner in (free, held):
+        for seed in range(60):
+            learner.learn(make_batch(2, 1, 32, seed=seed))
+        weight = actor_weights(learner)["mlp.layers.0.weight"].detach()
+        moved.append((weight - start).abs().mean((0, 1, 3)))
+    assert moved[1][0] > 0.5 * moved[0][0]
+    assert (moved[1][1:] < 0.1 * moved[0][1:]).all()

@@ -1,0 +1,157 @@
+"""Fine-tuning, and EWC in training: DDPG that is given task boundaries."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from bgpo_trl.algorithms import entry
+from bgpo_trl.configs import FineTuningConfig
+from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
+from bgpo_trl.transforms import TaskSchedule
+from tests.algorithms.playing import assert_same, weights
+from tests.algorithms.playing import play as play_one_task
+
+pytestmark = pytest.mark.usefixtures("easy_world")
+SEEDS = (1, 2)
+# Before the warm-up of 8 steps has ended, in the middle of training, and two tasks at once.
+BOUNDARIES = {5: [(0, 1)], 20: [(1, 1)], 31: [(0, 2)], 33: [(1, 2), (1, 0)]}
+both = pytest.mark.parametrize("name", ["fine-tuning", "ewc"])
+
+
+@pytest.fixture
+def make(bank, encoders, make_config, in_world):
+    def make(name, seeds=SEEDS, **changes):
+        config = replace(make_config(name=name).algorithm, **changes)
+        kind = entry(name.partition("+")[0]).make
+        algorithm = kind(config, seeds=seeds, bank=bank.seen(), encoders=encoders)
+        return in_world(algorithm, seeds, TaskSchedule((0, 0, 0)))
+
+    return make
+
+
+def play(algorithm, n_steps, state=None, boundaries=(), first=0):
+    """Train for some steps; tasks begin after those numbered in ``boundaries``, from ``first``."""
+    boundaries, transitions = dict(boundaries), []
+    for step in range(first, first + n_steps):
+        played, state = play_one_task(algorithm, 1, state)
+        transitions.append(played)
+        for index, task in boundaries.get(step, ()):
+            algorithm.begin_task(index, task)
+    return torch.cat(transitions, 1), state
+
+
+def of_seed(index):
+    """Return the boundaries of one seed, as if it were alone."""
+    return {
+        step: [(0, task) for seed, task in of_step if seed == index]
+        for step, of_step in BOUNDARIES.items()
+    }
+
+
+def copies(algorithm, index):
+    return [weight[index].detach().clone() for weight in weights(algorithm)]
+
+
+@both
+def test_until_the_first_boundary_it_is_ddpg_bit_for_bit(make, name):
+    algorithm, ddpg = make(name), make("ddpg")
+    ours, theirs = play(algorithm, 30)[0], play(ddpg, 30)[0]
+    assert (ours == theirs).all()
+    state = algorithm.learner.state_dict()
+    assert state["optimizer"]["state"]
+    for part in ("loss", "optimizer"):
+        assert_same(state[part], ddpg.learner.state_dict()[part])
+    assert_same(algorithm.replay.state_dict(), ddpg.replay.state_dict())
+
+
+def test_after_a_boundary_only_transitions_of_the_new_task_are_learned_from(make):
+    algorithm = make("fine-tuning")
+    _, state = play(algorithm, 20)
+    algorithm.begin_task(1, 1)
+    data, _ = play(algorithm, 12, state)
+    sizes = [len(algorithm.replay.contents(index)[0]) for index in range(2)]
+    assert sizes == [32, 12]
+    assert algorithm.replay.contents(1)[0]["latent"].equal(data[1]["latent"])
+
+
+@pytest.mark.parametrize("name", ["fine-tuning", "fine-tuning+td3", "fine-tuning+sac", "ewc"])
+def test_a_seed_rests_until_its_replay_has_filled_again(make, name):
+    algorithm = make(name)
+    _, state = play(algorithm, 20)
+    algorithm.begin_task(1, 1)
+    learning, resting = copies(algorithm, 0), copies(algorithm, 1)
+    warmup = algorithm.config.rl.warmup_steps
+    _, state = play(algorithm, warmup, state)
+    assert_same(copies(algorithm, 1), resting)
+    assert all(not now.equal(old) for now, old in zip(copies(algorithm, 0), learning, strict=True))
+    play(algorithm, 4, state)
+    assert all(not now.equal(old) for now, old in zip(copies(algorithm, 1), resting, strict=True))
+
+
+@both
+def test_each_seed_of_a_batch_learns_as_it_would_alone(make, name):
+    batch = make(name)
+    together = play(batch, 50, boundaries=BOUNDARIES)[0]
+    for index, seed in enumerate(SEEDS):
+        alone = make(name, seeds=(seed,))
+        data = play(alone, 50, boundaries=of_seed(index))[0][0]
+        for key in ("task", "demo_index", ("next", "terminated")):
+            assert together[index][key].equal(data[key]), key
+        for key in ("action", "latent"):
+            torch.testing.assert_close(together[index][key], data[key], rtol=1e-4, atol=1e-4)
+        for ours, theirs in zip(copies(batch, index), copies(alone, 0), strict=True):
+            torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-4)
+
+
+@both
+@pytest.mark.parametrize("seeds", [SEEDS, (1,)])
+@pytest.mark.parametrize("n_steps", [6, 21, 26, 34])
+def test_a_restored_run_continues_as_the_saved_one(make, tmp_path, name, seeds, n_steps):
+    """Also directly after a boundary, when the only seed's replay is empty."""
+    boundaries = BOUNDARIES if len(seeds) == 2 else {5: [(0, 1)], 20: [(0, 2)], 33: [(0, 0)]}
+    algorithm = make(name, seeds=seeds)
+    _, state = play(algorithm, n_steps, boundaries=boundaries)
+    parts = {"algorithm": algorithm.state_dict(), "world": algorithm.world.state_dict()}
+    save_checkpoint(tmp_path, {**parts, "state": state.to_dict()})
+    other = make(name, seeds=seeds)
+    play(other, 12, boundaries={9: [(0, 2)]})
+    saved = load_checkpoint(tmp_path)
+    other.world.load_state_dict(saved["world"])
+    other.load_state_dict(saved["algorithm"])
+    options = {"boundaries": boundaries, "first": n_steps}
+    ours = play(algorithm, 50 - n_steps, state, **options)[0]
+    theirs = play(other, 50 - n_steps, TensorDict(saved["state"], [len(seeds)]), **options)[0]
+    assert (ours == theirs).all()
+    assert_same(algorithm.state_dict(), other.state_dict())
+
+
+def test_ewc_without_weight_is_fine_tuning(make):
+    algorithm, plain = make("ewc", ewc_weight=0.0), make("fine-tuning")
+    ours, theirs = (play(one, 50, boundaries=BOUNDARIES)[0] for one in (algorithm, plain))
+    assert (ours == theirs).all()
+    assert all(fisher.any() for fisher in algorithm.learner.fisher.values())
+
+
+def test_ewc_holds_the_policy_back_from_the_boundary_on(make):
+    algorithm, plain = make("ewc"), make("fine-tuning")
+    ours, theirs = (play(one, 50, boundaries={30: [(1, 1)]})[0] for one in (algorithm, plain))
+    assert ours[0]["action"].equal(theirs[0]["action"])
+    assert ours[1, :40]["action"].equal(theirs[1, :40]["action"])
+    assert not ours[1]["action"].equal(theirs[1]["action"])
+
+
+def test_ewc_consolidates_once_where_several_tasks_begin_at_once(make):
+    once, twice = make("ewc"), make("ewc")
+    for algorithm, tasks in ((once, [(0, 1)]), (twice, [(0, 1), (0, 2)])):
+        play(algorithm, 20, boundaries={19: tasks})
+    assert_same(once.learner.state_dict(), twice.learner.state_dict())
+
+
+@pytest.mark.parametrize(
+    "setting", [{"experts": True}, {"group_balanced_replay": True}, {"demonstration_share": 0.5}]
+)
+def test_stores_that_are_not_emptied_are_refused(setting):
+    with pytest.raises(ValueError):
+        FineTuningConfig(**setting)
