@@ -97,23 +97,36 @@ def load_last(directory: Path, settings: Mapping[str, Any]) -> dict[str, Any] | 
     return state
 
 
+def differing_settings(
+    settings: Mapping[str, Any], others: Mapping[str, Any]
+) -> list[tuple[str, Any, Any]]:
+    """Return names and both values of the settings that differ, such as ``algorithm.beta``.
+
+    A setting that one lacks has the value ``"absent"`` there. Modules that add tasks are passed
+    over, since a module that was renamed adds the same tasks.
+    """
+    old, new = (
+        dict(_flatten({name: value for name, value in given.items() if name != "task_modules"}))
+        for given in (settings, others)
+    )
+    return [
+        (name, old.get(name, "absent"), new.get(name, "absent"))
+        for name in {**old, **new}
+        if name not in old or name not in new or old[name] != new[name]
+    ]
+
+
 def _compare(
     where: str | os.PathLike[str],
     saved: Mapping[str, Any],
     settings: Mapping[str, Any],
     longer: bool,
 ) -> None:
-    # A module that was renamed adds the same tasks.
-    old, new = (
-        dict(_flatten({name: value for name, value in given.items() if name != "task_modules"}))
-        for given in (saved, settings)
-    )
-    if longer and type(old.get("episodes")) is type(new.get("episodes")) is int:
-        old["episodes"] = max(old["episodes"], new["episodes"])
+    if longer and type(saved.get("episodes")) is type(settings.get("episodes")) is int:
+        saved = {**saved, "episodes": max(saved["episodes"], settings["episodes"])}
     differences = [
-        f"{name} is {old.get(name, 'absent')} there and {new.get(name, 'absent')} here"
-        for name in {**old, **new}
-        if name not in old or name not in new or old[name] != new[name]
+        f"{name} is {old} there and {new} here"
+        for name, old, new in differing_settings(saved, settings)
     ]
     if differences:
         raise ValueError(
