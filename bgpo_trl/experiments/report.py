@@ -46,7 +46,7 @@ from bgpo_trl.figures.of_run import draw_groups
 from bgpo_trl.figures.page import Section, write_page
 from bgpo_trl.figures.style import COLORS, save_figure
 from bgpo_trl.figures.success_matrix import plot_success_matrices
-from bgpo_trl.files.writing import make_folder
+from bgpo_trl.files.writing import make_folder, write_whole
 from bgpo_trl.runs.archive import archive_run
 from bgpo_trl.runs.results import find_table, read_table
 
@@ -285,7 +285,7 @@ def report(arguments: ReportArguments) -> str:
         if run is not None and max(run.summary.get("groups") or [0]) > 1:
             draw_groups(directory, presented(run), out / f"{directory.name}-groups.png")
     text = text_of(made.sections, out)
-    (out / "tables.md").write_text(text)
+    write_whole(out / "tables.md", text)
     settings = {str(path): (path, run.config, run.summary) for path, run in made.runs.items()}
     write_page(out / "report.html", made.sections, settings)
     return text
