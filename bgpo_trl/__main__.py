@@ -17,6 +17,7 @@ COMMANDS = {
     "ablation": ("experiments.paper", "Train BGPO without some of its parts (Fig. 9)."),
     "sweep": ("experiments.sweep", "Run algorithms in settings over many seeds on Ray."),
     "eight-tasks": ("experiments.sweep", "Run the benchmark of eight tasks, as a sweep."),
+    "merge": ("experiments.merge", "Merge runs of different seeds into one."),
     "report": ("experiments.report", "Write tables and figures of runs, or compare two."),
     "watch": ("experiments.watch", "Film what a run has learned."),
     "looking": ("experiments.looking", "Test a run with the objects' places hidden."),

@@ -23,6 +23,8 @@ from bgpo_trl.encoders.representation import Representation, embed_demonstration
 from bgpo_trl.files.checkpoint import has_checkpoint, load_checkpoint
 from bgpo_trl.runs.config_file import read_config
 from bgpo_trl.runs.demonstrations import load_inputs
+from bgpo_trl.runs.directory import check_checkpoint, fitting_checkpoint
+from bgpo_trl.runs.results import read_json
 from bgpo_trl.seeding import stream_seed
 from suites.nico.rendering import FRAME_HEIGHT, FRAME_WIDTH
 
@@ -269,19 +271,15 @@ def load_all_seeds(path: str | Path, *, make: Callable[..., Algorithm] | None = 
         raise ValueError(f"{path} has no checkpoint: let the run reach its first one, or keep it")
     encoders, bank = load_inputs(path, config.tasks, digests)
     saved = load_checkpoint(path / "checkpoint", mmap=True, newest=True)
-    try:
+    # Before anything is made of the sizes in the settings, which may not be the run's.
+    check_checkpoint(path / "checkpoint", saved, read_json(path / "config.json"))
+    with fitting_checkpoint(path):
         algorithm = make(config.algorithm, seeds=config.seeds, bank=bank.seen(), encoders=encoders)
         state = saved["algorithm"]
         if not algorithm.needs_replay:
             state["replay"] = algorithm.replay.state_dict()  # Avoids reading it.
         algorithm.load_state_dict(state)
         episodes = saved["world"]["source"]["episode"].tolist()
-    except (KeyError, IndexError, RuntimeError, TypeError, ValueError) as error:
-        reason = str(error).splitlines()[-1].strip()
-        raise ValueError(
-            f"{path / 'checkpoint'} does not fit {path / 'config.json'} ({reason}): use the "
-            "version of the code, and the make, of the run"
-        ) from error
     return LoadedRun(config, algorithm, encoders, bank, episodes)
 
 

@@ -26,7 +26,7 @@ from bgpo_trl.files.progress import progress_bar
 from bgpo_trl.runs.config_file import Digests, settings_of
 from bgpo_trl.runs.cost import CostLog
 from bgpo_trl.runs.demonstrations import keep_bank
-from bgpo_trl.runs.directory import load_last
+from bgpo_trl.runs.directory import fitting_checkpoint, load_last
 from bgpo_trl.runs.gwr_graphs import growth_moments, save_graph
 from bgpo_trl.runs.logger import RunLogger
 from bgpo_trl.transforms import TaskSchedule
@@ -99,30 +99,6 @@ class Trainer:
                 "lower the run's spread, or record at a larger one"
             )
         bank = bank.for_tasks(config.tasks)
-        self._schedule = schedule = TaskSchedule(
-            config.task_starts, cumulative=config.schedule == "practised"
-        )
-        seeds = config.seeds
-        make = entry(config.name).make if make is None else make
-        self.algorithm = make(
-            config.algorithm, seeds=seeds, bank=bank.seen(), encoders=encoders, device=device
-        )
-        self.world = World(
-            self.algorithm,
-            seeds=seeds,
-            schedule=schedule,
-            bank=bank.seen(),
-            spread=config.spread,
-        )
-        self.evaluator = Evaluator(
-            config.algorithm,
-            seeds=seeds,
-            schedule=schedule,
-            episodes=config.eval_episodes,
-            bank=bank.held_out(config.held_out),
-            encoders=encoders,
-            spread=config.spread,
-        )
         self.env_steps = 0
         # For the progress bar: the latest training episodes, and the latest evaluation.
         self._successes: deque[int] = deque(maxlen=100)
@@ -134,9 +110,12 @@ class Trainer:
         self._state: TensorDictBase | None = None
         with ExitStack() as opened:
             opened.enter_context(lock_directory(self.directory))
+            # Before anything is made of the sizes in the settings, which may not be the run's.
             saved = load_last(self.directory, self._settings) if resume else None
+            self._make_parts(bank, make, device)
             if saved is not None:
-                self._load(saved)
+                with fitting_checkpoint(self.directory):
+                    self._load(saved)
             self._cost = CostLog(self.directory / "cost.csv", resume=saved is not None)
             self.logger = RunLogger(
                 self.directory, config=self._settings, wandb=wandb, resume=resume
@@ -149,6 +128,35 @@ class Trainer:
             if encoders is not None:  # Others cannot be loaded to watch demonstrations.
                 keep_bank(self.directory, bank, encoders)
             self._opened = opened.pop_all()
+
+    def _make_parts(
+        self,
+        bank: DemonstrationBank,
+        make: Callable[..., Algorithm] | None,
+        device: torch.device | str,
+    ) -> None:
+        config, seen = self.config, bank.seen()
+        self._schedule = TaskSchedule(config.task_starts, cumulative=config.schedule == "practised")
+        make = entry(config.name).make if make is None else make
+        self.algorithm = make(
+            config.algorithm, seeds=config.seeds, bank=seen, encoders=self.encoders, device=device
+        )
+        self.world = World(
+            self.algorithm,
+            seeds=config.seeds,
+            schedule=self._schedule,
+            bank=seen,
+            spread=config.spread,
+        )
+        self.evaluator = Evaluator(
+            config.algorithm,
+            seeds=config.seeds,
+            schedule=self._schedule,
+            episodes=config.eval_episodes,
+            bank=bank.held_out(config.held_out),
+            encoders=self.encoders,
+            spread=config.spread,
+        )
 
     def run(self) -> None:
         """Train to the end; return at once if a resumed run is complete.

@@ -272,9 +272,9 @@ def rewrite_algorithm(run, **changes):
     rewrite(run, algorithm={**settings, **changes})
 
 
-def narrow_networks(run):
+def edit_networks(run, sizes):
     rl = json.loads((run / "config.json").read_text())["algorithm"]["rl"]
-    rewrite_algorithm(run, rl={**rl, "hidden_sizes": [32]})
+    rewrite_algorithm(run, rl={**rl, "hidden_sizes": sizes})
 
 
 def cut_checkpoints(run):
@@ -294,8 +294,13 @@ def cut_checkpoints(run):
         (lambda run: rewrite(run, bank="0" * 64), "with the demonstrations 000000000000"),
         (lambda run: rewrite(run, encoders=None), "ground truth"),
         (lambda run: rewrite_algorithm(run, state="state"), "ground truth"),
-        (narrow_networks, "checkpoint does not fit"),
-        (lambda run: rewrite(run, seeds=[3, 8, 9]), "checkpoint does not fit"),
+        (lambda run: edit_networks(run, [32]), r"hidden_sizes is \[64\] there and \[32\] here"),
+        (lambda run: edit_networks(run, [2_000_000_000]), "hidden_sizes is"),
+        (lambda run: rewrite_algorithm(run, max_steps=7), "max_steps is 6 there and 7 here"),
+        (
+            lambda run: rewrite(run, seeds=[3, 8, 9]),
+            r"seeds is \[3, 8\] there and \[3, 8, 9\] here",
+        ),
         (lambda run: rewrite(run, name="mine"), "'mine'"),
     ],
 )

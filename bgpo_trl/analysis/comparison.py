@@ -200,7 +200,7 @@ def run_directories(paths: Iterable[Path]) -> list[Path]:
 
 def read_settings(
     directories: Sequence[Path], *, anyway: bool = False
-) -> tuple[list[Setting], list[str]]:
+) -> tuple[list[Setting], str]:
     """Read runs and sort them by setting: their tasks, and how these are presented.
 
     Runs that are not finished, or not begun, are left out.
@@ -211,29 +211,30 @@ def read_settings(
             the length of the shortest.
 
     Returns:
-        The settings that have runs, and notes on runs that were left out.
+        The settings that have runs, and a line about the runs that were left out, or "".
 
     Raises:
         ValueError: If a run is damaged, none is finished, or runs of a setting have other
             conditions.
     """
     groups: dict[tuple, list[Run]] = {}
-    notes: list[str] = []
+    waiting: list[str] = []
     for directory in directories:
         path = find_table(directory / "eval.csv")
         if path is None or (path.suffix == ".csv" and not has_rows(path)):
-            notes.append(f"{directory} holds no test episode: let the run evaluate first")
+            waiting.append(f"{directory} holds no test episode")
             continue
         run = read_run(directory)
         if run.unfinished:
-            notes.append(f"{run.directory} {run.unfinished}: let the run finish")
+            waiting.append(f"{run.directory} {run.unfinished}")
         else:
             starts, schedule = run.starts, run.config.get("schedule", _USUAL)
             rising = all(start < end for start, end in pairwise(starts))
             kind = (run.tasks, not any(starts), rising, schedule)
             groups.setdefault(kind, []).append(run)
+    left_out = "; ".join(waiting) + f": let the run{'s' * (len(waiting) > 1)} finish"
     if not groups:
-        raise ValueError(notes[0] if notes else "there are no runs: name a run")
+        raise ValueError(left_out if waiting else "there are no runs: name a run")
     found = [_setting(runs, anyway) for runs in groups.values()]
     found.sort(key=lambda setting: (len(setting.first.tasks), setting.from_start))
     settings: list[Setting] = []
@@ -244,22 +245,13 @@ def read_settings(
             order = "in reverse" if turned else f"order {len(alike) + 1}"
             setting = replace(setting, order=order)
         settings.append(setting)
-    return settings, notes
+    return settings, left_out if waiting else ""
 
 
 def _setting(runs: list[Run], anyway: bool) -> Setting:
     order = {name: place for place, name in enumerate(NAMES)}
     runs = sorted(runs, key=lambda run: (order.get(run.algorithm, len(order)), run.directory))
-    notes = [differing for run in runs[1:] if (differing := differing_conditions(run, runs[0]))]
-    if notes and not anyway:
-        raise ValueError(_refused(notes[0]))
-    last = min(run.last for run in runs)
-    notes += [
-        f"{run.directory} is cut at {last} of {run.last} episodes"
-        for run in runs
-        if run.last > last
-    ]
-    runs = [replace(run, curves=run.curves.until(last)) for run in runs]
+    runs, notes = under_equal_conditions(runs, anyway=anyway)
     names = [NAMES.get(run.algorithm, run.algorithm) for run in runs]
     return Setting(
         {
@@ -268,6 +260,38 @@ def _setting(runs: list[Run], anyway: bool) -> Setting:
         },
         notes,
     )
+
+
+def under_equal_conditions(
+    runs: Sequence[Run], *, anyway: bool = False
+) -> tuple[list[Run], list[str]]:
+    """Check that runs are comparable, and cut longer ones to the length of the shortest.
+
+    Args:
+        runs: Runs of the same tasks.
+        anyway: Whether to note differing conditions instead of refusing them.
+
+    Returns:
+        The runs, and notes: differing conditions, those that not all runs state, and what is cut.
+
+    Raises:
+        ValueError: If conditions differ.
+    """
+    notes = [differing for run in runs[1:] if (differing := differing_conditions(runs[0], run))]
+    if notes and not anyway:
+        raise ValueError(_refused(notes[0]))
+    conditions = [_conditions(run) for run in runs]
+    for name in dict.fromkeys(name for of_run in conditions for name in of_run):
+        silent = sum(name not in of_run for of_run in conditions)
+        if silent:
+            notes.append(f"{name}: not stated by {silent} of {len(runs)} runs, taken as equal")
+    last = min(run.last for run in runs)
+    notes += [
+        f"{run.directory} is cut at {last} of {run.last} episodes"
+        for run in runs
+        if run.last > last
+    ]
+    return [replace(run, curves=run.curves.until(last)) for run in runs], notes
 
 
 def _refused(differing: str) -> str:
@@ -287,7 +311,10 @@ def reference_of(setting: Setting, settings: Iterable[Setting], *, anyway: bool)
     found = next((other for other in others if set(other.first.tasks) == tasks), None)
     if found is None or not setting.in_sequence:
         return None
-    differing = differing_conditions(setting.first, found.first, _OF_THE_SETTING)
+    # The digest of a bank depends on the order of its tasks.
+    turned = setting.first.tasks != found.first.tasks
+    ignored = (*_OF_THE_SETTING, "bank") if turned else _OF_THE_SETTING
+    differing = differing_conditions(setting.first, found.first, ignored)
     if differing and not anyway:
         raise ValueError(_refused(differing))
     setting.notes.extend([differing] if differing else [])
@@ -310,11 +337,14 @@ def differing_conditions(run: Run, other: Run, ignored: Sequence[str] = ()) -> s
 
 
 def _conditions(run: Run) -> dict[str, Any]:
-    algorithm = run.config.get("algorithm") or {}
-    limit = {"max_steps": algorithm["max_steps"]} if "max_steps" in algorithm else {}
-    return {k: v for k, v in run.config.items() if k not in _OF_THE_RUN} | limit
+    algorithm = run.config.get("algorithm")
+    known: dict[str, Any] = {"eval_every": run.eval_every, "schedule": _USUAL}
+    if isinstance(algorithm, dict) and "max_steps" in algorithm:
+        known["max_steps"] = algorithm["max_steps"]
+    return known | {k: v for k, v in run.config.items() if k not in _OF_THE_RUN}
 
 
 def _short(value: Any) -> str:
+    """Return a value as text; of a digest, the beginning."""
     text = str(value)
-    return text if len(text) <= 60 else f"{text[:12]}..."
+    return f"{text[:12]}..." if isinstance(value, str) and len(text) > 60 else text

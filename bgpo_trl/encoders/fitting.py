@@ -130,6 +130,8 @@ class Fit:
         if not path or not has_checkpoint(path):
             return 0
         saved = load_checkpoint(path)
+        if not saved.keys() >= {"config", "loss", "optimizer", "generator", "step"}:
+            raise ValueError(f"{path} holds no checkpoint of encoders: choose another folder")
         if saved["config"] != json.dumps(asdict(self.config)):
             raise ValueError(
                 f"{path} was written with another configuration: "

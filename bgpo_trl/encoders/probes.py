@@ -9,7 +9,7 @@ part of the encoders' training reads the ground-truth ``state``.
 
 from __future__ import annotations
 
-import json
+import io
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -32,6 +32,7 @@ from bgpo_trl.encoders.representation import (
     valid_frames,
     valid_steps,
 )
+from bgpo_trl.files.writing import write_json, write_whole
 from bgpo_trl.modules.inverse_model import InverseModel
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
@@ -93,9 +94,10 @@ def probe(
     if folder is not None:
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "probes.json").write_text(json.dumps(result, indent=2) + "\n")
-        picture = reconstruction_picture(vae, held_out)
-        matplotlib.image.imsave(folder / "reconstructions.png", picture.numpy())
+        write_json(folder / "probes.json", result)
+        picture, content = reconstruction_picture(vae, held_out), io.BytesIO()
+        matplotlib.image.imsave(content, picture.numpy(), format="png")
+        write_whole(folder / "reconstructions.png", content.getvalue())
     return result
 
 

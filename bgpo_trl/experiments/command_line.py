@@ -29,9 +29,10 @@ def command_line(
 ) -> None:
     """Call a function with the arguments of the command line, and print what it returns.
 
-    An expected error becomes one line. Ctrl-C and SIGTERM exit with 75 (``os.EX_TEMPFAIL``) if
-    ``--resume`` can continue. An error of somebody else's code, such as a module named with
-    ``--import``, keeps its traceback.
+    An expected error becomes one line. Control characters, which names in files of others may hold
+    and a terminal would act on, are printed as escapes. Ctrl-C and SIGTERM exit with 75
+    (``os.EX_TEMPFAIL``) if ``--resume`` can continue. An error of somebody else's code, such as a
+    module named with ``--import``, keeps its traceback.
 
     Args:
         command: Function of one dataclass, ``arguments``. Its docstring is shown by ``--help``.
@@ -44,14 +45,19 @@ def command_line(
     except (ValueError, OSError, RuntimeError) as error:
         if _is_of_others(error):
             raise
-        sys.exit(f"error: {error}")
+        sys.exit(f"error: {_printable(str(error))}")
     except KeyboardInterrupt:
         if not hasattr(kind, "resume"):
             sys.exit("interrupted")
         sys.stderr.write("interrupted: the same command with --resume continues\n")
         sys.exit(os.EX_TEMPFAIL)
     if text is not None:
-        sys.stdout.write(f"{text}\n")
+        sys.stdout.write("\n".join(map(_printable, text.split("\n"))) + "\n")
+
+
+def _printable(line: str) -> str:
+    """Return a line with escape sequences of Python for all that is not printable."""
+    return "".join(char if char.isprintable() else ascii(char)[1:-1] for char in line)
 
 
 def _parse(

@@ -18,6 +18,7 @@ from typing import Any
 from bgpo_trl.configs import RunConfig
 from bgpo_trl.files.locking import lock_directory
 from bgpo_trl.files.progress import progress_bar
+from bgpo_trl.files.writing import no_link
 
 try:
     import ray
@@ -97,7 +98,7 @@ def work(job: Job, play: Callable[[Job], None], command: Sequence[str]) -> None:
     sys.argv = list(command)
     with (
         lock_directory(job.directory, wait=True),  # A worker that Ray lost may still be writing.
-        (job.directory / "log.txt").open("a", buffering=1) as log,
+        open(job.directory / "log.txt", "a", buffering=1, opener=no_link) as log,
         contextlib.redirect_stdout(log),
         contextlib.redirect_stderr(log),
     ):

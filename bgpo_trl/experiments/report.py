@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -19,6 +19,7 @@ from bgpo_trl.analysis.comparison import (
     read_settings,
     reference_of,
     run_directories,
+    under_equal_conditions,
 )
 from bgpo_trl.analysis.scores import Values, late_scores, success_matrix
 from bgpo_trl.analysis.tables import (
@@ -45,7 +46,7 @@ from bgpo_trl.figures.of_run import draw_groups
 from bgpo_trl.figures.page import Section, write_page
 from bgpo_trl.figures.style import COLORS, save_figure
 from bgpo_trl.figures.success_matrix import plot_success_matrices
-from bgpo_trl.files.writing import make_folder
+from bgpo_trl.files.writing import make_folder, write_whole
 from bgpo_trl.runs.archive import archive_run
 from bgpo_trl.runs.results import find_table, read_table
 
@@ -166,12 +167,14 @@ def setting_sections(setting: Setting, reference: Setting | None, out: Path) -> 
     ]
     table = difference_table(setting)
     if table:
-        sections.append(Section(f"Differences: {title}", table, notes=[*DIFFERENCE_NOTES]))
+        sections.append(
+            Section(f"Differences: {title}", table, notes=[*setting.notes, *DIFFERENCE_NOTES])
+        )
     if setting.in_sequence:
         name = f"Forgetting and transfer: {title}"
         try:
             table, figures = sequence_table(setting, reference), draw_sequence(setting, out)
-            sections.append(Section(name, table, figures, [*SEQUENCE_NOTES]))
+            sections.append(Section(name, table, figures, [*setting.notes, *SEQUENCE_NOTES]))
         except ValueError as error:  # tested too rarely
             sections.append(Section(name, notes=[str(error)]))
     for share in (0.5, 0.8):
@@ -204,14 +207,14 @@ def make_report(directories: Sequence[Path], out: Path, *, anyway: bool = False)
     Raises:
         ValueError: If a run is damaged, none is finished, or conditions differ.
     """
-    settings, notes = read_settings(directories, anyway=anyway)
+    settings, left_out = read_settings(directories, anyway=anyway)
     references = [reference_of(setting, settings, anyway=anyway) for setting in settings]
     # All that may be refused comes before the first file.
     for setting in settings:
         for run in setting.runs.values():
             task_table(run)
     make_folder(out)
-    sections = [Section("Left out", notes=notes)] if notes else []
+    sections = [Section("Left out", notes=[left_out])] if left_out else []
     for setting, reference in zip(settings, references, strict=True):
         sections += setting_sections(setting, reference, out)
     pairs: list[tuple[Setting | None, Setting | None]] = [
@@ -224,7 +227,9 @@ def make_report(directories: Sequence[Path], out: Path, *, anyway: bool = False)
         some = continual or concurrent
         if table and some is not None:
             number = len(some.first.tasks)
-            about = [f"{missing} further claims need runs that are not here."] if missing else []
+            about = [note for each in (continual, concurrent) if each for note in each.notes]
+            if missing:
+                about.append(f"{missing} further claims need runs that are not here.")
             sections.append(Section(f"The paper's claims, {number} tasks", table, notes=about))
     runs = {run.directory: run for setting in settings for run in setting.runs.values()}
     return Report(sections, runs)
@@ -280,7 +285,7 @@ def report(arguments: ReportArguments) -> str:
         if run is not None and max(run.summary.get("groups") or [0]) > 1:
             draw_groups(directory, presented(run), out / f"{directory.name}-groups.png")
     text = text_of(made.sections, out)
-    (out / "tables.md").write_text(text)
+    write_whole(out / "tables.md", text)
     settings = {str(path): (path, run.config, run.summary) for path, run in made.runs.items()}
     write_page(out / "report.html", made.sections, settings)
     return text
@@ -291,12 +296,12 @@ def compare(paths: Sequence[Path], *, every: int | None = None, anyway: bool = F
 
     It has the success of both over the last 10 % of training, the second's lead with its 95 %
     interval (Welch), the p value of a permutation test of seeds, and what is found. If one run is
-    shorter, only the part that both have is compared.
+    not finished yet, only the part that both have is compared.
 
     Args:
         paths: Directories of the two runs.
         every: Also compare over each part of training of so many episodes.
-        anyway: Compare also runs under different conditions.
+        anyway: Compare also runs under different conditions, of which a note is returned.
 
     Raises:
         ValueError: If there are not two runs of the same tasks, a run is damaged, or conditions
@@ -307,13 +312,11 @@ def compare(paths: Sequence[Path], *, every: int | None = None, anyway: bool = F
     if every is not None and every < 1:
         raise ValueError(f"--every must be at least 1 episode, got {every}")
     first, second = map(read_run, paths)
-    differing = differing_conditions(first, second, ("episodes",))
     if first.tasks != second.tasks:
+        differing = differing_conditions(first, second)
         raise ValueError(f"{differing}: only runs of the same tasks in the same order are compared")
-    if differing and not anyway:
-        raise ValueError(f"{differing}: only runs under equal conditions are compared; --anyway")
-    last = min(first.last, second.last)
-    runs = [replace(run, curves=run.curves.until(last)) for run in (first, second)]
+    runs, notes = under_equal_conditions((first, second), anyway=anyway)
+    last = runs[0].last
     rows: Table = [["episodes", "task", "first", "second", "second - first", "p", "found"]]
     part = last + 1 if every is None else every
     for end in range(part, last + 1, part):
@@ -323,7 +326,7 @@ def compare(paths: Sequence[Path], *, every: int | None = None, anyway: bool = F
         ]
         rows += _differences(f"to {end}", first.tasks, *(matrix[:, 0] for matrix in matrices))
     rows += _differences("last 10 %", first.tasks, *map(late_scores, runs))
-    return "\n\n".join([*([differing] if differing else []), markdown(rows)])
+    return "\n\n".join([*notes, markdown(rows)])
 
 
 def _differences(period: str, tasks: tuple[str, ...], first: Values, second: Values) -> Table:

@@ -20,7 +20,7 @@ from typing import Literal
 from bgpo_trl.algorithms import ABLATIONS
 from bgpo_trl.configs import RunConfig
 from bgpo_trl.experiments.arguments import Arguments, BankArguments
-from bgpo_trl.experiments.merge import merge
+from bgpo_trl.experiments.merge import merge_runs
 from bgpo_trl.experiments.ray_jobs import Job, connected, play_jobs
 from bgpo_trl.experiments.run import pretrained_for, run_experiment
 from bgpo_trl.experiments.settings import run_config
@@ -197,7 +197,7 @@ def sweep(arguments: SweepArguments) -> str:
     for directory, group in jobs.items():
         if failed.keys().isdisjoint(group):
             with lock_directory(directory, wait=True):
-                merge([job.directory for job in group], directory)
+                merge_runs([job.directory for job in group], directory)
             lines.append(f"{directory}: blocks of seeds: {len(group)}")
     if failed:
         raise RuntimeError("; ".join(f"{job} failed: {why}" for job, why in failed.items()))

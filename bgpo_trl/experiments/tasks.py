@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from bgpo_trl.analysis.tables import Table, markdown
+from bgpo_trl.files.writing import write_whole
 from suites import nico
 from suites.nico.base import CONTROL_TIMESTEP, TIME_LIMIT, Environment
 from suites.nico.demonstrator import Demonstrator
@@ -160,6 +162,8 @@ def tasks(arguments: TasksArguments) -> str:
             ("starts.png", draw_starts(arguments.seed)),
         ):
             path = arguments.pictures / name
-            picture.save(path, optimize=True)
+            content = io.BytesIO()
+            picture.save(content, format="png", optimize=True)
+            write_whole(path, content.getvalue())
             found += f"\npicture: {path}"
     return "\n\n".join([markdown(table), markdown(spread), found])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,7 +12,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image
 
-from bgpo_trl.files.writing import make_folder
+from bgpo_trl.files.writing import make_folder, write_whole
 
 
 def plot_frame_strips(episodes: Mapping[str, NDArray], n_frames: int = 8) -> Figure:
@@ -64,4 +65,13 @@ def save_gif(
     make_folder(path.parent)
     large = frames.repeat(scale, 1).repeat(scale, 2)
     first, *others = (Image.fromarray(frame) for frame in large)
-    first.save(path, save_all=True, append_images=others, duration=round(1000 / fps), loop=0)
+    content = io.BytesIO()
+    first.save(
+        content,
+        format="gif",
+        save_all=True,
+        append_images=others,
+        duration=round(1000 / fps),
+        loop=0,
+    )
+    write_whole(path, content.getvalue())

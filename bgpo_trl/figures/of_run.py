@@ -16,6 +16,7 @@ from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.figures.groups import plot_groups, read_groups
 from bgpo_trl.figures.gwr import plot_gwr_growth, plot_gwr_pca
 from bgpo_trl.figures.style import save_figure
+from bgpo_trl.files.writing import write_whole
 from bgpo_trl.runs.gwr_graphs import load_graphs
 from bgpo_trl.runs.results import COUNT, read_table
 from bgpo_trl.transforms import TaskSchedule
@@ -85,4 +86,4 @@ def write_nodes(path: Path, weights: Tensor, tasks: Tensor, groups: Tensor | Non
     if groups is not None:
         table.insert(0, "group", groups.numpy())
     table.insert(0, "task", tasks.numpy())
-    table.to_csv(path, index=False, float_format="%.6g", lineterminator="\r\n")
+    write_whole(path, table.to_csv(index=False, float_format="%.6g", lineterminator="\r\n"))

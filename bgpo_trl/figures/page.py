@@ -10,6 +10,8 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
+from bgpo_trl.files.writing import write_whole
+
 
 @dataclass(frozen=True)
 class Section:
@@ -63,11 +65,11 @@ def write_page(
         settings = escape(json.dumps(config, indent=2))
         parts.append(f"<details><summary>settings</summary><pre>{settings}</pre></details>")
     body = "\n".join(parts)
-    path.write_text(
+    write_whole(
+        path,
         "<!doctype html>\n<html lang='en'>\n<head><meta charset='utf-8'>"
         f"<title>bgpo_trl report</title><style>{_STYLE}</style></head>\n<body>\n{body}\n</body>\n"
         "</html>\n",
-        encoding="utf-8",
     )
 
 

@@ -6,6 +6,7 @@ colorblind-safe palette; line styles and markers differ as well.
 
 from __future__ import annotations
 
+import io
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,7 +15,7 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from bgpo_trl.files.writing import make_folder
+from bgpo_trl.files.writing import make_folder, write_whole
 
 COLORS = (
     "#0072B2",
@@ -39,7 +40,9 @@ def save_figure(figure: Figure, path: str | os.PathLike[str], dpi: int = DPI) ->
     """Save a figure as PNG; the same figure always gives the same bytes."""
     path = Path(path)
     make_folder(path.parent)
-    figure.savefig(path, format="png", dpi=dpi, metadata={"Software": None})
+    content = io.BytesIO()
+    figure.savefig(content, format="png", dpi=dpi, metadata={"Software": None})
+    write_whole(path, content.getvalue())
 
 
 def style_axes(axes: Axes) -> None:

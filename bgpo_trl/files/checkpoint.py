@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+import pickle
 import re
 import warnings
 from collections import OrderedDict
@@ -18,7 +19,10 @@ from typing import Any, BinaryIO
 import torch
 from torch import Tensor, nn
 
+from bgpo_trl.files.writing import open_new
+
 _NAME = re.compile(r"checkpoint-\d+-[0-9a-f]{16}\.pt")
+_REMEDY = "put it back as the run left it, or begin a new run in another directory"
 _PLAIN_TYPES = (bool, int, float, str, type(None), Tensor, nn.Parameter)
 
 
@@ -56,7 +60,7 @@ def save_checkpoint(directory: str | os.PathLike[str], state: dict[str, Any]) ->
     number = _number(earlier[0]) + 1 if earlier else 1
     try:
         directory.mkdir(parents=True, exist_ok=True)
-        with open(temporary, "wb") as file:
+        with open_new(temporary) as file:
             digest = _write(state, file)
         path = directory / f"checkpoint-{number:06d}-{digest}.pt"
         temporary.replace(path)
@@ -94,12 +98,13 @@ def load_checkpoint(
     ``newest``, only the newest one is read, for what is to be used as it is, not resumed.
 
     Raises:
-        ValueError: If there is no intact checkpoint, or, with ``newest``, it is not the newest.
+        ValueError: If there is no intact checkpoint, or, with ``newest``, it is not the newest; or
+            if the file is not a checkpoint of this package.
     """
     directory = Path(directory)
     for path in _checkpoints(directory):
         if _is_intact(path):
-            return torch.load(path, map_location=map_location, weights_only=True, mmap=mmap)
+            return _read(path, map_location, mmap)
         if newest:
             raise ValueError(
                 f"{path} is damaged, and older checkpoints have learned less: resume the run, "
@@ -112,6 +117,18 @@ def load_checkpoint(
         f"{directory} holds no intact checkpoint to resume from: start a new run in another "
         "directory."
     )
+
+
+def _read(path: Path, map_location: str | torch.device, mmap: bool) -> dict[str, Any]:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # of pickles that torch has not written
+            state = torch.load(path, map_location=map_location, weights_only=True, mmap=mmap)
+    except (pickle.UnpicklingError, RuntimeError, ValueError, EOFError) as error:
+        raise ValueError(f"{path} is not a checkpoint: {_REMEDY}") from error
+    if not isinstance(state, dict):
+        raise ValueError(f"{path} holds a {type(state).__name__}, not a checkpoint: {_REMEDY}")
+    return state
 
 
 def has_checkpoint(directory: str | os.PathLike[str]) -> bool:

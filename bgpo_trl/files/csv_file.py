@@ -10,6 +10,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
+from bgpo_trl.files.writing import no_link
+
 
 class CsvFile:
     r"""Append-only CSV file with fixed columns that can be truncated to an earlier position.
@@ -43,7 +45,7 @@ class CsvFile:
         header = _csv_line(self.columns)
         self._header_size = len(header)
         try:
-            self._file = open(self.path, "a+b", buffering=0)  # noqa: SIM115 closed by close()
+            self._file = open(self.path, "a+b", buffering=0, opener=no_link)  # noqa: SIM115
         except OSError as error:
             raise OSError(
                 f"cannot write {self.path} ({error.strerror}): choose another run directory"

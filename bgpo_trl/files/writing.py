@@ -6,7 +6,7 @@ import contextlib
 import json
 import os
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 
 def make_folder(path: str | os.PathLike[str]) -> Path:
@@ -23,15 +23,37 @@ def make_folder(path: str | os.PathLike[str]) -> Path:
     return path
 
 
+def open_new(path: Path) -> BinaryIO:
+    """Open a file to write it anew; what has its name is removed first, such as a symbolic link.
+
+    Raises:
+        OSError: If it cannot be written.
+    """
+    path.unlink(missing_ok=True)
+    return path.open("xb")
+
+
+def no_link(path: str, flags: int) -> int:
+    """Open a file, as ``opener`` of `open`, but not through a symbolic link.
+
+    Raises:
+        OSError: If it cannot be opened, or is a symbolic link.
+    """
+    return os.open(path, flags | os.O_NOFOLLOW, 0o666)
+
+
 def write_whole(path: Path, content: str | bytes) -> None:
     """Write a file by way of a temporary one beside it; if it fails, the old one is kept.
+
+    A symbolic link of this name is replaced, and what it points to stays as it is.
 
     Raises:
         OSError: If it cannot be written.
     """
     temporary = path.with_name(f"{path.name}.tmp")
     try:
-        temporary.write_bytes(content.encode() if isinstance(content, str) else content)
+        with open_new(temporary) as file:
+            file.write(content.encode() if isinstance(content, str) else content)
         temporary.replace(path)
     except OSError:
         with contextlib.suppress(OSError):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -14,6 +15,16 @@ from bgpo_trl.runs.results import read_json
 
 CSV_FILES = ("train.csv", "eval.csv")
 """Files to which a run appends rows."""
+_OF_A_CHECKPOINT: Mapping[str, type] = {
+    "settings": dict,
+    "position": dict,
+    "algorithm": dict,
+    "world": dict,
+    "evaluator": dict,
+    "state": dict,
+    "env_steps": int,
+    "later": list,
+}
 
 
 def holds_run(directory: str | os.PathLike[str]) -> bool:
@@ -91,10 +102,69 @@ def load_last(directory: Path, settings: Mapping[str, Any]) -> dict[str, Any] | 
     if not (directory / "config.json").exists():
         raise ValueError(f"{directory} has a checkpoint, but no config.json: {remedy}")
     state = load_checkpoint(folder)
-    _compare(folder, state["settings"], settings, longer=True)
+    check_checkpoint(folder, state, settings)
     for name, position in state["position"].items():
         check_position(directory / name, position)
     return state
+
+
+def check_checkpoint(folder: Path, state: Mapping[str, Any], settings: Mapping[str, Any]) -> None:
+    """Check that a checkpoint was saved by `Trainer`, with the given settings or fewer episodes.
+
+    Args:
+        folder: Folder of the checkpoint.
+        state: Its content.
+        settings: Settings of the run, as JSON stores them.
+
+    Raises:
+        ValueError: If entries are missing, or settings differ.
+    """
+    missing = [
+        name for name, kind in _OF_A_CHECKPOINT.items() if not isinstance(state.get(name), kind)
+    ]
+    if missing:
+        raise ValueError(
+            f"{folder} holds no checkpoint of a run, it lacks {', '.join(missing)}: put it back as "
+            "the run left it, or begin a new run in another directory"
+        )
+    remedy = "put config.json back as the run left it, or choose another run directory"
+    _compare(folder, state["settings"], settings, longer=True, remedy=remedy)
+
+
+@contextlib.contextmanager
+def fitting_checkpoint(directory: Path) -> Iterator[None]:
+    """Turn errors of loading a checkpoint's state, in the block, into one line.
+
+    Raises:
+        ValueError: If the state does not fit what it is loaded into.
+    """
+    try:
+        yield
+    except (AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
+        reason = (str(error) or type(error).__name__).splitlines()[-1].strip()
+        raise ValueError(
+            f"{directory / 'checkpoint'} does not fit {directory / 'config.json'} ({reason}): use "
+            "the version of the code, and the make, of the run"
+        ) from error
+
+
+def differing_settings(
+    settings: Mapping[str, Any], others: Mapping[str, Any]
+) -> list[tuple[str, Any, Any]]:
+    """Return names and both values of the settings that differ, such as ``algorithm.beta``.
+
+    A setting that one lacks has the value ``"absent"`` there. Modules that add tasks are passed
+    over, since a module that was renamed adds the same tasks.
+    """
+    old, new = (
+        dict(_flatten({name: value for name, value in given.items() if name != "task_modules"}))
+        for given in (settings, others)
+    )
+    return [
+        (name, old.get(name, "absent"), new.get(name, "absent"))
+        for name in {**old, **new}
+        if name not in old or name not in new or old[name] != new[name]
+    ]
 
 
 def _compare(
@@ -102,23 +172,17 @@ def _compare(
     saved: Mapping[str, Any],
     settings: Mapping[str, Any],
     longer: bool,
+    remedy: str = "choose another run directory, or the same settings.",
 ) -> None:
-    # A module that was renamed adds the same tasks.
-    old, new = (
-        dict(_flatten({name: value for name, value in given.items() if name != "task_modules"}))
-        for given in (saved, settings)
-    )
-    if longer and type(old.get("episodes")) is type(new.get("episodes")) is int:
-        old["episodes"] = max(old["episodes"], new["episodes"])
+    if longer and type(saved.get("episodes")) is type(settings.get("episodes")) is int:
+        saved = {**saved, "episodes": max(saved["episodes"], settings["episodes"])}
     differences = [
-        f"{name} is {old.get(name, 'absent')} there and {new.get(name, 'absent')} here"
-        for name in {**old, **new}
-        if name not in old or name not in new or old[name] != new[name]
+        f"{name} is {old} there and {new} here"
+        for name, old, new in differing_settings(saved, settings)
     ]
     if differences:
         raise ValueError(
-            f"{where} holds a run with other settings ({'; '.join(differences)}): "
-            "choose another run directory, or the same settings."
+            f"{where} holds a run with other settings ({'; '.join(differences)}): {remedy}"
         )
 
 

@@ -18,6 +18,7 @@ from typing import Any, Literal, Self
 from torchrl.record.loggers.wandb import WandbLogger
 
 from bgpo_trl.files.csv_file import CsvFile, plain_value
+from bgpo_trl.files.writing import write_whole
 from bgpo_trl.runs.directory import claim_directory
 
 EVAL_COLUMNS = (
@@ -189,7 +190,7 @@ def _wandb_logger(directory: Path, settings: Mapping[str, Any], mode: str) -> Wa
         try:
             identity.parent.mkdir(exist_ok=True)
             if not identity.exists() or not identity.read_text():  # killed before it was written
-                identity.write_text(uuid.uuid4().hex)
+                write_whole(identity, uuid.uuid4().hex)
             return WandbLogger(
                 directory.name,
                 project="bgpo_trl",

@@ -18,8 +18,8 @@ SEQUENCE = (0, 14, 26)
 
 
 def settings_in(folder, **options):
-    settings, notes = read_settings(run_directories([folder]), **options)
-    return {setting.title: setting for setting in settings}, notes
+    settings, left_out = read_settings(run_directories([folder]), **options)
+    return {setting.title: setting for setting in settings}, left_out
 
 
 def test_runs_are_sorted_by_tasks_and_their_presentation(tmp_path):
@@ -32,7 +32,7 @@ def test_runs_are_sorted_by_tasks_and_their_presentation(tmp_path):
     write_run(tmp_path, "bgpo", 5, starts=(0, 0, 20), directory="c")
     write_run(tmp_path, "bgpo", 5, starts=SEQUENCE, directory="0", schedule="sequential")
     (tmp_path / "no-run").mkdir()
-    found, notes = settings_in(tmp_path)
+    found, left_out = settings_in(tmp_path)
     assert {title: setting.slug for title, setting in found.items()} == {
         "3 tasks, one after the other, sequential": "continual-3-sequential",
         "3 tasks, one after the other": "continual-3",
@@ -43,7 +43,7 @@ def test_runs_are_sorted_by_tasks_and_their_presentation(tmp_path):
     }
     three = found["3 tasks, one after the other"]
     assert list(three.runs) == ["BGPO", "DDPG, told the label", "mine"]
-    assert three.in_sequence and not three.from_start and not notes
+    assert three.in_sequence and not three.from_start and not left_out
     reference = reference_of(three, found.values(), anyway=False)
     assert reference is found["3 tasks, all from the start"]
     assert reference_of(found["8 tasks, one after the other"], found.values(), anyway=False) is None
@@ -61,15 +61,21 @@ def test_runs_of_one_algorithm_are_named_by_their_directories(tmp_path):
     [
         ("task_starts", [0, 14, 26], [0, 12, 26]),
         ("encoders", "eeeeeeeeeeee...", "f" * 12),
-        ("spread", 1.0, 0.5),  # whatever else a version stores of the world
+        ("bank", "bbbbbbbbbbbb...", "c" * 12),
+        ("eval_every", 2, 4),
+        ("eval_episodes", 10, 5),
+        ("held_out", "validation", "test"),
+        ("spread", 1.0, 0.5),
+        ("gravity", 9.81, 3.7),  # whatever else a version stores of the world
     ],
 )
 def test_runs_under_other_conditions_are_refused_in_one_line(tmp_path, what, ours, theirs):
-    write_run(tmp_path, "bgpo", 5, starts=SEQUENCE, spread=1.0)
-    other = write_run(tmp_path, "oracle", 5, starts=SEQUENCE, spread=1.0)
+    more = {"spread": 1.0, "gravity": 9.81, "bank": "b" * 64}
+    write_run(tmp_path, "bgpo", 5, starts=SEQUENCE, **more)
+    other = write_run(tmp_path, "oracle", 5, starts=SEQUENCE, **more)
     edit(other / "config.json", **{what: theirs})
     message = (
-        rf"oracle and .*bgpo differ in {what} \({re.escape(f'{theirs} and {ours}')}\): only runs"
+        rf"bgpo and .*oracle differ in {what} \({re.escape(f'{ours} and {theirs}')}\): only runs"
     )
     with pytest.raises(ValueError, match=message) as refused:
         settings_in(tmp_path)
@@ -122,14 +128,42 @@ def test_unfinished_runs_are_left_out(tmp_path):
     for episodes, unfinished in ((40, ""), (41, ""), (42, "has tests until episode 40 of 42")):
         edit(path / "config.json", episodes=episodes)
         assert read_run(path).unfinished == unfinished
-    found, notes = settings_in(tmp_path)
+    found, left_out = settings_in(tmp_path)
     assert [list(setting.runs) for setting in found.values()] == [["DDPG, told the label"]]
-    assert notes == [f"{path} has tests until episode 40 of 42: let the run finish"]
+    assert left_out == f"{path} has tests until episode 40 of 42: let the run finish"
+    waiting = [path, write_run(tmp_path, "maml", 5), write_run(tmp_path, "ddpg", 5)]
+    edit(waiting[1] / "config.json", episodes=42)
+    (waiting[2] / "eval.csv").unlink()
+    found, left_out = settings_in(tmp_path)
+    assert len(found) == 1 and left_out.isprintable()
+    assert all(str(run) in left_out for run in waiting)
     edit(path / "config.json", episodes=40)
     edit(path / "summary.json", episodes=30)  # continued, and its summary not yet written
     assert read_run(path).unfinished == "is being extended"
     with pytest.raises(ValueError, match="is being extended: let the run finish"):
         read_settings([path])
+
+
+def test_conditions_that_only_some_runs_state_are_noted(tmp_path):
+    for name in ("bgpo", "oracle", "ddpg"):
+        run = write_run(tmp_path, name, 5)
+        if name != "ddpg":
+            edit(run / "config.json", spread=0.5, schedule="practised")
+    (setting,) = settings_in(tmp_path)[0].values()
+    assert setting.notes == ["spread: not stated by 1 of 3 runs, taken as equal"]
+
+
+def test_the_order_of_tasks_does_not_make_banks_differ(tmp_path):
+    """The digest of a bank depends on it."""
+    write_run(tmp_path, "bgpo", 5, starts=SEQUENCE, bank="b" * 64)
+    other = write_run(tmp_path, "bgpo", 5, tasks=TASKS[::-1], bank="c" * 64)
+    continual, concurrent = settings_in(tmp_path)[0].values()
+    settings = (continual, concurrent)
+    assert reference_of(continual, settings, anyway=False) is concurrent
+    edit(other / "config.json", tasks=TASKS)
+    continual, concurrent = settings_in(tmp_path)[0].values()
+    with pytest.raises(ValueError, match="differ in bank"):
+        reference_of(continual, (continual, concurrent), anyway=False)
 
 
 def test_a_run_with_only_the_required_files_is_read(tmp_path):
@@ -153,5 +187,5 @@ def test_folders_without_runs_are_refused(tmp_path):
     with pytest.raises(ValueError, match="holds no test episode"):
         read_settings([path])
     write_run(tmp_path, "oracle", 5)
-    found, notes = settings_in(tmp_path)
-    assert len(found) == 1 and notes[0].startswith(f"{path} holds no test episode")
+    found, left_out = settings_in(tmp_path)
+    assert len(found) == 1 and left_out.startswith(f"{path} holds no test episode")

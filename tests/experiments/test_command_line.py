@@ -16,6 +16,7 @@ from bgpo_trl.configs import BGPOConfig
 from bgpo_trl.experiments.arguments import Arguments
 from bgpo_trl.experiments.command_line import command_line
 from bgpo_trl.runs.logger import EVAL_COLUMNS
+from bgpo_trl.runs.results import read_json
 from suites import opengl
 from tests.folders import contents
 
@@ -200,6 +201,23 @@ def test_an_interrupted_run_exits_with_the_status_for_another_try(capsys):
         command_line(interrupted, [])
     assert ended.value.code == os.EX_TEMPFAIL
     assert "--resume" in capsys.readouterr().err
+
+
+def test_control_characters_are_printed_as_escapes(capsys):
+    named = "\x1b[31mred\x9b\u202e"
+    escaped = r"\x1b[31mred\x9b\u202e"
+
+    def prints(arguments: Arguments):
+        return f"| {named} |\n| b\u00fc |"
+
+    def refuses(arguments: Arguments):
+        read_json(Path(f"{named}\nmore/config.json"))
+
+    command_line(prints, [])
+    assert capsys.readouterr().out == f"| {escaped} |\n| b\u00fc |\n"
+    with pytest.raises(SystemExit) as ended:
+        command_line(refuses, [])
+    assert str(ended.value).isprintable() and rf"{escaped}\nmore" in str(ended.value)
 
 
 def test_an_error_of_own_code_keeps_its_traceback_unless_it_misuses_the_package():

@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 import warnings
+from functools import partial
 
 import pytest
 
@@ -13,10 +14,10 @@ from bgpo_trl.experiments.one_shot import OneShotArguments, one_shot
 from bgpo_trl.experiments.report import ReportArguments, report
 from bgpo_trl.experiments.watch import WatchArguments, watch
 from bgpo_trl.figures.of_run import draw_growth
-from bgpo_trl.files.checkpoint import save_checkpoint
 from bgpo_trl.runs.config_file import read_config
 from suites import nico
 from tests.folders import contents
+from tests.foreign import CHECKPOINTS, put_checkpoint
 
 TASKS = nico.PAPER_TASKS
 FINAL = "seed,demonstrations,task,episodes,success,task_inference\n"
@@ -126,20 +127,15 @@ def test_final_tests_and_summary_are_optional_in_a_report(run):
     assert "## GWR-B" not in text and "## Cost" in text
 
 
-def checkpoint(state):
-    def do(run):
-        shutil.rmtree(run / "checkpoint")
-        save_checkpoint(run / "checkpoint", state)
-
-    return do
-
-
 LOADED = {
     **damages("config.json"),
     "no folder": shutil.rmtree,
     "no checkpoint": lambda run: shutil.rmtree(run / "checkpoint"),
-    "a checkpoint of something else": checkpoint({"step": 3, "loss": {}}),
-    "half a checkpoint": checkpoint({"algorithm": {"source": {}, "learner": {}}}),
+    **{
+        f"a checkpoint that is {name}": partial(put_checkpoint, content=content)
+        for name, content in CHECKPOINTS.items()
+    },
+    "edited settings": edit("config.json", eval_episodes=7),
     "no starts": edit("config.json", task_starts=[]),
     "unknown tasks": edit("config.json", tasks=["juggle", "sleep", "dance"]),
     "an unknown setting": edit("config.json", colour="red"),

@@ -261,7 +261,7 @@ def test_jobs_of_a_lost_machine_continue_identically_elsewhere(
         # Nothing is played after training here.
         (job.directory / "final.csv").write_text("seed\n3\n")
         (job.directory / "summary.json").write_text('{"commit": "", "nodes": null}')
-    merge.merge([job.directory for job in todo], tmp_path / "merged")
+    merge.merge_runs([job.directory for job in todo], tmp_path / "merged")
     assert Counter((r["seed"], r["episode"]) for r in rows(tmp_path / "merged" / "train.csv")) == {
         (seed, str(episode)): 1 for seed in "123458" for episode in range(1, 41)
     }

@@ -230,11 +230,13 @@ def test_other_conditions_are_refused_before_anything_is_written(tmp_path):
     write_run(tmp_path, "oracle", 5, held_out="test")
     before = contents(tmp_path)
     for archive in (None, tmp_path / "archive"):
-        with pytest.raises(ValueError, match=r"differ in held_out \(test and validation\)"):
+        with pytest.raises(ValueError, match=r"differ in held_out \(validation and test\)"):
             report(ReportArguments((tmp_path,), archive=archive))
         assert contents(tmp_path) == before
     report(ReportArguments((tmp_path,), anyway=True))
-    assert "differ in held_out (test and validation)" in text_of(tmp_path)
+    for title in ("3 tasks", "Differences: 3 tasks"):
+        section = text_of(tmp_path).split(f"## {title}, all from the start\n")[1].split("\n## ")[0]
+        assert "differ in held_out (validation and test)" in section
 
 
 def test_unfinished_runs_are_named_and_left_out(tmp_path):
@@ -286,7 +288,9 @@ def compared(*runs, **options):
 
 def test_two_runs_are_compared_seed_by_seed_on_the_episodes_of_both(pair):
     before = contents(pair[0].parent)
-    _, (*tasks, mean) = compared(*pair)
+    text, (*tasks, mean) = compared(*pair, anyway=True)
+    assert text.startswith(f"{pair[0]} and {pair[1]} differ in episodes (40 and 32)\n\n")
+    assert f"{pair[0]} is cut at 32 of 40 episodes" in text
     assert [row[1] for row in tasks] == list(TASKS)
     # At episode 32, the first run is at half of its level, rounded down: 20 % in each seed.
     by_hand = statistics.difference([0.9, 0.8, 1.0], [0.2, 0.2, 0.2])
@@ -299,7 +303,7 @@ def test_two_runs_are_compared_seed_by_seed_on_the_episodes_of_both(pair):
 
 
 def test_parts_of_training_leave_out_tasks_that_were_not_presented(pair):
-    _, rows = compared(*pair, every=14)
+    _, rows = compared(*pair, every=14, anyway=True)
     assert [row[0] for row in rows] == ["to 14"] * 2 + ["to 28"] * 4 + ["last 10 %"] * 4
     # To 28, tests at 26 and 28 of the second run are in its last fifth, five before are not.
     halves = [(2 * late + 5 * half) / 7 for late, half in ((9, 4), (8, 4), (10, 5))]
@@ -307,7 +311,9 @@ def test_parts_of_training_leave_out_tasks_that_were_not_presented(pair):
 
 
 def test_runs_under_other_conditions_or_of_other_tasks_are_not_compared(pair, tmp_path):
-    edit(pair[0] / "config.json", held_out="test")
+    with pytest.raises(ValueError, match=r"differ in episodes \(40 and 32\)"):
+        compared(*pair)
+    edit(pair[0] / "config.json", episodes=32, held_out="test")
     with pytest.raises(ValueError, match=r"differ in held_out \(test and validation\)"):
         compared(*pair)
     assert "differ in held_out (test and validation)" in compared(*pair, anyway=True)[0]

@@ -220,7 +220,7 @@ def test_merged_blocks_equal_one_run_of_all_seeds(few, tmp_path, monkeypatch):
         whole = Job(tmp_path / "whole" / merged.name, replace(group[0].config, seeds=(4, 0, 2)))
         for job in (*group, whole):
             write_run(job)
-        merge.merge([job.directory for job in group], merged)
+        merge.merge_runs([job.directory for job in group], merged)
         for name in ("train.csv", "eval.csv", "final.csv"):
             ours, theirs = rows(merged / name), rows(whole.directory / name)
             assert len(ours) == len(theirs) > 0
@@ -260,21 +260,21 @@ def test_merging_again_changes_nothing_and_a_gap_is_not_merged(few, tmp_path):
     for job in group:
         write_run(job)
     blocks = [job.directory for job in group]
-    merge.merge(blocks, merged)
+    merge.merge_runs(blocks, merged)
     before = contents(tmp_path)
-    merge.merge(blocks, merged)
+    merge.merge_runs(blocks, merged)
     assert contents(tmp_path) == before
     train = blocks[1] / "train.csv"
     lines = train.read_text().splitlines(keepends=True)
     for broken in (lines[:-1], [*lines, lines[-1]], [*lines[:-1], lines[1]]):
         train.write_text("".join(broken))
         with pytest.raises(ValueError, match="do not have each episode of each seed once"):
-            merge.merge(blocks, merged)
+            merge.merge_runs(blocks, merged)
         train.write_text("".join(lines))
         assert contents(tmp_path) == before
     (blocks[0] / "final.csv").unlink()
     with pytest.raises(ValueError, match=r"final\.csv is missing"):
-        merge.merge(blocks, merged)
+        merge.merge_runs(blocks, merged)
 
 
 @pytest.mark.usefixtures("easy_world")
@@ -290,7 +290,7 @@ def test_merged_blocks_of_real_runs_equal_one_run_of_all_seeds(
         return job.directory
 
     whole = train("whole", (8, 3))
-    merge.merge([train("first", (8,)), train("second", (3,))], tmp_path / "merged")
+    merge.merge_runs([train("first", (8,)), train("second", (3,))], tmp_path / "merged")
     config = (tmp_path / "merged" / "config.json").read_text()
     assert config == (whole / "config.json").read_text()
     for name in ("train.csv", "eval.csv"):

@@ -1,9 +1,6 @@
 import errno
-import resource
 import warnings
 from collections import OrderedDict
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,17 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bgpo_trl.files.checkpoint import has_checkpoint, load_checkpoint, save_checkpoint
-
-
-@contextmanager
-def largest_file(size: int) -> Iterator[None]:
-    """Makes the kernel refuse to write files beyond a size, as a full disk would."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+from tests.files.full_disk import largest_file
 
 
 def files(directory: Path) -> list[Path]:

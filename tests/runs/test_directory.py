@@ -4,14 +4,15 @@ import csv
 import json
 import shutil
 import signal
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import pytest
 
-from bgpo_trl.files.checkpoint import load_checkpoint
+from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
 from bgpo_trl.runs.directory import check_settings, holds_run
 from bgpo_trl.training import Trainer
 from tests.algorithms.playing import assert_same
+from tests.foreign import CHECKPOINTS, UNPICKLED, put_checkpoint
 from tests.test_training import at_step
 
 pytestmark = pytest.mark.usefixtures("easy_world")
@@ -108,8 +109,34 @@ def test_the_settings_in_the_checkpoint_are_compared(run, make, make_config, ref
     refused(
         lambda: make(run, config, resume=True),
         "run/checkpoint holds a run with other settings (task_starts is [0, 2, 4] there and [0, 1,",
-        "choose another run directory, or the same settings",
+        "put config.json back as the run left it",
     )
+
+
+@pytest.mark.parametrize("content", CHECKPOINTS.values(), ids=CHECKPOINTS.keys())
+def test_a_run_is_not_resumed_from_a_checkpoint_of_something_else(run, make, refused, content):
+    put_checkpoint(run, content)
+    refused(lambda: make(run, resume=True), "checkpoint", "put it back as the run left it")
+    assert not UNPICKLED
+
+
+@pytest.mark.parametrize("name", ["world", "algorithm", "evaluator"])
+def test_a_run_is_not_resumed_from_half_a_checkpoint(run, make, refused, name):
+    state = load_checkpoint(run / "checkpoint")
+    save_checkpoint(run / "checkpoint", {**state, name: {}})
+    refused(lambda: make(run, resume=True), "does not fit", "use the version of the code")
+
+
+@pytest.mark.parametrize("sizes", [{"hidden_sizes": (2_000_000_000,)}, {"replay_size": 10**15}])
+def test_sizes_that_are_not_the_checkpoints_take_no_memory(run, make, make_config, refused, sizes):
+    config = make_config()
+    rl = replace(config.algorithm.rl, **sizes)
+    config = replace(config, algorithm=replace(config.algorithm, rl=rl))
+    settings = json.loads((run / "config.json").read_text())
+    settings["algorithm"] = json.loads(json.dumps(asdict(config.algorithm)))
+    (run / "config.json").write_text(json.dumps(settings))
+    (name,) = sizes
+    refused(lambda: make(run, config, resume=True), f"algorithm.rl.{name} is", "config.json back")
 
 
 def test_resuming_a_directory_without_rows_starts_the_run(make, make_config, tmp_path):
