@@ -105,7 +105,7 @@ def _compare(
 ) -> None:
     # A module that was renamed adds the same tasks.
     old, new = (
-        dict(_flatten({name: value for name, value in given.items() if name != "task_modules"}))
+        dict(flatten({name: value for name, value in given.items() if name != "task_modules"}))
         for given in (saved, settings)
     )
     if longer and type(old.get("episodes")) is type(new.get("episodes")) is int:
@@ -122,9 +122,10 @@ def _compare(
         )
 
 
-def _flatten(settings: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+def flatten(settings: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the names and values of nested settings, such as ``"algorithm.rl.gamma"``."""
     if isinstance(settings, dict):
         for name, value in settings.items():
-            yield from _flatten(value, f"{prefix}.{name}" if prefix else name)
+            yield from flatten(value, f"{prefix}.{name}" if prefix else name)
     else:
         yield prefix, settings
