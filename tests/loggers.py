@@ -25,9 +25,6 @@ class Recorder(Logger):
         self.metrics.append((metrics, step))
         return metrics
 
-    def log_scalar(self, name, value, step=None):
-        raise NotImplementedError
-
     def log_hparams(self, cfg):
         self.settings.append(cfg)
 
@@ -35,14 +32,5 @@ class Recorder(Logger):
         assert not self.closed
         self.media.append((name, path))
 
-    def log_video(self, name, video, step=None, **kwargs):
-        raise NotImplementedError
-
-    def log_histogram(self, name, data, **kwargs):
-        raise NotImplementedError
-
     def shutdown(self, timeout=None):
         self.closed = True
-
-    def __repr__(self):
-        return "Recorder()"

@@ -19,7 +19,8 @@ from bgpo_trl.runs.directory import flatten
 from bgpo_trl.runs.provenance import commit_of_code, versions
 from bgpo_trl.runs.results import COUNT, TRAIN, read_table
 
-_NO_MEASURES = ["algorithm", "seed", "episode", "task", "group"]  # columns of which a mean is none
+# Columns of which there is no mean.
+_NO_MEASURES = ["algorithm", "seed", "episode", "task", "group"]
 
 
 class Dashboard:
@@ -57,17 +58,16 @@ class Dashboard:
         settings: Mapping[str, Any],
         per_seed: bool = False,
     ) -> None:
-        self._per_seed = per_seed
+        self._per_seed, loggers = per_seed, [*loggers]
+        # Training episodes since the last evaluation.
+        self._episodes = _untested(Path(directory)) if loggers else []
         self._loggers: list[Logger] = []
         for logger in loggers:
             try:
                 self._loggers.append(logger() if callable(logger) else logger)
             except Exception as error:
                 _warn("A logger", error)
-        # Training episodes since the last evaluation.
-        self._episodes: list[Mapping[Any, Any]] = []
         if self._loggers:
-            self._episodes = _untested(Path(directory))
             settings = {**settings, "commit": commit_of_code(), "versions": versions()}
             # TensorBoard takes no lists.
             plain = {
@@ -90,18 +90,17 @@ class Dashboard:
         """
         if not self._loggers:
             return
-        tests, played = pd.DataFrame([*rows]), pd.DataFrame(self._episodes)
-        episode = int(tests["episode"].iloc[0])
-        before = played["episode"] <= episode
-        self._episodes = [*played[~before].to_dict("records")]  # of seeds that are ahead
+        tests, episode = pd.DataFrame([*rows]), int(rows[0]["episode"])
+        played = [row for row in self._episodes if row["episode"] <= episode]
+        self._episodes = [row for row in self._episodes if row["episode"] > episode]
         of_seeds = tests.groupby("seed")["success"].mean()
-        metrics = _success("eval", tests)
+        metrics = {**_success("eval", tests), **_training(played)}
         if len(of_seeds) > 1:
             metrics["eval/success_sd"] = float(of_seeds.std(ddof=0))
         if self._per_seed:
             for (task, seed), success in tests.groupby(["task", "seed"])["success"]:
                 metrics[f"eval/success/{task}/seed_{seed}"] = float(success.mean())
-        self._log({**metrics, **_training(played[before])}, episode)
+        self._log(metrics, episode)
 
     def log_final(self, tests: pd.DataFrame, episode: int) -> None:
         """Log the tests after training.
@@ -235,10 +234,13 @@ def _success(group: str, table: pd.DataFrame) -> dict[str, float]:
     return {**metrics, f"{group}/success_mean": float(table["success"].mean())}
 
 
-def _training(table: pd.DataFrame) -> dict[str, float]:
-    """Return the means of training episodes."""
+def _training(episodes: Sequence[Mapping[Any, Any]]) -> dict[str, float]:
+    """Return the means of training episodes; NaN where one is, as after a divergence."""
+    if not episodes:
+        return {}
+    table = pd.DataFrame([*episodes])
     measures = table.drop(columns=[*_NO_MEASURES, "success"], errors="ignore")
-    means = measures.select_dtypes("number").mean().dropna()
+    means = measures.select_dtypes("number").mean(skipna=False)
     metrics = {f"train/{name}": float(mean) for name, mean in means.items()}
     return {**_success("train", table), **metrics}
 

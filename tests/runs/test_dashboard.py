@@ -11,7 +11,7 @@ import torch
 
 from bgpo_trl.runs import dashboard
 from bgpo_trl.runs.dashboard import Dashboard, tensorboard_logger, wandb_logger
-from bgpo_trl.runs.logger import RunLogger
+from bgpo_trl.runs.logger import TRAIN_COLUMNS, RunLogger
 from tests.loggers import Recorder
 
 SETTINGS = {"gamma": 0.98, "seeds": [3, 8], "network": {"hidden": [64], "rate": None}}
@@ -100,6 +100,25 @@ def test_an_evaluation_logs_means_over_seeds_of_tests_and_training(make):
     )
 
 
+def test_a_loss_that_diverged_is_seen(make):
+    recorder = Recorder()
+    with make(recorder) as board:
+        for loss in (0.5, float("nan")):
+            board.log_train(episode(3, 1, "grasp", 1, loss_actor=loss))
+        board.log_eval(evaluation(2))
+    assert np.isnan(recorder.metrics[0][0]["train/loss_actor"])
+
+
+def test_no_logger_is_made_beside_damaged_rows(make, tmp_path):
+    make().close()
+    with open(tmp_path / "train.csv", "a") as file:
+        file.write("x,three\n")
+    started = []
+    with pytest.raises(ValueError, match="line 2 is damaged"):
+        Dashboard(tmp_path, [lambda: started.append(1) or Recorder()], settings={})
+    assert started == []
+
+
 def test_success_of_each_seed_is_logged_on_request(make):
     recorder = Recorder()
     with make(recorder, per_seed=True) as board:
@@ -118,7 +137,8 @@ def test_a_resumed_run_logs_the_means_of_an_uninterrupted_one(make):
     uninterrupted, resumed = Recorder(), Recorder()
     random = np.random.default_rng(0)
     played = [
-        episode(seed, number, "push", number % 2, loss_actor=random.normal())
+        dict.fromkeys(TRAIN_COLUMNS, 2)
+        | episode(seed, number, "push", number % 2, loss_actor=random.normal())
         for number in range(1, 7)
         for seed in (3, 8)
     ]
