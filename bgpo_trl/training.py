@@ -5,14 +5,15 @@ from __future__ import annotations
 import gc
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Self
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torchrl.record.loggers.common import Logger
 
 from bgpo_trl.algorithms import Algorithm, entry
 from bgpo_trl.configs import RunConfig
@@ -25,6 +26,7 @@ from bgpo_trl.files.locking import lock_directory
 from bgpo_trl.files.progress import progress_bar
 from bgpo_trl.runs.config_file import Digests, settings_of
 from bgpo_trl.runs.cost import CostLog
+from bgpo_trl.runs.dashboard import Dashboard
 from bgpo_trl.runs.demonstrations import keep_bank
 from bgpo_trl.runs.directory import fitting_checkpoint, load_last
 from bgpo_trl.runs.gwr_graphs import growth_moments, save_graph
@@ -44,9 +46,9 @@ class Trainer:
 
     Checkpoints are written before the first step and between steps; Ctrl-C and SIGTERM wait for the
     end of the step and save. After any other failure, a resumed run repeats the steps since the
-    last checkpoint and writes the same rows. Rows are written at once; mirrors such as Weights &
-    Biases stay open for figures until `close`, which also unlocks the directory. Use the trainer in
-    a ``with`` block.
+    last checkpoint and writes the same rows. Rows are written at once; dashboards stay open for
+    final tests and figures until `close`, which also unlocks the directory. Use the trainer in a
+    ``with`` block.
 
     Args:
         config: The run.
@@ -58,7 +60,9 @@ class Trainer:
         make: Constructor of the algorithm; by default that of the entry ``config.name``.
         device: Device of the networks; see `Algorithm`.
         resume: Continue from the last checkpoint in the directory, if there is one.
-        wandb: Mirror the CSV files: ``"online"``, ``"offline"`` or None.
+        loggers: TorchRL's loggers, or functions without arguments that make one, called once the
+            directory is accepted. They get the means that `Dashboard` lists.
+        per_seed_curves: Whether they also get the test success of each seed.
         progress: Whether to show a progress bar.
 
     Raises:
@@ -79,7 +83,8 @@ class Trainer:
         make: Callable[..., Algorithm] | None = None,
         device: torch.device | str = "cpu",
         resume: bool = False,
-        wandb: Literal["online", "offline"] | None = None,
+        loggers: Iterable[Logger | Callable[[], Logger]] = (),
+        per_seed_curves: bool = False,
         progress: bool = True,
     ) -> None:
         self.config = config
@@ -118,15 +123,22 @@ class Trainer:
                     self._load(saved)
             self._cost = CostLog(self.directory / "cost.csv", resume=saved is not None)
             self.logger = RunLogger(
-                self.directory, config=self._settings, wandb=wandb, resume=resume
+                self.directory,
+                config=self._settings,
+                logged=self.algorithm.logged,
+                resume=resume,
             )
             opened.enter_context(self.logger)
             if saved is not None:
                 self.logger.truncate_to(saved["position"])
-                for row in saved["later"]:
-                    self._log(row)
             if encoders is not None:  # Others cannot be loaded to watch demonstrations.
                 keep_bank(self.directory, bank, encoders)
+            self.dashboard = Dashboard(
+                self.directory, loggers, settings=self._settings, per_seed=per_seed_curves
+            )
+            opened.enter_context(self.dashboard)
+            for row in () if saved is None else saved["later"]:
+                self._log(row)
             self._opened = opened.pop_all()
 
     def _make_parts(
@@ -218,7 +230,7 @@ class Trainer:
             bar.close()
 
     def close(self) -> None:
-        """Close files and mirrors, and unlock the directory for other processes."""
+        """Close files and dashboards, and unlock the directory for other processes."""
         self._opened.close()
 
     def __enter__(self) -> Self:
@@ -268,9 +280,9 @@ class Trainer:
             "num_nodes": nodes,
             "group": int(end.get("group", 0)),
             "num_groups": groups,
-            "loss_actor": float(losses.get("loss_actor", 0.0)),
-            "loss_value": float(losses.get("loss_value", 0.0)),
         }
+        for name in ("loss_actor", "loss_value", *algorithm.logged):
+            row[name] = float(losses.get(name, 0.0))
         self._log(row)
         if index == 0 and algorithm.gwr is not None and episode in self._growth_moments:
             save_graph(self.directory / "gwr", episode, algorithm.gwr)
@@ -289,30 +301,34 @@ class Trainer:
         if row["episode"] <= self.config.episodes:
             self._successes.append(row["success"])
             self.logger.log_train(row)
+            self.dashboard.log_train(row)
         else:
             self._later.append(row)
 
     def _evaluate(self) -> None:
         while (result := self.evaluator.run_next(self.algorithm.device)) is not None:
-            for index, snapshot in enumerate(result.snapshots):
-                for task in torch.nonzero(snapshot.presented).flatten().tolist():
-                    for success, steps in zip(
-                        result.success[index, task].tolist(),
-                        result.steps[index, task].tolist(),
-                        strict=True,
-                    ):
-                        self.logger.log_eval(
-                            {
-                                "algorithm": self.config.name,
-                                "seed": self.config.seeds[index],
-                                "episode": snapshot.episode,
-                                "env_steps": snapshot.env_steps,
-                                "task": self.config.tasks[task],
-                                "success": int(success),
-                                "return": float(success),
-                                "steps": steps,
-                            }
-                        )
+            rows = [
+                {
+                    "algorithm": self.config.name,
+                    "seed": self.config.seeds[index],
+                    "episode": snapshot.episode,
+                    "env_steps": snapshot.env_steps,
+                    "task": self.config.tasks[task],
+                    "success": int(success),
+                    "return": float(success),
+                    "steps": steps,
+                }
+                for index, snapshot in enumerate(result.snapshots)
+                for task in torch.nonzero(snapshot.presented).flatten().tolist()
+                for success, steps in zip(
+                    result.success[index, task].tolist(),
+                    result.steps[index, task].tolist(),
+                    strict=True,
+                )
+            ]
+            for row in rows:
+                self.logger.log_eval(row)
+            self.dashboard.log_eval(rows)
             presented = torch.stack([snapshot.presented for snapshot in result.snapshots])
             shown = (result.success.float().mean(2).sum(0) / presented.sum(0)).tolist()
             rates = ("-" if rate != rate else f"{rate:.2f}" for rate in shown)

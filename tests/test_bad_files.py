@@ -15,6 +15,7 @@ from bgpo_trl.figures.frames import plot_frame_strips
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.files.checkpoint import save_checkpoint
 from bgpo_trl.files.csv_file import CsvFile
+from bgpo_trl.runs.dashboard import wandb_logger
 from bgpo_trl.runs.logger import EVAL_COLUMNS, RunLogger
 from bgpo_trl.runs.results import read_curves, read_json, read_table
 from suites import nico
@@ -75,7 +76,8 @@ CASES = {
     "run that has only tests": (
         lambda f: log(f / "unevaluated"), "already holds a run", "resume it, or choose another"),
     "unknown wandb mode": (
-        lambda f: log(f / "new", wandb="yes"), "not 'yes'", '"online", "offline" or None'),
+        lambda f: wandb_logger(f / "new", "yes"),  # pyright: ignore
+        "not 'yes'", '"online" or "offline"'),
     "csv that is a folder": (lambda f: CsvFile(f, ["a"]), "Is a directory", "choose another run"),
     "csv without columns": (lambda f: CsvFile(f / "a.csv", []), "got ()", "needs columns"),
     "csv of binary data": (

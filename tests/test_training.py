@@ -22,6 +22,7 @@ from bgpo_trl.training import Trainer
 from tests.algorithms.playing import assert_same
 from tests.conftest import of_name
 from tests.folders import contents
+from tests.loggers import Recorder
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 CSV_FILES = ("train.csv", "eval.csv")
@@ -203,6 +204,59 @@ def test_an_algorithm_may_be_made_under_another_name(make, make_config, tmp_path
     assert trainer.algorithm.config == config.algorithm
     for file in CSV_FILES:
         assert {row["algorithm"] for row in rows(tmp_path / file)} == {"mine"}
+
+
+class WithEntropy(BGPO):
+    """An algorithm of a user that logs the number of its updates and what it never returns."""
+
+    logged = ("loss_entropy", "loss_missing")
+    n_updates = 0
+
+    def update(self):
+        losses = super().update()
+        self.n_updates += bool(losses)
+        return losses and {**losses, "loss_entropy": torch.tensor(float(self.n_updates))}
+
+
+def test_an_algorithm_may_log_further_losses(uninterrupted, make, tmp_path):
+    recorder = Recorder()
+    with make(tmp_path, make=WithEntropy, loggers=[recorder]) as trainer:
+        trainer.run()
+    ours, usual = rows(tmp_path / "train.csv"), rows(uninterrupted / "train.csv")
+    assert [list(row)[-2:] for row in ours[:1]] == [["loss_entropy", "loss_missing"]]
+    logged = [(float(row.pop("loss_entropy")), row.pop("loss_missing")) for row in ours]
+    assert ours == usual
+    assert logged[0] == (0.0, "0.0")  # before the first update
+    assert [n for n, _ in logged] == sorted(n for n, _ in logged)
+    assert logged[-1][0] == trainer.algorithm.n_updates > 0
+    played = [n for row, (n, _) in zip(ours, logged, strict=True) if int(row["episode"]) > 8]
+    assert recorder.metrics[-1][0]["train/loss_entropy"] == pytest.approx(sum(played) / len(played))
+    with pytest.raises(ValueError, match="columns"):
+        make(tmp_path, resume=True)
+
+
+def test_a_run_with_loggers_writes_the_same_files(uninterrupted, make, tmp_path):
+    """Also if it is interrupted, begun without loggers and resumed with them."""
+    trainer = make(tmp_path)
+    at_step(trainer, 9, lambda: signal.raise_signal(signal.SIGINT))
+    with pytest.raises(KeyboardInterrupt):
+        trainer.run()
+    recorder = Recorder()
+    with make(tmp_path, resume=True, loggers=[recorder], per_seed_curves=True) as resumed:
+        resumed.run()
+    assert_same_run(tmp_path, uninterrupted)
+    assert recorder.metrics[-1][1] == 10
+
+
+def test_a_longer_run_logs_the_episodes_of_seeds_that_were_ahead(make, make_config, tmp_path):
+    make(tmp_path / "run", make_config(episodes=6)).run()
+    short, long = Recorder(), Recorder()
+    with make(tmp_path / "run", resume=True, loggers=[short]) as trainer:
+        trainer.run()
+    with make(tmp_path / "whole", loggers=[long]) as trainer:
+        trainer.run()
+    assert [step for _, step in short.metrics] == [8, 10]
+    assert short.metrics == long.metrics[-2:]
 
 
 @pytest.mark.parametrize(

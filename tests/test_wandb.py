@@ -1,15 +1,16 @@
 """Files that wandb writes in its offline mode."""
 
-import csv
 import hashlib
 import json
 import os
 import signal
 import struct
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import wandb
 from PIL import Image
@@ -18,11 +19,13 @@ from wandb.proto.wandb_internal_pb2 import Record
 from bgpo_trl.figures.curves import plot_success_curves
 from bgpo_trl.figures.frames import save_gif
 from bgpo_trl.figures.style import save_figure
+from bgpo_trl.runs.dashboard import Dashboard, wandb_logger
+from bgpo_trl.runs.directory import flatten
 from bgpo_trl.runs.logger import RunLogger
 from bgpo_trl.training import Trainer
 
 pytestmark = pytest.mark.usefixtures("easy_world")
-NOT_IN_THE_CURVE = {"algorithm", "seed", "task", "episode", ""}
+TASKS = ("grasp_glass", "push_green_to_glass", "push_green_to_white")
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -81,28 +84,9 @@ def history(session: list[Record]) -> list[dict]:
     ]
 
 
-def curve(session: list[Record], group: str) -> list[tuple]:
-    """Return the rows of ``train.csv`` or ``eval.csv``, as wandb has them."""
-    rows = []
-    for row in history(session):
-        shown = {key: value for key, value in row.items() if key.startswith(f"{group}/")}
-        if shown:
-            (prefix,) = {key.rpartition("/")[0] for key in shown}
-            values = {key.rpartition("/")[2]: value for key, value in shown.items()}
-            rows.append((prefix, values.pop("step"), values))
-    return rows
-
-
-def curve_in_csv(directory: Path, group: str) -> list[tuple]:
-    with open(directory / f"{group}.csv", newline="") as file:
-        return [
-            (
-                f"{group}/{row['task']}/seed_{row['seed']}",
-                int(row["episode"]),
-                {k: float(v) for k, v in row.items() if k not in NOT_IN_THE_CURVE and v},
-            )
-            for row in csv.DictReader(file)
-        ]
+def evaluations(session: list[Record]) -> list[dict]:
+    """Return the metrics that were logged together."""
+    return [row for row in history(session) if any(key.startswith("eval/") for key in row)]
 
 
 def step_metrics(session: list[Record]) -> dict[str, str]:
@@ -112,15 +96,20 @@ def step_metrics(session: list[Record]) -> dict[str, str]:
 
 
 @pytest.fixture(scope="module")
-def run(easy_world, bank, encoders, make_config, tmp_path_factory):
+def make(easy_world, bank, encoders, make_config):
+    def make(directory, *, resume=False, **changes):
+        start = partial(wandb_logger, directory, "offline", group="continual-bgpo", tags=["bgpo"])
+        parts = {"bank": bank, "encoders": encoders, "progress": False}
+        return Trainer(make_config(**changes), directory, resume=resume, loggers=[start], **parts)
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def run(make, tmp_path_factory):
     """A whole run that was interrupted once, with a figure and a video at its end."""
     directory = tmp_path_factory.mktemp("runs") / "run"
-
-    def trainer():
-        parts = {"bank": bank, "encoders": encoders, "progress": False}
-        return Trainer(make_config(), directory, resume=True, wandb="offline", **parts)
-
-    with trainer() as interrupted:
+    with make(directory) as interrupted:
         act, steps = interrupted.algorithm.act, []
 
         def act_or_interrupt(state):
@@ -132,41 +121,103 @@ def run(easy_world, bank, encoders, make_config, tmp_path_factory):
         interrupted.algorithm.act = act_or_interrupt
         with pytest.raises(KeyboardInterrupt):
             interrupted.run()
-    with trainer() as resumed:
+    with make(directory, resume=True) as resumed:
         resumed.run()
+        final = pd.DataFrame({"task": TASKS, "success": [0.5, 0.25, 0.75]})
+        resumed.dashboard.log_final(final, 10)
         figures = directory / "figures"
         save_figure(plot_success_curves(directory / "eval.csv"), figures / "success.png")
         frames = np.random.default_rng(0).integers(256, size=(6, 32, 64, 3), dtype=np.uint8)
         save_gif(frames, figures / "grasp_glass.gif")
         for path in sorted(figures.iterdir()):
-            resumed.logger.log_media(f"figures/{path.stem}", path)
+            resumed.dashboard.log_media(f"figures/{path.stem}", path)
     return directory
 
 
-@pytest.mark.parametrize("group", ["train", "eval"])
-def test_the_curves_are_those_of_the_csv_files(run, group):
-    first, second = (curve(session, group) for session in sessions(run))
+def test_a_run_has_few_curves(run):
+    curves = {key for session in sessions(run) for row in history(session) for key in row}
+    success = {"success_mean", "success/step", "step", *(f"success/{task}" for task in TASKS)}
+    columns = {"return", "steps", "env_steps", "intrinsic_return", "num_nodes", "num_groups"}
+    columns |= {"loss_actor", "loss_value"}
+    media = {key for key in curves if key.startswith("figures/")}
+    assert {key for key in curves - media if not key.startswith("_")} == {
+        *(f"{group}/{name}" for group in ("eval", "train", "final") for name in success),
+        *(f"train/{name}" for name in columns),
+        "eval/success_sd",
+    }
+
+
+def test_the_curves_are_the_means_of_the_csv_files(run):
+    """Also of the training episodes on both sides of the interruption."""
+    first, second = map(evaluations, sessions(run))
     assert len(first) > 0
-    assert first + second == curve_in_csv(run, group)
+    train, tests = (pd.read_csv(run / f"{name}.csv") for name in ("train", "eval"))
+    logged = {row["eval/step"]: row for row in first + second}
+    assert list(logged) == [2, 4, 6, 8, 10]
+    for episode, row in logged.items():
+        tested = tests[tests["episode"] == episode]
+        played = train[train["episode"].isin([episode - 1, episode])]
+        for group, table in (("eval", tested), ("train", played)):
+            for task in TASKS:
+                of_task = table["success"][table["task"] == task]
+                if len(of_task):
+                    assert row[f"{group}/success/{task}"] == pytest.approx(of_task.mean())
+                else:
+                    assert f"{group}/success/{task}" not in row
+            assert row[f"{group}/success_mean"] == pytest.approx(table["success"].mean())
+        for column in ("env_steps", "loss_actor", "loss_value", "intrinsic_return", "num_nodes"):
+            assert row[f"train/{column}"] == pytest.approx(played[column].mean())
 
 
-def test_every_curve_is_drawn_over_the_episodes_of_its_seed_and_task(run):
+def test_the_summary_is_the_mean_of_the_last_evaluation(run):
+    summary = {
+        "/".join(item.nested_key) or item.key: json.loads(item.value_json)
+        for record in sessions(run)[-1]
+        for item in record.summary.update
+    }
+    tests = pd.read_csv(run / "eval.csv")
+    last = tests["success"][tests["episode"] == 10].mean()
+    assert summary["eval/success_mean"] == pytest.approx(last)
+    assert summary["final/success_mean"] == pytest.approx(0.5)
+
+
+def test_every_curve_is_drawn_over_training_episodes(run):
     for session in sessions(run):
         drawn_over = step_metrics(session)
-        for group in ("train", "eval"):
-            for prefix, _, values in curve(session, group):
-                assert {drawn_over[f"{prefix}/{name}"] for name in values} == {f"{prefix}/step"}
+        for row in evaluations(session):
+            steps = {drawn_over[key] for key in row if "/" in key and not key.endswith("/step")}
+            assert len({row[step] for step in steps}) == 1
 
 
 def test_both_sessions_belong_to_the_same_run_with_its_settings(run):
-    settings = json.loads((run / "config.json").read_text())
+    settings = dict(flatten(json.loads((run / "config.json").read_text())))
     started = [r.run for session in sessions(run) for r in session if r.HasField("run")]
     assert len({record.run_id for record in started}) == 1
-    assert [record.resume for record in started] == [True, True]
     for record in started:
-        saved = {item.key: json.loads(item.value_json) for item in record.config.update}
-        del saved["_wandb"]
-        assert saved == settings
+        assert (record.resume, record.run_group, [*record.tags]) == (
+            True,
+            "continual-bgpo",
+            ["bgpo"],
+        )
+    for session in sessions(run):
+        saved = {
+            item.key: json.loads(item.value_json)
+            for record in session
+            if record.HasField("config")
+            for item in record.config.update
+        }
+        assert {"commit", "versions.torch"} <= saved.keys()
+        for name, value in settings.items():
+            assert saved[name] == (json.dumps(value) if isinstance(value, list) else value)
+
+
+def test_a_refused_run_makes_no_run_on_wandb(run, make, tmp_path):
+    before = {path: path.stat().st_mtime_ns for path in run.rglob("*")}
+    with pytest.raises(ValueError, match="other settings"):
+        make(run, resume=True, seeds=(1, 2))
+    with pytest.raises(ValueError, match="already holds a run"):
+        make(run)
+    assert {path: path.stat().st_mtime_ns for path in run.rglob("*")} == before
 
 
 def test_figures_and_videos_are_uploaded_as_they_are(run):
@@ -201,38 +252,38 @@ def test_all_files_are_in_the_run_and_name_no_place_of_this_machine(run):
             assert len(str(place)) < 2 or str(place).encode() not in content
 
 
-def test_rows_arrive_in_any_order_and_again_after_a_crash(tmp_path):
-    """wandb's own step must never decrease; episodes do, when another seed is ahead."""
+def test_evaluations_are_logged_again_after_a_crash(tmp_path):
+    def play(board, log, episodes):
+        for episode in episodes:
+            row = {"algorithm": "x", "seed": 0, "task": "push", "episode": episode, "success": 1}
+            log.log_train({**row, "loss_actor": 1 / episode})
+            board.log_train({**row, "loss_actor": 1 / episode})
+            log.log_eval(row)
+            board.log_eval([row])
 
-    def write(logger, rows):
-        for seed, episode in rows:
-            row = {"algorithm": "bgpo", "seed": seed, "task": "grasp_glass", "episode": episode}
-            logger.log_train({**row, "loss_actor": 1 / (3 * episode + seed)})
-            for success in (True, False):
-                logger.log_eval({**row, "success": success, "return": float(success)})
-
-    rows = [(0, 7), (1, 2), (0, 8), (1, 3), (0, 9), (1, 1)]
-    with RunLogger(tmp_path, config={}, wandb="offline") as logger:
-        write(logger, rows[:3])
-        position = logger.position()
-        write(logger, rows[3:5])  # lost with the crash that follows
-    with RunLogger(tmp_path, config={}, wandb="offline", resume=True) as logger:
-        logger.truncate_to(position)
-        write(logger, rows[3:])
-    for group, n in (("train", 1), ("eval", 2)):
-        expected = curve_in_csv(tmp_path, group)
-        first, second = (curve(session, group) for session in sessions(tmp_path))
-        assert first == expected[: 5 * n]
-        assert second == expected[3 * n :]
+    start = partial(wandb_logger, tmp_path, "offline")
+    with RunLogger(tmp_path, config={}) as log:
+        with Dashboard(tmp_path, [start], settings={}) as board:
+            play(board, log, [1, 2])
+            position = log.position()
+            play(board, log, [3, 4])  # lost with the crash that follows
+        log.truncate_to(position)
+        with Dashboard(tmp_path, [start], settings={}) as board:
+            play(board, log, [3, 4, 5])
+    logged = [
+        [(row["train/step"], row["train/loss_actor"]) for row in evaluations(session)]
+        for session in sessions(tmp_path)
+    ]
+    assert logged == [[(n, 1 / n) for n in (1, 2, 3, 4)], [(n, 1 / n) for n in (3, 4, 5)]]
 
 
 def test_an_unreadable_figure_gives_one_warning_and_the_run_goes_on(tmp_path):
-    with RunLogger(tmp_path, config={}, wandb="offline") as logger:
-        (tmp_path / "broken.png").write_bytes(b"no picture")
-        with pytest.warns(
-            UserWarning, match="WandbLogger failed .* is disabled for the rest of this run"
-        ):
-            logger.log_media("figures/broken", tmp_path / "broken.png")
-        logger.log_eval({"algorithm": "bgpo", "seed": 0, "episode": 1, "success": True})
-        logger.log_media("figures/broken", tmp_path / "broken.png")
-    assert len((tmp_path / "eval.csv").read_text().splitlines()) == 2
+    RunLogger(tmp_path, config={}).close()
+    (tmp_path / "broken.png").write_bytes(b"no picture")
+    with (
+        Dashboard(tmp_path, [partial(wandb_logger, tmp_path, "offline")], settings={}) as board,
+        pytest.warns(UserWarning, match="WandbLogger failed") as caught,
+    ):
+        for _ in range(2):
+            board.log_media("figures/broken", tmp_path / "broken.png")
+    assert len(caught) == 1

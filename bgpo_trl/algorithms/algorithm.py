@@ -51,12 +51,15 @@ class Algorithm(ABC):
         test_actor: Network of test episodes, called with the parameters of a `Policy`.
         needs_label: Whether policies depend on the task label of a test episode.
         needs_replay: Whether `snapshot` depends on the replay buffer.
+        logged: Further entries of `update` to log, such as ``("loss_alpha",)``: columns of
+            ``train.csv``, 0 where an update has not returned them, and curves of dashboards.
     """
 
     gwr: GWRB | None = None
     groups: BehaviorGroups | None = None
     needs_label: bool = True
     needs_replay: bool = True
+    logged: tuple[str, ...] = ()
     learner: Learner
     replay: GroupReplay
     shown: DemonstrationReplay | None = None
@@ -125,8 +128,8 @@ class Algorithm(ABC):
         that `act` changes.
 
         Returns:
-            ``loss_actor``, ``loss_value`` and other losses, means over the seeds ``[]``; empty
-            before the first update.
+            ``loss_actor``, ``loss_value`` and other losses, means over the seeds ``[]``, of which
+            those in ``logged`` are logged too; empty before the first update.
         """
 
     @abstractmethod

@@ -29,10 +29,11 @@ from bgpo_trl.experiments.episodes import (
     random_actions,
     snapshots_of,
 )
-from bgpo_trl.experiments.records import commit_of_code, write_measurement
+from bgpo_trl.experiments.records import write_measurement
 from bgpo_trl.machine import set_threads
 from bgpo_trl.plugins import import_plugin
 from bgpo_trl.policy import LoadedRun
+from bgpo_trl.runs.provenance import commit_of_code
 from suites import nico
 from suites.nico import kinematics
 from suites.nico.base import CONTROL_TIMESTEP, TIME_LIMIT, Environment

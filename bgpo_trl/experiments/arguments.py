@@ -97,7 +97,13 @@ class Arguments(BankArguments):
     train_encoders: bool = False
     """Record demonstrations and train new encoders instead of using the pretrained ones."""
     wandb: Literal["online", "offline"] | None = None
-    """Also log to Weights & Biases."""
+    """Also log means over the seeds to Weights & Biases."""
+    wandb_group: str | None = None
+    """Group of the run on Weights & Biases; EXPERIMENT-ALGORITHM[-RL] by default."""
+    tensorboard: bool = False
+    """Also log these means to TensorBoard, into the run directory."""
+    per_seed_curves: bool = False
+    """Log the test success of each seed to them, too."""
     device: str = "auto"
     """Device of the networks: cpu, cuda, or auto for a GPU if there is one."""
     threads: int = 1

@@ -30,13 +30,14 @@ from bgpo_trl.experiments.episodes import (
     random_actions,
     snapshots_of,
 )
-from bgpo_trl.experiments.records import commit_of_code, write_measurement
+from bgpo_trl.experiments.records import write_measurement
 from bgpo_trl.figures.bars import plot_success_bars
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.files.progress import progress_bar
 from bgpo_trl.machine import set_threads
 from bgpo_trl.plugins import import_plugin
 from bgpo_trl.policy import LoadedRun
+from bgpo_trl.runs.provenance import commit_of_code
 from suites import nico
 from suites.nico.physics import OBJECTS
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from bgpo_trl.analysis.task_inference import group_purity, task_inference_accuracy
 from bgpo_trl.data.bank import DemonstrationBank
@@ -33,6 +34,8 @@ def measure(
 ) -> dict[str, Any]:
     """Test the trained policies with seen and with held-out demonstrations.
 
+    Dashboards get the success with held-out ones.
+
     Args:
         trainer: The trainer after training.
         bank: Training and held-out demonstrations.
@@ -45,6 +48,8 @@ def measure(
     algorithm, config = trainer.algorithm, trainer.config
     gwr, rows = algorithm.gwr, _final_tests(trainer, bank, episodes=episodes)
     write_rows(out / "final.csv", FINAL_COLUMNS, rows)
+    tests = pd.DataFrame(rows, columns=pd.Index(FINAL_COLUMNS))
+    trainer.dashboard.log_final(tests[tests["demonstrations"] == "held-out"], config.episodes)
     random_success = evaluate_random_policy(
         tasks=config.tasks,
         episodes=100,

@@ -21,11 +21,12 @@ from bgpo_trl.encoders.representation import embed_demonstrations
 from bgpo_trl.evaluation import Evaluator, Snapshot
 from bgpo_trl.experiments.arguments import TrainedArguments
 from bgpo_trl.experiments.episodes import evaluator_of
-from bgpo_trl.experiments.records import commit_of_code, write_measurement
+from bgpo_trl.experiments.records import write_measurement
 from bgpo_trl.figures.style import COLORS, save_figure
 from bgpo_trl.machine import set_threads
 from bgpo_trl.plugins import import_plugin
 from bgpo_trl.policy import TrainedPolicy, load_run
+from bgpo_trl.runs.provenance import commit_of_code
 from bgpo_trl.seeding import stream_seed
 
 # Number of the evaluation; it seeds start states that neither training nor final tests used.

@@ -1,9 +1,8 @@
-"""Records of how results came about, and of measurements on a run."""
+"""Records of measurements on a run, and the command that made them."""
 
 from __future__ import annotations
 
 import shlex
-import subprocess
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -16,19 +15,6 @@ from bgpo_trl.files.writing import make_folder, write_json, write_whole
 def command() -> str:
     """Return the command line of this process."""
     return shlex.join(["python", *sys.argv])
-
-
-def commit_of_code() -> str:
-    """Return the commit of this code, with ``-dirty`` if it was modified; ``""`` if unknown."""
-    root = Path(__file__).parents[2]
-    if not (root / ".git").exists():  # An installed package may lie in another repository.
-        return ""
-    describe = ["git", "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
-    try:
-        result = subprocess.run(describe, cwd=root, capture_output=True, text=True, check=True)
-    except (OSError, subprocess.CalledProcessError):
-        return ""
-    return result.stdout.strip()
 
 
 def write_measurement(

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import torch
+from torchrl.record.loggers.common import Logger
 
 from bgpo_trl.algorithms import ALGORITHMS, Algorithm
 from bgpo_trl.configs import STAGE_PRESETS, RunConfig
@@ -19,15 +21,17 @@ from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.encoders.train import make_pretrained
 from bgpo_trl.experiments.arguments import Arguments, BankArguments
 from bgpo_trl.experiments.measure import draw, measure
-from bgpo_trl.experiments.records import command, commit_of_code
+from bgpo_trl.experiments.records import command
 from bgpo_trl.experiments.settings import as_begun, chosen_tasks, is_finished
 from bgpo_trl.files.locking import lock_directory
 from bgpo_trl.files.writing import write_json
 from bgpo_trl.machine import choose_device, set_threads
 from bgpo_trl.plugins import import_plugin
 from bgpo_trl.runs.config_file import read_config
+from bgpo_trl.runs.dashboard import tensorboard_logger, wandb_logger
 from bgpo_trl.runs.demonstrations import BANK, load_inputs
 from bgpo_trl.runs.directory import holds_run
+from bgpo_trl.runs.provenance import commit_of_code
 from bgpo_trl.training import Trainer
 from suites import nico
 
@@ -45,8 +49,8 @@ def run_experiment(
     In addition to the files of `Trainer`, the run directory gets ``final.csv`` (success of the
     trained policies with demonstrations seen in training and with held-out ones, and task
     inference), ``gwr.csv`` (nodes of the first seed's GWR-B), ``figures/`` (including a video of a
-    test episode of each task; also logged to Weights & Biases) and finally ``summary.json``
-    (commit, command, success of a random policy, nodes of GWR-B, groups of behaviors).
+    test episode of each task; also on dashboards) and finally ``summary.json`` (commit, command,
+    success of a random policy, nodes of GWR-B, groups of behaviors).
 
     Args:
         arguments: Arguments of the command line.
@@ -71,7 +75,9 @@ def run_experiment(
     usual = registered is None or registered.config.rl.name == config.algorithm.rl.name
     rl = "" if usual else f"-{config.algorithm.rl.name}"
     size = arguments.preset or (arguments.config.stem if arguments.config else "quick")
-    out = arguments.out or Path("runs") / f"{name}-{config.name}{rl}-{size}"
+    group = f"{name}-{config.name}{rl}"
+    out = arguments.out or Path("runs") / f"{group}-{size}"
+    loggers = _loggers(arguments, config, out, group, size)
     if arguments.resume:
         config = _continued(arguments, config, out)
         if is_finished(out, config):
@@ -88,17 +94,34 @@ def run_experiment(
             make=make,
             device=device,
             resume=arguments.resume,
-            wandb=arguments.wandb,
+            loggers=loggers,
+            per_seed_curves=arguments.per_seed_curves,
         ) as trainer:
             trainer.run()
             summary = {"commit": commit, **measure(trainer, bank, out)}
             lines = draw(trainer, bank, out, summary["random_success"])
             for path in sorted((out / "figures").iterdir()):
-                trainer.logger.log_media(f"figures/{path.stem}", path)
+                trainer.dashboard.log_media(f"figures/{path.stem}", path)
             # Written last, as the mark of a complete run.
             write_json(out / "summary.json", summary)
     lines.append(f"curve and figures: {out}; in numbers: bgpo report {out}")
     return "\n".join(lines)
+
+
+def _loggers(
+    arguments: Arguments, config: RunConfig, out: Path, group: str, size: str
+) -> list[Callable[[], Logger]]:
+    """Return functions that make the loggers of the command line."""
+    loggers: list[Callable[[], Logger]] = []
+    if arguments.wandb is not None:
+        # Without --preset or --config, the size of a run that is resumed is its own.
+        sized = arguments.preset or arguments.config or not holds_run(out)
+        tags = (config.name, config.schedule, size) if sized else None
+        group = arguments.wandb_group or group
+        loggers.append(partial(wandb_logger, out, arguments.wandb, group=group, tags=tags))
+    if arguments.tensorboard:
+        loggers.append(partial(tensorboard_logger, out))
+    return loggers
 
 
 def _bank(arguments: Arguments, out: Path) -> Path | None:

@@ -157,7 +157,7 @@ def differing_settings(
     over, since a module that was renamed adds the same tasks.
     """
     old, new = (
-        dict(_flatten({name: value for name, value in given.items() if name != "task_modules"}))
+        dict(flatten({name: value for name, value in given.items() if name != "task_modules"}))
         for given in (settings, others)
     )
     return [
@@ -186,9 +186,10 @@ def _compare(
         )
 
 
-def _flatten(settings: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+def flatten(settings: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the names and values of nested settings, such as ``"algorithm.rl.gamma"``."""
     if isinstance(settings, dict):
         for name, value in settings.items():
-            yield from _flatten(value, f"{prefix}.{name}" if prefix else name)
+            yield from flatten(value, f"{prefix}.{name}" if prefix else name)
     else:
         yield prefix, settings

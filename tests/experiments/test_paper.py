@@ -22,6 +22,7 @@ from bgpo_trl.files.checkpoint import load_checkpoint
 from bgpo_trl.runs.results import read_final_tests, read_table, read_tests
 from suites import nico
 from tests.folders import contents
+from tests.loggers import Recorder
 
 ROOT = Path(__file__).parents[2]
 TASKS = nico.PAPER_TASKS
@@ -225,37 +226,80 @@ def test_the_directory_is_locked_from_the_encoders_to_the_figures(
     assert not (tmp_path / "run" / "lock").exists()
 
 
-def test_a_dashboard_gets_rows_and_figures_before_it_is_closed(tiniest, monkeypatch, tmp_path):
-    events = []
+@pytest.fixture
+def started(monkeypatch):
+    """Recorders in place of the loggers that a command starts, with what they are started with."""
+    started = []
 
-    class Dashboard:
-        def __init__(self, *args, **kwargs): ...
+    def start(directory, *mode, **options):
+        started.append((Recorder(), (directory, *mode), options))
+        return started[-1][0]
 
-        def log_metrics(self, metrics, step):
-            events.append("row")
+    monkeypatch.setattr(experiment, "wandb_logger", start)
+    monkeypatch.setattr(experiment, "tensorboard_logger", start)
+    return started
 
-        def shutdown(self):
-            events.append("shutdown")
 
-    monkeypatch.setattr("bgpo_trl.runs.logger.WandbLogger", Dashboard)
-    monkeypatch.setattr(
-        "bgpo_trl.runs.logger._log_wandb_media", lambda dashboard, *media: events.append(media)
-    )
+def test_dashboards_get_evaluations_final_tests_and_figures(tiniest, started, tmp_path):
     run = tmp_path / "run"
+    arguments = Arguments(out=run, wandb="offline", tensorboard=True)
+    continual(arguments)
     figures = ["episodes.png", "groups.png", "gwr.png", "gwr_growth.png", "success.png"]
     figures += [f"{task}.gif" for task in TASKS]
     shown = [(f"figures/{Path(n).stem}", run / "figures" / n) for n in sorted(figures)]
-    arguments = Arguments(out=run, wandb="offline")
-    continual(arguments)
-    tables = [read_table(run / name) for name in ("train.csv", "eval.csv")]
-    assert events == ["row"] * sum(map(len, tables)) + [*shown, "shutdown"]
     for task in TASKS:
         assert (run / "figures" / f"{task}.gif").read_bytes().startswith(b"GIF89a")
+    trained = read_final_tests(run / "final.csv").query("demonstrations == 'held-out'")
+    means = {f"final/success/{task}": s.mean() for task, s in trained.groupby("task")["success"]}
+    means["final/success_mean"] = trained["success"].mean()
+    tested = sorted(set(read_tests(run / "eval.csv")["episode"]))
+    assert [first[0] for _, first, _ in started] == [run, run]
+    for recorder, *_ in started:
+        assert [step for _, step in recorder.metrics] == [*tested, 6]
+        assert recorder.metrics[-1][0] == pytest.approx(means)
+        assert recorder.media == shown
+        assert recorder.closed
 
-    events.clear()
     (run / "summary.json").unlink()  # as if it had been killed when training was over
-    continual(replace(arguments, resume=True))
-    assert events == [*shown, "shutdown"]
+    continual(replace(arguments, tensorboard=False, resume=True))
+    resumed = started[-1][0]
+    assert [step for _, step in resumed.metrics] == [6]
+    assert resumed.media == shown
+
+
+def test_runs_on_wandb_are_grouped_and_tagged(undrawn, started, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    concurrent(Arguments(algorithm="oracle", rl="td3", schedule="sequential", wandb="offline"))
+    ablation(AblationArguments(variant="without-both", wandb="online", wandb_group="mine"))
+    out = Path("runs/concurrent-oracle-td3-quick")
+    (out / "summary.json").unlink()
+    concurrent(Arguments(out=out, resume=True, wandb="offline"))
+    assert [(first, options) for _, first, options in started] == [
+        (
+            (out, "offline"),
+            {"group": "concurrent-oracle-td3", "tags": ("oracle", "sequential", "quick")},
+        ),
+        (
+            (Path("runs/ablation-without-both-quick"), "online"),
+            {"group": "mine", "tags": ("without-both", "practised", "quick")},
+        ),
+        # The size of a run that is resumed by its directory is not known.
+        ((out, "offline"), {"group": "concurrent-oracle-td3", "tags": None}),
+    ]
+
+
+def test_a_refused_run_starts_no_logger(undrawn, started, tmp_path):
+    continual(Arguments(out=tmp_path / "run"))
+    for again in ({}, {"resume": True, "seeds": (4,)}):
+        with pytest.raises(ValueError, match="holds a run"):
+            continual(Arguments(out=tmp_path / "run", wandb="offline", tensorboard=True, **again))
+    assert started == []
+
+
+def test_curves_of_seeds_are_logged_on_request(undrawn, started, tmp_path):
+    continual(Arguments(out=tmp_path / "run", tensorboard=True, per_seed_curves=True))
+    metrics = started[0][0].metrics[0][0]
+    assert {f"eval/success/{TASKS[0]}/seed_{seed}" for seed in (3, 8)} <= metrics.keys()
 
 
 @pytest.mark.slow

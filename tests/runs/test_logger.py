@@ -1,4 +1,4 @@
-"""The log of a run in its directory, mirrored to a stand-in for Weights & Biases."""
+"""The log of a run in its directory."""
 
 import json
 from pathlib import Path
@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 import torch
 
-import bgpo_trl.runs.logger
 from bgpo_trl.runs.logger import EVAL_COLUMNS, TRAIN_COLUMNS, RunLogger
 
 CONFIG = {"gamma": 0.98, "network": {"hidden": [64]}}
@@ -89,94 +88,19 @@ def test_a_run_is_continued_only_on_request(tmp_path):
         RunLogger(tmp_path, config=CONFIG)
 
 
-class FakeWandb:
-    """Stands in for TorchRL's WandbLogger, with modes and calls that fail as a dead network."""
-
-    made: list[dict]
-    calls: list
-    unreachable: tuple[str, ...] = ()
-    fail_from = float("inf")
-
-    def __init__(self, exp_name, **kwargs):
-        if kwargs["mode"] in self.unreachable:
-            raise ConnectionError("no route\nto host")
-        self.made.append({"exp_name": exp_name, **kwargs})
-
-    def log_metrics(self, metrics, step):
-        if len(self.calls) >= self.fail_from:
-            raise ConnectionError("no route\nto host")
-        self.calls.append((metrics, step))
-
-    def shutdown(self):
-        self.calls.append("shutdown")
-
-
-@pytest.fixture
-def wandb(monkeypatch):
-    class Fake(FakeWandb):
-        made: list[dict] = []  # noqa: RUF012 fresh for each test
-        calls: list = []  # noqa: RUF012
-
-    monkeypatch.setattr(bgpo_trl.runs.logger, "WandbLogger", Fake)
-    return Fake
-
-
-def test_the_mirror_gets_every_number_of_a_row(wandb, tmp_path):
-    with RunLogger(tmp_path, config={}, wandb="online") as logger:
-        logger.log_eval({**ROW, "return": torch.tensor(0.5)})
-        logger.log_train({"episode": 8, "loss_actor": 2.0, "num_nodes": None})
-    values = {"env_steps": 210, "success": 1, "return": 0.5, "steps": 28}
-    assert wandb.calls == [
-        ({f"eval/grasp_glass/seed_2/{name}": value for name, value in values.items()}, 7),
-        ({"train/all/seed_0/loss_actor": 2.0}, 8),
-        "shutdown",
-    ]
-
-
-def test_a_failing_mirror_is_disabled_with_one_warning(wandb, tmp_path):
-    wandb.fail_from = 1
-    with (
-        pytest.warns(UserWarning, match=r"failed \(no route\) and is disabled") as caught,
-        RunLogger(tmp_path, config={}, wandb="online") as logger,
-    ):
-        for _ in range(4):
-            logger.log_eval(ROW)
-    assert len(caught) == 1
-    assert len((tmp_path / "eval.csv").read_text().splitlines()) == 5
-
-
-@pytest.mark.parametrize("mode", ["online", "offline"])
-def test_wandb_gets_the_settings_and_keeps_its_run_when_resumed(mode, wandb, tmp_path):
-    for resume in (False, True):
-        with RunLogger(tmp_path / "a", config=CONFIG, wandb=mode, resume=resume) as logger:
-            logger.log_eval(ROW)
-    RunLogger(tmp_path / "b", config=CONFIG, wandb=mode).close()
-    first, resumed, other = wandb.made
-    assert first == resumed
-    assert first["id"] != other["id"]
-    assert (first["mode"], first["config"]) == (mode, CONFIG)
-
-
-@pytest.mark.parametrize(
-    ("unreachable", "modes"), [(("online",), ["offline"]), (("online", "offline"), [])]
-)
-def test_an_unreachable_wandb_does_not_end_the_run(unreachable, modes, wandb, tmp_path):
-    wandb.unreachable = unreachable
-    with (
-        pytest.warns(UserWarning, match=r"\(no route\): "),
-        RunLogger(tmp_path, config={}, wandb="online") as logger,
-    ):
+def test_an_algorithm_may_add_columns_to_the_training_episodes(tmp_path):
+    with RunLogger(tmp_path, config=CONFIG, logged=("loss_meta",)) as logger:
+        logger.log_train({**ROW, "loss_meta": 0.5})
         logger.log_eval(ROW)
-    assert [made["mode"] for made in wandb.made] == modes
-    assert len((tmp_path / "eval.csv").read_text().splitlines()) == 2
+    header, row = (tmp_path / "train.csv").read_text().splitlines()
+    assert header == ",".join([*TRAIN_COLUMNS, "loss_meta"])
+    assert row == "bgpo,2,7,210,grasp_glass,1,1.0,28,,,,,,,0.5"
+    with pytest.raises(ValueError, match="columns"):
+        RunLogger(tmp_path, config=CONFIG, resume=True)
 
 
-def test_a_missing_wandb_package_is_one_warning(monkeypatch, tmp_path):
-    monkeypatch.setattr("torchrl.record.loggers.wandb._has_wandb", False)
-    with (
-        pytest.warns(UserWarning, match=r"pip install 'bgpo_trl\[wandb\]'") as caught,
-        RunLogger(tmp_path, config={}, wandb="online") as logger,
-    ):
-        logger.log_eval(ROW)
-    assert len(caught) == 1
-    assert len((tmp_path / "eval.csv").read_text().splitlines()) == 2
+@pytest.mark.parametrize("logged", [("success",), ("loss_meta", "loss_meta")])
+def test_a_column_that_is_there_already_is_refused(logged, tmp_path):
+    with pytest.raises(ValueError, match=logged[0]):
+        RunLogger(tmp_path / "run", config=CONFIG, logged=logged)
+    assert not (tmp_path / "run").exists()

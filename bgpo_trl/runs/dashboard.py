@@ -1,0 +1,269 @@
+"""Dashboards: means of a run, for Weights & Biases, TensorBoard or any other logger of TorchRL."""
+
+from __future__ import annotations
+
+import json
+import os
+import uuid
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, Self
+
+import pandas as pd
+from torchrl.record.loggers.common import Logger
+from torchrl.record.loggers.tensorboard import TensorboardLogger
+from torchrl.record.loggers.wandb import WandbLogger
+
+from bgpo_trl.files.writing import write_whole
+from bgpo_trl.runs.directory import flatten
+from bgpo_trl.runs.provenance import commit_of_code, versions
+from bgpo_trl.runs.results import COUNT, TRAIN, read_table
+
+# Columns of which there is no mean.
+_NO_MEASURES = ["algorithm", "seed", "episode", "task", "group"]
+
+
+class Dashboard:
+    """Log the means of a run to loggers, at the step of the training episodes of a seed.
+
+    | key | mean over |
+    |---|---|
+    | ``eval/success/TASK`` | seeds and test episodes of an evaluation |
+    | ``eval/success_mean`` | tasks presented so far, seeds and test episodes |
+    | ``train/success/TASK``, ``train/success_mean`` | training episodes since the last evaluation |
+    | ``train/COLUMN``, such as ``train/loss_actor`` | the same, of each number in ``train.csv`` |
+    | ``final/success/TASK``, ``final/success_mean`` | seeds and tests after training |
+
+    ``eval/success_sd`` is the standard deviation over seeds (``ddof=0``, as in the figures) of
+    their means. With ``per_seed``, each seed has a curve ``eval/success/TASK/seed_SEED`` too. The
+    settings, the commit and the versions of packages are logged as hyperparameters once, by names
+    such as ``algorithm.beta``. A logger that raises is dropped with one warning.
+
+    Args:
+        directory: The run directory. Training episodes in its ``train.csv`` that no evaluation
+            follows belong to the next one, so that a resumed run logs the same means.
+        loggers: Loggers, or functions without arguments that make one.
+        settings: Settings of the run, as JSON stores them.
+        per_seed: Whether to log the test success of each seed.
+
+    Raises:
+        ValueError: If there are loggers and ``train.csv`` or ``eval.csv`` is missing or damaged.
+    """
+
+    def __init__(
+        self,
+        directory: str | os.PathLike[str],
+        loggers: Iterable[Logger | Callable[[], Logger]] = (),
+        *,
+        settings: Mapping[str, Any],
+        per_seed: bool = False,
+    ) -> None:
+        self._per_seed, loggers = per_seed, [*loggers]
+        # Training episodes since the last evaluation.
+        self._episodes = _untested(Path(directory)) if loggers else []
+        self._loggers: list[Logger] = []
+        for logger in loggers:
+            try:
+                self._loggers.append(logger() if callable(logger) else logger)
+            except Exception as error:
+                _warn("A logger", error)
+        if self._loggers:
+            settings = {**settings, "commit": commit_of_code(), "versions": versions()}
+            # TensorBoard takes no lists.
+            plain = {
+                name: json.dumps(value) if isinstance(value, list) else value
+                for name, value in flatten(settings)
+            }
+            self._each(lambda logger: logger.log_hparams(dict(plain)))
+
+    def log_train(self, row: Mapping[str, Any]) -> None:
+        """Add a training episode, a row of ``train.csv``, to the means of the next evaluation."""
+        if self._loggers:
+            self._episodes.append(row)
+
+    def log_eval(self, rows: Sequence[Mapping[str, Any]]) -> None:
+        """Log an evaluation and the training episodes before it.
+
+        Args:
+            rows: Test episodes of all seeds after the same number of training episodes, as rows of
+                ``eval.csv``.
+        """
+        if not self._loggers:
+            return
+        tests, episode = pd.DataFrame([*rows]), int(rows[0]["episode"])
+        played = [row for row in self._episodes if row["episode"] <= episode]
+        self._episodes = [row for row in self._episodes if row["episode"] > episode]
+        of_seeds = tests.groupby("seed")["success"].mean()
+        metrics = {**_success("eval", tests), **_training(played)}
+        if len(of_seeds) > 1:
+            metrics["eval/success_sd"] = float(of_seeds.std(ddof=0))
+        if self._per_seed:
+            for (task, seed), success in tests.groupby(["task", "seed"])["success"]:
+                metrics[f"eval/success/{task}/seed_{seed}"] = float(success.mean())
+        self._log(metrics, episode)
+
+    def log_final(self, tests: pd.DataFrame, episode: int) -> None:
+        """Log the tests after training.
+
+        Args:
+            tests: ``task`` and ``success`` of each seed and task, as in ``final.csv``.
+            episode: Training episodes of a seed.
+        """
+        self._log(_success("final", tests), episode)
+
+    def log_media(self, name: str, path: str | os.PathLike[str]) -> None:
+        """Send a finished figure or video to Weights & Biases and loggers with a ``log_media``.
+
+        Args:
+            name: Name on the dashboard.
+            path: A picture, or a video as GIF or MP4.
+        """
+        self._each(lambda logger: _send(logger, name, Path(path)))
+
+    def close(self) -> None:
+        """Shut the loggers down."""
+        self._each(lambda logger: logger.shutdown())
+        self._loggers = []
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _log(self, metrics: Mapping[str, float], episode: int) -> None:
+        self._each(lambda logger: logger.log_metrics(dict(metrics), step=episode))
+
+    def _each(self, do: Callable[[Logger], object]) -> None:
+        for logger in tuple(self._loggers):
+            try:
+                do(logger)
+            except Exception as error:
+                self._loggers = [other for other in self._loggers if other is not logger]
+                _warn(type(logger).__name__, error)
+
+
+def wandb_logger(
+    directory: str | os.PathLike[str],
+    mode: Literal["online", "offline"],
+    *,
+    group: str | None = None,
+    tags: Sequence[str] | None = None,
+) -> WandbLogger:
+    """Start a run on Weights & Biases, offline if it does not answer, or continue that of a run.
+
+    Args:
+        directory: The run directory; its ``wandb/`` gets the files, and the id of the run, by which
+            a resumed run continues its curves.
+        mode: ``"online"``, or ``"offline"`` for a later ``wandb sync``.
+        group: Group of the run.
+        tags: Tags of the run; those of a continued run stay if None.
+
+    Raises:
+        ValueError: If there is no such mode.
+        ImportError: If wandb is not installed.
+        RuntimeError: If neither mode works.
+    """
+    if mode not in ("online", "offline"):
+        raise ValueError(f'the mode must be "online" or "offline", not {mode!r}')
+    directory = Path(directory)
+    identity = directory / "wandb" / "run_id"
+    identity.parent.mkdir(parents=True, exist_ok=True)
+    if not identity.exists() or not identity.read_text():  # killed before it was written
+        write_whole(identity, uuid.uuid4().hex)
+    try:
+        return WandbLogger(
+            directory.name,
+            project="bgpo_trl",
+            save_dir=str(directory),
+            id=identity.read_text(),
+            log_env_packages=False,  # would reveal paths of this machine
+            mode=mode,  # not `offline=`, which changes os.environ for good
+            group=group,
+            tags=None if tags is None else [*tags],
+            settings={
+                "init_timeout": 30,
+                "finish_timeout": 60,
+                "console": "off",  # would upload every redraw of the progress bar
+                "x_disable_meta": True,  # command, program and folders of this machine
+            },
+        )
+    except ImportError:
+        raise ImportError("wandb is not installed: pip install 'bgpo_trl[wandb]'") from None
+    except Exception as error:
+        if mode == "offline":
+            raise RuntimeError(f"wandb cannot write its files: {_reason(error)}") from error
+        warnings.warn(
+            f"wandb does not answer ({_reason(error)}): logging offline, upload it with "
+            f"`wandb sync {identity.parent}/offline-run-*`",
+            stacklevel=2,
+        )
+    return wandb_logger(directory, "offline", group=group, tags=tags)
+
+
+def tensorboard_logger(directory: str | os.PathLike[str]) -> TensorboardLogger:
+    """Return a logger that writes to ``tensorboard/`` in a run directory.
+
+    Raises:
+        ImportError: If tensorboard is not installed.
+    """
+    try:
+        return TensorboardLogger("tensorboard", log_dir=str(directory))
+    except ImportError:
+        raise ImportError(
+            "tensorboard is not installed: pip install 'bgpo_trl[tensorboard]'"
+        ) from None
+
+
+def _untested(directory: Path) -> list[Mapping[Any, Any]]:
+    """Return the training episodes of a run after its last evaluation."""
+    tested = read_table(directory / "eval.csv", {"episode": COUNT})["episode"]
+    train = read_table(directory / "train.csv", TRAIN)
+    train = train[train["episode"] > max(tested, default=0)]
+    for name in train.columns.difference([*TRAIN, "algorithm"]):
+        train[name] = pd.to_numeric(train[name], errors="coerce")
+    return [*train.to_dict("records")]
+
+
+def _success(group: str, table: pd.DataFrame) -> dict[str, float]:
+    """Return the mean success of each task, and of all."""
+    metrics = {
+        f"{group}/success/{task}": float(success.mean())
+        for task, success in table.groupby("task", sort=False)["success"]
+    }
+    return {**metrics, f"{group}/success_mean": float(table["success"].mean())}
+
+
+def _training(episodes: Sequence[Mapping[Any, Any]]) -> dict[str, float]:
+    """Return the means of training episodes; NaN where one is, as after a divergence."""
+    if not episodes:
+        return {}
+    table = pd.DataFrame([*episodes])
+    measures = table.drop(columns=[*_NO_MEASURES, "success"], errors="ignore")
+    means = measures.select_dtypes("number").mean(skipna=False)
+    metrics = {f"train/{name}": float(mean) for name, mean in means.items()}
+    return {**_success("train", table), **metrics}
+
+
+def _send(logger: Logger, name: str, path: Path) -> None:
+    if isinstance(logger, WandbLogger):
+        import wandb  # an optional extra, installed if there is a WandbLogger
+
+        # The path rather than the frames, for which wandb (and TorchRL's log_video) needs moviepy.
+        media = wandb.Video if path.suffix in (".gif", ".mp4") else wandb.Image
+        logger.experiment.log({name: media(str(path))})
+    elif log_media := getattr(logger, "log_media", None):
+        log_media(name, path)
+
+
+def _warn(name: str, error: Exception) -> None:
+    warnings.warn(
+        f"{name} failed ({_reason(error)}) and gets nothing more of this run: the CSV files are "
+        "complete.",
+        stacklevel=4,
+    )
+
+
+def _reason(error: Exception) -> str:
+    return (str(error) or type(error).__name__).splitlines()[0]
