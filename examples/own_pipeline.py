@@ -47,7 +47,7 @@ if __name__ == "__main__":
     optimizer, targets = torch.optim.Adam(loss.parameters()), ForeachSoftUpdate(loss, tau=0.005)
     replay = TensorDictReplayBuffer(storage=LazyTensorStorage(10_000), batch_size=128)
     explore = AdditiveGaussianModule(env.action_spec, sigma_init=0.3, sigma_end=0.3)
-    how = {"frames_per_batch": 100, "total_frames": 500, "auto_register_policy_transforms": False}
+    how = {"frames_per_batch": 200, "total_frames": 1_000, "auto_register_policy_transforms": False}
     for data in Collector(env, Seq(actor, explore), **how):
         replay.extend(data)
         for _ in range(50):

@@ -77,7 +77,7 @@ def test_own_pipeline_rewards_novelty_and_plays_episodes(run):
     rewards = np.array([float(reward) for reward, _ in printed])
     assert ((rewards > 0.0005) & (rewards < 0.1)).all()
     episodes, behaviors = re.search(r"(\d+) episodes, (\d+) behaviors\n$", out).groups()
-    assert int(episodes) >= 10  # 500 steps, at most 50 an episode
+    assert int(episodes) >= 20  # 1,000 steps, at most 50 an episode
     assert int(behaviors) > 2  # two that GWR-B starts with
 
 

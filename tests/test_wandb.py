@@ -6,6 +6,7 @@ import os
 import signal
 import struct
 import sys
+import time
 from functools import partial
 from pathlib import Path
 
@@ -68,8 +69,17 @@ def records(file: Path) -> list[Record]:
 
 
 def sessions(directory: Path) -> list[list[Record]]:
-    """Return the records of each process that worked on the run, first to last."""
-    files = directory.glob("wandb/offline-run-*/*.wandb")
+    """Return the records of each process that worked on the run, first to last.
+
+    wandb writes them in a process of its own, which may end after the call that finishes the run.
+    """
+    files = [*directory.glob("wandb/offline-run-*/*.wandb")]
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline and not all(
+        any(record.WhichOneof("record_type") == "exit" for record in records(file))
+        for file in files
+    ):
+        time.sleep(0.1)
     return [records(file) for file in sorted(files, key=lambda file: file.stat().st_mtime_ns)]
 
 

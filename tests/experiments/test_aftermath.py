@@ -12,6 +12,7 @@ from bgpo_trl.evaluation import start_seeds
 from bgpo_trl.experiments import aftermath
 from bgpo_trl.experiments.aftermath import CRITERIA, AftermathArguments, Continuation, Row
 from bgpo_trl.experiments.episodes import play
+from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
 from bgpo_trl.runs.results import read_table
 from suites import nico
 
@@ -239,6 +240,9 @@ def test_the_command_has_a_row_for_each_success(run_of, tmp_path):
     config = json.loads((run / "config.json").read_text())
     config["algorithm"]["max_steps"] = 50
     (run / "config.json").write_text(json.dumps(config))
+    state = load_checkpoint(run / "checkpoint")
+    state["settings"]["algorithm"]["max_steps"] = 50
+    save_checkpoint(run / "checkpoint", state)
     printed = aftermath.aftermath(
         AftermathArguments(run=run, demonstrators=True, episodes=1, out=out)
     )

@@ -57,7 +57,7 @@ def test_merged_jobs_are_reported_as_one_run_of_all_seeds(jobs, tmp_path):
     assert ours.seeds == theirs.seeds == (3, 8)
     np.testing.assert_array_equal(ours.success, theirs.success)
     text = report(ReportArguments((out,), out=tmp_path / "report"))
-    assert "| DDPG, told nothing | no | 2 |" in text
+    assert "| DDPG, told nothing | nothing | 2 |" in text
 
     merge(MergeArguments(jobs, out))
     assert contents(out) == merged
@@ -131,7 +131,7 @@ def write_program(path, text):
 
 def test_the_documented_slurm_array_requeues_interrupted_jobs_alone(tmp_path):
     page = (ROOT / "docs" / "benchmark.md").read_text()
-    (script,) = re.findall(r"^```bash\n(#!/bin/bash\n.*?)^```", page, re.DOTALL | re.MULTILINE)
+    (script,) = re.findall(r"^```sh\n(#!/bin/bash\n.*?)^```", page, re.DOTALL | re.MULTILINE)
     (tmp_path / "array.sh").write_text(script)
     programs = tmp_path / "programs"
     programs.mkdir()
