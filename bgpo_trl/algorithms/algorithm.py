@@ -76,6 +76,7 @@ class Algorithm(ABC):
     ) -> None:
         self.config = config
         self.device = torch.device(device)
+        self.seeds = tuple(seeds)
         self.n_seeds, self.n_tasks = len(seeds), len(bank.tasks)
         self.encoders = encoders
         self.state_size = STATE_SIZE

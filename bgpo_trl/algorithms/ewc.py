@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -15,8 +14,6 @@ from bgpo_trl.algorithms.fine_tuning import FineTuning
 from bgpo_trl.algorithms.learner import Learner
 from bgpo_trl.algorithms.rl import LearnerSpec, make_learner
 from bgpo_trl.configs import DDPGConfig, EWCConfig
-from bgpo_trl.data.bank import DemonstrationBank
-from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.objectives.off_policy import OffPolicyLoss
 from bgpo_trl.seeding import generators
 
@@ -41,18 +38,6 @@ class EWC(FineTuning):
     config: EWCConfig
     learner: EWCLearner
 
-    def __init__(
-        self,
-        config: EWCConfig,
-        *,
-        seeds: Sequence[int],
-        bank: DemonstrationBank,
-        encoders: Representation | None = None,
-        device: torch.device | str = "cpu",
-    ) -> None:
-        super().__init__(config, seeds=seeds, bank=bank, encoders=encoders, device=device)
-        self._seeds = seeds
-
     def _make_learner(self, spec: LearnerSpec) -> Learner:
         ddpg = make_learner(self.config.rl, spec)
         return EWCLearner(ddpg.actor, ddpg.loss, self.config.rl, weight=self.config.ewc_weight)
@@ -63,7 +48,7 @@ class EWC(FineTuning):
         If the replay is empty already, since several tasks begin at once, nothing changes.
         """
         if self.n_held()[index]:
-            stream = generators([self._seeds[index]], f"fisher {task}")
+            stream = generators([self.seeds[index]], f"fisher {task}")
             rows = torch.zeros(1, self.config.fisher_samples, dtype=torch.int64)
             drawn = self.replay.sample(rows, seeds=[index], generator=stream)
             self.learner.consolidate(index, self.to_device(drawn.select(*self.in_keys).squeeze(0)))

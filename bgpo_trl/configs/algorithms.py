@@ -118,9 +118,9 @@ class BGPOConfig(AlgorithmConfig):
     """Behavior-guided policy optimization (Alg. 1)."""
 
     context: Literal["behavior", "embedding", "label"] | None = "behavior"
-    """What policies know of the task besides the state: the behavior b of GWR-B (Alg. 1); the
-    demonstration's embedding phi in its place, without GWR-B (Fig. 9); the label of the task, or
-    nothing, for references."""
+    """Information about the task that policies read besides the state: the behavior b of GWR-B
+    (Alg. 1); the demonstration's embedding phi in its place, without GWR-B (Fig. 9); the label of
+    the task, or nothing, for references."""
     beta: float = 0.1
     """Weight of the intrinsic reward (Sec. IV-A)."""
     behavior_scale: float = 0.25

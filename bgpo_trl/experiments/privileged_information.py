@@ -37,7 +37,7 @@ class InformationArguments:
     """Runs of one learner with different inputs."""
 
     inputs: tuple[str, ...] = tuple(INPUTS)
-    """What the policies observe: state+label, latent+label, latent+phi, latent+behavior; a run
+    """Inputs of the policies: state+label, latent+label, latent+phi, latent+behavior; a run
     each."""
     episodes: int = 2_000
     """Training episodes of each seed."""
