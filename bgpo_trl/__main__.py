@@ -20,8 +20,11 @@ COMMANDS = {
     "merge": ("experiments.merge", "Merge runs of different seeds into one."),
     "report": ("experiments.report", "Write tables and figures of runs, or compare two."),
     "watch": ("experiments.watch", "Film what a run has learned."),
-    "looking": ("experiments.looking", "Test a run with the objects' places hidden."),
-    "aftermath": ("experiments.aftermath", "Test whether the successes of a run last."),
+    "looking": ("experiments.nico.looking", "Test a run of NICO with the objects' places hidden."),
+    "aftermath": (
+        "experiments.nico.aftermath",
+        "Test whether successes of a run of NICO last.",
+    ),
     "one-shot": ("experiments.one_shot", "Test a run with demonstrations cut short."),
     "unknown-task": ("experiments.unknown_task", "Measure how well new tasks are detected."),
     "groups": ("experiments.groups", "Measure the groups that form from demonstrations."),
@@ -29,7 +32,7 @@ COMMANDS = {
         "experiments.privileged_information",
         "Train with less and less given information.",
     ),
-    "tasks": ("experiments.tasks", "Measure the suite's tasks and their demonstrators."),
+    "tasks": ("experiments.nico.tasks", "Measure NICO's tasks and their demonstrators."),
     "doctor": ("doctor", "Check this machine and installation."),
 }
 """Module of each sub-command, whose function has its name, and a line about it."""

@@ -128,7 +128,7 @@ def check_frame_rate(seconds: float = 0.5) -> Iterator[Finding]:
     """Measure ten simulations in one environment on all cores, with random actions."""
     import torch
 
-    from bgpo_trl.envs import NicoEnv
+    from bgpo_trl.scenes.nico import NicoEnv
 
     env, generator = NicoEnv(batch_size=[10], seed=0), torch.Generator().manual_seed(0)
     state, steps, start = env.reset(), 0, time.perf_counter()

@@ -18,7 +18,7 @@ from bgpo_trl.algorithms.policy import Policy
 from bgpo_trl.configs import AlgorithmConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.encoders.representation import Representation
-from bgpo_trl.envs import NicoEnv
+from bgpo_trl.scenes import Scene, find_scene
 from bgpo_trl.seeding import stream_seed
 from bgpo_trl.transforms import TaskSchedule
 
@@ -68,8 +68,7 @@ class Evaluator:
 
     Config, seeds, schedule and encoders are those of training; the bank has held-out
     demonstrations. ``spread`` is the share of the whole range of start states. Each task is tested
-    in ``episodes`` episodes. ``make_env`` makes the simulation, with the arguments of `NicoEnv`,
-    the default.
+    in ``episodes`` episodes.
 
     Raises:
         ValueError: If a task has no demonstration.
@@ -85,8 +84,9 @@ class Evaluator:
         bank: DemonstrationBank,
         encoders: Representation | None,
         spread: float = 1.0,
-        make_env: Callable[..., NicoEnv] | None = None,
+        scene: Scene | str = "nico",
     ) -> None:
+        scene = find_scene(scene)
         self.max_steps = config.max_steps
         self._state_key = config.state
         self.seeds, self.schedule = tuple(seeds), schedule
@@ -100,13 +100,13 @@ class Evaluator:
                 "each task"
             )
         self._bank = bank
-        self.simulation = (make_env or NicoEnv)(
+        self.simulation = scene.simulate(
             bank.tasks,
             batch_size=self.shape,
             spread=spread,
             observation="pixels" if config.state == "latent" else "state",
         )
-        self.env = observation_env(config, self.simulation, encoders)
+        self.env = observation_env(config, self.simulation, encoders, scene.state)
         self._task = torch.arange(n_tasks)[:, None].expand(self.shape).contiguous()
         self._next = 0
         self._waiting: list[list[Snapshot]] = [[] for _ in seeds]
@@ -196,8 +196,8 @@ class Evaluator:
             state = self.env.step(state)["next"]
             watch()
             steps += active
-            success |= state["terminated"].squeeze(-1) & active
-            active = active & ~success
+            success |= state["success"].squeeze(-1) & active
+            active = active & ~state["done"].squeeze(-1)
             if not active.any():
                 break
         return TestResult(snapshots, success, steps)
@@ -225,8 +225,8 @@ class Evaluator:
 def start_seeds(seed: int, number: int, shape: Sequence[int]) -> NDArray[np.int64]:
     """Return the seeds of the start states of a seed's evaluation ``number``, of that shape.
 
-    The shape of an `Evaluator` is tasks by test episodes; `suites.nico.load` with one of these
-    seeds starts like the test episode.
+    The shape of an `Evaluator` is tasks by test episodes; a simulation with one of these seeds
+    starts like the test episode.
     """
     return _rng(seed, number).integers(2**32, size=tuple(shape))
 
@@ -243,20 +243,21 @@ def evaluate_random_policy(
     seed: int = 0,
     spread: float = 1.0,
     max_steps: int = 50,
+    scene: Scene | str = "nico",
 ) -> Tensor:
     """Return the success rate of uniformly random actions on each task, float32 ``[T]``."""
-    shape = (len(tasks), episodes)
-    env = NicoEnv(
+    shape, scene = (len(tasks), episodes), find_scene(scene)
+    env = scene.simulate(
         tasks,
         batch_size=shape,
         seed=stream_seed(seed, "random policy") // 2,
         spread=spread,
-        observation="state",
+        observation="pixels" if scene.state is None else "state",
     )
     generator = torch.Generator().manual_seed(seed)
     task = torch.arange(len(tasks))[:, None].expand(shape).contiguous()
     state = env.reset(TensorDict({"task": task}, shape))
     for _ in range(max_steps):
-        state.set("action", torch.rand(*shape, 4, generator=generator) * 2 - 1)
-        state = env.step(state)["next"]
-    return state["terminated"].squeeze(-1).float().mean(-1)
+        action = torch.rand(*shape, scene.action_size, generator=generator) * 2 - 1
+        state = env.step(state.set("action", action))["next"]
+    return state["success"].squeeze(-1).float().mean(-1)

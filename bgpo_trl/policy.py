@@ -25,10 +25,8 @@ from bgpo_trl.runs.config_file import read_config
 from bgpo_trl.runs.demonstrations import load_inputs
 from bgpo_trl.runs.directory import check_checkpoint, fitting_checkpoint
 from bgpo_trl.runs.results import read_json
+from bgpo_trl.scenes import find_scene
 from bgpo_trl.seeding import stream_seed
-from suites.nico.rendering import FRAME_HEIGHT, FRAME_WIDTH
-
-_FRAME = (FRAME_HEIGHT, FRAME_WIDTH, 3)
 
 
 @dataclass(frozen=True)
@@ -103,7 +101,7 @@ class TrainedPolicy:
         """Condition the policy on a demonstration, complete or truncated.
 
         Args:
-            demonstration: Frames, uint8 ``[T, 32, 64, 3]``, T at least 1.
+            demonstration: Frames, uint8 ``[T, H, W, 3]``, T at least 1; NICO's are 32 x 64.
             task: Task label, for algorithms that need it; ignored by others.
             generator: Source of MAML's draws for adaptation; None: derived from the seed.
 
@@ -114,7 +112,7 @@ class TrainedPolicy:
             ValueError: If the frames have another dtype or shape, or the label is unknown or
                 missing; the policy is unchanged then.
         """
-        frames = _frames(demonstration, "a demonstration is uint8 [T, 32, 64, 3], T at least 1", 4)
+        frames = self._frames(demonstration, "a demonstration is uint8 [T, {}], T at least 1", 4)
         algorithm, n_seeds, n_tasks = self.algorithm, len(self.config.seeds), len(self.tasks)
         if task is None and algorithm.needs_label:
             raise ValueError(
@@ -153,10 +151,10 @@ class TrainedPolicy:
 
     @torch.no_grad()
     def act(self, frame: ArrayLike) -> NDArray[np.float32]:
-        """Return the action for a frame, float32 ``[4]`` in [-1, 1].
+        """Return the action for a frame, float32 ``[A]`` in [-1, 1].
 
         Args:
-            frame: uint8 ``[32, 64, 3]``.
+            frame: uint8 ``[H, W, 3]``.
 
         Raises:
             ValueError: If the frame has another dtype or shape, or no demonstration was given
@@ -164,12 +162,26 @@ class TrainedPolicy:
         """
         if self._policy is None:
             raise ValueError("the policy has seen no demonstration: show it one with condition()")
-        seen = _frames(frame, "a frame is uint8 [32, 64, 3]", 3)
+        seen = self._frames(frame, "a frame is uint8 [{}]", 3)
         state = self._observe(TensorDict({"pixels": seen}))[self.config.algorithm.state].to(
             self.algorithm.device
         )
         action = self._policy.act(state.expand(1, len(self.tasks), 1, -1))
         return action[0, self._task, 0].cpu().numpy()
+
+    def _frames(self, frames: ArrayLike, wanted: str, ndim: int) -> Tensor:
+        array = np.asarray(frames)
+        shape, expected = array.shape, (*self.encoders.vae.frame_shape, 3)
+        if (
+            array.dtype != np.uint8
+            or array.ndim != ndim
+            or shape[-3:] != expected
+            or not array.size
+        ):
+            wanted = wanted.format(", ".join(map(str, expected)))
+            raise ValueError(f"{wanted}, got {array.dtype} {list(shape)}")
+        # Copied, since the array may be read-only.
+        return torch.tensor(np.ascontiguousarray(array))
 
 
 class LoadedRun(NamedTuple):
@@ -269,24 +281,21 @@ def load_all_seeds(path: str | Path, *, make: Callable[..., Algorithm] | None = 
                 f"{path} was merged: name one of its blocks, such as {path / blocks[0]}"
             )
         raise ValueError(f"{path} has no checkpoint: let the run reach its first one, or keep it")
-    encoders, bank = load_inputs(path, config.tasks, digests)
+    encoders, bank = load_inputs(path, config.tasks, digests, config.scene)
     saved = load_checkpoint(path / "checkpoint", mmap=True, newest=True)
     # Before anything is made of the sizes in the settings, which may not be the run's.
     check_checkpoint(path / "checkpoint", saved, read_json(path / "config.json"))
     with fitting_checkpoint(path):
-        algorithm = make(config.algorithm, seeds=config.seeds, bank=bank.seen(), encoders=encoders)
+        algorithm = make(
+            config.algorithm,
+            seeds=config.seeds,
+            bank=bank.seen(),
+            encoders=encoders,
+            scene=find_scene(config.scene),
+        )
         state = saved["algorithm"]
         if not algorithm.needs_replay:
             state["replay"] = algorithm.replay.state_dict()  # Avoids reading it.
         algorithm.load_state_dict(state)
         episodes = saved["world"]["source"]["episode"].tolist()
     return LoadedRun(config, algorithm, encoders, bank, episodes)
-
-
-def _frames(frames: ArrayLike, wanted: str, ndim: int) -> Tensor:
-    array = np.asarray(frames)
-    shape = array.shape
-    if array.dtype != np.uint8 or array.ndim != ndim or shape[-3:] != _FRAME or not array.size:
-        raise ValueError(f"{wanted}, got {array.dtype} {list(shape)}")
-    # Copied, since the array may be read-only.
-    return torch.tensor(np.ascontiguousarray(array))

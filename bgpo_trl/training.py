@@ -27,10 +27,11 @@ from bgpo_trl.files.progress import progress_bar
 from bgpo_trl.runs.config_file import Digests, settings_of
 from bgpo_trl.runs.cost import CostLog
 from bgpo_trl.runs.dashboard import Dashboard
-from bgpo_trl.runs.demonstrations import keep_bank
+from bgpo_trl.runs.demonstrations import keep_inputs
 from bgpo_trl.runs.directory import fitting_checkpoint, load_last
 from bgpo_trl.runs.gwr_graphs import growth_moments, save_graph
 from bgpo_trl.runs.logger import RunLogger
+from bgpo_trl.scenes import find_scene
 from bgpo_trl.transforms import TaskSchedule
 from bgpo_trl.world import World
 
@@ -54,7 +55,7 @@ class Trainer:
         config: The run.
         directory: The run's directory: ``config.json``, ``train.csv``, ``eval.csv``, ``cost.csv``,
             ``checkpoint/``, in ``gwr/`` graphs of the first seed's GWR-B during training, and
-            ``bank.safetensors`` if the demonstrations do not come with the encoders.
+            ``bank.safetensors`` and ``encoders/`` if these do not come with the scene.
         bank: Embedded demonstrations, seen and held out, of at least ``config.tasks``.
         encoders: Trained encoders, or None if unused.
         make: Constructor of the algorithm; by default that of the entry ``config.name``.
@@ -98,6 +99,13 @@ class Trainer:
                 f"{used}: load both together (load_pretrained), or embed anew "
                 "(bgpo_trl.encoders.make_bank)"
             )
+        self._scene = find_scene(config.scene)
+        self._scene.check_tasks(config.tasks)
+        if bank.scene_version not in (None, self._scene.version):
+            raise ValueError(
+                f"the demonstrations are of the scene {bank.scene_version}, the run is in "
+                f"{self._scene.version}: record and embed some of this scene"
+            )
         if bank.spread < config.spread:
             raise ValueError(
                 f"the bank was recorded at spread {bank.spread}, the run is at {config.spread}: "
@@ -132,7 +140,7 @@ class Trainer:
             if saved is not None:
                 self.logger.truncate_to(saved["position"])
             if encoders is not None:  # Others cannot be loaded to watch demonstrations.
-                keep_bank(self.directory, bank, encoders)
+                keep_inputs(self.directory, bank, encoders, self._scene)
             self.dashboard = Dashboard(
                 self.directory, loggers, settings=self._settings, per_seed=per_seed_curves
             )
@@ -151,7 +159,12 @@ class Trainer:
         self._schedule = TaskSchedule(config.task_starts, cumulative=config.schedule == "practised")
         make = entry(config.name).make if make is None else make
         self.algorithm = make(
-            config.algorithm, seeds=config.seeds, bank=seen, encoders=self.encoders, device=device
+            config.algorithm,
+            seeds=config.seeds,
+            bank=seen,
+            encoders=self.encoders,
+            device=device,
+            scene=self._scene,
         )
         self.world = World(
             self.algorithm,
@@ -168,6 +181,7 @@ class Trainer:
             bank=bank.held_out(config.held_out),
             encoders=self.encoders,
             spread=config.spread,
+            scene=self._scene,
         )
 
     def run(self) -> None:
@@ -273,7 +287,7 @@ class Trainer:
             "episode": episode,
             "env_steps": self.env_steps,
             "task": self.config.tasks[int(end["task"])],
-            "success": int(end["terminated"]),
+            "success": int(end["success"]),
             "return": float(extrinsic),
             "steps": int(end["step_count"]),
             "intrinsic_return": float(intrinsic),

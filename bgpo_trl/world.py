@@ -10,7 +10,6 @@ from torchrl.envs import EnvBase
 
 from bgpo_trl.algorithms import Algorithm
 from bgpo_trl.data.bank import DemonstrationBank
-from bgpo_trl.envs import NicoEnv
 from bgpo_trl.seeding import generators, stream_seed
 from bgpo_trl.transforms import DemonstrationSource, TaskSchedule
 
@@ -28,6 +27,7 @@ class World:
         spread: Share of the whole range of start states.
 
     Raises:
+        ValueError: If the algorithm's scene has no such task, spread or ground truth.
         TypeError: If the algorithm makes something else than an environment of all seeds.
 
     Attributes:
@@ -49,7 +49,8 @@ class World:
         self.source = DemonstrationSource(
             bank, schedule, batch_size=batch, generator=generators(seeds, "demonstrations")
         )
-        self.simulation = NicoEnv(
+        self._scene = algorithm.scene
+        self.simulation = self._scene.simulate(
             bank.tasks,
             batch_size=batch,
             seed=[stream_seed(seed, "env") for seed in seeds],
@@ -64,14 +65,27 @@ class World:
             )
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the state of draws and simulations, without the tensordict between two steps."""
-        return {
-            "source": dict(self.source.state_dict()),
-            "simulation": self.simulation.simulation_state(),
-        }
+        """Return the state of draws and simulations, without the tensordict between two steps.
+
+        That of simulations is None if they cannot be saved.
+        """
+        try:
+            simulation = self.simulation.simulation_state()
+        except NotImplementedError:
+            simulation = None
+        return {"source": dict(self.source.state_dict()), "simulation": simulation}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a `state_dict`."""
+        """Restore a `state_dict`.
+
+        Raises:
+            ValueError: If it holds no state of the simulations.
+        """
+        if state["simulation"] is None:
+            raise ValueError(
+                f"simulations of the scene {self._scene.name!r} cannot be saved, so this run "
+                "cannot be resumed: begin another one, or define save and load of its Simulation"
+            )
         self.env.reset()  # Transforms create their caches at the first reset.
         self.source.load_state_dict(state["source"])
         self.simulation.load_simulation_state(state["simulation"])

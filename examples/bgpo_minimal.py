@@ -27,9 +27,9 @@ from bgpo_trl.configs import GWRBConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.encoders.representation import Representation
-from bgpo_trl.envs import NicoEnv
 from bgpo_trl.evaluation import start_seeds
 from bgpo_trl.modules.gwr import GWRB
+from bgpo_trl.scenes.nico import NicoEnv
 from bgpo_trl.seeding import generators, stream_seed
 from bgpo_trl.transforms import (
     BehaviorLookup,

@@ -2,32 +2,33 @@
 
 import gc
 import hashlib
+import json
 import os
 import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import asdict, replace
 from json import JSONDecodeError
 from pathlib import Path
 from typing import Any
 
 import mujoco
-import numpy as np
 import pytest
 import torch
 from hypothesis import settings
 
 from bgpo_trl.algorithms import entry
 from bgpo_trl.algorithms.rl import RL
-from bgpo_trl.configs import BGPOConfig, RunConfig
+from bgpo_trl.configs import BGPOConfig, RepresentationConfig, RunConfig
 from bgpo_trl.data.bank import DemonstrationBank, DemonstrationSteps
 from bgpo_trl.encoders.representation import Representation
-from bgpo_trl.envs import NicoEnv
 from bgpo_trl.figures import style
 from bgpo_trl.modules.inverse_model import InverseModel
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
+from bgpo_trl.scenes import SCENES, Outcome
+from bgpo_trl.scenes.nico import NICO, NicoEnv, NicoSimulation
 from bgpo_trl.world import World
 from suites.nico import nico
 
@@ -65,7 +66,14 @@ def encoders():
         inverse = InverseModel()
     for module in (vae, lae, inverse):
         module.eval().requires_grad_(False)
-    return Representation(vae, lae, inverse, {})
+    metadata = {
+        "scene_version": NICO.version,
+        "spread": "1.0",
+        "config": json.dumps(asdict(RepresentationConfig())),
+        "seed": "0",
+        "command": "",
+    }
+    return Representation(vae, lae, inverse, metadata)
 
 
 @pytest.fixture(scope="session")
@@ -123,28 +131,30 @@ def in_world(bank):
     return enter
 
 
-class EasyNicoEnv(NicoEnv):
-    """An environment in which episodes also end, with success, once the arm is turned to one side.
+class EasySimulation(NicoSimulation):
+    """A simulation whose episodes also end, with success, once the arm is turned to one side.
 
     Nothing collides or falls: a contact would make the rounding of a batch, which differs from that
     of a seed alone, a hundred thousand times larger within two steps.
     """
 
-    def __init__(self, *arguments, **settings):
-        super().__init__(*arguments, **settings)
+    def __init__(self, tasks, **options):
+        super().__init__(tasks, **options)
         disabled = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_GRAVITY
-        for tasks in self._environments:
-            tasks[0].physics.model.opt.disableflags |= disabled
+        self.environment.physics.model.opt.disableflags |= disabled
 
-    def _step(self, tensordict):
-        moved = ~self._done
-        if "_step" in tensordict:
-            moved &= tensordict["_step"].reshape(-1).numpy()
-        following = super()._step(tensordict)
-        yaw = np.array([tasks[0].physics.arm_angles()[0] for tasks in self._environments])
-        self._done |= moved & (yaw > 0.1)
-        won = torch.from_numpy(moved & self._done).reshape(*self.batch_size, 1)
-        return following.update({"reward": won.float(), **self._dones()})
+    def step(self, action):
+        success, _ = super().step(action)
+        return Outcome(success or self.environment.physics.arm_angles()[0] > 0.1)
+
+
+class EasyNicoEnv(NicoEnv):
+    def _simulation(self):
+        return EasySimulation(self.tasks, spread=self._spread)
+
+
+EASY = replace(NICO, make_env=EasyNicoEnv)
+"""A scene in which episodes end after 1 to 6 steps, so that seeds are soon out of step."""
 
 
 @pytest.fixture(scope="module")
@@ -154,15 +164,14 @@ def easy_world():
     It lasts for the module: mark all of it with `pytest.mark.usefixtures("easy_world")`.
     """
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("bgpo_trl.world.NicoEnv", EasyNicoEnv)
-        patch.setattr("bgpo_trl.evaluation.NicoEnv", EasyNicoEnv)
+        patch.setitem(SCENES, "nico", EASY)
         yield EasyNicoEnv
 
 
 @pytest.fixture(autouse=True)
 def restored_registries() -> Iterator[None]:
-    """Remove tasks and RL algorithms that a test has added."""
-    registries: list[dict[str, Any]] = [nico._TASKS, RL]
+    """Remove tasks, scenes and RL algorithms that a test has added."""
+    registries: list[dict[str, Any]] = [nico._TASKS, RL, SCENES]
     before = [dict(registry) for registry in registries]
     yield
     for registry, entries in zip(registries, before, strict=True):

@@ -11,10 +11,12 @@ from bgpo_trl.configs import (
 )
 from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.encoders.train import train_encoders
+from bgpo_trl.scenes import SCENES
+from bgpo_trl.scenes.nico import NICO
 from bgpo_trl.training import Trainer
-from tests.conftest import EasyNicoEnv
+from tests.conftest import EASY
 
-RECORDING = {"per_task": 2, "held_out_per_task": 1, "progress": False}
+RECORDING = {"per_task": 2, "held_out_per_task": 1}
 ENCODERS = RepresentationConfig(
     vae=VAEConfig(batch_size=4, window=2, steps=20, warmup_steps=1),
     lae=SequenceAutoencoderConfig(batch_size=4, steps=20, warmup_steps=1),
@@ -28,8 +30,7 @@ def play(directory, parts):
     """Begin or continue a run, in a process of its own."""
     torch.set_num_threads(1)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("bgpo_trl.world.NicoEnv", EasyNicoEnv)
-        patch.setattr("bgpo_trl.evaluation.NicoEnv", EasyNicoEnv)
+        patch.setitem(SCENES, "nico", EASY)
         config, bank, encoders = torch.load(parts, weights_only=False)
         with Trainer(
             config, directory, bank=bank, encoders=encoders, resume=True, progress=False
@@ -40,6 +41,7 @@ def play(directory, parts):
 def train_small_encoders(directory):
     """Begin or continue the training of encoders, in a process of its own."""
     torch.set_num_threads(1)
-    dataset = record_demonstrations(directory / "demonstrations", **RECORDING)
+    options = {"scene": NICO, "progress": False}
+    dataset = record_demonstrations(directory / "demonstrations", **RECORDING, **options)
     weights = directory / "encoders.safetensors"
-    train_encoders(dataset, None, weights, directory / "log", ENCODERS, progress=False)
+    train_encoders(dataset, None, weights, directory / "log", ENCODERS, **options)

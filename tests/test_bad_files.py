@@ -121,7 +121,7 @@ CASES = {
         lambda f: load_bank(default_weights()), "not a bank", "--train-encoders"),
     "bank of other encoders": (
         lambda f: DemonstrationBank.load(f / "bank", encoder_id="y"),
-        "'encoder_id': 'x'", "--train-encoders"),
+        "by the encoders x, not by y", "--train-encoders"),
     "bank in no folder": (
         lambda f: bank().save(f / "file" / "b"), "cannot make the", "another"),
     # demonstrations

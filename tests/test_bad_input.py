@@ -16,7 +16,6 @@ from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv
 
 from bgpo_trl.analysis import metrics, statistics
 from bgpo_trl.configs import RunConfig
-from bgpo_trl.envs import NicoEnv
 from bgpo_trl.files.checkpoint import load_checkpoint
 from bgpo_trl.machine import choose_device, set_threads
 from bgpo_trl.modules.actor_critic import Actor, Critic
@@ -28,6 +27,7 @@ from bgpo_trl.objectives.ddpg import DDPGLoss
 from bgpo_trl.objectives.distillation import DistillationLoss
 from bgpo_trl.objectives.representation import SequenceReconstructionLoss, VAEInverseLoss
 from bgpo_trl.objectives.target_update import ForeachSoftUpdate
+from bgpo_trl.scenes.nico import NicoEnv
 from bgpo_trl.training import Trainer
 from bgpo_trl.transforms import (
     BehaviorLookup,

@@ -17,7 +17,7 @@ import tyro
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.bgpo import BGPO
 from bgpo_trl.algorithms.rl import RL
-from bgpo_trl.envs import NicoEnv
+from bgpo_trl.scenes.nico import NicoEnv
 from bgpo_trl.transforms import DemonstrationSource
 
 ROOT = Path(__file__).parents[1]

@@ -12,6 +12,7 @@ LAYERS = (
     "modules",
     "transforms",
     "objectives",
+    "scenes",
     "data",
     "encoders",
     "algorithms",
@@ -22,7 +23,7 @@ LAYERS = (
     "experiments",
 )
 """In the order of docs/design.md; ``top`` is the package itself."""
-TOP = ("envs", "world", "evaluation", "training", "policy", "doctor")
+TOP = ("world", "evaluation", "training", "policy", "doctor")
 """Modules and packages of ``top``, in their order."""
 OPEN = ("configs", "errors", "seeding", "machine", "threads", "plugins")
 """Open to all; they import from none of the layers."""
@@ -92,3 +93,11 @@ def test_the_suite_imports_no_learning_and_the_package_no_scripts():
         assert not packages(path) & {"bgpo_trl", "torch", "torchrl", "tensordict"}, path
     for path in FILES:
         assert not packages(path) & {"benchmarks", "examples", "tests", "scripts"}, path
+
+
+def test_only_the_scene_of_nico_and_its_measurements_import_the_suite():
+    for path in FILES:
+        named = {name for name in imported(path) if name.startswith("suites.nico")}
+        # The doctor looks at a frame of the suite even if PyTorch is broken.
+        if path.parent.name != "nico" and path.name != "doctor.py":
+            assert not named, path

@@ -12,9 +12,9 @@ from tensordict import TensorDict
 
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.recording import record_demonstrations
-from bgpo_trl.envs import NicoEnv
 from bgpo_trl.evaluation import evaluate_random_policy
 from bgpo_trl.files.tensor_file import load_tensors, save_tensors
+from bgpo_trl.scenes.nico import NicoEnv
 from bgpo_trl.training import Trainer
 from suites import nico
 from suites.nico import moves

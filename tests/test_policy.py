@@ -74,7 +74,7 @@ def trainer_of(encoders, tested_bank, make_config, easy_world, tmp_path_factory)
         if name not in trainers:
             config = make_config(name=name, episodes=16)
             directory = tmp_path_factory.mktemp(name) / "run"
-            weights = directory / "encoders" / "nico.safetensors"
+            weights = directory / "encoders" / "encoders.safetensors"
             save_representation(replace(encoders, metadata=METADATA), weights)
             replace(tested_bank, encoder_id=encoders.identity).save(bank_path(weights))
             trainers[name] = Trainer(
@@ -248,7 +248,7 @@ def test_a_run_of_own_tasks_is_loaded_where_the_task_is_known(
     own = replace(bank, tasks=("at_once", *TASKS[1:]))
     config = make_config(tasks=tasks, task_starts=(0, 2), episodes=4)
     run = tmp_path / "run"
-    weights = run / "encoders" / "nico.safetensors"
+    weights = run / "encoders" / "encoders.safetensors"
     save_representation(replace(encoders, metadata=METADATA), weights)
     with Trainer(config, run, bank=own, encoders=encoders, progress=False) as trainer:
         trainer.run()

@@ -14,10 +14,10 @@ from bgpo_trl import training
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.bgpo import BGPO
 from bgpo_trl.algorithms.policy import Policy
-from bgpo_trl.envs import NicoEnv
 from bgpo_trl.files.checkpoint import load_checkpoint
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.runs.cost import n_bytes, read_costs
+from bgpo_trl.scenes.nico import NicoEnv
 from bgpo_trl.training import Trainer
 from tests.algorithms.playing import assert_same
 from tests.conftest import of_name
@@ -569,7 +569,7 @@ def test_a_failure_to_write_the_bank_closes_the_run(make, tmp_path, monkeypatch)
     closed = []
     close = training.RunLogger.close
     monkeypatch.setattr(training.RunLogger, "close", lambda log: (closed.append(1), close(log)))
-    monkeypatch.setattr(training, "keep_bank", refuse)
+    monkeypatch.setattr(training, "keep_inputs", refuse)
     with pytest.raises(OSError, match="make room"):
         make(tmp_path / "run")
     assert closed == [1]

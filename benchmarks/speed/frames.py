@@ -24,7 +24,7 @@ from bare_process import bare_process
 from dm_control.suite.wrappers import pixels
 from torchrl.envs import Compose, DMControlWrapper, EnvBase, TransformedEnv
 
-from bgpo_trl.envs import NicoEnv
+from bgpo_trl.scenes.nico import NicoEnv
 from bgpo_trl.modules.vae import VAE
 from bgpo_trl.transforms import FrameEncoder
 from suites.nico.base import Environment

@@ -21,9 +21,9 @@ from bgpo_trl.data.replay import GroupReplay
 from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.modules.gwr import GWRB
+from bgpo_trl.scenes import Scene, find_scene
 from bgpo_trl.seeding import generators
 from bgpo_trl.transforms import DemonstrationSource
-from suites.nico.base import STATE_SIZE
 
 
 class Algorithm(ABC):
@@ -39,6 +39,11 @@ class Algorithm(ABC):
         bank: Embedded demonstrations for training episodes.
         encoders: Trained encoders, or None if unused. The frame encoder is moved to the device.
         device: Device of the networks. Simulations, GWR-B and replay stay on the CPU.
+        scene: The robot, or its name; NICO by default.
+
+    Raises:
+        ValueError: If policies are to read latents without encoders, or the ground truth of a scene
+            that has none; or if actions of the demonstrations have another size than the robot's.
 
     Attributes:
         gwr: GWR-B, or None.
@@ -73,17 +78,33 @@ class Algorithm(ABC):
         bank: DemonstrationBank,
         encoders: Representation | None = None,
         device: torch.device | str = "cpu",
+        scene: Scene | str = "nico",
     ) -> None:
         self.config = config
+        self.scene = find_scene(scene)
         self.device = torch.device(device)
         self.seeds = tuple(seeds)
         self.n_seeds, self.n_tasks = len(seeds), len(bank.tasks)
         self.encoders = encoders
-        self.state_size = STATE_SIZE
         if encoders is not None:
             encoders.vae.to(self.device)
-            if config.state == "latent":
-                self.state_size = encoders.vae.latent_size
+        if config.state == "state":
+            if self.scene.state is None:
+                raise ValueError(
+                    f"the scene {self.scene.name!r} has no ground truth: learn from frames, with "
+                    "state='latent'"
+                )
+            self.state_size = self.scene.state.size
+        elif encoders is None:
+            raise ValueError("state='latent' needs trained encoders")
+        else:
+            self.state_size = encoders.vae.latent_size
+        if bank.steps is not None and bank.steps.action.shape[-1] != self.scene.action_size:
+            raise ValueError(
+                f"actions of the demonstrations have {bank.steps.action.shape[-1]} components, "
+                f"those of the scene {self.scene.name!r} have {self.scene.action_size}: use "
+                "demonstrations of this robot"
+            )
         self._noise = generators(seeds, "exploration")
 
     @abstractmethod
@@ -95,7 +116,7 @@ class Algorithm(ABC):
 
     @abstractmethod
     def act(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the ``action`` ``[S, 4]`` of the policy with exploration noise."""
+        """Write the ``action`` ``[S, A]`` of the policy with exploration noise."""
 
     @abstractmethod
     def store(self, transition: TensorDictBase) -> None:

@@ -26,6 +26,7 @@ from bgpo_trl.data.replay import GroupReplay
 from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.modules.gwr import GWRB
+from bgpo_trl.scenes import Scene
 from bgpo_trl.seeding import generators
 from bgpo_trl.transforms import DemonstrationSource
 
@@ -57,8 +58,11 @@ class BGPO(Algorithm):
         bank: DemonstrationBank,
         encoders: Representation | None = None,
         device: torch.device | str = "cpu",
+        scene: Scene | str = "nico",
     ) -> None:
-        super().__init__(config, seeds=seeds, bank=bank, encoders=encoders, device=device)
+        super().__init__(
+            config, seeds=seeds, bank=bank, encoders=encoders, device=device, scene=scene
+        )
         embedding_size = bank.embedding.shape[-1]
         self.needs_label = config.context == "label"
         if config.context == "behavior":
@@ -86,6 +90,7 @@ class BGPO(Algorithm):
             seeds=seeds,
             in_keys=keys,
             in_features=self.state_size + context_size,
+            action_size=self.scene.action_size,
             return_bounds=(0.0, self._highest_return()),
             device=self.device,
         )
@@ -123,6 +128,7 @@ class BGPO(Algorithm):
             base_env,
             source,
             self.encoders,
+            state=self.scene.state,
             context=self.config.context,
             behavior_scale=self.config.behavior_scale,
             gwr=self.gwr,
@@ -145,7 +151,7 @@ class BGPO(Algorithm):
 
     @torch.no_grad()
     def act(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the ``action`` ``[S, 4]`` of the group's policy with exploration noise.
+        """Write the ``action`` ``[S, A]`` of the group's policy with exploration noise.
 
         Where groups have just been joined, the ``group`` of an episode that begins is updated.
         """
@@ -203,7 +209,7 @@ class BGPO(Algorithm):
             return
         end = transition.get("next")
         for seed in end["done"].flatten().nonzero().flatten().tolist():
-            success = bool(end["terminated"][seed])
+            success = bool(end["success"][seed])
             self.trials.end(seed, int(transition["demo_index"][seed]), success)
             pair = self.trials.same_task(seed)
             if pair is not None and {*pair} <= {*self.groups.numbers(seed)}:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -18,6 +19,7 @@ from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.modules.multi_head_actor import MultiHeadActor
 from bgpo_trl.objectives.distillation import DistillationLoss
+from bgpo_trl.scenes import Scene
 from bgpo_trl.seeding import generators
 
 
@@ -51,8 +53,11 @@ class DistNLL(TaskAlgorithm):
         bank: DemonstrationBank,
         encoders: Representation | None = None,
         device: torch.device | str = "cpu",
+        scene: Scene | str = "nico",
     ) -> None:
-        super().__init__(config, seeds=seeds, bank=bank, encoders=encoders, device=device)
+        super().__init__(
+            config, seeds=seeds, bank=bank, encoders=encoders, device=device, scene=scene
+        )
         self.learner = make_ddpg(config.rl, self.spec)
         self.loss, self.teacher = self.learner.loss, self.learner.actor
         self.training_actor = self.teacher
@@ -61,11 +66,14 @@ class DistNLL(TaskAlgorithm):
 
     def _make_students(self, seeds: Sequence[int]) -> None:
         streams = generators(seeds, "student")
-        network = {"in_keys": [self.config.state], "hidden_sizes": self.config.rl.hidden_sizes}
-        self.students = [
-            MultiHeadActor(self.state_size, generator=stream, **network).to(self.device)
-            for stream in streams
-        ]
+        network = partial(
+            MultiHeadActor,
+            self.state_size,
+            self.scene.action_size,
+            in_keys=[self.config.state],
+            hidden_sizes=self.config.rl.hidden_sizes,
+        )
+        self.students = [network(generator=stream).to(self.device) for stream in streams]
         # By seed: the task of each head, in order of appearance.
         self._head_tasks: list[list[int]] = [[] for _ in seeds]
         self._heads = generators(seeds, "heads")
@@ -76,9 +84,7 @@ class DistNLL(TaskAlgorithm):
         ]
         self._ended = torch.zeros(self.n_seeds, dtype=torch.bool)
         # Called with the parameters of a `Policy`.
-        self.test_actor = MultiHeadActor(self.state_size, batch_size=[self.n_seeds], **network).to(
-            self.device
-        )
+        self.test_actor = network(batch_size=[self.n_seeds]).to(self.device)
         for _ in range(self.n_tasks):
             self.test_actor.add_head()
 

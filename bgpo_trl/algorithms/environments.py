@@ -24,6 +24,7 @@ from bgpo_trl.configs import AlgorithmConfig
 from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.modules.gwr import GWRB
+from bgpo_trl.scenes import StateColumns
 from bgpo_trl.transforms import (
     BehaviorLookup,
     BehaviorMatchingReward,
@@ -31,7 +32,6 @@ from bgpo_trl.transforms import (
     FrameEncoder,
     GroupLookup,
 )
-from suites.nico.base import STATE_CENTER, STATE_SCALE
 
 __all__ = ["observation_env", "training_env"]
 
@@ -42,6 +42,7 @@ def training_env(
     source: DemonstrationSource,
     encoders: Representation | None,
     *,
+    state: StateColumns | None = None,
     context: Literal["behavior", "embedding", "label"] | None = None,
     behavior_scale: float = 1.0,
     gwr: GWRB | None = None,
@@ -57,6 +58,7 @@ def training_env(
         base_env: Simulations.
         source: Draws the task and the demonstration of each episode.
         encoders: Trained encoders; None if neither latents nor the intrinsic reward are used.
+        state: Scale of the ground truth; None if policies do not read it.
         context: What the policy's ``"context"`` is: the behavior b of ``gwr``, the demonstration's
             embedding phi in its place, the task's label one-hot, or nothing.
         behavior_scale: Factor of behavior or embedding in the context.
@@ -65,10 +67,10 @@ def training_env(
         beta: Weight of the intrinsic reward; with 0, it is neither added nor measured.
 
     Raises:
-        ValueError: If encoders are needed and missing.
+        ValueError: If encoders or the scale of the ground truth are needed and missing.
     """
     transforms: list[Transform] = [
-        encode(config, encoders),  # pixels -> latent
+        encode(config, encoders, state),  # pixels -> latent
         StepCounter(config.max_steps),
         source,  # -> task, demo_embedding
     ]
@@ -91,23 +93,31 @@ def training_env(
 
 
 def observation_env(
-    config: AlgorithmConfig, base_env: EnvBase, encoders: Representation | None
+    config: AlgorithmConfig,
+    base_env: EnvBase,
+    encoders: Representation | None,
+    state: StateColumns | None = None,
 ) -> TransformedEnv:
     """Return the environment of test episodes, whose policies are already conditioned."""
-    return TransformedEnv(base_env, Compose([encode(config, encoders), clip(config)]))
+    return TransformedEnv(base_env, Compose([encode(config, encoders, state), clip(config)]))
 
 
-def encode(config: AlgorithmConfig, encoders: Representation | None) -> Transform:
+def encode(
+    config: AlgorithmConfig, encoders: Representation | None, state: StateColumns | None = None
+) -> Transform:
     """Return the transform from the simulation's observation to the state.
 
     Raises:
-        ValueError: If ``config.state`` is ``"latent"`` and ``encoders`` is None.
+        ValueError: If ``config.state`` is ``"latent"`` and ``encoders`` is None, or it is
+            ``"state"`` and ``state``, the scale of the ground truth, is None.
     """
     if config.state == "latent":
         if encoders is None:
             raise ValueError("state='latent' needs trained encoders")
         return FrameEncoder(encoders.vae, del_keys=True)
-    loc, scale = torch.tensor(STATE_CENTER), torch.tensor(STATE_SCALE)
+    if state is None:
+        raise ValueError("state='state' needs a scene with ground truth: learn from frames instead")
+    loc, scale = torch.tensor(state.center), torch.tensor(state.scale)
     return ObservationNorm(loc, scale, in_keys=["state"], standard_normal=True)
 
 

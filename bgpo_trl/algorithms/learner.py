@@ -43,7 +43,7 @@ class Learner:
     def act(
         self, tensordict: TensorDictBase, generators: Sequence[torch.Generator], expert: Tensor
     ) -> Tensor:
-        """Return actions of a training step, ``[S, 4]`` in [-1, 1], on the CPU.
+        """Return actions of a training step, ``[S, A]`` in [-1, 1], on the CPU.
 
         The policies' inputs are ``[S]``, with one generator of exploration noise per seed;
         ``expert`` ``[S]`` selects the expert that acts.
@@ -56,7 +56,7 @@ class Learner:
         return tensordict.unsqueeze(1).expand(*self.actor.batch_size)
 
     def explore(self, action: Tensor, generators: Sequence[torch.Generator]) -> Tensor:
-        """Add Gaussian noise to actions ``[S, 4]`` and clip them to [-1, 1]."""
+        """Add Gaussian noise to actions ``[S, A]`` and clip them to [-1, 1]."""
         noise = self.noise * normal(generators, action.shape[1:])
         return (action.cpu() + noise).clamp(-1.0, 1.0)
 

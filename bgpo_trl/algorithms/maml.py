@@ -15,6 +15,7 @@ from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.modules.actor_critic import Actor
 from bgpo_trl.objectives.maml import MAMLLoss
+from bgpo_trl.scenes import Scene
 from bgpo_trl.seeding import generators
 
 
@@ -47,11 +48,15 @@ class MAML(TaskAlgorithm):
         bank: DemonstrationBank,
         encoders: Representation | None = None,
         device: torch.device | str = "cpu",
+        scene: Scene | str = "nico",
     ) -> None:
-        super().__init__(config, seeds=seeds, bank=bank, encoders=encoders, device=device)
+        super().__init__(
+            config, seeds=seeds, bank=bank, encoders=encoders, device=device, scene=scene
+        )
         ddpg = config.rl
         self.meta_actor = Actor(
             self.state_size,
+            self.scene.action_size,
             batch_size=[self.n_seeds],
             generator=generators(seeds, "actor"),
             in_keys=self.spec.in_keys,

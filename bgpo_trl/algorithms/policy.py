@@ -49,7 +49,7 @@ class Policy:
 
     @torch.no_grad()
     def act(self, state: Tensor) -> Tensor:
-        """Return actions ``[..., T, M, 4]`` in [-1, 1] for states ``[..., T, M, features]``."""
+        """Return actions ``[..., T, M, A]`` in [-1, 1] for states ``[..., T, M, features]``."""
         inputs: TensorDictBase = TensorDict({self.state_key: state}, state.shape[:-1])
         if self.context is not None:
             inputs["context"] = self.context

@@ -42,6 +42,8 @@ class LearnerSpec:
     """Device of networks and batches."""
     experts: Sequence[int] = (0,)
     """Numbers of the experts ``E``. Seed and number determine an expert's initial weights."""
+    action_size: int = 4
+    """Number of components of an action."""
 
     def generators(self, name: str) -> list[torch.Generator]:
         """Return one generator per expert of each seed, for one purpose."""
@@ -84,6 +86,7 @@ class LearnerSpec:
     ) -> Any:
         made = network(
             self.in_features,
+            self.action_size,
             in_keys=self.in_keys,
             hidden_sizes=config.hidden_sizes,
             batch_size=batch_size,
@@ -127,7 +130,7 @@ def make_sac(config: SACConfig, spec: LearnerSpec) -> Learner:
         actor,
         spec.twin_critics(config),
         alpha_init=config.alpha_init,
-        target_entropy=config.target_entropy,
+        target_entropy=config.target_entropy * spec.action_size,
         entropy_in_target=config.entropy_in_target,
         generator=spec.generators("policy samples"),
         **spec.loss_options(config),

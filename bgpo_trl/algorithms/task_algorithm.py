@@ -19,6 +19,7 @@ from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.replay import GroupReplay
 from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.objectives.off_policy import OffPolicyLoss
+from bgpo_trl.scenes import Scene
 from bgpo_trl.seeding import generators
 from bgpo_trl.transforms import DemonstrationSource
 
@@ -49,12 +50,16 @@ class TaskAlgorithm(Algorithm):
         bank: DemonstrationBank,
         encoders: Representation | None = None,
         device: torch.device | str = "cpu",
+        scene: Scene | str = "nico",
     ) -> None:
-        super().__init__(config, seeds=seeds, bank=bank, encoders=encoders, device=device)
+        super().__init__(
+            config, seeds=seeds, bank=bank, encoders=encoders, device=device, scene=scene
+        )
         self.spec = LearnerSpec(
             seeds=seeds,
             in_keys=[config.state],
             in_features=self.state_size,
+            action_size=self.scene.action_size,
             return_bounds=(0.0, 1.0),
             device=self.device,
             experts=range(self.n_tasks),
@@ -78,11 +83,11 @@ class TaskAlgorithm(Algorithm):
 
     def make_env(self, base_env: EnvBase, source: DemonstrationSource) -> TransformedEnv:
         """Return an environment without context."""
-        return training_env(self.config, base_env, source, self.encoders)
+        return training_env(self.config, base_env, source, self.encoders, state=self.scene.state)
 
     @torch.no_grad()
     def act(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the ``action`` ``[S, 4]`` of the tasks' policies with exploration noise."""
+        """Write the ``action`` ``[S, A]`` of the tasks' policies with exploration noise."""
         seen = self.to_device(tensordict.select(self.config.state))
         policies = networks_of(
             self.loss.actor_network_params, torch.arange(self.n_seeds), tensordict["task"]

@@ -105,8 +105,8 @@ class SACConfig(RLConfig):
     """See `RLConfig`."""
     alpha_init: float = 0.1
     """Initial temperature. Ours: 1 would long outweigh a return of 1."""
-    target_entropy: float = -4.0
-    """Entropy maintained by the temperature, in nats: minus the number of actions (Haarnoja et
+    target_entropy: float = -1.0
+    """Entropy maintained by the temperature, in nats for each component of an action (Haarnoja et
     al.)."""
     entropy_in_target: bool = False
     """Whether the critics' targets include the entropy. Ours: False as in Ball et al. (2023),

@@ -8,7 +8,9 @@ from typing import Literal
 
 from bgpo_trl.configs.algorithms import AlgorithmConfig, BGPOConfig
 from bgpo_trl.configs.checks import at_least, check, check_seeds, whole
-from suites import nico
+
+PAPER_TASKS = ("grasp_glass", "push_green_to_glass", "push_green_to_white")
+"""Names of the paper's tasks, in its order."""
 
 
 @dataclass(frozen=True)
@@ -19,8 +21,10 @@ class RunConfig:
     """Seeds, run as one batch (Sec. IV: 10)."""
     episodes: int = 20_000
     """Training episodes of each seed (Figs. 6 and 8)."""
-    tasks: tuple[str, ...] = nico.PAPER_TASKS
-    """Names of the tasks, as in the suite and the CSV files; by default the paper's three."""
+    scene: str = "nico"
+    """Name of the robot with its tasks in `bgpo_trl.scenes.SCENES`."""
+    tasks: tuple[str, ...] = PAPER_TASKS
+    """Names of the tasks, as in the scene and the CSV files; by default the paper's three."""
     task_starts: tuple[int, ...] = (0, 7_000, 13_000)
     """Episode from which each task is presented (Sec. IV-C); all 0 is the concurrent setting."""
     schedule: Literal["practised", "sequential"] = "practised"
@@ -55,8 +59,9 @@ class RunConfig:
         schedules = ("practised", "sequential")
         check(self, ("schedule", self.schedule in schedules, " or ".join(schedules)))
         check(self, ("tasks", not isinstance(self.tasks, str), "a tuple of names"))
-        nico.check_tasks(self.tasks)
-        nico.check_spread(self.spread)
+        distinct = len(set(self.tasks)) == len(self.tasks)
+        check(self, ("tasks", distinct, "names of different tasks"))
+        check(self, ("spread", 0.0 <= self.spread <= 1.0, "from 0 (nominal places) to 1"))
         starts = self.task_starts
         check(
             self,

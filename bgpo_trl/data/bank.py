@@ -10,8 +10,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from bgpo_trl.configs.runs import PAPER_TASKS
 from bgpo_trl.files.tensor_file import digest, load_tensors, save_tensors
-from suites import nico
 
 _LATENT_CODES, _ACTION_CODES = 25.0, 127.0
 """Int8 codes per standard deviation of a latent (range +-5.08) and per unit of action."""
@@ -25,7 +25,7 @@ class DemonstrationSteps:
 
     Attributes:
         latent: Frames of all demonstrations, concatenated, int8 ``[F, 64]``.
-        action: Action from each frame to the next, int8 ``[F, 4]``; undefined at a last frame.
+        action: Action from each frame to the next, int8 ``[F, A]``; undefined at a last frame.
         first: Index of the first frame of each demonstration, int64 ``[N]``.
         length: Number of frames of each, int64 ``[N]``; 0 if its steps are not kept.
 
@@ -56,7 +56,7 @@ class DemonstrationSteps:
 
         Args:
             latent: Standardized latents ``[N, T, 64]``; clipped at five standard deviations.
-            action: Actions in [-1, 1], ``[N, T - 1, 4]``.
+            action: Actions in [-1, 1], ``[N, T - 1, A]``.
             length: Number of frames to keep of each, int64 ``[N]``.
         """
         valid = torch.arange(latent.shape[1]) < length.unsqueeze(-1)
@@ -73,7 +73,7 @@ class DemonstrationSteps:
         return self.latent[frame] / _LATENT_CODES
 
     def actions(self, frame: Tensor) -> Tensor:
-        """Return the actions taken at frames int64 ``[...]``, float32 ``[..., 4]``."""
+        """Return the actions taken at frames int64 ``[...]``, float32 ``[..., A]``."""
         return self.action[frame] / _ACTION_CODES
 
     def select(self, rows: Tensor) -> DemonstrationSteps:
@@ -110,6 +110,7 @@ class DemonstrationBank:
         encoder_id: Identity of the encoders that embedded them (`Representation.identity`), or
             ``None`` if unknown.
         spread: Share of the range of start states that the demonstrations were recorded over.
+        scene_version: Version of the scene that they show, or ``None`` if unknown.
 
     Raises:
         ValueError: If a label has no name, or ``steps`` are of another number of demonstrations.
@@ -118,10 +119,11 @@ class DemonstrationBank:
     embedding: Tensor
     task: Tensor
     train: Tensor
-    tasks: tuple[str, ...] = nico.PAPER_TASKS
+    tasks: tuple[str, ...] = PAPER_TASKS
     steps: DemonstrationSteps | None = None
     encoder_id: str | None = None
     spread: float = 1.0
+    scene_version: str | None = None
 
     def __post_init__(self) -> None:
         unknown = self.task[(self.task < 0) | (self.task >= len(self.tasks))]
@@ -187,12 +189,17 @@ class DemonstrationBank:
         """Concatenate two banks; task names found only in ``other`` are appended.
 
         Raises:
-            ValueError: If they were embedded by different encoders.
+            ValueError: If they were embedded by different encoders, or show different scenes.
         """
         if self.encoder_id != other.encoder_id:
             raise ValueError(
                 f"one bank was embedded by the encoders {self.encoder_id}, the other by "
                 f"{other.encoder_id}: embed both by the same (bgpo_trl.encoders.make_bank)"
+            )
+        if self.scene_version != other.scene_version:
+            raise ValueError(
+                f"one bank shows the scene {self.scene_version}, the other {other.scene_version}: "
+                "record both in the same"
             )
         tasks = tuple(dict.fromkeys((*self.tasks, *other.tasks)))
         label = torch.tensor([tasks.index(name) for name in other.tasks])
@@ -204,6 +211,7 @@ class DemonstrationBank:
             None if self.steps is None or other.steps is None else self.steps + other.steps,
             self.encoder_id,
             min(self.spread, other.spread),
+            self.scene_version,
         )
 
     def _select(self, rows: Tensor) -> DemonstrationBank:
@@ -225,11 +233,12 @@ class DemonstrationBank:
         if self.encoder_id is None:
             raise ValueError("set encoder_id: a saved bank says which encoders embedded it")
         meta = {
-            "scene_version": nico.scene_version(),
             "encoder_id": self.encoder_id,
             "tasks": ",".join(self.tasks),
             "spread": str(self.spread),
         }
+        if self.scene_version is not None:
+            meta["scene_version"] = self.scene_version
         save_tensors(path, self._tensors(), meta)
 
     def _tensors(self) -> dict[str, Tensor]:
@@ -244,10 +253,8 @@ class DemonstrationBank:
         """Read a bank.
 
         Raises:
-            ValueError: If it is missing, damaged, or was made in another scene or by other
-                encoders.
+            ValueError: If it is missing, damaged, or was made by other encoders.
         """
-        wanted = {"scene_version": nico.scene_version(), "encoder_id": encoder_id}
         remedy = (
             "make it again with `python -m bgpo_trl.encoders.make_bank`, or use `--train-encoders`"
         )
@@ -260,7 +267,14 @@ class DemonstrationBank:
             steps = DemonstrationSteps(**columns) if columns else None
             tasks = tuple(meta["tasks"].split(","))
             spread = float(meta["spread"])
-            bank = cls(**rows, tasks=tasks, steps=steps, encoder_id=encoder_id, spread=spread)
+            bank = cls(
+                **rows,
+                tasks=tasks,
+                steps=steps,
+                encoder_id=encoder_id,
+                spread=spread,
+                scene_version=meta.get("scene_version"),
+            )
         except FileNotFoundError:
             raise ValueError(f"there is no demonstration bank at {path}; {remedy}") from None
         except (ValueError, TypeError, KeyError) as error:
@@ -274,7 +288,9 @@ class DemonstrationBank:
             and embedding.isfinite().all()
         ):
             raise ValueError(f"{path} is damaged (wrong shapes, or NaN); {remedy}")
-        found = {key: meta.get(key) for key in wanted}
-        if found != wanted:
-            raise ValueError(f"{path} was made for {found}, not for {wanted}; {remedy}")
+        if meta.get("encoder_id") != encoder_id:
+            raise ValueError(
+                f"{path} was embedded by the encoders {meta.get('encoder_id')}, not by "
+                f"{encoder_id}; {remedy}"
+            )
         return bank

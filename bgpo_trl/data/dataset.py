@@ -5,44 +5,41 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 from tensordict import MemoryMappedTensor, TensorDict
 
 from bgpo_trl.files.writing import make_folder, write_json
-from suites import nico
-from suites.nico.base import STATE_SIZE
-from suites.nico.rendering import FRAME_HEIGHT, FRAME_WIDTH
-
-MAX_STEPS = 50
-"""Actions of the longest demonstration."""
+from bgpo_trl.scenes import SCENES, Scene, find_scene
 
 _META = "dataset.json"
-_REMEDY = "record it again with `python -m bgpo_trl.data.recording PATH`"
+_REMEDY = "record it again with `python -m bgpo_trl.data.recording PATH`, or write it again"
 
 
 def load_demonstrations(path: str | Path, *, verify: bool = True) -> TensorDict:
-    """Open a dataset recorded by `record_demonstrations`, memory-mapped.
+    """Open a dataset of `record_demonstrations` or `write_demonstrations`, memory-mapped.
 
     ``verify`` compares the checksum, which reads the whole dataset.
 
     Raises:
-        ValueError: If it is missing, incomplete, damaged or of another scene version.
+        ValueError: If it is missing, incomplete, damaged or of another version of its scene.
     """
     path = Path(path)
     meta = read_meta(path)
-    version = nico.scene_version()
-    if meta.get("scene_version") != version:
+    # The scene of demonstrations from elsewhere need not be known here.
+    version = find_scene(meta["scene"]).version if meta["scene"] in SCENES else None
+    if version not in (None, meta["scene_version"]):
         raise ValueError(
-            f"{path} was recorded in scene {meta.get('scene_version')!r}, this is {version}; "
-            f"{_REMEDY}"
+            f"{path} was recorded in scene {meta['scene_version']!r}, this is {version}; {_REMEDY}"
         )
     if not meta.get("checksum"):
         raise ValueError(
             f"the recording at {path} is not complete; resume it with the same command"
         )
-    dataset = open_dataset(path, meta["per_task"] * len(meta["tasks"]))
+    dataset = open_dataset(path, meta)
     if verify and checksum_of(dataset) != meta["checksum"]:
         raise ValueError(f"{path} is damaged (checksum differs); remove it and {_REMEDY}")
     return dataset
@@ -53,14 +50,34 @@ def is_dataset(path: Path) -> bool:
     return (path / _META).exists()
 
 
-def make_dataset(path: Path, n: int) -> TensorDict:
-    """Make the files of ``n`` empty rows.
+def layout_of(
+    scene: Scene, *, max_steps: int | None = None, actions: bool = True
+) -> dict[str, Any]:
+    """Return the settings that fix the sizes of a dataset of a scene.
+
+    Args:
+        scene: The robot.
+        max_steps: Length of the longest episode; by default the scene's.
+        actions: Whether the actions are known.
+    """
+    return {
+        "scene": scene.name,
+        "scene_version": scene.version,
+        "frame_shape": [*scene.frame_shape],
+        "max_steps": max_steps or scene.max_steps,
+        "action_size": scene.action_size if actions else 0,
+        "state_size": 0 if scene.state is None else scene.state.size,
+    }
+
+
+def make_dataset(path: Path, meta: Mapping[str, Any]) -> TensorDict:
+    """Make the files of empty rows, given the settings.
 
     Raises:
         OSError: If there is not enough disk space.
     """
     make_folder(path)
-    dataset = _empty(n)
+    dataset = _empty(meta)
     size = sum(value.numel() * value.element_size() for _, value in dataset.items())
     free = shutil.disk_usage(path).free
     if size > free:  # Writing to a memory map on a full disk would kill the process.
@@ -71,13 +88,13 @@ def make_dataset(path: Path, n: int) -> TensorDict:
     return dataset.memmap_like(str(path))
 
 
-def open_dataset(path: Path, n: int) -> TensorDict:
-    """Open the files of ``n`` rows, memory-mapped.
+def open_dataset(path: Path, meta: Mapping[str, Any]) -> TensorDict:
+    """Open the files, memory-mapped, given the settings.
 
     Raises:
         ValueError: If a file is missing or has another size.
     """
-    expected = _empty(n)
+    expected = _empty(meta)
     for key, value in expected.items():
         file = path / f"{key}.memmap"
         size = value.numel() * value.element_size()
@@ -91,7 +108,7 @@ def open_dataset(path: Path, n: int) -> TensorDict:
         )
         for key, value in expected.items()
     }
-    return TensorDict(tensors, [n])
+    return TensorDict(tensors, expected.batch_size)
 
 
 def checksum_of(dataset: TensorDict) -> str:
@@ -122,28 +139,39 @@ def read_meta(path: Path) -> dict:
         raise ValueError(f"{path} is not a dataset of demonstrations; {_REMEDY}") from None
     except (ValueError, RecursionError):
         meta = None
-    if not isinstance(meta, dict) or not (
-        isinstance(meta.get("tasks"), list)
-        and isinstance(meta.get("per_task"), int)
-        and 0 < meta["per_task"] < 2**31
-    ):
+    if not isinstance(meta, dict) or not _is_complete(meta):
         raise ValueError(f"{path / _META} is damaged; remove {path} and {_REMEDY}")
     return meta
 
 
-def _empty(n: int) -> TensorDict:
-    frames = MAX_STEPS + 1
-    return TensorDict(
-        {
-            "pixels": torch.zeros((), dtype=torch.uint8).expand(
-                n, frames, FRAME_HEIGHT, FRAME_WIDTH, 3
-            ),
-            "state": torch.zeros(()).expand(n, frames, STATE_SIZE),
-            "action": torch.zeros(()).expand(n, MAX_STEPS, 4),
-            "length": torch.zeros((), dtype=torch.int64).expand(n),
-            "task": torch.zeros((), dtype=torch.int64).expand(n),
-            "train": torch.zeros((), dtype=torch.bool).expand(n),
-            "seed": torch.zeros((), dtype=torch.int64).expand(n),
-        },
-        [n],
+def _is_complete(meta: Mapping[str, Any]) -> bool:
+    """Return whether settings name tasks and scene, and sizes that a dataset can have."""
+    sizes = ("max_steps", "action_size", "state_size")
+    return (
+        isinstance(meta.get("tasks"), list)
+        and isinstance(meta.get("scene"), str)
+        and isinstance(meta.get("scene_version"), str)
+        and isinstance(meta.get("frame_shape"), list)
+        and len(meta["frame_shape"]) == 2
+        and all(isinstance(size, int) and 0 < size < 2**13 for size in meta["frame_shape"])
+        and all(isinstance(meta.get(name), int) and 0 <= meta[name] < 2**20 for name in sizes)
+        and isinstance(meta.get("rows"), int)
+        and 0 < meta["rows"] < 2**31
     )
+
+
+def _empty(meta: Mapping[str, Any]) -> TensorDict:
+    n, steps = meta["rows"], meta["max_steps"]
+    number = torch.zeros((), dtype=torch.int64)
+    columns = {
+        "pixels": torch.zeros((), dtype=torch.uint8).expand(n, steps + 1, *meta["frame_shape"], 3),
+        "length": number.expand(n),
+        "task": number.expand(n),
+        "train": torch.zeros((), dtype=torch.bool).expand(n),
+        "seed": number.expand(n),
+    }
+    if meta["state_size"]:
+        columns["state"] = torch.zeros(()).expand(n, steps + 1, meta["state_size"])
+    if meta["action_size"]:
+        columns["action"] = torch.zeros(()).expand(n, steps, meta["action_size"])
+    return TensorDict(columns, [n])

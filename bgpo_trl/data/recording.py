@@ -10,12 +10,12 @@ from typing import Annotated, Any
 import numpy as np
 import torch
 import tyro
-from dm_env import TimeStep
 from tensordict import TensorDict
 
 from bgpo_trl.data.dataset import (
     checksum_of,
     is_dataset,
+    layout_of,
     load_demonstrations,
     make_dataset,
     open_dataset,
@@ -24,16 +24,16 @@ from bgpo_trl.data.dataset import (
 )
 from bgpo_trl.files.progress import progress_bar
 from bgpo_trl.plugins import import_plugin
-from suites import nico
-from suites.nico.base import Environment
-from suites.nico.demonstrator import Demonstrator
-from suites.nico.rendering import FrameRenderer
+from bgpo_trl.scenes import Scene, Simulation, find_scene
+
+_Policy = Callable[[], np.ndarray]
 
 
 def record_demonstrations(
     path: str | Path,
     *,
-    tasks: Sequence[str] = nico.PAPER_TASKS,
+    scene: Scene | str = "nico",
+    tasks: Sequence[str] | None = None,
     per_task: int = 1_200,
     held_out_per_task: int = 200,
     play: bool = False,
@@ -46,49 +46,57 @@ def record_demonstrations(
 
     Row ``i`` depends on ``seed`` and ``i`` alone, so a resumed recording gives the same dataset.
 
-    With ``play``, record play instead: follow a demonstration for up to 30 steps, then act at
-    random until step 50. Trial and error visits states that no demonstration shows.
+    With ``play``, record play instead: follow a demonstration for up to three fifths of the longest
+    episode, then act at random to its end. Trial and error visits states that no demonstration
+    shows.
 
     Args:
         path: Folder of the dataset; made if missing.
-        tasks: Tasks to demonstrate, in the order of their labels.
+        scene: The robot, or its name.
+        tasks: Tasks to demonstrate, in the order of their labels; by default the scene's.
         per_task: Demonstrations of each task (1,200 in Sec. IV-B).
         held_out_per_task: How many of those are held out for test episodes.
         play: Record play instead of demonstrations.
-        spread: Share of the whole range of start states, see `suites.nico.load`.
+        spread: Share of the whole range of start states.
         seed: Seed of the start states and of the demonstrator's noise.
         attempts: Consecutive failures of a demonstrator after which recording stops.
         progress: Whether to show a progress bar.
 
     Returns:
-        A memory-mapped TensorDict ``[N]`` with ``pixels`` uint8 ``[N, 51, 32, 64, 3]``, ``state``
-        ``[N, 51, 16]``, ``action`` ``[N, 50, 4]``, ``length`` int64 ``[N]`` (frames, one more than
-        actions), ``task`` int64 ``[N]``, ``train`` bool ``[N]`` (``False``: held out) and ``seed``
-        int64 ``[N]``; zero beyond the length.
+        A memory-mapped TensorDict ``[N]`` with ``pixels`` uint8 ``[N, T + 1, H, W, 3]``, ``state``
+        ``[N, T + 1, F]`` if the scene has ground truth, ``action`` ``[N, T, A]``, ``length`` int64
+        ``[N]`` (frames, one more than actions), ``task`` int64 ``[N]``, ``train`` bool ``[N]``
+        (``False``: held out) and ``seed`` int64 ``[N]``; zero beyond the length.
 
     Raises:
-        ValueError: If an argument is invalid, or ``path`` holds another recording.
+        ValueError: If an argument is invalid, ``path`` holds another recording, or the scene has no
+            demonstrator.
         OSError: If there is not enough disk space.
         RuntimeError: If there is no OpenGL to render with, or a demonstrator fails too often;
             earlier rows are kept.
     """
-    wanted = _settings(tasks, per_task, held_out_per_task, play, spread, seed, attempts)
+    scene = find_scene(scene)
+    tasks = scene.default_tasks if tasks is None else tasks
+    wanted = _settings(scene, tasks, per_task, held_out_per_task, play, spread, seed, attempts)
     path = Path(path)
     started = is_dataset(path)
     if started and _is_complete(path, wanted):
         return load_demonstrations(path)
     # The renderer comes first, so that a machine without OpenGL fails before writing anything.
-    environments = _environments(tasks, spread)
-    n = per_task * len(tasks)
-    dataset = open_dataset(path, n) if started else make_dataset(path, n)
+    observation = "pixels" if scene.state is None else "both"
+    env = scene.simulate(tasks, batch_size=1, spread=spread, observation=observation)
+    dataset = open_dataset(path, wanted) if started else make_dataset(path, wanted)
     if not started:
         write_meta(path, wanted)
-    _record_rows(dataset, environments, wanted, attempts, progress)
+    recorder = _Recorder(scene, env.simulations[0], seed, attempts)
+    _record_rows(dataset, recorder, wanted, progress)
+    env.close()
     write_meta(path, {**wanted, "checksum": checksum_of(dataset)})
     return dataset
 
 
 def _settings(
+    scene: Scene,
     tasks: Sequence[str],
     per_task: int,
     held_out_per_task: int,
@@ -98,8 +106,13 @@ def _settings(
     attempts: int,
 ) -> dict[str, Any]:
     """Check the arguments and return the settings that identify a recording."""
-    nico.check_tasks(tasks)
-    nico.check_spread(spread)
+    scene.check_tasks(tasks)
+    scene.check_spread(spread)
+    if scene.demonstrator is None:
+        raise ValueError(
+            f"the scene {scene.name!r} has no demonstrator: write demonstrations that you have, "
+            "with write_demonstrations (docs/extending.md)"
+        )
     if not tasks:
         raise ValueError("name at least one of the tasks")
     if seed < 0:
@@ -111,8 +124,9 @@ def _settings(
             f"held_out_per_task is {held_out_per_task}: it must be less than per_task, {per_task}"
         )
     return {
-        "scene_version": nico.scene_version(),
+        **layout_of(scene),
         "tasks": list(tasks),
+        "rows": per_task * len(tasks),
         "per_task": per_task,
         "held_out_per_task": held_out_per_task,
         "spread": float(spread),
@@ -132,19 +146,80 @@ def _is_complete(path: Path, wanted: Mapping[str, Any]) -> bool:
     return bool(meta.get("checksum"))
 
 
-def _environments(tasks: Sequence[str], spread: float) -> list[Environment]:
-    """Return an environment of each task, with one simulation and renderer for all."""
-    physics = nico.Physics.from_xml_string(nico.scene_xml())
-    shared = {"physics": physics, "renderer": FrameRenderer(physics.model.ptr)}
-    return [nico.load(task, spread=spread, observation="both", **shared) for task in tasks]
+class _Recorder:
+    """Demonstrations and play in one simulation, each determined by its row."""
+
+    def __init__(self, scene: Scene, simulation: Simulation, seed: int, attempts: int) -> None:
+        self.scene, self.simulation = scene, simulation
+        self.seed, self.attempts = seed, attempts
+
+    def demonstrate(self, task: int, row: int) -> tuple[dict[str, np.ndarray] | None, int]:
+        """Return the first success, or ``None``, and the number of attempts."""
+        sequence = np.random.SeedSequence([self.seed, row])
+        for attempt in range(1, self.attempts + 1):
+            start, noise = (int(child.generate_state(1)[0]) for child in sequence.spawn(2))
+            episode, success = self._perform(task, start, noise, lambda demonstrator: demonstrator)
+            if success:
+                return episode, attempt
+        return None, self.attempts
+
+    def play(self, task: int, row: int) -> dict[str, np.ndarray]:
+        """Return an episode that follows a demonstration, then moves at random.
+
+        The movement is jerky in some episodes and smooth in others.
+        """
+        rng, size = np.random.default_rng([self.seed, row, 1]), self.scene.action_size
+        start, noise = (int(value) for value in rng.integers(2**32, size=2))
+        n_followed = rng.integers(self.scene.max_steps * 3 // 5 + 1)
+        persistence, spread = rng.uniform(0, 0.9), rng.uniform(0.2, 0.8)
+        movement, steps = rng.standard_normal(size), 0
+
+        def deviate(demonstrator: _Policy) -> _Policy:
+            def act() -> np.ndarray:
+                nonlocal movement, steps
+                steps += 1
+                if steps <= n_followed:
+                    return demonstrator()
+                jerk = (1 - persistence**2) ** 0.5 * rng.standard_normal(size)
+                movement = persistence * movement + jerk
+                return np.clip(spread * movement, -1.0, 1.0)
+
+            return act
+
+        return self._perform(task, start, noise, deviate)[0]
+
+    def _perform(
+        self, task: int, start: int, noise: int, policy_of: Callable[[_Policy], _Policy]
+    ) -> tuple[dict[str, np.ndarray], bool]:
+        """Return an episode from the start with seed ``start``, and whether it succeeded.
+
+        ``policy_of`` returns the policy that acts, given the demonstrator with that noise.
+        """
+        simulation, scene = self.simulation, self.scene
+        simulation.seed(start)
+        simulation.reset(task)
+        assert scene.demonstrator is not None  # checked before
+        act = policy_of(scene.demonstrator(simulation, task, noise))
+        frames, states, actions = [simulation.frame()], [self._state()], []
+        success = False
+        for _ in range(scene.max_steps):
+            actions.append(act())
+            success, failure = simulation.step(actions[-1])
+            frames.append(simulation.frame())
+            states.append(self._state())
+            if success or failure:
+                break
+        episode = {"pixels": np.stack(frames), "action": np.stack(actions)}
+        if scene.state is not None:
+            episode["state"] = np.stack(states)
+        return episode, success
+
+    def _state(self) -> np.ndarray:
+        return np.empty(0) if self.scene.state is None else self.simulation.state().copy()
 
 
 def _record_rows(
-    dataset: TensorDict,
-    environments: Sequence[Environment],
-    wanted: Mapping[str, Any],
-    attempts: int,
-    progress: bool,
+    dataset: TensorDict, recorder: _Recorder, wanted: Mapping[str, Any], progress: bool
 ) -> None:
     tasks, per_task, seed = wanted["tasks"], wanted["per_task"], wanted["seed"]
     play, n_shown = "play" in wanted, per_task - wanted["held_out_per_task"]
@@ -161,86 +236,30 @@ def _record_rows(
     for row in bar:
         task = row // per_task
         if play:
-            episode = _play(environments[task], seed, row)
+            episode = recorder.play(task, row)
         else:
-            episode, tries = _demonstrate(environments[task], seed, row, attempts)
+            episode, tries = recorder.demonstrate(task, row)
             tried[task] += tries
             if episode is None:
                 raise RuntimeError(
-                    f"the demonstrator of {tasks[task]!r} failed {attempts} times in a row "
-                    f"({done[task]} of {tried[task]} attempts succeeded, "
-                    f"{done[task] / tried[task]:.0%}): fix its demonstration(), or raise attempts"
+                    f"the demonstrator of {tasks[task]!r} failed {recorder.attempts} times in a "
+                    f"row ({done[task]} of {tried[task]} attempts succeeded, "
+                    f"{done[task] / tried[task]:.0%}): fix it, or raise attempts"
                 )
             done[task] += 1
-        n_frames = len(episode["pixels"])
-        for key in ("pixels", "state", "action"):
-            dataset[key][row, : len(episode[key])] = torch.from_numpy(episode[key])
+        for key, values in episode.items():
+            dataset[key][row, : len(values)] = torch.from_numpy(values)
         dataset["task"][row] = task
         dataset["seed"][row] = seed
         dataset["train"][row] = row % per_task < n_shown
         # Written last, since a row whose length is 0 is recorded again.
-        dataset["length"][row] = n_frames
-
-
-def _demonstrate(
-    env: Environment, seed: int, row: int, attempts: int
-) -> tuple[dict[str, np.ndarray] | None, int]:
-    """Return the first success, or ``None``, and the number of attempts."""
-    sequence = np.random.SeedSequence([seed, row])
-    for attempt in range(1, attempts + 1):
-        start, noise = (int(child.generate_state(1)[0]) for child in sequence.spawn(2))
-        demonstrator = Demonstrator(env, seed=noise)
-        episode, reward = _perform(env, start, demonstrator, demonstrator)
-        if reward:
-            return episode, attempt
-    return None, attempts
-
-
-def _play(env: Environment, seed: int, row: int) -> dict[str, np.ndarray]:
-    """Return an episode that follows a demonstration, then moves at random, jerkily or smoothly."""
-    rng = np.random.default_rng([seed, row, 1])
-    start, noise = (int(value) for value in rng.integers(2**32, size=2))
-    demonstrator = Demonstrator(env, seed=noise)
-    n_followed, persistence, spread = rng.integers(31), rng.uniform(0, 0.9), rng.uniform(0.2, 0.8)
-    movement, steps = rng.standard_normal(4), 0
-
-    def act(timestep: TimeStep) -> np.ndarray:
-        nonlocal movement, steps
-        steps += 1
-        if steps <= n_followed:
-            return demonstrator(timestep)
-        movement = persistence * movement + (1 - persistence**2) ** 0.5 * rng.standard_normal(4)
-        return np.clip(spread * movement, -1.0, 1.0)
-
-    return _perform(env, start, demonstrator, act)[0]
-
-
-def _perform(
-    env: Environment,
-    start: int,
-    demonstrator: Demonstrator,
-    policy: Callable[[TimeStep], np.ndarray],
-) -> tuple[dict[str, np.ndarray], float]:
-    """Return an episode from the start with seed ``start``, and its last reward."""
-    env.task.random.seed(start)
-    timestep = env.reset()
-    demonstrator.reset()
-    observations, actions = [timestep.observation], []
-    while not timestep.last():
-        actions.append(policy(timestep))
-        timestep = env.step(actions[-1])
-        observations.append(timestep.observation)
-    episode = {
-        "pixels": np.stack([o["pixels"] for o in observations]),
-        "state": np.stack([o["privileged_state"] for o in observations]),
-        "action": np.stack(actions),
-    }
-    return episode, float(timestep.reward)
+        dataset["length"][row] = len(episode["pixels"])
 
 
 def main(
     path: tyro.conf.Positional[Path],
-    tasks: tuple[str, ...] = nico.PAPER_TASKS,
+    scene: str = "nico",
+    tasks: tuple[str, ...] | None = None,
     module: Annotated[str | None, tyro.conf.arg(name="import")] = None,
     per_task: int = 1_200,
     held_out_per_task: int = 200,
@@ -252,8 +271,9 @@ def main(
 
     Args:
         path: Folder of the dataset.
-        tasks: Tasks to demonstrate.
-        module: Module that adds tasks with nico.add_task, imported first; here or installed.
+        scene: Name of the robot.
+        tasks: Tasks to demonstrate; by default the scene's, for NICO the paper's three.
+        module: Module that adds scenes or tasks, imported first; here or installed.
         per_task: Demonstrations of each task.
         held_out_per_task: How many of those are held out for test episodes.
         play: Record random play instead of demonstrations.
@@ -263,6 +283,7 @@ def main(
     import_plugin(module)
     record_demonstrations(
         path,
+        scene=scene,
         tasks=tasks,
         per_task=per_task,
         held_out_per_task=held_out_per_task,

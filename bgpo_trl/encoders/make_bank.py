@@ -8,12 +8,13 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 import tyro
 from tensordict import TensorDictBase
 
+from bgpo_trl.configs.runs import PAPER_TASKS
 from bgpo_trl.data.bank import DemonstrationBank, DemonstrationSteps
 from bgpo_trl.data.dataset import load_demonstrations, read_meta
 from bgpo_trl.encoders.pretrained import default_weights
@@ -22,7 +23,7 @@ from bgpo_trl.encoders.representation import (
     encode_frames,
     load_representation,
 )
-from suites import nico
+from bgpo_trl.plugins import import_plugin
 
 
 @torch.no_grad()
@@ -30,7 +31,7 @@ def make_bank(
     representation: Representation,
     dataset: TensorDictBase,
     *,
-    tasks: Sequence[str] = nico.PAPER_TASKS,
+    tasks: Sequence[str] = PAPER_TASKS,
     actions: Literal["inferred", "recorded"] = "inferred",
     spread: float = 1.0,
 ) -> DemonstrationBank:
@@ -38,28 +39,31 @@ def make_bank(
 
     Args:
         representation: The trained encoders.
-        dataset: Reads ``pixels`` ``[N, T, 32, 64, 3]``, ``length``, ``task`` and ``train`` ``[N]``,
-            and ``action`` ``[N, T - 1, 4]``.
+        dataset: Reads ``pixels`` ``[N, T, H, W, 3]``, ``length``, ``task`` and ``train`` ``[N]``,
+            and ``action`` ``[N, T - 1, A]``.
         tasks: Task names, in the order of their labels.
         actions: ``"inferred"`` stores the actions that the inverse model infers from the
             frames, the only actions that an observer of a demonstration has; ``"recorded"`` stores
-            the true ones, for comparison.
+            the true ones, for comparison. Without an inverse model, or recorded actions, the bank
+            has no steps: embeddings alone, without demonstrations as experience.
         spread: Share of the range of start states that the dataset was recorded over.
     """
     length = dataset["length"]
     latent = encode_frames(representation.vae, dataset)
-    action = dataset["action"]
+    action = dataset.get("action", None)
     if actions == "inferred":
-        action = representation.inverse(latent, length)
+        inverse = representation.inverse
+        action = None if inverse is None else inverse(latent, length)
     train = dataset["train"].clone()
     return DemonstrationBank(
         representation.lae.encode(latent, length),
         dataset["task"].clone(),
         train,
         tuple(tasks),
-        DemonstrationSteps.of(latent, action, length * train),
+        None if action is None else DemonstrationSteps.of(latent, action, length * train),
         representation.identity,
         spread,
+        representation.metadata.get("scene_version"),
     )
 
 
@@ -67,6 +71,7 @@ def main(
     dataset: tyro.conf.Positional[Path],
     out: tyro.conf.Positional[Path],
     weights: Path | None = None,
+    module: Annotated[str | None, tyro.conf.arg(name="import")] = None,
     actions: Literal["inferred", "recorded"] = "inferred",
 ) -> None:
     """Embed a recorded dataset with trained encoders.
@@ -74,12 +79,14 @@ def main(
     Args:
         dataset: Folder of the recorded demonstrations.
         out: Bank to write.
-        weights: Encoder weights; the pretrained ones by default.
+        weights: Encoder weights; by default those that come with the scene.
+        module: Module that adds the scene, imported first; here or installed.
         actions: Actions of the stored demonstrations, inferred from frames or recorded.
     """
-    weights = default_weights() if weights is None else weights
-    encoders = load_representation(weights, scene_version=nico.scene_version())
+    import_plugin(module)
     meta = read_meta(dataset)
+    weights = default_weights(scene=meta["scene"]) if weights is None else weights
+    encoders = load_representation(weights, scene_version=meta["scene_version"])
     bank = make_bank(
         encoders,
         load_demonstrations(dataset),

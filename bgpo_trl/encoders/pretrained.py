@@ -8,44 +8,60 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cache
-from importlib import resources
 from pathlib import Path
 
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.encoders.representation import Representation, load_representation
 from bgpo_trl.files.tensor_file import load_tensors
-from suites import nico
-
-_PAPER, _EIGHT = "nico.safetensors", "nico_eight.safetensors"
+from bgpo_trl.scenes import Scene, find_scene
 
 
 def load_pretrained(
-    weights: str | Path | None = None, *, tasks: Sequence[str] = nico.PAPER_TASKS
+    weights: str | Path | None = None,
+    *,
+    tasks: Sequence[str] | None = None,
+    scene: Scene | str = "nico",
 ) -> tuple[Representation, DemonstrationBank]:
     """Load encoders and the bank beside them.
 
     Args:
         weights: File of the encoders; by default the shipped ones for ``tasks``, see
             `default_weights`.
-        tasks: Names of tasks.
+        tasks: Names of tasks; by default the scene's.
+        scene: The robot, or its name.
 
     Raises:
         ValueError: If either file is missing, damaged or was made for another scene.
     """
-    weights = default_weights(tasks) if weights is None else Path(weights)
-    encoders = load_representation(weights, scene_version=nico.scene_version())
-    bank = DemonstrationBank.load(bank_path(weights), encoder_id=encoders.identity)
+    scene = find_scene(scene)
+    weights = default_weights(tasks, scene=scene) if weights is None else Path(weights)
+    encoders = load_representation(weights, scene_version=scene.version)
+    path = bank_path(weights)
+    bank = DemonstrationBank.load(path, encoder_id=encoders.identity)
+    if bank.scene_version not in (None, scene.version):
+        raise ValueError(
+            f"{path} shows the scene {bank.scene_version}, this is {scene.version}: record and "
+            "embed demonstrations of this scene"
+        )
     return encoders, bank
 
 
-def default_weights(tasks: Sequence[str] = nico.PAPER_TASKS) -> Path:
-    """Return the path of the shipped encoders for some tasks.
+def default_weights(tasks: Sequence[str] | None = None, *, scene: Scene | str = "nico") -> Path:
+    """Return the path of the encoders that come with a scene, for some of its tasks.
 
-    These are the encoders of eight tasks if one of the suite's further five is among them, and
-    otherwise, also for custom tasks, those of the paper's three.
+    For NICO, these are the encoders of eight tasks if one of the suite's further five is among
+    them, and otherwise, also for custom tasks, those of the paper's three.
+
+    Raises:
+        ValueError: If none come with the scene.
     """
-    further = set(nico.ALL_TASKS) - set(nico.PAPER_TASKS)
-    return _path(_PAPER if further.isdisjoint(tasks) else _EIGHT)
+    scene = find_scene(scene)
+    if scene.weights is None:
+        raise ValueError(
+            f"no encoders come with the scene {scene.name!r}: train some (--train-encoders), or "
+            "name their file (--encoders)"
+        )
+    return scene.weights.choose(scene.default_tasks if tasks is None else tasks)
 
 
 def bank_path(weights: Path) -> Path:
@@ -53,32 +69,26 @@ def bank_path(weights: Path) -> Path:
     return weights.with_name(f"{weights.stem}_bank{weights.suffix}")
 
 
-def find_weights(identity: str | None) -> Path:
-    """Return the path of the shipped encoders with an identity.
+def find_weights(identity: str | None, scene: Scene | str = "nico") -> Path | None:
+    """Return the path of the encoders with an identity that come with a scene; None if none do."""
+    weights = find_scene(scene).weights
+    files = () if weights is None else weights.files
+    return next((path for path in files if identity == _identity(path)), None)
 
-    Falls back to the encoders of the paper's tasks if no shipped ones have this identity.
-    """
-    return _path(_EIGHT if identity is not None and identity == _identity(_EIGHT) else _PAPER)
 
+def weights_of_bank(bank: Path, scene: Scene | str = "nico") -> Path:
+    """Return the path of the encoders of a scene that embedded a bank.
 
-def weights_of_bank(bank: Path) -> Path:
-    """Return the path of the shipped encoders that embedded a bank.
-
-    Falls back to the encoders of the paper's tasks if others embedded it, or it cannot be read.
+    Falls back to those of its usual tasks if others embedded it, or it cannot be read.
     """
     try:
         metadata = load_tensors(bank)[1]
     except (FileNotFoundError, ValueError):
         metadata = {}
-    return find_weights(metadata.get("encoder_id"))
+    return find_weights(metadata.get("encoder_id"), scene) or default_weights(scene=scene)
 
 
 @cache
-def _identity(name: str) -> str | None:
+def _identity(path: Path) -> str | None:
     """Return the identity of shipped encoders; None if they are not there."""
-    path = _path(name)
     return load_representation(path).identity if path.exists() else None
-
-
-def _path(name: str) -> Path:
-    return Path(str(resources.files("bgpo_trl") / "weights" / name))

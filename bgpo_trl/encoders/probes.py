@@ -14,6 +14,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import matplotlib.image
 import torch
@@ -37,11 +38,8 @@ from bgpo_trl.modules.inverse_model import InverseModel
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
 from bgpo_trl.objectives.representation import SequenceReconstructionLoss
-from suites import nico
-
-JOINTS = ("yaw", "pitch", "elbow", "hand")
-OBJECTS = ("glass", "green", "white")
-_FIRST_OBJECT = 7  # after 4 joints (rad) and the grip point (m)
+from bgpo_trl.plugins import import_plugin
+from bgpo_trl.scenes import StateColumns, find_scene
 
 
 def probe(
@@ -50,25 +48,29 @@ def probe(
     folder: str | Path | None = None,
     *,
     play: TensorDictBase | None = None,
+    columns: StateColumns | None = None,
 ) -> dict[str, float]:
     """Evaluate trained encoders.
 
     Args:
         representation: The trained encoders.
         dataset: Demonstrations that they were trained on, with their held-out part; reads
-            ``pixels``, ``action``, ``length``, ``train``, ``task`` and ``state`` ``[N, T, 16]``.
+            ``pixels``, ``length``, ``train``, ``task`` and, if they are there, ``action`` and
+            ``state``.
         folder: Folder for ``probes.json`` and ``reconstructions.png``; ``None`` writes nothing.
-        play: Recorded play in the form of the dataset; adds the errors of joints and objects in
-            frames with all objects on the table, as ``play_...``.
+        play: Recorded play in the form of the dataset; adds the errors of joints and objects, as
+            ``play_...``, in frames that ``columns.valid`` accepts.
+        columns: Meaning of ``state``; without it, joints and objects are left out.
 
     Returns:
         A flat dict: ``joint_<name>_rmse_rad`` (linear probe of one latent),
         ``<object>_error_cm`` and ``<object>_linear_error_cm`` (distance of a perceptron's and of a
         linear probe's place from the true one, mean over frames), ``inverse_rmse``, ``inverse_r2``
-        and ``inverse_r2_<joint>`` (actions of the training demonstrations, as they are inferred for
-        the bank), ``reconstruction`` (squared error per frame), ``mean_frame_reconstruction`` (the
-        same for the mean training frame, the level of an untrained VAE), ``sequence_mse`` (of
-        standardized latents, so 1 is the level of predicting the mean), ``task_accuracy_linear``,
+        and ``inverse_r2_<component>`` (actions of the training demonstrations, as they are inferred
+        for the bank; components have the names of the joints if there are as many),
+        ``reconstruction`` (squared error per frame), ``mean_frame_reconstruction`` (the same for
+        the mean training frame, the level of an untrained VAE), ``sequence_mse`` (of standardized
+        latents, so 1 is the level of predicting the mean), ``task_accuracy_linear``,
         ``task_accuracy_nearest`` and ``active_dimensions``.
 
     Raises:
@@ -78,8 +80,8 @@ def probe(
     train, held_out = split(dataset)
     latent, latent_held_out = encode_frames(vae, train), encode_frames(vae, held_out)
     result = {
-        **_probe_state(latent, train, latent_held_out, held_out),
-        **_probe_inverse(representation.inverse, latent, train),
+        **_probe_state(columns, latent, train, latent_held_out, held_out),
+        **_probe_inverse(representation.inverse, latent, train, columns),
         **_probe_reconstruction(vae, train, held_out),
         **_probe_sequences(lae, latent_held_out, held_out),
     }
@@ -90,7 +92,7 @@ def probe(
     phi_held_out = lae.encode(latent_held_out, held_out.get("length"))
     result |= _probe_tasks(phi, train.get("task"), phi_held_out, held_out.get("task"))
     if play is not None:
-        result |= _probe_play(vae, play)
+        result |= _probe_play(vae, play, columns)
     if folder is not None:
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
@@ -148,7 +150,7 @@ def reconstruction_picture(vae: VAE, demonstrations: TensorDictBase, columns: in
     """Return original frames above their reconstructions, each pixel enlarged to 4 x 4.
 
     Frames are spread over demonstrations and time; the picture is uint8
-    ``[2 * 32 * 4, columns * 64 * 4, 3]``.
+    ``[2 * H * 4, columns * W * 4, 3]``.
     """
     share = torch.linspace(0, 1, columns)
     demonstration = (share * (len(demonstrations) - 1)).round().long()
@@ -161,12 +163,15 @@ def reconstruction_picture(vae: VAE, demonstrations: TensorDictBase, columns: in
 
 
 def _probe_state(
+    columns: StateColumns | None,
     latent: Tensor,
     train: TensorDictBase,
     latent_held_out: Tensor,
     held_out: TensorDictBase,
     only: Callable[[Tensor], Tensor] | None = None,
 ) -> dict[str, float]:
+    if columns is None:
+        return {}
     valid, valid_held_out = (
         valid_steps(part.get("length"), latent.shape[1]) for part in (train, held_out)
     )
@@ -178,26 +183,22 @@ def _probe_state(
     read = perceptron_predict(latent[valid], state, latent_held_out[valid_held_out]) - wanted
     joints = {
         f"joint_{name}_rmse_rad": _mean(error[:, i].square()) ** 0.5
-        for i, name in enumerate(JOINTS)
+        for name, i in columns.angles.items()
     }
-    first = {name: _FIRST_OBJECT + 3 * i for i, name in enumerate(OBJECTS)}
     return joints | {
-        f"{name}_{kind}_cm": 100 * _mean(of_kind[:, i : i + 2].norm(dim=-1))
-        for name, i in first.items()
+        f"{name}_{kind}_cm": 100 * _mean(of_kind[:, list(place)].norm(dim=-1))
+        for name, place in columns.places.items()
         for kind, of_kind in (("error", read), ("linear_error", error))
     }
 
 
-def _probe_play(vae: VAE, play: TensorDictBase) -> dict[str, float]:
+def _probe_play(vae: VAE, play: TensorDictBase, columns: StateColumns | None) -> dict[str, float]:
+    if columns is None:
+        return {}
     train, held_out = split(play)
     latent, latent_held_out = encode_frames(vae, train), encode_frames(vae, held_out)
-    errors = _probe_state(latent, train, latent_held_out, held_out, only=_objects_on_table)
+    errors = _probe_state(columns, latent, train, latent_held_out, held_out, only=columns.valid)
     return {f"play_{name}": error for name, error in errors.items()}
-
-
-def _objects_on_table(state: Tensor) -> Tensor:
-    """Return whether all objects are above 0.6 m, bool, for states ``[..., 16]``."""
-    return (state[..., _FIRST_OBJECT + 2 :: 3] > 0.6).all(-1)
 
 
 def _probe_tasks(
@@ -214,14 +215,22 @@ def _probe_tasks(
 
 @torch.no_grad()
 def _probe_inverse(
-    inverse: InverseModel, latent: Tensor, shown: TensorDictBase
+    inverse: InverseModel | None,
+    latent: Tensor,
+    shown: TensorDictBase,
+    columns: StateColumns | None,
 ) -> dict[str, float]:
+    if inverse is None or "action" not in shown:
+        return {}
     action = shown.get("action")
     valid = valid_steps(shown.get("length") - 1, action.shape[1])
     action = action[valid]
     error = inverse(latent, shown.get("length"))[valid] - action
     left, all_ = error.square().sum(0), (action - action.mean(0)).square().sum(0)
-    by_joint = zip(JOINTS, (1 - left / all_).tolist(), strict=True)
+    names = list(range(action.shape[-1]))
+    if columns is not None and len(columns.angles) == len(names):
+        names = list(columns.angles)
+    by_joint = zip(names, (1 - left / all_).tolist(), strict=True)
     return {
         "inverse_rmse": _mean(error.square()) ** 0.5,
         "inverse_r2": 1 - (left.sum() / all_.sum()).item(),
@@ -269,20 +278,25 @@ class Arguments:
     """Folder of the recorded demonstrations."""
     play: tyro.conf.Positional[Path | None] = None
     """Folder of recorded play."""
+    module: Annotated[str | None, tyro.conf.arg(name="import")] = None
+    """Module that adds the scene, imported first; here or installed."""
     weights: Path | None = None
-    """Encoder weights; by default the pretrained ones for the dataset's tasks."""
+    """Encoder weights; by default those of the scene for the dataset's tasks."""
     out: Path = Path("runs/probes")
     """Folder for probes.json and reconstructions.png."""
 
 
 def main(arguments: Arguments) -> None:
     """Run the command line."""
-    weights = arguments.weights
+    import_plugin(arguments.module)
+    meta = read_meta(arguments.dataset)
+    scene, weights = find_scene(meta["scene"]), arguments.weights
     if weights is None:
-        weights = default_weights(read_meta(arguments.dataset)["tasks"])
-    representation = load_representation(weights, scene_version=nico.scene_version())
+        weights = default_weights(meta["tasks"], scene=scene)
+    representation = load_representation(weights, scene_version=scene.version)
     play = None if arguments.play is None else load_demonstrations(arguments.play)
-    probe(representation, load_demonstrations(arguments.dataset), arguments.out, play=play)
+    dataset = load_demonstrations(arguments.dataset)
+    probe(representation, dataset, arguments.out, play=play, columns=scene.state)
 
 
 if __name__ == "__main__":

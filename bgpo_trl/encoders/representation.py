@@ -4,8 +4,9 @@
 demonstrations and play, then the LSTM autoencoder on the latents of the demonstrations;
 `bgpo_trl.encoders.probes` evaluates the result.
 
-A dataset is a TensorDict ``[N]`` with ``pixels`` uint8 ``[N, T, 32, 64, 3]``, ``action``
-``[N, T - 1, A]``, ``length`` int64 ``[N]`` (frames) and ``train`` bool ``[N]``.
+A dataset is a TensorDict ``[N]`` with ``pixels`` uint8 ``[N, T, H, W, 3]``, ``action``
+``[N, T - 1, A]`` if actions are known, ``length`` int64 ``[N]`` (frames) and ``train`` bool
+``[N]``.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -47,14 +48,20 @@ class Representation:
     Attributes:
         vae: Frame encoder; ``vae.latent(pixels)`` is the latent used downstream.
         lae: Sequence encoder; ``lae.encode(latent, length)`` is the embedding phi.
-        inverse: Inverse model on latents; it infers the actions of demonstrations for a bank.
+        inverse: Inverse model on latents; it infers the actions of demonstrations for a bank. None
+            if it was trained on nothing: no recorded actions were known.
         metadata: ``scene_version``, ``spread``, ``config`` (JSON), ``seed``, ``command``.
     """
 
     vae: VAE
     lae: SequenceAutoencoder
-    inverse: InverseModel
+    inverse: InverseModel | None
     metadata: dict[str, str]
+
+    def networks(self) -> list[tuple[str, nn.Module]]:
+        """Return the networks with the prefixes of their weights in files."""
+        found = {"vae.": self.vae, "lae.": self.lae, "inverse.": self.inverse}
+        return [(prefix, network) for prefix, network in found.items() if network is not None]
 
     @property
     def identity(self) -> str:
@@ -83,7 +90,8 @@ def train_representation(
         play: Episodes of play in the same form, which train the frame encoder on states that
             demonstrations never visit. The inverse model then learns from the actions of play
             alone, so that it has seen none of the actions that it infers for demonstrations;
-            without play, it learns from those of demonstrations.
+            without play, it learns from those of demonstrations, and if these lack actions, there
+            is none.
         scene_version: Version of the scene of the frames, stored with the weights.
         spread: Share of the range of start states of the recordings, stored with the weights.
         command: Command line, stored with the weights.
@@ -109,9 +117,11 @@ def train_representation(
     latent = encode_frames(vae, train)
     lae = _train_lae(latent, train.get("length"), config.lae, fit, config.seed)
     own = seen[-1]
-    if play is not None:
-        latent = encode_frames(vae, own)
-    inverse = _train_inverse(latent, own, config.inverse, fit, config.seed)
+    inverse = None
+    if "action" in own:
+        if play is not None:
+            latent = encode_frames(vae, own)
+        inverse = _train_inverse(latent, own, config.inverse, fit, config.seed).cpu()
     metadata = {
         "scene_version": scene_version,
         "spread": str(spread),
@@ -119,7 +129,7 @@ def train_representation(
         "seed": str(config.seed),
         "command": command,
     }
-    return Representation(vae.cpu(), lae.cpu(), inverse.cpu(), metadata)
+    return Representation(vae.cpu(), lae.cpu(), inverse, metadata)
 
 
 def retrain_inverse(
@@ -158,7 +168,7 @@ def retrain_inverse(
 def encode_frames(vae: VAE, dataset: TensorDictBase, batch_size: int = 64) -> Tensor:
     """Encode the valid frames of demonstrations in batches.
 
-    Reads ``pixels`` uint8 ``[N, T, 32, 64, 3]`` and ``length`` ``[N]``.
+    Reads ``pixels`` uint8 ``[N, T, H, W, 3]`` and ``length`` ``[N]``.
 
     Returns:
         Standardized latents, float32 ``[N, T, latent_size]``; zeros at and beyond ``length``.
@@ -175,7 +185,7 @@ def encode_frames(vae: VAE, dataset: TensorDictBase, batch_size: int = 64) -> Te
 def embed_demonstrations(representation: Representation, dataset: TensorDictBase) -> Tensor:
     """Embed whole demonstrations as phi, float32 ``[N, embedding_size]`` (Alg. 1).
 
-    Reads ``pixels`` ``[N, T, 32, 64, 3]`` and ``length`` ``[N]``.
+    Reads ``pixels`` ``[N, T, H, W, 3]`` and ``length`` ``[N]``.
     """
     latent = encode_frames(representation.vae, dataset)
     return representation.lae.encode(latent, dataset.get("length"))
@@ -206,10 +216,18 @@ def load_representation(path: str | Path, *, scene_version: str | None = None) -
             raise ValueError("weights are float32")
         config = json.loads(metadata["config"])
         trained_on = metadata["scene_version"]
-        vae = VAE(config["vae"]["latent_size"], len(tensors["vae.inverse_head.bias"]))
+        vae = VAE(
+            config["vae"]["latent_size"],
+            len(tensors["vae.inverse_head.bias"]),
+            tensors["vae.mean_frame"].shape[:2],
+        )
         lae = SequenceAutoencoder(vae.latent_size, config["lae"]["embedding_size"])
-        inverse = InverseModel(vae.latent_size, vae.action_size, config["inverse"]["hidden_size"])
-        for name, module in (("vae.", vae), ("lae.", lae), ("inverse.", inverse)):
+        inverse = None
+        if any(name.startswith("inverse.") for name in tensors):
+            hidden_size = config["inverse"]["hidden_size"]
+            inverse = InverseModel(vae.latent_size, vae.action_size, hidden_size)
+        encoders = Representation(vae, lae, inverse, metadata)
+        for name, module in encoders.networks():
             module.load_state_dict(
                 {k.removeprefix(name): v for k, v in tensors.items() if k.startswith(name)}
             )
@@ -221,16 +239,16 @@ def load_representation(path: str | Path, *, scene_version: str | None = None) -
         raise ValueError(
             f"{path} was trained on scene {trained_on}, this is scene {scene_version}: {remedy}"
         )
-    for module in (vae, lae, inverse):
+    for _, module in encoders.networks():
         module.eval().requires_grad_(False)
-    return Representation(vae, lae, inverse, metadata)
+    return encoders
 
 
 def _tensors(representation: Representation) -> dict[str, Tensor]:
     return {
-        f"{name}.{key}": value
-        for name in ("vae", "lae", "inverse")
-        for key, value in getattr(representation, name).state_dict().items()
+        f"{prefix}{key}": value
+        for prefix, network in representation.networks()
+        for key, value in network.state_dict().items()
     }
 
 
@@ -252,19 +270,19 @@ def valid_steps(length: Tensor, steps: int) -> Tensor:
 
 
 def valid_frames(dataset: TensorDictBase) -> Tensor:
-    """Return all valid frames, concatenated, uint8 ``[sum(length), 32, 64, 3]``."""
+    """Return all valid frames, concatenated, uint8 ``[sum(length), H, W, 3]``."""
     pixels = dataset.get("pixels")
     return pixels[valid_steps(dataset.get("length"), pixels.shape[1])]
 
 
 def mean_frame(frames: Tensor) -> Tensor:
-    """Return the mean of uint8 ``[F, 32, 64, 3]`` as float32 ``[32, 64, 3]`` in [0, 1]."""
+    """Return the mean of uint8 ``[F, H, W, 3]`` as float32 ``[H, W, 3]`` in [0, 1]."""
     # In parts: a sum over all frames would first convert all of them to int64.
     parts = [part.sum(0, dtype=torch.int64) for part in frames.split(1024)]
     return torch.stack(parts).sum(0) / (255 * len(frames))
 
 
-def _initialized(seed: int, network: type[Network], *sizes: int) -> Network:
+def _initialized(seed: int, network: type[Network], *sizes: Any) -> Network:
     """Return a network with initial weights drawn from a seed, without use of global state."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -276,12 +294,10 @@ def _train_vae(datasets: Sequence[TensorDictBase], config: VAEConfig, fit: Fit, 
     if length.max() < config.window:
         raise ValueError(f"the dataset has no training demonstration of {config.window} frames")
     frames = torch.cat([valid_frames(dataset) for dataset in datasets])
-    # The padding after the last frame of a demonstration is never read.
-    action = torch.cat([dataset.get("action") for dataset in datasets])
-    padded = torch.nn.functional.pad(action, (0, 0, 0, 1))
-    action = padded[valid_steps(length, padded.shape[1])]
+    action = torch.cat([_actions_of_frames(dataset, datasets[-1]) for dataset in datasets])
     # Demonstrations come first. Their actions are unknown, unless there is no play to learn from.
-    n_demonstrated = 0 if len(datasets) == 1 else int(datasets[0].get("length").sum())
+    unknown = len(datasets) > 1 or "action" not in datasets[0]
+    n_demonstrated = int(datasets[0].get("length").sum()) if unknown else 0
     first = length.cumsum(0) - length
     starts = torch.cat(
         [
@@ -298,7 +314,8 @@ def _train_vae(datasets: Sequence[TensorDictBase], config: VAEConfig, fit: Fit, 
         return TensorDict({**windows, "action_known": drawn >= n_demonstrated}, [n_windows])
 
     generator = torch.Generator().manual_seed(seed)
-    vae = _initialized(seed, VAE, config.latent_size, action.shape[-1])
+    frame_shape = frames.shape[1:3]
+    vae = _initialized(seed, VAE, config.latent_size, action.shape[-1], frame_shape)
     vae.mean_frame.copy_(mean_frame(frames))
     loss = VAEInverseLoss(
         vae,
@@ -312,6 +329,18 @@ def _train_vae(datasets: Sequence[TensorDictBase], config: VAEConfig, fit: Fit, 
     chunks = (chunk.to(fit.device) for chunk in frames.split(64))
     vae.set_latent_scale(torch.cat([vae.encode(chunk)[0] for chunk in chunks]))
     return vae
+
+
+def _actions_of_frames(dataset: TensorDictBase, known: TensorDictBase) -> Tensor:
+    """Return the action after each valid frame, ``[sum(length), A]``, 0 where it is unknown.
+
+    ``known`` are episodes that may have actions, which fix their size.
+    """
+    length, n_frames = dataset.get("length"), dataset.get("pixels").shape[1]
+    size = known.get("action").shape[-1] if "action" in known else 1
+    action = dataset.get("action", torch.zeros(1, 1, size).expand(len(length), n_frames - 1, size))
+    # The padding after the last frame of a demonstration is never read.
+    return torch.nn.functional.pad(action, (0, 0, 0, 1))[valid_steps(length, n_frames)]
 
 
 def _train_inverse(

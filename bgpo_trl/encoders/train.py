@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 import tyro
@@ -32,7 +32,8 @@ from bgpo_trl.encoders.representation import (
 from bgpo_trl.files.csv_file import CsvFile
 from bgpo_trl.files.writing import make_folder
 from bgpo_trl.machine import choose_device
-from suites import nico
+from bgpo_trl.plugins import import_plugin
+from bgpo_trl.scenes import Scene, find_scene
 
 _COLUMNS = (
     "stage",
@@ -55,8 +56,10 @@ class Arguments:
     """Folder of the recorded demonstrations."""
     play: tyro.conf.Positional[Path | None] = None
     """Folder of recorded play; without it, the frame encoder learns from demonstrations only."""
+    module: Annotated[str | None, tyro.conf.arg(name="import")] = None
+    """Module that adds the scene, imported first; here or installed."""
     weights: Path | None = None
-    """File to write; by default the pretrained weights of the package for the dataset's tasks."""
+    """File to write; by default the pretrained weights of the scene for the dataset's tasks."""
     keep: Path | None = None
     """Encoders to keep: only their inverse model is trained anew, on play."""
     folder: Path = Path("runs/encoders")
@@ -76,9 +79,10 @@ def train_encoders(
     command: str = "",
     device: torch.device | str = "cpu",
     progress: bool = True,
-    tasks: Sequence[str] = nico.PAPER_TASKS,
+    tasks: Sequence[str] | None = None,
     spread: float = 1.0,
     keep: Representation | None = None,
+    scene: Scene | str = "nico",
 ) -> tuple[Representation, DemonstrationBank]:
     """Train, save and probe both encoders, and embed the demonstrations with them.
 
@@ -93,9 +97,10 @@ def train_encoders(
         command: Command line, stored with the weights.
         device: Device to train on.
         progress: Whether to show progress bars.
-        tasks: Task names, in the order of their labels.
+        tasks: Task names, in the order of their labels; by default the scene's.
         spread: Share of the range of start states of the recordings.
         keep: Encoders of which only the inverse model is trained anew, on play.
+        scene: The robot, or its name.
 
     Raises:
         ValueError: As `train_representation`; if there are encoders to keep, but no play.
@@ -103,6 +108,8 @@ def train_encoders(
     """
     if keep is not None and play is None:
         raise ValueError("to train the inverse model alone, give the folder of recorded play")
+    scene = find_scene(scene)
+    tasks = scene.default_tasks if tasks is None else tasks
     make_folder(folder)
     with CsvFile(folder / "train.csv", _COLUMNS) as file:
         fit = {
@@ -115,12 +122,14 @@ def train_encoders(
         if keep is not None and play is not None:
             representation = retrain_inverse(keep, play, config, **fit)
         else:
-            scene = {"scene_version": nico.scene_version(), "spread": spread}
-            representation = train_representation(dataset, config, play=play, **scene, **fit)
+            representation = train_representation(
+                dataset, config, play=play, scene_version=scene.version, spread=spread, **fit
+            )
     save_representation(representation, weights)
     bank = make_bank(representation, dataset, tasks=tasks, spread=spread)
     bank.save(bank_path(weights))
-    probe(representation, dataset, folder, play=None if keep else play)
+    play = None if keep else play
+    probe(representation, dataset, folder, play=play, columns=scene.state)
     return representation, bank
 
 
@@ -136,8 +145,9 @@ def make_pretrained(
     command: str = "",
     progress: bool = True,
     device: torch.device | str = "cpu",
-    tasks: Sequence[str] = nico.PAPER_TASKS,
+    tasks: Sequence[str] | None = None,
     spread: float = 1.0,
+    scene: Scene | str = "nico",
 ) -> tuple[Representation, DemonstrationBank]:
     """Record demonstrations and play, train both encoders, and embed the demonstrations.
 
@@ -155,14 +165,20 @@ def make_pretrained(
         command: Command line, stored with the weights.
         progress: Whether to show progress bars.
         device: Device to train on.
-        tasks: Tasks to demonstrate.
+        tasks: Tasks to demonstrate; by default the scene's.
         spread: Share of the whole range of start states.
+        scene: The robot, or its name.
 
     Raises:
         ValueError: If the dataset is damaged or was recorded in another scene.
     """
     record = partial(
-        record_demonstrations, tasks=tasks, spread=spread, seed=seed, progress=progress
+        record_demonstrations,
+        scene=scene,
+        tasks=tasks,
+        spread=spread,
+        seed=seed,
+        progress=progress,
     )
     demonstrations = record(dataset, per_task=per_task, held_out_per_task=held_out_per_task)
     play = record(
@@ -182,6 +198,7 @@ def make_pretrained(
         progress=progress,
         tasks=tasks,
         spread=spread,
+        scene=scene,
     )
 
 
@@ -199,16 +216,18 @@ def _log_of(file: CsvFile) -> Log:
 
 def main(arguments: Arguments) -> None:
     """Run the command line."""
+    import_plugin(arguments.module)
     dataset, meta = load_demonstrations(arguments.dataset), read_meta(arguments.dataset)
+    scene, weights = find_scene(meta["scene"]), arguments.weights
     play = None if arguments.play is None else load_demonstrations(arguments.play)
     command = shlex.join(["python", "-m", "bgpo_trl.encoders.train", *sys.argv[1:]])
     keep = None
     if arguments.keep is not None:
-        keep = load_representation(arguments.keep, scene_version=nico.scene_version())
+        keep = load_representation(arguments.keep, scene_version=scene.version)
     train_encoders(
         dataset,
         play,
-        default_weights(meta["tasks"]) if arguments.weights is None else arguments.weights,
+        default_weights(meta["tasks"], scene=scene) if weights is None else weights,
         arguments.folder,
         arguments.config,
         command,
@@ -216,6 +235,7 @@ def main(arguments: Arguments) -> None:
         tasks=meta["tasks"],
         spread=meta["spread"],
         keep=keep,
+        scene=scene,
     )
 
 

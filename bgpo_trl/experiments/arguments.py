@@ -14,8 +14,8 @@ class ImportArguments:
     """Own tasks and algorithms in a command."""
 
     module: Annotated[str | None, tyro.conf.arg(name="import")] = None
-    """Module that adds tasks (nico.add_task) or algorithms (ALGORITHMS), imported first; here or
-    installed."""
+    """Module that adds scenes (SCENES), tasks (nico.add_task) or algorithms (ALGORITHMS), imported
+    first; here or installed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,12 +36,17 @@ class TrainedArguments(ImportArguments):
 class BankArguments(ImportArguments):
     """Tasks and their demonstrations."""
 
+    scene: str | None = None
+    """Robot with its tasks, nico by default, or one that the module of --import adds."""
     tasks: tuple[str, ...] | None = None
-    """Tasks in the order of presentation, or "all" for the suite's eight; the paper's three by
-    default. In runs, unless there are three, they start at even intervals."""
+    """Tasks in the order of presentation, or "all" for all of the scene; by default its usual ones,
+    for NICO the paper's three. In runs, unless there are three, they start at even intervals."""
+    encoders: Path | None = None
+    """Encoders trained by bgpo_trl.encoders.train, with their bank beside them; those that come
+    with the scene by default. With --resume, the run's own."""
     bank: Path | None = None
-    """Demonstrations embedded by bgpo_trl.encoders.make_bank; for tasks missing in it, the
-    package's are used. With --resume, the run's own by default."""
+    """Demonstrations embedded by bgpo_trl.encoders.make_bank; for tasks missing in it, those beside
+    the encoders are used. With --resume, the run's own by default."""
 
 
 @dataclass(frozen=True)

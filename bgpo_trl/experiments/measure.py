@@ -55,6 +55,7 @@ def measure(
         episodes=100,
         spread=config.spread,
         max_steps=config.algorithm.max_steps,
+        scene=config.scene,
     )
     summary = {
         "command": command(),
@@ -146,7 +147,7 @@ def record_episodes(trainer: Trainer, bank: DemonstrationBank) -> dict[str, np.n
         bank: Training and held-out demonstrations; held-out ones are shown.
 
     Returns:
-        Frames uint8 ``[N, 32, 64, 3]``, by task and outcome.
+        Frames uint8 ``[N, H, W, 3]``, by task and outcome.
 
     Raises:
         ValueError: If the run observes ground truth instead of frames.

@@ -128,6 +128,7 @@ def measure(policy: TrainedPolicy, shares: Sequence[float], episodes: int, seed:
     with tempfile.TemporaryDirectory() as folder:
         shown = record_demonstrations(
             folder,
+            scene=config.scene,
             tasks=tasks,
             per_task=episodes,
             held_out_per_task=0,

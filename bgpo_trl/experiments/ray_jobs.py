@@ -41,12 +41,14 @@ class Job:
         config: The run.
         module: Module that adds its tasks or algorithm, see `bgpo_trl.plugins.import_plugin`.
         bank: Demonstrations of tasks that are not the paper's.
+        encoders: Encoders that do not come with the scene.
     """
 
     directory: Path
     config: RunConfig
     module: str | None = None
     bank: Path | None = None
+    encoders: Path | None = None
 
     def __str__(self) -> str:
         return f"{self.directory.parent.name}/{self.directory.name}"

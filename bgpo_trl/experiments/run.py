@@ -12,28 +12,24 @@ from torchrl.record.loggers.common import Logger
 from bgpo_trl.algorithms import ALGORITHMS, Algorithm
 from bgpo_trl.configs import STAGE_PRESETS, RunConfig
 from bgpo_trl.data.bank import DemonstrationBank
-from bgpo_trl.encoders.pretrained import (
-    default_weights,
-    load_pretrained,
-    weights_of_bank,
-)
+from bgpo_trl.encoders.pretrained import load_pretrained, weights_of_bank
 from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.encoders.train import make_pretrained
 from bgpo_trl.experiments.arguments import Arguments, BankArguments
 from bgpo_trl.experiments.measure import draw, measure
 from bgpo_trl.experiments.records import command
-from bgpo_trl.experiments.settings import as_begun, chosen_tasks, is_finished
+from bgpo_trl.experiments.settings import as_begun, chosen_scene, chosen_tasks, is_finished
 from bgpo_trl.files.locking import lock_directory
 from bgpo_trl.files.writing import write_json
 from bgpo_trl.machine import choose_device, set_threads
 from bgpo_trl.plugins import import_plugin
 from bgpo_trl.runs.config_file import read_config
 from bgpo_trl.runs.dashboard import tensorboard_logger, wandb_logger
-from bgpo_trl.runs.demonstrations import BANK, load_inputs
+from bgpo_trl.runs.demonstrations import BANK, load_inputs, own_weights
 from bgpo_trl.runs.directory import holds_run
 from bgpo_trl.runs.provenance import commit_of_code
+from bgpo_trl.scenes import Scene, find_scene
 from bgpo_trl.training import Trainer
-from suites import nico
 
 _DATASET, _ENCODERS = "demonstrations", "encoders"  # folders of a run that trains its encoders
 
@@ -62,12 +58,14 @@ def run_experiment(
         Results to print, with the path of the run directory.
 
     Raises:
-        ValueError: If the directory holds another run, or no run to resume; or if ``bank`` is given
-            for encoders that are yet to be trained.
+        ValueError: If the directory holds another run, or no run to resume; or if ``bank`` or
+            ``encoders`` are given although encoders are yet to be trained.
         BlockingIOError: If another process is using the directory.
     """
-    if arguments.train_encoders and arguments.bank is not None:
-        raise ValueError("--bank is of the pretrained encoders: leave it or --train-encoders out")
+    if arguments.train_encoders and (arguments.bank or arguments.encoders):
+        raise ValueError(
+            "--bank and --encoders name what is there: leave them or --train-encoders out"
+        )
     commit = commit_of_code()  # read first, since commits may follow during training
     set_threads(arguments.threads)
     device = choose_device(arguments.device)
@@ -131,9 +129,9 @@ def _bank(arguments: Arguments, out: Path) -> Path | None:
 
 
 def _makes_encoders(arguments: Arguments, out: Path) -> bool:
-    # A bank fits the pretrained encoders alone.
-    small = arguments.preset in STAGE_PRESETS and _bank(arguments, out) is None
-    return arguments.train_encoders or small
+    # A bank fits the encoders that embedded it alone.
+    given = arguments.encoders is not None or _bank(arguments, out) is not None
+    return arguments.train_encoders or (arguments.preset in STAGE_PRESETS and not given)
 
 
 def _continued(arguments: Arguments, config: RunConfig, out: Path) -> RunConfig:
@@ -156,40 +154,51 @@ def _encoders(
 ) -> tuple[Representation, DemonstrationBank]:
     """Return the pretrained encoders and a bank, or new ones made in the run directory."""
     begun = arguments.resume and arguments.bank is None and (out / "config.json").exists()
-    if begun and (out / _ENCODERS / "nico.safetensors").exists():
-        return load_inputs(out, config.tasks, read_config(out / "config.json")[1])
+    scene, own = find_scene(config.scene), own_weights(out)
+    if begun and own.exists():
+        return load_inputs(out, config.tasks, read_config(out / "config.json")[1], scene)
     if not _makes_encoders(arguments, out):
-        return pretrained_for(config.tasks, _bank(arguments, out))
+        bank = _bank(arguments, out)
+        return pretrained_for(config.tasks, bank, scene=scene, weights=arguments.encoders)
     stage = STAGE_PRESETS.get(arguments.preset or "")
     encoders, bank = make_pretrained(
-        out / _ENCODERS / "nico.safetensors",
+        own,
         out / _DATASET,
         folder=out / _ENCODERS,
         command=command(),
         device=device,
         tasks=config.tasks,
         spread=config.spread,
+        scene=scene,
         **({} if stage is None else vars(stage)),
     )
     return encoders, bank.for_tasks(config.tasks)
 
 
 def pretrained_for(
-    tasks: Sequence[str], bank: Path | None = None
+    tasks: Sequence[str],
+    bank: Path | None = None,
+    *,
+    scene: Scene | str = "nico",
+    weights: Path | None = None,
 ) -> tuple[Representation, DemonstrationBank]:
-    """Load the pretrained encoders and the demonstrations of some tasks.
+    """Load trained encoders and the demonstrations of some tasks.
 
     Args:
         tasks: Names of the tasks.
-        bank: Bank to take them from; those that it lacks are taken from the shipped one of the
-            same encoders.
+        bank: Bank to take them from; those that it lacks are taken from the one beside the
+            encoders.
+        scene: The robot, or its name.
+        weights: File of the encoders; by default those that come with the scene, for the bank if
+            there is one.
 
     Raises:
-        ValueError: If the bank is missing, damaged or of other encoders, or a task has no
-            demonstrations.
+        ValueError: If a file is missing, damaged or of other encoders, no encoders come with the
+            scene, or a task has no demonstrations.
     """
-    weights = default_weights(tasks) if bank is None else weights_of_bank(bank)
-    encoders, found = load_pretrained(weights)
+    if weights is None and bank is not None:
+        weights = weights_of_bank(bank, scene)
+    encoders, found = load_pretrained(weights, tasks=tasks, scene=scene)
     if bank is not None:
         own = DemonstrationBank.load(bank, encoder_id=encoders.identity)
         lacking = [task for task in tasks if task not in own.tasks]
@@ -198,10 +207,12 @@ def pretrained_for(
 
 
 def bank_of(arguments: BankArguments) -> DemonstrationBank:
-    """Load the demonstrations that a command line names, embedded by the pretrained encoders.
+    """Load the demonstrations that a command line names, embedded by trained encoders.
 
     Raises:
-        ValueError: As for `import_plugin`, `chosen_tasks` and `pretrained_for`.
+        ValueError: As for `import_plugin`, `chosen_scene`, `chosen_tasks` and `pretrained_for`.
     """
     import_plugin(arguments.module)
-    return pretrained_for(chosen_tasks(arguments.tasks, nico.PAPER_TASKS), arguments.bank)[1]
+    scene = chosen_scene(arguments.scene)
+    tasks = chosen_tasks(arguments.tasks, scene)
+    return pretrained_for(tasks, arguments.bank, scene=scene, weights=arguments.encoders)[1]

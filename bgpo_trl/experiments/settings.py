@@ -17,7 +17,7 @@ from bgpo_trl.experiments.arguments import Arguments
 from bgpo_trl.plugins import import_plugin
 from bgpo_trl.runs.config_file import read_config
 from bgpo_trl.runs.results import read_json
-from suites import nico
+from bgpo_trl.scenes import Scene, find_scene
 
 _Entry = TypeVar("_Entry")
 # Flags of the settings of the same name.
@@ -46,8 +46,11 @@ def run_config(arguments: Arguments, *, from_start: bool = False) -> RunConfig:
     """
     import_plugin(arguments.module)
     config = _with_algorithm(_begin(arguments), arguments)
+    scene = chosen_scene(arguments.scene, config.scene)
+    if scene.name != config.scene:
+        config = _in_scene(config, scene)
     if arguments.tasks is not None:
-        config = _with_tasks(config, chosen_tasks(arguments.tasks, config.tasks))
+        config = _with_tasks(config, chosen_tasks(arguments.tasks, scene, config.tasks))
     if arguments.episodes is not None:
         config = _with_episodes(config, arguments.episodes)
     given = {name: getattr(arguments, name) for name in _PLAIN}
@@ -94,6 +97,14 @@ def _with_algorithm(config: RunConfig, arguments: Arguments) -> RunConfig:
     return replace(config, algorithm=replace(config.algorithm, rl=rl))
 
 
+def _in_scene(config: RunConfig, scene: Scene) -> RunConfig:
+    """Return a run of the usual tasks of another scene, with episodes of their length."""
+    rl = config.algorithm.rl
+    rl = replace(rl, warmup_steps=max(rl.warmup_steps, scene.max_steps))
+    algorithm = replace(config.algorithm, max_steps=scene.max_steps, rl=rl)
+    return _with_tasks(replace(config, scene=scene.name, algorithm=algorithm), scene.default_tasks)
+
+
 def _with_tasks(config: RunConfig, tasks: tuple[str, ...]) -> RunConfig:
     same = len(tasks) == len(config.task_starts)
     starts = config.task_starts if same else even_starts(len(tasks), config.episodes)
@@ -117,20 +128,32 @@ def chosen(entries: Mapping[str, _Entry], name: str, flag: str) -> _Entry:
     return entries[name]
 
 
-def chosen_tasks(tasks: tuple[str, ...] | None, default: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the tasks that ``--tasks`` names.
+def chosen_scene(name: str | None, default: str = "nico") -> Scene:
+    """Return the scene that ``--scene`` names.
+
+    Raises:
+        ValueError: If it does not exist.
+    """
+    return find_scene(default if name is None else name)
+
+
+def chosen_tasks(
+    tasks: tuple[str, ...] | None, scene: Scene, default: tuple[str, ...] | None = None
+) -> tuple[str, ...]:
+    """Return the tasks of a scene that ``--tasks`` names, by default its usual ones.
 
     Raises:
         ValueError: If it is empty or a task does not exist.
     """
     if tasks is None:
-        return default
+        return scene.default_tasks if default is None else default
     if tasks == ("all",):
-        return nico.ALL_TASKS
+        return scene.all_tasks
+    known = tuple(scene.tasks)
     if not tasks:
-        raise ValueError(f"--tasks: it is empty; name some of {', '.join(nico.TASKS)}")
+        raise ValueError(f"--tasks: it is empty; name some of {', '.join(known)}")
     for name in tasks:
-        chosen(nico.TASKS, name, "--tasks")
+        chosen(dict.fromkeys(known), name, "--tasks")
     return tasks
 
 

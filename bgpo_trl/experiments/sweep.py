@@ -29,7 +29,7 @@ from bgpo_trl.plugins import import_plugin
 from bgpo_trl.runs.config_file import Digests, settings_of
 from bgpo_trl.runs.directory import check_settings, holds_run
 from bgpo_trl.runs.results import read_json
-from suites import nico
+from bgpo_trl.scenes import find_scene
 
 Setting = Literal[
     "concurrent",
@@ -97,13 +97,17 @@ def make_jobs(arguments: SweepArguments) -> dict[Path, list[Job]]:
                 config.seeds[first : first + arguments.block]
                 for first in range(0, len(config.seeds), arguments.block)
             ]
-            bank = None if arguments.bank is None else arguments.bank.absolute()
+            bank, encoders = (
+                None if path is None else path.absolute()
+                for path in (arguments.bank, arguments.encoders)
+            )
             jobs[merged] = [
                 Job(
                     merged / "-".join(["seeds", *map(str, block)]),
                     replace(config, seeds=block),
                     module=arguments.module,
                     bank=bank,
+                    encoders=encoders,
                 )
                 for block in blocks
             ]
@@ -116,9 +120,12 @@ def _config(arguments: SweepArguments, setting: Setting, name: str) -> RunConfig
     """Return the settings of an algorithm's runs."""
     tasks = arguments.tasks
     if setting.startswith("eight"):
-        if tasks is not None:
-            raise ValueError(f"--tasks: the setting {setting} has the suite's eight: leave it out")
-        tasks = nico.ALL_TASKS[::-1] if setting == "eight-reversed" else nico.ALL_TASKS
+        if tasks is not None or arguments.scene not in (None, "nico"):
+            raise ValueError(
+                f"the setting {setting} has the eight tasks of NICO: leave --tasks and --scene out"
+            )
+        eight = find_scene("nico").all_tasks
+        tasks = eight[::-1] if setting == "eight-reversed" else eight
     return run_config(
         Arguments(
             algorithm=name,
@@ -127,6 +134,7 @@ def _config(arguments: SweepArguments, setting: Setting, name: str) -> RunConfig
             episodes=arguments.episodes,
             eval_every=arguments.eval_every,
             held_out=arguments.held_out,
+            scene=arguments.scene,
             tasks=tasks,
             schedule="sequential" if setting.endswith("sequential") else "practised",
         ),
@@ -162,7 +170,9 @@ def check_directories(
 def play(job: Job) -> None:
     """Play a job to its end, from its last checkpoint if there is one."""
     import_plugin(job.module)
-    arguments = Arguments(out=job.directory, resume=holds_run(job.directory), bank=job.bank)
+    arguments = Arguments(
+        out=job.directory, resume=holds_run(job.directory), bank=job.bank, encoders=job.encoders
+    )
     run_experiment(arguments, "sweep", job.config)
 
 
@@ -180,8 +190,18 @@ def sweep(arguments: SweepArguments) -> str:
     import_plugin(arguments.module)
     jobs = make_jobs(arguments)
     digests = {
-        tasks: Digests(*(part.identity for part in pretrained_for(tasks, arguments.bank)))
-        for tasks in {group[0].config.tasks for group in jobs.values()}
+        config.tasks: Digests(
+            *(
+                part.identity
+                for part in pretrained_for(
+                    config.tasks,
+                    arguments.bank,
+                    scene=config.scene,
+                    weights=arguments.encoders,
+                )
+            )
+        )
+        for config in (group[0].config for group in jobs.values())
     }
     check_directories(jobs, digests)
     todo = [job for group in jobs.values() for job in group if not job.finished]

@@ -19,16 +19,14 @@ from bgpo_trl.figures.of_run import draw_growth
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.plugins import import_plugin
 from bgpo_trl.policy import TrainedPolicy, load_run
-from suites import nico
-from suites.nico.rendering import FrameRenderer
+from bgpo_trl.scenes import Scene, Simulation, find_scene
 
 __all__ = ["Episode", "WatchArguments", "compose", "demonstrate", "play", "watch"]
 
-_ROOM = (180, 70, 600, 350)  # (pixels) crop of the 640x480 room view to NICO and the table
-_SIZES = ((256, 128), (256, 128), (192, 128))
+_HEIGHT = 128  # (pixels) of each picture
 _BORDER, _CAPTION, _GAP = 4, 18, 8
 _COLORS = {None: "#999999", True: "#009E73", False: "#D55E00"}
-_FPS = 10  # twice as fast as NICO
+_FPS = 10  # twice as fast as NICO moves
 
 
 @dataclass(frozen=True)
@@ -51,16 +49,16 @@ class Episode:
 
     Attributes:
         task: Name of the task.
-        demonstration: Frames uint8 ``[T, 32, 64, 3]``.
-        seen: Observed frames, uint8 ``[N, 32, 64, 3]``.
-        room: View of the room, uint8 ``[N, 128, 192, 3]``.
+        demonstration: Frames uint8 ``[T, H, W, 3]``.
+        seen: Observed frames, uint8 ``[N, H, W, 3]``.
+        view: An onlooker's view, uint8 ``[N, 128, W', 3]``; None if the scene has none.
         success: Whether the episode succeeded.
     """
 
     task: str
     demonstration: NDArray
     seen: NDArray
-    room: NDArray
+    view: NDArray | None
     success: bool
 
     @property
@@ -69,11 +67,14 @@ class Episode:
         return f"{'success' if self.success else 'no success'} after {len(self.seen) - 1} steps"
 
 
-def demonstrate(tasks: Sequence[str], seed: int, spread: float = 1.0) -> dict[str, NDArray]:
-    """Return a new demonstration of each task, uint8 ``[T, 32, 64, 3]``."""
+def demonstrate(
+    tasks: Sequence[str], seed: int, spread: float = 1.0, scene: Scene | str = "nico"
+) -> dict[str, NDArray]:
+    """Return a new demonstration of each task, uint8 ``[T, H, W, 3]``."""
     with tempfile.TemporaryDirectory() as folder:
         recorded = record_demonstrations(
             folder,
+            scene=scene,
             tasks=tasks,
             per_task=1,
             held_out_per_task=0,
@@ -88,21 +89,31 @@ def demonstrate(tasks: Sequence[str], seed: int, spread: float = 1.0) -> dict[st
 def play(policy: TrainedPolicy, task: str, demonstration: NDArray, seed: int) -> Episode:
     """Show the policy a demonstration, and return its episode from the start with that seed."""
     policy.condition(demonstration, task=task)
-    env = nico.load(task, seed=seed, spread=policy.config.spread)
-    renderer = FrameRenderer(env.physics.model.ptr, "room", height=480, width=640)
+    config = policy.config
+    env = find_scene(config.scene).simulate([task], batch_size=1, spread=config.spread)
+    simulation = env.simulations[0]
+    simulation.seed(seed)
+    simulation.reset(0)
+    seen, views, success = [simulation.frame()], [_view(simulation)], False
+    for _ in range(config.algorithm.max_steps):
+        success, failure = simulation.step(policy.act(seen[-1]).astype(np.float64))
+        seen.append(simulation.frame())
+        views.append(_view(simulation))
+        if success or failure:
+            break
+    env.close()
+    there = [view for view in views if view is not None]
+    return Episode(task, demonstration, np.stack(seen), np.stack(there) if there else None, success)
 
-    def look() -> NDArray:
-        room = Image.fromarray(renderer.render(env.physics.data.ptr)).crop(_ROOM)
-        return np.asarray(room.resize(_SIZES[2], Image.Resampling.LANCZOS))
 
-    timestep = env.reset()
-    seen, room = [timestep.observation["pixels"]], [look()]
-    while not timestep.last() and len(seen) <= policy.config.algorithm.max_steps:
-        timestep = env.step(policy.act(seen[-1]))
-        seen.append(timestep.observation["pixels"])
-        room.append(look())
-    renderer.close()
-    return Episode(task, demonstration, np.stack(seen), np.stack(room), bool(timestep.reward))
+def _view(simulation: Simulation) -> NDArray | None:
+    """Return an onlooker's view, uint8 ``[128, W, 3]``; None if there is none."""
+    try:
+        view = Image.fromarray(simulation.view())
+    except NotImplementedError:
+        return None
+    width = round(view.width * _HEIGHT / view.height)
+    return np.asarray(view.resize((width, _HEIGHT), Image.Resampling.LANCZOS))
 
 
 def compose(episodes: Sequence[Episode]) -> NDArray:
@@ -111,13 +122,16 @@ def compose(episodes: Sequence[Episode]) -> NDArray:
     The frames continue to the end of the longest episode, and the last one is held for two seconds.
     """
     steps = max(max(len(e.demonstration), len(e.seen)) for e in episodes)
-    height = _CAPTION + _SIZES[0][1] + 2 * _BORDER + _GAP
-    width = sum(width + 2 * _BORDER for width, _ in _SIZES) + 4 * _GAP
+    height = _CAPTION + _HEIGHT + 2 * _BORDER + _GAP
+    shape = episodes[0].seen.shape[1:3]
+    widths = 2 * [round(shape[1] * _HEIGHT / shape[0])]
+    widths += [] if episodes[0].view is None else [episodes[0].view.shape[2]]
+    width = sum(width + 2 * _BORDER for width in widths) + (len(widths) + 1) * _GAP
     pictures = []
     for step in range(steps):
         picture = Image.new("RGB", (width, height * len(episodes) + _GAP), "white")
         for row, episode in enumerate(episodes):
-            _draw(picture, episode, step, row * height + _GAP // 2)
+            _draw(picture, episode, step, row * height + _GAP // 2, widths)
         pictures.append(picture)
     # A palette shared by all frames keeps static pixels identical: a quarter of the file size.
     sample = [np.asarray(picture) for picture in pictures[:: max(1, steps // 4)] + pictures[-1:]]
@@ -127,33 +141,38 @@ def compose(episodes: Sequence[Episode]) -> NDArray:
     return np.stack([np.asarray(frame.convert("RGB")) for frame in frames])
 
 
-def _draw(picture: Image.Image, episode: Episode, step: int, top: int) -> None:
+def _draw(
+    picture: Image.Image, episode: Episode, step: int, top: int, widths: Sequence[int]
+) -> None:
     draw, font = ImageDraw.Draw(picture), ImageFont.load_default(13)
     now = min(step, len(episode.seen) - 1)
     outcome = episode.success if now == len(episode.seen) - 1 else None
     shown = episode.demonstration[min(step, len(episode.demonstration) - 1)]
     color = _COLORS[outcome]
-    panels = (
-        (shown, f"shown: {episode.task.replace('_', ' ')}", _COLORS[None]),
-        (episode.seen[now], "NICO's view", color),
-        (episode.room[now], f"step {now}" if outcome is None else episode.outcome, color),
-    )
+    progress = f"step {now}" if outcome is None else episode.outcome
+    panels = [(shown, f"shown: {episode.task.replace('_', ' ')}", _COLORS[None])]
+    if episode.view is None:
+        panels.append((episode.seen[now], progress, color))
+    else:
+        panels.append((episode.seen[now], "the robot's view", color))
+        panels.append((episode.view[now], progress, color))
     left = _GAP
-    for (frame, caption, border), size in zip(panels, _SIZES, strict=True):
+    for (frame, caption, border), width in zip(panels, widths, strict=True):
+        size = (width, _HEIGHT)
         image = Image.fromarray(frame).resize(size, Image.Resampling.NEAREST)
         picture.paste(ImageOps.expand(image, _BORDER, border), (left, top + _CAPTION))
         fill = "black" if border == _COLORS[None] else border
         draw.text((left + _BORDER, top), caption, fill=fill, font=font)
-        left += size[0] + 2 * _BORDER + _GAP
+        left += width + 2 * _BORDER + _GAP
 
 
 def watch(arguments: WatchArguments) -> str:
     """Film the trained policies of a run beside new demonstrations that they are shown.
 
-    Writes nico.gif, and its frames as a strip nico.png, into the run's figures/: for each task the
-    demonstration, the policy's observations and a view of the room, framed green on success and red
-    on timeout. NICO starts from the same scene in every task, so only the demonstration makes the
-    difference. If the run saved graphs, also writes gwr_growth.png, the growth of GWR-B.
+    Writes film.gif, and its frames as a strip film.png, into the run's figures/: for each task the
+    demonstration, the policy's observations and a view of the robot, framed green on success and
+    red on timeout. NICO starts from the same scene in every task, so only the demonstration makes
+    the difference. If the run saved graphs, also writes gwr_growth.png, the growth of GWR-B.
 
     Raises:
         ValueError: If the directory holds no run that can be loaded, or the run has no such seed.
@@ -161,16 +180,17 @@ def watch(arguments: WatchArguments) -> str:
     run, out = arguments.run, arguments.out or arguments.run / "figures"
     import_plugin(arguments.module)
     policy = load_run(run, seed=arguments.run_seed)
-    shown = demonstrate(policy.tasks, arguments.scene_seed, policy.config.spread)
-    episodes = [play(policy, task, frames, arguments.scene_seed) for task, frames in shown.items()]
+    config, seed = policy.config, arguments.scene_seed
+    shown = demonstrate(policy.tasks, seed, config.spread, config.scene)
+    episodes = [play(policy, task, frames, seed) for task, frames in shown.items()]
     out.mkdir(parents=True, exist_ok=True)
-    save_gif(compose(episodes), out / "nico.gif", fps=_FPS, scale=1)
+    save_gif(compose(episodes), out / "film.gif", fps=_FPS, scale=1)
     strips = {}
     for episode in episodes:
         strips[f"{episode.task}: the demonstration"] = episode.demonstration
-        strips[f"{episode.task}: NICO's view, {episode.outcome}"] = episode.seen
-    save_figure(plot_frame_strips(strips), out / "nico.png")
-    draw_growth(run, policy.config, policy.bank, out)
+        strips[f"{episode.task}: the robot's view, {episode.outcome}"] = episode.seen
+    save_figure(plot_frame_strips(strips), out / "film.png")
+    draw_growth(run, config, policy.bank, out)
     outcomes = [f"{episode.task}: {episode.outcome}" for episode in episodes]
     learned = f"seed {policy.seed} after {policy.episodes:,} training episodes"
     return "\n".join([learned, *outcomes, f"pictures: {out}"])

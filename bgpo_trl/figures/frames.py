@@ -16,7 +16,7 @@ from bgpo_trl.files.writing import make_folder, write_whole
 
 
 def plot_frame_strips(episodes: Mapping[str, NDArray], n_frames: int = 8) -> Figure:
-    """Plot episodes, frames uint8 ``[N, 32, 64, 3]`` by title, as rows of frames.
+    """Plot episodes, frames uint8 ``[N, H, W, 3]`` by title, as rows of frames.
 
     A row has at most ``n_frames``, evenly spaced from the first to the last.
 

@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from itertools import pairwise
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-FRAME_SHAPE = (32, 64, 3)
-"""Height, width and channels of a frame (Sec. IV-A: "a 64x32 RGB image")."""
+FRAME_SHAPE = (32, 64)
+"""Height and width of a frame (Sec. IV-A: "a 64x32 RGB image")."""
 
 _CHANNELS = (3, 32, 64, 128)
-_COARSE_SHAPE = (128, 4, 8)
-_COARSE_SIZE = 4096
-_MAP_SHAPE = (16, 32)
-# Half the height and width of the map of keypoints, in the unit of its coordinates.
-_MAP_REACH = (1.0, 2.0)
-# Coordinates are multiplied by these, to have the scale of the other dimensions.
-_COORDINATE_SCALE = (3.0, 1.5)
+# Three poolings halve the frame.
+_POOLED = 8
+# Pixels in the unit of the coordinates of keypoints.
+_UNIT = 16
+# Coordinates at the border of the frame, on the scale of the other dimensions.
+_LARGEST_COORDINATE = 3.0
 # Standard deviation of the blobs that the decoder draws at keypoints: a little more than a cell.
 _BLOB = 0.16
 # On a CPU, activations of more frames do not fit into the cache, and take twice as long.
@@ -27,7 +27,7 @@ _FRAMES_AT_ONCE = 64
 
 
 class VAE(nn.Module):
-    """Convolutional VAE over 64x32 RGB frames, with a one-layer inverse model on its latents.
+    """Convolutional VAE over RGB frames, with a one-layer inverse model on its latents.
 
     Encoder (Sec. IV-A): three 3x3 convolutions of 32, 64 and 128 channels, each followed by 2x2
     max-pooling and ReLU, then one dense layer each for mean and log-variance. Decoder: the mirror
@@ -41,20 +41,22 @@ class VAE(nn.Module):
     there (Jakab et al., 2018). The paper has none; a dense layer alone encodes places in a way from
     which a policy learns to read them more slowly (docs/learning.md).
 
-    Frames are uint8 ``[..., 32, 64, 3]``, and tensors channels-last like them. Latents are
-    ``[..., latent_size]``, on the scale of mu unless they come from `latent`.
+    Frames are uint8 ``[..., H, W, 3]``, and tensors channels-last like them; height and width are
+    padded to multiples of 8 inside. Latents are ``[..., latent_size]``, on the scale of mu unless
+    they come from `latent`.
 
     Args:
         latent_size: Dimensions of z (paper: 64); a quarter of it, rounded down, is the number of
             keypoints.
         action_size: Dimensions of an action (paper: 4).
+        frame_shape: Height and width of a frame, at least 16 each (paper: 32 and 64).
 
     Raises:
-        ValueError: If there is no action, or no keypoint; from methods, if frames have another
-            dtype or shape, or latents another size.
+        ValueError: If there is no action or no keypoint, or frames are too small; from methods, if
+            frames have another dtype or shape, or latents another size.
 
     Attributes:
-        mean_frame: Buffer ``[32, 64, 3]`` in [0, 1], set before training; grey until then.
+        mean_frame: Buffer ``[H, W, 3]`` in [0, 1], set before training; grey until then.
         latent_mean: Buffer ``[latent_size]``, subtracted from mu by `latent`.
         latent_std: Buffer ``[latent_size]``, by which `latent` divides.
 
@@ -68,57 +70,73 @@ class VAE(nn.Module):
     latent_mean: Tensor
     latent_std: Tensor
 
-    def __init__(self, latent_size: int = 64, action_size: int = 4) -> None:
+    def __init__(
+        self,
+        latent_size: int = 64,
+        action_size: int = 4,
+        frame_shape: Sequence[int] = FRAME_SHAPE,
+    ) -> None:
         if latent_size < 4 or action_size < 1:
             raise ValueError(
                 f"latent_size must be at least 4 and action_size at least 1, got {latent_size} and "
                 f"{action_size}"
             )
+        if len(frame_shape) != 2 or min(frame_shape) < 16:
+            raise ValueError(f"frames must be at least 16 x 16 pixels, got {tuple(frame_shape)}")
         super().__init__()
         self.latent_size = latent_size
         self.action_size = action_size
+        self.frame_shape = (int(frame_shape[0]), int(frame_shape[1]))
+        self._padded = tuple(-(-size // _POOLED) * _POOLED for size in self.frame_shape)
+        self._map_shape = (self._padded[0] // 2, self._padded[1] // 2)
+        # Half the height and width of the map of keypoints, in the unit of its coordinates.
+        self._map_reach = (self._map_shape[0] / _UNIT, self._map_shape[1] / _UNIT)
+        self._coarse_shape = (_CHANNELS[3], *(size // _POOLED for size in self._padded))
+        coarse_size = math.prod(self._coarse_shape)
         self.encoder = nn.ModuleList(nn.Conv2d(a, b, 3, padding=1) for a, b in pairwise(_CHANNELS))
         self.n_keypoints = latent_size // 4
         self.keypoint_maps = nn.Conv2d(_CHANNELS[2], self.n_keypoints, 1)
         self.log_sharpness = nn.Parameter(torch.full((self.n_keypoints, 1, 1), math.log(3.0)))
-        self.mean_head = nn.Linear(_COARSE_SIZE, latent_size - 2 * self.n_keypoints)
-        self.log_variance_head = nn.Linear(_COARSE_SIZE, latent_size)
+        self.mean_head = nn.Linear(coarse_size, latent_size - 2 * self.n_keypoints)
+        self.log_variance_head = nn.Linear(coarse_size, latent_size)
         # Little noise at first (sigma 0.14): with noise as large as the signal, the decoder would
         # learn to ignore z.
         nn.init.zeros_(self.log_variance_head.weight)
         nn.init.constant_(self.log_variance_head.bias, -4.0)
-        self.decoder_dense = nn.Linear(latent_size, _COARSE_SIZE)
+        self.decoder_dense = nn.Linear(latent_size, coarse_size)
         self.decoder = nn.ModuleList(
             nn.ConvTranspose2d(b, a, 4, stride=2, padding=1)
             for b, a in pairwise(reversed(_CHANNELS))
         )
         self.place = nn.Conv2d(_CHANNELS[1] + self.n_keypoints, _CHANNELS[1], 3, padding=1)
         self.inverse_head = nn.Linear(2 * latent_size, action_size)
-        self.register_buffer("mean_frame", torch.full(FRAME_SHAPE, 0.5))
+        self.register_buffer("mean_frame", torch.full((*self.frame_shape, 3), 0.5))
         self.register_buffer("latent_mean", torch.zeros(latent_size))
         self.register_buffer("latent_std", torch.ones(latent_size))
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def encode(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and log-variance of the posterior, float32 ``[..., latent_size]`` each."""
-        _check_frames(pixels)
-        mu, coarse = self._mean(pixels.reshape(-1, *FRAME_SHAPE))
+        self._check_frames(pixels)
+        mu, coarse = self._mean(pixels.reshape(-1, *pixels.shape[-3:]))
         shape = *pixels.shape[:-3], self.latent_size
         return mu.reshape(shape), self.log_variance_head(coarse).float().reshape(shape)
 
     def decode(self, z: Tensor) -> Tensor:
-        """Return reconstructed frames, float32 ``[..., 32, 64, 3]`` in [0, 1]."""
+        """Return reconstructed frames, float32 ``[..., H, W, 3]`` in [0, 1]."""
         self._check_latent(z)
         flat = z.reshape(-1, self.latent_size)
         x = F.relu(self.decoder_dense(flat))
-        x = x.unflatten(-1, _COARSE_SHAPE).contiguous(memory_format=torch.channels_last)
+        x = x.unflatten(-1, self._coarse_shape).contiguous(memory_format=torch.channels_last)
         for convolution in self.decoder[:-1]:
             x = F.relu(convolution(x))
         x = torch.cat([x, self._blobs(flat).to(x.dtype)], 1)
         x = F.relu(self.place(x.contiguous(memory_format=torch.channels_last)))
         # eps: without it, pixels that are nearly always black or white could not change.
-        x = self.decoder[-1](x).permute(0, 2, 3, 1) + torch.logit(self.mean_frame, eps=0.02)
-        return torch.sigmoid(x.float()).reshape(*z.shape[:-1], *FRAME_SHAPE)
+        height, width = self.frame_shape
+        x = self.decoder[-1](x).permute(0, 2, 3, 1)[:, :height, :width]
+        x = torch.sigmoid((x + torch.logit(self.mean_frame, eps=0.02)).float())
+        return x.reshape(*z.shape[:-1], height, width, 3)
 
     def inverse(self, z: Tensor, z_next: Tensor) -> Tensor:
         """Predict the action between consecutive latents, ``[..., action_size]`` in (-1, 1)."""
@@ -129,8 +147,8 @@ class VAE(nn.Module):
     @torch.no_grad()
     def latent(self, pixels: Tensor) -> Tensor:
         """Return the features used downstream: mu, standardized, ``[..., latent_size]``."""
-        _check_frames(pixels)
-        frames = pixels.reshape(-1, *FRAME_SHAPE)
+        self._check_frames(pixels)
+        frames = pixels.reshape(-1, *pixels.shape[-3:])
         parts = frames.split(_FRAMES_AT_ONCE) if frames.device.type == "cpu" else (frames,)
         mu = torch.cat([self._mean(part)[0] for part in parts])
         return self.standardize(mu).reshape(*pixels.shape[:-3], self.latent_size)
@@ -161,41 +179,49 @@ class VAE(nn.Module):
         if z.shape[-1:] != (self.latent_size,):
             raise ValueError(f"a latent must be [..., {self.latent_size}], got {[*z.shape]}")
 
+    def _check_frames(self, pixels: Tensor) -> None:
+        height, width = self.frame_shape
+        if pixels.dtype != torch.uint8 or pixels.shape[-3:] != (height, width, 3):
+            raise ValueError(
+                f"pixels must be uint8 [..., {height}, {width}, 3], got {pixels.dtype} "
+                f"{tuple(pixels.shape)}"
+            )
+
     def _mean(self, frames: Tensor) -> tuple[Tensor, Tensor]:
-        """Return mu ``[N, latent_size]`` and the features ``[N, 4096]`` of frames ``[N, ...]``."""
+        """Return mu ``[N, latent_size]`` and the features ``[N, C]`` of frames ``[N, ...]``."""
         x = frames.to(self.mean_frame.dtype) / 255 - self.mean_frame
+        if self._padded != self.frame_shape:
+            below, right = (p - f for p, f in zip(self._padded, self.frame_shape, strict=True))
+            x = F.pad(x, (0, 0, 0, right, 0, below))
         first, second, third = self.encoder
         # Pooling before ReLU gives the same result (both are monotone), at a quarter the size.
         x = F.relu(F.max_pool2d(first(x.permute(0, 3, 1, 2)), 2))
         fine = F.relu(second(x))
         coarse = F.relu(F.max_pool2d(third(F.max_pool2d(fine, 2)), 2)).flatten(1)
         maps = self.log_sharpness.exp() * self.keypoint_maps(fine)
-        weight = maps.flatten(2).to(self.mean_frame.dtype).softmax(-1).unflatten(2, _MAP_SHAPE)
+        weight = maps.flatten(2).to(self.mean_frame.dtype).softmax(-1).unflatten(2, self._map_shape)
         row, column = self._grid()
         x, y = (weight.sum(2) * column).sum(-1), (weight.sum(3) * row).sum(-1)
-        coordinates = torch.cat([_COORDINATE_SCALE[1] * x, _COORDINATE_SCALE[0] * y], -1)
+        height, width = self._map_reach
+        coordinates = torch.cat(
+            [_LARGEST_COORDINATE / width * x, _LARGEST_COORDINATE / height * y], -1
+        )
         return torch.cat([coordinates, self.mean_head(coarse).to(coordinates.dtype)], -1), coarse
 
     def _blobs(self, z: Tensor) -> Tensor:
-        """Return a blob at each keypoint of latents ``[N, latent_size]``, ``[N, K, 16, 32]``."""
+        """Return a blob at each keypoint of latents ``[N, latent_size]``, ``[N, K, ...]``."""
         x, y = z[:, : 2 * self.n_keypoints].unsqueeze(-1).chunk(2, 1)
         row, column = self._grid()
-        across = (x / _COORDINATE_SCALE[1] - column).square() / (2 * _BLOB**2)
-        along = (y / _COORDINATE_SCALE[0] - row).square() / (2 * _BLOB**2)
+        height, width = (_LARGEST_COORDINATE / reach for reach in self._map_reach)
+        across = (x / width - column).square() / (2 * _BLOB**2)
+        along = (y / height - row).square() / (2 * _BLOB**2)
         return (-along).exp().unsqueeze(-1) * (-across).exp().unsqueeze(-2)
 
     def _grid(self) -> tuple[Tensor, Tensor]:
-        """Return the coordinates of the map's rows ``[16]`` and columns ``[32]``."""
+        """Return the coordinates of the map's rows and columns."""
         like = {"dtype": self.mean_frame.dtype, "device": self.mean_frame.device}
         row, column = (
             torch.linspace(-reach, reach, size, **like)
-            for reach, size in zip(_MAP_REACH, _MAP_SHAPE, strict=True)
+            for reach, size in zip(self._map_reach, self._map_shape, strict=True)
         )
         return row, column
-
-
-def _check_frames(pixels: Tensor) -> None:
-    if pixels.dtype != torch.uint8 or pixels.shape[-3:] != FRAME_SHAPE:
-        raise ValueError(
-            f"pixels must be uint8 [..., 32, 64, 3], got {pixels.dtype} {tuple(pixels.shape)}"
-        )

@@ -20,14 +20,14 @@ class VAEInverseLoss(LossModule):
 
     With z sampled from N(mu, sigma^2), once per frame, the terms are
 
-    - ``reconstruction``: squared error, summed over the 6144 values of a frame, mean over frames.
+    - ``reconstruction``: squared error, summed over the values of a frame, mean over frames.
       With a mean over pixels, a small object would count so little that the KL term would switch
       off the dimensions that encode it.
     - ``kl``: KL(N(mu, sigma^2) || N(0, 1)), summed over dimensions, mean over frames.
     - ``inverse``: ``1/2 ||a_hat_t - a_t||^2``, with a_hat_t predicted from z_t and z_t+1, mean over
       the ``K - 1`` transitions of the windows whose actions are known; 0 if there are none.
 
-    Reads ``pixels`` uint8 ``[*B, K, 32, 64, 3]``, ``action`` ``[*B, K, A]``, in which action t
+    Reads ``pixels`` uint8 ``[*B, K, H, W, 3]``, ``action`` ``[*B, K, A]``, in which action t
     leads from frame t to t + 1 (the last one is ignored), and optionally ``action_known`` bool
     ``[*B]``, by default true: the actions of somebody else's demonstration are unknown. Writes the
     terms ``[]``: detached, for logging, and weighted as ``loss_*``, which add up to the

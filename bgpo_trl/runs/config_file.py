@@ -11,7 +11,7 @@ from typing import Any, Literal, NamedTuple, get_args, get_origin, get_type_hint
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.rl import RL
 from bgpo_trl.configs import AlgorithmConfig, RLConfig, RunConfig
-from suites import nico
+from bgpo_trl.scenes import SCENES, find_scene
 
 
 class Digests(NamedTuple):
@@ -57,8 +57,9 @@ def read_config(path: str | Path, defaults: RunConfig | None = None) -> tuple[Ru
         values, modules = settings.pop("algorithm"), settings.pop("task_modules", {})
         name = settings.get("name")
         kind = _algorithm_config(name, settings.pop("algorithm_class", None))
-        unknown = _unknown_task(settings.get("tasks"))
-        if kind is not None and unknown is None:
+        scene = settings.get("scene", "nico")
+        unknown = _unknown_task(scene, settings.get("tasks"))
+        if kind is not None and scene in SCENES and unknown is None:
             algorithm = _read(kind, values, "algorithm.")
             return _read(RunConfig, {**settings, "algorithm": algorithm}, ""), digests
     except (FileNotFoundError, NotADirectoryError):
@@ -71,6 +72,11 @@ def read_config(path: str | Path, defaults: RunConfig | None = None) -> tuple[Ru
         raise ValueError(
             f"{path} is a run of {name!r}, whose hyperparameters no imported module has: name the "
             "module that adds it with --import, or import it first in Python"
+        )
+    if scene not in SCENES:
+        raise ValueError(
+            f"{path} is a run in the scene {scene!r}, which no imported module adds: name the "
+            "module with --import, or import it first in Python"
         )
     # The module is not imported, since a file should not decide what is imported.
     module = modules.get(unknown) if isinstance(modules, dict) else None
@@ -96,11 +102,10 @@ def settings_of(config: RunConfig, digests: Digests) -> dict[str, Any]:
         ValueError: If a hyperparameter is of a type that `read_config` would not restore.
     """
     kind = type(config.algorithm)
-    added = {name: nico.TASKS[name].__module__ for name in config.tasks}
     settings = {
         **asdict(config),
         "algorithm_class": f"{kind.__module__}.{kind.__qualname__}",
-        "task_modules": {name: added[name] for name in added if name not in nico.ALL_TASKS},
+        "task_modules": dict(find_scene(config.scene).modules(config.tasks)),
         **digests._asdict(),
     }
     settings = _as_json(settings)
@@ -130,10 +135,12 @@ def _merged(defaults: dict[str, Any], settings: dict[str, Any]) -> dict[str, Any
     return merged
 
 
-def _unknown_task(tasks: object) -> str | None:
-    """Return the first task that is not in the suite; None if there is none, or no list."""
-    names = tasks if isinstance(tasks, list) else []
-    return next((name for name in names if isinstance(name, str) and name not in nico.TASKS), None)
+def _unknown_task(scene: object, tasks: object) -> str | None:
+    """Return the first task that is not in a scene; None if there is none, or no list."""
+    if not (isinstance(scene, str) and scene in SCENES and isinstance(tasks, list)):
+        return None
+    known = find_scene(scene).tasks
+    return next((name for name in tasks if isinstance(name, str) and name not in known), None)
 
 
 def _algorithm_config(name: object, stored: object) -> type[AlgorithmConfig] | None:

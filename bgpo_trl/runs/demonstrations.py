@@ -10,40 +10,53 @@ from bgpo_trl.encoders.pretrained import bank_path, find_weights
 from bgpo_trl.encoders.representation import (
     Representation,
     load_representation,
+    save_representation,
 )
 from bgpo_trl.runs.config_file import Digests
-from suites import nico
+from bgpo_trl.scenes import Scene, find_scene
 
 BANK = "bank.safetensors"
 """File of a run directory that holds its demonstrations, unless they come with its encoders."""
 
 
-def keep_bank(directory: Path, bank: DemonstrationBank, encoders: Representation) -> None:
-    """Store the demonstrations of a run, unless they are there already or come with its encoders.
+def keep_inputs(
+    directory: Path,
+    bank: DemonstrationBank,
+    encoders: Representation,
+    scene: Scene | str = "nico",
+) -> None:
+    """Store encoders and demonstrations of a run, unless they are there or come with the scene.
 
-    A copy, of at most a few megabytes, moves with the directory to other machines. Runs with the
-    shipped demonstrations store none, since their digest in ``config.json`` identifies them.
+    Copies, of some megabytes, move with the directory to other machines. Runs with the shipped
+    encoders and demonstrations store none, since digests in ``config.json`` identify them.
 
     Args:
         directory: The run directory.
         bank: Demonstrations of the run's tasks.
         encoders: Encoders of the run.
+        scene: The robot, or its name.
 
     Raises:
-        OSError: If the file cannot be written.
+        OSError: If a file cannot be written.
     """
-    for path in (directory / BANK, bank_path(_weights(directory, encoders.identity))):
+    weights = _weights(directory, scene, encoders.identity)
+    if weights is None:
+        weights = own_weights(directory)
+        save_representation(encoders, weights)
+    for path in (directory / BANK, bank_path(weights)):
         try:
             there = DemonstrationBank.load(path, encoder_id=encoders.identity)
             if there.for_tasks(bank.tasks).identity == bank.identity:
                 return
         except ValueError:  # missing, damaged, of other encoders or of other tasks
             continue
-    replace(bank, encoder_id=encoders.identity).save(directory / BANK)
+    version = find_scene(scene).version
+    bank = replace(bank, encoder_id=encoders.identity, scene_version=version)
+    bank.save(directory / BANK)
 
 
 def load_inputs(
-    directory: Path, tasks: tuple[str, ...], digests: Digests
+    directory: Path, tasks: tuple[str, ...], digests: Digests, scene: Scene | str = "nico"
 ) -> tuple[Representation, DemonstrationBank]:
     """Load the encoders and demonstrations that a run was trained with.
 
@@ -51,17 +64,22 @@ def load_inputs(
         directory: The run directory.
         tasks: Tasks of the run.
         digests: Digests in its ``config.json``.
+        scene: The robot, or its name.
 
     Raises:
         ValueError: If one of the files is missing, damaged or another one.
     """
-    own, weights = _own_weights(directory), _weights(directory, digests.encoders)
-    encoders = load_representation(weights, scene_version=nico.scene_version())
+    weights = _weights(directory, scene, digests.encoders)
+    if weights is None:
+        raise ValueError(
+            f"{directory} was trained with the encoders {str(digests.encoders)[:12]}, which do not "
+            f"come with the scene: put them at {own_weights(directory)}"
+        )
+    encoders = load_representation(weights, scene_version=find_scene(scene).version)
     if encoders.identity != digests.encoders:
-        present = own if own == weights else "those that come with the package"
         raise ValueError(
             f"{directory} was trained with the encoders {str(digests.encoders)[:12]}, not with "
-            f"{present} ({encoders.identity[:12]}): put its own at {own}"
+            f"{weights} ({encoders.identity[:12]}): put its own there"
         )
     kept = directory / BANK
     path = kept if kept.exists() else bank_path(weights)
@@ -74,11 +92,12 @@ def load_inputs(
     return encoders, bank
 
 
-def _own_weights(directory: Path) -> Path:
-    return directory / "encoders" / "nico.safetensors"
+def own_weights(directory: Path) -> Path:
+    """Return the path of encoders that a run does not share with others."""
+    return directory / "encoders" / "encoders.safetensors"
 
 
-def _weights(directory: Path, identity: str | None) -> Path:
-    """Return the path of a run's encoders: its own if it has some, else shipped ones."""
-    own = _own_weights(directory)
-    return own if own.exists() else find_weights(identity)
+def _weights(directory: Path, scene: Scene | str, identity: str | None) -> Path | None:
+    """Return the path of a run's encoders: its own if it has some, else those of the scene."""
+    own = own_weights(directory)
+    return own if own.exists() else find_weights(identity, scene)

@@ -25,7 +25,7 @@ class FrameEncoder(Transform):
        them.
 
     It also works in a replay buffer or on any TensorDict with frames. Reads the ``in_keys``, uint8
-    ``[*B, 32, 64, 3]``; writes the ``out_keys``, float32 ``[*B, 64]``.
+    ``[*B, H, W, 3]``; writes the ``out_keys``, float32 ``[*B, 64]``.
 
     Args:
         vae: The encoder; only its ``latent`` is called.

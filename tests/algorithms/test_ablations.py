@@ -66,7 +66,7 @@ def has_groups(variant):
 
 COMMON = {
     *("latent", "step_count", "task", "demo_embedding", "demo_index", "behavior", "context"),
-    *("episode_reward", "done", "terminated", "truncated"),
+    *("episode_reward", "success", "done", "terminated", "truncated"),
 }
 FROM_GWR = {"behavior_node"}
 FROM_GROUPS = {"group", "group_novelty"}

@@ -11,6 +11,7 @@ from bgpo_trl.algorithms.environments import encode
 from bgpo_trl.algorithms.policy import Policy
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.modules.gwr import GWRB
+from bgpo_trl.scenes.nico import NICO
 from bgpo_trl.seeding import generators
 from bgpo_trl.transforms import BehaviorLookup, GroupLookup, TaskSchedule
 from tests.algorithms.bgpo_variants import CHANGES, SCHEDULE, VARIANTS
@@ -376,7 +377,7 @@ def test_missing_encoders_are_refused(make_config, bank, in_world, variant):
     config = replace(config, **CHANGES.get(variant, {}))
     if state == "state":
         in_world(BGPO(config, seeds=(0,), bank=bank.seen()), (0,), SCHEDULE)
-        assert encode(config, None)
+        assert encode(config, None, NICO.state)
     else:
         with pytest.raises(ValueError, match="needs trained encoders"):
             in_world(BGPO(config, seeds=(0,), bank=bank.seen()), (0,), SCHEDULE)

@@ -309,15 +309,23 @@ def test_a_bank_is_read_as_it_was_written(plain_bank, tmp_path):
         assert getattr(loaded, name).dtype == getattr(plain_bank, name).dtype
 
 
-def test_a_bank_of_other_encoders_or_another_scene_is_refused(plain_bank, tmp_path, monkeypatch):
+def test_a_bank_of_other_encoders_is_refused(plain_bank, tmp_path):
     path = tmp_path / "bank.safetensors"
     plain_bank.save(path)
 
-    with pytest.raises(ValueError, match=r"was made for .*'abc'.*, not for .*'xyz'.*; make it"):
+    with pytest.raises(ValueError, match="by the encoders abc, not by xyz; make it again with"):
         DemonstrationBank.load(path, encoder_id="xyz")
-    monkeypatch.setattr(nico, "scene_version", lambda: "nico-2-00000000")
-    with pytest.raises(ValueError, match=r"not for .*nico-2-00000000.*; make it again with"):
-        DemonstrationBank.load(path, encoder_id="abc")
+
+
+def test_a_bank_remembers_its_scene_and_joins_none_of_another(plain_bank, tmp_path):
+    assert plain_bank.scene_version is None
+    for version in (None, "nico-1"):
+        bank = replace(plain_bank, scene_version=version)
+        bank.save(tmp_path / "bank.safetensors")
+        loaded = DemonstrationBank.load(tmp_path / "bank.safetensors", encoder_id="abc")
+        assert loaded.scene_version == version
+    with pytest.raises(ValueError, match="shows the scene nico-1, the other nico-2"):
+        loaded + replace(plain_bank, scene_version="nico-2")
 
 
 def test_a_bank_that_is_missing_or_damaged_is_refused(plain_bank, tmp_path):

@@ -10,8 +10,9 @@ import pytest
 import torch
 
 from bgpo_trl.data import recording as demonstrations
-from bgpo_trl.data.dataset import load_demonstrations, open_dataset
+from bgpo_trl.data.dataset import load_demonstrations, open_dataset, read_meta
 from bgpo_trl.data.recording import record_demonstrations
+from bgpo_trl.scenes.nico import scene as nico_scene
 from suites import nico
 from suites.nico.demonstrator import Demonstrator
 
@@ -123,7 +124,7 @@ def test_a_demonstration_that_fails_is_tried_again(tmp_path, monkeypatch):
         def __call__(self, timestep):
             return super().__call__(timestep) if len(attempts) > 2 else np.zeros(4)
 
-    monkeypatch.setattr(demonstrations, "Demonstrator", ClumsyAtFirst)
+    monkeypatch.setattr(nico_scene, "Demonstrator", ClumsyAtFirst)
     dataset = record_demonstrations(
         tmp_path, tasks=["grasp_glass"], per_task=1, held_out_per_task=0, progress=False
     )
@@ -151,13 +152,13 @@ def test_a_demonstrator_that_never_succeeds_is_told_of(tmp_path, monkeypatch):
         record_demonstrations(tmp_path, attempts=3, progress=False, **options)
     told = re.fullmatch(
         r"the demonstrator of 'fickle' failed 3 times in a row \(2 of (\d+) attempts succeeded, "
-        r"(\d+)%\): fix its demonstration\(\), or raise attempts",
+        r"(\d+)%\): fix it, or raise attempts",
         str(raised.value),
     )
     assert int(told[1]) >= 5
     assert int(told[2]) == round(200 / int(told[1]))
 
-    before = open_dataset(tmp_path, 8)["length"].clone()
+    before = open_dataset(tmp_path, read_meta(tmp_path))["length"].clone()
     assert (before > 0).tolist() == [True] * 6 + [False] * 2
     monkeypatch.setattr(Fickle, "times", 99)
     mended = record_demonstrations(tmp_path, attempts=50, progress=False, **options)
@@ -166,16 +167,16 @@ def test_a_demonstrator_that_never_succeeds_is_told_of(tmp_path, monkeypatch):
 
 
 def test_an_interrupted_recording_ends_as_an_uninterrupted_one(recorded, tmp_path, monkeypatch):
-    record = demonstrations._demonstrate
+    record = demonstrations._Recorder.demonstrate
     rows = []
 
-    def interrupted(env, seed, row, attempts):
+    def interrupted(recorder, task, row):
         rows.append(row)
         if len(rows) == 5:
             raise KeyboardInterrupt
-        return record(env, seed, row, attempts)
+        return record(recorder, task, row)
 
-    monkeypatch.setattr(demonstrations, "_demonstrate", interrupted)
+    monkeypatch.setattr(demonstrations._Recorder, "demonstrate", interrupted)
     with pytest.raises(KeyboardInterrupt):
         record_demonstrations(tmp_path, **TINY)
     with pytest.raises(ValueError, match=r"is not complete; resume it with the same command$"):
@@ -221,7 +222,10 @@ def test_another_recording_is_not_continued(copy, wrong, complete):
         ({"held_out_per_task": 3}, r"^held_out_per_task is 3: it must be less than per_task, 3$"),
         ({"held_out_per_task": -1}, r"^held_out_per_task is -1: .*$"),
         ({"per_task": 0}, r"^held_out_per_task is 1: it must be less than per_task, 0$"),
-        ({"tasks": ["juggle"]}, r"^no NICO task 'juggle'; choose one of grasp_glass, .*$"),
+        (
+            {"tasks": ["juggle"]},
+            r"^the scene 'nico' has no task 'juggle': choose .*$",
+        ),
     ],
 )
 def test_wrong_arguments_are_refused_before_anything_is_written(tmp_path, wrong, message):

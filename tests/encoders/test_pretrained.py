@@ -18,6 +18,8 @@ from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.encoders.representation import save_representation
 from bgpo_trl.encoders.train import make_pretrained
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
+from bgpo_trl.scenes import SCENES
+from bgpo_trl.scenes.nico import NICO
 from suites import nico
 
 TINY = RepresentationConfig(
@@ -87,8 +89,8 @@ def test_the_same_command_records_and_trains_nothing_again(made, folder, monkeyp
     def refuse(*arguments):
         raise AssertionError("recorded again")
 
-    for name in ("_demonstrate", "_play"):
-        monkeypatch.setattr(f"bgpo_trl.data.recording.{name}", refuse)
+    for name in ("demonstrate", "play"):
+        monkeypatch.setattr(f"bgpo_trl.data.recording._Recorder.{name}", refuse)
     play = load_demonstrations(folder / "demonstrations-play")
     assert (len(play), int((~play["train"]).sum())) == (6, 3)
     encoders, bank = make_pretrained(
@@ -110,14 +112,14 @@ def test_the_same_command_records_and_trains_nothing_again(made, folder, monkeyp
 
 def test_files_that_do_not_belong_together_are_refused(made, copy, monkeypatch):
     with monkeypatch.context() as patch:
-        patch.setattr(nico, "scene_version", lambda: "another")
+        patch.setitem(SCENES, "nico", replace(NICO, version="another"))
         with pytest.raises(ValueError, match="scene another"):
             load_pretrained(copy)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(5)
         other = replace(made[0], lae=SequenceAutoencoder())
     save_representation(other, copy)
-    with pytest.raises(ValueError, match=r"some_bank\.safetensors was made for .*make it again"):
+    with pytest.raises(ValueError, match=r"some_bank\.safetensors was embedded by .*make it again"):
         load_pretrained(copy)
     copy.with_name("some_bank.safetensors").unlink()
     with pytest.raises(ValueError, match="no demonstration bank"):

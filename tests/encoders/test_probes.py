@@ -13,6 +13,7 @@ from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.modules.inverse_model import InverseModel
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
+from bgpo_trl.scenes.nico import NICO
 
 
 def demonstrations(n: int = 6) -> TensorDict:
@@ -63,7 +64,7 @@ def test_probes_are_not_fitted_on_held_out_demonstrations(untrained: Representat
     """Two held-out demonstrations of three: measuring on one alone is fitting on the same four."""
     data = demonstrations()
     data["state"][data["train"]] = 0.5
-    result = probe(untrained, data)
+    result = probe(untrained, data, columns=NICO.state)
     error = data["state"][4:, :, 0] - 0.5
     valid = torch.arange(51) < data["length"][4:].unsqueeze(-1)
     expected = error[valid].square().mean().sqrt().item()
@@ -72,12 +73,12 @@ def test_probes_are_not_fitted_on_held_out_demonstrations(untrained: Representat
 
 def test_frames_beyond_the_length_do_not_count(untrained: Representation) -> None:
     data = demonstrations()
-    expected = probe(untrained, data)
+    expected = probe(untrained, data, columns=NICO.state)
     beyond = torch.arange(51) >= data["length"].unsqueeze(-1)
     data["pixels"][beyond] = 7
     data["state"][beyond] = 1e6
     data["action"][beyond[:, 1:]] = 1e6
-    assert probe(untrained, data) == pytest.approx(expected)
+    assert probe(untrained, data, columns=NICO.state) == pytest.approx(expected)
 
 
 def test_frames_of_play_with_a_fallen_object_are_left_out(untrained: Representation) -> None:
@@ -85,7 +86,7 @@ def test_frames_of_play_with_a_fallen_object_are_left_out(untrained: Representat
     play["state"][..., 7:] = 0.7
     play["state"][:, 1, 15] = 0.1  # the white box has just fallen
     play["state"][:, 1, 0] = 1e6
-    result = probe(untrained, demonstrations(), play=play)
-    assert result.items() >= probe(untrained, demonstrations()).items()
+    result = probe(untrained, demonstrations(), play=play, columns=NICO.state)
+    assert result.items() >= probe(untrained, demonstrations(), columns=NICO.state).items()
     assert 0.01 < result["play_joint_yaw_rmse_rad"] < 10
     assert result["play_white_error_cm"] == pytest.approx(0, abs=1e-2)

@@ -31,6 +31,7 @@ from bgpo_trl.encoders.representation import (
     valid_frames,
 )
 from bgpo_trl.encoders.train import train_encoders
+from bgpo_trl.scenes.nico import NICO
 from suites import nico
 
 CONFIG = RepresentationConfig(
@@ -120,7 +121,7 @@ def test_encoders_capture_frames_places_actions_and_tasks(
     trained: Representation, dataset: TensorDict
 ) -> None:
     """Held-out errors of the probes, against guessing the mean of the training set."""
-    probed = probe(trained, dataset)
+    probed = probe(trained, dataset, columns=NICO.state)
     assert probed["reconstruction"] < 0.75 * probed["mean_frame_reconstruction"]
     positions = [
         part["state"][torch.arange(51) < part["length"].unsqueeze(-1)] for part in split(dataset)
@@ -246,7 +247,9 @@ def test_training_writes_weights_log_and_probes(tmp_path: Path) -> None:
     assert [row["step"] for row in rows] == 3 * ["2", "4"]
     weighted_kl = TINY.vae.kl_weight * float(rows[0]["kl"])
     assert float(rows[0]["loss_kl"]) == pytest.approx(weighted_kl)
-    assert json.loads((folder / "probes.json").read_text()) == probe(loaded, squares(8), play=play)
+    assert json.loads((folder / "probes.json").read_text()) == probe(
+        loaded, squares(8), play=play, columns=NICO.state
+    )
     assert (folder / "reconstructions.png").exists()
 
 

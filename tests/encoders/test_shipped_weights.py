@@ -10,8 +10,10 @@ from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.encoders.representation import load_representation
 from bgpo_trl.experiments.run import pretrained_for
 from bgpo_trl.runs.config_file import Digests
-from bgpo_trl.runs.demonstrations import keep_bank, load_inputs
+from bgpo_trl.runs.demonstrations import keep_inputs, load_inputs
 from suites import nico
+
+META = {"scene": "nico", "spread": 0.5}
 
 
 @pytest.mark.parametrize(
@@ -38,11 +40,11 @@ def test_tasks_outside_the_paper_use_the_encoders_of_eight_tasks(tasks, name):
 def test_training_writes_the_encoders_of_the_datasets_tasks(monkeypatch, tasks, given):
     written = []
     monkeypatch.setattr(train, "load_demonstrations", lambda path: path)
-    monkeypatch.setattr(train, "read_meta", lambda path: {"tasks": tasks, "spread": 0.5})
+    monkeypatch.setattr(train, "read_meta", lambda path: META | {"tasks": tasks})
     monkeypatch.setattr(
         train,
         "train_encoders",
-        lambda dataset, play, weights, *_, tasks, spread, keep: written.append(
+        lambda dataset, play, weights, *_, tasks, spread, keep, scene: written.append(
             (weights, tasks, spread)
         ),
     )
@@ -54,7 +56,7 @@ def test_a_run_finds_its_encoders_by_their_digest(tmp_path):
     for tasks in (nico.PAPER_TASKS, nico.ALL_TASKS):
         encoders, bank = load_pretrained(tasks=tasks)
         paper = bank.for_tasks(nico.PAPER_TASKS)
-        keep_bank(tmp_path, paper, encoders)
+        keep_inputs(tmp_path, paper, encoders)
         digests = Digests(encoders.identity, paper.identity)
         found, demonstrations = load_inputs(tmp_path, nico.PAPER_TASKS, digests)
         assert found.identity == encoders.identity

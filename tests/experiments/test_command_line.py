@@ -108,7 +108,7 @@ CASES = [
     ("bgpo_trl.data.recording new --per-task 0", "held_out_per_task"),
     ("bgpo_trl.encoders.make_bank absent new", "there is no dataset at absent"),
     ("bgpo_trl.encoders.train empty", "empty is not a dataset"),
-    ("bgpo_trl.encoders.probes empty --weights file", "file is damaged"),
+    ("bgpo_trl.encoders.probes empty --weights file", "empty is not a dataset"),
     ("suites.nico.explore --out a.jpeg", "cannot write a.jpeg"),
 ]
 

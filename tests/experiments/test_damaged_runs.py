@@ -9,7 +9,7 @@ from functools import partial
 import pytest
 
 from bgpo_trl.experiments.arguments import TrainedArguments
-from bgpo_trl.experiments.looking import looking
+from bgpo_trl.experiments.nico.looking import looking
 from bgpo_trl.experiments.one_shot import OneShotArguments, one_shot
 from bgpo_trl.experiments.report import ReportArguments, report
 from bgpo_trl.experiments.watch import WatchArguments, watch

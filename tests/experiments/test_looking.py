@@ -9,12 +9,12 @@ import torch
 from scipy.spatial.transform import Rotation
 from tensordict import TensorDict
 
-from bgpo_trl.envs import NicoEnv
-from bgpo_trl.experiments import looking
 from bgpo_trl.experiments.arguments import TrainedArguments
 from bgpo_trl.experiments.episodes import load_blocks
-from bgpo_trl.experiments.looking import HidingEnv, Row
+from bgpo_trl.experiments.nico import looking
+from bgpo_trl.experiments.nico.looking import HidingEnv, Row
 from bgpo_trl.runs.results import read_table
+from bgpo_trl.scenes.nico import NicoEnv
 from bgpo_trl.training import Trainer
 from suites import nico
 from suites.nico.rendering import FrameRenderer
@@ -105,7 +105,7 @@ def poses(physics):
 
 
 def check(env, row, expected):
-    frame, state = scene(env._environments[row][0].physics, expected)
+    frame, state = scene(env.simulations[row].environment.physics, expected)
     np.testing.assert_array_equal(env.frames()[row], frame)
     np.testing.assert_allclose(env._current["state"][row], state, atol=1e-6)
 
@@ -117,10 +117,10 @@ def test_observations_show_objects_at_nominal_places(hidden):
     nominal = [(place, Rotation.identity()) for place in nico.nominal_places()]
     for row in range(2):
         check(env, row, nominal)
-    starts = [poses(tasks[0].physics) for tasks in env._environments]
+    starts = [poses(simulation.environment.physics) for simulation in env.simulations]
 
     # The second glass is moved, turned and knocked over: what is shown follows, or does not.
-    physics = env._environments[1][0].physics
+    physics = env.simulations[1].environment.physics
     toppled = Rotation.from_euler("xz", [90, 40], degrees=True).as_quat()
     pose = [*(starts[1][0][0] + [0.03, 0.05, -0.01]), *toppled[[3, 0, 1, 2]]]
     physics.named.data.qpos["glass"] = pose
@@ -128,13 +128,13 @@ def test_observations_show_objects_at_nominal_places(hidden):
     for _ in range(3):
         state.set("action", torch.tensor([[0.0, 0.0, 0.5, 0.0]] * 2))
         state = env.step(state)["next"]
-    for row, tasks in enumerate(env._environments):
+    for row, simulation in enumerate(env.simulations):
         expected = nominal
         if hidden == "places":
             expected = [
                 (place + now[0] - start[0], now[1] * start[1].inv())
                 for (place, _), start, now in zip(
-                    nominal, starts[row], poses(tasks[0].physics), strict=True
+                    nominal, starts[row], poses(simulation.environment.physics), strict=True
                 )
             ]
         check(env, row, expected)
@@ -159,7 +159,8 @@ def test_the_simulation_is_that_of_the_plain_environment(hidden):
             for env, state in zip(envs, states, strict=True)
         ]
         true, hiding = (env.simulation_state() for env in envs)
-        assert true["physics"].equal(hiding["physics"])
+        for plain, other in zip(true["simulations"], hiding["simulations"], strict=True):
+            assert plain["physics"].equal(other["physics"])
         assert states[0]["done"].equal(states[1]["done"])
     for env in envs:
         env.close()

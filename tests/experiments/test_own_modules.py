@@ -97,7 +97,7 @@ def test_an_algorithm_of_a_module_is_trained_and_filmed(undrawn, folder):
     with pytest.raises(ValueError, match="name the module that adds it with --import"):
         watch(WatchArguments(run))
     watch(WatchArguments(run, module="my_algorithm"))
-    assert (run / "figures" / "nico.gif").exists()
+    assert (run / "figures" / "film.gif").exists()
 
 
 def test_an_rl_algorithm_of_a_module_is_chosen_by_name():

@@ -324,7 +324,11 @@ def test_the_smoke_preset_passes_every_stage_although_it_is_interrupted(tmp_path
     assert result.stdout.endswith("curve and figures: run; in numbers: bgpo report run\n")
     for name in (
         *("config.json", "train.csv", "eval.csv", "figures/success.png", "figures/gwr.png"),
-        *("encoders/nico.safetensors", "encoders/nico_bank.safetensors", "encoders/probes.json"),
+        *(
+            "encoders/encoders.safetensors",
+            "encoders/encoders_bank.safetensors",
+            "encoders/probes.json",
+        ),
         "demonstrations/dataset.json",
     ):
         assert (tmp_path / "run" / name).stat().st_size > 0

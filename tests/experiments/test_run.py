@@ -14,7 +14,7 @@ ONE, TWO, THREE = nico.PAPER_TASKS
 def own(bank, encoders, monkeypatch, tmp_path):
     """Path of a bank of two tasks, one of them shipped under the same name."""
     bank = replace(bank, encoder_id=encoders.identity)
-    monkeypatch.setattr(experiment, "load_pretrained", lambda _: (encoders, bank))
+    monkeypatch.setattr(experiment, "load_pretrained", lambda *_, **__: (encoders, bank))
     path = tmp_path / "own.safetensors"
     other = replace(bank, embedding=bank.embedding + 1)
     renamed = replace(other.for_tasks([ONE, TWO]), tasks=("juggle", TWO))

@@ -328,7 +328,7 @@ def without_ray(monkeypatch):
     monkeypatch.setattr(sweep, "play_jobs", play_jobs)
     monkeypatch.setattr(sweep, "play", play)
     some = [SimpleNamespace(identity=digest) for digest in SOME]
-    monkeypatch.setattr(sweep, "pretrained_for", lambda tasks, bank: some)
+    monkeypatch.setattr(sweep, "pretrained_for", lambda tasks, bank, **_: some)
     return SimpleNamespace(played=played, broken=broken)
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 from PIL import Image
 
-from bgpo_trl.experiments import tasks as nico_tasks
+from bgpo_trl.experiments.nico import tasks as nico_tasks
 from suites import nico
 
 

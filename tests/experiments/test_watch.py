@@ -32,14 +32,14 @@ def test_a_film_has_its_files_and_leaves_the_run_unchanged(run_of, undemonstrate
     before = contents(run)
     printed = watch.watch(watch.WatchArguments(run, run_seed=8, out=out))
     assert contents(run) == before
-    expected = {"nico.gif", "nico.png"} | ({"gwr_growth.png"} if name == "bgpo" else set())
+    expected = {"film.gif", "film.png"} | ({"gwr_growth.png"} if name == "bgpo" else set())
     assert {path.name for path in out.iterdir()} == expected
     first, *outcomes, last = printed.splitlines()
     assert re.fullmatch(r"seed 8 after \d+ training episodes", first)
     for task, line in zip(nico.PAPER_TASKS, outcomes, strict=True):
         assert line.startswith((f"{task}: no success after 6 steps", f"{task}: success after "))
     assert last == f"pictures: {out}"
-    with Image.open(out / "nico.gif") as gif:
+    with Image.open(out / "film.gif") as gif:
         assert gif.size == (760, 494)
 
 
@@ -69,7 +69,7 @@ def test_an_episode_has_the_frames_of_the_policys_actions():
     policy = SimpleNamespace(
         condition=lambda demonstration, task: watched.append((demonstration, task)),
         act=act,
-        config=SimpleNamespace(algorithm=SimpleNamespace(max_steps=50), spread=1.0),
+        config=SimpleNamespace(algorithm=SimpleNamespace(max_steps=50), scene="nico", spread=1.0),
     )
     episode = watch.play(policy, "push_green_to_white", frames[:2], 3)
     ((demonstration, task),) = watched
@@ -77,8 +77,8 @@ def test_an_episode_has_the_frames_of_the_policys_actions():
     assert task == "push_green_to_white"
     np.testing.assert_array_equal(episode.seen, frames)
     np.testing.assert_array_equal(np.stack(seen), frames[:-1])
-    assert episode.room.shape == (len(frames), 128, 192, 3)
-    assert len(np.unique(episode.room, axis=0)) > 1
+    assert episode.view.shape == (len(frames), 128, 192, 3)
+    assert len(np.unique(episode.view, axis=0)) > 1
     assert episode.outcome == f"success after {len(actions)} steps"
 
     left[:], policy.config.algorithm.max_steps = actions, 4

@@ -7,7 +7,7 @@ import pytest
 
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.runs.config_file import Digests
-from bgpo_trl.runs.demonstrations import BANK, keep_bank, load_inputs
+from bgpo_trl.runs.demonstrations import BANK, keep_inputs, load_inputs
 from suites import nico
 
 TASKS = nico.PAPER_TASKS
@@ -30,7 +30,7 @@ def mixed(shipped):
 def test_shipped_demonstrations_are_not_copied(shipped, tmp_path, tasks):
     encoders, bank = shipped
     bank = bank.for_tasks(tasks)
-    keep_bank(tmp_path, bank, encoders)
+    keep_inputs(tmp_path, bank, encoders)
     assert list(tmp_path.iterdir()) == []
     found = load_inputs(tmp_path, tasks, Digests(encoders.identity, bank.identity))[1]
     assert (found.tasks, found.identity) == (tasks, bank.identity)
@@ -39,7 +39,7 @@ def test_shipped_demonstrations_are_not_copied(shipped, tmp_path, tasks):
 def test_own_demonstrations_move_with_the_run(shipped, mixed, tmp_path):
     encoders, _ = shipped
     (tmp_path / "run").mkdir()
-    keep_bank(tmp_path / "run", mixed, encoders)
+    keep_inputs(tmp_path / "run", mixed, encoders)
     shutil.move(tmp_path / "run", tmp_path / "moved")
     digests = Digests(encoders.identity, mixed.identity)
     found = load_inputs(tmp_path / "moved", mixed.tasks, digests)[1]

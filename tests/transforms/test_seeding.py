@@ -7,8 +7,8 @@ import pytest
 import torch
 from torchrl.envs import Compose, ParallelEnv, SerialEnv, StepCounter, TransformedEnv
 
-from bgpo_trl.envs import NicoEnv
 from bgpo_trl.modules.gwr import GWRB
+from bgpo_trl.scenes.nico import NicoEnv
 from bgpo_trl.transforms import (
     BehaviorLookup,
     BehaviorMatchingReward,

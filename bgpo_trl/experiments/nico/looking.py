@@ -10,26 +10,20 @@ always the true one; what is altered is the picture of it that the policy gets.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import mujoco
 import numpy as np
-from dm_env import TimeStep
 from numpy.typing import NDArray
 
 from bgpo_trl.analysis import statistics
 from bgpo_trl.analysis.tables import Table, markdown
-from bgpo_trl.envs import NicoEnv
 from bgpo_trl.evaluation import start_seeds
 from bgpo_trl.experiments.arguments import TrainedArguments
-from bgpo_trl.experiments.episodes import (
-    evaluator_of,
-    load_blocks,
-    play,
-    random_actions,
-    snapshots_of,
-)
+from bgpo_trl.experiments.episodes import evaluator_of, snapshots_of
+from bgpo_trl.experiments.nico.scripted import load_blocks_of_nico, play, random_actions
 from bgpo_trl.experiments.records import write_measurement
 from bgpo_trl.figures.bars import plot_success_bars
 from bgpo_trl.figures.style import save_figure
@@ -38,6 +32,8 @@ from bgpo_trl.machine import set_threads
 from bgpo_trl.plugins import import_plugin
 from bgpo_trl.policy import LoadedRun
 from bgpo_trl.runs.provenance import commit_of_code
+from bgpo_trl.scenes.nico.env import NicoEnv, NicoSimulation
+from bgpo_trl.scenes.nico.scene import NICO
 from suites import nico
 from suites.nico.physics import OBJECTS
 
@@ -66,49 +62,76 @@ class Row(NamedTuple):
     success: float
 
 
-class HidingEnv(NicoEnv):
-    """`NicoEnv` whose observations hide where the objects are; the simulation is the same.
+class HidingSimulation(NicoSimulation):
+    """NICO at the table, whose observations hide where the objects are.
 
     Frames and ground truth show each object at its nominal place and turn; if only places are
     hidden, moved and turned from there as it was since the start of the episode. The arm is shown
-    as it is. Episodes have to begin with a reset.
+    as it is.
+
+    Args:
+        tasks: As for `NicoSimulation`, as is ``spread``.
+        shown: Physics to show; the true one is only read. Others may share it.
+        hidden: ``"places"`` hides where objects started, ``"objects"`` also how they move.
+    """
+
+    def __init__(
+        self, tasks: Sequence[str], *, shown: nico.Physics, hidden: Hidden, spread: float = 1.0
+    ) -> None:
+        super().__init__(tasks, spread=spread)
+        self._hides_movement = hidden == "objects"
+        self._shown = shown
+        joints = [shown.model.joint(name).qposadr[0] for name in OBJECTS]
+        self._poses = np.add.outer(joints, np.arange(7))
+        self._nominal = np.hstack([nico.nominal_places(), [[1.0, 0.0, 0.0, 0.0]] * len(OBJECTS)])
+        self._start = self._nominal
+
+    def reset(self, task: int) -> None:
+        """Begin an episode of a task."""
+        super().reset(task)
+        self._start = self.environment.physics.data.qpos[self._poses].copy()
+
+    def _show(self) -> nico.Physics:
+        """Return the physics to show, in its state of this moment."""
+        true, shown = self.environment.physics.data.qpos, self._shown
+        poses = self._nominal
+        if not self._hides_movement:
+            poses = _moved(self._nominal, self._start, true[self._poses])
+        shown.data.qpos[:] = true
+        shown.data.qpos[self._poses] = poses
+        # All that is drawn follows from positions, hence without contacts and forces.
+        mujoco.mj_kinematics(shown.model.ptr, shown.data.ptr)
+        mujoco.mj_camlight(shown.model.ptr, shown.data.ptr)
+        return shown
+
+    def frame(self) -> NDArray[np.uint8]:
+        """Return NICO's view of the shown scene, ``[32, 64, 3]``."""
+        return self.draw(self._show())
+
+    def state(self) -> NDArray[Any]:
+        """Return the ground truth of the shown scene, ``[16]``."""
+        return self.environment.task.get_observation(self._show())["privileged_state"]
+
+
+class HidingEnv(NicoEnv):
+    """`NicoEnv` of `HidingSimulation`.
 
     Args:
         tasks: As for `NicoEnv`, as are all other arguments.
-        hidden: ``"places"`` hides where objects started, ``"objects"`` also how they move.
+        hidden: As for `HidingSimulation`.
     """
 
     def __init__(
         self, tasks: Sequence[str] = nico.PAPER_TASKS, *, hidden: Hidden, **arguments: Any
     ) -> None:
-        super().__init__(tasks, **arguments)
-        self._hides_movement = hidden == "objects"
-        # The shown scene has a simulation of its own, so that the true one is only read.
+        self._hidden: Hidden = hidden
         self._shown = nico.Physics.from_xml_string(nico.scene_xml())
-        joints = [self._shown.model.joint(name).qposadr[0] for name in OBJECTS]
-        self._poses = np.add.outer(joints, np.arange(7))
-        self._nominal = np.hstack([nico.nominal_places(), [[1.0, 0.0, 0.0, 0.0]] * len(OBJECTS)])
-        self._starts = np.tile(self._nominal, (self.batch_size.numel(), 1, 1))
+        super().__init__(tasks, **arguments)
 
-    def _record(self, row: int, timestep: TimeStep) -> None:
-        environment, shown = self._environment(row), self._shown
-        true = environment.physics.data.qpos
-        if timestep.first():
-            self._starts[row] = true[self._poses]
-        shown.data.qpos[:] = true
-        shown.data.qpos[self._poses] = self._nominal
-        if not self._hides_movement:
-            shown.data.qpos[self._poses] = _moved(
-                self._nominal, self._starts[row], true[self._poses]
-            )
-        # All that is drawn follows from positions, hence without contacts and forces.
-        mujoco.mj_kinematics(shown.model.ptr, shown.data.ptr)
-        mujoco.mj_camlight(shown.model.ptr, shown.data.ptr)
-        if self._renderer is not None:
-            self._renderer.render(shown.data.ptr, out=self._current["pixels"][row])
-        if "state" in self._current:
-            observation = environment.task.get_observation(shown)
-            self._current["state"][row] = observation["privileged_state"]
+    def _simulation(self) -> HidingSimulation:
+        return HidingSimulation(
+            self.tasks, shown=self._shown, hidden=self._hidden, spread=self._spread
+        )
 
 
 def _moved(poses: NDArray, start: NDArray, now: NDArray) -> NDArray:
@@ -144,8 +167,10 @@ def measure_looking(
     config, found = run.config, {}
     held_out = run.bank.held_out(config.held_out)
     for name, hidden in VIEWS.items():
-        make_env = None if hidden is None else partial(HidingEnv, hidden=hidden)
-        evaluator = evaluator_of(run, held_out, episodes, make_env=make_env)
+        scene = NICO
+        if hidden is not None:
+            scene = replace(NICO, make_env=partial(HidingEnv, hidden=hidden))
+        evaluator = evaluator_of(run, held_out, episodes, scene=scene)
         snapshots = snapshots_of(run, evaluator, _NUMBER)
         success = evaluator.run(snapshots, run.algorithm.device, watch).success
         found[name] = success.double().mean(-1).numpy()
@@ -206,7 +231,7 @@ def looking(arguments: TrainedArguments) -> str:
     import_plugin(arguments.module)
     set_threads(arguments.threads)
     rows: list[Row] = []
-    for run in load_blocks(arguments.run):
+    for run in load_blocks_of_nico(arguments.run):
         steps = len(VIEWS) * (run.config.algorithm.max_steps + 1)
         with progress_bar("looking", total=steps, unit="step") as bar:
             rows += measure_looking(run, arguments.episodes, bar.update)

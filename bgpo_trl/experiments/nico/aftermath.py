@@ -21,19 +21,14 @@ from numpy.typing import NDArray
 from bgpo_trl.analysis.tables import Table, markdown
 from bgpo_trl.evaluation import start_seeds
 from bgpo_trl.experiments.arguments import TrainedArguments
-from bgpo_trl.experiments.episodes import (
-    Episode,
-    evaluator_of,
-    load_blocks,
-    play,
-    random_actions,
-    snapshots_of,
-)
+from bgpo_trl.experiments.episodes import evaluator_of, snapshots_of
+from bgpo_trl.experiments.nico.scripted import Episode, load_blocks_of_nico, play, random_actions
 from bgpo_trl.experiments.records import write_measurement
 from bgpo_trl.machine import set_threads
 from bgpo_trl.plugins import import_plugin
 from bgpo_trl.policy import LoadedRun
 from bgpo_trl.runs.provenance import commit_of_code
+from bgpo_trl.scenes.nico.env import NicoSimulation
 from suites import nico
 from suites.nico import kinematics
 from suites.nico.base import CONTROL_TIMESTEP, TIME_LIMIT, Environment
@@ -209,8 +204,12 @@ def policy_episodes(run: LoadedRun, episodes: int) -> list[Episode]:
     evaluator, first = evaluator_of(run, held_out, episodes), list[NDArray]()
 
     def states() -> NDArray:
-        found = evaluator.simulation.simulation_state()["physics"].numpy()
-        return found.reshape(*evaluator.shape, -1)
+        found = [
+            simulation.environment.physics.get_state()
+            for simulation in evaluator.simulation.simulations
+            if isinstance(simulation, NicoSimulation)
+        ]
+        return np.reshape(found, (*evaluator.shape, -1))
 
     result = evaluator.run(
         snapshots_of(run, evaluator, _NUMBER),
@@ -265,7 +264,7 @@ def check_criteria(tasks: Iterable[str]) -> None:
     if missing:
         raise ValueError(
             f"nothing says what a success of {missing[0]} is worth: add a Criterion to "
-            "bgpo_trl.experiments.aftermath.CRITERIA in the module of --import"
+            "bgpo_trl.experiments.nico.aftermath.CRITERIA in the module of --import"
         )
 
 
@@ -336,7 +335,7 @@ def episodes_of(arguments: AftermathArguments) -> dict[str, list[Episode]]:
     max_steps = round(TIME_LIMIT / CONTROL_TIMESTEP)
     episodes: dict[str, list[Episode]] = {}
     if arguments.run is not None:
-        runs = load_blocks(arguments.run)
+        runs = load_blocks_of_nico(arguments.run)
         config = runs[0].config
         tasks, max_steps, spread = config.tasks, config.algorithm.max_steps, config.spread
         seeds = [seed for run in runs for seed in run.config.seeds]

@@ -1,0 +1,1 @@
+"""Measurements that only make sense for NICO's table."""

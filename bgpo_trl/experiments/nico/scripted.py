@@ -1,0 +1,97 @@
+"""Runs of NICO, and episodes from the starts of their tests, played by scripted policies."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from dm_env import TimeStep
+from numpy.typing import NDArray
+
+from bgpo_trl.experiments.episodes import load_blocks
+from bgpo_trl.policy import LoadedRun
+from suites import nico
+from suites.nico.base import Environment
+
+Actor = Callable[[TimeStep], NDArray]
+"""Scripted policy: maps a time step to an action ``[4]``."""
+
+
+def load_blocks_of_nico(run: Path) -> list[LoadedRun]:
+    """Load all seeds of a run of NICO, see `load_blocks`.
+
+    Raises:
+        ValueError: As for `load_blocks`, or if the run is of another scene.
+    """
+    blocks = load_blocks(run)
+    scene = blocks[0].config.scene
+    if scene != "nico":
+        raise ValueError(f"{run} is a run of the scene {scene!r}: this test is of NICO's table")
+    return blocks
+
+
+@dataclass(frozen=True)
+class Episode:
+    """First and last state of a test episode.
+
+    Attributes:
+        task: Name of the task.
+        seed: Seed of the run whose start it was.
+        success: Whether it ended with success.
+        start: State of the simulation at the start, as from ``physics.get_state()``.
+        end: The same at the end.
+    """
+
+    task: str
+    seed: int
+    success: bool
+    start: NDArray
+    end: NDArray
+
+
+def play(
+    tasks: tuple[str, ...],
+    starts: NDArray[np.int64],
+    seed: int,
+    make_actor: Callable[[Environment, int], Actor],
+    max_steps: int,
+    spread: float = 1.0,
+) -> list[Episode]:
+    """Play an episode from each start with a scripted policy.
+
+    Args:
+        tasks: Names of the tasks.
+        starts: Seeds of the starts, ``[T, M]``, as from `start_seeds`.
+        seed: Seed of the run whose starts they are.
+        make_actor: Called at each start with the environment and the start's seed.
+        max_steps: Longest episode.
+        spread: Share of the whole range of start states.
+    """
+    physics, episodes = nico.Physics.from_xml_string(nico.scene_xml()), []
+    for task, of_task in zip(tasks, starts.tolist(), strict=True):
+        for start_seed in of_task:
+            env = nico.load(
+                task,
+                seed=start_seed,
+                spread=spread,
+                observation="state",
+                time_limit=float("inf"),
+                physics=physics,
+            )
+            timestep = env.reset()
+            start, act = physics.get_state(), make_actor(env, start_seed)
+            for _ in range(max_steps):
+                timestep = env.step(act(timestep))
+                if timestep.last():
+                    break
+            episodes.append(Episode(task, seed, timestep.last(), start, physics.get_state()))
+    return episodes
+
+
+def random_actions(env: Environment, seed: int) -> Actor:
+    """Return a policy of uniformly random actions."""
+    del env
+    random = np.random.default_rng(seed)
+    return lambda _: random.uniform(-1.0, 1.0, 4)

@@ -1,0 +1,178 @@
+"""NICO's tasks as a TorchRL environment: the suite `suites.nico` as simulations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from dm_env import TimeStep
+from numpy.typing import NDArray
+
+from bgpo_trl.scenes.simulation import Observation, Outcome, Simulation, SimulationEnv
+from bgpo_trl.seeding import random_state, set_random_state
+from suites import nico
+from suites.nico.base import STATE_SIZE, Environment, check_spread
+from suites.nico.rendering import FRAME_HEIGHT, FRAME_WIDTH, FrameRenderer
+
+__all__ = ["FRAME_SHAPE", "NicoEnv", "NicoSimulation"]
+
+FRAME_SHAPE = (FRAME_HEIGHT, FRAME_WIDTH)
+_ROOM = (180, 70, 600, 350)  # (pixels) crop of the 640x480 room view to NICO and the table
+
+
+class NicoSimulation(Simulation):
+    """NICO at the table, with one physics for all tasks.
+
+    Args:
+        tasks: Names of the tasks, in the order of their numbers.
+        spread: Share of the whole range of start states.
+
+    Attributes:
+        environments: Environment of each task.
+        environment: That of the current one.
+        timestep: What the last step or reset has returned.
+        renderer: Renderer of the frames, which other simulations may share.
+    """
+
+    renderer: FrameRenderer | None = None
+
+    def __init__(self, tasks: Sequence[str], *, spread: float = 1.0) -> None:
+        physics = nico.Physics.from_xml_string(nico.scene_xml())
+        random = np.random.RandomState(0)  # All tasks draw from one source.
+        self.environments = [
+            nico.load(
+                task,
+                seed=random,
+                spread=spread,
+                observation="state",  # Frames are drawn in one thread, by `frame`.
+                time_limit=float("inf"),
+                physics=physics,
+            )
+            for task in tasks
+        ]
+        self.environment: Environment = self.environments[0]
+        self.timestep: TimeStep
+        self._room: FrameRenderer | None = None
+
+    def seed(self, seed: int) -> None:
+        """Seed the draws of all following starts."""
+        self.environment.task.random.seed(seed)
+
+    def reset(self, task: int) -> None:
+        """Begin an episode of a task."""
+        self.environment = self.environments[task]
+        self.timestep = self.environment.reset()
+
+    def step(self, action: NDArray[np.float64]) -> Outcome:
+        """Perform an action ``[4]``; an episode ends with success only."""
+        self.timestep = self.environment.step(action)
+        return Outcome(self.timestep.last())
+
+    def frame(self) -> NDArray[np.uint8]:
+        """Return NICO's view, ``[32, 64, 3]``."""
+        return self.draw(self.environment.physics)
+
+    def draw(self, physics: nico.Physics) -> NDArray[np.uint8]:
+        """Return NICO's view of any physics of the scene, ``[32, 64, 3]``."""
+        if self.renderer is None:
+            self.renderer = FrameRenderer(physics.model.ptr)
+        return self.renderer.render(physics.data.ptr)
+
+    def state(self) -> NDArray[Any]:
+        """Return joints (rad), grip and object positions (m), ``[16]``."""
+        return self.timestep.observation["privileged_state"]
+
+    def view(self) -> NDArray[np.uint8]:
+        """Return NICO at the table, seen from the room, ``[280, 420, 3]``."""
+        physics = self.environment.physics
+        if self._room is None:
+            self._room = FrameRenderer(physics.model.ptr, "room", height=480, width=640)
+        left, top, right, bottom = _ROOM
+        return self._room.render(physics.data.ptr)[top:bottom, left:right]
+
+    def close(self) -> None:
+        """Free the renderer of the room."""
+        if self._room is not None:
+            self._room.close()
+            self._room = None
+
+    def save(self) -> dict[str, Any]:
+        """Return the state of physics and random numbers."""
+        return {
+            "task": self.environments.index(self.environment),
+            "physics": torch.from_numpy(self.environment.physics.get_state()),
+            "random": random_state(self.environment.task.random),
+        }
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Continue from what `save` returned."""
+        self.environment = self.environments[state["task"]]
+        self.environment.physics.set_state(state["physics"].numpy())
+        set_random_state(self.environment.task.random, state["random"])
+        for environment in self.environments:
+            environment._reset_next_step = False
+
+
+class NicoEnv(SimulationEnv):
+    """NICO at the table as a TorchRL environment; keys and behavior as of `SimulationEnv`.
+
+    ``"pixels"`` are ``[*B, 32, 64, 3]``, ``"state"`` is ``[*B, 16]``: joints (rad), grip and object
+    positions (m). Actions are ``[*B, 4]``. All simulations share one renderer. Episodes end on
+    success only: append ``StepCounter(50)`` for the paper's time limit.
+
+    Args:
+        tasks: Names of the tasks, in the order of their presentation.
+        spread: Share of the whole range of start states, from 0 (nominal places) to 1.
+        observation: ``"pixels"``, ``"state"`` or ``"both"``.
+        **options: ``batch_size``, ``seed`` and ``threads`` of `SimulationEnv`.
+
+    Raises:
+        ValueError: If a task is unknown or named twice, the spread is out of range, or as for
+            `SimulationEnv`.
+
+    Example:
+        >>> env = NicoEnv(batch_size=[2], seed=0)
+        >>> env.rollout(3)["pixels"].shape
+        torch.Size([2, 3, 32, 64, 3])
+    """
+
+    def __init__(
+        self,
+        tasks: Sequence[str] = nico.PAPER_TASKS,
+        *,
+        spread: float = 1.0,
+        observation: Observation = "pixels",
+        **options: Any,
+    ) -> None:
+        check_spread(spread)
+        if not isinstance(tasks, str):
+            nico.check_tasks(tasks)
+        self._spread = spread
+        self._renderer: FrameRenderer | None = None
+        super().__init__(
+            self._make,
+            tasks,
+            frame_shape=FRAME_SHAPE,
+            action_size=4,
+            state_size=STATE_SIZE,
+            observation=observation,
+            **options,
+        )
+
+    def _make(self) -> NicoSimulation:
+        simulation = self._simulation()
+        if self._renderer is None and self.observation != "state":
+            self._renderer = FrameRenderer(simulation.environment.physics.model.ptr)
+        simulation.renderer = self._renderer
+        return simulation
+
+    def _simulation(self) -> NicoSimulation:
+        return NicoSimulation(self.tasks, spread=self._spread)
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """End the threads and free the renderer."""
+        super().close(raise_if_closed=raise_if_closed)
+        if self._renderer is not None:
+            self._renderer.close()

@@ -1,0 +1,202 @@
+"""Scenes: what experiments need to know about a robot and its simulation."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bgpo_trl.scenes.simulation import Observation, Simulation, SimulationEnv
+
+__all__ = ["SCENES", "Scene", "StateColumns", "Weights", "find_scene"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class StateColumns:
+    """Meaning of the ground truth ``"state"``, float32 ``[N]``.
+
+    It serves policies with ``state="state"`` and the probes of encoders; frames alone suffice for
+    everything else.
+
+    Attributes:
+        center: Mean of each column, subtracted from what policies observe.
+        scale: Spread of each column, by which it is divided.
+        angles: Columns of joints (rad), by name, which probes read linearly.
+        places: Columns of the coordinates of objects on the table (m), by name.
+        valid: Function from states ``[..., N]`` to bool ``[...]``: frames to probe in play, such as
+            those with all objects on the table; None for all.
+    """
+
+    center: Sequence[float]
+    scale: Sequence[float]
+    angles: Mapping[str, int] = field(default_factory=dict)
+    places: Mapping[str, Sequence[int]] = field(default_factory=dict)
+    valid: Callable[[Any], Any] | None = None
+
+    def __post_init__(self) -> None:
+        if len(self.center) != len(self.scale):
+            raise ValueError(
+                f"center has {len(self.center)} columns, scale has {len(self.scale)}: give as many"
+            )
+
+    @property
+    def size(self) -> int:
+        """Number of columns."""
+        return len(self.center)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Weights:
+    """Encoders that come with a scene, each with a bank beside it, see `bank_path`.
+
+    Attributes:
+        files: Their files.
+        choose: Function from names of tasks to the file that serves them.
+    """
+
+    files: Sequence[Path]
+    choose: Callable[[Sequence[str]], Path]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Scene:
+    """A robot and its tasks: all that experiments know about a simulation.
+
+    What is None is missing: without a ``demonstrator``, demonstrations come from elsewhere; without
+    ``state``, policies learn from frames and probes leave the ground truth out; without
+    ``weights``, encoders are trained or named.
+
+    Attributes:
+        name: Name in settings, datasets and on command lines.
+        version: Version of everything that frames and dynamics depend on. Datasets, encoders and
+            banks of another version are refused.
+        tasks: Names of all tasks; may grow while the program runs.
+        default_tasks: Names of the tasks of an experiment by default.
+        own_tasks: Names of the tasks that come with the scene; the default ones if None.
+        make_env: Constructor of the environment, see `simulate`. It is `SimulationEnv` around a
+            `Simulation`, or an ``EnvBase`` with the same keys, attributes and methods.
+        frame_shape: Height and width of a frame, at least 16 each.
+        action_size: Number of components of an action, each in [-1, 1].
+        max_steps: Length of the longest episode.
+        has_spread: Whether starts can be drawn from a share of their range.
+        demonstrator: Function from a simulation at the start of an episode, the number of the
+            task and the seed of its noise to a function that returns the next action ``[A]``.
+        state: Meaning of the ground truth.
+        weights: Encoders that come with it.
+        modules: Modules that define tasks which are not the scene's own, by name of the task.
+    """
+
+    name: str
+    version: str
+    tasks: Collection[str]
+    default_tasks: tuple[str, ...]
+    own_tasks: tuple[str, ...] | None = None
+    make_env: Callable[..., SimulationEnv]
+    frame_shape: tuple[int, int]
+    action_size: int
+    max_steps: int = 50
+    has_spread: bool = False
+    demonstrator: Callable[[Simulation, int, int], Callable[[], NDArray[Any]]] | None = None
+    state: StateColumns | None = None
+    weights: Weights | None = None
+    modules: Callable[[Sequence[str]], Mapping[str, str]] = lambda _: {}
+
+    def __post_init__(self) -> None:
+        if min(self.frame_shape) < 16 or len(self.frame_shape) != 2:
+            raise ValueError(
+                f"frame_shape is {self.frame_shape}: a height and a width of at least 16 pixels"
+            )
+        if self.action_size < 1 or self.max_steps < 1:
+            raise ValueError(
+                f"action_size and max_steps must be at least 1, got {self.action_size} and "
+                f"{self.max_steps}"
+            )
+        self.check_tasks(self.default_tasks)
+
+    @property
+    def all_tasks(self) -> tuple[str, ...]:
+        """Names of the tasks that come with the scene."""
+        return self.default_tasks if self.own_tasks is None else self.own_tasks
+
+    def simulate(
+        self,
+        tasks: Sequence[str],
+        *,
+        batch_size: int | Sequence[int] = (),
+        seed: int | Sequence[int] | None = 0,
+        spread: float = 1.0,
+        observation: Observation = "pixels",
+    ) -> SimulationEnv:
+        """Return the simulations of some tasks as an environment, see `SimulationEnv`.
+
+        Args:
+            tasks: Names of the tasks, in the order of their numbers.
+            batch_size: Shape of the batch.
+            seed: As for `SimulationEnv`.
+            spread: Share of the whole range of start states, from 0 to 1.
+            observation: ``"pixels"``, ``"state"`` or ``"both"``.
+
+        Raises:
+            ValueError: If a task is unknown, or ground truth or spread are asked of a scene that
+                has none.
+        """
+        self.check_tasks(tasks)
+        self.check_spread(spread)
+        if observation != "pixels" and self.state is None:
+            raise ValueError(f"the scene {self.name!r} has no ground truth: observe pixels")
+        options: dict[str, Any] = {"spread": spread} if self.has_spread else {}
+        return self.make_env(
+            tasks, batch_size=batch_size, seed=seed, observation=observation, **options
+        )
+
+    def check_tasks(self, tasks: Sequence[str]) -> None:
+        """Raise ``ValueError`` if a task does not exist or is named twice."""
+        for position, name in enumerate(tasks):
+            if name not in self.tasks:
+                raise ValueError(
+                    f"the scene {self.name!r} has no task {name!r}: choose one of "
+                    f"{', '.join(self.tasks)}, or add it first (docs/extending.md)"
+                )
+            if name in tasks[:position]:
+                raise ValueError(f"the task {name!r} is named twice: name each once")
+
+    def check_spread(self, spread: float) -> None:
+        """Raise ``ValueError`` unless starts can be drawn from that share of their range."""
+        if not 0.0 <= spread <= 1.0:
+            raise ValueError(f"spread is {spread}: choose a number from 0 (nominal places) to 1")
+        if spread != 1.0 and not self.has_spread:
+            raise ValueError(f"the starts of the scene {self.name!r} have no spread: leave it at 1")
+
+    def random_action(self, random: np.random.Generator) -> NDArray[np.float64]:
+        """Return a uniformly random action, ``[A]`` in [-1, 1]."""
+        return random.uniform(-1, 1, self.action_size)
+
+
+SCENES: dict[str, Scene | str] = {"nico": "bgpo_trl.scenes.nico:NICO"}
+"""Scenes by name, or ``"module:attribute"`` to import when they are first used. A module of
+``--import`` adds its own."""
+
+
+def find_scene(name: Scene | str) -> Scene:
+    """Return the scene with a name; a scene is returned as it is.
+
+    Raises:
+        ValueError: If `SCENES` has none.
+    """
+    if isinstance(name, Scene):
+        return name
+    found = SCENES.get(name)
+    if isinstance(found, str):
+        module, _, attribute = found.partition(":")
+        found = SCENES[name] = getattr(importlib.import_module(module), attribute)
+    if found is None:
+        raise ValueError(
+            f"there is no scene {name!r}: choose one of {', '.join(SCENES)}, or name the module "
+            "that adds it with --import"
+        )
+    return found

@@ -1,0 +1,361 @@
+"""Simulations of a robot as one TorchRL environment, batched and switching task at each reset."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, Literal, NamedTuple, get_args
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from bgpo_trl.errors import as_shape, missing_key
+from bgpo_trl.machine import usable_cores
+from bgpo_trl.seeding import Seeding, row_seeds
+from bgpo_trl.threads import RowPool
+
+__all__ = ["Observation", "Outcome", "Simulation", "SimulationEnv"]
+
+Observation = Literal["pixels", "state", "both"]
+
+
+class Outcome(NamedTuple):
+    """What a step has led to.
+
+    Attributes:
+        success: Whether the task is solved, which ends the episode with reward 1.
+        failure: Whether the episode ends without success, for example by a fall.
+    """
+
+    success: bool
+    failure: bool = False
+
+
+class Simulation(ABC):
+    """One simulated robot, of which `SimulationEnv` steps several side by side.
+
+    A subclass for a robot of your own defines `seed`, `reset`, `step` and `frame`. With `state`,
+    policies can learn from the ground truth; with `save` and `load`, runs can be resumed; with
+    `view`, films show the robot.
+    """
+
+    @abstractmethod
+    def seed(self, seed: int) -> None:
+        """Seed the draws of all following starts, for all tasks alike; below 2**32."""
+
+    @abstractmethod
+    def reset(self, task: int) -> None:
+        """Begin an episode of the task with that number, from a start drawn at random."""
+
+    @abstractmethod
+    def step(self, action: NDArray[np.float64]) -> Outcome:
+        """Perform an action ``[A]`` in [-1, 1]; it may run beside the steps of others, in a thread.
+
+        It is not called after the end of an episode.
+        """
+
+    @abstractmethod
+    def frame(self) -> NDArray[np.uint8]:
+        """Return the camera's frame, ``[H, W, 3]``; it is called in one thread only."""
+
+    def state(self) -> NDArray[Any]:
+        """Return the ground truth, ``[N]``."""
+        raise NotImplementedError
+
+    def view(self) -> NDArray[np.uint8]:
+        """Return an onlooker's view of the robot for films, ``[H', W', 3]``."""
+        raise NotImplementedError
+
+    def save(self) -> dict[str, Any]:
+        """Return all that the future depends on, as tensors, numbers, strings, lists and dicts."""
+        raise NotImplementedError
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Continue from what `save` returned."""
+        raise NotImplementedError
+
+    def close(self) -> None:  # noqa: B027 - most have nothing to free
+        """Free what the simulation holds."""
+
+
+class SimulationEnv(EnvBase):
+    """Simulations of several tasks, one for each element of the batch.
+
+    All run in this process. Threads step them, and the caller's thread draws each frame as soon as
+    its simulation has finished; results do not depend on the number of threads. The task of an
+    episode is chosen at reset, by the entry ``"task"`` of the reset's tensordict. Episodes end as
+    the simulation says: append ``StepCounter(max_steps)`` for a time limit.
+
+    Writes at reset and step: ``"pixels"`` uint8 ``[*B, H, W, 3]`` and/or ``"state"`` float32
+    ``[*B, N]``; ``"task"`` int64 ``[*B]``, an index into ``tasks``; ``"success"`` bool
+    ``[*B, 1]``. Reads ``"action"`` float32 ``[*B, A]`` in [-1, 1]. ``"reward"`` is 1 on success,
+    else 0; ``"terminated"`` and ``"done"`` are success or failure, ``"truncated"`` is never set
+    here.
+
+    An optional boolean entry ``"_step"`` ``[*B]`` selects the simulations that advance; the others
+    repeat their last observation.
+
+    ``set_seed`` also reaches the transforms of this package, at the next reset (see
+    `EpisodeTransform`). A copy, by ``copy.deepcopy`` or ``pickle``, continues as the original
+    would, if the simulation's copy does, with threads of its own. Workers of a ``ParallelEnv``
+    therefore draw alike until the ``ParallelEnv``'s ``set_seed``, which seeds each differently.
+
+    Args:
+        make: Constructor of a simulation, called once for each element of the batch.
+        tasks: Names of the tasks, in the order of their numbers.
+        frame_shape: Height and width of a frame.
+        action_size: Number of components of an action.
+        state_size: Length of the ground truth; None if there is none.
+        batch_size: Shape of the batch; an int is the length of a batch of one dimension.
+        seed: Seed of the first simulation's starts, from which the others count up; or one for
+            each; or None for seeds from the operating system.
+        observation: ``"pixels"``, ``"state"`` or ``"both"``.
+        threads: Threads that step, the caller's among them; None takes one for each core.
+
+    Raises:
+        ValueError: If there are not as many seeds as simulations, a seed is out of range, or there
+            is to be no task, simulation or thread, or ground truth that the simulation lacks.
+    """
+
+    def __init__(
+        self,
+        make: Callable[[], Simulation],
+        tasks: Sequence[str],
+        *,
+        frame_shape: Sequence[int],
+        action_size: int,
+        state_size: int | None = None,
+        batch_size: int | Sequence[int] = (),
+        seed: int | Sequence[int] | None = 0,
+        observation: Observation = "pixels",
+        threads: int | None = None,
+    ) -> None:
+        super().__init__(batch_size=as_shape(batch_size, "batch_size"), device="cpu")
+        if observation not in get_args(Observation):
+            choices = ", ".join(map(repr, get_args(Observation)))
+            raise ValueError(f"observation is {observation!r}; choose one of {choices}")
+        if threads is not None and threads < 1:
+            raise ValueError(f"threads must be at least 1, or None for all cores, got {threads}")
+        if not tasks or isinstance(tasks, str):
+            raise ValueError(f"tasks must be a sequence of names, got {tasks!r}")
+        if observation != "pixels" and state_size is None:
+            raise ValueError("the simulation has no ground truth: observe pixels")
+        self.tasks = tuple(tasks)
+        self.observation: Observation = observation
+        count = self.batch_size.numel()
+        seeds = row_seeds(seed, count)
+        self.seeding: Seeding | None = None  # read by the transforms
+        self.simulations = [make() for _ in seeds]
+        self.seed_rows(seeds)
+        self._threads = RowPool(
+            min(count, usable_cores() if threads is None else threads), "simulation"
+        )
+        self._task = np.zeros(count, dtype=np.int64)
+        self._begun = np.zeros(count, dtype=bool)
+        self._success, self._failure = np.zeros((2, count), dtype=bool)
+        self._current: dict[str, np.ndarray] = {}
+        self._make_specs((*frame_shape, 3), state_size, action_size)
+
+    def _make_specs(
+        self, frame_shape: Sequence[int], state_size: int | None, action_size: int
+    ) -> None:
+        batch, count = self.batch_size, self.batch_size.numel()
+        observation: dict[str, Any] = {
+            "task": Categorical(len(self.tasks), shape=batch, dtype=torch.int64),
+            "success": Binary(1, shape=torch.Size([*batch, 1]), dtype=torch.bool),
+        }
+        if self.observation != "state":
+            shape = torch.Size(frame_shape)
+            observation["pixels"] = Bounded(0, 255, shape=batch + shape, dtype=torch.uint8)
+            self._current["pixels"] = np.zeros((count, *shape), np.uint8)
+        if self.observation != "pixels" and state_size is not None:
+            observation["state"] = Unbounded(
+                shape=torch.Size([*batch, state_size]), dtype=torch.float32
+            )
+            self._current["state"] = np.zeros((count, state_size), np.float32)
+        self.observation_spec = Composite(observation, shape=batch)
+        # A TransformedEnv passes only entries of the state spec on to `_reset`.
+        self.state_spec = Composite({"task": observation["task"].clone()}, shape=batch)
+        self.action_spec = Bounded(
+            -1.0, 1.0, shape=torch.Size([*batch, action_size]), dtype=torch.float32
+        )
+        # Not Bounded, which TorchRL's RewardScaling and RewardClipping refuse.
+        self.reward_spec = Unbounded(shape=torch.Size([*batch, 1]), dtype=torch.float32)
+        self.done_spec = Composite(
+            {
+                key: Categorical(2, shape=torch.Size([*batch, 1]), dtype=torch.bool)
+                for key in ("done", "terminated", "truncated")
+            },
+            shape=batch,
+        )
+
+    def _observe(self) -> dict[str, torch.Tensor]:
+        # Fresh memory each time: what was handed out before must not change.
+        out = {
+            key: torch.from_numpy(value.copy()).unflatten(0, self.batch_size)
+            if self.batch_size
+            else torch.from_numpy(value[0].copy())
+            for key, value in self._current.items()
+        }
+        batch = self.batch_size
+        out["task"] = torch.from_numpy(self._task.copy()).reshape(batch)
+        out["success"] = torch.from_numpy(self._success.copy()).reshape(*batch, 1)
+        done = torch.from_numpy(self._success | self._failure).reshape(*batch, 1)
+        return {
+            **out,
+            "done": done,
+            "terminated": done.clone(),
+            "truncated": torch.zeros_like(done),
+        }
+
+    def _record(self, row: int) -> None:
+        simulation = self.simulations[row]
+        if "pixels" in self._current:
+            self._current["pixels"][row] = simulation.frame()
+        if "state" in self._current:
+            self._current["state"][row] = simulation.state()
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        del kwargs
+        rows = np.ones(len(self._task), dtype=bool)
+        if tensordict is not None:
+            reset = tensordict.get("_reset", None)
+            if reset is not None:
+                rows = reset.reshape(-1).numpy()
+            task = tensordict.get("task", None)
+            if task is not None:
+                if task.is_floating_point() or task.shape.numel() != len(rows):
+                    raise ValueError(
+                        f"task must be a whole number for each of {len(rows)} simulations, got "
+                        f"{task.dtype} {[*task.shape]}"
+                    )
+                chosen = task.reshape(-1).numpy()
+                if ((chosen < 0) | (chosen >= len(self.tasks)))[rows].any():
+                    raise ValueError(
+                        f"task must lie in 0..{len(self.tasks) - 1}, got {chosen.tolist()}"
+                    )
+                self._task[rows] = chosen[rows]
+        for row in np.flatnonzero(rows).tolist():
+            self.simulations[row].reset(int(self._task[row]))
+            self._record(row)
+        self._begun |= rows
+        self._success[rows] = self._failure[rows] = False
+        return TensorDict(self._observe(), self.batch_size)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        rows = ~(self._success | self._failure)
+        steps = tensordict.get("_step", None)
+        if steps is not None:
+            rows = rows & steps.reshape(-1).numpy()
+        action = tensordict.get("action", None)
+        if action is None:
+            raise missing_key(type(self).__name__, tensordict, ["action"])
+        size = self.action_spec.shape[-1]
+        if action.shape != (*self.batch_size, size):
+            raise ValueError(f"actions must be {[*self.batch_size, size]}, got {[*action.shape]}")
+        if not self._begun[rows].all():
+            raise ValueError("there is no episode to step in: reset the environment first")
+        actions = action.detach().reshape(-1, size).double().numpy()
+        # Checked for all before any of them moves.
+        if not np.isfinite(actions[rows]).all():
+            raise ValueError(
+                f"an action is {size} finite numbers in [-1, 1], got {actions.tolist()}: if a "
+                "policy chose it, learning has diverged, lower its learning rate"
+            )
+        rewards = np.zeros((len(rows), 1), np.float32)
+        self._advance(np.flatnonzero(rows).tolist(), actions, rewards)
+        reward = torch.from_numpy(rewards).reshape(*self.batch_size, 1)
+        return TensorDict({**self._observe(), "reward": reward}, self.batch_size)
+
+    def _advance(
+        self, rows: Iterable[int], actions: NDArray[np.float64], rewards: NDArray[np.float32]
+    ) -> None:
+        """Step simulations in all threads and draw their frames in this one."""
+
+        def step(row: int) -> Outcome:
+            return self.simulations[row].step(actions[row])
+
+        def record(row: int, outcome: Outcome) -> None:
+            self._record(row)
+            rewards[row] = outcome.success
+            self._success[row], self._failure[row] = outcome
+
+        self._threads.each(rows, step, record)
+
+    def frames(self) -> np.ndarray:
+        """Return a copy of the frames that were drawn last, uint8 ``[*B, H, W, 3]``.
+
+        Raises:
+            ValueError: If frames are not observed.
+        """
+        if "pixels" not in self._current:
+            raise ValueError("there are no frames with observation='state': observe 'both'")
+        pixels = self._current["pixels"].copy()
+        return pixels.reshape(*self.batch_size, *pixels.shape[1:])
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """End the threads and close the simulations."""
+        self._threads.close()
+        for simulation in self.simulations:
+            simulation.close()
+        super().close(raise_if_closed=raise_if_closed)
+
+    def _set_seed(self, seed: int | None) -> None:
+        seeds = row_seeds(seed, len(self.simulations))
+        self.seed_rows(seeds)
+        self.seeding = Seeding(tuple(seeds))
+
+    def seed_rows(self, seeds: Sequence[int]) -> None:
+        """Set the seeds of the simulations' start states; transforms are not reseeded."""
+        seeds = row_seeds(seeds, len(self.simulations))
+        for simulation, seed in zip(self.simulations, seeds, strict=True):
+            simulation.seed(seed)
+
+    def simulation_state(self) -> dict[str, Any]:
+        """Return all that the future depends on, for checkpoints.
+
+        Raises:
+            NotImplementedError: If the simulation cannot be saved.
+        """
+        return {
+            "simulations": [simulation.save() for simulation in self.simulations],
+            "task": torch.from_numpy(self._task.copy()),
+            "begun": torch.from_numpy(self._begun.copy()),
+            "success": torch.from_numpy(self._success.copy()),
+            "failure": torch.from_numpy(self._failure.copy()),
+            "current": {key: torch.from_numpy(v.copy()) for key, v in self._current.items()},
+        }
+
+    def load_simulation_state(self, state: dict[str, Any]) -> None:
+        """Continue from what `simulation_state` returned.
+
+        Raises:
+            ValueError: If it belongs to another number of simulations or kind of observation.
+        """
+        if len(state["simulations"]) != len(self.simulations):
+            raise ValueError(
+                f"the state holds {len(state['simulations'])} simulations, this environment has "
+                f"{len(self.simulations)}: use the same number of seeds"
+            )
+        if state["current"].keys() != self._current.keys():
+            raise ValueError(
+                f"the state was saved with the observations {sorted(state['current'])}, this "
+                f"environment has {sorted(self._current)}: use the same observation"
+            )
+        if int(state["task"].max()) >= len(self.tasks):
+            raise ValueError(
+                f"the state was saved in task {int(state['task'].max())}, this environment has "
+                f"{len(self.tasks)} tasks: use the same tasks"
+            )
+        for simulation, saved in zip(self.simulations, state["simulations"], strict=True):
+            simulation.load(saved)
+        self._task[:] = state["task"].numpy()
+        self._begun[:] = state["begun"].numpy()
+        self._success[:] = state["success"].numpy()
+        self._failure[:] = state["failure"].numpy()
+        for key, value in self._current.items():
+            value[:] = state["current"][key].numpy()

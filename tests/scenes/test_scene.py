@@ -1,0 +1,196 @@
+"""Another robot than NICO, from its simulation to a policy that is loaded and filmed."""
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs import check_env_specs
+
+from bgpo_trl.algorithms import ALGORITHMS
+from bgpo_trl.configs import RunConfig
+from bgpo_trl.data.dataset import load_demonstrations
+from bgpo_trl.data.recording import record_demonstrations
+from bgpo_trl.encoders.train import make_pretrained
+from bgpo_trl.evaluation import evaluate_random_policy
+from bgpo_trl.experiments.watch import WatchArguments, watch
+from bgpo_trl.policy import load_run
+from bgpo_trl.runs.results import TRAIN, read_table
+from bgpo_trl.scenes import SCENES, SimulationEnv, StateColumns, find_scene
+from bgpo_trl.training import Trainer
+from tests.resumable import ENCODERS
+from tests.scenes.dot import Dot, SavedDot, scene
+
+TASKS = ("left", "right")
+
+
+@pytest.fixture(scope="module")
+def pretrained(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("dot")
+    return make_pretrained(
+        folder / "encoders.safetensors",
+        folder / "demonstrations",
+        folder=folder / "log",
+        scene=scene(),
+        config=ENCODERS,
+        per_task=6,
+        held_out_per_task=2,
+        progress=False,
+    )
+
+
+def config(**changes):
+    algorithm = replace(ALGORITHMS["bgpo"].config, max_steps=12)
+    run = RunConfig(
+        scene="dot",
+        tasks=TASKS,
+        task_starts=(0, 2),
+        seeds=(3, 5),
+        episodes=4,
+        eval_every=2,
+        algorithm=replace(algorithm, rl=replace(algorithm.rl, warmup_steps=12)),
+    )
+    return replace(run, **changes)
+
+
+def train(directory, pretrained, *, resume=False, **changes):
+    encoders, bank = pretrained
+    options = {"bank": bank, "encoders": encoders, "resume": resume, "progress": False}
+    with Trainer(config(**changes), directory, **options) as trainer:
+        trainer.run()
+
+
+def test_an_environment_of_a_simulation_keeps_the_promises_to_torchrl():
+    env = scene().simulate(TASKS, batch_size=[2])
+    check_env_specs(env)
+    start = env.reset(TensorDict({"task": torch.tensor([0, 1])}, [2]))
+    assert start["pixels"].shape == (2, 16, 24, 3)
+    assert env.action_spec.shape == (2, 1)
+    states = [start]
+    for _ in range(4):
+        action = torch.tensor([[-0.5], [-0.9]])  # The first one succeeds, the second falls off.
+        states.append(env.step(states[-1].clone().set("action", action))["next"])
+    assert [state["success"].flatten().tolist() for state in states][-1] == [True, False]
+    assert states[-1]["terminated"].all()
+    assert states[-1]["done"].all()
+    rewards = torch.stack([state["reward"] for state in states[1:]]).sum(0)
+    assert rewards.flatten().tolist() == [1.0, 0.0]
+    assert not env.reset()["done"].any()
+
+
+def test_a_failed_episode_is_no_success_of_random_actions():
+    falling = scene(lambda: Falling())
+    rate = evaluate_random_policy(tasks=TASKS, episodes=4, max_steps=12, scene=falling)
+    assert rate.tolist() == [0.0, 0.0]
+
+
+class Falling(Dot):
+    def step(self, action):
+        return super().step(action)._replace(success=False, failure=True)
+
+
+def test_a_demonstration_that_fails_is_not_recorded(tmp_path):
+    options = {"per_task": 2, "held_out_per_task": 1, "attempts": 2, "progress": False}
+    with pytest.raises(RuntimeError, match="the demonstrator of 'left' failed 2 times in a row"):
+        record_demonstrations(tmp_path, scene=scene(Falling), **options)
+
+
+def test_what_a_scene_lacks_is_refused_in_a_line(tmp_path):
+    dot = scene()
+    refused = {
+        "has no task 'up'": lambda: dot.simulate(["up"]),
+        "is named twice": lambda: dot.simulate(["left", "left"]),
+        "have no spread": lambda: dot.simulate(TASKS, spread=0.5),
+        "has no ground truth": lambda: dot.simulate(TASKS, observation="state"),
+        "at least 16 pixels": lambda: scene(frame_shape=(16, 8)),
+        "there is no scene 'dog'": lambda: find_scene("dog"),
+        "has no demonstrator": lambda: record_demonstrations(
+            tmp_path / "new", scene=scene(demonstrator=None)
+        ),
+    }
+    for message, call in refused.items():
+        with pytest.raises(ValueError, match=message):
+            call()
+    assert not any(tmp_path.iterdir())
+
+
+def test_demonstrations_have_the_shapes_of_the_scene(tmp_path):
+    columns = StateColumns(center=(0.0,), scale=(1.0,))
+
+    class Seen(Dot):
+        def state(self):
+            return np.array([self.place])
+
+    seen = scene(Seen, state=columns)
+    shape = {"frame_shape": (16, 24), "action_size": 1, "state_size": 1}
+    seen = replace(seen, make_env=partial(SimulationEnv, Seen, **shape))
+    options = {"per_task": 2, "held_out_per_task": 1, "progress": False}
+    data = record_demonstrations(tmp_path, scene=seen, **options)
+    assert data["pixels"].shape == (4, 13, 16, 24, 3)
+    assert data["action"].shape == (4, 12, 1)
+    assert data["state"].shape == (4, 13, 1)
+    for row in load_demonstrations(tmp_path):
+        moved = 0.5 * row["action"].flatten().cumsum(0)
+        length = int(row["length"])
+        torch.testing.assert_close(
+            row["state"].flatten()[1:length],
+            row["state"][0, 0] + moved[: length - 1],
+            atol=1e-6,
+            rtol=0,
+        )
+
+
+def test_a_run_learns_on_another_robot_and_is_loaded_and_filmed(pretrained, tmp_path, monkeypatch):
+    monkeypatch.setitem(SCENES, "dot", scene())
+    train(tmp_path / "run", pretrained)
+    table = read_table(tmp_path / "run" / "train.csv", TRAIN)
+    assert len(table) == 8
+    assert set(table["task"]) == set(TASKS)
+
+    # The encoders do not come with the scene: the run keeps them.
+    policy = load_run(tmp_path / "run")
+    assert policy.encoders.identity == pretrained[0].identity
+    policy.condition(np.zeros((3, 16, 24, 3), np.uint8), task="left")
+    assert policy.act(np.zeros((16, 24, 3), np.uint8)).shape == (1,)
+    with pytest.raises(ValueError, match=r"a frame is uint8 \[16, 24, 3\], got .*\[32, 64, 3\]"):
+        policy.act(np.zeros((32, 64, 3), np.uint8))
+    outcomes = watch(WatchArguments(run=tmp_path / "run"))
+    assert "left: " in outcomes
+    assert (tmp_path / "run" / "figures" / "film.gif").exists()
+
+
+@pytest.mark.parametrize("name", ["dist-nll-demonstrations", "maml", "ewc"])
+def test_baselines_learn_on_another_robot(pretrained, tmp_path, monkeypatch, name):
+    monkeypatch.setitem(SCENES, "dot", scene())
+    algorithm = replace(ALGORITHMS[name].config, max_steps=12)
+    train(tmp_path, pretrained, name=name, algorithm=algorithm, schedule="sequential")
+    assert len(read_table(tmp_path / "train.csv", TRAIN)) == 8
+
+
+def test_a_run_continues_if_its_simulation_can_be_saved(pretrained, tmp_path, monkeypatch):
+    monkeypatch.setitem(SCENES, "dot", scene(SavedDot))
+    train(tmp_path / "whole", pretrained)
+    train(tmp_path / "parts", pretrained, episodes=2)
+    train(tmp_path / "parts", pretrained, resume=True)
+    for name in ("train.csv", "eval.csv"):
+        whole, parts = ((tmp_path / run / name).read_text() for run in ("whole", "parts"))
+        assert whole == parts
+
+
+def test_a_run_whose_simulation_cannot_be_saved_is_not_resumed(pretrained, tmp_path, monkeypatch):
+    monkeypatch.setitem(SCENES, "dot", scene())
+    train(tmp_path, pretrained, episodes=2)
+    before = (tmp_path / "train.csv").read_bytes()
+    with pytest.raises(ValueError, match="'dot' cannot be saved, so this run cannot be resumed"):
+        train(tmp_path, pretrained, resume=True)
+    assert (tmp_path / "train.csv").read_bytes() == before
+
+
+def test_demonstrations_of_another_robot_are_refused(pretrained, bank, encoders, tmp_path):
+    known = replace(pretrained[1], tasks=("grasp_glass", "push_green_to_glass"))
+    run = config(scene="nico", tasks=known.tasks)
+    with pytest.raises(ValueError, match="demonstrations are of the scene dot-1, the run is in"):
+        Trainer(run, tmp_path / "run", bank=known, encoders=pretrained[0])
+    assert not (tmp_path / "run").exists()
