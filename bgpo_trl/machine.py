@@ -2,10 +2,19 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
+import sys
 from pathlib import Path
 
 import torch
+
+# Options of mallopt (malloc.h), and bytes.
+_KEEP_FREED = {
+    -1: 2**30,  # M_TRIM_THRESHOLD: free memory that is kept
+    -2: 2**26,  # M_TOP_PAD: memory that is requested at once
+    -3: 2**25,  # M_MMAP_THRESHOLD: size from which memory is mapped for itself; the largest allowed
+}
 
 
 def usable_cores(quota: str | Path = "/sys/fs/cgroup/cpu.max") -> int:
@@ -31,6 +40,20 @@ def set_threads(threads: int) -> None:
     if threads < 1:
         raise ValueError(f"threads must be at least 1, got {threads}: small networks need only 1")
     torch.set_num_threads(threads)
+
+
+def keep_freed_memory() -> None:
+    """Have glibc keep freed memory for the next tensors, up to 1 GB, for the whole process.
+
+    By default it returns freed memory to the operating system between two operations, so that an
+    update of ten seeds spends a tenth of its time on page faults. Without glibc, nothing happens.
+    """
+    if not sys.platform.startswith("linux"):
+        return
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if mallopt is not None:  # The C library is not musl.
+        for option, size in _KEEP_FREED.items():
+            mallopt(option, size)
 
 
 def choose_device(name: str = "auto") -> torch.device:

@@ -21,13 +21,11 @@ class AdvantageWeightedLoss(OffPolicyLoss):
     """Regression to replayed actions, weighted by their advantage (AWAC; Nair et al., 2020)."""
 
     def next_value(self, successor: TensorDictBase) -> Tensor:
-        with self.network("target_actor_network") as actor:
-            data = actor(successor)
+        data = self.call_network("target_actor_network", successor)
         return self.values("target_value_network", data)
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        with self.network("actor_network") as actor:
-            data = actor(self.current(tensordict))
+        data = self.call_network("actor_network", self.current(tensordict))
         error = (data["action"] - tensordict["action"]).square().mean(-1)
         replayed = self.values("value_network", tensordict.copy())
         advantage = replayed - self.values("value_network", data)

@@ -58,6 +58,23 @@ def test_help_imports_neither_torch_nor_mujoco(options):
     assert process.returncode == 0, process.stderr
 
 
+@pytest.mark.parametrize(
+    ("names", "package"),
+    [
+        (("report", "merge"), "dm_control"),  # opens a display on import
+        # `looking` alone subclasses a simulation.
+        (tuple(name for name in command.COMMANDS if name != "looking"), "torchrl"),
+    ],
+    ids=["no display to read results", "no TorchRL for help"],
+)
+def test_commands_import_little_before_they_are_called(names, package):
+    modules = [f"bgpo_trl.{command.COMMANDS[name][0]}" for name in names]
+    code = f"import importlib, sys\nfor name in {modules}:\n    importlib.import_module(name)\n"
+    code += f"assert {package!r} not in sys.modules"
+    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    assert process.returncode == 0, process.stderr
+
+
 def test_an_unknown_command_is_refused(monkeypatch, capsys):
     with pytest.raises(SystemExit) as ended:
         call(monkeypatch, "continul")

@@ -17,6 +17,8 @@ import tyro
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.bgpo import BGPO
 from bgpo_trl.algorithms.rl import RL
+from bgpo_trl.experiments.arguments import Arguments
+from bgpo_trl.experiments.settings import run_config
 from bgpo_trl.scenes.nico import NicoEnv
 from bgpo_trl.transforms import DemonstrationSource
 
@@ -107,9 +109,17 @@ def test_the_python_of_a_page_runs_from_top_to_bottom(page, tmp_path, monkeypatc
 @every_page
 def test_no_block_is_of_a_kind_that_is_not_tested(page):
     fences = re.findall(r"^```(.*)$", page.read_text(), re.MULTILINE)
-    # Scripts (sh) are run by tests of their own.
-    assert {*fences[::2]} <= {"python", "bash", "sh", "text"}
+    # Scripts (sh) are run by tests of their own, settings (yaml) are read by the next test.
+    assert {*fences[::2]} <= {"python", "bash", "sh", "yaml", "text"}
     assert {*fences[1::2]} <= {""}
+
+
+@every_page
+def test_settings_of_a_page_can_be_read(page, tmp_path):
+    for number, block in enumerate(blocks(page, "yaml")):
+        file = tmp_path / f"{number}.yaml"
+        file.write_text(block)
+        assert run_config(Arguments(config=file)) != run_config(Arguments())
 
 
 @pytest.mark.parametrize("command", OF_PYTHON)

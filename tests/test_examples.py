@@ -107,3 +107,16 @@ def test_gwr_alone_finds_two_clusters(run):
     right = float(re.search(r"cluster of their own kind: ([\d.]+)%\n", out).group(1))
     assert right > 99
     assert np.asarray(Image.open("runs/gwr-alone.png").convert("RGB")).std() > 5
+
+
+@pytest.mark.slow
+def test_own_scene_is_learned_from_its_pixels(run):
+    out = run("own_scene.py")
+
+    chance, last = {}, {}
+    for line in out.splitlines():
+        task, *rates = re.match(r"(\w+): random actions (\d+)%, .* (\d+)%$", line).groups()
+        chance[task], last[task] = map(int, rates)
+    assert [*last] == ["stretch_left", "stretch_right"]
+    assert max(chance.values()) <= 10
+    assert min(last.values()) >= 40

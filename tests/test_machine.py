@@ -1,6 +1,9 @@
 """Quotas of the machine are heeded, devices found or refused."""
 
 import os
+import platform
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -48,3 +51,36 @@ def test_an_unavailable_device_is_refused():
     if not torch.cuda.is_available():
         with pytest.raises(ValueError, match=r"^no device 'cuda' here \(.*\): use auto or cpu$"):
             choose_device("cuda")
+
+
+FAULTS = """
+import resource, sys, threading
+import torch
+from bgpo_trl.machine import keep_freed_memory
+
+if sys.argv[1] == "keep":
+    keep_freed_memory()
+
+def use():
+    for _ in range(20):
+        [torch.ones(2**20) + i for i in range(3)]
+
+def count():
+    use()  # what is used for the first time has to be mapped
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    use()
+    print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+
+thread = threading.Thread(target=count)  # as the updates of a training run
+thread.start()
+thread.join()
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other libraries keep memory or not")
+def test_freed_memory_that_is_kept_is_used_again_without_page_faults():
+    counts = [
+        int(subprocess.check_output([sys.executable, "-c", FAULTS, mode], text=True))
+        for mode in ("return", "keep")
+    ]
+    assert counts[1] < counts[0] / 100

@@ -24,7 +24,7 @@ from timing import interleave
 from bgpo_trl.algorithms import Algorithm, entry
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.experiments.command_line import command_line
-from bgpo_trl.machine import set_threads
+from bgpo_trl.machine import keep_freed_memory, set_threads
 from bgpo_trl.transforms import TaskSchedule
 from bgpo_trl.world import World
 from suites import nico
@@ -85,6 +85,7 @@ class Steps:
 def main(arguments: Arguments) -> None:
     """Print the table."""
     set_threads(1)
+    keep_freed_memory()
     encoders, bank = load_pretrained(tasks=nico.ALL_TASKS[: max(arguments.tasks)])
     running: dict[str, Steps] = {}
     for name, n_tasks in product(arguments.algorithms, arguments.tasks):

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from scipy import stats
 from torch import Tensor
 
 from bgpo_trl.data.bank import DemonstrationBank
@@ -53,6 +52,8 @@ def roc_area(known: Tensor, unknown: Tensor) -> Tensor:
         known: Novelties ``[K]``.
         unknown: Novelties ``[U]``.
     """
+    from scipy import stats
+
     wins = stats.mannwhitneyu(unknown, known).statistic
     return torch.tensor(wins / (len(known) * len(unknown)))
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from math import inf
 from numbers import Integral
 
@@ -25,14 +24,6 @@ def whole(config: object, least: int, *names: str) -> None:
     for name in names:
         check(config, (name, isinstance(getattr(config, name), Integral), "a whole number"))
     at_least(config, least, *names)
-
-
-def check_seeds(seeds: Sequence[int]) -> None:
-    """Raise ``ValueError`` unless seeds are whole numbers, different, and none is negative."""
-    if not all(isinstance(seed, Integral) for seed in seeds):
-        raise ValueError(f"seeds must be whole numbers, got {seeds}")
-    if not seeds or len(set(seeds)) < len(seeds) or min(seeds) < 0:
-        raise ValueError(f"seeds must be one or more, all different and none negative: {seeds}")
 
 
 def positive(config: object, *names: str) -> None:

@@ -7,7 +7,8 @@ from numbers import Integral
 from typing import Literal
 
 from bgpo_trl.configs.algorithms import AlgorithmConfig, BGPOConfig
-from bgpo_trl.configs.checks import at_least, check, check_seeds, whole
+from bgpo_trl.configs.checks import at_least, check, whole
+from bgpo_trl.seeding import check_seeds
 
 PAPER_TASKS = ("grasp_glass", "push_green_to_glass", "push_green_to_white")
 """Names of the paper's tasks, in its order."""

@@ -51,7 +51,7 @@ def is_dataset(path: Path) -> bool:
 
 
 def layout_of(
-    scene: Scene, *, max_steps: int | None = None, actions: bool = True
+    scene: Scene, *, max_steps: int | None = None, actions: bool = True, states: bool = True
 ) -> dict[str, Any]:
     """Return the settings that fix the sizes of a dataset of a scene.
 
@@ -59,6 +59,7 @@ def layout_of(
         scene: The robot.
         max_steps: Length of the longest episode; by default the scene's.
         actions: Whether the actions are known.
+        states: Whether the ground truth is known, if the scene has some.
     """
     return {
         "scene": scene.name,
@@ -66,7 +67,7 @@ def layout_of(
         "frame_shape": [*scene.frame_shape],
         "max_steps": max_steps or scene.max_steps,
         "action_size": scene.action_size if actions else 0,
-        "state_size": 0 if scene.state is None else scene.state.size,
+        "state_size": scene.state.size if states and scene.state is not None else 0,
     }
 
 

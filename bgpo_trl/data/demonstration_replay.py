@@ -49,8 +49,9 @@ class DemonstrationReplay:
     ) -> None:
         if bank.steps is None:
             raise ValueError(
-                "the bank has no steps of demonstrations to learn from: make it again with "
-                "`python -m bgpo_trl.encoders.make_bank`, or set demonstration_share to 0"
+                "the bank has no steps of demonstrations to learn from: set demonstration_share to "
+                "0, or make it again by encoders that were trained with actions "
+                "(docs/extending.md, Your demonstrations)"
             )
         if (bank.steps.length < 2).any():
             row = int((bank.steps.length < 2).nonzero()[0])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import torch
@@ -24,7 +24,10 @@ from bgpo_trl.data.dataset import (
 )
 from bgpo_trl.files.progress import progress_bar
 from bgpo_trl.plugins import import_plugin
-from bgpo_trl.scenes import Scene, Simulation, find_scene
+from bgpo_trl.scenes import Scene, find_scene
+
+if TYPE_CHECKING:
+    from bgpo_trl.scenes import Simulation
 
 _Policy = Callable[[], np.ndarray]
 

@@ -60,7 +60,7 @@ def probe(
         folder: Folder for ``probes.json`` and ``reconstructions.png``; ``None`` writes nothing.
         play: Recorded play in the form of the dataset; adds the errors of joints and objects, as
             ``play_...``, in frames that ``columns.valid`` accepts.
-        columns: Meaning of ``state``; without it, joints and objects are left out.
+        columns: Meaning of ``state``; without either, joints and objects are left out.
 
     Returns:
         A flat dict: ``joint_<name>_rmse_rad`` (linear probe of one latent),
@@ -170,7 +170,7 @@ def _probe_state(
     held_out: TensorDictBase,
     only: Callable[[Tensor], Tensor] | None = None,
 ) -> dict[str, float]:
-    if columns is None:
+    if columns is None or "state" not in train:
         return {}
     valid, valid_held_out = (
         valid_steps(part.get("length"), latent.shape[1]) for part in (train, held_out)
@@ -193,7 +193,7 @@ def _probe_state(
 
 
 def _probe_play(vae: VAE, play: TensorDictBase, columns: StateColumns | None) -> dict[str, float]:
-    if columns is None:
+    if columns is None or "state" not in play:
         return {}
     train, held_out = split(play)
     latent, latent_held_out = encode_frames(vae, train), encode_frames(vae, held_out)

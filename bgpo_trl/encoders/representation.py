@@ -90,8 +90,8 @@ def train_representation(
         play: Episodes of play in the same form, which train the frame encoder on states that
             demonstrations never visit. The inverse model then learns from the actions of play
             alone, so that it has seen none of the actions that it infers for demonstrations;
-            without play, it learns from those of demonstrations, and if these lack actions, there
-            is none.
+            without play, it learns from those of demonstrations. If what it would learn from lacks
+            actions, there is none.
         scene_version: Version of the scene of the frames, stored with the weights.
         spread: Share of the range of start states of the recordings, stored with the weights.
         command: Command line, stored with the weights.
@@ -148,11 +148,13 @@ def retrain_inverse(
     What limits the inverse model is the amount of play (docs/learning.md), which costs little to
     record, whereas the other encoders would take longer to train on it. Of ``config``, the seed,
     the intervals and ``inverse`` are used. Other arguments, the result and errors are as for
-    `train_representation`.
+    `train_representation`; play without actions is refused, too.
     """
     config = config or RepresentationConfig()
     folder = Path(checkpoint) if checkpoint else None
     own, _ = split(play)
+    if "action" not in own:
+        raise ValueError("the inverse model learns from actions, which this play lacks: record it")
     vae = representation.vae.to(device)
     latent = encode_frames(vae, own)
     fit = Fit(config, folder, log, progress, device)
@@ -294,10 +296,11 @@ def _train_vae(datasets: Sequence[TensorDictBase], config: VAEConfig, fit: Fit, 
     if length.max() < config.window:
         raise ValueError(f"the dataset has no training demonstration of {config.window} frames")
     frames = torch.cat([valid_frames(dataset) for dataset in datasets])
-    action = torch.cat([_actions_of_frames(dataset, datasets[-1]) for dataset in datasets])
-    # Demonstrations come first. Their actions are unknown, unless there is no play to learn from.
-    unknown = len(datasets) > 1 or "action" not in datasets[0]
-    n_demonstrated = int(datasets[0].get("length").sum()) if unknown else 0
+    own = datasets[-1]
+    action = torch.cat([_actions_of_frames(dataset, own) for dataset in datasets])
+    # Actions of demonstrations are unknown, unless there is no play to learn from.
+    n_known = int(own.get("length").sum()) if "action" in own else 0
+    n_unknown = len(frames) - n_known
     first = length.cumsum(0) - length
     starts = torch.cat(
         [
@@ -311,7 +314,7 @@ def _train_vae(datasets: Sequence[TensorDictBase], config: VAEConfig, fit: Fit, 
         drawn = starts[torch.randint(len(starts), (n_windows,), generator=generator)]
         index = drawn.unsqueeze(-1) + torch.arange(config.window)
         windows = {"pixels": frames[index], "action": action[index]}
-        return TensorDict({**windows, "action_known": drawn >= n_demonstrated}, [n_windows])
+        return TensorDict({**windows, "action_known": drawn >= n_unknown}, [n_windows])
 
     generator = torch.Generator().manual_seed(seed)
     frame_shape = frames.shape[1:3]
@@ -331,14 +334,12 @@ def _train_vae(datasets: Sequence[TensorDictBase], config: VAEConfig, fit: Fit, 
     return vae
 
 
-def _actions_of_frames(dataset: TensorDictBase, known: TensorDictBase) -> Tensor:
-    """Return the action after each valid frame, ``[sum(length), A]``, 0 where it is unknown.
-
-    ``known`` are episodes that may have actions, which fix their size.
-    """
+def _actions_of_frames(dataset: TensorDictBase, own: TensorDictBase) -> Tensor:
+    """Return the action after each valid frame, ``[sum(length), A]``; 0 if not of ``own``."""
     length, n_frames = dataset.get("length"), dataset.get("pixels").shape[1]
-    size = known.get("action").shape[-1] if "action" in known else 1
-    action = dataset.get("action", torch.zeros(1, 1, size).expand(len(length), n_frames - 1, size))
+    action = own.get("action", torch.zeros(1, 1, 1))
+    if dataset is not own or "action" not in own:
+        action = torch.zeros(()).expand(len(length), n_frames - 1, action.shape[-1])
     # The padding after the last frame of a demonstration is never read.
     return torch.nn.functional.pad(action, (0, 0, 0, 1))[valid_steps(length, n_frames)]
 

@@ -72,8 +72,8 @@ class Arguments(BankArguments):
     minutes), quick (1,200 episodes of 2 seeds, 20 minutes), the default; desk (6,000 episodes of 5
     seeds, some five hours) or paper (20,000 episodes of 10 seeds, days)."""
     config: Path | None = None
-    """JSON file of settings, named as in a run's config.json, or a run directory to repeat; the
-    preset's for those that it lacks."""
+    """YAML or JSON file of settings, named as in a run's config.json, or a run directory to repeat;
+    the preset's for those that it lacks."""
     out: Path | None = None
     """Run directory; runs/EXPERIMENT-ALGORITHM[-RL]-PRESET by default, with the name of the file
     of --config for PRESET."""

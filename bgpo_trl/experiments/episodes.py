@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from bgpo_trl.data.bank import DemonstrationBank
-from bgpo_trl.evaluation import Evaluator, Snapshot
 from bgpo_trl.files.checkpoint import has_checkpoint
-from bgpo_trl.policy import LoadedRun, TrainedPolicy, load_all_seeds
-from bgpo_trl.scenes import Scene
-from bgpo_trl.training import Trainer
-from bgpo_trl.transforms import TaskSchedule
+
+if TYPE_CHECKING:
+    from bgpo_trl.evaluation import Evaluator, Snapshot
+    from bgpo_trl.policy import LoadedRun, TrainedPolicy
+    from bgpo_trl.scenes import Scene
+    from bgpo_trl.training import Trainer
 
 
 def load_blocks(run: Path) -> list[LoadedRun]:
@@ -19,6 +21,8 @@ def load_blocks(run: Path) -> list[LoadedRun]:
     Raises:
         ValueError: As for `load_all_seeds`.
     """
+    from bgpo_trl.policy import load_all_seeds
+
     blocks = sorted(path for path in run.glob("seeds-*") if has_checkpoint(path / "checkpoint"))
     if not blocks or has_checkpoint(run / "checkpoint"):
         blocks = [run]
@@ -42,6 +46,9 @@ def evaluator_of(
         starts: Episode from which each task is presented; by default all are.
         scene: Robot to test, that of the run if None.
     """
+    from bgpo_trl.evaluation import Evaluator
+    from bgpo_trl.transforms import TaskSchedule
+
     config = run.config
     return Evaluator(
         config.algorithm,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -15,12 +16,13 @@ from bgpo_trl.analysis.task_inference import group_purity, task_inference_accura
 from bgpo_trl.configs import BGPOConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.experiments.arguments import BankArguments
-from bgpo_trl.experiments.run import bank_of
 from bgpo_trl.experiments.settings import check_draws, even_starts
 from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.modules.gwr import GWRB
 from bgpo_trl.seeding import generators
-from bgpo_trl.transforms import TaskSchedule
+
+if TYPE_CHECKING:
+    from bgpo_trl.transforms import TaskSchedule
 
 
 @dataclass(frozen=True)
@@ -97,6 +99,9 @@ def groups(arguments: GroupsArguments) -> str:
         ValueError: If there is nothing to draw, or a bank or task does not exist.
     """
     torch.set_num_threads(1)
+    from bgpo_trl.experiments.run import bank_of
+    from bgpo_trl.transforms import TaskSchedule
+
     check_draws(arguments.seeds, arguments.draws)
     bank, config = bank_of(arguments), BGPOConfig()
     bank = replace(bank, embedding=arguments.scale * bank.embedding)

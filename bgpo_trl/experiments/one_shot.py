@@ -5,7 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -17,17 +17,18 @@ from bgpo_trl.analysis.tables import Table, markdown
 from bgpo_trl.analysis.task_inference import task_inference_accuracy
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.recording import record_demonstrations
-from bgpo_trl.encoders.representation import embed_demonstrations
-from bgpo_trl.evaluation import Evaluator, Snapshot
 from bgpo_trl.experiments.arguments import TrainedArguments
 from bgpo_trl.experiments.episodes import evaluator_of
 from bgpo_trl.experiments.records import write_measurement
 from bgpo_trl.figures.style import COLORS, save_figure
 from bgpo_trl.machine import set_threads
 from bgpo_trl.plugins import import_plugin
-from bgpo_trl.policy import TrainedPolicy, load_run
 from bgpo_trl.runs.provenance import commit_of_code
 from bgpo_trl.seeding import stream_seed
+
+if TYPE_CHECKING:
+    from bgpo_trl.evaluation import Evaluator
+    from bgpo_trl.policy import TrainedPolicy
 
 # Number of the evaluation; it seeds start states that neither training nor final tests used.
 _NUMBER = 2**31 + 1
@@ -72,6 +73,8 @@ def show(
         Tuples of seed, task, success, share of demonstrations whose task was inferred, and mean
         activity.
     """
+    from bgpo_trl.evaluation import Snapshot
+
     algorithm, seeds = policy.algorithm, policy.config.seeds
     n_tasks, n_seeds = len(task), len(seeds)
     snapshots = [
@@ -118,6 +121,8 @@ def measure(policy: TrainedPolicy, shares: Sequence[float], episodes: int, seed:
     Raises:
         ValueError: If a share is not in (0, 1], or ``episodes`` is less than 1.
     """
+    from bgpo_trl.encoders.representation import embed_demonstrations
+
     if not shares or not all(0 < share <= 1 for share in shares):
         raise ValueError(f"--shares are in (0, 1], got {', '.join(map(str, shares)) or 'none'}")
     if episodes < 1:
@@ -206,6 +211,8 @@ def one_shot(arguments: OneShotArguments) -> str:
     Raises:
         ValueError: If the run cannot be loaded, or a share is not in (0, 1].
     """
+    from bgpo_trl.policy import load_run
+
     commit, out = commit_of_code(), arguments.out or arguments.run
     import_plugin(arguments.module)
     set_threads(arguments.threads)

@@ -9,18 +9,15 @@ from typing import Annotated, Any
 
 from tyro.conf import subcommand
 
-from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.analysis.comparison import read_run
 from bgpo_trl.analysis.scores import episodes_to_80, late_scores
 from bgpo_trl.analysis.statistics import mean
 from bgpo_trl.analysis.tables import Table, markdown
 from bgpo_trl.configs import PRESETS, DDPGConfig, SACConfig, TD3Config
-from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.experiments.settings import chosen
 from bgpo_trl.figures.curves import plot_success_curves
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.machine import choose_device, set_threads
-from bgpo_trl.training import Trainer
 
 INPUTS: dict[str, tuple[str, dict[str, Any]]] = {
     "state+label": ("oracle", {"state": "state"}),
@@ -72,6 +69,10 @@ def privileged_information(arguments: InformationArguments) -> str:
     Raises:
         ValueError: If an input is unknown or repeated, or a directory holds another run.
     """
+    from bgpo_trl.algorithms import ALGORITHMS
+    from bgpo_trl.encoders.pretrained import load_pretrained
+    from bgpo_trl.training import Trainer
+
     names = arguments.inputs
     if not names or len(set(names)) < len(names):
         raise ValueError(f"--inputs: name some of {', '.join(INPUTS)}, each once")

@@ -40,9 +40,8 @@ from bgpo_trl.analysis.tables import (
     task_table,
 )
 from bgpo_trl.figures.curves import plot_success_curves
-from bgpo_trl.figures.groups import plot_counts, read_counts
+from bgpo_trl.figures.groups import draw_groups, plot_counts, read_counts
 from bgpo_trl.figures.gwr import plot_gwr_pca
-from bgpo_trl.figures.of_run import draw_groups
 from bgpo_trl.figures.page import Section, write_page
 from bgpo_trl.figures.style import COLORS, save_figure
 from bgpo_trl.figures.success_matrix import plot_success_matrices

@@ -21,7 +21,7 @@ from bgpo_trl.experiments.records import command
 from bgpo_trl.experiments.settings import as_begun, chosen_scene, chosen_tasks, is_finished
 from bgpo_trl.files.locking import lock_directory
 from bgpo_trl.files.writing import write_json
-from bgpo_trl.machine import choose_device, set_threads
+from bgpo_trl.machine import choose_device, keep_freed_memory, set_threads
 from bgpo_trl.plugins import import_plugin
 from bgpo_trl.runs.config_file import read_config
 from bgpo_trl.runs.dashboard import tensorboard_logger, wandb_logger
@@ -68,6 +68,7 @@ def run_experiment(
         )
     commit = commit_of_code()  # read first, since commits may follow during training
     set_threads(arguments.threads)
+    keep_freed_memory()
     device = choose_device(arguments.device)
     registered = ALGORITHMS.get(config.name)
     usual = registered is None or registered.config.rl.name == config.algorithm.rl.name

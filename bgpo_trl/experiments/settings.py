@@ -9,15 +9,13 @@ from typing import TypeVar
 
 import tyro
 
-from bgpo_trl.algorithms import ALGORITHMS
-from bgpo_trl.algorithms.rl import RL
 from bgpo_trl.configs import PRESETS, RunConfig
-from bgpo_trl.configs.checks import check_seeds
 from bgpo_trl.experiments.arguments import Arguments
 from bgpo_trl.plugins import import_plugin
-from bgpo_trl.runs.config_file import read_config
+from bgpo_trl.runs.config_file import read_config, read_settings
 from bgpo_trl.runs.results import read_json
 from bgpo_trl.scenes import Scene, find_scene
+from bgpo_trl.seeding import check_seeds
 
 _Entry = TypeVar("_Entry")
 # Flags of the settings of the same name.
@@ -69,6 +67,8 @@ def run_config(arguments: Arguments, *, from_start: bool = False) -> RunConfig:
 
 def _begin(arguments: Arguments) -> RunConfig:
     """Return the settings that flags change: of a run to be resumed, of a file, or a preset's."""
+    from bgpo_trl.algorithms import ALGORITHMS
+
     path, preset = arguments.config, PRESETS[arguments.preset or "quick"]
     if path is None:
         stored = arguments.resume and arguments.preset is None and arguments.out is not None
@@ -78,7 +78,7 @@ def _begin(arguments: Arguments) -> RunConfig:
     path = path / "config.json" if path.is_dir() else path
     if not path.exists():
         raise ValueError(f"--config: there is no file {path}: name one, or a run directory")
-    settings = read_json(path)
+    settings = read_settings(path)
     name = settings.get("name", preset.name)
     if isinstance(name, str) and name in ALGORITHMS:
         preset = replace(preset, name=name, algorithm=ALGORITHMS[name].config)
@@ -86,6 +86,9 @@ def _begin(arguments: Arguments) -> RunConfig:
 
 
 def _with_algorithm(config: RunConfig, arguments: Arguments) -> RunConfig:
+    from bgpo_trl.algorithms import ALGORITHMS
+    from bgpo_trl.algorithms.rl import RL
+
     if arguments.algorithm is not None:
         entry = chosen(ALGORITHMS, arguments.algorithm, "--algorithm")
         config = replace(config, name=arguments.algorithm, algorithm=entry.config)

@@ -17,12 +17,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from bgpo_trl.algorithms import ABLATIONS
 from bgpo_trl.configs import RunConfig
 from bgpo_trl.experiments.arguments import Arguments, BankArguments
 from bgpo_trl.experiments.merge import merge_runs
 from bgpo_trl.experiments.ray_jobs import Job, connected, play_jobs
-from bgpo_trl.experiments.run import pretrained_for, run_experiment
 from bgpo_trl.experiments.settings import run_config
 from bgpo_trl.files.locking import lock_directory
 from bgpo_trl.plugins import import_plugin
@@ -30,6 +28,7 @@ from bgpo_trl.runs.config_file import Digests, settings_of
 from bgpo_trl.runs.directory import check_settings, holds_run
 from bgpo_trl.runs.results import read_json
 from bgpo_trl.scenes import find_scene
+from suites import opengl
 
 Setting = Literal[
     "concurrent",
@@ -83,6 +82,8 @@ def make_jobs(arguments: SweepArguments) -> dict[Path, list[Job]]:
     Raises:
         ValueError: If the settings are invalid, or the grid is empty.
     """
+    from bgpo_trl.algorithms import ABLATIONS
+
     if arguments.block < 1:
         raise ValueError(f"block must be at least 1, got {arguments.block}")
     if arguments.cpus_per_run <= 0 or arguments.gpus_per_run < 0:
@@ -169,6 +170,8 @@ def check_directories(
 
 def play(job: Job) -> None:
     """Play a job to its end, from its last checkpoint if there is one."""
+    from bgpo_trl.experiments.run import run_experiment
+
     import_plugin(job.module)
     arguments = Arguments(
         out=job.directory, resume=holds_run(job.directory), bank=job.bank, encoders=job.encoders
@@ -187,6 +190,8 @@ def sweep(arguments: SweepArguments) -> str:
         ValueError: If the settings are invalid, or a directory holds another run.
         RuntimeError: If a job fails, such as on a full disk, after the others have finished.
     """
+    from bgpo_trl.experiments.run import pretrained_for
+
     import_plugin(arguments.module)
     jobs = make_jobs(arguments)
     digests = {
@@ -208,6 +213,8 @@ def sweep(arguments: SweepArguments) -> str:
     lines = [f"jobs: {sum(map(len, jobs.values()))}, to run: {len(todo)}"]
     failed: dict[Job, str] = {}
     if todo:
+        if arguments.address == "local":  # The machines of a cluster are not this one.
+            opengl.check()
         resources = {"cpus": arguments.cpus_per_run, "gpus": arguments.gpus_per_run}
         try:
             with connected(arguments.address, **resources):

@@ -11,7 +11,6 @@ from matplotlib.figure import Figure
 from bgpo_trl.analysis.novelty import Detection, leave_one_out, roc_curve
 from bgpo_trl.analysis.tables import Table, markdown
 from bgpo_trl.experiments.arguments import BankArguments
-from bgpo_trl.experiments.run import bank_of
 from bgpo_trl.experiments.settings import check_draws
 from bgpo_trl.figures.style import COLORS, LINES, save_figure, style_axes
 from bgpo_trl.files.writing import write_json
@@ -55,6 +54,8 @@ def unknown_task(arguments: UnknownTaskArguments) -> str:
     Raises:
         ValueError: If there is nothing to draw, or a bank or task does not exist.
     """
+    from bgpo_trl.experiments.run import bank_of
+
     check_draws(arguments.seeds, arguments.draws)
     bank = bank_of(arguments)
     if len(bank.tasks) < 2:

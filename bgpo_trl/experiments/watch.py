@@ -6,6 +6,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import tyro
@@ -18,8 +19,11 @@ from bgpo_trl.figures.frames import plot_frame_strips, save_gif
 from bgpo_trl.figures.of_run import draw_growth
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.plugins import import_plugin
-from bgpo_trl.policy import TrainedPolicy, load_run
-from bgpo_trl.scenes import Scene, Simulation, find_scene
+from bgpo_trl.scenes import Scene, find_scene
+
+if TYPE_CHECKING:
+    from bgpo_trl.policy import TrainedPolicy
+    from bgpo_trl.scenes import Simulation
 
 __all__ = ["Episode", "WatchArguments", "compose", "demonstrate", "play", "watch"]
 
@@ -177,6 +181,8 @@ def watch(arguments: WatchArguments) -> str:
     Raises:
         ValueError: If the directory holds no run that can be loaded, or the run has no such seed.
     """
+    from bgpo_trl.policy import load_run
+
     run, out = arguments.run, arguments.out or arguments.run / "figures"
     import_plugin(arguments.module)
     policy = load_run(run, seed=arguments.run_seed)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -22,6 +23,7 @@ from bgpo_trl.figures.style import (
     LINES,
     add_legend,
     mark_starts,
+    save_figure,
     style_axes,
     task_markers,
 )
@@ -202,3 +204,12 @@ def _draw_rows(axes: Axes, seed: pd.DataFrame, n_tasks: int, last: int, width: f
     axes.tick_params(axis="y", length=0)
     axes.spines["left"].set_visible(False)
     axes.set_ylabel("Group", fontsize=8)
+
+
+def draw_groups(run: Path, presented: Mapping[str, int], out: Path) -> None:
+    """Write the figure of the groups of a run to the path ``out``; arguments as for `plot_groups`.
+
+    Raises:
+        ValueError: If ``train.csv`` is missing or damaged, or the run has no groups.
+    """
+    save_figure(plot_groups(read_groups(run / "train.csv", list(presented)), presented), out)

@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pandas as pd
 import torch
 from torch import Tensor
 
-from bgpo_trl.algorithms import Algorithm
 from bgpo_trl.analysis.task_inference import majority_task, match_counts
 from bgpo_trl.configs import RunConfig
 from bgpo_trl.data.bank import DemonstrationBank
-from bgpo_trl.figures.groups import plot_groups, read_groups
 from bgpo_trl.figures.gwr import plot_gwr_growth, plot_gwr_pca
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.files.writing import write_whole
 from bgpo_trl.runs.gwr_graphs import load_graphs
 from bgpo_trl.runs.results import COUNT, read_table
-from bgpo_trl.transforms import TaskSchedule
+
+if TYPE_CHECKING:
+    from bgpo_trl.algorithms import Algorithm
 
 
 def draw_growth(
@@ -34,6 +35,8 @@ def draw_growth(
     Raises:
         ValueError: If a file of the run is damaged.
     """
+    from bgpo_trl.transforms import TaskSchedule
+
     networks, n_tasks = load_graphs(run / "gwr"), len(config.task_starts)
     if not networks:
         return False
@@ -50,15 +53,6 @@ def draw_growth(
     figure = plot_gwr_growth(graphs, [nodes[seed] for seed in config.seeds], config.tasks)
     save_figure(figure, (out or run / "figures") / "gwr_growth.png")
     return True
-
-
-def draw_groups(run: Path, presented: Mapping[str, int], out: Path) -> None:
-    """Write the figure of the groups of a run to the path ``out``; arguments as for `plot_groups`.
-
-    Raises:
-        ValueError: If ``train.csv`` is missing or damaged, or the run has no groups.
-    """
-    save_figure(plot_groups(read_groups(run / "train.csv", list(presented)), presented), out)
 
 
 def draw_nodes(

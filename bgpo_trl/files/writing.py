@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import shutil
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -21,6 +23,25 @@ def make_folder(path: str | os.PathLike[str]) -> Path:
     except OSError as error:
         raise OSError(f"cannot make the folder {path} ({error.strerror}): choose another") from None
     return path
+
+
+@contextlib.contextmanager
+def new_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Make a folder to write in; it is removed again if that fails.
+
+    Raises:
+        ValueError: If something has its name.
+        OSError: If it cannot be made.
+    """
+    path = Path(path)
+    if os.path.lexists(path):
+        raise ValueError(f"{path} exists: choose another folder, or remove it")
+    make_folder(path)
+    try:
+        yield path
+    except BaseException:
+        shutil.rmtree(path)
+        raise
 
 
 def open_new(path: Path) -> BinaryIO:

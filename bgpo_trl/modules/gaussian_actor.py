@@ -57,12 +57,16 @@ class GaussianActor(StackedNetwork):
         return tensordict.set("action", loc.tanh())
 
     def sample(self, tensordict: TensorDictBase, noise: Tensor) -> TensorDictBase:
-        """Draw actions of states, differentiable with respect to the weights.
+        """Draw actions of states: `forward`, then `draw`."""
+        return self.draw(self(tensordict), noise)
 
-        Besides the entries of `forward` it writes ``"action_log_prob"`` ``[*S, *B]``, the log
-        density of the action. ``noise`` holds standard normals ``[*S, *B, action_dim]``.
+    @staticmethod
+    def draw(tensordict: TensorDictBase, noise: Tensor) -> TensorDictBase:
+        """Draw actions from ``"loc"`` and ``"scale"``, differentiable with respect to both.
+
+        Writes ``"action"`` and ``"action_log_prob"`` ``[*S, *B]``, the log density of the action.
+        ``noise`` holds standard normals ``[*S, *B, action_dim]``.
         """
-        self(tensordict)
         scale: Tensor = tensordict["scale"]
         pre_tanh: Tensor = tensordict["loc"] + scale * noise
         log_prob = -0.5 * (noise.square() + math.log(2 * math.pi)) - scale.log()

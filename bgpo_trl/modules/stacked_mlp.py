@@ -106,6 +106,10 @@ class StackedLinear(nn.Module):
         Raises:
             ValueError: If the input does not lead with ``S`` or has another number of features.
         """
+        return self.product(self.rows(input)).reshape(*input.shape[:-1], self.out_features)
+
+    def rows(self, input: Tensor) -> Tensor:
+        """Return an input of `forward` as ``[N, rows, in_features]``, with ``N`` layers in all."""
         stack = self.batch_size
         if input.shape[-1] != self.in_features or input.shape[: len(stack)] != stack:
             raise ValueError(
@@ -113,19 +117,19 @@ class StackedLinear(nn.Module):
                 f"{self.in_features} features, shape {[*stack]} + [*B, {self.in_features}], got "
                 f"{[*input.shape]}"
             )
-        n_layers = stack.numel()
-        x = input.reshape(n_layers, -1, self.in_features)
-        weight = self.weight.reshape(n_layers, self.in_features, self.out_features)
-        bias = self.bias.reshape(n_layers, 1, self.out_features)
+        return input.reshape(stack.numel(), -1, self.in_features)
+
+    def product(self, rows: Tensor) -> Tensor:
+        """Apply the ``N`` layers to `rows`; return ``[N, rows, out_features]``."""
+        weight = self.weight.reshape(-1, self.in_features, self.out_features)
+        bias = self.bias.reshape(-1, 1, self.out_features)
         # Products with few columns are slow: one column is a weighted sum, and few are faster as
-        # rows, each several times with its gradients.
+        # rows, unless a gradient follows, which would then have the rows in its last dimension.
         if self.out_features == 1:
-            output = (x * weight.mT).sum(-1, keepdim=True) + bias
-        elif self.out_features <= 16:
-            output = torch.baddbmm(bias.mT, weight.mT, x.mT).mT
-        else:
-            output = torch.baddbmm(bias, x, weight)
-        return output.reshape(*input.shape[:-1], self.out_features)
+            return (rows * weight.mT).sum(-1, keepdim=True) + bias
+        if self.out_features <= 16 and not torch.is_grad_enabled():
+            return torch.baddbmm(bias.mT, weight.mT, rows.mT).mT
+        return torch.baddbmm(bias, rows, weight)
 
 
 class StackedMLP(nn.Module):
@@ -174,10 +178,11 @@ class StackedMLP(nn.Module):
 
     def forward(self, input: Tensor) -> Tensor:
         """Return the output ``[*S, *B, out_features]``; input as for `StackedLinear`."""
-        first, *others = self.layers
-        x = first(input)
+        first, *others = cast(list[StackedLinear], self.layers)
+        # The stack is flattened once: a ReLU in place on a view would copy its gradient.
+        x = first.product(first.rows(input))
         for layer in others:
             if self.layer_norm:
                 x = F.layer_norm(x, x.shape[-1:])
-            x = layer(x.relu_())
-        return x
+            x = layer.product(x.relu_())
+        return x.reshape(*input.shape[:-1], x.shape[-1])

@@ -66,13 +66,11 @@ class DDPGLoss(OffPolicyLoss):
 
     def next_value(self, successor: TensorDictBase) -> Tensor:
         """Return the values ``[*S, *B]`` of the target policy's actions."""
-        with self.network("target_actor_network") as actor:
-            data = actor(successor)
+        data = self.call_network("target_actor_network", successor)
         return self.values("target_value_network", data)
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Compute the actor's loss ``[]`` and ``"pre_tanh_magnitude"``."""
-        with self.network("actor_network") as actor:
-            data = actor(self.current(tensordict))
+        data = self.call_network("actor_network", self.current(tensordict))
         value = self.values("value_network", data, frozen=True)
         return self.penalized(value, data, tensordict)

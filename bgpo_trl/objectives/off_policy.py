@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -12,6 +11,7 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictParams, dispatch
 from torch import Tensor
+from torch.func import functional_call
 from torchrl.objectives import LossModule, ValueEstimators
 from torchrl.objectives.utils import distance_loss
 from torchrl.objectives.value import TD0Estimator
@@ -275,14 +275,13 @@ class OffPolicyLoss(LossModule):
     def values(self, name: str, data: TensorDictBase, *, frozen: bool = False) -> Tensor:
         """Return a critic's values ``[*S, *B]``, or ``[*S, 2, *B]`` of twin critics.
 
-        Arguments as for `network`.
+        Arguments as for `call_network`.
         """
         if self.twin_critics:
             dim = len(self.batch_size)
             data = data.select(*self.value_network.in_keys).unsqueeze(dim)
             data = data.expand(*data.batch_size[:dim], 2, *data.batch_size[dim + 1 :])
-        with self.network(name, frozen=frozen) as critic:
-            data = critic(data)
+        data = self.call_network(name, data, frozen=frozen)
         return data.get(self.tensor_keys.state_action_value).squeeze(-1)
 
     def penalized(
@@ -300,10 +299,9 @@ class OffPolicyLoss(LossModule):
         Raises:
             ValueError: If the actor wrote no ``"pre_tanh_action"`` to penalize.
         """
-        loss = -self.mean_per_seed(value, tensordict)
+        loss = -value
         if self.imitation:
-            imitated = self.imitation_loss(data, tensordict)
-            loss = loss + self.imitation * self.mean_per_seed(imitated, tensordict)
+            loss = loss + self.imitation * self.imitation_loss(data, tensordict)
         pre_tanh = data.get(self.tensor_keys.pre_tanh_action, None)
         if pre_tanh is None:
             if self.pre_tanh_penalty:
@@ -311,12 +309,12 @@ class OffPolicyLoss(LossModule):
                     f"the actor wrote no {self.tensor_keys.pre_tanh_action!r} to penalize: write "
                     "it, name it with set_keys(pre_tanh_action=...), or pass pre_tanh_penalty=0"
                 )
-            return loss.sum(), {}
+            return self.mean_per_seed(loss, tensordict).sum(), {}
         square = pre_tanh.square()
         if self.pre_tanh_penalty:
-            loss = loss + self.pre_tanh_penalty * self.mean_per_seed(square, tensordict, features=1)
+            loss = loss + self.pre_tanh_penalty * square.mean(-1)
         magnitude = self.flatten_batch(square.detach()).mean(-1).sqrt()
-        return loss.sum(), {"pre_tanh_magnitude": magnitude}
+        return self.mean_per_seed(loss, tensordict).sum(), {"pre_tanh_magnitude": magnitude}
 
     def imitation_loss(self, data: TensorDictBase, tensordict: TensorDictBase) -> Tensor:
         """Return the squared distance ``[*S, *B]`` of the actor's actions to demonstrated ones.
@@ -335,39 +333,35 @@ class OffPolicyLoss(LossModule):
         distance = (data.get(keys.action) - tensordict.get(keys.action)).square().sum(-1)
         return distance * demonstrated
 
-    def mean_per_seed(
-        self, loss: Tensor, tensordict: TensorDictBase, *, features: int = 0
-    ) -> Tensor:
-        """Return the mean ``[*S]`` of ``[*S, *B, ...]``, weighted by ``"priority_weight"``.
-
-        ``features`` is the number of dimensions after those of the transitions.
-        """
+    def mean_per_seed(self, loss: Tensor, tensordict: TensorDictBase) -> Tensor:
+        """Return the mean ``[*S]`` of ``[*S, *B]``, weighted by ``"priority_weight"``."""
         weights = tensordict.get(self.tensor_keys.priority_weight, None)
         if weights is not None and self.use_prioritized_weights:
-            transitions = loss.shape[: loss.ndim - features]
-            if weights.shape != transitions:
+            if weights.shape != loss.shape:
                 raise ValueError(
                     f"{self.tensor_keys.priority_weight!r} must be one weight a transition, "
-                    f"{[*transitions]}, got {[*weights.shape]}"
+                    f"{[*loss.shape]}, got {[*weights.shape]}"
                 )
-            loss = loss * weights.reshape(*weights.shape, *[1] * features)
+            loss = loss * weights
         return self.flatten_batch(loss).mean(-1)
 
     def flatten_batch(self, values: Tensor) -> Tensor:
         """Flatten all but the leading dimensions ``S`` of values into one."""
         return values.reshape(*self.batch_size, -1)
 
-    @contextmanager
-    def network(self, name: str, *, frozen: bool = False) -> Iterator[Any]:
-        """Yield the actor or value network, or its target, with its parameters in this loss.
+    def call_network(
+        self, name: str, data: TensorDictBase, *, frozen: bool = False
+    ) -> TensorDictBase:
+        """Apply the actor or value network, or its target, with its parameters in this loss.
 
-        With ``frozen``, gradients reach the network's input only, not its parameters.
+        Args:
+            name: ``"actor_network"``, ``"value_network"``, or one of these after ``"target_"``.
+            data: Input of the network, which may write into it.
+            frozen: Whether gradients reach the input only, not the parameters.
         """
-        params = getattr(self, f"{name}_params")
+        weights = {
+            key if isinstance(key, str) else ".".join(key): value.detach() if frozen else value
+            for key, value in getattr(self, f"{name}_params").items(True, True)
+        }
         network = getattr(self, name.removeprefix("target_"))
-        # Otherwise detached tensors are put in as new parameters, whose gradients cost an eighth of
-        # an update and are never used.
-        with (params.detach() if frozen else params).to_module(
-            network, preserve_module_state=False
-        ):
-            yield network
+        return functional_call(network, weights, (data,), tie_weights=False)

@@ -33,7 +33,7 @@ class SACLoss(OffPolicyLoss):
     added to the other losses, and ``"alpha"`` and ``"entropy"`` ``[*S]``.
 
     Args:
-        actor_network: A `GaussianActor`, or a policy with the same ``sample`` and ``action_dim``.
+        actor_network: A `GaussianActor`, or a policy with the same ``draw`` and ``action_dim``.
         value_network: Twin Q-functions, ``batch_size`` ``[*S, 2]``.
         alpha_init: Initial temperature.
         target_entropy: Entropy of the policy, in nats over all action dimensions; None: minus their
@@ -61,7 +61,7 @@ class SACLoss(OffPolicyLoss):
 
     def __init__(
         self,
-        actor_network: Any,  # with `sample` and `action_dim`
+        actor_network: Any,  # with `draw` and `action_dim`
         value_network: TensorDictModuleBase,
         *,
         alpha_init: float = SACConfig.alpha_init,
@@ -109,8 +109,7 @@ class SACLoss(OffPolicyLoss):
         # A TensorDict without a batch size is read as one of vectors.
         batch = data.batch_size or data.get(self.input_keys[0]).shape[:-1]
         noise = self.noise(self.log_alpha.new_empty(*batch, self.actor_network.action_dim))
-        with self.network("actor_network") as actor:
-            data = actor.sample(data, noise)
+        data = self.actor_network.draw(self.call_network("actor_network", data), noise)
         return data, data.get(self.tensor_keys.log_prob)
 
     def _each(self, of_seed: Tensor, like: Tensor) -> Tensor:

@@ -70,8 +70,7 @@ class TD3Loss(OffPolicyLoss):
 
     def next_value(self, successor: TensorDictBase) -> Tensor:
         """Return the smaller values ``[*S, *B]`` of the smoothed target actions."""
-        with self.network("target_actor_network") as actor:
-            data = actor(successor)
+        data = self.call_network("target_actor_network", successor)
         action = data.get(self.tensor_keys.action)
         noise = (self.noise(action) * self.policy_noise).clamp(-self.noise_clip, self.noise_clip)
         data.set(self.tensor_keys.action, (action + noise).clamp(-1.0, 1.0))
@@ -79,7 +78,6 @@ class TD3Loss(OffPolicyLoss):
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Compute the actor's loss ``[]`` and ``"pre_tanh_magnitude"``."""
-        with self.network("actor_network") as actor:
-            data = actor(self.current(tensordict))
+        data = self.call_network("actor_network", self.current(tensordict))
         values = self.values("value_network", data, frozen=True)
         return self.penalized(values.select(len(self.batch_size), 0), data, tensordict)

@@ -1,17 +1,21 @@
-"""Settings of a run, read from its ``config.json``."""
+"""Settings of a run, read from its ``config.json`` or from a file of one's own."""
 
 from __future__ import annotations
 
 import json
+import re
 import sys
 from dataclasses import asdict, is_dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
 
-from bgpo_trl.algorithms import ALGORITHMS
-from bgpo_trl.algorithms.rl import RL
+import yaml
+
 from bgpo_trl.configs import AlgorithmConfig, RLConfig, RunConfig
+from bgpo_trl.runs.results import read_json
 from bgpo_trl.scenes import SCENES, find_scene
+
+_YAML = (".yaml", ".yml")
 
 
 class Digests(NamedTuple):
@@ -26,13 +30,49 @@ class Digests(NamedTuple):
     bank: str | None
 
 
+class _Loader(yaml.SafeLoader):
+    """PyYAML's safe loader, which also reads 1e-4 as a number, as YAML 1.2 and JSON do."""
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+$"),
+    [*"-+0123456789"],
+)
+
+
+def read_settings(path: Path) -> dict[str, Any]:
+    """Return the entries of a file of settings.
+
+    Args:
+        path: YAML file if its name ends in ``.yaml`` or ``.yml``, else JSON.
+
+    Raises:
+        ValueError: If the file is missing or damaged, or is no mapping of names to values.
+    """
+    if path.suffix not in _YAML:
+        return read_json(path)
+    try:
+        found = yaml.load(path.read_text(), Loader=_Loader)
+    except (yaml.YAMLError, OSError, ValueError, RecursionError) as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f", line {mark.line + 1}" if mark is not None else ""
+        reason = getattr(error, "problem", None) or next(iter(str(error).splitlines()), "")
+        raise ValueError(f"{path}{where} is not YAML ({reason}): correct it") from None
+    if not isinstance(found, dict) or not all(isinstance(name, str) for name in found):
+        raise ValueError(
+            f"{path} must hold settings, one `name: value` a line, as config.json does"
+        )
+    return found
+
+
 def read_config(path: str | Path, defaults: RunConfig | None = None) -> tuple[RunConfig, Digests]:
     """Read the settings that `Trainer` wrote: the inverse of ``dataclasses.asdict``.
 
     Settings missing from a run of an earlier version get their defaults.
 
     Args:
-        path: The ``config.json`` of a run.
+        path: The ``config.json`` of a run, or another file that `read_settings` reads.
         defaults: Settings that the file may lack, also all of the algorithm; by default, those of
             the classes.
 
@@ -44,8 +84,9 @@ def read_config(path: str | Path, defaults: RunConfig | None = None) -> tuple[Ru
             hyperparameters that this process does not know.
     """
     path = Path(path)
+    of_run = path.name == "config.json"
     try:
-        settings = json.loads(path.read_text())
+        settings = json.loads(path.read_text()) if of_run else read_settings(path)
         if defaults is not None and isinstance(settings, dict):
             settings = _merged(_as_json(asdict(defaults)), settings)
         if not isinstance(settings, dict) or not isinstance(settings.get("algorithm"), dict):
@@ -65,9 +106,8 @@ def read_config(path: str | Path, defaults: RunConfig | None = None) -> tuple[Ru
     except (FileNotFoundError, NotADirectoryError):
         raise ValueError(f"{path.parent} holds no run: there is no {path.name}") from None
     except (ValueError, OSError, RecursionError) as error:
-        raise ValueError(
-            f"{path} cannot be read ({error}): use the version of the code that made the run"
-        ) from error
+        remedy = "use the version of the code that made the run" if of_run else "correct it"
+        raise ValueError(f"{path} cannot be read ({error}): {remedy}") from error
     if kind is None:
         raise ValueError(
             f"{path} is a run of {name!r}, whose hyperparameters no imported module has: name the "
@@ -156,6 +196,8 @@ def _algorithm_config(name: object, stored: object) -> type[AlgorithmConfig] | N
         kind = getattr(sys.modules.get(module), attribute, None)
         if isinstance(kind, type) and issubclass(kind, AlgorithmConfig):
             return kind
+    from bgpo_trl.algorithms import ALGORITHMS
+
     if not isinstance(name, str) or name not in ALGORITHMS:
         return None
     return type(ALGORITHMS[name].config)
@@ -164,13 +206,15 @@ def _algorithm_config(name: object, stored: object) -> type[AlgorithmConfig] | N
 def _read(hint: Any, value: Any, where: str) -> Any:
     """Convert a JSON value to its annotated type; ``where`` names it in errors."""
     if hint is RLConfig and isinstance(value, dict):
+        from bgpo_trl.algorithms.rl import RL
+
         name = value.get("name")
         if name not in RL:
             raise ValueError(f"{where}name is {name!r}, not a known RL algorithm")
         hint = type(RL[name].config)
     if is_dataclass(hint) and isinstance(value, dict):
         hints = get_type_hints(hint)
-        unknown = sorted(value.keys() - hints.keys())
+        unknown = sorted(value.keys() - hints.keys(), key=str)
         if unknown:
             raise ValueError(f"unknown setting {where}{unknown[0]}")
         read = {key: _read(hints[key], item, f"{where}{key}.") for key, item in value.items()}

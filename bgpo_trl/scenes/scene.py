@@ -6,12 +6,13 @@ import importlib
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bgpo_trl.scenes.simulation import Observation, Simulation, SimulationEnv
+if TYPE_CHECKING:
+    from bgpo_trl.scenes.simulation import Observation, Simulation, SimulationEnv
 
 __all__ = ["SCENES", "Scene", "StateColumns", "Weights", "find_scene"]
 

@@ -244,7 +244,8 @@ class SimulationEnv(EnvBase):
             self._record(row)
         self._begun |= rows
         self._success[rows] = self._failure[rows] = False
-        return TensorDict(self._observe(), self.batch_size)
+        # With the device, TorchRL does not copy all entries at each step.
+        return TensorDict(self._observe(), self.batch_size, self.device)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         rows = ~(self._success | self._failure)
@@ -269,7 +270,7 @@ class SimulationEnv(EnvBase):
         rewards = np.zeros((len(rows), 1), np.float32)
         self._advance(np.flatnonzero(rows).tolist(), actions, rewards)
         reward = torch.from_numpy(rewards).reshape(*self.batch_size, 1)
-        return TensorDict({**self._observe(), "reward": reward}, self.batch_size)
+        return TensorDict({**self._observe(), "reward": reward}, self.batch_size, self.device)
 
     def _advance(
         self, rows: Iterable[int], actions: NDArray[np.float64], rewards: NDArray[np.float32]

@@ -3,21 +3,22 @@
 # MuJoCo's bindings come without stubs.
 # pyright: reportAttributeAccessIssue=false
 
+from __future__ import annotations
+
 from suites import opengl  # isort: skip (before MuJoCo, which reads the choice on import)
 
 import atexit
 import contextlib
 import functools
 import operator
-import os
 import threading
 import weakref
 from collections.abc import Callable, Sequence
 
 import mujoco
 import numpy as np
-from dm_control._render import base as dm_control_contexts
-from mujoco.rendering.classic import gl_context
+
+gl_context, dm_control_contexts = opengl.import_backends()
 
 FRAME_HEIGHT = 32  # (pixels), the paper's "64x32 RGB image"
 FRAME_WIDTH = 64  # (pixels)
@@ -129,7 +130,7 @@ class FrameRenderer:
         width: Width of a frame (pixels).
 
     Raises:
-        RuntimeError: If no OpenGL context can be made; the message names the packages to install.
+        RuntimeError: If no OpenGL context can be made; the message names the remedy.
         ValueError: If the scene has no such camera, or cannot render frames of that size.
     """
 
@@ -147,10 +148,9 @@ class FrameRenderer:
             raise ValueError(f"no camera {camera!r} in the scene; choose one of {names}")
         self.frame_size = (height, width)
         check_frame_size(model, self.frame_size)
-        if opengl.refusal:
-            raise RuntimeError(opengl.refusal)
+        opengl.check()
         try:
-            with _turn:
+            with _turn, opengl.glfw_errors():
                 while _abandoned:
                     _close(_abandoned.pop())
                 self._renderer = mujoco.Renderer(model, height, width, max_geom=200)
@@ -158,13 +158,7 @@ class FrameRenderer:
                 _close_at_exit()
                 _leave()
         except Exception as error:  # MuJoCo's backends raise many kinds of errors.
-            backend = os.environ.get("MUJOCO_GL", "default")
-            reason = next(iter(str(error).splitlines()), type(error).__name__)
-            raise RuntimeError(
-                f"no OpenGL context from the {backend} backend ({reason}): set MUJOCO_GL to egl "
-                "or osmesa, or unset it, and check that the library is installed (Debian/Ubuntu: "
-                "`apt-get install libegl1 libgl1-mesa-dri`, or `libosmesa6`)"
-            ) from error
+            raise RuntimeError(opengl.explain(error)) from error
         self._model, self._camera_name = model, camera
         self._camera = mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
@@ -173,7 +167,7 @@ class FrameRenderer:
         self._taller = max(1.0, paper * height / width) if camera == FRAME_CAMERA else 1.0
         weakref.finalize(self, _abandoned.append, self._renderer).atexit = False
 
-    def __reduce__(self) -> tuple[Callable[..., "FrameRenderer"], tuple[mujoco.MjModel, str]]:
+    def __reduce__(self) -> tuple[Callable[..., FrameRenderer], tuple[mujoco.MjModel, str]]:
         height, width = self.frame_size
         make = functools.partial(FrameRenderer, height=height, width=width)
         return make, (self._model, self._camera_name)

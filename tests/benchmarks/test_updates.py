@@ -3,10 +3,12 @@
 import sys
 from importlib.util import find_spec
 
+import pytest
 import torch
 
 from benchmarks.speed import updates
 from benchmarks.speed.updates import BATCH, Floor, Ours, TorchRLLoop, contenders, floor_batch
+from benchmarks.speed.versions import Update
 
 
 def weights(ours: Ours) -> list[torch.Tensor]:
@@ -70,3 +72,12 @@ def test_a_missing_stable_baselines3_is_left_out_and_said(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "stable_baselines3", None)
     assert "Stable-Baselines3" not in contenders(seeds=1, transitions=BATCH)
     assert "pip install" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("rl", ["ddpg", "td3", "sac"])
+def test_an_update_by_which_versions_are_compared_moves_every_weight(rl):
+    update = Update(rl, seeds=2, experts=1)
+    before = [parameter.clone() for parameter in update.learner.loss.parameters()]
+    update(2)  # TD3's actor moves in every second
+    for parameter, start in zip(update.learner.loss.parameters(), before, strict=True):
+        assert parameter.ne(start).flatten(1).any(-1).all()

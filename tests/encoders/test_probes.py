@@ -60,6 +60,12 @@ def test_picture_shows_frames_over_reconstructions(untrained: Representation) ->
     assert (last == data["pixels"][5, :7]).flatten(1).all(-1).any(), "of a valid step"
 
 
+def test_probes_leave_out_a_ground_truth_that_was_not_recorded(untrained: Representation) -> None:
+    data = demonstrations().exclude("state", "action")
+    result = probe(untrained, data, play=data, columns=NICO.state)
+    assert result == probe(untrained, data)
+
+
 def test_probes_are_not_fitted_on_held_out_demonstrations(untrained: Representation) -> None:
     """Two held-out demonstrations of three: measuring on one alone is fitting on the same four."""
     data = demonstrations()

@@ -40,8 +40,7 @@ def test_the_actor_imitates_good_actions_most(registry):
     batch = TensorDict({"state": state, "action": action, "next": successor}, [2, 1, 16])
     losses = learner.loss(batch.clone())
 
-    with learner.loss.network("actor_network") as actor:
-        acted = actor(batch.select("state"))
+    acted = learner.loss.call_network("actor_network", batch.select("state"))
     q = [
         learner.loss.values("value_network", data)
         for data in (batch.select("state", "action"), acted.clone())

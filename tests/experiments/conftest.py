@@ -10,9 +10,10 @@ from tensordict.nn import TensorDictModule
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.policy import Policy
 from bgpo_trl.data.bank import DemonstrationBank
+from bgpo_trl.encoders import pretrained
 from bgpo_trl.experiments import measure, privileged_information, settings
 from bgpo_trl.experiments import run as experiment
-from bgpo_trl.figures import of_run
+from bgpo_trl.figures import groups, of_run
 from bgpo_trl.policy import LoadedRun
 from bgpo_trl.training import Trainer
 from suites import nico
@@ -23,7 +24,7 @@ from suites.nico.base import STATE_CENTER, STATE_SCALE
 def tiny(monkeypatch, encoders, bank, make_config):
     """Untrained encoders, runs of a second and two final test episodes of each task."""
     config = make_config(episodes=6)
-    for module in (experiment, privileged_information):
+    for module in (experiment, pretrained):
         monkeypatch.setattr(module, "load_pretrained", lambda *_, **__: (encoders, bank))
     for module in (settings, privileged_information):
         monkeypatch.setattr(module, "PRESETS", {"quick": config, "desk": config})
@@ -44,7 +45,7 @@ def tiniest(tiny, monkeypatch):
         path.parent.mkdir(exist_ok=True)
         path.touch()
 
-    for module in (measure, of_run):
+    for module in (measure, groups, of_run):
         monkeypatch.setattr(module, "save_figure", touch)
         for name in dir(module):
             if name.startswith("plot_"):

@@ -161,33 +161,62 @@ def test_a_folder_without_permission_is_refused(folder, monkeypatch):
     assert contents(folder) == before
 
 
-def test_without_opengl_neither_recording_nor_run_begins(folder, monkeypatch):
+def test_a_context_that_cannot_be_made_ends_a_run_in_one_line(folder, monkeypatch):
     def refuse(*args, **kwargs):
         raise ValueError("no display\nof any kind")
 
     before = contents(folder)
-    with monkeypatch.context() as patch:
-        patch.setattr(mujoco, "Renderer", refuse)
-        message = exit_code(monkeypatch, "bgpo concurrent --out new")
+    monkeypatch.setattr(mujoco, "Renderer", refuse)
+    message = exit_code(monkeypatch, "bgpo concurrent --out new")
     assert "(no display)" in message and "\n" not in message
-    monkeypatch.setattr(opengl, "refusal", "MUJOCO_GL is 'vulkan': do not set it")
-    message = exit_code(monkeypatch, "bgpo_trl.data.recording new")
-    assert message == "error: MUJOCO_GL is 'vulkan': do not set it"
     assert contents(folder) == before
 
 
-def test_an_unknown_opengl_backend_is_refused_before_a_run_begins(tmp_path):
-    """In a process of its own, since MuJoCo reads the variable when it is imported."""
+@pytest.mark.parametrize(
+    "command",
+    [
+        "bgpo continual --out new",
+        "bgpo continual --train-encoders --out new",
+        "bgpo sweep --preset quick --out new",
+        "bgpo tasks --pictures empty",
+        "bgpo_trl.data.recording new",
+        "suites.nico.explore --out new.gif",
+        "bgpo watch runs/bgpo",
+        "bgpo looking runs/bgpo",
+        "bgpo aftermath runs/bgpo",
+        "bgpo one-shot runs/bgpo",
+    ],
+)
+def test_without_opengl_a_command_that_renders_writes_nothing(
+    folder, run_of, monkeypatch, capsys, command
+):
+    run_of("bgpo")
+    before = contents(folder)
+    monkeypatch.setattr(opengl, "refusal", "MUJOCO_GL is 'vulkan': do not set it")
+    message = exit_code(monkeypatch, command)
+    assert message == "error: MUJOCO_GL is 'vulkan': do not set it"
+    assert capsys.readouterr() == ("", "")
+    assert contents(folder) == before
+
+
+def test_an_opengl_device_that_does_not_exist_is_refused_before_a_run_begins(tmp_path):
+    """In a process of its own, since dm_control looks for the device when it is imported."""
     process = subprocess.run(
         [sys.executable, str(ROOT / "benchmarks" / "concurrent_tasks.py"), "--out", "run"],
         cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(ROOT), "MUJOCO_GL": "vulkan"},
+        env={
+            **os.environ,
+            "PYTHONPATH": str(ROOT),
+            "MUJOCO_GL": "egl",
+            "MUJOCO_EGL_DEVICE_ID": "99",
+        },
         capture_output=True,
         text=True,
         timeout=300,
     )
     assert process.returncode == 1
-    assert process.stderr.startswith("error: MUJOCO_GL is 'vulkan', ")
+    assert process.stderr.startswith("error: no OpenGL context from the egl backend (")
+    assert "unset MUJOCO_EGL_DEVICE_ID" in process.stderr
     assert process.stderr.count("\n") == 1
     assert not process.stdout
     assert not list(tmp_path.iterdir())

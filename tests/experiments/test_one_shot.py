@@ -10,6 +10,7 @@ import torch
 
 from bgpo_trl import load_run
 from bgpo_trl.data.recording import record_demonstrations
+from bgpo_trl.evaluation import Evaluator
 from bgpo_trl.experiments import one_shot
 from bgpo_trl.experiments.one_shot import OneShotArguments, Row
 from suites import nico
@@ -108,7 +109,7 @@ def test_all_shares_are_tested_from_the_same_starts(run_of, monkeypatch):
         assert all(snapshot.presented.all() for snapshot in snapshots)
         return SimpleNamespace(success=torch.ones(2, 3, 1, dtype=torch.bool))
 
-    monkeypatch.setattr(one_shot.Evaluator, "run", run)
+    monkeypatch.setattr(Evaluator, "run", run)
     rows = one_shot.measure(policy, (0.5, 0.7, 1.0), 1, 1)
     assert len(numbers) == 3 and len(set(numbers)) == 1
     assert {row[4] for row in rows} == {1.0}

@@ -144,6 +144,75 @@ def test_a_file_can_name_another_rl_algorithm(tmp_path):
     assert run_config(Arguments(config=path)).algorithm.rl == SACConfig(gamma=0.5)
 
 
+YAML = """
+name: bgpo-single
+seeds: [3, 5]
+tasks: [grasp_glass, push_green_to_glass]
+task_starts: [0, 300]  # the second task from episode 301
+episodes: 600
+spread: 1  # a whole number for a share
+algorithm:
+  beta: 0.2
+  rl: {name: sac, learning_rate: 3e-4}
+"""
+
+
+def test_yaml_json_and_flags_store_the_same_settings(tmp_path):
+    in_yaml, in_json = tmp_path / "mine.yaml", tmp_path / "mine.json"
+    in_yaml.write_text(YAML)
+    write(
+        in_json,
+        {
+            "name": "bgpo-single",
+            "seeds": [3, 5],
+            "tasks": ["grasp_glass", "push_green_to_glass"],
+            "task_starts": [0, 300],
+            "episodes": 600,
+            "spread": 1,
+            "algorithm": {"beta": 0.2, "rl": {"name": "sac", "learning_rate": 0.0003}},
+        },
+    )
+    flags = Arguments(
+        algorithm="bgpo-single",
+        rl="sac",
+        seeds=(3, 5),
+        tasks=("grasp_glass", "push_green_to_glass"),
+        episodes=600,
+        spread=1.0,
+        hyperparameters=("--algorithm.beta", "0.2", "--algorithm.rl.learning-rate", "3e-4"),
+    )
+    by_file = [Arguments(config=path) for path in (in_yaml, in_json)]
+    stored = [settings_of(run_config(given), Digests("a", "b")) for given in (*by_file, flags)]
+    assert stored[0] == stored[1] == stored[2]
+    assert stored[0]["algorithm"]["beta"] == 0.2
+
+
+@pytest.mark.parametrize(
+    ("content", "cause"),
+    [
+        ("seeds: [0, 1\nepisodes: 5", "line 2"),
+        ("seeds:\n\t- 0", "line 2"),
+        ("- seeds", "name: value"),
+        ("", "name: value"),
+        ("1: 2", "name: value"),
+        ("episods: 5", "unknown setting episods"),
+        ("algorithm: {1: 2, two: 3}", "unknown setting algorithm.1"),
+        ("episodes: many", "episodes is 'many'"),
+        ("tasks: &all [*all]", "tasks is"),
+        ("seeds: !!python/tuple [1]", "line 1"),
+        ("[" * 5_000, "mine.yaml"),
+        ("seeds: \0", "mine.yaml"),
+    ],
+)
+def test_a_yaml_file_that_is_damaged_or_has_wrong_settings_is_refused(tmp_path, content, cause):
+    path = tmp_path / "mine.yaml"
+    path.write_text(content)
+    with pytest.raises(ValueError, match=r"mine\.yaml") as raised:
+        run_config(Arguments(config=path))
+    assert cause in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
 @pytest.mark.parametrize(
     "content", ["", "[]", '{"colour": 1}', '{"episodes": "many"}', '{"algorithm": {"beta": -1}}']
 )

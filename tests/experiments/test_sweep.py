@@ -15,6 +15,7 @@ from bgpo_trl.analysis.comparison import NAMES
 from bgpo_trl.configs import PRESETS
 from bgpo_trl.experiments import merge, sweep
 from bgpo_trl.experiments import ray_jobs as jobs
+from bgpo_trl.experiments import run as experiment
 from bgpo_trl.experiments.ray_jobs import Job
 from bgpo_trl.experiments.report import ReportArguments, report
 from bgpo_trl.experiments.sweep import EightTasksArguments, SweepArguments
@@ -120,7 +121,7 @@ def test_jobs_carry_tasks_module_and_bank(tmp_path, monkeypatch):
     events = []
     monkeypatch.setattr(sweep, "import_plugin", events.append)
     monkeypatch.setattr(
-        sweep, "run_experiment", lambda arguments, *_: events.append(arguments.bank)
+        experiment, "run_experiment", lambda arguments, *_: events.append(arguments.bank)
     )
     sweep.play(continual)
     assert events == ["my_tasks", tmp_path / bank]
@@ -328,7 +329,7 @@ def without_ray(monkeypatch):
     monkeypatch.setattr(sweep, "play_jobs", play_jobs)
     monkeypatch.setattr(sweep, "play", play)
     some = [SimpleNamespace(identity=digest) for digest in SOME]
-    monkeypatch.setattr(sweep, "pretrained_for", lambda tasks, bank, **_: some)
+    monkeypatch.setattr(experiment, "pretrained_for", lambda tasks, bank, **_: some)
     return SimpleNamespace(played=played, broken=broken)
 
 

@@ -161,9 +161,12 @@ def test_sacs_noise_is_floating_point_for_observations_of_integers():
     class Whole(GaussianActor):
         """A policy of integer observations."""
 
-        def sample(self, tensordict, noise):
+        def forward(self, tensordict):
+            return super().forward(tensordict.set("state", tensordict["state"].float()))
+
+        def draw(self, tensordict, noise):
             assert noise.dtype == torch.float32
-            return super().sample(tensordict.set("state", tensordict["state"].float()), noise)
+            return super().draw(tensordict, noise)
 
     critic = Critic(STATE, ACTION, in_keys=["state"], batch_size=2)
     loss = SACLoss(Whole(STATE, ACTION, in_keys=["state"]), critic, constant_keys=["state"])

@@ -12,28 +12,28 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import tyro
 from numpy.typing import NDArray
 
 from bgpo_trl.analysis.tables import Table, markdown
-from bgpo_trl.evaluation import start_seeds
 from bgpo_trl.experiments.arguments import TrainedArguments
 from bgpo_trl.experiments.episodes import evaluator_of, snapshots_of
 from bgpo_trl.experiments.nico.scripted import Episode, load_blocks_of_nico, play, random_actions
 from bgpo_trl.experiments.records import write_measurement
 from bgpo_trl.machine import set_threads
 from bgpo_trl.plugins import import_plugin
-from bgpo_trl.policy import LoadedRun
 from bgpo_trl.runs.provenance import commit_of_code
-from bgpo_trl.scenes.nico.env import NicoSimulation
 from suites import nico
 from suites.nico import kinematics
 from suites.nico.base import CONTROL_TIMESTEP, TIME_LIMIT, Environment
 from suites.nico.demonstrator import Demonstrator
 from suites.nico.physics import HAND, OBJECT_HALF_HEIGHT, TABLE_HEIGHT
+
+if TYPE_CHECKING:
+    from bgpo_trl.policy import LoadedRun
 
 LIFT = 0.05  # (m) over the object's place on the table
 GAP = 0.015  # (m) between things that still count as together
@@ -200,6 +200,8 @@ class Row(NamedTuple):
 
 def policy_episodes(run: LoadedRun, episodes: int) -> list[Episode]:
     """Return the test episodes of all seeds' trained policies, as many of each task and seed."""
+    from bgpo_trl.scenes.nico import NicoSimulation  # with TorchRL, for which --help does not wait
+
     held_out = run.bank.held_out(run.config.held_out)
     evaluator, first = evaluator_of(run, held_out, episodes), list[NDArray]()
 
@@ -239,6 +241,8 @@ def scripted_episodes(
     spread: float = 1.0,
 ) -> list[Episode]:
     """Return the episodes of an entry of `SCRIPTED`, in the starts of `policy_episodes`."""
+    from bgpo_trl.evaluation import start_seeds
+
     starts = {seed: start_seeds(seed, _NUMBER, (len(tasks), episodes)) for seed in seeds}
     return [
         episode

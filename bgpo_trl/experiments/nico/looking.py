@@ -34,7 +34,7 @@ from bgpo_trl.policy import LoadedRun
 from bgpo_trl.runs.provenance import commit_of_code
 from bgpo_trl.scenes.nico.env import NicoEnv, NicoSimulation
 from bgpo_trl.scenes.nico.scene import NICO
-from suites import nico
+from suites import nico, opengl
 from suites.nico.physics import OBJECTS
 
 Hidden = Literal["places", "objects"]
@@ -230,6 +230,7 @@ def looking(arguments: TrainedArguments) -> str:
     commit, out = commit_of_code(), arguments.out or arguments.run
     import_plugin(arguments.module)
     set_threads(arguments.threads)
+    opengl.check()  # before the progress bar
     rows: list[Row] = []
     for run in load_blocks_of_nico(arguments.run):
         steps = len(VIEWS) * (run.config.algorithm.max_steps + 1)

@@ -5,15 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from dm_env import TimeStep
 from numpy.typing import NDArray
 
 from bgpo_trl.experiments.episodes import load_blocks
-from bgpo_trl.policy import LoadedRun
 from suites import nico
 from suites.nico.base import Environment
+
+if TYPE_CHECKING:
+    from bgpo_trl.policy import LoadedRun
 
 Actor = Callable[[TimeStep], NDArray]
 """Scripted policy: maps a time step to an action ``[4]``."""

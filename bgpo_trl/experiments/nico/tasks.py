@@ -14,7 +14,7 @@ from PIL import Image, ImageDraw
 
 from bgpo_trl.analysis.tables import Table, markdown
 from bgpo_trl.files.writing import write_whole
-from suites import nico
+from suites import nico, opengl
 from suites.nico.base import CONTROL_TIMESTEP, TIME_LIMIT, Environment
 from suites.nico.demonstrator import Demonstrator
 
@@ -135,6 +135,8 @@ def tasks(arguments: TasksArguments) -> str:
         raise ValueError(f"--starts must be at least 2, got {arguments.starts}")
     if arguments.pictures is not None and not arguments.pictures.is_dir():
         raise ValueError(f"there is no folder {arguments.pictures}: make it first")
+    if arguments.pictures is not None:
+        opengl.check()  # before minutes of measurements
     names = nico.ALL_TASKS
     starts: dict[str, NDArray[np.float64]] = {}
     table: Table = [["task", "random actions", "demonstrator", "steps"]]

@@ -1,0 +1,247 @@
+"""Write demonstrations as a LeRobot dataset."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Self, cast
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+from PIL import Image
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from bgpo_trl.files.writing import new_folder, write_json
+
+_DATA = "data/chunk-{:03d}/file-{:03d}.parquet"
+_FILE_MB, _FILES_PER_CHUNK = 100, 1000
+_INDICES = ("frame_index", "episode_index", "index", "task_index")
+_KEYS = {"action": "action", "state": "observation.environment_state"}
+
+
+def write_lerobot(
+    path: str | Path,
+    dataset: TensorDictBase,
+    *,
+    tasks: Sequence[str],
+    fps: int,
+    image_key: str = "observation.images.camera",
+    robot_type: str | None = None,
+) -> None:
+    """Write demonstrations as a LeRobot dataset, one episode for each.
+
+    Frames are stored as PNG, hence without loss. A row of the format has an observation and the
+    action that follows; that of the last frame is 0. Statistics are mean, standard deviation and
+    range; LeRobot's ``augment_dataset_quantile_stats`` adds the quantiles that some policies need.
+
+    Args:
+        path: Folder of the LeRobot dataset, which must not exist.
+        dataset: Demonstrations of `load_demonstrations`, or some, such as
+            ``dataset[dataset["train"]]``. Reads ``pixels`` uint8 ``[N, T, H, W, 3]``, ``length``
+            and ``task`` ``[N]``, and, if they are there, ``action`` ``[N, T - 1, A]`` and
+            ``state`` ``[N, T, F]`` (as ``observation.environment_state``).
+        tasks: Names or descriptions of the tasks, in the order of their labels.
+        fps: Frames per second, 5 for NICO.
+        image_key: Name of the camera.
+        robot_type: Name of the robot.
+
+    Raises:
+        ValueError: If the folder exists, there is no demonstration, a label has no name, or ``fps``
+            is not positive.
+        OSError: If a file cannot be written; nothing is left.
+    """
+    if fps < 1 or not len(dataset):
+        raise ValueError(
+            f"there are {len(dataset)} demonstrations at {fps} frames per second: give at least 1"
+        )
+    if int(dataset["task"].max()) >= len(tasks) or len({*tasks}) < len(tasks):
+        raise ValueError(f"{', '.join(tasks)}: give a name of its own for each label of the tasks")
+    keys = {key: name for key, name in _KEYS.items() if key in dataset}
+    features = _features(dataset, keys, image_key)
+    with new_folder(path) as folder:
+        episodes = _write_data(folder, dataset, keys, image_key, fps)
+        stats = _merged([episode.pop("stats") for episode in episodes])
+        meta = folder / "meta"
+        (meta / "episodes" / "chunk-000").mkdir(parents=True)
+        table = pa.Table.from_pylist(
+            [{**episode, "tasks": [tasks[episode["tasks"]]]} for episode in episodes]
+        )
+        pq.write_table(table, meta / "episodes" / "chunk-000" / "file-000.parquet")
+        index = pd.Index(tasks, name="task")
+        pd.DataFrame({"task_index": range(len(tasks))}, index).to_parquet(meta / "tasks.parquet")
+        write_json(meta / "stats.json", stats)
+        write_json(
+            meta / "info.json",
+            {
+                "codebase_version": "v3.0",
+                "robot_type": robot_type,
+                "total_episodes": len(episodes),
+                "total_frames": int(dataset["length"].sum()),
+                "total_tasks": len(tasks),
+                "chunks_size": _FILES_PER_CHUNK,
+                "data_files_size_in_mb": _FILE_MB,
+                "video_files_size_in_mb": 2 * _FILE_MB,
+                "fps": fps,
+                "splits": {"train": f"0:{len(episodes)}"},
+                "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+                "video_path": None,
+                "features": features,
+            },
+        )
+
+
+def _features(dataset: TensorDictBase, keys: Mapping[str, str], image_key: str) -> dict[str, Any]:
+    """Return the entry ``features`` of ``info.json``."""
+    names = ["height", "width", "channels"]
+    shape = [*dataset["pixels"].shape[-3:]]
+    features = {image_key: {"dtype": "image", "shape": shape, "names": names}}
+    for key, name in keys.items():
+        size = dataset[key].shape[-1]
+        names = [f"{key}_{number}" for number in range(size)]
+        features[name] = {"dtype": "float32", "shape": [size], "names": names}
+    for name in ("timestamp", *_INDICES):
+        dtype = "float32" if name == "timestamp" else "int64"
+        features[name] = {"dtype": dtype, "shape": [1], "names": None}
+    return features
+
+
+def _write_data(
+    folder: Path, dataset: TensorDictBase, keys: Mapping[str, str], image_key: str, fps: int
+) -> list[dict[str, Any]]:
+    """Write the rows of all frames; return the metadata of each episode, with ``stats``."""
+    episodes, start = [], 0
+    with _DataFiles(folder) as files:
+        for number in range(len(dataset)):
+            row = cast(TensorDictBase, dataset[number])
+            length = int(row["length"])
+            columns = _columns(row, keys)
+            columns |= {
+                "timestamp": np.arange(length, dtype=np.float32) / np.float32(fps),
+                "frame_index": np.arange(length),
+                "episode_index": np.full(length, number),
+                "index": np.arange(start, start + length),
+                "task_index": np.full(length, int(row["task"])),
+            }
+            frames = cast(Tensor, row["pixels"])[:length].numpy()
+            stats = {name: _stats(values) for name, values in columns.items()}
+            stats[image_key] = _stats(frames)
+            chunk_index, file_index = files.write(columns, image_key, [*map(_png, frames)])
+            episodes.append(
+                {
+                    "episode_index": number,
+                    "tasks": int(row["task"]),
+                    "length": length,
+                    "data/chunk_index": chunk_index,
+                    "data/file_index": file_index,
+                    "dataset_from_index": start,
+                    "dataset_to_index": start + length,
+                    "meta/episodes/chunk_index": 0,
+                    "meta/episodes/file_index": 0,
+                    **{f"stats/{f}/{name}": v for f, s in stats.items() for name, v in s.items()},
+                    "stats": stats,
+                }
+            )
+            start += length
+    return episodes
+
+
+def _columns(row: TensorDictBase, keys: Mapping[str, str]) -> dict[str, NDArray[Any]]:
+    """Return actions and states of an episode by the names of their features."""
+    length = int(row["length"])
+    columns = {}
+    for key, name in keys.items():
+        n_known = length - (key == "action")
+        values = cast(Tensor, row[key])
+        columns[name] = np.zeros((length, values.shape[-1]), np.float32)
+        columns[name][:n_known] = values[:n_known].numpy()
+    return columns
+
+
+class _DataFiles:
+    """Parquet files of the rows, each filled with whole episodes up to about `_FILE_MB`."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder, self._file, self._size = folder, -1, 0
+        self._writer: Any = None
+
+    def write(
+        self, columns: Mapping[str, NDArray[Any]], image_key: str, images: Sequence[bytes]
+    ) -> tuple[int, int]:
+        """Write an episode; return the numbers of its chunk and file."""
+        table = _table(columns, image_key, images)
+        if self._writer is None or self._size > _FILE_MB * 2**20:
+            self.close()
+            self._file, self._size = self._file + 1, 0
+            path = self._folder / _DATA.format(*divmod(self._file, _FILES_PER_CHUNK))
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._writer = pq.ParquetWriter(path, table.schema)
+        self._writer.write_table(table)
+        self._size += sum(map(len, images))
+        return divmod(self._file, _FILES_PER_CHUNK)
+
+    def close(self) -> None:
+        if self._writer is not None:
+            self._writer.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _png(frame: NDArray[np.uint8]) -> bytes:
+    content = io.BytesIO()
+    Image.fromarray(frame).save(content, "png")
+    return content.getvalue()
+
+
+def _table(
+    columns: Mapping[str, NDArray[Any]], image_key: str, images: Sequence[bytes]
+) -> pa.Table:
+    """Return the rows of an episode; a feature of one number is a plain column."""
+    pictures = [{"bytes": image, "path": f"frame-{n:06d}.png"} for n, image in enumerate(images)]
+    arrays = {image_key: pa.array(pictures, pa.struct({"bytes": pa.binary(), "path": pa.string()}))}
+    for name, values in columns.items():
+        flat = pa.array(values.reshape(-1))
+        size = values[0].size
+        arrays[name] = flat if size == 1 else pa.FixedSizeListArray.from_arrays(flat, size)
+    return pa.table(arrays)
+
+
+def _stats(values: NDArray[Any]) -> dict[str, Any]:
+    """Return the statistics of a feature, of images by channel ``[3, 1, 1]`` in [0, 1]."""
+    if values.ndim == 4:
+        values = values / 255
+        axes, shape = (0, 1, 2), (3, 1, 1)
+    else:
+        axes, shape = (0,), (values[0].size,)
+    found = {name: getattr(values, name)(axes) for name in ("min", "max", "mean", "std")}
+    return {
+        **{name: np.reshape(value, shape).astype(float).tolist() for name, value in found.items()},
+        "count": [len(values)],
+    }
+
+
+def _merged(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the statistics of all episodes from those of each."""
+    merged = {}
+    for feature in parts[0]:
+        column = {name: np.array([p[feature][name] for p in parts]) for name in parts[0][feature]}
+        count = column["count"]
+        weight = count.reshape(-1, *[1] * (column["mean"].ndim - 1)) / count.sum()
+        mean = (weight * column["mean"]).sum(0)
+        squares = column["std"] ** 2 + (column["mean"] - mean) ** 2
+        merged[feature] = {
+            "min": column["min"].min(0).tolist(),
+            "max": column["max"].max(0).tolist(),
+            "mean": mean.tolist(),
+            "std": np.sqrt((weight * squares).sum(0)).tolist(),
+            "count": [int(count.sum())],
+        }
+    return merged

@@ -1,0 +1,293 @@
+"""Demonstrations written as a LeRobot dataset, and read from one."""
+
+import json
+import shutil
+import sys
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from tensordict import TensorDict
+
+pa = pytest.importorskip("pyarrow")
+
+import pyarrow.parquet as pq  # noqa: E402
+
+from bgpo_trl.data.lerobot import read_lerobot, write_lerobot  # noqa: E402
+from bgpo_trl.data.lerobot import writing as lerobot_writing  # noqa: E402
+from bgpo_trl.data.writing import resize_frames, write_demonstrations  # noqa: E402
+
+TASKS = ("grasp_glass", "push_green_to_white")
+STATE = "observation.environment_state"
+LENGTHS = (5, 2, 4)
+
+
+def dataset_of(keys=("pixels", "action", "state")):
+    """Three demonstrations of noise, of the second, first and second task."""
+    generator = torch.Generator().manual_seed(0)
+    length = torch.tensor(LENGTHS)
+    steps = torch.arange(5) < length.unsqueeze(-1)
+    entries = {
+        "pixels": torch.randint(256, (3, 5, 32, 64, 3), generator=generator, dtype=torch.uint8),
+        "action": torch.rand(3, 4, 4, generator=generator) * 2 - 1,
+        "state": torch.randn(3, 5, 16, generator=generator),
+    }
+    chosen = {
+        key: entries[key]
+        * steps[(..., *[None] * (entries[key].ndim - 2))][:, : entries[key].shape[1]]
+        for key in keys
+    }
+    if "action" in chosen:
+        chosen["action"] = chosen["action"] * steps[:, 1:, None]
+    return TensorDict({**chosen, "length": length, "task": torch.tensor([1, 0, 1])}, [3])
+
+
+@pytest.fixture
+def written(tmp_path):
+    """A LeRobot dataset."""
+    write_lerobot(tmp_path / "written", dataset_of(), tasks=TASKS, fps=5, robot_type="nico")
+    return tmp_path / "written"
+
+
+@pytest.mark.parametrize("keys", [("pixels", "action", "state"), ("pixels",)])
+def test_what_is_written_is_read_again(tmp_path, keys):
+    dataset = dataset_of(keys)
+    write_lerobot(tmp_path / "lerobot", dataset, tasks=TASKS, fps=5)
+
+    found = read_lerobot(tmp_path / "lerobot", state_key=STATE if "state" in keys else None)
+
+    assert [*found] == [*TASKS]
+    for (task, number), row in zip([(1, 0), (0, 0), (1, 1)], dataset, strict=True):
+        episode, length = found[TASKS[task]][number], int(row["length"])
+        assert {*episode} == {*keys}
+        for key, values in episode.items():
+            expected = row[key][: length - (key == "action")].numpy()
+            assert values.dtype == expected.dtype
+            np.testing.assert_array_equal(values, expected)
+
+
+def test_a_dataset_that_went_through_lerobot_is_the_same(tmp_path):
+    rng = np.random.default_rng(0)
+    episodes = {
+        name: [
+            {
+                "pixels": rng.integers(0, 256, (n, 32, 64, 3), dtype=np.uint8),
+                "action": rng.uniform(-1, 1, (n - 1, 4)),
+            }
+            for n in lengths
+        ]
+        for name, lengths in zip(TASKS, [(3, 5), (4, 2, 6)], strict=True)
+    }
+    options = {"scene": "nico", "held_out_per_task": 1}
+    before = write_demonstrations(tmp_path / "before", episodes, **options)
+    write_lerobot(tmp_path / "lerobot", before, tasks=TASKS, fps=5)
+    after = write_demonstrations(tmp_path / "after", read_lerobot(tmp_path / "lerobot"), **options)
+    assert (before == after).all()
+
+
+def test_actions_of_one_component_are_plain_numbers(tmp_path):
+    dataset = dataset_of(("pixels", "action"))
+    dataset["action"] = dataset["action"][..., :1]
+    write_lerobot(tmp_path / "one", dataset, tasks=TASKS, fps=5)
+    column = pq.read_table(tmp_path / "one/data/chunk-000/file-000.parquet")["action"]
+    assert column.type == pa.float32()
+    found = read_lerobot(tmp_path / "one")[TASKS[0]][0]["action"]
+    np.testing.assert_array_equal(found, dataset["action"][1, :1])
+
+
+def test_the_files_are_those_of_version_3_of_the_format(written):
+    dataset = dataset_of()
+    info = json.loads((written / "meta" / "info.json").read_text())
+    totals = {"total_episodes": 3, "total_frames": 11, "total_tasks": 2, "fps": 5}
+    assert info["codebase_version"] == "v3.0"
+    assert {key: info[key] for key in totals} == totals
+    camera = info["features"]["observation.images.camera"]
+    assert (camera["dtype"], camera["shape"]) == ("image", [32, 64, 3])
+    assert info["features"]["action"]["shape"] == [4]
+
+    tasks = pd.read_parquet(written / "meta" / "tasks.parquet")
+    assert tasks["task_index"].to_dict() == {"grasp_glass": 0, "push_green_to_white": 1}
+
+    episodes = pq.read_table(written / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    assert [row["length"] for row in episodes] == [*LENGTHS]
+    assert [row["tasks"] for row in episodes] == [[TASKS[1]], [TASKS[0]], [TASKS[1]]]
+    bounds = [(row["dataset_from_index"], row["dataset_to_index"]) for row in episodes]
+    assert bounds == [(0, 5), (5, 7), (7, 11)]
+
+    table = pq.read_table(written / info["data_path"].format(chunk_index=0, file_index=0))
+    assert {*table.column_names} == {*info["features"]}
+    rows = table.to_pandas()
+    assert rows["index"].tolist() == [*range(11)]
+    assert rows["frame_index"].tolist() == [0, 1, 2, 3, 4, 0, 1, 0, 1, 2, 3]
+    assert rows["episode_index"].tolist() == [0] * 5 + [1] * 2 + [2] * 4
+    assert rows["task_index"].tolist() == [1] * 5 + [0] * 2 + [1] * 4
+    np.testing.assert_allclose(rows["timestamp"][:5], [0, 0.2, 0.4, 0.6, 0.8], rtol=1e-6)
+    action = np.stack([*rows["action"]])
+    np.testing.assert_array_equal(action[:5], [*dataset["action"][0].tolist(), [0] * 4])
+
+
+def test_statistics_are_those_of_all_frames(written):
+    dataset = dataset_of()
+    stats = json.loads((written / "meta" / "stats.json").read_text())
+    frames = torch.cat([dataset["pixels"][i, :n] for i, n in enumerate(LENGTHS)]).numpy() / 255
+    states = torch.cat([dataset["state"][i, :n] for i, n in enumerate(LENGTHS)]).numpy()
+    for name in ("min", "max", "mean", "std"):
+        expected = getattr(frames, name)((0, 1, 2))
+        found = np.array(stats["observation.images.camera"][name])
+        assert found.shape == (3, 1, 1)
+        np.testing.assert_allclose(found.flatten(), expected, rtol=1e-6)
+        np.testing.assert_allclose(stats[STATE][name], getattr(states, name)(0), rtol=1e-5)
+    assert stats[STATE]["count"] == [11]
+
+
+def test_long_datasets_are_spread_over_several_files(tmp_path, monkeypatch):
+    monkeypatch.setattr(lerobot_writing, "_FILE_MB", 0)
+    monkeypatch.setattr(lerobot_writing, "_FILES_PER_CHUNK", 2)
+    write_lerobot(tmp_path / "many", dataset_of(), tasks=TASKS, fps=5)
+    files = sorted((tmp_path / "many" / "data").glob("*/*"))
+    names = [str(file.relative_to(tmp_path / "many" / "data")) for file in files]
+    assert names == [
+        "chunk-000/file-000.parquet",
+        "chunk-000/file-001.parquet",
+        "chunk-001/file-000.parquet",
+    ]
+    rows = pq.read_table(tmp_path / "many/meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    places = [(row["data/chunk_index"], row["data/file_index"]) for row in rows]
+    assert places == [(0, 0), (0, 1), (1, 0)]
+    assert [len(e["pixels"]) for e in read_lerobot(tmp_path / "many")[TASKS[1]]] == [5, 4]
+
+
+def test_frames_of_another_size_are_resized_if_asked(written, tmp_path):
+    found = read_lerobot(written, frame_shape=(16, 32))[TASKS[0]][0]["pixels"]
+    np.testing.assert_array_equal(found, resize_frames(dataset_of()["pixels"][1, :2], (16, 32)))
+    with pytest.raises(ValueError, match=r"frames of 16 x 32 pixels.*resize"):
+        small = {TASKS[0]: [{"pixels": found}] * 2}
+        write_demonstrations(tmp_path / "own", small, scene="nico", held_out_per_task=1)
+
+
+def edit_info(path, **changes):
+    file = path / "meta" / "info.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), **changes}))
+
+
+def edit_rows(path, change, file="data/chunk-000/file-000.parquet"):
+    rows = pq.read_table(path / file).to_pandas()
+    pq.write_table(pa.Table.from_pandas(change(rows)), path / file)
+
+
+def without(row):
+    return lambda path: edit_rows(path, lambda rows: rows.drop(index=row))
+
+
+def empty_image(path):
+    edit_rows(
+        path,
+        lambda rows: rows.assign(**{"observation.images.camera": [{"bytes": b"PNG"}] * len(rows)}),
+    )
+
+
+TOP = {"dtype": "image", "shape": [32, 64, 3], "names": None}
+
+
+@pytest.mark.parametrize(
+    ("damage", "cause", "remedy"),
+    [
+        (without(6), "episode 1", "has 1 of 2 frames"),
+        (without([5, 6]), "episode 1", "has 0 of 2 frames"),
+        (
+            lambda p: edit_rows(p, lambda rows: rows.assign(task_index=range(11))),
+            "has the tasks [0, 1, 2, 3, 4]",
+            "one task",
+        ),
+        (
+            lambda p: edit_rows(p, lambda rows: rows.drop(columns="frame_index")),
+            "file-000.parquet is damaged or of another format",
+            "frame_index",
+        ),
+        (empty_image, "episode 0", "is damaged"),
+        (lambda p: (p / "meta/info.json").write_text("{"), "info.json", "is damaged"),
+        (lambda p: (p / "meta/info.json").write_text("[]"), "info.json", "is damaged"),
+        (lambda p: (p / "meta/info.json").unlink(), "info.json", "give the folder of a whole"),
+        (lambda p: shutil.rmtree(p / "data"), "data is missing", "give the folder of a whole"),
+        (lambda p: shutil.rmtree(p / "meta/episodes"), "episodes is missing", "whole dataset"),
+        (lambda p: (p / "meta/tasks.parquet").write_bytes(b"PAR1"), "tasks.parquet", "damaged"),
+        (lambda p: edit_info(p, codebase_version="v2.1"), "version v2.1, not 3", "convert it"),
+        (lambda p: edit_info(p, features={}), "cameras none", "image_key"),
+        (lambda p: edit_info(p, features={"a": TOP, "b": TOP}), "cameras a, b", "image_key"),
+    ],
+)
+def test_incomplete_and_damaged_datasets_are_refused(written, refused, damage, cause, remedy):
+    damage(written)
+    refused(lambda: read_lerobot(written), cause, remedy)
+
+
+def test_videos_need_pyav(written, refused, monkeypatch):
+    edit_info(written, features={"camera": {**TOP, "dtype": "video"}})
+    monkeypatch.setitem(sys.modules, "av", None)
+    refused(lambda: read_lerobot(written), "has its frames as video", "pip install av")
+
+
+def test_unknown_features_are_refused(written, refused):
+    refused(lambda: read_lerobot(written, image_key="wrist"), "cameras", "image_key")
+    refused(lambda: read_lerobot(written, state_key="joints"), "no 'joints'", STATE)
+    found = read_lerobot(written, action_key=None)
+    assert {*found[TASKS[0]][0]} == {"pixels"}
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"fps": 0}, {"tasks": TASKS[:1]}, {"tasks": TASKS[:1] * 2}],
+)
+def test_invalid_arguments_are_refused_before_anything_is_written(tmp_path, options):
+    with pytest.raises(ValueError):
+        write_lerobot(tmp_path / "new", dataset_of(), **({"tasks": TASKS, "fps": 5} | options))
+    with pytest.raises(ValueError):
+        write_lerobot(tmp_path / "new", dataset_of()[:0], tasks=TASKS, fps=5)
+    assert not [*tmp_path.iterdir()]
+
+
+def test_nothing_is_left_if_writing_fails(tmp_path, monkeypatch):
+    def fail(*_):
+        raise OSError("no space left")
+
+    monkeypatch.setattr(lerobot_writing, "write_json", fail)
+    with pytest.raises(OSError, match="no space left"):
+        write_lerobot(tmp_path / "new", dataset_of(), tasks=TASKS, fps=5)
+    assert not [*tmp_path.iterdir()]
+
+
+def test_frames_of_a_video_are_decoded_from_the_first_of_the_episode(written):
+    av = pytest.importorskip("av")
+    camera = "observation.images.camera"
+    grays = np.arange(11) * 20 + 20
+    path = written / f"videos/{camera}/chunk-000/file-000.mp4"
+    path.parent.mkdir(parents=True)
+    with av.open(str(path), "w") as video:
+        stream = video.add_stream("mpeg4", rate=5)
+        stream.width, stream.height, stream.pix_fmt = 64, 32, "yuv420p"
+        stream.bit_rate = 8_000_000
+        for gray in grays:
+            frame = np.full((32, 64, 3), gray, np.uint8)
+            video.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
+        video.mux(stream.encode())
+    edit_rows(written, lambda rows: rows.drop(columns=camera))
+    prefix, starts = f"videos/{camera}/", (0.0, 1.0, 1.4)
+    places = {
+        prefix + "chunk_index": 0,
+        prefix + "file_index": 0,
+        prefix + "from_timestamp": starts,
+    }
+    meta = "meta/episodes/chunk-000/file-000.parquet"
+    edit_rows(written, lambda rows: rows.assign(**places), meta)
+    features = json.loads((written / "meta/info.json").read_text())["features"]
+    edit_info(written, features={**features, camera: {**TOP, "dtype": "video"}})
+
+    found = read_lerobot(written)
+
+    read = [found[TASKS[1]][0], found[TASKS[0]][0], found[TASKS[1]][1]]
+    shown = np.concatenate([episode["pixels"].mean((1, 2, 3)) for episode in read])
+    np.testing.assert_allclose(shown, grays, atol=6)
+    path.unlink()
+    with pytest.raises(ValueError, match=r"episode 0 of .* is "):
+        read_lerobot(written)

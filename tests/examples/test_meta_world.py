@@ -1,0 +1,149 @@
+"""Meta-World's tasks as a scene. Needs the package, which is not among our dependencies."""
+
+import numpy as np
+import pytest
+import torch
+from torchrl.envs.utils import check_env_specs
+
+from bgpo_trl.data.recording import record_demonstrations
+from bgpo_trl.scenes import find_scene
+
+pytest.importorskip("metaworld", reason="Meta-World is not installed (docs/extending.md)")
+
+from examples.meta_world import FIVE, MetaWorld, demonstrator
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def worlds():
+    return {}
+
+
+@pytest.fixture
+def simulation(worlds):
+    return MetaWorld(FIVE, worlds)
+
+
+def act_at_random(simulation, steps, seed=0):
+    random = np.random.default_rng(seed)
+    return [simulation.step(random.uniform(-1, 1, 4)) for _ in range(steps)]
+
+
+def assert_same(a, b):
+    assert np.array_equal(a.observation, b.observation)
+    assert np.array_equal(a.frame(), b.frame())
+
+
+@pytest.mark.parametrize("task", range(5))
+def test_a_start_depends_on_seed_and_episode_alone(simulation, worlds, task):
+    simulation.seed(3)
+    simulation.reset((task + 1) % 5)
+    act_at_random(simulation, 5)
+    simulation.reset(task)
+    other = MetaWorld(FIVE, worlds)
+    other.seed(3)
+    other.reset(task)
+    act_at_random(other, 7)
+    other.reset(task)
+
+    assert_same(simulation, other)
+    first = simulation.observation[4:7].copy()
+    simulation.reset(task)
+    assert not np.array_equal(simulation.observation[4:7], first)
+
+
+@pytest.mark.parametrize("task", range(5))
+def test_simulations_of_one_world_do_not_influence_each_other(simulation, worlds, task):
+    beside, alone = MetaWorld(FIVE, worlds), MetaWorld(FIVE)
+    for each, seed in ((simulation, 1), (beside, 2), (alone, 1)):
+        each.seed(seed)
+        each.reset(task)
+    random = np.random.default_rng(0)
+    for action in random.uniform(-1, 1, (6, 4)):
+        simulation.step(action)
+        beside.step(random.uniform(-1, 1, 4))
+        alone.step(action)
+        assert_same(simulation, alone)
+
+
+@pytest.mark.parametrize("task", range(5))
+def test_a_saved_episode_continues_bit_by_bit(simulation, task):
+    simulation.seed(8)
+    simulation.reset((task + 2) % 5)
+    simulation.reset(task)
+    act_at_random(simulation, 9)
+    resumed = MetaWorld(FIVE)
+    resumed.load(simulation.save())
+
+    assert resumed.save() == simulation.save()
+    for each in (simulation, resumed):
+        act_at_random(each, 4, seed=1)
+    assert_same(simulation, resumed)
+    for each in (simulation, resumed):
+        each.reset(task)
+    assert_same(simulation, resumed)
+
+
+def test_a_simulation_saved_before_its_first_episode_keeps_its_seed(simulation):
+    simulation.seed(5)
+    resumed = MetaWorld(FIVE)
+    resumed.load(simulation.save())
+    for each in (simulation, resumed):
+        each.reset(0)
+    assert_same(simulation, resumed)
+
+
+@pytest.mark.parametrize("task", range(5))
+def test_demonstrators_succeed_and_random_actions_do_not(simulation, task):
+    solved, lucky = 0, 0
+    for start in range(20):
+        simulation.seed(start)
+        simulation.reset(task)
+        act = demonstrator(simulation, task, start)
+        solved += any(simulation.step(act()).success for _ in range(50))
+        simulation.reset(task)
+        lucky += any(outcome.success for outcome in act_at_random(simulation, 50, start))
+    assert solved >= 19
+    assert lucky <= 2
+
+
+def test_success_has_to_last_for_two_actions(simulation, monkeypatch):
+    simulation.seed(0)
+    simulation.reset(0)
+    reports = iter([False] * 3 + [True] * 4 + [False] * 4 + [True] + [False] * 3 + [True])
+
+    def step(env, action):
+        return simulation.observation, 0.0, False, False, {"success": next(reports)}
+
+    monkeypatch.setattr(type(simulation.world.env), "step", step)
+    outcomes = [simulation.step(np.zeros(4)).success for _ in range(4)]
+    assert outcomes == [False, False, False, True]
+
+
+def test_the_scene_is_an_environment_whose_seeds_do_not_depend_on_each_other():
+    scene = find_scene("metaworld")
+    env = scene.simulate(FIVE[:2], batch_size=[2], seed=[4, 9], observation="both")
+    check_env_specs(env)
+    actions = torch.rand(2, 3, 4, generator=torch.Generator().manual_seed(0)) * 2 - 1
+
+    def play(env, actions):
+        env.set_seed(4)
+        state = env.reset()
+        for action in actions.unbind(1):
+            state = env.step(state.set("action", action))["next"]
+        return state
+
+    both = play(env, actions)
+    alone = play(scene.simulate(FIVE[:2], batch_size=[1]), actions[:1])
+    assert both["pixels"].shape == (2, 32, 64, 3)
+    assert both["pixels"][:1].equal(alone["pixels"])
+    assert not both["pixels"][0].equal(both["pixels"][1])
+
+
+def test_demonstrations_are_recorded(tmp_path):
+    dataset = record_demonstrations(
+        tmp_path, scene="metaworld", per_task=2, held_out_per_task=1, progress=False
+    )
+    assert dataset["task"].tolist() == [task for task in range(5) for _ in range(2)]
+    assert (dataset["length"] > 10).all()
