@@ -15,7 +15,7 @@ export OMP_NUM_THREADS ?= 1
 # Keeps pyright from checking online for a newer version.
 export PYRIGHT_PYTHON_IGNORE_WARNINGS := 1
 
-.PHONY: help run test slow lint format typecheck bench clean
+.PHONY: help run test slow lint format typecheck docs bench clean
 
 help:  ## list these commands
 	@grep -hE '^[a-z]+:.*##' Makefile | sed -E 's/^([a-z]+):.*## */\1\t/' | expand -t 12
@@ -39,6 +39,10 @@ format: $(SETUP)  ## format, and apply ruff's automatic fixes
 
 typecheck: $(SETUP)  ## pyright
 	$(BIN)/pyright
+
+docs: $(SETUP)  ## the documentation as a site, build/site/index.html
+	$(BIN)/python scripts/site_pages.py build/pages
+	$(BIN)/zensical build --strict --clean
 
 bench: $(SETUP) $(GL)  ## speed of frames, updates, training steps and GWR-B
 	$(BIN)/pip install -q -c constraints.txt -e '.[bench]'

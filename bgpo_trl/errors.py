@@ -19,7 +19,7 @@ def missing_key(
         tensordict: TensorDict that lacks some of them.
         keys: All entries that are read; those present are left out of the message.
 
-    Example:
+    Examples:
         >>> from tensordict import TensorDict
         >>> print(missing_key("Actor", TensorDict({"latent": 0.0}), ["latent", "behavior"]))
         Actor found no 'behavior' in a TensorDict with ['latent']: write it before, or name another

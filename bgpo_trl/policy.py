@@ -219,7 +219,7 @@ def load_run(
         ValueError: If the run, its checkpoint, seed, algorithm, tasks, encoders or demonstrations
             cannot be found, or if it learned from the ground truth instead of frames.
 
-    Example:
+    Examples:
         >>> import bgpo_trl
         >>> bgpo_trl.load_run("no-run")
         Traceback (most recent call last):

@@ -30,7 +30,7 @@ def stream_seed(seed: int, name: str) -> int:
 def generators(seeds: Sequence[int], name: str) -> list[torch.Generator]:
     """Return one generator per seed for a named stream, the same alone as in any batch.
 
-    Example:
+    Examples:
         >>> alone, = generators([7], "exploration")
         >>> _, in_batch = generators([3, 7], "exploration")
         >>> bool((torch.rand(4, generator=alone) == torch.rand(4, generator=in_batch)).all())
@@ -50,7 +50,7 @@ def row_seeds(seed: int | Iterable[int] | None, count: int) -> list[int]:
     Raises:
         ValueError: If there are not as many seeds as rows, or one is out of range.
 
-    Example:
+    Examples:
         >>> row_seeds(7, 3), row_seeds([5, 2], 2)
         ([7, 8, 9], [5, 2])
     """

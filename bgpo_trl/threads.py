@@ -17,7 +17,7 @@ class RowPool:
     ``name`` is the prefix of the others' names. A copy, also in another process, starts threads of
     its own.
 
-    Example:
+    Examples:
         >>> pool, results = RowPool(3, "squares"), [0] * 5
         >>> pool.each(range(5), lambda row: row**2, results.__setitem__)
         >>> results

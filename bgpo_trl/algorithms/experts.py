@@ -29,7 +29,7 @@ class ActiveGroups:
         most: Largest number of active groups of a seed.
         rest_after: Steps without being played after which a group is no longer active.
 
-    Example:
+    Examples:
         >>> active = ActiveGroups(1, most=2, rest_after=3)
         >>> for group in (0, 1, 0, 2):
         ...     active.play(0, group)

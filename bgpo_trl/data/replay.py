@@ -40,7 +40,7 @@ class GroupReplay:
     Raises:
         ValueError: If ``capacity`` or the number of generators is not positive.
 
-    Example:
+    Examples:
         >>> replay = GroupReplay(100, generator=[torch.Generator()], keys=["state"])
         >>> for i in range(6):
         ...     replay.add(TensorDict({"state": torch.tensor([i])}, [1]), torch.tensor([i % 2]))

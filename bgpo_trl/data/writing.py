@@ -57,7 +57,7 @@ def write_demonstrations(
             its position, from 0.
         OSError: If there is not enough disk space, or the folder cannot be written.
 
-    Example:
+    Examples:
         >>> frames = np.zeros((5, 32, 64, 3), np.uint8)
         >>> episodes = {"grasp_glass": [{"pixels": frames}, {"pixels": frames[:3]}]}
         >>> path = getfixture("tmp_path") / "own"
@@ -105,7 +105,7 @@ def resize_frames(pixels: NDArray[np.uint8], frame_shape: Sequence[int]) -> NDAr
     A pixel is the rounded mean of the pixels below it. Height and width are scaled independently:
     crop the frames before, if their ratio is not to change.
 
-    Example:
+    Examples:
         >>> resize_frames(np.full((1, 64, 64, 3), 7, np.uint8), (32, 64)).shape
         (1, 32, 64, 3)
     """

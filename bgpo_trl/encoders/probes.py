@@ -1,6 +1,6 @@
-"""Linear probes of the latents and of the embeddings, on held-out demonstrations.
+"""Probes of the latents and of the embeddings, on held-out demonstrations.
 
-    python -m bgpo_trl.encoders.probes data/nico data/nico-play
+    python -m bgpo_trl.encoders.probes data/nico data/nico-play-long
 
 Policies observe only latents and behaviors, so information that these lack cannot be learned
 later. Every probe is fitted on training demonstrations and evaluated on held-out ones. No other
@@ -118,11 +118,12 @@ def ridge_predict(x: Tensor, y: Tensor, x_new: Tensor, penalty: float = 1e-4) ->
     return (b @ weight + offset).float()
 
 
-def perceptron_predict(x: Tensor, y: Tensor, x_new: Tensor, steps: int = 4_000) -> Tensor:
-    """Predict ``y`` ``[M, k]`` for ``x_new`` ``[M, d]`` by a perceptron with 256 hidden units.
+def perceptron_predict(x: Tensor, y: Tensor, x_new: Tensor, steps: int = 6_000) -> Tensor:
+    """Predict ``y`` ``[M, k]`` for ``x_new`` ``[M, d]`` by a perceptron with two hidden layers.
 
-    It is what a policy of the default size could read. It is fitted on ``x`` ``[N, d]`` and ``y``
-    ``[N, k]``, both standardized, by ``steps`` steps of Adam on 256 rows.
+    Its layers have 256 units, as a policy's of the default size, so it reads what a policy could.
+    It is fitted on ``x`` ``[N, d]`` and ``y`` ``[N, k]``, both standardized, by ``steps`` steps of
+    AdamW on 256 rows.
     """
     generator = torch.Generator().manual_seed(0)
     (scale, center), (unit, offset) = torch.std_mean(x, 0), torch.std_mean(y, 0)
@@ -130,9 +131,13 @@ def perceptron_predict(x: Tensor, y: Tensor, x_new: Tensor, steps: int = 4_000) 
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         network = torch.nn.Sequential(
-            torch.nn.Linear(x.shape[1], 256), torch.nn.ReLU(), torch.nn.Linear(256, y.shape[1])
+            torch.nn.Linear(x.shape[1], 256),
+            torch.nn.ReLU(),
+            torch.nn.Linear(256, 256),
+            torch.nn.ReLU(),
+            torch.nn.Linear(256, y.shape[1]),
         )
-    optimizer = torch.optim.Adam(network.parameters(), lr=3e-3)
+    optimizer = torch.optim.AdamW(network.parameters(), lr=2e-3, weight_decay=1e-3)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
     for _ in range(steps):
         rows = torch.randint(len(x), (256,), generator=generator)
@@ -272,7 +277,7 @@ def _mean(values: Tensor) -> float:
 
 @dataclass(frozen=True)
 class Arguments:
-    """Evaluate trained encoders with linear probes."""
+    """Evaluate trained encoders with probes."""
 
     dataset: tyro.conf.Positional[Path]
     """Folder of the recorded demonstrations."""

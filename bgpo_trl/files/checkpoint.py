@@ -46,7 +46,7 @@ def save_checkpoint(directory: str | os.PathLike[str], state: dict[str, Any]) ->
         ValueError: If the state holds any other type, which loading would refuse.
         OSError: If the file cannot be written, such as on a full disk; earlier checkpoints stay.
 
-    Example:
+    Examples:
         >>> import tempfile
         >>> directory = tempfile.mkdtemp()
         >>> _ = save_checkpoint(directory, {"episode": 7, "weight": torch.ones(2)})

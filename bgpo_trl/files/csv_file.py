@@ -25,7 +25,7 @@ class CsvFile:
         ValueError: If the file exists with other columns, or two columns have the same name.
         OSError: If the file cannot be written.
 
-    Example:
+    Examples:
         >>> import tempfile
         >>> path = Path(tempfile.mkdtemp()) / "eval.csv"
         >>> with CsvFile(path, ["episode", "return"]) as file:

@@ -28,7 +28,7 @@ def lock_directory(directory: str | os.PathLike[str], *, wait: bool = False) -> 
         BlockingIOError: If another process holds the lock.
         OSError: If the directory cannot be made, written or locked.
 
-    Example:
+    Examples:
         >>> import tempfile
         >>> run = Path(tempfile.mkdtemp()) / "run"
         >>> with lock_directory(run):

@@ -69,7 +69,7 @@ class Actor(StackedNetwork):
         in_keys: Entries to read, ``[*S, *B, features]`` each.
         **mlp: ``hidden_sizes``, ``layer_norm``, ``batch_size`` and ``generator`` of `StackedMLP`.
 
-    Example:
+    Examples:
         >>> from tensordict import TensorDict
         >>> actor = Actor(96, batch_size=(10,))
         >>> data = TensorDict({"latent": torch.zeros(10, 64), "behavior": torch.zeros(10, 32)}, 10)
@@ -102,7 +102,7 @@ class Critic(StackedNetwork):
     Reads ``in_keys`` and ``"action"``; writes ``"state_action_value"`` ``[*S, *B, 1]``. Arguments
     as for `Actor`, without the action in ``in_features`` and ``in_keys``.
 
-    Example:
+    Examples:
         >>> from tensordict import TensorDict
         >>> critic = Critic(3, 2, in_keys=["state"])
         >>> data = TensorDict({"state": torch.zeros(7, 3), "action": torch.zeros(7, 2)}, 7)

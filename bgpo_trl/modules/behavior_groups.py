@@ -72,7 +72,7 @@ class BehaviorGroups(nn.Module):
     Raises:
         ValueError: If ``smallest`` is below 4 or ``evidence`` is not positive.
 
-    Example:
+    Examples:
         >>> groups = BehaviorGroups(3)
         >>> inputs = torch.randn(60, 3, generator=torch.Generator().manual_seed(0))
         >>> inputs[1::2] += 10

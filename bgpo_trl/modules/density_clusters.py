@@ -37,7 +37,7 @@ def density_clusters(
         outliers, which no branch had absorbed when it became a cluster of its own. All 0 if there
         is one cluster.
 
-    Example:
+    Examples:
         >>> points = np.random.default_rng(0).normal(size=(60, 4))
         >>> np.bincount(density_clusters(points))
         array([60])

@@ -27,7 +27,7 @@ class GaussianActor(StackedNetwork):
     and ``"scale"`` ``[*S, *B, action_dim]``, and ``"action"``, ``tanh(loc)``. `sample` draws
     actions from given noise. Arguments as for `Actor`.
 
-    Example:
+    Examples:
         >>> import torch
         >>> from tensordict import TensorDict
         >>> actor = GaussianActor(3, 2, in_keys=["state"])

@@ -74,7 +74,7 @@ class BehaviorGraph(NamedTuple):
         Raises:
             ImportError: If networkx is not installed.
 
-        Example:
+        Examples:
             >>> gwr = GWRB(2, init="data")
             >>> for point in ([0, 0], [1, 0], [0.9, 0.1]):
             ...     match = gwr.adapt(point)
@@ -131,7 +131,7 @@ class GWRB(nn.Module):
     Raises:
         ValueError: If an argument is out of range.
 
-    Example:
+    Examples:
         >>> gwr = GWRB(2, GWRBConfig(max_age=15), batch_size=[3], init="data")
         >>> phi = torch.tensor([[0.0, 0.0], [0.5, 0.0], [0.0, 0.5]])
         >>> gwr.adapt(phi).activity

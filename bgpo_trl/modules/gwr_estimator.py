@@ -38,7 +38,7 @@ class GWRBEstimator(OneToOneFeatureMixin, TransformerMixin, ClusterMixin, BaseEs
         n_features_in_: Number d of columns.
         feature_names_in_: Names of the columns, if X had any.
 
-    Example:
+    Examples:
         >>> model = GWRBEstimator(GWRBConfig(activity_scale=4)).fit([[0.0, 0.0], [1.0, 1.0]])
         >>> model.partial_fit([[0.1, 0.0]]).predict([[0.0, 0.2], [0.9, 1.0]])
         array([0, 1])

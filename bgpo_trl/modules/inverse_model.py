@@ -21,7 +21,7 @@ class InverseModel(nn.Module):
         action_size: Dimensions of an action.
         hidden_size: Units of each of the two hidden layers.
 
-    Example:
+    Examples:
         >>> z, length = torch.randn(5, 51, 64), torch.tensor([51, 30, 2, 2, 40])
         >>> InverseModel()(z, length).shape
         torch.Size([5, 50, 4])

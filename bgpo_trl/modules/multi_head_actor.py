@@ -33,7 +33,7 @@ class MultiHeadActor(StackedNetwork):
         ValueError: If the trunk has no layer; from ``forward``, if an entry is missing or the
             number of tasks is not that of heads.
 
-    Example:
+    Examples:
         >>> from tensordict import TensorDict
         >>> actor = MultiHeadActor(64)
         >>> _ = actor.add_head()

@@ -20,7 +20,7 @@ class SequenceAutoencoder(nn.Module):
         ValueError: If a size is not positive; from methods, if shapes disagree or a length is
             outside 1..T.
 
-    Example:
+    Examples:
         >>> z, length = torch.randn(5, 51, 64), torch.tensor([51, 30, 1, 2, 40])
         >>> SequenceAutoencoder().encode(z, length).shape
         torch.Size([5, 32])

@@ -41,7 +41,7 @@ class StackedLinear(nn.Module):
     Raises:
         ValueError: If a size is less than 1, or the number of generators is not that of layers.
 
-    Example:
+    Examples:
         >>> layer = StackedLinear(3, 5, batch_size=(10,))
         >>> layer(torch.zeros(10, 256, 3)).shape
         torch.Size([10, 256, 5])
@@ -148,7 +148,7 @@ class StackedMLP(nn.Module):
         batch_size: Leading dimensions ``S`` of the weights.
         generator: As in `StackedLinear`.
 
-    Example:
+    Examples:
         >>> mlp = StackedMLP(96, 4)
         >>> mlp(torch.zeros(256, 96)).shape
         torch.Size([256, 4])

@@ -60,7 +60,7 @@ class VAE(nn.Module):
         latent_mean: Buffer ``[latent_size]``, subtracted from mu by `latent`.
         latent_std: Buffer ``[latent_size]``, by which `latent` divides.
 
-    Example:
+    Examples:
         >>> frames = torch.zeros(10, 32, 64, 3, dtype=torch.uint8)
         >>> VAE().latent(frames).shape
         torch.Size([10, 64])

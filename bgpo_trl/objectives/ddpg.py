@@ -36,7 +36,7 @@ class DDPGLoss(OffPolicyLoss):
         pre_tanh_penalty: Weight of the penalty, 0 for none.
         **common: Other arguments of `OffPolicyLoss`.
 
-    Example:
+    Examples:
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from bgpo_trl.modules.actor_critic import Actor, Critic

@@ -27,7 +27,7 @@ class SeededNoise(nn.Module):
     Raises:
         ValueError: If the number of generators is not that of the seeds.
 
-    Example:
+    Examples:
         >>> noise = SeededNoise([2], [torch.Generator().manual_seed(seed) for seed in (3, 8)])
         >>> noise(torch.zeros(2, 128, 4)).shape
         torch.Size([2, 128, 4])

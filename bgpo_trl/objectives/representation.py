@@ -44,7 +44,7 @@ class VAEInverseLoss(LossModule):
         ValueError: From ``forward``, if a window has fewer than 2 frames, an entry is missing, or
             actions have another shape.
 
-    Example:
+    Examples:
         >>> loss = VAEInverseLoss(VAE(), generator=torch.Generator().manual_seed(0))
         >>> frames = torch.zeros(3, 4, 32, 64, 3, dtype=torch.uint8)
         >>> windows = TensorDict({"pixels": frames, "action": torch.zeros(3, 4, 4)}, [3, 4])
@@ -187,7 +187,7 @@ class SequenceReconstructionLoss(LossModule):
     Args:
         lae: Network to train.
 
-    Example:
+    Examples:
         >>> loss = SequenceReconstructionLoss(SequenceAutoencoder())
         >>> length = torch.tensor([51, 9])
         >>> data = TensorDict({"latent": torch.randn(2, 51, 64), "length": length}, [2])

@@ -46,7 +46,7 @@ class SACLoss(OffPolicyLoss):
     Raises:
         ValueError: If ``alpha_init`` is not positive.
 
-    Example:
+    Examples:
         >>> from bgpo_trl.modules.actor_critic import Critic
         >>> from bgpo_trl.modules.gaussian_actor import GaussianActor
         >>> actor = GaussianActor(6, 4, in_keys=["state"], batch_size=(10,))

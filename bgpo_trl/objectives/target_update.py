@@ -26,7 +26,7 @@ class ForeachSoftUpdate(SoftUpdate):
     Raises:
         ValueError: If not exactly one of ``eps`` and ``tau`` is given, or targets would never move.
 
-    Example:
+    Examples:
         >>> from bgpo_trl.modules.actor_critic import Actor, Critic
         >>> from bgpo_trl.objectives.ddpg import DDPGLoss
         >>> target_update = ForeachSoftUpdate(DDPGLoss(Actor(96), Critic(96)), tau=0.005)

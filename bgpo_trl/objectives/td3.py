@@ -39,7 +39,7 @@ class TD3Loss(OffPolicyLoss):
     Raises:
         ValueError: If the noise is negative.
 
-    Example:
+    Examples:
         >>> from bgpo_trl.modules.actor_critic import Actor, Critic
         >>> actor = Actor(6, 4, in_keys=["state"], batch_size=(10,))
         >>> loss = TD3Loss(actor, Critic(6, 4, in_keys=["state"], batch_size=(10, 2)))

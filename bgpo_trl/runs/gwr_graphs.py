@@ -17,7 +17,7 @@ _NAME = re.compile(r"episode-(\d+)\.safetensors")
 def growth_moments(episodes: int, count: int = 6) -> list[int]:
     """Return evenly spaced training episodes after which to save a graph, the last included.
 
-    Example:
+    Examples:
         >>> growth_moments(1200), growth_moments(3)
         ([200, 400, 600, 800, 1000, 1200], [1, 2, 3])
     """

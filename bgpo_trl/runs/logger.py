@@ -54,7 +54,7 @@ class RunLogger:
             ``resume``; if a name in ``logged`` is that of another column.
         OSError: If the directory cannot be written.
 
-    Example:
+    Examples:
         >>> import tempfile
         >>> directory = Path(tempfile.mkdtemp()) / "run"
         >>> with RunLogger(directory, config={"gamma": 0.98}) as logger:

@@ -30,7 +30,7 @@ class BehaviorLookup(DemonstrationLookup):
     which the demonstration's embedding is the behavior, replace it by
     ``RenameTransform(["demo_embedding"], ["behavior"], create_copy=True)``.
 
-    Example:
+    Examples:
         >>> from types import SimpleNamespace
         >>> from torchrl.envs import Compose, PendulumEnv, StepCounter, TransformedEnv
         >>> from bgpo_trl.transforms import DemonstrationSource, TaskSchedule

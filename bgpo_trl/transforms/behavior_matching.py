@@ -41,7 +41,7 @@ class BehaviorMatchingReward(EpisodeTransform):
         ValueError: If beta is negative, or latents, behaviors or rewards are missing or of another
             size than the encoder's.
 
-    Example:
+    Examples:
         >>> from types import SimpleNamespace
         >>> from torchrl.envs import Compose, PendulumEnv, RenameTransform, StepCounter
         >>> from torchrl.envs import TransformedEnv, UnsqueezeTransform

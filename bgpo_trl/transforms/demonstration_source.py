@@ -32,7 +32,7 @@ class TaskSchedule:
     Raises:
         ValueError: If no task is available from the start, or a start is negative.
 
-    Example:
+    Examples:
         >>> TaskSchedule().available(torch.tensor([0, 6_999, 7_000, 13_000]))
         tensor([[ True, False, False],
                 [ True, False, False],
@@ -129,7 +129,7 @@ class DemonstrationSource(EpisodeTransform):
         ValueError: If the bank has wrong shapes or no demonstration of a task, the number of
             generators is wrong, or the environment has another batch size or ignores the task.
 
-    Example:
+    Examples:
         >>> from types import SimpleNamespace
         >>> from torchrl.envs import Compose, PendulumEnv, StepCounter, TransformedEnv
         >>> bank = SimpleNamespace(embedding=torch.rand(6, 32), task=torch.arange(6) % 3)

@@ -36,7 +36,7 @@ class FrameEncoder(Transform):
     Raises:
         ValueError: If the numbers of ``in_keys`` and ``out_keys`` differ, or frames are missing.
 
-    Example:
+    Examples:
         >>> from tensordict import TensorDict
         >>> encoder = FrameEncoder(VAE(), del_keys=True)
         >>> frames = torch.zeros(5, 32, 64, 3, dtype=torch.uint8)

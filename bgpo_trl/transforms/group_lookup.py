@@ -22,7 +22,7 @@ class GroupLookup(DemonstrationLookup):
     Reads ``demo_embedding`` float32 ``[*B, 32]`` and ``done``; writes ``group`` int64 ``[*B]`` and
     ``group_novelty`` float32 ``[*B]``.
 
-    Example:
+    Examples:
         >>> from types import SimpleNamespace
         >>> from torchrl.envs import Compose, PendulumEnv, StepCounter, TransformedEnv
         >>> from bgpo_trl.transforms import DemonstrationSource, TaskSchedule

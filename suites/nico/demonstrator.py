@@ -30,7 +30,7 @@ class Demonstrator:
     Raises:
         ValueError: If the environment's task defines no demonstration.
 
-    Example:
+    Examples:
         >>> from suites import nico
         >>> from suites.nico.demonstrator import Demonstrator
         >>> env = nico.load("push_green_to_white", seed=1, observation="state")

@@ -55,7 +55,7 @@ def add_task(name: str, task: type[NicoTask]) -> None:
         ValueError: If the name is taken by one of the suite's tasks, is "all" or not an identifier,
             or the class is not a `NicoTask`.
 
-    Example:
+    Examples:
         >>> from suites import nico
         >>> class TouchWhiteWithGlass(nico.NicoTask):
         ...     def succeeded(self, physics):
@@ -119,7 +119,7 @@ def load(
         ValueError: If the task, the spread, the observation or the frame size is invalid, or
             ``time_limit`` is not positive.
 
-    Example:
+    Examples:
         >>> from suites import nico
         >>> env = nico.load("grasp_glass", seed=0)
         >>> env.reset().observation["pixels"].shape
@@ -152,7 +152,7 @@ def register() -> None:
     ``DMControlEnv("nico", "grasp_glass")`` finds them, in this process: within workers, use
     ``DMControlWrapper(nico.load("grasp_glass"))``. Call it again after adding a task.
 
-    Example:
+    Examples:
         >>> from dm_control import suite
         >>> from suites import nico
         >>> nico.register()

@@ -132,7 +132,7 @@ class NicoEnv(SimulationEnv):
         ValueError: If a task is unknown or named twice, the spread is out of range, or as for
             `SimulationEnv`.
 
-    Example:
+    Examples:
         >>> env = NicoEnv(batch_size=[2], seed=0)
         >>> env.rollout(3)["pixels"].shape
         torch.Size([2, 3, 32, 64, 3])

@@ -1,0 +1,86 @@
+"""The documentation as a site: it is built without warnings, and no link in it is dead."""
+
+import shutil
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+from urllib.parse import unquote, urldefrag
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+BUILD = [sys.executable, "-m", "zensical", "build", "--strict", "--clean"]
+
+
+class Links(HTMLParser):
+    """Targets and anchors of an HTML page."""
+
+    def __init__(self, page):
+        super().__init__()
+        self.targets, self.anchors = set(), {""}
+        self.feed(page.read_text())
+
+    def handle_starttag(self, tag, attrs):
+        for name, value in attrs:
+            if name in ("href", "src") and value:
+                self.targets.add(value)
+            elif name == "id":
+                self.anchors.add(value)
+
+
+def gather(out):
+    script = ROOT / "scripts" / "site_pages.py"
+    subprocess.run([sys.executable, script, out / "build" / "pages"], check=True)
+    shutil.copyfile(ROOT / "zensical.toml", out / "zensical.toml")
+    for package in ("bgpo_trl", "suites"):
+        (out / package).symlink_to(ROOT / package)  # for the reference
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("site")
+    gather(folder)
+    built = subprocess.run(BUILD, cwd=folder, capture_output=True, text=True)
+    assert built.returncode == 0, built.stdout + built.stderr
+    return folder / "build" / "site"
+
+
+def test_no_link_of_the_site_is_dead(site):
+    pages = {page: Links(page) for page in site.rglob("*.html") if page.name != "404.html"}
+    dead, inner = [], 0
+    for page, links in pages.items():
+        for target in links.targets:
+            path, anchor = urldefrag(unquote(target))
+            if ":" in path:
+                continue  # elsewhere, or data
+            file = page if not path else (page.parent / path).resolve()
+            file = file / "index.html" if file.is_dir() else file
+            known = pages[file].anchors if file in pages else {"", anchor}
+            inner += 1
+            if not file.exists() or anchor not in known:
+                dead.append((page.name, target))
+    assert dead == []
+    assert inner > 500
+
+
+def test_pages_link_to_each_other_and_load_nothing_from_elsewhere(site):
+    home = Links(site / "index.html")
+    assert "docs/design.html" in home.targets
+    assert "benchmarks/results/quick/continual-3.png" in home.targets
+    text = (site / "index.html").read_text()
+    assert 'src="http' not in text
+    assert 'rel="stylesheet" href="http' not in text
+
+
+def test_the_reference_has_arguments_and_examples_of_docstrings(site):
+    text = (site / "reference" / "gwr.html").read_text()
+    assert 'id="bgpo_trl.modules.gwr.GWRB.adapt"' in text
+    assert "&gt;&gt;&gt;" in text
+
+
+def test_a_dead_link_is_refused(tmp_path):
+    gather(tmp_path)
+    page = tmp_path / "build" / "pages" / "docs" / "design.md"
+    page.write_text(page.read_text() + "\n[nowhere](nowhere.md)\n")
+    assert subprocess.run(BUILD, cwd=tmp_path, capture_output=True).returncode != 0

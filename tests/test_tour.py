@@ -1,0 +1,56 @@
+"""The notebook runs from top to bottom, with few episodes of training."""
+
+from pathlib import Path
+
+import nbformat
+import pytest
+from nbclient import NotebookClient
+
+NOTEBOOK = Path(__file__).parents[1] / "examples" / "tour.ipynb"
+SHORTER = {
+    'EPISODES = "push_green_to_glass", 240': 'EPISODES = "push_green_to_glass", 2',
+    "eval_episodes=20": "eval_episodes=1",
+    'ROOT / "runs" / "tour"': 'Path("RUNS")',
+}
+
+
+@pytest.fixture(scope="module")
+def cells(tmp_path_factory):
+    notebook = nbformat.read(NOTEBOOK, as_version=4)
+    nbformat.validate(notebook)
+    assert all(not cell.outputs for cell in notebook.cells if cell.cell_type == "code")
+    runs = tmp_path_factory.mktemp("runs")
+    for cell in notebook.cells:
+        for shown, tested in SHORTER.items():
+            cell.source = cell.source.replace(shown, tested.replace("RUNS", str(runs / "tour")))
+    folder = {"metadata": {"path": str(NOTEBOOK.parent)}}
+    NotebookClient(notebook, timeout=300, kernel_name="python3", resources=folder).execute()
+    assert (runs / "tour" / "eval.csv").exists()
+    return [cell for cell in notebook.cells if cell.cell_type == "code"]
+
+
+def printed(cells):
+    return "".join(
+        output.text for cell in cells for output in cell.outputs if output.get("name") == "stdout"
+    )
+
+
+def test_it_prints_what_it_says(cells):
+    text = printed(cells)
+    for task in ("grasp_glass", "push_green_to_glass", "push_green_to_white"):
+        assert f"{task}: the nearest demonstration of the bank is one of {task}\n" in text
+    assert "6 groups, purity on held-out demonstrations 100%\n" in text
+    assert "after 2 episodes: " in text
+    assert "Recognition(node=" in text
+    assert text.count("success after ") == 3
+
+
+def test_it_shows_figures_and_a_film(cells):
+    kinds = [
+        kind
+        for cell in cells
+        for output in cell.outputs
+        for kind in output.get("data", {})
+        if kind.startswith("image/")
+    ]
+    assert kinds == ["image/png"] * 3 + ["image/gif", "image/png"]
