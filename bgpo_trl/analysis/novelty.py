@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from bgpo_trl.data.bank import DemonstrationBank
-from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.seeding import generators
+
+if TYPE_CHECKING:
+    from bgpo_trl.data.bank import DemonstrationBank
 
 
 @dataclass(frozen=True)
@@ -99,6 +101,8 @@ def leave_one_out(
             f"leaving out task {task} takes demonstrations of it that are held out, and others "
             "both to learn from and held out: the bank lacks some"
         )
+    from bgpo_trl.modules.behavior_groups import BehaviorGroups
+
     groups = BehaviorGroups(learned.shape[-1], batch_size=[len(seeds)])
     streams = generators(seeds, "leave one out")
     rows = torch.stack([torch.randint(len(learned), (draws,), generator=s) for s in streams])

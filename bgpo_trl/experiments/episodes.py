@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.files.checkpoint import has_checkpoint
 
 if TYPE_CHECKING:
+    from bgpo_trl.data.bank import DemonstrationBank
     from bgpo_trl.evaluation import Evaluator, Snapshot
     from bgpo_trl.policy import LoadedRun, TrainedPolicy
     from bgpo_trl.scenes import Scene

@@ -14,14 +14,13 @@ from torch import Tensor
 from bgpo_trl.analysis.tables import Table, markdown
 from bgpo_trl.analysis.task_inference import group_purity, task_inference_accuracy
 from bgpo_trl.configs import BGPOConfig
-from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.experiments.arguments import BankArguments
 from bgpo_trl.experiments.settings import check_draws, even_starts
-from bgpo_trl.modules.behavior_groups import BehaviorGroups
-from bgpo_trl.modules.gwr import GWRB
 from bgpo_trl.seeding import generators
 
 if TYPE_CHECKING:
+    from bgpo_trl.data.bank import DemonstrationBank
+    from bgpo_trl.modules.behavior_groups import BehaviorGroups
     from bgpo_trl.transforms import TaskSchedule
 
 
@@ -65,6 +64,8 @@ def form(
         The groups; by task, the number of its different demonstrations when it first had a group of
         its own; seconds.
     """
+    from bgpo_trl.modules.behavior_groups import BehaviorGroups
+
     groups = BehaviorGroups(
         bank.embedding.shape[-1], smallest=config.group_size, evidence=config.group_evidence
     )
@@ -100,6 +101,7 @@ def groups(arguments: GroupsArguments) -> str:
     """
     torch.set_num_threads(1)
     from bgpo_trl.experiments.run import bank_of
+    from bgpo_trl.modules.gwr import GWRB
     from bgpo_trl.transforms import TaskSchedule
 
     check_draws(arguments.seeds, arguments.draws)

@@ -15,8 +15,6 @@ from matplotlib.ticker import PercentFormatter
 
 from bgpo_trl.analysis.tables import Table, markdown
 from bgpo_trl.analysis.task_inference import task_inference_accuracy
-from bgpo_trl.data.bank import DemonstrationBank
-from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.experiments.arguments import TrainedArguments
 from bgpo_trl.experiments.episodes import evaluator_of
 from bgpo_trl.experiments.records import write_measurement
@@ -73,6 +71,7 @@ def show(
         Tuples of seed, task, success, share of demonstrations whose task was inferred, and mean
         activity.
     """
+    from bgpo_trl.data.bank import DemonstrationBank
     from bgpo_trl.evaluation import Snapshot
 
     algorithm, seeds = policy.algorithm, policy.config.seeds
@@ -121,6 +120,7 @@ def measure(policy: TrainedPolicy, shares: Sequence[float], episodes: int, seed:
     Raises:
         ValueError: If a share is not in (0, 1], or ``episodes`` is less than 1.
     """
+    from bgpo_trl.data.recording import record_demonstrations
     from bgpo_trl.encoders.representation import embed_demonstrations
 
     if not shares or not all(0 < share <= 1 for share in shares):

@@ -13,10 +13,8 @@ import tyro
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont, ImageOps
 
-from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.experiments.arguments import ImportArguments
 from bgpo_trl.figures.frames import plot_frame_strips, save_gif
-from bgpo_trl.figures.of_run import draw_growth
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.plugins import import_plugin
 from bgpo_trl.scenes import Scene, find_scene
@@ -75,6 +73,8 @@ def demonstrate(
     tasks: Sequence[str], seed: int, spread: float = 1.0, scene: Scene | str = "nico"
 ) -> dict[str, NDArray]:
     """Return a new demonstration of each task, uint8 ``[T, H, W, 3]``."""
+    from bgpo_trl.data.recording import record_demonstrations
+
     with tempfile.TemporaryDirectory() as folder:
         recorded = record_demonstrations(
             folder,
@@ -181,6 +181,7 @@ def watch(arguments: WatchArguments) -> str:
     Raises:
         ValueError: If the directory holds no run that can be loaded, or the run has no such seed.
     """
+    from bgpo_trl.figures.of_run import draw_growth
     from bgpo_trl.policy import load_run
 
     run, out = arguments.run, arguments.out or arguments.run / "figures"

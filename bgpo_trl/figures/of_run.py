@@ -12,7 +12,6 @@ from torch import Tensor
 
 from bgpo_trl.analysis.task_inference import majority_task, match_counts
 from bgpo_trl.configs import RunConfig
-from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.figures.gwr import plot_gwr_growth, plot_gwr_pca
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.files.writing import write_whole
@@ -21,6 +20,7 @@ from bgpo_trl.runs.results import COUNT, read_table
 
 if TYPE_CHECKING:
     from bgpo_trl.algorithms import Algorithm
+    from bgpo_trl.data.bank import DemonstrationBank
 
 
 def draw_growth(
