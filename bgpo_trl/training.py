@@ -40,10 +40,9 @@ class Trainer:
     """One run: an algorithm, its evaluations and its files.
 
     Each seed of the batch plays ``config.episodes`` training episodes. Seeds that finish early go
-    on, unlogged, until the last one finishes; logged values are those of the seed alone, except for
-    the losses, which are means over seeds. A run resumed with more ``config.episodes`` equals a run
-    of that length. Each update runs while the environment steps, and learns from all earlier
-    transitions.
+    on, unlogged, until the last one finishes; logged values are those of the seed alone. A run
+    resumed with more ``config.episodes`` equals a run of that length. Each update runs while the
+    environment steps, and learns from all earlier transitions.
 
     Checkpoints are written before the first step and between steps; Ctrl-C and SIGTERM wait for the
     end of the step and save. After any other failure, a resumed run repeats the steps since the
@@ -296,7 +295,8 @@ class Trainer:
             "num_groups": groups,
         }
         for name in ("loss_actor", "loss_value", *algorithm.logged):
-            row[name] = float(losses.get(name, 0.0))
+            loss = losses.get(name, torch.zeros(()))
+            row[name] = float(loss[index] if loss.ndim else loss)
         self._log(row)
         if index == 0 and algorithm.gwr is not None and episode in self._growth_moments:
             save_graph(self.directory / "gwr", episode, algorithm.gwr)

@@ -30,7 +30,7 @@ class AdvantageWeightedLoss(OffPolicyLoss):
         replayed = self.values("value_network", tensordict.copy())
         advantage = replayed - self.values("value_network", data)
         weight = (advantage.detach() / 0.1).exp().clamp(max=20)
-        return self.mean_per_seed(weight * error, tensordict).sum(), {}
+        return self.reduce(weight * error, tensordict), {}
 
 
 @dataclass(frozen=True)

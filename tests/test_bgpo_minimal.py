@@ -146,7 +146,7 @@ def test_losses_of_every_update_are_those_of_the_library(minimal, library):
     ours = torch.stack([torch.stack(result) for _, result in minimal.calls["update"]])
     updates = [result for _, result in library.algorithm.calls["update"] if result]
     theirs = torch.stack(
-        [torch.stack([losses["loss_actor"], losses["loss_value"]]) for losses in updates]
+        [torch.cat([losses["loss_actor"], losses["loss_value"]]) for losses in updates]
     )
     assert len(ours) > 80
     assert_close(ours, theirs)

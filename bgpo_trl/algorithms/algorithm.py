@@ -150,8 +150,8 @@ class Algorithm(ABC):
         that `act` changes.
 
         Returns:
-            ``loss_actor``, ``loss_value`` and other losses, means over the seeds ``[]``, of which
-            those in ``logged`` are logged too; empty before the first update.
+            ``loss_actor``, ``loss_value`` and other losses of each seed ``[S]`` (or ``[]``, of
+            all), of which those in ``logged`` are logged too; empty before the first update.
         """
 
     @abstractmethod
@@ -220,8 +220,7 @@ class Algorithm(ABC):
 
     def learn(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """Take a gradient step on a batch and update the targets; return the losses of `update`."""
-        losses = self.learner.learn(self.to_device(batch))
-        return {key: loss / self.n_seeds for key, loss in losses.items()}
+        return self.learner.learn(self.to_device(batch))
 
     def to_device(self, batch: TensorDictBase) -> TensorDictBase:
         """Return a batch on the device of the networks."""

@@ -76,16 +76,16 @@ class EWCLearner(Learner):
         self.fisher = {key: torch.zeros_like(value) for key, value in self.anchor.items()}
 
     def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
-        """Return the losses of DDPG and the penalty, the sum over seeds."""
+        """Return the losses of DDPG and the penalty, ``[S, E]``."""
         return {**super().losses(batch), "loss_ewc": self.penalty()}
 
     def penalty(self) -> Tensor:
-        """Return the penalty, the sum over seeds ``[]``."""
+        """Return the penalty of each actor, ``[S, E]``."""
         of_each = [
-            (self.fisher[key] * (value - self.anchor[key]).square()).sum()
+            (self.fisher[key] * (value - self.anchor[key]).square()).flatten(2).sum(-1)
             for key, value in self._weights().items()
         ]
-        return self.weight / 2 * torch.stack(of_each).sum()
+        return self.weight / 2 * torch.stack(of_each).sum(0)
 
     def consolidate(self, index: int, inputs: TensorDictBase) -> None:
         """Anchor the actor of one seed where it is.

@@ -26,7 +26,7 @@ class Learner:
 
     Args:
         actor: Writes the ``action`` without noise; its weights lead with ``[S, E]``.
-        loss: Returns entries ``loss_...`` ``[]`` to minimize, each a sum over seeds and experts.
+        loss: Returns entries ``loss_...`` ``[S, E]`` to minimize (``reduction="none"``).
         config: Hyperparameters, of which ``gamma``, ``tau`` and ``learning_rate`` are read here.
         noise: Standard deviation of the Gaussian exploration noise.
     """
@@ -63,18 +63,18 @@ class Learner:
     def learn(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """Take a gradient step on transitions ``[S, E, B]``, update the targets; return the losses.
 
-        Losses are sums over seeds and experts ``[]``.
+        Losses are sums over the experts of a seed, ``[S]``.
         """
         parts = self.losses(batch)
         self.optimizer.zero_grad()
-        torch.stack([*parts.values()]).sum().backward()
+        torch.stack([part.sum() for part in parts.values()]).sum().backward()
         self.optimizer.step()
         if self.actor_is_due:
             self.target_update.step()
-        return {key: value.detach() for key, value in parts.items()}
+        return {key: value.detach().sum(1) for key, value in parts.items()}
 
     def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
-        """Return the losses to minimize on transitions ``[S, E, B]``."""
+        """Return the losses ``[S, E]`` to minimize on transitions ``[S, E, B]``."""
         return {str(k): v for k, v in self.loss(batch).items() if str(k).startswith("loss_")}
 
     def clear_momentum(self, index: int) -> None:
@@ -117,7 +117,7 @@ class TD3Learner(Learner):
             raise ValueError(f"policy_delay must be at least 1, got {config.policy_delay}")
         super().__init__(actor, loss, config, noise=config.noise)
         self.policy_delay, self.n_updates = config.policy_delay, 0
-        self.loss_actor = torch.zeros(())
+        self.loss_actor = torch.zeros(actor.batch_size[0])
 
     def learn(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """Take a gradient step; ``loss_actor`` is that of the latest actor update, 0 before."""

@@ -70,6 +70,7 @@ class LearnerSpec:
             "return_bounds": self.return_bounds if config.clip_targets else None,
             "imitation": config.imitation,
             "constant_keys": self.in_keys[1:],
+            "reduction": "none",
         }
 
     @property

@@ -36,8 +36,8 @@ def merge(arguments: MergeArguments) -> str:
     """Merge finished runs that differ only in their seeds, such as the jobs of a cluster.
 
     Writes config.json, train.csv, eval.csv, final.csv, cost.csv and summary.json as one run of all
-    seeds would have, but for losses, which stay means over the seeds of a job. `bgpo report` reads
-    the directory; `bgpo watch` and the tests of policies need one of the runs.
+    seeds would have. `bgpo report` reads the directory; `bgpo watch` and the tests of policies need
+    one of the runs.
 
     Raises:
         ValueError: If there are fewer than two runs; if one is damaged or not finished; if their
@@ -73,10 +73,9 @@ def _check_target(out: Path, runs: Sequence[Path]) -> None:
 def merge_runs(blocks: Sequence[Path], directory: Path) -> None:
     """Write the files that one run of all seeds would have written, each atomically.
 
-    Rows are sorted by seed and episode. Losses remain means over the seeds of a block; costs are
-    sums over blocks, left out if a block has none. Files about the first seed alone (``gwr.csv``
-    and figures) are copied from the first block, except ``success.png`` and ``groups.png``, which
-    `bgpo_trl.experiments.report` draws.
+    Rows are sorted by seed and episode. Costs are sums over blocks, left out if a block has none.
+    Files about the first seed alone (``gwr.csv`` and figures) are copied from the first block,
+    except ``success.png`` and ``groups.png``, which `bgpo_trl.experiments.report` draws.
 
     Args:
         blocks: Run directories that differ only in their seeds.

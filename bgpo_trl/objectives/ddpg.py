@@ -70,7 +70,7 @@ class DDPGLoss(OffPolicyLoss):
         return self.values("target_value_network", data)
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Compute the actor's loss ``[]`` and ``"pre_tanh_magnitude"``."""
+        """Compute the actor's loss, reduced, and ``"pre_tanh_magnitude"``."""
         data = self.call_network("actor_network", self.current(tensordict))
         value = self.values("value_network", data, frozen=True)
         return self.penalized(value, data, tensordict)

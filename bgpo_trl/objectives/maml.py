@@ -83,7 +83,7 @@ class MAMLLoss(DDPGLoss):
         self.inner_learning_rate = inner_learning_rate
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Compute the loss ``[]`` of the adapted policies, and store these in ``actor_network``.
+        """Compute the loss of the adapted policies, reduced, and store these in ``actor_network``.
 
         Raises:
             ValueError: If the batch cannot be cut in halves.
@@ -95,9 +95,9 @@ class MAMLLoss(DDPGLoss):
             )
         support, query = tensordict.chunk(2, dim=-1)
         adapted = self.adapt(support)
-        loss = self.policy_loss(adapted, query).sum()
+        loss = self.policy_loss(adapted, query)
         self._keep(adapted)
-        return loss, {}
+        return loss.sum() if self.reduction == "sum" else loss, {}
 
     def adapt(self, tensordict: TensorDictBase) -> Parameters:
         """Return the policy's parameters ``[*S, T, ...]`` after one gradient step on each task.

@@ -57,7 +57,8 @@ class OffPolicyLoss(LossModule):
     1. regresses the critics to ``r + gamma * next_value``, clipped to ``return_bounds``. Only
        ``"terminated"`` ends the bootstrap; a truncated episode goes on;
     2. takes the mean of a loss over the batch and its *sum* over the actor's ``batch_size``, so
-       that each seed has the gradient that it would have alone;
+       that each seed has the gradient that it would have alone; with ``reduction="none"``, losses
+       are those of each seed, to be summed by the caller;
     3. reads entries that are constant within an episode from the root, not from ``"next"``;
     4. sums the losses of twin critics, one network with the ``batch_size`` ``[*S, 2]``.
 
@@ -69,7 +70,8 @@ class OffPolicyLoss(LossModule):
     prioritized replay: the squared error, the larger one of twin critics. Returns, without a batch
     size, the entries of `loss_actor` and
 
-    - ``"loss_actor"``, ``"loss_value"`` ``[]``: to be added, with any other ``"loss_..."``;
+    - ``"loss_actor"``, ``"loss_value"`` ``[]``, or ``[*S]`` without reduction: to be added, with
+      any other ``"loss_..."``;
     - ``"pred_value"`` ``[*S, *B]``, or ``[*S, 2, *B]`` of twin critics: values of the batch;
     - ``"target_value"`` ``[*S, *B]``: bootstrapped targets;
     - ``"pred_value_max"``, ``"target_value_max"``, ``"td_error_max"`` ``[*S]``: over the batch.
@@ -83,11 +85,12 @@ class OffPolicyLoss(LossModule):
         constant_keys: Entries of the networks' input that are constant within an episode.
         loss_function: ``"l2"``, ``"l1"`` or ``"smooth_l1"``, of prediction and target.
         delay_actor: Whether the actor has a target network, as the critics always have.
+        reduction: ``"sum"`` over ``S``, or ``"none"``.
 
     Raises:
         ValueError: If ``return_bounds`` is not an increasing pair, the penalty is negative, there
-            is no such ``loss_function``, the critics' ``batch_size`` is not the actor's, or that of
-            twin critics not ``[*S, 2]``;
+            is no such ``loss_function`` or ``reduction``, the critics' ``batch_size`` is not the
+            actor's, or that of twin critics not ``[*S, 2]``;
             from ``forward``, if an entry is missing, or reward or weights have another shape.
     """
 
@@ -117,6 +120,7 @@ class OffPolicyLoss(LossModule):
         constant_keys: Sequence[NestedKey] = (),
         loss_function: str = "l2",
         delay_actor: bool = True,
+        reduction: str = "sum",
     ) -> None:
         if not (pre_tanh_penalty >= 0 and math.isfinite(pre_tanh_penalty)):
             raise ValueError(f"pre_tanh_penalty must be a number >= 0, got {pre_tanh_penalty}")
@@ -126,6 +130,8 @@ class OffPolicyLoss(LossModule):
             raise ValueError(f"return_bounds must be (low, high) with low < high: {return_bounds}")
         if loss_function not in ("l2", "l1", "smooth_l1"):
             raise ValueError(f"loss_function must be l2, l1 or smooth_l1, got {loss_function!r}")
+        if reduction not in ("sum", "none"):
+            raise ValueError(f"reduction must be sum or none, got {reduction!r}")
         super().__init__()
         self.batch_size = torch.Size(getattr(actor_network, "batch_size", ()))
         critics = torch.Size(getattr(value_network, "batch_size", ()))
@@ -141,7 +147,7 @@ class OffPolicyLoss(LossModule):
         self.convert_to_functional(value_network, "value_network", create_target_params=True)
         self.return_bounds, self.pre_tanh_penalty = return_bounds, pre_tanh_penalty
         self.imitation = imitation
-        self.loss_function = loss_function
+        self.loss_function, self.reduction = loss_function, reduction
         written = set(actor_network.out_keys)
         read = [*actor_network.in_keys, *(k for k in value_network.in_keys if k not in written)]
         self.input_keys = [*dict.fromkeys(unravel_key(key) for key in read)]
@@ -202,11 +208,11 @@ class OffPolicyLoss(LossModule):
         raise NotImplementedError
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Compute the actor's loss ``[]``, and further entries for the result of `forward`."""
+        """Compute the actor's loss, reduced, and further entries for the result of `forward`."""
         raise NotImplementedError
 
     def loss_value(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Compute the critics' loss ``[]`` and their further entries; write ``"td_error"``."""
+        """Compute the critics' loss, reduced, and their further entries; write ``"td_error"``."""
         with torch.no_grad():
             target = self.target(tensordict)
         data = self._select(tensordict, self.value_network.in_keys)
@@ -219,7 +225,7 @@ class OffPolicyLoss(LossModule):
         if self.twin_critics:
             distance, td_error = distance.sum(twin_dim), td_error.amax(twin_dim)
         tensordict.set(self.tensor_keys.priority, td_error)
-        return self.mean_per_seed(distance, tensordict).sum(), {
+        return self.reduce(distance, tensordict), {
             "pred_value": prediction,
             "target_value": target,
             "pred_value_max": self.flatten_batch(prediction).amax(-1),
@@ -294,7 +300,7 @@ class OffPolicyLoss(LossModule):
         and the outputs of the actor; the transitions of ``tensordict`` give the weights.
 
         Returns:
-            The loss ``[]`` and ``"pre_tanh_magnitude"`` ``[*S]``, the root of that mean square.
+            The loss, reduced, and ``"pre_tanh_magnitude"`` ``[*S]``, the root of that mean square.
 
         Raises:
             ValueError: If the actor wrote no ``"pre_tanh_action"`` to penalize.
@@ -309,12 +315,12 @@ class OffPolicyLoss(LossModule):
                     f"the actor wrote no {self.tensor_keys.pre_tanh_action!r} to penalize: write "
                     "it, name it with set_keys(pre_tanh_action=...), or pass pre_tanh_penalty=0"
                 )
-            return self.mean_per_seed(loss, tensordict).sum(), {}
+            return self.reduce(loss, tensordict), {}
         square = pre_tanh.square()
         if self.pre_tanh_penalty:
             loss = loss + self.pre_tanh_penalty * square.mean(-1)
         magnitude = self.flatten_batch(square.detach()).mean(-1).sqrt()
-        return self.mean_per_seed(loss, tensordict).sum(), {"pre_tanh_magnitude": magnitude}
+        return self.reduce(loss, tensordict), {"pre_tanh_magnitude": magnitude}
 
     def imitation_loss(self, data: TensorDictBase, tensordict: TensorDictBase) -> Tensor:
         """Return the squared distance ``[*S, *B]`` of the actor's actions to demonstrated ones.
@@ -332,6 +338,11 @@ class OffPolicyLoss(LossModule):
             return torch.zeros(tensordict.batch_size, device=tensordict.device)
         distance = (data.get(keys.action) - tensordict.get(keys.action)).square().sum(-1)
         return distance * demonstrated
+
+    def reduce(self, loss: Tensor, tensordict: TensorDictBase) -> Tensor:
+        """Return the weighted means ``[*S]`` of a loss ``[*S, *B]``, or their sum ``[]``."""
+        mean = self.mean_per_seed(loss, tensordict)
+        return mean.sum() if self.reduction == "sum" else mean
 
     def mean_per_seed(self, loss: Tensor, tensordict: TensorDictBase) -> Tensor:
         """Return the mean ``[*S]`` of ``[*S, *B]``, weighted by ``"priority_weight"``."""

@@ -91,15 +91,15 @@ class SACLoss(OffPolicyLoss):
         return value
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Compute the actor's loss ``[]``, and the temperature's loss and entries."""
+        """Compute the actor's loss, reduced, and the temperature's loss and entries."""
         data, log_prob = self._sample(self.current(tensordict))
         values = self.values("value_network", data, frozen=True)
         alpha = self.log_alpha.detach().exp()
         loss = self._each(alpha, log_prob) * log_prob - values.amin(len(self.batch_size))
         log_prob = log_prob.detach()
         loss_alpha = -self._each(self.log_alpha, log_prob) * (log_prob + self.target_entropy)
-        return self.mean_per_seed(loss, tensordict).sum(), {
-            "loss_alpha": self.mean_per_seed(loss_alpha, tensordict).sum(),
+        return self.reduce(loss, tensordict), {
+            "loss_alpha": self.reduce(loss_alpha, tensordict),
             "alpha": alpha,
             "entropy": -self.flatten_batch(log_prob).mean(-1),
         }

@@ -77,7 +77,7 @@ class TD3Loss(OffPolicyLoss):
         return self.values("target_value_network", data).amin(len(self.batch_size))
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Compute the actor's loss ``[]`` and ``"pre_tanh_magnitude"``."""
+        """Compute the actor's loss, reduced, and ``"pre_tanh_magnitude"``."""
         data = self.call_network("actor_network", self.current(tensordict))
         values = self.values("value_network", data, frozen=True)
         return self.penalized(values.select(len(self.batch_size), 0), data, tensordict)
