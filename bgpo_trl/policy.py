@@ -60,6 +60,9 @@ class Recognition:
 class TrainedPolicy:
     """The policy of one seed of a run, without learning or noise, as returned by `load_run`.
 
+    It can be pickled, for worker processes. An algorithm of one's own has to take the arguments of
+    `Algorithm` alone for that.
+
     Args:
         config: The run.
         algorithm: The algorithm of all seeds, as left by the run.
@@ -89,6 +92,14 @@ class TrainedPolicy:
         self._index = config.seeds.index(seed)
         self._policy: Policy | None = None
         self._task = 0
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        state = self.algorithm.state_dict()
+        if not self.algorithm.needs_replay:
+            del state["replay"]
+        shown = None if self._policy is None else self._policy.state_dict()
+        parts = (type(self.algorithm), self.config, state, self.encoders, self.bank)
+        return _unpickled, (*parts, self.seed, self.episodes, shown, self._task)
 
     @torch.no_grad()
     def condition(
@@ -182,6 +193,47 @@ class TrainedPolicy:
             raise ValueError(f"{wanted}, got {array.dtype} {list(shape)}")
         # Copied, since the array may be read-only.
         return torch.tensor(np.ascontiguousarray(array))
+
+
+def _unpickled(
+    make: Callable[..., Algorithm],
+    config: RunConfig,
+    state: dict[str, Any],
+    encoders: Representation,
+    bank: DemonstrationBank,
+    seed: int,
+    episodes: int,
+    shown: dict[str, Any] | None,
+    task: int,
+) -> TrainedPolicy:
+    algorithm = _restored(make, config, state, encoders, bank)
+    policy = TrainedPolicy(
+        config, algorithm, seed=seed, encoders=encoders, bank=bank, episodes=episodes
+    )
+    policy._policy = None if shown is None else algorithm.policy(**shown)
+    policy._task = task
+    return policy
+
+
+def _restored(
+    make: Callable[..., Algorithm],
+    config: RunConfig,
+    state: dict[str, Any],
+    encoders: Representation,
+    bank: DemonstrationBank,
+) -> Algorithm:
+    """Make the algorithm of a run from its state, without a replay that it does not need."""
+    algorithm = make(
+        config.algorithm,
+        seeds=config.seeds,
+        bank=bank.seen(),
+        encoders=encoders,
+        scene=find_scene(config.scene),
+    )
+    if not algorithm.needs_replay:
+        state = {**state, "replay": algorithm.replay.state_dict()}  # avoids reading it
+    algorithm.load_state_dict(state)
+    return algorithm
 
 
 class LoadedRun(NamedTuple):
@@ -286,16 +338,6 @@ def load_all_seeds(path: str | Path, *, make: Callable[..., Algorithm] | None = 
     # Before anything is made of the sizes in the settings, which may not be the run's.
     check_checkpoint(path / "checkpoint", saved, read_json(path / "config.json"))
     with fitting_checkpoint(path):
-        algorithm = make(
-            config.algorithm,
-            seeds=config.seeds,
-            bank=bank.seen(),
-            encoders=encoders,
-            scene=find_scene(config.scene),
-        )
-        state = saved["algorithm"]
-        if not algorithm.needs_replay:
-            state["replay"] = algorithm.replay.state_dict()  # Avoids reading it.
-        algorithm.load_state_dict(state)
+        algorithm = _restored(make, config, saved["algorithm"], encoders, bank)
         episodes = saved["world"]["source"]["episode"].tolist()
     return LoadedRun(config, algorithm, encoders, bank, episodes)

@@ -1,6 +1,7 @@
 """Loaded policies act as in the test episodes of their runs."""
 
 import json
+import pickle
 import runpy
 import shutil
 import subprocess
@@ -149,6 +150,23 @@ def test_recognition_of_demonstrations_of_any_length(trainer_of, load, encoders,
     assert (seen.group, seen.group_novelty) == (int(member.group), float(member.novelty))
     assert seen.known == (seen.group_novelty <= 1)
     assert policy.act(frames[-1]).shape == (4,)
+
+
+@pytest.mark.parametrize("name", ["bgpo", "bgpo-single", "maml", "dist-nll"])
+def test_a_pickled_policy_acts_as_before_and_can_be_conditioned_anew(load, name):
+    policy, (frame, *_) = load(name), noise(5, 1)
+    unconditioned = pickle.loads(pickle.dumps(policy))
+    policy.condition(DEMONSTRATIONS[1], task=TASKS[1])
+    copied = pickle.loads(pickle.dumps(policy))
+    assert (copied.act(frame) == policy.act(frame)).all()
+    for one in (policy, copied, unconditioned):
+        one.condition(DEMONSTRATIONS[2], task=TASKS[2])
+    for other in (copied, unconditioned):
+        assert (other.act(frame) == policy.act(frame)).all()
+        assert (other.seed, other.episodes, other.tasks) == (
+            *(policy.seed, policy.episodes),
+            policy.tasks,
+        )
 
 
 def test_frames_may_be_lists_tensors_views_or_read_only(load):
