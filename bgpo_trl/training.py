@@ -41,8 +41,8 @@ class Trainer:
 
     Each seed of the batch plays ``config.episodes`` training episodes. Seeds that finish early go
     on, unlogged, until the last one finishes; logged values are those of the seed alone. A run
-    resumed with more ``config.episodes`` equals a run of that length. Each update runs while the
-    environment steps, and learns from all earlier transitions.
+    resumed with more ``config.episodes`` equals a run of that length. Updates, one in
+    ``update_every`` steps, run while the environment steps, and learn from all earlier transitions.
 
     Checkpoints are written before the first step and between steps; Ctrl-C and SIGTERM wait for the
     end of the step and save. After any other failure, a resumed run repeats the steps since the
@@ -214,9 +214,10 @@ class Trainer:
                 while int(episodes.min()) < n_episodes:
                     before, started = episodes.clone(), time.monotonic()
                     state = self._act(state)
-                    update = background.submit(algorithm.update)
+                    due = self.env_steps % self.config.algorithm.rl.update_every == 0
+                    update = background.submit(algorithm.update) if due else None
                     transition, state = env.step_and_maybe_reset(state)
-                    losses = update.result() or losses
+                    losses = (update and update.result()) or losses
                     algorithm.store(transition)
                     self._cost.add_step(n_tasks, time.monotonic() - started)
                     self.env_steps += 1
@@ -231,9 +232,9 @@ class Trainer:
                             bar.set_postfix_str(self._success_so_far(), refresh=False)
                             bar.update()
                     self._evaluate()
-                    due = time.monotonic() - saved > 60 * self.config.checkpoint_minutes
+                    late = time.monotonic() - saved > 60 * self.config.checkpoint_minutes
                     stop = interrupted()
-                    if due or stop or int(episodes.min()) >= n_episodes:
+                    if late or stop or int(episodes.min()) >= n_episodes:
                         self.save()
                         saved = time.monotonic()
                     if stop:

@@ -91,14 +91,15 @@ class DistNLL(TaskAlgorithm):
     def store(self, transition: TensorDictBase) -> None:
         """Add a transition of each seed to the replay of its task."""
         super().store(transition)
-        self._ended = transition.get(("next", "done")).flatten().clone()
+        self._ended |= transition.get(("next", "done")).flatten()
 
     def update(self) -> dict[str, Tensor]:
-        """Update each seed's teachers, and distill them for seeds whose episode has just ended."""
+        """Update each seed's teachers; distill them if an episode has ended since the last call."""
+        ended, self._ended = self._ended, torch.zeros_like(self._ended)
         if not self.ready():
             return {}
         losses = self.learn(self.sample_tasks())
-        for index in self._ended.nonzero().flatten().tolist():
+        for index in ended.nonzero().flatten().tolist():
             self._distill(index)
         return losses
 

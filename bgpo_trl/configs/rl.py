@@ -39,11 +39,13 @@ class RLConfig:
     from what was demonstrated (docs/learning.md)."""
     warmup_steps: int = 256
     """Environment steps of each seed before the first update. Ours: not given in the paper."""
+    update_every: int = 1
+    """Environment steps of each seed per update (1 in Alg. 1)."""
 
     def __post_init__(self) -> None:
         positive(self, "learning_rate")
         at_least(self, 0, "imitation")
-        whole(self, 1, "batch_size", "warmup_steps", "replay_size")
+        whole(self, 1, "batch_size", "warmup_steps", "replay_size", "update_every")
         # With a smaller replay, learning would never begin.
         least = max(self.batch_size, self.warmup_steps)
         sizes = bool(self.hidden_sizes) and all(
