@@ -234,6 +234,23 @@ def test_an_algorithm_may_log_further_losses(uninterrupted, make, tmp_path):
         make(tmp_path, resume=True)
 
 
+@pytest.mark.parametrize("every", [1, 3])
+def test_an_update_follows_every_so_many_steps(make, make_config, tmp_path, every):
+    config = make_config()
+    rl = replace(config.algorithm.rl, update_every=every)
+    config = replace(config, algorithm=replace(config.algorithm, rl=rl))
+    calls = []
+
+    class Counted(BGPO):
+        def update(self):
+            calls.append(len(self.replay))
+            return super().update()
+
+    with make(tmp_path, config, make=Counted) as trainer:
+        trainer.run()
+    assert calls == [*range(0, trainer.env_steps, every)]  # transitions stored before
+
+
 def test_a_run_with_loggers_writes_the_same_files(uninterrupted, make, tmp_path):
     """Also if it is interrupted, begun without loggers and resumed with them."""
     trainer = make(tmp_path)

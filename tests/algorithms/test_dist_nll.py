@@ -332,6 +332,21 @@ def test_students_learn_from_their_teachers_at_the_end_of_each_episode(make, sch
                 torch.testing.assert_close(expected, value, rtol=1e-4, atol=1e-5)
 
 
+def test_no_end_of_an_episode_is_missed_between_updates(make, monkeypatch):
+    algorithm, distilled = make(), []
+    monkeypatch.setattr(algorithm, "_distill", distilled.append)
+    state, ended, expected = algorithm.world.env.reset(), set(), []
+    for step in range(40):
+        transition, state = algorithm.world.env.step_and_maybe_reset(algorithm.act(state))
+        algorithm.store(transition)
+        ended |= {*transition["next", "done"].flatten().nonzero().flatten().tolist()}
+        if step % 3 == 2:
+            expected += sorted(ended) if algorithm.update() else []
+            ended = set()
+    assert distilled == expected
+    assert {*distilled} == {0, 1}
+
+
 def test_old_heads_and_the_trunk_are_kept_when_a_head_is_added(make):
     """Seen where learning changes nothing: the weights are all as they were drawn."""
     algorithm = make(learning_rate=1e-30)  # none to speak of, so that only the head is new
