@@ -47,9 +47,9 @@ _PAPER = DDPGConfig(
     pre_tanh_penalty=0.0,
 )
 _PUBLISHED: Any = {"rl": _PAPER, "gwr": GWRBConfig(activity_scale=1.0), "behavior_scale": 1.0}
-_SHOWN: Any = {"demonstration_share": 0.75, "rl": DDPGConfig(noise=0.1)}
+_SHOWN: Any = {"demonstration_share": 0.75, "rl": BGPOConfig().rl}
 _SHOWN_TASKS: Any = {**_SHOWN, "task_batch_size": 128}
-_SHOWN_SINGLE: Any = {**_SHOWN, "rl": DDPGConfig(noise=0.1, batch_size=384)}  # three tasks' batches
+_SHOWN_SINGLE: Any = {**_SHOWN, "rl": replace(BGPOConfig().rl, batch_size=384)}  # of three tasks
 
 ALGORITHMS: dict[str, Entry] = {
     "bgpo": Entry(BGPO, BGPOConfig()),

@@ -185,8 +185,9 @@ def test_the_variants_beyond_the_paper_add_one_thing_at_a_time(make):
     assert not (
         published.experts or published.group_balanced_replay or published.demonstration_share
     )
-    alone = {"demonstration_share": 0.75, "rl": DDPGConfig(noise=0.1, batch_size=384)}
-    shown = {**alone, "rl": DDPGConfig(noise=0.1), "expert_batch_size": 128}
+    slow = DDPGConfig(noise=0.1, update_every=4)
+    alone = {"demonstration_share": 0.75, "rl": replace(slow, batch_size=384)}
+    shown = {**alone, "rl": slow, "expert_batch_size": 128}
     for variant, added in {
         "group-balanced-replay": {"group_balanced_replay": True},
         "bgpo-experts": {"group_balanced_replay": True, "experts": True},
