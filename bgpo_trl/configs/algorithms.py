@@ -26,7 +26,7 @@ class AlgorithmConfig:
     demonstration_share: float = 0.0
     """Share of an update's transitions taken from the demonstrations shown so far in training, with
     actions inferred by the inverse model. Ours: the paper has none."""
-    demonstration_noise: float = 0.4
+    demonstration_noise: float = 0.2
     """Standard deviation of the noise added to demonstrated states when they are sampled. Ours:
     keeps policies from learning a few demonstrations by heart (docs/learning.md)."""
 
