@@ -15,7 +15,9 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
+
+import tyro
 
 # Three checkpoints (two kept, one being written) of 10 seeds and 20,000 episodes take 9 GB; three
 # of `--preset quick` 0.2 GB.
@@ -31,6 +33,10 @@ class DoctorArguments:
 
     frame: Path | None = None
     """PNG file to write what the robot sees to."""
+    scene: str = "nico"
+    """Robot to check beside the machine, nico or one that the module of --import adds."""
+    module: Annotated[str | None, tyro.conf.arg(name="import")] = None
+    """Module that adds the robot; here or installed."""
 
 
 class Finding(NamedTuple):
@@ -47,10 +53,13 @@ def doctor(arguments: DoctorArguments) -> None:
     A line begins with ok; note, for usable with a limitation; or wrong, for unusable, with which
     the exit status is 1.
     """
+    name, module, path = arguments.scene, arguments.module, arguments.frame
+    foreign = name != "nico"
     checks: dict[str, Callable[[], Iterator[Finding]]] = {
         "versions": check_versions,
-        "OpenGL": lambda: check_frame(arguments.frame),
-        "frames/s": check_frame_rate,
+        "OpenGL": lambda: check_frame(None if foreign else path),
+        **({name: lambda: check_scene(name, module, path)} if foreign else {}),
+        "frames/s": lambda: check_frame_rate(name),
         "threads": check_threads,
         "disk": lambda: check_disk(Path.cwd()),
     }
@@ -124,16 +133,44 @@ def check_frame(path: Path | None = None) -> Iterator[Finding]:
         Image.fromarray(still).resize((640, 320), Image.Resampling.NEAREST).save(path)
 
 
-def check_frame_rate(seconds: float = 0.5) -> Iterator[Finding]:
+def check_scene(name: str, module: str | None, path: Path | None = None) -> Iterator[Finding]:
+    """Draw a robot's view before and after random actions; optionally write the first to a PNG."""
+    import torch
+    from PIL import Image
+
+    from bgpo_trl.plugins import import_plugin
+    from bgpo_trl.scenes import find_scene
+
+    import_plugin(module)
+    scene, generator = find_scene(name), torch.Generator().manual_seed(0)
+    env = scene.simulate(scene.default_tasks, batch_size=[1])
+    state = env.reset()
+    still = moved = state["pixels"][0].numpy()
+    for _ in range(min(5, scene.max_steps)):
+        state["action"] = torch.rand(1, scene.action_size, generator=generator) * 2 - 1
+        _, state = env.step_and_maybe_reset(state)
+        moved = state["pixels"][0].numpy()
+    env.close()
+    changed = int((still != moved).any(-1).sum())
+    seen = f"{' x '.join(map(str, scene.frame_shape))}, {changed} pixels change by random actions"
+    blind = ": are the camera and the actions' size as they should be?"
+    yield Finding("ok" if changed else "wrong", name, seen + ("" if changed else blind))
+    if path is not None:
+        size = [8 * length for length in still.shape[1::-1]]
+        Image.fromarray(still).resize(size, Image.Resampling.NEAREST).save(path)
+
+
+def check_frame_rate(name: str = "nico", seconds: float = 0.5) -> Iterator[Finding]:
     """Measure ten simulations in one environment on all cores, with random actions."""
     import torch
 
-    from bgpo_trl.scenes.nico import NicoEnv
+    from bgpo_trl.scenes import find_scene
 
-    env, generator = NicoEnv(batch_size=[10], seed=0), torch.Generator().manual_seed(0)
+    scene, generator = find_scene(name), torch.Generator().manual_seed(0)
+    env = scene.simulate(scene.default_tasks, batch_size=[10])
     state, steps, start = env.reset(), 0, time.perf_counter()
     while time.perf_counter() - start < seconds:
-        state["action"] = torch.rand(10, 4, generator=generator) * 2 - 1
+        state["action"] = torch.rand(10, scene.action_size, generator=generator) * 2 - 1
         _, state = env.step_and_maybe_reset(state)
         steps += 1
     rate = 10 * steps / (time.perf_counter() - start)

@@ -12,7 +12,9 @@ import pytest
 from PIL import Image
 
 from bgpo_trl import doctor
-from bgpo_trl.doctor import Finding
+from bgpo_trl.doctor import DoctorArguments, Finding
+from bgpo_trl.scenes import SCENES
+from tests.scenes.dot import Dot, scene
 
 ROOT = Path(__file__).parents[1]
 
@@ -56,6 +58,28 @@ def test_blank_frames_and_frames_that_never_change_are_wrong(monkeypatch, noise)
     monkeypatch.setattr("suites.nico.rendering.FrameRenderer.render", lambda *_: frame)
     _, found = doctor.check_frame()
     assert (found.level, found.subject) == ("wrong", "frame")
+
+
+class Blind(Dot):
+    def frame(self):
+        return np.zeros((16, 24, 3), np.uint8)
+
+
+@pytest.mark.parametrize(("make", "level"), [(Dot, "ok"), (Blind, "wrong")])
+def test_another_robot_is_drawn_and_measured(tmp_path, monkeypatch, capsys, make, level):
+    monkeypatch.setitem(SCENES, "dot", scene(make))
+    monkeypatch.setattr(doctor, "check_frame", lambda path: [Finding("ok", "OpenGL", str(path))])
+    try:
+        doctor.doctor(DoctorArguments(frame=tmp_path / "dot.png", scene="dot"))
+    except SystemExit as stopped:
+        assert (stopped.code, level) == (1, "wrong")
+    lines = [line.split(maxsplit=2) for line in capsys.readouterr().out.splitlines()]
+    found = {subject: (level, message) for level, subject, message in lines}
+    assert found["OpenGL"] == ("ok", "None")  # the picture is of the robot asked for
+    assert found["dot"][0] == level
+    assert found["dot"][1].startswith("16 x 24, ")
+    assert float(found["frames/s"][1].partition(":")[0]) > 0
+    assert Image.open(tmp_path / "dot.png").size == (8 * 24, 8 * 16)
 
 
 def test_few_frames_a_second_are_noted(monkeypatch):

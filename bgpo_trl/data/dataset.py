@@ -16,7 +16,10 @@ from bgpo_trl.files.writing import make_folder, write_json
 from bgpo_trl.scenes import SCENES, Scene, find_scene
 
 _META = "dataset.json"
-_REMEDY = "record it again with `python -m bgpo_trl.data.recording PATH`, or write it again"
+_REMEDY = (
+    "record it again with `python -m bgpo_trl.data.recording PATH` (a robot other than NICO: "
+    "--scene), or write it again"
+)
 
 
 def load_demonstrations(path: str | Path, *, verify: bool = True) -> TensorDict:

@@ -58,8 +58,8 @@ def default_weights(tasks: Sequence[str] | None = None, *, scene: Scene | str = 
     scene = find_scene(scene)
     if scene.weights is None:
         raise ValueError(
-            f"no encoders come with the scene {scene.name!r}: train some (--train-encoders), or "
-            "name their file (--encoders)"
+            f"no encoders come with the scene {scene.name!r}: name a file (--encoders, --weights "
+            "in the commands of bgpo_trl.encoders), or let a run train some (--train-encoders)"
         )
     return scene.weights.choose(scene.default_tasks if tasks is None else tasks)
 

@@ -75,11 +75,17 @@ def load_inputs(
             f"{directory} was trained with the encoders {str(digests.encoders)[:12]}, which do not "
             f"come with the scene: put them at {own_weights(directory)}"
         )
-    encoders = load_representation(weights, scene_version=find_scene(scene).version)
+    encoders = load_representation(weights)
     if encoders.identity != digests.encoders:
         raise ValueError(
             f"{directory} was trained with the encoders {str(digests.encoders)[:12]}, not with "
             f"{weights} ({encoders.identity[:12]}): put its own there"
+        )
+    learned, version = encoders.metadata.get("scene_version"), find_scene(scene).version
+    if learned != version:
+        raise ValueError(
+            f"{directory} was trained in the scene {learned}, this is {version}: use the version "
+            "of the scene that it was trained in"
         )
     kept = directory / BANK
     path = kept if kept.exists() else bank_path(weights)

@@ -64,22 +64,25 @@ class Simulation(ABC):
 
     def state(self) -> NDArray[Any]:
         """Return the ground truth, ``[N]``."""
-        raise NotImplementedError
+        raise self._lacks("state()")
 
     def view(self) -> NDArray[np.uint8]:
         """Return an onlooker's view of the robot for films, ``[H', W', 3]``."""
-        raise NotImplementedError
+        raise self._lacks("view()")
 
     def save(self) -> dict[str, Any]:
         """Return all that the future depends on, as tensors, numbers, strings, lists and dicts."""
-        raise NotImplementedError
+        raise self._lacks("save()")
 
     def load(self, state: dict[str, Any]) -> None:
         """Continue from what `save` returned."""
-        raise NotImplementedError
+        raise self._lacks("load()")
 
     def close(self) -> None:  # noqa: B027 - most have nothing to free
         """Free what the simulation holds."""
+
+    def _lacks(self, method: str) -> NotImplementedError:
+        return NotImplementedError(f"{type(self).__name__} does not define {method}")
 
 
 class SimulationEnv(EnvBase):
@@ -215,7 +218,14 @@ class SimulationEnv(EnvBase):
     def _record(self, row: int) -> None:
         simulation = self.simulations[row]
         if "pixels" in self._current:
-            self._current["pixels"][row] = simulation.frame()
+            frame, shape = simulation.frame(), self._current["pixels"].shape[1:]
+            # NumPy would convert and broadcast others: fractions would become black.
+            if frame.dtype != np.uint8 or frame.shape != shape:
+                raise ValueError(
+                    f"{type(simulation).__name__}.frame() returned {frame.dtype} "
+                    f"{[*frame.shape]}: return uint8 {[*shape]}, as the scene's frame_shape says"
+                )
+            self._current["pixels"][row] = frame
         if "state" in self._current:
             self._current["state"][row] = simulation.state()
 

@@ -6,8 +6,9 @@ from dataclasses import replace
 import pytest
 
 from bgpo_trl.encoders.pretrained import load_pretrained
+from bgpo_trl.encoders.representation import save_representation
 from bgpo_trl.runs.config_file import Digests
-from bgpo_trl.runs.demonstrations import BANK, keep_inputs, load_inputs
+from bgpo_trl.runs.demonstrations import BANK, keep_inputs, load_inputs, own_weights
 from suites import nico
 
 TASKS = nico.PAPER_TASKS
@@ -63,3 +64,15 @@ def test_demonstrations_of_another_run_are_refused(shipped, mixed, tmp_path):
     assert str(error.value).endswith(str(tmp_path / "run" / BANK))
     earlier = Digests(encoders.identity, None)  # Runs of earlier versions did not say.
     assert load_inputs(tmp_path, TASKS, earlier)[1].identity == bank.identity
+
+
+def test_other_encoders_and_a_changed_scene_are_told_apart(shipped, tmp_path):
+    encoders, bank = shipped
+    foreign = replace(encoders, metadata={**encoders.metadata, "scene_version": "mars-1"})
+    own_weights(tmp_path).parent.mkdir()
+    save_representation(foreign, own_weights(tmp_path))
+    digests = Digests(foreign.identity, bank.identity)
+    with pytest.raises(ValueError, match=r"was trained in the scene mars-1, this is .*: use the"):
+        load_inputs(tmp_path, TASKS, digests)
+    with pytest.raises(ValueError, match=r"was trained with the encoders 0123, not with .*: put"):
+        load_inputs(tmp_path, TASKS, digests._replace(encoders="0123"))

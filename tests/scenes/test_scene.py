@@ -13,8 +13,10 @@ from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.configs import RunConfig
 from bgpo_trl.data.dataset import load_demonstrations
 from bgpo_trl.data.recording import record_demonstrations
-from bgpo_trl.encoders.train import make_pretrained
+from bgpo_trl.data.writing import write_demonstrations
+from bgpo_trl.encoders.train import make_pretrained, train_encoders
 from bgpo_trl.evaluation import evaluate_random_policy
+from bgpo_trl.experiments.one_shot import OneShotArguments, one_shot
 from bgpo_trl.experiments.watch import WatchArguments, watch
 from bgpo_trl.policy import load_run
 from bgpo_trl.runs.results import TRAIN, read_table
@@ -159,6 +161,95 @@ def test_a_run_learns_on_another_robot_and_is_loaded_and_filmed(pretrained, tmp_
     outcomes = watch(WatchArguments(run=tmp_path / "run"))
     assert "left: " in outcomes
     assert (tmp_path / "run" / "figures" / "film.gif").exists()
+    one_shot(OneShotArguments(run=tmp_path / "run", shares=(1.0,), episodes=2))
+    assert {*read_table(tmp_path / "run" / "one_shot.csv")["task"]} == {*TASKS}
+
+
+class Walker(Dot):
+    """A dot that is slow, with a second action that does nothing, in square frames."""
+
+    size = 16
+
+    def step(self, action):
+        return super().step(0.05 * action)
+
+    def frame(self):
+        frame = np.zeros((self.size, self.size, 3), np.uint8)
+        frame[6:10, round(5 + 5 * self.place) :][:, :4] = 255
+        return frame
+
+
+class LargeWalker(Walker):
+    size = 48
+
+
+@pytest.mark.parametrize(("make", "n_actions", "n_steps"), [(Walker, 1, 7), (LargeWalker, 2, 80)])
+def test_frames_actions_and_episodes_have_any_size(make, n_actions, n_steps, tmp_path, monkeypatch):
+    shape = {"frame_shape": (make.size, make.size), "action_size": n_actions}
+    n_frames = n_steps - 3
+    shown = {
+        task: [
+            {
+                "pixels": np.random.default_rng(n).integers(
+                    0, 256, (n_frames + n, make.size, make.size, 3), dtype=np.uint8
+                ),
+                "action": np.zeros((n_frames + n - 1, n_actions)),
+            }
+            for n in range(3)
+        ]
+        for task in TASKS
+    }
+    walker = replace(
+        scene(**shape), make_env=partial(SimulationEnv, make, **shape), max_steps=n_steps
+    )
+    monkeypatch.setitem(SCENES, "dot", walker)
+    dataset = write_demonstrations(tmp_path / "own", shown, scene=walker, held_out_per_task=1)
+    pretrained = train_encoders(
+        dataset,
+        None,
+        tmp_path / "encoders.safetensors",
+        tmp_path / "log",
+        ENCODERS,
+        scene=walker,
+        progress=False,
+    )
+    algorithm = config().algorithm
+    rl = replace(algorithm.rl, warmup_steps=n_steps)
+    algorithm = replace(algorithm, max_steps=n_steps, rl=rl)
+    train(tmp_path / "run", pretrained, algorithm=algorithm, episodes=2)
+
+    # Actions at random do not get to an edge.
+    steps = read_table(tmp_path / "run" / "train.csv")["steps"].astype(int)
+    assert steps.tolist() == [n_steps] * 4
+    policy = load_run(tmp_path / "run")
+    frames = shown["left"][0]["pixels"]
+    policy.condition(frames)
+    assert policy.act(frames[0]).shape == (n_actions,)
+
+
+@pytest.mark.parametrize(
+    ("frame", "found"),
+    [
+        (np.ones((16, 24, 3), np.float32), r"float32 \[16, 24, 3\]"),
+        (np.ones((24, 16, 3), np.uint8), r"uint8 \[24, 16, 3\]"),
+        (np.ones((16, 24, 1), np.uint8), r"uint8 \[16, 24, 1\]"),
+    ],
+)
+def test_frames_of_another_kind_than_the_scenes_are_refused(frame, found):
+    class Odd(Dot):
+        def frame(self):
+            return frame
+
+    env = scene(Odd).simulate(TASKS)
+    with pytest.raises(ValueError, match=rf"Odd.frame\(\) returned {found}: return uint8 \[16, 24"):
+        env.reset()
+
+
+def test_a_ground_truth_that_the_simulation_does_not_have_is_named():
+    shape = {"frame_shape": (16, 24), "action_size": 1}
+    env = SimulationEnv(Dot, TASKS, state_size=1, observation="both", **shape)
+    with pytest.raises(NotImplementedError, match=r"Dot does not define state\(\)"):
+        env.reset()
 
 
 @pytest.mark.parametrize("name", ["dist-nll-demonstrations", "maml", "ewc"])
