@@ -76,7 +76,7 @@ PRESETS: dict[str, RunConfig] = {
         seeds=(0, 1), episodes=12, task_starts=(0, 4, 8), eval_every=6, eval_episodes=1
     ),
     "quick": RunConfig(
-        seeds=(0, 1), episodes=1_200, task_starts=(0, 380, 700), eval_every=120, eval_episodes=10
+        seeds=(0, 1), episodes=1_800, task_starts=(0, 570, 1_050), eval_every=150, eval_episodes=10
     ),
     "desk": RunConfig(
         seeds=(0, 1, 2, 3, 4),
@@ -88,4 +88,4 @@ PRESETS: dict[str, RunConfig] = {
     "paper": RunConfig(),
 }
 """Runs by ``--preset``: ``smoke`` passes every stage in minutes, ``quick`` shows learning, ``desk``
-is five seeds in some hours, ``paper`` is the paper's scale."""
+is five seeds in two hours, ``paper`` is the paper's scale."""
