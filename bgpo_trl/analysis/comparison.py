@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -61,6 +61,17 @@ class Run:
     def algorithm(self) -> str:
         """Name of the algorithm; the directory's where ``config.json`` has none."""
         return self.config.get("name") or self.directory.name
+
+    @property
+    def changed(self) -> dict[str, Any]:
+        """Hyperparameters that are not the algorithm's usual ones, by name."""
+        return self.summary.get("changed") or {}
+
+    @property
+    def title(self) -> str:
+        """Name in tables, with the changed hyperparameters."""
+        changed = [f"{name} {_short(value)}" for name, value in self.changed.items()]
+        return ", ".join([NAMES.get(self.algorithm, self.algorithm), *changed])
 
     @property
     def tasks(self) -> tuple[str, ...]:
@@ -150,10 +161,20 @@ class Setting:
         parts = (kind, number, self.schedule, self.order.replace(" ", "-"))
         return "-".join(filter(None, parts))
 
-    def find(self, algorithm: str) -> tuple[str, Run] | None:
-        """Return the name and the first run of an algorithm; None without one."""
-        found = ((name, run) for name, run in self.runs.items() if run.algorithm == algorithm)
-        return next(found, None)
+    def find(
+        self, algorithm: str, changed: Mapping[str, Any] | None = None
+    ) -> tuple[str, Run] | None:
+        """Return the name and the first run of an algorithm; None without one.
+
+        Args:
+            algorithm: Name of the algorithm.
+            changed: Its changed hyperparameters; none by default.
+        """
+        wanted = (algorithm, changed or {})
+        for name, run in self.runs.items():
+            if (run.algorithm, run.changed) == wanted:
+                return name, run
+        return None
 
 
 def read_run(directory: Path) -> Run:
@@ -176,7 +197,7 @@ def read_run(directory: Path) -> Run:
         )
     path = directory / "summary.json"
     lists: dict[str, Any] = dict.fromkeys(("nodes", "groups", "group_purity"), list | None)
-    summary = read_json(path, lists) if path.exists() else {}
+    summary = read_json(path, {**lists, "changed": dict | None}) if path.exists() else {}
     return Run(directory, config, summary, read_curves(directory / "eval.csv", tasks))
 
 
@@ -250,9 +271,16 @@ def read_settings(
 
 def _setting(runs: list[Run], anyway: bool) -> Setting:
     order = {name: place for place, name in enumerate(NAMES)}
-    runs = sorted(runs, key=lambda run: (order.get(run.algorithm, len(order)), run.directory))
+    runs = sorted(
+        runs,
+        key=lambda run: (
+            order.get(run.algorithm, len(order)),
+            bool(run.changed),
+            run.directory,
+        ),
+    )
     runs, notes = under_equal_conditions(runs, anyway=anyway)
-    names = [NAMES.get(run.algorithm, run.algorithm) for run in runs]
+    names = [run.title for run in runs]
     return Setting(
         {
             name if names.count(name) == 1 else f"{name} ({run.directory.name})": run

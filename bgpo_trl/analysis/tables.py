@@ -206,7 +206,7 @@ def sequence_table(setting: Setting, reference: Setting | None) -> Table:
             best,
             metrics.backward_transfer(matrix).mean(1),
         )
-        beside = reference.find(run.algorithm) if reference is not None else None
+        beside = reference.find(run.algorithm, run.changed) if reference is not None else None
         forward = forward_transfer(run, beside[1]) if beside else None
         cells = [statistics.mean(scores).points() for scores in measured]
         rows.append([name, *cells, forward.points() if forward else "-"])

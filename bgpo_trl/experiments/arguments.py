@@ -97,8 +97,8 @@ class Arguments(BankArguments):
     """Half of the held-out demonstrations to test on: validation, the default, to choose settings;
     test to report results."""
     resume: bool = False
-    """Continue the run in the directory, or begin it if there is none. With --out and neither
-    --preset nor --config, its settings are those of the run."""
+    """Continue the run in the directory, or begin it if there is none. With --out, or in a run's
+    folder, and with neither --preset nor --config, its settings are those of the run."""
     train_encoders: bool = False
     """Record demonstrations and train new encoders instead of using the pretrained ones."""
     wandb: Literal["online", "offline"] | None = None

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import chain, combinations
 from pathlib import Path
+from shlex import quote
 from typing import Annotated, Any
 
 import pandas as pd
@@ -54,7 +55,8 @@ def merge(arguments: MergeArguments) -> str:
         _check_target(out, runs)
         merge_runs(runs, out)
     seeds = read_json(out / "config.json")["seeds"]
-    return f"{out}: seeds {' '.join(map(str, seeds))}; tables and figures: bgpo report {out}"
+    report = f"bgpo report {quote(str(out))}"
+    return f"{out}: seeds {' '.join(map(str, seeds))}; tables and figures: {report}"
 
 
 def _check_target(out: Path, runs: Sequence[Path]) -> None:

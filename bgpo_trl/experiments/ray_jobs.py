@@ -19,6 +19,7 @@ from bgpo_trl.configs import RunConfig
 from bgpo_trl.files.locking import lock_directory
 from bgpo_trl.files.progress import progress_bar
 from bgpo_trl.files.writing import no_link
+from bgpo_trl.runs.directory import CSV_FILES
 
 try:
     import ray
@@ -147,7 +148,7 @@ def play_jobs(
     )(work)
     pending = {task.remote(job, play, sys.argv): job for job in jobs}
     failed: dict[Job, str] = {}
-    total = sum(len(job.config.seeds) * job.config.episodes for job in jobs)
+    total = sum(map(_planned_episodes, jobs))
     with progress_bar("sweep", total=total, initial=_episodes(jobs), unit="episode") as bar:
         try:
             while pending:
@@ -167,9 +168,17 @@ def play_jobs(
     return failed
 
 
+def _planned_episodes(job: Job) -> int:
+    """Return the number of training episodes of a run and of test episodes between them."""
+    config = job.config
+    evaluations = range(config.eval_every, config.episodes + 1, config.eval_every)
+    tested = sum(start < episode for episode in evaluations for start in config.task_starts)
+    return len(config.seeds) * (config.episodes + config.eval_episodes * tested)
+
+
 def _episodes(jobs: Iterable[Job]) -> int:
-    """Return the number of training episodes on record."""
-    files = (job.directory / "train.csv" for job in jobs)
+    """Return the number of these episodes on record."""
+    files = (job.directory / name for job in jobs for name in CSV_FILES)
     return sum(max(0, path.read_bytes().count(b"\n") - 1) for path in files if path.exists())
 
 

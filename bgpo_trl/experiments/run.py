@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
+from shlex import quote
 
 import torch
 from torchrl.record.loggers.common import Logger
@@ -18,7 +19,14 @@ from bgpo_trl.encoders.train import make_pretrained
 from bgpo_trl.experiments.arguments import Arguments, BankArguments
 from bgpo_trl.experiments.measure import draw, measure
 from bgpo_trl.experiments.records import command
-from bgpo_trl.experiments.settings import as_begun, chosen_scene, chosen_tasks, is_finished
+from bgpo_trl.experiments.settings import (
+    as_begun,
+    changed_hyperparameters,
+    chosen_scene,
+    chosen_tasks,
+    is_finished,
+    named_directory,
+)
 from bgpo_trl.files.locking import lock_directory
 from bgpo_trl.files.writing import write_json
 from bgpo_trl.machine import choose_device, keep_freed_memory, set_threads
@@ -27,7 +35,7 @@ from bgpo_trl.runs.config_file import read_config
 from bgpo_trl.runs.dashboard import tensorboard_logger, wandb_logger
 from bgpo_trl.runs.demonstrations import BANK, load_inputs, own_weights
 from bgpo_trl.runs.directory import holds_run
-from bgpo_trl.runs.provenance import commit_of_code
+from bgpo_trl.runs.provenance import commit_of_code, versions
 from bgpo_trl.scenes import Scene, find_scene
 from bgpo_trl.training import Trainer
 
@@ -45,8 +53,9 @@ def run_experiment(
     In addition to the files of `Trainer`, the run directory gets ``final.csv`` (success of the
     trained policies with demonstrations seen in training and with held-out ones, and task
     inference), ``gwr.csv`` (nodes of the first seed's GWR-B), ``figures/`` (including a video of a
-    test episode of each task; also on dashboards) and finally ``summary.json`` (commit, command,
-    success of a random policy, nodes of GWR-B, groups of behaviors).
+    test episode of each task; also on dashboards) and finally ``summary.json`` (commit,
+    versions of packages, changed hyperparameters, command, success of a random policy, nodes of
+    GWR-B, groups of behaviors).
 
     Args:
         arguments: Arguments of the command line.
@@ -75,7 +84,7 @@ def run_experiment(
     rl = "" if usual else f"-{config.algorithm.rl.name}"
     size = arguments.preset or (arguments.config.stem if arguments.config else "quick")
     group = f"{name}-{config.name}{rl}"
-    out = arguments.out or Path("runs") / f"{group}-{size}"
+    out = named_directory(arguments) or Path("runs") / f"{group}-{size}"
     loggers = _loggers(arguments, config, out, group, size)
     if arguments.resume:
         config = _continued(arguments, config, out)
@@ -97,13 +106,15 @@ def run_experiment(
             per_seed_curves=arguments.per_seed_curves,
         ) as trainer:
             trainer.run()
-            summary = {"commit": commit, **measure(trainer, bank, out)}
+            code = {"commit": commit, "versions": versions()}
+            changed = changed_hyperparameters(config)
+            summary = {**code, "changed": changed, **measure(trainer, bank, out)}
             lines = draw(trainer, bank, out, summary["random_success"])
             for path in sorted((out / "figures").iterdir()):
                 trainer.dashboard.log_media(f"figures/{path.stem}", path)
             # Written last, as the mark of a complete run.
             write_json(out / "summary.json", summary)
-    lines.append(f"curve and figures: {out}; in numbers: bgpo report {out}")
+    lines.append(f"curve and figures: {out}; in numbers: bgpo report {quote(str(out))}")
     return "\n".join(lines)
 
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import tyro
 
@@ -13,6 +13,7 @@ from bgpo_trl.configs import PRESETS, RunConfig
 from bgpo_trl.experiments.arguments import Arguments
 from bgpo_trl.plugins import import_plugin
 from bgpo_trl.runs.config_file import read_config, read_settings
+from bgpo_trl.runs.directory import differing_settings
 from bgpo_trl.runs.results import read_json
 from bgpo_trl.scenes import Scene, find_scene
 from bgpo_trl.seeding import check_seeds
@@ -71,8 +72,9 @@ def _begin(arguments: Arguments) -> RunConfig:
 
     path, preset = arguments.config, PRESETS[arguments.preset or "quick"]
     if path is None:
-        stored = arguments.resume and arguments.preset is None and arguments.out is not None
-        path = arguments.out / "config.json" if stored and arguments.out is not None else None
+        out = named_directory(arguments)
+        stored = arguments.resume and arguments.preset is None and out is not None
+        path = out / "config.json" if stored and out is not None else None
         if path is None or not path.exists():
             return replace(preset, algorithm=ALGORITHMS[preset.name].config)
     path = path / "config.json" if path.is_dir() else path
@@ -83,6 +85,20 @@ def _begin(arguments: Arguments) -> RunConfig:
     if isinstance(name, str) and name in ALGORITHMS:
         preset = replace(preset, name=name, algorithm=ALGORITHMS[name].config)
     return read_config(path, defaults=preset)[0]
+
+
+def named_directory(arguments: Arguments) -> Path | None:
+    """Return the run directory that a command line names.
+
+    It is ``--out`` or, with ``--resume`` and neither ``--preset`` nor ``--config``, the current
+    folder if it holds a run.
+    """
+    given = (arguments.out, arguments.preset, arguments.config)
+    if arguments.resume and given == (None, None, None):
+        here = Path.cwd()
+        if all((here / name).exists() for name in ("config.json", "train.csv")):
+            return here
+    return arguments.out
 
 
 def _with_algorithm(config: RunConfig, arguments: Arguments) -> RunConfig:
@@ -194,6 +210,24 @@ def as_begun(config: RunConfig, directory: Path, *, keep_eval_every: bool = Fals
         return config
     every = config.eval_every if keep_eval_every else saved.eval_every
     return replace(config, task_starts=saved.task_starts, eval_every=every)
+
+
+def changed_hyperparameters(config: RunConfig) -> dict[str, Any]:
+    """Return the hyperparameters of a run that are not the usual ones of its algorithm, by name."""
+    from bgpo_trl.algorithms import ALGORITHMS
+    from bgpo_trl.algorithms.rl import RL
+
+    if config.name not in ALGORITHMS:
+        return {}
+    usual, rl = ALGORITHMS[config.name].config, config.algorithm.rl.name
+    changed = {}
+    if rl != usual.rl.name and rl in RL:
+        changed, usual = {"rl.name": rl}, replace(usual, rl=RL[rl].config)
+    scene = find_scene(config.scene)
+    if scene.name != RunConfig().scene:
+        usual = _in_scene(replace(config, algorithm=usual), scene).algorithm
+    different = differing_settings(asdict(usual), asdict(config.algorithm))
+    return changed | {name: value for name, _, value in different}
 
 
 def is_finished(directory: Path, config: RunConfig) -> bool:

@@ -8,6 +8,7 @@ import uuid
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
+from shlex import quote
 from typing import Any, Literal, Self
 
 import pandas as pd
@@ -196,7 +197,7 @@ def wandb_logger(
             raise RuntimeError(f"wandb cannot write its files: {_reason(error)}") from error
         warnings.warn(
             f"wandb does not answer ({_reason(error)}): logging offline, upload it with "
-            f"`wandb sync {identity.parent}/offline-run-*`",
+            f"`wandb sync {quote(str(identity.parent))}/offline-run-*`",
             stacklevel=2,
         )
     return wandb_logger(directory, "offline", group=group, tags=tags)

@@ -95,9 +95,9 @@ class SimulationEnv(EnvBase):
 
     Writes at reset and step: ``"pixels"`` uint8 ``[*B, H, W, 3]`` and/or ``"state"`` float32
     ``[*B, N]``; ``"task"`` int64 ``[*B]``, an index into ``tasks``; ``"success"`` bool
-    ``[*B, 1]``. Reads ``"action"`` float32 ``[*B, A]`` in [-1, 1]. ``"reward"`` is 1 on success,
-    else 0; ``"terminated"`` and ``"done"`` are success or failure, ``"truncated"`` is never set
-    here.
+    ``[*B, 1]``. Reads ``"action"`` float32 ``[*B, A]`` in [-1, 1]; numbers beyond count as its
+    ends. ``"reward"`` is 1 on success, else 0; ``"terminated"`` and ``"done"`` are success or
+    failure, ``"truncated"`` is never set here.
 
     An optional boolean entry ``"_step"`` ``[*B]`` selects the simulations that advance; the others
     repeat their last observation.
@@ -278,7 +278,7 @@ class SimulationEnv(EnvBase):
                 "policy chose it, learning has diverged, lower its learning rate"
             )
         rewards = np.zeros((len(rows), 1), np.float32)
-        self._advance(np.flatnonzero(rows).tolist(), actions, rewards)
+        self._advance(np.flatnonzero(rows).tolist(), actions.clip(-1.0, 1.0), rewards)
         reward = torch.from_numpy(rewards).reshape(*self.batch_size, 1)
         return TensorDict({**self._observe(), "reward": reward}, self.batch_size, self.device)
 

@@ -56,6 +56,21 @@ def test_runs_of_one_algorithm_are_named_by_their_directories(tmp_path):
     assert list(setting.runs) == ["BGPO (beta)", "BGPO (plain)"]
 
 
+def test_changed_hyperparameters_are_part_of_a_name(tmp_path):
+    """The plain run comes first, though its directory does not."""
+    changed = write_run(tmp_path, "bgpo", 8, directory="a")
+    edit(changed / "summary.json", changed={"beta": 0.2, "rl.name": "td3"})
+    plain = write_run(tmp_path, "bgpo", 8, directory="b")
+    (setting,) = settings_in(tmp_path)[0].values()
+    assert {name: run.directory for name, run in setting.runs.items()} == {
+        "BGPO": plain,
+        "BGPO, beta 0.2, rl.name td3": changed,
+    }
+    assert setting.find("bgpo") == ("BGPO", setting.runs["BGPO"])
+    (alone,) = settings_in(changed)[0].values()
+    assert alone.find("bgpo") is None
+
+
 @pytest.mark.parametrize(
     ("what", "ours", "theirs"),
     [

@@ -1,9 +1,11 @@
 """The paper's experiments: what they run and which files they write."""
 
 import csv
+import importlib.metadata
 import json
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -32,10 +34,11 @@ WITHOUT_GWR += ("without-gwr", "without-both")
 
 
 def test_an_experiment_writes_curves_figures_and_a_summary(tiny, tmp_path):
-    run = tmp_path / "run"
+    run = tmp_path / "a run"
     printed = concurrent(Arguments(out=run))
     assert "GWR-B nodes: [" in printed and "groups of behaviors: [" in printed
     assert f"curve and figures: {run}" in printed
+    assert shlex.split(printed)[-3:] == ["bgpo", "report", str(run)]
     for name in ("success.png", "gwr.png", "gwr_growth.png", "groups.png", "episodes.png"):
         assert (run / "figures" / name).read_bytes().startswith(b"\x89PNG")
     assert json.loads((run / "config.json").read_text())["task_starts"] == [0, 0, 0]
@@ -50,6 +53,7 @@ def test_an_experiment_writes_curves_figures_and_a_summary(tiny, tmp_path):
     assert tests["task_inference"].between(0, 1).all()
     summary = json.loads((run / "summary.json").read_text())
     assert re.fullmatch(r"|[0-9a-f]{7,}(-dirty)?", summary["commit"])
+    assert summary["versions"]["torch"] == importlib.metadata.version("torch")
     assert summary["random_success"] == pytest.approx(
         dict(zip(TASKS, [0.1, 0.2, 0.3], strict=True))
     )
@@ -157,8 +161,8 @@ def test_a_finished_run_is_only_changed_by_making_it_longer(undrawn, tmp_path, m
     assert printed.startswith(f"{run} is finished, all 9 episodes")
 
 
-def test_resume_with_the_directory_alone_takes_the_settings_of_the_run(undrawn, tmp_path):
-    """A run of other settings than the preset's, also when it is extended."""
+def test_resume_alone_takes_the_settings_of_the_run(undrawn, tmp_path, monkeypatch):
+    """A run of other settings than the preset's, also when it is extended, and in its folder."""
     run = tmp_path / "run"
     begun = Arguments(
         out=run, algorithm="bgpo-single", episodes=4, hyperparameters=("--algorithm.beta", "0.3")
@@ -175,7 +179,11 @@ def test_resume_with_the_directory_alone_takes_the_settings_of_the_run(undrawn, 
     before = contents(run)
     with pytest.raises(ValueError, match="holds a run with other settings"):
         continual(replace(alone, algorithm="bgpo"))
+    monkeypatch.chdir(run)
+    assert continual(Arguments(resume=True)).startswith(f"{run} is finished, all 5 episodes")
     assert contents(run) == before
+    changed = json.loads((run / "summary.json").read_text())["changed"]
+    assert changed == {"beta": 0.3}
 
 
 def test_a_run_that_does_not_exist_begins_when_it_is_resumed(undrawn, tmp_path):

@@ -284,6 +284,7 @@ def test_merged_blocks_of_real_runs_equal_one_run_of_all_seeds(
         for name in ("config.json", "train.csv", "eval.csv"):
             (job.directory / name).unlink()
         Trainer(job.config, job.directory, bank=bank, encoders=encoders, progress=False).run()
+        assert jobs._episodes([job]) == jobs._planned_episodes(job)
         return job.directory
 
     whole = train("whole", (8, 3))

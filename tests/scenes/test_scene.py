@@ -82,6 +82,13 @@ def test_an_environment_of_a_simulation_keeps_the_promises_to_torchrl():
     assert not env.reset()["done"].any()
 
 
+def test_actions_beyond_the_range_count_as_its_ends():
+    env = scene().simulate(TASKS, batch_size=1)
+    state, start = env.reset(), env.simulations[0].place
+    env.step(state.set("action", torch.tensor([[-3.0]])))
+    assert env.simulations[0].place == start - 0.5
+
+
 def test_a_failed_episode_is_no_success_of_random_actions():
     falling = scene(lambda: Falling())
     rate = evaluate_random_policy(tasks=TASKS, episodes=4, max_steps=12, scene=falling)
