@@ -15,13 +15,15 @@ def make_folder(path: str | os.PathLike[str]) -> Path:
     """Make a folder and its parents unless they exist.
 
     Raises:
-        OSError: If it cannot be made, for example because a file has that name.
+        OSError: If it cannot be made, for example because a file has that name, or is read-only.
     """
     path = Path(path)
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OSError(f"cannot make the folder {path} ({error.strerror}): choose another") from None
+    if not os.access(path, os.W_OK):
+        raise PermissionError(f"the folder {path} is read-only: choose another, such as by --out")
     return path
 
 

@@ -1,5 +1,8 @@
 """Reports and comparisons of runs with success written by hand."""
 
+import os
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -217,6 +220,18 @@ def test_a_run_alone_is_reported_in_its_directory(tmp_path):
     assert "## Differences" not in text_of(run)
     assert (run / "continual-bgpo-groups.png").exists()
     assert list(rows_of(text_of(run), f"BGPO: {ONE_AFTER_THE_OTHER}")) == [*TASKS, "all"]
+
+
+def test_a_run_that_is_read_only_is_reported_elsewhere(tmp_path, monkeypatch):
+    run = write_run(tmp_path, "bgpo", 9, starts=STARTS)
+    before = contents(run)
+    # For root, permissions would not make it so.
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != run)
+    with pytest.raises(PermissionError, match=r"read-only.*--out"):
+        report(ReportArguments((run,)))
+    report(ReportArguments((run,), out=tmp_path / "report"))
+    assert "## BGPO: " in text_of(tmp_path / "report")
+    assert contents(run) == before
 
 
 def test_tests_too_rare_for_phases_leave_that_table_out(tmp_path):
