@@ -87,6 +87,8 @@ class Arguments(BankArguments):
     episodes: int | None = None
     """Training episodes; the preset's by default. The task starts are scaled in proportion. With
     --resume, a larger number extends the run, whose task starts are kept."""
+    task_starts: tuple[int, ...] | None = None
+    """Episodes after which tasks are presented, one for each; the preset's by default."""
     eval_every: int | None = None
     """Training episodes between evaluations; the preset's by default."""
     eval_episodes: int | None = None

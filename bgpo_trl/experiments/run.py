@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from shlex import quote
@@ -158,7 +159,10 @@ def _continued(arguments: Arguments, config: RunConfig, out: Path) -> RunConfig:
             f"{out} holds the beginning of new encoders: add --train-encoders, or name another "
             "directory"
         )
-    return as_begun(config, out, keep_eval_every=arguments.eval_every is not None)
+    continued = as_begun(config, out, keep_eval_every=arguments.eval_every is not None)
+    if arguments.task_starts is not None:  # the run's, or `Trainer` refuses them
+        continued = replace(continued, task_starts=arguments.task_starts)
+    return continued
 
 
 def _encoders(

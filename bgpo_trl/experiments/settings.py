@@ -22,6 +22,7 @@ _Entry = TypeVar("_Entry")
 # Flags of the settings of the same name.
 _PLAIN = (
     "seeds",
+    "task_starts",
     "schedule",
     "spread",
     "eval_every",
@@ -55,6 +56,8 @@ def run_config(arguments: Arguments, *, from_start: bool = False) -> RunConfig:
     given = {name: getattr(arguments, name) for name in _PLAIN}
     config = replace(config, **{name: value for name, value in given.items() if value is not None})
     if from_start:
+        if any(arguments.task_starts or ()):
+            raise ValueError("--task-starts: all tasks are presented from the start here")
         config = at_once(config)
     if arguments.hyperparameters:
         config = tyro.cli(RunConfig, default=config, args=arguments.hyperparameters)

@@ -76,6 +76,7 @@ def test_another_length_scales_the_task_starts(preset, episodes, starts, eval_ev
     "changes",
     [
         {"seeds": (7, 9)},
+        {"task_starts": (0, 5, 5)},
         {"schedule": "sequential"},
         {"spread": 0.5, "held_out": "test"},
         {"eval_every": 7, "eval_episodes": 3, "checkpoint_minutes": 1.0},
@@ -230,6 +231,7 @@ def test_a_file_that_is_damaged_or_has_wrong_settings_is_refused(tmp_path, conte
         {"episodes": 0},
         {"seeds": ()},
         {"seeds": (2, 2)},
+        {"task_starts": (0, 5)},
         {"episodes": 10, "eval_every": 50},
         {"tasks": ()},
         {"tasks": ("dance",)},
@@ -244,3 +246,8 @@ def test_a_file_that_is_damaged_or_has_wrong_settings_is_refused(tmp_path, conte
 def test_wrong_settings_are_refused(wrong):
     with pytest.raises(ValueError):
         run_config(Arguments(**wrong))
+
+
+def test_task_starts_are_refused_where_all_tasks_begin_at_once():
+    with pytest.raises(ValueError, match="--task-starts"):
+        run_config(Arguments(task_starts=(0, 5, 5)), from_start=True)
