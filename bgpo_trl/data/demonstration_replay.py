@@ -95,11 +95,14 @@ class DemonstrationReplay:
             ``"action"``, ``"priority_weight"``, ``"demonstrated"`` (true) and, under ``"next"``,
             the state, ``"reward"`` and ``"terminated"``.
         """
-        shown = self._shown.sample(group)
-        steps = self._steps
+        shown, steps = self._shown.draw(group), self._steps
         share = draw_for_rows(torch.rand, group, self._generators, dtype=torch.float64)
         number = shown["demo_index"]
-        constants = shown if self._own_constants else self._shown.sample(group)
+        constants = (
+            shown
+            if self._own_constants
+            else self._shown.draw(group, keys=[*self._constant_keys])
+        )
         n_steps = steps.length[number] - 1
         step = (share * n_steps).long()
         frame = steps.first[number] + step

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -66,8 +67,7 @@ class GroupReplay:
                 "capacity and the number of generators must be at least 1, got "
                 f"{capacity} and {n_seeds}"
             )
-        self._seed = torch.arange(n_seeds)
-        self._n_added = torch.zeros(n_seeds, dtype=torch.int64)
+        self._n_added = [0] * n_seeds
         # Transition t of seed i is row (t % capacity) * n_seeds + i, so that a step of all seeds is
         # one block and a row has a single index, for which torch has its fastest kernels.
         self._rows: dict[Any, Tensor] = {}  # by key
@@ -76,7 +76,7 @@ class GroupReplay:
 
     def __len__(self) -> int:
         """Return the smallest number of transitions held for a seed."""
-        return min(int(self._n_added.min()), self.capacity)
+        return min(*self._n_added, self.capacity)
 
     def sizes(self, group: Tensor) -> Tensor:
         """Return the number of transitions held of each of the groups ``[S, G]``."""
@@ -101,18 +101,23 @@ class GroupReplay:
             ValueError: If an entry is missing, or differs in shape or dtype from those stored; if a
                 group is negative.
         """
-        entries = self._checked(transition, group, mask)
+        chosen = None if mask is None else mask.nonzero().flatten()
+        numbers = group.tolist()
+        entries = self._checked(transition, numbers, mask)
         for key, entry in entries.items():
             if key not in self._rows:
                 self._rows[key] = self._allocate(entry.shape[1:], entry.dtype)
-        rows = self._n_added % self.capacity * len(self._generators) + self._seed
-        chosen = self._seed if mask is None else mask.nonzero().flatten()
-        self._group[rows[chosen]] = group[chosen]
-        for key, stored in self._rows.items():
-            stored.index_copy_(0, rows[chosen], entries[key][chosen])
-        for seed in chosen.tolist():
-            self._index[seed].append(int(group[seed]), int(self._n_added[seed]))
-        self._n_added[chosen] += 1
+        n_seeds = len(self._generators)
+        seeds = range(n_seeds) if chosen is None else chosen.tolist()
+        rows = torch.tensor(
+            [self._n_added[seed] % self.capacity * n_seeds + seed for seed in seeds],
+            dtype=torch.int64,
+        )
+        for stored, entry in [(self._group, group), *((self._rows[k], entries[k]) for k in entries)]:
+            stored.index_copy_(0, rows, entry if chosen is None else entry[chosen])
+        for seed in seeds:
+            self._index[seed].append(numbers[seed], self._n_added[seed])
+            self._n_added[seed] += 1
 
     def sample(
         self,
@@ -136,34 +141,53 @@ class GroupReplay:
         Raises:
             ValueError: If one of these seeds holds no transition and has a row with a group.
         """
+        return TensorDict(self.draw(group, seeds=seeds, generator=generator), group.shape)
+
+    def draw(
+        self,
+        group: Tensor,
+        *,
+        seeds: Sequence[int] | None = None,
+        generator: Sequence[torch.Generator] | None = None,
+        keys: Collection[NestedKey] | None = None,
+    ) -> dict[NestedKey, Tensor]:
+        """Return the entries of `sample` by key, or only some of them, without a TensorDict."""
         seeds = range(len(self._generators)) if seeds is None else seeds
         empty = [i for i, seed in enumerate(seeds) if not self._n_added[seed]]
-        if group[empty].ge(0).any():
+        if empty and group[empty].ge(0).any():
             raise ValueError("every seed needs a transition before the first sample")
         sources = [self._generators[seed] for seed in seeds] if generator is None else generator
-        flat = group.flatten(1)
-        steps, weight = np.empty(flat.shape, np.int64), np.ones(flat.shape, np.float32)
-        shares_of_all = draw_for_rows(torch.rand, flat, sources, dtype=torch.float64).numpy()
-        wanted = flat.numpy()
-        oldest = self._oldest()
+        rows, weight = self._located(group.flatten(1), seeds, sources)
+        drawn: dict[NestedKey, Tensor] = {}
+        for key, stored in self._rows.items():
+            if (key != self._source_key or key in self._keys) and (keys is None or key in keys):
+                entry = stored.index_select(0, rows).view(*group.shape, *stored.shape[1:])
+                for i in empty:
+                    entry[i] = 0  # the NaN of uninitialized memory would outlast a weight of 0
+                drawn[key] = entry
+        drawn["priority_weight"] = weight.view(group.shape)
+        return drawn
+
+    def _located(
+        self, group: Tensor, seeds: Sequence[int], sources: Sequence[torch.Generator]
+    ) -> tuple[Tensor, Tensor]:
+        """Draw rows of the buffer for groups ``[S, R]``; return them, ``[S * R]``, and weights."""
+        shares_of_all = draw_for_rows(torch.rand, group, sources, dtype=torch.float64).numpy()
+        oldest, wanted = self._oldest(), group.numpy()
+        steps, weight = np.empty(wanted.shape, np.int64), np.ones(wanted.shape, np.float32)
         for i, (seed, shares) in enumerate(zip(seeds, shares_of_all, strict=True)):
-            for number in np.unique(wanted[i]).tolist():
-                rows = wanted[i] == number
+            numbers = {*wanted[i].tolist()}
+            for number in numbers:
+                rows = slice(None) if len(numbers) == 1 else wanted[i] == number
                 held = self._index[seed].steps_of(number, oldest[seed])
                 if len(held):
                     steps[i, rows] = held[(shares[rows] * len(held)).astype(np.int64)]
                 else:
                     steps[i, rows], weight[i, rows] = oldest[seed], 0.0
-        columns = self._seed[list(seeds)].unsqueeze(-1)
-        rows = (torch.from_numpy(steps) % self.capacity * len(self._generators) + columns).view(-1)
-        batch = TensorDict(batch_size=group.shape)
-        for key, stored in self._rows.items():
-            if key != self._source_key or key in self._keys:
-                drawn = stored.index_select(0, rows)
-                batch.set(key, drawn.view(*group.shape, *stored.shape[1:]))
-        for i in empty:
-            batch[i].zero_()  # the NaN of uninitialized memory would outlast a weight of 0
-        return batch.set("priority_weight", torch.from_numpy(weight).view(group.shape))
+        steps %= self.capacity
+        steps *= len(self._generators)
+        steps += np.array(seeds)[:, None]
+        return torch.from_numpy(steps).view(-1), torch.from_numpy(weight)
 
     def contents(self, seed: int) -> tuple[TensorDict, Tensor]:
         """Copy all transitions held for a seed, oldest first, and the group of each, ``[N]``."""
@@ -197,7 +221,8 @@ class GroupReplay:
 
     def state_dict(self) -> dict[str, Any]:
         """Return the filled part of the buffer (a copy) and the states of the generators."""
-        sizes = self._n_added.clamp(max=self.capacity)
+        n_added = torch.tensor(self._n_added)
+        sizes = n_added.clamp(max=self.capacity)
         longest, n_seeds = int(sizes.max()), len(self._generators)
         # Zeros replace the uninitialized rows of seeds that hold fewer transitions.
         empty = (torch.arange(longest).unsqueeze(-1) >= sizes).view(-1)
@@ -208,7 +233,7 @@ class GroupReplay:
             rows.set(key, filled)
         return {
             "capacity": self.capacity,
-            "n_added": self._n_added.clone(),
+            "n_added": n_added,
             "generators": torch.stack([g.get_state() for g in self._generators]),
             "rows": rows.to_dict(),
         }
@@ -230,18 +255,18 @@ class GroupReplay:
             self._rows[key] = self._allocate(saved.shape[1:], saved.dtype)
             self._rows[key][: len(saved)] = saved
         self._group = self._rows.pop(_GROUP)
-        self._n_added = n_added.clone()
+        self._n_added = n_added.tolist()
         for generator, state in zip(self._generators, state_dict["generators"], strict=True):
             generator.set_state(state.clone())
         self._index = [self._indexed(seed) for seed in range(len(self._generators))]
 
     def _oldest(self) -> list[int]:
         """Return the step of the oldest transition held for each seed, counted from 0."""
-        return (self._n_added - self.capacity).clamp(min=0).tolist()
+        return [max(0, n_added - self.capacity) for n_added in self._n_added]
 
     def _held(self, seed: int) -> Tensor:
         """Return the rows of all transitions held for a seed, oldest first."""
-        end = int(self._n_added[seed])
+        end = self._n_added[seed]
         steps = torch.arange(max(0, end - self.capacity), end)
         return steps % self.capacity * len(self._generators) + seed
 
@@ -252,7 +277,7 @@ class GroupReplay:
         return index
 
     def _checked(
-        self, transition: TensorDictBase, group: Tensor, mask: Tensor | None
+        self, transition: TensorDictBase, numbers: Sequence[int], mask: Tensor | None
     ) -> dict[Any, Tensor]:
         """Return the entries to store; raise ``ValueError`` if one does not fit."""
         n_seeds = len(self._generators)
@@ -263,12 +288,20 @@ class GroupReplay:
             )
         if mask is not None and (mask.shape != (n_seeds,) or mask.dtype != torch.bool):
             raise ValueError(f"mask must be bool [{n_seeds}], got {mask.dtype} {[*mask.shape]}")
-        if not (group if mask is None else group[mask]).ge(0).all():
-            raise ValueError(f"a group must be at least 0, got {group.tolist()}")
+        stored_numbers = numbers if mask is None else compress(numbers, mask.tolist())
+        if min(stored_numbers, default=0) < 0:
+            raise ValueError(f"a group must be at least 0, got {numbers}")
         keys = [*self._keys, *([] if self._source_key is None else [self._source_key])]
-        if any(key not in transition.keys(True) for key in keys):
-            raise missing_key("GroupReplay", transition, keys)
-        entries: dict[Any, Tensor] = dict(transition.select(*keys).items(True, True))
+        entries: dict[Any, Tensor] = {}
+        for key in keys:
+            entry = transition.get(key, None)
+            if entry is None:
+                raise missing_key("GroupReplay", transition, keys)
+            if isinstance(entry, TensorDictBase):
+                parts = TensorDict({key: entry}, entry.batch_size[:1])
+                entries |= dict(parts.items(True, True))
+            else:
+                entries[key] = entry
         for key, stored in self._rows.items():
             entry = entries.get(key)
             if entry is None or entry.shape[1:] != stored.shape[1:] or entry.dtype != stored.dtype:
@@ -296,9 +329,14 @@ def draw_for_rows(
     Rows without a group (-1) get 0 and consume no random numbers, so a seed's draws do not depend
     on how many slots are free. ``draw`` is :func:`torch.rand` or :func:`torch.randn`.
     """
+    wanted = group >= 0
+    if wanted.all():
+        n_rows = group[0].numel()
+        drawn = [draw(n_rows, *shape, generator=source, dtype=dtype) for source in generator]
+        return torch.stack(drawn).view(*group.shape, *shape)
     numbers = torch.zeros(*group.shape, *shape, dtype=dtype)
-    for of_seed, wanted, source in zip(numbers, group >= 0, generator, strict=True):
-        of_seed[wanted] = draw(int(wanted.sum()), *shape, generator=source, dtype=dtype)
+    for of_seed, rows, source in zip(numbers, wanted, generator, strict=True):
+        of_seed[rows] = draw(int(rows.sum()), *shape, generator=source, dtype=dtype)
     return numbers
 
 
