@@ -99,9 +99,7 @@ class DemonstrationReplay:
         share = draw_for_rows(torch.rand, group, self._generators, dtype=torch.float64)
         number = shown["demo_index"]
         constants = (
-            shown
-            if self._own_constants
-            else self._shown.draw(group, keys=[*self._constant_keys])
+            shown if self._own_constants else self._shown.draw(group, keys=[*self._constant_keys])
         )
         n_steps = steps.length[number] - 1
         step = (share * n_steps).long()

@@ -113,8 +113,9 @@ class GroupReplay:
             [self._n_added[seed] % self.capacity * n_seeds + seed for seed in seeds],
             dtype=torch.int64,
         )
-        for stored, entry in [(self._group, group), *((self._rows[k], entries[k]) for k in entries)]:
-            stored.index_copy_(0, rows, entry if chosen is None else entry[chosen])
+        self._group.index_copy_(0, rows, group if chosen is None else group[chosen])
+        for key, entry in entries.items():
+            self._rows[key].index_copy_(0, rows, entry if chosen is None else entry[chosen])
         for seed in seeds:
             self._index[seed].append(numbers[seed], self._n_added[seed])
             self._n_added[seed] += 1

@@ -157,6 +157,7 @@ class SimulationEnv(EnvBase):
         self._threads = RowPool(
             min(count, usable_cores() if threads is None else threads), "simulation"
         )
+        self._action_size = action_size
         self._task = np.zeros(count, dtype=np.int64)
         self._begun = np.zeros(count, dtype=bool)
         self._success, self._failure = np.zeros((2, count), dtype=bool)
@@ -265,7 +266,7 @@ class SimulationEnv(EnvBase):
         action = tensordict.get("action", None)
         if action is None:
             raise missing_key(type(self).__name__, tensordict, ["action"])
-        size = self.action_spec.shape[-1]
+        size = self._action_size
         if action.shape != (*self.batch_size, size):
             raise ValueError(f"actions must be {[*self.batch_size, size]}, got {[*action.shape]}")
         if not self._begun[rows].all():

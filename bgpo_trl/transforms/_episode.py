@@ -30,7 +30,7 @@ def ending(tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> Tenso
     """
     done = next_tensordict.get("done")
     was_done = tensordict.get("done", None)
-    ended = done if was_done is None else done & ~was_done
+    ended = done if was_done is None else done > was_done
     return ended.reshape(next_tensordict.batch_size)
 
 
@@ -210,11 +210,11 @@ class DemonstrationLookup(EpisodeTransform):
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         for key in self.out_keys:
-            next_tensordict.set(key, tensordict[key])
+            next_tensordict.set(key, tensordict.get(key))
         if self.learn:
             ended = ending(tensordict, next_tensordict)
             if ended.any():
-                self.network.adapt(tensordict[self.in_keys[0]], mask=ended)
+                self.network.adapt(tensordict.get(self.in_keys[0]), mask=ended)
         return next_tensordict
 
     def _demonstration_spec(self, observation_spec: Composite) -> TensorSpec:

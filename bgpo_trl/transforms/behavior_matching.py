@@ -91,17 +91,20 @@ class BehaviorMatchingReward(EpisodeTransform):
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         latent_key, behavior_key, reward_key = self.in_keys
         h_key, c_key, extrinsic_key, intrinsic_key = self.out_keys
-        h, c = tensordict[h_key], tensordict[c_key]
-        phi = self._read(next_tensordict[latent_key], h, c, next_tensordict)
+        h, c = tensordict.get(h_key), tensordict.get(c_key)
+        phi = self._read(next_tensordict.get(latent_key), h, c, next_tensordict)
         stepped = tensordict.get("_step", None)
         if stepped is not None:
             rows = stepped.reshape(*phi.shape[:-1], 1)
             for key, before in ((h_key, h), (c_key, c)):
-                next_tensordict.set(key, torch.where(rows, next_tensordict[key], before))
-        error = torch.linalg.vector_norm(tensordict[behavior_key] - phi, dim=-1)
-        extrinsic = next_tensordict[reward_key]
+                next_tensordict.set(key, torch.where(rows, next_tensordict.get(key), before))
+        extrinsic = next_tensordict.get(reward_key)
+        intrinsic = torch.zeros_like(extrinsic)
         ended = ending(tensordict, next_tensordict)
-        intrinsic = torch.where(ended, torch.exp(-error), 0).unsqueeze(-1).to(extrinsic.dtype)
+        if ended.any():
+            error = torch.linalg.vector_norm(tensordict.get(behavior_key) - phi, dim=-1)
+            bonus = torch.where(ended, torch.exp(-error), 0)
+            intrinsic = bonus.unsqueeze(-1).to(extrinsic.dtype)
         next_tensordict.set(extrinsic_key, extrinsic)
         next_tensordict.set(intrinsic_key, intrinsic)
         return next_tensordict.set(reward_key, extrinsic + self.beta * intrinsic)
@@ -109,7 +112,10 @@ class BehaviorMatchingReward(EpisodeTransform):
     def _read(self, z: Tensor, h: Tensor, c: Tensor, into: TensorDictBase) -> Tensor:
         # Simulations are on the CPU, even if the encoder is not.
         device = next(self.lae.parameters()).device
-        h, c = (x.to(z.device) for x in self.lae.step(z.to(device), h.to(device), c.to(device)))
+        if z.device == device:
+            h, c = self.lae.step(z, h, c)
+        else:
+            h, c = (x.to(z.device) for x in self.lae.step(z.to(device), h.to(device), c.to(device)))
         into.set(self.out_keys[0], h).set(self.out_keys[1], c)
         return h
 

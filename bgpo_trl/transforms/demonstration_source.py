@@ -248,7 +248,7 @@ class DemonstrationSource(EpisodeTransform):
         if next_tensordict.get(task_key, None) is None:
             own_keys.append(task_key)
         for key in own_keys:
-            next_tensordict.set(key, tensordict[key])
+            next_tensordict.set(key, tensordict.get(key))
         self.episode += ending(tensordict, next_tensordict)
         return next_tensordict
 

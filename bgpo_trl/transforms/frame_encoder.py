@@ -83,9 +83,10 @@ class FrameEncoder(Transform):
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         stepped = tensordict.get("_step", None)
+        if stepped is None:
+            return self._encode(next_tensordict, None, ())
         before = [tensordict.get(key, None) for key in self.out_keys]
-        rows = None if stepped is None else stepped.reshape(tensordict.batch_size)
-        return self._encode(next_tensordict, rows, before)
+        return self._encode(next_tensordict, stepped.reshape(tensordict.batch_size), before)
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
@@ -107,12 +108,13 @@ class FrameEncoder(Transform):
                 tensordict.set(out_key, latent)
             self._drop(tensordict)
         # TorchRL does not hand a reset the observation before it.
-        self._latest = [tensordict[key] for key in self.out_keys]
+        self._latest = [tensordict.get(key) for key in self.out_keys]
         return tensordict
 
     def _drop(self, tensordict: TensorDictBase) -> TensorDictBase:
         if self.del_keys:
-            tensordict.exclude(*self.in_keys, inplace=True)
+            for key in self.in_keys:
+                tensordict.pop(key)
         return tensordict
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:

@@ -100,6 +100,16 @@ class Environment(control.Environment):
             return timestep._replace(discount=0.0)
         return timestep
 
+    def advance(self, action: np.ndarray) -> bool:
+        """Advance one control step of an episode; return whether the task is solved.
+
+        It observes nothing, for those who draw frames and read states themselves.
+        """
+        self.task.before_step(action, self.physics)
+        self.physics.step(self._n_sub_steps)
+        self.task.after_step(self.physics)
+        return self.task.get_termination(self.physics) is not None
+
     def close(self) -> None:
         """Free the renderer, unless it is shared; the next frame creates a new one."""
         self.task.close()

@@ -32,7 +32,7 @@ class NicoSimulation(Simulation):
     Attributes:
         environments: Environment of each task.
         environment: That of the current one.
-        timestep: What the last step or reset has returned.
+        timestep: First time step of the episode.
         renderer: Renderer of the frames, which other simulations may share.
     """
 
@@ -67,8 +67,7 @@ class NicoSimulation(Simulation):
 
     def step(self, action: NDArray[np.float64]) -> Outcome:
         """Perform an action ``[4]``; an episode ends with success only."""
-        self.timestep = self.environment.step(action)
-        return Outcome(self.timestep.last())
+        return Outcome(self.environment.advance(action))
 
     def frame(self) -> NDArray[np.uint8]:
         """Return NICO's view, ``[32, 64, 3]``."""
@@ -82,7 +81,7 @@ class NicoSimulation(Simulation):
 
     def state(self) -> NDArray[Any]:
         """Return joints (rad), grip and object positions (m), ``[16]``."""
-        return self.timestep.observation["privileged_state"]
+        return self.environment.physics.privileged_state()
 
     def view(self) -> NDArray[np.uint8]:
         """Return NICO at the table, seen from the room, ``[280, 420, 3]``."""
