@@ -187,7 +187,9 @@ class Evaluator:
         presented = torch.stack([s.presented for s in snapshots])
         active = presented[:, :, None].expand(self.shape).clone()
         success, steps = torch.zeros(self.shape, dtype=torch.bool), torch.zeros(self.shape).long()
-        state = self.env.reset(TensorDict({"task": self._task}, self.shape))
+        # Episodes of tasks not yet presented do not begin, and are never drawn.
+        start = {"task": self._task, "_reset": active.unsqueeze(-1)}
+        state = self.env.reset(TensorDict(start, self.shape))
         watch()
         for _ in range(self.max_steps):
             seen = state[self._state_key].to(device)

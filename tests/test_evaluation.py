@@ -278,6 +278,8 @@ def test_only_tasks_that_were_presented_are_tested(make, starts):
         assert snapshot.episode == algorithm.world.source.episode[index] > 2
         assert (result.steps[index] > 0).all(-1).tolist() == presented
         assert not result.success[index, ~snapshot.presented].any()
+        frames = torch.from_numpy(evaluator.simulation.frames()[index])
+        assert frames.flatten(2).any(-1).all(-1).tolist() == presented  # others are never drawn
 
 
 @pytest.mark.parametrize(("episode", "presented"), [(1, 1), (2, 1), (3, 2), (4, 2), (5, 3)])

@@ -18,8 +18,8 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -27,6 +27,7 @@ import frames
 import torch
 import tyro
 import updates
+from steps import Steps
 from timing import Timing, interleave, ratio
 
 from bgpo_trl.algorithms.bgpo import BGPO
@@ -95,8 +96,8 @@ def measure_updates(arguments: Arguments) -> Table:
     }
 
 
-class Training:
-    """BGPO in training, as `bgpo_trl.training.Trainer` without logging and evaluation.
+class Training(Steps):
+    """BGPO in training on the paper's tasks, past its warm-up.
 
     Args:
         seeds: Seeds of the batch.
@@ -104,21 +105,11 @@ class Training:
 
     def __init__(self, seeds: range) -> None:
         encoders, bank = load_pretrained()
-        self.algorithm = BGPO(BGPOConfig(), seeds=seeds, bank=bank.seen(), encoders=encoders)
+        algorithm = BGPO(BGPOConfig(), seeds=seeds, bank=bank.seen(), encoders=encoders)
         schedule = TaskSchedule((0, 0, 0))
-        self.world = World(self.algorithm, seeds=seeds, schedule=schedule, bank=bank.seen())
-        self._background = ThreadPoolExecutor(1, "update")
-        self._state = self.world.env.reset()
-        while len(self.algorithm.replay) <= self.algorithm.config.rl.warmup_steps:
-            self.step()
-
-    def step(self) -> None:
-        """Take a step in all environments, with an update of all seeds."""
-        self._state = self.algorithm.act(self._state)
-        update = self._background.submit(self.algorithm.update)
-        transition, self._state = self.world.env.step_and_maybe_reset(self._state)
-        update.result()
-        self.algorithm.store(transition)
+        self.world = World(algorithm, seeds=seeds, schedule=schedule, bank=bank.seen())
+        super().__init__(algorithm, self.world)
+        self.play(algorithm.config.rl.warmup_steps + 1)
 
     def time_parts(self) -> dict[str, float]:
         """Time every part from now on; return seconds by part, a dict updated in place."""
@@ -156,11 +147,12 @@ def measure_step(arguments: Arguments) -> Table:
 
     def one_after_the_other() -> None:
         for single in singles:
-            single.step()
+            single.play(1)
 
     names = f"{arguments.seeds} seeds in a batch", f"{arguments.seeds} runs of one seed"
     times = interleave(
-        dict(zip(names, (batch.step, one_after_the_other), strict=True)), rounds=arguments.rounds
+        dict(zip(names, (partial(batch.play, 1), one_after_the_other), strict=True)),
+        rounds=arguments.rounds,
     )
     table: Table = {
         name: {
@@ -170,8 +162,7 @@ def measure_step(arguments: Arguments) -> Table:
         for name, taken in times.items()
     }
     seconds = batch.time_parts()
-    for _ in range(arguments.rounds):
-        batch.step()
+    batch.play(arguments.rounds)
     for part, spent in seconds.items():
         table[f"{names[0]}: {part}"] = {"ms a step of all": 1e3 * spent / arguments.rounds}
     return table
@@ -189,7 +180,7 @@ def measure_memory(arguments: Arguments) -> Table:
         if step % every == 0:
             count = len(training.algorithm.replay)
             marks.append((count, _resident(), count * arguments.seeds * transition_size))
-        training.step()
+        training.play(1)
     table: Table = {}
     _, first_resident, first_stored = marks[0]
     for stored_steps, resident, stored in marks:

@@ -9,8 +9,7 @@ learner has two hidden layers and layer norm in the critic, as in its runs.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -19,8 +18,6 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 from torchrl import objectives
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.data.replay_buffers.samplers import RandomSampler
-from torchrl.data.replay_buffers.storages import Storage
 from torchrl.modules import MLP, TanhModule, ValueOperator
 
 from bgpo_trl.algorithms.rl import LearnerSpec, make_learner
@@ -60,10 +57,6 @@ def contenders(seeds: int = 10, transitions: int = 50_000) -> dict[str, Contende
         "ours, 1 seed": (_repeat(single.update, 4), 4),
         f"ours, {seeds} seeds, without sampling": (lambda: fixed.learn(batch), seeds),
         "ours, 1 seed, without sampling": (_repeat(lambda: fixed_single.learn(batch_single), 4), 4),
-        f"ours, {seeds} seeds, TorchRL's buffer": (
-            _with_torchrl_buffer(stack, seeds, transitions),
-            seeds,
-        ),
         f"floor, {seeds} seeds, without sampling": (_on_tensors(floor, batch), seeds),
         "TorchRL loop": (_repeat(TorchRLLoop(transitions).update, 4), 4),
         "BGPO's learner, 2 seeds of 4 experts, without sampling": (bgpo_learner(2, 4), 2),
@@ -149,38 +142,6 @@ def bgpo_learner(seeds: int, experts: int) -> Callable[[], object]:
     batch = random_transitions(*shape, generator=torch.Generator().manual_seed(0))
     batch["demonstrated"] = torch.arange(shape[-1]).expand(shape) % 4 > 0
     return lambda: learner.learn(batch)
-
-
-class SeedSampler(RandomSampler):
-    """Uniform sampler of TorchRL's buffer for steps of ``S`` seeds stored as successive rows.
-
-    Args:
-        generators: Source of the sampled indices of each seed.
-    """
-
-    def __init__(self, generators: Sequence[torch.Generator]) -> None:
-        super().__init__()
-        self._generators = generators
-
-    def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[str, Any]]:
-        """Return rows of ``batch_size / S`` transitions of each seed, one seed after another."""
-        n_seeds = len(self._generators)
-        n_steps, share = len(storage) // n_seeds, batch_size // n_seeds
-        steps = [torch.randint(n_steps, (share,), generator=g) for g in self._generators]
-        return (torch.stack(steps) * n_seeds + torch.arange(n_seeds).unsqueeze(-1)).view(-1), {}
-
-
-def _with_torchrl_buffer(ours: Ours, seeds: int, transitions: int) -> Callable[[], object]:
-    """Return an update that samples from TorchRL's buffer instead."""
-    buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(transitions * seeds),
-        sampler=SeedSampler(generators(range(seeds), "replay")),
-        batch_size=BATCH * seeds,
-    )
-    generator = torch.Generator().manual_seed(0)
-    for _ in range(seeds):
-        buffer.extend(random_transitions(transitions, generator=generator))
-    return lambda: ours.learn(buffer.sample().view(seeds, BATCH))
 
 
 class Floor:

@@ -1,10 +1,10 @@
-"""An update of BGPO's learner in two versions of this package, in processes that take turns.
+"""A training step of BGPO in two versions of this package, part by part, in turns.
 
     git worktree add ../before 6cac0ef
-    python benchmarks/speed/versions.py ../before . --seeds 1 3 10 --experts 3
+    python benchmarks/speed/versions.py ../before . --seeds 1 3 10
 
-An update is a gradient step on a constant batch of 128 transitions an expert, with two hidden
-layers of 256 units, in a background thread as in training. Times are CPU times of one thread.
+Times are CPU times, of processes with one thread of torch. Both versions train as many experts with
+the same hidden layers on as many transitions, in their own version of the world.
 """
 
 from __future__ import annotations
@@ -14,17 +14,15 @@ import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import torch
 import tyro
-from tensordict import TensorDict
 
-ROWS, LATENT, CONTEXT, ACTION, HIDDEN = 128, 64, 32, 4, (256, 256)
+PARTS = ("act", "environment", "store", "sample", "learn", "whole step")
+HIDDEN, SHARE, WARM_UP = (256, 256), 0.25, 131  # SHARE: of demonstrated transitions
 
 
 @dataclass(frozen=True)
@@ -39,120 +37,120 @@ class Arguments:
     """Numbers of seeds."""
     experts: int = 3
     """Experts of each seed."""
-    rl: str = "ddpg"
-    """RL algorithm: ddpg, td3 or sac."""
+    rows: int = 64
+    """Transitions of an expert in an update."""
     rounds: int = 15
     """Turns of each version."""
+    steps: int = 10
+    """Steps in each turn."""
 
 
-class Worker:
-    """A process that makes updates with one version of the package.
+def start(folder: Path, arguments: Arguments) -> subprocess.Popen[str]:
+    """Start a process that trains with the version in a folder."""
+    numbers = map(str, (arguments.experts, arguments.rows, arguments.steps))
+    return subprocess.Popen(
+        [sys.executable, Path(__file__).resolve(), "--work", *numbers],
+        env={**os.environ, "PYTHONPATH": str(folder.resolve()), "OMP_NUM_THREADS": "1"},
+        cwd=folder,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
 
-    Args:
-        folder: The version.
-        rl: RL algorithm.
-    """
 
-    def __init__(self, folder: Path, rl: str) -> None:
-        self._process = subprocess.Popen(
-            [sys.executable, Path(__file__).resolve(), "--work", rl],
-            env={**os.environ, "PYTHONPATH": str(folder.resolve()), "OMP_NUM_THREADS": "1"},
-            cwd=folder,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
+def ask(process: subprocess.Popen[str], seeds: int) -> list[float]:
+    """Return the CPU times (ms) of the parts of a step in a process."""
+    assert process.stdin and process.stdout
+    print(seeds, file=process.stdin, flush=True)
+    return [float(part) for part in process.stdout.readline().split()]
+
+
+def work(experts: int, rows: int, steps: int) -> None:
+    """Time some steps for each number of seeds in the input, with the version in use."""
+    import bgpo_trl.machine as machine
+
+    machine.set_threads(1)
+    if hasattr(machine, "keep_freed_memory"):  # not in earlier versions
+        machine.keep_freed_memory()
+    training: dict[int, Training] = {}
+    for line in sys.stdin:
+        seeds = int(line)
+        if seeds not in training:
+            training[seeds] = Training(seeds, experts, rows)
+        print(*training[seeds].time(steps), flush=True)
+
+
+class Training:
+    """BGPO in training on the paper's tasks, as in a run."""
+
+    def __init__(self, seeds: int, experts: int, rows: int) -> None:
+        from bgpo_trl.algorithms import entry
+        from bgpo_trl.encoders.pretrained import load_pretrained
+        from bgpo_trl.transforms import TaskSchedule
+        from bgpo_trl.world import World
+
+        encoders, bank = load_pretrained()
+        known, parts = entry("bgpo"), {"seeds": range(seeds), "bank": bank.seen()}
+        config = replace(
+            known.config,
+            rl=replace(known.config.rl, warmup_steps=WARM_UP - 1, hidden_sizes=HIDDEN),
+            active_groups=experts,
+            expert_batch_size=rows,
+            demonstration_share=SHARE,
         )
+        self.algorithm = known.make(config, encoders=encoders, **parts)
+        self.env = World(self.algorithm, schedule=TaskSchedule((0, 0, 0)), **parts).env
+        self._background = ThreadPoolExecutor(1, "update")
+        self._state = self.env.reset()
+        self.time(WARM_UP)
+        for group in range(1, experts):  # as if groups had been found, for as many experts
+            self.algorithm.experts._parent = lambda *_: 0
+            self.algorithm.experts.play([group] * seeds)
+        self.time(2)
 
-    def time(self, seeds: int, experts: int) -> float:
-        """Return the CPU time of an update (ms)."""
-        process = self._process
-        assert process.stdin and process.stdout
-        process.stdin.write(f"{seeds} {experts}\n")
-        process.stdin.flush()
-        return float(process.stdout.readline())
-
-    def close(self) -> None:
-        """End the process."""
-        self._process.communicate()
-
-
-def work(rl: str) -> None:
-    """Time some updates for each line ``seeds experts`` of the input, with the version in use."""
-    torch.set_num_threads(1)
-    try:
-        from bgpo_trl.machine import keep_freed_memory
-    except ImportError:  # an earlier version
-        pass
-    else:
-        keep_freed_memory()
-    updates: dict[tuple[int, int], Update] = {}
-    with ThreadPoolExecutor(1, "update") as background:
-        for line in sys.stdin:
-            seeds, experts = map(int, line.split())
-            if (seeds, experts) not in updates:
-                updates[seeds, experts] = Update(rl, seeds, experts)
-                background.submit(updates[seeds, experts], 8).result()
-            count, start = max(2, 20 // (seeds * experts)), time.process_time()
-            background.submit(updates[seeds, experts], count).result()
-            print(1_000 * (time.process_time() - start) / count, flush=True)
-
-
-class Update:
-    """Updates of a learner ``[S, E]`` on a constant batch."""
-
-    def __init__(self, rl: str, seeds: int, experts: int) -> None:
-        from bgpo_trl.algorithms.rl import RL, LearnerSpec, make_learner
-
-        keys, device = ["latent", "context"], torch.device("cpu")
-        spec = LearnerSpec(range(seeds), keys, LATENT + CONTEXT, (0.0, 1.1), device, range(experts))
-        self.learner = make_learner(type(RL[rl].config)(hidden_sizes=HIDDEN), spec)
-        generator, shape = torch.Generator().manual_seed(0), (seeds, experts, ROWS)
-
-        def normal(size: int) -> torch.Tensor:
-            return torch.randn(*shape, size, generator=generator)
-
-        success = torch.rand(*shape, 1, generator=generator) < 0.1
-        root = {
-            "latent": normal(LATENT),
-            "context": normal(CONTEXT),
-            "action": normal(ACTION).tanh(),
-        }
-        weighted = {
-            "priority_weight": torch.ones(shape),
-            "demonstrated": torch.arange(ROWS).expand(shape) % 4 > 0,
-        }
-        following = {"latent": normal(LATENT), "reward": success.float(), "terminated": success}
-        self.batch = TensorDict({**root, **weighted, "next": following}, shape)
-
-    def __call__(self, count: int) -> None:
-        """Make updates."""
-        for _ in range(count):
-            self.learner.learn(self.batch)
+    def time(self, steps: int) -> list[float]:
+        """Take steps; return the CPU times (ms) of the parts of one."""
+        algorithm, seconds = self.algorithm, np.zeros(len(PARTS))
+        learn, drawn = algorithm.learn, []
+        for _ in range(steps):
+            marks = [time.process_time()]
+            state = algorithm.act(self._state)
+            marks.append(time.process_time())
+            transition, self._state = self.env.step_and_maybe_reset(state)
+            marks.append(time.process_time())
+            algorithm.store(transition)
+            marks.append(time.process_time())
+            algorithm.learn = lambda batch: drawn.append(batch) or {}
+            self._background.submit(algorithm.update).result()
+            marks.append(time.process_time())
+            algorithm.learn = learn
+            while drawn:
+                self._background.submit(learn, drawn.pop()).result()
+            marks.append(time.process_time())
+            seconds += [*np.diff(marks), marks[-1] - marks[0]]
+        return (1_000 * seconds / steps).tolist()
 
 
 def main(arguments: Arguments) -> None:
     """Print the table."""
-    print("| seeds of experts | before (ms) | after (ms) | after / before | quartiles |")
-    print("|---|---:|---:|---:|---:|")
-    with ExitStack() as stack:
-        workers = [Worker(path, arguments.rl) for path in (arguments.before, arguments.after)]
-        for worker in workers:
-            stack.callback(worker.close)
+    print("| seeds | part | before (ms) | after (ms) | after / before | quartiles |")
+    print("|---:|---|---:|---:|---:|---:|")
+    with start(arguments.before, arguments) as one, start(arguments.after, arguments) as other:
         for seeds in arguments.seeds:
-            times = np.empty((arguments.rounds, 2))
-            for row in times:
-                row[:] = [worker.time(seeds, arguments.experts) for worker in workers]
-            before, after = np.median(times, 0)
-            low, ratio, high = np.percentile(times[:, 1] / times[:, 0], [25, 50, 75])
-            print(
-                f"| {seeds} of {arguments.experts} | {before:.1f} | {after:.1f} | {ratio:.2f} "
-                f"| {low:.2f}-{high:.2f} |",
-                flush=True,
-            )
+            rounds = range(arguments.rounds)
+            times = np.array([[ask(one, seeds), ask(other, seeds)] for _ in rounds])
+            for part, taken in zip(PARTS, times.transpose(2, 0, 1), strict=True):
+                before, after = np.median(taken, 0)
+                low, ratio, high = np.percentile(taken[:, 1] / taken[:, 0], [25, 50, 75])
+                print(
+                    f"| {seeds} | {part} | {before:.2f} | {after:.2f} | {ratio:.2f} "
+                    f"| {low:.2f}-{high:.2f} |",
+                    flush=True,
+                )
 
 
 if __name__ == "__main__":
     if sys.argv[1:2] == ["--work"]:
-        work(sys.argv[2])
+        work(*map(int, sys.argv[2:]))
     else:
         main(tyro.cli(Arguments))

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Any, cast
+from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
@@ -213,10 +213,11 @@ class Algorithm(ABC):
         if self.shown is None or not len(self.shown):
             return self.replay.sample(groups(n_rows))
         n_shown = round(self.config.demonstration_share * n_rows)
-        played = self.replay.sample(groups(n_rows - n_shown))
-        shown = self.shown.sample(groups(n_shown))
-        played["demonstrated"] = torch.zeros(played.shape, dtype=torch.bool)
-        return cast(TensorDictBase, torch.cat([played, shown], -1))
+        played_group, shown_group = groups(n_rows - n_shown), groups(n_shown)
+        played, shown = self.replay.draw(played_group), self.shown.draw(shown_group)
+        played["demonstrated"] = torch.zeros_like(played_group, dtype=torch.bool)
+        batch = {key: torch.cat([entry, shown[key]], 2) for key, entry in played.items()}
+        return TensorDict(batch, batch["demonstrated"].shape)
 
     def learn(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """Take a gradient step on a batch and update the targets; return the losses of `update`."""

@@ -95,6 +95,10 @@ class DemonstrationReplay:
             ``"action"``, ``"priority_weight"``, ``"demonstrated"`` (true) and, under ``"next"``,
             the state, ``"reward"`` and ``"terminated"``.
         """
+        return TensorDict(self.draw(group), group.shape)
+
+    def draw(self, group: Tensor) -> dict[NestedKey, Tensor]:
+        """Return the entries of `sample` by key, without a TensorDict."""
         shown, steps = self._shown.draw(group), self._steps
         share = draw_for_rows(torch.rand, group, self._generators, dtype=torch.float64)
         number = shown["demo_index"]
@@ -108,22 +112,17 @@ class DemonstrationReplay:
         state = steps.latents(frame)
         if self._noise:
             noise = draw_for_rows(torch.randn, group, self._generators, state.shape[-1])
-            state = state + self._noise * noise
-        return TensorDict(
-            {
-                self._state_key: state,
-                "action": steps.actions(frame),
-                "priority_weight": shown["priority_weight"],
-                "demonstrated": torch.ones(group.shape, dtype=torch.bool),
-                **{key: constants[key] for key in self._constant_keys},
-                "next": {
-                    self._state_key: steps.latents(frame + 1),
-                    "reward": shown["reward"].unsqueeze(-1) * ends,
-                    "terminated": ends,
-                },
-            },
-            group.shape,
-        )
+            state += noise.mul_(self._noise)
+        return {
+            self._state_key: state,
+            "action": steps.actions(frame),
+            "priority_weight": shown["priority_weight"],
+            "demonstrated": torch.ones(group.shape, dtype=torch.bool),
+            **{key: constants[key] for key in self._constant_keys},
+            ("next", self._state_key): steps.latents(frame + 1),
+            ("next", "reward"): shown["reward"].unsqueeze(-1) * ends,
+            ("next", "terminated"): ends,
+        }
 
     def regroup(self, seed: int, group: Tensor) -> None:
         """Assign demonstrations of a seed to groups anew, from the group of each in the bank."""

@@ -56,8 +56,11 @@ def test_contenders_come_with_the_frames_they_make(monkeypatch, threads):
     drawn, steps = [], []
     monkeypatch.setattr(frames, "Stock", Elsewhere)
     monkeypatch.setattr(frames, "BareLoop", Elsewhere)
-    step = Environment.step
-    monkeypatch.setattr(Environment, "step", lambda *args: steps.append(None) or step(*args))
+    for name in ("step", "advance"):
+        call = getattr(Environment, name)
+        monkeypatch.setattr(
+            Environment, name, lambda *args, call=call: steps.append(None) or call(*args)
+        )
     encode = frames.VAE().latent
     vae = frames.VAE()
     monkeypatch.setattr(vae, "latent", lambda pixels: drawn.append(pixels) or encode(pixels))

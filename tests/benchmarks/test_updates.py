@@ -8,7 +8,7 @@ import torch
 
 from benchmarks.speed import updates
 from benchmarks.speed.updates import BATCH, Floor, Ours, TorchRLLoop, contenders, floor_batch
-from benchmarks.speed.versions import Update
+from benchmarks.speed.versions import Training
 
 
 def weights(ours: Ours) -> list[torch.Tensor]:
@@ -74,10 +74,13 @@ def test_a_missing_stable_baselines3_is_left_out_and_said(monkeypatch, capsys):
     assert "pip install" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("rl", ["ddpg", "td3", "sac"])
-def test_an_update_by_which_versions_are_compared_moves_every_weight(rl):
-    update = Update(rl, seeds=2, experts=1)
-    before = [parameter.clone() for parameter in update.learner.loss.parameters()]
-    update(2)  # TD3's actor moves in every second
-    for parameter, start in zip(update.learner.loss.parameters(), before, strict=True):
-        assert parameter.ne(start).flatten(1).any(-1).all()
+@pytest.mark.slow
+def test_a_step_by_which_versions_are_compared_is_the_sum_of_its_parts_and_trains():
+    training = Training(seeds=1, experts=2, rows=16)
+    loss = training.algorithm.experts.learner.loss
+    before = [parameter.clone() for parameter in loss.parameters()]
+    assert {len(parameter[0]) for parameter in before} == {2}
+    *parts, whole = training.time(1)
+    assert min(parts) > 0 and sum(parts) == pytest.approx(whole)
+    for parameter, start in zip(loss.parameters(), before, strict=True):
+        assert parameter.ne(start).flatten(2).any(-1)[0, 0].all()
