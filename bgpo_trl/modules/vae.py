@@ -207,7 +207,7 @@ class VAE(nn.Module):
         x = F.max_pool2d(_convolution(x.permute(0, 3, 1, 2), first), 2).relu_()
         fine = _convolution(x, second).relu_()
         coarse = F.max_pool2d(_convolution(F.max_pool2d(fine, 2), third), 2).relu_().flatten(1)
-        maps = self.log_sharpness.exp() * _convolution(fine, self.keypoint_maps)
+        maps = self.log_sharpness.exp() * self.keypoint_maps(fine)
         weight = maps.flatten(2).to(self.mean_frame.dtype).softmax(-1).view(maps.shape)
         x, y = (weight.sum(2) * self._column).sum(-1), (weight.sum(3) * self._row).sum(-1)
         height, width = self._map_reach

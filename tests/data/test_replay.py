@@ -99,6 +99,19 @@ def test_all_that_a_group_holds_is_drawn_equally_often():
     assert drawn[1].round().long().unique().equal(torch.arange(10, 30))
 
 
+def test_entries_are_drawn_as_they_are_sampled_also_some_of_them():
+    groups, asked = [(0, 1), (1, 1), (0, 0), (2, 1)], torch.tensor([[0, 1, 0, -1], [1, 1, 0, 7]])
+    first, second, third = make(), make(), make()
+    for replay in (first, second, third):
+        fill(replay, groups)
+    sampled, drawn, some = first.sample(asked), second.draw(asked), third.draw(asked, keys=KEYS[1:])
+    assert drawn.keys() == {*sampled.keys(True, True)} - {"next"}
+    assert some.keys() == {KEYS[1], "priority_weight"}
+    filled = drawn["priority_weight"] > 0
+    for entries in (drawn, some):
+        assert all(entry[filled].equal(sampled[key][filled]) for key, entry in entries.items())
+
+
 def test_a_seed_of_a_stack_is_that_seed_alone():
     together = make(7, n_seeds=3)
     alone = [GroupReplay(7, generator=[stream], keys=KEYS) for stream in generators(3)]
