@@ -81,10 +81,7 @@ class SequenceAutoencoder(nn.Module):
             )
         state = (h.reshape(-1, self.embedding_size), c.reshape(-1, self.embedding_size))
         z = z.reshape(-1, self.latent_size)
-        lstm = self.encoder
-        h, c = torch.lstm_cell(
-            z, state, lstm.weight_ih_l0, lstm.weight_hh_l0, lstm.bias_ih_l0, lstm.bias_hh_l0
-        )
+        h, c = torch.lstm_cell(z, state, *self.encoder.all_weights[0])
         return h.reshape(shape), c.reshape(shape)
 
     def decode(self, phi: Tensor, n_steps: int) -> Tensor:
