@@ -30,7 +30,7 @@ def ending(tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> Tenso
     """
     done = next_tensordict.get("done")
     was_done = tensordict.get("done", None)
-    ended = done if was_done is None else done > was_done
+    ended = done if was_done is None else done & ~was_done
     return ended.reshape(next_tensordict.batch_size)
 
 
