@@ -8,7 +8,7 @@ import torch
 
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.modules.behavior_groups import BehaviorGroups
-from bgpo_trl.modules.density_clusters import density_clusters
+from bgpo_trl.modules.density_clusters import density_clusters, local_whitening
 from bgpo_trl.transforms import TaskSchedule
 from suites import nico
 
@@ -137,10 +137,23 @@ def test_groups_are_the_density_clusters_of_all_demonstrations():
     inputs = inputs[torch.randperm(200, generator=torch.Generator().manual_seed(0))]
     groups = BehaviorGroups(4)
     show(groups, inputs)
-    labels = density_clusters(inputs.numpy())
+    labels = density_clusters(inputs.numpy() @ local_whitening(inputs.numpy()))
     pairs = {*zip(labels.tolist(), groups.lookup(inputs).group.tolist(), strict=True)}
     assert len({label for label, _ in pairs if label >= 0}) == 4
     assert len([pair for pair in pairs if pair[0] >= 0]) == 4
+
+
+def test_behaviors_that_differ_in_a_small_feature_have_their_groups():
+    """All vary in four wide features, so that plain distances know one group."""
+    generator = torch.Generator().manual_seed(0)
+    which = torch.arange(400) % 2
+    inputs = torch.randn(400, 5, generator=generator) * torch.tensor([1.0, 1.0, 1.0, 1.0, 0.14])
+    inputs[:, 4] += 1.4 * which
+    groups = BehaviorGroups(5)
+    show(groups, inputs[:300])
+    found = groups.lookup(inputs[300:])
+    assert int(groups.num_groups) == 2
+    assert len({*zip(which[300:].tolist(), found.group.tolist(), strict=True)}) == 2
 
 
 def test_masked_networks_in_a_batch_equal_networks_alone():
