@@ -304,7 +304,8 @@ def test_joined_groups_keep_the_number_of_the_one_shown_most():
 def test_groups_of_shipped_demonstrations_contain_one_task_each(order):
     """Draws as in a run; labels are used for the draws and the count alone.
 
-    A task looks different from either side of the table, so that it may have two groups.
+    A task looks different from either side of the table, so that it may have two groups; two of all
+    may be in pieces.
     """
     n_tasks, each = len(nico.PAPER_TASKS), 120
     bank = load_pretrained(tasks=nico.PAPER_TASKS)[1]
@@ -317,7 +318,7 @@ def test_groups_of_shipped_demonstrations_contain_one_task_each(order):
     for available in schedule.available(torch.arange(each * n_tasks + 60)):
         task = rng.choice(available.nonzero().flatten())
         groups.adapt(seen.embedding[int(rng.choice(rows[task]))])
-    assert n_tasks <= int(groups.num_groups) <= 2 * n_tasks
+    assert n_tasks <= int(groups.num_groups) <= 2 * n_tasks + 2
     group = groups.lookup(held_out.embedding).group
     majority = {int(g): held_out.task[group == g].mode().values.item() for g in group.unique()}
     assert {*majority.values()} == {*range(n_tasks)}
