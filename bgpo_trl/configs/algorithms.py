@@ -156,8 +156,8 @@ class BGPOConfig(AlgorithmConfig):
     group_size: int = 10
     """Least number of different demonstrations of a group of behaviors. Ours."""
     group_evidence: float = 1.0
-    """Standard errors by which the density between two groups must be lower than in them. Ours: a
-    low one, since trials can join groups of one task, and nothing splits one of several."""
+    """Depth of the valley of density between two groups, in multiples of what chance explains
+    (`density_clusters`). Ours."""
 
     @property
     def grouped(self) -> bool:

@@ -14,7 +14,7 @@ from tensordict import TensorClass
 from torch import Tensor, nn
 
 from bgpo_trl.errors import as_shape
-from bgpo_trl.modules.density_clusters import density_clusters
+from bgpo_trl.modules.density_clusters import density_clusters, local_whitening
 from bgpo_trl.modules.gwr import as_mask
 
 _KNOWN_SHARE = 0.99  # of a group's own demonstrations that are to count as known
@@ -47,7 +47,9 @@ class BehaviorGroups(nn.Module):
 
     A group is a cluster of the different demonstrations shown so far, separated from the others by
     a valley of significantly lower density (`density_clusters`). No distance is given: the same
-    inputs at another scale form the same groups.
+    inputs at another scale form the same groups. Distances are measured after `local_whitening`,
+    since most features of an embedding vary within each behavior, and those that tell behaviors
+    apart may be the small ones.
 
     1. A demonstration that is shown again adds nothing. With every ``smallest`` new ones (beyond
        ``100 * smallest``: with every hundredth part more), all are clustered anew; until the first
@@ -67,7 +69,7 @@ class BehaviorGroups(nn.Module):
         n_features: Size d of an input.
         batch_size: Shape of the batch (the seeds), or its length; ``()`` is a single set of groups.
         smallest: Least number of different demonstrations of a group.
-        evidence: Standard errors by which a valley must be deeper than chance.
+        evidence: Depth of a significant valley, in multiples of what chance explains.
 
     Raises:
         ValueError: If ``smallest`` is below 4 or ``evidence`` is not positive.
@@ -88,7 +90,7 @@ class BehaviorGroups(nn.Module):
         *,
         batch_size: int | Sequence[int] = (),
         smallest: int = 10,
-        evidence: float = 3.0,
+        evidence: float = 1.0,
     ) -> None:
         super().__init__()
         (self.n_features,) = as_shape([n_features], "n_features")
@@ -188,8 +190,9 @@ class BehaviorGroups(nn.Module):
             n_clustered = len(network.cluster)
             due = n_clustered + max(self.smallest, n_clustered // 100)
             if is_new and len(network.points) >= due:
+                network.fit_metric(len(network.points))
                 network.cluster = density_clusters(
-                    network.points, smallest=self.smallest, evidence=self.evidence
+                    network.places(network.points), smallest=self.smallest, evidence=self.evidence
                 )
                 network.arrange()
         return self._match(group, novelty, phi)
@@ -233,6 +236,7 @@ class BehaviorGroups(nn.Module):
         sizes = {len(arrays[name]) for name in ("points", "shown", "group", "member")}
         if len(sizes) > 1 or not {*network.group.tolist()} <= {*range(len(network.parent))}:
             raise ValueError("a group is missing in the state: load one that state_dict returned")
+        network.fit_metric(len(network.cluster))
         network.measure()
         return network
 
@@ -281,6 +285,7 @@ class _Network:
         links: Pairs of demonstrations whose clusters are one group.
         revision: See `BehaviorGroups.revision`.
         reach: By group, the 99 % quantile of its members' distances to their k-th neighbor in it.
+        metric: Linear map [d, d] after which distances are measured.
     """
 
     k: int
@@ -293,12 +298,26 @@ class _Network:
     links: list[tuple[int, int]] = field(default_factory=list)
     revision: int = 0
     reach: dict[int, float] = field(default_factory=dict)
+    metric: NDArray[np.float64] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.metric = np.eye(self.points.shape[1])
+
+    def fit_metric(self, n_points: int) -> None:
+        """Measure distances as the first demonstrations suggest, all that are being clustered."""
+        if n_points > 1:
+            self.metric = local_whitening(self.points[:n_points])
+
+    def places(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return points where their Euclidean distances are those of the metric."""
+        return points @ self.metric
 
     def lookup(self, inputs: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return group and novelty ``[m]`` of inputs ``[m, d]``."""
         if not self.reach:
             return np.zeros(len(inputs), np.int64), np.full(len(inputs), np.inf)
-        distances, of_member = cdist(inputs, self.points[self.member]), self.group[self.member]
+        members, of_member = self.points[self.member], self.group[self.member]
+        distances = cdist(self.places(inputs), self.places(members))
         group = of_member[distances.argmin(1)]
         novelty = np.empty(len(inputs))
         for number in np.unique(group):
@@ -331,7 +350,7 @@ class _Network:
 
     def _kth_distances(self, rows: NDArray[np.int64]) -> NDArray[np.floating]:
         """Return the distance of each of some demonstrations to its k-th neighbor among them."""
-        points = self.points[rows]
+        points = self.places(self.points[rows])
         return np.partition(cdist(points, points), self.k, axis=1)[:, self.k]
 
     def arrange(self) -> None:
@@ -361,7 +380,8 @@ class _Network:
         """Return the clusters, of which linked ones have the same label."""
         labels, inside = self.cluster.copy(), np.flatnonzero(self.cluster >= 0)
         for link in self.links:
-            nearest = cdist(self.points[[*link]], self.points[inside]).argmin(1)
+            ends, others = self.places(self.points[[*link]]), self.places(self.points[inside])
+            nearest = cdist(ends, others).argmin(1)
             one, other = labels[inside[nearest]]
             labels[labels == other] = one
         return labels

@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 from scipy.cluster.hierarchy import linkage
+from scipy.spatial import KDTree
 from scipy.spatial.distance import pdist, squareform
 
 Points = NDArray[np.float64]
 
 
 def density_clusters(
-    points: Points, *, smallest: int = 10, evidence: float = 3.0
+    points: Points, *, smallest: int = 10, evidence: float = 1.0
 ) -> NDArray[np.int64]:
     """Cluster points by density; one cluster unless there is evidence of a valley.
 
@@ -22,15 +23,19 @@ def density_clusters(
     (cf. Burman and Polonik, 2009, "Multivariate mode hunting"): the density at a point is
     proportional to ``r ** -m`` for data of `intrinsic_dimension` ``m``, and the logarithm of an
     estimate from ``k`` neighbors has a standard error of ``1 / sqrt(k)``. So the branches differ by
-    ``m log(s / median(r)) / sqrt(2 / k)`` standard errors. Distances enter as ratios only: points
-    that are scaled form the same clusters.
+    ``m log(s / median(r)) / sqrt(2 / k)`` standard errors. Chance offers ``n / k`` separate
+    estimates in two branches of ``n`` points, the largest of which is some ``sqrt(2 log(n / k))``
+    standard errors off. In more dimensions, more ways lead around what looks like a valley: by
+    simulation, the deepest one in points with a single mode is at most about ``1 / sqrt(m)`` of
+    that, and a valley is significant if it is ``evidence`` times as deep. Distances enter as
+    ratios only: points that are scaled form the same clusters.
 
     Time and memory are quadratic in the number of points; 2,000 of 32 features take 0.1 s.
 
     Args:
         points: ``[n, d]``, all different.
         smallest: Least number of points of a cluster.
-        evidence: Standard errors that make a valley significant.
+        evidence: Depth of a significant valley, in multiples of what chance explains.
 
     Returns:
         Cluster of each point, int64 ``[n]``, numbered in the order of their first points; -1 for
@@ -56,19 +61,21 @@ def density_clusters(
     np.fill_diagonal(reach, 0.0)
     merges = linkage(squareform(reach, checks=False), "single")
     dimension = intrinsic_dimension(near, points.shape[1])
-    # A valley at distance s is significant for branches with a median core distance below s / gap.
-    gap = np.exp(evidence * np.sqrt(2 / k) / dimension)
 
-    def is_cluster(branch: list[list[int]], distance: float) -> bool:
+    def is_cluster(branch: list[list[int]], other: list[list[int]], distance: float) -> bool:
         if len(branch) > 1:
             return True
         (members,) = branch
-        return len(members) >= smallest and gap * np.median(core[members]) <= distance
+        if len(members) < smallest:
+            return False
+        n_both = len(members) + max(map(len, other))
+        errors = evidence * np.sqrt(2 * np.log(n_both / k) / dimension)
+        return np.exp(errors * np.sqrt(2 / k) / dimension) * np.median(core[members]) <= distance
 
     branches = {point: [[point]] for point in range(n_points)}
     for new, (left, right, distance, _) in enumerate(merges, n_points):
         small, large = sorted((branches.pop(int(left)), branches.pop(int(right))), key=_size)
-        if is_cluster(small, distance) and is_cluster(large, distance):
+        if is_cluster(small, large, distance) and is_cluster(large, small, distance):
             branches[new] = small + large
         elif len(small) == len(large) == 1:
             large[0] += small[0]
@@ -81,6 +88,44 @@ def density_clusters(
         for number, members in enumerate(sorted(found, key=min)):
             labels[members] = number
     return labels
+
+
+def local_whitening(points: Points, *, k: int = 2) -> Points:
+    """Return a linear map ``[d, d]`` after which points differ from their neighbors evenly.
+
+    The covariance of the differences between points and their ``k`` nearest neighbors is, up to a
+    factor, that within clusters, although no cluster is known (Art, Gnanadesikan and Kettenring,
+    1982, "Data-based metrics for cluster analysis"). The map makes it spherical: features by which
+    neighbors hardly differ count for more, and clusters that they separate move apart. Neighbors
+    are found twice: by the distances given, and by those of the first map. Few points say little
+    about the covariance, which is shrunk accordingly (oracle approximating shrinkage, Chen et al.,
+    2010): with few of them, or if it is spherical anyway, the map is a scaling.
+
+    Args:
+        points: ``[n, d]``, all different, at least two.
+        k: Neighbors of a point; with fewer others, all of them.
+
+    Examples:
+        >>> points = np.random.default_rng(0).normal(size=(500, 2)) * [1.0, 0.1]
+        >>> wide, narrow = (points @ local_whitening(points)).std(0)
+        >>> bool(0.8 < wide / narrow < 1.25)
+        True
+    """
+    n, d = points.shape
+    k, whitening = min(k, n - 1), np.eye(d)
+    for _ in range(2):
+        places = points @ whitening
+        near = KDTree(places).query(places, k + 1)[1]
+        differences = (points[:, None] - points[near]).reshape(-1, d)
+        covariance = differences.T @ differences / (n * k)
+        total, squares = float(np.trace(covariance)), float((covariance**2).sum())
+        unevenness = (n + 1 - 2 / d) * (squares - total**2 / d)
+        evenly = (1 - 2 / d) * squares + total**2
+        shrinkage = evenly / unevenness if evenly < unevenness else 1.0
+        covariance = (1 - shrinkage) * covariance + shrinkage * total / d * np.eye(d)
+        variances, directions = np.linalg.eigh(covariance)
+        whitening = directions / np.sqrt(variances)
+    return whitening
 
 
 def intrinsic_dimension(near: Points, most: int) -> float:

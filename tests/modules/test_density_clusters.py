@@ -4,8 +4,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.distance import pdist
 
-from bgpo_trl.modules.density_clusters import density_clusters, intrinsic_dimension
+from bgpo_trl.modules.density_clusters import (
+    density_clusters,
+    intrinsic_dimension,
+    local_whitening,
+)
 
 CENTERS = 9 * np.eye(6)
 
@@ -51,6 +56,33 @@ def test_unimodal_points_are_one_cluster(name, points):
     assert not density_clusters(points).any()
 
 
+@pytest.mark.parametrize("d", [2, 3, 4, 6, 8, 16, 32])
+@pytest.mark.parametrize("n_points", [40, 150, 600])
+def test_chance_splits_no_points_with_a_single_mode(n_points, d):
+    rng = np.random.default_rng(d)
+    for points in (
+        rng.normal(size=(n_points, d)),
+        rng.uniform(size=(n_points, d)),
+        rng.standard_t(4, size=(n_points, d)),
+        rng.gamma(2, size=(n_points, d)),
+    ):
+        assert not density_clusters(points).any()
+        assert not density_clusters(points @ local_whitening(points)).any()
+
+
+@pytest.mark.parametrize("d", [2, 8, 32])
+@pytest.mark.parametrize("sizes", [(25, 25), (20, 300)])
+def test_sizes_and_spreads_may_differ(sizes, d):
+    rng = np.random.default_rng(d)
+    labels = np.repeat([0, 1], sizes)
+    points = rng.normal(size=(len(labels), d)) * np.array([2.0, 1.0])[labels, None]
+    points[labels == 1, 0] += 8 * np.sqrt(d)
+    found = density_clusters(points)
+    assert found.max() == 1
+    inside = found >= 0
+    assert (found[inside] == labels[inside]).all() and inside.mean() > 0.9
+
+
 def test_cluster_needs_the_least_number_of_points_and_the_evidence():
     points, _ = blobs([90, 14])
     assert density_clusters(points).max() == 1
@@ -81,3 +113,47 @@ def test_intrinsic_dimension_of_a_cube_is_that_of_its_space(d):
     distances = np.sort(np.linalg.norm(points[:, None] - points, axis=-1))[:, 1:11]
     assert intrinsic_dimension(distances, 7) == pytest.approx(d, rel=0.15)
     assert intrinsic_dimension(np.ones((4, 10)), 7) == 7
+
+
+def test_local_whitening_is_the_inverse_root_of_the_covariance_of_neighbors_differences():
+    """Worked by hand: pairs that are (2, 0) or (0, 1) apart, each other's nearest neighbors."""
+    points = np.array([[0, 0], [2, 0], [100, 0], [100, 1.0]])
+    # Mean outer product diag(2, 0.5): trace 2.5, sum of squares 4.25. With n = 4 and d = 2, the
+    # shrinkage is (0 * 4.25 + 6.25) / (4 * (4.25 - 3.125)) > 1: a scaling with the mean of 1.25.
+    whitening = local_whitening(points, k=1)
+    np.testing.assert_allclose(whitening @ whitening.T, np.eye(2) / 1.25, atol=1e-12)
+    # Ten such pairs of each kind: shrinkage 6.25 / (40 * 1.125).
+    many = np.concatenate([points + 1_000 * np.array([i, i]) for i in range(10)])
+    shrinkage = 6.25 / (40 * 1.125)
+    variances = (1 - shrinkage) * np.array([2, 0.5]) + shrinkage * 1.25
+    whitening = local_whitening(many, k=1)
+    np.testing.assert_allclose(whitening @ whitening.T, np.diag(1 / variances), atol=1e-12)
+
+
+def test_whitened_distances_do_not_depend_on_scale_rotation_and_place():
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(200, 4)) * [1, 0.3, 0.1, 0.03]
+    turn = np.linalg.qr(rng.normal(size=(4, 4)))[0]
+    other = 50 * points @ turn + 7
+    ours, theirs = points @ local_whitening(points), other @ local_whitening(other)
+    np.testing.assert_allclose(pdist(ours), pdist(theirs), rtol=1e-8)
+
+
+def test_whitening_uncovers_clusters_that_differ_in_a_small_feature():
+    """Four features in which all points vary hide a fifth that tells the clusters apart."""
+    rng = np.random.default_rng(0)
+    labels = np.repeat([0, 1], 150)
+    points = np.concatenate([rng.normal(size=(300, 4)), 0.14 * rng.normal(size=(300, 1))], 1)
+    points[:, 4] += 1.4 * labels
+    assert not density_clusters(points).any()
+    found = density_clusters(points @ local_whitening(points))
+    inside = found >= 0
+    assert found.max() == 1
+    assert (found[inside] == labels[inside]).all() and inside.mean() > 0.75
+
+
+@pytest.mark.parametrize("constant", [0, 3])
+def test_features_that_never_vary_do_no_harm(constant):
+    points, labels = blobs([40, 40])
+    points = np.concatenate([points, np.full((80, constant), 5.0)], 1)
+    assert density_clusters(points @ local_whitening(points)).tolist() == labels.tolist()
