@@ -226,7 +226,7 @@ def _files(folder) -> dict[str, str]:
 
 _OTHER_PROCESS = """
 import sys
-from bgpo_trl.files.locking import lock_directory
+from bgpo_trl.files.writing import lock_directory
 
 directory, wait = sys.argv[1], sys.argv[2] == "True"
 if wait:

@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from bgpo_trl.threads import RowPool
+from bgpo_trl.machine import RowPool
 
 
 @pytest.fixture(params=[1, 3, 20])

@@ -28,8 +28,7 @@ from bgpo_trl.experiments.settings import (
     is_finished,
     named_directory,
 )
-from bgpo_trl.files.locking import lock_directory
-from bgpo_trl.files.writing import write_json
+from bgpo_trl.files.writing import lock_directory, write_json
 from bgpo_trl.machine import choose_device, keep_freed_memory, set_threads
 from bgpo_trl.plugins import import_plugin
 from bgpo_trl.runs.config_file import read_config

@@ -4,7 +4,7 @@ import os
 import select
 import signal
 
-from bgpo_trl.files.locking import lock_directory
+from bgpo_trl.files.writing import lock_directory
 
 
 def test_a_second_process_is_refused_until_the_first_releases_the_lock(
