@@ -4,7 +4,6 @@ PyTorch takes ``cpu:0``, the CPU under another name, for another device, so that
 there and back. A GPU is tested too if there is one.
 """
 
-import csv
 from operator import attrgetter
 
 import pytest
@@ -25,13 +24,9 @@ from bgpo_trl.encoders.representation import (
 )
 from bgpo_trl.training import Trainer
 from bgpo_trl.transforms import FrameEncoder
+from tests.helpers import rows
 
 DEVICES = ["cpu:0", *(["cuda"] if torch.cuda.is_available() else [])]
-
-
-def rows(path):
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
 
 
 @pytest.mark.usefixtures("easy_world")

@@ -1,6 +1,5 @@
 """Tasks from outside the suite: from their registration to their rows in a run's CSV files."""
 
-import csv
 import json
 from dataclasses import replace
 
@@ -18,6 +17,7 @@ from bgpo_trl.scenes.nico import NicoEnv
 from bgpo_trl.training import Trainer
 from suites import nico
 from suites.nico import moves
+from tests.helpers import rows
 
 
 class AtOnce(nico.NicoTask):
@@ -53,11 +53,6 @@ def names_and_embeddings(bank):
     return [
         (bank.tasks[t], *phi) for t, phi in zip(bank.task, bank.embedding.tolist(), strict=True)
     ]
-
-
-def rows(path):
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
 
 
 @pytest.fixture

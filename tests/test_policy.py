@@ -23,7 +23,7 @@ from bgpo_trl.encoders.representation import save_representation
 from bgpo_trl.training import Trainer
 from suites import nico
 from suites.nico import nico as suite_nico
-from tests.folders import contents
+from tests.helpers import contents
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 ROOT = Path(__file__).parents[1]

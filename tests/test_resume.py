@@ -16,7 +16,7 @@ from bgpo_trl.encoders import fitting
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.files.checkpoint import load_checkpoint
 from bgpo_trl.training import Trainer
-from tests.files.test_checkpoint import largest_file
+from tests.helpers import largest_file
 from tests.resumable import play, train_small_encoders
 from tests.test_training import assert_same_run, at_step
 

@@ -1,6 +1,5 @@
 """Whole runs, small ones: what they write, and that no interrupt changes it."""
 
-import csv
 import itertools
 import signal
 from collections import Counter, defaultdict
@@ -21,8 +20,7 @@ from bgpo_trl.scenes.nico import NicoEnv
 from bgpo_trl.training import Trainer
 from tests.algorithms.playing import assert_same
 from tests.conftest import of_name
-from tests.folders import contents
-from tests.loggers import Recorder
+from tests.helpers import Recorder, contents
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 CSV_FILES = ("train.csv", "eval.csv")
@@ -61,11 +59,6 @@ def run_of(make, make_config, easy_world, tmp_path_factory):
 @pytest.fixture(scope="module")
 def uninterrupted(run_of):
     return run_of("bgpo")
-
-
-def rows(path):
-    with open(path, newline="") as file:
-        return list(csv.DictReader(file))
 
 
 def assert_same_run(first, second):

@@ -18,7 +18,7 @@ from bgpo_trl.experiments.command_line import command_line
 from bgpo_trl.runs.logger import EVAL_COLUMNS
 from bgpo_trl.runs.results import read_json
 from suites import opengl
-from tests.folders import contents
+from tests.helpers import contents
 
 ROOT = Path(__file__).parents[2]
 

@@ -16,8 +16,7 @@ from bgpo_trl.experiments.watch import WatchArguments, watch
 from bgpo_trl.figures.of_run import draw_growth
 from bgpo_trl.runs.config_file import read_config
 from suites import nico
-from tests.folders import contents
-from tests.foreign import CHECKPOINTS, put_checkpoint
+from tests.helpers import CHECKPOINTS, contents, put_checkpoint
 
 TASKS = nico.PAPER_TASKS
 FINAL = "seed,demonstrations,task,episodes,success,task_inference\n"

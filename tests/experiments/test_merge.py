@@ -18,7 +18,7 @@ from bgpo_trl.experiments.report import ReportArguments, report
 from bgpo_trl.runs.results import read_curves
 from suites import nico
 from tests.analysis.runs import edit
-from tests.folders import contents
+from tests.helpers import contents
 
 ROOT = Path(__file__).parents[2]
 

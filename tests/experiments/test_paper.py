@@ -23,8 +23,7 @@ from bgpo_trl.experiments.report import ReportArguments, report
 from bgpo_trl.files.checkpoint import load_checkpoint
 from bgpo_trl.runs.results import read_final_tests, read_table, read_tests
 from suites import nico
-from tests.folders import contents
-from tests.loggers import Recorder
+from tests.helpers import Recorder, contents
 
 ROOT = Path(__file__).parents[2]
 TASKS = nico.PAPER_TASKS

@@ -18,7 +18,7 @@ from bgpo_trl.experiments.privileged_information import (
 from bgpo_trl.files.checkpoint import load_checkpoint
 from bgpo_trl.runs.results import read_table
 from suites import nico
-from tests.folders import contents
+from tests.helpers import contents
 
 
 @pytest.mark.parametrize("rl", RL)

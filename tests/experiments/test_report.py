@@ -14,7 +14,7 @@ from bgpo_trl.analysis.tables import success_table
 from bgpo_trl.experiments.report import ReportArguments, report
 from bgpo_trl.runs.cost import Cost, write_costs
 from tests.analysis.runs import TASKS, edit, make_run, write_run, write_training
-from tests.folders import contents
+from tests.helpers import contents
 
 STARTS = (0, 14, 26)
 ONE_AFTER_THE_OTHER = "3 tasks, one after the other"

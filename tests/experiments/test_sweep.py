@@ -24,7 +24,7 @@ from bgpo_trl.runs.cost import Cost, read_costs, write_costs
 from bgpo_trl.runs.results import read_table
 from bgpo_trl.training import Trainer
 from suites import nico
-from tests.folders import contents
+from tests.helpers import contents
 
 SOME = Digests("some", "bank")
 BY_TASKS = {nico.PAPER_TASKS: SOME}

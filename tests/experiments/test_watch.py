@@ -13,7 +13,7 @@ from bgpo_trl.runs.config_file import read_config
 from bgpo_trl.runs.gwr_graphs import load_graphs
 from suites import nico
 from suites.nico.demonstrator import Demonstrator
-from tests.folders import contents
+from tests.helpers import contents
 
 GRAY, GREEN, RED = (0x99, 0x99, 0x99), (0x00, 0x9E, 0x73), (0xD5, 0x5E, 0x00)
 

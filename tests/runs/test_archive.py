@@ -6,7 +6,7 @@ import pytest
 
 from bgpo_trl.runs.archive import archive_run
 from tests.analysis.runs import write_run, write_training
-from tests.folders import contents
+from tests.helpers import contents
 
 
 def test_an_archive_is_compressed_and_always_the_same(tmp_path):

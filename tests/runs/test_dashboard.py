@@ -12,7 +12,7 @@ import torch
 from bgpo_trl.runs import dashboard
 from bgpo_trl.runs.dashboard import Dashboard, tensorboard_logger, wandb_logger
 from bgpo_trl.runs.logger import TRAIN_COLUMNS, RunLogger
-from tests.loggers import Recorder
+from tests.helpers import Recorder
 
 SETTINGS = {"gamma": 0.98, "seeds": [3, 8], "network": {"hidden": [64], "rate": None}}
 

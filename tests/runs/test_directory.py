@@ -12,7 +12,7 @@ from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
 from bgpo_trl.runs.directory import check_settings, holds_run
 from bgpo_trl.training import Trainer
 from tests.algorithms.playing import assert_same
-from tests.foreign import CHECKPOINTS, UNPICKLED, put_checkpoint
+from tests.helpers import CHECKPOINTS, UNPICKLED, put_checkpoint
 from tests.test_training import at_step
 
 pytestmark = pytest.mark.usefixtures("easy_world")

@@ -8,7 +8,7 @@ import torch
 from bgpo_trl.modules.gwr import GWRB
 from bgpo_trl.runs.gwr_graphs import growth_moments, load_graphs, save_graph
 from bgpo_trl.training import Trainer
-from tests.files.test_checkpoint import largest_file
+from tests.helpers import largest_file
 
 
 def grown(seed=0, n=30):
