@@ -33,7 +33,8 @@ TINY_ENCODERS = RepresentationConfig(
 def contents(folder: Path) -> dict[Path, bytes | None]:
     """Return all that lies below a folder: the bytes of each file, None for a folder."""
     return {
-        path: path.read_bytes() if path.is_file() else None for path in sorted(folder.rglob("*"))
+        path.relative_to(folder): path.read_bytes() if path.is_file() else None
+        for path in sorted(folder.rglob("*"))
     }
 
 

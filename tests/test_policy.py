@@ -22,7 +22,6 @@ from bgpo_trl.encoders.pretrained import bank_path
 from bgpo_trl.encoders.representation import save_representation
 from bgpo_trl.training import Trainer
 from suites import nico
-from suites.nico import nico as suite_nico
 from tests.helpers import contents
 
 pytestmark = pytest.mark.usefixtures("easy_world")
@@ -169,15 +168,6 @@ def test_a_pickled_policy_acts_as_before_and_can_be_conditioned_anew(load, name)
         )
 
 
-def test_frames_may_be_lists_tensors_views_or_read_only(load):
-    policy, frames = load(), noise(9, 8)
-    expected = policy.condition(frames[::-1].copy()).embedding
-    read_only = frames[::-1].copy()
-    read_only.flags.writeable = False
-    for same in (frames[::-1], list(frames[::-1]), read_only, torch.tensor(read_only.copy())):
-        assert policy.condition(same).embedding.equal(expected)
-
-
 @every_algorithm
 def test_only_algorithms_that_do_not_infer_the_task_need_its_label(load, name):
     policy = load(name)
@@ -189,15 +179,6 @@ def test_only_algorithms_that_do_not_infer_the_task_need_its_label(load, name):
             policy.condition(DEMONSTRATIONS[0], task=wrong)
     seen = policy.condition(DEMONSTRATIONS[0], task=TASKS[1])
     assert (seen.task, seen.node) == (TASKS[1], None)
-
-
-@pytest.mark.parametrize("name", LABELED)
-def test_actions_depend_on_the_label(load, name):
-    policy, actions = load(name), []
-    for task in TASKS:
-        policy.condition(DEMONSTRATIONS[0], task=task)
-        actions.append(policy.act(noise(0, 1)[0]))
-    assert np.abs(actions[0] - actions[1]).max() > 1e-5
 
 
 @every_algorithm
@@ -249,35 +230,6 @@ def test_act_needs_a_demonstration_and_a_frame(load):
     for wrong in (frames, frames[0] / 255, frames[0, :, :-1], []):
         with pytest.raises(ValueError, match=r"uint8 \[32, 64, 3\]"):
             policy.act(wrong)
-
-
-class AtOnce(nico.NicoTask):
-    """Success: a step has passed."""
-
-    def succeeded(self, physics):
-        return physics.time() > 0
-
-
-def test_a_run_of_own_tasks_is_loaded_where_the_task_is_known(
-    encoders, bank, make_config, tmp_path
-):
-    nico.add_task("at_once", AtOnce)
-    tasks = ("at_once", TASKS[1])
-    own = replace(bank, tasks=("at_once", *TASKS[1:]))
-    config = make_config(tasks=tasks, task_starts=(0, 2), episodes=4)
-    run = tmp_path / "run"
-    weights = run / "encoders" / "encoders.safetensors"
-    save_representation(replace(encoders, metadata=METADATA), weights)
-    with Trainer(config, run, bank=own, encoders=encoders, progress=False) as trainer:
-        trainer.run()
-    policy = bgpo_trl.load_run(run)
-    assert (policy.tasks, policy.bank.tasks) == (tasks, tasks)
-    assert policy.bank.identity == own.for_tasks(tasks).identity
-    assert policy.condition(DEMONSTRATIONS[0], task="at_once").task == "at_once"
-
-    suite_nico._TASKS.pop("at_once")
-    with pytest.raises(ValueError, match=AtOnce.__module__):
-        bgpo_trl.load_run(run)
 
 
 def rewrite(run, **changes):
@@ -335,16 +287,6 @@ def test_a_run_that_cannot_be_loaded_is_refused_in_one_line(trainer_of, tmp_path
 def test_a_seed_that_is_not_in_the_run_is_refused(load, seed):
     with pytest.raises(ValueError, match="has no seed"):
         load(seed=seed)
-
-
-def test_the_first_seed_is_the_default(load):
-    policies = [load(), load(seed=3), load(seed=8)]
-    (frame,) = noise(0, 1)
-    for policy in policies:
-        policy.condition(DEMONSTRATIONS[0])
-    first, same, other = (policy.act(frame) for policy in policies)
-    np.testing.assert_array_equal(first, same)
-    assert np.abs(first - other).max() > 1e-4
 
 
 def test_the_one_shot_example_prints_the_recognition_and_the_outcome(trainer_of, capsys):

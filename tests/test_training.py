@@ -2,7 +2,7 @@
 
 import itertools
 import signal
-from collections import Counter, defaultdict
+from collections import Counter
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -20,7 +20,7 @@ from bgpo_trl.scenes.nico import NicoEnv
 from bgpo_trl.training import Trainer
 from tests.algorithms.playing import assert_same
 from tests.conftest import of_name
-from tests.helpers import Recorder, contents
+from tests.helpers import Recorder, contents, rows
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 CSV_FILES = ("train.csv", "eval.csv")
@@ -110,19 +110,6 @@ def test_every_seed_plays_every_episode_once(run_of, make_config, name):
     if name.startswith("bgpo"):
         assert int(train[-1]["num_nodes"]) > 2
     assert (float(train[0]["loss_value"]), float(train[-1]["loss_value"]) > 0) == (0, True)
-
-
-@pytest.mark.parametrize("starts", [(0, 5, 10), (4, 0, 8), (0, 0, 0)])
-def test_tasks_are_presented_from_their_starts_on(make, make_config, tmp_path, starts):
-    config = make_config("state", "oracle", seeds=(0, 1, 2), episodes=16, task_starts=starts)
-    make(tmp_path, config).run()
-    first = defaultdict(lambda: 99)
-    for row in rows(tmp_path / "train.csv"):
-        first[row["task"]] = min(first[row["task"]], int(row["episode"]))
-    for task, start in zip(TASKS, starts, strict=True):
-        assert start < first[task] <= start + 3  # three seeds draw: the next episodes have it
-    for row in rows(tmp_path / "eval.csv"):
-        assert int(row["episode"]) > starts[TASKS.index(row["task"])]
 
 
 def test_all_presented_tasks_are_tested_every_few_episodes(make, make_config, tmp_path):
@@ -398,21 +385,6 @@ def test_an_ignored_interrupt_stays_ignored(make, make_config, tmp_path):
     assert len(rows(tmp_path / "train.csv")) == 4
 
 
-def test_checkpoints_are_written_at_the_configured_interval(make, make_config, tmp_path):
-    trainer = make(tmp_path, make_config(episodes=2, checkpoint_minutes=0.0))
-    trainer.run()
-    numbers = [path.name.split("-")[1] for path in (tmp_path / "checkpoint").glob("*.pt")]
-    assert max(int(number) for number in numbers) == 1 + trainer.env_steps  # one before the first
-
-
-def test_the_progress_bar_shows_episodes_and_success(make, make_config, tmp_path, capsys):
-    make(tmp_path, make_config(task_starts=(0, 2, 99)), progress=True).run()
-    won = [int(row["success"]) for row in rows(tmp_path / "train.csv")]
-    last = capsys.readouterr().err.split("\r")[-1]
-    assert "20/20" in last
-    assert f"success {sum(won) / len(won):.2f}" in last
-
-
 def test_resuming_a_finished_run_changes_nothing(uninterrupted, make):
     before = contents(uninterrupted)
     with make(uninterrupted, resume=True) as trainer:
@@ -509,14 +481,6 @@ def test_tasks_begin_for_each_seed_before_they_are_played(make, make_config, tmp
     steps = [int(row["env_steps"]) for row in boundary]
     assert steps[0] != steps[1]
     assert max(steps) < 20
-
-
-def test_only_fine_tuning_and_ewc_are_given_boundaries(make, make_config, tmp_path):
-    given = set()
-    for name in ALGORITHMS:
-        with make(tmp_path / name, make_config(name=name)) as trainer:
-            given |= {name} if trainer.algorithm.needs_boundaries else set()
-    assert given == {"fine-tuning", "ewc"}
 
 
 @pytest.mark.parametrize("name", ["bgpo", "maml", "dist-nll", "ewc"])

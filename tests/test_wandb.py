@@ -99,12 +99,6 @@ def evaluations(session: list[Record]) -> list[dict]:
     return [row for row in history(session) if any(key.startswith("eval/") for key in row)]
 
 
-def step_metrics(session: list[Record]) -> dict[str, str]:
-    """Return the step metric of each curve."""
-    metrics = [r.metric for r in session if r.WhichOneof("record_type") == "metric"]
-    return {metric.name: metric.step_metric for metric in metrics if metric.step_metric}
-
-
 @pytest.fixture(scope="module")
 def make(easy_world, bank, encoders, make_config):
     def make(directory, *, resume=False, **changes):
@@ -144,19 +138,6 @@ def run(make, tmp_path_factory):
     return directory
 
 
-def test_a_run_has_few_curves(run):
-    curves = {key for session in sessions(run) for row in history(session) for key in row}
-    success = {"success_mean", "success/step", "step", *(f"success/{task}" for task in TASKS)}
-    columns = {"return", "steps", "env_steps", "intrinsic_return", "num_nodes", "num_groups"}
-    columns |= {"loss_actor", "loss_value"}
-    media = {key for key in curves if key.startswith("figures/")}
-    assert {key for key in curves - media if not key.startswith("_")} == {
-        *(f"{group}/{name}" for group in ("eval", "train", "final") for name in success),
-        *(f"train/{name}" for name in columns),
-        "eval/success_sd",
-    }
-
-
 def test_the_curves_are_the_means_of_the_csv_files(run):
     """Also of the training episodes on both sides of the interruption."""
     first, second = map(evaluations, sessions(run))
@@ -179,26 +160,6 @@ def test_the_curves_are_the_means_of_the_csv_files(run):
             assert row[f"train/{column}"] == pytest.approx(played[column].mean())
 
 
-def test_the_summary_is_the_mean_of_the_last_evaluation(run):
-    summary = {
-        "/".join(item.nested_key) or item.key: json.loads(item.value_json)
-        for record in sessions(run)[-1]
-        for item in record.summary.update
-    }
-    tests = pd.read_csv(run / "eval.csv")
-    last = tests["success"][tests["episode"] == 10].mean()
-    assert summary["eval/success_mean"] == pytest.approx(last)
-    assert summary["final/success_mean"] == pytest.approx(0.5)
-
-
-def test_every_curve_is_drawn_over_training_episodes(run):
-    for session in sessions(run):
-        drawn_over = step_metrics(session)
-        for row in evaluations(session):
-            steps = {drawn_over[key] for key in row if "/" in key and not key.endswith("/step")}
-            assert len({row[step] for step in steps}) == 1
-
-
 def test_both_sessions_belong_to_the_same_run_with_its_settings(run):
     settings = dict(flatten(json.loads((run / "config.json").read_text())))
     started = [r.run for session in sessions(run) for r in session if r.HasField("run")]
@@ -219,15 +180,6 @@ def test_both_sessions_belong_to_the_same_run_with_its_settings(run):
         assert {"commit", "versions.torch"} <= saved.keys()
         for name, value in settings.items():
             assert saved[name] == (json.dumps(value) if isinstance(value, list) else value)
-
-
-def test_a_refused_run_makes_no_run_on_wandb(run, make, tmp_path):
-    before = {path: path.stat().st_mtime_ns for path in run.rglob("*")}
-    with pytest.raises(ValueError, match="other settings"):
-        make(run, resume=True, seeds=(1, 2))
-    with pytest.raises(ValueError, match="already holds a run"):
-        make(run)
-    assert {path: path.stat().st_mtime_ns for path in run.rglob("*")} == before
 
 
 def test_figures_and_videos_are_uploaded_as_they_are(run):
@@ -285,15 +237,3 @@ def test_evaluations_are_logged_again_after_a_crash(tmp_path):
         for session in sessions(tmp_path)
     ]
     assert logged == [[(n, 1 / n) for n in (1, 2, 3, 4)], [(n, 1 / n) for n in (3, 4, 5)]]
-
-
-def test_an_unreadable_figure_gives_one_warning_and_the_run_goes_on(tmp_path):
-    RunLogger(tmp_path, config={}).close()
-    (tmp_path / "broken.png").write_bytes(b"no picture")
-    with (
-        Dashboard(tmp_path, [partial(wandb_logger, tmp_path, "offline")], settings={}) as board,
-        pytest.warns(UserWarning, match="WandbLogger failed") as caught,
-    ):
-        for _ in range(2):
-            board.log_media("figures/broken", tmp_path / "broken.png")
-    assert len(caught) == 1

@@ -64,8 +64,3 @@ def test_what_says_how_to_read_the_tensors_is_not_believed(recorded, copy, meta)
     assert set(found.keys()) == KEYS
     for key in KEYS:
         torch.testing.assert_close(found[key], expected[key], rtol=0, atol=0)
-
-
-def test_a_folder_that_is_missing_is_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"there is no dataset at .*nowhere; record it again"):
-        load_demonstrations(tmp_path / "nowhere")

@@ -1,8 +1,6 @@
 import json
 import re
-import runpy
 import shutil
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -15,13 +13,10 @@ from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.scenes.nico import scene as nico_scene
 from suites import nico
 from suites.nico.demonstrator import Demonstrator
+from tests.helpers import contents
 
 TINY = {"per_task": 3, "held_out_per_task": 1, "progress": False}
 KEYS = {"pixels", "state", "action", "length", "task", "train", "seed"}
-
-
-def contents(path: Path) -> dict[str, bytes]:
-    return {file.name: file.read_bytes() for file in path.iterdir()}
 
 
 def edit_meta(path: Path, **changes: object) -> None:
@@ -102,15 +97,6 @@ def test_play_follows_a_demonstration_and_then_moves_at_random(tmp_path):
     again = record_demonstrations(tmp_path / "again", play=True, **options)
     for key in KEYS:
         assert again[key].equal(play[key])
-
-
-def test_demonstrations_differ_from_each_other_and_between_seeds(recorded, tmp_path):
-    starts = load_demonstrations(recorded)["state"][:, 0]
-    other = record_demonstrations(
-        tmp_path, tasks=["grasp_glass"], per_task=1, held_out_per_task=0, seed=1, progress=False
-    )
-
-    assert len(torch.cat([starts, other["state"][:, 0]]).unique(dim=0)) == 10
 
 
 def test_a_demonstration_that_fails_is_tried_again(tmp_path, monkeypatch):
@@ -243,15 +229,3 @@ def test_a_full_disk_is_noticed_before_recording(tmp_path, monkeypatch):
         record_demonstrations(tmp_path, **TINY)
 
     assert not list(tmp_path.iterdir())
-
-
-def test_the_command_ends_user_errors_in_one_line(recorded, monkeypatch, capsys):
-    size = ["--per-task", "3", "--held-out-per-task", "1"]
-    monkeypatch.setattr(sys, "argv", ["recording", str(recorded), *size, "--seed", "1"])
-    monkeypatch.delitem(sys.modules, "bgpo_trl.data.recording")  # which runpy would warn of
-    with pytest.raises(SystemExit) as ended:
-        runpy.run_module("bgpo_trl.data.recording", run_name="__main__", alter_sys=True)
-
-    assert ended.value.code.startswith(f"error: {recorded} holds another recording")
-    assert "\n" not in ended.value.code
-    assert capsys.readouterr() == ("", "")

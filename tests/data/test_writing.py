@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from bgpo_trl.data.dataset import load_demonstrations, read_meta
-from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.data.writing import resize_frames, write_demonstrations
 from tests.helpers import contents
 
@@ -170,14 +169,6 @@ def test_a_folder_that_exists_is_kept_as_it_is(tmp_path):
     before = contents(tmp_path)
     with pytest.raises(ValueError, match="exists: choose another folder, or remove it"):
         write(tmp_path / "own", episodes_of(seed=1))
-    assert contents(tmp_path) == before
-
-
-def test_a_written_dataset_is_not_continued_as_a_recording(tmp_path):
-    write(tmp_path / "own", episodes_of())
-    before = contents(tmp_path)
-    with pytest.raises(ValueError, match="holds another recording"):
-        record_demonstrations(tmp_path / "own", per_task=3, held_out_per_task=1, progress=False)
     assert contents(tmp_path) == before
 
 

@@ -40,12 +40,6 @@ class Turn(nico.NicoTask):
         return bool(self._side * (physics.arm_angles()[0] - self._yaw) > 0.2)
 
 
-class TurnLeft(Turn):
-    """Success: the arm has turned to the left."""
-
-    side = 1.0
-
-
 def turn(yaw):
     return torch.nn.functional.pad(yaw.unsqueeze(-1), (0, 3))
 
@@ -74,12 +68,6 @@ def test_a_policy_that_uses_the_places_fails_without_them(scripted_run):
     found = by_condition(scripted_run("turn", Turn, look))
     assert min(found["seen"]) > 0.5
     assert found["places hidden"] == found["objects hidden"] == [0, 0]
-
-
-def test_a_remembered_movement_succeeds_in_all_conditions(scripted_run):
-    found = by_condition(scripted_run("turn_left", TurnLeft, remember))
-    assert found["seen"] == found["places hidden"] == found["objects hidden"]
-    assert min(found["seen"]) > 0.5 > max(found["random actions"])
 
 
 def test_the_starts_are_the_same_in_all_conditions(scripted_run):
@@ -221,12 +209,6 @@ def trained(bank, shipped, make_config, tmp_path):
         return tmp_path / "run"
 
     return train
-
-
-def test_a_run_on_the_ground_truth_is_tested_too(trained, encoders):
-    run = trained(encoders)
-    looking.looking(TrainedArguments(run=run, episodes=1))
-    assert len(read_table(run / "looking.csv")) == 4 * 2 * 3
 
 
 def test_a_run_without_encoders_is_refused(trained, refused):

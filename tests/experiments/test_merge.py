@@ -103,19 +103,6 @@ def test_runs_that_are_not_one_run_are_not_merged(jobs, tmp_path, refused, choos
     refused(lambda: merge(MergeArguments(chosen, tmp_path / "out")), cause, "")
 
 
-def test_an_unfinished_run_is_not_merged(jobs, tmp_path, refused):
-    (jobs[0] / "summary.json").unlink()
-    arguments = MergeArguments(jobs, tmp_path / "out")
-    refused(lambda: merge(arguments), f"{jobs[0]} is not finished", "--resume")
-
-
-def test_enormous_numbers_of_episodes_take_no_memory(jobs, tmp_path, refused):
-    for job in jobs:
-        for name in ("config.json", "summary.json"):
-            edit(job / name, episodes=10**15)
-    refused(lambda: merge(MergeArguments(jobs, tmp_path / "out")), "each episode", "run them again")
-
-
 def test_merging_replaces_no_other_results(jobs, tmp_path, refused):
     other = train(tmp_path / "other", 5)
     for out in (jobs[0], other):

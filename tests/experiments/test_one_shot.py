@@ -2,7 +2,6 @@
 
 import csv
 import json
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +9,6 @@ import torch
 
 from bgpo_trl import load_run
 from bgpo_trl.data.recording import record_demonstrations
-from bgpo_trl.evaluation import Evaluator
 from bgpo_trl.experiments import one_shot
 from bgpo_trl.experiments.one_shot import OneShotArguments, Row
 from suites import nico
@@ -101,20 +99,6 @@ def test_policies_are_shown_the_beginning_of_new_demonstrations(run_of, tmp_path
                 assert found[5:] == pytest.approx((np.mean(inferred), np.mean(activity)), abs=1e-5)
 
 
-def test_all_shares_are_tested_from_the_same_starts(run_of, monkeypatch):
-    policy, numbers = load_run(run_of("bgpo")), []
-
-    def run(self, snapshots, device):
-        numbers.extend({snapshot.number for snapshot in snapshots})
-        assert all(snapshot.presented.all() for snapshot in snapshots)
-        return SimpleNamespace(success=torch.ones(2, 3, 1, dtype=torch.bool))
-
-    monkeypatch.setattr(Evaluator, "run", run)
-    rows = one_shot.measure(policy, (0.5, 0.7, 1.0), 1, 1)
-    assert len(numbers) == 3 and len(set(numbers)) == 1
-    assert {row[4] for row in rows} == {1.0}
-
-
 def table():
     rows = [
         (0.5, 0, "a", 4, 0.25, 1.0, 0.5),
@@ -134,20 +118,6 @@ def test_means_equal_those_by_hand():
     assert list(means) == ["all", "a", "b"]
     assert means["all"][0.5] == pytest.approx(np.array([[0.5, 0.5, 0.6], [0.25, 0.5, 0.5]]))
     assert means["a"][1.0] == pytest.approx(np.array([[1, 1, 1], [0.5, 1, 1]]))
-
-
-def test_the_figure_shows_the_means():
-    success, inferred = one_shot.plot(table()).axes
-    curves = {line.get_label(): np.array(line.get_data()).T.tolist() for line in success.lines}
-    assert curves == {
-        "all": [[0.5, 0.375], [1.0, 0.875]],
-        "a": [[0.5, 0.125], [1.0, 0.75]],
-        "b": [[0.5, 0.625], [1.0, 1.0]],
-    }
-    assert inferred.lines[1].get_ydata().tolist() == [0.75, 1.0]
-    (band,) = success.collections
-    edges = band.get_paths()[0].vertices
-    assert sorted(set(edges[edges[:, 0] == 0.5, 1])) == pytest.approx([0.25, 0.5])
 
 
 @pytest.mark.parametrize(

@@ -185,12 +185,6 @@ def test_resume_alone_takes_the_settings_of_the_run(undrawn, tmp_path, monkeypat
     assert changed == {"beta": 0.3}
 
 
-def test_a_run_that_does_not_exist_begins_when_it_is_resumed(undrawn, tmp_path):
-    again = Arguments(out=tmp_path / "run", resume=True, episodes=4)
-    continual(again)
-    assert (tmp_path / "run" / "train.csv").read_text().count("\n") == 1 + 2 * 4
-
-
 def test_the_config_of_a_run_repeats_it(undrawn, tmp_path):
     first, second = tmp_path / "first", tmp_path / "second"
     continual(
@@ -301,12 +295,6 @@ def test_a_refused_run_starts_no_logger(undrawn, started, tmp_path):
         with pytest.raises(ValueError, match="holds a run"):
             continual(Arguments(out=tmp_path / "run", wandb="offline", tensorboard=True, **again))
     assert started == []
-
-
-def test_curves_of_seeds_are_logged_on_request(undrawn, started, tmp_path):
-    continual(Arguments(out=tmp_path / "run", tensorboard=True, per_seed_curves=True))
-    metrics = started[0][0].metrics[0][0]
-    assert {f"eval/success/{TASKS[0]}/seed_{seed}" for seed in (3, 8)} <= metrics.keys()
 
 
 @pytest.mark.slow

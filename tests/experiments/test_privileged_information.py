@@ -2,13 +2,9 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
-from typing import Annotated
 
 import pytest
-import tyro
 
-from bgpo_trl.algorithms.rl import RL
 from bgpo_trl.configs import DDPGConfig
 from bgpo_trl.experiments.privileged_information import (
     INPUTS,
@@ -19,14 +15,6 @@ from bgpo_trl.files.checkpoint import load_checkpoint
 from bgpo_trl.runs.results import read_table
 from suites import nico
 from tests.helpers import contents
-
-
-@pytest.mark.parametrize("rl", RL)
-def test_the_settings_of_the_rl_algorithm_are_flags(rl):
-    kind = Annotated[InformationArguments, tyro.conf.OmitArgPrefixes]
-    arguments = tyro.cli(kind, args=["--out", "here", rl, "--learning-rate", "0.5"])
-    assert arguments.rl == replace(RL[rl].config, learning_rate=0.5)
-    assert arguments.out == Path("here")
 
 
 def test_each_input_has_a_run_and_a_row(tiny, tmp_path):

@@ -184,7 +184,7 @@ def test_figures_are_written_beside_the_tables(reported):
     assert len(list(reported.glob("*.png"))) == page.count("data:image/png") == 5
 
 
-@pytest.mark.parametrize("tasks", [("juggle",), ("juggle", "sleep"), tuple("abcdefgh")])
+@pytest.mark.parametrize("tasks", [("juggle",), tuple("abcdefgh")])
 def test_any_number_of_tasks_is_reported(tasks, tmp_path):
     starts = range(0, 32, 32 // len(tasks))
     for name, level in {"mine": 9, "bgpo": 2}.items():
@@ -252,26 +252,6 @@ def test_other_conditions_are_refused_before_anything_is_written(tmp_path):
     for title in ("3 tasks", "Differences: 3 tasks"):
         section = text_of(tmp_path).split(f"## {title}, all from the start\n")[1].split("\n## ")[0]
         assert "differ in held_out (validation and test)" in section
-
-
-def test_unfinished_runs_are_named_and_left_out(tmp_path):
-    write_run(tmp_path, "bgpo", 9)
-    path = write_run(tmp_path, "oracle", 5)
-    edit(path / "config.json", episodes=50)
-    report(ReportArguments((tmp_path,)))
-    text = text_of(tmp_path)
-    assert f"- {path} has tests until episode 40 of 50: let the run finish" in text
-    assert "DDPG" not in text
-
-
-def test_several_folders_need_one_for_the_report(tmp_path):
-    runs = tuple(write_run(tmp_path, name, 9) for name in ("bgpo", "oracle"))
-    with pytest.raises(ValueError, match="--out: several folders are given"):
-        report(ReportArguments(runs))
-    report(ReportArguments(runs, out=tmp_path / "out"))
-    assert len(rows_of(text_of(tmp_path / "out"), "3 tasks, all from the start")) == 2
-    with pytest.raises(ValueError, match="name a run, or a folder of runs"):
-        report(ReportArguments(()))
 
 
 def test_the_report_on_an_archive_is_the_same_to_the_digit(reported, tmp_path):

@@ -21,18 +21,12 @@ from bgpo_trl.experiments.report import ReportArguments, report
 from bgpo_trl.experiments.sweep import EightTasksArguments, SweepArguments
 from bgpo_trl.runs.config_file import Digests, settings_of
 from bgpo_trl.runs.cost import Cost, read_costs, write_costs
-from bgpo_trl.runs.results import read_table
-from bgpo_trl.training import Trainer
 from suites import nico
-from tests.helpers import contents
+from tests.helpers import contents, rows
 
 SOME = Digests("some", "bank")
 BY_TASKS = {nico.PAPER_TASKS: SOME}
 HEAD = "algorithm,seed,episode,env_steps,task,success,return,steps"
-
-
-def rows(path):
-    return read_table(path).to_dict("records")
 
 
 def write_run(job):
@@ -125,30 +119,6 @@ def test_jobs_carry_tasks_module_and_bank(tmp_path, monkeypatch):
     )
     sweep.play(continual)
     assert events == ["my_tasks", tmp_path / bank]
-
-
-def test_settings_of_eight_tasks_differ_by_order_and_schedule(tmp_path):
-    settings = ("sequential", "eight", "eight-reversed", "eight-sequential", "eight-concurrent")
-    arguments = SweepArguments(
-        settings=settings,
-        episodes=4_000,
-        eval_every=50,
-        held_out="test",
-        out=tmp_path,
-    )
-    grid = {path.name: group[0].config for path, group in sweep.make_jobs(arguments).items()}
-    assert list(grid) == [f"{setting}-bgpo" for setting in arguments.settings]
-    assert [config.tasks for config in grid.values()] == [
-        *(nico.PAPER_TASKS, nico.ALL_TASKS, nico.ALL_TASKS[::-1], nico.ALL_TASKS, nico.ALL_TASKS)
-    ]
-    unpractised = [config.schedule == "sequential" for config in grid.values()]
-    assert unpractised == [True, False, False, True, False]
-    each_500 = tuple(range(0, 4_000, 500))
-    assert [config.task_starts for config in grid.values()] == [
-        *((0, 1_400, 2_600), each_500, each_500, each_500, (0,) * 8)
-    ]
-    for config in grid.values():
-        assert (config.episodes, config.eval_every, config.held_out) == (4_000, 50, "test")
 
 
 def test_the_benchmark_of_eight_tasks_is_a_grid_with_tests_every_50_episodes(monkeypatch):

@@ -9,9 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
-from PIL import Image
 
-from bgpo_trl.figures import style
 from bgpo_trl.figures.curves import plot_success_curves
 from bgpo_trl.figures.gwr import plot_gwr_pca
 from bgpo_trl.figures.style import save_figure
@@ -91,30 +89,6 @@ def test_each_panel_shows_its_task_with_a_trailing_window(tmp_path):
     assert curve(b) == {2: 0, 3: 0, 6: 1 / 2}
 
 
-def test_named_files_of_one_algorithm_have_separate_curves(tmp_path):
-    files = {
-        name: write_eval_csv(tmp_path / f"{number}.csv", [("bgpo", 0, 1, "a", number)])
-        for number, name in enumerate(("failed", "solved"))
-    }
-    figure = plot_success_curves(files)
-    labels = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert labels == ["failed (1 seed)", "solved (1 seed)"]
-    assert [curve(figure.axes[0], index) for index in (0, 1)] == [{1: 0}, {1: 1}]
-
-
-def test_curves_do_not_depend_on_the_order_of_rows_or_files(run, tmp_path):
-    header, *lines = run.read_text().splitlines()
-    parts = []
-    for algorithm in ("BGPO", "MAML", "Dist-NLL"):
-        rows = [line for line in lines if line.startswith(algorithm)]
-        parts.append(tmp_path / f"{algorithm}.csv")
-        parts[-1].write_text("\n".join([header, *reversed(rows)]) + "\n")
-    whole, spread = plot_success_curves(run), plot_success_curves(parts)
-    for expected, axes in zip(whole.axes, spread.axes, strict=True):
-        for index in range(3):
-            assert curve(axes, index) == curve(expected, index) != {}
-
-
 def test_task_starts_and_random_success_are_marked(run):
     presented = {TASKS[2]: 0, TASKS[0]: 35, TASKS[1]: 65}
     figure = plot_success_curves(run, presented=presented, random_success={TASKS[0]: 0.05})
@@ -167,14 +141,6 @@ def test_the_same_data_gives_the_same_file_without_global_state(run, tmp_path):
     assert all(image.startswith(b"\x89PNG") for image in content)
     assert dict(mpl.rcParams) == before
     assert plt.get_fignums() == []
-
-
-def test_a_saved_figure_has_300_pixels_an_inch(run, tmp_path, monkeypatch, usual_dpi):
-    monkeypatch.setattr(style, "DPI", usual_dpi)
-    figure = plot_success_curves(run)
-    save_figure(figure, tmp_path / "curves.png")
-    with Image.open(tmp_path / "curves.png") as image:
-        np.testing.assert_allclose(image.size, 300 * figure.get_size_inches(), atol=1)
 
 
 def visible_texts(figure: Figure) -> list[Text]:

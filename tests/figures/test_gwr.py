@@ -139,10 +139,3 @@ def test_growth_draws_the_number_of_nodes_of_each_seed():
     assert first == [[1, 2], [2, 3], [3, 5]]
     assert other == [[1, 2], [2, 2], [3, 2]]
     assert moments == [[10, 2], [20, 5]]
-
-
-def test_growth_draws_tensors_and_graphs_without_edges():
-    start = (torch.rand(2, 32), torch.tensor([[0, 1]]), torch.tensor([-1, -1]))
-    no_edge = (torch.rand(2, 32), torch.zeros(0, 2, dtype=torch.int64), torch.tensor([0, -1]))
-    for graph in (start, no_edge):
-        FigureCanvasAgg(plot_gwr_growth({1: graph}, [[2]], TASKS)).draw()

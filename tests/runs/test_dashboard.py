@@ -109,29 +109,6 @@ def test_a_loss_that_diverged_is_seen(make):
     assert np.isnan(recorder.metrics[0][0]["train/loss_actor"])
 
 
-def test_no_logger_is_made_beside_damaged_rows(make, tmp_path):
-    make().close()
-    with open(tmp_path / "train.csv", "a") as file:
-        file.write("x,three\n")
-    started = []
-    with pytest.raises(ValueError, match="line 2 is damaged"):
-        Dashboard(tmp_path, [lambda: started.append(1) or Recorder()], settings={})
-    assert started == []
-
-
-def test_success_of_each_seed_is_logged_on_request(make):
-    recorder = Recorder()
-    with make(recorder, per_seed=True) as board:
-        board.log_train(episode(3, 1, "grasp", 1))
-        board.log_eval(evaluation(2))
-    [(metrics, _)] = recorder.metrics
-    of_seeds = {key: value for key, value in metrics.items() if "/seed_" in key}
-    assert of_seeds == {
-        f"eval/success/{task}/seed_{seed}": np.mean(successes)
-        for (seed, task), successes in TESTED.items()
-    }
-
-
 def test_a_resumed_run_logs_the_means_of_an_uninterrupted_one(make):
     """Training episodes that no evaluation follows are in the CSV file only."""
     uninterrupted, resumed = Recorder(), Recorder()
@@ -237,20 +214,6 @@ def fake_wandb(monkeypatch):
 
     monkeypatch.setattr(dashboard, "WandbLogger", Fake)
     return Fake
-
-
-@pytest.mark.parametrize("mode", ["online", "offline"])
-def test_wandb_keeps_its_run_when_resumed(mode, fake_wandb, tmp_path):
-    for directory in ("a", "a", "b"):
-        wandb_logger(tmp_path / directory, mode, group="continual-bgpo", tags=("bgpo", "quick"))
-    first, resumed, other = fake_wandb.made
-    assert first == resumed
-    assert first["id"] != other["id"]
-    assert (first["mode"], first["group"], first["tags"]) == (
-        mode,
-        "continual-bgpo",
-        ["bgpo", "quick"],
-    )
 
 
 def test_wandb_logs_offline_when_it_does_not_answer(fake_wandb, tmp_path):

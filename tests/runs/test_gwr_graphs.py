@@ -8,7 +8,6 @@ import torch
 from bgpo_trl.modules.gwr import GWRB
 from bgpo_trl.runs.gwr_graphs import growth_moments, load_graphs, save_graph
 from bgpo_trl.training import Trainer
-from tests.helpers import largest_file
 
 
 def grown(seed=0, n=30):
@@ -60,26 +59,6 @@ def test_run_saves_the_graphs_of_its_first_seed(tmp_path, bank, encoders, make_c
     for first, second in zip(last, trainer.algorithm.gwr.graph(0), strict=True):
         assert first.equal(second)
     assert not last.weights.equal(trainer.algorithm.gwr.graph(1).weights)
-
-
-def test_run_without_gwr_saves_no_graphs(tmp_path, bank, encoders, make_config):
-    config = make_config(name="ddpg", episodes=2)
-    with Trainer(config, tmp_path, bank=bank, encoders=encoders, progress=False) as trainer:
-        trainer.run()
-    assert not (tmp_path / "gwr").exists()
-    assert load_graphs(tmp_path / "gwr") == {}
-
-
-def test_full_disk_leaves_the_earlier_graph(tmp_path):
-    before = save_graph(tmp_path, 5, grown(n=5)).read_bytes()
-    with (
-        largest_file(100),
-        pytest.raises(OSError, match=r"cannot write .*: make room, or choose") as error,
-    ):
-        save_graph(tmp_path, 5, grown(n=30))
-    assert "\n" not in str(error.value)
-    (only,) = tmp_path.iterdir()
-    assert only.read_bytes() == before
 
 
 @pytest.mark.parametrize("content", [b"", b"\x00" * 100, None])

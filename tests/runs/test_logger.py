@@ -44,31 +44,6 @@ def test_a_run_writes_its_settings_and_two_csv_files(tmp_path):
     }
 
 
-def write(logger: RunLogger, episodes: range) -> None:
-    for episode in episodes:
-        logger.log_train({**ROW, "episode": episode, "loss_actor": 1 / (episode + 1)})
-        if episode % 2:
-            logger.log_eval({**ROW, "episode": episode})
-
-
-@pytest.mark.parametrize("checkpoint_at", [None, 5])
-def test_a_resumed_run_writes_the_same_files_as_an_uninterrupted_one(checkpoint_at, tmp_path):
-    with RunLogger(tmp_path / "straight", config=CONFIG) as logger:
-        write(logger, range(20))
-
-    killed = RunLogger(tmp_path / "resumed", config=CONFIG)
-    position = {}
-    if checkpoint_at is not None:
-        write(killed, range(checkpoint_at))
-        position = killed.position()
-    write(killed, range(checkpoint_at or 0, 9))
-
-    with RunLogger(tmp_path / "resumed", config=CONFIG, resume=True) as logger:
-        logger.truncate_to(position)
-        write(logger, range(checkpoint_at or 0, 20))
-    assert contents(tmp_path / "resumed") == contents(tmp_path / "straight")
-
-
 @pytest.mark.parametrize("resume", [False, True])
 def test_a_directory_with_other_settings_is_refused_unchanged(resume, tmp_path):
     with RunLogger(tmp_path, config=CONFIG) as logger:
@@ -80,23 +55,6 @@ def test_a_directory_with_other_settings_is_refused_unchanged(resume, tmp_path):
     message = str(error.value)
     assert "(gamma is 0.98 there and 0.95 here; beta is absent there and 0.1 here)" in message
     assert contents(tmp_path) == before
-
-
-def test_a_run_is_continued_only_on_request(tmp_path):
-    RunLogger(tmp_path, config=CONFIG).close()
-    with pytest.raises(ValueError, match="already holds a run: resume it"):
-        RunLogger(tmp_path, config=CONFIG)
-
-
-def test_an_algorithm_may_add_columns_to_the_training_episodes(tmp_path):
-    with RunLogger(tmp_path, config=CONFIG, logged=("loss_meta",)) as logger:
-        logger.log_train({**ROW, "loss_meta": 0.5})
-        logger.log_eval(ROW)
-    header, row = (tmp_path / "train.csv").read_text().splitlines()
-    assert header == ",".join([*TRAIN_COLUMNS, "loss_meta"])
-    assert row == "bgpo,2,7,210,grasp_glass,1,1.0,28,,,,,,,0.5"
-    with pytest.raises(ValueError, match="columns"):
-        RunLogger(tmp_path, config=CONFIG, resume=True)
 
 
 @pytest.mark.parametrize("logged", [("success",), ("loss_meta", "loss_meta")])
