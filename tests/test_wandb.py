@@ -17,9 +17,9 @@ import wandb
 from PIL import Image
 from wandb.proto.wandb_internal_pb2 import Record
 
-from bgpo_trl.figures.curves import plot_success_curves
 from bgpo_trl.figures.frames import save_gif
 from bgpo_trl.figures.style import save_figure
+from bgpo_trl.figures.success import plot_success_curves
 from bgpo_trl.runs.dashboard import Dashboard, wandb_logger
 from bgpo_trl.runs.directory import flatten
 from bgpo_trl.runs.logger import RunLogger

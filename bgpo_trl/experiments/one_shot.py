@@ -17,11 +17,10 @@ from bgpo_trl.analysis.tables import Table, markdown
 from bgpo_trl.analysis.task_inference import task_inference_accuracy
 from bgpo_trl.experiments.arguments import TrainedArguments
 from bgpo_trl.experiments.episodes import evaluator_of
-from bgpo_trl.experiments.records import write_measurement
 from bgpo_trl.figures.style import COLORS, save_figure
 from bgpo_trl.machine import set_threads
 from bgpo_trl.plugins import import_plugin
-from bgpo_trl.runs.provenance import commit_of_code
+from bgpo_trl.runs.provenance import commit_of_code, write_measurement
 from bgpo_trl.seeding import stream_seed
 
 if TYPE_CHECKING:

@@ -39,15 +39,13 @@ from bgpo_trl.analysis.tables import (
     success_table,
     task_table,
 )
-from bgpo_trl.figures.curves import plot_success_curves
 from bgpo_trl.figures.groups import draw_groups, plot_counts, read_counts
 from bgpo_trl.figures.gwr import plot_gwr_pca
 from bgpo_trl.figures.page import Section, write_page
 from bgpo_trl.figures.style import COLORS, save_figure
-from bgpo_trl.figures.success_matrix import plot_success_matrices
+from bgpo_trl.figures.success import plot_success_curves, plot_success_matrices
 from bgpo_trl.files.writing import make_folder, write_whole
-from bgpo_trl.runs.archive import archive_run
-from bgpo_trl.runs.results import find_table, read_table
+from bgpo_trl.runs.results import archive_run, find_table, read_table
 
 # For a screen: figures of results are kept under version control.
 _DPI = 150

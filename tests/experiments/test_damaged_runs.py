@@ -13,7 +13,7 @@ from bgpo_trl.experiments.nico.looking import looking
 from bgpo_trl.experiments.one_shot import OneShotArguments, one_shot
 from bgpo_trl.experiments.report import ReportArguments, report
 from bgpo_trl.experiments.watch import WatchArguments, watch
-from bgpo_trl.figures.of_run import draw_growth
+from bgpo_trl.figures.gwr import draw_growth
 from bgpo_trl.runs.config_file import read_config
 from suites import nico
 from tests.helpers import CHECKPOINTS, contents, put_checkpoint

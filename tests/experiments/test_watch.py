@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from bgpo_trl.experiments import watch
-from bgpo_trl.figures import of_run as growth
+from bgpo_trl.figures import gwr as growth
 from bgpo_trl.runs.config_file import read_config
 from bgpo_trl.runs.gwr_graphs import load_graphs
 from suites import nico

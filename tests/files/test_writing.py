@@ -9,9 +9,8 @@ import pytest
 import torch
 from matplotlib.figure import Figure
 
-from bgpo_trl.experiments.records import write_rows
 from bgpo_trl.figures.frames import save_gif
-from bgpo_trl.figures.of_run import write_nodes
+from bgpo_trl.figures.gwr import write_nodes
 from bgpo_trl.figures.page import write_page
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
@@ -19,6 +18,7 @@ from bgpo_trl.files.csv_file import CsvFile
 from bgpo_trl.files.tensor_file import save_tensors
 from bgpo_trl.files.writing import lock_directory, write_whole
 from bgpo_trl.runs.cost import write_costs
+from bgpo_trl.runs.provenance import write_rows
 from tests.helpers import largest_file
 
 

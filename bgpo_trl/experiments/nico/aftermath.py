@@ -22,10 +22,9 @@ from bgpo_trl.analysis.tables import Table, markdown
 from bgpo_trl.experiments.arguments import TrainedArguments
 from bgpo_trl.experiments.episodes import evaluator_of, snapshots_of
 from bgpo_trl.experiments.nico.scripted import Episode, load_blocks_of_nico, play, random_actions
-from bgpo_trl.experiments.records import write_measurement
 from bgpo_trl.machine import set_threads
 from bgpo_trl.plugins import import_plugin
-from bgpo_trl.runs.provenance import commit_of_code
+from bgpo_trl.runs.provenance import commit_of_code, write_measurement
 from suites import nico
 from suites.nico import kinematics
 from suites.nico.base import CONTROL_TIMESTEP, TIME_LIMIT, Environment

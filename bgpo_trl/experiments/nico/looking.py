@@ -19,13 +19,12 @@ from bgpo_trl.analysis.tables import Table, markdown
 from bgpo_trl.experiments.arguments import TrainedArguments
 from bgpo_trl.experiments.episodes import evaluator_of, snapshots_of
 from bgpo_trl.experiments.nico.scripted import load_blocks_of_nico, play, random_actions
-from bgpo_trl.experiments.records import write_measurement
-from bgpo_trl.figures.bars import plot_success_bars
 from bgpo_trl.figures.style import save_figure
+from bgpo_trl.figures.success import plot_success_bars
 from bgpo_trl.files.progress import progress_bar
 from bgpo_trl.machine import set_threads
 from bgpo_trl.plugins import import_plugin
-from bgpo_trl.runs.provenance import commit_of_code
+from bgpo_trl.runs.provenance import commit_of_code, write_measurement
 from suites import opengl
 
 if TYPE_CHECKING:
