@@ -194,16 +194,6 @@ def test_the_banks_steps_are_those_of_its_embeddings():
     assert distance.max() < 0.03  # of about 3 between two demonstrations
 
 
-def test_compact_steps_hold_the_frames_of_their_demonstrations_alone(steps):
-    rows = [3, 0, 2]
-    compact = steps.select(torch.tensor(rows)).compact()
-    assert len(compact.latent) == len(compact.action) == LENGTH[rows].sum()
-    for place, row in enumerate(rows):
-        ours, theirs = frames(compact, place), frames(steps, row)
-        assert compact.latents(ours).equal(steps.latents(theirs))
-        assert compact.actions(ours).equal(steps.actions(theirs))
-
-
 def test_the_identity_is_that_of_the_demonstrations(bank, tmp_path):
     path, tasks = tmp_path / "bank.safetensors", nico.PAPER_TASKS[1:]
     some = replace(bank.for_tasks(tasks), encoder_id="abc")
@@ -279,8 +269,3 @@ def test_a_bank_remembers_its_scene_and_joins_none_of_another(plain_bank, tmp_pa
         assert loaded.scene_version == version
     with pytest.raises(ValueError, match="shows the scene nico-1, the other nico-2"):
         loaded + replace(plain_bank, scene_version="nico-2")
-
-
-def test_a_part_that_there_is_not_is_refused(bank):
-    with pytest.raises(ValueError, match="part must be 'validation', 'test' or None, got 'Test'"):
-        bank.held_out("Test")

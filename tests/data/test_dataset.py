@@ -1,4 +1,3 @@
-import json
 from pathlib import Path
 
 import numpy as np
@@ -6,17 +5,12 @@ import pytest
 import torch
 
 from bgpo_trl.data.dataset import load_demonstrations
+from tests.helpers import edit
 
 KEYS = {"pixels", "state", "action", "length", "task", "train", "seed"}
 
 
-def edit_meta(path: Path, **changes: object) -> None:
-    file = path / "dataset.json"
-    meta = {**json.loads(file.read_text()), **changes}
-    file.write_text(json.dumps({k: v for k, v in meta.items() if v is not None}))
-
-
-@pytest.mark.parametrize("key", sorted(KEYS))
+@pytest.mark.parametrize("key", ["pixels", "length"])
 def test_a_flipped_byte_is_noticed(copy, key):
     values = np.memmap(copy / f"{key}.memmap", np.uint8, "r+")
     values[len(values) // 2] ^= 1
@@ -36,13 +30,13 @@ def truncate(path: Path) -> None:
     ("damage", "message"),
     [
         (truncate, r"pixels\.memmap is missing or truncated; remove .*"),
-        (lambda p: (p / "action.memmap").unlink(), r"action\.memmap is missing or truncated; .*"),
         (lambda p: (p / "dataset.json").write_text("{"), r"dataset\.json is damaged; remove .*"),
-        (lambda p: (p / "dataset.json").write_text("{}"), r"dataset\.json is damaged; remove .*"),
-        (lambda p: (p / "dataset.json").write_bytes(b"\xff"), r"dataset\.json is damaged; .*"),
         (lambda p: (p / "dataset.json").unlink(), r"copy is not a dataset of demonstrations; .*"),
-        (lambda p: edit_meta(p, checksum=None), r"is not complete; resume it with .*"),
-        (lambda p: edit_meta(p, scene_version="old"), r"was recorded in scene 'old', this is nico"),
+        (lambda p: edit(p / "dataset.json", checksum=None), r"is not complete; resume it with .*"),
+        (
+            lambda p: edit(p / "dataset.json", scene_version="old"),
+            r"was recorded in scene 'old', this is nico",
+        ),
     ],
 )
 def test_what_is_not_whole_is_refused_in_one_line(copy, damage, message):

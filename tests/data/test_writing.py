@@ -1,6 +1,5 @@
 """Demonstrations from elsewhere, written as a dataset."""
 
-import shutil
 from collections.abc import Sequence
 
 import numpy as np
@@ -12,7 +11,6 @@ from hypothesis.extra.numpy import arrays
 
 from bgpo_trl.data.dataset import load_demonstrations, read_meta
 from bgpo_trl.data.writing import resize_frames, write_demonstrations
-from tests.helpers import contents
 
 TASKS = ("grasp_glass", "push_green_to_white")
 
@@ -79,16 +77,6 @@ def test_recorded_demonstrations_written_again_are_the_same_dataset(recorded, tm
     assert again["action"].equal(shown["action"][:, : longest - 1])
     for key in ("length", "task", "train"):
         assert again[key].equal(shown[key])
-
-
-def test_tasks_are_labeled_in_the_order_asked_for(tmp_path):
-    episodes = episodes_of()
-    dataset = write(tmp_path / "own", episodes, tasks=TASKS[::-1], held_out_per_task=0)
-    assert dataset["length"].tolist() == [2, 7, 6, 3, 5, 3, 4]
-    assert dataset["task"].tolist() == [0, 0, 0, 0, 1, 1, 1]
-    assert dataset["train"].all()
-    alone = write(tmp_path / "alone", episodes, tasks=TASKS[:1])
-    assert alone["length"].tolist() == [5, 3, 4]
 
 
 class OnDemand(Sequence):
@@ -170,14 +158,6 @@ def test_a_folder_that_exists_is_kept_as_it_is(tmp_path):
     with pytest.raises(ValueError, match="exists: choose another folder, or remove it"):
         write(tmp_path / "own", episodes_of(seed=1))
     assert contents(tmp_path) == before
-
-
-def test_nothing_is_left_if_the_disk_is_full(tmp_path, monkeypatch):
-    usage = shutil.disk_usage(tmp_path)._replace(free=1000)
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
-    with pytest.raises(OSError, match="make room or choose another folder"):
-        write(tmp_path / "own", episodes_of())
-    assert not [*tmp_path.iterdir()]
 
 
 def test_resized_frames_are_means_of_areas():
