@@ -8,19 +8,13 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from bgpo_trl.configs import (
-    InverseModelConfig,
-    RepresentationConfig,
-    SequenceAutoencoderConfig,
-    VAEConfig,
-)
 from bgpo_trl.encoders.representation import (
     load_representation,
     save_representation,
     train_representation,
 )
 from bgpo_trl.training import Trainer
-from tests.helpers import rows
+from tests.helpers import TINY_ENCODERS, rows
 
 DEVICES = ["cpu:0", *(["cuda"] if torch.cuda.is_available() else [])]
 
@@ -59,15 +53,10 @@ def test_encoders_trained_elsewhere_come_back_to_the_cpu(device, tmp_path):
         },
         [4],
     )
-    config = RepresentationConfig(
-        vae=VAEConfig(steps=2, batch_size=4),
-        lae=SequenceAutoencoderConfig(steps=2, batch_size=4),
-        inverse=InverseModelConfig(steps=2, batch_size=4),
-    )
     found = []
     for place in ("cpu", device):
         trained = train_representation(
-            data, config, scene_version="noise", device=place, progress=False
+            data, TINY_ENCODERS, scene_version="noise", device=place, progress=False
         )
         save_representation(trained, tmp_path / "weights.safetensors")
         found.append(load_representation(tmp_path / "weights.safetensors"))

@@ -7,12 +7,6 @@ import pytest
 import torch
 
 import bgpo_trl
-from bgpo_trl.configs import (
-    InverseModelConfig,
-    RepresentationConfig,
-    SequenceAutoencoderConfig,
-    VAEConfig,
-)
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.dataset import load_demonstrations
 from bgpo_trl.data.writing import write_demonstrations
@@ -21,12 +15,8 @@ from bgpo_trl.encoders.representation import load_representation
 from bgpo_trl.encoders.train import train_encoders
 from bgpo_trl.scenes import SCENES, Outcome, Scene, Simulation, SimulationEnv
 from bgpo_trl.training import Trainer
+from tests.helpers import TINY_ENCODERS
 
-TINY = RepresentationConfig(
-    vae=VAEConfig(batch_size=8, window=2, steps=4, warmup_steps=1),
-    lae=SequenceAutoencoderConfig(batch_size=8, steps=4, warmup_steps=1),
-    inverse=InverseModelConfig(hidden_size=8, batch_size=8, steps=4, warmup_steps=1),
-)
 TASKS = ("left", "right")
 
 
@@ -118,7 +108,7 @@ def made(tmp_path, monkeypatch):
             play,
             weights,
             tmp_path / "fit",
-            TINY,
+            TINY_ENCODERS,
             progress=False,
             tasks=TASKS,
             scene="slider",

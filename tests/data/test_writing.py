@@ -11,6 +11,7 @@ from hypothesis.extra.numpy import arrays
 
 from bgpo_trl.data.dataset import load_demonstrations, read_meta
 from bgpo_trl.data.writing import resize_frames, write_demonstrations
+from tests.helpers import contents
 
 TASKS = ("grasp_glass", "push_green_to_white")
 

@@ -2,7 +2,7 @@
 
 import csv
 import json
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -34,6 +34,7 @@ from bgpo_trl.encoders.train import train_encoders
 from bgpo_trl.modules.vae import VAE
 from bgpo_trl.scenes.nico import NICO
 from suites import nico
+from tests.helpers import TINY_ENCODERS
 
 CONFIG = RepresentationConfig(
     vae=VAEConfig(
@@ -49,13 +50,7 @@ CONFIG = RepresentationConfig(
     inverse=InverseModelConfig(hidden_size=64, batch_size=128, steps=300, warmup_steps=10),
     checkpoint_every=50,
 )
-TINY = RepresentationConfig(
-    vae=VAEConfig(batch_size=4, window=2, steps=4, warmup_steps=1),
-    lae=SequenceAutoencoderConfig(batch_size=4, steps=4, warmup_steps=1),
-    inverse=InverseModelConfig(hidden_size=8, batch_size=8, steps=4, warmup_steps=1),
-    checkpoint_every=1,
-    log_every=2,
-)
+TINY = replace(TINY_ENCODERS, checkpoint_every=1, log_every=2)
 DIRECTIONS = np.array([[1, 0, 0, 0], [-1, 0, 0, 1], [0, 1, -1, 0]])  # of both squares, by task
 
 
@@ -284,21 +279,3 @@ def test_configurations_and_datasets_that_cannot_be_trained_on_are_refused() -> 
         train_representation(squares(8), config, scene_version="squares", progress=False)
     with pytest.raises(ValueError, match="held-out"):
         split(squares(8).set("train", torch.ones(8, dtype=torch.bool)))
-
-
-def test_save_and_load(tiny: Representation, tmp_path: Path) -> None:
-    path = tmp_path / "new" / "weights.safetensors"
-    save_representation(tiny, path)
-    loaded = load_representation(path, scene_version="squares")
-    assert same(tiny, loaded)
-    pixels = squares(2)["pixels"]
-    assert torch.equal(loaded.vae.latent(pixels), tiny.vae.latent(pixels))
-    assert loaded.metadata == tiny.metadata
-    assert loaded.metadata["command"] == "make weights"
-    assert loaded.metadata["seed"] == "0"
-    assert json.loads(loaded.metadata["config"]) == asdict(TINY)
-    for made in (tiny, loaded):
-        for module in (made.vae, made.lae, made.inverse):
-            assert not module.training
-            assert not any(p.requires_grad for p in module.parameters())
-    assert [file.name for file in path.parent.iterdir()] == ["weights.safetensors"]
