@@ -138,17 +138,6 @@ def test_an_object_that_comes_back_is_not_pushed_aside():
     assert not holds and displacement > 0
 
 
-def test_a_raised_fist_does_not_press():
-    pressed = demonstrated("press_white")
-
-    def rise(physics):
-        physics.named.data.qpos["shoulder_pitch"] += 1.0
-        physics.named.data.ctrl["shoulder_pitch"] += 1.0
-
-    holds, gap = outcome("press_white", pressed, end=ending(pressed, rise))
-    assert not holds and gap > 0.05
-
-
 def test_a_continuation_equals_the_environment():
     env = nico.load("press_white", seed=5, observation="state")
     env.reset()
@@ -242,13 +231,3 @@ def test_the_command_has_a_row_for_each_success(run_of, tmp_path):
     assert (rows["actor"] == "demonstrators").sum() >= 4
     assert set(rows["holds"]) <= {"True", "False"}
     assert set(json.loads((out / "aftermath.json").read_text())) == {"commit", "command"}
-
-
-def test_demonstrators_and_random_actions_start_alike_without_a_run(monkeypatch, tmp_path):
-    monkeypatch.setattr(nico, "ALL_TASKS", ("press_white",))
-    arguments = AftermathArguments(demonstrators=True, episodes=1, seeds=(4,), out=tmp_path)
-    episodes = aftermath.episodes_of(arguments)
-    assert list(episodes) == ["demonstrators", "random actions"]
-    (first,), (second,) = episodes.values()
-    assert (first.start == second.start).all()
-    assert first.seed == 4

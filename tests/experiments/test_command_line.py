@@ -153,16 +153,12 @@ def test_a_wrong_flag_is_named(folder, monkeypatch, capsys, command, named):
 @pytest.mark.parametrize(
     "command",
     [
-        "bgpo continual --out new",
         "bgpo continual --train-encoders --out new",
         "bgpo sweep --preset quick --out new",
         "bgpo tasks --pictures empty",
         "bgpo_trl.data.recording new",
         "suites.nico.explore --out new.gif",
-        "bgpo watch runs/bgpo",
-        "bgpo looking runs/bgpo",
-        "bgpo aftermath runs/bgpo",
-        "bgpo one-shot runs/bgpo",
+        *(f"bgpo {name} runs/bgpo" for name in ("watch", "looking", "aftermath", "one-shot")),
     ],
 )
 def test_without_opengl_a_command_that_renders_writes_nothing(

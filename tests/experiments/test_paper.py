@@ -105,23 +105,6 @@ def test_every_algorithm_runs_and_is_reported_under_its_name(tiniest, tmp_path, 
             assert float(cell) == pytest.approx(100 * trained[task, kind], abs=0.05)
 
 
-@pytest.mark.parametrize(
-    ("experiment", "arguments", "name"),
-    [
-        (continual, Arguments(rl="sac"), "continual-bgpo-sac-quick"),
-        (ablation, AblationArguments(rl="sac", continual=True), "ablation-continual-bgpo-single"),
-    ],
-)
-def test_the_default_directory_names_experiment_algorithm_and_rl_algorithm(
-    tiny, tmp_path, monkeypatch, experiment, arguments, name
-):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "taken").touch()
-    monkeypatch.setattr("bgpo_trl.experiments.run.holds_run", lambda out: True)
-    with pytest.raises(ValueError, match=f"runs/{name}.* holds a run"):
-        experiment(arguments)
-
-
 def test_a_finished_run_is_only_changed_by_making_it_longer(undrawn, tmp_path, monkeypatch):
     run = tmp_path / "run"
     arguments = Arguments(out=run)
@@ -193,19 +176,6 @@ def test_the_config_of_a_run_repeats_it(undrawn, tmp_path):
     continual(Arguments(out=second, config=first))
     for name in ("config.json", "train.csv", "eval.csv"):
         assert (second / name).read_bytes() == (first / name).read_bytes()
-
-
-def test_a_run_that_was_interrupted_while_it_made_encoders_is_resumed(
-    undrawn, tmp_path, monkeypatch, encoders, bank
-):
-    monkeypatch.setattr(experiment, "make_pretrained", lambda *_, **__: (encoders, bank))
-    (tmp_path / "demonstrations").mkdir()
-    arguments = Arguments(out=tmp_path, resume=True, episodes=2)
-    with pytest.raises(ValueError, match="beginning of new encoders: add --train-encoders"):
-        continual(arguments)
-    assert [path.name for path in tmp_path.iterdir()] == ["demonstrations"]
-    continual(replace(arguments, train_encoders=True))
-    assert (tmp_path / "summary.json").exists()
 
 
 def test_the_directory_is_locked_from_the_encoders_to_the_figures(

@@ -96,9 +96,7 @@ def test_success_is_a_mean_over_seeds(reported):
     ("summary", "shown"),
     [
         ({"needs_label": False, "needs_boundaries": False}, "nothing"),
-        ({"needs_label": False, "needs_boundaries": True}, "boundaries"),
         ({"needs_label": True, "needs_boundaries": True}, "label, boundaries"),
-        ({"needs_label": True}, "label"),
         ({}, "?"),
     ],
 )
@@ -213,15 +211,6 @@ def test_a_single_seed_has_no_interval(tmp_path):
     assert "nan" not in text
 
 
-def test_a_run_alone_is_reported_in_its_directory(tmp_path):
-    run = write_run(tmp_path, "bgpo", 9, starts=STARTS)
-    complete(run, seeds=3)
-    assert report(ReportArguments((run,))).strip() == text_of(run).strip()
-    assert "## Differences" not in text_of(run)
-    assert (run / "continual-bgpo-groups.png").exists()
-    assert list(rows_of(text_of(run), f"BGPO: {ONE_AFTER_THE_OTHER}")) == [*TASKS, "all"]
-
-
 def test_a_run_that_is_read_only_is_reported_elsewhere(tmp_path, monkeypatch):
     run = write_run(tmp_path, "bgpo", 9, starts=STARTS)
     before = contents(run)
@@ -295,14 +284,6 @@ def test_two_runs_are_compared_seed_by_seed_on_the_episodes_of_both(pair):
     ]
     assert [row[2:] for row in tasks] == [mean[2:]] * 3
     assert contents(pair[0].parent) == before
-
-
-def test_parts_of_training_leave_out_tasks_that_were_not_presented(pair):
-    _, rows = compared(*pair, every=14, anyway=True)
-    assert [row[0] for row in rows] == ["to 14"] * 2 + ["to 28"] * 4 + ["last 10 %"] * 4
-    # To 28, tests at 26 and 28 of the second run are in its last fifth, five before are not.
-    halves = [(2 * late + 5 * half) / 7 for late, half in ((9, 4), (8, 4), (10, 5))]
-    assert rows[2][2:4] == ["20.0", f"{10 * sum(halves) / 3:.1f}"]
 
 
 def test_runs_under_other_conditions_or_of_other_tasks_are_not_compared(pair, tmp_path):
