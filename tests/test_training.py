@@ -4,12 +4,10 @@ import itertools
 import signal
 from collections import Counter
 from dataclasses import replace
-from types import SimpleNamespace
 
 import pytest
 import torch
 
-from bgpo_trl import training
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.bgpo import BGPO
 from bgpo_trl.algorithms.policy import Policy
@@ -509,44 +507,6 @@ def test_ewc_is_resumed_across_a_boundary_bit_for_bit(run_of, make, make_config,
     assert (held[config.seeds.index(int(row["seed"]))] == 0) == (before == 0)
     make(tmp_path, config, resume=True).run()
     assert_same_run(tmp_path, run_of("ewc"))
-
-
-def test_step_times_exclude_tests_and_checkpoints(make, make_config, tmp_path, monkeypatch):
-    clock = [0.0]
-    monkeypatch.setattr(training, "time", SimpleNamespace(monotonic=lambda: clock[0]))
-    trainer = make(tmp_path, make_config(episodes=4, checkpoint_minutes=0.0))
-
-    def taking(seconds, function):
-        def call(*arguments):
-            clock[0] += seconds
-            return function(*arguments)
-
-        return call
-
-    for owner, method, seconds in (
-        (trainer.algorithm, "act", 0.25),
-        (trainer.evaluator, "run_next", 100.0),
-        (trainer, "save", 100.0),
-    ):
-        monkeypatch.setattr(owner, method, taking(seconds, getattr(owner, method)))
-    trainer.run()
-    costs = read_costs(tmp_path / "cost.csv")
-    assert sum(cost.steps for cost in costs.values()) == trainer.env_steps
-    assert all(cost.seconds == 0.25 * cost.steps for cost in costs.values())
-
-
-def test_a_failure_to_write_the_bank_closes_the_run(make, tmp_path, monkeypatch):
-    def refuse(*args):
-        raise OSError("cannot write the bank: make room")
-
-    closed = []
-    close = training.RunLogger.close
-    monkeypatch.setattr(training.RunLogger, "close", lambda log: (closed.append(1), close(log)))
-    monkeypatch.setattr(training, "keep_inputs", refuse)
-    with pytest.raises(OSError, match="make room"):
-        make(tmp_path / "run")
-    assert closed == [1]
-    assert not (tmp_path / "run" / "lock").exists()
 
 
 def test_a_bank_of_other_encoders_is_refused(make_config, encoders, bank, tmp_path):
