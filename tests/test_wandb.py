@@ -19,8 +19,7 @@ from bgpo_trl.figures.frames import save_gif
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.figures.success import plot_success_curves
 from bgpo_trl.runs.dashboard import Dashboard, wandb_logger
-from bgpo_trl.runs.directory import flatten
-from bgpo_trl.runs.logger import RunLogger
+from bgpo_trl.runs.directory import RunLogger, flatten
 from bgpo_trl.training import Trainer
 
 pytestmark = pytest.mark.usefixtures("easy_world")

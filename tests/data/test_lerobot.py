@@ -14,8 +14,8 @@ pa = pytest.importorskip("pyarrow")
 
 import pyarrow.parquet as pq  # noqa: E402
 
+from bgpo_trl.data import lerobot  # noqa: E402
 from bgpo_trl.data.lerobot import read_lerobot, write_lerobot  # noqa: E402
-from bgpo_trl.data.lerobot import writing as lerobot_writing  # noqa: E402
 from bgpo_trl.data.writing import resize_frames, write_demonstrations  # noqa: E402
 from tests.helpers import edit  # noqa: E402
 
@@ -133,8 +133,8 @@ def test_statistics_are_those_of_all_frames(written):
 
 
 def test_long_datasets_are_spread_over_several_files(tmp_path, monkeypatch):
-    monkeypatch.setattr(lerobot_writing, "_FILE_MB", 0)
-    monkeypatch.setattr(lerobot_writing, "_FILES_PER_CHUNK", 2)
+    monkeypatch.setattr(lerobot, "_FILE_MB", 0)
+    monkeypatch.setattr(lerobot, "_FILES_PER_CHUNK", 2)
     write_lerobot(tmp_path / "many", dataset_of(), tasks=TASKS, fps=5)
     files = sorted((tmp_path / "many" / "data").glob("*/*"))
     names = [str(file.relative_to(tmp_path / "many" / "data")) for file in files]

@@ -14,7 +14,7 @@ from bgpo_trl import __main__ as bgpo
 from bgpo_trl.configs import BGPOConfig
 from bgpo_trl.experiments.arguments import Arguments
 from bgpo_trl.experiments.command_line import command_line
-from bgpo_trl.runs.logger import EVAL_COLUMNS
+from bgpo_trl.runs.directory import EVAL_COLUMNS
 from bgpo_trl.runs.results import read_json
 from suites import opengl
 from tests.helpers import contents

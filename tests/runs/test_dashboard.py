@@ -11,7 +11,7 @@ import torch
 
 from bgpo_trl.runs import dashboard
 from bgpo_trl.runs.dashboard import Dashboard, tensorboard_logger, wandb_logger
-from bgpo_trl.runs.logger import TRAIN_COLUMNS, RunLogger
+from bgpo_trl.runs.directory import TRAIN_COLUMNS, RunLogger
 from tests.helpers import Recorder
 
 SETTINGS = {"gamma": 0.98, "seeds": [3, 8], "network": {"hidden": [64], "rate": None}}

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from bgpo_trl.runs.logger import EVAL_COLUMNS, TRAIN_COLUMNS, RunLogger
+from bgpo_trl.runs.directory import EVAL_COLUMNS, TRAIN_COLUMNS, RunLogger
 
 CONFIG = {"gamma": 0.98, "network": {"hidden": [64]}}
 ROW = {
