@@ -6,9 +6,10 @@ import signal
 from dataclasses import asdict, replace
 
 import pytest
+import torch
 
 from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
-from bgpo_trl.runs.directory import check_settings
+from bgpo_trl.runs.directory import EVAL_COLUMNS, TRAIN_COLUMNS, RunLogger, check_settings
 from bgpo_trl.training import Trainer
 from tests.algorithms.playing import assert_same
 from tests.helpers import CHECKPOINTS, UNPICKLED, put_checkpoint, rows
@@ -172,3 +173,39 @@ def test_only_the_number_of_episodes_may_grow(make, make_config, tmp_path):
     for episodes in (9, "11", True):
         with pytest.raises(ValueError, match="episodes is 10 there and"):
             check_settings(tmp_path, {**settings, "episodes": episodes}, longer=True)
+
+
+CONFIG = {"gamma": 0.98, "network": {"hidden": [64]}}
+ROW = {
+    "algorithm": "bgpo",
+    "seed": 2,
+    "episode": 7,
+    "env_steps": 210,
+    "task": "grasp_glass",
+    "success": True,
+    "return": 1.0,
+    "steps": 28,
+}
+
+
+def test_a_run_writes_its_settings_and_two_csv_files(tmp_path):
+    directory = tmp_path / "runs" / "first"
+    with RunLogger(directory, config=CONFIG) as logger:
+        logger.log_train({**ROW, "intrinsic_return": torch.tensor(0.25)})
+        logger.log_eval(ROW)
+        sizes = {name: (directory / name).stat().st_size for name in ("train.csv", "eval.csv")}
+        assert logger.position() == sizes
+        with pytest.raises(ValueError, match="loss_meta"):
+            logger.log_train({"loss_meta": 0.5})
+    assert json.loads((directory / "config.json").read_text()) == CONFIG
+    cells = "bgpo,2,7,210,grasp_glass,1,1.0,28"
+    train, tests = ((directory / name).read_text().splitlines() for name in sizes)
+    assert train == [",".join(TRAIN_COLUMNS), f"{cells},0.25,,,,,"]
+    assert tests == [",".join(EVAL_COLUMNS), cells]
+
+
+@pytest.mark.parametrize("logged", [("success",), ("loss_meta", "loss_meta")])
+def test_a_column_that_is_there_already_is_refused(logged, tmp_path):
+    with pytest.raises(ValueError, match=logged[0]):
+        RunLogger(tmp_path / "run", config=CONFIG, logged=logged)
+    assert not (tmp_path / "run").exists()
