@@ -51,34 +51,6 @@ def check_settings(
         _compare(directory, read_json(path), settings, longer)
 
 
-def claim_directory(directory: Path, settings: Mapping[str, Any], *, resume: bool) -> None:
-    """Write ``config.json``, unless the directory holds a run that must not be continued.
-
-    Args:
-        directory: The run directory, made if missing.
-        settings: Settings of the run, as JSON stores them.
-        resume: Whether the directory may hold this run, possibly with fewer ``episodes``.
-
-    Raises:
-        ValueError: If the directory holds a run with other settings, or any run without
-            ``resume``.
-        OSError: If the directory cannot be written.
-    """
-    check_settings(directory, settings, longer=resume)
-    if not resume and holds_run(directory):
-        raise ValueError(
-            f"{directory} already holds a run: resume it, or choose another run directory."
-        )
-    make_folder(directory)
-    path = directory / "config.json"
-    try:
-        write_json(path, settings)
-    except OSError as error:
-        raise OSError(
-            f"cannot write {path} ({error.strerror}): make room, or choose another run directory"
-        ) from None
-
-
 def load_last(directory: Path, settings: Mapping[str, Any]) -> dict[str, Any] | None:
     """Read the checkpoint that a run resumes from, without changing any file.
 
@@ -259,7 +231,20 @@ class RunLogger:
                 f"train.csv has the column {', '.join(sorted(repeated))} already: choose other "
                 "names for what the algorithm logs"
             )
-        claim_directory(self.directory, config, resume=resume)
+        check_settings(self.directory, config, longer=resume)
+        if not resume and holds_run(self.directory):
+            raise ValueError(
+                f"{self.directory} already holds a run: resume it, or choose another run directory."
+            )
+        make_folder(self.directory)
+        path = self.directory / "config.json"
+        try:
+            write_json(path, config)
+        except OSError as error:
+            raise OSError(
+                f"cannot write {path} ({error.strerror}): make room, or choose another run "
+                "directory"
+            ) from None
         self._train = CsvFile(self.directory / "train.csv", columns)
         self._eval = CsvFile(self.directory / "eval.csv", EVAL_COLUMNS)
 

@@ -174,12 +174,12 @@ def test_groups_nodes_and_costs_of_a_run_are_listed(reported):
 
 
 def test_figures_are_written_beside_the_tables(reported):
-    text, page = text_of(reported), (reported / "report.html").read_text()
+    text = text_of(reported)
     figures = ["continual-3", "continual-3-counts", "continual-3-matrix", "continual-3-nodes"]
     for name in (*figures, "concurrent-3"):
         assert (reported / f"{name}.png").read_bytes().startswith(b"\x89PNG")
         assert f"]({name}.png)" in text
-    assert len(list(reported.glob("*.png"))) == page.count("data:image/png") == 5
+    assert len(list(reported.glob("*.png"))) == 5
 
 
 @pytest.mark.parametrize("tasks", [("juggle",), tuple("abcdefgh")])

@@ -11,7 +11,6 @@ from matplotlib.figure import Figure
 
 from bgpo_trl.figures.frames import save_gif
 from bgpo_trl.figures.gwr import write_nodes
-from bgpo_trl.figures.page import write_page
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
 from bgpo_trl.files.csv_file import CsvFile
@@ -34,7 +33,6 @@ WRITERS = {
     "text": lambda path: write_whole(path, "new"),
     "figure": lambda path: save_figure(Figure(), path),
     "gif": lambda path: save_gif(np.zeros((2, 32, 64, 3), np.uint8), path),
-    "page": lambda path: write_page(path, [], {}),
     "tensors": lambda path: save_tensors(path, {"a": torch.zeros(2)}, {}),
     "rows": lambda path: write_rows(path, ["a"], [[1]]),
     "costs": lambda path: write_costs(path, {}),

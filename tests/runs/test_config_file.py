@@ -123,6 +123,6 @@ def test_the_module_of_an_unknown_task_is_reported_not_imported(tmp_path, module
     path = write(tmp_path / "config.json", config, **changes)
     assert read_config(path)[0] == config
     nico.nico._TASKS.pop("juggle")
-    said = f"has the task 'juggle', added by {where}: name a module that adds it with --import"
+    said = f"has the task 'juggle', added by {where}: name the module that adds it with --import"
     with pytest.raises(ValueError, match=said):
         read_config(path)
