@@ -28,6 +28,7 @@ from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
 from bgpo_trl.scenes import SCENES, Outcome
 from bgpo_trl.scenes.nico import NICO, NicoEnv, NicoSimulation
+from bgpo_trl.training import Trainer
 from bgpo_trl.world import World
 from suites.nico import nico
 from tests.helpers import contents
@@ -129,6 +130,17 @@ def in_world(bank):
         return algorithm
 
     return enter
+
+
+@pytest.fixture(scope="session")
+def make_trainer(bank, encoders, make_config):
+    """Make a trainer of a run in a directory, by default one of the settings of `make_config`."""
+
+    def make(directory, config=None, **arguments):
+        parts = {"bank": bank, "encoders": encoders, "progress": False, **arguments}
+        return Trainer(config or make_config(), directory, **parts)
+
+    return make
 
 
 class EasySimulation(NicoSimulation):

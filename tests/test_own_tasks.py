@@ -15,7 +15,6 @@ from bgpo_trl.scenes.nico import NicoEnv
 from bgpo_trl.training import Trainer
 from suites import nico
 from suites.nico import moves
-from tests.helpers import rows
 
 
 class AtOnce(nico.NicoTask):
@@ -92,19 +91,6 @@ def test_bad_names_and_classes_of_tasks_are_refused(name, task):
     with pytest.raises(ValueError, match=r"cannot be called|must be a subclass"):
         nico.add_task(name, task)
     assert dict(nico.TASKS) == before
-
-
-def test_results_of_an_own_task_have_its_name(play):
-    tasks = ("at_once", "push_green_to_white")
-    run = play("run", bank_of(*nico.PAPER_TASKS, "at_once"), tasks=tasks, task_starts=(0, 3))
-
-    assert json.loads((run / "config.json").read_text())["tasks"] == [*tasks]
-    train, tests = rows(run / "train.csv"), rows(run / "eval.csv")
-    assert {row["task"] for row in train} == {row["task"] for row in tests} == {*tasks}
-    for row in [*train, *tests]:
-        own = row["task"] == "at_once"
-        assert (row["success"], row["steps"]) == (("1", "1") if own else ("0", "6"))
-    assert {row["task"] for row in train if int(row["episode"]) <= 3} == {"at_once"}
 
 
 def test_a_run_does_not_depend_on_tasks_that_are_not_in_it(play):

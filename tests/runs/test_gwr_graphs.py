@@ -5,7 +5,6 @@ import torch
 
 from bgpo_trl.modules.gwr import GWRB
 from bgpo_trl.runs.gwr_graphs import growth_moments, load_graphs, save_graph
-from bgpo_trl.training import Trainer
 from tests.helpers import rows
 
 
@@ -37,9 +36,8 @@ def test_loaded_graphs_equal_the_saved_ones(tmp_path):
         assert loaded.get_extra_state()[0]["next_node"] == gwr.get_extra_state()[0]["next_node"]
 
 
-def test_run_saves_the_graphs_of_its_first_seed(tmp_path, bank, encoders, make_config):
-    config = make_config(episodes=8)
-    with Trainer(config, tmp_path, bank=bank, encoders=encoders, progress=False) as trainer:
+def test_run_saves_the_graphs_of_its_first_seed(tmp_path, make_trainer, make_config):
+    with make_trainer(tmp_path, make_config(episodes=8)) as trainer:
         trainer.run()
     graphs = load_graphs(tmp_path / "gwr")
     assert list(graphs) == growth_moments(8)
