@@ -133,8 +133,8 @@ def in_world(bank):
 
 
 @pytest.fixture(scope="session")
-def make_trainer(bank, encoders, make_config):
-    """Make a trainer of a run in a directory, by default one of the settings of `make_config`."""
+def begin(bank, encoders, make_config):
+    """Make the trainer of a run, by default of the settings of `make_config`."""
 
     def make(directory, config=None, **arguments):
         parts = {"bank": bank, "encoders": encoders, "progress": False, **arguments}

@@ -67,17 +67,17 @@ def assert_same_encoders(first, second):
 
 
 @pytest.fixture
-def make(make_trainer, make_config):
+def make(begin, make_config):
     def make(directory, config=None, **arguments):
-        return make_trainer(directory, config or make_config(checkpoint_minutes=0.0), **arguments)
+        return begin(directory, config or make_config(checkpoint_minutes=0.0), **arguments)
 
     return make
 
 
 @pytest.fixture(scope="module")
-def uninterrupted(easy_world, make_trainer, make_config, tmp_path_factory):
+def uninterrupted(easy_world, begin, make_config, tmp_path_factory):
     directory = tmp_path_factory.mktemp("uninterrupted")
-    make_trainer(directory, make_config(checkpoint_minutes=0.0)).run()
+    begin(directory, make_config(checkpoint_minutes=0.0)).run()
     return directory
 
 

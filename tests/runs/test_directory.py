@@ -18,10 +18,10 @@ pytestmark = pytest.mark.usefixtures("easy_world")
 
 
 @pytest.fixture(scope="module")
-def interrupted(easy_world, make_trainer, tmp_path_factory):
+def interrupted(easy_world, begin, tmp_path_factory):
     """A run that was interrupted half-way, with rows after its last checkpoint."""
     directory = tmp_path_factory.mktemp("interrupted") / "run"
-    with make_trainer(directory) as trainer:
+    with begin(directory) as trainer:
         at_step(trainer, 25, lambda: signal.raise_signal(signal.SIGINT))
         with pytest.raises(KeyboardInterrupt):
             trainer.run()
@@ -42,15 +42,13 @@ def interrupt(trainer, step):
         trainer.run()
 
 
-def test_one_process_at_a_time_uses_a_run_directory(run, make_trainer, other_process, refused):
+def test_one_process_at_a_time_uses_a_run_directory(run, begin, other_process, refused):
     first = other_process(run)
     assert first.stdout.readline() == "has it\n"
     for resume in (False, True):
-        refused(
-            lambda resume=resume: make_trainer(run, resume=resume), f"{run} is in use", "stop it"
-        )
+        refused(lambda resume=resume: begin(run, resume=resume), f"{run} is in use", "stop it")
     first.communicate("\n")
-    with make_trainer(run, resume=True):
+    with begin(run, resume=True):
         second = other_process(run)
         assert "is in use by another process" in second.communicate()[1]
     assert not (run / "lock").exists()
@@ -83,43 +81,39 @@ DAMAGES = {
 
 
 @pytest.mark.parametrize(("damage", "cause"), DAMAGES.values(), ids=DAMAGES.keys())
-def test_a_run_that_lacks_a_file_is_refused_unchanged(run, make_trainer, refused, damage, cause):
+def test_a_run_that_lacks_a_file_is_refused_unchanged(run, begin, refused, damage, cause):
     damage(run)
-    refused(lambda: make_trainer(run, resume=True), cause, "as the run left it")
+    refused(lambda: begin(run, resume=True), cause, "as the run left it")
     if (run / "config.json").exists():
-        refused(lambda: make_trainer(run), "already holds a run", "choose another run directory")
+        refused(lambda: begin(run), "already holds a run", "choose another run directory")
 
 
-def test_the_settings_in_the_checkpoint_are_compared(run, make_trainer, make_config, refused):
+def test_the_settings_in_the_checkpoint_are_compared(run, begin, make_config, refused):
     edit_settings(run)
     config = make_config(task_starts=(0, 1, 2))
     refused(
-        lambda: make_trainer(run, config, resume=True),
+        lambda: begin(run, config, resume=True),
         "run/checkpoint holds a run with other settings (task_starts is [0, 2, 4] there and [0, 1,",
         "put config.json back as the run left it",
     )
 
 
 @pytest.mark.parametrize("content", CHECKPOINTS.values(), ids=CHECKPOINTS.keys())
-def test_a_run_is_not_resumed_from_a_checkpoint_of_something_else(
-    run, make_trainer, refused, content
-):
+def test_a_run_is_not_resumed_from_a_checkpoint_of_something_else(run, begin, refused, content):
     put_checkpoint(run, content)
-    refused(lambda: make_trainer(run, resume=True), "checkpoint", "put it back as the run left it")
+    refused(lambda: begin(run, resume=True), "checkpoint", "put it back as the run left it")
     assert not UNPICKLED
 
 
 @pytest.mark.parametrize("name", ["world", "algorithm", "evaluator"])
-def test_a_run_is_not_resumed_from_half_a_checkpoint(run, make_trainer, refused, name):
+def test_a_run_is_not_resumed_from_half_a_checkpoint(run, begin, refused, name):
     state = load_checkpoint(run / "checkpoint")
     save_checkpoint(run / "checkpoint", {**state, name: {}})
-    refused(lambda: make_trainer(run, resume=True), "does not fit", "use the version of the code")
+    refused(lambda: begin(run, resume=True), "does not fit", "use the version of the code")
 
 
 @pytest.mark.parametrize("sizes", [{"hidden_sizes": (2_000_000_000,)}, {"replay_size": 10**15}])
-def test_sizes_that_are_not_the_checkpoints_take_no_memory(
-    run, make_trainer, make_config, refused, sizes
-):
+def test_sizes_that_are_not_the_checkpoints_take_no_memory(run, begin, make_config, refused, sizes):
     config = make_config()
     rl = replace(config.algorithm.rl, **sizes)
     config = replace(config, algorithm=replace(config.algorithm, rl=rl))
@@ -128,27 +122,27 @@ def test_sizes_that_are_not_the_checkpoints_take_no_memory(
     (run / "config.json").write_text(json.dumps(settings))
     (name,) = sizes
     refused(
-        lambda: make_trainer(run, config, resume=True),
+        lambda: begin(run, config, resume=True),
         f"algorithm.rl.{name} is",
         "config.json back",
     )
 
 
-def test_a_run_extended_in_steps_equals_a_longer_run(make_trainer, make_config, tmp_path):
+def test_a_run_extended_in_steps_equals_a_longer_run(begin, make_config, tmp_path):
     """Seeds that were done early have gone on, and nothing of that is lost."""
     run, straight = tmp_path / "longer", tmp_path / "straight"
     config = make_config(episodes=16)
-    with make_trainer(straight, config) as trainer:
+    with begin(straight, config) as trainer:
         trainer.run()
     for episodes in (12, 13):
-        with make_trainer(run, replace(config, episodes=episodes), resume=True) as trainer:
+        with begin(run, replace(config, episodes=episodes), resume=True) as trainer:
             trainer.run()
         played = sorted((row["seed"], int(row["episode"])) for row in rows(run / "train.csv"))
         assert played == [(seed, n + 1) for seed in "38" for n in range(episodes)]
         assert load_checkpoint(run / "checkpoint")["later"]
-    with make_trainer(run, config, resume=True) as trainer:
+    with begin(run, config, resume=True) as trainer:
         interrupt(trainer, 1)
-    with make_trainer(run, config, resume=True) as trainer:
+    with begin(run, config, resume=True) as trainer:
         trainer.run()
     for file in ("train.csv", "eval.csv"):
         # Episodes that were played early are logged late.
@@ -158,11 +152,11 @@ def test_a_run_extended_in_steps_equals_a_longer_run(make_trainer, make_config, 
     assert_same(*(load_checkpoint(folder / "checkpoint") for folder in (run, straight)))
 
     with pytest.raises(ValueError, match="episodes is 16 there and 13 here"):
-        make_trainer(run, replace(config, episodes=13), resume=True)
+        begin(run, replace(config, episodes=13), resume=True)
 
 
-def test_only_the_number_of_episodes_may_grow(make_trainer, make_config, tmp_path):
-    with make_trainer(tmp_path):
+def test_only_the_number_of_episodes_may_grow(begin, make_config, tmp_path):
+    with begin(tmp_path):
         pass
     settings = json.loads((tmp_path / "config.json").read_text())
     check_settings(tmp_path, settings)

@@ -36,8 +36,8 @@ def test_loaded_graphs_equal_the_saved_ones(tmp_path):
         assert loaded.get_extra_state()[0]["next_node"] == gwr.get_extra_state()[0]["next_node"]
 
 
-def test_run_saves_the_graphs_of_its_first_seed(tmp_path, make_trainer, make_config):
-    with make_trainer(tmp_path, make_config(episodes=8)) as trainer:
+def test_run_saves_the_graphs_of_its_first_seed(tmp_path, begin, make_config):
+    with begin(tmp_path, make_config(episodes=8)) as trainer:
         trainer.run()
     graphs = load_graphs(tmp_path / "gwr")
     assert list(graphs) == growth_moments(8)
