@@ -6,7 +6,6 @@ import importlib.metadata
 import shlex
 import subprocess
 import sys
-from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import pandas as pd
@@ -38,24 +37,16 @@ def command() -> str:
     return shlex.join(["python", *sys.argv])
 
 
-def write_measurement(
-    folder: Path, name: str, columns: Sequence[str], rows: Iterable[Sequence[object]], commit: str
-) -> None:
-    """Write rows to ``NAME.csv``, and the commit and command of their measurement to ``NAME.json``.
+def write_measurement(folder: Path, name: str, table: pd.DataFrame, commit: str) -> None:
+    """Write a table to ``NAME.csv``, and the commit and command that made it to ``NAME.json``.
 
-    Args:
-        folder: Folder of the files; made if missing.
-        name: Name of the measurement.
-        columns: Names of the columns.
-        rows: The rows; NaN becomes an empty cell.
-        commit: Result of `commit_of_code` when the measurement began.
+    The folder is made if missing; ``commit`` is that of the code when the measurement began.
     """
     make_folder(folder)
-    write_rows(folder / f"{name}.csv", columns, rows)
+    write_table(folder / f"{name}.csv", table)
     write_json(folder / f"{name}.json", {"commit": commit, "command": command()})
 
 
-def write_rows(path: Path, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+def write_table(path: Path, table: pd.DataFrame) -> None:
     """Write a CSV file; NaN becomes an empty cell."""
-    table = pd.DataFrame([*rows], columns=[*columns])
     write_whole(path, table.to_csv(index=False, lineterminator="\r\n"))

@@ -4,13 +4,14 @@ import csv
 import json
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 
 from bgpo_trl import load_run
 from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.experiments import one_shot
-from bgpo_trl.experiments.one_shot import OneShotArguments, Row
+from bgpo_trl.experiments.one_shot import OneShotArguments
 from suites import nico
 
 TASKS = nico.PAPER_TASKS
@@ -65,7 +66,8 @@ def test_policies_are_shown_the_beginning_of_new_demonstrations(run_of, tmp_path
         return snapshot(index, embedding, task, generator)
 
     monkeypatch.setattr(policy.algorithm, "snapshot", spy)
-    rows = one_shot.measure(policy, (0.3, 1.0), 2, 4)
+    table = one_shot.measure(policy, (0.3, 1.0), 2, 4)
+    rows = [*table.itertuples(index=False, name=None)]
     shown = record_demonstrations(
         tmp_path / "again", per_task=2, held_out_per_task=0, seed=4, progress=False
     )
@@ -110,7 +112,8 @@ def table():
         (1.0, 0, "b", 4, 1.0, 1.0, 1.0),
         (1.0, 1, "b", 4, 1.0, 1.0, 1.0),
     ]
-    return one_shot.means([Row(*row) for row in rows])
+    names = ["share", "seed", "task", "episodes", "success", "task_inference", "activity"]
+    return one_shot.means(pd.DataFrame(rows, columns=names))
 
 
 def test_means_equal_those_by_hand():

@@ -5,6 +5,7 @@ import select
 import signal
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from matplotlib.figure import Figure
@@ -17,7 +18,7 @@ from bgpo_trl.files.csv_file import CsvFile
 from bgpo_trl.files.tensor_file import save_tensors
 from bgpo_trl.files.writing import lock_directory, write_whole
 from bgpo_trl.runs.cost import write_costs
-from bgpo_trl.runs.provenance import write_rows
+from bgpo_trl.runs.provenance import write_table
 from tests.helpers import largest_file
 
 
@@ -34,7 +35,7 @@ WRITERS = {
     "figure": lambda path: save_figure(Figure(), path),
     "gif": lambda path: save_gif(np.zeros((2, 32, 64, 3), np.uint8), path),
     "tensors": lambda path: save_tensors(path, {"a": torch.zeros(2)}, {}),
-    "rows": lambda path: write_rows(path, ["a"], [[1]]),
+    "rows": lambda path: write_table(path, pd.DataFrame({"a": [1]})),
     "costs": lambda path: write_costs(path, {}),
     "nodes": lambda path: write_nodes(path, torch.zeros(2, 3), torch.zeros(2)),
 }

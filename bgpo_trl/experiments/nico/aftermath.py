@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+import pandas as pd
 import tyro
 from numpy.typing import NDArray
 
@@ -369,6 +370,7 @@ def aftermath(arguments: AftermathArguments) -> str:
     episodes = episodes_of(arguments)
     rows = [row for actor, of_actor in episodes.items() for row in judge(actor, of_actor)]
     out = arguments.out or arguments.run or Path("runs/aftermath")
-    write_measurement(out, "aftermath", Row._fields, rows, commit)
+    table = pd.DataFrame(rows, columns=pd.Index(Row._fields))
+    write_measurement(out, "aftermath", table, commit)
     counts = {actor: Counter(e.task for e in of_actor) for actor, of_actor in episodes.items()}
     return markdown(aftermath_table(rows, counts))

@@ -12,6 +12,7 @@ from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from bgpo_trl.analysis import statistics
@@ -149,7 +150,7 @@ def looking(arguments: TrainedArguments) -> str:
         steps = len(VIEWS) * (run.config.algorithm.max_steps + 1)
         with progress_bar("looking", total=steps, unit="step") as bar:
             rows += measure_looking(run, arguments.episodes, bar.update)
-    write_measurement(out, "looking", Row._fields, rows, commit)
+    write_measurement(out, "looking", pd.DataFrame(rows), commit)
     tasks, success = success_by_condition(rows)
     save_figure(plot_success_bars(success, tasks), out / "looking.png")
     return markdown(looking_table(rows))
