@@ -17,7 +17,7 @@ from bgpo_trl.experiments import run as experiment
 from bgpo_trl.experiments.run import pretrained_for
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.runs.config_file import Digests
-from bgpo_trl.runs.demonstrations import BANK, keep_inputs, load_inputs
+from bgpo_trl.runs.demonstrations import BANK, keep_inputs, load_inputs, own_weights
 from bgpo_trl.scenes import SCENES
 from bgpo_trl.scenes.nico import NICO
 from suites import nico
@@ -221,3 +221,15 @@ def test_tasks_that_the_bank_lacks_are_taken_from_the_package(own, bank):
         assert found.of_task(task).embedding.equal(shipped.embedding + offset)
         assert found.of_task(task).train.equal(shipped.train)
     assert experiment.pretrained_for([TWO])[1].embedding.equal(bank.for_tasks([TWO]).embedding)
+
+
+def test_other_encoders_and_a_changed_scene_are_told_apart(shipped, tmp_path):
+    encoders, bank = shipped
+    foreign = replace(encoders, metadata={**encoders.metadata, "scene_version": "mars-1"})
+    own_weights(tmp_path).parent.mkdir()
+    save_representation(foreign, own_weights(tmp_path))
+    digests = Digests(foreign.identity, bank.identity)
+    with pytest.raises(ValueError, match=r"was trained in the scene mars-1, this is .*: use the"):
+        load_inputs(tmp_path, TASKS, digests)
+    with pytest.raises(ValueError, match=r"was trained with the encoders 0123, not with .*: put"):
+        load_inputs(tmp_path, TASKS, digests._replace(encoders="0123"))
