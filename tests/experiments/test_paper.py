@@ -238,27 +238,6 @@ def test_dashboards_get_evaluations_final_tests_and_figures(tiniest, started, tm
     assert resumed.media == shown
 
 
-def test_runs_on_wandb_are_grouped_and_tagged(undrawn, started, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    concurrent(Arguments(algorithm="oracle", rl="td3", schedule="sequential", wandb="offline"))
-    ablation(AblationArguments(variant="without-both", wandb="online", wandb_group="mine"))
-    out = Path("runs/concurrent-oracle-td3-quick")
-    (out / "summary.json").unlink()
-    concurrent(Arguments(out=out, resume=True, wandb="offline"))
-    assert [(first, options) for _, first, options in started] == [
-        (
-            (out, "offline"),
-            {"group": "concurrent-oracle-td3", "tags": ("oracle", "sequential", "quick")},
-        ),
-        (
-            (Path("runs/ablation-without-both-quick"), "online"),
-            {"group": "mine", "tags": ("without-both", "practised", "quick")},
-        ),
-        # The size of a run that is resumed by its directory is not known.
-        ((out, "offline"), {"group": "concurrent-oracle-td3", "tags": None}),
-    ]
-
-
 def test_a_refused_run_starts_no_logger(undrawn, started, tmp_path):
     continual(Arguments(out=tmp_path / "run"))
     for again in ({}, {"resume": True, "seeds": (4,)}):

@@ -165,17 +165,6 @@ def test_directories_of_other_runs_are_refused(few, tmp_path):
     with pytest.raises(ValueError, match=r"seeds-2 holds a run with other settings .*episodes is"):
         sweep.check_directories(longer, BY_TASKS)
 
-    # Other blocks would be merged over what is there.
-    folder = tmp_path / "concurrent-maml"
-    config = json.loads((folder / "seeds-2" / "config.json").read_text())
-    (folder / "config.json").write_text(json.dumps({**config, "seeds": [7, 8, 9]}))
-    sweep.check_directories(grid, BY_TASKS)
-    others = sweep.make_jobs(
-        SweepArguments(out=tmp_path, episodes=7, **{**few, "algorithms": ("maml",), "block": 3})
-    )
-    with pytest.raises(ValueError, match="concurrent-maml holds a run with other settings"):
-        sweep.check_directories(others, BY_TASKS)
-
     alone = sweep.make_jobs(SweepArguments(out=tmp_path / "alone", **few))
     write_run(Job(tmp_path / "alone" / "concurrent-maml", alone.popitem()[1][0].config))
     before = contents(tmp_path)
