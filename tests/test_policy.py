@@ -22,7 +22,7 @@ from bgpo_trl.encoders.pretrained import bank_path
 from bgpo_trl.encoders.representation import save_representation
 from bgpo_trl.training import Trainer
 from suites import nico
-from tests.helpers import contents
+from tests.helpers import contents, edit
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 ROOT = Path(__file__).parents[1]
@@ -233,18 +233,12 @@ def test_act_needs_a_demonstration_and_a_frame(load):
 
 
 def rewrite(run, **changes):
-    path = run / "config.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
+    edit(run / "config.json", **changes)
 
 
-def rewrite_algorithm(run, **changes):
+def rewrite_algorithm(run, rl=None, **changes):
     settings = json.loads((run / "config.json").read_text())["algorithm"]
-    rewrite(run, algorithm={**settings, **changes})
-
-
-def edit_networks(run, sizes):
-    rl = json.loads((run / "config.json").read_text())["algorithm"]["rl"]
-    rewrite_algorithm(run, rl={**rl, "hidden_sizes": sizes})
+    rewrite(run, algorithm={**settings, "rl": {**settings["rl"], **(rl or {})}, **changes})
 
 
 def cut_checkpoints(run):
@@ -264,8 +258,11 @@ def cut_checkpoints(run):
         (lambda run: rewrite(run, bank="0" * 64), "with the demonstrations 000000000000"),
         (lambda run: rewrite(run, encoders=None), "ground truth"),
         (lambda run: rewrite_algorithm(run, state="state"), "ground truth"),
-        (lambda run: edit_networks(run, [32]), r"hidden_sizes is \[64\] there and \[32\] here"),
-        (lambda run: edit_networks(run, [2_000_000_000]), "hidden_sizes is"),
+        (
+            lambda run: rewrite_algorithm(run, {"hidden_sizes": [32]}),
+            r"hidden_sizes is \[64\] there and \[32\] here",
+        ),
+        (lambda run: rewrite_algorithm(run, {"hidden_sizes": [2_000_000_000]}), "hidden_sizes is"),
         (lambda run: rewrite_algorithm(run, max_steps=7), "max_steps is 6 there and 7 here"),
         (
             lambda run: rewrite(run, seeds=[3, 8, 9]),

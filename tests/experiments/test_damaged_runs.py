@@ -2,7 +2,6 @@
 
 import json
 import re
-import shutil
 import warnings
 from functools import partial
 
@@ -128,18 +127,12 @@ def test_final_tests_and_summary_are_optional_in_a_report(run):
 
 LOADED = {
     **damages("config.json"),
-    "no folder": shutil.rmtree,
-    "no checkpoint": lambda run: shutil.rmtree(run / "checkpoint"),
     **{
         f"a checkpoint that is {name}": partial(put_checkpoint, content=content)
         for name, content in CHECKPOINTS.items()
     },
     "edited settings": edit("config.json", eval_episodes=7),
     "no starts": edit("config.json", task_starts=[]),
-    "unknown tasks": edit("config.json", tasks=["juggle", "sleep", "dance"]),
-    "an unknown setting": edit("config.json", colour="red"),
-    "an unknown algorithm": edit("config.json", name="ppo", algorithm_class=None),
-    "other encoders": edit("config.json", encoders="0" * 64),
 }
 
 
