@@ -174,7 +174,8 @@ def plot(table: Mapping[str, Mapping[float, np.ndarray]]) -> Figure:
         axes.xaxis.set_major_formatter(PercentFormatter(1, decimals=0))
         style_axes(axes)
     figure.supxlabel("Share of the demonstration seen", fontsize=9)
-    add_legend(figure, *panels[0].get_legend_handles_labels(), 7.0)
+    handles, labels = panels[0].get_legend_handles_labels()
+    add_legend(figure, handles, labels, 7.0)
     return figure
 
 

@@ -15,6 +15,7 @@ from bgpo_trl.experiments.nico.scripted import play
 from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
 from bgpo_trl.runs.results import read_table
 from suites import nico
+from tests.helpers import cells
 
 NUMBER = aftermath._NUMBER
 in_every_task = pytest.mark.parametrize("task", nico.ALL_TASKS)
@@ -198,9 +199,9 @@ def test_the_command_has_a_row_for_each_success(run_of, tmp_path):
     printed = aftermath.aftermath(
         AftermathArguments(run=run, demonstrators=True, episodes=1, out=out)
     )
-    table = [[cell.strip() for cell in x.split("|")[1:-1]] for x in printed.splitlines()[2:]]
+    table = cells(printed)[1:]
     actors = ("policy", "demonstrators", "random actions")
-    assert [cells[:2] for cells in table] == [
+    assert [row[:2] for row in table] == [
         [actor, task] for actor in actors for task in nico.PAPER_TASKS
     ]
     rows = read_table(out / "aftermath.csv")

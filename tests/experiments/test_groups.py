@@ -16,6 +16,7 @@ from bgpo_trl.experiments.groups import (
     unknown_task,
 )
 from bgpo_trl.transforms import TaskSchedule
+from tests.helpers import cells
 
 
 def test_draws_are_of_the_tasks_available():
@@ -40,12 +41,11 @@ def test_a_task_owns_a_group_if_most_of_both_are_in_common():
 @pytest.mark.parametrize("scale", [1.0, 0.1])
 def test_the_shipped_tasks_form_six_pure_groups_in_every_schedule(scale):
     table = groups.groups(groups.GroupsArguments(draws=900, seeds=(0,), scale=scale))
-    _, _, *rows = table.splitlines()
-    cells = [[cell.strip() for cell in row.split("|")[1:-1]] for row in rows]
+    rows = cells(table)[1:]
     schedules = ["one after the other", "in reverse", "the newest only", "from the start"]
-    assert [row[0] for row in cells] == schedules
-    assert all(row[1:3] == ["6", "100"] for row in cells)
-    assert all(1 < int(row[3]) <= 60 and float(row[6]) > 95 for row in cells)
+    assert [row[0] for row in rows] == schedules
+    assert all(row[1:3] == ["6", "100"] for row in rows)
+    assert all(1 < int(row[3]) <= 60 and float(row[6]) > 95 for row in rows)
 
 
 def test_each_shipped_task_is_detected_when_it_is_left_out(tmp_path):

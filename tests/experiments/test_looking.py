@@ -19,6 +19,7 @@ from bgpo_trl.scenes.nico.hiding import HidingEnv
 from bgpo_trl.training import Trainer
 from suites import nico
 from suites.nico.rendering import FrameRenderer
+from tests.helpers import cells
 
 GLASS_Y = 8  # of the state
 VIEWS = ["seen", "places hidden", "objects hidden"]
@@ -191,9 +192,9 @@ def test_the_command_tests_every_seed_in_every_condition(run_of, tmp_path, name)
     assert set(rows["success"]) <= {"0.0", "1.0"}
     assert (out / "looking.png").exists()
     assert set(json.loads((out / "looking.json").read_text())) == {"commit", "command"}
-    lines = [[cell.strip() for cell in x.split("|")[1:-1]] for x in printed.splitlines()]
-    assert lines[0] == ["success, %", *conditions]
-    assert [cells[0] for cells in lines[2:]] == [*nico.PAPER_TASKS, "all"]
+    head, *lines = cells(printed)
+    assert head == ["success, %", *conditions]
+    assert [row[0] for row in lines] == [*nico.PAPER_TASKS, "all"]
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from bgpo_trl.analysis.tables import success_table
 from bgpo_trl.experiments.report import ReportArguments, report
 from bgpo_trl.runs.cost import Cost, write_costs
 from tests.analysis.runs import TASKS, edit, make_run, write_run, write_training
-from tests.helpers import contents
+from tests.helpers import cells, contents
 
 STARTS = (0, 14, 26)
 ONE_AFTER_THE_OTHER = "3 tasks, one after the other"
@@ -67,9 +67,7 @@ def reported(tmp_path_factory):
 def rows_of(text, title):
     """The table below a title, as lists of cells, by the first cell."""
     section = text.split(f"## {title}\n")[1].split("\n## ")[0]
-    lines = [line for line in section.splitlines() if line.startswith("|")]
-    table = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
-    return {row[0]: row[1:] for row in table[2:]}
+    return {row[0]: row[1:] for row in cells(section)[1:]}
 
 
 def text_of(folder):
@@ -266,8 +264,7 @@ def pair(tmp_path):
 
 def compared(*runs, **options):
     text = report(ReportArguments(runs, compare=True, **options))
-    lines = [line for line in text.splitlines() if line.startswith("|")]
-    return text, [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:]]
+    return text, cells(text)[1:]
 
 
 def test_two_runs_are_compared_seed_by_seed_on_the_episodes_of_both(pair):
