@@ -21,6 +21,7 @@ from bgpo_trl.experiments.report import ReportArguments, report
 from bgpo_trl.experiments.sweep import EightTasksArguments, SweepArguments
 from bgpo_trl.runs.config_file import Digests, settings_of
 from bgpo_trl.runs.cost import Cost, read_costs, write_costs
+from bgpo_trl.training import Trainer
 from suites import nico
 from tests.helpers import contents, rows
 
