@@ -18,8 +18,8 @@ from wandb.proto.wandb_internal_pb2 import Record
 from bgpo_trl.figures.frames import save_gif
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.figures.success import plot_success_curves
-from bgpo_trl.runs.dashboard import Dashboard, wandb_logger
-from bgpo_trl.runs.directory import RunLogger, flatten
+from bgpo_trl.runs.dashboard import wandb_logger
+from bgpo_trl.runs.directory import flatten
 from bgpo_trl.training import Trainer
 
 pytestmark = pytest.mark.usefixtures("easy_world")
@@ -189,28 +189,3 @@ def test_all_files_are_in_the_run_and_name_no_place_of_this_machine(run):
         content = path.read_bytes()
         for place in (run.parent, Path.cwd(), Path.home(), sys.prefix, sys.executable):
             assert len(str(place)) < 2 or str(place).encode() not in content
-
-
-def test_evaluations_are_logged_again_after_a_crash(tmp_path):
-    def play(board, log, episodes):
-        for episode in episodes:
-            row = {"algorithm": "x", "seed": 0, "task": "push", "episode": episode, "success": 1}
-            log.log_train({**row, "loss_actor": 1 / episode})
-            board.log_train({**row, "loss_actor": 1 / episode})
-            log.log_eval(row)
-            board.log_eval([row])
-
-    start = partial(wandb_logger, tmp_path, "offline")
-    with RunLogger(tmp_path, config={}) as log:
-        with Dashboard(tmp_path, [start], settings={}) as board:
-            play(board, log, [1, 2])
-            position = log.position()
-            play(board, log, [3, 4])  # lost with the crash that follows
-        log.truncate_to(position)
-        with Dashboard(tmp_path, [start], settings={}) as board:
-            play(board, log, [3, 4, 5])
-    logged = [
-        [(row["train/step"], row["train/loss_actor"]) for row in evaluations(session)]
-        for session in sessions(tmp_path)
-    ]
-    assert logged == [[(n, 1 / n) for n in (1, 2, 3, 4)], [(n, 1 / n) for n in (3, 4, 5)]]

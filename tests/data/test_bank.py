@@ -72,12 +72,9 @@ def test_the_steps_of_two_are_those_of_one_after_the_other(steps):
     "changes",
     [
         {"latent": torch.zeros(12, 64)},
-        {"action": torch.zeros(11, 4, dtype=torch.int8)},
         {"first": torch.zeros(4, dtype=torch.int64)},
-        {"first": torch.tensor([0, 4, 4, 7, 12])},
         {"first": torch.tensor([0, 4, 4, -1, 12])},
         {"length": torch.tensor([4, 0, 2, 7, 0])},
-        {"length": torch.tensor([4, -1, 2, 6, 0])},
         {"length": LENGTH.float()},
     ],
 )

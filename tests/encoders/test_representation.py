@@ -25,13 +25,11 @@ from bgpo_trl.encoders.representation import (
     load_representation,
     mean_frame,
     retrain_inverse,
-    save_representation,
     split,
     train_representation,
     valid_frames,
 )
 from bgpo_trl.encoders.train import train_encoders
-from bgpo_trl.modules.vae import VAE
 from bgpo_trl.scenes.nico import NICO
 from suites import nico
 from tests.helpers import TINY_ENCODERS
@@ -228,27 +226,6 @@ def test_the_inverse_model_alone_is_trained_as_with_the_other_encoders(tmp_path:
     with pytest.raises(ValueError, match="give the folder of recorded play"):
         train(None, folder=tmp_path / "nothing")
     assert not (tmp_path / "nothing").exists()
-
-
-@pytest.mark.parametrize("with_play", [False, True])
-def test_no_inverse_model_is_learned_from_episodes_without_actions(with_play, tmp_path) -> None:
-    shown, filmed = squares(8), squares(8, seed=1).exclude("action")
-    parts = (shown, filmed) if with_play else (filmed, None)
-    options = {"scene_version": "squares", "progress": False}
-    found = train_representation(parts[0], TINY, play=parts[1], **options)
-
-    assert found.inverse is None
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(TINY.seed)
-        initial = VAE(TINY.vae.latent_size, 1)
-    for name in ("weight", "bias"):
-        head, before = found.vae.inverse_head, initial.inverse_head
-        assert getattr(head, name).equal(getattr(before, name))
-    save_representation(found, tmp_path / "weights")
-    loaded = load_representation(tmp_path / "weights")
-    assert loaded.inverse is None and loaded.identity == found.identity
-    with pytest.raises(ValueError, match="learns from actions, which this play lacks"):
-        retrain_inverse(found, filmed, TINY, progress=False)
 
 
 def test_training_writes_weights_log_and_probes(tmp_path: Path) -> None:
