@@ -211,3 +211,13 @@ def test_the_command_has_a_row_for_each_success(run_of, tmp_path):
     assert (rows["actor"] == "demonstrators").sum() >= 4
     assert set(rows["holds"]) <= {"True", "False"}
     assert set(json.loads((out / "aftermath.json").read_text())) == {"commit", "command"}
+
+
+def test_demonstrators_and_random_actions_start_alike_without_a_run(monkeypatch, tmp_path):
+    monkeypatch.setattr(nico, "ALL_TASKS", ("press_white",))
+    arguments = AftermathArguments(demonstrators=True, episodes=1, seeds=(4,), out=tmp_path)
+    episodes = aftermath.episodes_of(arguments)
+    assert list(episodes) == ["demonstrators", "random actions"]
+    (first,), (second,) = episodes.values()
+    assert (first.start == second.start).all()
+    assert first.seed == 4

@@ -279,3 +279,16 @@ def test_the_smoke_preset_passes_every_stage_although_it_is_interrupted(tmp_path
     with open(tmp_path / "run" / "train.csv", newline="") as file:
         episodes = [(row["seed"], int(row["episode"])) for row in csv.DictReader(file)]
     assert sorted(episodes) == [(seed, n) for seed in "01" for n in range(1, 13)]
+
+
+def test_a_run_that_was_interrupted_while_it_made_encoders_is_resumed(
+    undrawn, tmp_path, monkeypatch, encoders, bank
+):
+    monkeypatch.setattr(experiment, "make_pretrained", lambda *_, **__: (encoders, bank))
+    (tmp_path / "demonstrations").mkdir()
+    arguments = Arguments(out=tmp_path, resume=True, episodes=2)
+    with pytest.raises(ValueError, match="beginning of new encoders: add --train-encoders"):
+        continual(arguments)
+    assert [path.name for path in tmp_path.iterdir()] == ["demonstrations"]
+    continual(replace(arguments, train_encoders=True))
+    assert (tmp_path / "summary.json").exists()

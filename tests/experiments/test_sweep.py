@@ -130,6 +130,14 @@ def test_the_benchmark_of_eight_tasks_is_a_grid_with_tests_every_50_episodes(mon
     assert [arguments.eval_every for arguments in asked] == [50, 20]
     grid = sweep.make_jobs(asked[0])
     assert len(grid) == 3 * 8
+    more = SweepArguments(settings=("eight-sequential", "sequential"), episodes=4_000)
+    config = {path.name: group[0].config for path, group in (grid | sweep.make_jobs(more)).items()}
+    assert config["eight-bgpo"].task_starts == tuple(range(0, 4_000, 500))
+    assert config["eight-concurrent-bgpo"].task_starts == (0,) * 8
+    assert config["eight-reversed-bgpo"].tasks == nico.ALL_TASKS[::-1]
+    assert config["sequential-bgpo"].tasks == nico.PAPER_TASKS
+    unpractised = {name for name, of_runs in config.items() if of_runs.schedule == "sequential"}
+    assert unpractised == {"eight-sequential-bgpo", "sequential-bgpo"}
     for group in grid.values():
         (job,) = group
         assert job.config.seeds == (10, 11, 12, 13, 14)

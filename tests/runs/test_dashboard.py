@@ -259,3 +259,16 @@ def test_tensorboard_gets_the_means_as_scalars_in_the_run_directory(make, monkey
     assert closed == [str(tmp_path / "tensorboard")]
     assert {name: value for name, value, _ in written if name in MEANS} == pytest.approx(MEANS)
     assert {step for *_, step in written} == {2}
+
+
+def test_success_of_each_seed_is_logged_on_request(make):
+    recorder = Recorder()
+    with make(recorder, per_seed=True) as board:
+        board.log_train(episode(3, 1, "grasp", 1))
+        board.log_eval(evaluation(2))
+    [(metrics, _)] = recorder.metrics
+    of_seeds = {key: value for key, value in metrics.items() if "/seed_" in key}
+    assert of_seeds == {
+        f"eval/success/{task}/seed_{seed}": np.mean(successes)
+        for (seed, task), successes in TESTED.items()
+    }
