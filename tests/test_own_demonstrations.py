@@ -8,8 +8,7 @@ import torch
 
 import bgpo_trl
 from bgpo_trl.data.bank import DemonstrationBank
-from bgpo_trl.data.dataset import load_demonstrations
-from bgpo_trl.data.writing import write_demonstrations
+from bgpo_trl.data.dataset import load_demonstrations, write_demonstrations
 from bgpo_trl.encoders.pretrained import bank_path
 from bgpo_trl.encoders.representation import load_representation
 from bgpo_trl.encoders.train import train_encoders

@@ -22,7 +22,7 @@ from PIL import Image
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from bgpo_trl.data.writing import resize_frames
+from bgpo_trl.data.dataset import resize_frames
 from bgpo_trl.files.writing import new_folder, write_json
 
 try:

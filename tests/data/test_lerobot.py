@@ -15,8 +15,8 @@ pa = pytest.importorskip("pyarrow")
 import pyarrow.parquet as pq  # noqa: E402
 
 from bgpo_trl.data import lerobot  # noqa: E402
+from bgpo_trl.data.dataset import resize_frames, write_demonstrations  # noqa: E402
 from bgpo_trl.data.lerobot import read_lerobot, write_lerobot  # noqa: E402
-from bgpo_trl.data.writing import resize_frames, write_demonstrations  # noqa: E402
 from tests.helpers import edit  # noqa: E402
 
 TASKS = ("grasp_glass", "push_green_to_white")
