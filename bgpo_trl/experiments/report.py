@@ -10,7 +10,7 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from bgpo_trl.analysis import metrics, statistics
+from bgpo_trl.analysis import statistics
 from bgpo_trl.analysis.comparison import (
     Run,
     Setting,
@@ -21,7 +21,7 @@ from bgpo_trl.analysis.comparison import (
     run_directories,
     under_equal_conditions,
 )
-from bgpo_trl.analysis.scores import Values, late_scores, success_matrix
+from bgpo_trl.analysis.scores import Values, evaluation_matrix, late_scores, success_matrix
 from bgpo_trl.analysis.tables import (
     COST_NOTE,
     DIFFERENCE_NOTES,
@@ -319,7 +319,7 @@ def compare(paths: Sequence[Path], *, every: int | None = None, anyway: bool = F
     part = last + 1 if every is None else every
     for end in range(part, last + 1, part):
         matrices = [
-            metrics.evaluation_matrix(run.curves.success, run.curves.episodes, [end], window=part)
+            evaluation_matrix(run.curves.success, run.curves.episodes, [end], window=part)
             for run in runs
         ]
         rows += _differences(f"to {end}", first.tasks, *(matrix[:, 0] for matrix in matrices))
