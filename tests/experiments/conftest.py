@@ -84,7 +84,7 @@ def finished_runs(bank, encoders, make_config, tmp_path_factory):
 def shipped(encoders, monkeypatch):
     """Untrained encoders in place of those that come with the package."""
     place = "bgpo_trl.runs.demonstrations.load_representation"
-    monkeypatch.setattr(place, lambda path, scene_version: encoders)
+    monkeypatch.setattr(place, lambda path: encoders)
 
 
 @pytest.fixture

@@ -33,7 +33,7 @@ def test_another_algorithm_changes_nothing_else(name):
     ("preset", "episodes", "starts", "eval_every"),
     [
         ("paper", 10_000, (0, 3_500, 6_500), 1),
-        ("quick", 2_400, (0, 760, 1_400), 120),
+        ("quick", 2_400, (0, 760, 1_400), 150),
         ("quick", 20, (0, 6, 12), 20),  # tested once at least
     ],
 )
@@ -70,9 +70,9 @@ def test_hyperparameters_are_flags():
     ("tasks", "episodes", "starts"),
     [
         ((TWO,), None, (0,)),
-        ((TWO, ONE), None, (0, 600)),
+        ((TWO, ONE), None, (0, 900)),
         ((TWO, ONE), 100, (0, 50)),
-        ((THREE, ONE, TWO), None, (0, 380, 700)),  # as many as the preset has
+        ((THREE, ONE, TWO), None, (0, 570, 1_050)),  # as many as the preset has
         (("all",), 4_000, tuple(range(0, 4_000, 500))),
     ],
 )
