@@ -116,23 +116,6 @@ def test_actions_equal_those_of_a_snapshot_bit_for_bit(trainer_of, load, encoder
             torch.testing.assert_close(torch.from_numpy(policy.act(frame)), expected)
 
 
-@pytest.mark.parametrize("name", [name for name in NAMES if name not in (*UNCONDITIONED, *LABELED)])
-def test_actions_depend_on_the_demonstration(load, encoders, name):
-    policy, (frame,) = load(name), noise(0, 1)
-    dark, bright = (np.full((20, 32, 64, 3), shade, np.uint8) for shade in (0, 255))
-    if policy.algorithm.gwr is not None:  # So short a run has not learned to tell these apart.
-        graphs = policy.algorithm.gwr.get_extra_state()
-        for graph in graphs:
-            graph["weights"][:2] = torch.stack([embed(encoders, dark), embed(encoders, bright)])
-        policy.algorithm.gwr.set_extra_state(graphs)
-    actions = []
-    for shown in (dark, bright, dark):
-        policy.condition(shown)
-        actions.append(policy.act(frame))
-    assert np.abs(actions[0] - actions[1]).max() > 1e-4
-    np.testing.assert_array_equal(actions[0], actions[2])
-
-
 @pytest.mark.parametrize("length", [1, 2, 20, 51, 70])
 def test_recognition_of_demonstrations_of_any_length(trainer_of, load, encoders, length):
     algorithm, config = trainer_of("bgpo").algorithm, trainer_of("bgpo").config.algorithm

@@ -101,17 +101,3 @@ def test_growth_panels_share_the_components_of_the_last_graph():
     assert late.get_xlabel() == "component 1 (94% of variance)"  # 16 of 17
     assert early.get_title() == "episode 10: 2 nodes, 1 outside"
     assert late.get_title() == "episode 20: 5 nodes, 1 outside"
-
-
-def test_growth_draws_edges_and_colored_nodes():
-    figure = plot_gwr_growth(GRAPHS, [[1, 2]], TASKS)
-    early, late, _ = figure.axes
-    assert [len(c.get_offsets()) for c in early.collections[1:]] == [1, 0, 1]
-    assert [len(c.get_offsets()) for c in late.collections[1:]] == [2, 2, 1]
-    colors = [tuple(c.get_facecolor()[0]) for c in late.collections[1:]]
-    assert len(set(colors)) == 3
-    labels = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert labels == ["task 1: grasp glass", "task 2: push green to white", "no demonstration"]
-    edges = [segment.tolist() for segment in late.collections[0].get_segments()]
-    ends = [[(-2, -0.5), (2, -0.5)], [(-2, 0.5), (2, 0.5)], [(-2, -0.5), (88, 0)]]
-    assert np.array(edges) == pytest.approx(np.array(ends))
