@@ -29,7 +29,6 @@ ROOT = Path(__file__).parents[1]
 TASKS = nico.PAPER_TASKS
 NAMES = [name for name in ALGORITHMS if name not in ("without-bonus", "without-both")]
 LABELED = [name for name in NAMES if name.startswith(("maml", "dist-nll", "oracle"))]
-UNCONDITIONED = ("ddpg", "fine-tuning", "ewc")  # by any demonstration
 METADATA = {
     "scene_version": nico.scene_version(),
     "config": json.dumps(asdict(RepresentationConfig())),
