@@ -113,6 +113,11 @@ class RowPool:
         The caller's thread calls ``arrived`` with each row and its result, as soon as possible.
         """
         waiting, results = deque(rows), deque[tuple[int, T]]()
+        n_helpers = min(self._helpers, len(waiting) - 1)
+        if n_helpers < 1:
+            for row in waiting:
+                arrived(row, work(row))
+            return
 
         def work_on_next() -> bool:
             try:
@@ -130,14 +135,12 @@ class RowPool:
             while results:
                 arrived(*results.popleft())
 
-        n_helpers = min(self._helpers, len(waiting) - 1)
         helpers = [self._pool.submit(work_on_all) for _ in range(n_helpers)]
         interval = sys.getswitchinterval()
         try:
-            if helpers:
-                # A thread that returns from MuJoCo waits up to this long for the GIL, by default
-                # 5 ms, the time of several simulations.
-                sys.setswitchinterval(2e-4)
+            # A thread that returns from MuJoCo waits up to this long for the GIL, by default 5 ms,
+            # the time of several simulations.
+            sys.setswitchinterval(2e-4)
             while work_on_next():
                 hand_over()
         finally:
