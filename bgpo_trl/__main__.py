@@ -26,7 +26,7 @@ COMMANDS = {
         "Test whether successes of a run of NICO last.",
     ),
     "one-shot": ("experiments.one_shot", "Test a run with demonstrations cut short."),
-    "unknown-task": ("experiments.unknown_task", "Measure how well new tasks are detected."),
+    "unknown-task": ("experiments.groups", "Measure how well new tasks are detected."),
     "groups": ("experiments.groups", "Measure the groups that form from demonstrations."),
     "privileged-information": (
         "experiments.privileged_information",

@@ -1,14 +1,23 @@
-"""Resources of the machine: usable cores, threads, and the device of the networks."""
+"""Resources of the machine: cores, threads, freed memory, devices, and signals that end a run."""
 
 from __future__ import annotations
 
 import ctypes
 import os
+import signal
 import sys
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any, TypeVar
 
 import torch
 
+T = TypeVar("T")
+_USUAL = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
 # Options of mallopt (malloc.h), and bytes.
 _KEEP_FREED = {
     -1: 2**30,  # M_TRIM_THRESHOLD: free memory that is kept
@@ -73,3 +82,108 @@ def choose_device(name: str = "auto") -> torch.device:
         reason = str(error).splitlines()[0].partition(". ")[0]
         raise ValueError(f"no device {name!r} here ({reason}): use auto or cpu") from error
     return device
+
+
+class RowPool:
+    """Threads that share the rows of a batch; the caller's is one of ``n``.
+
+    ``name`` is the prefix of the others' names. A copy, also in another process, starts threads of
+    its own.
+
+    Examples:
+        >>> pool, results = RowPool(3, "squares"), [0] * 5
+        >>> pool.each(range(5), lambda row: row**2, results.__setitem__)
+        >>> results
+        [0, 1, 4, 9, 16]
+    """
+
+    def __init__(self, n: int, name: str) -> None:
+        self._helpers = n - 1
+        self._name = name
+        self._pool = ThreadPoolExecutor(max(1, self._helpers), name)
+
+    def __reduce__(self) -> tuple[type[RowPool], tuple[int, str]]:
+        return RowPool, (self._helpers + 1, self._name)
+
+    def each(
+        self, rows: Iterable[int], work: Callable[[int], T], arrived: Callable[[int, T], object]
+    ) -> None:
+        """Call ``work`` on each row in any thread.
+
+        The caller's thread calls ``arrived`` with each row and its result, as soon as possible.
+        """
+        waiting, results = deque(rows), deque[tuple[int, T]]()
+        n_helpers = min(self._helpers, len(waiting) - 1)
+        if n_helpers < 1:
+            for row in waiting:
+                arrived(row, work(row))
+            return
+
+        def work_on_next() -> bool:
+            try:
+                row = waiting.popleft()
+            except IndexError:
+                return False
+            results.append((row, work(row)))
+            return True
+
+        def work_on_all() -> None:
+            while work_on_next():
+                pass
+
+        def hand_over() -> None:
+            while results:
+                arrived(*results.popleft())
+
+        helpers = [self._pool.submit(work_on_all) for _ in range(n_helpers)]
+        interval = sys.getswitchinterval()
+        try:
+            # A thread that returns from MuJoCo waits up to this long for the GIL, by default 5 ms,
+            # the time of several simulations.
+            sys.setswitchinterval(2e-4)
+            while work_on_next():
+                hand_over()
+        finally:
+            wait(helpers)  # No helper works on after the call, even if it raises.
+            sys.setswitchinterval(interval)
+        for helper in helpers:
+            helper.result()
+        hand_over()
+
+    def close(self) -> None:
+        """End the helpers."""
+        self._pool.shutdown()
+
+
+@contextmanager
+def interrupts_wait() -> Iterator[Callable[[], bool]]:
+    """Defer the first Ctrl-C or SIGTERM to the end of the block; a second one interrupts at once.
+
+    SIGTERM is what ``kill`` and cluster schedulers send before they end a process. Both raise
+    ``KeyboardInterrupt``. Yields a function that returns whether a signal came. Signal handling is
+    left unchanged outside the main thread, and of a signal that is ignored (Ctrl-C of background
+    jobs) or has a custom handler.
+    """
+    asked = False
+
+    def ask(signum: int, frame: Any) -> None:
+        nonlocal asked
+        if asked:
+            raise KeyboardInterrupt
+        asked = True
+
+    in_main = threading.current_thread() is threading.main_thread()
+    usual = {
+        number: handler
+        for number, handler in _USUAL.items()
+        if in_main and signal.getsignal(number) is handler
+    }
+    for number in usual:
+        signal.signal(number, ask)
+    try:
+        yield lambda: asked
+    finally:
+        for number, handler in usual.items():
+            signal.signal(number, handler)
+    if asked:
+        raise KeyboardInterrupt

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -57,6 +57,55 @@ class Recognition:
     task: str | None = None
 
 
+@dataclass(frozen=True)
+class LoadedRun:
+    """All seeds of a run, as left by its last checkpoint. It can be pickled, without a replay.
+
+    Attributes:
+        config: The run.
+        algorithm: The algorithm of all seeds.
+        encoders: The run's encoders.
+        bank: The run's demonstrations, embedded.
+        episodes: Training episodes of each seed so far.
+    """
+
+    config: RunConfig
+    algorithm: Algorithm
+    encoders: Representation
+    bank: DemonstrationBank
+    episodes: Sequence[int]
+
+    @classmethod
+    def restore(
+        cls,
+        make: Callable[..., Algorithm],
+        config: RunConfig,
+        state: dict[str, Any],
+        encoders: Representation,
+        bank: DemonstrationBank,
+        episodes: Sequence[int],
+    ) -> LoadedRun:
+        """Make the algorithm of a run from its state, without a replay that it does not need."""
+        algorithm = make(
+            config.algorithm,
+            seeds=config.seeds,
+            bank=bank.seen(),
+            encoders=encoders,
+            scene=find_scene(config.scene),
+        )
+        if not algorithm.needs_replay:
+            state = {**state, "replay": algorithm.replay.state_dict()}  # avoids reading it
+        algorithm.load_state_dict(state)
+        return cls(config, algorithm, encoders, bank, episodes)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        state = self.algorithm.state_dict()
+        if not self.algorithm.needs_replay:
+            del state["replay"]
+        parts = (type(self.algorithm), self.config, state, self.encoders, self.bank, self.episodes)
+        return LoadedRun.restore, parts
+
+
 class TrainedPolicy:
     """The policy of one seed of a run, without learning or noise, as returned by `load_run`.
 
@@ -64,42 +113,28 @@ class TrainedPolicy:
     `Algorithm` alone for that.
 
     Args:
-        config: The run.
-        algorithm: The algorithm of all seeds, as left by the run.
-        encoders: The run's encoders.
-        bank: The run's demonstrations, embedded.
-        seed: One of the run's seeds.
-        episodes: Training episodes that the seed has learned from.
+        run: The run.
+        seed: One of its seeds.
     """
 
-    def __init__(
-        self,
-        config: RunConfig,
-        algorithm: Algorithm,
-        *,
-        encoders: Representation,
-        bank: DemonstrationBank,
-        seed: int,
-        episodes: int,
-    ) -> None:
-        self.config = config
-        self.algorithm = algorithm
-        self.encoders = encoders
-        self.bank = bank
-        self.seed, self.episodes = seed, episodes
-        self.tasks = config.tasks
-        self._observe = Compose([encode(config.algorithm, encoders), clip(config.algorithm)])
-        self._index = config.seeds.index(seed)
+    def __init__(self, run: LoadedRun, seed: int) -> None:
+        self._run, self.seed = run, seed
+        self.config, self.algorithm = run.config, run.algorithm
+        self.encoders, self.bank, self.tasks = run.encoders, run.bank, run.config.tasks
+        self._index = run.config.seeds.index(seed)
+        self.episodes = run.episodes[self._index]
+        config = run.config.algorithm
+        self._observe = Compose([encode(config, run.encoders), clip(config)])
         self._policy: Policy | None = None
         self._task = 0
 
     def __reduce__(self) -> tuple[Any, ...]:
-        state = self.algorithm.state_dict()
-        if not self.algorithm.needs_replay:
-            del state["replay"]
         shown = None if self._policy is None else self._policy.state_dict()
-        parts = (type(self.algorithm), self.config, state, self.encoders, self.bank)
-        return _unpickled, (*parts, self.seed, self.episodes, shown, self._task)
+        return TrainedPolicy, (self._run, self.seed), (shown, self._task)
+
+    def __setstate__(self, state: tuple[dict[str, Any] | None, int]) -> None:
+        shown, self._task = state
+        self._policy = None if shown is None else self.algorithm.policy(**shown)
 
     @torch.no_grad()
     def condition(
@@ -195,65 +230,6 @@ class TrainedPolicy:
         return torch.tensor(np.ascontiguousarray(array))
 
 
-def _unpickled(
-    make: Callable[..., Algorithm],
-    config: RunConfig,
-    state: dict[str, Any],
-    encoders: Representation,
-    bank: DemonstrationBank,
-    seed: int,
-    episodes: int,
-    shown: dict[str, Any] | None,
-    task: int,
-) -> TrainedPolicy:
-    algorithm = _restored(make, config, state, encoders, bank)
-    policy = TrainedPolicy(
-        config, algorithm, seed=seed, encoders=encoders, bank=bank, episodes=episodes
-    )
-    policy._policy = None if shown is None else algorithm.policy(**shown)
-    policy._task = task
-    return policy
-
-
-def _restored(
-    make: Callable[..., Algorithm],
-    config: RunConfig,
-    state: dict[str, Any],
-    encoders: Representation,
-    bank: DemonstrationBank,
-) -> Algorithm:
-    """Make the algorithm of a run from its state, without a replay that it does not need."""
-    algorithm = make(
-        config.algorithm,
-        seeds=config.seeds,
-        bank=bank.seen(),
-        encoders=encoders,
-        scene=find_scene(config.scene),
-    )
-    if not algorithm.needs_replay:
-        state = {**state, "replay": algorithm.replay.state_dict()}  # avoids reading it
-    algorithm.load_state_dict(state)
-    return algorithm
-
-
-class LoadedRun(NamedTuple):
-    """All seeds of a run, as left by its last checkpoint.
-
-    Attributes:
-        config: The run.
-        algorithm: The algorithm of all seeds.
-        encoders: The run's encoders.
-        bank: The run's demonstrations, embedded.
-        episodes: Training episodes of each seed so far.
-    """
-
-    config: RunConfig
-    algorithm: Algorithm
-    encoders: Representation
-    bank: DemonstrationBank
-    episodes: Sequence[int]
-
-
 def load_run(
     path: str | Path,
     *,
@@ -285,16 +261,8 @@ def load_run(
         raise ValueError(f"{path} has no seed {seed!r}: choose one of {seeds}")
     if config.algorithm.state != "latent" or digests.encoders is None:
         raise ValueError(f"{path} learned from the ground truth: only runs from frames can watch")
-    config, algorithm, encoders, bank, episodes = load_all_seeds(path, make=make)
-    seed = config.seeds[0] if seed is None else seed
-    return TrainedPolicy(
-        config,
-        algorithm,
-        encoders=encoders,
-        bank=bank,
-        seed=seed,
-        episodes=episodes[config.seeds.index(seed)],
-    )
+    run = load_all_seeds(path, make=make)
+    return TrainedPolicy(run, config.seeds[0] if seed is None else seed)
 
 
 def load_all_seeds(path: str | Path, *, make: Callable[..., Algorithm] | None = None) -> LoadedRun:
@@ -338,6 +306,5 @@ def load_all_seeds(path: str | Path, *, make: Callable[..., Algorithm] | None = 
     # Before anything is made of the sizes in the settings, which may not be the run's.
     check_checkpoint(path / "checkpoint", saved, read_json(path / "config.json"))
     with fitting_checkpoint(path):
-        algorithm = _restored(make, config, saved["algorithm"], encoders, bank)
-        episodes = saved["world"]["source"]["episode"].tolist()
-    return LoadedRun(config, algorithm, encoders, bank, episodes)
+        state, episodes = saved["algorithm"], saved["world"]["source"]["episode"].tolist()
+        return LoadedRun.restore(make, config, state, encoders, bank, episodes)

@@ -21,16 +21,15 @@ from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.evaluation import Evaluator
 from bgpo_trl.files.checkpoint import save_checkpoint
-from bgpo_trl.files.interrupts import interrupts_wait
-from bgpo_trl.files.locking import lock_directory
 from bgpo_trl.files.progress import progress_bar
+from bgpo_trl.files.writing import lock_directory
+from bgpo_trl.machine import interrupts_wait
 from bgpo_trl.runs.config_file import Digests, settings_of
 from bgpo_trl.runs.cost import CostLog
 from bgpo_trl.runs.dashboard import Dashboard
 from bgpo_trl.runs.demonstrations import keep_inputs
-from bgpo_trl.runs.directory import fitting_checkpoint, load_last
+from bgpo_trl.runs.directory import RunLogger, fitting_checkpoint, load_last
 from bgpo_trl.runs.gwr_graphs import growth_moments, save_graph
-from bgpo_trl.runs.logger import RunLogger
 from bgpo_trl.scenes import find_scene
 from bgpo_trl.transforms import TaskSchedule
 from bgpo_trl.world import World

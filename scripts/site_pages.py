@@ -43,7 +43,7 @@ REFERENCE = {
     "algorithms": ["algorithms.algorithm", "algorithms.environments", "algorithms.bgpo"],
     "training": ["training", "configs.runs", "configs.algorithms"],
     "scenes": ["scenes.scene", "scenes.simulation"],
-    "data": ["data.recording", "data.writing", "data.dataset", "data.bank"],
+    "data": ["data.recording", "data.dataset", "data.bank"],
 }
 TITLES = {
     "policy": "Trained policies",

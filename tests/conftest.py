@@ -1,7 +1,6 @@
 """Settings of all tests, and parts of a run that take about a second."""
 
 import gc
-import hashlib
 import json
 import os
 import signal
@@ -29,8 +28,10 @@ from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
 from bgpo_trl.scenes import SCENES, Outcome
 from bgpo_trl.scenes.nico import NICO, NicoEnv, NicoSimulation
+from bgpo_trl.training import Trainer
 from bgpo_trl.world import World
 from suites.nico import nico
+from tests.helpers import contents
 
 # Without a deadline, since the duration of an example depends on the load of the machine.
 settings.register_profile("bgpo_trl", deadline=None)
@@ -131,6 +132,17 @@ def in_world(bank):
     return enter
 
 
+@pytest.fixture(scope="session")
+def begin(bank, encoders, make_config):
+    """Make the trainer of a run, by default of the settings of `make_config`."""
+
+    def make(directory, config=None, **arguments):
+        parts = {"bank": bank, "encoders": encoders, "progress": False, **arguments}
+        return Trainer(config or make_config(), directory, **parts)
+
+    return make
+
+
 class EasySimulation(NicoSimulation):
     """A simulation whose episodes also end, with success, once the arm is turned to one side.
 
@@ -204,7 +216,7 @@ def refused(tmp_path) -> Callable[..., None]:
     """Check that a call raises one line with cause and remedy, and changes no file."""
 
     def check(call: Callable[[], object], cause: str, remedy: str) -> None:
-        before = _files(tmp_path)
+        before = contents(tmp_path)
         with pytest.raises((ValueError, OSError, RuntimeError)) as raised:
             call()
         message = str(raised.value)
@@ -212,21 +224,14 @@ def refused(tmp_path) -> Callable[..., None]:
         assert message.isprintable()  # one line, and nothing that a terminal would act on
         assert cause in message
         assert remedy in message
-        assert _files(tmp_path) == before
+        assert contents(tmp_path) == before
 
     return check
 
 
-def _files(folder) -> dict[str, str]:
-    return {
-        str(path): hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
-        for path in folder.rglob("*")
-    }
-
-
 _OTHER_PROCESS = """
 import sys
-from bgpo_trl.files.locking import lock_directory
+from bgpo_trl.files.writing import lock_directory
 
 directory, wait = sys.argv[1], sys.argv[2] == "True"
 if wait:

@@ -16,7 +16,7 @@ from bgpo_trl.figures.style import save_figure
 from bgpo_trl.files.checkpoint import save_checkpoint
 from bgpo_trl.files.csv_file import CsvFile
 from bgpo_trl.runs.dashboard import wandb_logger
-from bgpo_trl.runs.logger import EVAL_COLUMNS, RunLogger
+from bgpo_trl.runs.directory import EVAL_COLUMNS, RunLogger
 from bgpo_trl.runs.results import read_curves, read_json, read_table
 from suites import nico
 

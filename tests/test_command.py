@@ -3,7 +3,6 @@
 import importlib.metadata
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
 
 import pytest
@@ -34,11 +33,6 @@ def call(monkeypatch, *options):
 
 def test_the_version_is_that_of_the_distribution():
     assert bgpo_trl.__version__ == importlib.metadata.version("bgpo_trl")
-
-
-def test_pyproject_names_the_command():
-    scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
-    assert scripts == {"bgpo": "bgpo_trl.__main__:main"}
 
 
 def test_help_lists_every_command(monkeypatch, capsys):
@@ -113,12 +107,3 @@ def test_what_a_command_returns_is_printed(monkeypatch, capsys):
     call(monkeypatch, "watch", "runs/own", "--import", "my_tasks")
     assert asked == [WatchArguments(run=Path("runs/own"), module="my_tasks")]
     assert capsys.readouterr().out == "pictures\n"
-
-
-def test_ctrl_c_during_the_imports_ends_in_one_line(monkeypatch):
-    def interrupt(name):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(command.importlib, "import_module", interrupt)
-    with pytest.raises(SystemExit, match=r"^interrupted$"):
-        call(monkeypatch, "continual")

@@ -22,18 +22,11 @@ from bgpo_trl.encoders.representation import (
 from bgpo_trl.modules.inverse_model import InverseModel
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
+from tests.helpers import UNPICKLED, Malice
 
 FILES = [f"{key}.memmap" for key in ("pixels", "state", "action", "length", "task", "train")]
 FILES += ["dataset.json", "meta.json"]
-RUN: list[str] = []
 examples = pytest.mark.parametrize("n", [30, pytest.param(1_000, marks=pytest.mark.slow)])
-
-
-class Malice:
-    """Betrays whoever unpickles it."""
-
-    def __reduce__(self):
-        return RUN.append, ("unpickled",)
 
 
 damages = st.one_of(
@@ -79,7 +72,7 @@ def read_or_refused(read, expected) -> None:
         assert found.keys() == expected.keys()
         for key, value in expected.items():
             torch.testing.assert_close(found[key], value, rtol=0, atol=0)
-    assert not RUN
+    assert not UNPICKLED
 
 
 # ---- the dataset

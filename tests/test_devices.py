@@ -4,34 +4,19 @@ PyTorch takes ``cpu:0``, the CPU under another name, for another device, so that
 there and back. A GPU is tested too if there is one.
 """
 
-import csv
-from operator import attrgetter
-
 import pytest
 import torch
 from tensordict import TensorDict
-from torch import nn
 
-from bgpo_trl.configs import (
-    InverseModelConfig,
-    RepresentationConfig,
-    SequenceAutoencoderConfig,
-    VAEConfig,
-)
 from bgpo_trl.encoders.representation import (
     load_representation,
     save_representation,
     train_representation,
 )
 from bgpo_trl.training import Trainer
-from bgpo_trl.transforms import FrameEncoder
+from tests.helpers import TINY_ENCODERS, rows
 
 DEVICES = ["cpu:0", *(["cuda"] if torch.cuda.is_available() else [])]
-
-
-def rows(path):
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
 
 
 @pytest.mark.usefixtures("easy_world")
@@ -56,46 +41,6 @@ def test_a_run_is_the_same_on_every_device(device, name, bank, encoders, make_co
                     assert float(ours[key]) == pytest.approx(float(theirs[key]), abs=1e-3)
 
 
-POLICIES = {
-    "bgpo": ("learner.actor", "learner.loss"),
-    "bgpo+sac": ("learner.actor", "learner.loss"),
-    "maml": ("meta_actor", "critic", "loss"),
-    "dist-nll": ("teacher", "students", "critic", "loss"),
-}
-
-
-@pytest.mark.usefixtures("easy_world")
-@pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize("name", POLICIES)
-def test_learner_and_encoder_are_on_the_device(device, name, bank, encoders, make_config, tmp_path):
-    parts = {"bank": bank, "encoders": encoders, "progress": False}
-    try:
-        config = make_config(name=name)
-        algorithm = Trainer(config, tmp_path, device=device, **parts).algorithm
-        modules = [attrgetter(part)(algorithm) for part in POLICIES[name]]
-        for part in (*modules, encoders.vae):
-            for module in part if isinstance(part, list) else [part]:
-                for where, weights in module.named_parameters():
-                    assert weights.device.type == torch.device(device).type, where
-    finally:
-        encoders.vae.cpu()
-
-
-def test_frames_follow_the_encoder_and_latents_come_back():
-    class Elsewhere(nn.Module):
-        def __init__(self):
-            super().__init__()
-            self.weights = nn.Parameter(torch.empty(1, device="meta"))
-
-        def latent(self, frames):
-            assert frames.device.type == "meta"
-            return torch.ones(*frames.shape[:-3], 64)
-
-    latent = FrameEncoder(Elsewhere())._apply_transform(torch.zeros(3, 32, 64, 3).byte())
-    assert latent.device.type == "cpu"
-    assert latent.shape == (3, 64)
-
-
 @pytest.mark.parametrize("device", DEVICES)
 def test_encoders_trained_elsewhere_come_back_to_the_cpu(device, tmp_path):
     generator = torch.Generator().manual_seed(0)
@@ -108,15 +53,10 @@ def test_encoders_trained_elsewhere_come_back_to_the_cpu(device, tmp_path):
         },
         [4],
     )
-    config = RepresentationConfig(
-        vae=VAEConfig(steps=2, batch_size=4),
-        lae=SequenceAutoencoderConfig(steps=2, batch_size=4),
-        inverse=InverseModelConfig(steps=2, batch_size=4),
-    )
     found = []
     for place in ("cpu", device):
         trained = train_representation(
-            data, config, scene_version="noise", device=place, progress=False
+            data, TINY_ENCODERS, scene_version="noise", device=place, progress=False
         )
         save_representation(trained, tmp_path / "weights.safetensors")
         found.append(load_representation(tmp_path / "weights.safetensors"))

@@ -138,20 +138,6 @@ def test_a_command_is_understood(command, monkeypatch, parse_only):
             run(script, arguments, monkeypatch)
 
 
-@pytest.mark.parametrize(
-    "command",
-    [
-        "python benchmarks/continual.py --presett quick",
-        "python benchmarks/concurrent_tasks.py --preset huge",
-        "python -m suites.nico.explore --tasks grasp_glass",
-        "python -m bgpo_trl.data.recording --per-task 3",
-    ],
-)
-def test_a_command_that_is_wrong_is_not_understood(command, monkeypatch, parse_only):
-    with pytest.raises(SystemExit):
-        run(*script_of(command), monkeypatch)
-
-
 @pytest.mark.parametrize("command", sorted({*COMMANDS} - {*OF_PYTHON}))
 def test_a_verb_or_tool_is_there(command):
     tool, *words = shlex.split(command)

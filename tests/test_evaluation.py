@@ -282,20 +282,6 @@ def test_only_tasks_that_were_presented_are_tested(make, starts):
         assert frames.flatten(2).any(-1).all(-1).tolist() == presented  # others are never drawn
 
 
-@pytest.mark.parametrize(("episode", "presented"), [(1, 1), (2, 1), (3, 2), (4, 2), (5, 3)])
-def test_a_task_is_presented_once_an_episode_could_be_of_it(make, episode, presented):
-    algorithm, evaluator = make(n_steps=0)
-    algorithm.world.source.episode.fill_(episode)
-    assert take(evaluator, algorithm)[0].presented.sum() == presented
-
-
-def test_seeds_may_have_played_different_numbers_of_episodes(make):
-    algorithm, evaluator = make(n_steps=0)
-    algorithm.world.source.episode.copy_(torch.tensor([1, 3]))
-    result = evaluator.run(take(evaluator, algorithm))
-    assert (result.steps > 0).all(-1).tolist() == [[True, False, False], [True, True, False]]
-
-
 def test_a_bank_without_a_held_out_demonstration_of_a_task_is_refused(bank, encoders, make_config):
     train = bank.train | (bank.task == 1)
     incomplete = DemonstrationBank(bank.embedding, bank.task, train).held_out()

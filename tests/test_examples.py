@@ -1,6 +1,5 @@
 """Examples run in an empty folder and print what they describe."""
 
-import csv
 import re
 import runpy
 import sys
@@ -13,6 +12,7 @@ from PIL import Image
 
 from bgpo_trl.data.dataset import load_demonstrations
 from suites import nico
+from tests.helpers import rows
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
@@ -29,11 +29,6 @@ def run(tmp_path, monkeypatch, capsys):
         return capsys.readouterr().out
 
     return run
-
-
-def rows(path):
-    with open(path, newline="") as file:
-        return list(csv.DictReader(file))
 
 
 def test_own_task_is_recorded_learned_and_counted_under_its_name(run):

@@ -1,14 +1,16 @@
-"""Quotas of the machine are heeded, devices found or refused."""
+"""Quotas of the machine are heeded, devices found or refused, rows shared between threads."""
 
 import os
+import pickle
 import platform
 import subprocess
 import sys
+import threading
 
 import pytest
 import torch
 
-from bgpo_trl.machine import choose_device, usable_cores
+from bgpo_trl.machine import RowPool, choose_device, usable_cores
 
 CORES = len(os.sched_getaffinity(0))
 
@@ -45,14 +47,6 @@ def test_auto_chooses_an_available_gpu(monkeypatch, gpu, device):
     assert choose_device() == torch.device(device)
 
 
-def test_an_unavailable_device_is_refused():
-    with pytest.raises(ValueError, match=r"^no device 'abacus' here \(.*\): use auto or cpu$"):
-        choose_device("abacus")
-    if not torch.cuda.is_available():
-        with pytest.raises(ValueError, match=r"^no device 'cuda' here \(.*\): use auto or cpu$"):
-            choose_device("cuda")
-
-
 FAULTS = """
 import resource, sys, threading
 import torch
@@ -84,3 +78,50 @@ def test_freed_memory_that_is_kept_is_used_again_without_page_faults():
         for mode in ("return", "keep")
     ]
     assert counts[1] < counts[0] / 100
+
+
+@pytest.fixture(params=[1, 3, 20])
+def threads(request):
+    threads = RowPool(request.param, "test")
+    yield threads
+    threads.close()
+
+
+def test_each_row_is_computed_once_and_received_by_the_calling_thread(threads):
+    rows, places = list(range(3, 15)), set()
+
+    def arrived(row, result):
+        places.add(threading.current_thread())
+        results.append((row, result))
+
+    for _ in range(2):
+        results: list[tuple[int, int]] = []
+        threads.each(rows, lambda row: row**2, arrived)
+        assert sorted(results) == [(row, row**2) for row in rows]
+    threads.each([], lambda row: row, arrived)
+    assert places == {threading.current_thread()}
+
+
+def test_an_error_in_a_thread_is_raised_after_all_have_ended(threads):
+    interval, working = sys.getswitchinterval(), []
+
+    def work(row):
+        working.append(row)
+        try:
+            if row == 7:
+                raise ValueError("row 7")
+        finally:
+            working.remove(row)
+
+    with pytest.raises(ValueError, match="row 7"):
+        threads.each(range(12), work, lambda row, result: None)
+    assert not working
+    assert sys.getswitchinterval() == interval
+
+
+def test_a_copy_has_its_own_threads(threads):
+    copy, results = pickle.loads(pickle.dumps(threads)), {}
+    threads.close()
+    copy.each(range(5), lambda row: row**2, results.__setitem__)
+    assert results == {row: row**2 for row in range(5)}
+    copy.close()

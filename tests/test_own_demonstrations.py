@@ -7,84 +7,22 @@ import pytest
 import torch
 
 import bgpo_trl
-from bgpo_trl.configs import (
-    InverseModelConfig,
-    RepresentationConfig,
-    SequenceAutoencoderConfig,
-    VAEConfig,
-)
 from bgpo_trl.data.bank import DemonstrationBank
-from bgpo_trl.data.dataset import load_demonstrations
-from bgpo_trl.data.writing import write_demonstrations
+from bgpo_trl.data.dataset import load_demonstrations, write_demonstrations
 from bgpo_trl.encoders.pretrained import bank_path
 from bgpo_trl.encoders.representation import load_representation
 from bgpo_trl.encoders.train import train_encoders
-from bgpo_trl.scenes import SCENES, Outcome, Scene, Simulation, SimulationEnv
+from bgpo_trl.scenes import SCENES
 from bgpo_trl.training import Trainer
+from tests.helpers import TINY_ENCODERS
+from tests.scenes.dot import SavedDot, scene
 
-TINY = RepresentationConfig(
-    vae=VAEConfig(batch_size=8, window=2, steps=4, warmup_steps=1),
-    lae=SequenceAutoencoderConfig(batch_size=8, steps=4, warmup_steps=1),
-    inverse=InverseModelConfig(hidden_size=8, batch_size=8, steps=4, warmup_steps=1),
-)
 TASKS = ("left", "right")
-
-
-class Slider(Simulation):
-    """A bright column that an action of one component moves to the left or right edge."""
-
-    def __init__(self, tasks):
-        self.tasks = tasks
-
-    def seed(self, seed):
-        self.random = np.random.default_rng(seed)
-
-    def reset(self, task):
-        self.task, self.place = self.tasks[task], self.random.uniform(6, 18)
-
-    def step(self, action):
-        self.place = float(np.clip(self.place + 4 * action[0], 0, 23))
-        return Outcome(self.place < 1 if self.task == "left" else self.place > 22)
-
-    def frame(self):
-        frame = np.full((16, 24, 3), 40, np.uint8)
-        frame[:, round(self.place)] = 220
-        return frame
-
-    def save(self):
-        return {"task": self.task, "place": self.place, "random": self.random.bit_generator.state}
-
-    def load(self, state):
-        self.task, self.place = state["task"], state["place"]
-        self.random.bit_generator.state = state["random"]
-
-
-def simulate(tasks, **options):
-    return SimulationEnv(
-        lambda: Slider(tasks),
-        tasks,
-        frame_shape=(16, 24),
-        action_size=1,
-        state_size=None,
-        **options,
-    )
-
-
-SLIDER = Scene(
-    name="slider",
-    version="slider-1",
-    tasks=TASKS,
-    default_tasks=TASKS,
-    make_env=simulate,
-    frame_shape=(16, 24),
-    action_size=1,
-    max_steps=6,
-)
 
 
 def filmed(n, seed, actions=False):
     """Demonstrations of both tasks."""
-    simulation, episodes = Slider(TASKS), {name: [] for name in TASKS}
+    simulation, episodes = SavedDot(), {name: [] for name in TASKS}
     simulation.seed(seed)
     for task, (name, direction) in enumerate(zip(TASKS, (-1.0, 1.0), strict=True)):
         for _ in range(n):
@@ -102,35 +40,35 @@ def filmed(n, seed, actions=False):
 @pytest.fixture
 def made(tmp_path, monkeypatch):
     """Encoders and bank of demonstrations, without actions unless asked for, read from files."""
-    monkeypatch.setitem(SCENES, "slider", SLIDER)
+    monkeypatch.setitem(SCENES, "dot", scene(SavedDot, demonstrator=None))
 
     def make(*, actions=False, with_play=False):
         path = tmp_path / "filmed"
-        write_demonstrations(path, filmed(5, 0, actions), scene="slider", held_out_per_task=2)
-        weights, play = tmp_path / "slider.safetensors", None
+        write_demonstrations(path, filmed(5, 0, actions), scene="dot", held_out_per_task=2)
+        weights, play = tmp_path / "dot.safetensors", None
         if with_play:
             movements = filmed(4, 2, actions=True)
             play = write_demonstrations(
-                tmp_path / "play", movements, scene="slider", held_out_per_task=1
+                tmp_path / "play", movements, scene="dot", held_out_per_task=1
             )
         train_encoders(
             load_demonstrations(path),
             play,
             weights,
             tmp_path / "fit",
-            TINY,
+            TINY_ENCODERS,
             progress=False,
             tasks=TASKS,
-            scene="slider",
+            scene="dot",
         )
-        encoders = load_representation(weights, scene_version="slider-1")
+        encoders = load_representation(weights, scene_version="dot-1")
         return encoders, DemonstrationBank.load(bank_path(weights), encoder_id=encoders.identity)
 
     return make
 
 
 def config_of(make_config, share):
-    config = make_config(scene="slider", tasks=TASKS, task_starts=(0, 2), episodes=4, seeds=(3,))
+    config = make_config(scene="dot", tasks=TASKS, task_starts=(0, 2), episodes=4, seeds=(3,))
     return replace(config, algorithm=replace(config.algorithm, demonstration_share=share))
 
 

@@ -1,6 +1,5 @@
 """Tasks from outside the suite: from their registration to their rows in a run's CSV files."""
 
-import csv
 import json
 from dataclasses import replace
 
@@ -11,9 +10,7 @@ from dm_control import suite
 from tensordict import TensorDict
 
 from bgpo_trl.data.bank import DemonstrationBank
-from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.evaluation import evaluate_random_policy
-from bgpo_trl.files.tensor_file import load_tensors, save_tensors
 from bgpo_trl.scenes.nico import NicoEnv
 from bgpo_trl.training import Trainer
 from suites import nico
@@ -55,11 +52,6 @@ def names_and_embeddings(bank):
     ]
 
 
-def rows(path):
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
 @pytest.fixture
 def play(tmp_path, make_config):
     """Play a run of the oracle on the true state."""
@@ -99,37 +91,6 @@ def test_bad_names_and_classes_of_tasks_are_refused(name, task):
     with pytest.raises(ValueError, match=r"cannot be called|must be a subclass"):
         nico.add_task(name, task)
     assert dict(nico.TASKS) == before
-
-
-def test_an_own_task_can_be_replaced_through_add_task_alone():
-    other = type("Other", (AtOnce,), {})
-    nico.add_task("at_once", other)
-    assert nico.TASKS["at_once"] is other
-    with pytest.raises(TypeError):
-        nico.TASKS["at_once"] = AtOnce  # pyright: ignore
-
-
-def test_recorded_demonstrations_solve_the_task(tmp_path):
-    settings = {"per_task": 3, "held_out_per_task": 1, "progress": False}
-    recorded = record_demonstrations(tmp_path, tasks=["push_white_to_green"], **settings)
-    green, white = recorded["state"][..., 10:12], recorded["state"][..., 13:15]
-    apart = torch.linalg.vector_norm(green - white, dim=-1)
-    assert (apart[:, 0] > 0.1).all()
-    assert (apart[range(3), recorded["length"] - 1] < 0.08).all()  # boxes of 5 cm, turned
-    assert recorded["task"].tolist() == [0, 0, 0]
-
-
-def test_results_of_an_own_task_have_its_name(play):
-    tasks = ("at_once", "push_green_to_white")
-    run = play("run", bank_of(*nico.PAPER_TASKS, "at_once"), tasks=tasks, task_starts=(0, 3))
-
-    assert json.loads((run / "config.json").read_text())["tasks"] == [*tasks]
-    train, tests = rows(run / "train.csv"), rows(run / "eval.csv")
-    assert {row["task"] for row in train} == {row["task"] for row in tests} == {*tasks}
-    for row in [*train, *tests]:
-        own = row["task"] == "at_once"
-        assert (row["success"], row["steps"]) == (("1", "1") if own else ("0", "6"))
-    assert {row["task"] for row in train if int(row["episode"]) <= 3} == {"at_once"}
 
 
 def test_a_run_does_not_depend_on_tasks_that_are_not_in_it(play):
@@ -181,18 +142,6 @@ def test_banks_are_joined_by_the_names_of_their_tasks():
     joined = bank_of("a", "b", n=1) + bank_of("c", "b", n=1)
     assert joined.tasks == ("a", "b", "c")
     assert names_and_embeddings(joined) == [("a", 0, 0), ("b", 1, 1), ("c", 0, 0), ("b", 1, 1)]
-
-
-def test_a_bank_file_holds_the_names_of_its_tasks(tmp_path):
-    path = tmp_path / "bank.safetensors"
-    replace(bank_of("at_once", "grasp_glass"), encoder_id="abc").save(path)
-    assert DemonstrationBank.load(path, encoder_id="abc").tasks == ("at_once", "grasp_glass")
-
-    tensors, metadata = load_tensors(path)
-    del metadata["tasks"]
-    save_tensors(path, tensors, metadata)
-    with pytest.raises(ValueError, match="task names are missing"):
-        DemonstrationBank.load(path, encoder_id="abc")
 
 
 @pytest.mark.parametrize(

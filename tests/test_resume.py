@@ -15,8 +15,7 @@ from bgpo_trl.data.dataset import load_demonstrations
 from bgpo_trl.encoders import fitting
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.files.checkpoint import load_checkpoint
-from bgpo_trl.training import Trainer
-from tests.files.test_checkpoint import largest_file
+from tests.helpers import largest_file
 from tests.resumable import play, train_small_encoders
 from tests.test_training import assert_same_run, at_step
 
@@ -68,19 +67,17 @@ def assert_same_encoders(first, second):
 
 
 @pytest.fixture
-def make(bank, encoders, make_config):
+def make(begin, make_config):
     def make(directory, config=None, **arguments):
-        config = config or make_config(checkpoint_minutes=0.0)
-        return Trainer(config, directory, bank=bank, encoders=encoders, progress=False, **arguments)
+        return begin(directory, config or make_config(checkpoint_minutes=0.0), **arguments)
 
     return make
 
 
 @pytest.fixture(scope="module")
-def uninterrupted(easy_world, bank, encoders, make_config, tmp_path_factory):
+def uninterrupted(easy_world, begin, make_config, tmp_path_factory):
     directory = tmp_path_factory.mktemp("uninterrupted")
-    config = make_config(checkpoint_minutes=0.0)
-    Trainer(config, directory, bank=bank, encoders=encoders, progress=False).run()
+    begin(directory, make_config(checkpoint_minutes=0.0)).run()
     return directory
 
 

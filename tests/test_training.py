@@ -1,16 +1,13 @@
 """Whole runs, small ones: what they write, and that no interrupt changes it."""
 
-import csv
 import itertools
 import signal
-from collections import Counter, defaultdict
+from collections import Counter
 from dataclasses import replace
-from types import SimpleNamespace
 
 import pytest
 import torch
 
-from bgpo_trl import training
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.bgpo import BGPO
 from bgpo_trl.algorithms.policy import Policy
@@ -21,8 +18,7 @@ from bgpo_trl.scenes.nico import NicoEnv
 from bgpo_trl.training import Trainer
 from tests.algorithms.playing import assert_same
 from tests.conftest import of_name
-from tests.folders import contents
-from tests.loggers import Recorder
+from tests.helpers import Recorder, contents, rows
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 CSV_FILES = ("train.csv", "eval.csv")
@@ -36,23 +32,14 @@ LONGER = {"maml": {"episodes": 16}, "dist-nll": {"episodes": 16}}
 
 
 @pytest.fixture(scope="module")
-def make(bank, encoders, make_config):
-    def make(directory, config=None, **arguments):
-        parts = {"bank": bank, "encoders": encoders, "progress": False, **arguments}
-        return Trainer(config or make_config(), directory, **parts)
-
-    return make
-
-
-@pytest.fixture(scope="module")
-def run_of(make, make_config, easy_world, tmp_path_factory):
+def run_of(begin, make_config, easy_world, tmp_path_factory):
     """Play a run of each algorithm once."""
     directories = {}
 
     def run_of(name):
         if name not in directories:
             directories[name] = tmp_path_factory.mktemp(name)
-            make(directories[name], make_config(name=name, **of_name(LONGER, name))).run()
+            begin(directories[name], make_config(name=name, **of_name(LONGER, name))).run()
         return directories[name]
 
     return run_of
@@ -61,11 +48,6 @@ def run_of(make, make_config, easy_world, tmp_path_factory):
 @pytest.fixture(scope="module")
 def uninterrupted(run_of):
     return run_of("bgpo")
-
-
-def rows(path):
-    with open(path, newline="") as file:
-        return list(csv.DictReader(file))
 
 
 def assert_same_run(first, second):
@@ -119,22 +101,9 @@ def test_every_seed_plays_every_episode_once(run_of, make_config, name):
     assert (float(train[0]["loss_value"]), float(train[-1]["loss_value"]) > 0) == (0, True)
 
 
-@pytest.mark.parametrize("starts", [(0, 5, 10), (4, 0, 8), (0, 0, 0)])
-def test_tasks_are_presented_from_their_starts_on(make, make_config, tmp_path, starts):
-    config = make_config("state", "oracle", seeds=(0, 1, 2), episodes=16, task_starts=starts)
-    make(tmp_path, config).run()
-    first = defaultdict(lambda: 99)
-    for row in rows(tmp_path / "train.csv"):
-        first[row["task"]] = min(first[row["task"]], int(row["episode"]))
-    for task, start in zip(TASKS, starts, strict=True):
-        assert start < first[task] <= start + 3  # three seeds draw: the next episodes have it
-    for row in rows(tmp_path / "eval.csv"):
-        assert int(row["episode"]) > starts[TASKS.index(row["task"])]
-
-
-def test_all_presented_tasks_are_tested_every_few_episodes(make, make_config, tmp_path):
+def test_all_presented_tasks_are_tested_every_few_episodes(begin, make_config, tmp_path):
     config = make_config(episodes=5, task_starts=(0, 2, 4), eval_every=2, eval_episodes=3)
-    make(tmp_path, config).run()
+    begin(tmp_path, config).run()
     tests = rows(tmp_path / "eval.csv")
     counts = Counter((int(row["seed"]), int(row["episode"]), row["task"]) for row in tests)
     due = [(2, TASKS[0]), (4, TASKS[0]), (4, TASKS[1])]
@@ -147,10 +116,10 @@ def test_all_presented_tasks_are_tested_every_few_episodes(make, make_config, tm
 
 
 @every_learner
-def test_rows_of_a_seed_equal_those_of_the_seed_alone(run_of, make, make_config, tmp_path, name):
+def test_rows_of_a_seed_equal_those_of_the_seed_alone(run_of, begin, make_config, tmp_path, name):
     for seed in make_config().seeds:
         config = make_config(name=name, seeds=(seed,), **of_name(LONGER, name))
-        make(tmp_path / str(seed), config).run()
+        begin(tmp_path / str(seed), config).run()
         for file in CSV_FILES:
             together = [row for row in rows(run_of(name) / file) if row["seed"] == str(seed)]
             alone = rows(tmp_path / str(seed) / file)
@@ -163,9 +132,9 @@ def test_rows_of_a_seed_equal_those_of_the_seed_alone(run_of, make, make_config,
 
 
 def test_training_draws_seen_demonstrations_and_tests_held_out_ones(
-    make, make_config, bank, tmp_path, monkeypatch
+    begin, make_config, bank, tmp_path, monkeypatch
 ):
-    trainer = make(tmp_path, make_config(name="without-gwr", episodes=4))
+    trainer = begin(tmp_path, make_config(name="without-gwr", episodes=4))
     store, test = trainer.algorithm.store, trainer.evaluator.run
     trained_on, tested_on = [], []
 
@@ -187,18 +156,20 @@ def test_training_draws_seen_demonstrations_and_tests_held_out_ones(
 
 
 @pytest.mark.parametrize("name", ["maml", "dist-nll-demonstrations", "oracle", "ddpg"])
-def test_policies_may_learn_from_the_true_state_without_encoders(make, make_config, tmp_path, name):
-    make(tmp_path, make_config("state", name, episodes=6), encoders=None).run()
+def test_policies_may_learn_from_the_true_state_without_encoders(
+    begin, make_config, tmp_path, name
+):
+    begin(tmp_path, make_config("state", name, episodes=6), encoders=None).run()
     train = rows(tmp_path / "train.csv")
     assert {(row["num_nodes"], row["intrinsic_return"]) for row in train} == {("0", "0.0")}
     assert {row["success"] for row in train} == {"0", "1"}
 
 
-def test_an_algorithm_may_be_made_under_another_name(make, make_config, tmp_path):
+def test_an_algorithm_may_be_made_under_another_name(begin, make_config, tmp_path):
     config = replace(make_config("state", "ddpg", episodes=2), name="mine")
     with pytest.raises(ValueError, match="no algorithm 'mine'"):
-        make(tmp_path / "refused", config)
-    trainer = make(tmp_path, config, make=ALGORITHMS["ddpg"].make)
+        begin(tmp_path / "refused", config)
+    trainer = begin(tmp_path, config, make=ALGORITHMS["ddpg"].make)
     trainer.run()
     assert trainer.algorithm.config == config.algorithm
     for file in CSV_FILES:
@@ -217,9 +188,9 @@ class WithEntropy(BGPO):
         return losses and {**losses, "loss_entropy": torch.tensor(float(self.n_updates))}
 
 
-def test_an_algorithm_may_log_further_losses(uninterrupted, make, tmp_path):
+def test_an_algorithm_may_log_further_losses(uninterrupted, begin, tmp_path):
     recorder = Recorder()
-    with make(tmp_path, make=WithEntropy, loggers=[recorder]) as trainer:
+    with begin(tmp_path, make=WithEntropy, loggers=[recorder]) as trainer:
         trainer.run()
     ours, usual = rows(tmp_path / "train.csv"), rows(uninterrupted / "train.csv")
     assert [list(row)[-2:] for row in ours[:1]] == [["loss_entropy", "loss_missing"]]
@@ -231,11 +202,11 @@ def test_an_algorithm_may_log_further_losses(uninterrupted, make, tmp_path):
     played = [n for row, (n, _) in zip(ours, logged, strict=True) if int(row["episode"]) > 8]
     assert recorder.metrics[-1][0]["train/loss_entropy"] == pytest.approx(sum(played) / len(played))
     with pytest.raises(ValueError, match="columns"):
-        make(tmp_path, resume=True)
+        begin(tmp_path, resume=True)
 
 
 @pytest.mark.parametrize("every", [1, 3])
-def test_an_update_follows_every_so_many_steps(make, make_config, tmp_path, every):
+def test_an_update_follows_every_so_many_steps(begin, make_config, tmp_path, every):
     config = make_config()
     rl = replace(config.algorithm.rl, update_every=every)
     config = replace(config, algorithm=replace(config.algorithm, rl=rl))
@@ -246,30 +217,30 @@ def test_an_update_follows_every_so_many_steps(make, make_config, tmp_path, ever
             calls.append(len(self.replay))
             return super().update()
 
-    with make(tmp_path, config, make=Counted) as trainer:
+    with begin(tmp_path, config, make=Counted) as trainer:
         trainer.run()
     assert calls == [*range(0, trainer.env_steps, every)]  # transitions stored before
 
 
-def test_a_run_with_loggers_writes_the_same_files(uninterrupted, make, tmp_path):
+def test_a_run_with_loggers_writes_the_same_files(uninterrupted, begin, tmp_path):
     """Also if it is interrupted, begun without loggers and resumed with them."""
-    trainer = make(tmp_path)
+    trainer = begin(tmp_path)
     at_step(trainer, 9, lambda: signal.raise_signal(signal.SIGINT))
     with pytest.raises(KeyboardInterrupt):
         trainer.run()
     recorder = Recorder()
-    with make(tmp_path, resume=True, loggers=[recorder], per_seed_curves=True) as resumed:
+    with begin(tmp_path, resume=True, loggers=[recorder], per_seed_curves=True) as resumed:
         resumed.run()
     assert_same_run(tmp_path, uninterrupted)
     assert recorder.metrics[-1][1] == 10
 
 
-def test_a_longer_run_logs_the_episodes_of_seeds_that_were_ahead(make, make_config, tmp_path):
-    make(tmp_path / "run", make_config(episodes=6)).run()
+def test_a_longer_run_logs_the_episodes_of_seeds_that_were_ahead(begin, make_config, tmp_path):
+    begin(tmp_path / "run", make_config(episodes=6)).run()
     short, long = Recorder(), Recorder()
-    with make(tmp_path / "run", resume=True, loggers=[short]) as trainer:
+    with begin(tmp_path / "run", resume=True, loggers=[short]) as trainer:
         trainer.run()
-    with make(tmp_path / "whole", loggers=[long]) as trainer:
+    with begin(tmp_path / "whole", loggers=[long]) as trainer:
         trainer.run()
     assert [step for _, step in short.metrics] == [8, 10]
     assert short.metrics == long.metrics[-2:]
@@ -287,18 +258,18 @@ def test_a_longer_run_logs_the_episodes_of_seeds_that_were_ahead(make, make_conf
     ],
 )
 def test_wrong_results_of_an_algorithm_are_refused(
-    make, make_config, tmp_path, monkeypatch, method, wrong
+    begin, make_config, tmp_path, monkeypatch, method, wrong
 ):
     monkeypatch.setattr(BGPO, method, staticmethod(wrong))
     with pytest.raises(TypeError, match=r"BGPO must (return|be)"):
-        make(tmp_path, make_config("state", "ddpg", episodes=2)).run()
+        begin(tmp_path, make_config("state", "ddpg", episodes=2)).run()
 
 
 @pytest.mark.parametrize(("number", "step"), [("SIGINT", 1), ("SIGTERM", 20)])
 def test_a_signal_waits_for_the_step_and_the_resumed_run_is_the_same(
-    uninterrupted, make, tmp_path, number, step
+    uninterrupted, begin, tmp_path, number, step
 ):
-    trainer = make(tmp_path)
+    trainer = begin(tmp_path)
     at_step(trainer, step, lambda: signal.raise_signal(signal.Signals[number]))
     with pytest.raises(KeyboardInterrupt):
         trainer.run()
@@ -306,7 +277,7 @@ def test_a_signal_waits_for_the_step_and_the_resumed_run_is_the_same(
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
-    make(tmp_path, resume=True).run()
+    begin(tmp_path, resume=True).run()
     assert_same_run(tmp_path, uninterrupted)
     costs = [read_costs(run / "cost.csv").values() for run in (tmp_path, uninterrupted)]
     ours, theirs = [[(cost.steps, cost.megabytes) for cost in of_run] for of_run in costs]
@@ -314,11 +285,11 @@ def test_a_signal_waits_for_the_step_and_the_resumed_run_is_the_same(
 
 
 @every_learner
-def test_a_run_interrupted_several_times_is_the_same(run_of, make, make_config, tmp_path, name):
+def test_a_run_interrupted_several_times_is_the_same(run_of, begin, make_config, tmp_path, name):
     config = make_config(name=name, **of_name(LONGER, name))
     steps = (3, 1, 9, 22) if of_name(LONGER, name) else (3, 1, 9)
     for step in steps:
-        trainer = make(tmp_path, config, resume=True)
+        trainer = begin(tmp_path, config, resume=True)
         at_step(trainer, step, lambda: signal.raise_signal(signal.SIGINT))
         with pytest.raises(KeyboardInterrupt):
             trainer.run()
@@ -329,7 +300,7 @@ def test_a_run_interrupted_several_times_is_the_same(run_of, make, make_config, 
     if name == "dist-nll":
         assert all(saved["algorithm"]["tasks"])
         assert saved["algorithm"]["ended"].any()  # the next update is to distill
-    make(tmp_path, config, resume=True).run()
+    begin(tmp_path, config, resume=True).run()
     assert_same_run(tmp_path, run_of(name))
 
 
@@ -352,10 +323,10 @@ METHODS = (
     ("method", "saved"), [*((method, 11) for method in METHODS), ("algorithm.update", 0)]
 )
 def test_a_run_that_fails_is_resumed_from_its_last_checkpoint(
-    uninterrupted, make, tmp_path, monkeypatch, method, saved
+    uninterrupted, begin, tmp_path, monkeypatch, method, saved
 ):
     """Rows written after the checkpoint are written again."""
-    trainer = make(tmp_path)
+    trainer = begin(tmp_path)
     trainer.config = replace(trainer.config, checkpoint_minutes=0.0)
     part, name = method.split(".")
     owner, save = getattr(trainer, part), trainer.save
@@ -372,13 +343,13 @@ def test_a_run_that_fails_is_resumed_from_its_last_checkpoint(
     state = load_checkpoint(tmp_path / "checkpoint")
     assert state["env_steps"] == saved
     assert state["position"]["train.csv"] < (tmp_path / "train.csv").stat().st_size
-    make(tmp_path, resume=True).run()
+    begin(tmp_path, resume=True).run()
     assert_same_run(tmp_path, uninterrupted)
 
 
 @pytest.mark.parametrize("first", [signal.SIGINT, signal.SIGTERM])
-def test_a_second_signal_ends_the_run_at_once(make, tmp_path, first):
-    trainer = make(tmp_path)
+def test_a_second_signal_ends_the_run_at_once(begin, tmp_path, first):
+    trainer = begin(tmp_path)
 
     def impatient():
         signal.raise_signal(first)
@@ -392,8 +363,8 @@ def test_a_second_signal_ends_the_run_at_once(make, tmp_path, first):
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_an_ignored_interrupt_stays_ignored(make, make_config, tmp_path):
-    trainer = make(tmp_path, make_config(episodes=2))
+def test_an_ignored_interrupt_stays_ignored(begin, make_config, tmp_path):
+    trainer = begin(tmp_path, make_config(episodes=2))
     at_step(trainer, 1, lambda: signal.raise_signal(signal.SIGINT))
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
@@ -405,43 +376,28 @@ def test_an_ignored_interrupt_stays_ignored(make, make_config, tmp_path):
     assert len(rows(tmp_path / "train.csv")) == 4
 
 
-def test_checkpoints_are_written_at_the_configured_interval(make, make_config, tmp_path):
-    trainer = make(tmp_path, make_config(episodes=2, checkpoint_minutes=0.0))
-    trainer.run()
-    numbers = [path.name.split("-")[1] for path in (tmp_path / "checkpoint").glob("*.pt")]
-    assert max(int(number) for number in numbers) == 1 + trainer.env_steps  # one before the first
-
-
-def test_the_progress_bar_shows_episodes_and_success(make, make_config, tmp_path, capsys):
-    make(tmp_path, make_config(task_starts=(0, 2, 99)), progress=True).run()
-    won = [int(row["success"]) for row in rows(tmp_path / "train.csv")]
-    last = capsys.readouterr().err.split("\r")[-1]
-    assert "20/20" in last
-    assert f"success {sum(won) / len(won):.2f}" in last
-
-
-def test_resuming_a_finished_run_changes_nothing(uninterrupted, make):
+def test_resuming_a_finished_run_changes_nothing(uninterrupted, begin):
     before = contents(uninterrupted)
-    with make(uninterrupted, resume=True) as trainer:
+    with begin(uninterrupted, resume=True) as trainer:
         trainer.algorithm.act = crash
         trainer.run()
     assert contents(uninterrupted) == before
     assert trainer.env_steps == load_checkpoint(uninterrupted / "checkpoint")["env_steps"]
 
 
-def test_a_directory_with_another_run_is_refused(uninterrupted, make, make_config, encoders):
+def test_a_directory_with_another_run_is_refused(uninterrupted, begin, make_config, encoders):
     before = contents(uninterrupted)
     with pytest.raises(ValueError, match="already holds a run"):
-        make(uninterrupted)
+        begin(uninterrupted)
     changes = {"episodes": 9}, {"task_starts": (0, 2, 5)}, {"seeds": (1, 2)}, {"name": "ddpg"}
     for change in changes:
         with pytest.raises(ValueError, match="other settings"):
-            make(uninterrupted, make_config(**change), resume=True)
+            begin(uninterrupted, make_config(**change), resume=True)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(1)
         other = replace(encoders, lae=SequenceAutoencoder())
     with pytest.raises(ValueError, match="other settings"):
-        make(uninterrupted, encoders=other, resume=True)
+        begin(uninterrupted, encoders=other, resume=True)
     assert contents(uninterrupted) == before
 
 
@@ -459,8 +415,8 @@ def test_costs_are_counted_by_the_number_of_presented_tasks(uninterrupted):
     assert sizes[2] == pytest.approx(n_bytes(state) / 1e6, abs=1e-6)
 
 
-def test_the_sequential_schedule_trains_the_newest_task_and_tests_all(make, make_config, tmp_path):
-    make(tmp_path, make_config(schedule="sequential")).run()
+def test_the_sequential_schedule_trains_the_newest_task_and_tests_all(begin, make_config, tmp_path):
+    begin(tmp_path, make_config(schedule="sequential")).run()
     tasks = make_config().tasks
     played = {(int(row["episode"]), row["task"]) for row in rows(tmp_path / "train.csv")}
     newest = [tasks[(episode > 2) + (episode > 4)] for episode in range(1, 11)]
@@ -494,12 +450,14 @@ class Attentive(BGPO):
 
 
 @pytest.mark.parametrize("interrupted", [False, True])
-def test_tasks_begin_for_each_seed_before_they_are_played(make, make_config, tmp_path, interrupted):
+def test_tasks_begin_for_each_seed_before_they_are_played(
+    begin, make_config, tmp_path, interrupted
+):
     config = make_config("state", "ddpg", task_starts=(3, 0, 3), schedule="sequential")
     config = replace(config, name="attentive", episodes=6)
 
     def go_on(stop):
-        with make(tmp_path, config, make=Attentive, resume=True) as trainer:
+        with begin(tmp_path, config, make=Attentive, resume=True) as trainer:
             if stop:
                 at_step(trainer, 1, lambda: signal.raise_signal(signal.SIGINT))
             trainer.run()
@@ -518,21 +476,13 @@ def test_tasks_begin_for_each_seed_before_they_are_played(make, make_config, tmp
     assert max(steps) < 20
 
 
-def test_only_fine_tuning_and_ewc_are_given_boundaries(make, make_config, tmp_path):
-    given = set()
-    for name in ALGORITHMS:
-        with make(tmp_path / name, make_config(name=name)) as trainer:
-            given |= {name} if trainer.algorithm.needs_boundaries else set()
-    assert given == {"fine-tuning", "ewc"}
-
-
 @pytest.mark.parametrize("name", ["bgpo", "maml", "dist-nll", "ewc"])
 def test_only_algorithms_that_need_boundaries_depend_on_them(
-    run_of, make, make_config, tmp_path, monkeypatch, name
+    run_of, begin, make_config, tmp_path, monkeypatch, name
 ):
     usual = run_of(name)
     monkeypatch.setattr(Trainer, "_begin_tasks", lambda trainer, index: None)
-    make(tmp_path, make_config(name=name, **of_name(LONGER, name))).run()
+    begin(tmp_path, make_config(name=name, **of_name(LONGER, name))).run()
     if name == "ewc":
         assert (tmp_path / "train.csv").read_text() != (usual / "train.csv").read_text()
     else:
@@ -540,56 +490,18 @@ def test_only_algorithms_that_need_boundaries_depend_on_them(
 
 
 @pytest.mark.parametrize("before", [0, 1])
-def test_ewc_is_resumed_across_a_boundary_bit_for_bit(run_of, make, make_config, tmp_path, before):
+def test_ewc_is_resumed_across_a_boundary_bit_for_bit(run_of, begin, make_config, tmp_path, before):
     config = make_config(name="ewc")
     played = rows(run_of("ewc") / "train.csv")
     row = next(row for row in played if row["episode"] == "4")  # the last before the third task
-    trainer, end = make(tmp_path, config), int(row["env_steps"])
+    trainer, end = begin(tmp_path, config), int(row["env_steps"])
     at_step(trainer, end - before, lambda: signal.raise_signal(signal.SIGINT))
     with pytest.raises(KeyboardInterrupt):
         trainer.run()
     held = load_checkpoint(tmp_path / "checkpoint")["algorithm"]["replay"]["n_added"]
     assert (held[config.seeds.index(int(row["seed"]))] == 0) == (before == 0)
-    make(tmp_path, config, resume=True).run()
+    begin(tmp_path, config, resume=True).run()
     assert_same_run(tmp_path, run_of("ewc"))
-
-
-def test_step_times_exclude_tests_and_checkpoints(make, make_config, tmp_path, monkeypatch):
-    clock = [0.0]
-    monkeypatch.setattr(training, "time", SimpleNamespace(monotonic=lambda: clock[0]))
-    trainer = make(tmp_path, make_config(episodes=4, checkpoint_minutes=0.0))
-
-    def taking(seconds, function):
-        def call(*arguments):
-            clock[0] += seconds
-            return function(*arguments)
-
-        return call
-
-    for owner, method, seconds in (
-        (trainer.algorithm, "act", 0.25),
-        (trainer.evaluator, "run_next", 100.0),
-        (trainer, "save", 100.0),
-    ):
-        monkeypatch.setattr(owner, method, taking(seconds, getattr(owner, method)))
-    trainer.run()
-    costs = read_costs(tmp_path / "cost.csv")
-    assert sum(cost.steps for cost in costs.values()) == trainer.env_steps
-    assert all(cost.seconds == 0.25 * cost.steps for cost in costs.values())
-
-
-def test_a_failure_to_write_the_bank_closes_the_run(make, tmp_path, monkeypatch):
-    def refuse(*args):
-        raise OSError("cannot write the bank: make room")
-
-    closed = []
-    close = training.RunLogger.close
-    monkeypatch.setattr(training.RunLogger, "close", lambda log: (closed.append(1), close(log)))
-    monkeypatch.setattr(training, "keep_inputs", refuse)
-    with pytest.raises(OSError, match="make room"):
-        make(tmp_path / "run")
-    assert closed == [1]
-    assert not (tmp_path / "run" / "lock").exists()
 
 
 def test_a_bank_of_other_encoders_is_refused(make_config, encoders, bank, tmp_path):

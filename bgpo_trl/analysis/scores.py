@@ -1,6 +1,10 @@
-"""Scores of a run: arrays by seed and task, from which tables and comparisons are made.
+"""Measures of multi-task and continual learning: of arrays, and of the seeds and tasks of a run.
 
-Among them is the forward transfer between tasks that are presented one after the other.
+``success`` ``[..., E, T]`` is the share of successes on each of ``T`` tasks at each of ``E``
+evaluations (`bgpo_trl.runs.results.Curves` adds a leading seed dimension). NaN marks tasks that
+were not tested, because they had not been presented yet. ``episodes`` ``[E]`` are the training
+episodes before each evaluation. ``ValueError`` is raised if they do not increase, or shapes do not
+match.
 """
 
 from __future__ import annotations
@@ -13,12 +17,164 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from bgpo_trl.analysis import metrics
 from bgpo_trl.analysis.comparison import Run
 from bgpo_trl.analysis.statistics import Estimate, contrast
 from bgpo_trl.runs.results import TRAIN, find_table, read_final_tests, read_table, read_tests
 
 Values = NDArray[np.float64]
+
+
+def in_window(episodes: ArrayLike, end: int, window: int) -> NDArray[np.bool_]:
+    """Return which ``episodes`` ``[E]`` are among the last ``window`` until ``end``, ``[E]``."""
+    episodes = np.asarray(episodes)
+    return (episodes > end - window) & (episodes <= end)
+
+
+def evaluation_matrix(
+    success: ArrayLike, episodes: ArrayLike, ends: ArrayLike, *, window: int
+) -> Values:
+    """Return ``R[i, j]``, the success on task j at the end of phase i, ``[..., P, T]``.
+
+    ``ends`` ``[P]`` are the last episodes of the phases: the starts of the later tasks, and the end
+    of training. Success is the mean over the evaluations in the ``window`` episodes before an end;
+    NaN for tasks without a test among them.
+
+    Raises:
+        ValueError: If a phase has no evaluation in its window.
+    """
+    success, episodes = np.asarray(success, float), np.asarray(episodes)
+    _check_episodes(success, episodes, -2)
+    phases = []
+    for end in np.asarray(ends).tolist():
+        chosen = in_window(episodes, end, window)
+        if not chosen.any():
+            raise ValueError(
+                f"there is no evaluation in the {window} episodes before episode {end}: test "
+                "more often, or for a longer run"
+            )
+        phases.append(_mean(success[..., chosen, :], axis=-2))
+    return np.stack(phases, axis=-2)
+
+
+def change_since_learned(matrix: ArrayLike) -> Values:
+    """Return each task's change of success since the end of its own phase, ``[..., T]``.
+
+    ``R[T - 1, j] - R[j, j]``, where phase j introduces task j. Its mean over all tasks but the last
+    is the backward transfer of Lopez-Paz & Ranzato (2017, "Gradient Episodic Memory for Continual
+    Learning").
+
+    Args:
+        matrix: Result of `evaluation_matrix` with one phase per task, ``[..., T, T]``.
+
+    Raises:
+        ValueError: If the numbers of phases and tasks differ.
+    """
+    matrix = np.asarray(matrix, float)
+    if matrix.shape[-1] != matrix.shape[-2]:
+        raise ValueError(f"matrix must have one phase per task, got {list(matrix.shape[-2:])}")
+    return matrix[..., -1, :] - np.diagonal(matrix, axis1=-2, axis2=-1)
+
+
+def forgetting_since_best(success: ArrayLike) -> Values:
+    """Return the loss of success since each task's best evaluation, ``[...]``.
+
+    The mean over tasks of the highest success at any evaluation minus that at the last one; never
+    negative (Chaudhry et al., 2018, "Riemannian Walk for Incremental Learning", but over all
+    evaluations and tasks). Noise of single evaluations counts as forgetting: average ``success``
+    ``[..., E, T]`` first with `trailing_mean`.
+    """
+    success = np.asarray(success, float)
+    _check_episodes(success, np.arange(success.shape[-2] if success.ndim > 1 else 0), -2)
+    # Unlike np.nanmax, it does not warn of tasks without a test.
+    best = np.fmax.reduce(success, axis=-2)
+    return _mean(best - success[..., -1, :], axis=-1)
+
+
+def area_under_curve(success: ArrayLike, episodes: ArrayLike) -> Values:
+    """Return the mean height of learning curves ``[..., E]``, between 0 and 1, ``[...]``.
+
+    Integrates by trapezoids; before the first evaluation, the curve rises linearly from 0 at
+    episode 0. Curves must not contain NaN.
+    """
+    success, episodes = np.asarray(success, float), np.asarray(episodes, float)
+    _check_episodes(success, episodes, -1)
+    start = np.zeros((*success.shape[:-1], 1))
+    heights = np.concatenate([start, success], axis=-1)
+    return np.trapezoid(heights, np.concatenate([[0.0], episodes]), axis=-1) / episodes[-1]
+
+
+def overall_episodes_to(success: ArrayLike, episodes: ArrayLike, threshold: float = 0.8) -> float:
+    """Return the training episodes until overall success first reaches a rate, else infinity.
+
+    Overall success is the mean over seeds and the tasks presented so far, and over the last three
+    evaluations, since a single one has few test episodes. ``success`` is ``[S, E, T]``.
+    """
+    reached = _mean(trailing_mean(success, 3), axis=-1).mean(axis=0) >= threshold
+    return float(np.asarray(episodes)[reached.argmax()]) if reached.any() else float("inf")
+
+
+def trials_to(success: ArrayLike, threshold: float = 0.5, *, window: int = 20) -> float:
+    """Return the number of its own training episodes that a task takes to reach a success rate.
+
+    ``success`` ``[N]`` are the outcomes of these episodes in order. The rate is taken over the
+    latest ``window`` of them, and undefined for fewer; infinity if it is never reached.
+
+    Raises:
+        ValueError: If the window is empty.
+    """
+    if window < 1:
+        raise ValueError(f"window must be at least 1 episode, not {window}")
+    won = np.concatenate([[0.0], np.cumsum(np.asarray(success, float))])
+    reached = won[window:] - won[:-window] >= threshold * window
+    return float(reached.argmax() + window) if reached.any() else float("inf")
+
+
+def times_the_first(episodes: ArrayLike) -> Values:
+    """Return the learning times of the later tasks as multiples of the first task's, ``[T - 1]``.
+
+    The median over seeds of `trials_to` ``[S, T]``, with tasks in order of presentation. A task
+    that a seed never learns counts as infinitely long. Seeds that never learn the first task are
+    left out; NaN if none is left.
+    """
+    episodes = np.asarray(episodes, float)
+    learned = episodes[np.isfinite(episodes[:, 0])]
+    if not len(learned):
+        return np.full(episodes.shape[1] - 1, np.nan)
+    return np.median(learned[:, 1:] / learned[:, :1], axis=0)
+
+
+def trailing_mean(success: ArrayLike, n: int) -> Values:
+    """Return the mean of each evaluation and up to ``n - 1`` before it, ``[..., E, T]``.
+
+    Raises:
+        ValueError: If ``n`` is less than 1.
+    """
+    success = np.asarray(success, float)
+    if n < 1 or success.ndim < 2:
+        raise ValueError(f"success must be [..., E, T] and n at least 1, got {success.shape}, {n}")
+    n_evaluations = success.shape[-2]
+    return np.stack(
+        [
+            _mean(success[..., max(0, end - n) : end, :], axis=-2)
+            for end in range(1, n_evaluations + 1)
+        ],
+        axis=-2,
+    )
+
+
+def _check_episodes(success: Values, episodes: NDArray, axis: int) -> None:
+    """Raise ``ValueError`` unless there is one episode per evaluation, in increasing order."""
+    n_evaluations = success.shape[axis] if success.ndim >= -axis else 0
+    if not n_evaluations or episodes.shape != (n_evaluations,) or (np.diff(episodes) <= 0).any():
+        raise ValueError(
+            "each evaluation needs a training episode, in increasing order: got success "
+            f"{[*success.shape]} for episodes {episodes.tolist()}"
+        )
+
+
+def _mean(values: Values, axis: int) -> Values:
+    """Return the mean of the values that are not NaN; NaN where all are."""
+    return np.ma.filled(np.ma.masked_invalid(values).mean(axis), np.nan)
 
 
 def late_window(run: Run) -> int:
@@ -33,7 +189,7 @@ def late_scores(run: Run) -> Values:
         ValueError: If a seed has no test of a task then.
     """
     curves = run.curves
-    scores = metrics.evaluation_matrix(
+    scores = evaluation_matrix(
         curves.success, curves.episodes, [run.last], window=late_window(run)
     )[:, 0]
     # A seed may also be missing altogether.
@@ -53,7 +209,7 @@ def area_scores(run: Run) -> Values:
     for task, start in enumerate(run.starts):
         since = episodes > start
         curve = run.curves.success[:, since, task]
-        areas.append(metrics.area_under_curve(curve, episodes[since] - start))
+        areas.append(area_under_curve(curve, episodes[since] - start))
     return np.stack(areas, axis=-1)
 
 
@@ -66,7 +222,7 @@ def best_scores(run: Run) -> Values:
         episodes, success = curves.episodes[tested], curves.success[:, tested, task]
         whole = episodes[episodes >= episodes[0] + window - 1]
         for end in whole if len(whole) else episodes[-1:]:
-            inside = metrics.in_window(episodes, end, window)
+            inside = in_window(episodes, end, window)
             best[task] = max(best[task], np.nanmean(success[:, inside]))
     return best
 
@@ -87,7 +243,7 @@ def success_matrix(run: Run) -> Values:
             f"{run.directory} starts its tasks at {begun}: only for tasks one after the other"
         )
     window = max(run.eval_every, min(lengths) // 5)
-    matrix = metrics.evaluation_matrix(
+    matrix = evaluation_matrix(
         run.curves.success, run.curves.episodes, [*begun[1:], run.last], window=window
     )
     if np.isnan(np.diagonal(matrix, axis1=-2, axis2=-1)).any():
@@ -100,13 +256,13 @@ def success_matrix(run: Run) -> Values:
 
 def episodes_to_80(run: Run) -> float:
     """Return the training episodes until overall success reaches 80 %, infinity if never."""
-    return metrics.overall_episodes_to(run.curves.success, run.curves.episodes)
+    return overall_episodes_to(run.curves.success, run.curves.episodes)
 
 
 def own_episodes(run: Run, threshold: float = 0.5) -> Values | None:
     """Return the training episodes of each task until a rate of them succeed, ``[S, T]``.
 
-    See `metrics.trials_to`; infinite where that was not reached. None if the run has no
+    See `trials_to`; infinite where that was not reached. None if the run has no
     ``train.csv``.
     """
     path = run.directory / "train.csv"
@@ -116,7 +272,7 @@ def own_episodes(run: Run, threshold: float = 0.5) -> Values | None:
     table = table[table["episode"] <= run.last]
     if table.empty:
         return None
-    times = table.groupby(["seed", "task"])["success"].agg(metrics.trials_to, threshold)
+    times = table.groupby(["seed", "task"])["success"].agg(trials_to, threshold)
     return times.unstack("task").reindex(columns=list(run.tasks)).fillna(np.inf).to_numpy()
 
 
@@ -128,7 +284,7 @@ def success_lengths(run: Run) -> dict[str, float]:
     tests = read_tests(run.directory / "eval.csv")
     if "steps" not in tests:
         return {}
-    late = metrics.in_window(tests["episode"], run.last, late_window(run))
+    late = in_window(tests["episode"], run.last, late_window(run))
     won = tests[late & (tests["success"] == 1)]
     steps = pd.to_numeric(won["steps"], errors="coerce").groupby(won["task"]).mean()
     return {str(task): float(length) for task, length in steps.dropna().items()}
@@ -182,10 +338,11 @@ def expected_own_episodes(
 def forward_transfer(run: Run, reference: Run) -> Estimate | None:
     """Return the mean forward transfer to all tasks but the first, with its 95 % interval.
 
-    Computed as in Continual World (`metrics.forward_transfer`), from the areas of `own_areas`,
-    means over seeds. The interval is Welch's of the seeds' contributions to first order (the delta
-    method), so that the seeds of the reference count, too. None if the reference leaves nothing to
-    gain on a task.
+    ``(area - reference) / (1 - reference)`` of the areas of `own_areas`, means over seeds, as in
+    Continual World (Wolczyk et al., 2021): 1 for success from the start, 0 for no gain, negative
+    for slower learning. The interval is Welch's of the seeds' contributions to first order (the
+    delta method), so that the seeds of the reference count, too. None if the reference leaves
+    nothing to gain on a task.
     """
     ours, theirs = own_areas(run, reference)
     area, height = ours.mean(0), theirs.mean(0)
@@ -195,7 +352,7 @@ def forward_transfer(run: Run, reference: Run) -> Estimate | None:
     gained = contrast(
         [(ours / left).mean(-1), (theirs * (1 - area) / left**2).mean(-1)], [1.0, -1.0]
     )
-    value = float(metrics.forward_transfer(area, height).mean())
+    value = float(((area - height) / left).mean())
     return replace(gained, value=value).interval()
 
 

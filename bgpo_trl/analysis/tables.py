@@ -7,19 +7,23 @@ from itertools import combinations, product
 
 import numpy as np
 
-from bgpo_trl.analysis import metrics, statistics
+from bgpo_trl.analysis import statistics
 from bgpo_trl.analysis.comparison import NAMES, Run, Setting
 from bgpo_trl.analysis.scores import (
     Values,
     area_scores,
     best_scores,
+    change_since_learned,
     episodes_to_80,
     final_shares,
+    forgetting_since_best,
     forward_transfer,
     late_scores,
     own_episodes,
     success_lengths,
     success_matrix,
+    times_the_first,
+    trailing_mean,
 )
 from bgpo_trl.runs.cost import Cost, read_costs
 from bgpo_trl.runs.results import find_table
@@ -199,13 +203,9 @@ def sequence_table(setting: Setting, reference: Setting | None) -> Table:
     """
     rows = [["", "forgetting", "since best", "backward transfer", "forward transfer"]]
     for name, run in setting.runs.items():
-        matrix = success_matrix(run)
-        best = metrics.forgetting_since_best(metrics.trailing_mean(run.curves.success, 3))
-        measured = (
-            -metrics.change_since_learned(matrix).mean(1),
-            best,
-            metrics.backward_transfer(matrix).mean(1),
-        )
+        change = change_since_learned(success_matrix(run))
+        best = forgetting_since_best(trailing_mean(run.curves.success, 3))
+        measured = (-change.mean(1), best, change[:, :-1].mean(1))
         beside = reference.find(run.algorithm, run.changed) if reference is not None else None
         forward = forward_transfer(run, beside[1]) if beside else None
         cells = [statistics.mean(scores).points() for scores in measured]
@@ -241,7 +241,7 @@ def ratio_cells(episodes: Values) -> list[str]:
     note = "" if learned == len(episodes) else f" ({learned} of {len(episodes)} seeds)"
     return [
         "-" if np.isnan(times) else ("not reached" if np.isinf(times) else f"{times:.2f}") + note
-        for times in metrics.times_the_first(episodes).tolist()
+        for times in times_the_first(episodes).tolist()
     ]
 
 

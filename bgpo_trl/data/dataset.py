@@ -1,18 +1,20 @@
-"""Files of a recorded dataset of demonstrations (frames, states, actions), and loading them."""
+"""Datasets of demonstrations: their files, loading them, and writing those made elsewhere."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from tensordict import MemoryMappedTensor, TensorDict
 
-from bgpo_trl.files.writing import make_folder, write_json
+from bgpo_trl.files.writing import make_folder, new_folder, write_json
 from bgpo_trl.scenes import SCENES, Scene, find_scene
 
 _META = "dataset.json"
@@ -179,3 +181,195 @@ def _empty(meta: Mapping[str, Any]) -> TensorDict:
     if meta["action_size"]:
         columns["action"] = torch.zeros(()).expand(n, steps, meta["action_size"])
     return TensorDict(columns, [n])
+
+
+Episodes = Mapping[str, Sequence[Mapping[str, Any]]]
+"""Episodes by the name of their task; for an episode's entries, see `write_demonstrations`."""
+_KEYS = ("pixels", "action", "state")
+
+
+def write_demonstrations(
+    path: str | Path,
+    episodes: Episodes,
+    *,
+    scene: Scene | str,
+    held_out_per_task: int,
+    tasks: Sequence[str] | None = None,
+    spread: float = 1.0,
+) -> TensorDict:
+    """Write demonstrations as a dataset that trains encoders and makes banks.
+
+    An episode is a mapping with ``pixels`` uint8 ``[T, H, W, 3]``, frames of the scene's size with
+    ``T`` of at least 2; ``action`` ``[T - 1, A]`` in [-1, 1], from each frame to the next and with
+    the meaning of the scene's actions; and ``state`` ``[T, N]``, the ground truth. Actions and
+    states may be left out of all episodes, but not of some. Without actions, encoders have no
+    inverse model, unless play is recorded for it, and banks no steps: demonstrations then tell the
+    task, but are no experience. The ground truth serves probes alone.
+
+    All episodes are checked before anything is written. Each is indexed twice, so a sequence may
+    load its episodes from files on demand.
+
+    Args:
+        path: Folder of the dataset, which must not exist.
+        episodes: Episodes by the name of their task, as many of each as there are.
+        scene: The robot, or its name.
+        held_out_per_task: How many of each task are held out for test episodes: the last ones.
+        tasks: Tasks to write, in the order of their labels; by default all of ``episodes``.
+        spread: Share of the whole range of start states that the demonstrations cover.
+
+    Returns:
+        A memory-mapped TensorDict ``[N]``, as of `record_demonstrations`; ``seed`` is 0.
+
+    Raises:
+        ValueError: If an argument or an episode is invalid; it names the episode by its task and
+            its position, from 0.
+        OSError: If there is not enough disk space, or the folder cannot be written.
+
+    Examples:
+        >>> frames = np.zeros((5, 32, 64, 3), np.uint8)
+        >>> episodes = {"grasp_glass": [{"pixels": frames}, {"pixels": frames[:3]}]}
+        >>> path = getfixture("tmp_path") / "own"
+        >>> dataset = write_demonstrations(path, episodes, scene="nico", held_out_per_task=1)
+        >>> dataset["length"].tolist(), dataset["train"].tolist()
+        ([5, 3], [True, False])
+    """
+    scene = find_scene(scene)
+    tasks = list(episodes) if tasks is None else list(tasks)
+    scene.check_tasks(tasks)
+    scene.check_spread(spread)
+    _check_counts(episodes, tasks, held_out_per_task)
+    keys, lengths = _check_episodes(scene, episodes, tasks)
+    meta = {
+        **layout_of(
+            scene,
+            max_steps=max(lengths) - 1,
+            actions="action" in keys,
+            states="state" in keys,
+        ),
+        "tasks": tasks,
+        "rows": len(lengths),
+        "held_out_per_task": held_out_per_task,
+        "spread": float(spread),
+    }
+    with new_folder(path) as folder:
+        dataset = make_dataset(folder, meta)
+        row = 0
+        for task, name in enumerate(tasks):
+            n_shown = len(episodes[name]) - held_out_per_task
+            for number in range(len(episodes[name])):
+                for key, values in episodes[name][number].items():
+                    dataset[key][row, : len(values)] = torch.from_numpy(np.asarray(values).copy())
+                dataset["task"][row] = task
+                dataset["train"][row] = number < n_shown
+                dataset["length"][row] = lengths[row]
+                row += 1
+        write_meta(folder, {**meta, "checksum": checksum_of(dataset)})
+    return dataset
+
+
+def resize_frames(pixels: NDArray[np.uint8], frame_shape: Sequence[int]) -> NDArray[np.uint8]:
+    """Return frames uint8 ``[T, H, W, 3]`` in another height and width, by area averaging.
+
+    A pixel is the rounded mean of the pixels below it. Height and width are scaled independently:
+    crop the frames before, if their ratio is not to change.
+
+    Examples:
+        >>> resize_frames(np.full((1, 64, 64, 3), 7, np.uint8), (32, 64)).shape
+        (1, 32, 64, 3)
+    """
+    frames = torch.from_numpy(np.asarray(pixels).copy()).permute(0, 3, 1, 2)
+    parts = [
+        torch.nn.functional.interpolate(part.float(), tuple(frame_shape), mode="area").round()
+        for part in frames.split(64)
+    ]
+    return torch.cat(parts).to(torch.uint8).permute(0, 2, 3, 1).contiguous().numpy()
+
+
+def _check_counts(episodes: Episodes, tasks: Sequence[str], held_out_per_task: int) -> None:
+    if not tasks:
+        raise ValueError("there are no episodes: give some of at least one task")
+    if held_out_per_task < 0:
+        raise ValueError(f"held_out_per_task must be at least 0, got {held_out_per_task}")
+    for name in tasks:
+        n_episodes = len(episodes.get(name, ()))
+        if not n_episodes:
+            raise ValueError(f"there is no episode of {name!r}: add some, or leave the task out")
+        if n_episodes <= held_out_per_task:
+            raise ValueError(
+                f"{name!r} has {n_episodes} episodes, too few to hold out {held_out_per_task}: "
+                "lower held_out_per_task, or add episodes"
+            )
+
+
+def _check_episodes(
+    scene: Scene, episodes: Episodes, tasks: Sequence[str]
+) -> tuple[set[str], list[int]]:
+    """Return the keys of all episodes and the number of frames of each."""
+    keys: set[str] | None = None
+    lengths = []
+    for name in tasks:
+        for number in range(len(episodes[name])):
+            episode = episodes[name][number]
+            try:
+                _check_keys(episode, keys)
+                lengths.append(_check_frames(scene, episode["pixels"]))
+                _check_numbers(scene, episode, lengths[-1])
+            except ValueError as error:
+                raise ValueError(f"episode {number} of {name!r} {error}") from None
+            keys = set(episode)
+    return keys or set(), lengths
+
+
+def _check_keys(episode: object, keys: set[str] | None) -> None:
+    if not isinstance(episode, Mapping):
+        raise ValueError(
+            f"is missing ({type(episode).__name__}): give its 'pixels', or leave the episode out"
+        )
+    names = ", ".join(repr(key) for key in episode) or "nothing"
+    if "pixels" not in episode or not {*episode} <= {*_KEYS}:
+        raise ValueError(f"has {names}: give 'pixels', and if known 'action' and 'state'")
+    if keys not in (None, {*episode}):
+        raise ValueError(
+            f"has {names}, those before it {', '.join(map(repr, sorted(keys)))}: give actions, and "
+            "states, of all episodes or of none"
+        )
+
+
+def _check_frames(scene: Scene, pixels: Any) -> int:
+    """Return the number of frames."""
+    pixels = np.asarray(pixels)
+    shape = pixels.shape
+    if pixels.dtype != np.uint8 or len(shape) != 4 or shape[-1] != 3 or shape[0] < 2:
+        raise ValueError(
+            f"has pixels {pixels.dtype} {[*shape]}: give uint8 [T, H, W, 3], at least two frames"
+        )
+    if shape[1:3] != tuple(scene.frame_shape):
+        height, width = scene.frame_shape
+        raise ValueError(
+            f"has frames of {shape[1]} x {shape[2]} pixels, the scene {scene.name!r} of {height} x "
+            f"{width}: resize them first, for example with resize_frames"
+        )
+    return len(pixels)
+
+
+def _check_numbers(scene: Scene, episode: Mapping[str, Any], length: int) -> None:
+    """Check the shapes and ranges of actions and states."""
+    if "state" in episode and scene.state is None:
+        raise ValueError(f"has a state, but the scene {scene.name!r} has no ground truth: omit it")
+    shapes = {"action": (length - 1, scene.action_size)}
+    if scene.state is not None:
+        shapes["state"] = (length, scene.state.size)
+    for key, shape in shapes.items():
+        if key not in episode:
+            continue
+        values = np.asarray(episode[key])
+        if values.dtype.kind not in "fiu" or values.shape != shape:
+            raise ValueError(
+                f"has the {key} {values.dtype} {[*values.shape]}: give {[*shape]} numbers for its "
+                f"{length} frames"
+            )
+        if not np.isfinite(values).all():
+            raise ValueError(f"has a {key} that is not finite: mend it, or leave the episode out")
+    largest = np.abs(np.asarray(episode.get("action", 0), np.float32)).max()
+    if largest > 1:
+        raise ValueError(f"has an action of size {largest:.4g}: scale actions to [-1, 1]")

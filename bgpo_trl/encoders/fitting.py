@@ -101,24 +101,14 @@ class Fit:
                 if self.log:
                     self.log({"stage": stage, "step": done, "learning_rate": rate, **parts})
             if path and (done % self.config.checkpoint_every == 0 or done == schedule.steps):
-                self._save(path, done, loss, optimizer, generator)
-
-    def _save(
-        self,
-        path: Path,
-        step: int,
-        loss: LossModule,
-        optimizer: torch.optim.Optimizer,
-        generator: torch.Generator,
-    ) -> None:
-        state = {
-            "config": json.dumps(asdict(self.config)),
-            "step": step,
-            "loss": loss.state_dict(),
-            "optimizer": optimizer.state_dict(),
-            "generator": generator.get_state(),
-        }
-        save_checkpoint(path, state)
+                state = {
+                    "config": json.dumps(asdict(self.config)),
+                    "step": done,
+                    "loss": loss.state_dict(),
+                    "optimizer": optimizer.state_dict(),
+                    "generator": generator.get_state(),
+                }
+                save_checkpoint(path, state)
 
     def _resume(
         self,

@@ -142,12 +142,11 @@ def make_pretrained(
     per_task: int = 1_200,
     held_out_per_task: int = 200,
     seed: int = 0,
-    command: str = "",
     progress: bool = True,
-    device: torch.device | str = "cpu",
     tasks: Sequence[str] | None = None,
     spread: float = 1.0,
     scene: Scene | str = "nico",
+    **options: Any,
 ) -> tuple[Representation, DemonstrationBank]:
     """Record demonstrations and play, train both encoders, and embed the demonstrations.
 
@@ -162,24 +161,22 @@ def make_pretrained(
         per_task: Demonstrations of each task.
         held_out_per_task: How many of those are held out.
         seed: Seed of the recording.
-        command: Command line, stored with the weights.
         progress: Whether to show progress bars.
-        device: Device to train on.
         tasks: Tasks to demonstrate; by default the scene's.
         spread: Share of the whole range of start states.
         scene: The robot, or its name.
+        **options: Further arguments of `train_encoders`.
 
     Raises:
         ValueError: If the dataset is damaged or was recorded in another scene.
     """
-    record = partial(
-        record_demonstrations,
-        scene=scene,
-        tasks=tasks,
-        spread=spread,
-        seed=seed,
-        progress=progress,
-    )
+    shared: dict[str, Any] = {
+        "scene": scene,
+        "tasks": tasks,
+        "spread": spread,
+        "progress": progress,
+    }
+    record = partial(record_demonstrations, seed=seed, **shared)
     demonstrations = record(dataset, per_task=per_task, held_out_per_task=held_out_per_task)
     play = record(
         Path(dataset).with_name(f"{Path(dataset).name}-play"),
@@ -193,12 +190,8 @@ def make_pretrained(
         Path(weights),
         Path(folder),
         config or RepresentationConfig(),
-        command,
-        device,
-        progress=progress,
-        tasks=tasks,
-        spread=spread,
-        scene=scene,
+        **shared,
+        **options,
     )
 
 

@@ -13,13 +13,13 @@ from bgpo_trl.analysis.task_inference import group_purity, task_inference_accura
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.evaluation import evaluate_random_policy
 from bgpo_trl.experiments.episodes import evaluator_of, snapshots_of
-from bgpo_trl.experiments.records import command, write_rows
-from bgpo_trl.figures.curves import plot_success_curves
 from bgpo_trl.figures.frames import plot_frame_strips, save_gif
 from bgpo_trl.figures.groups import draw_groups
-from bgpo_trl.figures.of_run import draw_growth, draw_nodes
+from bgpo_trl.figures.gwr import draw_growth, draw_nodes
 from bgpo_trl.figures.style import save_figure
+from bgpo_trl.figures.success import plot_success_curves
 from bgpo_trl.files.progress import progress_bar
+from bgpo_trl.runs.provenance import command, write_table
 from bgpo_trl.training import Trainer
 
 # Number of the evaluation after training; it seeds start states that training never tested.
@@ -48,8 +48,8 @@ def measure(
     """
     algorithm, config = trainer.algorithm, trainer.config
     gwr, rows = algorithm.gwr, _final_tests(trainer, bank, episodes=episodes)
-    write_rows(out / "final.csv", FINAL_COLUMNS, rows)
     tests = pd.DataFrame(rows, columns=pd.Index(FINAL_COLUMNS))
+    write_table(out / "final.csv", tests)
     trainer.dashboard.log_final(tests[tests["demonstrations"] == "held-out"], config.episodes)
     random_success = evaluate_random_policy(
         tasks=config.tasks,

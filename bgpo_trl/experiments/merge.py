@@ -12,11 +12,10 @@ from typing import Annotated, Any
 import pandas as pd
 import tyro
 
-from bgpo_trl.experiments.records import command
-from bgpo_trl.files.locking import lock_directory
-from bgpo_trl.files.writing import make_folder, write_json, write_whole
+from bgpo_trl.files.writing import lock_directory, make_folder, write_json, write_whole
 from bgpo_trl.runs.cost import read_costs, total_cost, write_costs
 from bgpo_trl.runs.directory import differing_settings
+from bgpo_trl.runs.provenance import command
 from bgpo_trl.runs.results import read_json, read_table
 from bgpo_trl.seeding import check_seeds
 

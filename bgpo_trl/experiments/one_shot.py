@@ -5,7 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -17,11 +17,10 @@ from bgpo_trl.analysis.tables import Table, markdown
 from bgpo_trl.analysis.task_inference import task_inference_accuracy
 from bgpo_trl.experiments.arguments import TrainedArguments
 from bgpo_trl.experiments.episodes import evaluator_of
-from bgpo_trl.experiments.records import write_measurement
-from bgpo_trl.figures.style import COLORS, save_figure
+from bgpo_trl.figures.style import COLORS, add_legend, readable, save_figure, style_axes
 from bgpo_trl.machine import set_threads
 from bgpo_trl.plugins import import_plugin
-from bgpo_trl.runs.provenance import commit_of_code
+from bgpo_trl.runs.provenance import commit_of_code, write_measurement
 from bgpo_trl.seeding import stream_seed
 
 if TYPE_CHECKING:
@@ -30,18 +29,7 @@ if TYPE_CHECKING:
 
 # Number of the evaluation; it seeds start states that neither training nor final tests used.
 _NUMBER = 2**31 + 1
-
-
-class Row(NamedTuple):
-    """Row of ``one_shot.csv``; the last two values are NaN for algorithms without GWR-B."""
-
-    share: float
-    seed: int
-    task: str
-    episodes: int
-    success: float
-    task_inference: float
-    activity: float
+_MEASURES = ["success", "task_inference", "activity"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +46,7 @@ class OneShotArguments(TrainedArguments):
 
 def show(
     policy: TrainedPolicy, embedding: torch.Tensor, task: torch.Tensor, evaluator: Evaluator
-) -> list[tuple[int, int, float, float, float]]:
+) -> pd.DataFrame:
     """Test the policies of all seeds, each with the same demonstrations.
 
     Args:
@@ -68,54 +56,46 @@ def show(
         evaluator: Evaluator for ``M`` episodes of ``T`` tasks.
 
     Returns:
-        Tuples of seed, task, success, share of demonstrations whose task was inferred, and mean
-        activity.
+        A row of each seed and task, with the success, the share of demonstrations whose task was
+        inferred, and the mean activity; the last two are NaN without GWR-B.
     """
     from bgpo_trl.data.bank import DemonstrationBank
     from bgpo_trl.evaluation import Snapshot
 
     algorithm, seeds = policy.algorithm, policy.config.seeds
     n_tasks, n_seeds = len(task), len(seeds)
-    snapshots = [
-        Snapshot(
-            number=_NUMBER,
-            episode=0,
-            env_steps=0,
-            presented=torch.ones(n_tasks, dtype=torch.bool),
-            policy=algorithm.snapshot(
-                index,
-                embedding,
-                task,
-                torch.Generator().manual_seed(stream_seed(seed, "one-shot")),
-            ),
+    snapshots = []
+    for index, seed in enumerate(seeds):
+        generator = torch.Generator().manual_seed(stream_seed(seed, "one-shot"))
+        snapshots.append(
+            Snapshot(
+                number=_NUMBER,
+                episode=0,
+                env_steps=0,
+                presented=torch.ones(n_tasks, dtype=torch.bool),
+                policy=algorithm.snapshot(index, embedding, task, generator),
+            )
         )
-        for index, seed in enumerate(seeds)
-    ]
     success = evaluator.run(snapshots, algorithm.device).success.double().mean(-1)
     inferred, activity = torch.full((2, n_seeds, n_tasks), torch.nan, dtype=torch.double)
     if algorithm.gwr is not None:
         activity = algorithm.gwr.lookup(embedding.expand(n_seeds, *embedding.shape)).activity
-        activity, seen = activity.mean(-1), policy.bank.seen()
+        activity, seen = activity.mean(-1).double(), policy.bank.seen()
         for number, (phi, label) in enumerate(zip(embedding, task, strict=True)):
             tested = DemonstrationBank(
                 phi, label, torch.zeros_like(label, dtype=torch.bool), policy.tasks
             )
             inferred[:, number] = task_inference_accuracy(algorithm.gwr, seen, tested, n_tasks)
-    return [
-        (
-            seed,
-            number,
-            float(success[index, number]),
-            float(inferred[index, number]),
-            float(activity[index, number]),
-        )
-        for index, seed in enumerate(seeds)
-        for number in range(n_tasks)
-    ]
+    measured = {"success": success, "task_inference": inferred, "activity": activity}
+    columns = {name: values.flatten().numpy() for name, values in measured.items()}
+    index = pd.MultiIndex.from_product([seeds, policy.tasks], names=["seed", "task"])
+    return pd.DataFrame(columns, index).reset_index()
 
 
-def measure(policy: TrainedPolicy, shares: Sequence[float], episodes: int, seed: int) -> list[Row]:
-    """Return the rows of the CSV file; for the arguments see `OneShotArguments`.
+def measure(
+    policy: TrainedPolicy, shares: Sequence[float], episodes: int, seed: int
+) -> pd.DataFrame:
+    """Return the rows of ``one_shot.csv``; for the arguments see `OneShotArguments`.
 
     Raises:
         ValueError: If a share is not in (0, 1], or ``episodes`` is less than 1.
@@ -129,7 +109,6 @@ def measure(policy: TrainedPolicy, shares: Sequence[float], episodes: int, seed:
         raise ValueError(f"--episodes must be at least 1, got {episodes}")
     tasks, config = policy.tasks, policy.config
     evaluator = evaluator_of(policy, policy.bank.held_out(), episodes)
-    rows = []
     with tempfile.TemporaryDirectory() as folder:
         shown = record_demonstrations(
             folder,
@@ -141,29 +120,29 @@ def measure(policy: TrainedPolicy, shares: Sequence[float], episodes: int, seed:
             seed=seed,
             progress=False,
         ).to_tensordict()
-    length = shown.get("length").clone()
+    length, tables = shown.get("length").clone(), []
     for share in shares:
         shown["length"] = (share * length).round().long().clamp(min=1)
         embedding = embed_demonstrations(policy.encoders, shown).view(len(tasks), episodes, -1)
-        tested = show(policy, embedding, shown["task"].view(len(tasks), episodes), evaluator)
-        rows += [Row(share, s, tasks[task], episodes, *found) for s, task, *found in tested]
-    return rows
+        table = show(policy, embedding, shown["task"].view(len(tasks), episodes), evaluator)
+        table.insert(0, "share", share)
+        table.insert(3, "episodes", episodes)
+        tables.append(table)
+    return pd.concat(tables, ignore_index=True)
 
 
-def means(rows: Sequence[Row]) -> dict[str, dict[float, np.ndarray]]:
+def means(table: pd.DataFrame) -> dict[str, dict[float, np.ndarray]]:
     """Return each seed's mean success, task inference and activity, ``[S, 3]``, by task and share.
 
     The key ``"all"`` holds the means over tasks.
     """
-    table = pd.DataFrame(rows)
-    measures, shares = ["success", "task_inference", "activity"], table["share"].unique()
     return {
         task: {
             share: of_task[of_task["share"] == share]
-            .groupby("seed", sort=False)[measures]
+            .groupby("seed", sort=False)[_MEASURES]
             .mean()
             .to_numpy()
-            for share in shares
+            for share in table["share"].unique()
         }
         for task, of_task in [("all", table), *table.groupby("task", sort=False)]
     }
@@ -186,19 +165,17 @@ def plot(table: Mapping[str, Mapping[float, np.ndarray]]) -> Figure:
             shown = sorted(shares)
             seeds = np.stack([shares[share][:, column] for share in shown])
             mean, spread = seeds.mean(1), seeds.std(1)
-            axes.plot(shown, mean, "o-", color=color, markersize=4, label=task.replace("_", " "))
+            axes.plot(shown, mean, "o-", color=color, markersize=4, label=readable(task))
             if task == "all":
                 low, high = np.clip(mean - spread, 0, 1), np.clip(mean + spread, 0, 1)
                 axes.fill_between(shown, low, high, color=color, alpha=0.15, linewidth=0)
         axes.set(xticks=sorted(next(iter(table.values()))), ylim=(0, 1.02))
         axes.set_title(name, fontsize=9)
         axes.xaxis.set_major_formatter(PercentFormatter(1, decimals=0))
-        axes.tick_params(labelsize=8)
-        axes.grid(color="0.9", linewidth=0.6)
-        axes.spines[["top", "right"]].set_visible(False)
+        style_axes(axes)
     figure.supxlabel("Share of the demonstration seen", fontsize=9)
     handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=4, fontsize=8, frameon=False)
+    add_legend(figure, handles, labels, 7.0)
     return figure
 
 
@@ -217,23 +194,14 @@ def one_shot(arguments: OneShotArguments) -> str:
     import_plugin(arguments.module)
     set_threads(arguments.threads)
     policy = load_run(arguments.run)
-    rows = measure(policy, arguments.shares, arguments.episodes, arguments.seed)
-    rounded = [
-        row._replace(
-            success=round(row.success, 4),
-            task_inference=round(row.task_inference, 4),
-            activity=round(row.activity, 4),
-        )
-        for row in rows
-    ]
-    write_measurement(out, "one_shot", Row._fields, rounded, commit)
-    found = means(rows)
+    tested = measure(policy, arguments.shares, arguments.episodes, arguments.seed)
+    write_measurement(out, "one_shot", tested.round(dict.fromkeys(_MEASURES, 4)), commit)
+    found = means(tested)
     save_figure(plot(found), out / "one_shot.png")
     table: Table = [["task", "seen", "success", "inferred", "activity"]]
     for task, shares in found.items():
         for share, seeds in shares.items():
             success, inferred, activity = seeds.mean(0)
-            without_gwr = bool(np.isnan(inferred))
-            from_gwr = ["", ""] if without_gwr else [f"{inferred:.1%}", f"{activity:.2f}"]
+            from_gwr = ["", ""] if np.isnan(inferred) else [f"{inferred:.1%}", f"{activity:.2f}"]
             table.append([task, f"{share:.0%}", f"{success:.1%}", *from_gwr])
     return markdown(table)

@@ -15,8 +15,8 @@ from bgpo_trl.analysis.statistics import mean
 from bgpo_trl.analysis.tables import Table, markdown
 from bgpo_trl.configs import PRESETS, DDPGConfig, SACConfig, TD3Config
 from bgpo_trl.experiments.settings import chosen
-from bgpo_trl.figures.curves import plot_success_curves
 from bgpo_trl.figures.style import save_figure
+from bgpo_trl.figures.success import plot_success_curves
 from bgpo_trl.machine import choose_device, set_threads
 
 INPUTS: dict[str, tuple[str, dict[str, Any]]] = {

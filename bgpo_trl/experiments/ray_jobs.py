@@ -16,9 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from bgpo_trl.configs import RunConfig
-from bgpo_trl.files.locking import lock_directory
 from bgpo_trl.files.progress import progress_bar
-from bgpo_trl.files.writing import no_link
+from bgpo_trl.files.writing import lock_directory, no_link
 from bgpo_trl.runs.directory import CSV_FILES
 
 try:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 import tyro
 
-from bgpo_trl.analysis import metrics, statistics
+from bgpo_trl.analysis import statistics
 from bgpo_trl.analysis.comparison import (
     Run,
     Setting,
@@ -21,7 +21,7 @@ from bgpo_trl.analysis.comparison import (
     run_directories,
     under_equal_conditions,
 )
-from bgpo_trl.analysis.scores import Values, late_scores, success_matrix
+from bgpo_trl.analysis.scores import Values, evaluation_matrix, late_scores, success_matrix
 from bgpo_trl.analysis.tables import (
     COST_NOTE,
     DIFFERENCE_NOTES,
@@ -39,15 +39,12 @@ from bgpo_trl.analysis.tables import (
     success_table,
     task_table,
 )
-from bgpo_trl.figures.curves import plot_success_curves
 from bgpo_trl.figures.groups import draw_groups, plot_counts, read_counts
 from bgpo_trl.figures.gwr import plot_gwr_pca
-from bgpo_trl.figures.page import Section, write_page
 from bgpo_trl.figures.style import COLORS, save_figure
-from bgpo_trl.figures.success_matrix import plot_success_matrices
+from bgpo_trl.figures.success import plot_success_curves, plot_success_matrices
 from bgpo_trl.files.writing import make_folder, write_whole
-from bgpo_trl.runs.archive import archive_run
-from bgpo_trl.runs.results import find_table, read_table
+from bgpo_trl.runs.results import archive_run, find_table, read_table
 
 # For a screen: figures of results are kept under version control.
 _DPI = 150
@@ -74,11 +71,15 @@ class ReportArguments:
 
 
 @dataclass(frozen=True)
-class Report:
-    """Sections of a report, and its runs by directory."""
+class Section:
+    """Section of the report: title, notes, figures and a table."""
 
-    sections: list[Section]
-    runs: dict[Path, Run]
+    title: str
+    table: Table = field(default_factory=list)
+    """Rows of cells, the first with the column names; omitted if empty."""
+    figures: dict[str, Path] = field(default_factory=dict)
+    """Paths by caption."""
+    notes: list[str] = field(default_factory=list)
 
 
 def presented(run: Run) -> dict[str, int]:
@@ -200,8 +201,10 @@ def setting_sections(setting: Setting, reference: Setting | None, out: Path) -> 
     return sections
 
 
-def make_report(directories: Sequence[Path], out: Path, *, anyway: bool = False) -> Report:
-    """Compute the tables and draw the figures of runs.
+def make_report(
+    directories: Sequence[Path], out: Path, *, anyway: bool = False
+) -> tuple[list[Section], dict[Path, Run]]:
+    """Compute the tables and draw the figures of runs; return sections, and runs by directory.
 
     Raises:
         ValueError: If a run is damaged, none is finished, or conditions differ.
@@ -230,8 +233,7 @@ def make_report(directories: Sequence[Path], out: Path, *, anyway: bool = False)
             if missing:
                 about.append(f"{missing} further claims need runs that are not here.")
             sections.append(Section(f"The paper's claims, {number} tasks", table, notes=about))
-    runs = {run.directory: run for setting in settings for run in setting.runs.values()}
-    return Report(sections, runs)
+    return sections, {run.directory: run for s in settings for run in s.runs.values()}
 
 
 def text_of(sections: Sequence[Section], out: Path) -> str:
@@ -253,10 +255,9 @@ def report(arguments: ReportArguments) -> str:
 
     Prints and writes tables.md: success, differences between algorithms, forgetting and transfer,
     learning times, groups of behaviors, cost, each run task by task, and the paper's claims as far
-    as there are runs for them; beside it, figures, and report.html with all of these. The report of
-    a single run is written into its directory. With --archive, first copies what reports read of
-    the runs, compressed, and writes the report beside the copies. docs/benchmark.md defines the
-    measures.
+    as there are runs for them; beside it, figures. The report of a single run is written into its
+    directory. With --archive, first copies what reports read of the runs, compressed, and writes
+    the report beside the copies. docs/benchmark.md defines the measures.
 
     Raises:
         ValueError: If a run is damaged, none is finished, or conditions differ.
@@ -278,15 +279,13 @@ def report(arguments: ReportArguments) -> str:
             archive_run(directory, copy)
         directories = copies
     out = arguments.out or arguments.archive or named[0]
-    made = make_report(directories, out, anyway=arguments.anyway)
+    sections, runs = make_report(directories, out, anyway=arguments.anyway)
     for directory in directories if directories == named else ():
-        run = made.runs.get(directory)
+        run = runs.get(directory)
         if run is not None and max(run.summary.get("groups") or [0]) > 1:
             draw_groups(directory, presented(run), out / f"{directory.name}-groups.png")
-    text = text_of(made.sections, out)
+    text = text_of(sections, out)
     write_whole(out / "tables.md", text)
-    settings = {str(path): (path, run.config, run.summary) for path, run in made.runs.items()}
-    write_page(out / "report.html", made.sections, settings)
     return text
 
 
@@ -320,7 +319,7 @@ def compare(paths: Sequence[Path], *, every: int | None = None, anyway: bool = F
     part = last + 1 if every is None else every
     for end in range(part, last + 1, part):
         matrices = [
-            metrics.evaluation_matrix(run.curves.success, run.curves.episodes, [end], window=part)
+            evaluation_matrix(run.curves.success, run.curves.episodes, [end], window=part)
             for run in runs
         ]
         rows += _differences(f"to {end}", first.tasks, *(matrix[:, 0] for matrix in matrices))

@@ -19,7 +19,6 @@ from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.encoders.train import make_pretrained
 from bgpo_trl.experiments.arguments import Arguments, BankArguments
 from bgpo_trl.experiments.measure import draw, measure
-from bgpo_trl.experiments.records import command
 from bgpo_trl.experiments.settings import (
     as_begun,
     changed_hyperparameters,
@@ -28,15 +27,14 @@ from bgpo_trl.experiments.settings import (
     is_finished,
     named_directory,
 )
-from bgpo_trl.files.locking import lock_directory
-from bgpo_trl.files.writing import write_json
+from bgpo_trl.files.writing import lock_directory, write_json
 from bgpo_trl.machine import choose_device, keep_freed_memory, set_threads
 from bgpo_trl.plugins import import_plugin
 from bgpo_trl.runs.config_file import read_config
 from bgpo_trl.runs.dashboard import tensorboard_logger, wandb_logger
 from bgpo_trl.runs.demonstrations import BANK, load_inputs, own_weights
 from bgpo_trl.runs.directory import holds_run
-from bgpo_trl.runs.provenance import commit_of_code, versions
+from bgpo_trl.runs.provenance import command, commit_of_code, versions
 from bgpo_trl.scenes import Scene, find_scene
 from bgpo_trl.training import Trainer
 

@@ -22,7 +22,7 @@ from bgpo_trl.experiments.arguments import Arguments, BankArguments
 from bgpo_trl.experiments.merge import merge_runs
 from bgpo_trl.experiments.ray_jobs import Job, connected, play_jobs
 from bgpo_trl.experiments.settings import run_config
-from bgpo_trl.files.locking import lock_directory
+from bgpo_trl.files.writing import lock_directory
 from bgpo_trl.plugins import import_plugin
 from bgpo_trl.runs.config_file import Digests, settings_of
 from bgpo_trl.runs.directory import check_settings, holds_run

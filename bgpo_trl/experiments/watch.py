@@ -181,7 +181,7 @@ def watch(arguments: WatchArguments) -> str:
     Raises:
         ValueError: If the directory holds no run that can be loaded, or the run has no such seed.
     """
-    from bgpo_trl.figures.of_run import draw_growth
+    from bgpo_trl.figures.gwr import draw_growth
     from bgpo_trl.policy import load_run
 
     run, out = arguments.run, arguments.out or arguments.run / "figures"

@@ -96,36 +96,31 @@ def read_config(path: str | Path, defaults: RunConfig | None = None) -> tuple[Ru
             if not isinstance(found, str | None):
                 raise ValueError(f"{name} is {found!r}")
         values, modules = settings.pop("algorithm"), settings.pop("task_modules", {})
-        name = settings.get("name")
+        name, scene = settings.get("name"), settings.get("scene", "nico")
         kind = _algorithm_config(name, settings.pop("algorithm_class", None))
-        scene = settings.get("scene", "nico")
+        if kind is None:
+            raise LookupError(f"is a run of {name!r}, whose hyperparameters no imported module has")
+        if scene not in SCENES:
+            raise LookupError(f"is a run in the scene {scene!r}, which no imported module adds")
         unknown = _unknown_task(scene, settings.get("tasks"))
-        if kind is not None and scene in SCENES and unknown is None:
-            algorithm = _read(kind, values, "algorithm.")
-            return _read(RunConfig, {**settings, "algorithm": algorithm}, ""), digests
+        if unknown is not None:
+            # The module is not imported, since a file should not decide what is imported.
+            module = modules.get(unknown) if isinstance(modules, dict) else None
+            known = isinstance(module, str) and module != "__main__"
+            where = f"the module {module!r}" if known else "a script or notebook"
+            raise LookupError(f"has the task {unknown!r}, added by {where}")
+        algorithm = _read(kind, values, "algorithm.")
+        return _read(RunConfig, {**settings, "algorithm": algorithm}, ""), digests
     except (FileNotFoundError, NotADirectoryError):
         raise ValueError(f"{path.parent} holds no run: there is no {path.name}") from None
+    except LookupError as error:
+        raise ValueError(
+            f"{path} {error}: name the module that adds it with --import, or import it first in "
+            "Python"
+        ) from None
     except (ValueError, OSError, RecursionError) as error:
         remedy = "use the version of the code that made the run" if of_run else "correct it"
         raise ValueError(f"{path} cannot be read ({error}): {remedy}") from error
-    if kind is None:
-        raise ValueError(
-            f"{path} is a run of {name!r}, whose hyperparameters no imported module has: name the "
-            "module that adds it with --import, or import it first in Python"
-        )
-    if scene not in SCENES:
-        raise ValueError(
-            f"{path} is a run in the scene {scene!r}, which no imported module adds: name the "
-            "module with --import, or import it first in Python"
-        )
-    # The module is not imported, since a file should not decide what is imported.
-    module = modules.get(unknown) if isinstance(modules, dict) else None
-    known = isinstance(module, str) and module != "__main__"
-    where = f"the module {module!r}" if known else "a script or notebook"
-    raise ValueError(
-        f"{path} has the task {unknown!r}, added by {where}: name a module that adds it with "
-        "--import, or add it first in Python"
-    )
 
 
 def settings_of(config: RunConfig, digests: Digests) -> dict[str, Any]:

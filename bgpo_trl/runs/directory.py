@@ -1,15 +1,15 @@
-"""Contents of a run directory, and the checks before a run starts or resumes in it."""
+"""Run directories: their checks before a run starts or resumes, and the logs written to them."""
 
 from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from bgpo_trl.files.checkpoint import has_checkpoint, load_checkpoint
-from bgpo_trl.files.csv_file import check_position, has_rows
+from bgpo_trl.files.csv_file import CsvFile, check_position, has_rows
 from bgpo_trl.files.writing import make_folder, write_json
 from bgpo_trl.runs.results import read_json
 
@@ -49,34 +49,6 @@ def check_settings(
     path = Path(directory) / "config.json"
     if path.exists():
         _compare(directory, read_json(path), settings, longer)
-
-
-def claim_directory(directory: Path, settings: Mapping[str, Any], *, resume: bool) -> None:
-    """Write ``config.json``, unless the directory holds a run that must not be continued.
-
-    Args:
-        directory: The run directory, made if missing.
-        settings: Settings of the run, as JSON stores them.
-        resume: Whether the directory may hold this run, possibly with fewer ``episodes``.
-
-    Raises:
-        ValueError: If the directory holds a run with other settings, or any run without
-            ``resume``.
-        OSError: If the directory cannot be written.
-    """
-    check_settings(directory, settings, longer=resume)
-    if not resume and holds_run(directory):
-        raise ValueError(
-            f"{directory} already holds a run: resume it, or choose another run directory."
-        )
-    make_folder(directory)
-    path = directory / "config.json"
-    try:
-        write_json(path, settings)
-    except OSError as error:
-        raise OSError(
-            f"cannot write {path} ({error.strerror}): make room, or choose another run directory"
-        ) from None
 
 
 def load_last(directory: Path, settings: Mapping[str, Any]) -> dict[str, Any] | None:
@@ -193,3 +165,139 @@ def flatten(settings: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
             yield from flatten(value, f"{prefix}.{name}" if prefix else name)
     else:
         yield prefix, settings
+
+
+EVAL_COLUMNS = (
+    "algorithm",
+    "seed",
+    "episode",
+    "env_steps",
+    "task",
+    "success",
+    "return",
+    "steps",
+)
+"""Columns of ``eval.csv``, one row per test episode."""
+
+TRAIN_COLUMNS = (
+    *EVAL_COLUMNS,
+    "intrinsic_return",
+    "num_nodes",
+    "group",
+    "num_groups",
+    "loss_actor",
+    "loss_value",
+)
+"""Columns of ``train.csv``, one row per training episode; those of ``Algorithm.logged`` follow."""
+
+
+class RunLogger:
+    """Write the log of a run into its directory.
+
+    Args:
+        directory: The run directory; made if missing.
+        config: Settings of the run, as JSON stores them, written to ``config.json``.
+        logged: Further columns of ``train.csv``; see `Algorithm`.
+        resume: Continue the run in the directory, which may have had fewer ``episodes``; call
+            `truncate_to` next.
+
+    Raises:
+        ValueError: If the directory holds a run with other settings or columns, or any run without
+            ``resume``; if a name in ``logged`` is that of another column.
+        OSError: If the directory cannot be written.
+
+    Examples:
+        >>> import tempfile
+        >>> directory = Path(tempfile.mkdtemp()) / "run"
+        >>> with RunLogger(directory, config={"gamma": 0.98}) as logger:
+        ...     logger.log_eval({"algorithm": "bgpo", "seed": 0, "episode": 1, "success": True})
+        >>> (directory / "eval.csv").read_text().splitlines()[1]
+        'bgpo,0,1,,,1,,'
+    """
+
+    def __init__(
+        self,
+        directory: str | os.PathLike[str],
+        *,
+        config: Mapping[str, Any],
+        logged: Sequence[str] = (),
+        resume: bool = False,
+    ) -> None:
+        self.directory = Path(directory)
+        columns = (*TRAIN_COLUMNS, *logged)
+        repeated = {name for name in logged if columns.count(name) > 1}
+        if repeated:
+            raise ValueError(
+                f"train.csv has the column {', '.join(sorted(repeated))} already: choose other "
+                "names for what the algorithm logs"
+            )
+        check_settings(self.directory, config, longer=resume)
+        if not resume and holds_run(self.directory):
+            raise ValueError(
+                f"{self.directory} already holds a run: resume it, or choose another run directory."
+            )
+        make_folder(self.directory)
+        path = self.directory / "config.json"
+        try:
+            write_json(path, config)
+        except OSError as error:
+            raise OSError(
+                f"cannot write {path} ({error.strerror}): make room, or choose another run "
+                "directory"
+            ) from None
+        self._train = CsvFile(self.directory / "train.csv", columns)
+        self._eval = CsvFile(self.directory / "eval.csv", EVAL_COLUMNS)
+
+    def log_train(self, row: Mapping[str, Any]) -> None:
+        """Write a training episode.
+
+        Args:
+            row: Values by column of `TRAIN_COLUMNS` or ``logged``; missing ones stay empty.
+
+        Raises:
+            ValueError: If there is no such column.
+            OSError: If the row cannot be written.
+        """
+        self._train.write(row)
+
+    def log_eval(self, row: Mapping[str, Any]) -> None:
+        """Write a test episode.
+
+        Args:
+            row: Values by column of `EVAL_COLUMNS`: names of the algorithm and the task, seed,
+                training episodes and environment steps of that seed so far, and the test episode's
+                success, extrinsic return and length in steps.
+
+        Raises:
+            ValueError: If there is no such column.
+            OSError: If the row cannot be written.
+        """
+        self._eval.write(row)
+
+    def position(self) -> dict[str, int]:
+        """Flush the CSV files to disk and return their sizes, for the checkpoint."""
+        return {file.path.name: file.position() for file in (self._train, self._eval)}
+
+    def truncate_to(self, position: Mapping[str, int]) -> None:
+        """Drop the rows that a resumed run will write again.
+
+        Args:
+            position: Result of `position` saved in the checkpoint; empty to start over, for a run
+                that ended before its first checkpoint.
+
+        Raises:
+            ValueError: If a file is shorter.
+        """
+        for file in (self._train, self._eval):
+            file.truncate_to(position.get(file.path.name, 0))
+
+    def close(self) -> None:
+        """Close the CSV files."""
+        self._train.close()
+        self._eval.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

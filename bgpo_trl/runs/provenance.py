@@ -1,10 +1,16 @@
-"""Code that a run was made with: commit and versions."""
+"""Where results come from: code, versions and command; and files of measurements with these."""
 
 from __future__ import annotations
 
 import importlib.metadata
+import shlex
 import subprocess
+import sys
 from pathlib import Path
+
+import pandas as pd
+
+from bgpo_trl.files.writing import make_folder, write_json, write_whole
 
 
 def commit_of_code() -> str:
@@ -24,3 +30,23 @@ def versions() -> dict[str, str]:
     """Return the installed versions of the packages that a run depends on most."""
     packages = ("bgpo_trl", "torch", "torchrl", "mujoco")
     return {package: importlib.metadata.version(package) for package in packages}
+
+
+def command() -> str:
+    """Return the command line of this process."""
+    return shlex.join(["python", *sys.argv])
+
+
+def write_measurement(folder: Path, name: str, table: pd.DataFrame, commit: str) -> None:
+    """Write a table to ``NAME.csv``, and the commit and command that made it to ``NAME.json``.
+
+    The folder is made if missing; ``commit`` is that of the code when the measurement began.
+    """
+    make_folder(folder)
+    write_table(folder / f"{name}.csv", table)
+    write_json(folder / f"{name}.json", {"commit": commit, "command": command()})
+
+
+def write_table(path: Path, table: pd.DataFrame) -> None:
+    """Write a CSV file; NaN becomes an empty cell."""
+    write_whole(path, table.to_csv(index=False, lineterminator="\r\n"))

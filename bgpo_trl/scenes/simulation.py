@@ -14,9 +14,8 @@ from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from bgpo_trl.errors import as_shape, missing_key
-from bgpo_trl.machine import usable_cores
+from bgpo_trl.machine import RowPool, usable_cores
 from bgpo_trl.seeding import Seeding, row_seeds
-from bgpo_trl.threads import RowPool
 
 __all__ = ["Observation", "Outcome", "Simulation", "SimulationEnv"]
 

@@ -1,6 +1,4 @@
-"""Scores of runs and forward transfer, against numbers worked out by hand."""
-
-from dataclasses import replace
+"""Measures of arrays and of runs, against numbers worked out by hand."""
 
 import numpy as np
 import pytest
@@ -9,6 +7,108 @@ from bgpo_trl.analysis import scores
 from bgpo_trl.analysis.comparison import read_run
 from bgpo_trl.analysis.scores import expected_own_episodes, forward_transfer, own_areas
 from tests.analysis.runs import NAN, STARTS, TASKS, make_run, write_run, write_training
+
+# Two tasks in the order of their presentation, evaluated after 10, 20, 30 and 40 episodes; task 2
+# comes in after 20.
+EPISODES = [10, 20, 30, 40]
+SUCCESS = np.array([[0.0, NAN], [0.8, NAN], [0.6, 0.0], [0.4, 0.5]])
+
+
+def test_evaluation_matrix_by_hand():
+    last_only = scores.evaluation_matrix(SUCCESS, EPISODES, [20, 40], window=10)
+    np.testing.assert_allclose(last_only, [[0.8, NAN], [0.4, 0.5]])
+    both = scores.evaluation_matrix(SUCCESS, EPISODES, [20, 40], window=20)
+    np.testing.assert_allclose(both, [[0.4, NAN], [0.5, 0.25]])
+
+
+def test_each_seed_is_measured_separately():
+    seeds = np.stack([SUCCESS, 0.5 * SUCCESS, np.nan_to_num(SUCCESS)])
+    matrix = scores.evaluation_matrix(seeds, EPISODES, [20, 40], window=10)
+    assert matrix.shape == (3, 2, 2)
+    change = [scores.change_since_learned(of_seed) for of_seed in matrix]
+    np.testing.assert_allclose(scores.change_since_learned(matrix), change)
+    best = [scores.forgetting_since_best(of_seed) for of_seed in seeds]
+    np.testing.assert_allclose(scores.forgetting_since_best(seeds), best)
+
+
+def test_changes_since_tasks_were_learned_by_hand():
+    matrix = [[0.8, NAN, NAN], [0.7, 0.9, NAN], [0.4, 1.0, 0.3]]
+    # Task 1 has lost 0.4, task 2 has gained 0.1; of task 3 nothing can be said.
+    assert scores.change_since_learned(matrix) == pytest.approx([-0.4, 0.1, 0])
+    with pytest.raises(ValueError, match="one phase per task"):
+        scores.change_since_learned(matrix[1:])
+
+
+def test_forgetting_since_the_best_so_far_by_hand():
+    # Task 1 was at 0.8 and is at 0.4; task 2 is at its best.
+    assert scores.forgetting_since_best(SUCCESS) == pytest.approx((0.4 + 0) / 2)
+    assert scores.forgetting_since_best(SUCCESS[:1]) == 0  # a task never tested is left out
+
+
+def test_a_success_of_zero_is_not_treated_as_missing():
+    matrix = [[0.8, NAN], [0.0, 0.5]]
+    assert scores.change_since_learned(matrix) == pytest.approx([-0.8, 0])
+    assert scores.trailing_mean([[1.0], [0.0]], 2).tolist() == [[1], [0.5]]
+    assert scores.area_under_curve([0.0, 0.0], [10, 20]) == 0
+    assert scores.forgetting_since_best([[0.6], [0.0]]) == 0.6
+
+
+def test_area_under_curve_by_hand():
+    # Triangle to 10, then two trapezoids; the last interval is twice as long.
+    area = (10 * 0.2 + 10 * (0.4 + 0.8) / 2 + 20 * (0.8 + 0.6) / 2) / 40
+    assert scores.area_under_curve([0.4, 0.8, 0.6], [10, 20, 40]) == pytest.approx(area)
+    several = scores.area_under_curve([[0.4, 0.8, 0.6], [1, 1, 1]], [10, 20, 40])
+    assert several.tolist() == pytest.approx([area, 1 - 10 * 0.5 / 40])
+
+
+def test_episodes_until_overall_success_reaches_a_rate():
+    # By evaluation and task, of two seeds. Means over seeds and presented tasks: 1/2, 1, 1, then
+    # the second task comes in at 0 and is done.
+    seeds = np.ones((2, 5, 2))
+    seeds[:, :3, 1], seeds[:, 3, 1], seeds[0, 0, 0] = NAN, 0, 0
+    episodes = np.array([10, 20, 30, 40, 50])
+    # Over three evaluations: 1/2, 3/4, 5/6, (1 + 0) / 2, (1 + 1/2) / 2.
+    assert scores.overall_episodes_to(seeds, episodes) == 30
+    assert scores.overall_episodes_to(seeds, episodes, 0.7) == 20
+    assert scores.overall_episodes_to(seeds[:, :2], episodes[:2]) == np.inf
+
+
+def test_own_episodes_until_half_of_the_last_twenty_succeed():
+    # The tenth success is the thirteenth episode, but twenty are needed for a rate.
+    early = [0, 0, 0] + [1] * 10 + [0] * 7
+    assert scores.trials_to(early) == 20
+    # 9 of episodes 1 to 20 succeed and 9 of 2 to 21; of 3 to 22, 10 do.
+    late = [0, 0] + [0, 1] * 9 + [0, 1]
+    assert scores.trials_to(late) == 22
+    assert scores.trials_to(late[:-1]) == np.inf
+    assert scores.trials_to([1] * 19) == scores.trials_to([]) == np.inf
+
+
+def test_another_rate_over_another_window():
+    outcomes = [1, 0, 1, 0, 1, 1, 1, 1, 0]
+    assert scores.trials_to(outcomes, 0.8, window=5) == 7  # episodes 3 to 7
+    assert scores.trials_to(outcomes, 1.0, window=2) == 6
+    assert scores.trials_to(outcomes, window=1) == 1
+    with pytest.raises(ValueError, match="at least 1 episode, not 0"):
+        scores.trials_to(outcomes, window=0)
+
+
+def test_learning_times_relative_to_the_first_task():
+    inf = np.inf
+    seeds = [[100, 50, 300], [40, 40, inf], [50, 100, 100]]
+    # By seed 0.5, 1 and 2; 3, never and 2.
+    assert scores.times_the_first(seeds).tolist() == [1, 3]
+    # A seed without the first task says nothing; half of the others never learn the third.
+    assert scores.times_the_first([*seeds[:2], [inf, 20, 20]]).tolist() == [0.75, inf]
+    np.testing.assert_array_equal(scores.times_the_first([[inf, 20, inf]]), [NAN, NAN])
+
+
+def test_trailing_mean_by_hand():
+    np.testing.assert_allclose(
+        scores.trailing_mean(SUCCESS, 3),
+        [[0, NAN], [0.4, NAN], [1.4 / 3, 0], [0.6, 0.25]],
+    )
+    np.testing.assert_array_equal(scores.trailing_mean(SUCCESS, 1), SUCCESS)
 
 
 def test_late_scores_average_the_last_tenth_of_training():
@@ -174,19 +274,3 @@ def test_seeds_of_run_and_reference_widen_the_interval():
         widened.curves.success[1] -= less
         after = forward_transfer(run, reference)
         assert np.ptp(after[1:]) > np.ptp(before[1:])
-
-
-@pytest.mark.slow
-def test_the_interval_of_forward_transfer_has_its_nominal_coverage():
-    rng, covered, n = np.random.default_rng(0), 0, 1_500
-    truth = forward_transfer(make_run(), make_run(RISING, (0, 0, 0))).value
-    for _ in range(n):
-        pair = make_run(), make_run(RISING, (0, 0, 0))
-        for index, run in enumerate(pair):
-            levels = 0.05 * rng.normal(size=(6, 1, 3))
-            noisy = run.curves.success[:1] + levels + 0.05 * rng.normal(size=(6, 6, 3))
-            curves = replace(run.curves, seeds=tuple(range(6)), success=noisy)
-            pair = (*pair[:index], replace(run, curves=curves), *pair[index + 1 :])
-        found = forward_transfer(*pair)
-        covered += found.low <= truth <= found.high
-    assert covered / n == pytest.approx(0.95, abs=0.02)

@@ -114,29 +114,3 @@ def test_missing_scores_are_refused(scores):
     for call in (statistics.mean, lambda s: statistics.difference([0.1, 0.2], s)):
         with pytest.raises(ValueError, match="scores must be finite, one for each"):
             call(scores)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("n_tasks", [3, 8])
-def test_intervals_have_their_nominal_coverage(n_tasks):
-    """Of two algorithms whose seeds have a level of their own, in addition to noise by task."""
-    rng, n = np.random.default_rng(4), 4_000
-    covered = np.zeros(2)
-    for _ in range(n):
-        runs = []
-        for level, spread in ((0.8, 0.05), (0.7, 0.1)):
-            of_seed = level + spread * rng.normal(size=(5, 1))
-            share = np.clip(of_seed + 0.08 * rng.normal(size=(5, n_tasks)), 0, 1)
-            runs.append((rng.binomial(15, share) / 15).mean(1))
-        truth = [_expected(level, spread) for level, spread in ((0.8, 0.05), (0.7, 0.1))]
-        mean = statistics.mean(runs[0])
-        gap = statistics.contrast(runs, [1, -1]).interval()
-        covered += mean.low <= truth[0] <= mean.high, gap.low <= truth[0] - truth[1] <= gap.high
-    assert covered / n == pytest.approx([0.95, 0.95], abs=0.015), covered / n
-
-
-def _expected(level, spread):
-    """Expected success of a clipped normal share."""
-    width = np.hypot(spread, 0.08)
-    x = np.linspace(level - 8 * width, level + 8 * width, 20_001)
-    return np.trapezoid(np.clip(x, 0, 1) * stats.norm.pdf(x, level, width), x)

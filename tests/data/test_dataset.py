@@ -1,30 +1,24 @@
-import json
+"""Datasets of demonstrations: damaged ones, and those that are written from elsewhere."""
+
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
-from bgpo_trl.data.dataset import load_demonstrations
+from bgpo_trl.data.dataset import (
+    load_demonstrations,
+    read_meta,
+    resize_frames,
+    write_demonstrations,
+)
+from tests.helpers import contents, edit
 
 KEYS = {"pixels", "state", "action", "length", "task", "train", "seed"}
-
-
-def edit_meta(path: Path, **changes: object) -> None:
-    file = path / "dataset.json"
-    meta = {**json.loads(file.read_text()), **changes}
-    file.write_text(json.dumps({k: v for k, v in meta.items() if v is not None}))
-
-
-@pytest.mark.parametrize("key", sorted(KEYS))
-def test_a_flipped_byte_is_noticed(copy, key):
-    values = np.memmap(copy / f"{key}.memmap", np.uint8, "r+")
-    values[len(values) // 2] ^= 1
-    values.flush()
-
-    with pytest.raises(ValueError, match=r"is damaged \(checksum differs\); remove it and .*$"):
-        load_demonstrations(copy)
-    assert len(load_demonstrations(copy, verify=False)) == 9
 
 
 def truncate(path: Path) -> None:
@@ -36,13 +30,13 @@ def truncate(path: Path) -> None:
     ("damage", "message"),
     [
         (truncate, r"pixels\.memmap is missing or truncated; remove .*"),
-        (lambda p: (p / "action.memmap").unlink(), r"action\.memmap is missing or truncated; .*"),
         (lambda p: (p / "dataset.json").write_text("{"), r"dataset\.json is damaged; remove .*"),
-        (lambda p: (p / "dataset.json").write_text("{}"), r"dataset\.json is damaged; remove .*"),
-        (lambda p: (p / "dataset.json").write_bytes(b"\xff"), r"dataset\.json is damaged; .*"),
         (lambda p: (p / "dataset.json").unlink(), r"copy is not a dataset of demonstrations; .*"),
-        (lambda p: edit_meta(p, checksum=None), r"is not complete; resume it with .*"),
-        (lambda p: edit_meta(p, scene_version="old"), r"was recorded in scene 'old', this is nico"),
+        (lambda p: edit(p / "dataset.json", checksum=None), r"is not complete; resume it with .*"),
+        (
+            lambda p: edit(p / "dataset.json", scene_version="old"),
+            r"was recorded in scene 'old', this is nico",
+        ),
     ],
 )
 def test_what_is_not_whole_is_refused_in_one_line(copy, damage, message):
@@ -66,6 +60,162 @@ def test_what_says_how_to_read_the_tensors_is_not_believed(recorded, copy, meta)
         torch.testing.assert_close(found[key], expected[key], rtol=0, atol=0)
 
 
-def test_a_folder_that_is_missing_is_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"there is no dataset at .*nowhere; record it again"):
-        load_demonstrations(tmp_path / "nowhere")
+TASKS = ("grasp_glass", "push_green_to_white")
+
+
+def episode_of(length, seed=0, keys=("pixels", "action", "state")):
+    """An episode of noise."""
+    rng = np.random.default_rng([seed, length])
+    episode = {
+        "pixels": rng.integers(0, 256, (length, 32, 64, 3), dtype=np.uint8),
+        "action": rng.uniform(-1, 1, (length - 1, 4)),
+        "state": rng.normal(size=(length, 16)),
+    }
+    return {key: episode[key] for key in keys}
+
+
+def episodes_of(**options):
+    """Three episodes of one task, four of another."""
+    return {
+        TASKS[0]: [episode_of(length, **options) for length in (5, 3, 4)],
+        TASKS[1]: [episode_of(length, **options) for length in (2, 7, 6, 3)],
+    }
+
+
+def write(path, episodes, **options):
+    return write_demonstrations(
+        path, episodes, **{"scene": "nico", "held_out_per_task": 1} | options
+    )
+
+
+@pytest.mark.parametrize("keys", [("pixels",), ("pixels", "action"), ("pixels", "state")])
+def test_a_dataset_has_the_given_entries_in_order_and_zeros_beyond_them(tmp_path, keys):
+    episodes = episodes_of(keys=keys)
+    write(tmp_path / "own", episodes)
+    dataset = load_demonstrations(tmp_path / "own")
+
+    assert {*dataset.keys()} == {*keys, "length", "task", "train", "seed"}
+    assert dataset["length"].tolist() == [5, 3, 4, 2, 7, 6, 3]
+    assert dataset["task"].tolist() == [0, 0, 0, 1, 1, 1, 1]
+    assert dataset["train"].tolist() == [True, True, False, True, True, True, False]
+    assert dataset["pixels"].shape == (7, 7, 32, 64, 3)
+    for row, episode in zip(dataset, episodes[TASKS[0]] + episodes[TASKS[1]], strict=True):
+        for key, values in episode.items():
+            expected = torch.from_numpy(values).to(row[key].dtype)
+            assert row[key][: len(values)].equal(expected)
+            assert not row[key][len(values) :].any()
+    assert read_meta(tmp_path / "own")["tasks"] == [*TASKS]
+
+
+def test_recorded_demonstrations_written_again_are_the_same_dataset(recorded, tmp_path):
+    shown = load_demonstrations(recorded)
+    names = read_meta(recorded)["tasks"]
+    episodes = {name: [] for name in names}
+    for row in shown:
+        length = int(row["length"])
+        taken = {"pixels": length, "action": length - 1, "state": length}
+        values = {key: row[key][:n].numpy() for key, n in taken.items()}
+        episodes[names[int(row["task"])]].append(values)
+
+    again = write(tmp_path / "again", episodes)
+
+    longest = int(shown["length"].max())
+    for key in ("pixels", "state"):
+        assert again[key].equal(shown[key][:, :longest])
+    assert again["action"].equal(shown["action"][:, : longest - 1])
+    for key in ("length", "task", "train"):
+        assert again[key].equal(shown[key])
+
+
+class OnDemand(Sequence):
+    """Episodes that are made when they are indexed."""
+
+    def __len__(self):
+        return 3
+
+    def __getitem__(self, number):
+        return {key: torch.from_numpy(v) for key, v in episode_of(number + 2).items()}
+
+
+def test_episodes_may_be_tensors_that_are_loaded_on_demand(tmp_path):
+    lazy = write(tmp_path / "lazy", {TASKS[0]: OnDemand()})
+    eager = write(tmp_path / "eager", {TASKS[0]: [episode_of(n) for n in (2, 3, 4)]})
+    assert (lazy == eager).all()
+
+
+def changed(**entries):
+    """Episodes of which the third of the second task is changed; None removes an entry."""
+    episodes = episodes_of()
+    episode = {**episodes[TASKS[1]][2], **entries}
+    episodes[TASKS[1]][2] = {key: value for key, value in episode.items() if value is not None}
+    return episodes
+
+
+def missing():
+    episodes = episodes_of()
+    episodes[TASKS[1]][2] = None
+    return episodes
+
+
+NAMED = "episode 2 of 'push_green_to_white' "
+
+
+@pytest.mark.parametrize(
+    ("episodes", "cause", "remedy"),
+    [
+        (missing(), NAMED + "is missing", "leave the episode out"),
+        (changed(pixels=None), NAMED + "has 'action', 'state'", "give 'pixels'"),
+        (changed(actions=0), NAMED + "has 'pixels'", "give 'pixels', and if known 'action'"),
+        (changed(action=None), NAMED + "has 'pixels', 'state'", "of all episodes or of none"),
+        (
+            changed(pixels=np.zeros((6, 48, 64, 3), np.uint8)),
+            NAMED + "has frames of 48 x 64 pixels, the scene 'nico' of 32 x 64",
+            "resize_frames",
+        ),
+        (changed(pixels=np.zeros((6, 32, 64, 3))), NAMED + "has pixels float64", "give uint8"),
+        (changed(pixels=np.zeros((6, 32, 64), np.uint8)), "[6, 32, 64]", "[T, H, W, 3]"),
+        (changed(pixels=np.zeros((1, 32, 64, 3), np.uint8)), "[1, 32, 64, 3]", "two frames"),
+        (changed(action=np.zeros((6, 4))), NAMED + "has the action float64 [6, 4]", "[5, 4]"),
+        (changed(action=np.zeros((5, 3))), "[5, 3]", "give [5, 4] numbers"),
+        (changed(action=[["left"] * 4] * 5), "has the action", "give [5, 4] numbers"),
+        (changed(action=np.full((5, 4), -1.5)), "an action of size 1.5", "scale actions"),
+        (changed(action=np.full((5, 4), np.nan)), "not finite", "mend it"),
+        (changed(state=np.zeros((6, 15))), "has the state", "give [6, 16] numbers"),
+        ({}, "there are no episodes", "give some"),
+        ({**episodes_of(), "push_green_to_glass": []}, "no episode of", "leave the task out"),
+        ({"grasp_glass": [episode_of(3)]}, "'grasp_glass' has 1 episodes", "lower held_out"),
+        ({"juggle": [episode_of(3)] * 2}, "no task 'juggle'", "add it first"),
+    ],
+)
+def test_invalid_episodes_are_refused_before_anything_is_written(
+    tmp_path, refused, episodes, cause, remedy
+):
+    refused(lambda: write(tmp_path / "made" / "own", episodes), cause, remedy)
+
+
+@pytest.mark.parametrize("options", [{"held_out_per_task": -1}, {"spread": 1.5}, {"scene": "mars"}])
+def test_invalid_arguments_are_refused_before_anything_is_written(tmp_path, options):
+    with pytest.raises(ValueError):
+        write(tmp_path / "own", episodes_of(), **options)
+    assert not [*tmp_path.iterdir()]
+
+
+def test_a_folder_that_exists_is_kept_as_it_is(tmp_path):
+    write(tmp_path / "own", episodes_of())
+    before = contents(tmp_path)
+    with pytest.raises(ValueError, match="exists: choose another folder, or remove it"):
+        write(tmp_path / "own", episodes_of(seed=1))
+    assert contents(tmp_path) == before
+
+
+def test_resized_frames_are_means_of_areas():
+    frame = np.arange(2 * 4 * 3, dtype=np.uint8).reshape(1, 2, 4, 3)
+    # The means of (0, 3, 12, 15) and (6, 9, 18, 21), of the first channel.
+    assert resize_frames(frame, (1, 2)).tolist() == [[[[8, 8, 10], [14, 14, 16]]]]
+
+
+@given(arrays(np.uint8, (3, 4, 6, 3)), st.integers(1, 3), st.integers(1, 3))
+def test_resizing_keeps_enlarged_frames(frames, by_height, by_width):
+    large = frames.repeat(by_height, 1).repeat(by_width, 2)
+    np.testing.assert_array_equal(resize_frames(large, (4, 6)), frames)
+    np.testing.assert_array_equal(resize_frames(frames, large.shape[1:3]), large)

@@ -1,9 +1,5 @@
-import json
 import re
-import runpy
 import shutil
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,19 +11,10 @@ from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.scenes.nico import scene as nico_scene
 from suites import nico
 from suites.nico.demonstrator import Demonstrator
+from tests.helpers import contents, edit
 
 TINY = {"per_task": 3, "held_out_per_task": 1, "progress": False}
 KEYS = {"pixels", "state", "action", "length", "task", "train", "seed"}
-
-
-def contents(path: Path) -> dict[str, bytes]:
-    return {file.name: file.read_bytes() for file in path.iterdir()}
-
-
-def edit_meta(path: Path, **changes: object) -> None:
-    file = path / "dataset.json"
-    meta = {**json.loads(file.read_text()), **changes}
-    file.write_text(json.dumps({k: v for k, v in meta.items() if v is not None}))
 
 
 def test_recording_returns_what_loading_does(recorded):
@@ -72,14 +59,6 @@ def test_each_demonstration_does_its_task(recorded):
             assert (green[row, 0] - target[row, 0])[:2].norm() > 0.1
 
 
-def test_tasks_and_held_out_ones_are_marked(recorded):
-    dataset = load_demonstrations(recorded)
-
-    assert dataset["task"].tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 2]
-    assert dataset["train"].tolist() == [True, True, False] * 3
-    assert dataset["seed"].tolist() == [0] * 9
-
-
 def test_play_follows_a_demonstration_and_then_moves_at_random(tmp_path):
     options = {"per_task": 6, "held_out_per_task": 1, "progress": False}
     play = record_demonstrations(tmp_path / "play", play=True, **options)
@@ -102,15 +81,6 @@ def test_play_follows_a_demonstration_and_then_moves_at_random(tmp_path):
     again = record_demonstrations(tmp_path / "again", play=True, **options)
     for key in KEYS:
         assert again[key].equal(play[key])
-
-
-def test_demonstrations_differ_from_each_other_and_between_seeds(recorded, tmp_path):
-    starts = load_demonstrations(recorded)["state"][:, 0]
-    other = record_demonstrations(
-        tmp_path, tasks=["grasp_glass"], per_task=1, held_out_per_task=0, seed=1, progress=False
-    )
-
-    assert len(torch.cat([starts, other["state"][:, 0]]).unique(dim=0)) == 10
 
 
 def test_a_demonstration_that_fails_is_tried_again(tmp_path, monkeypatch):
@@ -194,20 +164,15 @@ def test_missing_rows_are_recorded_again(recorded, copy):
     pixels = np.memmap(copy / "pixels.memmap", np.uint8, "r+").reshape(9, -1)
     pixels[8, :1000] = 7  # as after a kill in the middle of a row
     pixels.flush()
-    edit_meta(copy, checksum=None)
+    edit(copy / "dataset.json", checksum=None)
 
     record_demonstrations(copy, **TINY)
 
     assert contents(copy) == contents(recorded)
 
 
-@pytest.mark.parametrize(
-    "wrong", [{"seed": 1}, {"per_task": 4}, {"held_out_per_task": 2}, {"tasks": ["grasp_glass"]}]
-)
-@pytest.mark.parametrize("complete", [True, False])
-def test_another_recording_is_not_continued(copy, wrong, complete):
-    if not complete:
-        edit_meta(copy, checksum=None)
+@pytest.mark.parametrize("wrong", [{"seed": 1}, {"tasks": ["grasp_glass"]}])
+def test_another_recording_is_not_continued(copy, wrong):
     before = contents(copy)
 
     with pytest.raises(ValueError, match=r"holds another recording .*; choose another folder or"):
@@ -219,13 +184,9 @@ def test_another_recording_is_not_continued(copy, wrong, complete):
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"held_out_per_task": 3}, r"^held_out_per_task is 3: it must be less than per_task, 3$"),
-        ({"held_out_per_task": -1}, r"^held_out_per_task is -1: .*$"),
-        ({"per_task": 0}, r"^held_out_per_task is 1: it must be less than per_task, 0$"),
-        (
-            {"tasks": ["juggle"]},
-            r"^the scene 'nico' has no task 'juggle': choose .*$",
-        ),
+        ({"held_out_per_task": 3}, "held_out_per_task is 3: it must be less than per_task, 3"),
+        ({"per_task": 0}, "held_out_per_task is 1: it must be less than per_task, 0"),
+        ({"seed": -1}, "seed must be at least 0"),
     ],
 )
 def test_wrong_arguments_are_refused_before_anything_is_written(tmp_path, wrong, message):
@@ -243,15 +204,3 @@ def test_a_full_disk_is_noticed_before_recording(tmp_path, monkeypatch):
         record_demonstrations(tmp_path, **TINY)
 
     assert not list(tmp_path.iterdir())
-
-
-def test_the_command_ends_user_errors_in_one_line(recorded, monkeypatch, capsys):
-    size = ["--per-task", "3", "--held-out-per-task", "1"]
-    monkeypatch.setattr(sys, "argv", ["recording", str(recorded), *size, "--seed", "1"])
-    monkeypatch.delitem(sys.modules, "bgpo_trl.data.recording")  # which runpy would warn of
-    with pytest.raises(SystemExit) as ended:
-        runpy.run_module("bgpo_trl.data.recording", run_name="__main__", alter_sys=True)
-
-    assert ended.value.code.startswith(f"error: {recorded} holds another recording")
-    assert "\n" not in ended.value.code
-    assert capsys.readouterr() == ("", "")

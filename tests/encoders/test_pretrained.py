@@ -1,36 +1,33 @@
-"""Encoders and the bank of their embeddings, which are made and loaded together."""
+"""Encoders and the bank of their embeddings, which are made, shipped and loaded together."""
 
 import json
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 
-from bgpo_trl.configs import (
-    InverseModelConfig,
-    RepresentationConfig,
-    SequenceAutoencoderConfig,
-    VAEConfig,
-)
 from bgpo_trl.data.dataset import load_demonstrations
+from bgpo_trl.encoders import pretrained
 from bgpo_trl.encoders.pretrained import load_pretrained
-from bgpo_trl.encoders.representation import save_representation
+from bgpo_trl.encoders.representation import load_representation, save_representation
 from bgpo_trl.encoders.train import make_pretrained
+from bgpo_trl.experiments import run as experiment
+from bgpo_trl.experiments.run import pretrained_for
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
+from bgpo_trl.runs.config_file import Digests
+from bgpo_trl.runs.demonstrations import BANK, keep_inputs, load_inputs, own_weights
 from bgpo_trl.scenes import SCENES
 from bgpo_trl.scenes.nico import NICO
 from suites import nico
+from tests.helpers import TINY_ENCODERS
 
-TINY = RepresentationConfig(
-    vae=VAEConfig(steps=2, batch_size=4, warmup_steps=1),
-    lae=SequenceAutoencoderConfig(steps=2, batch_size=4, warmup_steps=1),
-    inverse=InverseModelConfig(hidden_size=8, batch_size=8, steps=4, warmup_steps=1),
-)
-TASKS = nico.PAPER_TASKS[::-1]
+TASKS = nico.PAPER_TASKS
+REVERSED = TASKS[::-1]
 ARGUMENTS = {
-    "config": TINY,
-    "tasks": TASKS,
+    "config": TINY_ENCODERS,
+    "tasks": REVERSED,
     "per_task": 3,
     "held_out_per_task": 1,
     "progress": False,
@@ -65,24 +62,11 @@ def test_made_encoders_and_bank_are_loaded(made, folder):
     loaded_encoders, loaded_bank = load_pretrained(folder / "encoders" / "some.safetensors")
     assert loaded_encoders.identity == encoders.identity
     assert loaded_encoders.metadata["command"] == "a command"
-    assert loaded_bank.tasks == bank.tasks == TASKS
+    assert loaded_bank.tasks == bank.tasks == REVERSED
     for recorded in ("demonstrations", "demonstrations-play"):
-        assert json.loads((folder / recorded / "dataset.json").read_text())["tasks"] == [*TASKS]
+        assert json.loads((folder / recorded / "dataset.json").read_text())["tasks"] == [*REVERSED]
     for name in ("embedding", "task", "train"):
         assert getattr(loaded_bank, name).equal(getattr(bank, name))
-
-
-def test_the_bank_holds_the_embedding_of_each_demonstration(made, folder):
-    encoders, bank = made
-    demonstrations = load_demonstrations(folder / "demonstrations")
-    assert bank.task.tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 2]
-    assert bank.train.tolist() == [True, True, False] * 3
-    for row, demonstration in enumerate(demonstrations):
-        length = int(demonstration["length"])
-        latent = encoders.vae.latent(demonstration["pixels"][:length])
-        phi = encoders.lae.encode(latent[None], torch.tensor([length]))[0]
-        torch.testing.assert_close(bank.embedding[row], phi, rtol=1e-4, atol=1e-5)
-    assert len(bank.embedding.unique(dim=0)) == 9
 
 
 def test_the_same_command_records_and_trains_nothing_again(made, folder, monkeypatch):
@@ -124,3 +108,128 @@ def test_files_that_do_not_belong_together_are_refused(made, copy, monkeypatch):
     copy.with_name("some_bank.safetensors").unlink()
     with pytest.raises(ValueError, match="no demonstration bank"):
         load_pretrained(copy)
+
+
+@pytest.mark.parametrize(
+    ("tasks", "name"),
+    [
+        (nico.PAPER_TASKS, "nico"),
+        (("grasp_glass",), "nico"),
+        (("juggle", "grasp_glass"), "nico"),
+        (nico.ALL_TASKS, "nico_eight"),
+        (("press_white",), "nico_eight"),
+        (("juggle", "press_white"), "nico_eight"),
+    ],
+)
+def test_tasks_outside_the_paper_use_the_encoders_of_eight_tasks(tasks, name):
+    path = pretrained.default_weights(tasks)
+    assert path.parts[-3:] == ("bgpo_trl", "weights", f"{name}.safetensors")
+    encoders, bank = load_pretrained(tasks=tasks)
+    assert encoders.identity == load_representation(path).identity
+    assert {*tasks} - {"juggle"} <= {*bank.tasks}
+
+
+def test_a_bank_is_used_with_the_encoders_that_embedded_it(tmp_path):
+    path = tmp_path / "bank.safetensors"
+    for tasks in (nico.PAPER_TASKS, nico.ALL_TASKS):
+        weights = pretrained.default_weights(tasks)
+        shutil.copy(pretrained.bank_path(weights), path)
+        assert pretrained.weights_of_bank(path) == weights
+        encoders, bank = pretrained_for(nico.PAPER_TASKS, path)
+        assert encoders.identity == load_representation(weights).identity
+        assert bank.tasks == nico.PAPER_TASKS
+
+
+def test_an_unreadable_bank_gets_the_default_encoders(tmp_path: Path):
+    assert pretrained.weights_of_bank(tmp_path / "nothing") == pretrained.default_weights()
+    (tmp_path / "rubbish").write_bytes(b"rubbish")
+    assert pretrained.weights_of_bank(tmp_path / "rubbish") == pretrained.default_weights()
+
+
+@pytest.fixture(scope="module")
+def shipped():
+    return load_pretrained()
+
+
+@pytest.fixture(scope="module")
+def mixed(shipped):
+    """Demonstrations of a shipped task and of another name."""
+    bank = shipped[1]
+    own = replace(bank.for_tasks([TASKS[0]]), tasks=("juggle",))
+    return (own + bank.for_tasks([TASKS[1]])).for_tasks([TASKS[1], "juggle"])
+
+
+@pytest.mark.parametrize("tasks", [TASKS, TASKS[1:], TASKS[::-1]])
+def test_shipped_demonstrations_are_not_copied(shipped, tmp_path, tasks):
+    encoders, bank = shipped
+    bank = bank.for_tasks(tasks)
+    keep_inputs(tmp_path, bank, encoders)
+    assert list(tmp_path.iterdir()) == []
+    found = load_inputs(tmp_path, tasks, Digests(encoders.identity, bank.identity))[1]
+    assert (found.tasks, found.identity) == (tasks, bank.identity)
+
+
+def test_own_demonstrations_move_with_the_run(shipped, mixed, tmp_path):
+    encoders, _ = shipped
+    (tmp_path / "run").mkdir()
+    keep_inputs(tmp_path / "run", mixed, encoders)
+    shutil.move(tmp_path / "run", tmp_path / "moved")
+    digests = Digests(encoders.identity, mixed.identity)
+    found = load_inputs(tmp_path / "moved", mixed.tasks, digests)[1]
+    assert found.tasks == mixed.tasks
+    for name in ("embedding", "task", "train"):
+        assert getattr(found, name).equal(getattr(mixed, name))
+    assert found.identity == mixed.identity
+    shutil.rmtree(tmp_path / "moved")
+
+
+def test_demonstrations_of_another_run_are_refused(shipped, mixed, tmp_path):
+    encoders, bank = shipped
+    digests = Digests(encoders.identity, mixed.identity)
+    with pytest.raises(ValueError, match=r"^the bank has no demonstration of 'juggle'"):
+        load_inputs(tmp_path, mixed.tasks, digests)
+    with pytest.raises(
+        ValueError,
+        match=rf"demonstrations {mixed.identity[:12]}, not with .*: put its own at .*run",
+    ) as error:
+        load_inputs(tmp_path / "run", TASKS, digests)
+    assert str(error.value).endswith(str(tmp_path / "run" / BANK))
+    earlier = Digests(encoders.identity, None)  # Runs of earlier versions did not say.
+    assert load_inputs(tmp_path, TASKS, earlier)[1].identity == bank.identity
+
+
+ONE, TWO, THREE = TASKS
+
+
+@pytest.fixture
+def own(bank, encoders, monkeypatch, tmp_path):
+    """Path of a bank of two tasks, one of them shipped under the same name."""
+    bank = replace(bank, encoder_id=encoders.identity)
+    monkeypatch.setattr(experiment, "load_pretrained", lambda *_, **__: (encoders, bank))
+    path = tmp_path / "own.safetensors"
+    other = replace(bank, embedding=bank.embedding + 1)
+    renamed = replace(other.for_tasks([ONE, TWO]), tasks=("juggle", TWO))
+    renamed.save(path)
+    return path
+
+
+def test_tasks_that_the_bank_lacks_are_taken_from_the_package(own, bank):
+    found = experiment.pretrained_for(["juggle", TWO, THREE], own)[1]
+    assert found.tasks == ("juggle", TWO, THREE)
+    for task, name, offset in ((0, ONE, 1), (1, TWO, 1), (2, THREE, 0)):
+        shipped = bank.for_tasks([name])
+        assert found.of_task(task).embedding.equal(shipped.embedding + offset)
+        assert found.of_task(task).train.equal(shipped.train)
+    assert experiment.pretrained_for([TWO])[1].embedding.equal(bank.for_tasks([TWO]).embedding)
+
+
+def test_other_encoders_and_a_changed_scene_are_told_apart(shipped, tmp_path):
+    encoders, bank = shipped
+    foreign = replace(encoders, metadata={**encoders.metadata, "scene_version": "mars-1"})
+    own_weights(tmp_path).parent.mkdir()
+    save_representation(foreign, own_weights(tmp_path))
+    digests = Digests(foreign.identity, bank.identity)
+    with pytest.raises(ValueError, match=r"was trained in the scene mars-1, this is .*: use the"):
+        load_inputs(tmp_path, TASKS, digests)
+    with pytest.raises(ValueError, match=r"was trained with the encoders 0123, not with .*: put"):
+        load_inputs(tmp_path, TASKS, digests._replace(encoders="0123"))

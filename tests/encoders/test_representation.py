@@ -2,7 +2,7 @@
 
 import csv
 import json
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -25,15 +25,14 @@ from bgpo_trl.encoders.representation import (
     load_representation,
     mean_frame,
     retrain_inverse,
-    save_representation,
     split,
     train_representation,
     valid_frames,
 )
 from bgpo_trl.encoders.train import train_encoders
-from bgpo_trl.modules.vae import VAE
 from bgpo_trl.scenes.nico import NICO
 from suites import nico
+from tests.helpers import TINY_ENCODERS
 
 CONFIG = RepresentationConfig(
     vae=VAEConfig(
@@ -49,13 +48,7 @@ CONFIG = RepresentationConfig(
     inverse=InverseModelConfig(hidden_size=64, batch_size=128, steps=300, warmup_steps=10),
     checkpoint_every=50,
 )
-TINY = RepresentationConfig(
-    vae=VAEConfig(batch_size=4, window=2, steps=4, warmup_steps=1),
-    lae=SequenceAutoencoderConfig(batch_size=4, steps=4, warmup_steps=1),
-    inverse=InverseModelConfig(hidden_size=8, batch_size=8, steps=4, warmup_steps=1),
-    checkpoint_every=1,
-    log_every=2,
-)
+TINY = replace(TINY_ENCODERS, checkpoint_every=1, log_every=2)
 DIRECTIONS = np.array([[1, 0, 0, 0], [-1, 0, 0, 1], [0, 1, -1, 0]])  # of both squares, by task
 
 
@@ -235,27 +228,6 @@ def test_the_inverse_model_alone_is_trained_as_with_the_other_encoders(tmp_path:
     assert not (tmp_path / "nothing").exists()
 
 
-@pytest.mark.parametrize("with_play", [False, True])
-def test_no_inverse_model_is_learned_from_episodes_without_actions(with_play, tmp_path) -> None:
-    shown, filmed = squares(8), squares(8, seed=1).exclude("action")
-    parts = (shown, filmed) if with_play else (filmed, None)
-    options = {"scene_version": "squares", "progress": False}
-    found = train_representation(parts[0], TINY, play=parts[1], **options)
-
-    assert found.inverse is None
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(TINY.seed)
-        initial = VAE(TINY.vae.latent_size, 1)
-    for name in ("weight", "bias"):
-        head, before = found.vae.inverse_head, initial.inverse_head
-        assert getattr(head, name).equal(getattr(before, name))
-    save_representation(found, tmp_path / "weights")
-    loaded = load_representation(tmp_path / "weights")
-    assert loaded.inverse is None and loaded.identity == found.identity
-    with pytest.raises(ValueError, match="learns from actions, which this play lacks"):
-        retrain_inverse(found, filmed, TINY, progress=False)
-
-
 def test_training_writes_weights_log_and_probes(tmp_path: Path) -> None:
     folder, weights = tmp_path / "run", tmp_path / "weights.safetensors"
     play = squares(10)
@@ -284,39 +256,3 @@ def test_configurations_and_datasets_that_cannot_be_trained_on_are_refused() -> 
         train_representation(squares(8), config, scene_version="squares", progress=False)
     with pytest.raises(ValueError, match="held-out"):
         split(squares(8).set("train", torch.ones(8, dtype=torch.bool)))
-
-
-def test_save_and_load(tiny: Representation, tmp_path: Path) -> None:
-    path = tmp_path / "new" / "weights.safetensors"
-    save_representation(tiny, path)
-    loaded = load_representation(path, scene_version="squares")
-    assert same(tiny, loaded)
-    pixels = squares(2)["pixels"]
-    assert torch.equal(loaded.vae.latent(pixels), tiny.vae.latent(pixels))
-    assert loaded.metadata == tiny.metadata
-    assert loaded.metadata["command"] == "make weights"
-    assert loaded.metadata["seed"] == "0"
-    assert json.loads(loaded.metadata["config"]) == asdict(TINY)
-    for made in (tiny, loaded):
-        for module in (made.vae, made.lae, made.inverse):
-            assert not module.training
-            assert not any(p.requires_grad for p in module.parameters())
-    assert [file.name for file in path.parent.iterdir()] == ["weights.safetensors"]
-
-
-def test_missing_damaged_and_foreign_weights_are_refused(
-    tiny: Representation, tmp_path: Path
-) -> None:
-    path = tmp_path / "w.safetensors"
-    with pytest.raises(ValueError, match=r"no encoder weights.*--train-encoders"):
-        load_representation(path)
-    save_representation(tiny, path)
-    with pytest.raises(ValueError, match=r"scene squares, this is scene nico-2"):
-        load_representation(path, scene_version="nico-2")
-    content = path.read_bytes()
-    flipped = bytearray(content)
-    flipped[len(content) // 2] ^= 1
-    for damaged in (b"", b"not weights", content[: len(content) // 2], bytes(flipped)):
-        path.write_bytes(damaged)
-        with pytest.raises(ValueError, match="damaged"):
-            load_representation(path)

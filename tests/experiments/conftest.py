@@ -13,7 +13,7 @@ from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.encoders import pretrained
 from bgpo_trl.experiments import measure, privileged_information, settings
 from bgpo_trl.experiments import run as experiment
-from bgpo_trl.figures import groups, of_run
+from bgpo_trl.figures import groups, gwr
 from bgpo_trl.policy import LoadedRun
 from bgpo_trl.training import Trainer
 from suites import nico
@@ -45,7 +45,7 @@ def tiniest(tiny, monkeypatch):
         path.parent.mkdir(exist_ok=True)
         path.touch()
 
-    for module in (measure, groups, of_run):
+    for module in (measure, groups, gwr):
         monkeypatch.setattr(module, "save_figure", touch)
         for name in dir(module):
             if name.startswith("plot_"):
@@ -84,7 +84,7 @@ def finished_runs(bank, encoders, make_config, tmp_path_factory):
 def shipped(encoders, monkeypatch):
     """Untrained encoders in place of those that come with the package."""
     place = "bgpo_trl.runs.demonstrations.load_representation"
-    monkeypatch.setattr(place, lambda path, scene_version: encoders)
+    monkeypatch.setattr(place, lambda path: encoders)
 
 
 @pytest.fixture

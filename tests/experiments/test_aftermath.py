@@ -15,6 +15,7 @@ from bgpo_trl.experiments.nico.scripted import play
 from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
 from bgpo_trl.runs.results import read_table
 from suites import nico
+from tests.helpers import cells
 
 NUMBER = aftermath._NUMBER
 in_every_task = pytest.mark.parametrize("task", nico.ALL_TASKS)
@@ -48,30 +49,9 @@ def test_successes_of_demonstrators_last(task):
         assert distance > {"lift": 0.1, "displacement": 0.03}[CRITERIA[task].distance]
 
 
-@pytest.mark.parametrize(
-    ("other", "task"), [("push_glass_right", "grasp_glass"), ("push_green_to_white", "lift_green")]
-)
-def test_an_object_that_is_only_touched_is_not_lifted(other, task):
-    pushed = demonstrated(other)
-    name = "glass" if task == "grasp_glass" else "green_box"
-    assert Continuation().begin(pushed.end).touching("hand", name)
-    holds, lift = outcome(task, pushed)
-    assert not holds
-    assert lift < 0.01
-
-
-def test_an_object_that_is_thrown_up_is_not_lifted():
-    def throw(physics):
-        physics.named.data.qpos["glass"][:3] += [0.0, 0.3, 0.2]  # out of the hand's reach
-        physics.named.data.qvel["glass"][2] = 12.0  # in the air until 2.4 s later
-
-    pushed = demonstrated("push_glass_right")
-    thrown = ending(pushed, throw)
-    then = Continuation()
-    then.begin(thrown)
-    then.act(np.zeros(4), 11)  # of the faster raises, and the second after them
-    assert then.physics.object_position("glass")[2] > 1
-    assert outcome("grasp_glass", pushed, end=thrown) == (False, 0.0)
+def throw(physics):
+    physics.named.data.qpos["glass"][:3] += [0.0, 0.3, 0.2]  # out of the hand's reach
+    physics.named.data.qvel["glass"][2] = 12.0  # in the air until 2.4 s later
 
 
 def apart(velocity, distance=0.0):
@@ -81,26 +61,9 @@ def apart(velocity, distance=0.0):
         away /= np.linalg.norm(away)
         physics.named.data.qpos["green_box"][:3] += distance * away
         physics.named.data.qvel["green_box"][:3] += velocity * away
-        physics.named.data.qpos["shoulder_pitch"] += 1.0  # The hand is no longer in the way.
-        physics.named.data.ctrl["shoulder_pitch"] += 1.0
+        raise_arm(physics)  # The hand is no longer in the way.
 
     return change
-
-
-@pytest.mark.parametrize(
-    ("change", "together"),
-    [
-        (apart(0.0), True),
-        (apart(0.0, 0.01), True),
-        (apart(0.0, 0.025), False),
-        (apart(1.0), False),  # They touch, and part.
-    ],
-)
-def test_objects_pushed_together_have_to_stay_together(change, together):
-    pushed = demonstrated("push_green_to_glass")
-    holds, gap = outcome("push_green_to_glass", pushed, end=ending(pushed, change))
-    assert holds == together
-    assert (gap <= 0.015) == together
 
 
 def topple(physics):
@@ -110,30 +73,32 @@ def topple(physics):
 
 def slide(physics):
     physics.named.data.qvel["glass"][0] = 3.0  # along the table, and off it
+    raise_arm(physics)
+
+
+def raise_arm(physics):
     physics.named.data.qpos["shoulder_pitch"] += 1.0
     physics.named.data.ctrl["shoulder_pitch"] += 1.0
 
 
-@pytest.mark.parametrize("change", [topple, slide])
-def test_an_object_that_falls_or_slides_is_not_pushed_aside(change):
-    pushed = demonstrated("push_glass_right")
-    assert not outcome("push_glass_right", pushed, end=ending(pushed, change)).holds
-
-
-def test_a_moving_object_does_not_stand():
-    physics = Continuation().begin(demonstrated("press_white").start)
-    assert all(aftermath.stands(physics, name) for name in nico.OBJECTS)
-    physics.named.data.qvel["glass"][1] = 0.03
-    assert [aftermath.stands(physics, name) for name in nico.OBJECTS] == [False, True, True]
-
-
-def test_a_push_to_the_other_side_does_not_count():
-    pushed = demonstrated("push_white_left")
-    left = outcome("push_white_left", pushed)
-    right = outcome("push_white_right", pushed)
-    assert left.holds and not right.holds
-    assert right.distance == -left.distance
-    assert not outcome("push_white_left", pushed, end=pushed.start).holds
+@pytest.mark.parametrize(
+    ("task", "shown", "change", "lasts"),
+    [
+        ("grasp_glass", "push_glass_right", lambda _: None, False),  # only touched
+        ("grasp_glass", "push_glass_right", throw, False),
+        ("lift_green", "push_green_to_white", lambda _: None, False),
+        ("push_green_to_glass", "push_green_to_glass", apart(0.0, 0.01), True),
+        ("push_green_to_glass", "push_green_to_glass", apart(0.0, 0.025), False),
+        ("push_green_to_glass", "push_green_to_glass", apart(1.0), False),  # they touch, and part
+        ("push_glass_right", "push_glass_right", topple, False),
+        ("push_glass_right", "push_glass_right", slide, False),
+        ("push_white_right", "push_white_left", lambda _: None, False),
+        ("press_white", "press_white", raise_arm, False),
+    ],
+)
+def test_a_success_has_to_last(task, shown, change, lasts):
+    episode = demonstrated(shown)
+    assert outcome(task, episode, end=ending(episode, change)).holds == lasts
 
 
 def test_an_object_that_comes_back_is_not_pushed_aside():
@@ -144,25 +109,13 @@ def test_an_object_that_comes_back_is_not_pushed_aside():
         start = Continuation().begin(pushed.start).object_position("white_box")
         physics.named.data.qpos["white_box"][:2] += start[:2]
         physics.named.data.qpos["white_box"][:2] /= 2
-        physics.named.data.qpos["shoulder_pitch"] += 1.0
-        physics.named.data.ctrl["shoulder_pitch"] += 1.0
+        raise_arm(physics)
 
     # Success with the box at its farthest; the box then returns while nothing is done.
     wait, then.act = then.act, lambda *_: pull(then.physics) or wait(*_)
     holds, displacement = CRITERIA["push_white_left"].judge(then, pushed)
     assert aftermath.stands(then.physics, "white_box")
     assert not holds and displacement > 0
-
-
-def test_a_raised_fist_does_not_press():
-    pressed = demonstrated("press_white")
-
-    def rise(physics):
-        physics.named.data.qpos["shoulder_pitch"] += 1.0
-        physics.named.data.ctrl["shoulder_pitch"] += 1.0
-
-    holds, gap = outcome("press_white", pressed, end=ending(pressed, rise))
-    assert not holds and gap > 0.05
 
 
 def test_a_continuation_equals_the_environment():
@@ -246,9 +199,9 @@ def test_the_command_has_a_row_for_each_success(run_of, tmp_path):
     printed = aftermath.aftermath(
         AftermathArguments(run=run, demonstrators=True, episodes=1, out=out)
     )
-    table = [[cell.strip() for cell in x.split("|")[1:-1]] for x in printed.splitlines()[2:]]
+    table = cells(printed)[1:]
     actors = ("policy", "demonstrators", "random actions")
-    assert [cells[:2] for cells in table] == [
+    assert [row[:2] for row in table] == [
         [actor, task] for actor in actors for task in nico.PAPER_TASKS
     ]
     rows = read_table(out / "aftermath.csv")

@@ -2,12 +2,10 @@
 
 import os
 import runpy
-import subprocess
 import sys
 import warnings
 from pathlib import Path
 
-import mujoco
 import pytest
 import torch
 
@@ -15,10 +13,10 @@ from bgpo_trl import __main__ as bgpo
 from bgpo_trl.configs import BGPOConfig
 from bgpo_trl.experiments.arguments import Arguments
 from bgpo_trl.experiments.command_line import command_line
-from bgpo_trl.runs.logger import EVAL_COLUMNS
+from bgpo_trl.runs.directory import EVAL_COLUMNS
 from bgpo_trl.runs.results import read_json
 from suites import opengl
-from tests.folders import contents
+from tests.helpers import contents
 
 ROOT = Path(__file__).parents[2]
 
@@ -83,6 +81,7 @@ CASES = [
     ("bgpo privileged-information --out file", "cannot make the folder"),
     # runs that are read
     ("bgpo report", "name a run"),
+    ("bgpo report run empty", "--out: several folders are given"),
     ("bgpo report file", "file is not a directory"),
     ("bgpo report run", "run holds no test episode"),
     ("bgpo report damaged", "config.json is damaged"),
@@ -150,41 +149,15 @@ def test_a_wrong_flag_is_named(folder, monkeypatch, capsys, command, named):
     assert contents(folder) == before
 
 
-def test_a_folder_without_permission_is_refused(folder, monkeypatch):
-    def refuse(path, *args, **kwargs):
-        raise PermissionError(13, "Permission denied", str(path))
-
-    monkeypatch.setattr(Path, "mkdir", refuse)
-    before = contents(folder)
-    message = exit_code(monkeypatch, "bgpo continual --out elsewhere/run")
-    assert "elsewhere/run (Permission denied)" in message
-    assert contents(folder) == before
-
-
-def test_a_context_that_cannot_be_made_ends_a_run_in_one_line(folder, monkeypatch):
-    def refuse(*args, **kwargs):
-        raise ValueError("no display\nof any kind")
-
-    before = contents(folder)
-    monkeypatch.setattr(mujoco, "Renderer", refuse)
-    message = exit_code(monkeypatch, "bgpo concurrent --out new")
-    assert "(no display)" in message and "\n" not in message
-    assert contents(folder) == before
-
-
 @pytest.mark.parametrize(
     "command",
     [
-        "bgpo continual --out new",
         "bgpo continual --train-encoders --out new",
         "bgpo sweep --preset quick --out new",
         "bgpo tasks --pictures empty",
         "bgpo_trl.data.recording new",
         "suites.nico.explore --out new.gif",
-        "bgpo watch runs/bgpo",
-        "bgpo looking runs/bgpo",
-        "bgpo aftermath runs/bgpo",
-        "bgpo one-shot runs/bgpo",
+        *(f"bgpo {name} runs/bgpo" for name in ("watch", "looking", "aftermath", "one-shot")),
     ],
 )
 def test_without_opengl_a_command_that_renders_writes_nothing(
@@ -197,29 +170,6 @@ def test_without_opengl_a_command_that_renders_writes_nothing(
     assert message == "error: MUJOCO_GL is 'vulkan': do not set it"
     assert capsys.readouterr() == ("", "")
     assert contents(folder) == before
-
-
-def test_an_opengl_device_that_does_not_exist_is_refused_before_a_run_begins(tmp_path):
-    """In a process of its own, since dm_control looks for the device when it is imported."""
-    process = subprocess.run(
-        [sys.executable, str(ROOT / "benchmarks" / "concurrent_tasks.py"), "--out", "run"],
-        cwd=tmp_path,
-        env={
-            **os.environ,
-            "PYTHONPATH": str(ROOT),
-            "MUJOCO_GL": "egl",
-            "MUJOCO_EGL_DEVICE_ID": "99",
-        },
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-    assert process.returncode == 1
-    assert process.stderr.startswith("error: no OpenGL context from the egl backend (")
-    assert "unset MUJOCO_EGL_DEVICE_ID" in process.stderr
-    assert process.stderr.count("\n") == 1
-    assert not process.stdout
-    assert not list(tmp_path.iterdir())
 
 
 def test_an_interrupted_run_exits_with_the_status_for_another_try(capsys):

@@ -2,7 +2,6 @@
 
 import json
 import re
-import shutil
 import warnings
 from functools import partial
 
@@ -13,11 +12,10 @@ from bgpo_trl.experiments.nico.looking import looking
 from bgpo_trl.experiments.one_shot import OneShotArguments, one_shot
 from bgpo_trl.experiments.report import ReportArguments, report
 from bgpo_trl.experiments.watch import WatchArguments, watch
-from bgpo_trl.figures.of_run import draw_growth
+from bgpo_trl.figures.gwr import draw_growth
 from bgpo_trl.runs.config_file import read_config
 from suites import nico
-from tests.folders import contents
-from tests.foreign import CHECKPOINTS, put_checkpoint
+from tests.helpers import CHECKPOINTS, contents, put_checkpoint
 
 TASKS = nico.PAPER_TASKS
 FINAL = "seed,demonstrations,task,episodes,success,task_inference\n"
@@ -129,18 +127,12 @@ def test_final_tests_and_summary_are_optional_in_a_report(run):
 
 LOADED = {
     **damages("config.json"),
-    "no folder": shutil.rmtree,
-    "no checkpoint": lambda run: shutil.rmtree(run / "checkpoint"),
     **{
         f"a checkpoint that is {name}": partial(put_checkpoint, content=content)
         for name, content in CHECKPOINTS.items()
     },
     "edited settings": edit("config.json", eval_episodes=7),
     "no starts": edit("config.json", task_starts=[]),
-    "unknown tasks": edit("config.json", tasks=["juggle", "sleep", "dance"]),
-    "an unknown setting": edit("config.json", colour="red"),
-    "an unknown algorithm": edit("config.json", name="ppo", algorithm_class=None),
-    "other encoders": edit("config.json", encoders="0" * 64),
 }
 
 

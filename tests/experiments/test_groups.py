@@ -1,4 +1,4 @@
-"""Groups that form from demonstrations, and detection of unknown tasks, on the shipped bank."""
+"""Groups that form from demonstrations, and detection of unknown tasks."""
 
 import json
 
@@ -7,8 +7,16 @@ import torch
 
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.experiments import groups
-from bgpo_trl.experiments.unknown_task import UnknownTaskArguments, unknown_task
+from bgpo_trl.experiments.groups import (
+    Detection,
+    UnknownTaskArguments,
+    leave_one_out,
+    roc_area,
+    roc_curve,
+    unknown_task,
+)
 from bgpo_trl.transforms import TaskSchedule
+from tests.helpers import cells
 
 
 def test_draws_are_of_the_tasks_available():
@@ -33,12 +41,11 @@ def test_a_task_owns_a_group_if_most_of_both_are_in_common():
 @pytest.mark.parametrize("scale", [1.0, 0.1])
 def test_the_shipped_tasks_form_six_pure_groups_in_every_schedule(scale):
     table = groups.groups(groups.GroupsArguments(draws=900, seeds=(0,), scale=scale))
-    _, _, *rows = table.splitlines()
-    cells = [[cell.strip() for cell in row.split("|")[1:-1]] for row in rows]
+    rows = cells(table)[1:]
     schedules = ["one after the other", "in reverse", "the newest only", "from the start"]
-    assert [row[0] for row in cells] == schedules
-    assert all(row[1:3] == ["6", "100"] for row in cells)
-    assert all(1 < int(row[3]) <= 60 and float(row[6]) > 95 for row in cells)
+    assert [row[0] for row in rows] == schedules
+    assert all(row[1:3] == ["6", "100"] for row in rows)
+    assert all(1 < int(row[3]) <= 60 and float(row[6]) > 95 for row in rows)
 
 
 def test_each_shipped_task_is_detected_when_it_is_left_out(tmp_path):
@@ -48,3 +55,52 @@ def test_each_shipped_task_is_detected_when_it_is_left_out(tmp_path):
     for task, measured in found.items():
         assert measured["area"][0] > 0.95, task
     assert (tmp_path / "roc.png").stat().st_size > 1000
+
+
+def test_the_roc_area_equals_the_integral_of_the_roc_curve():
+    generator = torch.Generator().manual_seed(0)
+    known = torch.rand(50, generator=generator).round(decimals=1)  # with ties
+    unknown = torch.rand(30, generator=generator).round(decimals=1) * 1.2
+    false_alarms, detected = roc_curve(known, unknown)
+    assert (false_alarms[0], detected[0]) == (0, 0)
+    assert (false_alarms[-1], detected[-1]) == (1, 1)
+    expected = torch.trapezoid(detected, false_alarms)
+    torch.testing.assert_close(roc_area(known, unknown), expected)
+
+
+def test_detections_are_counted_by_network():
+    known = torch.tensor([[0.2, 0.8, 0.8, 1.4], [0.2, 0.2, 0.2, 1.0]])
+    unknown = torch.tensor([[1.5, 0.7], [1.2, 1.4]])
+    found = Detection(known, unknown)
+    assert found.false_alarms.tolist() == [0.25, 0.0]
+    assert found.detected.tolist() == [0.5, 1.0]
+    assert found.area.tolist() == [5 / 8, 1.0]
+
+
+def places(*centers, n=40, spread=0.05):
+    """A bank with one task around each center, every fourth demonstration held out."""
+    generator = torch.Generator().manual_seed(1)
+    task = torch.arange(len(centers)).repeat_interleave(n)
+    noise = spread * torch.randn(len(task), 2, generator=generator)
+    embedding = torch.tensor(centers)[task] + noise
+    train = torch.arange(len(task)) % 4 != 0
+    names = tuple(f"task{i}" for i in range(len(centers)))
+    return DemonstrationBank(embedding, task, train, names)
+
+
+def test_only_a_task_with_other_embeddings_is_detected():
+    apart = places((0.0, 0.0), (3.0, 0.0), (0.0, 3.0))
+    found = leave_one_out(apart, 2, seeds=[0, 1], draws=100)
+    assert found.known.shape == (2, 20) and found.unknown.shape == (2, 10)
+    assert found.area.tolist() == [1.0, 1.0]
+    assert found.detected.tolist() == [1.0, 1.0] and found.false_alarms.tolist() == [0.0, 0.0]
+    same = places((0.0, 0.0), (3.0, 0.0), (3.0, 0.0))
+    found = leave_one_out(same, 2, seeds=[0], draws=100)
+    assert 0.2 < found.area.item() < 0.8 and found.detected.item() == 0.0
+
+
+def test_a_seed_in_a_batch_equals_the_seed_alone():
+    bank = places((0.0, 0.0), (3.0, 0.0), (0.0, 3.0), spread=0.5)
+    both = leave_one_out(bank, 0, seeds=[3, 4], draws=50)
+    alone = leave_one_out(bank, 0, seeds=[4], draws=50)
+    torch.testing.assert_close(both.known[1:], alone.known)

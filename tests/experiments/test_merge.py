@@ -18,7 +18,7 @@ from bgpo_trl.experiments.report import ReportArguments, report
 from bgpo_trl.runs.results import read_curves
 from suites import nico
 from tests.analysis.runs import edit
-from tests.folders import contents
+from tests.helpers import contents
 
 ROOT = Path(__file__).parents[2]
 
@@ -101,19 +101,6 @@ REFUSED = {
 def test_runs_that_are_not_one_run_are_not_merged(jobs, tmp_path, refused, choose, cause):
     chosen = choose(jobs)
     refused(lambda: merge(MergeArguments(chosen, tmp_path / "out")), cause, "")
-
-
-def test_an_unfinished_run_is_not_merged(jobs, tmp_path, refused):
-    (jobs[0] / "summary.json").unlink()
-    arguments = MergeArguments(jobs, tmp_path / "out")
-    refused(lambda: merge(arguments), f"{jobs[0]} is not finished", "--resume")
-
-
-def test_enormous_numbers_of_episodes_take_no_memory(jobs, tmp_path, refused):
-    for job in jobs:
-        for name in ("config.json", "summary.json"):
-            edit(job / name, episodes=10**15)
-    refused(lambda: merge(MergeArguments(jobs, tmp_path / "out")), "each episode", "run them again")
 
 
 def test_merging_replaces_no_other_results(jobs, tmp_path, refused):

@@ -12,8 +12,6 @@ from bgpo_trl.experiments.arguments import Arguments
 from bgpo_trl.experiments.one_shot import OneShotArguments, one_shot
 from bgpo_trl.experiments.paper import continual
 from bgpo_trl.experiments.report import ReportArguments, report
-from bgpo_trl.experiments.settings import run_config
-from bgpo_trl.experiments.sweep import SweepArguments, make_jobs
 from bgpo_trl.experiments.watch import WatchArguments, watch
 from bgpo_trl.plugins import import_plugin
 from bgpo_trl.runs.results import read_table
@@ -98,29 +96,6 @@ def test_an_algorithm_of_a_module_is_trained_and_filmed(undrawn, folder):
         watch(WatchArguments(run))
     watch(WatchArguments(run, module="my_algorithm"))
     assert (run / "figures" / "film.gif").exists()
-
-
-def test_an_rl_algorithm_of_a_module_is_chosen_by_name():
-    with pytest.raises(ValueError, match="'quiet'"):
-        run_config(Arguments(rl="quiet"))
-    config = run_config(Arguments(rl="quiet", module="my_algorithm"))
-    assert config.algorithm.rl == RL["quiet"].config
-    own = Arguments(algorithm="mine", module="my_algorithm")
-    assert run_config(own).algorithm == ALGORITHMS["mine"].config
-    assert run_config(replace(own, rl="sac")).algorithm.rl == RL["sac"].config
-
-
-def test_a_sweep_has_jobs_of_an_algorithm_of_a_module(folder):
-    arguments = SweepArguments(
-        algorithms=("mine",), settings=("eight", "concurrent"), module="my_algorithm", out=folder
-    )
-    import_plugin("my_algorithm")
-    grid = {path.name: group[0] for path, group in make_jobs(arguments).items()}
-    assert list(grid) == ["eight-mine", "concurrent-mine"]
-    assert [job.config.tasks for job in grid.values()] == [nico.ALL_TASKS, nico.PAPER_TASKS]
-    for job in grid.values():
-        assert (job.module, job.config.name) == ("my_algorithm", "mine")
-        assert job.config.algorithm == ALGORITHMS["mine"].config
 
 
 def test_a_run_of_a_task_of_a_module_is_reported_filmed_and_tested(

@@ -23,8 +23,7 @@ from bgpo_trl.experiments.report import ReportArguments, report
 from bgpo_trl.files.checkpoint import load_checkpoint
 from bgpo_trl.runs.results import read_final_tests, read_table, read_tests
 from suites import nico
-from tests.folders import contents
-from tests.loggers import Recorder
+from tests.helpers import Recorder, contents
 
 ROOT = Path(__file__).parents[2]
 TASKS = nico.PAPER_TASKS
@@ -106,23 +105,6 @@ def test_every_algorithm_runs_and_is_reported_under_its_name(tiniest, tmp_path, 
             assert float(cell) == pytest.approx(100 * trained[task, kind], abs=0.05)
 
 
-@pytest.mark.parametrize(
-    ("experiment", "arguments", "name"),
-    [
-        (continual, Arguments(rl="sac"), "continual-bgpo-sac-quick"),
-        (ablation, AblationArguments(rl="sac", continual=True), "ablation-continual-bgpo-single"),
-    ],
-)
-def test_the_default_directory_names_experiment_algorithm_and_rl_algorithm(
-    tiny, tmp_path, monkeypatch, experiment, arguments, name
-):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "taken").touch()
-    monkeypatch.setattr("bgpo_trl.experiments.run.holds_run", lambda out: True)
-    with pytest.raises(ValueError, match=f"runs/{name}.* holds a run"):
-        experiment(arguments)
-
-
 def test_a_finished_run_is_only_changed_by_making_it_longer(undrawn, tmp_path, monkeypatch):
     run = tmp_path / "run"
     arguments = Arguments(out=run)
@@ -186,12 +168,6 @@ def test_resume_alone_takes_the_settings_of_the_run(undrawn, tmp_path, monkeypat
     assert changed == {"beta": 0.3}
 
 
-def test_a_run_that_does_not_exist_begins_when_it_is_resumed(undrawn, tmp_path):
-    again = Arguments(out=tmp_path / "run", resume=True, episodes=4)
-    continual(again)
-    assert (tmp_path / "run" / "train.csv").read_text().count("\n") == 1 + 2 * 4
-
-
 def test_the_config_of_a_run_repeats_it(undrawn, tmp_path):
     first, second = tmp_path / "first", tmp_path / "second"
     continual(
@@ -200,19 +176,6 @@ def test_the_config_of_a_run_repeats_it(undrawn, tmp_path):
     continual(Arguments(out=second, config=first))
     for name in ("config.json", "train.csv", "eval.csv"):
         assert (second / name).read_bytes() == (first / name).read_bytes()
-
-
-def test_a_run_that_was_interrupted_while_it_made_encoders_is_resumed(
-    undrawn, tmp_path, monkeypatch, encoders, bank
-):
-    monkeypatch.setattr(experiment, "make_pretrained", lambda *_, **__: (encoders, bank))
-    (tmp_path / "demonstrations").mkdir()
-    arguments = Arguments(out=tmp_path, resume=True, episodes=2)
-    with pytest.raises(ValueError, match="beginning of new encoders: add --train-encoders"):
-        continual(arguments)
-    assert [path.name for path in tmp_path.iterdir()] == ["demonstrations"]
-    continual(replace(arguments, train_encoders=True))
-    assert (tmp_path / "summary.json").exists()
 
 
 def test_the_directory_is_locked_from_the_encoders_to_the_figures(
@@ -275,39 +238,12 @@ def test_dashboards_get_evaluations_final_tests_and_figures(tiniest, started, tm
     assert resumed.media == shown
 
 
-def test_runs_on_wandb_are_grouped_and_tagged(undrawn, started, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    concurrent(Arguments(algorithm="oracle", rl="td3", schedule="sequential", wandb="offline"))
-    ablation(AblationArguments(variant="without-both", wandb="online", wandb_group="mine"))
-    out = Path("runs/concurrent-oracle-td3-quick")
-    (out / "summary.json").unlink()
-    concurrent(Arguments(out=out, resume=True, wandb="offline"))
-    assert [(first, options) for _, first, options in started] == [
-        (
-            (out, "offline"),
-            {"group": "concurrent-oracle-td3", "tags": ("oracle", "sequential", "quick")},
-        ),
-        (
-            (Path("runs/ablation-without-both-quick"), "online"),
-            {"group": "mine", "tags": ("without-both", "practised", "quick")},
-        ),
-        # The size of a run that is resumed by its directory is not known.
-        ((out, "offline"), {"group": "concurrent-oracle-td3", "tags": None}),
-    ]
-
-
 def test_a_refused_run_starts_no_logger(undrawn, started, tmp_path):
     continual(Arguments(out=tmp_path / "run"))
     for again in ({}, {"resume": True, "seeds": (4,)}):
         with pytest.raises(ValueError, match="holds a run"):
             continual(Arguments(out=tmp_path / "run", wandb="offline", tensorboard=True, **again))
     assert started == []
-
-
-def test_curves_of_seeds_are_logged_on_request(undrawn, started, tmp_path):
-    continual(Arguments(out=tmp_path / "run", tensorboard=True, per_seed_curves=True))
-    metrics = started[0][0].metrics[0][0]
-    assert {f"eval/success/{TASKS[0]}/seed_{seed}" for seed in (3, 8)} <= metrics.keys()
 
 
 @pytest.mark.slow
@@ -343,3 +279,16 @@ def test_the_smoke_preset_passes_every_stage_although_it_is_interrupted(tmp_path
     with open(tmp_path / "run" / "train.csv", newline="") as file:
         episodes = [(row["seed"], int(row["episode"])) for row in csv.DictReader(file)]
     assert sorted(episodes) == [(seed, n) for seed in "01" for n in range(1, 13)]
+
+
+def test_a_run_that_was_interrupted_while_it_made_encoders_is_resumed(
+    undrawn, tmp_path, monkeypatch, encoders, bank
+):
+    monkeypatch.setattr(experiment, "make_pretrained", lambda *_, **__: (encoders, bank))
+    (tmp_path / "demonstrations").mkdir()
+    arguments = Arguments(out=tmp_path, resume=True, episodes=2)
+    with pytest.raises(ValueError, match="beginning of new encoders: add --train-encoders"):
+        continual(arguments)
+    assert [path.name for path in tmp_path.iterdir()] == ["demonstrations"]
+    continual(replace(arguments, train_encoders=True))
+    assert (tmp_path / "summary.json").exists()

@@ -2,13 +2,9 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
-from typing import Annotated
 
 import pytest
-import tyro
 
-from bgpo_trl.algorithms.rl import RL
 from bgpo_trl.configs import DDPGConfig
 from bgpo_trl.experiments.privileged_information import (
     INPUTS,
@@ -18,22 +14,14 @@ from bgpo_trl.experiments.privileged_information import (
 from bgpo_trl.files.checkpoint import load_checkpoint
 from bgpo_trl.runs.results import read_table
 from suites import nico
-from tests.folders import contents
-
-
-@pytest.mark.parametrize("rl", RL)
-def test_the_settings_of_the_rl_algorithm_are_flags(rl):
-    kind = Annotated[InformationArguments, tyro.conf.OmitArgPrefixes]
-    arguments = tyro.cli(kind, args=["--out", "here", rl, "--learning-rate", "0.5"])
-    assert arguments.rl == replace(RL[rl].config, learning_rate=0.5)
-    assert arguments.out == Path("here")
+from tests.helpers import cells, contents
 
 
 def test_each_input_has_a_run_and_a_row(tiny, tmp_path):
     ddpg = DDPGConfig(hidden_sizes=(7,), batch_size=16, warmup_steps=8, replay_size=200)
     arguments = InformationArguments(episodes=2, seeds=(1,), out=tmp_path, rl=ddpg)
     printed = privileged_information(arguments)
-    head, _, *rows = [[cell.strip() for cell in x.split("|")[1:-1]] for x in printed.splitlines()]
+    head, *rows = cells(printed)
     assert head == ["policy observes", *nico.PAPER_TASKS, "all", "episodes to 80 %"]
     assert [row[0] for row in rows] == list(INPUTS)
     for name in INPUTS:

@@ -7,25 +7,21 @@ import tempfile
 import threading
 import time
 from collections import Counter
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
-from bgpo_trl.configs import BGPOConfig, RunConfig
+from bgpo_trl.configs import RunConfig
 from bgpo_trl.experiments import merge
 from bgpo_trl.experiments import ray_jobs as jobs
 from bgpo_trl.experiments.ray_jobs import Job
-from bgpo_trl.runs.results import read_table
 from bgpo_trl.training import Trainer
+from tests.helpers import rows
 
 # Otherwise Ray starts a worker on every core, in vain.
 SMALL = {"include_dashboard": False, "object_store_memory": 80_000_000}
-
-
-def rows(path):
-    return read_table(path).to_dict("records")
 
 
 def processes_of(folder):
@@ -265,16 +261,3 @@ def test_jobs_of_a_lost_machine_continue_identically_elsewhere(
     assert Counter((r["seed"], r["episode"]) for r in rows(tmp_path / "merged" / "train.csv")) == {
         (seed, str(episode)): 1 for seed in "123458" for episode in range(1, 41)
     }
-
-
-def test_jobs_are_hashable_with_any_hyperparameters(tmp_path):
-    @dataclass
-    class Part:
-        size: int = 1
-
-    @dataclass(frozen=True)
-    class Own(BGPOConfig):
-        part: Part = field(default_factory=Part)
-
-    first, second = (Job(tmp_path, RunConfig(algorithm=Own())) for _ in range(2))
-    assert {first: "failed"}.get(second) is None

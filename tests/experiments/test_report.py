@@ -14,7 +14,7 @@ from bgpo_trl.analysis.tables import success_table
 from bgpo_trl.experiments.report import ReportArguments, report
 from bgpo_trl.runs.cost import Cost, write_costs
 from tests.analysis.runs import TASKS, edit, make_run, write_run, write_training
-from tests.folders import contents
+from tests.helpers import cells, contents
 
 STARTS = (0, 14, 26)
 ONE_AFTER_THE_OTHER = "3 tasks, one after the other"
@@ -67,9 +67,7 @@ def reported(tmp_path_factory):
 def rows_of(text, title):
     """The table below a title, as lists of cells, by the first cell."""
     section = text.split(f"## {title}\n")[1].split("\n## ")[0]
-    lines = [line for line in section.splitlines() if line.startswith("|")]
-    table = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
-    return {row[0]: row[1:] for row in table[2:]}
+    return {row[0]: row[1:] for row in cells(section)[1:]}
 
 
 def text_of(folder):
@@ -96,9 +94,7 @@ def test_success_is_a_mean_over_seeds(reported):
     ("summary", "shown"),
     [
         ({"needs_label": False, "needs_boundaries": False}, "nothing"),
-        ({"needs_label": False, "needs_boundaries": True}, "boundaries"),
         ({"needs_label": True, "needs_boundaries": True}, "label, boundaries"),
-        ({"needs_label": True}, "label"),
         ({}, "?"),
     ],
 )
@@ -176,15 +172,15 @@ def test_groups_nodes_and_costs_of_a_run_are_listed(reported):
 
 
 def test_figures_are_written_beside_the_tables(reported):
-    text, page = text_of(reported), (reported / "report.html").read_text()
+    text = text_of(reported)
     figures = ["continual-3", "continual-3-counts", "continual-3-matrix", "continual-3-nodes"]
     for name in (*figures, "concurrent-3"):
         assert (reported / f"{name}.png").read_bytes().startswith(b"\x89PNG")
         assert f"]({name}.png)" in text
-    assert len(list(reported.glob("*.png"))) == page.count("data:image/png") == 5
+    assert len(list(reported.glob("*.png"))) == 5
 
 
-@pytest.mark.parametrize("tasks", [("juggle",), ("juggle", "sleep"), tuple("abcdefgh")])
+@pytest.mark.parametrize("tasks", [("juggle",), tuple("abcdefgh")])
 def test_any_number_of_tasks_is_reported(tasks, tmp_path):
     starts = range(0, 32, 32 // len(tasks))
     for name, level in {"mine": 9, "bgpo": 2}.items():
@@ -211,15 +207,6 @@ def test_a_single_seed_has_no_interval(tmp_path):
     (row,) = rows_of(text, "Differences: 3 tasks, all from the start").values()
     assert row[:4] == ["+70.0", "not decided", "-", "-"]
     assert "nan" not in text
-
-
-def test_a_run_alone_is_reported_in_its_directory(tmp_path):
-    run = write_run(tmp_path, "bgpo", 9, starts=STARTS)
-    complete(run, seeds=3)
-    assert report(ReportArguments((run,))).strip() == text_of(run).strip()
-    assert "## Differences" not in text_of(run)
-    assert (run / "continual-bgpo-groups.png").exists()
-    assert list(rows_of(text_of(run), f"BGPO: {ONE_AFTER_THE_OTHER}")) == [*TASKS, "all"]
 
 
 def test_a_run_that_is_read_only_is_reported_elsewhere(tmp_path, monkeypatch):
@@ -254,26 +241,6 @@ def test_other_conditions_are_refused_before_anything_is_written(tmp_path):
         assert "differ in held_out (validation and test)" in section
 
 
-def test_unfinished_runs_are_named_and_left_out(tmp_path):
-    write_run(tmp_path, "bgpo", 9)
-    path = write_run(tmp_path, "oracle", 5)
-    edit(path / "config.json", episodes=50)
-    report(ReportArguments((tmp_path,)))
-    text = text_of(tmp_path)
-    assert f"- {path} has tests until episode 40 of 50: let the run finish" in text
-    assert "DDPG" not in text
-
-
-def test_several_folders_need_one_for_the_report(tmp_path):
-    runs = tuple(write_run(tmp_path, name, 9) for name in ("bgpo", "oracle"))
-    with pytest.raises(ValueError, match="--out: several folders are given"):
-        report(ReportArguments(runs))
-    report(ReportArguments(runs, out=tmp_path / "out"))
-    assert len(rows_of(text_of(tmp_path / "out"), "3 tasks, all from the start")) == 2
-    with pytest.raises(ValueError, match="name a run, or a folder of runs"):
-        report(ReportArguments(()))
-
-
 def test_the_report_on_an_archive_is_the_same_to_the_digit(reported, tmp_path):
     report(ReportArguments((reported,), archive=tmp_path / "archive"))
     assert text_of(tmp_path / "archive") == text_of(reported)
@@ -297,8 +264,7 @@ def pair(tmp_path):
 
 def compared(*runs, **options):
     text = report(ReportArguments(runs, compare=True, **options))
-    lines = [line for line in text.splitlines() if line.startswith("|")]
-    return text, [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:]]
+    return text, cells(text)[1:]
 
 
 def test_two_runs_are_compared_seed_by_seed_on_the_episodes_of_both(pair):
@@ -315,14 +281,6 @@ def test_two_runs_are_compared_seed_by_seed_on_the_episodes_of_both(pair):
     ]
     assert [row[2:] for row in tasks] == [mean[2:]] * 3
     assert contents(pair[0].parent) == before
-
-
-def test_parts_of_training_leave_out_tasks_that_were_not_presented(pair):
-    _, rows = compared(*pair, every=14, anyway=True)
-    assert [row[0] for row in rows] == ["to 14"] * 2 + ["to 28"] * 4 + ["last 10 %"] * 4
-    # To 28, tests at 26 and 28 of the second run are in its last fifth, five before are not.
-    halves = [(2 * late + 5 * half) / 7 for late, half in ((9, 4), (8, 4), (10, 5))]
-    assert rows[2][2:4] == ["20.0", f"{10 * sum(halves) / 3:.1f}"]
 
 
 def test_runs_under_other_conditions_or_of_other_tasks_are_not_compared(pair, tmp_path):

@@ -21,18 +21,13 @@ from bgpo_trl.experiments.report import ReportArguments, report
 from bgpo_trl.experiments.sweep import EightTasksArguments, SweepArguments
 from bgpo_trl.runs.config_file import Digests, settings_of
 from bgpo_trl.runs.cost import Cost, read_costs, write_costs
-from bgpo_trl.runs.results import read_table
 from bgpo_trl.training import Trainer
 from suites import nico
-from tests.folders import contents
+from tests.helpers import contents, rows
 
 SOME = Digests("some", "bank")
 BY_TASKS = {nico.PAPER_TASKS: SOME}
 HEAD = "algorithm,seed,episode,env_steps,task,success,return,steps"
-
-
-def rows(path):
-    return read_table(path).to_dict("records")
 
 
 def write_run(job):
@@ -127,30 +122,6 @@ def test_jobs_carry_tasks_module_and_bank(tmp_path, monkeypatch):
     assert events == ["my_tasks", tmp_path / bank]
 
 
-def test_settings_of_eight_tasks_differ_by_order_and_schedule(tmp_path):
-    settings = ("sequential", "eight", "eight-reversed", "eight-sequential", "eight-concurrent")
-    arguments = SweepArguments(
-        settings=settings,
-        episodes=4_000,
-        eval_every=50,
-        held_out="test",
-        out=tmp_path,
-    )
-    grid = {path.name: group[0].config for path, group in sweep.make_jobs(arguments).items()}
-    assert list(grid) == [f"{setting}-bgpo" for setting in arguments.settings]
-    assert [config.tasks for config in grid.values()] == [
-        *(nico.PAPER_TASKS, nico.ALL_TASKS, nico.ALL_TASKS[::-1], nico.ALL_TASKS, nico.ALL_TASKS)
-    ]
-    unpractised = [config.schedule == "sequential" for config in grid.values()]
-    assert unpractised == [True, False, False, True, False]
-    each_500 = tuple(range(0, 4_000, 500))
-    assert [config.task_starts for config in grid.values()] == [
-        *((0, 1_400, 2_600), each_500, each_500, each_500, (0,) * 8)
-    ]
-    for config in grid.values():
-        assert (config.episodes, config.eval_every, config.held_out) == (4_000, 50, "test")
-
-
 def test_the_benchmark_of_eight_tasks_is_a_grid_with_tests_every_50_episodes(monkeypatch):
     asked = []
     monkeypatch.setattr(sweep, "sweep", lambda arguments: asked.append(arguments) or "done")
@@ -159,6 +130,14 @@ def test_the_benchmark_of_eight_tasks_is_a_grid_with_tests_every_50_episodes(mon
     assert [arguments.eval_every for arguments in asked] == [50, 20]
     grid = sweep.make_jobs(asked[0])
     assert len(grid) == 3 * 8
+    more = SweepArguments(settings=("eight-sequential", "sequential"), episodes=4_000)
+    config = {path.name: group[0].config for path, group in (grid | sweep.make_jobs(more)).items()}
+    assert config["eight-bgpo"].task_starts == tuple(range(0, 4_000, 500))
+    assert config["eight-concurrent-bgpo"].task_starts == (0,) * 8
+    assert config["eight-reversed-bgpo"].tasks == nico.ALL_TASKS[::-1]
+    assert config["sequential-bgpo"].tasks == nico.PAPER_TASKS
+    unpractised = {name for name, of_runs in config.items() if of_runs.schedule == "sequential"}
+    assert unpractised == {"eight-sequential-bgpo", "sequential-bgpo"}
     for group in grid.values():
         (job,) = group
         assert job.config.seeds == (10, 11, 12, 13, 14)
@@ -194,17 +173,6 @@ def test_directories_of_other_runs_are_refused(few, tmp_path):
     longer = sweep.make_jobs(SweepArguments(out=tmp_path, episodes=7, **few))
     with pytest.raises(ValueError, match=r"seeds-2 holds a run with other settings .*episodes is"):
         sweep.check_directories(longer, BY_TASKS)
-
-    # Other blocks would be merged over what is there.
-    folder = tmp_path / "concurrent-maml"
-    config = json.loads((folder / "seeds-2" / "config.json").read_text())
-    (folder / "config.json").write_text(json.dumps({**config, "seeds": [7, 8, 9]}))
-    sweep.check_directories(grid, BY_TASKS)
-    others = sweep.make_jobs(
-        SweepArguments(out=tmp_path, episodes=7, **{**few, "algorithms": ("maml",), "block": 3})
-    )
-    with pytest.raises(ValueError, match="concurrent-maml holds a run with other settings"):
-        sweep.check_directories(others, BY_TASKS)
 
     alone = sweep.make_jobs(SweepArguments(out=tmp_path / "alone", **few))
     write_run(Job(tmp_path / "alone" / "concurrent-maml", alone.popitem()[1][0].config))

@@ -8,12 +8,12 @@ import pytest
 from PIL import Image
 
 from bgpo_trl.experiments import watch
-from bgpo_trl.figures import of_run as growth
+from bgpo_trl.figures import gwr as growth
 from bgpo_trl.runs.config_file import read_config
 from bgpo_trl.runs.gwr_graphs import load_graphs
 from suites import nico
 from suites.nico.demonstrator import Demonstrator
-from tests.folders import contents
+from tests.helpers import contents
 
 GRAY, GREEN, RED = (0x99, 0x99, 0x99), (0x00, 0x9E, 0x73), (0xD5, 0x5E, 0x00)
 

@@ -1,9 +1,7 @@
 """Content of the figures of nodes and groups, from a train.csv written by hand."""
 
 import numpy as np
-import pandas as pd
 import pytest
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.colors import to_hex
 
@@ -90,15 +88,6 @@ def test_a_group_has_a_row_with_a_mark_for_each_episode(path):
     assert [text.get_text() for text in second.get_yticklabels()] == ["0", "2"]
     labels = [text.get_text() for text in figure.legends[0].get_texts()]
     assert labels == ["task 1: grasp glass", "task 2: push green to white"]
-
-
-def test_many_groups_of_many_seeds_fit_on_a_page(path):
-    run = read_groups(path, TASKS).query("seed == 8")
-    seeds = pd.concat([run.assign(seed=seed) for seed in range(10)])
-    for episodes in (run, seeds):
-        figure = plot_groups(episodes, PRESENTED)
-        assert figure.get_figheight() < 14
-        FigureCanvasAgg(figure).draw()
 
 
 def test_runs_without_episodes_or_groups_are_refused(path):

@@ -77,22 +77,6 @@ def test_groups_are_shown_in_a_second_panel():
     assert by_task.get_xlim() == by_group.get_xlim()
 
 
-@pytest.mark.parametrize(
-    ("weights", "node_task", "message"),
-    [
-        (np.zeros((1, 4)), [0], r"N, d >= 2, not \[1, 4\]"),
-        (np.zeros(4), [0] * 4, "N, d >= 2"),
-        (np.full((3, 4), np.nan), [0] * 3, "must be finite"),
-        (np.zeros((3, 4)), [0] * 2, "one task for each of the 3 nodes"),
-        (np.zeros((3, 4)), [0, 1, 2], "position in the 2 task_names, not 0 to 2"),
-        (np.zeros((3, 4)), [0, 1, -2], "not -2 to 1"),
-    ],
-)
-def test_bad_nodes_are_refused(weights, node_task, message):
-    with pytest.raises(ValueError, match=message):
-        plot_gwr_pca(weights, node_task, ["a", "b"])
-
-
 # In a plane of four dimensions: the last graph's spread is largest along the second axis.
 LAST = np.array([[0, 0, 0, 0], [0, 4, 0, 0], [1, 0, 0, 0], [1, 4, 0, 0], [0.5, 90, 0, 0]])
 GRAPHS = {
@@ -117,32 +101,3 @@ def test_growth_panels_share_the_components_of_the_last_graph():
     assert late.get_xlabel() == "component 1 (94% of variance)"  # 16 of 17
     assert early.get_title() == "episode 10: 2 nodes, 1 outside"
     assert late.get_title() == "episode 20: 5 nodes, 1 outside"
-
-
-def test_growth_draws_edges_and_colored_nodes():
-    figure = plot_gwr_growth(GRAPHS, [[1, 2]], TASKS)
-    early, late, _ = figure.axes
-    assert [len(c.get_offsets()) for c in early.collections[1:]] == [1, 0, 1]
-    assert [len(c.get_offsets()) for c in late.collections[1:]] == [2, 2, 1]
-    colors = [tuple(c.get_facecolor()[0]) for c in late.collections[1:]]
-    assert len(set(colors)) == 3
-    labels = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert labels == ["task 1: grasp glass", "task 2: push green to white", "no demonstration"]
-    edges = [segment.tolist() for segment in late.collections[0].get_segments()]
-    ends = [[(-2, -0.5), (2, -0.5)], [(-2, 0.5), (2, 0.5)], [(-2, -0.5), (88, 0)]]
-    assert np.array(edges) == pytest.approx(np.array(ends))
-
-
-def test_growth_draws_the_number_of_nodes_of_each_seed():
-    counts = plot_gwr_growth(GRAPHS, [[2, 3, 5], [2, 2, 2]], TASKS).axes[-1]
-    other, first, moments = [np.array(line.get_data()).T.tolist() for line in counts.lines]
-    assert first == [[1, 2], [2, 3], [3, 5]]
-    assert other == [[1, 2], [2, 2], [3, 2]]
-    assert moments == [[10, 2], [20, 5]]
-
-
-def test_growth_draws_tensors_and_graphs_without_edges():
-    start = (torch.rand(2, 32), torch.tensor([[0, 1]]), torch.tensor([-1, -1]))
-    no_edge = (torch.rand(2, 32), torch.zeros(0, 2, dtype=torch.int64), torch.tensor([0, -1]))
-    for graph in (start, no_edge):
-        FigureCanvasAgg(plot_gwr_growth({1: graph}, [[2]], TASKS)).draw()

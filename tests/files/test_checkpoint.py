@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bgpo_trl.files.checkpoint import has_checkpoint, load_checkpoint, save_checkpoint
-from tests.files.full_disk import largest_file
+from tests.helpers import largest_file
 
 
 def files(directory: Path) -> list[Path]:

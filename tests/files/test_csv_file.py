@@ -1,7 +1,6 @@
 import csv
 import errno
 import math
-import resource
 
 import numpy as np
 import pytest
@@ -10,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bgpo_trl.files.csv_file import CsvFile
+from tests.helpers import largest_file
 
 COLUMNS = ("episode", "task", "return")
 
@@ -117,16 +117,14 @@ def test_truncation_within_a_row_is_refused(tmp_path):
 @pytest.mark.parametrize("room", range(6))
 def test_a_row_that_does_not_fit_on_the_disk_is_not_written_in_part(room, tmp_path):
     path = tmp_path / "eval.csv"
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     with CsvFile(path, COLUMNS) as file:
         file.write({"episode": 1})
         before = path.read_bytes()
-        resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) + room, hard))
-        try:
-            with pytest.raises(OSError, match=r"cannot write to .*: make room") as error:
-                file.write({"episode": 2000})  # 7 bytes
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        with (
+            largest_file(len(before) + room),
+            pytest.raises(OSError, match=r"cannot write to .*: make room") as error,
+        ):
+            file.write({"episode": 2000})  # 7 bytes
         assert error.value.errno in (errno.ENOSPC, errno.EFBIG)
         assert path.read_bytes() == before
         file.write({"episode": 2000})

@@ -30,10 +30,3 @@ def test_a_bar_is_redrawn_more_often_on_a_terminal_than_in_a_log(monkeypatch, te
     assert "100/100" in lines[-1]
     assert "success 0.99" in lines[-1]
     assert all("<" in line for line in lines[1:])  # elapsed<left
-
-
-def test_a_hidden_bar_prints_nothing(monkeypatch):
-    stream = Stream()
-    monkeypatch.setattr("sys.stderr", stream)
-    assert list(progress_bar("train", range(3), shown=False)) == [0, 1, 2]
-    assert stream.getvalue() == ""

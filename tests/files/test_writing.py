@@ -1,32 +1,25 @@
-"""Files that are replaced as a whole."""
+"""Files that are replaced as a whole, and folders that one process at a time holds."""
 
-import json
+import os
+import select
+import signal
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from matplotlib.figure import Figure
 
-from bgpo_trl.experiments.records import write_rows
 from bgpo_trl.figures.frames import save_gif
-from bgpo_trl.figures.of_run import write_nodes
-from bgpo_trl.figures.page import write_page
+from bgpo_trl.figures.gwr import write_nodes
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
 from bgpo_trl.files.csv_file import CsvFile
 from bgpo_trl.files.tensor_file import save_tensors
-from bgpo_trl.files.writing import write_json, write_whole
+from bgpo_trl.files.writing import lock_directory, write_whole
 from bgpo_trl.runs.cost import write_costs
-from tests.files.full_disk import largest_file
-
-
-def test_a_file_is_written_and_replaced(tmp_path):
-    for content, found in (("a\n", b"a\n"), (b"\x00b", b"\x00b")):
-        write_whole(tmp_path / "file", content)
-        assert (tmp_path / "file").read_bytes() == found
-    write_json(tmp_path / "file", {"a": [1, None]})
-    assert json.loads((tmp_path / "file").read_text()) == {"a": [1, None]}
-    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+from bgpo_trl.runs.provenance import write_table
+from tests.helpers import largest_file
 
 
 def test_a_failed_write_keeps_the_old_file(tmp_path):
@@ -41,9 +34,8 @@ WRITERS = {
     "text": lambda path: write_whole(path, "new"),
     "figure": lambda path: save_figure(Figure(), path),
     "gif": lambda path: save_gif(np.zeros((2, 32, 64, 3), np.uint8), path),
-    "page": lambda path: write_page(path, [], {}),
     "tensors": lambda path: save_tensors(path, {"a": torch.zeros(2)}, {}),
-    "rows": lambda path: write_rows(path, ["a"], [[1]]),
+    "rows": lambda path: write_table(path, pd.DataFrame({"a": [1]})),
     "costs": lambda path: write_costs(path, {}),
     "nodes": lambda path: write_nodes(path, torch.zeros(2, 3), torch.zeros(2)),
 }
@@ -79,3 +71,70 @@ def test_rows_are_not_appended_through_a_symbolic_link(tmp_path, refused, exists
     (tmp_path / "eval.csv").symlink_to(tmp_path / "private")
     refused(lambda: CsvFile(tmp_path / "eval.csv", ["a"]), "symbolic links", "choose another")
     assert (tmp_path / "private").exists() == exists
+
+
+def test_a_second_process_is_refused_until_the_first_releases_the_lock(
+    other_process, refused, tmp_path
+):
+    run = tmp_path / "run"
+    process = other_process(run)
+    assert process.stdout.readline() == "has it\n"
+    refused(lambda: lock_directory(run).__enter__(), f"{run} is in use", "let it finish, or stop")
+    process.communicate("\n")
+    with lock_directory(run):
+        pass
+
+
+def test_a_killed_process_holds_no_lock(other_process, tmp_path):
+    process = other_process(tmp_path)
+    assert process.stdout.readline() == "has it\n"
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert (tmp_path / "lock").exists()
+    with lock_directory(tmp_path):
+        pass
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_process_waits_until_the_last_holder_releases_a_reentrant_lock(other_process, tmp_path):
+    first = lock_directory(tmp_path)
+    second = lock_directory(tmp_path / "." / ".." / tmp_path.name)
+    first.__enter__(), second.__enter__()
+    first.__exit__(None, None, None)
+    process = other_process(tmp_path, wait=True)
+    assert process.stdout.readline() == "waits\n"
+    assert not select.select([process.stdout], [], [], 0.5)[0]
+    second.__exit__(None, None, None)
+    assert process.stdout.readline() == "has it\n"
+
+
+def test_a_forked_process_does_not_hold_the_lock(tmp_path):
+    with lock_directory(tmp_path):
+        child = os.fork()
+        if not child:
+            code = 1
+            try:
+                with lock_directory(tmp_path):
+                    pass
+            except BlockingIOError:
+                code = 0
+            finally:
+                os._exit(code)
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+        assert (tmp_path / "lock").exists()
+
+
+def test_folders_made_for_the_lock_are_removed_while_empty(tmp_path):
+    with lock_directory(tmp_path / "a" / "b"):
+        pass
+    assert not list(tmp_path.iterdir())
+    with lock_directory(tmp_path / "a" / "b"):
+        (tmp_path / "a" / "kept").touch()
+    assert [path.name for path in tmp_path.rglob("*")] == ["a", "kept"]
+
+
+def test_a_directory_that_cannot_be_locked_is_refused(tmp_path, refused):
+    (tmp_path / "file").touch()
+    (tmp_path / "run" / "lock").mkdir(parents=True)
+    for name in ("file", "run"):
+        refused(lambda name=name: lock_directory(tmp_path / name).__enter__(), "cannot", "choose")

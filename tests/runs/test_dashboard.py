@@ -11,8 +11,8 @@ import torch
 
 from bgpo_trl.runs import dashboard
 from bgpo_trl.runs.dashboard import Dashboard, tensorboard_logger, wandb_logger
-from bgpo_trl.runs.logger import TRAIN_COLUMNS, RunLogger
-from tests.loggers import Recorder
+from bgpo_trl.runs.directory import TRAIN_COLUMNS, RunLogger
+from tests.helpers import Recorder
 
 SETTINGS = {"gamma": 0.98, "seeds": [3, 8], "network": {"hidden": [64], "rate": None}}
 
@@ -109,29 +109,6 @@ def test_a_loss_that_diverged_is_seen(make):
     assert np.isnan(recorder.metrics[0][0]["train/loss_actor"])
 
 
-def test_no_logger_is_made_beside_damaged_rows(make, tmp_path):
-    make().close()
-    with open(tmp_path / "train.csv", "a") as file:
-        file.write("x,three\n")
-    started = []
-    with pytest.raises(ValueError, match="line 2 is damaged"):
-        Dashboard(tmp_path, [lambda: started.append(1) or Recorder()], settings={})
-    assert started == []
-
-
-def test_success_of_each_seed_is_logged_on_request(make):
-    recorder = Recorder()
-    with make(recorder, per_seed=True) as board:
-        board.log_train(episode(3, 1, "grasp", 1))
-        board.log_eval(evaluation(2))
-    [(metrics, _)] = recorder.metrics
-    of_seeds = {key: value for key, value in metrics.items() if "/seed_" in key}
-    assert of_seeds == {
-        f"eval/success/{task}/seed_{seed}": np.mean(successes)
-        for (seed, task), successes in TESTED.items()
-    }
-
-
 def test_a_resumed_run_logs_the_means_of_an_uninterrupted_one(make):
     """Training episodes that no evaluation follows are in the CSV file only."""
     uninterrupted, resumed = Recorder(), Recorder()
@@ -206,18 +183,6 @@ def test_a_logger_that_fails_is_dropped_with_one_warning(make, method, monkeypat
     assert (len(intact.metrics), len(intact.media), intact.closed) == (2, 2, True)
 
 
-def test_a_logger_that_cannot_be_made_is_left_out(make):
-    recorder = Recorder()
-
-    def missing():
-        raise ImportError("it is not installed")
-
-    with pytest.warns(UserWarning, match="it is not installed"):
-        board = make(missing, lambda: recorder)
-    board.close()
-    assert recorder.closed
-
-
 class FakeWandb:
     """Stands in for TorchRL's WandbLogger, with modes that fail as without a network."""
 
@@ -237,28 +202,6 @@ def fake_wandb(monkeypatch):
 
     monkeypatch.setattr(dashboard, "WandbLogger", Fake)
     return Fake
-
-
-@pytest.mark.parametrize("mode", ["online", "offline"])
-def test_wandb_keeps_its_run_when_resumed(mode, fake_wandb, tmp_path):
-    for directory in ("a", "a", "b"):
-        wandb_logger(tmp_path / directory, mode, group="continual-bgpo", tags=("bgpo", "quick"))
-    first, resumed, other = fake_wandb.made
-    assert first == resumed
-    assert first["id"] != other["id"]
-    assert (first["mode"], first["group"], first["tags"]) == (
-        mode,
-        "continual-bgpo",
-        ["bgpo", "quick"],
-    )
-
-
-def test_wandb_logs_offline_when_it_does_not_answer(fake_wandb, tmp_path):
-    fake_wandb.unreachable = ("online",)
-    with pytest.warns(UserWarning, match=r"\(no route\): logging offline") as caught:
-        wandb_logger(tmp_path, "online", group="mine")
-    assert len(caught) == 1
-    assert [(made["mode"], made["group"]) for made in fake_wandb.made] == [("offline", "mine")]
 
 
 def test_a_run_goes_on_without_wandb_when_both_modes_fail(make, fake_wandb, tmp_path):
@@ -316,3 +259,16 @@ def test_tensorboard_gets_the_means_as_scalars_in_the_run_directory(make, monkey
     assert closed == [str(tmp_path / "tensorboard")]
     assert {name: value for name, value, _ in written if name in MEANS} == pytest.approx(MEANS)
     assert {step for *_, step in written} == {2}
+
+
+def test_success_of_each_seed_is_logged_on_request(make):
+    recorder = Recorder()
+    with make(recorder, per_seed=True) as board:
+        board.log_train(episode(3, 1, "grasp", 1))
+        board.log_eval(evaluation(2))
+    [(metrics, _)] = recorder.metrics
+    of_seeds = {key: value for key, value in metrics.items() if "/seed_" in key}
+    assert of_seeds == {
+        f"eval/success/{task}/seed_{seed}": np.mean(successes)
+        for (seed, task), successes in TESTED.items()
+    }

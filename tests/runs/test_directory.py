@@ -1,37 +1,27 @@
 """A run's directory: one process at a time, complete, and of the same run; else nothing changes."""
 
-import csv
 import json
 import shutil
 import signal
 from dataclasses import asdict, replace
 
 import pytest
+import torch
 
 from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
-from bgpo_trl.runs.directory import check_settings, holds_run
-from bgpo_trl.training import Trainer
+from bgpo_trl.runs.directory import EVAL_COLUMNS, TRAIN_COLUMNS, RunLogger, check_settings
 from tests.algorithms.playing import assert_same
-from tests.foreign import CHECKPOINTS, UNPICKLED, put_checkpoint
+from tests.helpers import CHECKPOINTS, UNPICKLED, put_checkpoint, rows
 from tests.test_training import at_step
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 
 
 @pytest.fixture(scope="module")
-def make(bank, encoders, make_config):
-    def make(directory, config=None, **arguments):
-        parts = {"bank": bank, "encoders": encoders, "progress": False, **arguments}
-        return Trainer(config or make_config(), directory, **parts)
-
-    return make
-
-
-@pytest.fixture(scope="module")
-def interrupted(easy_world, make, tmp_path_factory):
+def interrupted(easy_world, begin, tmp_path_factory):
     """A run that was interrupted half-way, with rows after its last checkpoint."""
     directory = tmp_path_factory.mktemp("interrupted") / "run"
-    with make(directory) as trainer:
+    with begin(directory) as trainer:
         at_step(trainer, 25, lambda: signal.raise_signal(signal.SIGINT))
         with pytest.raises(KeyboardInterrupt):
             trainer.run()
@@ -46,24 +36,19 @@ def run(interrupted, tmp_path):
     return shutil.copytree(interrupted, tmp_path / "run")
 
 
-def rows(path):
-    with open(path, newline="") as file:
-        return [tuple(row.values()) for row in csv.DictReader(file)]
-
-
 def interrupt(trainer, step):
     at_step(trainer, step, lambda: signal.raise_signal(signal.SIGINT))
     with pytest.raises(KeyboardInterrupt):
         trainer.run()
 
 
-def test_one_process_at_a_time_uses_a_run_directory(run, make, other_process, refused):
+def test_one_process_at_a_time_uses_a_run_directory(run, begin, other_process, refused):
     first = other_process(run)
     assert first.stdout.readline() == "has it\n"
     for resume in (False, True):
-        refused(lambda resume=resume: make(run, resume=resume), f"{run} is in use", "stop it")
+        refused(lambda resume=resume: begin(run, resume=resume), f"{run} is in use", "stop it")
     first.communicate("\n")
-    with make(run, resume=True):
+    with begin(run, resume=True):
         second = other_process(run)
         assert "is in use by another process" in second.communicate()[1]
     assert not (run / "lock").exists()
@@ -96,39 +81,39 @@ DAMAGES = {
 
 
 @pytest.mark.parametrize(("damage", "cause"), DAMAGES.values(), ids=DAMAGES.keys())
-def test_a_run_that_lacks_a_file_is_refused_unchanged(run, make, refused, damage, cause):
+def test_a_run_that_lacks_a_file_is_refused_unchanged(run, begin, refused, damage, cause):
     damage(run)
-    refused(lambda: make(run, resume=True), cause, "as the run left it")
+    refused(lambda: begin(run, resume=True), cause, "as the run left it")
     if (run / "config.json").exists():
-        refused(lambda: make(run), "already holds a run", "choose another run directory")
+        refused(lambda: begin(run), "already holds a run", "choose another run directory")
 
 
-def test_the_settings_in_the_checkpoint_are_compared(run, make, make_config, refused):
+def test_the_settings_in_the_checkpoint_are_compared(run, begin, make_config, refused):
     edit_settings(run)
     config = make_config(task_starts=(0, 1, 2))
     refused(
-        lambda: make(run, config, resume=True),
+        lambda: begin(run, config, resume=True),
         "run/checkpoint holds a run with other settings (task_starts is [0, 2, 4] there and [0, 1,",
         "put config.json back as the run left it",
     )
 
 
 @pytest.mark.parametrize("content", CHECKPOINTS.values(), ids=CHECKPOINTS.keys())
-def test_a_run_is_not_resumed_from_a_checkpoint_of_something_else(run, make, refused, content):
+def test_a_run_is_not_resumed_from_a_checkpoint_of_something_else(run, begin, refused, content):
     put_checkpoint(run, content)
-    refused(lambda: make(run, resume=True), "checkpoint", "put it back as the run left it")
+    refused(lambda: begin(run, resume=True), "checkpoint", "put it back as the run left it")
     assert not UNPICKLED
 
 
 @pytest.mark.parametrize("name", ["world", "algorithm", "evaluator"])
-def test_a_run_is_not_resumed_from_half_a_checkpoint(run, make, refused, name):
+def test_a_run_is_not_resumed_from_half_a_checkpoint(run, begin, refused, name):
     state = load_checkpoint(run / "checkpoint")
     save_checkpoint(run / "checkpoint", {**state, name: {}})
-    refused(lambda: make(run, resume=True), "does not fit", "use the version of the code")
+    refused(lambda: begin(run, resume=True), "does not fit", "use the version of the code")
 
 
 @pytest.mark.parametrize("sizes", [{"hidden_sizes": (2_000_000_000,)}, {"replay_size": 10**15}])
-def test_sizes_that_are_not_the_checkpoints_take_no_memory(run, make, make_config, refused, sizes):
+def test_sizes_that_are_not_the_checkpoints_take_no_memory(run, begin, make_config, refused, sizes):
     config = make_config()
     rl = replace(config.algorithm.rl, **sizes)
     config = replace(config, algorithm=replace(config.algorithm, rl=rl))
@@ -136,51 +121,42 @@ def test_sizes_that_are_not_the_checkpoints_take_no_memory(run, make, make_confi
     settings["algorithm"] = json.loads(json.dumps(asdict(config.algorithm)))
     (run / "config.json").write_text(json.dumps(settings))
     (name,) = sizes
-    refused(lambda: make(run, config, resume=True), f"algorithm.rl.{name} is", "config.json back")
+    refused(
+        lambda: begin(run, config, resume=True),
+        f"algorithm.rl.{name} is",
+        "config.json back",
+    )
 
 
-def test_resuming_a_directory_without_rows_starts_the_run(make, make_config, tmp_path):
-    config = make_config("state", "ddpg", episodes=2)
-    assert not holds_run(tmp_path)
-    for _ in range(2):
-        with make(tmp_path, config, resume=True):
-            assert holds_run(tmp_path)
-    with pytest.raises(ValueError, match="already holds a run"):
-        make(tmp_path, config)
-    with make(tmp_path, config, resume=True) as trainer:
-        trainer.run()
-    assert len(rows(tmp_path / "train.csv")) == 4
-
-
-def test_a_run_extended_in_steps_equals_a_longer_run(make, make_config, tmp_path):
+def test_a_run_extended_in_steps_equals_a_longer_run(begin, make_config, tmp_path):
     """Seeds that were done early have gone on, and nothing of that is lost."""
     run, straight = tmp_path / "longer", tmp_path / "straight"
     config = make_config(episodes=16)
-    with make(straight, config) as trainer:
+    with begin(straight, config) as trainer:
         trainer.run()
     for episodes in (12, 13):
-        with make(run, replace(config, episodes=episodes), resume=True) as trainer:
+        with begin(run, replace(config, episodes=episodes), resume=True) as trainer:
             trainer.run()
-        played = rows(run / "train.csv")
-        assert len(set(played)) == len(played) == 2 * episodes
-        assert max(int(row[2]) for row in played) == episodes
+        played = sorted((row["seed"], int(row["episode"])) for row in rows(run / "train.csv"))
+        assert played == [(seed, n + 1) for seed in "38" for n in range(episodes)]
         assert load_checkpoint(run / "checkpoint")["later"]
-    with make(run, config, resume=True) as trainer:
+    with begin(run, config, resume=True) as trainer:
         interrupt(trainer, 1)
-    with make(run, config, resume=True) as trainer:
+    with begin(run, config, resume=True) as trainer:
         trainer.run()
     for file in ("train.csv", "eval.csv"):
         # Episodes that were played early are logged late.
-        assert sorted(rows(run / file)) == sorted(rows(straight / file))
+        lines = [sorted((folder / file).read_text().splitlines()) for folder in (run, straight)]
+        assert lines[0] == lines[1]
     assert (run / "config.json").read_text() == (straight / "config.json").read_text()
     assert_same(*(load_checkpoint(folder / "checkpoint") for folder in (run, straight)))
 
     with pytest.raises(ValueError, match="episodes is 16 there and 13 here"):
-        make(run, replace(config, episodes=13), resume=True)
+        begin(run, replace(config, episodes=13), resume=True)
 
 
-def test_only_the_number_of_episodes_may_grow(make, make_config, tmp_path):
-    with make(tmp_path):
+def test_only_the_number_of_episodes_may_grow(begin, make_config, tmp_path):
+    with begin(tmp_path):
         pass
     settings = json.loads((tmp_path / "config.json").read_text())
     check_settings(tmp_path, settings)
@@ -191,3 +167,39 @@ def test_only_the_number_of_episodes_may_grow(make, make_config, tmp_path):
     for episodes in (9, "11", True):
         with pytest.raises(ValueError, match="episodes is 10 there and"):
             check_settings(tmp_path, {**settings, "episodes": episodes}, longer=True)
+
+
+CONFIG = {"gamma": 0.98, "network": {"hidden": [64]}}
+ROW = {
+    "algorithm": "bgpo",
+    "seed": 2,
+    "episode": 7,
+    "env_steps": 210,
+    "task": "grasp_glass",
+    "success": True,
+    "return": 1.0,
+    "steps": 28,
+}
+
+
+def test_a_run_writes_its_settings_and_two_csv_files(tmp_path):
+    directory = tmp_path / "runs" / "first"
+    with RunLogger(directory, config=CONFIG) as logger:
+        logger.log_train({**ROW, "intrinsic_return": torch.tensor(0.25)})
+        logger.log_eval(ROW)
+        sizes = {name: (directory / name).stat().st_size for name in ("train.csv", "eval.csv")}
+        assert logger.position() == sizes
+        with pytest.raises(ValueError, match="loss_meta"):
+            logger.log_train({"loss_meta": 0.5})
+    assert json.loads((directory / "config.json").read_text()) == CONFIG
+    cells = "bgpo,2,7,210,grasp_glass,1,1.0,28"
+    train, tests = ((directory / name).read_text().splitlines() for name in sizes)
+    assert train == [",".join(TRAIN_COLUMNS), f"{cells},0.25,,,,,"]
+    assert tests == [",".join(EVAL_COLUMNS), cells]
+
+
+@pytest.mark.parametrize("logged", [("success",), ("loss_meta", "loss_meta")])
+def test_a_column_that_is_there_already_is_refused(logged, tmp_path):
+    with pytest.raises(ValueError, match=logged[0]):
+        RunLogger(tmp_path / "run", config=CONFIG, logged=logged)
+    assert not (tmp_path / "run").exists()

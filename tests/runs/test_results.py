@@ -1,4 +1,4 @@
-"""Curves read back from CSV files, against tables written by hand."""
+"""Results read back from CSV files, against tables written by hand; compact copies."""
 
 import gzip
 
@@ -10,10 +10,13 @@ from bgpo_trl.runs.results import (
     AMOUNT,
     COUNT,
     SHARE,
+    archive_run,
     read_curves,
     read_table,
     read_tests,
 )
+from tests.analysis.runs import write_run, write_training
+from tests.helpers import contents
 
 HEAD = "algorithm,seed,episode,env_steps,task,success,return,steps\n"
 
@@ -79,3 +82,28 @@ def test_a_line_with_too_many_cells_is_refused(tmp_path):
         (tmp_path / "x.csv").write_text("a,b\n" + rows)
         with pytest.raises(ValueError, match=r"x\.csv is not a CSV file of a run"):
             read_table(tmp_path / "x.csv")
+
+
+def test_an_archive_is_compressed_and_always_the_same(tmp_path):
+    run = write_run(tmp_path, "bgpo", 9)
+    write_training(run, [[[0] * 10 + [1] * 3] * 3] * 3, ("a", "b", "c"))
+    for name in ("a", "b"):
+        archive_run(run, tmp_path / name)
+    archive_run(tmp_path / "a", tmp_path / "c")  # from the compact form
+    files = [{p.name: p.read_bytes() for p in (tmp_path / n).iterdir()} for n in "abc"]
+    assert files[0] == files[1] == files[2]
+    assert {"config.json", "train.csv.gz", "eval.csv.gz"} <= files[0].keys()
+    assert files[0]["config.json"] == (run / "config.json").read_bytes()
+    heads = {n: gzip.decompress(files[0][n]).decode().split("\n")[0] for n in files[0] if "gz" in n}
+    assert heads["train.csv.gz"] == "seed,episode,task,success,num_nodes,group,num_groups"
+    assert heads["eval.csv.gz"] == "algorithm,seed,episode,task,success,steps"
+
+
+def test_an_archive_is_not_written_over_another_run(tmp_path):
+    run, other = (write_run(tmp_path, name, 9) for name in ("bgpo", "oracle"))
+    before = contents(tmp_path)
+    with pytest.raises(ValueError, match="is the run itself: name another folder"):
+        archive_run(run, run)
+    with pytest.raises(ValueError, match="holds another run: name another folder"):
+        archive_run(run, other)
+    assert contents(tmp_path) == before

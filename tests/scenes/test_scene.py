@@ -11,9 +11,8 @@ from torchrl.envs import check_env_specs
 
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.configs import RunConfig
-from bgpo_trl.data.dataset import load_demonstrations
+from bgpo_trl.data.dataset import load_demonstrations, write_demonstrations
 from bgpo_trl.data.recording import record_demonstrations
-from bgpo_trl.data.writing import write_demonstrations
 from bgpo_trl.encoders.train import make_pretrained, train_encoders
 from bgpo_trl.evaluation import evaluate_random_policy
 from bgpo_trl.experiments.one_shot import OneShotArguments, one_shot

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+import pandas as pd
 import tyro
 from numpy.typing import NDArray
 
@@ -22,10 +23,9 @@ from bgpo_trl.analysis.tables import Table, markdown
 from bgpo_trl.experiments.arguments import TrainedArguments
 from bgpo_trl.experiments.episodes import evaluator_of, snapshots_of
 from bgpo_trl.experiments.nico.scripted import Episode, load_blocks_of_nico, play, random_actions
-from bgpo_trl.experiments.records import write_measurement
 from bgpo_trl.machine import set_threads
 from bgpo_trl.plugins import import_plugin
-from bgpo_trl.runs.provenance import commit_of_code
+from bgpo_trl.runs.provenance import commit_of_code, write_measurement
 from suites import nico
 from suites.nico import kinematics
 from suites.nico.base import CONTROL_TIMESTEP, TIME_LIMIT, Environment
@@ -370,6 +370,7 @@ def aftermath(arguments: AftermathArguments) -> str:
     episodes = episodes_of(arguments)
     rows = [row for actor, of_actor in episodes.items() for row in judge(actor, of_actor)]
     out = arguments.out or arguments.run or Path("runs/aftermath")
-    write_measurement(out, "aftermath", Row._fields, rows, commit)
+    table = pd.DataFrame(rows, columns=pd.Index(Row._fields))
+    write_measurement(out, "aftermath", table, commit)
     counts = {actor: Counter(e.task for e in of_actor) for actor, of_actor in episodes.items()}
     return markdown(aftermath_table(rows, counts))

@@ -12,6 +12,7 @@ from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from bgpo_trl.analysis import statistics
@@ -19,13 +20,12 @@ from bgpo_trl.analysis.tables import Table, markdown
 from bgpo_trl.experiments.arguments import TrainedArguments
 from bgpo_trl.experiments.episodes import evaluator_of, snapshots_of
 from bgpo_trl.experiments.nico.scripted import load_blocks_of_nico, play, random_actions
-from bgpo_trl.experiments.records import write_measurement
-from bgpo_trl.figures.bars import plot_success_bars
 from bgpo_trl.figures.style import save_figure
+from bgpo_trl.figures.success import plot_success_bars
 from bgpo_trl.files.progress import progress_bar
 from bgpo_trl.machine import set_threads
 from bgpo_trl.plugins import import_plugin
-from bgpo_trl.runs.provenance import commit_of_code
+from bgpo_trl.runs.provenance import commit_of_code, write_measurement
 from suites import opengl
 
 if TYPE_CHECKING:
@@ -150,7 +150,7 @@ def looking(arguments: TrainedArguments) -> str:
         steps = len(VIEWS) * (run.config.algorithm.max_steps + 1)
         with progress_bar("looking", total=steps, unit="step") as bar:
             rows += measure_looking(run, arguments.episodes, bar.update)
-    write_measurement(out, "looking", Row._fields, rows, commit)
+    write_measurement(out, "looking", pd.DataFrame(rows), commit)
     tasks, success = success_by_condition(rows)
     save_figure(plot_success_bars(success, tasks), out / "looking.png")
     return markdown(looking_table(rows))

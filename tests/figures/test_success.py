@@ -1,4 +1,7 @@
+"""Content of the figures of success, and labels of all figures."""
+
 import itertools
+import re
 from pathlib import Path
 
 import matplotlib as mpl
@@ -9,12 +12,13 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
-from PIL import Image
 
-from bgpo_trl.figures import style
-from bgpo_trl.figures.curves import plot_success_curves
-from bgpo_trl.figures.gwr import plot_gwr_pca
+from bgpo_trl.figures.frames import plot_frame_strips, save_gif
+from bgpo_trl.figures.groups import plot_counts
+from bgpo_trl.figures.gwr import plot_gwr_growth, plot_gwr_pca
 from bgpo_trl.figures.style import save_figure
+from bgpo_trl.figures.success import plot_success_bars, plot_success_curves, plot_success_matrices
+from suites import nico
 
 TASKS = ["grasp_glass", "push_green_to_glass", "push_green_to_white"]
 
@@ -91,30 +95,6 @@ def test_each_panel_shows_its_task_with_a_trailing_window(tmp_path):
     assert curve(b) == {2: 0, 3: 0, 6: 1 / 2}
 
 
-def test_named_files_of_one_algorithm_have_separate_curves(tmp_path):
-    files = {
-        name: write_eval_csv(tmp_path / f"{number}.csv", [("bgpo", 0, 1, "a", number)])
-        for number, name in enumerate(("failed", "solved"))
-    }
-    figure = plot_success_curves(files)
-    labels = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert labels == ["failed (1 seed)", "solved (1 seed)"]
-    assert [curve(figure.axes[0], index) for index in (0, 1)] == [{1: 0}, {1: 1}]
-
-
-def test_curves_do_not_depend_on_the_order_of_rows_or_files(run, tmp_path):
-    header, *lines = run.read_text().splitlines()
-    parts = []
-    for algorithm in ("BGPO", "MAML", "Dist-NLL"):
-        rows = [line for line in lines if line.startswith(algorithm)]
-        parts.append(tmp_path / f"{algorithm}.csv")
-        parts[-1].write_text("\n".join([header, *reversed(rows)]) + "\n")
-    whole, spread = plot_success_curves(run), plot_success_curves(parts)
-    for expected, axes in zip(whole.axes, spread.axes, strict=True):
-        for index in range(3):
-            assert curve(axes, index) == curve(expected, index) != {}
-
-
 def test_task_starts_and_random_success_are_marked(run):
     presented = {TASKS[2]: 0, TASKS[0]: 35, TASKS[1]: 65}
     figure = plot_success_curves(run, presented=presented, random_success={TASKS[0]: 0.05})
@@ -133,19 +113,6 @@ def test_task_starts_and_random_success_are_marked(run):
     assert not any(0.05 in values for values in (dotted[0], dotted[1], dotted[3]))
     labels = [text.get_text() for text in figure.legends[0].get_texts()]
     assert labels == ["BGPO (2 seeds)", "MAML (2 seeds)", "Dist-NLL (2 seeds)", "random policy"]
-
-
-def test_files_without_curves_are_refused(tmp_path, run):
-    empty = write_eval_csv(tmp_path / "empty.csv", [])
-    with pytest.raises(ValueError, match=r"empty\.csv holds no test episode: let the run evaluate"):
-        plot_success_curves(empty)
-    with pytest.raises(ValueError, match="no test episodes"):
-        plot_success_curves([])
-    (tmp_path / "other.csv").write_text("seed,task,loss\n")
-    with pytest.raises(ValueError, match=r"lacks the columns algorithm, episode"):
-        plot_success_curves(tmp_path / "other.csv")
-    with pytest.raises(ValueError, match="window must be at least 1"):
-        plot_success_curves(run, window=0)
 
 
 def figures(run: Path) -> list[Figure]:
@@ -167,14 +134,6 @@ def test_the_same_data_gives_the_same_file_without_global_state(run, tmp_path):
     assert all(image.startswith(b"\x89PNG") for image in content)
     assert dict(mpl.rcParams) == before
     assert plt.get_fignums() == []
-
-
-def test_a_saved_figure_has_300_pixels_an_inch(run, tmp_path, monkeypatch, usual_dpi):
-    monkeypatch.setattr(style, "DPI", usual_dpi)
-    figure = plot_success_curves(run)
-    save_figure(figure, tmp_path / "curves.png")
-    with Image.open(tmp_path / "curves.png") as image:
-        np.testing.assert_allclose(image.size, 300 * figure.get_size_inches(), atol=1)
 
 
 def visible_texts(figure: Figure) -> list[Text]:
@@ -226,3 +185,80 @@ def test_no_label_is_cut_off_or_overlaps_another(n_tasks, algorithms, tmp_path):
     both = plot_gwr_pca(nodes, np.arange(50) % (n_tasks + 1) - 1, tasks, np.arange(50) % n_tasks)
     for figure in (curves, pca, both):
         check_labels(figure)
+
+
+NAN = np.nan
+FIRST, SECOND = [[0.75, NAN], [0.5, 1.0]], [[0.25, NAN], [0.0, 0.125]]
+
+
+def heat_maps(figure):
+    """Returns the panels without the color bar."""
+    return [axes for axes in figure.axes if axes.images]
+
+
+def test_a_panel_shows_the_matrix_as_colors_and_numbers():
+    figure = plot_success_matrices({"one": FIRST, "two": SECOND}, ["grasp_glass", "lift_green"])
+    one, two = heat_maps(figure)
+    assert (one.get_title(), two.get_title()) == ("one", "two")
+    for panel, matrix in ((one, FIRST), (two, SECOND)):
+        np.testing.assert_array_equal(np.ma.filled(panel.images[0].get_array(), NAN), matrix)
+        assert panel.images[0].get_clim() == (0, 1)
+    numbers = {text.get_position(): text.get_text() for text in one.texts}
+    assert numbers == {(0, 0): "75", (0, 1): "50", (1, 1): "100"}  # column and row, from the top
+    rows = [label.get_text() for label in one.get_yticklabels()]
+    assert rows == ["1: grasp glass", "2: lift green"]
+    assert [label.get_text() for label in two.get_yticklabels()] == ["1", "2"]
+
+
+@pytest.mark.parametrize("n_panels", [1, 5])
+def test_no_label_of_eight_tasks_overlaps_another(n_panels):
+    matrix = np.where(np.tri(8) == 1, np.linspace(0, 1, 64).reshape(8, 8), NAN)
+    panels = {f"Dist-NLL + demonstrations {number}": matrix for number in range(n_panels)}
+    figure = plot_success_matrices(panels, nico.ALL_TASKS)
+    FigureCanvasAgg(figure).draw()
+    assert len(visible_texts(figure)) > 36 * n_panels
+    check_labels(figure)
+
+
+SUCCESS = {"seen": [[0.5, 1.0], [0.7, 1.0], [0.6, 1.0]], "hidden": [[0.0, 0.2]]}
+
+
+def test_bars_are_means_with_their_intervals():
+    figure = plot_success_bars(SUCCESS, ["grasp_glass", "push_green_to_white"])
+    (axes,) = figure.axes
+    heights = [bar.get_height() for bar in axes.patches]
+    assert heights == pytest.approx([0.6, 1.0, 0.0, 0.2])
+    centers = [bar.get_x() + bar.get_width() / 2 for bar in axes.patches]
+    assert centers == pytest.approx([-0.2, 0.8, 0.2, 1.2])
+    # The t value for three seeds is 4.303; one seed has no interval and no dots.
+    intervals, dots = axes.collections
+    found = np.array([segment[:, 1] for segment in intervals.get_segments()])
+    half = 4.303 * 0.1 / np.sqrt(3)
+    assert found == pytest.approx(np.array([[0.6 - half, 0.6 + half], [1, 1]]), abs=1e-3)
+    assert sorted(dots.get_offsets()[:, 1]) == pytest.approx([0.5, 0.6, 0.7, 1, 1, 1])
+    names = [label.get_text() for label in axes.get_xticklabels()]
+    assert names == ["grasp glass", "push green\nto white"]
+    (legend,) = figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == ["seen", "hidden"]
+
+
+REFUSED = {
+    "no test episodes": lambda: plot_success_curves([]),
+    "row and a column per task, not [2, 2]": lambda: plot_success_matrices({"one": FIRST}, "abc"),
+    "not none": lambda: plot_success_matrices({}, "ab"),
+    "success must be [seeds, 2] by": lambda: plot_success_bars({"seen": [[0.5]]}, "ab"),
+    "nothing to show": lambda: plot_frame_strips({"none": np.zeros((0, 2, 2, 3), np.uint8)}),
+    "uint8 [T, H, W, 3]": lambda: save_gif(np.zeros((1, 2, 3, 3)), "none.gif"),
+    "N, d >= 2, not [1, 4]": lambda: plot_gwr_pca(np.zeros((1, 4)), [0], "ab"),
+    "must be finite": lambda: plot_gwr_pca(np.full((3, 4), NAN), [0] * 3, "ab"),
+    "one task for each of the 3 nodes": lambda: plot_gwr_pca(np.zeros((3, 4)), [0] * 2, "ab"),
+    "2 task_names, not 0 to 2": lambda: plot_gwr_pca(np.zeros((3, 4)), [0, 1, 2], "ab"),
+    "no graph to show": lambda: plot_gwr_growth({}, [], "ab"),
+    "no training episode": lambda: plot_counts({}, {}),
+}
+
+
+@pytest.mark.parametrize("cause", REFUSED)
+def test_what_cannot_be_drawn_is_refused(cause):
+    with pytest.raises(ValueError, match=re.escape(cause)):
+        REFUSED[cause]()

@@ -1,4 +1,4 @@
-"""Figure of learning curves (Figs. 6, 8, 9)."""
+"""Figures of success: learning curves (Figs. 6, 8, 9), matrices by phase, bars by condition."""
 
 from __future__ import annotations
 
@@ -11,9 +11,11 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
-from numpy.typing import NDArray
+from matplotlib.image import AxesImage
+from matplotlib.ticker import MaxNLocator, PercentFormatter
+from numpy.typing import ArrayLike, NDArray
 
+from bgpo_trl.analysis import statistics
 from bgpo_trl.figures.style import COLORS, LINES, add_legend, mark_starts, readable, style_axes
 from bgpo_trl.runs.results import read_tests
 
@@ -162,3 +164,127 @@ def _draw_curve(axes: Axes, grid: NDArray, curves: NDArray, name: str, index: in
     )
     low, high = np.clip(mean - spread, 0, 1), np.clip(mean + spread, 0, 1)
     axes.fill_between(grid, low, high, color=color, alpha=0.18, linewidth=0)
+
+
+_MATRICES = 3  # side by side
+# Of viridis, on which white letters are readable up to about this height.
+_COLOR_MAP, _WHITE_BELOW = "viridis", 0.6
+
+
+def plot_success_matrices(matrices: Mapping[str, ArrayLike], tasks: Sequence[str]) -> Figure:
+    """Plot ``R[i, j]``, success on task j after the phase of task i, in a panel for each run.
+
+    Cells give percent; tasks that have not been presented stay white. A task that is forgotten
+    fades down its column.
+
+    Args:
+        matrices: Success in [0, 1] by title, ``[T, T]``; NaN for tasks that were not tested.
+        tasks: Names of the tasks, in the order of their presentation.
+
+    Raises:
+        ValueError: If there are no matrices, or one does not have a row and a column per task.
+    """
+    n_tasks = len(tasks)
+    found = {title: np.asarray(matrix, float) for title, matrix in matrices.items()}
+    wrong = [list(matrix.shape) for matrix in found.values() if matrix.shape != (n_tasks, n_tasks)]
+    if wrong or not found:
+        raise ValueError(
+            f"matrices must be [{n_tasks}, {n_tasks}], a row and a column per task, "
+            f"not {wrong[0] if wrong else 'none'}"
+        )
+    n_columns = min(_MATRICES, len(found))
+    n_rows = math.ceil(len(found) / n_columns)
+    side = 0.31 * n_tasks  # inches
+    # Titles of panels of few tasks are longer than these; a letter is about 0.08 wide.
+    width = max(side, 0.08 * max(map(len, found)))
+    figure = Figure(figsize=(width * n_columns + 2.9, (side + 0.45) * n_rows + 0.5))
+    figure.set_layout_engine("constrained", w_pad=0.08, h_pad=0.08)
+    panels = figure.subplots(n_rows, n_columns, squeeze=False).flat
+    for number, (title, matrix) in enumerate(found.items()):
+        panel = panels[number]
+        image = _draw_matrix(panel, matrix)
+        panel.set_title(title, fontsize=9)
+        _label_tasks(panel, tasks, names=number % n_columns == 0)
+    for panel in panels[len(found) :]:
+        panel.remove()
+    figure.supxlabel("Success on task", fontsize=9)
+    figure.supylabel("After the phase of task", fontsize=9)
+    bar = figure.colorbar(image, ax=figure.axes, shrink=0.8, aspect=30, pad=0.02)
+    bar.ax.tick_params(labelsize=8)
+    bar.set_label("Success rate", fontsize=9)
+    return figure
+
+
+def _draw_matrix(panel: Axes, matrix: NDArray) -> AxesImage:
+    image = panel.imshow(matrix, cmap=_COLOR_MAP, vmin=0, vmax=1)
+    for (row, column), success in np.ndenumerate(matrix):
+        if np.isfinite(success):
+            color = "w" if success < _WHITE_BELOW else "k"
+            text = f"{100 * success:.0f}"
+            panel.text(column, row, text, ha="center", va="center", fontsize=7, color=color)
+    return image
+
+
+def _label_tasks(panel: Axes, tasks: Sequence[str], *, names: bool) -> None:
+    """Label the axes with the numbers of the tasks, and the rows with their names if asked."""
+    numbers = [str(number) for number in range(1, len(tasks) + 1)]
+    rows = [f"{number}: {readable(task)}" for number, task in zip(numbers, tasks, strict=True)]
+    panel.set_xticks(range(len(tasks)), numbers)
+    panel.set_yticks(range(len(tasks)), rows if names else numbers)
+    panel.tick_params(labelsize=8, length=0)
+    panel.spines[:].set_visible(False)
+
+
+_WIDTH = 0.8  # of the bars of a task, whose centers are 1 apart
+
+
+def plot_success_bars(success: Mapping[str, ArrayLike], tasks: Sequence[str]) -> Figure:
+    """Plot the success on each task as a group of bars, one for each condition.
+
+    Bars are means over seeds, with 95 % t intervals if there are at least two seeds, and a dot for
+    each seed.
+
+    Args:
+        success: Success in [0, 1] of each seed and task, ``[S, T]``, by condition.
+        tasks: Names of the tasks.
+
+    Raises:
+        ValueError: If there are no conditions, or one has not a column per task.
+    """
+    found = {name: np.asarray(scores, float) for name, scores in success.items()}
+    if not found or any(s.ndim != 2 or s.shape[1] != len(tasks) for s in found.values()):
+        shapes = [list(scores.shape) for scores in found.values()]
+        raise ValueError(f"success must be [seeds, {len(tasks)}] by condition, got {shapes}")
+    width = max(3.6, 1.0 + 0.28 * len(tasks) * len(found))  # inches
+    figure = Figure(figsize=(width, 3.2), layout="constrained")
+    axes = figure.add_subplot()
+    slim = _WIDTH / len(found)
+    for number, (name, scores) in enumerate(found.items()):
+        mean = scores.mean(0)
+        places = np.arange(len(tasks)) + (number - (len(found) - 1) / 2) * slim
+        color = COLORS[number % len(COLORS)]
+        axes.bar(places, mean, slim * 0.9, color=color, alpha=0.75, label=name)
+        if len(scores) > 1:
+            low, high = np.clip(np.transpose([statistics.mean(s)[1:] for s in scores.T]), 0.0, 1.0)
+            axes.errorbar(
+                places, mean, [mean - low, high - mean], fmt="none", ecolor="0.2", elinewidth=0.9
+            )
+            around = np.linspace(-0.2, 0.2, len(scores)) * slim
+            axes.scatter(
+                np.add.outer(around, places),
+                scores,
+                s=4,
+                color="0.2",
+                linewidths=0,
+                zorder=3,
+                clip_on=False,
+            )
+    names = [readable(task).replace(" to ", "\nto ") for task in tasks]
+    axes.set_xticks(range(len(tasks)), names)
+    axes.set_ylim(0, 1.02)
+    axes.set_ylabel("Success rate", fontsize=9)
+    axes.yaxis.set_major_formatter(PercentFormatter(1, decimals=0))
+    style_axes(axes)
+    axes.grid(visible=False, axis="x")
+    add_legend(figure, *axes.get_legend_handles_labels(), width)
+    return figure

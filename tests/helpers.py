@@ -1,0 +1,136 @@
+"""What tests of several packages share: files of runs, damage done to them, and stand-ins."""
+
+import csv
+import hashlib
+import io
+import json
+import pickle
+import resource
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+from torchrl.record.loggers.common import Logger
+
+from bgpo_trl.configs import (
+    InverseModelConfig,
+    RepresentationConfig,
+    SequenceAutoencoderConfig,
+    VAEConfig,
+)
+
+TINY_ENCODERS = RepresentationConfig(
+    vae=VAEConfig(batch_size=4, window=2, steps=4, warmup_steps=1),
+    lae=SequenceAutoencoderConfig(batch_size=4, steps=4, warmup_steps=1),
+    inverse=InverseModelConfig(hidden_size=8, batch_size=8, steps=4, warmup_steps=1),
+)
+"""A training of encoders that ends within a second."""
+
+
+def contents(folder: Path) -> dict[Path, bytes | None]:
+    """Return all that lies below a folder: the bytes of each file, None for a folder."""
+    return {
+        path.relative_to(folder): path.read_bytes() if path.is_file() else None
+        for path in sorted(folder.rglob("*"))
+    }
+
+
+def rows(path: str | Path) -> list[dict[str, str]]:
+    """Return the rows of a CSV file."""
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def cells(text: str) -> list[list[str]]:
+    """Return the cells of a table in Markdown: first the head, then the rows."""
+    lines = [line for line in text.splitlines() if line.startswith("|")]
+    table = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    return [table[0], *table[2:]]
+
+
+def edit(path: Path, **changes: object) -> None:
+    """Change entries of a JSON file; None removes an entry."""
+    found = {**json.loads(path.read_text()), **changes}
+    path.write_text(json.dumps({k: v for k, v in found.items() if v is not None}))
+
+
+@contextmanager
+def largest_file(size: int) -> Iterator[None]:
+    """Have the kernel refuse to write files beyond a size, as a full disk would."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+UNPICKLED: list[str] = []
+
+
+class Malice:
+    """Betrays whoever unpickles it."""
+
+    def __reduce__(self):
+        return UNPICKLED.append, ("unpickled",)
+
+
+def _saved(state: Any) -> bytes:
+    content = io.BytesIO()
+    torch.save(state, content)
+    return content.getvalue()
+
+
+CHECKPOINTS = {
+    "a list": _saved([1, 2]),
+    "half a dict": _saved({"algorithm": {}, "settings": {}}),
+    "settings in words": _saved({"algorithm": {}, "settings": "bgpo"}),
+    "a class of somebody else": _saved({"settings": Path()}),
+    "a malicious pickle": pickle.dumps(Malice()),
+    "a picture": b"\x89PNG\r\n" * 20,
+}
+"""Bytes of a checkpoint that no run has written, by what is in it."""
+
+
+def put_checkpoint(run: Path, content: bytes) -> None:
+    """Replace the checkpoints of a run by one of this content, with its digest."""
+    shutil.rmtree(run / "checkpoint")
+    (run / "checkpoint").mkdir()
+    digest = hashlib.sha256(content).hexdigest()[:16]
+    (run / "checkpoint" / f"checkpoint-000007-{digest}.pt").write_bytes(content)
+
+
+class Recorder(Logger):
+    """Logger that keeps what it gets, in place of a service.
+
+    Attributes:
+        metrics: Pairs of metrics and step.
+        settings: Hyperparameters.
+        media: Pairs of name and path.
+        closed: Whether it was shut down.
+    """
+
+    def __init__(self):
+        super().__init__("run", "")
+        self.metrics, self.settings, self.media, self.closed = [], [], [], False
+
+    def _create_experiment(self):
+        return None
+
+    def log_metrics(self, metrics, step=None, *, keys_sep="/"):
+        assert not self.closed
+        self.metrics.append((metrics, step))
+        return metrics
+
+    def log_hparams(self, cfg):
+        self.settings.append(cfg)
+
+    def log_media(self, name, path):
+        assert not self.closed
+        self.media.append((name, path))
+
+    def shutdown(self, timeout=None):
+        self.closed = True
