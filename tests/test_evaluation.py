@@ -111,7 +111,7 @@ def plain_policy(algorithm, snapshot, index, task, episode, phi):
     group = 0
     if algorithm.config.experts:
         group = int(algorithm.groups.lookup(phi.expand(algorithm.n_seeds, -1)).group[index])
-    policy.load_state_dict(algorithm.experts.actor_weights(index, group))
+    policy.load_state_dict(algorithm.actor_weights(index, group))
     context = {}
     if snapshot.policy.context is not None:
         context = {"context": snapshot.policy.context[task, episode]}

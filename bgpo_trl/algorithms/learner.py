@@ -15,7 +15,11 @@ from bgpo_trl.objectives.off_policy import OffPolicyLoss
 from bgpo_trl.objectives.target_update import ForeachSoftUpdate
 from bgpo_trl.seeding import normal
 
-__all__ = ["Learner", "SACLearner", "TD3Learner"]
+__all__ = ["Expert", "Learner", "SACLearner", "TD3Learner"]
+
+Expert = dict[str, dict[str, Tensor]]
+"""One expert of a learner: ``networks`` with targets, ``moments`` of Adam, state of its ``noise``,
+each by name."""
 
 
 class Learner:
@@ -85,6 +89,69 @@ class Learner:
         """
         for moments in self.optimizer.state.values():
             moments["exp_avg"][index] = 0.0
+
+    def _stacked(self) -> dict[str, dict[str, Tensor]]:
+        """Return the tensors that have a row for each expert, ``[S, E, ...]``, as in `Expert`."""
+        parameters = dict(self.loss.named_parameters())
+        named, stack = {**parameters, **dict(self.loss.named_buffers())}, self.actor.batch_size
+        return {
+            "networks": {k: v for k, v in named.items() if v.shape[: len(stack)] == stack},
+            "moments": {
+                f"{moment} of {name}": value
+                for name, parameter in parameters.items()
+                for moment, value in self.optimizer.state.get(parameter, {}).items()
+                if moment != "step"
+            },
+        }
+
+    @torch.no_grad()
+    def read(self, seed: int, slot: int) -> Expert:
+        """Copy an expert, given its place in the stack."""
+        expert = {
+            part: {name: tensor[seed, slot].clone() for name, tensor in tensors.items()}
+            for part, tensors in self._stacked().items()
+        }
+        noise = self.loss.noise
+        return {**expert, "noise": {} if noise is None else {"state": noise.get(seed, slot)}}
+
+    @torch.no_grad()
+    def write(self, seed: int, slot: int, expert: Expert) -> None:
+        """Put an expert into a place of the stack; moments that it lacks are 0."""
+        for part, tensors in self._stacked().items():
+            for name, tensor in tensors.items():
+                tensor[seed, slot] = expert[part].get(name, 0.0)
+        if self.loss.noise is not None:
+            self.loss.noise.set(seed, slot, expert["noise"]["state"])
+
+    @torch.no_grad()
+    def resize(self, width: int) -> None:
+        """Change the number ``E`` of experts, by leaving out the last or by copies of the first.
+
+        Tensors keep their identity, so that optimizer, targets and policy follow. Copies have no
+        moments.
+        """
+        now = self.actor.batch_size[1]
+        if width == now:
+            return
+        self.optimizer.zero_grad()
+        columns = [slot if slot < now else 0 for slot in range(width)]
+        for part, tensors in self._stacked().items():
+            for tensor in tensors.values():
+                resized = tensor[:, columns]
+                if part == "moments":
+                    resized[:, now:] = 0.0
+                tensor.data = resized
+        self.loss.batch_size = self.actor.batch_size
+        if self.loss.noise is not None:
+            self.loss.noise.resize(width)
+
+    def actor_weights(self, expert: Expert) -> dict[str, Tensor]:
+        """Copy the weights of an expert's policy to the CPU, by name in the actor."""
+        networks = expert["networks"]
+        return {
+            name: networks[f"actor_network_params.{name}"].to("cpu", copy=True)
+            for name, _ in self.actor.named_parameters()
+        }
 
     @property
     def actor_is_due(self) -> bool:

@@ -59,6 +59,24 @@ class SeededNoise(nn.Module):
             drawn = normal(self.generators, like.shape[len(self.batch_size) :]).view(like.shape)
         return drawn.to(like)
 
+    def get(self, seed: int, expert: int) -> Tensor:
+        """Return the state of a generator, in a batch ``[S, E]``."""
+        return self.generators[seed * self.batch_size[1] + expert].get_state()
+
+    def set(self, seed: int, expert: int, state: Tensor) -> None:
+        """Restore the result of `get`."""
+        self.generators[seed * self.batch_size[1] + expert].set_state(state.cpu())
+
+    def resize(self, width: int) -> None:
+        """Change ``E`` of a batch ``[S, E]``; generators that are added have yet to be `set`."""
+        n_seeds, now = self.batch_size
+        self.generators = [
+            self.generators[seed * now + expert] if expert < now else torch.Generator()
+            for seed in range(n_seeds)
+            for expert in range(width)
+        ]
+        self.batch_size = torch.Size([n_seeds, width])
+
     def get_extra_state(self) -> Tensor:
         """Return the states of the generators, uint8 ``[number, bytes]``."""
         states = [generator.get_state() for generator in self.generators]

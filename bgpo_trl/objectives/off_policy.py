@@ -18,6 +18,7 @@ from torchrl.objectives.value import TD0Estimator
 
 from bgpo_trl.configs import RLConfig
 from bgpo_trl.errors import missing_key
+from bgpo_trl.objectives.noise import SeededNoise
 
 __all__ = ["OffPolicyLoss", "TransitionKeys"]
 
@@ -133,6 +134,7 @@ class OffPolicyLoss(LossModule):
         if reduction not in ("sum", "none"):
             raise ValueError(f"reduction must be sum or none, got {reduction!r}")
         super().__init__()
+        self.noise: SeededNoise | None = None
         self.batch_size = torch.Size(getattr(actor_network, "batch_size", ()))
         critics = torch.Size(getattr(value_network, "batch_size", ()))
         wanted = (*self.batch_size, 2) if self.twin_critics else self.batch_size

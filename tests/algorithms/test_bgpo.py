@@ -30,7 +30,7 @@ def plain_action(algorithm, state):
     """Actions without noise, computed from the weights of the snapshots."""
     actions = []
     for seed, group in enumerate(groups_of(state, algorithm)):
-        weight = algorithm.experts.actor_weights(seed, group)
+        weight = algorithm.actor_weights(seed, group)
         x = torch.cat([state[key][seed] for key in algorithm.in_keys])
         hidden = (x @ weight["mlp.layers.0.weight"] + weight["mlp.layers.0.bias"]).relu()
         actions.append(
@@ -208,12 +208,11 @@ def test_snapshots_have_the_context_of_training_and_learn_nothing(make_bgpo, var
         policy = algorithm.snapshot(index, *shown, torch.Generator())
         assert policy.context[index, 0].equal(0.25 * state["behavior"][index])
         row = (index, 0) if algorithm.config.experts else ()  # else it is the same for all
-        for key, value in algorithm.experts.actor_weights(index, group).items():
+        for key, value in algorithm.actor_weights(index, group).items():
             assert policy.parameters[key][row].equal(value)
     for index, graph in enumerate(before):
         assert_same_graph(algorithm.gwr.graph(index), graph, rtol=0, atol=0)
-    for part in ("experts", "active", "learner"):
-        assert_same(algorithm.state_dict()[part], states[part])
+    assert_same(algorithm.state_dict(), states)
 
 
 def test_test_episodes_are_played_by_the_expert_of_their_demonstration(make_bgpo, bank):
@@ -229,7 +228,7 @@ def test_test_episodes_are_played_by_the_expert_of_their_demonstration(make_bgpo
     behaviors = algorithm.gwr.lookup(embedding.expand(2, 3, 4, 32)).embedding
     assert all(len(of_seed.unique()) > 1 for of_seed in groups)
     for seed, t, m in torch.cartesian_prod(*map(torch.arange, groups.shape)).tolist():
-        weight = algorithm.experts.actor_weights(seed, int(groups[seed, t, m]))
+        weight = algorithm.actor_weights(seed, int(groups[seed, t, m]))
         x = torch.cat([state[seed, t, m], 0.25 * behaviors[seed, t, m]])
         hidden = (x @ weight["mlp.layers.0.weight"] + weight["mlp.layers.0.bias"]).relu()
         action = hidden @ weight["mlp.layers.1.weight"] + weight["mlp.layers.1.bias"]
@@ -360,8 +359,8 @@ def test_each_seed_of_a_batch_learns_as_it_would_alone(make_bgpo, variant, rl):
             n_groups = int(alone.groups.num_groups)
             assert n_groups == batch.groups.num_groups[index] > 2
             for group in range(n_groups):
-                ours = batch.experts.actor_weights(index, group)
-                for key, value in alone.experts.actor_weights(0, group).items():
+                ours = batch.actor_weights(index, group)
+                for key, value in alone.actor_weights(0, group).items():
                     torch.testing.assert_close(ours[key], value, rtol=1e-4, atol=1e-4)
         losses.append(alone.update())
     for key, value in batch.update().items():

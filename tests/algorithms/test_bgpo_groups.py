@@ -66,7 +66,7 @@ def test_joined_groups_have_one_expert_and_one_replay(make_bgpo, bank):
     assert joined in pair
     (other,) = {*pair} - {joined}
     assert other not in algorithm.groups.numbers(1)
-    assert other not in algorithm._active.group[1]
+    assert other not in algorithm.active.group[1]
     for replay in (algorithm.replay, algorithm.shown._shown):
         entries, group = replay.contents(1)
         assert group.equal(after[entries["demo_index"]])
@@ -84,9 +84,9 @@ def test_another_group_plays_where_demonstrations_of_the_group_never_began(make_
     for seed, start, group in began:
         rows = (data["latent"][seed] == start).all(-1) & starts[seed]
         assert rows.any() and (data["group"][seed][rows] == group).any()
-    for seed, active in enumerate(algorithm._active.group.tolist()):
+    for seed, active in enumerate(algorithm.active.group.tolist()):
         assert algorithm.groups.numbers(seed)[-1] in active
-    assert {*data["group"].unique().tolist()} - {*algorithm._active.group.unique().tolist()}
+    assert {*data["group"].unique().tolist()} - {*algorithm.active.group.unique().tolist()}
 
 
 def batches_of(algorithm):
@@ -94,7 +94,7 @@ def batches_of(algorithm):
     batches, learn = [], algorithm.learn
 
     def spy(batch):
-        batches.append((algorithm._active.group, batch.clone()))
+        batches.append((algorithm.active.group, batch.clone()))
         return learn(batch)
 
     algorithm.learn = spy
@@ -153,7 +153,7 @@ def test_what_is_stored_is_of_the_group_that_its_demonstration_has_today(make_bg
             counts = replay.sizes(torch.arange(9).expand(2, 9))[seed]
             assert counts.equal(group.bincount(minlength=9))
             known = {*algorithm.groups.numbers(seed), -1}
-            assert {*algorithm._active.group[seed].tolist()} <= known
+            assert {*algorithm.active.group[seed].tolist()} <= known
     assert n_groups >= {1, 3}
     assert algorithm.groups.revision.min() > 0
     assert all(len(groups) > 2 for groups in played)

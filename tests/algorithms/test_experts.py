@@ -61,7 +61,7 @@ def make(name="ddpg", most=2, seeds=SEEDS, rest_after=99):
     config = replace(RL[name].config, hidden_sizes=(8,))
     spec = LearnerSpec(seeds, ["state"], 6, (0.0, 1.1), torch.device("cpu"))
     return Experts(
-        lambda width: make_learner(config, replace(spec, experts=range(width))),
+        make_learner(config, spec),
         ActiveGroups(len(seeds), most, rest_after),
         lambda seed, group: PARENTS[group],
     )
@@ -85,6 +85,10 @@ def learn(experts, seed, rows=slice(None)):
     batch = data[torch.arange(len(group)).unsqueeze(1), group.clamp(min=0)].clone()
     weight = (group >= 0).float().unsqueeze(-1).expand(-1, -1, 8)
     experts.learner.learn(batch.set("priority_weight", weight))
+
+
+def width_of(experts):
+    return experts.learner.actor.batch_size[1]
 
 
 def slot_of(experts, seed, group):
@@ -213,10 +217,10 @@ def test_a_stack_is_as_wide_as_groups_are_active(name):
     for step, groups in enumerate([(0, 0), (0, 1), (2, 1), (3, 1), (4, 1), *[(4, 1)] * 3]):
         experts.play(groups)
         learn(experts, step)
-        widths.append(experts.width)
-        assert {p.shape[:2] for p in experts.learner.loss.parameters()} == {(2, experts.width)}
+        widths.append(width_of(experts))
+        assert {p.shape[:2] for p in experts.learner.loss.parameters()} == {(2, width_of(experts))}
         for state in experts.learner.optimizer.state.values():
-            assert state["exp_avg"].shape[:2] == (2, experts.width)
+            assert state["exp_avg"].shape[:2] == (2, width_of(experts))
             assert int(state["step"]) == step + 1 if name != "td3" else True
     assert widths == [1, 2, 2, 3, 3, 3, 2, 1]
 
@@ -275,7 +279,7 @@ def test_a_seed_of_a_batch_is_that_seed_alone(name):
             second = 2
         slots = together.play([first, second])
         assert alone.play([second]).tolist() == slots[1:].tolist()
-        widths.add((together.width, alone.width))
+        widths.add((width_of(together), width_of(alone)))
         learn(together, step)
         learn(alone, step, slice(1, 2))
     assert len(widths) > 3
