@@ -85,7 +85,7 @@ class Algorithm(ABC):
         self.device = torch.device(device)
         self.seeds = tuple(seeds)
         self.n_seeds, self.n_tasks = len(seeds), len(bank.tasks)
-        self.encoders = encoders
+        self.bank, self.encoders = bank, encoders
         if encoders is not None:
             encoders.vae.to(self.device)
         if config.state == "state":
@@ -172,12 +172,7 @@ class Algorithm(ABC):
         return Policy(self.test_actor, self.config.state, parameters, context)
 
     def demonstrations(
-        self,
-        config: AlgorithmConfig,
-        bank: DemonstrationBank,
-        seeds: Sequence[int],
-        constant_keys: Sequence[NestedKey] = (),
-        own_constants: bool = True,
+        self, constant_keys: Sequence[NestedKey] = (), own_constants: bool = True
     ) -> DemonstrationReplay | None:
         """Return the replay of shown demonstrations, or None without a ``demonstration_share``.
 
@@ -187,17 +182,17 @@ class Algorithm(ABC):
         Raises:
             ValueError: If the state is not the latent, or the bank has no steps.
         """
-        if not config.demonstration_share:
+        if not self.config.demonstration_share:
             return None
-        if config.state != "latent":
+        if self.config.state != "latent":
             raise ValueError("demonstrations are latents: set demonstration_share to 0")
         return DemonstrationReplay(
-            bank,
-            generator=generators(seeds, "demonstration replay"),
-            state_key=config.state,
+            self.bank,
+            generator=generators(self.seeds, "demonstration replay"),
+            state_key=self.config.state,
             constant_keys=constant_keys,
             own_constants=own_constants,
-            noise=config.demonstration_noise,
+            noise=self.config.demonstration_noise,
         )
 
     def sample(self, groups: Callable[[int], Tensor], n_rows: int) -> TensorDictBase:

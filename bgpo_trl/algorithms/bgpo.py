@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, cast
 
 import torch
@@ -19,13 +18,11 @@ from bgpo_trl.algorithms.policy import Policy
 from bgpo_trl.algorithms.rl import LearnerSpec, make_learner
 from bgpo_trl.algorithms.trials import GroupTrials
 from bgpo_trl.configs import BGPOConfig
-from bgpo_trl.data.bank import DemonstrationBank, DemonstrationSteps
+from bgpo_trl.data.bank import DemonstrationSteps
 from bgpo_trl.data.demonstration_replay import DemonstrationReplay
 from bgpo_trl.data.replay import GroupReplay
-from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.modules.gwr import GWRB
-from bgpo_trl.scenes import Scene
 from bgpo_trl.seeding import generators
 from bgpo_trl.transforms import DemonstrationSource
 
@@ -50,20 +47,9 @@ class BGPO(Algorithm):
     config: BGPOConfig
     needs_replay = False
 
-    def __init__(
-        self,
-        config: BGPOConfig,
-        *,
-        seeds: Sequence[int],
-        bank: DemonstrationBank,
-        encoders: Representation | None = None,
-        device: torch.device | str = "cpu",
-        scene: Scene | str = "nico",
-    ) -> None:
-        super().__init__(
-            config, seeds=seeds, bank=bank, encoders=encoders, device=device, scene=scene
-        )
-        embedding_size = bank.embedding.shape[-1]
+    def __init__(self, config: BGPOConfig, **arguments: Any) -> None:
+        super().__init__(config, **arguments)
+        seeds, embedding_size = self.seeds, self.bank.embedding.shape[-1]
         self.needs_label = config.context == "label"
         if config.context == "behavior":
             self.gwr = GWRB(
@@ -79,7 +65,6 @@ class BGPO(Algorithm):
                 smallest=config.group_size,
                 evidence=config.group_evidence,
             )
-        self._shown_embedding = bank.embedding
         self._revision = torch.zeros(len(seeds), dtype=torch.int64)
         sizes = {None: 0, "label": self.n_tasks}
         context_size = sizes.get(config.context, embedding_size)
@@ -107,12 +92,10 @@ class BGPO(Algorithm):
             keys=[*keys, "action", *(("next", key) for key in (keys[0], "reward", "terminated"))],
             source_key="demo_index" if config.grouped else None,
         )
-        self.shown = self.demonstrations(
-            config, bank, seeds, constant_keys=keys[1:], own_constants=not config.experts
-        )
+        self.shown = self.demonstrations(keys[1:], own_constants=not config.experts)
         self.trials: GroupTrials | None = None
         if self.shown is not None and config.experts:
-            steps = cast(DemonstrationSteps, bank.steps)
+            steps = cast(DemonstrationSteps, self.bank.steps)
             starts = steps.latents(steps.first)
             self.trials = GroupTrials(starts, seeds=seeds, smallest=config.group_size)
 
@@ -218,7 +201,7 @@ class BGPO(Algorithm):
         if self.groups is None or (changed := self.groups.revision != self._revision).sum() == 0:
             return
         self._revision = self.groups.revision
-        shown = self._shown_embedding.expand(self.n_seeds, *self._shown_embedding.shape)
+        shown = self.bank.embedding.expand(self.n_seeds, *self.bank.embedding.shape)
         group_of = self.groups.lookup(shown, changed).group
         for seed in changed.nonzero().flatten().tolist():
             for replay in (self.replay, self.shown):
