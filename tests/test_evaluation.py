@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict
 
 from bgpo_trl.algorithms import ALGORITHMS, entry
-from bgpo_trl.algorithms.policy import Policy
+from bgpo_trl.algorithms.algorithm import Policy
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.evaluation import Evaluator, evaluate_random_policy
 from bgpo_trl.modules.actor_critic import Actor

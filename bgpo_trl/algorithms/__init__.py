@@ -9,8 +9,7 @@ from typing import Any
 from bgpo_trl.algorithms.algorithm import Algorithm
 from bgpo_trl.algorithms.bgpo import BGPO
 from bgpo_trl.algorithms.dist_nll import DistNLL
-from bgpo_trl.algorithms.ewc import EWC
-from bgpo_trl.algorithms.fine_tuning import FineTuning
+from bgpo_trl.algorithms.ewc import EWC, FineTuning
 from bgpo_trl.algorithms.maml import MAML
 from bgpo_trl.configs import (
     AlgorithmConfig,

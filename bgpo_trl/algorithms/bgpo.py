@@ -10,12 +10,10 @@ from torch import Tensor
 from torch.nn.functional import one_hot
 from torchrl.envs import EnvBase, TransformedEnv
 
-from bgpo_trl.algorithms.algorithm import Algorithm
+from bgpo_trl.algorithms.algorithm import Algorithm, Policy
 from bgpo_trl.algorithms.environments import training_env
 from bgpo_trl.algorithms.experts import ActiveGroups, Experts
-from bgpo_trl.algorithms.learner import Learner
-from bgpo_trl.algorithms.policy import Policy
-from bgpo_trl.algorithms.rl import LearnerSpec, make_learner
+from bgpo_trl.algorithms.rl import Learner, LearnerSpec, make_learner
 from bgpo_trl.algorithms.trials import GroupTrials
 from bgpo_trl.configs import BGPOConfig
 from bgpo_trl.data.bank import DemonstrationSteps

@@ -10,7 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torch.func import functional_call
 
-from bgpo_trl.algorithms.policy import Policy
+from bgpo_trl.algorithms.algorithm import Policy
 from bgpo_trl.algorithms.rl import make_ddpg
 from bgpo_trl.algorithms.task_algorithm import TaskAlgorithm, networks_of
 from bgpo_trl.configs import DistNLLConfig

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bgpo_trl.algorithms.learner import Expert, Learner
+from bgpo_trl.algorithms.rl import Expert, Learner
 
 __all__ = ["ActiveGroups", "Experts"]
 

@@ -7,8 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bgpo_trl.algorithms.learner import Learner
-from bgpo_trl.algorithms.policy import Policy
+from bgpo_trl.algorithms.algorithm import Policy
+from bgpo_trl.algorithms.rl import Learner
 from bgpo_trl.algorithms.task_algorithm import TaskAlgorithm
 from bgpo_trl.configs import MAMLConfig
 from bgpo_trl.modules.actor_critic import Actor

@@ -6,9 +6,9 @@ import pytest
 import torch
 from torchrl.envs import check_env_specs
 
+from bgpo_trl.algorithms.algorithm import Policy
 from bgpo_trl.algorithms.bgpo import BGPO
 from bgpo_trl.algorithms.environments import encode
-from bgpo_trl.algorithms.policy import Policy
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.modules.gwr import GWRB
 from bgpo_trl.scenes.nico import NICO

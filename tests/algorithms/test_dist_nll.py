@@ -8,8 +8,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from bgpo_trl.algorithms.algorithm import Policy
 from bgpo_trl.algorithms.dist_nll import DistNLL
-from bgpo_trl.algorithms.policy import Policy
 from bgpo_trl.configs import DistNLLConfig
 from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
 from bgpo_trl.modules.multi_head_actor import MultiHeadActor

@@ -8,8 +8,8 @@ import torch
 from tensordict import TensorDict
 from torch.nn.functional import layer_norm
 
+from bgpo_trl.algorithms.algorithm import Policy
 from bgpo_trl.algorithms.maml import MAML
-from bgpo_trl.algorithms.policy import Policy
 from bgpo_trl.configs import MAMLConfig
 from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
 from bgpo_trl.modules.actor_critic import Actor

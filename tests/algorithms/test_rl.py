@@ -8,8 +8,8 @@ import torch
 from tensordict import TensorDict
 
 from bgpo_trl.algorithms import ALGORITHMS
+from bgpo_trl.algorithms.algorithm import Policy
 from bgpo_trl.algorithms.bgpo import BGPO
-from bgpo_trl.algorithms.policy import Policy
 from bgpo_trl.algorithms.rl import RL, LearnerSpec, RLEntry, make_ddpg, make_learner
 from bgpo_trl.configs import DDPGConfig, RLConfig, TD3Config
 from bgpo_trl.seeding import generators
