@@ -192,16 +192,9 @@ class TD3Learner(Learner):
     """Learner whose actor and targets are updated once in ``policy_delay`` updates of its critics.
 
     (Fujimoto et al., 2018.) Arguments as for `Learner`.
-
-    Raises:
-        ValueError: If ``policy_delay`` is less than 1.
     """
 
-    loss: OffPolicyLoss
-
     def __init__(self, actor: Any, loss: OffPolicyLoss, config: TD3Config) -> None:
-        if config.policy_delay < 1:
-            raise ValueError(f"policy_delay must be at least 1, got {config.policy_delay}")
         super().__init__(actor, loss, config, noise=config.noise)
         self.policy_delay, self.n_updates = config.policy_delay, 0
         self.loss_actor = torch.zeros(actor.batch_size[0])

@@ -169,22 +169,6 @@ def test_a_new_group_starts_from_the_one_it_parted_from_without_its_moments(name
     assert all(" of " in key for key in differing(grandchild, parent))
 
 
-def test_a_parent_that_is_put_aside_is_inherited_from_too():
-    experts = make()
-    for step, group in enumerate((0, 2, 3)):  # two slots: 0 is put aside
-        experts.play([group, group])
-        learn(experts, step)
-    assert 0 not in experts.active.groups[0]
-    parent = experts.actor_weights(0, 0)
-    (slot, _) = experts.play([1, 3]).tolist()
-    child = tensors_of(experts, 0, slot)
-    for key, value in parent.items():
-        assert child[f"actor_network_params.{key}"].equal(value)
-    learn(experts, 9)  # it was not taken from the parent, but copied
-    assert not differing(experts.actor_weights(0, 0), parent)
-    assert differing(experts.actor_weights(0, 1), parent) == set(parent)
-
-
 @every_rl
 def test_tests_see_the_weights_of_a_group_wherever_they_are(name):
     experts = make(name)
