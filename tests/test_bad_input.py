@@ -24,8 +24,11 @@ from bgpo_trl.modules.multi_head_actor import MultiHeadActor
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
 from bgpo_trl.objectives.ddpg import DDPGLoss
-from bgpo_trl.objectives.distillation import DistillationLoss
-from bgpo_trl.objectives.representation import SequenceReconstructionLoss, VAEInverseLoss
+from bgpo_trl.objectives.supervised import (
+    DistillationLoss,
+    SequenceReconstructionLoss,
+    VAEInverseLoss,
+)
 from bgpo_trl.objectives.target_update import ForeachSoftUpdate
 from bgpo_trl.scenes.nico import NicoEnv
 from bgpo_trl.training import Trainer
