@@ -24,12 +24,12 @@ from bgpo_trl.modules.multi_head_actor import MultiHeadActor
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
 from bgpo_trl.objectives.ddpg import DDPGLoss
+from bgpo_trl.objectives.off_policy import ForeachSoftUpdate
 from bgpo_trl.objectives.supervised import (
     DistillationLoss,
     SequenceReconstructionLoss,
     VAEInverseLoss,
 )
-from bgpo_trl.objectives.target_update import ForeachSoftUpdate
 from bgpo_trl.scenes.nico import NicoEnv
 from bgpo_trl.training import Trainer
 from bgpo_trl.transforms import (
@@ -135,7 +135,6 @@ WRONG = {
     "ddpg flat reward": (lambda: loss()(transitions(reward=(8,))), "got [8]"),
     "ddpg bounds": (lambda: loss(return_bounds=(1, 0)), "(1, 0)"),
     "ddpg penalty": (lambda: loss(pre_tanh_penalty=NAN), "got nan"),
-    "ddpg distance": (lambda: loss(loss_function="huber"), "'huber'"),
     "ddpg gamma": (lambda: loss().make_value_estimator(gamma=95), "gamma must"),
     "targets that never move": (lambda: ForeachSoftUpdate(loss(), tau=0.0), "tau=0.0"),
     "targets without a rate": (lambda: ForeachSoftUpdate(loss()), "tau=None"),

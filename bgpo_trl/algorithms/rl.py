@@ -19,9 +19,8 @@ from bgpo_trl.configs import DDPGConfig, RLConfig, SACConfig, TD3Config
 from bgpo_trl.modules.actor_critic import Actor, Critic
 from bgpo_trl.modules.gaussian_actor import GaussianActor
 from bgpo_trl.objectives.ddpg import DDPGLoss
-from bgpo_trl.objectives.off_policy import OffPolicyLoss
+from bgpo_trl.objectives.off_policy import ForeachSoftUpdate, OffPolicyLoss
 from bgpo_trl.objectives.sac import SACLoss
-from bgpo_trl.objectives.target_update import ForeachSoftUpdate
 from bgpo_trl.objectives.td3 import TD3Loss
 from bgpo_trl.seeding import generators, normal
 

@@ -12,8 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from bgpo_trl.configs import SACConfig
-from bgpo_trl.objectives.noise import SeededNoise
-from bgpo_trl.objectives.off_policy import OffPolicyLoss
+from bgpo_trl.objectives.off_policy import OffPolicyLoss, SeededNoise
 
 __all__ = ["SACLoss"]
 

@@ -11,8 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from bgpo_trl.configs import TD3Config
-from bgpo_trl.objectives.noise import SeededNoise
-from bgpo_trl.objectives.off_policy import OffPolicyLoss
+from bgpo_trl.objectives.off_policy import OffPolicyLoss, SeededNoise
 
 __all__ = ["TD3Loss"]
 

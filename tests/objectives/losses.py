@@ -8,8 +8,8 @@ from torch import Tensor
 from bgpo_trl.modules.actor_critic import Actor, Critic
 from bgpo_trl.modules.gaussian_actor import GaussianActor
 from bgpo_trl.objectives.ddpg import DDPGLoss
+from bgpo_trl.objectives.off_policy import ForeachSoftUpdate
 from bgpo_trl.objectives.sac import SACLoss
-from bgpo_trl.objectives.target_update import ForeachSoftUpdate
 from bgpo_trl.objectives.td3 import TD3Loss
 
 SIZES = {"state": 6, "label": 2}

@@ -14,7 +14,7 @@ from torchrl.objectives.value import TD0Estimator
 from bgpo_trl.configs import RLConfig
 from bgpo_trl.modules.actor_critic import Critic
 from bgpo_trl.objectives.ddpg import DDPGLoss
-from bgpo_trl.objectives.target_update import ForeachSoftUpdate
+from bgpo_trl.objectives.off_policy import ForeachSoftUpdate
 from tests.objectives.losses import (
     ACTION,
     LOSSES,
@@ -304,7 +304,6 @@ def test_bad_arguments_are_refused(name):
     for option, value in (
         ("return_bounds", (1.0, 1.0)),
         ("imitation", math.nan),
-        ("loss_function", "huber"),
         ("constant_keys", ["lable"]),
     ):
         with pytest.raises(ValueError, match=option):
