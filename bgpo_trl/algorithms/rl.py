@@ -16,8 +16,7 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from bgpo_trl.configs import DDPGConfig, RLConfig, SACConfig, TD3Config
-from bgpo_trl.modules.actor_critic import Actor, Critic
-from bgpo_trl.modules.gaussian_actor import GaussianActor
+from bgpo_trl.modules.actor_critic import Actor, Critic, GaussianActor
 from bgpo_trl.objectives.ddpg import DDPGLoss
 from bgpo_trl.objectives.off_policy import ForeachSoftUpdate, OffPolicyLoss
 from bgpo_trl.objectives.sac import SACLoss

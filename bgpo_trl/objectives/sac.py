@@ -47,7 +47,7 @@ class SACLoss(OffPolicyLoss):
 
     Examples:
         >>> from bgpo_trl.modules.actor_critic import Critic
-        >>> from bgpo_trl.modules.gaussian_actor import GaussianActor
+        >>> from bgpo_trl.modules.actor_critic import GaussianActor
         >>> actor = GaussianActor(6, 4, in_keys=["state"], batch_size=(10,))
         >>> loss = SACLoss(actor, Critic(6, 4, in_keys=["state"], batch_size=(10, 2)))
         >>> loss.make_value_estimator(gamma=0.95)

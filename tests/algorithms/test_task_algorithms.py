@@ -9,8 +9,7 @@ from tensordict import TensorDict
 
 from bgpo_trl.algorithms.algorithm import Policy
 from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
-from bgpo_trl.modules.actor_critic import Actor
-from bgpo_trl.modules.multi_head_actor import MultiHeadActor
+from bgpo_trl.modules.actor_critic import Actor, MultiHeadActor
 from bgpo_trl.transforms import TaskSchedule
 from tests.algorithms.playing import assert_same, play
 

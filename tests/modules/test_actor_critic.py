@@ -8,9 +8,7 @@ import torch
 from tensordict import TensorDict
 from torch.func import functional_call
 
-from bgpo_trl.modules.actor_critic import Actor, Critic
-from bgpo_trl.modules.gaussian_actor import GaussianActor
-from bgpo_trl.modules.multi_head_actor import MultiHeadActor
+from bgpo_trl.modules.actor_critic import Actor, Critic, GaussianActor, MultiHeadActor
 from bgpo_trl.modules.stacked_mlp import StackedLinear, StackedMLP
 
 

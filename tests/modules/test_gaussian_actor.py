@@ -5,7 +5,7 @@ import torch
 from tensordict import TensorDict
 from torch.distributions import Normal, TanhTransform, TransformedDistribution
 
-from bgpo_trl.modules.gaussian_actor import GaussianActor
+from bgpo_trl.modules.actor_critic import GaussianActor
 
 
 def make(batch_size=(), generator=None):

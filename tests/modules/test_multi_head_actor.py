@@ -4,7 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from bgpo_trl.modules.multi_head_actor import MultiHeadActor
+from bgpo_trl.modules.actor_critic import MultiHeadActor
 
 
 def generator(seed):

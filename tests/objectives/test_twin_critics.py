@@ -8,8 +8,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from bgpo_trl.modules.actor_critic import Actor, Critic
-from bgpo_trl.modules.gaussian_actor import GaussianActor
+from bgpo_trl.modules.actor_critic import Actor, Critic, GaussianActor
 from bgpo_trl.objectives.sac import SACLoss
 from tests.objectives.losses import (
     ACTION,
