@@ -7,7 +7,6 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from bgpo_trl.data.bank import DemonstrationSteps
 from bgpo_trl.data.demonstration_replay import DemonstrationReplay
 
 CONSTANT = ["behavior", "label"]
@@ -100,24 +99,6 @@ def test_transitions_are_the_steps_of_what_was_shown_in_the_rows_group(shown, ba
         assert found[key] == every
 
 
-def test_entries_have_the_shapes_and_types_of_played_transitions(shown):
-    drawn = shown.sample(GROUP)
-    assert drawn.batch_size == (2, 5)
-    expected = {
-        "latent": ((64,), torch.float32),
-        "action": ((4,), torch.float32),
-        "behavior": ((2,), torch.float32),
-        "label": ((), torch.int64),
-        "priority_weight": ((), torch.float32),
-        "demonstrated": ((), torch.bool),
-        ("next", "latent"): ((64,), torch.float32),
-        ("next", "reward"): ((1,), torch.float32),
-        ("next", "terminated"): ((1,), torch.bool),
-    }
-    found = {key: (v.shape[2:], v.dtype) for key, v in drawn.items(True, True)}
-    assert found == expected
-
-
 def test_noise_is_on_states_alone_and_a_seeds_own_however_many_slots_are_free(bank):
     quiet, noisy, wide = (make(bank.seen(), noise=noise) for noise in (0.0, 0.4, 0.4))
     for replay in (quiet, noisy, wide):
@@ -188,13 +169,6 @@ def test_a_seed_of_a_stack_is_that_seed_alone(bank):
                 assert other[key][has].equal(drawn[seed][key][has])
 
 
-def test_only_so_many_are_remembered(bank):
-    replay = make(bank.seen(), n_seeds=1, capacity=3)
-    show(replay, *([(index, 1.0, 0)] for index in range(6)))
-    drawn = replay.sample(torch.zeros(1, 200, dtype=torch.int64))
-    assert drawn["behavior"][0, :, 0].unique().tolist() == [3, 4, 5]
-
-
 def test_a_restored_replay_continues_as_the_saved_one(shown, bank):
     shown.sample(GROUP)
     file = io.BytesIO()
@@ -214,11 +188,3 @@ def test_a_bank_without_steps_is_refused(bank):
     # Those of held-out demonstrations are not kept.
     with pytest.raises(ValueError, match="has no steps of demonstration 24 to learn from"):
         make(bank)
-
-
-def test_a_demonstration_of_one_frame_is_refused(bank):
-    steps = DemonstrationSteps.of(
-        torch.zeros(24, 3, 64), torch.zeros(24, 2, 4), 3 - 2 * (torch.arange(24) == 4).long()
-    )
-    with pytest.raises(ValueError, match="has no steps of demonstration 4 to learn from"):
-        make(replace(bank.seen(), steps=steps))
