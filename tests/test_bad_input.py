@@ -135,8 +135,7 @@ WRONG = {
     "ddpg bounds": (lambda: loss(return_bounds=(1, 0)), "(1, 0)"),
     "ddpg penalty": (lambda: loss(pre_tanh_penalty=NAN), "got nan"),
     "ddpg gamma": (lambda: loss().make_value_estimator(gamma=95), "gamma must"),
-    "targets that never move": (lambda: ForeachSoftUpdate(loss(), tau=0.0), "tau=0.0"),
-    "targets without a rate": (lambda: ForeachSoftUpdate(loss()), "tau=None"),
+    "targets that never move": (lambda: ForeachSoftUpdate(loss(), tau=0.0), "got 0.0"),
     "distillation without teacher": (
         lambda: DistillationLoss(actor())(transitions()), "no 'teacher_action'"),
     "distillation without spread": (

@@ -51,16 +51,13 @@ class SeededNoise(nn.Module):
     ) -> None:
         super().__init__()
         self.batch_size = torch.Size(batch_size)
-        self.generators: list[torch.Generator] = []
-        if isinstance(generator, torch.Generator):
-            self.generators = [generator]
-        elif generator is not None:
-            self.generators = list(generator)
-            if len(self.generators) != self.batch_size.numel():
-                raise ValueError(
-                    f"pass one generator a seed: {self.batch_size.numel()} are needed, got "
-                    f"{len(self.generators)}"
-                )
+        one_for_all = isinstance(generator, torch.Generator)
+        self.generators = [generator] if one_for_all else list(generator or ())
+        if isinstance(generator, Sequence) and len(generator) != self.batch_size.numel():
+            raise ValueError(
+                f"pass one generator a seed: {self.batch_size.numel()} are needed, got "
+                f"{len(generator)}"
+            )
 
     def forward(self, like: Tensor) -> Tensor:
         """Return noise of the shape, dtype and device of ``like`` ``[*S, ...]``."""
@@ -470,11 +467,10 @@ class ForeachSoftUpdate(SoftUpdate):
 
     Args:
         loss_module: Loss with target networks.
-        eps: Share of the target that is kept, ``1 - tau``; exclusive with ``tau``.
-        tau: Share of the source that is taken over (Polyak averaging).
+        tau: Share of the source that is taken over (Polyak averaging), in (0, 1].
 
     Raises:
-        ValueError: If not exactly one of ``eps`` and ``tau`` is given, or targets would never move.
+        ValueError: If ``tau`` is out of range.
 
     Examples:
         >>> from bgpo_trl.modules.actor_critic import Actor, Critic
@@ -483,13 +479,10 @@ class ForeachSoftUpdate(SoftUpdate):
         >>> target_update.step()  # after each step of the optimizer
     """
 
-    def __init__(
-        self, loss_module: LossModule, *, eps: float | None = None, tau: float | None = None
-    ) -> None:
-        kept = eps if tau is None else 1 - tau
-        if (eps is not None and tau is not None) or kept is None or not 0 <= kept < 1:
-            raise ValueError(f"give tau in (0, 1], or eps in [0, 1), got tau={tau}, eps={eps}")
-        super().__init__(loss_module, eps=eps, tau=tau)
+    def __init__(self, loss_module: LossModule, *, tau: float) -> None:
+        if not 0 < tau <= 1:
+            raise ValueError(f"tau must be above 0 and at most 1, got {tau}")
+        super().__init__(loss_module, tau=tau)
         pairs = [
             pair
             for name, target in loss_module.named_children()
@@ -497,10 +490,10 @@ class ForeachSoftUpdate(SoftUpdate):
             for pair in _float_pairs(target, getattr(loss_module, name.removeprefix("target_")))
         ]
         self._target_tensors, self._source_tensors = map(list, zip(*pairs, strict=True))
-        self._move = get_ema_multi_avg_fn(kept)
+        self._move = get_ema_multi_avg_fn(1 - tau)
 
     def step(self) -> None:
-        """Update all targets: ``target <- eps * target + (1 - eps) * source``."""
+        """Update all targets: ``target <- (1 - tau) * target + tau * source``."""
         self._move(self._target_tensors, self._source_tensors, None)
 
 
