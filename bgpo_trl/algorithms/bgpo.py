@@ -12,9 +12,8 @@ from torchrl.envs import EnvBase, TransformedEnv
 
 from bgpo_trl.algorithms.algorithm import Algorithm, Policy
 from bgpo_trl.algorithms.environments import training_env
-from bgpo_trl.algorithms.experts import ActiveGroups, Experts
+from bgpo_trl.algorithms.experts import ActiveGroups, Experts, GroupTrials
 from bgpo_trl.algorithms.rl import Learner, LearnerSpec, make_learner
-from bgpo_trl.algorithms.trials import GroupTrials
 from bgpo_trl.configs import BGPOConfig
 from bgpo_trl.data.bank import DemonstrationSteps
 from bgpo_trl.data.demonstration_replay import DemonstrationReplay
