@@ -131,17 +131,6 @@ def test_each_half_of_a_tasks_batch_has_its_share_of_demonstrations(make, bank):
     assert n_batches > 50
 
 
-def test_each_test_draws_its_own_transitions(make):
-    algorithm = make()
-    play(algorithm, 40)
-    first, same, other = (
-        snapshot(algorithm, 0, generator_seed=seed).parameters for seed in (5, 5, 6)
-    )
-    for key, value in first.items():
-        assert value.equal(same[key])
-        assert not value.equal(other[key])
-
-
 @pytest.mark.parametrize(
     ("name", "value"),
     [
