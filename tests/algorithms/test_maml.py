@@ -4,7 +4,6 @@ import pytest
 import torch
 from torch.nn.functional import layer_norm
 
-from bgpo_trl.configs import MAMLConfig
 from bgpo_trl.seeding import generators
 from bgpo_trl.transforms import TaskSchedule
 from tests.algorithms.playing import play
@@ -129,17 +128,3 @@ def test_each_half_of_a_tasks_batch_has_its_share_of_demonstrations(make, bank):
             assert (bank.seen().task[of.long().argmax(-1)] == task).all()
             n_batches += 1
     assert n_batches > 50
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("inner_learning_rate", -0.1),
-        ("task_batch_size", 0),
-        ("task_batch_size", 7),  # one half is to adapt to, the other to judge by
-        ("adaptation_size", 0),
-    ],
-)
-def test_settings_without_a_meaning_are_refused(name, value):
-    with pytest.raises(ValueError, match=f"^{name} must be .*, got {value}$"):
-        MAMLConfig(**{name: value})
