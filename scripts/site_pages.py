@@ -19,8 +19,7 @@ REFERENCE = {
     "transforms": [
         "transforms.frame_encoder",
         "transforms.demonstration_source",
-        "transforms.behavior_lookup",
-        "transforms.group_lookup",
+        "transforms.lookup",
         "transforms.behavior_matching",
     ],
     "gwr": ["modules.gwr", "modules.gwr_estimator", "modules.behavior_groups"],

@@ -141,5 +141,5 @@ def test_a_replay_buffer_with_a_lookup_is_saved_and_loaded():
     second.load_state_dict(first.state_dict())
     drawn = second.sample()
     assert drawn["behavior"].equal(
-        first._transform[0].gwr.lookup(drawn["demo_embedding"]).embedding
+        first._transform[0].network.lookup(drawn["demo_embedding"]).embedding
     )

@@ -121,7 +121,6 @@ def test_outside_an_environment_it_only_looks_up():
     assert found["group_novelty"].equal(expected.novelty)
     assert found["group_novelty"].isfinite().all()
     assert all(len(state["points"]) == 15 for state in groups.get_extra_state())
-    assert lookup.groups is groups
 
 
 def test_bad_batch_sizes_and_missing_entries_are_refused():

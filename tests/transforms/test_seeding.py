@@ -74,7 +74,7 @@ def test_a_row_has_the_seed_counted_up_to_it():
 
 def test_a_seed_does_not_undo_what_was_learned():
     env = compose((2,), max_steps=2)
-    source, gwr = env.transform[1], env.transform[2].gwr
+    source, gwr = env.transform[1], env.transform[2].network
     env.set_seed(7)
     rollout(env, 6)
     learned = [gwr.graph(row).weights for row in range(2)]
