@@ -22,6 +22,7 @@ from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.modules.gwr import GWRB
 from bgpo_trl.seeding import generators
 from bgpo_trl.transforms import DemonstrationSource
+from bgpo_trl.transforms.behavior_matching import matching_reward
 
 
 class BGPO(Algorithm):
@@ -177,8 +178,8 @@ class BGPO(Algorithm):
         if ended.any():
             reward = torch.ones(self.n_seeds)
             if self.beta:
-                error = transition["behavior"] - transition["demo_embedding"]
-                reward += self.beta * torch.exp(-torch.linalg.vector_norm(error, dim=-1))
+                phi = transition["demo_embedding"]
+                reward += self.beta * matching_reward(transition["behavior"], phi)
             shown.add(transition, reward, group, ended)
 
     def _join_groups(self, transition: TensorDictBase) -> None:
