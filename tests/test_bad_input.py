@@ -209,7 +209,6 @@ WRONG = {
         ).reset(), "have sizes (16, 32)"),
     "NaN bonus": (lambda: BehaviorMatchingReward(lae, beta=NAN), "got nan"),
     "encoder without frames": (lambda: world(FrameEncoder(VAE())).reset(), "no 'pixels'"),
-    "keys that do not pair": (lambda: FrameEncoder(VAE(), out_keys=("a", "b")), "got 2 for 1"),
     "time limit too late": (lambda: world(source(), StepCounter(5)).reset(), "DemonstrationSource"),
     "learning without an end": (
         lambda: TransformedEnv(

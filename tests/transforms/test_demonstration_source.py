@@ -187,7 +187,6 @@ def test_bad_arguments_and_wrong_orders_are_refused():
             lambda: DemonstrationSource(bank, both, batch_size=[3], generator=generators([0, 1])),
             "one or 3",
         ),
-        (lambda: DemonstrationSource(bank, both, batch_size=[3], follow=source), "follow"),
         (lambda: make([0, 1], base=MockEnv([0, 1, 2]))[0].reset(), "batch_size"),
         (lambda: source.seed_rows([1]), "1 seeds for 2 simulations"),
     ):
