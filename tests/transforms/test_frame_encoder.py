@@ -4,7 +4,6 @@ import pytest
 import torch
 from torchrl.envs import Compose, Transform, TransformedEnv, check_env_specs
 
-from bgpo_trl.modules.vae import VAE
 from bgpo_trl.transforms import FrameEncoder
 from tests.transforms.environment import MockEnv, TopRow, make_modules, play
 
@@ -89,8 +88,3 @@ def test_an_environment_without_these_frames_is_refused():
     vae = make_modules()[0]
     with pytest.raises(ValueError, match=r"found no 'left'.*give the key"):
         _ = TransformedEnv(MockEnv(), FrameEncoder(vae, "left")).observation_spec
-
-
-def test_the_spec_has_the_dtype_of_the_encoder():
-    env = TransformedEnv(MockEnv([0, 1]), FrameEncoder(VAE().double()))
-    assert env.observation_spec["latent"].dtype == env.reset()["latent"].dtype == torch.float64
