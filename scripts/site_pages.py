@@ -33,8 +33,7 @@ REFERENCE = {
     "objectives": [
         "objectives.off_policy",
         "objectives.ddpg",
-        "objectives.td3",
-        "objectives.sac",
+        "objectives.twin_critics",
         "objectives.maml",
         "objectives.supervised",
     ],

@@ -18,7 +18,8 @@ from bgpo_trl.analysis import metrics, statistics
 from bgpo_trl.configs import RunConfig
 from bgpo_trl.files.checkpoint import load_checkpoint
 from bgpo_trl.machine import choose_device, set_threads
-from bgpo_trl.modules.actor_critic import Actor, Critic, MultiHeadActor
+from bgpo_trl.modules.actor_critic import Actor, Critic
+from bgpo_trl.modules.gaussian_actors import MultiHeadActor
 from bgpo_trl.modules.gwr import GWRB
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE

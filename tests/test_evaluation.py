@@ -12,7 +12,8 @@ from bgpo_trl.algorithms import ALGORITHMS, entry
 from bgpo_trl.algorithms.algorithm import Policy
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.evaluation import Evaluator, evaluate_random_policy
-from bgpo_trl.modules.actor_critic import Actor, MultiHeadActor
+from bgpo_trl.modules.actor_critic import Actor
+from bgpo_trl.modules.gaussian_actors import MultiHeadActor
 from bgpo_trl.seeding import stream_seed
 from bgpo_trl.transforms import TaskSchedule
 from suites import nico

@@ -14,7 +14,7 @@ from bgpo_trl.algorithms.algorithm import Policy
 from bgpo_trl.algorithms.rl import make_ddpg
 from bgpo_trl.algorithms.task_algorithm import TaskAlgorithm, networks_of
 from bgpo_trl.configs import DistNLLConfig
-from bgpo_trl.modules.actor_critic import MultiHeadActor
+from bgpo_trl.modules.gaussian_actors import MultiHeadActor
 from bgpo_trl.objectives.supervised import DistillationLoss
 from bgpo_trl.seeding import generators
 

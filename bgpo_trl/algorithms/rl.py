@@ -1,4 +1,4 @@
-"""The RL algorithm f_RL of Alg. 1: DDPG, TD3 or SAC.
+"""The RL algorithm f_RL of Alg. 1: exploration and gradient steps, by default of DDPG.
 
 Another one is added as an entry of `RL` under the ``name`` of its config, as
 ``examples/own_rl_algorithm.py`` does.
@@ -15,24 +15,13 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
-from bgpo_trl.configs import DDPGConfig, RLConfig, SACConfig, TD3Config
-from bgpo_trl.modules.actor_critic import Actor, Critic, GaussianActor
+from bgpo_trl.configs import DDPGConfig, RLConfig
+from bgpo_trl.modules.actor_critic import Actor, Critic
 from bgpo_trl.objectives.ddpg import DDPGLoss
 from bgpo_trl.objectives.off_policy import ForeachSoftUpdate, OffPolicyLoss
-from bgpo_trl.objectives.sac import SACLoss
-from bgpo_trl.objectives.td3 import TD3Loss
 from bgpo_trl.seeding import generators, normal
 
-__all__ = [
-    "RL",
-    "Expert",
-    "Learner",
-    "LearnerSpec",
-    "RLEntry",
-    "SACLearner",
-    "TD3Learner",
-    "make_learner",
-]
+__all__ = ["RL", "Expert", "Learner", "LearnerSpec", "RLEntry", "make_learner"]
 
 
 Expert = dict[str, dict[str, Tensor]]
@@ -71,7 +60,7 @@ class Learner:
         ``expert`` ``[S]`` selects the expert that acts.
         """
         action = self.actor(self._for_all(tensordict))["action"]
-        return self.explore(_of_expert(action, expert), generators)
+        return self.explore(of_expert(action, expert), generators)
 
     def _for_all(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Expand inputs ``[S]`` to all experts, ``[S, E]``."""
@@ -186,63 +175,7 @@ class Learner:
         self.optimizer.load_state_dict(state["optimizer"])
 
 
-class TD3Learner(Learner):
-    """Learner whose actor and targets are updated once in ``policy_delay`` updates of its critics.
-
-    (Fujimoto et al., 2018.) Arguments as for `Learner`.
-    """
-
-    def __init__(self, actor: Any, loss: OffPolicyLoss, config: TD3Config) -> None:
-        super().__init__(actor, loss, config, noise=config.noise)
-        self.policy_delay, self.n_updates = config.policy_delay, 0
-        self.loss_actor = torch.zeros(actor.batch_size[0])
-
-    def learn(self, batch: TensorDictBase) -> dict[str, Tensor]:
-        """Take a gradient step; ``loss_actor`` is that of the latest actor update, 0 before."""
-        parts = super().learn(batch)
-        self.n_updates += 1
-        self.loss_actor = parts.get("loss_actor", self.loss_actor)
-        return {"loss_actor": self.loss_actor, **parts}
-
-    def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
-        """Return the losses, without that of the actor if its update is not due."""
-        if self.actor_is_due:
-            return super().losses(batch)
-        return {"loss_value": self.loss.loss_value(batch)[0]}
-
-    @property
-    def actor_is_due(self) -> bool:
-        """Whether the next update also updates the actor: every ``policy_delay``-th does."""
-        return (self.n_updates + 1) % self.policy_delay == 0
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the states of loss and optimizer, and the number of updates."""
-        latest = {"n_updates": self.n_updates, "loss_actor": self.loss_actor}
-        return {**super().state_dict(), **latest}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a `state_dict`."""
-        super().load_state_dict(state)
-        self.n_updates, self.loss_actor = state["n_updates"], state["loss_actor"]
-
-
-class SACLearner(Learner):
-    """Learner that explores by sampling from its policy (Haarnoja et al., 2018)."""
-
-    actor: GaussianActor
-
-    def act(
-        self, tensordict: TensorDictBase, generators: Sequence[torch.Generator], expert: Tensor
-    ) -> Tensor:
-        """Return actions drawn for a training step; see `Learner.act`."""
-        noise = normal(generators, [self.actor.action_dim]).unsqueeze(1)
-        noise = noise.expand(*self.actor.batch_size, -1)
-        device = next(self.actor.parameters()).device
-        drawn = self.actor.sample(self._for_all(tensordict), noise.to(device))
-        return _of_expert(drawn["action"], expert).cpu()
-
-
-def _of_expert(values: Tensor, expert: Tensor) -> Tensor:
+def of_expert(values: Tensor, expert: Tensor) -> Tensor:
     """Select one expert of each seed from ``[S, E, ...]``."""
     seed = torch.arange(len(values), device=values.device)
     return values[seed, expert.to(values.device)]
@@ -331,36 +264,6 @@ def make_ddpg(config: DDPGConfig, spec: LearnerSpec) -> Learner:
     return Learner(actor, loss, config, noise=config.noise)
 
 
-def make_td3(config: TD3Config, spec: LearnerSpec) -> Learner:
-    """Return a TD3 learner (Fujimoto et al., 2018)."""
-    actor = spec.actor(Actor, config)
-    loss = TD3Loss(
-        actor,
-        spec.twin_critics(config),
-        policy_noise=config.policy_noise,
-        noise_clip=config.noise_clip,
-        pre_tanh_penalty=config.pre_tanh_penalty,
-        generator=spec.generators("target noise"),
-        **spec.loss_options(config),
-    )
-    return TD3Learner(actor, loss, config)
-
-
-def make_sac(config: SACConfig, spec: LearnerSpec) -> Learner:
-    """Return a SAC learner with a learned temperature (Haarnoja et al., 2018)."""
-    actor = spec.actor(GaussianActor, config)
-    loss = SACLoss(
-        actor,
-        spec.twin_critics(config),
-        alpha_init=config.alpha_init,
-        target_entropy=config.target_entropy * spec.action_size,
-        entropy_in_target=config.entropy_in_target,
-        generator=spec.generators("policy samples"),
-        **spec.loss_options(config),
-    )
-    return SACLearner(actor, loss, config)
-
-
 @dataclass(frozen=True)
 class RLEntry:
     """RL algorithm and its default hyperparameters."""
@@ -371,12 +274,9 @@ class RLEntry:
     """Its default hyperparameters; those of a run are of the same class."""
 
 
-RL: dict[str, RLEntry] = {
-    "ddpg": RLEntry(make_ddpg, DDPGConfig()),
-    "td3": RLEntry(make_td3, TD3Config()),
-    "sac": RLEntry(make_sac, SACConfig()),
-}
-"""RL algorithms by the ``name`` of their config."""
+RL: dict[str, RLEntry] = {"ddpg": RLEntry(make_ddpg, DDPGConfig())}
+"""RL algorithms by the ``name`` of their config; `bgpo_trl.algorithms.twin_critics` adds TD3 and
+SAC."""
 
 
 def make_learner(config: RLConfig, spec: LearnerSpec) -> Learner:

@@ -9,7 +9,8 @@ from tensordict import TensorDict
 
 from bgpo_trl.algorithms.algorithm import Policy
 from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
-from bgpo_trl.modules.actor_critic import Actor, MultiHeadActor
+from bgpo_trl.modules.actor_critic import Actor
+from bgpo_trl.modules.gaussian_actors import MultiHeadActor
 from bgpo_trl.transforms import TaskSchedule
 from tests.algorithms.playing import assert_same, play
 
