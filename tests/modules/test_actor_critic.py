@@ -161,18 +161,6 @@ def test_log_probabilities_and_their_gradients_stay_finite_where_the_tanh_satura
     assert all(torch.isfinite(p.grad).all() for p in actor.parameters())
 
 
-@pytest.mark.parametrize("n_seeds", [1, 3])
-def test_stacked_seeds_are_each_seed_alone(n_seeds):
-    stacked = gaussian([n_seeds], [torch.Generator().manual_seed(seed) for seed in range(n_seeds)])
-    data, noise = gaussian_states(n_seeds, 5), torch.randn(n_seeds, 5, 2)
-    together = stacked.sample(data.clone(), noise)
-    for seed in range(n_seeds):
-        alone = gaussian(generator=torch.Generator().manual_seed(seed))
-        apart = alone.sample(data[seed].clone(), noise[seed])
-        for key in ("action", "action_log_prob", "loc", "scale"):
-            torch.testing.assert_close(together[key][seed], apart[key])
-
-
 # ---- the policy with a head for each task
 
 
@@ -227,25 +215,3 @@ def test_a_new_head_changes_neither_the_others_nor_the_trunk():
     for key in actor.out_keys:
         assert after[key][:2].equal(before[key])
         assert not after[key][2].equal(after[key][1])
-
-
-@pytest.mark.parametrize("batch", [(), (7,), (2, 7)])
-def test_stacked_policies_are_each_one_alone(batch):
-    seeds = (3, 8)
-    stacked = MultiHeadActor(
-        *(5, 2),
-        in_keys=["state"],
-        hidden_sizes=(16, 8),
-        batch_size=[2],
-        generator=[generator(s) for s in seeds],
-    )
-    for head in range(3):
-        stacked.add_head([generator(100 * s + head) for s in seeds])
-    data = stacked(states(2, 3, *batch))
-    for index, seed in enumerate(seeds):
-        alone = multi_head(3, seed=seed, hidden_sizes=(16, 8))
-        for key, value in alone.state_dict().items():
-            assert stacked.state_dict()[key][index].equal(value)
-        expected = alone(states(2, 3, *batch)[index])
-        for key in alone.out_keys:
-            torch.testing.assert_close(data[key][index], expected[key])

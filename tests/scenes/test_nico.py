@@ -3,14 +3,12 @@
 import itertools
 import pickle
 from copy import deepcopy
-from functools import partial
 
 import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import (
-    SerialEnv,
     StepCounter,
     TransformedEnv,
     check_env_specs,
@@ -95,26 +93,6 @@ def test_each_row_of_a_batch_equals_the_row_alone():
         alone_start = alone.reset(TensorDict({"task": tasks[index]}))
         assert_equal(alone_start, start[index])
         assert_equal(run(alone, alone_start, steps[:, *index]), rollout[:, *index])
-
-
-def test_seeds_of_rows_are_given_one_by_one_or_count_up():
-    env = NicoEnv(batch_size=[2], seed=[8, 3], observation="state")
-    first = env.reset()["state"]
-    env.set_seed(8)
-    second = env.reset()["state"]
-    assert first[0].equal(second[0])
-    assert not first[1].equal(second[1])
-    assert NicoEnv(batch_size=2, seed=8, observation="state").reset()["state"].equal(second)
-
-
-@pytest.mark.parametrize(("seed", "alike"), [(0, True), (None, False)])
-def test_workers_have_the_same_starts_until_they_are_seeded(seed, alike):
-    env = SerialEnv(2, partial(NicoEnv, seed=seed, observation="state"))
-    first, second = env.reset()["state"]
-    assert first.equal(second) == alike
-    env.set_seed(0)
-    first, second = env.reset()["state"]
-    assert not first.equal(second)
 
 
 @pytest.mark.parametrize(
@@ -349,15 +327,3 @@ def test_results_do_not_depend_on_the_number_of_threads():
     for threads in (2, 5):
         together = play(threads)
         assert (together == alone).all()
-
-
-def test_frames_returns_a_copy_of_the_latest_frames():
-    env = NicoEnv(batch_size=[2, 1], seed=3)
-    start = env.reset()
-    shown = env.frames()
-    assert (shown == start["pixels"].numpy()).all()
-    after = env.rand_step(start)["next"]
-    assert (shown == start["pixels"].numpy()).all()  # what was shown stays as it was
-    assert (env.frames() == after["pixels"].numpy()).all()
-    with pytest.raises(ValueError, match="observe 'both'"):
-        NicoEnv(seed=3, observation="state").frames()
