@@ -209,6 +209,29 @@ def test_without_spread_objects_are_at_their_nominal_places(load):
     np.testing.assert_array_equal(env.physics.get_state(), state)
 
 
+def test_a_smaller_spread_scales_the_draws(load):
+    nominal = np.array([[0.4, angle, 0.0] for angle in np.radians([22, 0, -22])])
+    swapped = nominal[::-1]
+    sides = []
+    for seed in range(200):
+        found = []
+        for spread in (1.0, 0.5):
+            env = load("grasp_glass", seed=seed, spread=spread, observation="state")
+            env.reset()
+            places = polar_places(env.physics)
+            is_swapped = places[0, 1] < places[2, 1]
+            found.append((is_swapped, places - (swapped if is_swapped else nominal)))
+        (whole_side, whole), (half_side, half) = found
+        np.testing.assert_allclose(half[:, [0, 2]], whole[:, [0, 2]] / 2, atol=1e-9)
+        if half_side == whole_side:
+            np.testing.assert_allclose(half[:, 1], whole[:, 1] / 2, atol=1e-9)
+        sides.append((whole_side, half_side))
+    whole_side, half_side = np.array(sides).T
+    assert 0.40 < whole_side.mean() < 0.60
+    assert 0.16 < half_side.mean() < 0.34
+    assert not (half_side & ~whole_side).any()
+
+
 def test_starts_are_at_rest(load):
     env = load("grasp_glass", seed=3, observation="state")
     for _ in range(5):
