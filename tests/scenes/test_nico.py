@@ -327,3 +327,8 @@ def test_results_do_not_depend_on_the_number_of_threads():
     for threads in (2, 5):
         together = play(threads)
         assert (together == alone).all()
+
+
+def test_frames_that_are_not_observed_are_not_returned():
+    with pytest.raises(ValueError, match="observe 'both'"):
+        NicoEnv(seed=3, observation="state").frames()
