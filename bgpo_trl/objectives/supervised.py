@@ -34,7 +34,8 @@ class NetworkLoss(LossModule):
 
     def __init__(self, in_keys: Sequence[NestedKey], out_keys: Sequence[str]) -> None:
         super().__init__()
-        self.in_keys, self.out_keys = list(in_keys), list(out_keys)
+        self.in_keys = list(in_keys)  # pyright: ignore[reportAttributeAccessIssue] any nested keys
+        self.out_keys = list(out_keys)
 
     @property
     def functional(self) -> bool:

@@ -47,6 +47,7 @@ class TD3Loss(OffPolicyLoss):
     """
 
     twin_critics = True
+    noise: SeededNoise  # pyright: ignore[reportIncompatibleVariableOverride] always there
     actor_keys = ("pre_tanh_magnitude",)
 
     def __init__(
@@ -122,6 +123,7 @@ class SACLoss(OffPolicyLoss):
     """
 
     twin_critics = True
+    noise: SeededNoise  # pyright: ignore[reportIncompatibleVariableOverride] always there
     actor_keys = ("loss_alpha", "alpha", "entropy")
 
     def __init__(
