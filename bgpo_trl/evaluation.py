@@ -13,8 +13,8 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from bgpo_trl.algorithms import Algorithm
+from bgpo_trl.algorithms.algorithm import Policy
 from bgpo_trl.algorithms.environments import observation_env
-from bgpo_trl.algorithms.policy import Policy
 from bgpo_trl.configs import AlgorithmConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.encoders.representation import Representation

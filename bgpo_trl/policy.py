@@ -15,8 +15,8 @@ from torch import Tensor
 from torchrl.envs import Compose
 
 from bgpo_trl.algorithms import Algorithm, entry
+from bgpo_trl.algorithms.algorithm import Policy
 from bgpo_trl.algorithms.environments import clip, encode
-from bgpo_trl.algorithms.policy import Policy
 from bgpo_trl.configs import RunConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.encoders.representation import Representation, embed_demonstrations

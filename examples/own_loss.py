@@ -8,8 +8,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from bgpo_trl.algorithms import ALGORITHMS
-from bgpo_trl.algorithms.learner import Learner
-from bgpo_trl.algorithms.rl import RL, LearnerSpec, RLEntry
+from bgpo_trl.algorithms.rl import RL, Learner, LearnerSpec, RLEntry
 from bgpo_trl.configs import DDPGConfig, RunConfig
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.modules.actor_critic import Actor

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from bgpo_trl.algorithms import ALGORITHMS
-from bgpo_trl.algorithms.learner import TD3Learner
-from bgpo_trl.algorithms.rl import RL, LearnerSpec, RLEntry, make_td3
+from bgpo_trl.algorithms.rl import RL, LearnerSpec, RLEntry
+from bgpo_trl.algorithms.twin_critics import TD3Learner, make_td3
 from bgpo_trl.configs import RunConfig, TD3Config
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.training import Trainer

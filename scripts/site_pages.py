@@ -19,8 +19,7 @@ REFERENCE = {
     "transforms": [
         "transforms.frame_encoder",
         "transforms.demonstration_source",
-        "transforms.behavior_lookup",
-        "transforms.group_lookup",
+        "transforms.lookup",
         "transforms.behavior_matching",
     ],
     "gwr": ["modules.gwr", "modules.gwr_estimator", "modules.behavior_groups"],
@@ -34,11 +33,9 @@ REFERENCE = {
     "objectives": [
         "objectives.off_policy",
         "objectives.ddpg",
-        "objectives.td3",
-        "objectives.sac",
+        "objectives.twin_critics",
         "objectives.maml",
-        "objectives.distillation",
-        "objectives.representation",
+        "objectives.supervised",
     ],
     "algorithms": ["algorithms.algorithm", "algorithms.environments", "algorithms.bgpo"],
     "training": ["training", "configs.runs", "configs.algorithms"],

@@ -9,11 +9,11 @@ import torch
 from tensordict import TensorDict
 
 from bgpo_trl.algorithms import ALGORITHMS, entry
-from bgpo_trl.algorithms.policy import Policy
+from bgpo_trl.algorithms.algorithm import Policy
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.evaluation import Evaluator, evaluate_random_policy
 from bgpo_trl.modules.actor_critic import Actor
-from bgpo_trl.modules.multi_head_actor import MultiHeadActor
+from bgpo_trl.modules.gaussian_actors import MultiHeadActor
 from bgpo_trl.seeding import stream_seed
 from bgpo_trl.transforms import TaskSchedule
 from suites import nico
@@ -111,7 +111,7 @@ def plain_policy(algorithm, snapshot, index, task, episode, phi):
     group = 0
     if algorithm.config.experts:
         group = int(algorithm.groups.lookup(phi.expand(algorithm.n_seeds, -1)).group[index])
-    policy.load_state_dict(algorithm.experts.actor_weights(index, group))
+    policy.load_state_dict(algorithm.actor_weights(index, group))
     context = {}
     if snapshot.policy.context is not None:
         context = {"context": snapshot.policy.context[task, episode]}

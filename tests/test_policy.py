@@ -15,7 +15,7 @@ import torch
 
 import bgpo_trl
 from bgpo_trl.algorithms import ALGORITHMS
-from bgpo_trl.algorithms.policy import Policy
+from bgpo_trl.algorithms.algorithm import Policy
 from bgpo_trl.configs import RepresentationConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.encoders.pretrained import bank_path

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from bgpo_trl.algorithms import ALGORITHMS
+from bgpo_trl.algorithms.algorithm import Policy
 from bgpo_trl.algorithms.bgpo import BGPO
-from bgpo_trl.algorithms.policy import Policy
 from bgpo_trl.files.checkpoint import load_checkpoint
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.runs.cost import n_bytes, read_costs

@@ -10,19 +10,18 @@ from __future__ import annotations
 import json
 import math
 import statistics
-import sys
 import tracemalloc
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import torch
-import tyro
 from matplotlib.figure import Figure
 from timing import Timing, interleave
 from torch import Tensor
 
+from bgpo_trl.experiments.command_line import command_line
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.machine import set_threads
 from bgpo_trl.modules.gwr import GWRB
@@ -168,7 +167,7 @@ def plot(rows: list[dict[str, Any]]) -> Figure:
 
 
 def main(arguments: Arguments) -> None:
-    """Measure, print and write the results."""
+    """Measure the cost of GWR-B against its nodes; print and write the results."""
     if not arguments.nodes or min(arguments.nodes) < 2:
         raise ValueError(f"--nodes must be one or more, of at least 2, got {arguments.nodes}")
     for name in ("features", "networks", "rounds"):
@@ -200,9 +199,4 @@ def main(arguments: Arguments) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Annotated[Arguments, tyro.conf.OmitArgPrefixes], description=__doc__))
-    except (ValueError, OSError) as error:
-        sys.exit(f"error: {error}")
-    except KeyboardInterrupt:
-        sys.exit("interrupted")
+    command_line(main)

@@ -14,18 +14,16 @@ from __future__ import annotations
 import json
 import platform
 import resource
-import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import frames
 import torch
-import tyro
 import updates
 from steps import Steps
 from timing import Timing, interleave, ratio
@@ -33,6 +31,7 @@ from timing import Timing, interleave, ratio
 from bgpo_trl.algorithms.bgpo import BGPO
 from bgpo_trl.configs import BGPOConfig
 from bgpo_trl.encoders.pretrained import load_pretrained
+from bgpo_trl.experiments.command_line import command_line
 from bgpo_trl.machine import usable_cores
 from bgpo_trl.transforms import TaskSchedule
 from bgpo_trl.world import World
@@ -234,7 +233,7 @@ def show(table: Table) -> str:
 
 
 def main(arguments: Arguments) -> None:
-    """Run the chosen measurements."""
+    """Measure the speed of training: frames, updates, steps and memory."""
     if not arguments.parts:
         raise ValueError("--parts is empty: name some of frames, updates, step, memory")
     for name in ("seeds", "rounds", "steps", "threads"):
@@ -267,7 +266,4 @@ def main(arguments: Arguments) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Annotated[Arguments, tyro.conf.OmitArgPrefixes], description=__doc__))
-    except (ValueError, OSError, RuntimeError) as error:
-        sys.exit(f"error: {error}")
+    command_line(main)

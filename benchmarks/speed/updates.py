@@ -25,7 +25,7 @@ from bgpo_trl.configs import BGPOConfig
 from bgpo_trl.data.replay import GroupReplay
 from bgpo_trl.modules.actor_critic import Actor, Critic
 from bgpo_trl.objectives.ddpg import DDPGLoss
-from bgpo_trl.objectives.target_update import ForeachSoftUpdate
+from bgpo_trl.objectives.off_policy import ForeachSoftUpdate
 from bgpo_trl.seeding import generators
 
 Contender = tuple[Callable[[], object], int]

@@ -6,11 +6,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
+from bgpo_trl.algorithms import twin_critics  # adds TD3 and SAC
 from bgpo_trl.algorithms.algorithm import Algorithm
 from bgpo_trl.algorithms.bgpo import BGPO
 from bgpo_trl.algorithms.dist_nll import DistNLL
-from bgpo_trl.algorithms.ewc import EWC
-from bgpo_trl.algorithms.fine_tuning import FineTuning
+from bgpo_trl.algorithms.ewc import EWC, FineTuning
 from bgpo_trl.algorithms.maml import MAML
 from bgpo_trl.configs import (
     AlgorithmConfig,
@@ -23,7 +23,7 @@ from bgpo_trl.configs import (
     MAMLConfig,
 )
 
-__all__ = ["ABLATIONS", "ALGORITHMS", "Algorithm", "Entry", "entry"]
+__all__ = ["ABLATIONS", "ALGORITHMS", "Algorithm", "Entry", "entry", "twin_critics"]
 
 
 @dataclass(frozen=True)

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
+from torch.func import functional_call
 from torchrl.envs import EnvBase, TransformedEnv
 
-from bgpo_trl.algorithms.learner import Learner
-from bgpo_trl.algorithms.policy import Policy
+from bgpo_trl.algorithms.rl import Learner
 from bgpo_trl.configs import AlgorithmConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.demonstration_replay import DemonstrationReplay
@@ -24,6 +25,54 @@ from bgpo_trl.modules.gwr import GWRB
 from bgpo_trl.scenes import Scene, find_scene
 from bgpo_trl.seeding import generators
 from bgpo_trl.transforms import DemonstrationSource
+
+__all__ = ["Algorithm", "Policy"]
+
+
+@dataclass(frozen=True)
+class Policy:
+    """Snapshot of a policy for test episodes, unaffected by further training.
+
+    Attributes:
+        actor: Network, called with ``parameters`` instead of its weights.
+        state_key: Key of the state.
+        parameters: By name in the actor. Leading dimensions: none, ``[T]`` (one network per task)
+            or ``[T, M]`` (one per episode). In a stack of seeds, ``[S]`` comes first.
+        context: Input besides the state, ``[T, M, C]``; None if the actor reads no context.
+    """
+
+    actor: TensorDictModuleBase
+    state_key: NestedKey
+    parameters: dict[str, Tensor]
+    context: Tensor | None = None
+
+    @classmethod
+    def stack(cls, policies: Sequence[Policy], device: torch.device | str = "cpu") -> Policy:
+        """Stack the policies of several seeds as one, ``[S]``, on a device."""
+        first = policies[0]
+        contexts = [policy.context for policy in policies if policy.context is not None]
+        return cls(
+            first.actor,
+            first.state_key,
+            {
+                key: torch.stack([policy.parameters[key] for policy in policies]).to(device)
+                for key in first.parameters
+            },
+            torch.stack(contexts).to(device) if contexts else None,
+        )
+
+    @torch.no_grad()
+    def act(self, state: Tensor) -> Tensor:
+        """Return actions ``[..., T, M, A]`` in [-1, 1] for states ``[..., T, M, features]``."""
+        inputs: TensorDictBase = TensorDict({self.state_key: state}, state.shape[:-1])
+        if self.context is not None:
+            inputs["context"] = self.context
+        functional_call(self.actor, self.parameters, (inputs,))
+        return inputs["action"]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return parameters and context, the arguments of `Algorithm.policy`."""
+        return {"parameters": self.parameters, "context": self.context}
 
 
 class Algorithm(ABC):
@@ -85,7 +134,7 @@ class Algorithm(ABC):
         self.device = torch.device(device)
         self.seeds = tuple(seeds)
         self.n_seeds, self.n_tasks = len(seeds), len(bank.tasks)
-        self.encoders = encoders
+        self.bank, self.encoders = bank, encoders
         if encoders is not None:
             encoders.vae.to(self.device)
         if config.state == "state":
@@ -172,12 +221,7 @@ class Algorithm(ABC):
         return Policy(self.test_actor, self.config.state, parameters, context)
 
     def demonstrations(
-        self,
-        config: AlgorithmConfig,
-        bank: DemonstrationBank,
-        seeds: Sequence[int],
-        constant_keys: Sequence[NestedKey] = (),
-        own_constants: bool = True,
+        self, constant_keys: Sequence[NestedKey] = (), own_constants: bool = True
     ) -> DemonstrationReplay | None:
         """Return the replay of shown demonstrations, or None without a ``demonstration_share``.
 
@@ -187,17 +231,17 @@ class Algorithm(ABC):
         Raises:
             ValueError: If the state is not the latent, or the bank has no steps.
         """
-        if not config.demonstration_share:
+        if not self.config.demonstration_share:
             return None
-        if config.state != "latent":
+        if self.config.state != "latent":
             raise ValueError("demonstrations are latents: set demonstration_share to 0")
         return DemonstrationReplay(
-            bank,
-            generator=generators(seeds, "demonstration replay"),
-            state_key=config.state,
+            self.bank,
+            generator=generators(self.seeds, "demonstration replay"),
+            state_key=self.config.state,
             constant_keys=constant_keys,
             own_constants=own_constants,
-            noise=config.demonstration_noise,
+            noise=self.config.demonstration_noise,
         )
 
     def sample(self, groups: Callable[[int], Tensor], n_rows: int) -> TensorDictBase:

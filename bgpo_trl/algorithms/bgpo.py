@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any, cast
 
 import torch
@@ -12,23 +10,19 @@ from torch import Tensor
 from torch.nn.functional import one_hot
 from torchrl.envs import EnvBase, TransformedEnv
 
-from bgpo_trl.algorithms.algorithm import Algorithm
+from bgpo_trl.algorithms.algorithm import Algorithm, Policy
 from bgpo_trl.algorithms.environments import training_env
-from bgpo_trl.algorithms.experts import ActiveGroups, Experts
-from bgpo_trl.algorithms.learner import Learner
-from bgpo_trl.algorithms.policy import Policy
-from bgpo_trl.algorithms.rl import LearnerSpec, make_learner
-from bgpo_trl.algorithms.trials import GroupTrials
+from bgpo_trl.algorithms.experts import ActiveGroups, Experts, GroupTrials
+from bgpo_trl.algorithms.rl import Learner, LearnerSpec, make_learner
 from bgpo_trl.configs import BGPOConfig
-from bgpo_trl.data.bank import DemonstrationBank, DemonstrationSteps
+from bgpo_trl.data.bank import DemonstrationSteps
 from bgpo_trl.data.demonstration_replay import DemonstrationReplay
 from bgpo_trl.data.replay import GroupReplay
-from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.modules.gwr import GWRB
-from bgpo_trl.scenes import Scene
 from bgpo_trl.seeding import generators
 from bgpo_trl.transforms import DemonstrationSource
+from bgpo_trl.transforms.behavior_matching import matching_reward
 
 
 class BGPO(Algorithm):
@@ -42,7 +36,8 @@ class BGPO(Algorithm):
     Arguments as for `Algorithm`; encoders may be None if neither latents nor embeddings are used.
 
     Attributes:
-        experts: The networks of each group; of a single group without ``config.experts``.
+        active: The groups played lately.
+        experts: The networks of each group; None for one pair of networks.
         trials: Trials by which groups of one task are joined; None without experts or
             demonstrations.
     """
@@ -50,20 +45,9 @@ class BGPO(Algorithm):
     config: BGPOConfig
     needs_replay = False
 
-    def __init__(
-        self,
-        config: BGPOConfig,
-        *,
-        seeds: Sequence[int],
-        bank: DemonstrationBank,
-        encoders: Representation | None = None,
-        device: torch.device | str = "cpu",
-        scene: Scene | str = "nico",
-    ) -> None:
-        super().__init__(
-            config, seeds=seeds, bank=bank, encoders=encoders, device=device, scene=scene
-        )
-        embedding_size = bank.embedding.shape[-1]
+    def __init__(self, config: BGPOConfig, **arguments: Any) -> None:
+        super().__init__(config, **arguments)
+        seeds, embedding_size = self.seeds, self.bank.embedding.shape[-1]
         self.needs_label = config.context == "label"
         if config.context == "behavior":
             self.gwr = GWRB(
@@ -79,7 +63,6 @@ class BGPO(Algorithm):
                 smallest=config.group_size,
                 evidence=config.group_evidence,
             )
-        self._shown_embedding = bank.embedding
         self._revision = torch.zeros(len(seeds), dtype=torch.int64)
         sizes = {None: 0, "label": self.n_tasks}
         context_size = sizes.get(config.context, embedding_size)
@@ -94,14 +77,12 @@ class BGPO(Algorithm):
             return_bounds=(0.0, self._highest_return()),
             device=self.device,
         )
+        self.learner = self._make_learner(spec)
         n_active = config.active_groups if config.grouped else 1
-        self._active = ActiveGroups(len(seeds), n_active, config.rest_after)
-        self.experts = Experts(
-            lambda width: self._make_learner(replace(spec, experts=range(width))),
-            self._active if config.experts else ActiveGroups(len(seeds), 1),
-            lambda seed, group: 0 if self.groups is None else self.groups.parent(seed, group),
-        )
-        self.learner = self.experts.learner
+        self.active = ActiveGroups(len(seeds), n_active, config.rest_after)
+        self.experts: Experts | None = None
+        if config.experts and (groups := self.groups) is not None:
+            self.experts = Experts(self.learner, self.active, groups.parent)
         self.test_actor = self.learner.actor
         self.replay = GroupReplay(
             rl.replay_size,
@@ -109,12 +90,10 @@ class BGPO(Algorithm):
             keys=[*keys, "action", *(("next", key) for key in (keys[0], "reward", "terminated"))],
             source_key="demo_index" if config.grouped else None,
         )
-        self.shown = self.demonstrations(
-            config, bank, seeds, constant_keys=keys[1:], own_constants=not config.experts
-        )
+        self.shown = self.demonstrations(keys[1:], own_constants=not config.experts)
         self.trials: GroupTrials | None = None
         if self.shown is not None and config.experts:
-            steps = cast(DemonstrationSteps, bank.steps)
+            steps = cast(DemonstrationSteps, self.bank.steps)
             starts = steps.latents(steps.first)
             self.trials = GroupTrials(starts, seeds=seeds, smallest=config.group_size)
 
@@ -155,18 +134,18 @@ class BGPO(Algorithm):
 
         Where groups have just been joined, the ``group`` of an episode that begins is updated.
         """
-        if self.config.experts:
-            expert = self.experts.play(self._playing(tensordict))
-            self.learner = self.experts.learner
+        groups = self._playing(tensordict)
+        if self.experts is not None:
+            expert = self.experts.play(groups)
         else:
             expert = torch.zeros(self.n_seeds, dtype=torch.int64)
-            for seed, group in enumerate(self._groups_of(tensordict)):
-                self._active.play(seed, group)
+            for seed, group in enumerate(groups):
+                self.active.play(seed, group)
         seen = self.to_device(tensordict.select(*self.in_keys))
         return tensordict.set("action", self.learner.act(seen, self._noise, expert))
 
     def _playing(self, tensordict: TensorDictBase) -> list[int]:
-        """Return the groups whose experts act; update the groups of episodes that begin."""
+        """Return the groups that act; update the groups of episodes that begin."""
         groups, trials = self._groups_of(tensordict), self.trials
         if trials is None or self.groups is None:
             return groups
@@ -199,8 +178,8 @@ class BGPO(Algorithm):
         if ended.any():
             reward = torch.ones(self.n_seeds)
             if self.beta:
-                error = transition["behavior"] - transition["demo_embedding"]
-                reward += self.beta * torch.exp(-torch.linalg.vector_norm(error, dim=-1))
+                phi = transition["demo_embedding"]
+                reward += self.beta * matching_reward(transition["behavior"], phi)
             shown.add(transition, reward, group, ended)
 
     def _join_groups(self, transition: TensorDictBase) -> None:
@@ -220,7 +199,7 @@ class BGPO(Algorithm):
         if self.groups is None or (changed := self.groups.revision != self._revision).sum() == 0:
             return
         self._revision = self.groups.revision
-        shown = self._shown_embedding.expand(self.n_seeds, *self._shown_embedding.shape)
+        shown = self.bank.embedding.expand(self.n_seeds, *self.bank.embedding.shape)
         group_of = self.groups.lookup(shown, changed).group
         for seed in changed.nonzero().flatten().tolist():
             for replay in (self.replay, self.shown):
@@ -229,16 +208,15 @@ class BGPO(Algorithm):
             known = self.groups.numbers(seed)
             if self.trials is not None:
                 self.trials.regroup(seed, group_of[seed], known)
-            for group in self._active.group[seed].tolist():
-                if group >= 0 and group not in known:
-                    (self.experts if self.config.experts else self._active).rest(seed, group)
-        self.learner = self.experts.learner
+            for group in [*self.active.groups[seed]]:
+                if group not in known:
+                    (self.experts or self.active).rest(seed, group)
 
     def update(self) -> dict[str, Tensor]:
         """Make one update of each seed."""
         if len(self.replay) < self.config.rl.warmup_steps:
             return {}
-        config, active = self.config, self._active
+        config, active = self.config, self.active
         if config.experts:
             return self.learn(
                 self.sample(
@@ -253,20 +231,26 @@ class BGPO(Algorithm):
     ) -> Policy:
         """Copy the policy of one seed; with experts, that of each episode, ``[T, M, ...]``."""
         del generator
-        if self.config.experts and self.groups is not None:
+        if self.experts is not None and self.groups is not None:
             shown = embedding.expand(self.n_seeds, *embedding.shape)
             group = self.groups.lookup(shown).group[index]
             numbers = group.unique().tolist()
-            experts = {number: self.experts.actor_weights(index, number) for number in numbers}
+            experts = {number: self.actor_weights(index, number) for number in numbers}
             each = [experts[number] for number in group.flatten().tolist()]
             parameters = {
                 key: torch.stack([weights[key] for weights in each]).unflatten(0, group.shape)
                 for key in each[0]
             }
         else:
-            parameters = self.experts.actor_weights(index, 0)
+            parameters = self.actor_weights(index)
         context = self.context(index, embedding, task)
         return self.policy(parameters, context)
+
+    def actor_weights(self, index: int, group: int = 0) -> dict[str, Tensor]:
+        """Copy the weights of the policy of one seed to the CPU; with experts, that of a group."""
+        if self.experts is not None:
+            return self.experts.actor_weights(index, group)
+        return self.learner.actor_weights(self.learner.read(index, 0))
 
     def context(self, index: int, embedding: Tensor, task: Tensor) -> Tensor | None:
         """Return the context of test episodes, ``[*B, C]``; None for a policy without context.
@@ -284,21 +268,15 @@ class BGPO(Algorithm):
             behavior = self.gwr.lookup(shown, mask=only).embedding[index]
         return self.config.behavior_scale * behavior
 
-    def state_dict(self) -> dict[str, Any]:
-        """Return everything that future actions, updates and snapshots depend on."""
-        state = {**super().state_dict(), "experts": self.experts.state_dict()}
-        state["active"] = self._active.state_dict()
-        return state
-
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a `state_dict`."""
-        self.experts.load_state_dict(state["experts"])
-        self.learner = self.experts.learner
         super().load_state_dict(state)
-        self._active.load_state_dict(state["active"])
         if self.groups is not None:
             self._revision = self.groups.revision
 
     def _learned(self) -> dict[str, Any]:
+        # Experts come first, since they determine the shape of the learner's networks.
+        played = {"active": self.active} if self.experts is None else {"experts": self.experts}
         parts = {"gwr": self.gwr, "groups": self.groups, "trials": self.trials}
-        return super()._learned() | {key: part for key, part in parts.items() if part is not None}
+        found = {key: part for key, part in parts.items() if part is not None}
+        return {**played, **super()._learned(), **found}

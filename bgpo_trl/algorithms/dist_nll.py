@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -11,15 +10,12 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torch.func import functional_call
 
-from bgpo_trl.algorithms.policy import Policy
+from bgpo_trl.algorithms.algorithm import Policy
 from bgpo_trl.algorithms.rl import make_ddpg
 from bgpo_trl.algorithms.task_algorithm import TaskAlgorithm, networks_of
 from bgpo_trl.configs import DistNLLConfig
-from bgpo_trl.data.bank import DemonstrationBank
-from bgpo_trl.encoders.representation import Representation
-from bgpo_trl.modules.multi_head_actor import MultiHeadActor
-from bgpo_trl.objectives.distillation import DistillationLoss
-from bgpo_trl.scenes import Scene
+from bgpo_trl.modules.gaussian_actors import MultiHeadActor
+from bgpo_trl.objectives.supervised import DistillationLoss
 from bgpo_trl.seeding import generators
 
 
@@ -45,27 +41,13 @@ class DistNLL(TaskAlgorithm):
     config: DistNLLConfig
     needs_replay = False
 
-    def __init__(
-        self,
-        config: DistNLLConfig,
-        *,
-        seeds: Sequence[int],
-        bank: DemonstrationBank,
-        encoders: Representation | None = None,
-        device: torch.device | str = "cpu",
-        scene: Scene | str = "nico",
-    ) -> None:
-        super().__init__(
-            config, seeds=seeds, bank=bank, encoders=encoders, device=device, scene=scene
-        )
+    def __init__(self, config: DistNLLConfig, **arguments: Any) -> None:
+        super().__init__(config, **arguments)
         self.learner = make_ddpg(config.rl, self.spec)
         self.loss, self.teacher = self.learner.loss, self.learner.actor
         self.training_actor = self.teacher
         self.critic = self.loss.value_network
-        self._make_students(seeds)
-
-    def _make_students(self, seeds: Sequence[int]) -> None:
-        streams = generators(seeds, "student")
+        streams = generators(self.seeds, "student")
         network = partial(
             MultiHeadActor,
             self.state_size,
@@ -75,8 +57,8 @@ class DistNLL(TaskAlgorithm):
         )
         self.students = [network(generator=stream).to(self.device) for stream in streams]
         # By seed: the task of each head, in order of appearance.
-        self._head_tasks: list[list[int]] = [[] for _ in seeds]
-        self._heads = generators(seeds, "heads")
+        self._head_tasks: list[list[int]] = [[] for _ in self.seeds]
+        self._heads = generators(self.seeds, "heads")
         self._distillation = [DistillationLoss(student) for student in self.students]
         self._student_optimizers = [
             torch.optim.Adam(student.parameters(), lr=self.config.learning_rate, fused=True)

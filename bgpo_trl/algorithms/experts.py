@@ -1,21 +1,22 @@
-"""Experts: separate networks for each group of behaviors, of which only the active ones learn."""
+"""Experts: networks for each group of behaviors, which groups learn, and which are one task."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
+from copy import deepcopy
+from dataclasses import dataclass, field
+from itertools import combinations
 from math import inf
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from bgpo_trl.algorithms.learner import Learner
-from bgpo_trl.objectives.noise import SeededNoise
+from bgpo_trl.algorithms.rl import Expert, Learner
+from bgpo_trl.seeding import stream_seed
 
-__all__ = ["ActiveGroups", "Experts"]
-
-State = dict[str, Tensor]
-_MOMENTS, _NOISE = "optimizer.", "noise."
+__all__ = ["ActiveGroups", "Experts", "GroupTrials"]
 
 
 class ActiveGroups:
@@ -103,35 +104,23 @@ class Experts:
     """Networks of a learner, one set for each group of behaviors of each seed.
 
     The learner's networks are a stack ``[S, E]``, those of the active groups: ``E`` follows their
-    number, so that an update costs as much as groups are active. When a group rests, its networks,
-    targets, optimizer moments and random generators are put aside until it is played again, and do
-    not change until then. A new group starts from its parent's networks, without moments.
+    number, so that an update costs as much as groups are active. When a group rests, its expert
+    (networks, targets, moments, noise) is put aside until the group is played again, and does not
+    change until then. A new group starts from its parent's networks, without moments.
 
     Args:
-        make: Makes a learner of a stack ``[S, E]``, given ``E``.
+        learner: The learner, of one expert per seed.
         active: The active groups, from now on changed only by `play` and `rest`.
         parent: Returns the parent of a group, given the position of the seed; group 0 has none.
-
-    Attributes:
-        learner: The learner of today; another one when ``E`` changes.
     """
 
     def __init__(
-        self,
-        make: Callable[[int], Learner],
-        active: ActiveGroups,
-        parent: Callable[[int, int], int],
+        self, learner: Learner, active: ActiveGroups, parent: Callable[[int, int], int]
     ) -> None:
-        self._make, self.active, self._parent = make, active, parent
-        self.learner = make(1)
-        # By seed: whose networks are in each slot, and those put aside.
+        self.learner, self.active, self._parent = learner, active, parent
+        # By seed: whose expert is in each slot, and the experts put aside.
         self._placed: list[list[int]] = [[] for _ in active.groups]
-        self._aside: list[dict[int, State]] = [{} for _ in active.groups]
-
-    @property
-    def width(self) -> int:
-        """Number ``E`` of slots."""
-        return self.learner.actor.batch_size[1]
+        self._inactive: list[dict[int, Expert]] = [{} for _ in active.groups]
 
     def play(self, groups: Sequence[int]) -> Tensor:
         """Activate the group of each seed's episode; return its slots, int64 ``[S]``."""
@@ -142,157 +131,206 @@ class Experts:
         return torch.tensor([placed.index(group) for placed, group in pairs])
 
     def rest(self, seed: int, group: int) -> None:
-        """Put the networks of an active group aside, until it is played again."""
+        """Put the expert of an active group aside, until the group is played again."""
         self.active.rest(seed, group)
         self._arrange()
 
-    def actor_weights(self, seed: int, group: int) -> State:
+    def actor_weights(self, seed: int, group: int) -> dict[str, Tensor]:
         """Copy the weights of a group's policy to the CPU, given the position of the seed.
 
-        A group without networks (not yet played) uses those of its nearest ancestor.
+        A group without an expert (not yet played) uses that of its nearest ancestor.
         """
-        prefix = "actor_network_params."
-        state = self._state(seed, self._with_networks(seed, group))
-        return {
-            key.removeprefix(prefix): value.to("cpu", copy=True)
-            for key, value in state.items()
-            if key.startswith(prefix)
-        }
+        return self.learner.actor_weights(self._find(seed, group))
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the networks put aside, and the active groups."""
-        aside = [{group: dict(state) for group, state in row.items()} for row in self._aside]
-        return {"active": self.active.state_dict(), "aside": aside}
+        """Return the active groups, and the experts put aside."""
+        return {"active": self.active.state_dict(), "inactive": [{**row} for row in self._inactive]}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a `state_dict`; the state of the learner, whose ``E`` changes, is loaded next."""
+        """Restore a `state_dict`; the learner, whose ``E`` changes, is restored next."""
         self.active.load_state_dict(state["active"])
         self._placed = [[*groups] for groups in self.active.groups]
-        if self._wanted_width != self.width:
-            self.learner = self._make(self._wanted_width)
-        device = next(self.learner.loss.parameters()).device
-        self._aside = [
-            {
-                group: {k: v if k.startswith(_NOISE) else v.to(device) for k, v in saved.items()}
-                for group, saved in row.items()
-            }
-            for row in state["aside"]
-        ]
-
-    @property
-    def _wanted_width(self) -> int:
-        return self.active.group.shape[1]
+        self._inactive = [{**row} for row in state["inactive"]]
+        self.learner.resize(self.active.group.shape[1])
 
     def _arrange(self) -> None:
-        """Move the networks of the active groups to their slots."""
-        changed = [
-            (seed, placed, now)
-            for seed, (placed, now) in enumerate(zip(self._placed, self.active.groups, strict=True))
-            if placed != now
-        ]
-        if not changed:
+        """Move the experts of the active groups to their slots."""
+        before, now = self._placed, [[*groups] for groups in self.active.groups]
+        if before == now:
             return
-        for seed, placed, now in changed:
-            for slot, group in enumerate(placed):
-                if group != (now[slot] if slot < len(now) else -1):
-                    state = self._read(seed, slot)
-                    self._aside[seed][group] = {key: value.clone() for key, value in state.items()}
-                    placed[slot] = -1
-        if self._wanted_width != self.width:
-            self.learner = _resized(self.learner, self._make(self._wanted_width))
-        for seed, placed, now in changed:
-            del placed[len(now) :]
-            placed += [-1] * (len(now) - len(placed))
-            for slot, group in enumerate(now):
-                if placed[slot] != group:
-                    self._write(seed, slot, self._start(seed, group))
-                    placed[slot] = group
+        for seed, slot, group in _moved(before, now):
+            self._inactive[seed][group] = self.learner.read(seed, slot)
+        arriving = [(*place, self._start(*place[::2])) for place in _moved(now, before)]
+        self.learner.resize(self.active.group.shape[1])
+        for seed, slot, group, expert in arriving:
+            self.learner.write(seed, slot, expert)
+            self._inactive[seed].pop(group, None)
+        self._placed = now
 
-    def _start(self, seed: int, group: int) -> State:
-        """Return what a group that becomes active starts with, and take it from aside."""
-        origin = self._with_networks(seed, group)
-        if group == origin and group in self._aside[seed]:
-            return self._aside[seed].pop(group)
-        inherited = self._state(seed, origin)
-        return {k: v.clone() for k, v in inherited.items() if not k.startswith(_MOMENTS)}
+    def _start(self, seed: int, group: int) -> Expert:
+        """Return the expert with which a group becomes active."""
+        expert = self._find(seed, group)
+        return expert if group in self._inactive[seed] else {**expert, "moments": {}}
 
-    def _with_networks(self, seed: int, group: int) -> int:
-        """Return the group, or its nearest ancestor that has networks."""
-        while group and group not in self._aside[seed] and group not in self._placed[seed]:
+    def _find(self, seed: int, group: int) -> Expert:
+        """Return the expert of a group, or of its nearest ancestor that has one."""
+        inactive, placed = self._inactive[seed], self._placed[seed]
+        while group and group not in inactive and group not in placed:
             group = self._parent(seed, group)
-        return group
-
-    def _state(self, seed: int, group: int) -> State:
-        if group in self._aside[seed]:
-            return self._aside[seed][group]
-        placed = self._placed[seed]
-        # Before the first step, the networks of group 0 are those of the first slot.
-        return self._read(seed, placed.index(group) if group in placed else 0)
-
-    def _read(self, seed: int, slot: int) -> State:
-        """Return all that makes up an expert: views of tensors, states of generators."""
-        tensors = _tensors(self.learner, self._shape)
-        noise = {
-            key: generators[seed * self.width + slot].get_state()
-            for key, generators in _generators(self.learner, self._shape)
-        }
-        return {key: value[seed, slot] for key, value in tensors.items()} | noise
-
-    def _write(self, seed: int, slot: int, state: State) -> None:
-        for key, value in _tensors(self.learner, self._shape).items():
-            value[seed, slot] = state.get(key, 0.0)
-        for key, generators in _generators(self.learner, self._shape):
-            generators[seed * self.width + slot].set_state(state[key].clone())
-
-    @property
-    def _shape(self) -> torch.Size:
-        return torch.Size([len(self._placed), self.width])
+        if group in inactive:
+            return inactive[group]
+        # Before the first step, the expert of group 0 is that of the first slot.
+        return self.learner.read(seed, placed.index(group) if group in placed else 0)
 
 
-def _tensors(learner: Learner, batch: torch.Size) -> State:
-    """Return the tensors of a learner with a row for each expert, ``[S, E, ...]``."""
-    tensors: State = {
-        key: value
-        for key, value in learner.loss.state_dict().items()
-        if isinstance(value, Tensor) and value.shape[: len(batch)] == batch
-    }
-    parameters = [p for group in learner.optimizer.param_groups for p in group["params"]]
-    for number, parameter in enumerate(parameters):
-        for key, value in learner.optimizer.state.get(parameter, {}).items():
-            if key != "step":
-                tensors[f"{_MOMENTS}{number}.{key}"] = value
-    return tensors
+def _moved(one: list[list[int]], other: list[list[int]]) -> list[tuple[int, int, int]]:
+    """Return seed, slot and group of each slot whose group is not the same in the other."""
+    return [
+        (seed, slot, group)
+        for seed, (ours, theirs) in enumerate(zip(one, other, strict=True))
+        for slot, group in enumerate(ours)
+        if theirs[slot : slot + 1] != [group]
+    ]
 
 
-def _generators(learner: Learner, batch: torch.Size) -> Iterator[tuple[str, list[torch.Generator]]]:
-    """Yield the generators of a learner's losses, one for each expert in the order of the stack."""
-    for name, module in learner.loss.named_modules():
-        if isinstance(module, SeededNoise) and len(module.generators) == batch.numel():
-            yield f"{_NOISE}{name}", module.generators
+_FITTING_SHARE = 0.9  # of a group's own demonstrations whose starts are to count as fitting
+_Counts = dict[int, dict[int, list[int]]]  # successes and episodes, by groups shown and played
 
 
-def _resized(learner: Learner, other: Learner) -> Learner:
-    """Give ``other`` the state of a learner, of which it has more or fewer columns ``E``."""
-    state, like = learner.state_dict(), other.state_dict()
-    n_seeds, width = learner.actor.batch_size
-    new_width = other.actor.batch_size[1]
-    kept = min(width, new_width)
+class GroupTrials:
+    """Trials of one group's behavior in episodes that another group's demonstration begins.
 
-    def fitted(value: Any, to: Any) -> Any:
-        if not isinstance(value, Tensor) or value.shape == to.shape:
-            return value
-        columns = to.clone().reshape(n_seeds, new_width, -1)
-        columns[:, :kept] = value.reshape(n_seeds, width, -1)[:, :kept]
-        return columns.view(to.shape)
+    A task that looks different from different starts, such as a push to the left or to the right,
+    forms several groups. The expert of one of them does not know what to do where its own
+    demonstrations never began. Then
 
-    state["loss"] = {key: fitted(value, like["loss"][key]) for key, value in state["loss"].items()}
-    parameters = [p for group in other.optimizer.param_groups for p in group["params"]]
-    moments = {
-        number: {
-            key: fitted(value, value if key == "step" else torch.zeros_like(parameters[number]))
-            for key, value in of_parameter.items()
-        }
-        for number, of_parameter in state["optimizer"]["state"].items()
-    }
-    other.load_state_dict({**state, "optimizer": {**state["optimizer"], "state": moments}})
-    return other
+    1. a start *fits* a group if its distance to the nearest start of the group's demonstrations is
+       at most the 90 % quantile of this distance among those starts themselves;
+    2. where a start does not fit the demonstrated group, the episode is played by that group or by
+       one that it fits, whichever Thompson sampling of their successes there selects;
+    3. two groups are one task if playing one after demonstrations of the other has had
+       ``successes`` together and been tried as many times each way, and if neither way the
+       successes fall short, by more than a standard deviation, of half the rate that the group
+       played has after its own demonstrations, from starts that fit.
+
+    Args:
+        starts: First latent of each demonstration that may be shown, float32 ``[N, 64]``.
+        seeds: Seeds ``S``, which determine the sampling.
+        smallest: Least number of demonstrations of a group, without which every start fits it.
+        successes: See 3.
+    """
+
+    def __init__(
+        self, starts: Tensor, *, seeds: Sequence[int], smallest: int = 10, successes: int = 5
+    ) -> None:
+        self._starts, self.smallest, self.successes = starts, smallest, successes
+        self._streams = [stream_seed(seed, "trials") for seed in seeds]
+        self._state: list[_Seed] = [_Seed() for _ in seeds]
+
+    def begin(self, seed: int, start: Tensor, group: int) -> int:
+        """Return the group that is to play an episode.
+
+        Args:
+            seed: Position of the seed.
+            start: First latent of the episode, ``[64]``.
+            group: Group of the demonstration.
+        """
+        state = self._state[seed]
+        played, fits = group, self.fits(seed, start, group)
+        if not fits:
+            others = sorted({*state.shown.values()} - {group})
+            arms = [group, *(other for other in others if self.fits(seed, start, other))]
+            paid = state.after_others.get(group, {})
+            counts = np.array([paid.get(arm, (0, 0)) for arm in arms])
+            rng = np.random.default_rng((self._streams[seed], state.n_trials))
+            state.n_trials += 1
+            won, episodes = counts.T
+            played = arms[int(rng.beta(1 + won, 1 + episodes - won).argmax())]
+        state.episode = group, played, fits
+        return played
+
+    def playing(self, seed: int) -> int:
+        """Return the group that plays the present episode of a seed."""
+        return self._state[seed].episode[1]
+
+    def end(self, seed: int, demonstration: int, success: bool) -> None:
+        """Count the end of an episode, given the position of its demonstration in ``starts``."""
+        state = self._state[seed]
+        group, played, fits = state.episode
+        counts = state.after_own if fits else state.after_others
+        entry = counts.setdefault(group, {}).setdefault(played, [0, 0])
+        entry[0] += success
+        entry[1] += 1
+        state.shown[demonstration] = group
+
+    def regroup(self, seed: int, group: Tensor, numbers: Sequence[int]) -> None:
+        """Assign demonstrations to groups anew, given the group ``[N]`` of each and all numbers.
+
+        Counts of groups that are no more are forgotten.
+        """
+        state, known = self._state[seed], {*numbers}
+        state.shown = {row: int(group[row]) for row in state.shown}
+        state.after_own, state.after_others = (
+            {
+                shown: {played: entry for played, entry in of_shown.items() if played in known}
+                for shown, of_shown in counts.items()
+                if shown in known
+            }
+            for counts in (state.after_own, state.after_others)
+        )
+
+    def fits(self, seed: int, start: Tensor, group: int) -> bool:
+        """Return whether a start ``[64]`` fits a group."""
+        rows = [row for row, of in self._state[seed].shown.items() if of == group]
+        if len(rows) < self.smallest:
+            return True
+        starts = self._starts[rows]
+        apart = torch.cdist(starts, starts).fill_diagonal_(torch.inf).amin(-1)
+        return bool(torch.cdist(start[None], starts).amin() <= apart.quantile(_FITTING_SHARE))
+
+    def same_task(self, seed: int) -> tuple[int, int] | None:
+        """Return two groups that are one task, or None."""
+        counts = self._state[seed].after_others
+        for one, other in combinations(sorted(counts), 2):
+            (won, n), (won_back, n_back) = (
+                counts[shown].get(played, (0, 0)) for shown, played in ((one, other), (other, one))
+            )
+            tried = min(n, n_back, won + won_back) >= self.successes
+            if tried and self._pays(seed, one, other) and self._pays(seed, other, one):
+                return one, other
+        return None
+
+    def _pays(self, seed: int, shown: int, played: int) -> bool:
+        """Return whether a group is not much worse after another's demonstrations than its own."""
+        state = self._state[seed]
+        won, episodes = state.after_others[shown][played]
+        own, of = state.after_own.get(played, {}).get(played, (0, 1))
+        half = episodes * own / of / 2
+        return won >= half - half**0.5
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what is counted, and the present episodes."""
+        return {"seeds": [deepcopy(vars(state)) for state in self._state]}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore a `state_dict`."""
+        self._state = [_Seed(**deepcopy(saved)) for saved in state["seeds"]]
+
+
+@dataclass
+class _Seed:
+    """Counts of a seed.
+
+    Attributes:
+        shown: Group of each demonstration shown, by its position.
+        after_own: Counts from starts that fit the group shown.
+        after_others: Counts from starts that do not.
+        n_trials: Number of choices made.
+        episode: Groups shown and played in the present episode; whether its start fits the former.
+    """
+
+    shown: dict[int, int] = field(default_factory=dict)
+    after_own: _Counts = field(default_factory=dict)
+    after_others: _Counts = field(default_factory=dict)
+    n_trials: int = 0
+    episode: tuple[int, int, bool] = (0, 0, True)

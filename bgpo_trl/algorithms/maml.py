@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from bgpo_trl.algorithms.learner import Learner
-from bgpo_trl.algorithms.policy import Policy
+from bgpo_trl.algorithms.algorithm import Policy
+from bgpo_trl.algorithms.rl import Learner
 from bgpo_trl.algorithms.task_algorithm import TaskAlgorithm
 from bgpo_trl.configs import MAMLConfig
-from bgpo_trl.data.bank import DemonstrationBank
-from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.modules.actor_critic import Actor
 from bgpo_trl.objectives.maml import MAMLLoss
-from bgpo_trl.scenes import Scene
 from bgpo_trl.seeding import generators
 
 
@@ -40,25 +37,14 @@ class MAML(TaskAlgorithm):
     config: MAMLConfig
     loss: MAMLLoss
 
-    def __init__(
-        self,
-        config: MAMLConfig,
-        *,
-        seeds: Sequence[int],
-        bank: DemonstrationBank,
-        encoders: Representation | None = None,
-        device: torch.device | str = "cpu",
-        scene: Scene | str = "nico",
-    ) -> None:
-        super().__init__(
-            config, seeds=seeds, bank=bank, encoders=encoders, device=device, scene=scene
-        )
+    def __init__(self, config: MAMLConfig, **arguments: Any) -> None:
+        super().__init__(config, **arguments)
         ddpg = config.rl
         self.meta_actor = Actor(
             self.state_size,
             self.scene.action_size,
             batch_size=[self.n_seeds],
-            generator=generators(seeds, "actor"),
+            generator=generators(self.seeds, "actor"),
             in_keys=self.spec.in_keys,
             hidden_sizes=ddpg.hidden_sizes,
         ).to(self.device)

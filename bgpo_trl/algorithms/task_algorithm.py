@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -15,11 +15,8 @@ from bgpo_trl.algorithms.algorithm import Algorithm
 from bgpo_trl.algorithms.environments import training_env
 from bgpo_trl.algorithms.rl import LearnerSpec
 from bgpo_trl.configs import DistNLLConfig, MAMLConfig
-from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.replay import GroupReplay
-from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.objectives.off_policy import OffPolicyLoss
-from bgpo_trl.scenes import Scene
 from bgpo_trl.seeding import generators
 from bgpo_trl.transforms import DemonstrationSource
 
@@ -42,21 +39,10 @@ class TaskAlgorithm(Algorithm):
     loss: OffPolicyLoss
     training_actor: TensorDictModuleBase
 
-    def __init__(
-        self,
-        config: MAMLConfig | DistNLLConfig,
-        *,
-        seeds: Sequence[int],
-        bank: DemonstrationBank,
-        encoders: Representation | None = None,
-        device: torch.device | str = "cpu",
-        scene: Scene | str = "nico",
-    ) -> None:
-        super().__init__(
-            config, seeds=seeds, bank=bank, encoders=encoders, device=device, scene=scene
-        )
+    def __init__(self, config: MAMLConfig | DistNLLConfig, **arguments: Any) -> None:
+        super().__init__(config, **arguments)
         self.spec = LearnerSpec(
-            seeds=seeds,
+            seeds=self.seeds,
             in_keys=[config.state],
             in_features=self.state_size,
             action_size=self.scene.action_size,
@@ -67,10 +53,10 @@ class TaskAlgorithm(Algorithm):
         keys = [config.state, "action"]
         self.replay = GroupReplay(
             config.rl.replay_size,
-            generator=generators(seeds, "replay"),
+            generator=generators(self.seeds, "replay"),
             keys=[*keys, *(("next", key) for key in (config.state, "reward", "terminated"))],
         )
-        self.shown = self.demonstrations(config, bank, seeds)
+        self.shown = self.demonstrations()
         self._tasks = torch.arange(self.n_tasks).expand(self.n_seeds, -1)
         # As many transitions as guarantee a full batch of some task. Waiting for them makes
         # learning start at the same step for all seeds, as each would alone.

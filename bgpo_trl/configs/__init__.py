@@ -3,11 +3,15 @@
 from bgpo_trl.configs.algorithms import (
     AlgorithmConfig,
     BGPOConfig,
+    DDPGConfig,
     DistNLLConfig,
     EWCConfig,
     FineTuningConfig,
     GWRBConfig,
     MAMLConfig,
+    RLConfig,
+    SACConfig,
+    TD3Config,
 )
 from bgpo_trl.configs.encoders import (
     STAGE_PRESETS,
@@ -17,7 +21,6 @@ from bgpo_trl.configs.encoders import (
     StageConfig,
     VAEConfig,
 )
-from bgpo_trl.configs.rl import DDPGConfig, RLConfig, SACConfig, TD3Config
 from bgpo_trl.configs.runs import PRESETS, RunConfig
 
 __all__ = [

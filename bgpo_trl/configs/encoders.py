@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from bgpo_trl.configs.checks import at_least, check, positive, whole
+from bgpo_trl.configs.algorithms import at_least, check, positive, whole
 
 
 @dataclass(frozen=True)

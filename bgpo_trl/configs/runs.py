@@ -6,8 +6,7 @@ from dataclasses import dataclass, field
 from numbers import Integral
 from typing import Literal
 
-from bgpo_trl.configs.algorithms import AlgorithmConfig, BGPOConfig
-from bgpo_trl.configs.checks import at_least, check, whole
+from bgpo_trl.configs.algorithms import AlgorithmConfig, BGPOConfig, at_least, check, whole
 from bgpo_trl.seeding import check_seeds
 
 PAPER_TASKS = ("grasp_glass", "push_green_to_glass", "push_green_to_white")

@@ -37,7 +37,7 @@ from bgpo_trl.files.writing import write_json, write_whole
 from bgpo_trl.modules.inverse_model import InverseModel
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
-from bgpo_trl.objectives.representation import SequenceReconstructionLoss
+from bgpo_trl.objectives.supervised import SequenceReconstructionLoss
 from bgpo_trl.plugins import import_plugin
 from bgpo_trl.scenes import StateColumns, find_scene
 

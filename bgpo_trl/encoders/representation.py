@@ -32,7 +32,7 @@ from bgpo_trl.files.tensor_file import digest, load_tensors, save_tensors
 from bgpo_trl.modules.inverse_model import InverseModel, window
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
-from bgpo_trl.objectives.representation import (
+from bgpo_trl.objectives.supervised import (
     ActionInferenceLoss,
     SequenceReconstructionLoss,
     VAEInverseLoss,

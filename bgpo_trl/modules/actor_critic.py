@@ -1,4 +1,4 @@
-"""Policy and Q-function: perceptrons, with an optional stack of seeds in their weights.
+"""Policies and Q-function: perceptrons, with an optional stack of seeds in their weights.
 
 Paper, Sec. IV-A: one hidden layer of 64 ReLU units, and an output layer that is linear in the
 Q-function and tanh in the policy. The default here is one of 256 units (`RLConfig.hidden_sizes`).

@@ -40,7 +40,7 @@ class DDPGLoss(OffPolicyLoss):
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from bgpo_trl.modules.actor_critic import Actor, Critic
-        >>> from bgpo_trl.objectives.target_update import ForeachSoftUpdate
+        >>> from bgpo_trl.objectives.off_policy import ForeachSoftUpdate
         >>> seeds = {"in_keys": ["state"], "batch_size": (10,)}
         >>> loss = DDPGLoss(Actor(6, 4, **seeds), Critic(6, 4, **seeds), return_bounds=(0.0, 1.0))
         >>> loss.make_value_estimator(gamma=0.95)

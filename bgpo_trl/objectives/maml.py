@@ -112,13 +112,8 @@ class MAMLLoss(DDPGLoss):
         """Return ``L_i`` ``[*S, T]`` of policies with parameters ``[*S, T, ...]``, one per task."""
         data = self.current(tensordict)
         functional_call(self.actor_network, parameters, (data,))
-        loss = -self.values("value_network", data, frozen=True)
-        if self.imitation:
-            loss = loss + self.imitation * self.imitation_loss(data, tensordict)
-        if self.pre_tanh_penalty:
-            square = data[self.tensor_keys.pre_tanh_action].square().mean(-1)
-            loss = loss + self.pre_tanh_penalty * square
-        return self.mean_per_seed(loss, tensordict)
+        value = self.values("value_network", data, frozen=True)
+        return self.mean_per_seed(self.actor_objective(value, data, tensordict), tensordict)
 
     def _each_task(self) -> Parameters:
         n_stacked = len(self.batch_size) - 1

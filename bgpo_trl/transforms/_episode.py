@@ -11,7 +11,6 @@ from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Compose, EnvBase, RewardSum, StepCounter, Transform, TransformedEnv
 
-from bgpo_trl.errors import missing_key
 from bgpo_trl.seeding import Seeding
 
 
@@ -151,82 +150,6 @@ class EpisodeTransform(Transform):
             env = env.base_env
         at = transforms.index(self) if transforms else 0
         return transforms[:at], transforms[at + 1 :]
-
-
-class DemonstrationLookup(EpisodeTransform):
-    """Base of the transforms that look up a demonstration in a network that learns from it.
-
-    1. At reset, the result of the lookup is written; it stays the same until the episode ends.
-    2. At the end of an episode (``done``), with ``learn=True``, the network adapts to its
-       demonstration. The networks of other rows do not change.
-
-    Called on a TensorDict outside an environment, or in a replay buffer, it only looks up. A
-    ``clone`` looks up in the same network, and with ``learn=True`` teaches it too.
-
-    Args:
-        network: One network, or one per row. Its ``batch_size`` must be the environment's; if it
-            does not learn here, the leading dimensions suffice.
-        learn: Adapt the network. May be changed at any time; independent of ``train()`` and
-            ``eval()``, which TorchRL calls on all transforms. Set it to False for
-            ``check_env_specs`` if episodes can end within the three steps of the check.
-        in_keys: Key of the demonstration's embedding.
-        out_keys: Entries written.
-
-    Raises:
-        ValueError: If the demonstration's embedding is missing, or the network is to learn from an
-            environment of another batch size.
-    """
-
-    def __init__(
-        self,
-        network: Any,
-        *,
-        learn: bool,
-        in_keys: Sequence[NestedKey],
-        out_keys: Sequence[NestedKey],
-    ) -> None:
-        super().__init__(in_keys, out_keys)
-        self.network = network
-        self.learn = learn
-
-    def look_up(self, embedding: Tensor) -> tuple[Tensor, ...]:
-        """Return the ``out_keys`` for embeddings ``[*B, d]``."""
-        raise NotImplementedError
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Look up the demonstrations of any TensorDict, without learning."""
-        embedding = tensordict.get(self.in_keys[0], None)
-        if embedding is None:
-            raise missing_key(type(self).__name__, tensordict, self.in_keys)
-        for key, value in zip(self.out_keys, self.look_up(embedding), strict=True):
-            # The network may compute in another dtype than the one that the spec announces.
-            tensordict.set(key, value.to(embedding.dtype) if value.is_floating_point() else value)
-        return tensordict
-
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
-        return self.forward(tensordict_reset)
-
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        for key in self.out_keys:
-            next_tensordict.set(key, tensordict.get(key))
-        if self.learn:
-            ended = ending(tensordict, next_tensordict)
-            if ended.any():
-                self.network.adapt(tensordict.get(self.in_keys[0]), mask=ended)
-        return next_tensordict
-
-    def _demonstration_spec(self, observation_spec: Composite) -> TensorSpec:
-        """Return the spec of the demonstration's embedding, after checking the batch size."""
-        demonstration = self._read_spec(observation_spec, self.in_keys[0], "DemonstrationSource")
-        if self.learn and observation_spec.shape != self.network.batch_size:
-            raise ValueError(
-                f"{type(self.network).__name__} was made for "
-                f"batch_size={tuple(self.network.batch_size)}, but the environment to learn from "
-                f"has {tuple(observation_spec.shape)}: make both the same"
-            )
-        return demonstration
 
 
 def _flat(transform: nn.Module) -> Iterator[nn.Module]:

@@ -14,6 +14,11 @@ from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.transforms._episode import EpisodeTransform, ending
 
 
+def matching_reward(behavior: Tensor, phi: Tensor) -> Tensor:
+    """Return the intrinsic reward ``exp(-||b - phi_g||)`` (Eq. 7) of embeddings ``[*B, d]``."""
+    return torch.exp(-torch.linalg.vector_norm(behavior - phi, dim=-1))
+
+
 class BehaviorMatchingReward(EpisodeTransform):
     """Intrinsic reward at the end of an episode for matching its behavior ``b`` (Eq. 7).
 
@@ -102,8 +107,7 @@ class BehaviorMatchingReward(EpisodeTransform):
         intrinsic = torch.zeros_like(extrinsic)
         ended = ending(tensordict, next_tensordict)
         if ended.any():
-            error = torch.linalg.vector_norm(tensordict.get(behavior_key) - phi, dim=-1)
-            bonus = torch.where(ended, torch.exp(-error), 0)
+            bonus = torch.where(ended, matching_reward(tensordict.get(behavior_key), phi), 0)
             intrinsic = bonus.unsqueeze(-1).to(extrinsic.dtype)
         next_tensordict.set(extrinsic_key, extrinsic)
         next_tensordict.set(intrinsic_key, intrinsic)

@@ -121,8 +121,6 @@ class DemonstrationSource(EpisodeTransform):
         batch_size: Batch size of the environment, or its length; ``()`` is a single one.
         generator: Source of the streams, one for all rows or one per row, used only on
             construction; None: torch's default generator. ``env.set_seed`` replaces the streams.
-        follow: Another source, whose ``episode`` count determines the available tasks (evaluation
-            follows training) and whose batch size is the leading dimensions of ``batch_size``.
         out_keys: Keys of task, embedding and index.
 
     Raises:
@@ -155,7 +153,6 @@ class DemonstrationSource(EpisodeTransform):
         *,
         batch_size: int | Sequence[int] = (),
         generator: torch.Generator | Sequence[torch.Generator] | None = None,
-        follow: DemonstrationSource | None = None,
         out_keys: Sequence[NestedKey] = ("task", "demo_embedding", "demo_index"),
     ) -> None:
         super().__init__((), out_keys)
@@ -179,14 +176,7 @@ class DemonstrationSource(EpisodeTransform):
         sources = generator if isinstance(generator, Sequence) else [generator] * n_rows
         if len(sources) != n_rows:
             raise ValueError(f"generator must be one or {n_rows}, one a row; got {len(sources)}")
-        if follow is not None and batch_size[: follow.episode.ndim] != follow.episode.shape:
-            raise ValueError(
-                f"batch_size {tuple(batch_size)} must start with that of the source to follow, "
-                f"{tuple(follow.episode.shape)}"
-            )
         self.schedule = schedule
-        # A list, so that it is not registered as a submodule.
-        self._follow = [] if follow is None else [follow]
         self.register_buffer("_stream", _streams(sources).view(batch_size))
         self.register_buffer("episode", torch.zeros(batch_size, dtype=torch.int64))
         self.register_buffer("_embedding", bank.embedding.float(), persistent=False)
@@ -206,10 +196,7 @@ class DemonstrationSource(EpisodeTransform):
         return copy
 
     def _draw(self, rows: Tensor) -> None:
-        presented = self._follow[0].episode if self._follow else self.episode
-        extra = self.episode.ndim - presented.ndim
-        available = self.schedule.available(presented[(..., *[None] * extra)])
-        available = available.expand(*rows.shape, -1)[rows].tolist()
+        available = self.schedule.available(self.episode)[rows].tolist()
         episodes, streams = self.episode[rows].tolist(), self._stream[rows].tolist()
         drawn = []
         for tasks, stream, episode in zip(available, streams, episodes, strict=True):

@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import pytest
 
+from bgpo_trl.algorithms import entry
 from bgpo_trl.algorithms.bgpo import BGPO
-from tests.algorithms.bgpo_variants import CHANGES, SCHEDULE, VARIANTS
+from tests.algorithms.playing import CHANGES, SCHEDULE, VARIANTS
 
 
 @pytest.fixture
@@ -33,5 +34,19 @@ def make_bgpo(bank, encoders, make_config, in_world):
                 shown = [(seed + row) % len(bank.seen().task) for seed in seeds]
                 algorithm.groups.adapt(bank.seen().embedding[shown])
         return in_world(algorithm, seeds, schedule, bank)
+
+    return make
+
+
+@pytest.fixture
+def make_task_algorithm(bank, encoders, make_config, in_world):
+    """Makes MAML or Dist-NLL, of as many tasks as the schedule has."""
+
+    def make(name, seeds=(4, 6), schedule=SCHEDULE, state="state", bank=bank, **changes):
+        config = make_config(state, name).algorithm
+        config = replace(config, **{"task_batch_size": 4, **changes})
+        of_tasks = bank.for_tasks(bank.tasks[: schedule.n_tasks])
+        algorithm = entry(name).make(config, seeds=seeds, bank=of_tasks.seen(), encoders=encoders)
+        return in_world(algorithm, seeds, schedule, of_tasks)
 
     return make

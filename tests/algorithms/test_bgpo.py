@@ -1,21 +1,21 @@
 """BGPO as a whole: what it sees, what it learns from, and that seeds share nothing."""
 
+from copy import deepcopy
 from dataclasses import replace
 
 import pytest
 import torch
 from torchrl.envs import check_env_specs
 
+from bgpo_trl.algorithms import ABLATIONS, ALGORITHMS
+from bgpo_trl.algorithms.algorithm import Policy
 from bgpo_trl.algorithms.bgpo import BGPO
-from bgpo_trl.algorithms.environments import encode
-from bgpo_trl.algorithms.policy import Policy
+from bgpo_trl.configs import DDPGConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.modules.gwr import GWRB
-from bgpo_trl.scenes.nico import NICO
 from bgpo_trl.seeding import generators
 from bgpo_trl.transforms import BehaviorLookup, GroupLookup, TaskSchedule
-from tests.algorithms.bgpo_variants import CHANGES, SCHEDULE, VARIANTS
-from tests.algorithms.playing import assert_same, play, weights
+from tests.algorithms.playing import CHANGES, SCHEDULE, VARIANTS, assert_same, play, weights
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 variants = pytest.mark.parametrize("variant", VARIANTS)
@@ -24,19 +24,6 @@ variants = pytest.mark.parametrize("variant", VARIANTS)
 def groups_of(state, algorithm):
     """The group whose expert acts, of each seed."""
     return state["group"].tolist() if algorithm.config.experts else [0] * algorithm.n_seeds
-
-
-def plain_action(algorithm, state):
-    """Actions without noise, computed from the weights of the snapshots."""
-    actions = []
-    for seed, group in enumerate(groups_of(state, algorithm)):
-        weight = algorithm.experts.actor_weights(seed, group)
-        x = torch.cat([state[key][seed] for key in algorithm.in_keys])
-        hidden = (x @ weight["mlp.layers.0.weight"] + weight["mlp.layers.0.bias"]).relu()
-        actions.append(
-            (hidden @ weight["mlp.layers.1.weight"] + weight["mlp.layers.1.bias"]).tanh()
-        )
-    return torch.stack(actions)
 
 
 def assert_same_graph(first, second, **tolerance):
@@ -72,6 +59,7 @@ def test_each_variant_is_an_environment_with_the_input_it_is_named_after(
     assert ("behavior" in start) == (told in ("phi", "b"))
     if "behavior" in start:
         assert start["context"].equal(0.25 * start["behavior"])
+        assert start["behavior"].equal(start["demo_embedding"]) == (told == "phi")
     assert ("group" in start) == (algorithm.groups is not None) == (variant in CHANGES)
     assert ("behavior_node" in start) == (told == "b")
     assert ("lae_h" in start) == (told in ("phi", "b"))
@@ -79,19 +67,6 @@ def test_each_variant_is_an_environment_with_the_input_it_is_named_after(
     assert (before is not None) == (told == "b")
     if before is not None:
         assert_same_graph(algorithm.gwr.graph(0), before, rtol=0, atol=0)
-
-
-def test_what_the_policy_sees_is_in_the_scale_of_latents(make_bgpo):
-    algorithm = make_bgpo("ground truth, label", max_steps=50)
-    seen = play(algorithm, 60)[0]["state"]
-    assert seen.abs().max() <= 5
-    assert seen.mean((0, 1)).abs().max() < 3
-    assert 0.1 < seen.std() < 3
-
-
-def test_phi_is_the_behavior_where_there_is_no_gwr(make_bgpo, bank):
-    data, _ = play(make_bgpo("latent, phi"), 20)
-    assert data["behavior"].equal(bank.seen().embedding[data["demo_index"]])
 
 
 def test_a_label_is_the_task_of_the_episode(make_bgpo):
@@ -140,40 +115,6 @@ def test_a_reference_learns_the_same_from_whatever_demonstrations(make_bgpo, ban
         assert ours.equal(theirs)
 
 
-def test_plain_ddpg_acts_and_learns_by_the_state_and_nothing_else(make_bgpo):
-    algorithm, blind = make_bgpo("latent, nothing"), make_bgpo("latent, nothing")
-    states = [learner.world.env.reset() for learner in (algorithm, blind)]
-    kept = ["latent", "action", *(("next", key) for key in ("latent", "reward", "terminated"))]
-    for _ in range(20):
-        actions = [algorithm.act(states[0]), blind.act(states[1].select("latent"))]
-        assert set(actions[1].keys()) == {"latent", "action"}
-        for index, learner in enumerate((algorithm, blind)):
-            losses = learner.update()
-            chosen = states[index].set("action", actions[index]["action"])
-            transition, states[index] = learner.world.env.step_and_maybe_reset(chosen)
-            learner.store(transition.select(*kept) if learner is blind else transition)
-        assert actions[0]["action"].equal(actions[1]["action"])
-    assert losses
-    drawn = algorithm.replay.sample(torch.zeros(2, 3, dtype=torch.int64))
-    assert set(drawn.keys(True, True)) == {*kept, "priority_weight"}
-    for ours, theirs in zip(weights(algorithm), weights(blind), strict=True):
-        assert ours.equal(theirs)
-
-
-def test_what_is_said_of_a_labeled_task_is_its_place(make_bgpo):
-    """The first layer adds the row of weights that belongs to the label."""
-    algorithm = make_bgpo("latent, label", schedule=TaskSchedule((0, 0, 0)))
-    state = algorithm.world.env.reset()
-    first, second = algorithm.learner.actor.mlp.layers
-    for index in range(2):
-        weight = first.weight[index, 0]
-        hidden = state["latent"][index] @ weight[:64] + weight[64 + state["task"][index]]
-        hidden = (hidden + first.bias[index, 0]).relu()
-        action = (hidden @ second.weight[index, 0] + second.bias[index, 0]).tanh()
-        acted = algorithm.learner.actor(state.unsqueeze(1).clone())["action"]
-        torch.testing.assert_close(acted[index, 0], action)
-
-
 def act_in_tests(algorithm, state, embedding, task):
     policies = [
         algorithm.snapshot(index, embedding, task, torch.Generator())
@@ -201,19 +142,18 @@ def test_snapshots_have_the_context_of_training_and_learn_nothing(make_bgpo, var
     algorithm = make_bgpo(variant)
     play(algorithm, 33)
     before = [algorithm.gwr.graph(i) for i in range(2)]
-    states = algorithm.state_dict()
+    states = deepcopy(algorithm.state_dict())
     state = algorithm.world.env.reset()
     shown = (state["demo_embedding"].unsqueeze(1), state["task"].unsqueeze(1))
     for index, group in enumerate(groups_of(state, algorithm)):
         policy = algorithm.snapshot(index, *shown, torch.Generator())
         assert policy.context[index, 0].equal(0.25 * state["behavior"][index])
         row = (index, 0) if algorithm.config.experts else ()  # else it is the same for all
-        for key, value in algorithm.experts.actor_weights(index, group).items():
+        for key, value in algorithm.actor_weights(index, group).items():
             assert policy.parameters[key][row].equal(value)
     for index, graph in enumerate(before):
         assert_same_graph(algorithm.gwr.graph(index), graph, rtol=0, atol=0)
-    for part in ("experts", "active", "learner"):
-        assert_same(algorithm.state_dict()[part], states[part])
+    assert_same(algorithm.state_dict(), states)
 
 
 def test_test_episodes_are_played_by_the_expert_of_their_demonstration(make_bgpo, bank):
@@ -229,7 +169,7 @@ def test_test_episodes_are_played_by_the_expert_of_their_demonstration(make_bgpo
     behaviors = algorithm.gwr.lookup(embedding.expand(2, 3, 4, 32)).embedding
     assert all(len(of_seed.unique()) > 1 for of_seed in groups)
     for seed, t, m in torch.cartesian_prod(*map(torch.arange, groups.shape)).tolist():
-        weight = algorithm.experts.actor_weights(seed, int(groups[seed, t, m]))
+        weight = algorithm.actor_weights(seed, int(groups[seed, t, m]))
         x = torch.cat([state[seed, t, m], 0.25 * behaviors[seed, t, m]])
         hidden = (x @ weight["mlp.layers.0.weight"] + weight["mlp.layers.0.bias"]).relu()
         action = hidden @ weight["mlp.layers.1.weight"] + weight["mlp.layers.1.bias"]
@@ -260,27 +200,6 @@ def test_episodes_follow_algorithm_1(make_bgpo, bank, encoders, variant):
             torch.testing.assert_close(step["next", "reward"], reward)
         assert_same_graph(algorithm.gwr.graph(index), gwr.graph())
         assert len(gwr.graph().weights) > 2
-
-
-@variants
-@pytest.mark.parametrize("scale", [0.0, 0.7])
-def test_exploration_is_noise_of_each_seed_on_the_policys_action(
-    make_bgpo, make_config, variant, scale
-):
-    ddpg = replace(make_config().algorithm.rl, noise=scale)
-    algorithm, sources = make_bgpo(variant, config=ddpg), generators((3, 8), "exploration")
-    with torch.no_grad():  # so that some actions are cut off, and some are not
-        algorithm.learner.actor.mlp.layers[-1].bias.copy_(torch.tensor([0.0, 1.0, -1.0, 0.0]))
-    state, n_cut = algorithm.world.env.reset(), 0
-    for _ in range(8):
-        state = algorithm.act(state)
-        action = plain_action(algorithm, state)
-        for index, source in enumerate(sources):
-            expected = action[index] + scale * torch.randn(4, generator=source)
-            n_cut += int((expected.abs() > 1).sum())
-            torch.testing.assert_close(state["action"][index], expected.clamp(-1, 1))
-        _, state = algorithm.world.env.step_and_maybe_reset(state)
-    assert (0 < n_cut < 64) == (scale > 0)
 
 
 @pytest.mark.parametrize(
@@ -314,11 +233,6 @@ def test_targets_are_clipped_to_the_attainable_returns(make_bgpo, variant, chang
         returns = torch.where(terminated, batch["next", "reward"], expected)
         assert 0 < terminated.float().mean() < 1
         torch.testing.assert_close(target, returns)
-
-
-def test_clipping_can_be_turned_off(make_bgpo, make_config):
-    ddpg = replace(make_config().algorithm.rl, clip_targets=False)
-    assert make_bgpo(config=ddpg).learner.loss.return_bounds is None
 
 
 def test_the_first_update_comes_after_the_warm_up_and_with_the_step_that_follows(make_bgpo):
@@ -360,8 +274,8 @@ def test_each_seed_of_a_batch_learns_as_it_would_alone(make_bgpo, variant, rl):
             n_groups = int(alone.groups.num_groups)
             assert n_groups == batch.groups.num_groups[index] > 2
             for group in range(n_groups):
-                ours = batch.experts.actor_weights(index, group)
-                for key, value in alone.experts.actor_weights(0, group).items():
+                ours = batch.actor_weights(index, group)
+                for key, value in alone.actor_weights(0, group).items():
                     torch.testing.assert_close(ours[key], value, rtol=1e-4, atol=1e-4)
         losses.append(alone.update())
     for key, value in batch.update().items():
@@ -369,28 +283,57 @@ def test_each_seed_of_a_batch_learns_as_it_would_alone(make_bgpo, variant, rl):
         torch.testing.assert_close(value, expected, rtol=1e-3, atol=1e-4)
 
 
-@variants
-def test_missing_encoders_are_refused(make_config, bank, in_world, variant):
-    state, _, name = VARIANTS[variant]
-    config = make_config(state, name).algorithm
-    config = replace(config, **CHANGES.get(variant, {}))
-    if state == "state":
-        in_world(BGPO(config, seeds=(0,), bank=bank.seen()), (0,), SCHEDULE)
-        assert encode(config, None, NICO.state)
-    else:
+def test_latents_and_bonuses_without_encoders_are_refused(make_config, bank, in_world):
+    for state in ("latent", "state"):
+        config = make_config(state, "without-gwr").algorithm
         with pytest.raises(ValueError, match="needs trained encoders"):
             in_world(BGPO(config, seeds=(0,), bank=bank.seen()), (0,), SCHEDULE)
 
 
-@pytest.mark.parametrize("told", ["phi", "b"])
-def test_matching_behaviors_on_ground_truth_is_refused(make_config, bank, encoders, in_world, told):
-    config = make_config("state", VARIANTS[f"latent, {told}"][2]).algorithm
+# ---- the ablations
 
-    def enter(encoders):
-        algorithm = BGPO(config, seeds=(0,), bank=bank.seen(), encoders=encoders)
-        return in_world(algorithm, (0,), SCHEDULE).world.env.reset()
 
-    with pytest.raises(ValueError, match="matching behaviors needs trained encoders"):
-        enter(None)
-    with pytest.raises(ValueError, match="found no 'latent'"):
-        enter(encoders)
+def test_the_four_variants_of_the_paper_differ_by_transforms_only(make_config, make_bgpo):
+    """The same weights, streams, simulations and starts, and transforms of their own."""
+    last = ["ObservationNorm", "ClipTransform", "RewardSum"]
+    of_each = {
+        "bgpo-single": ["BehaviorLookup", "BehaviorMatchingReward"],
+        "without-bonus": ["BehaviorLookup"],
+        "without-gwr": ["RenameTransform", "BehaviorMatchingReward"],
+        "without-both": ["RenameTransform"],
+    }
+    assert tuple(of_each) == ABLATIONS[:4]
+    states, starts = [], []
+    for variant, transforms in of_each.items():
+        config = make_config(name=variant).algorithm
+        algorithm = make_bgpo(beta=config.beta, context=config.context)
+        assert (
+            replace(config, beta=0.1, context="behavior")
+            == make_config(name="bgpo-single").algorithm
+        )
+        found = [type(transform).__name__ for transform in algorithm.world.env.transform]
+        assert found == ["FrameEncoder", "StepCounter", "DemonstrationSource", *transforms, *last]
+        starts.append(algorithm.world.env.reset())
+        states.append({key: algorithm.state_dict()[key] for key in ("learner", "noise")})
+        states[-1]["world"] = algorithm.world.state_dict()
+    for state, start in zip(states, starts, strict=True):
+        assert_same(state, states[0])
+        for key in ("latent", "task", "demo_index", "demo_embedding"):
+            assert start[key].equal(starts[0][key])
+
+
+def test_the_variants_beyond_the_paper_add_one_thing_at_a_time():
+    published = ALGORITHMS["bgpo-single"].config
+    assert not (
+        published.experts or published.group_balanced_replay or published.demonstration_share
+    )
+    slow = DDPGConfig(noise=0.1, update_every=4)
+    alone = {"demonstration_share": 0.75, "rl": replace(slow, batch_size=384)}
+    shown = {**alone, "rl": slow, "expert_batch_size": 128}
+    for variant, added in {
+        "group-balanced-replay": {"group_balanced_replay": True},
+        "bgpo-experts": {"group_balanced_replay": True, "experts": True},
+        "demonstrations": alone,
+        "bgpo": {"group_balanced_replay": True, "experts": True, **shown},
+    }.items():
+        assert ALGORITHMS[variant].config == replace(published, **added)

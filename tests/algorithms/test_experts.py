@@ -61,7 +61,7 @@ def make(name="ddpg", most=2, seeds=SEEDS, rest_after=99):
     config = replace(RL[name].config, hidden_sizes=(8,))
     spec = LearnerSpec(seeds, ["state"], 6, (0.0, 1.1), torch.device("cpu"))
     return Experts(
-        lambda width: make_learner(config, replace(spec, experts=range(width))),
+        make_learner(config, spec),
         ActiveGroups(len(seeds), most, rest_after),
         lambda seed, group: PARENTS[group],
     )
@@ -85,6 +85,10 @@ def learn(experts, seed, rows=slice(None)):
     batch = data[torch.arange(len(group)).unsqueeze(1), group.clamp(min=0)].clone()
     weight = (group >= 0).float().unsqueeze(-1).expand(-1, -1, 8)
     experts.learner.learn(batch.set("priority_weight", weight))
+
+
+def width_of(experts):
+    return experts.learner.actor.batch_size[1]
 
 
 def slot_of(experts, seed, group):
@@ -165,22 +169,6 @@ def test_a_new_group_starts_from_the_one_it_parted_from_without_its_moments(name
     assert all(" of " in key for key in differing(grandchild, parent))
 
 
-def test_a_parent_that_is_put_aside_is_inherited_from_too():
-    experts = make()
-    for step, group in enumerate((0, 2, 3)):  # two slots: 0 is put aside
-        experts.play([group, group])
-        learn(experts, step)
-    assert 0 not in experts.active.groups[0]
-    parent = experts.actor_weights(0, 0)
-    (slot, _) = experts.play([1, 3]).tolist()
-    child = tensors_of(experts, 0, slot)
-    for key, value in parent.items():
-        assert child[f"actor_network_params.{key}"].equal(value)
-    learn(experts, 9)  # it was not taken from the parent, but copied
-    assert not differing(experts.actor_weights(0, 0), parent)
-    assert differing(experts.actor_weights(0, 1), parent) == set(parent)
-
-
 @every_rl
 def test_tests_see_the_weights_of_a_group_wherever_they_are(name):
     experts = make(name)
@@ -213,35 +201,12 @@ def test_a_stack_is_as_wide_as_groups_are_active(name):
     for step, groups in enumerate([(0, 0), (0, 1), (2, 1), (3, 1), (4, 1), *[(4, 1)] * 3]):
         experts.play(groups)
         learn(experts, step)
-        widths.append(experts.width)
-        assert {p.shape[:2] for p in experts.learner.loss.parameters()} == {(2, experts.width)}
+        widths.append(width_of(experts))
+        assert {p.shape[:2] for p in experts.learner.loss.parameters()} == {(2, width_of(experts))}
         for state in experts.learner.optimizer.state.values():
-            assert state["exp_avg"].shape[:2] == (2, experts.width)
+            assert state["exp_avg"].shape[:2] == (2, width_of(experts))
             assert int(state["step"]) == step + 1 if name != "td3" else True
     assert widths == [1, 2, 2, 3, 3, 3, 2, 1]
-
-
-@every_rl
-def test_an_expert_that_rests_is_left_as_it_is_and_one_that_does_not_is_not(name):
-    experts = make(name, most=3, rest_after=5)
-    for step, group in enumerate([0, 1, 1]):
-        experts.play([group, 0])
-        learn(experts, step)
-    before = experts.actor_weights(0, 0)
-    for step in (3, 4):  # since TD3 updates the actor every other time
-        experts.play([1, 0])
-        learn(experts, step)
-    learnt = experts.actor_weights(0, 0)
-    assert differing(before, learnt)
-    for step in range(5, 12):
-        experts.play([1, 0])
-        learn(experts, step)
-        assert experts.active.groups == [[1], [0]]
-        assert not differing(experts.actor_weights(0, 0), learnt)
-    for step in (12, 13):
-        experts.play([0, 0])
-        learn(experts, step)
-    assert differing(experts.actor_weights(0, 0), learnt)
 
 
 @every_rl
@@ -275,7 +240,7 @@ def test_a_seed_of_a_batch_is_that_seed_alone(name):
             second = 2
         slots = together.play([first, second])
         assert alone.play([second]).tolist() == slots[1:].tolist()
-        widths.add((together.width, alone.width))
+        widths.add((width_of(together), width_of(alone)))
         learn(together, step)
         learn(alone, step, slice(1, 2))
     assert len(widths) > 3

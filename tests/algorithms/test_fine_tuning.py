@@ -134,14 +134,6 @@ def test_ewc_without_weight_is_fine_tuning(make):
     assert all(fisher.any() for fisher in algorithm.learner.fisher.values())
 
 
-def test_ewc_holds_the_policy_back_from_the_boundary_on(make):
-    algorithm, plain = make("ewc"), make("fine-tuning")
-    ours, theirs = (play(one, 50, boundaries={30: [(1, 1)]})[0] for one in (algorithm, plain))
-    assert ours[0]["action"].equal(theirs[0]["action"])
-    assert ours[1, :40]["action"].equal(theirs[1, :40]["action"])
-    assert not ours[1]["action"].equal(theirs[1]["action"])
-
-
 def test_ewc_consolidates_once_where_several_tasks_begin_at_once(make):
     once, twice = make("ewc"), make("ewc")
     for algorithm, tasks in ((once, [(0, 1)]), (twice, [(0, 1), (0, 2)])):

@@ -4,7 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from bgpo_trl.algorithms.policy import Policy
+from bgpo_trl.algorithms.algorithm import Policy
 from bgpo_trl.modules.actor_critic import Actor
 
 KEYS = ["state", "context"]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from bgpo_trl.algorithms.trials import GroupTrials
+from bgpo_trl.algorithms.experts import GroupTrials
 
 LEFT, RIGHT = torch.tensor([-10.0, 0.0]), torch.tensor([10.0, 0.0])
 # Forty demonstrations of each group: two tasks (groups 0 and 1, 2 and 3), each from both sides.

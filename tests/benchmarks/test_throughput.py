@@ -10,7 +10,6 @@ from benchmarks.speed import throughput
 from benchmarks.speed.bare_process import SUBSTEPS
 from bgpo_trl.configs import BGPOConfig, DDPGConfig
 from suites import nico
-from suites.nico.base import Environment
 
 frames = throughput.frames
 
@@ -33,45 +32,6 @@ def test_the_bare_loop_simulates_what_our_task_does():
         mujoco.mj_step(model, data, SUBSTEPS)
     np.testing.assert_allclose(data.qpos[:12], environment.physics.data.qpos[:12], atol=0.02)
     assert np.abs(data.qpos[:3] - starts[0][1:4]).max() > 0.05
-
-
-def test_processes_of_the_bare_loop_make_frames_until_it_is_dropped():
-    loop = frames.BareLoop(1)
-    for _ in range(frames.EPISODE + 1):
-        loop.step()
-    assert loop._number == 1
-
-
-@pytest.mark.parametrize("threads", [1, 2])
-def test_contenders_come_with_the_frames_they_make(monkeypatch, threads):
-    class Elsewhere:
-        """In place of processes, which take seconds to start."""
-
-        def __init__(self, *args, **kwargs):
-            pass
-
-        def step(self):
-            pass
-
-    drawn, steps = [], []
-    monkeypatch.setattr(frames, "Stock", Elsewhere)
-    monkeypatch.setattr(frames, "BareLoop", Elsewhere)
-    for name in ("step", "advance"):
-        call = getattr(Environment, name)
-        monkeypatch.setattr(
-            Environment, name, lambda *args, call=call: steps.append(None) or call(*args)
-        )
-    encode = frames.VAE().latent
-    vae = frames.VAE()
-    monkeypatch.setattr(vae, "latent", lambda pixels: drawn.append(pixels) or encode(pixels))
-    contenders = frames.contenders(threads, vae)
-    assert {f"bare limit, {n} threads" for n in (1, threads)} <= contenders.keys()
-    for name, (call, count) in contenders.items():
-        steps.clear(), drawn.clear()
-        call()
-        if not name.startswith(("bare", "stock")):
-            assert len(steps) == count == frames.ROWS, name
-        assert bool(drawn) == ("encoder" in name), name
 
 
 def test_ratios_are_against_the_named_contenders(monkeypatch):

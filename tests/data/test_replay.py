@@ -128,20 +128,6 @@ def test_a_seed_of_a_stack_is_that_seed_alone():
             assert (replay.sample(asked)[0] == drawn[seed]).all()
 
 
-def test_some_seeds_draw_what_they_would_draw_with_all():
-    some, every = make(n_seeds=3), make(n_seeds=3)
-    for replay in (some, every):
-        fill(replay, [(step % 2, 1, 0) for step in range(9)])
-    asked = torch.tensor([[0, 1, 1, 0]])
-    whole = every.sample(asked.expand(3, -1))
-    drawn = some.sample(asked.expand(2, -1), seeds=[2, 0])
-    has = whole["priority_weight"][[2, 0]] > 0
-    assert drawn["priority_weight"].equal(whole["priority_weight"][[2, 0]])
-    assert drawn["latent"][has].equal(whole["latent"][[2, 0]][has])
-    # They alone have drawn, so that the other draws now what it did then.
-    assert (some.sample(asked, seeds=[1])[0] == whole[1]).all()
-
-
 def test_rows_without_a_group_draw_nothing():
     asked = torch.tensor([[0, -1, 1, -1], [-1, -1, -1, -1]])
     ours, theirs = generators(2), generators(2)
@@ -286,29 +272,6 @@ def test_a_negative_group_is_refused_where_it_would_be_stored():
     assert drawn["latent"].item() == transition(4, 2)["latent"][1].item()
 
 
-def test_rows_may_have_several_dimensions():
-    one, other = make(), make()
-    for replay in (one, other):
-        fill(replay, [(step % 2, step % 3) for step in range(9)])
-    group = torch.tensor([[[0, 0, 1], [1, -1, 0]], [[2, 1, 0], [0, 0, 5]]])
-    flat = other.sample(group.flatten(1))
-    drawn = one.sample(group)
-    assert drawn.batch_size == (2, 2, 3)
-    assert (drawn.reshape(2, 6) == flat).all()
-
-
-def test_samples_share_nothing_with_the_buffer():
-    replay = GroupReplay(4, generator=generators(1), keys=["action"])
-    data = TensorDict({"action": torch.ones(1, 2, requires_grad=True)}, [1])
-    replay.add(data, torch.tensor([0]))
-    data["action"].data.zero_()
-    rows = torch.zeros(1, 4, dtype=torch.int64)
-    replay.sample(rows)["action"].zero_()
-    drawn = replay.sample(rows)["action"]
-    assert (drawn == 1).all()
-    assert not drawn.requires_grad
-
-
 def test_transitions_follow_their_source_to_another_group():
     replay = GroupReplay(5, generator=generators(2), keys=["latent"], source_key="source")
     for step in range(7):
@@ -323,21 +286,6 @@ def test_transitions_follow_their_source_to_another_group():
     assert steps[20:].unique().tolist() == [2, 3, 5, 6]
     with pytest.raises(ValueError, match="source_key"):
         make().regroup(0, torch.tensor([0]))
-
-
-def test_rows_never_stored_are_saved_as_zeros(monkeypatch):
-    """Uninitialized memory would differ from run to run."""
-    monkeypatch.setattr(torch, "empty", lambda *shape, **kw: torch.ones(*shape, **kw))
-    replay = make(9, n_seeds=3)
-    for step in range(5):
-        mask = torch.tensor([step < 2, step < 5, step < 4])
-        replay.add(transition(7 + step, 3), torch.zeros(3, dtype=torch.int64), mask)
-    saved = TensorDict(replay.state_dict()["rows"], [15])
-    stored = saved["latent"].view(5, 3).T
-    for seed, size in enumerate((2, 5, 4)):
-        torch.testing.assert_close(stored[seed, :size], 7 + torch.arange(size) + seed / 100)
-        for rows in saved.view(5, 3)[size:, seed].values(True, True):
-            assert (rows == 0).all()
 
 
 def test_capacity_costs_no_memory_until_it_is_filled():

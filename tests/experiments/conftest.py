@@ -8,7 +8,7 @@ import torch
 from tensordict.nn import TensorDictModule
 
 from bgpo_trl.algorithms import ALGORITHMS
-from bgpo_trl.algorithms.policy import Policy
+from bgpo_trl.algorithms.algorithm import Policy
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.encoders import pretrained
 from bgpo_trl.experiments import measure, privileged_information, settings

@@ -14,8 +14,7 @@ from bgpo_trl.experiments.episodes import load_blocks
 from bgpo_trl.experiments.nico import looking
 from bgpo_trl.experiments.nico.looking import Row
 from bgpo_trl.runs.results import read_table
-from bgpo_trl.scenes.nico import NicoEnv
-from bgpo_trl.scenes.nico.hiding import HidingEnv
+from bgpo_trl.scenes.nico import HidingEnv, NicoEnv
 from bgpo_trl.training import Trainer
 from suites import nico
 from suites.nico.rendering import FrameRenderer

@@ -24,7 +24,8 @@ from dataclasses import dataclass
 
 from bgpo_trl.algorithms import ALGORITHMS, Entry
 from bgpo_trl.algorithms.bgpo import BGPO
-from bgpo_trl.algorithms.rl import RL, RLEntry, make_td3
+from bgpo_trl.algorithms.rl import RL, RLEntry
+from bgpo_trl.algorithms.twin_critics import make_td3
 from bgpo_trl.configs import BGPOConfig, TD3Config
 
 

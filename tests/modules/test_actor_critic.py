@@ -1,4 +1,4 @@
-"""Perceptrons against plain ones, and each seed of a stack against that seed alone."""
+"""Policies and Q-functions against plain ones, and each seed of a stack against that seed alone."""
 
 import itertools
 import math
@@ -6,11 +6,11 @@ import math
 import pytest
 import torch
 from tensordict import TensorDict
+from torch.distributions import Normal, TanhTransform, TransformedDistribution
 from torch.func import functional_call
 
 from bgpo_trl.modules.actor_critic import Actor, Critic
-from bgpo_trl.modules.gaussian_actor import GaussianActor
-from bgpo_trl.modules.multi_head_actor import MultiHeadActor
+from bgpo_trl.modules.gaussian_actors import GaussianActor, MultiHeadActor
 from bgpo_trl.modules.stacked_mlp import StackedLinear, StackedMLP
 
 
@@ -56,21 +56,6 @@ def test_initial_weights_are_uniform_within_one_over_root_of_inputs():
     assert not torch.equal(layer.weight[0], layer.weight[1])
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda: StackedLinear(2, 2, (3,), generators(2)), "needs 3, got 2"),
-        (lambda: StackedLinear(0, 2), "at least 1"),
-        (lambda: Actor(6, batch_size=0), "at least 1"),
-        (lambda: StackedLinear(2, 2, (3,))(torch.zeros(5, 3, 2)), "one leading index per layer"),
-        (lambda: StackedLinear(2, 2)(torch.zeros(4, 1)), "2 features"),
-    ],
-)
-def test_bad_sizes_are_refused(call, message):
-    with pytest.raises(ValueError, match=message):
-        call()
-
-
 def test_actor_and_critic_are_the_networks_of_the_paper():
     actor, critic = Actor(96, hidden_sizes=(64,)), Critic(96, hidden_sizes=(64,))
     assert [tuple(w.shape) for w in actor.parameters()] == [(96, 64), (64,), (64, 4), (4,)]
@@ -100,20 +85,6 @@ def test_layer_norm_is_the_textbook_one_before_each_relu():
         x = ((x - mean) / (variance + 1e-5).sqrt()).clamp(min=0)
     last = mlp.layers[-1]
     torch.testing.assert_close(output, x @ last.weight + last.bias.unsqueeze(1))
-
-
-def test_inputs_widths_and_depths_can_be_configured():
-    keys = [("observation", "state"), "task_one_hot"]
-    options = {"in_keys": keys, "hidden_sizes": (16, 8), "batch_size": (3,)}
-    actor, critic = Actor(9, 2, **options), Critic(9, 2, **options)
-    data = TensorDict(
-        {"observation": {"state": torch.randn(3, 5, 6)}, "task_one_hot": torch.randn(3, 5, 3)},
-        [3, 5],
-    )
-    critic(actor(data))
-    assert data["action"].shape == (3, 5, 2)
-    assert data["state_action_value"].shape == (3, 5, 1)
-    assert [p.shape[-1] for p in actor.parameters() if p.ndim == 3] == [16, 8, 2]
 
 
 @pytest.mark.parametrize("stack", [(), (3,), (2, 5)])
@@ -146,3 +117,101 @@ def test_networks_can_be_called_with_keywords_and_name_a_missing_entry():
     assert torch.equal(pre_tanh, expected["pre_tanh_action"])
     with pytest.raises(ValueError, match="Actor found no 'state'"):
         actor(TensorDict({"latent": state}, [5]))
+
+
+def test_as_many_generators_as_layers_are_needed():
+    with pytest.raises(ValueError, match="needs 3, got 2"):
+        StackedLinear(2, 2, (3,), generators(2))
+
+
+# ---- SAC's policy
+
+
+def gaussian(batch_size=(), generator=None):
+    network = {"in_keys": ["state"], "hidden_sizes": (8,), "batch_size": batch_size}
+    return GaussianActor(3, 2, generator=generator, **network)
+
+
+def gaussian_states(*shape, scale=1.0):
+    state = torch.randn(*shape, 3, generator=torch.Generator().manual_seed(0)) * scale
+    return TensorDict({"state": state}, shape)
+
+
+def test_actions_are_those_of_a_squashed_gaussian():
+    actor, noise = gaussian(), torch.randn(50, 2)
+    drawn = actor.sample(gaussian_states(50), noise)
+    pre_tanh = drawn["loc"] + drawn["scale"] * noise
+    assert drawn["action"].equal(pre_tanh.tanh())
+    # In double precision, since PyTorch's own inverts the tanh.
+    policy = TransformedDistribution(
+        Normal(drawn["loc"].double(), drawn["scale"].double()), TanhTransform()
+    )
+    expected = policy.log_prob(pre_tanh.double().tanh()).sum(-1).float()
+    torch.testing.assert_close(drawn["action_log_prob"], expected, rtol=1e-4, atol=1e-4)
+
+
+def test_log_probabilities_and_their_gradients_stay_finite_where_the_tanh_saturates():
+    actor = gaussian()
+    drawn = actor.sample(gaussian_states(20, scale=1e3), torch.full((20, 2), 50.0))
+    assert drawn["action"].abs().max() == 1
+    scale = drawn["scale"].log()
+    assert (scale.min().item(), scale.max().item()) == (pytest.approx(-5), pytest.approx(2))
+    drawn["action_log_prob"].sum().backward()
+    assert torch.isfinite(drawn["action_log_prob"]).all()
+    assert all(torch.isfinite(p.grad).all() for p in actor.parameters())
+
+
+# ---- the policy with a head for each task
+
+
+def generator(seed):
+    return torch.Generator().manual_seed(seed)
+
+
+def multi_head(n_heads, seed=0, **arguments):
+    arguments = {"in_keys": ["state"], "hidden_sizes": (64,), **arguments}
+    actor = MultiHeadActor(5, 2, generator=generator(seed), **arguments)
+    for head in range(n_heads):
+        actor.add_head(generator(100 * seed + head))
+    return actor
+
+
+def states(*shape, scale=1.0):
+    return TensorDict({"state": scale * torch.randn(*shape, 5, generator=generator(9))}, shape)
+
+
+@pytest.mark.parametrize("hidden_sizes", [(8,), (16, 8), (16, 12, 8)])
+def test_a_head_maps_the_output_of_the_trunk_to_mean_and_deviation(hidden_sizes):
+    actor = multi_head(3, hidden_sizes=hidden_sizes)
+    assert [layer.out_features for layer in actor.trunk.layers] == list(hidden_sizes)
+    data = actor(states(3, 7))
+    for task, head in enumerate(actor.heads):
+        x = data["state"][task]
+        for layer in actor.trunk.layers:
+            x = (x @ layer.weight + layer.bias).relu()
+        loc, scale = (x @ head.weight + head.bias).split(2, -1)
+        torch.testing.assert_close(data["loc"][task], loc.tanh())
+        # Log-scales are spread evenly between those of the narrowest and of the widest.
+        torch.testing.assert_close(data["scale"][task].log10(), scale.sigmoid() - 1)
+    assert data["action"].equal(data["loc"])
+    for key in actor.out_keys:
+        assert data[key].shape == (3, 7, 2)
+
+
+def test_a_new_head_changes_neither_the_others_nor_the_trunk():
+    actor = multi_head(2)
+    state = states(3, 7)
+    kept = {key: value.clone() for key, value in actor.state_dict().items()}
+    parameters = [id(p) for p in actor.parameters()]
+    before = actor(state[:2].clone())
+    head = actor.add_head(generator(7))
+
+    assert actor.heads[2] is head
+    assert [id(p) for p in actor.parameters()][: len(parameters)] == parameters
+    assert len(list(actor.parameters())) == len(parameters) + 2
+    for key, value in kept.items():
+        assert actor.state_dict()[key].equal(value)
+    after = actor(state.clone())
+    for key in actor.out_keys:
+        assert after[key][:2].equal(before[key])
+        assert not after[key][2].equal(after[key][1])

@@ -221,28 +221,6 @@ def test_best_match_and_neighbor_learn_and_habituate():
     assert gwr.graph().weights[0, 0].item() == pytest.approx(0.025 + step)
 
 
-def test_best_match_and_neighbor_have_constants_of_their_own():
-    config = GWRBConfig(
-        initial_habituation=0.5, alpha_best=2.0, alpha_neighbor=4.0, tau_best=2.0, tau_neighbor=4.0,
-        lr_best=0.4, lr_neighbor=0.2,
-    )  # fmt: skip
-    gwr = from_data([[0.0], [1.0]], config)
-    gwr.adapt(torch.tensor([0.5]))
-    # h_inf = 0 and 1/4; what is left of h - h_inf is exp(-1) for both
-    graph = gwr.graph()
-    assert graph.habituation.tolist() == pytest.approx(
-        [0.5 * math.exp(-1), 0.25 + 0.25 * math.exp(-1)]
-    )
-    assert graph.weights.flatten().tolist() == pytest.approx([0.4 * 0.5 * 0.5, 1 - 0.2 * 0.5 * 0.5])
-
-
-def test_novel_input_inserts_a_node_once_the_best_match_is_habituated():
-    gwr = from_data([[0.0], [-9.0]])
-    # h_n = 1 - (1 - exp(-1.05 n / 3.3)) / 1.05 is .15028 for n = 7 and .12224 for n = 8
-    counts = [int((gwr.adapt(torch.tensor([5.0])), gwr.num_nodes)[1]) for _ in range(9)]
-    assert counts == [2] * 8 + [3]
-
-
 def test_inserted_node_lies_between_and_takes_over_the_edge():
     gwr = from_data([[0.0, 0.0], [1.0, 0.0]], ALWAYS_INSERT)
     gwr.adapt(torch.tensor([0.25, 0.5]))
@@ -298,29 +276,6 @@ def test_first_two_inputs_become_the_nodes():
     assert match.activity.item() == pytest.approx(math.exp(-1))
     assert gwr.graph().weights.tolist() == [[0.5, 0.0], [0.5, 1.0]]
     assert (gwr.graph().edges.tolist(), gwr.graph().ages.tolist()) == ([[0, 1]], [0])
-
-
-def test_random_start_is_two_connected_nodes_within_the_range_of_phi():
-    graph = GWRB(500, generator=torch.Generator().manual_seed(0)).graph()
-    assert graph.edges.tolist() == [[0, 1]]
-    assert graph.habituation.tolist() == [1.0, 1.0]
-    assert -1 <= graph.weights.min() < -0.95 < 0.95 < graph.weights.max() < 1
-    assert abs(graph.weights.mean()) < 0.1
-
-
-def test_redrawn_networks_equal_networks_constructed_with_the_same_generators():
-    def generators():
-        return [torch.Generator().manual_seed(seed) for seed in (5, 6)]
-
-    gwr, fresh = GWRB(3, batch_size=2), GWRB(3, batch_size=2, generator=generators())
-    gwr.redraw(generators())
-    phi = torch.rand(2, 3, generator=torch.Generator().manual_seed(0))
-    for _ in range(2):
-        for network in range(2):
-            assert gwr.graph(network).weights.equal(fresh.graph(network).weights)
-            assert gwr.graph(network).ages.equal(fresh.graph(network).ages)
-        gwr.adapt(phi)
-        fresh.adapt(phi)
 
 
 @pytest.mark.parametrize("init", ["random", "data"])
@@ -397,23 +352,6 @@ def test_loaded_state_continues_bit_for_bit(tmp_path):
     assert any(node[-1] >= len(node) for node in identities)  # nodes were removed
 
 
-def test_state_is_that_of_earlier_versions():
-    """Shipped runs hold these keys, and nothing else."""
-    state = from_data([[0.0], [1.0]]).state_dict()
-    assert [*state] == ["_extra_state"]
-    (network,) = state["_extra_state"]
-    expected = {
-        "weights": torch.tensor([[0.0], [1.0]]),
-        "habituation": torch.ones(2, dtype=torch.float64),
-        "edges": torch.tensor([[0, 1]]),
-        "ages": torch.tensor([0]),
-        "node": torch.tensor([0, 1]),
-        "next_node": 2,
-    }
-    assert [*network] == [*expected]
-    assert_same(network, expected)
-
-
 def test_graphs_states_matches_and_copies_do_not_change_when_the_network_learns():
     gwr = GWRB(4, GROWING)
     state, graph, twin = gwr.state_dict(), gwr.graph(), copy.deepcopy(gwr)
@@ -443,24 +381,14 @@ def test_state_of_other_sizes_is_rejected():
     "damage",
     [
         {"weights": None},
-        {"weights": torch.zeros(2)},
         {"weights": torch.full((2, 1), math.nan)},
         {"weights": torch.zeros(3, 1)},
-        {"habituation": [1.0, 1.0]},
         {"habituation": torch.tensor([1.0, 3.0])},
-        {"habituation": torch.tensor(1.0)},
-        {"edges": torch.tensor([[0.0, 1.0]])},
-        {"edges": torch.tensor([0, 1])},
         {"edges": torch.tensor([[0, 7]])},
         {"edges": torch.tensor([[1, 1]])},
         {"edges": torch.tensor([[0, 1], [1, 0]]), "ages": torch.tensor([0, 0])},
-        {"ages": torch.zeros(1)},
         {"ages": torch.tensor([-5])},
-        {"ages": torch.tensor([0, 0])},
-        {"node": torch.tensor([0.0, 1.0])},
         {"node": torch.tensor([1, 0])},
-        {"node": torch.tensor(0)},
-        {"next_node": None},
         {"next_node": 1},
     ],
     ids=str,
@@ -475,52 +403,10 @@ def test_damaged_state_is_rejected(damage):
     assert_same(gwr.get_extra_state(), [before])
 
 
-def test_fully_habituated_nodes_are_loaded():
-    gone = {"alpha_best": 1.0, "alpha_neighbor": 1.0, "tau_best": 1e-3, "tau_neighbor": 1e-3}
-    gwr, other = (GWRB(1, GWRBConfig(**gone)) for _ in range(2))
-    gwr.adapt(torch.tensor([0.5]))
-    (state,) = gwr.get_extra_state()
-    assert state["habituation"].tolist() == [0.0, 0.0]
-    other.load_state_dict(gwr.state_dict())
-    assert_same(other.get_extra_state(), [state])
-
-
-def test_edges_older_than_the_limit_expire_after_loading():
-    old, gwr = (from_data([[0.0], [1.0]], replace(ALWAYS_INSERT, max_age=n)) for n in (80, 2))
-    old.adapt([9.0])
-    for _ in range(10):
-        old.adapt([1.0])
-    assert old.graph().ages.max() > 9  # of the edge from node 1 to the third
-    gwr.load_state_dict(old.state_dict())
-    gwr.adapt([1.0])
-    assert gwr.graph().edges.tolist() == [[0, 1], [0, 2]]
-
-
 def test_removed_nodes_cost_no_memory():
     gwr = grown(3, n=2000, config=replace(GROWING, max_age=1), max_nodes=12)
     assert gwr.graph().node[-1] > 200  # so many nodes there were
     assert sum(buffer.numel() for buffer in gwr.buffers()) <= 50 * 4
-
-
-def test_many_nodes_need_no_matrix_of_pairs():
-    n = 40_000  # a float32 matrix of all pairs would take 6.4 GB
-    row = torch.arange(n)
-    state = {
-        "weights": row.float().unsqueeze(-1),
-        "habituation": torch.full((n,), 0.1, dtype=torch.float64),
-        "edges": torch.stack([row[:-1], row[1:]], -1),
-        "ages": torch.zeros(n - 1, dtype=torch.int64),
-        "node": row,
-        "next_node": n,
-    }
-    gwr = GWRB(1)
-    gwr.load_state_dict({"_extra_state": [state]})
-    assert gwr.adapt(torch.tensor([30_000.4])).node == 30_000
-    graph = gwr.graph()
-    assert graph.weights[-1].item() == pytest.approx(30_000.2)
-    assert graph.edges[graph.edges[:, 1] == n].tolist() == [[30_000, n], [30_001, n]]
-    assert len(graph.edges) == n
-    assert int(graph.ages.sum()) == 2  # to 29,999 and to the new node
 
 
 def test_network_that_grew_in_inference_mode_learns_outside():
@@ -536,14 +422,6 @@ def test_network_that_grew_in_inference_mode_learns_outside():
     assert_same(inside.get_extra_state(), outside.get_extra_state())
 
 
-def test_no_gradient_flows_through_a_match():
-    gwr = GWRB(2)
-    phi = torch.zeros(2, requires_grad=True)
-    for match in (gwr.lookup(phi), gwr.adapt(phi)):
-        assert not match.embedding.requires_grad
-        assert not match.activity.requires_grad
-
-
 # ---- inputs of all kinds
 
 
@@ -551,14 +429,11 @@ def test_no_gradient_flows_through_a_match():
     "kind",
     [
         lambda phi: phi.float(),
-        lambda phi: phi.numpy(),
-        lambda phi: phi.numpy().astype(np.float32),
         lambda phi: phi.tolist(),
-        lambda phi: list(phi),
         lambda phi: phi.numpy()[..., ::-1].copy()[..., ::-1],
         lambda phi: np.broadcast_to(phi.numpy(), phi.shape),
     ],
-    ids=["float32", "numpy", "numpy32", "lists", "list of tensors", "strides", "read-only"],
+    ids=["float32", "lists", "strides", "read-only"],
 )
 @pytest.mark.parametrize("batch_size", [(), (2,)])
 @pytest.mark.filterwarnings("error")
@@ -573,40 +448,17 @@ def test_tensors_arrays_and_lists_are_the_same_inputs(kind, batch_size):
     assert_same(one.lookup(kind(many)), other.lookup(many))
 
 
-def test_integers_and_masks_of_any_kind_are_taken():
-    gwr = GWRB(2, batch_size=np.int64(2), init="data")
-    for mask in ([True, False], np.array([True, False])):
-        gwr.adapt([[1, 2], [3, 4]], mask)
-    assert gwr.num_nodes.tolist() == [2, 0]
-    assert gwr.graph(0).weights.tolist() == [[1.0, 2.0], [1.0, 2.0]]
-    assert GWRB(np.int64(1)).adapt(np.array([2], np.int32), mask=False).node == -1
-
-
-def test_inputs_may_be_as_large_as_squared_distances_allow():
-    gwr, far = GWRB(1, init="data"), 9e18  # the square of twice as much is just below 3.4e38
-    gwr.adapt([far])
-    assert gwr.lookup([-far]).activity == 0
-    assert gwr.lookup([far]).activity == 1
-
-
 @pytest.mark.parametrize(
     ("phi", "mask"),
     [
         ([[1, 2], [3]], None),
-        (None, None),
-        ("ab", None),
         (np.ones((2, 2), complex), None),
-        (torch.zeros(2), None),
         (torch.zeros(2, 3), None),
-        (torch.zeros(3, 2), None),
-        (torch.tensor(0.0), None),
         ([[0, 0], [0, math.nan]], None),
-        ([[0, 0], [math.inf, 0]], None),
         ([[0, 0], [-9.5e18, 0]], None),
         ([[0, 0], [0, 3e38]], [False, True]),
         ([[0, 0], [0, 0]], [1.0, 1.0]),
         ([[0, 0], [0, 0]], [[True], [False]]),
-        ([[0, 0], [0, 0]], "ab"),
     ],
 )
 def test_bad_input_is_rejected_and_changes_nothing(phi, mask):
@@ -620,20 +472,9 @@ def test_bad_input_is_rejected_and_changes_nothing(phi, mask):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "name"),
-    [
-        ({"n_features": 0}, "n_features"),
-        ({"n_features": 2.5}, "n_features"),
-        ({"n_features": "2"}, "n_features"),
-        ({"max_nodes": 1}, "max_nodes"),
-        ({"max_nodes": 2.5}, "max_nodes"),
-        ({"init": "zeros"}, "init"),
-        ({"batch_size": [0]}, "batch_size"),
-        ({"batch_size": 2.5}, "batch_size"),
-        ({"generator": 0}, "generator"),
-        ({"batch_size": [3], "generator": [torch.Generator()]}, "generator"),
-    ],
+    ("name", "value"),
+    [("init", "zeros"), ("max_nodes", 1), ("batch_size", [0]), ("generator", [torch.Generator()])],
 )
-def test_arguments_out_of_range_are_rejected(arguments, name):
+def test_arguments_out_of_range_are_rejected(name, value):
     with pytest.raises(ValueError, match=rf"^{name} must be"):
-        GWRB(**{"n_features": 4, **arguments})
+        GWRB(4, **{"batch_size": [3], name: value})

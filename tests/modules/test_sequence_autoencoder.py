@@ -63,24 +63,9 @@ def test_latents_beyond_the_length_have_no_influence(
     torch.testing.assert_close(lae.encode(padded, LENGTH), lae.encode(z, LENGTH))
 
 
-def test_a_sequence_has_the_same_embedding_alone_and_unpadded(lae: SequenceAutoencoder) -> None:
-    z = sequences(5)
-    phi = lae.encode(z, LENGTH)
-    for i, n in enumerate(LENGTH):
-        torch.testing.assert_close(lae.encode(z[i, :n], n), phi[i])
-
-
 def test_decoder_is_fed_phi_at_every_step(lae: SequenceAutoencoder) -> None:
     phi = torch.rand(3, 32) * 2 - 1
     states = plain_lstm(phi.unsqueeze(1).expand(-1, 9, -1), lae.decoder.all_weights[0])
     torch.testing.assert_close(lae.decode(phi, 9), lae.readout(states))
     torch.testing.assert_close(lae.decode(phi[0], 4), lae.decode(phi, 9)[0, :4])
     assert lae.decode(phi.expand(2, 3, 32), 5).shape == (2, 3, 5, 64)
-
-
-@pytest.mark.parametrize("length", [[51, 0], [51, 52], [51], 51])
-def test_lengths_that_do_not_fit_are_refused(
-    lae: SequenceAutoencoder, length: list[int] | int
-) -> None:
-    with pytest.raises(ValueError, match=r"length|1\.\.51"):
-        lae.encode(sequences(2), torch.tensor(length))

@@ -6,11 +6,10 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from bgpo_trl.modules.actor_critic import Actor, Critic
-from bgpo_trl.modules.gaussian_actor import GaussianActor
+from bgpo_trl.modules.gaussian_actors import GaussianActor
 from bgpo_trl.objectives.ddpg import DDPGLoss
-from bgpo_trl.objectives.sac import SACLoss
-from bgpo_trl.objectives.target_update import ForeachSoftUpdate
-from bgpo_trl.objectives.td3 import TD3Loss
+from bgpo_trl.objectives.off_policy import ForeachSoftUpdate
+from bgpo_trl.objectives.twin_critics import SACLoss, TD3Loss
 
 SIZES = {"state": 6, "label": 2}
 STATE, ACTION = SIZES["state"], 4

@@ -7,7 +7,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from bgpo_trl.objectives.ddpg import DDPGLoss
-from bgpo_trl.objectives.target_update import ForeachSoftUpdate
+from bgpo_trl.objectives.off_policy import ForeachSoftUpdate
 from tests.objectives.losses import (
     constant_critics,
     make_batch,

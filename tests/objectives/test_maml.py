@@ -8,7 +8,7 @@ from torch.nn.functional import layer_norm
 from bgpo_trl.modules.actor_critic import Actor, Critic
 from bgpo_trl.objectives.ddpg import DDPGLoss
 from bgpo_trl.objectives.maml import MAMLLoss
-from bgpo_trl.objectives.target_update import ForeachSoftUpdate
+from bgpo_trl.objectives.off_policy import ForeachSoftUpdate
 
 N_STATES, N_ACTIONS, TASKS = 3, 2, 3
 
@@ -250,15 +250,6 @@ def test_a_task_of_weight_zero_changes_nothing_and_is_not_adapted_to():
     torch.testing.assert_close(result.detach(), expected)
 
 
-def test_a_weight_scales_the_contribution_of_its_task():
-    """The inner step as well: of half the weight it is half as long."""
-    batch = transitions(2, TASKS, 8)
-    loss, other = (stack_loss(inner_learning_rate=rate) for rate in (0.4, 0.2))
-    half, full = loss.adapt(weighted(batch, 0.5, 0.5, 0.5)), other.adapt(batch)
-    for ours, theirs in zip(half.values(), full.values(), strict=True):
-        torch.testing.assert_close(ours, theirs)
-
-
 def test_each_seed_of_a_stack_has_the_gradient_that_it_has_alone():
     together = stack_loss(3, inner_learning_rate=0.5)
     # Targets that are no copies of what is learned, and a task that is known to one seed only.
@@ -287,13 +278,6 @@ def test_each_seed_of_a_stack_has_the_gradient_that_it_has_alone():
     torch.testing.assert_close(whole.detach(), values)
 
 
-def test_values_are_reported_per_task():
-    losses = stack_loss()(transitions(2, TASKS, 8))
-    assert losses["loss_actor"].shape == losses["loss_value"].shape == ()
-    assert losses["pred_value"].shape == (2, TASKS, 8)
-    assert losses["pred_value_max"].equal(losses["pred_value"].amax(-1))
-
-
 @pytest.mark.parametrize(
     "shapes", [([2], [3, 2], [3, 2]), ([2], [2], [2]), ([], [3], [2]), ([], [], [])]
 )
@@ -309,17 +293,3 @@ def test_a_negative_rate_and_batches_without_halves_are_refused():
         stack_loss(inner_learning_rate=-0.1)
     with pytest.raises(ValueError, match="even number"):
         stack_loss().loss_actor(transitions(2, TASKS, 7))
-
-
-def test_the_adapted_policies_are_copies_that_start_as_the_meta_policy():
-    network = {"in_keys": ["state"], "hidden_sizes": (8,)}
-    meta, tasks = (Actor(3, 2, batch_size=shape, **network) for shape in ([], [TASKS]))
-    before = [w.detach().clone() for w in tasks.parameters()]
-    loss = MAMLLoss(meta, tasks, Critic(3, 2, batch_size=[TASKS], **network))
-    ForeachSoftUpdate(loss, tau=0.1)
-    for params in (loss.actor_network_params, loss.target_actor_network_params):
-        for ours, of_meta in zip(ordered(params), meta.parameters(), strict=True):
-            assert ours.equal(of_meta.expand_as(ours))
-    loss.loss_actor(transitions(TASKS, 8, dtype=torch.float32))
-    for given, kept in zip(tasks.parameters(), before, strict=True):
-        assert given.equal(kept)

@@ -5,12 +5,9 @@ import math
 
 import pytest
 import torch
-from tensordict import TensorDict
 from torch import Tensor
 
-from bgpo_trl.modules.actor_critic import Actor, Critic
-from bgpo_trl.modules.gaussian_actor import GaussianActor
-from bgpo_trl.objectives.sac import SACLoss
+from bgpo_trl.modules.actor_critic import Actor
 from tests.objectives.losses import (
     ACTION,
     LOSSES,
@@ -129,48 +126,3 @@ def test_each_seeds_temperature_moves_its_entropy_towards_the_target():
 def test_bad_options_are_refused(name, option, value):
     with pytest.raises(ValueError, match=option):
         make_loss(name, **{option: value})
-
-
-def test_each_transition_has_a_draw_of_its_own_whatever_the_batch_size():
-    loss, batch = make_loss("sac"), make_batch(32)
-    batch["next", "state"] = batch["next", "state"][:1].expand(32, STATE).clone()
-    batch["next", "terminated"] = torch.zeros(32, 1, dtype=torch.bool)
-    batch["next", "reward"] = torch.zeros(32, 1)
-    loss(batch)
-    within = loss.target(batch)
-    loss = make_loss("sac")
-    without = TensorDict(batch.exclude("td_error").to_dict(), [])
-    loss(without)
-    torch.testing.assert_close(loss.target(without), within)
-    assert len(within.unique()) == 32
-
-
-def test_sacs_target_entropy_counts_the_actions_by_default():
-    networks = [
-        (
-            GaussianActor(STATE, n, in_keys=["state"]),
-            Critic(STATE, n, in_keys=["state"], batch_size=2),
-        )
-        for n in (1, 3)
-    ]
-    assert [SACLoss(*pair).target_entropy for pair in networks] == [-1.0, -3.0]
-    assert SACLoss(*networks[0], target_entropy=-4.0).target_entropy == -4.0
-
-
-def test_sacs_noise_is_floating_point_for_observations_of_integers():
-    class Whole(GaussianActor):
-        """A policy of integer observations."""
-
-        def forward(self, tensordict):
-            return super().forward(tensordict.set("state", tensordict["state"].float()))
-
-        def draw(self, tensordict, noise):
-            assert noise.dtype == torch.float32
-            return super().draw(tensordict, noise)
-
-    critic = Critic(STATE, ACTION, in_keys=["state"], batch_size=2)
-    loss = SACLoss(Whole(STATE, ACTION, in_keys=["state"]), critic, constant_keys=["state"])
-    loss.make_value_estimator()
-    batch = make_batch(8)
-    batch["state"] = batch["state"].long()
-    assert loss.next_value(loss.following(batch)).shape == (8,)

@@ -14,7 +14,6 @@ from bgpo_trl.configs import RunConfig
 from bgpo_trl.data.dataset import load_demonstrations, write_demonstrations
 from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.encoders.train import make_pretrained, train_encoders
-from bgpo_trl.evaluation import evaluate_random_policy
 from bgpo_trl.experiments.one_shot import OneShotArguments, one_shot
 from bgpo_trl.experiments.watch import WatchArguments, watch
 from bgpo_trl.policy import load_run
@@ -86,12 +85,6 @@ def test_actions_beyond_the_range_count_as_its_ends():
     state, start = env.reset(), env.simulations[0].place
     env.step(state.set("action", torch.tensor([[-3.0]])))
     assert env.simulations[0].place == start - 0.5
-
-
-def test_a_failed_episode_is_no_success_of_random_actions():
-    falling = scene(lambda: Falling())
-    rate = evaluate_random_policy(tasks=TASKS, episodes=4, max_steps=12, scene=falling)
-    assert rate.tolist() == [0.0, 0.0]
 
 
 class Falling(Dot):

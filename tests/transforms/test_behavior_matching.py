@@ -2,12 +2,10 @@
 
 import pytest
 import torch
-from torchrl.data import Unbounded
 from torchrl.envs import (
     Compose,
     RenameTransform,
     RewardSum,
-    StepCounter,
     TransformedEnv,
     check_env_specs,
 )
@@ -61,16 +59,6 @@ def test_reward_by_hand_at_success_and_at_time_out():
     assert (after["intrinsic_reward"][1, 4::5] > 1e-4).all()
 
 
-def test_reward_sum_after_it_sums_all_three_rewards():
-    env = make_env([0, 1], lengths=[3, 9], max_steps=5)
-    after = play(env, 15)[0]["next"]
-    for part in ("reward", "extrinsic_reward", "intrinsic_reward"):
-        for row, length in ((0, 3), (1, 5)):
-            for start, end in spans(15, length):
-                total = after[part][row, start : end + 1].sum(0)
-                torch.testing.assert_close(after[f"episode_{part}"][row, end], total)
-
-
 def test_with_beta_zero_the_intrinsic_reward_is_measured_only():
     plain, weighted = (play(make_env(beta=beta), 8)[0]["next"] for beta in (0.0, 0.5))
     assert plain["reward"].equal(plain["extrinsic_reward"])
@@ -87,44 +75,6 @@ def test_an_end_is_rewarded_once():
         rewarded += data["next", "intrinsic_reward"] > 0
         data = env.step_mdp(data)
     assert rewarded.tolist() == [[1], [1]]
-
-
-def test_nested_keys_and_rewards_of_float64():
-    vae, lae, _ = make_modules()
-    behavior = torch.linspace(-0.5, 0.5, 32)
-
-    class WithBehavior(MockEnv):
-        def __init__(self):
-            super().__init__([0, 1], 3, ("agent", "pixels"))
-            self.observation_spec["agent", "b"] = Unbounded((2, 32))
-            self.reward_spec = Unbounded((2, 1), dtype=torch.float64)
-
-        def _observe(self, action):
-            return super()._observe(action).set(("agent", "b"), behavior.expand(2, 32).clone())
-
-        def _step(self, tensordict):
-            data = super()._step(tensordict)
-            return data.set("reward", data["reward"].double())
-
-    h, c = ("agent", "h"), ("agent", "c")
-    env = TransformedEnv(
-        WithBehavior(),
-        Compose(
-            FrameEncoder(vae, [("agent", "pixels")], [("agent", "z")]),
-            StepCounter(5),
-            BehaviorMatchingReward(
-                lae,
-                in_keys=[("agent", "z"), ("agent", "b"), "reward"],
-                out_keys=[h, c, "extrinsic_reward", "intrinsic_reward"],
-            ),
-            RewardSum(),
-        ),
-    )
-    check_env_specs(env)
-    after = play(env, 6)[0]["next"]
-    match = torch.exp(-(after[h][:, 2] - behavior).norm(dim=-1))
-    torch.testing.assert_close(after["reward"][:, 2, 0], 1 + 0.1 * match.double())
-    assert after["intrinsic_reward"].dtype == torch.float64
 
 
 def test_bad_arguments_and_wrong_orders_are_refused():

@@ -96,12 +96,3 @@ def test_resumes_from_a_state_dict(n_steps):
     steps, _ = play(resumed, 12, saved)
     for key, value in expected.items(True, True):
         torch.testing.assert_close(steps[key], value)
-
-
-def test_a_reset_of_no_row_changes_nothing():
-    env = make_env([0, 1], vae=make_modules()[0])
-    before = env.reset()
-    data = before.clone().set("_reset", torch.zeros(2, 1, dtype=torch.bool))
-    after = env.reset(data)
-    for key, value in before.items():
-        assert after[key].equal(value)

@@ -124,33 +124,6 @@ def test_an_unfinished_episode_starts_again():
     collector.shutdown(close_env=False)
 
 
-def test_an_episode_ends_once():
-    env, source = make([0, 1], [2, 4])
-    env.rollout(4, break_when_any_done=False, break_when_all_done=True)  # row 0 waits for row 1
-    assert source.episode.tolist() == [1, 1]
-    data = env.reset()
-    for _ in range(6):  # stepping on without a reset
-        data = env.step_mdp(env.step(data.set("action", torch.zeros(2, 4))))
-    assert source.episode.tolist() == [2, 2]
-
-
-def test_evaluation_follows_the_schedule_of_training():
-    training, source = make([0, 1], [2, 50], TaskSchedule((0, 3), cumulative=False))
-    testing = DemonstrationSource(
-        make_bank(), source.schedule, batch_size=[2, 4], generator=None, follow=source
-    )
-    env = TransformedEnv(MockEnv([[0] * 4, [1] * 4], 2), Compose(StepCounter(50), testing))
-    seen = []
-    for _ in range(3):
-        play(training, 4)
-        seen.append(play(env, 2)[0]["task"])
-    assert seen[0].unique().tolist() == [0]
-    assert seen[-1][0].unique().tolist() == [1]  # seed 0 has played six episodes ...
-    assert seen[-1][1].unique().tolist() == [0]  # ... and seed 1 none to its end
-    assert testing.episode.tolist() == [[3] * 4] * 2
-    assert not [key for key in testing.state_dict() if "follow" in key]
-
-
 @pytest.mark.parametrize("wrapped", [False, True])
 def test_reaches_environments_inside_a_serial_env(wrapped):
     def single(length):
@@ -187,7 +160,6 @@ def test_bad_arguments_and_wrong_orders_are_refused():
             lambda: DemonstrationSource(bank, both, batch_size=[3], generator=generators([0, 1])),
             "one or 3",
         ),
-        (lambda: DemonstrationSource(bank, both, batch_size=[3], follow=source), "follow"),
         (lambda: make([0, 1], base=MockEnv([0, 1, 2]))[0].reset(), "batch_size"),
         (lambda: source.seed_rows([1]), "1 seeds for 2 simulations"),
     ):
@@ -195,26 +167,6 @@ def test_bad_arguments_and_wrong_orders_are_refused():
             call()
     with pytest.raises(TypeError, match="append it to an environment"):
         source(TensorDict(batch_size=[2]))
-
-
-@pytest.mark.parametrize("seeds", [None, [4, 2]])
-def test_changes_of_an_observation_do_not_reach_the_bank(seeds):
-    env, source = make(seeds)
-    bank = source._embedding.clone(), source._task.clone()
-    data = env.reset()
-    for key in ("demo_embedding", "task", "demo_index"):
-        data[key].zero_()
-    assert source._embedding.equal(bank[0]) and source._task.equal(bank[1])
-
-
-def test_a_bank_of_other_dtypes_is_converted():
-    bank = make_bank()
-    other = SimpleNamespace(embedding=bank.embedding.double(), task=bank.task.int())
-    source = DemonstrationSource(other, CONCURRENT)
-    env = TransformedEnv(MockEnv(), Compose(StepCounter(50), source))
-    check_env_specs(env)
-    data = env.reset()
-    assert data["demo_embedding"].dtype == torch.float32 and data["task"].dtype == torch.int64
 
 
 def test_a_clone_counts_and_draws_by_itself():

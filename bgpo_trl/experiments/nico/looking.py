@@ -30,7 +30,7 @@ from suites import opengl
 
 if TYPE_CHECKING:
     from bgpo_trl.policy import LoadedRun
-    from bgpo_trl.scenes.nico.hiding import Hidden
+    from bgpo_trl.scenes.nico import Hidden
 
 VIEWS: dict[str, Hidden | None] = {
     "seen": None,
@@ -71,8 +71,7 @@ def measure_looking(
     Raises:
         ValueError: If ``episodes`` is less than 1.
     """
-    from bgpo_trl.scenes.nico import NICO
-    from bgpo_trl.scenes.nico.hiding import HidingEnv
+    from bgpo_trl.scenes.nico import NICO, HidingEnv
 
     if episodes < 1:
         raise ValueError(f"--episodes must be at least 1, got {episodes}")

@@ -2,18 +2,13 @@
 
 import itertools
 import pickle
-import threading
 from copy import deepcopy
-from functools import partial
 
 import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import (
-    RewardClipping,
-    RewardScaling,
-    SerialEnv,
     StepCounter,
     TransformedEnv,
     check_env_specs,
@@ -66,21 +61,6 @@ def test_specs_pass_the_check_of_torchrl(batch_size, observation):
     check_env_specs(NicoEnv(batch_size=batch_size, observation=observation))
 
 
-@batch_sizes
-def test_entries_have_the_documented_shapes_and_types(batch_size):
-    env = NicoEnv(batch_size=batch_size, observation="both")
-    start = env.reset()
-    end = env.rand_step(start.clone())["next"]
-
-    for td in (start, end):
-        assert (td["pixels"].shape, td["pixels"].dtype) == ((*batch_size, 32, 64, 3), torch.uint8)
-        assert (td["state"].shape, td["state"].dtype) == ((*batch_size, 16), torch.float32)
-        assert (td["task"].shape, td["task"].dtype) == (batch_size, torch.int64)
-        for key in ("done", "terminated", "truncated"):
-            assert (td[key].shape, td[key].dtype) == ((*batch_size, 1), torch.bool)
-    assert (end["reward"].shape, end["reward"].dtype) == ((*batch_size, 1), torch.float32)
-
-
 @pytest.mark.parametrize("spread", [0.0, 0.4, 1.0])
 def test_each_row_equals_the_environment_of_the_suite(spread):
     batch = NicoEnv(batch_size=[3], seed=6, spread=spread, observation="both")
@@ -113,34 +93,6 @@ def test_each_row_of_a_batch_equals_the_row_alone():
         alone_start = alone.reset(TensorDict({"task": tasks[index]}))
         assert_equal(alone_start, start[index])
         assert_equal(run(alone, alone_start, steps[:, *index]), rollout[:, *index])
-
-
-def test_seeds_of_rows_are_given_one_by_one_or_count_up():
-    env = NicoEnv(batch_size=[2], seed=[8, 3], observation="state")
-    first = env.reset()["state"]
-    env.set_seed(8)
-    second = env.reset()["state"]
-    assert first[0].equal(second[0])
-    assert not first[1].equal(second[1])
-    assert NicoEnv(batch_size=2, seed=8, observation="state").reset()["state"].equal(second)
-
-
-def test_without_a_seed_all_starts_differ():
-    first, second = (NicoEnv(batch_size=2, seed=None, observation="state") for _ in range(2))
-    starts = torch.cat([first.reset()["state"], second.reset()["state"]])
-    first.set_seed(None)
-    starts = torch.cat([starts, first.reset()["state"]])
-    assert len(starts.unique(dim=0)) == 6
-
-
-@pytest.mark.parametrize(("seed", "alike"), [(0, True), (None, False)])
-def test_workers_have_the_same_starts_until_they_are_seeded(seed, alike):
-    env = SerialEnv(2, partial(NicoEnv, seed=seed, observation="state"))
-    first, second = env.reset()["state"]
-    assert first.equal(second) == alike
-    env.set_seed(0)
-    first, second = env.reset()["state"]
-    assert not first.equal(second)
 
 
 @pytest.mark.parametrize(
@@ -202,16 +154,6 @@ def test_rows_masked_out_of_a_step_do_not_move():
     assert_equal(late[1], expected)
 
 
-def test_the_task_is_chosen_at_reset_and_kept():
-    env = NicoEnv(batch_size=[3], observation="state")
-    assert env.reset()["task"].tolist() == [0, 0, 0]
-    td = env.reset(task_td(2, 0, 1))
-    assert td["task"].tolist() == [2, 0, 1]
-    assert run(env, td, actions(env, 2))["task"].tolist() == [[2, 0, 1]] * 2
-    assert env.reset()["task"].tolist() == [2, 0, 1]
-    assert env.reset(task_td(1, 1, 1))["task"].tolist() == [1, 1, 1]
-
-
 def succeed(env: NicoEnv, row: int, td: TensorDictBase) -> TensorDictBase:
     """Demonstrate in one row, while others rest, until it succeeds; return the last step."""
     simulation = env.simulations[row].environment
@@ -270,18 +212,6 @@ def test_episodes_have_no_time_limit_without_a_step_counter():
     last = limited.rollout(60, policy=lambda td: td.set("action", torch.zeros(4)))[-1]["next"]
     assert (last["truncated"].item(), last["terminated"].item()) == (True, False)
     assert last["step_count"] == 50
-
-
-@pytest.mark.parametrize(
-    ("transform", "rewards"),
-    [(RewardScaling(loc=-0.5, scale=4.0), (-0.5, 3.5)), (RewardClipping(0.1, 0.7), (0.1, 0.7))],
-    ids=["scaling", "clipping"],
-)
-def test_rewards_can_be_scaled_and_clipped(transform, rewards):
-    env = TransformedEnv(NicoEnv(batch_size=[2], seed=2, observation="state"), transform)
-    check_env_specs(env)
-    last = succeed(env, 1, env.reset(task_td(0, 0)))
-    torch.testing.assert_close(last["reward"].flatten(), torch.tensor(rewards))
 
 
 @batch_sizes
@@ -399,37 +329,6 @@ def test_results_do_not_depend_on_the_number_of_threads():
         assert (together == alone).all()
 
 
-def test_closing_ends_the_threads():
-    env = NicoEnv(batch_size=[3], seed=0, threads=3)
-    before = threading.active_count()
-    env.rollout(2)
-    assert before < threading.active_count() <= before + 2  # and the caller's own
-    env.close()
-    assert threading.active_count() == before
-
-
-def test_frames_returns_a_copy_of_the_latest_frames():
-    env = NicoEnv(batch_size=[2, 1], seed=3)
-    start = env.reset()
-    shown = env.frames()
-    assert (shown == start["pixels"].numpy()).all()
-    after = env.rand_step(start)["next"]
-    assert (shown == start["pixels"].numpy()).all()  # what was shown stays as it was
-    assert (env.frames() == after["pixels"].numpy()).all()
+def test_frames_that_are_not_observed_are_not_returned():
     with pytest.raises(ValueError, match="observe 'both'"):
         NicoEnv(seed=3, observation="state").frames()
-
-
-def test_dtypes_do_not_depend_on_the_default_of_torch():
-    default = torch.get_default_dtype()
-    try:
-        torch.set_default_dtype(torch.float64)
-        check_env_specs(NicoEnv(observation="state", seed=0))
-    finally:
-        torch.set_default_dtype(default)
-
-
-def test_actions_may_require_gradients():
-    learned = torch.zeros(4, requires_grad=True)
-    rollout = NicoEnv(observation="state").rollout(2, lambda td: td.set("action", learned))
-    assert rollout.shape == (2,)

@@ -1,4 +1,4 @@
-"""The example of an own loss: it runs, and its gradients are those of its equation."""
+"""The examples of an own loss and of an own RL algorithm: they run, and are what they say."""
 
 import csv
 import runpy
@@ -9,27 +9,22 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from bgpo_trl.algorithms.rl import RL, LearnerSpec, make_learner
+from bgpo_trl.algorithms.rl import LearnerSpec, make_learner
+from bgpo_trl.seeding import generators
 
-EXAMPLE = Path(__file__).parents[2] / "examples" / "own_loss.py"
-
-
-@pytest.fixture
-def registry(monkeypatch):
-    """Remove the entries of the example after the test."""
-    monkeypatch.setitem(RL, "awac", None)
-    return RL
+EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
-def test_it_runs_and_every_task_is_tested(registry, capsys):
-    runpy.run_path(str(EXAMPLE), run_name="__main__")
+@pytest.mark.parametrize(("name", "seeds"), [("own_loss", "0"), ("own_rl_algorithm", "01")])
+def test_it_runs_and_every_task_is_tested(name, seeds, capsys):
+    runpy.run_path(str(EXAMPLES / f"{name}.py"), run_name="__main__")
     tests = list(csv.DictReader(capsys.readouterr().out.splitlines()))
     played = [(row["algorithm"], row["seed"], row["episode"]) for row in tests if row["seed"]]
-    assert Counter(played) == {("oracle", "0", n): 3 for n in "24"}
+    assert Counter(played) == {("oracle", seed, n): 3 for n in "24" for seed in seeds}
 
 
-def test_the_actor_imitates_good_actions_most(registry):
-    config = runpy.run_path(str(EXAMPLE))["AWACConfig"](hidden_sizes=(8,))
+def test_the_actor_imitates_good_actions_most():
+    config = runpy.run_path(str(EXAMPLES / "own_loss.py"))["AWACConfig"](hidden_sizes=(8,))
     spec = LearnerSpec([4, 7], ["state"], 3, (0.0, 1.0), torch.device("cpu"))
     learner = make_learner(config, spec)
     generator = torch.Generator().manual_seed(0)
@@ -56,3 +51,19 @@ def test_the_actor_imitates_good_actions_most(registry):
     policy = [p.clone() for p in learner.actor.parameters()]
     learner.learn(batch)
     assert not any(p.equal(q) for p, q in zip(policy, learner.actor.parameters(), strict=True))
+
+
+def test_it_acts_at_random_now_and_then():
+    config = runpy.run_path(str(EXAMPLES / "own_rl_algorithm.py"))["EpsilonConfig"](
+        noise=0.0, epsilon=0.5
+    )
+    spec = LearnerSpec([4], ["state"], 3, (0.0, 1.0), torch.device("cpu"))
+    learner = make_learner(config, spec)
+    data, sources = TensorDict({"state": torch.randn(1, 3)}, [1]), generators([4], "exploration")
+    with torch.no_grad():
+        usual = learner.actor(data.unsqueeze(1))["action"].squeeze(1)
+        expert = torch.tensor([0])
+        drawn = torch.cat([learner.act(data, sources, expert) for _ in range(400)])
+    random = drawn[(drawn != usual).any(-1)]
+    assert 150 < len(random) < 250
+    assert random.abs().max() > 0.9 > abs(random.mean()) * 10

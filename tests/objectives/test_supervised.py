@@ -5,13 +5,15 @@ import math
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from bgpo_trl.modules.inverse_model import InverseModel
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
-from bgpo_trl.objectives.representation import (
+from bgpo_trl.objectives.supervised import (
     ActionInferenceLoss,
+    DistillationLoss,
     SequenceReconstructionLoss,
     VAEInverseLoss,
 )
@@ -65,11 +67,6 @@ def test_hand_computed_numbers() -> None:
     assert set(result.keys()) == set(loss.out_keys)
 
 
-def test_kl_of_the_prior_is_zero() -> None:
-    loss = VAEInverseLoss(HandVAE(torch.zeros(1, 3, 4), torch.zeros(1, 3, 4)))  # type: ignore[arg-type]
-    assert loss(windows(1))["kl"].item() == 0
-
-
 def test_latents_are_sampled_with_the_posteriors_standard_deviation() -> None:
     """With actions zero the inverse loss is half the variance of z_next - z: sigma^2 a number."""
     mu, log_variance = torch.zeros(4, 3, 1000), torch.full((4, 3, 1000), 2 * math.log(0.3))
@@ -110,28 +107,6 @@ def test_noise_comes_from_the_generator_alone() -> None:
         loss = VAEInverseLoss(vae, generator=torch.Generator().manual_seed(5))
         results.append(loss(windows())["reconstruction"])
     assert torch.equal(*results)
-
-
-@pytest.mark.parametrize("term", ["reconstruction", "kl", "inverse"])
-def test_every_term_trains_the_encoder(term: str) -> None:
-    torch.manual_seed(0)
-    loss = VAEInverseLoss(VAE(), generator=torch.Generator().manual_seed(0))
-    loss(windows())[f"loss_{term}"].backward()
-    gradient = loss.vae.encoder[0].weight.grad
-    assert gradient is not None
-    assert gradient.abs().sum() > 0
-
-
-def test_leading_dimensions_and_other_keys() -> None:
-    torch.manual_seed(0)
-    vae, data = VAE(), windows(4)
-    expected = VAEInverseLoss(vae, generator=torch.Generator().manual_seed(0))(data)
-    loss = VAEInverseLoss(vae, generator=torch.Generator().manual_seed(0))
-    loss.set_keys(pixels="image", action=("agents", "action"))
-    renamed = TensorDict({"image": data["pixels"], "agents": {"action": data["action"]}}, [4, 3])
-    result = loss(renamed.reshape(2, 2, 3))
-    for key in list(expected.keys()):
-        torch.testing.assert_close(result[key], expected[key])
 
 
 class GivenReconstruction(nn.Module):
@@ -177,3 +152,78 @@ def test_sequence_loss_and_gradient_ignore_padding(filler: float) -> None:
         value.backward()
         gradients.append([value.detach(), *(p.grad.clone() for p in loss.parameters())])
     torch.testing.assert_close(*gradients)
+
+
+# Two tasks, three states of each, two action components.
+MEAN = [[[0.0, 0.5], [-0.25, 1.0], [0.1, 0.2]], [[0.0, 0.0], [0.75, -0.5], [-1.0, 0.3]]]
+SCALE = [[[0.1, 0.2], [1.0, 0.5], [0.3, 0.3]], [[0.25, 1.0], [0.4, 0.1], [0.15, 0.9]]]
+ACTION = [[[0.2, 0.5], [0.25, 0.0], [-0.4, 0.8]], [[0.0, 1.0], [0.7, -0.4], [-1.0, -0.6]]]
+
+
+class Given(TensorDictModuleBase):
+    """A policy whose states are the parameters of its distributions."""
+
+    def __init__(self):
+        super().__init__()
+        self.in_keys, self.out_keys = ["parameters"], ["loc", "scale"]
+
+    def forward(self, tensordict):
+        loc, scale = tensordict["parameters"].unbind(-1)
+        return tensordict.set("loc", loc).set("scale", scale)
+
+
+def given_batch():
+    parameters = torch.stack([torch.tensor(MEAN), torch.tensor(SCALE)], -1)
+    batch = {
+        "parameters": parameters.requires_grad_(),
+        "teacher_action": torch.tensor(ACTION).requires_grad_(),
+    }
+    return TensorDict(batch, [2, 3])
+
+
+def expected_loss():
+    total = 0.0
+    for of_task in zip(MEAN, SCALE, ACTION, strict=True):
+        for m, s, a in zip(*of_task, strict=True):
+            for mean, scale, action in zip(m, s, a, strict=True):
+                nll = 0.5 * math.log(2 * math.pi * scale**2)
+                nll += (action - mean) ** 2 / (2 * scale**2)
+                total += nll / 3  # a mean over the states, a sum over the rest
+    return total
+
+
+def test_the_loss_is_the_negative_log_likelihood_of_the_teachers_actions():
+    batch = given_batch()
+    losses = DistillationLoss(Given())(batch)
+    assert losses["loss_distillation"].shape == ()
+    assert losses["loss_distillation"].item() == pytest.approx(expected_loss(), rel=1e-5)
+    assert set(batch.keys()) == {"parameters", "teacher_action"}
+
+
+def test_gradients_are_those_of_the_student_and_the_teacher_has_none():
+    batch = given_batch()
+    DistillationLoss(Given())(batch)["loss_distillation"].backward()
+    mean, scale, action = (torch.tensor(values) for values in (MEAN, SCALE, ACTION))
+    error = mean - action
+    expected = torch.stack([error / scale**2, 1 / scale - error**2 / scale**3], -1) / 3
+    torch.testing.assert_close(batch["parameters"].grad, expected)
+    assert batch["teacher_action"].grad is None
+
+
+def test_weights_are_factors_of_the_losses_of_states():
+    batch = given_batch()
+    whole = DistillationLoss(Given())(batch)["loss_distillation"]
+    weights = torch.tensor([[1.0, 1.0, 1.0], [0.0, 0.0, 0.0]])
+    first = DistillationLoss(Given())(batch.set("priority_weight", weights))["loss_distillation"]
+    second = DistillationLoss(Given())(batch.set("priority_weight", 1 - weights))
+    torch.testing.assert_close(first + second["loss_distillation"], whole)
+    first.backward()
+    assert (batch["parameters"].grad[0] != 0).any() and (batch["parameters"].grad[1] == 0).all()
+
+
+@pytest.mark.parametrize("entry", ["teacher_action", "priority_weight"])
+def test_entries_that_would_broadcast_are_refused(entry):
+    batch = given_batch()
+    batch[entry] = torch.ones(2, 3, 1)
+    with pytest.raises(ValueError, match=entry):
+        DistillationLoss(Given())(batch)

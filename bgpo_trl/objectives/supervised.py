@@ -1,12 +1,14 @@
-"""Losses of the VAE, the sequence autoencoder and the inverse model (paper, Sec. III-A)."""
+"""Losses of supervised learning: the encoders (paper, Sec. III-A) and distillation."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import torch
-from tensordict import TensorDict, TensorDictBase
-from tensordict.utils import NestedKey
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torch.nn.functional import gaussian_nll_loss
 from torchrl.objectives import LossModule
 
 from bgpo_trl.errors import missing_key
@@ -14,8 +16,40 @@ from bgpo_trl.modules.inverse_model import InverseModel
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
 
+__all__ = [
+    "ActionInferenceLoss",
+    "DistillationLoss",
+    "SequenceReconstructionLoss",
+    "VAEInverseLoss",
+]
 
-class VAEInverseLoss(LossModule):
+
+class NetworkLoss(LossModule):
+    """Base of losses whose parameters stay in their network, and whose entries have fixed names.
+
+    Args:
+        in_keys: Entries read.
+        out_keys: Entries written.
+    """
+
+    def __init__(self, in_keys: Sequence[NestedKey], out_keys: Sequence[str]) -> None:
+        super().__init__()
+        self.in_keys = list(in_keys)  # pyright: ignore[reportAttributeAccessIssue] any nested keys
+        self.out_keys = list(out_keys)
+
+    @property
+    def functional(self) -> bool:
+        """False, since the parameters stay in the network."""
+        return False
+
+    def inputs(self, tensordict: TensorDictBase) -> list[Tensor]:
+        """Return the entries of ``in_keys``; raise ``ValueError`` if one is missing."""
+        if any(tensordict.get(key, None) is None for key in self.in_keys):
+            raise missing_key(type(self).__name__, tensordict, self.in_keys)
+        return [tensordict.get(key) for key in self.in_keys]
+
+
+class VAEInverseLoss(NetworkLoss):
     """Joint loss of the VAE and its inverse model, on windows of consecutive frames ``[*B, K]``.
 
     With z sampled from N(mu, sigma^2), once per frame, the terms are
@@ -52,15 +86,6 @@ class VAEInverseLoss(LossModule):
         ['loss_inverse', 'loss_kl', 'loss_reconstruction']
     """
 
-    @dataclass
-    class _AcceptedKeys:
-        pixels: NestedKey = "pixels"
-        action: NestedKey = "action"
-        action_known: NestedKey = "action_known"
-
-    default_keys = _AcceptedKeys
-    tensor_keys: _AcceptedKeys
-
     def __init__(
         self,
         vae: VAE,
@@ -70,7 +95,8 @@ class VAEInverseLoss(LossModule):
         inverse_weight: float = 1.0,
         generator: torch.Generator | None = None,
     ) -> None:
-        super().__init__()
+        terms = ["reconstruction", "kl", "inverse"]
+        super().__init__(["pixels", "action"], [*(f"loss_{name}" for name in terms), *terms])
         self.vae = vae
         self.weights = {
             "reconstruction": reconstruction_weight,
@@ -79,27 +105,9 @@ class VAEInverseLoss(LossModule):
         }
         self.generator = generator
 
-    @property
-    def functional(self) -> bool:
-        """False, since the parameters stay in the network."""
-        return False
-
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """The keys that ``forward`` reads."""
-        return [self.tensor_keys.pixels, self.tensor_keys.action]
-
-    @property
-    def out_keys(self) -> list[NestedKey]:
-        """The keys that ``forward`` writes."""
-        return [*(f"loss_{name}" for name in self.weights), *self.weights]
-
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Return the terms for a batch of windows."""
-        pixels = tensordict.get(self.tensor_keys.pixels, None)
-        action = tensordict.get(self.tensor_keys.action, None)
-        if pixels is None or action is None:
-            raise missing_key("VAEInverseLoss", tensordict, self.in_keys)
+        pixels, action = self.inputs(tensordict)
         if pixels.ndim < 5 or pixels.shape[-4] < 2:
             raise ValueError(f"windows need at least 2 frames, got pixels {tuple(pixels.shape)}")
         mu, log_variance = self.vae.encode(pixels)
@@ -114,7 +122,7 @@ class VAEInverseLoss(LossModule):
                 f"action must be {[*pixels.shape[:-3], predicted.shape[-1]]} for these pixels and "
                 f"this VAE, got {[*action.shape]}"
             )
-        known = tensordict.get(self.tensor_keys.action_known, None)
+        known = tensordict.get("action_known", None)
         if known is None:
             known = torch.ones(pixels.shape[:-4], dtype=torch.bool, device=pixels.device)
         squared = (predicted - action[..., :-1, :]).square().sum(-1).mean(-1)
@@ -127,7 +135,7 @@ class VAEInverseLoss(LossModule):
         return TensorDict({**weighted, **{name: term.detach() for name, term in terms.items()}}, [])
 
 
-class ActionInferenceLoss(LossModule):
+class ActionInferenceLoss(NetworkLoss):
     """Squared error of the inverse model, summed over an action.
 
     Reads ``window`` ``[*B, 8 * latent_size]`` and ``action`` ``[*B, action_size]``; writes
@@ -137,45 +145,19 @@ class ActionInferenceLoss(LossModule):
         inverse: Network to train.
     """
 
-    @dataclass
-    class _AcceptedKeys:
-        window: NestedKey = "window"
-        action: NestedKey = "action"
-
-    default_keys = _AcceptedKeys
-    tensor_keys: _AcceptedKeys
-
     def __init__(self, inverse: InverseModel) -> None:
-        super().__init__()
+        super().__init__(["window", "action"], ["loss_inverse"])
         self.inverse = inverse
-
-    @property
-    def functional(self) -> bool:
-        """False, since the parameters stay in the network."""
-        return False
-
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """The keys that ``forward`` reads."""
-        return [self.tensor_keys.window, self.tensor_keys.action]
-
-    @property
-    def out_keys(self) -> list[NestedKey]:
-        """The keys that ``forward`` writes."""
-        return ["loss_inverse"]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Return the loss for a batch of windows."""
-        window = tensordict.get(self.tensor_keys.window, None)
-        action = tensordict.get(self.tensor_keys.action, None)
-        if window is None or action is None:
-            raise missing_key("ActionInferenceLoss", tensordict, self.in_keys)
+        window, action = self.inputs(tensordict)
         # Without the clamp of `infer`, beyond which there would be no gradient.
         error = (self.inverse.network(window) - action).square().sum(-1).mean()
         return TensorDict({"loss_inverse": error}, [])
 
 
-class SequenceReconstructionLoss(LossModule):
+class SequenceReconstructionLoss(NetworkLoss):
     """Masked mean squared error of the sequence autoencoder (paper, Sec. III-A).
 
     Each sequence is embedded, reconstructed in reverse order and compared with its valid latents,
@@ -195,39 +177,13 @@ class SequenceReconstructionLoss(LossModule):
         torch.Size([])
     """
 
-    @dataclass
-    class _AcceptedKeys:
-        latent: NestedKey = "latent"
-        length: NestedKey = "length"
-
-    default_keys = _AcceptedKeys
-    tensor_keys: _AcceptedKeys
-
     def __init__(self, lae: SequenceAutoencoder) -> None:
-        super().__init__()
+        super().__init__(["latent", "length"], ["loss_reconstruction"])
         self.lae = lae
-
-    @property
-    def functional(self) -> bool:
-        """False, since ``nn.LSTM`` caches its weights."""
-        return False
-
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """The keys that ``forward`` reads."""
-        return [self.tensor_keys.latent, self.tensor_keys.length]
-
-    @property
-    def out_keys(self) -> list[NestedKey]:
-        """The keys that ``forward`` writes."""
-        return ["loss_reconstruction"]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Return the loss for a batch of sequences."""
-        latent = tensordict.get(self.tensor_keys.latent, None)
-        length = tensordict.get(self.tensor_keys.length, None)
-        if latent is None or length is None:
-            raise missing_key("SequenceReconstructionLoss", tensordict, self.in_keys)
+        latent, length = self.inputs(tensordict)
         n_steps = int(length.max())
         reconstructed = self.lae.decode(self.lae.encode(latent, length), n_steps)
         back = length.unsqueeze(-1) - 1 - torch.arange(n_steps, device=length.device)
@@ -238,3 +194,49 @@ class SequenceReconstructionLoss(LossModule):
             {"loss_reconstruction": error / (valid.sum() * latent.shape[-1])},
             [],
         )
+
+
+class DistillationLoss(NetworkLoss):
+    """Negative log-likelihood of the teachers' actions (Rusu et al., 2016, Eq. 1, for Gaussians).
+
+    Reads the ``in_keys`` of the policy, ``teacher_action`` ``[T, B, action_dim]`` and, if present,
+    ``priority_weight`` ``[T, B]``, a factor of each state's loss; writes ``loss_distillation``
+    ``[]``: ``-log N(teacher_action; loc, scale^2)``, summed over action components and tasks, mean
+    over ``B``.
+
+    Args:
+        actor_network: Policy that writes ``loc`` and ``scale``.
+
+    Raises:
+        ValueError: From ``forward``, if an entry is missing or has the wrong shape, or the policy
+            writes no distribution.
+    """
+
+    def __init__(self, actor_network: TensorDictModuleBase) -> None:
+        super().__init__([*actor_network.in_keys, "teacher_action"], ["loss_distillation"])
+        self.actor_network = actor_network
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """Return the loss for states and teachers' actions ``[T, B]``."""
+        *_, teacher_action = self.inputs(tensordict)
+        policy = self.actor_network(tensordict.select(*self.actor_network.in_keys))
+        loc, scale = policy.get("loc", None), policy.get("scale", None)
+        if loc is None or scale is None:
+            raise missing_key("DistillationLoss, from its actor,", policy, ["loc", "scale"])
+        if teacher_action.shape != loc.shape:
+            raise ValueError(
+                f"'teacher_action' must be {[*loc.shape]}, as the policy's 'loc' is, got "
+                f"{[*teacher_action.shape]}"
+            )
+        nll = gaussian_nll_loss(
+            loc, teacher_action.detach(), scale.square(), full=True, reduction="none"
+        )
+        loss, weights = nll.sum(-1), tensordict.get("priority_weight", None)
+        if weights is not None:
+            if weights.shape != loss.shape:
+                raise ValueError(
+                    f"'priority_weight' must be one weight a state, {[*loss.shape]}, got "
+                    f"{[*weights.shape]}"
+                )
+            loss = loss * weights
+        return TensorDict({"loss_distillation": loss.mean(-1).sum()})

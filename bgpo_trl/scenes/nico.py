@@ -1,22 +1,32 @@
-"""NICO's tasks as a TorchRL environment: the suite `suites.nico` as simulations."""
+"""NICO at the table, the scene of the paper: the suite `suites.nico` as simulations."""
+
+# MuJoCo's bindings come without stubs.
+# pyright: reportAttributeAccessIssue=false
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any, Literal
 
+import mujoco
 import numpy as np
 import torch
 from dm_env import TimeStep
 from numpy.typing import NDArray
 
+from bgpo_trl.scenes.scene import Scene, StateColumns, Weights
 from bgpo_trl.scenes.simulation import Observation, Outcome, Simulation, SimulationEnv
 from bgpo_trl.seeding import random_state, set_random_state
 from suites import nico
-from suites.nico.base import STATE_SIZE, Environment, check_spread
+from suites.nico.base import STATE_CENTER, STATE_SCALE, STATE_SIZE, Environment, check_spread
+from suites.nico.demonstrator import Demonstrator
+from suites.nico.physics import OBJECTS
 from suites.nico.rendering import FRAME_HEIGHT, FRAME_WIDTH, FrameRenderer
 
-__all__ = ["FRAME_SHAPE", "NicoEnv", "NicoSimulation"]
+__all__ = ["FRAME_SHAPE", "NICO", "HidingEnv", "NicoEnv", "NicoSimulation"]
+
 
 FRAME_SHAPE = (FRAME_HEIGHT, FRAME_WIDTH)
 _ROOM = (180, 70, 600, 350)  # (pixels) crop of the 640x480 room view to NICO and the table
@@ -175,3 +185,154 @@ class NicoEnv(SimulationEnv):
         super().close(raise_if_closed=raise_if_closed)
         if self._renderer is not None:
             self._renderer.close()
+
+
+Hidden = Literal["places", "objects"]
+
+
+class HidingSimulation(NicoSimulation):
+    """NICO at the table, whose observations hide where the objects are.
+
+    Frames and ground truth show each object at its nominal place and turn; if only places are
+    hidden, moved and turned from there as it was since the start of the episode. The arm is shown
+    as it is.
+
+    Args:
+        tasks: As for `NicoSimulation`, as is ``spread``.
+        shown: Physics to show; the true one is only read. Others may share it.
+        hidden: ``"places"`` hides where objects started, ``"objects"`` also how they move.
+    """
+
+    def __init__(
+        self, tasks: Sequence[str], *, shown: nico.Physics, hidden: Hidden, spread: float = 1.0
+    ) -> None:
+        super().__init__(tasks, spread=spread)
+        self._hides_movement = hidden == "objects"
+        self._shown = shown
+        joints = [shown.model.joint(name).qposadr[0] for name in OBJECTS]
+        self._poses = np.add.outer(joints, np.arange(7))
+        self._nominal = np.hstack([nico.nominal_places(), [[1.0, 0.0, 0.0, 0.0]] * len(OBJECTS)])
+        self._start = self._nominal
+
+    def reset(self, task: int) -> None:
+        """Begin an episode of a task."""
+        super().reset(task)
+        self._start = self.environment.physics.data.qpos[self._poses].copy()
+
+    def _show(self) -> nico.Physics:
+        """Return the physics to show, in its state of this moment."""
+        true, shown = self.environment.physics.data.qpos, self._shown
+        poses = self._nominal
+        if not self._hides_movement:
+            poses = _moved(self._nominal, self._start, true[self._poses])
+        shown.data.qpos[:] = true
+        shown.data.qpos[self._poses] = poses
+        # All that is drawn follows from positions, hence without contacts and forces.
+        mujoco.mj_kinematics(shown.model.ptr, shown.data.ptr)
+        mujoco.mj_camlight(shown.model.ptr, shown.data.ptr)
+        return shown
+
+    def frame(self) -> NDArray[np.uint8]:
+        """Return NICO's view of the shown scene, ``[32, 64, 3]``."""
+        return self.draw(self._show())
+
+    def state(self) -> NDArray[Any]:
+        """Return the ground truth of the shown scene, ``[16]``."""
+        return self.environment.task.get_observation(self._show())["privileged_state"]
+
+
+class HidingEnv(NicoEnv):
+    """`NicoEnv` of `HidingSimulation`.
+
+    Args:
+        tasks: As for `NicoEnv`, as are all other arguments.
+        hidden: As for `HidingSimulation`.
+    """
+
+    def __init__(
+        self, tasks: Sequence[str] = nico.PAPER_TASKS, *, hidden: Hidden, **arguments: Any
+    ) -> None:
+        self._hidden: Hidden = hidden
+        self._shown = nico.Physics.from_xml_string(nico.scene_xml())
+        super().__init__(tasks, **arguments)
+
+    def _simulation(self) -> HidingSimulation:
+        return HidingSimulation(
+            self.tasks, shown=self._shown, hidden=self._hidden, spread=self._spread
+        )
+
+
+def _moved(poses: NDArray, start: NDArray, now: NDArray) -> NDArray:
+    """Move and turn poses ``[N, 7]``, position and quaternion, as others from ``start`` to now."""
+    out = poses.copy()
+    out[:, :3] += now[:, :3] - start[:, :3]
+    back, turn = np.empty((2, 4))
+    for i in range(len(poses)):
+        mujoco.mju_negQuat(back, start[i, 3:])
+        mujoco.mju_mulQuat(turn, now[i, 3:], back)
+        mujoco.mju_mulQuat(out[i, 3:], turn, poses[i, 3:])
+    return out
+
+
+_FIRST_OBJECT = 7  # column of the state, after four joints (rad) and the grip point (m)
+
+
+def _demonstrator(simulation: Simulation, task: int, seed: int) -> Callable[[], NDArray[Any]]:
+    """Return NICO's demonstrator at the start of an episode."""
+    if not isinstance(simulation, NicoSimulation):
+        raise TypeError(f"NICO's demonstrator acts in a NicoSimulation, got {simulation!r}")
+    demonstrator = Demonstrator(simulation.environments[task], seed=seed)
+    demonstrator.reset()
+    return lambda: demonstrator(simulation.timestep)
+
+
+def _objects_on_table(state: torch.Tensor) -> torch.Tensor:
+    """Return whether all objects are above 0.6 m, bool, for states ``[..., 16]``."""
+    return (state[..., _FIRST_OBJECT + 2 :: 3] > 0.6).all(-1)
+
+
+_PAPER, _EIGHT = (
+    Path(str(resources.files("bgpo_trl") / "weights" / name))
+    for name in ("nico.safetensors", "nico_eight.safetensors")
+)
+
+
+def _weights_for(tasks: Sequence[str]) -> Path:
+    """Return the encoders of eight tasks if one of the suite's further five is among them.
+
+    Otherwise, also for custom tasks, return those of the paper's three.
+    """
+    further = set(nico.ALL_TASKS) - set(nico.PAPER_TASKS)
+    return _PAPER if further.isdisjoint(tasks) else _EIGHT
+
+
+def _modules(tasks: Sequence[str]) -> Mapping[str, str]:
+    return {name: nico.TASKS[name].__module__ for name in tasks if name not in nico.ALL_TASKS}
+
+
+NICO = Scene(
+    name="nico",
+    version=nico.scene_version(),
+    tasks=nico.TASKS,
+    default_tasks=nico.PAPER_TASKS,
+    own_tasks=nico.ALL_TASKS,
+    make_env=NicoEnv,
+    frame_shape=FRAME_SHAPE,
+    action_size=4,
+    max_steps=50,
+    has_spread=True,
+    demonstrator=_demonstrator,
+    state=StateColumns(
+        center=STATE_CENTER,
+        scale=STATE_SCALE,
+        angles={name: column for column, name in enumerate(("yaw", "pitch", "elbow", "hand"))},
+        places={
+            name: (_FIRST_OBJECT + 3 * number, _FIRST_OBJECT + 3 * number + 1)
+            for number, name in enumerate(("glass", "green", "white"))
+        },
+        valid=_objects_on_table,
+    ),
+    weights=Weights(files=(_PAPER, _EIGHT), choose=_weights_for),
+    modules=_modules,
+)
+"""NICO at the table, the scene of the paper."""

@@ -1,0 +1,207 @@
+"""What MAML and Dist-NLL share: a network of each task, what they read, and independent seeds."""
+
+from copy import deepcopy
+from dataclasses import replace
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from bgpo_trl.algorithms.algorithm import Policy
+from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
+from bgpo_trl.modules.actor_critic import Actor
+from bgpo_trl.modules.gaussian_actors import MultiHeadActor
+from bgpo_trl.transforms import TaskSchedule
+from tests.algorithms.playing import assert_same, play
+
+pytestmark = pytest.mark.usefixtures("easy_world")
+SEEDS = (4, 6)
+SCHEDULE = TaskSchedule((0, 2, 4))
+AT_ONCE = TaskSchedule((0, 0, 0))
+SIZE, N_TASKS = 16, 3  # of the ground truth, and tasks
+both = pytest.mark.parametrize("name", ["maml", "dist-nll"])
+with_demonstrations = pytest.mark.parametrize(
+    ("name", "changes"),
+    [
+        ("maml", {}),
+        ("dist-nll", {}),
+        ("maml-demonstrations", {"state": "latent", "task_batch_size": 8}),
+        ("dist-nll-demonstrations", {"state": "latent"}),
+    ],
+)
+
+
+@pytest.fixture
+def make(make_task_algorithm):
+    def make(name, schedule=SCHEDULE, **changes):
+        return make_task_algorithm(name, schedule=schedule, **changes)
+
+    return make
+
+
+def snapshot(algorithm, index, embedding=0.0):
+    shape = (algorithm.n_tasks, 2)
+    task = torch.arange(algorithm.n_tasks).unsqueeze(1).expand(shape)
+    shown = torch.full((*shape, 32), embedding)
+    return algorithm.snapshot(index, shown, task, torch.Generator().manual_seed(0))
+
+
+def networks(loss):
+    """The tensors of a loss that have a row for each task of each seed, by name."""
+    return {key: value for key, value in loss.state_dict().items() if value.ndim > 1}
+
+
+@with_demonstrations
+def test_a_seed_learns_in_a_batch_as_it_does_alone(make, name, changes):
+    batch = make(name, **changes)
+    together, _ = play(batch, 40)
+    losses = []
+    for index, seed in enumerate(SEEDS):
+        alone = make(name, seeds=(seed,), **changes)
+        data = play(alone, 40)[0][0]
+        for key in ("task", "demo_index", "step_count", ("next", "terminated")):
+            assert together[index][key].equal(data[key]), key
+        for key in ("action", batch.config.state, ("next", "reward")):
+            torch.testing.assert_close(together[index][key], data[key], rtol=1e-4, atol=1e-4)
+        theirs = networks(alone.loss)
+        for key, ours in networks(batch.loss).items():
+            torch.testing.assert_close(ours[index], theirs[key][0], rtol=1e-4, atol=1e-4, msg=key)
+        frozen, frozen_alone = snapshot(batch, index).parameters, snapshot(alone, 0).parameters
+        for key, value in frozen.items():
+            torch.testing.assert_close(value, frozen_alone[key], rtol=1e-4, atol=1e-4)
+        losses.append(alone.update())
+    assert together["task"].unique().tolist() == [0, 1, 2]
+    for key, value in batch.update().items():
+        expected = torch.cat([loss[key] for loss in losses])
+        torch.testing.assert_close(value, expected, rtol=1e-3, atol=1e-4)
+
+
+@both
+@pytest.mark.parametrize(("warmup", "n_tasks", "expected"), [(8, 3, 10), (8, 1, 8), (15, 3, 15)])
+def test_the_first_update_comes_after_the_warm_up_when_some_task_fills_a_batch_for_sure(
+    make, name, warmup, n_tasks, expected
+):
+    """Three tasks can have three transitions each without four of any."""
+    ddpg = replace(make(name).config.rl, warmup_steps=warmup)
+    algorithm = make(name, TaskSchedule((0,) * n_tasks), rl=ddpg)
+    start = deepcopy(algorithm.learner.state_dict())
+    _, state = play(algorithm, expected)  # with an update before each step
+    assert_same(algorithm.learner.state_dict(), start)
+    play(algorithm, 1, state)
+    assert algorithm.learner.state_dict()["optimizer"]["state"]
+
+
+@both
+def test_tasks_that_are_never_presented_make_no_difference(make, name):
+    ddpg = replace(make(name).config.rl, warmup_steps=10)  # as many as three tasks need
+    three, one = (make(name, TaskSchedule(s), rl=ddpg) for s in ((0, 99, 99), (0,)))
+    start = deepcopy(networks(three.loss))
+    ours, theirs = play(three, 30)[0], play(one, 30)[0]
+    torch.testing.assert_close(ours["action"], theirs["action"], rtol=1e-4, atol=1e-5)
+    alone = networks(one.loss)
+    for key, value in networks(three.loss).items():
+        if value.shape[1] != N_TASKS:  # MAML's own policy, which all tasks share
+            torch.testing.assert_close(value, alone[key], rtol=1e-4, atol=1e-5)
+            continue
+        torch.testing.assert_close(value[:, 0], alone[key][:, 0], rtol=1e-4, atol=1e-5)
+        if "value" in key:
+            assert value[:, 1:].equal(start[key][:, 1:])
+
+
+@both
+def test_a_critic_stays_as_it_was_until_there_is_data_of_its_task(make, name):
+    algorithm = make(name)
+    critics = [value for key, value in networks(algorithm.loss).items() if "value" in key]
+    start = [value.clone() for value in critics]
+    counts, learned = torch.zeros(2, N_TASKS).long(), torch.zeros(2, N_TASKS).bool()
+    stages, state = [], algorithm.world.env.reset()
+    for _ in range(50):
+        state = algorithm.act(state)
+        if algorithm.update():
+            learned |= counts >= algorithm.config.task_batch_size
+        for now, before in zip(critics, start, strict=True):
+            assert (now != before).flatten(2).any(-1).equal(learned)
+        stages.append(tuple(learned.flatten().tolist()))
+        transition, state = algorithm.world.env.step_and_maybe_reset(state)
+        algorithm.store(transition)
+        counts[torch.arange(2), transition["task"]] += 1
+        assert algorithm.replay.sizes(torch.arange(N_TASKS).expand(2, -1)).equal(counts)
+    assert not any(stages[0])
+    assert all(stages[-1])
+    assert len(set(stages)) > 3
+
+
+@both
+def test_preparing_a_test_leaves_no_trace_and_is_not_changed_later(make, name):
+    algorithm = make(name)
+    _, state = play(algorithm, 40)
+    before = deepcopy(algorithm.state_dict())
+    gradients = [deepcopy(p.grad) for p in algorithm.loss.parameters()]
+    frozen = snapshot(algorithm, 1).parameters
+    assert_same(algorithm.state_dict(), before)
+    assert_same([p.grad for p in algorithm.loss.parameters()], gradients)
+    copied = deepcopy(frozen)
+    play(algorithm, 20, state)
+    assert_same(frozen, copied)
+    later = snapshot(algorithm, 1).parameters
+    assert not any(value.requires_grad for value in frozen.values())
+    assert any(not value.equal(later[key]) for key, value in frozen.items())
+
+
+@both
+def test_snapshots_act_as_plain_ones_with_these_weights(make, name):
+    algorithm = make(name)
+    play(algorithm, 40)
+    frozen = [snapshot(algorithm, index) for index in range(2)]
+    state = torch.randn(2, N_TASKS, 5, SIZE, generator=torch.Generator().manual_seed(0))
+    actions = Policy.stack(frozen).act(state)
+    for index in range(2):
+        if name == "maml":  # a network for each task
+            alone = Actor(SIZE, in_keys=["state"], hidden_sizes=(64,), batch_size=[N_TASKS])
+        else:
+            alone = MultiHeadActor(SIZE, in_keys=["state"], hidden_sizes=(64,))
+            for _ in range(N_TASKS):
+                alone.add_head()
+        alone.load_state_dict(frozen[index].parameters)
+        expected = alone(TensorDict({"state": state[index]}, [N_TASKS, 5]))["action"]
+        torch.testing.assert_close(actions[index], expected)
+
+
+@both
+def test_demonstrations_are_never_read(make, name):
+    seeing, blind = make(name), make(name)
+    ours, _ = play(seeing, 40)
+    theirs, _ = play(blind, 40, hidden=["demo_embedding"])
+    for key in ("action", "state", "demo_index", ("next", "reward")):
+        assert ours[key].equal(theirs[key]), key
+    assert_same(dict(seeing.loss.state_dict()), dict(blind.loss.state_dict()))
+    for index in range(2):
+        nothing = snapshot(blind, index, embedding=float("nan"))
+        assert_same(snapshot(seeing, index).parameters, nothing.parameters)
+
+
+@with_demonstrations
+@pytest.mark.parametrize("n_steps", [5, 30])
+def test_a_restored_run_continues_as_the_saved_one(make, tmp_path, name, changes, n_steps):
+    algorithm = make(name, **changes)
+    _, state = play(algorithm, n_steps)
+    parts = {"algorithm": algorithm.state_dict(), "world": algorithm.world.state_dict()}
+    save_checkpoint(tmp_path, {**parts, "state": state.to_dict()})
+    other = make(name, seeds=(5, 7), **changes)  # other weights, streams and simulations
+    saved = load_checkpoint(tmp_path)
+    other.world.load_state_dict(saved["world"])
+    other.load_state_dict(saved["algorithm"])
+    ours, _ = play(algorithm, 20, state)
+    theirs, _ = play(other, 20, TensorDict(saved["state"], [2]))
+    assert (ours == theirs).all()
+    assert_same(algorithm.state_dict(), other.state_dict())
+    assert_same(snapshot(algorithm, 1).parameters, snapshot(other, 1).parameters)
+
+
+def test_a_replay_too_small_to_fill_a_batch_is_refused(make, make_config):
+    rl = make_config("state", "maml").algorithm.rl
+    # Three tasks have a full batch of 8 among them after 3 * 7 + 1 transitions.
+    small = {"task_batch_size": 8, "rl": replace(rl, replay_size=22)}
+    make("maml", **small)
+    with pytest.raises(ValueError, match=r"replay_size must be at least 22, .* learning begins"):
+        make("maml", **{**small, "rl": replace(rl, replay_size=21)})
