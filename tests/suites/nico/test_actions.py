@@ -42,6 +42,22 @@ def test_targets_do_not_run_away_from_the_joints(env):
     np.testing.assert_allclose(targets(env), joints + ahead)
 
 
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_targets_stay_within_the_range_of_the_joints(env, sign):
+    env.reset()
+    # The arm raised behind the robot, where nothing is in its way.
+    env.physics.data.qpos[1] = env.physics.data.ctrl[1] = -1.5
+    env.physics.forward()
+
+    reached = []
+    for _ in range(20):
+        env.step(np.array([sign, -1.0, sign, sign]))
+        reached.append(targets(env))
+
+    degrees = np.array([100, -100, 85, 160 / 3]) * [sign, 1, sign, sign > 0]
+    np.testing.assert_allclose(reached[-1], np.radians(degrees)[[0, 1, 2, 3, 3, 3]], atol=1e-3)
+
+
 def test_actions_beyond_the_range_count_as_its_ends(env):
 
     def target(action: list[float]) -> np.ndarray:

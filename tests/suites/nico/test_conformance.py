@@ -6,11 +6,13 @@ What the base class does for all tasks alike is tested in one.
 import itertools
 import re
 
+import mujoco
 import numpy as np
 import pytest
 
 from suites import nico
 from suites.nico import base, kinematics
+from suites.nico.demonstrator import Demonstrator
 from suites.nico.physics import OBJECT_HALF_HEIGHT, OBJECTS, TABLE_HEIGHT, Physics
 
 all_tasks = pytest.mark.parametrize("task", nico.ALL_TASKS)
@@ -18,6 +20,12 @@ all_tasks = pytest.mark.parametrize("task", nico.ALL_TASKS)
 
 def random_actions(count: int, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).uniform(-1.0, 1.0, (count, 4))
+
+
+def test_the_first_tasks_are_those_of_the_paper():
+    assert nico.PAPER_TASKS == ("grasp_glass", "push_green_to_glass", "push_green_to_white")
+    assert nico.ALL_TASKS[:3] == nico.PAPER_TASKS
+    assert len(nico.ALL_TASKS) == len(set(nico.ALL_TASKS)) == 8
 
 
 @all_tasks
@@ -167,6 +175,18 @@ def test_starts_depend_on_episode_and_seed_and_not_on_the_task(load, task):
     np.testing.assert_array_equal(found[:5], starts("grasp_glass", 0, 5))
 
 
+def test_observations_share_no_memory(load):
+    env = load("grasp_glass", seed=0, observation="both")
+    observations = [env.reset().observation]
+    observations += [env.step(action).observation for action in random_actions(3)]
+    for first, second in itertools.combinations(observations, 2):
+        for key in first:
+            assert not np.shares_memory(first[key], second[key])
+    before = env.physics.get_state()
+    observations[-1]["privileged_state"][:] = 0
+    np.testing.assert_array_equal(env.physics.get_state(), before)
+
+
 def polar_places(physics: Physics) -> np.ndarray:
     """Return radius (m), angle (rad) and turn (rad) of each object, ``[3, 3]``."""
     poses = [physics.named.data.qpos[name] for name in OBJECTS]
@@ -194,6 +214,32 @@ def test_objects_start_apart_and_upright_on_the_table(load, spread):
         assert not physics.robot_touches()
         assert not any(task.succeeded(physics) for task in tasks)
         assert (physics.data.qpos[:12] >= low).all() and (physics.data.qpos[:12] <= high).all()
+
+
+def test_starts_are_spread_over_the_table(load):
+    env = load("grasp_glass", seed=0, observation="state")
+    places, polar = [], []
+    for _ in range(200):
+        env.reset()
+        places.append([env.physics.object_position(name)[:2] for name in OBJECTS])
+        polar.append(polar_places(env.physics))
+    deviation = 100 * np.std(places, axis=0)  # (cm)
+    for name, (x, y) in zip(OBJECTS, deviation, strict=True):
+        # Of the green box 1.44 cm in the long run, since its radius is near to two others.
+        assert x >= (1.3 if name == "green_box" else 1.5)
+        assert y >= (3.5 if name == "green_box" else 6.0)
+
+    radii, angles, turns = np.moveaxis(polar, -1, 0)
+    glass, green, white = angles.T
+    is_left = glass > white
+    assert 70 < is_left.sum() < 130
+    neighbors = np.sort(angles, axis=1)
+    np.testing.assert_array_equal(neighbors[:, 1], green)
+    assert np.diff(neighbors).min() >= np.radians(20) - 1e-9
+    assert np.abs(np.diff(radii)).max() <= 0.03 + 1e-9
+    # Also on one and the same side.
+    assert 100 * np.std(0.4 * glass[is_left]) > 1.5
+    assert np.std(turns, axis=0).min() > 1.5  # (rad), of any turn
 
 
 def test_without_spread_objects_are_at_their_nominal_places(load):
@@ -240,6 +286,73 @@ def test_starts_are_at_rest(load):
             end = env.step(np.zeros(4)).observation["privileged_state"]
         np.testing.assert_allclose(end[:4], start[:4], atol=0.02)  # (rad)
         np.testing.assert_allclose(end[4:], start[4:], atol=0.002)  # (m)
+
+
+def test_objects_are_within_reach(load):
+    env = load("grasp_glass", seed=0, observation="state")
+    physics = env.physics
+    limits = np.radians([100, 100, 85])
+    for _ in range(10):
+        env.reset()
+        for name in OBJECTS:
+            target = physics.object_position(name) + np.array([0.0, 0.0, 0.02])
+            arm = kinematics.inverse(target)
+            assert (np.abs(arm) < limits).all()
+            set_arm(physics, arm)
+            np.testing.assert_allclose(physics.grip_position(), target, atol=1e-3)
+
+
+def set_arm(physics: Physics, arm: np.ndarray) -> None:
+    physics.data.qpos[:3] = arm
+    physics.forward()
+
+
+@pytest.fixture(scope="module")
+def segmentation(physics):
+    """Simulation -> name of the body that each pixel of the frame shows, or None."""
+    renderer = mujoco.Renderer(physics.model.ptr, 32, 64)
+    renderer.enable_segmentation_rendering()
+    names = np.array([physics.model.id2name(b, "body") for b in physics.model.geom_bodyid] + [""])
+
+    def segment() -> np.ndarray:
+        renderer.update_scene(physics.data.ptr, "eyes")
+        ids, types = np.moveaxis(renderer.render(), -1, 0)
+        return names[np.where(types == mujoco.mjtObj.mjOBJ_GEOM, ids, -1)]
+
+    yield segment
+    renderer.render()  # Makes its context current, or closing would free buffers of another one.
+    renderer.close()
+
+
+def hand_bodies() -> list[str]:
+    digits = ("thumb", "upper_finger", "lower_finger")
+    return ["hand", *(f"{digit}_{segment}" for digit in digits for segment in (1, 2, 3))]
+
+
+@all_tasks
+def test_the_hand_stays_in_view_in_demonstrations(load, segmentation, task):
+    env = load(task, seed=0, observation="state")
+    demonstrator = Demonstrator(env, seed=0)
+    in_view = []
+    for _ in range(6):
+        timestep = env.reset()
+        demonstrator.reset()
+        in_view.append(np.isin(segmentation(), hand_bodies()).sum() >= 4)
+        while not timestep.last():
+            timestep = env.step(demonstrator(timestep))
+            in_view.append(np.isin(segmentation(), hand_bodies()).sum() >= 4)
+    assert len(in_view) > 100
+    assert np.mean(in_view) >= 0.98
+
+
+def test_objects_are_at_least_4_pixels_wide(load, segmentation):
+    env = load("grasp_glass", seed=0, observation="state")
+    for _ in range(20):
+        env.reset()
+        set_arm(env.physics, np.array([0.0, -1.5, 0.0]))  # out of the way
+        shown = segmentation()
+        for name in OBJECTS:
+            assert (shown == name).any(axis=0).sum() >= 4
 
 
 @pytest.mark.parametrize(

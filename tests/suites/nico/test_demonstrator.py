@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from suites import nico
-from suites.nico import moves
+from suites.nico import kinematics, moves
 from suites.nico.demonstrator import Demonstrator
 
 all_tasks = pytest.mark.parametrize("task", nico.ALL_TASKS)
@@ -56,6 +56,34 @@ def test_it_needs_a_reset_and_a_task_with_a_demonstration(physics):
     env._task = type("Juggle", (nico.NicoTask,), {})(random=np.random.RandomState(0))
     with pytest.raises(ValueError, match="Juggle"):
         Demonstrator(env)
+
+
+class NoNoise:
+    """Source of the middle of any distribution."""
+
+    def normal(self, mean, _, size):
+        return np.full(size, mean)
+
+    def uniform(self, low, high):
+        return (low + high) / 2
+
+
+@pytest.mark.parametrize(
+    ("degrees", "right"), [(24.0, 0.075), (20.0, 0.42 * np.radians(20) - 0.094), (14.0, 0.03)]
+)
+def test_a_grasp_starts_closer_to_a_glass_with_a_near_neighbor(physics, degrees, right):
+    with physics.reset_context():
+        for name, angle in (("glass", 20.0), ("green_box", 20.0 - degrees), ("white_box", -40.0)):
+            place = kinematics.polar(0.42, np.radians(angle))
+            physics.named.data.qpos[name][:2] = place
+
+    above, *_ = moves.grasp(physics, NoNoise(), "glass")  # pyright: ignore[reportArgumentType]
+    physics.data.qpos[:3] = above.place(physics)
+    physics.forward()
+
+    radius, angle = kinematics.to_polar(physics.grip_position())
+    assert radius == pytest.approx(0.42, abs=1e-3)
+    assert 0.42 * (np.radians(20) - angle) == pytest.approx(right, abs=1e-3)
 
 
 def test_a_phase_with_a_further_condition_lasts_until_it_holds(physics, monkeypatch):
@@ -130,3 +158,26 @@ def test_95_percent_succeed_in_20_to_40_steps(physics, capsys):
     with capsys.disabled():
         sys.stdout.write("\n" + "\n".join(table) + "\n")
     assert passed
+
+
+@pytest.mark.slow
+def test_100_000_random_steps_without_a_warning(physics):
+    random = np.random.default_rng(0)
+    environments = [
+        nico.load(task, seed=0, observation="state", physics=physics) for task in nico.ALL_TASKS
+    ]
+    steps = episode = 0
+    while steps < 100_000:
+        env = environments[episode % len(environments)]
+        timestep = env.reset()
+        # Held for some steps and often at the ends of the range, actions drive the arm further.
+        hold, decimals = random.integers(1, 20), int(random.integers(0, 3))
+        actions = np.repeat(random.uniform(-1.0, 1.0, (50, 4)).round(decimals), hold, axis=0)
+        for action in actions[:50]:
+            timestep = env.step(action)
+            steps += 1
+            if timestep.last():
+                break
+        # Before the next reset, which clears the counts.
+        assert not any(warning.number for warning in physics.data.warning)
+        episode += 1

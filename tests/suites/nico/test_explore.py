@@ -44,6 +44,13 @@ def test_pictures_become_a_strip_or_an_animation(pictures, tmp_path):
         write_pictures(tmp_path / "episode.jpg", pictures)
 
 
+def test_random_actions_and_demonstrations_differ(pictures):
+    random = picture_episode("push_green_to_white", random=True, seed=0)
+
+    assert np.asarray(random[0]).tolist() == np.asarray(pictures[0]).tolist()
+    assert np.asarray(random[8]).tolist() != np.asarray(pictures[8]).tolist()
+
+
 @pytest.mark.parametrize(
     ("out", "screen", "shown", "written"),
     [

@@ -54,3 +54,9 @@ def test_constants_agree_with_the_scene(physics):
     assert size["glass"][1] == OBJECT_HALF_HEIGHT["glass"]
     for box in ("green_box", "white_box"):
         assert size[box][2] == OBJECT_HALF_HEIGHT[box]
+
+
+def test_polar_coordinates_are_about_the_yaw_axis():
+    np.testing.assert_allclose(kinematics.polar(0.4, np.pi / 2), [0.0268, -0.0499 + 0.4])
+    for angle in (-2.0, 0.0, 1.3):
+        assert kinematics.to_polar(kinematics.polar(0.3, angle)) == pytest.approx((0.3, angle))

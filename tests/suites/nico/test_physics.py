@@ -1,5 +1,8 @@
 """State of a simulation, contacts and gaps."""
 
+import itertools
+
+import mujoco
 import numpy as np
 import pytest
 
@@ -73,6 +76,22 @@ def test_the_same_actions_from_a_restored_state_give_the_same_observations(load,
     np.testing.assert_array_equal(again, seen)
 
 
+def test_parts_of_the_state_can_be_chosen(physics):
+    part = mujoco.mjtState.mjSTATE_QPOS.value
+    with physics.reset_context():
+        pass
+    angles = physics.get_state(part)
+
+    physics.set_state(angles + 0.01, part)
+
+    np.testing.assert_array_equal(physics.data.qpos, angles + 0.01)
+
+
+def test_a_state_of_another_length_is_refused(physics):
+    with pytest.raises(ValueError, match="266 numbers"):
+        physics.set_state(np.zeros(33))
+
+
 GRIP = np.array([0.42, 0.05, TABLE_HEIGHT + 0.045])
 
 
@@ -101,6 +120,32 @@ def test_only_an_object_in_the_hand_is_touched_and_held(physics, name, curl, lef
         assert physics.held(other) is (held and other == name)
 
 
+@pytest.mark.parametrize("name", nico.OBJECTS)
+def test_an_object_touched_by_the_palm_from_the_side_is_not_pressed(physics, name):
+    put(physics, name, np.array([GRIP[0], GRIP[1], TABLE_HEIGHT + 0.03]), 0.0)
+
+    assert physics.touching("palm", name)
+    assert not physics.pressed(name)
+
+
+def test_the_hand_ends_at_the_wrist(physics):
+    put(physics, "white_box", GRIP, 0.0)
+    put(physics, "white_box", physics.named.data.geom_xpos["forearm"].copy(), 0.0)
+
+    assert physics.touching("forearm", "white_box")
+    assert not physics.touching("hand", "white_box")
+
+
+def test_the_gap_to_the_hand_is_that_to_its_nearest_part(physics):
+    put(physics, "green_box", np.array([0.42, -0.07, TABLE_HEIGHT + 0.03]), 0.3)
+    digits = ("thumb", "upper_finger", "lower_finger")
+    parts = [f"{digit}_{n}" for digit, n in itertools.product(digits, (1, 2, 3))]
+    gaps = [physics.gap(part, "green_box") for part in ("palm", "wrist", *parts)]
+
+    assert 0.002 < min(gaps) < max(gaps)
+    assert physics.gap("hand", "green_box") == physics.gap("green_box", "hand") == min(gaps)
+
+
 @pytest.mark.parametrize(
     "query",
     [
@@ -116,8 +161,3 @@ def test_only_an_object_in_the_hand_is_touched_and_held(physics, name, curl, lef
 def test_unknown_names_are_refused(physics, query):
     with pytest.raises(ValueError, match=r"^no .*'(cup|palm)' .* one of .*white_box$"):
         query(physics)
-
-
-def test_a_state_of_another_length_is_refused(physics):
-    with pytest.raises(ValueError, match="266 numbers"):
-        physics.set_state(np.zeros(33))

@@ -62,6 +62,12 @@ def test_missing_and_unknown_backends_are_reported_in_one_line(
         choose_backend(lambda _: False)
 
 
+def test_other_systems_have_their_own_backend(on_linux, monkeypatch):
+    monkeypatch.setattr(platform, "system", lambda: "Darwin")
+
+    assert choose_backend(lambda _: False) is None
+
+
 def run_python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
     clean = {key: value for key, value in os.environ.items() if key != "MUJOCO_GL"}
     return subprocess.run(
@@ -117,6 +123,19 @@ for _ in range(2):
     assert (process.stderr, process.returncode) == ("", 0)
 
 
+def test_frames_of_simulations_that_share_a_renderer_do_not_mix(physics, renderer):
+    other = nico.Physics.from_xml_string(nico.scene_xml())
+    with other.reset_context():
+        other.named.data.qpos["green_box"][:2] = [0.45, 0.1]
+    with physics.reset_context():
+        pass
+
+    first, second = renderer.render(physics.data.ptr), renderer.render(other.data.ptr)
+
+    assert (first != second).any()
+    np.testing.assert_array_equal(renderer.render(physics.data.ptr), first)
+
+
 @pytest.mark.parametrize("how", ["close", "drop", "drop in a cycle"])
 def test_closing_a_renderer_changes_no_frames_of_others(physics, renderer, how):
     before = renderer.render(physics.data.ptr)
@@ -153,6 +172,22 @@ def test_a_renderer_of_another_thread_changes_no_frames(physics, renderer, ended
             elsewhere.close()
         here.close()
     np.testing.assert_array_equal(renderer.render(physics.data.ptr), before)
+
+
+def test_threads_may_render_at_the_same_time(physics, renderer):
+    before = renderer.render(physics.data.ptr)
+
+    def draw(number: int) -> bool:
+        own = renderer if number % 2 else FrameRenderer(physics.model.ptr)
+        return all((own.render(physics.data.ptr) == before).all() for _ in range(20))
+
+    with ThreadPoolExecutor(4) as pool:
+        assert all(pool.map(draw, range(8)))
+
+
+def test_the_driver_has_the_same_name_in_any_thread(renderer):
+    with ThreadPoolExecutor(1) as pool:
+        assert pool.submit(renderer.driver).result() == renderer.driver() != "unknown"
 
 
 @pytest.mark.parametrize(
@@ -242,34 +277,3 @@ print(expected.std() > 10, made, drawn, same())
     process = run_python(code)
 
     assert (process.stdout, process.stderr) == ("True True True True\n", "")
-
-
-def middle_of_glass(frame: np.ndarray) -> float:
-    """Return the horizontal position of the glass in a frame, from 0 (left) to 1 (right)."""
-    red, green, blue = np.moveaxis(frame.astype(int), -1, 0)
-    return np.nonzero((red > 2 * green) & (red > 2 * blue))[1].mean() / frame.shape[1]
-
-
-@pytest.mark.parametrize("frame_size", [(84, 84), (64, 128), [48, 32], (np.int64(100), 80)])
-def test_frames_of_any_size_show_all_of_the_table(load, frame_size):
-    env = nico.load("grasp_glass", seed=0, frame_size=frame_size)
-    spec = env.observation_spec()["pixels"]
-
-    pixels = env.reset().observation["pixels"]
-    env.close()
-
-    assert spec.shape == (*frame_size, 3)
-    spec.validate(pixels)
-    paper = load("grasp_glass", seed=0).reset().observation["pixels"]
-    assert middle_of_glass(pixels) == pytest.approx(middle_of_glass(paper), abs=0.02)
-
-
-@pytest.mark.parametrize("frame_size", [(0, 84), (84, 641), (84,), (84, 84, 3), 84, (84.0, 84)])
-def test_sizes_that_frames_cannot_have_are_refused(frame_size):
-    with pytest.raises(ValueError, match="frame_size"):
-        nico.load("grasp_glass", frame_size=frame_size)
-
-
-def test_a_size_other_than_the_shared_renderers_is_refused(renderer):
-    with pytest.raises(ValueError, match="frame_size"):
-        nico.load("grasp_glass", frame_size=(84, 84), renderer=renderer)

@@ -108,6 +108,16 @@ def test_grasp_needs_both_sides_of_a_closing_hand(physics, thumb, upper, lower, 
     assert succeeded("grasp_glass", physics) is held
 
 
+def test_the_palm_counts_as_the_thumb_side(physics):
+    # Moved right, along the normal of the palm, until it overlaps the palm by half a millimetre.
+    shift = (0.043 - 0.018 - 0.025 + 0.0005) * np.array([np.sin(ARM[0]), -np.cos(ARM[0])])
+    glass = (*(GRIP[:2] + shift), *GLASS[2:])
+    place(physics, {"glass": glass}, arm=ARM, curls=(OPEN, OPEN, OPEN), closing=0.1)
+    assert not succeeded("grasp_glass", physics)
+    place(physics, {"glass": glass}, arm=ARM, curls=(OPEN, 1.2 * CLOSED, 1.2 * CLOSED), closing=0.1)
+    assert succeeded("grasp_glass", physics)
+
+
 def test_grasp_needs_the_glass_in_the_hand(physics):
     lying_glass = (GRIP[0], GRIP[1], TABLE_HEIGHT + 0.025, *LYING)
     box = (GRIP[0], GRIP[1], TABLE_HEIGHT + 0.025)
@@ -182,3 +192,13 @@ def test_the_white_box_is_pressed_by_the_fist_on_its_top(physics, above, curl, p
     place(physics, {"white_box": top[:2]}, arm=arm, curls=(curl,) * 3)
 
     assert succeeded("press_white", physics) is pressed
+
+
+def test_a_box_that_lies_on_the_hand_is_not_pressed(physics):
+    box = np.array([0.42, -0.2, TABLE_HEIGHT + 0.2])
+    arm = kinematics.inverse(box, (0.02, 0.12))
+    found = set()
+    for above in np.arange(0.03, 0.08, 0.005):
+        place(physics, {"white_box": (*box[:2], box[2] + above)}, arm=arm, curls=(0.85,) * 3)
+        found.add((physics.touching("hand", "white_box"), succeeded("press_white", physics)))
+    assert found == {(True, False), (False, False)}
