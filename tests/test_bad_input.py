@@ -221,6 +221,8 @@ WRONG = {
     # measures
     "area of nothing": (lambda: scores.area_under_curve([], []), "success [0]"),
     "area back in time": (lambda: scores.area_under_curve([0.1, 0.2], [2, 1]), "[2.0, 1.0]"),
+    "curves longer than their episodes": (
+        lambda: scores.overall_episodes_to([[[0.1], [0.9]]], [10]), "for episodes [10]"),
     "matrix of unequal lists": (
         lambda: scores.evaluation_matrix([[0.1]], [1, 2], [2], window=2), "[1, 2]"),
     "matrix without a test": (

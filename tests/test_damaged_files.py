@@ -195,3 +195,14 @@ def test_damaged_tensors(files, read, n):
             read_or_refused(lambda: read(copy), expected)
 
     holds()
+
+
+@pytest.mark.parametrize("read", [read_bank, read_encoders])
+@pytest.mark.parametrize("place", [0.3, 0.6, 0.999])
+def test_a_flipped_bit_of_a_number_is_noticed(files, tmp_path, read, place):
+    copy = Path(shutil.copy(files / read.__name__.removeprefix("read_"), tmp_path))
+    header = 8 + int.from_bytes(copy.read_bytes()[:8], "little")
+    where = header / copy.stat().st_size
+    do_damage(copy, ("flip", where + place * (1 - where), 0))
+    with pytest.raises(ValueError, match="is damaged"):
+        read(copy)

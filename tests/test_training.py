@@ -2,12 +2,14 @@
 
 import itertools
 import signal
-from collections import Counter
+from collections import Counter, defaultdict
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
 
+from bgpo_trl import training
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.algorithm import Policy
 from bgpo_trl.algorithms.bgpo import BGPO
@@ -113,6 +115,19 @@ def test_all_presented_tasks_are_tested_every_few_episodes(begin, make_config, t
     for row in tests:
         assert row["env_steps"] == steps[row["seed"], row["episode"]]
         assert int(row["success"]) == float(row["return"])
+
+
+@pytest.mark.parametrize("starts", [(0, 5, 10), (4, 0, 8), (0, 0, 0)])
+def test_tasks_are_presented_from_their_starts_on(begin, make_config, tmp_path, starts):
+    config = make_config("state", "oracle", seeds=(0, 1, 2), episodes=16, task_starts=starts)
+    begin(tmp_path, config).run()
+    first = defaultdict(lambda: 99)
+    for row in rows(tmp_path / "train.csv"):
+        first[row["task"]] = min(first[row["task"]], int(row["episode"]))
+    for task, start in zip(TASKS, starts, strict=True):
+        assert start < first[task] <= start + 3  # three seeds draw: the next episodes have it
+    for row in rows(tmp_path / "eval.csv"):
+        assert int(row["episode"]) > starts[TASKS.index(row["task"])]
 
 
 @every_learner
@@ -347,6 +362,13 @@ def test_a_run_that_fails_is_resumed_from_its_last_checkpoint(
     assert_same_run(tmp_path, uninterrupted)
 
 
+def test_checkpoints_are_written_at_the_configured_interval(begin, make_config, tmp_path):
+    trainer = begin(tmp_path, make_config(episodes=2, checkpoint_minutes=0.0))
+    trainer.run()
+    numbers = [path.name.split("-")[1] for path in (tmp_path / "checkpoint").glob("*.pt")]
+    assert max(int(number) for number in numbers) == 1 + trainer.env_steps  # one before the first
+
+
 @pytest.mark.parametrize("first", [signal.SIGINT, signal.SIGTERM])
 def test_a_second_signal_ends_the_run_at_once(begin, tmp_path, first):
     trainer = begin(tmp_path)
@@ -413,6 +435,30 @@ def test_costs_are_counted_by_the_number_of_presented_tasks(uninterrupted):
     assert 0 < sizes[0] < sizes[1] < sizes[2]  # the replay grows
     state = load_checkpoint(uninterrupted / "checkpoint")["algorithm"]
     assert sizes[2] == pytest.approx(n_bytes(state) / 1e6, abs=1e-6)
+
+
+def test_step_times_exclude_tests_and_checkpoints(begin, make_config, tmp_path, monkeypatch):
+    clock = [0.0]
+    monkeypatch.setattr(training, "time", SimpleNamespace(monotonic=lambda: clock[0]))
+    trainer = begin(tmp_path, make_config(episodes=4, checkpoint_minutes=0.0))
+
+    def taking(seconds, function):
+        def call(*arguments):
+            clock[0] += seconds
+            return function(*arguments)
+
+        return call
+
+    for owner, method, seconds in (
+        (trainer.algorithm, "act", 0.25),
+        (trainer.evaluator, "run_next", 100.0),
+        (trainer, "save", 100.0),
+    ):
+        monkeypatch.setattr(owner, method, taking(seconds, getattr(owner, method)))
+    trainer.run()
+    costs = read_costs(tmp_path / "cost.csv")
+    assert sum(cost.steps for cost in costs.values()) == trainer.env_steps
+    assert all(cost.seconds == 0.25 * cost.steps for cost in costs.values())
 
 
 def test_the_sequential_schedule_trains_the_newest_task_and_tests_all(begin, make_config, tmp_path):
@@ -489,6 +535,14 @@ def test_only_algorithms_that_need_boundaries_depend_on_them(
         assert_same_run(tmp_path, usual)
 
 
+def test_only_fine_tuning_and_ewc_are_given_boundaries(begin, make_config, tmp_path):
+    given = set()
+    for name in ALGORITHMS:
+        with begin(tmp_path / name, make_config(name=name)) as trainer:
+            given |= {name} if trainer.algorithm.needs_boundaries else set()
+    assert given == {"fine-tuning", "ewc"}
+
+
 @pytest.mark.parametrize("before", [0, 1])
 def test_ewc_is_resumed_across_a_boundary_bit_for_bit(run_of, begin, make_config, tmp_path, before):
     config = make_config(name="ewc")
@@ -509,3 +563,17 @@ def test_a_bank_of_other_encoders_is_refused(make_config, encoders, bank, tmp_pa
     with pytest.raises(ValueError, match="of others"):
         Trainer(make_config(), tmp_path / "run", bank=foreign, encoders=encoders)
     assert not (tmp_path / "run").exists()
+
+
+def test_a_failure_to_write_the_bank_closes_the_run(begin, tmp_path, monkeypatch):
+    def refuse(*args):
+        raise OSError("cannot write the bank: make room")
+
+    closed = []
+    close = training.RunLogger.close
+    monkeypatch.setattr(training.RunLogger, "close", lambda log: (closed.append(1), close(log)))
+    monkeypatch.setattr(training, "keep_inputs", refuse)
+    with pytest.raises(OSError, match="make room"):
+        begin(tmp_path / "run")
+    assert closed == [1]
+    assert not (tmp_path / "run" / "lock").exists()

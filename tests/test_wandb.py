@@ -1,5 +1,6 @@
 """Files that wandb writes in its offline mode."""
 
+import hashlib
 import json
 import os
 import signal
@@ -13,6 +14,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import wandb
+from PIL import Image
 from wandb.proto.wandb_internal_pb2 import Record
 
 from bgpo_trl.figures.frames import save_gif
@@ -96,6 +98,12 @@ def evaluations(session: list[Record]) -> list[dict]:
     return [row for row in history(session) if any(key.startswith("eval/") for key in row)]
 
 
+def step_metrics(session: list[Record]) -> dict[str, str]:
+    """Return the step metric of each curve."""
+    metrics = [r.metric for r in session if r.WhichOneof("record_type") == "metric"]
+    return {metric.name: metric.step_metric for metric in metrics if metric.step_metric}
+
+
 @pytest.fixture(scope="module")
 def make(easy_world, bank, encoders, make_config):
     def make(directory, *, resume=False, **changes):
@@ -157,6 +165,39 @@ def test_the_curves_are_the_means_of_the_csv_files(run):
             assert row[f"train/{column}"] == pytest.approx(played[column].mean())
 
 
+def test_a_run_has_few_curves(run):
+    curves = {key for session in sessions(run) for row in history(session) for key in row}
+    success = {"success_mean", "success/step", "step", *(f"success/{task}" for task in TASKS)}
+    columns = {"return", "steps", "env_steps", "intrinsic_return", "num_nodes", "num_groups"}
+    columns |= {"loss_actor", "loss_value"}
+    media = {key for key in curves if key.startswith("figures/")}
+    assert {key for key in curves - media if not key.startswith("_")} == {
+        *(f"{group}/{name}" for group in ("eval", "train", "final") for name in success),
+        *(f"train/{name}" for name in columns),
+        "eval/success_sd",
+    }
+
+
+def test_the_summary_is_the_mean_of_the_last_evaluation(run):
+    summary = {
+        "/".join(item.nested_key) or item.key: json.loads(item.value_json)
+        for record in sessions(run)[-1]
+        for item in record.summary.update
+    }
+    tests = pd.read_csv(run / "eval.csv")
+    last = tests["success"][tests["episode"] == 10].mean()
+    assert summary["eval/success_mean"] == pytest.approx(last)
+    assert summary["final/success_mean"] == pytest.approx(0.5)
+
+
+def test_every_curve_is_drawn_over_training_episodes(run):
+    for session in sessions(run):
+        drawn_over = step_metrics(session)
+        for row in evaluations(session):
+            steps = {drawn_over[key] for key in row if "/" in key and not key.endswith("/step")}
+            assert len({row[step] for step in steps}) == 1
+
+
 def test_both_sessions_belong_to_the_same_run_with_its_settings(run):
     settings = dict(flatten(json.loads((run / "config.json").read_text())))
     started = [r.run for session in sessions(run) for r in session if r.HasField("run")]
@@ -189,3 +230,23 @@ def test_all_files_are_in_the_run_and_name_no_place_of_this_machine(run):
         content = path.read_bytes()
         for place in (run.parent, Path.cwd(), Path.home(), sys.prefix, sys.executable):
             assert len(str(place)) < 2 or str(place).encode() not in content
+
+
+def test_figures_and_videos_are_uploaded_as_they_are(run):
+    media = {}
+    for row in history(sessions(run)[-1]):
+        for key, value in row.items():
+            name, _, part = key.rpartition("/")
+            if name.startswith("figures/"):
+                media.setdefault(name, {})[part] = value
+    assert {name: entry["_type"] for name, entry in media.items()} == {
+        "figures/success": "image-file",
+        "figures/grasp_glass": "video-file",
+    }
+    files = sorted(run.glob("wandb/offline-run-*"))[-1] / "files"
+    for name, suffix in (("success", ".png"), ("grasp_glass", ".gif")):
+        sent = (files / media[f"figures/{name}"]["path"]).read_bytes()
+        assert sent == (run / "figures" / f"{name}{suffix}").read_bytes()
+        assert media[f"figures/{name}"]["sha256"] == hashlib.sha256(sent).hexdigest()
+    with Image.open(run / "figures" / "grasp_glass.gif") as video:
+        assert video.n_frames == 6

@@ -109,6 +109,7 @@ def overall_episodes_to(success: ArrayLike, episodes: ArrayLike, threshold: floa
     Overall success is the mean over seeds and the tasks presented so far, and over the last three
     evaluations, since a single one has few test episodes. ``success`` is ``[S, E, T]``.
     """
+    _check_episodes(np.asarray(success, float), np.asarray(episodes), -2)
     reached = _mean(trailing_mean(success, 3), axis=-1).mean(axis=0) >= threshold
     return float(np.asarray(episodes)[reached.argmax()]) if reached.any() else float("inf")
 

@@ -62,6 +62,44 @@ def test_training_episodes_are_played_by_the_teacher_of_their_task_with_noise(ma
     assert tasks == {0, 1, 2}
 
 
+def test_a_teacher_learns_from_the_transitions_of_its_own_task_only(make):
+    """All that happens in task 1 is changed in one of two runs."""
+    generator = torch.Generator().manual_seed(0)
+
+    def draw(*size):
+        return torch.rand(2, *size, generator=generator) * 2 - 1
+
+    first, second = make(), make()
+    for step in range(40):
+        transition = {
+            "state": draw(SIZE),
+            "action": draw(4),
+            "task": torch.tensor([step % 3, step % 2]),
+            "next": {
+                "state": draw(SIZE),
+                "reward": draw(1),
+                "terminated": draw(1) > 0,
+                "done": torch.zeros(2, 1, dtype=torch.bool),
+            },
+        }
+        transition = TensorDict(transition, [2])
+        first.update()
+        second.update()
+        first.store(transition)
+        others = transition["task"].unsqueeze(-1) != 1
+        changed = transition.clone()
+        for key in ("state", "action", ("next", "state"), ("next", "reward")):
+            changed[key] = transition[key].where(others, -transition[key])
+        second.store(changed)
+    compared = 0
+    for key, value in first.loss.state_dict().items():
+        if value.ndim:  # not the discount
+            differs = (value != second.loss.state_dict()[key]).flatten(2).any(-1)
+            assert differs.tolist() == 2 * [[False, True, False]], key
+            compared += 1
+    assert compared == 16
+
+
 def test_teachers_learn_from_demonstrations_too_and_students_do_not(make, bank):
     """All frames of demonstrations are turned round in one of two runs."""
     steps = bank.seen().steps

@@ -277,3 +277,26 @@ def test_restored_experts_go_on_bit_for_bit(name, n_steps):
         for group in range(6):
             ours, theirs = (one.actor_weights(seed, group) for one in (experts, restored))
             assert not differing(ours, theirs)
+
+
+@every_rl
+def test_an_expert_that_rests_is_left_as_it_is_and_one_that_does_not_is_not(name):
+    experts = make(name, most=3, rest_after=5)
+    for step, group in enumerate([0, 1, 1]):
+        experts.play([group, 0])
+        learn(experts, step)
+    before = experts.actor_weights(0, 0)
+    for step in (3, 4):  # since TD3 updates the actor every other time
+        experts.play([1, 0])
+        learn(experts, step)
+    learnt = experts.actor_weights(0, 0)
+    assert differing(before, learnt)
+    for step in range(5, 12):
+        experts.play([1, 0])
+        learn(experts, step)
+        assert experts.active.groups == [[1], [0]]
+        assert not differing(experts.actor_weights(0, 0), learnt)
+    for step in (12, 13):
+        experts.play([0, 0])
+        learn(experts, step)
+    assert differing(experts.actor_weights(0, 0), learnt)

@@ -7,6 +7,7 @@ import torch
 from tensordict import TensorDict
 
 from bgpo_trl.algorithms import ALGORITHMS
+from bgpo_trl.algorithms.algorithm import Policy
 from bgpo_trl.algorithms.bgpo import BGPO
 from bgpo_trl.algorithms.rl import RL, LearnerSpec, RLEntry, make_ddpg, make_learner
 from bgpo_trl.configs import DDPGConfig, RLConfig, TD3Config
@@ -40,6 +41,25 @@ def weights(learner):
 
 def targets(learner):
     return {key: v.clone() for key, v in learner.loss.state_dict().items() if "target_" in key}
+
+
+def changed(before, after):
+    return {key for key, value in before.items() if not value.equal(after[key])}
+
+
+@every_rl
+def test_every_update_is_one_of_the_critics_and_every_other_one_of_td3s_actor(name):
+    learner = make(name)
+    for update in range(1, 7):
+        before, slow = weights(learner), targets(learner)
+        told = learner.learn(make_batch(2, 1, 16, seed=update))
+        now = changed(before, weights(learner))
+        critics = {key for key in before if "value_network" in key}
+        due = name != "td3" or update % 2 == 0
+        assert critics
+        assert now == (set(before) if due else critics)
+        assert bool(changed(slow, targets(learner))) == due
+        assert "loss_actor" in told  # also where it is the latest one
 
 
 def test_td3_computes_the_actors_loss_only_where_it_is_due(monkeypatch):
@@ -117,6 +137,20 @@ def test_the_settings_reach_the_loss(name):
     assert [layer.out_features for layer in learner.actor.mlp.layers][:2] == [7, 5]
 
 
+@every_rl
+def test_targets_are_clipped_to_the_attainable_returns_unless_told_not_to(name):
+    assert make(name).loss.return_bounds == (0.0, 1.3)
+    assert make(name, clip_targets=False).loss.return_bounds is None
+    learner = make(name, **({"entropy_in_target": False} if name == "sac" else {}))
+    for key, value in learner.loss.state_dict().items():
+        if "target_" in key and "value" in key and key.endswith("1.bias"):
+            value.fill_(50.0)
+    batch = make_batch(2, 1, 16)
+    ended = batch["next", "terminated"].squeeze(-1)
+    expected = torch.where(ended, 1.0, 1.3)
+    torch.testing.assert_close(learner.loss(batch)["target_value"], expected)
+
+
 @pytest.fixture
 def make_bgpo(bank, make_config):
     def make_bgpo(rl):
@@ -124,6 +158,22 @@ def make_bgpo(bank, make_config):
         return BGPO(config, seeds=SEEDS, bank=bank.seen())
 
     return make_bgpo
+
+
+@every_rl
+def test_test_episodes_are_without_noise(make_bgpo, bank, name):
+    algorithm = make_bgpo(name)
+    embedding, task = bank.held_out().embedding.view(3, 4, 32), torch.zeros(3, 4).long()
+    policy = Policy.stack(
+        [algorithm.snapshot(i, embedding, task, torch.Generator()) for i in range(2)]
+    )
+    state = torch.randn(2, 3, 4, 16)
+    label = torch.tensor([1.0, 0, 0]).expand(2, 3, 4, 3)
+    shown = TensorDict({"state": state, "context": label}, [2, 3, 4])
+    expected = algorithm.learner.actor(shown.view(2, 1, 12))["action"].view(2, 3, 4, 4)
+    first, second = (policy.act(state) for _ in range(2))
+    assert first.equal(second)
+    torch.testing.assert_close(first, expected)
 
 
 @pytest.mark.parametrize("name", ["maml", "dist-nll", "ewc"])

@@ -109,17 +109,18 @@ def test_tasks_that_are_never_presented_make_no_difference(make, name):
 
 
 @both
-def test_a_critic_stays_as_it_was_until_there_is_data_of_its_task(make, name):
+def test_networks_stay_as_they_were_until_there_is_data_of_their_task(make, name):
+    """But for MAML's policies, which start from one that learns from all tasks."""
     algorithm = make(name)
-    critics = [value for key, value in networks(algorithm.loss).items() if "value" in key]
-    start = [value.clone() for value in critics]
+    own = [v for key, v in networks(algorithm.loss).items() if name != "maml" or "value" in key]
+    start = [value.clone() for value in own]
     counts, learned = torch.zeros(2, N_TASKS).long(), torch.zeros(2, N_TASKS).bool()
     stages, state = [], algorithm.world.env.reset()
     for _ in range(50):
         state = algorithm.act(state)
         if algorithm.update():
             learned |= counts >= algorithm.config.task_batch_size
-        for now, before in zip(critics, start, strict=True):
+        for now, before in zip(own, start, strict=True):
             assert (now != before).flatten(2).any(-1).equal(learned)
         stages.append(tuple(learned.flatten().tolist()))
         transition, state = algorithm.world.env.step_and_maybe_reset(state)
@@ -205,3 +206,8 @@ def test_a_replay_too_small_to_fill_a_batch_is_refused(make, make_config):
     make("maml", **small)
     with pytest.raises(ValueError, match=r"replay_size must be at least 22, .* learning begins"):
         make("maml", **{**small, "rl": replace(rl, replay_size=21)})
+
+
+@both
+def test_targets_are_clipped_to_the_attainable_returns(make, name):
+    assert make(name).loss.return_bounds == (0.0, 1.0)

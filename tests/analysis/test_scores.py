@@ -1,5 +1,7 @@
 """Measures of arrays and of runs, against numbers worked out by hand."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -274,3 +276,19 @@ def test_seeds_of_run_and_reference_widen_the_interval():
         widened.curves.success[1] -= less
         after = forward_transfer(run, reference)
         assert np.ptp(after[1:]) > np.ptp(before[1:])
+
+
+@pytest.mark.slow
+def test_the_interval_of_forward_transfer_has_its_nominal_coverage():
+    rng, covered, n = np.random.default_rng(0), 0, 1_500
+    truth = forward_transfer(make_run(), make_run(RISING, (0, 0, 0))).value
+    for _ in range(n):
+        pair = make_run(), make_run(RISING, (0, 0, 0))
+        for index, run in enumerate(pair):
+            levels = 0.05 * rng.normal(size=(6, 1, 3))
+            noisy = run.curves.success[:1] + levels + 0.05 * rng.normal(size=(6, 6, 3))
+            curves = replace(run.curves, seeds=tuple(range(6)), success=noisy)
+            pair = (*pair[:index], replace(run, curves=curves), *pair[index + 1 :])
+        found = forward_transfer(*pair)
+        covered += found.low <= truth <= found.high
+    assert covered / n == pytest.approx(0.95, abs=0.02)

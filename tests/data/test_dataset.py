@@ -1,5 +1,6 @@
 """Datasets of demonstrations: damaged ones, and those that are written from elsewhere."""
 
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -48,6 +49,17 @@ def test_what_is_not_whole_is_refused_in_one_line(copy, damage, message):
     assert "\n" not in str(error.value)
     if "resume" not in message:
         assert "record it again with `python -m bgpo_trl.data.recording PATH`" in str(error.value)
+
+
+@pytest.mark.parametrize("key", sorted(KEYS))
+def test_a_flipped_byte_is_noticed(copy, key):
+    values = np.memmap(copy / f"{key}.memmap", np.uint8, "r+")
+    values[len(values) // 2] ^= 1
+    values.flush()
+
+    with pytest.raises(ValueError, match=r"is damaged \(checksum differs\); remove it and .*$"):
+        load_demonstrations(copy)
+    assert len(load_demonstrations(copy, verify=False)) == 9
 
 
 @pytest.mark.parametrize("meta", ["{", '{"_type": "os.system"}', None])
@@ -219,3 +231,11 @@ def test_resizing_keeps_enlarged_frames(frames, by_height, by_width):
     large = frames.repeat(by_height, 1).repeat(by_width, 2)
     np.testing.assert_array_equal(resize_frames(large, (4, 6)), frames)
     np.testing.assert_array_equal(resize_frames(frames, large.shape[1:3]), large)
+
+
+def test_nothing_is_left_if_the_disk_is_full(tmp_path, monkeypatch):
+    usage = shutil.disk_usage(tmp_path)._replace(free=1000)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
+    with pytest.raises(OSError, match="make room or choose another folder"):
+        write(tmp_path / "own", episodes_of())
+    assert not [*tmp_path.iterdir()]

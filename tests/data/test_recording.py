@@ -8,7 +8,7 @@ import torch
 from bgpo_trl.data import recording as demonstrations
 from bgpo_trl.data.dataset import load_demonstrations, open_dataset, read_meta
 from bgpo_trl.data.recording import record_demonstrations
-from bgpo_trl.scenes.nico import scene as nico_scene
+from bgpo_trl.scenes import nico as nico_scene
 from suites import nico
 from suites.nico.demonstrator import Demonstrator
 from tests.helpers import contents, edit
@@ -29,6 +29,23 @@ def test_recording_returns_what_loading_does(recorded):
     again = record_demonstrations(recorded, **TINY)  # complete: only opened
     for key in KEYS:
         torch.testing.assert_close(again[key], dataset[key], rtol=0, atol=0)
+
+
+def test_tasks_and_held_out_ones_are_marked(recorded):
+    dataset = load_demonstrations(recorded)
+
+    assert dataset["task"].tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 2]
+    assert dataset["train"].tolist() == [True, True, False] * 3
+    assert dataset["seed"].tolist() == [0] * 9
+
+
+def test_demonstrations_differ_from_each_other_and_between_seeds(recorded, tmp_path):
+    starts = load_demonstrations(recorded)["state"][:, 0]
+    other = record_demonstrations(
+        tmp_path, tasks=["grasp_glass"], per_task=1, held_out_per_task=0, seed=1, progress=False
+    )
+
+    assert len(torch.cat([starts, other["state"][:, 0]]).unique(dim=0)) == 10
 
 
 def test_padding_is_zero_and_the_rest_is_not(recorded):

@@ -128,6 +128,32 @@ def test_a_seed_of_a_stack_is_that_seed_alone():
             assert (replay.sample(asked)[0] == drawn[seed]).all()
 
 
+def test_some_seeds_draw_what_they_would_draw_with_all():
+    some, every = make(n_seeds=3), make(n_seeds=3)
+    for replay in (some, every):
+        fill(replay, [(step % 2, 1, 0) for step in range(9)])
+    asked = torch.tensor([[0, 1, 1, 0]])
+    whole = every.sample(asked.expand(3, -1))
+    drawn = some.sample(asked.expand(2, -1), seeds=[2, 0])
+    has = whole["priority_weight"][[2, 0]] > 0
+    assert drawn["priority_weight"].equal(whole["priority_weight"][[2, 0]])
+    assert drawn["latent"][has].equal(whole["latent"][[2, 0]][has])
+    # They alone have drawn, so that the other draws now what it did then.
+    assert (some.sample(asked, seeds=[1])[0] == whole[1]).all()
+
+
+def test_samples_share_nothing_with_the_buffer():
+    replay = GroupReplay(4, generator=generators(1), keys=["action"])
+    data = TensorDict({"action": torch.ones(1, 2, requires_grad=True)}, [1])
+    replay.add(data, torch.tensor([0]))
+    data["action"].data.zero_()
+    rows = torch.zeros(1, 4, dtype=torch.int64)
+    replay.sample(rows)["action"].zero_()
+    drawn = replay.sample(rows)["action"]
+    assert (drawn == 1).all()
+    assert not drawn.requires_grad
+
+
 def test_rows_without_a_group_draw_nothing():
     asked = torch.tensor([[0, -1, 1, -1], [-1, -1, -1, -1]])
     ours, theirs = generators(2), generators(2)

@@ -221,6 +221,21 @@ def test_best_match_and_neighbor_learn_and_habituate():
     assert gwr.graph().weights[0, 0].item() == pytest.approx(0.025 + step)
 
 
+def test_best_match_and_neighbor_have_constants_of_their_own():
+    config = GWRBConfig(
+        initial_habituation=0.5, alpha_best=2.0, alpha_neighbor=4.0, tau_best=2.0, tau_neighbor=4.0,
+        lr_best=0.4, lr_neighbor=0.2,
+    )  # fmt: skip
+    gwr = from_data([[0.0], [1.0]], config)
+    gwr.adapt(torch.tensor([0.5]))
+    # h_inf = 0 and 1/4; what is left of h - h_inf is exp(-1) for both
+    graph = gwr.graph()
+    assert graph.habituation.tolist() == pytest.approx(
+        [0.5 * math.exp(-1), 0.25 + 0.25 * math.exp(-1)]
+    )
+    assert graph.weights.flatten().tolist() == pytest.approx([0.4 * 0.5 * 0.5, 1 - 0.2 * 0.5 * 0.5])
+
+
 def test_inserted_node_lies_between_and_takes_over_the_edge():
     gwr = from_data([[0.0, 0.0], [1.0, 0.0]], ALWAYS_INSERT)
     gwr.adapt(torch.tensor([0.25, 0.5]))

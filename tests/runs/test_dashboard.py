@@ -204,6 +204,14 @@ def fake_wandb(monkeypatch):
     return Fake
 
 
+def test_wandb_logs_offline_when_it_does_not_answer(fake_wandb, tmp_path):
+    fake_wandb.unreachable = ("online",)
+    with pytest.warns(UserWarning, match=r"\(no route\): logging offline") as caught:
+        wandb_logger(tmp_path, "online", group="mine")
+    assert len(caught) == 1
+    assert [(made["mode"], made["group"]) for made in fake_wandb.made] == [("offline", "mine")]
+
+
 def test_a_run_goes_on_without_wandb_when_both_modes_fail(make, fake_wandb, tmp_path):
     fake_wandb.unreachable = ("online", "offline")
     with pytest.warns(UserWarning) as caught:

@@ -5,7 +5,7 @@ import torch
 
 from bgpo_trl.modules.gwr import GWRB
 from bgpo_trl.runs.gwr_graphs import growth_moments, load_graphs, save_graph
-from tests.helpers import rows
+from tests.helpers import largest_file, rows
 
 
 def grown(seed=0, n=30):
@@ -58,3 +58,15 @@ def test_damaged_graph_is_rejected(tmp_path, content):
     path.write_bytes(path.read_bytes()[:-9] if content is None else content)
     with pytest.raises(ValueError, match=r"episode-000005.safetensors is damaged or not a graph"):
         load_graphs(tmp_path)
+
+
+def test_full_disk_leaves_the_earlier_graph(tmp_path):
+    before = save_graph(tmp_path, 5, grown(n=5)).read_bytes()
+    with (
+        largest_file(100),
+        pytest.raises(OSError, match=r"cannot write .*: make room, or choose") as error,
+    ):
+        save_graph(tmp_path, 5, grown(n=30))
+    assert "\n" not in str(error.value)
+    (only,) = tmp_path.iterdir()
+    assert only.read_bytes() == before

@@ -14,6 +14,7 @@ from bgpo_trl.configs import RunConfig
 from bgpo_trl.data.dataset import load_demonstrations, write_demonstrations
 from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.encoders.train import make_pretrained, train_encoders
+from bgpo_trl.evaluation import evaluate_random_policy
 from bgpo_trl.experiments.one_shot import OneShotArguments, one_shot
 from bgpo_trl.experiments.watch import WatchArguments, watch
 from bgpo_trl.policy import load_run
@@ -90,6 +91,12 @@ def test_actions_beyond_the_range_count_as_its_ends():
 class Falling(Dot):
     def step(self, action):
         return super().step(action)._replace(success=False, failure=True)
+
+
+def test_a_failed_episode_is_no_success_of_random_actions():
+    falling = scene(lambda: Falling())
+    rate = evaluate_random_policy(tasks=TASKS, episodes=4, max_steps=12, scene=falling)
+    assert rate.tolist() == [0.0, 0.0]
 
 
 def test_a_demonstration_that_fails_is_not_recorded(tmp_path):

@@ -124,6 +124,16 @@ def test_an_unfinished_episode_starts_again():
     collector.shutdown(close_env=False)
 
 
+def test_an_episode_ends_once():
+    env, source = make([0, 1], [2, 4])
+    env.rollout(4, break_when_any_done=False, break_when_all_done=True)  # row 0 waits for row 1
+    assert source.episode.tolist() == [1, 1]
+    data = env.reset()
+    for _ in range(6):  # stepping on without a reset
+        data = env.step_mdp(env.step(data.set("action", torch.zeros(2, 4))))
+    assert source.episode.tolist() == [2, 2]
+
+
 @pytest.mark.parametrize("wrapped", [False, True])
 def test_reaches_environments_inside_a_serial_env(wrapped):
     def single(length):
@@ -137,6 +147,16 @@ def test_reaches_environments_inside_a_serial_env(wrapped):
     steps, _ = play(env, 24)
     assert steps["task"].equal(make_bank().task[steps["demo_index"]])
     assert source.episode.tolist() == [6, 4]
+
+
+@pytest.mark.parametrize("seeds", [None, [4, 2]])
+def test_changes_of_an_observation_do_not_reach_the_bank(seeds):
+    env, source = make(seeds)
+    bank = source._embedding.clone(), source._task.clone()
+    data = env.reset()
+    for key in ("demo_embedding", "task", "demo_index"):
+        data[key].zero_()
+    assert source._embedding.equal(bank[0]) and source._task.equal(bank[1])
 
 
 def test_an_environment_that_ignores_the_task_is_refused():

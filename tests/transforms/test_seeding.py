@@ -62,6 +62,13 @@ def test_the_same_seed_gives_the_same_episode_and_another_seed_another(batch_siz
         assert not first[key].equal(different[key])
 
 
+def test_a_row_has_the_seed_counted_up_to_it():
+    batch, alone = compose((2,)), compose()
+    batch.set_seed(7)
+    alone.set_seed(8)
+    assert_equal(rollout(batch)[1], rollout(alone))
+
+
 def test_a_seed_does_not_undo_what_was_learned():
     env = compose((2,), max_steps=2)
     source, gwr = env.transform[1], env.transform[2].network
