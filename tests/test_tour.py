@@ -39,7 +39,8 @@ def test_it_prints_what_it_says(cells):
     text = printed(cells)
     for task in ("grasp_glass", "push_green_to_glass", "push_green_to_white"):
         assert f"{task}: the nearest demonstration of the bank is one of {task}\n" in text
-    assert "6 groups, purity on held-out demonstrations 100%\n" in text
+    n_groups = int(text.split(" groups, purity on held-out demonstrations 100%\n")[0].split()[-1])
+    assert 6 <= n_groups <= 8  # three tasks on either side, and at most two more
     assert "after 2 episodes: " in text
     assert "Recognition(node=" in text
     assert text.count("success after ") == 3

