@@ -40,7 +40,7 @@ class DoctorArguments:
 
 
 class Limited(Exception):
-    """What a check found can be used, with a limitation."""
+    """Limitation, found by a check, of something that works all the same."""
 
 
 def doctor(arguments: DoctorArguments) -> None:

@@ -1,4 +1,4 @@
-"""What tests of several packages share: files of runs, damage done to them, and stand-ins."""
+"""Files of runs, damage done to them, and stand-ins, for tests of several packages."""
 
 import csv
 import hashlib

@@ -23,7 +23,7 @@ Observation = Literal["pixels", "state", "both"]
 
 
 class Outcome(NamedTuple):
-    """What a step has led to.
+    """Outcome of a step.
 
     Attributes:
         success: Whether the task is solved, which ends the episode with reward 1.
