@@ -65,8 +65,10 @@ ALGORITHMS: dict[str, Entry] = {
         DistNLL, DistNLLConfig(rl=_PAPER, task_batch_size=256, distillation_batch_size=1_000)
     ),
     "oracle": Entry(BGPO, replace(_SINGLE, context="label")),
+    "oracle-demonstrations": Entry(BGPO, replace(_SINGLE, context="label", **_SHOWN_SINGLE)),
     "ddpg": Entry(BGPO, replace(_SINGLE, context=None)),
     "fine-tuning": Entry(FineTuning, FineTuningConfig()),
+    "fine-tuning-demonstrations": Entry(FineTuning, FineTuningConfig(**_SHOWN)),
     "ewc": Entry(EWC, EWCConfig()),
     "without-bonus": Entry(BGPO, replace(_SINGLE, beta=0.0)),
     "without-gwr": Entry(BGPO, replace(_SINGLE, context="embedding")),
@@ -77,7 +79,8 @@ ALGORITHMS: dict[str, Entry] = {
 """BGPO; ``bgpo-experts``, BGPO without demonstrations; ``bgpo-single``, which in addition has only
 one actor and one critic; the paper's baselines, without and with demonstrations; two references,
 DDPG with the task's label (``oracle``) and without context (``ddpg``); two baselines of continual
-learning, which are given the boundaries of tasks. Names in ``-paper`` follow the publication:
+learning, which are given the boundaries of tasks (``fine-tuning``, ``ewc``). Names in
+``-demonstrations`` learn from demonstrations as BGPO does. Names in ``-paper`` follow the publication:
 networks of 64 units, batches of 256, no stabilizers. The others are ``bgpo-single`` without GWR-B,
 the intrinsic reward or both, or with one addition of this package. Modules of own algorithms may
 add entries."""

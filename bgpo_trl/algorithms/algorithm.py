@@ -247,14 +247,12 @@ class Algorithm(ABC):
     def sample(self, groups: Callable[[int], Tensor], n_rows: int) -> TensorDictBase:
         """Draw transitions ``[S, E, B]`` for an update, a share of demonstrated ones last.
 
-        Until a demonstration was shown to each seed, all are from training episodes.
-
         Args:
             groups: Returns the group of each of ``n`` transitions, int64 ``[S, E, n]``, given
                 ``n``; -1 for none.
             n_rows: Number of transitions ``B``.
         """
-        if self.shown is None or not len(self.shown):
+        if self.shown is None:
             return self.replay.sample(groups(n_rows))
         n_shown = round(self.config.demonstration_share * n_rows)
         played_group, shown_group = groups(n_rows - n_shown), groups(n_shown)

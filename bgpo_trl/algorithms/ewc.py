@@ -22,7 +22,7 @@ __all__ = ["EWC", "EWCLearner", "FineTuning", "diagonal_fisher"]
 class FineTuning(BGPO):
     """One policy that goes on learning where a task begins, from an empty replay.
 
-    It is given the boundaries of tasks, and by default no context: a lower bound for methods
+    With a ``demonstration_share``, it also learns from the demonstrations shown since. It is given the boundaries of tasks, and by default no context: a lower bound for methods
     against forgetting (Wolczyk et al., 2021, "Continual World"). It is meant for the sequential
     schedule, in which only the newest task is played. ``ddpg`` in that schedule differs in that it
     still learns from the transitions of earlier tasks.
@@ -56,6 +56,8 @@ class FineTuning(BGPO):
         """Empty the replay of the seed, which then rests until it has filled again."""
         del task
         self.replay.clear(index)
+        if self.shown is not None:
+            self.shown.clear(index)
         self.learner.clear_momentum(index)
 
     def state_dict(self) -> dict[str, Any]:

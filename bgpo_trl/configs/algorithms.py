@@ -321,14 +321,13 @@ class FineTuningConfig(BGPOConfig):
     group_balanced_replay: bool = False
     """See `BGPOConfig`; only False."""
     demonstration_share: float = 0.0
-    """See `AlgorithmConfig`; only 0."""
+    """See `AlgorithmConfig`; of the demonstrations shown since the latest boundary."""
     rl: RLConfig = field(default_factory=DDPGConfig)
     """See `AlgorithmConfig`."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        # Else, old transitions would return from other stores than the replay that is emptied.
-        for name in ("experts", "group_balanced_replay", "demonstration_share"):
+        for name in ("experts", "group_balanced_replay"):
             check(self, (name, not getattr(self, name), "off, as in fine-tuning"))
 
 

@@ -128,6 +128,10 @@ class DemonstrationReplay:
         """Assign demonstrations of a seed to groups anew, from the group of each in the bank."""
         self._shown.regroup(seed, group)
 
+    def clear(self, seed: int) -> None:
+        """Discard the demonstrations of a seed, given its position."""
+        self._shown.clear(seed)
+
     def state_dict(self) -> dict[str, Any]:
         """Return the stored demonstrations and the states of the generators."""
         return self._shown.state_dict()

@@ -59,11 +59,12 @@ class Arguments(BankArguments):
 
     algorithm: str | None = None
     """bgpo, the default; bgpo-experts: without demonstrations as experience; bgpo-single: without
-    experts too; maml and dist-nll: the baselines, alone or followed by -demonstrations; bgpo-paper,
-    maml-paper, dist-nll-paper: as published; oracle and ddpg: DDPG with the task label as context,
-    and without context; fine-tuning and ewc: DDPG without context that is given task boundaries,
-    best with --schedule sequential; a variant of `bgpo ablation`; or one that the module of
-    --import adds."""
+    experts too; maml and dist-nll: the baselines; bgpo-paper, maml-paper, dist-nll-paper: as
+    published; oracle and ddpg: DDPG with the task label as context, and without context;
+    fine-tuning and ewc: DDPG without context that is given task boundaries, best with --schedule
+    sequential; maml, dist-nll, oracle or fine-tuning followed by -demonstrations: with
+    demonstrations as experience; a variant of `bgpo ablation`; or one that the module of --import
+    adds."""
     rl: str | None = None
     """The RL algorithm of BGPO, its ablations and the references: ddpg, td3, sac, or one that the
     module of --import adds; DDPG by default."""

@@ -18,6 +18,7 @@ SEEDS = (1, 2)
 # Before the warm-up of 8 steps has ended, in the middle of training, and two tasks at once.
 BOUNDARIES = {5: [(0, 1)], 20: [(1, 1)], 31: [(0, 2)], 33: [(1, 2), (1, 0)]}
 both = pytest.mark.parametrize("name", ["fine-tuning", "ewc"])
+each = pytest.mark.parametrize("name", ["fine-tuning", "fine-tuning-demonstrations", "ewc"])
 
 
 @pytest.fixture
@@ -76,6 +77,24 @@ def test_after_a_boundary_only_transitions_of_the_new_task_are_learned_from(make
     assert algorithm.replay.contents(1)[0]["latent"].equal(data[1]["latent"])
 
 
+def test_after_a_boundary_only_demonstrations_shown_since_are_learned_from(make):
+    algorithm, drawn = make("fine-tuning-demonstrations"), []
+    _, state = play(algorithm, 20)
+    algorithm.begin_task(1, 1)
+    data, _ = play(algorithm, 12, state)
+    shown = data[1]["demo_index"][data[1]["next", "done"].flatten()].unique()
+    algorithm.learn = lambda batch: drawn.append(batch) or {}
+    for _ in range(20):
+        algorithm.update()
+    batch = torch.cat(drawn, 2)[1]
+    learned = batch["latent"][batch["demonstrated"]]
+    steps = algorithm.bank.steps
+    frames = [steps.first[row] + torch.arange(int(steps.length[row])) for row in shown]
+    own = steps.latents(torch.cat(frames))
+    assert len(learned) > 20
+    assert (learned.unsqueeze(1) == own).all(-1).any(-1).all()
+
+
 @pytest.mark.parametrize("name", ["fine-tuning", "fine-tuning+td3", "fine-tuning+sac", "ewc"])
 def test_a_seed_rests_until_its_replay_has_filled_again(make, name):
     algorithm = make(name)
@@ -90,7 +109,7 @@ def test_a_seed_rests_until_its_replay_has_filled_again(make, name):
     assert all(not now.equal(old) for now, old in zip(copies(algorithm, 1), resting, strict=True))
 
 
-@both
+@each
 def test_each_seed_of_a_batch_learns_as_it_would_alone(make, name):
     batch = make(name)
     together = play(batch, 50, boundaries=BOUNDARIES)[0]
@@ -105,7 +124,7 @@ def test_each_seed_of_a_batch_learns_as_it_would_alone(make, name):
             torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-4)
 
 
-@both
+@each
 @pytest.mark.parametrize("seeds", [SEEDS, (1,)])
 @pytest.mark.parametrize("n_steps", [6, 21, 26, 34])
 def test_a_restored_run_continues_as_the_saved_one(make, tmp_path, name, seeds, n_steps):
@@ -141,9 +160,7 @@ def test_ewc_consolidates_once_where_several_tasks_begin_at_once(make):
     assert_same(once.learner.state_dict(), twice.learner.state_dict())
 
 
-@pytest.mark.parametrize(
-    "setting", [{"experts": True}, {"group_balanced_replay": True}, {"demonstration_share": 0.5}]
-)
+@pytest.mark.parametrize("setting", [{"experts": True}, {"group_balanced_replay": True}])
 def test_stores_that_are_not_emptied_are_refused(setting):
     with pytest.raises(ValueError):
         FineTuningConfig(**setting)
