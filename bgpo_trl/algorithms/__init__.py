@@ -80,10 +80,10 @@ ALGORITHMS: dict[str, Entry] = {
 one actor and one critic; the paper's baselines, without and with demonstrations; two references,
 DDPG with the task's label (``oracle``) and without context (``ddpg``); two baselines of continual
 learning, which are given the boundaries of tasks (``fine-tuning``, ``ewc``). Names in
-``-demonstrations`` learn from demonstrations as BGPO does. Names in ``-paper`` follow the publication:
-networks of 64 units, batches of 256, no stabilizers. The others are ``bgpo-single`` without GWR-B,
-the intrinsic reward or both, or with one addition of this package. Modules of own algorithms may
-add entries."""
+``-demonstrations`` learn from demonstrations as BGPO does. Names in ``-paper`` follow the
+publication: networks of 64 units, batches of 256, no stabilizers. The others are ``bgpo-single``
+without GWR-B, the intrinsic reward or both, or with one addition of this package. Modules of own
+algorithms may add entries."""
 
 ABLATIONS = (
     "bgpo-single",

@@ -22,10 +22,11 @@ __all__ = ["EWC", "EWCLearner", "FineTuning", "diagonal_fisher"]
 class FineTuning(BGPO):
     """One policy that goes on learning where a task begins, from an empty replay.
 
-    With a ``demonstration_share``, it also learns from the demonstrations shown since. It is given the boundaries of tasks, and by default no context: a lower bound for methods
+    It is given the boundaries of tasks, and by default no context: a lower bound for methods
     against forgetting (Wolczyk et al., 2021, "Continual World"). It is meant for the sequential
     schedule, in which only the newest task is played. ``ddpg`` in that schedule differs in that it
-    still learns from the transitions of earlier tasks.
+    still learns from the transitions of earlier tasks. With a ``demonstration_share``, it also
+    learns from demonstrations, of those shown since the boundary.
 
     After a boundary, a seed rests until its replay holds ``warmup_steps`` transitions again, as
     before its first update: it acts, and its actor and critic do not change.
