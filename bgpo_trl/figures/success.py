@@ -1,4 +1,4 @@
-"""Figures of success: learning curves (Figs. 6, 8, 9), matrices by phase, bars by condition."""
+"""Figures of success: learning curves (Figs. 6, 8, 9), matrices by phase, success by condition."""
 
 from __future__ import annotations
 
@@ -16,7 +16,15 @@ from matplotlib.ticker import MaxNLocator, PercentFormatter
 from numpy.typing import ArrayLike, NDArray
 
 from bgpo_trl.analysis import statistics
-from bgpo_trl.figures.style import COLORS, LINES, add_legend, mark_starts, readable, style_axes
+from bgpo_trl.figures.style import (
+    COLORS,
+    LINES,
+    MARKERS,
+    add_legend,
+    mark_starts,
+    readable,
+    style_axes,
+)
 from bgpo_trl.runs.results import read_tests
 
 _CHANCE: dict[str, Any] = {"color": "0.35", "linestyle": ":", "linewidth": 1.2}
@@ -287,4 +295,46 @@ def plot_success_bars(success: Mapping[str, ArrayLike], tasks: Sequence[str]) ->
     style_axes(axes)
     axes.grid(visible=False, axis="x")
     add_legend(figure, *axes.get_legend_handles_labels(), width)
+    return figure
+
+
+def plot_success_by(
+    success: Mapping[float, ArrayLike], tasks: Sequence[str], *, label: str
+) -> Figure:
+    """Plot the success on each task against a number, as lines.
+
+    Lines are means over seeds; dots are single seeds.
+
+    Args:
+        success: Success in [0, 1] of each seed and task, ``[S, T]``, by the number.
+        tasks: Names of the tasks.
+        label: Name of the number.
+
+    Raises:
+        ValueError: If there is no number, or one has not a column per task.
+    """
+    found = {number: np.asarray(scores, float) for number, scores in sorted(success.items())}
+    if not found or any(s.ndim != 2 or s.shape[1] != len(tasks) for s in found.values()):
+        shapes = [list(scores.shape) for scores in found.values()]
+        raise ValueError(f"success must be [seeds, {len(tasks)}] by number, got {shapes}")
+    figure = Figure(figsize=(4.2, 3.2), layout="constrained")
+    axes = figure.add_subplot()
+    for index, task in enumerate(tasks):
+        style: dict[str, Any] = {
+            "color": COLORS[index % len(COLORS)],
+            "marker": MARKERS[index % len(MARKERS)],
+        }
+        means = [scores[:, index].mean() for scores in found.values()]
+        line = LINES[index % len(LINES)]
+        axes.plot([*found], means, label=readable(task), linestyle=line, markersize=5, **style)
+        for number, scores in found.items():
+            numbers = np.full(len(scores), number)
+            axes.scatter(numbers, scores[:, index], s=8, alpha=0.5, clip_on=False, **style)
+    axes.set_xticks([*found])
+    axes.set_xlabel(label, fontsize=9)
+    axes.set_ylim(0, 1.02)
+    axes.set_ylabel("Success rate", fontsize=9)
+    axes.yaxis.set_major_formatter(PercentFormatter(1, decimals=0))
+    style_axes(axes)
+    add_legend(figure, *axes.get_legend_handles_labels(), 4.2)
     return figure

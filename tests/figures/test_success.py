@@ -17,7 +17,12 @@ from bgpo_trl.figures.frames import plot_frame_strips, save_gif
 from bgpo_trl.figures.groups import plot_counts
 from bgpo_trl.figures.gwr import plot_gwr_growth, plot_gwr_pca
 from bgpo_trl.figures.style import save_figure
-from bgpo_trl.figures.success import plot_success_bars, plot_success_curves, plot_success_matrices
+from bgpo_trl.figures.success import (
+    plot_success_bars,
+    plot_success_by,
+    plot_success_curves,
+    plot_success_matrices,
+)
 from suites import nico
 
 TASKS = ["grasp_glass", "push_green_to_glass", "push_green_to_white"]
@@ -242,11 +247,25 @@ def test_bars_are_means_with_their_intervals():
     assert [text.get_text() for text in legend.get_texts()] == ["seen", "hidden"]
 
 
+def test_lines_pass_through_the_means_and_dots_are_seeds():
+    success = {1.0: [[0.2, 0.9], [0.6, 0.7]], 0.0: [[1.0, 0.5], [0.8, 0.5]]}
+    figure = plot_success_by(success, ["grasp_glass", "lift_green"], label="Spread")
+    (axes,) = figure.axes
+    lines = {str(line.get_label()): line.get_xydata() for line in axes.lines}
+    assert lines["grasp glass"] == pytest.approx(np.array([[0, 0.9], [1, 0.4]]))
+    assert lines["lift green"] == pytest.approx(np.array([[0, 0.5], [1, 0.8]]))
+    dots = np.concatenate([found.get_offsets() for found in axes.collections])
+    expected = [(number, rate) for number, scores in success.items() for rate in np.ravel(scores)]
+    assert sorted(map(tuple, dots.tolist())) == sorted(expected)
+    assert axes.get_xlabel() == "Spread"
+
+
 REFUSED = {
     "no test episodes": lambda: plot_success_curves([]),
     "row and a column per task, not [2, 2]": lambda: plot_success_matrices({"one": FIRST}, "abc"),
     "not none": lambda: plot_success_matrices({}, "ab"),
     "success must be [seeds, 2] by": lambda: plot_success_bars({"seen": [[0.5]]}, "ab"),
+    "success must be [seeds, 2] by number": lambda: plot_success_by({}, "ab", label="x"),
     "nothing to show": lambda: plot_frame_strips({"none": np.zeros((0, 2, 2, 3), np.uint8)}),
     "uint8 [T, H, W, 3]": lambda: save_gif(np.zeros((1, 2, 3, 3)), "none.gif"),
     "N, d >= 2, not [1, 4]": lambda: plot_gwr_pca(np.zeros((1, 4)), [0], "ab"),
