@@ -1,8 +1,10 @@
 """Networks on another device than the simulation: the same run, to float tolerance.
 
-PyTorch takes ``cpu:0``, the CPU under another name, for another device, so that tensors are moved
-there and back. A GPU is tested too if there is one.
+The other device is one made up for the tests, on which tensors of two devices do not mix, as on a
+GPU; a GPU is tested too if there is one.
 """
+
+from contextlib import nullcontext
 
 import pytest
 import torch
@@ -15,15 +17,42 @@ from bgpo_trl.encoders.representation import (
 )
 from bgpo_trl.training import Trainer
 from tests.helpers import TINY_ENCODERS, rows
+from tests.second_device import second_device
 
-DEVICES = ["cpu:0", *(["cuda"] if torch.cuda.is_available() else [])]
+ALGORITHMS = ["bgpo", "bgpo+td3", "bgpo+sac", "maml-demonstrations", "dist-nll-demonstrations"]
+ALGORITHMS += ["fine-tuning-demonstrations", "ewc"]
+
+
+@pytest.fixture(params=["second", *(["cuda"] if torch.cuda.is_available() else [])])
+def device(request):
+    used = second_device() if request.param == "second" else nullcontext(request.param)
+    with used as device:
+        yield device
+
+
+def test_tensors_of_two_devices_do_not_mix():
+    """A check of the second device itself."""
+    with second_device() as device:
+        there, here = torch.ones(2, 3, device=device), torch.arange(3.0)
+        assert there.device == device
+        for wrong in (lambda: there + here, lambda: torch.stack([there[0], here])):
+            with pytest.raises(RuntimeError, match="two devices"):
+                wrong()
+        with pytest.raises(RuntimeError, match="generator"):
+            torch.rand(2, device=device, generator=torch.Generator())
+        weight = here.to(device).requires_grad_()
+        (there * weight).sum().backward()
+        assert weight.grad is not None
+        assert weight.grad.device == device
+        assert weight.grad.cpu().equal(torch.full((3,), 2.0))
+        there[0] += 1.0
+        assert (there.cpu() + torch.tensor(1.0)).tolist() == [[3.0] * 3, [2.0] * 3]
 
 
 @pytest.mark.usefixtures("easy_world")
-@pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize("name", ["bgpo", "bgpo+td3", "bgpo+sac", "maml", "dist-nll"])
+@pytest.mark.parametrize("name", ALGORITHMS)
 def test_a_run_is_the_same_on_every_device(device, name, bank, encoders, make_config, tmp_path):
-    longer = {"episodes": 16} if name in ("maml", "dist-nll") else {}
+    longer = {"episodes": 16} if name.startswith(("maml", "dist-nll")) else {}
     config = make_config(name=name, **longer)
     parts = {"bank": bank, "encoders": encoders, "progress": False}
     try:
@@ -41,7 +70,6 @@ def test_a_run_is_the_same_on_every_device(device, name, bank, encoders, make_co
                     assert float(ours[key]) == pytest.approx(float(theirs[key]), abs=1e-3)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_encoders_trained_elsewhere_come_back_to_the_cpu(device, tmp_path):
     generator = torch.Generator().manual_seed(0)
     data = TensorDict(
