@@ -3,8 +3,9 @@
     python benchmarks/speed/steps.py bgpo-single bgpo bgpo-experts dist-nll maml
     python benchmarks/speed/steps.py bgpo --tasks 3 8 --played 1500
 
-A step covers all seeds: act, simulate, render and encode while the update runs in a background
-thread, then store. Before timing, each algorithm trains on all tasks until it has groups and
+A step covers all seeds: act, simulate, render and encode while an update, if one is due, runs in a
+background thread, then store. An algorithm's update is due as often as in its runs
+(``update_every``). Before timing, each algorithm trains on all tasks until it has groups and
 updates.
 """
 
@@ -64,17 +65,21 @@ class Steps:
 
     def __init__(self, algorithm: Algorithm, world: World) -> None:
         self.algorithm, self.env = algorithm, world.env
-        self._background = ThreadPoolExecutor(1, "update")
+        self.update_every = algorithm.config.rl.update_every
+        self._background, self._played = ThreadPoolExecutor(1, "update"), 0
         self._state = self.env.reset()
 
     def play(self, steps: int) -> None:
-        """Take training steps, each with its update."""
+        """Take training steps, with the updates that are due."""
         for _ in range(steps):
             state = self.algorithm.act(self._state)
-            update = self._background.submit(self.algorithm.update)
+            due = self._played % self.update_every == 0
+            update = self._background.submit(self.algorithm.update) if due else None
             transition, self._state = self.env.step_and_maybe_reset(state)
-            update.result()
+            if update is not None:
+                update.result()
             self.algorithm.store(transition)
+            self._played += 1
 
     def update(self, count: int) -> None:
         """Make updates without environment steps."""

@@ -32,7 +32,7 @@ from bgpo_trl.algorithms.bgpo import BGPO
 from bgpo_trl.configs import BGPOConfig
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.experiments.command_line import command_line
-from bgpo_trl.machine import usable_cores
+from bgpo_trl.machine import keep_freed_memory, usable_cores
 from bgpo_trl.transforms import TaskSchedule
 from bgpo_trl.world import World
 
@@ -135,7 +135,7 @@ class Training(Steps):
         keep_time(world.env, "step_and_maybe_reset", "whole environment")
         for method in ("act", "update", "store"):
             keep_time(algorithm, method, method)
-        keep_time(algorithm.replay, "sample", "of which sample")
+        keep_time(algorithm, "sample", "of which sample")
         return seconds
 
 
@@ -143,27 +143,29 @@ def measure_step(arguments: Arguments) -> Table:
     """Time a training step of a batch of seeds and of as many single-seed runs, in turn."""
     batch = Training(range(arguments.seeds))
     singles = [Training(range(seed, seed + 1)) for seed in range(arguments.seeds)]
+    every = batch.update_every  # so many steps have one update
 
     def one_after_the_other() -> None:
         for single in singles:
-            single.play(1)
+            single.play(every)
 
     names = f"{arguments.seeds} seeds in a batch", f"{arguments.seeds} runs of one seed"
     times = interleave(
-        dict(zip(names, (partial(batch.play, 1), one_after_the_other), strict=True)),
+        dict(zip(names, (partial(batch.play, every), one_after_the_other), strict=True)),
         rounds=arguments.rounds,
     )
     table: Table = {
         name: {
-            "ms a step of all": _milliseconds(taken),
+            "ms a step of all": _milliseconds([t / every for t in taken]),
             "share of single runs": ratio(taken, times[names[1]]).median,
         }
         for name, taken in times.items()
     }
     seconds = batch.time_parts()
-    batch.play(arguments.rounds)
+    batch.play(arguments.rounds * every)
     for part, spent in seconds.items():
-        table[f"{names[0]}: {part}"] = {"ms a step of all": 1e3 * spent / arguments.rounds}
+        taken = 1e3 * spent / (arguments.rounds * every)
+        table[f"{names[0]}: {part}"] = {"ms a step of all": taken}
     return table
 
 
@@ -242,6 +244,7 @@ def main(arguments: Arguments) -> None:
             raise ValueError(f"--{name} must be at least 1, got {number}")
     threads = arguments.threads or usable_cores()
     torch.set_num_threads(1)
+    keep_freed_memory()  # as in runs
     measures: dict[Part, Callable[[], Table]] = {
         "frames": lambda: measure_frames(arguments, threads),
         "updates": lambda: measure_updates(arguments),
