@@ -237,22 +237,53 @@ def success_matrix(run: Run) -> Values:
     Raises:
         ValueError: If tasks do not start one after the other, or a phase has no test of its task.
     """
-    begun = run.starts
-    lengths = [end - start for start, end in pairwise([*begun, run.last])]
-    if min(lengths) <= 0:
-        raise ValueError(
-            f"{run.directory} starts its tasks at {begun}: only for tasks one after the other"
-        )
-    window = max(run.eval_every, min(lengths) // 5)
-    matrix = evaluation_matrix(
-        run.curves.success, run.curves.episodes, [*begun[1:], run.last], window=window
-    )
+    ends, window = _phases(run)
+    matrix = evaluation_matrix(run.curves.success, run.curves.episodes, ends, window=window)
     if np.isnan(np.diagonal(matrix, axis1=-2, axis2=-1)).any():
         raise ValueError(
-            f"{run.directory} has a phase of {min(lengths)} episodes without a test of its task: "
-            "let it be tested more often than once a phase"
+            f"{run.directory} has no test of a task in the last {window} episodes of its phase: "
+            "let it be tested more often"
         )
     return matrix
+
+
+def since_best_unchanged(run: Run, draws: int = 400, rng: int = 0) -> Values:
+    """Return the `forgetting_since_best` to expect of policies that do not change, ``[S]``.
+
+    The best of several noisy means is higher than the last one, also where nothing is forgotten.
+    In this simulation, tests since the last fifth of a task's own phase succeed independently, with
+    the same probability, which is their mean in the run. Earlier tests are those of the run.
+
+    Args:
+        run: A run with tasks one after the other.
+        draws: Number of simulations, of which the mean is taken.
+        rng: Seed of the simulations.
+
+    Raises:
+        ValueError: If the run does not state its ``eval_episodes``, or as for `success_matrix`.
+    """
+    n_tests = run.config.get("eval_episodes")
+    if not isinstance(n_tests, int) or n_tests < 1:
+        raise ValueError(f"{run.directory / 'config.json'} has no eval_episodes")
+    random, (ends, window) = np.random.default_rng(rng), _phases(run)
+    found, simulated = run.curves.success, np.repeat(run.curves.success[None], draws, 0)
+    for task, end in enumerate(ends):
+        since = run.curves.episodes > end - window
+        rate = np.repeat(_mean(found[:, since, task], 1)[:, None], since.sum(), 1)
+        successes = random.binomial(n_tests, rate, (draws, *rate.shape))
+        simulated[:, :, since, task] = successes / n_tests
+    return forgetting_since_best(trailing_mean(simulated, 3)).mean(0)
+
+
+def _phases(run: Run) -> tuple[list[int], int]:
+    """Return the last episode of each task's phase, and a fifth of the shortest, in episodes."""
+    ends = [*run.starts[1:], run.last]
+    lengths = [end - start for start, end in zip(run.starts, ends, strict=True)]
+    if min(lengths) <= 0:
+        raise ValueError(
+            f"{run.directory} starts its tasks at {run.starts}: only for tasks one after the other"
+        )
+    return ends, max(run.eval_every, min(lengths) // 5)
 
 
 def episodes_to_80(run: Run) -> float:

@@ -20,6 +20,7 @@ from bgpo_trl.analysis.scores import (
     forward_transfer,
     late_scores,
     own_episodes,
+    since_best_unchanged,
     success_lengths,
     success_matrix,
     times_the_first,
@@ -51,7 +52,8 @@ SEQUENCE_NOTES = (
     "Means over seeds and 95 % intervals, in points. R[i, j]: success on task j over the last "
     "fifth of the phase of task i. Forgetting: mean over tasks of R[j, j] minus R at the end; "
     "backward transfer: the negative, without the last task; since best: a task's best mean of "
-    "three tests minus its last.",
+    "three tests minus its last; if unchanged: what that is on average, by the noise of tests "
+    "alone, for policies whose success does not change after the phase of their task.",
     "Forward transfer: (area - reference) / (1 - reference), areas under a task's curve over its "
     "own episodes, from the first to the last test of its phase; reference: the same algorithm "
     "with all tasks from the start, whose seeds count in the interval.",
@@ -201,15 +203,22 @@ def sequence_table(setting: Setting, reference: Setting | None) -> Table:
         setting: The setting.
         reference: That with all tasks from the start, for forward transfer.
     """
-    rows = [["", "forgetting", "since best", "backward transfer", "forward transfer"]]
+    columns = ["forgetting", "since best", "if unchanged", "backward transfer", "forward transfer"]
+    rows = [["", *columns]]
     for name, run in setting.runs.items():
         change = change_since_learned(success_matrix(run))
         best = forgetting_since_best(trailing_mean(run.curves.success, 3))
-        measured = (-change.mean(1), best, change[:, :-1].mean(1))
+        by_noise = "-"
+        if run.config.get("eval_episodes"):
+            by_noise = f"{100 * since_best_unchanged(run).mean():+.1f}"
         beside = reference.find(run.algorithm, run.changed) if reference is not None else None
         forward = forward_transfer(run, beside[1]) if beside else None
-        cells = [statistics.mean(scores).points() for scores in measured]
-        rows.append([name, *cells, forward.points() if forward else "-"])
+        forgetting, since_best, backward = (
+            statistics.mean(scores).points()
+            for scores in (-change.mean(1), best, change[:, :-1].mean(1))
+        )
+        cells = [forgetting, since_best, by_noise, backward, forward.points() if forward else "-"]
+        rows.append([name, *cells])
     return rows
 
 

@@ -1,5 +1,6 @@
 """Measures of arrays and of runs, against numbers worked out by hand."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +10,7 @@ from bgpo_trl.analysis import scores
 from bgpo_trl.analysis.comparison import read_run
 from bgpo_trl.analysis.scores import expected_own_episodes, forward_transfer, own_areas
 from tests.analysis.runs import NAN, STARTS, TASKS, make_run, write_run, write_training
+from tests.analysis.runs import SUCCESS as SUCCESS_OF_RUN
 
 # Two tasks in the order of their presentation, evaluated after 10, 20, 30 and 40 episodes; task 2
 # comes in after 20.
@@ -45,6 +47,23 @@ def test_forgetting_since_the_best_so_far_by_hand():
     # Task 1 was at 0.8 and is at 0.4; task 2 is at its best.
     assert scores.forgetting_since_best(SUCCESS) == pytest.approx((0.4 + 0) / 2)
     assert scores.forgetting_since_best(SUCCESS[:1]) == 0  # a task never tested is left out
+
+
+def test_what_noise_alone_leaves_of_the_best_equals_the_sum_over_all_outcomes():
+    # With one test an evaluation, the tests since the last fifth of a phase have 32, 8, 2 outcomes.
+    run = make_run()
+    run.config["eval_episodes"] = 1
+    success, expected = np.array(SUCCESS_OF_RUN), []
+    for task, first in enumerate((1, 3, 5)):
+        rate, total = success[first:, task].mean(), 0.0
+        for outcome in itertools.product((0, 1), repeat=6 - first):
+            won, column = sum(outcome), np.concatenate([success[:first, task], outcome])
+            chance = rate**won * (1 - rate) ** (len(outcome) - won)
+            means = scores.trailing_mean(column[:, None], 3)
+            total += chance * scores.forgetting_since_best(means)
+        expected.append(total)
+    found = scores.since_best_unchanged(run, draws=20_000)
+    assert found == pytest.approx([np.mean(expected)] * 2, abs=0.01)
 
 
 def test_a_success_of_zero_is_not_treated_as_missing():
@@ -159,7 +178,7 @@ def test_the_success_matrix_averages_the_last_fifth_of_a_phase():
 def test_the_success_matrix_needs_tasks_one_after_the_other():
     with pytest.raises(ValueError, match=r"starts its tasks at \[0, 0, 10\]: only for tasks one"):
         scores.success_matrix(make_run(starts=(0, 0, 10)))
-    with pytest.raises(ValueError, match=r"of 2 episodes without a test .* more often"):
+    with pytest.raises(ValueError, match=r"no test .* more often"):
         scores.success_matrix(make_run(starts=(0, 6, 8)))
 
 
