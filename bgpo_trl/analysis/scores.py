@@ -251,8 +251,8 @@ def since_best_unchanged(run: Run, draws: int = 400, rng: int = 0) -> Values:
     """Return the `forgetting_since_best` to expect of policies that do not change, ``[S]``.
 
     The best of several noisy means is higher than the last one, also where nothing is forgotten.
-    In this simulation, tests since the last fifth of a task's own phase succeed independently, with
-    the same probability, which is their mean in the run. Earlier tests are those of the run.
+    In this simulation, tests after a task's own phase succeed independently, each with the success
+    at the end of the phase, R[j, j] of `success_matrix`. Earlier tests are those of the run.
 
     Args:
         run: A run with tasks one after the other.
@@ -265,11 +265,11 @@ def since_best_unchanged(run: Run, draws: int = 400, rng: int = 0) -> Values:
     n_tests = run.config.get("eval_episodes")
     if not isinstance(n_tests, int) or n_tests < 1:
         raise ValueError(f"{run.directory / 'config.json'} has no eval_episodes")
-    random, (ends, window) = np.random.default_rng(rng), _phases(run)
-    found, simulated = run.curves.success, np.repeat(run.curves.success[None], draws, 0)
-    for task, end in enumerate(ends):
-        since = run.curves.episodes > end - window
-        rate = np.repeat(_mean(found[:, since, task], 1)[:, None], since.sum(), 1)
+    random, learned = np.random.default_rng(rng), success_matrix(run)
+    simulated = np.repeat(run.curves.success[None], draws, 0)
+    for task, end in enumerate(_phases(run)[0]):
+        since = run.curves.episodes > end
+        rate = np.repeat(learned[:, task, task, None], since.sum(), 1)
         successes = random.binomial(n_tests, rate, (draws, *rate.shape))
         simulated[:, :, since, task] = successes / n_tests
     return forgetting_since_best(trailing_mean(simulated, 3)).mean(0)

@@ -53,7 +53,7 @@ SEQUENCE_NOTES = (
     "fifth of the phase of task i. Forgetting: mean over tasks of R[j, j] minus R at the end; "
     "backward transfer: the negative, without the last task; since best: a task's best mean of "
     "three tests minus its last; if unchanged: what that is on average, by the noise of tests "
-    "alone, for policies whose success does not change after the phase of their task.",
+    "alone, for policies whose success stays at R[j, j].",
     "Forward transfer: (area - reference) / (1 - reference), areas under a task's curve over its "
     "own episodes, from the first to the last test of its phase; reference: the same algorithm "
     "with all tasks from the start, whose seeds count in the interval.",

@@ -50,12 +50,12 @@ def test_forgetting_since_the_best_so_far_by_hand():
 
 
 def test_what_noise_alone_leaves_of_the_best_equals_the_sum_over_all_outcomes():
-    # With one test an evaluation, the tests since the last fifth of a phase have 32, 8, 2 outcomes.
+    # With one test an evaluation, the tests after a phase have 16, 4 and 1 outcomes.
     run = make_run()
     run.config["eval_episodes"] = 1
     success, expected = np.array(SUCCESS_OF_RUN), []
-    for task, first in enumerate((1, 3, 5)):
-        rate, total = success[first:, task].mean(), 0.0
+    for task, first in enumerate((2, 4, 6)):
+        rate, total = success[first - 1, task], 0.0  # the test at the end of the phase
         for outcome in itertools.product((0, 1), repeat=6 - first):
             won, column = sum(outcome), np.concatenate([success[:first, task], outcome])
             chance = rate**won * (1 - rate) ** (len(outcome) - won)
