@@ -83,15 +83,21 @@ def check_versions() -> str:
     if not python.contains(platform.python_version()):
         raise RuntimeError(f"Python is {platform.python_version()}, bgpo_trl needs {python}")
     required = map(Requirement, importlib.metadata.requires("bgpo_trl") or ())
-    found = {}
+    found, wrong = dict[str, str](), list[Requirement]()
     for wanted in required:
         if wanted.marker is None or wanted.marker.evaluate({"extra": ""}):
-            found[wanted.name] = importlib.metadata.version(wanted.name)
+            try:
+                found[wanted.name] = importlib.metadata.version(wanted.name)
+            except importlib.metadata.PackageNotFoundError:
+                found[wanted.name] = "missing"
+                wrong.append(wanted)
+                continue
             if not wanted.specifier.contains(found[wanted.name], prereleases=True):
-                raise RuntimeError(
-                    f"{wanted.name} is {found[wanted.name]}: pip install "
-                    f"'{wanted.name}{wanted.specifier}'"
-                )
+                wrong.append(wanted)
+    if wrong:
+        reasons = ", ".join(f"{wanted.name} is {found[wanted.name]}" for wanted in wrong)
+        remedy = " ".join(f"'{wanted.name}{wanted.specifier}'" for wanted in wrong)
+        raise RuntimeError(f"{reasons}: pip install {remedy}")
     listed = ", ".join(f"{name} {version}" for name, version in found.items())
     return f"Python {platform.python_version()}, {listed}"
 

@@ -2,6 +2,7 @@
 
 import importlib.metadata
 import os
+import shlex
 import shutil
 import subprocess
 import sys
@@ -9,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from packaging.requirements import Requirement
 from PIL import Image
 
 from bgpo_trl import doctor
@@ -34,6 +36,26 @@ def test_a_dependency_outside_its_range_is_wrong_and_extras_are_not_required(
     else:
         with pytest.raises(RuntimeError, match="pip install 'torch"):
             doctor.check_versions()
+
+
+def test_all_that_is_missing_or_does_not_fit_is_installed_by_one_line(monkeypatch):
+    installed = {"numpy": "2.0", "torch": "2.12.9"}
+
+    def version(name):
+        if name not in installed:
+            raise importlib.metadata.PackageNotFoundError(name)
+        return installed[name]
+
+    required = ["numpy>=2.0", "torch>=2.13,<3", "tqdm>=4.66", 'wandb>=99; extra == "wandb"']
+    monkeypatch.setattr(importlib.metadata, "requires", lambda _: required)
+    monkeypatch.setattr(importlib.metadata, "version", version)
+    with pytest.raises(RuntimeError) as raised:
+        doctor.check_versions()
+    problem, remedy = str(raised.value).split(": ")
+    assert "torch" in problem and "2.12.9" in problem and "tqdm" in problem
+    program, verb, *packages = shlex.split(remedy)
+    assert (program, verb) == ("pip", "install")
+    assert [Requirement(package).name for package in packages] == ["torch", "tqdm"]
 
 
 def test_a_frame_is_drawn_and_written(tmp_path):
