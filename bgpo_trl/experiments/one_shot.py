@@ -18,6 +18,7 @@ from bgpo_trl.analysis.task_inference import task_inference_accuracy
 from bgpo_trl.experiments.arguments import TrainedArguments
 from bgpo_trl.experiments.episodes import evaluator_of
 from bgpo_trl.figures.style import COLORS, add_legend, readable, save_figure, style_axes
+from bgpo_trl.files.writing import check_folder
 from bgpo_trl.machine import set_threads
 from bgpo_trl.plugins import import_plugin
 from bgpo_trl.runs.provenance import commit_of_code, write_measurement
@@ -187,6 +188,7 @@ def one_shot(arguments: OneShotArguments) -> str:
 
     Raises:
         ValueError: If the run cannot be loaded, or a share is not in (0, 1].
+        OSError: If the results cannot be written.
     """
     from bgpo_trl.policy import load_run
 
@@ -194,6 +196,7 @@ def one_shot(arguments: OneShotArguments) -> str:
     import_plugin(arguments.module)
     set_threads(arguments.threads)
     policy = load_run(arguments.run)
+    check_folder(out)
     tested = measure(policy, arguments.shares, arguments.episodes, arguments.seed)
     write_measurement(out, "one_shot", tested.round(dict.fromkeys(_MEASURES, 4)), commit)
     found = means(tested)

@@ -16,6 +16,7 @@ from PIL import Image, ImageDraw, ImageFont, ImageOps
 from bgpo_trl.experiments.arguments import ImportArguments
 from bgpo_trl.figures.frames import plot_frame_strips, save_gif
 from bgpo_trl.figures.style import save_figure
+from bgpo_trl.files.writing import check_folder
 from bgpo_trl.plugins import import_plugin
 from bgpo_trl.scenes import Scene, find_scene
 
@@ -180,6 +181,7 @@ def watch(arguments: WatchArguments) -> str:
 
     Raises:
         ValueError: If the directory holds no run that can be loaded, or the run has no such seed.
+        OSError: If the pictures cannot be written.
     """
     from bgpo_trl.figures.gwr import draw_growth
     from bgpo_trl.policy import load_run
@@ -187,10 +189,10 @@ def watch(arguments: WatchArguments) -> str:
     run, out = arguments.run, arguments.out or arguments.run / "figures"
     import_plugin(arguments.module)
     policy = load_run(run, seed=arguments.run_seed)
+    check_folder(out)
     config, seed = policy.config, arguments.scene_seed
     shown = demonstrate(policy.tasks, seed, config.spread, config.scene)
     episodes = [play(policy, task, frames, seed) for task, frames in shown.items()]
-    out.mkdir(parents=True, exist_ok=True)
     save_gif(compose(episodes), out / "film.gif", fps=_FPS, scale=1)
     strips = {}
     for episode in episodes:

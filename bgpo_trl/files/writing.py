@@ -24,9 +24,24 @@ def make_folder(path: str | os.PathLike[str]) -> Path:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OSError(f"cannot make the folder {path} ({error.strerror}): choose another") from None
-    if not os.access(path, os.W_OK):
-        raise PermissionError(f"the folder {path} is read-only: choose another, such as by --out")
+    check_folder(path)
     return path
+
+
+def check_folder(path: str | os.PathLike[str]) -> None:
+    """Check that files can be written into a folder, before the work whose results they are.
+
+    A folder that is missing is not made.
+
+    Raises:
+        OSError: If it, or the folder in which it would be made, is read-only or a file.
+    """
+    absolute = Path(path).absolute()
+    there = next(place for place in (absolute, *absolute.parents) if place.exists())
+    if not there.is_dir():
+        raise NotADirectoryError(f"{there} is a file: choose another folder, such as by --out")
+    if not os.access(there, os.W_OK):
+        raise PermissionError(f"the folder {there} is read-only: choose another, such as by --out")
 
 
 @contextlib.contextmanager

@@ -1,6 +1,7 @@
 """Damaged run directories: one line each, from every command that reads them, and no change."""
 
 import json
+import os
 import re
 import warnings
 from functools import partial
@@ -8,6 +9,7 @@ from functools import partial
 import pytest
 
 from bgpo_trl.experiments.arguments import TrainedArguments
+from bgpo_trl.experiments.nico.aftermath import AftermathArguments, aftermath
 from bgpo_trl.experiments.nico.looking import looking
 from bgpo_trl.experiments.one_shot import OneShotArguments, one_shot
 from bgpo_trl.experiments.report import ReportArguments, report
@@ -146,6 +148,29 @@ def test_a_damaged_run_is_neither_filmed_nor_tested(run, damage, command, argume
     damage(run)
     check_refused(lambda: command(arguments(run=run, out=tmp_path / "out")))
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("out", ["here", "here/new"])
+@pytest.mark.parametrize(
+    ("command", "arguments", "work"),
+    [
+        (watch, WatchArguments, "watch.demonstrate"),
+        (one_shot, OneShotArguments, "one_shot.measure"),
+        (looking, TrainedArguments, "nico.looking.measure_looking"),
+        (aftermath, AftermathArguments, "nico.aftermath.episodes_of"),
+    ],
+    ids=["watch", "one_shot", "looking", "aftermath"],
+)
+def test_a_read_only_folder_is_refused_before_the_work(
+    run, command, arguments, work, out, tmp_path, monkeypatch
+):
+    (tmp_path / "here").mkdir()
+    monkeypatch.setattr(f"bgpo_trl.experiments.{work}", lambda *_: pytest.fail("has begun"))
+    # For root, permissions would not make it so.
+    monkeypatch.setattr(os, "access", lambda path, mode: path != tmp_path / "here")
+    with pytest.raises(PermissionError, match=r"read-only.*--out"):
+        command(arguments(run=run, out=tmp_path / out))
+    assert not list((tmp_path / "here").iterdir())
 
 
 GROWTH = {

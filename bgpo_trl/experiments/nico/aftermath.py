@@ -23,6 +23,7 @@ from bgpo_trl.analysis.tables import Table, markdown
 from bgpo_trl.experiments.arguments import TrainedArguments
 from bgpo_trl.experiments.episodes import evaluator_of, snapshots_of
 from bgpo_trl.experiments.nico.scripted import Episode, load_blocks_of_nico, play, random_actions
+from bgpo_trl.files.writing import check_folder
 from bgpo_trl.machine import set_threads
 from bgpo_trl.plugins import import_plugin
 from bgpo_trl.runs.provenance import commit_of_code, write_measurement
@@ -363,13 +364,15 @@ def aftermath(arguments: AftermathArguments) -> str:
 
     Raises:
         ValueError: As for `episodes_of`, or if the run cannot be loaded.
+        OSError: If the results cannot be written.
     """
     commit = commit_of_code()
     import_plugin(arguments.module)
     set_threads(arguments.threads)
+    out = arguments.out or arguments.run or Path("runs/aftermath")
+    check_folder(out)
     episodes = episodes_of(arguments)
     rows = [row for actor, of_actor in episodes.items() for row in judge(actor, of_actor)]
-    out = arguments.out or arguments.run or Path("runs/aftermath")
     table = pd.DataFrame(rows, columns=pd.Index(Row._fields))
     write_measurement(out, "aftermath", table, commit)
     counts = {actor: Counter(e.task for e in of_actor) for actor, of_actor in episodes.items()}

@@ -23,6 +23,7 @@ from bgpo_trl.experiments.nico.scripted import load_blocks_of_nico, play, random
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.figures.success import plot_success_bars
 from bgpo_trl.files.progress import progress_bar
+from bgpo_trl.files.writing import check_folder
 from bgpo_trl.machine import set_threads
 from bgpo_trl.plugins import import_plugin
 from bgpo_trl.runs.provenance import commit_of_code, write_measurement
@@ -139,13 +140,15 @@ def looking(arguments: TrainedArguments) -> str:
 
     Raises:
         ValueError: If the run cannot be loaded, or ``episodes`` is less than 1.
+        OSError: If the results cannot be written.
     """
     commit, out = commit_of_code(), arguments.out or arguments.run
     import_plugin(arguments.module)
     set_threads(arguments.threads)
     opengl.check()  # before the progress bar
-    rows: list[Row] = []
-    for run in load_blocks_of_nico(arguments.run):
+    runs, rows = load_blocks_of_nico(arguments.run), list[Row]()
+    check_folder(out)
+    for run in runs:
         steps = len(VIEWS) * (run.config.algorithm.max_steps + 1)
         with progress_bar("looking", total=steps, unit="step") as bar:
             rows += measure_looking(run, arguments.episodes, bar.update)
