@@ -48,6 +48,7 @@ from bgpo_trl.figures.success import (
     plot_success_matrices,
 )
 from bgpo_trl.files.writing import make_folder, write_whole
+from bgpo_trl.runs.provenance import without_folders
 from bgpo_trl.runs.results import archive_run, find_table, read_table
 
 # For a screen: figures of results are kept under version control.
@@ -292,7 +293,10 @@ def section_by(runs: dict[float, Run], name: str, out: Path) -> Section:
 
 
 def text_of(sections: Sequence[Section], out: Path) -> str:
-    """Return sections in Markdown; figures are linked from the folder ``out``."""
+    """Return sections in Markdown; figures are linked from the folder ``out``.
+
+    Notes name folders of this machine by their last name only, since reports are shared.
+    """
     text = []
     for section in sections:
         text.append(f"## {section.title}")
@@ -301,7 +305,7 @@ def text_of(sections: Sequence[Section], out: Path) -> str:
             f"![{caption}]({path.relative_to(out).as_posix()})"
             for caption, path in section.figures.items()
         ]
-        text += ["\n".join(f"- {note}" for note in section.notes if note)]
+        text += ["\n".join(f"- {without_folders(note)}" for note in section.notes if note)]
     return "\n\n".join(filter(None, text)) + "\n"
 
 

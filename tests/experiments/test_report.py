@@ -222,6 +222,16 @@ def test_a_run_that_is_read_only_is_reported_elsewhere(tmp_path, monkeypatch):
     assert contents(run) == before
 
 
+def test_reports_do_not_tell_the_folders_of_this_machine(tmp_path):
+    run = write_run(tmp_path, "bgpo", 9)
+    edit(run / "summary.json", command=f"python x.py --out {tmp_path}/bgpo --seeds 0 1")
+    (write_run(tmp_path, "oracle", 5) / "eval.csv").unlink()
+    printed = report(ReportArguments((tmp_path,)))
+    assert str(tmp_path) not in printed and printed == text_of(tmp_path)
+    assert "`python x.py --out .../bgpo --seeds 0 1`" in printed
+    assert ".../concurrent-oracle holds no test episode" in printed
+
+
 def test_tests_too_rare_for_phases_leave_that_table_out(tmp_path):
     write_run(tmp_path, "bgpo", 9, starts=(0, 1, 20))
     report(ReportArguments((tmp_path,)))
