@@ -57,8 +57,9 @@ def test_help_imports_neither_torch_nor_mujoco(options):
     [
         (("report", "merge"), "dm_control"),  # opens a display on import
         (tuple(command.COMMANDS), "torchrl"),
+        (tuple(command.COMMANDS), "ray"),  # an extra
     ],
-    ids=["no display to read results", "no TorchRL for help"],
+    ids=["no display to read results", "no TorchRL for help", "no Ray for help"],
 )
 def test_commands_import_little_before_they_are_called(names, package):
     modules = [f"bgpo_trl.{command.COMMANDS[name][0]}" for name in names]

@@ -42,7 +42,7 @@ def command_line(
     kind = get_type_hints(command)["arguments"]
     try:
         text = command(_parse(kind, command, options, program))
-    except (ValueError, OSError, RuntimeError) as error:
+    except (ValueError, OSError, RuntimeError, ImportError) as error:
         if _is_of_others(error):
             raise
         sys.exit(f"error: {_printable(str(error))}")

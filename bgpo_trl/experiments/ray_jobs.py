@@ -20,14 +20,6 @@ from bgpo_trl.files.progress import progress_bar
 from bgpo_trl.files.writing import lock_directory, no_link
 from bgpo_trl.runs.directory import CSV_FILES
 
-try:
-    import ray
-    from ray.exceptions import RayError
-except ImportError as error:
-    raise ImportError(
-        "sweeps run on Ray, which is not installed: pip install 'bgpo_trl[ray]'"
-    ) from error
-
 # Bounds the retries of a job that always crashes its worker.
 RETRIES = 10
 
@@ -71,7 +63,14 @@ def connected(address: str, cpus: float, gpus: float) -> Iterator[None]:
     Raises:
         ValueError: If this machine is too small for a job.
         ConnectionError: If there is no such cluster.
+        ImportError: If Ray is not installed.
     """
+    try:
+        import ray  # here, since --help does not need it
+    except ImportError:
+        raise ImportError(
+            "sweeps run on Ray, which is not installed: pip install 'bgpo_trl[ray]'"
+        ) from None
     # Disables Ray's usage reports, and the niceness that it gives to workers.
     os.environ.update(RAY_USAGE_STATS_ENABLED="0", RAY_worker_niceness="0")
     options: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR}
@@ -133,6 +132,9 @@ def play_jobs(
     Raises:
         KeyboardInterrupt: On Ctrl-C, which is passed on to ``play``; it has a minute to save.
     """
+    import ray
+    from ray.exceptions import RayError
+
     # Workers import modules beside `play`, from this package and, of own tasks, from here.
     folders = [Path(inspect.getfile(play)).resolve().parent, Path(__file__).resolve().parents[2]]
     folders.append(Path.cwd())
@@ -181,6 +183,6 @@ def _episodes(jobs: Iterable[Job]) -> int:
     return sum(max(0, path.read_bytes().count(b"\n") - 1) for path in files if path.exists())
 
 
-def _reason(error: RayError) -> str:
+def _reason(error: Exception) -> str:
     cause = getattr(error, "cause", None) or error
     return f"{type(cause).__name__}: {(str(cause).splitlines() or [''])[0]}"

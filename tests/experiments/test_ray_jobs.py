@@ -16,6 +16,8 @@ import pytest
 from bgpo_trl.configs import RunConfig
 from bgpo_trl.experiments import merge
 from bgpo_trl.experiments import ray_jobs as jobs
+from bgpo_trl.experiments.arguments import Arguments
+from bgpo_trl.experiments.command_line import command_line
 from bgpo_trl.experiments.ray_jobs import Job
 from bgpo_trl.training import Trainer
 from tests.helpers import rows
@@ -172,7 +174,7 @@ def test_a_machine_without_enough_cores_or_gpus_is_refused(monkeypatch):
         cluster_resources=lambda: {"CPU": 2.0},
         shutdown=lambda: ended.append(1),
     )
-    monkeypatch.setattr(jobs, "ray", stub)
+    monkeypatch.setitem(sys.modules, "ray", stub)
     for cpus, gpus, message in (
         (3, 0, "--cpus-per-run 3: Ray finds 2"),
         (2, 0.5, "--gpus-per-run"),
@@ -186,9 +188,13 @@ def test_a_machine_without_enough_cores_or_gpus_is_refused(monkeypatch):
 
 def test_a_missing_ray_names_the_extra_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
-    monkeypatch.delitem(sys.modules, "bgpo_trl.experiments.ray_jobs")
-    with pytest.raises(ImportError, match=r"pip install 'bgpo_trl\[ray\]'"):
-        __import__("bgpo_trl.experiments.ray_jobs")
+
+    def sweep(arguments: Arguments):
+        with jobs.connected("local", 1, 0):
+            raise AssertionError("went on")
+
+    with pytest.raises(SystemExit, match=r"^error: [^\n]*pip install 'bgpo_trl\[ray\]'$"):
+        command_line(sweep, [])
 
 
 @pytest.fixture
