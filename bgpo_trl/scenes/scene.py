@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
@@ -172,10 +171,6 @@ class Scene:
             raise ValueError(f"spread is {spread}: choose a number from 0 (nominal places) to 1")
         if spread != 1.0 and not self.has_spread:
             raise ValueError(f"the starts of the scene {self.name!r} have no spread: leave it at 1")
-
-    def random_action(self, random: np.random.Generator) -> NDArray[np.float64]:
-        """Return a uniformly random action, ``[A]`` in [-1, 1]."""
-        return random.uniform(-1, 1, self.action_size)
 
 
 SCENES: dict[str, Scene | str] = {"nico": "bgpo_trl.scenes.nico:NICO"}
