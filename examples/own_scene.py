@@ -36,7 +36,7 @@ STEP, NEAR = 0.2, 0.3  # (rad)
 def renderer():
     """Return the renderer that all simulations share."""
     model = suite.load("reacher", "easy").physics.model
-    # What takes most of a frame's time and shows nothing.
+    # Multisampling, shadows and reflections take most of a frame's time and show nothing.
     model.vis.quality.offsamples, model.light_castshadow[:] = 0, 0
     model.mat_reflectance[:] = 0
     # The encoders have to see the arm, which is a pixel wide, rather than the ball.

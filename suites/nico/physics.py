@@ -123,7 +123,7 @@ class Physics(dm_mujoco.Physics):
         self._object_id("body", name)
         return self.data.userdata[1:].reshape(-1, 3)[OBJECTS.index(name)].copy()
 
-    # What an episode remembers is in MuJoCo's user data, hence in `get_state`.
+    # Kept in MuJoCo's user data, so that `get_state` has all that an episode remembers.
 
     def begin_episode(self) -> None:
         """Store where the objects are, for `start_position`, and set `steady_steps` to 0."""

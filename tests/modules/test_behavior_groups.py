@@ -126,7 +126,7 @@ def test_merged_groups_keep_the_number_of_the_one_shown_most(often):
     assert groups.numbers(0) == [numbers[often]]
     assert group_of(groups, torch.linspace(0, 12, 50).unsqueeze(-1)) == [numbers[often]]
     assert int(groups.revision) > 1
-    # What comes next is group 2, even though there is only one now.
+    # Numbers are never used again: the next new group is 2, though only one is left.
     show(groups, line(40, 44, 40))
     assert groups.numbers(0) == sorted([numbers[often], 2])
     assert groups.parent(0, 2) == numbers[often]

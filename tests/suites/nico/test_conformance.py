@@ -1,6 +1,6 @@
 """Rules that every task of the suite keeps, after ``dm_control.suite.tests.suite_test``.
 
-What the base class does for all tasks alike is tested in one.
+What the base class does in the same way for every task is tested with one task only.
 """
 
 import itertools
