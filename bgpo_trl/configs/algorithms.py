@@ -275,8 +275,8 @@ class BGPOConfig(AlgorithmConfig):
     """See `AlgorithmConfig`. Ours: what demonstrations show is rarely found by chance."""
     rl: RLConfig = field(default_factory=lambda: DDPGConfig(noise=0.1, update_every=4))
     """See `AlgorithmConfig`. Ours: exploration noise on the scale of demonstrated actions, since
-    what to explore is near them, and an update every four steps, since hardly less is learned from
-    demonstrations than with one every step (docs/learning.md); without demonstrations, 0.3 and 1."""
+    what to explore is near them; an update every four steps, since hardly less is learned from
+    demonstrations than by one every step (docs/learning.md). Without demonstrations, 0.3 and 1."""
     active_groups: int = 4
     """Largest number of groups per update, those played last. Ours: bounds the cost of an
     update."""
