@@ -17,7 +17,10 @@ from typing import Any, TypeVar
 import torch
 
 T = TypeVar("T")
-_USUAL = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
+_USUAL = {  # handlers, of SIGTERM also that of command lines, which resume after it
+    signal.SIGINT: (signal.default_int_handler,),
+    signal.SIGTERM: (signal.SIG_DFL, signal.default_int_handler),
+}
 # Options of mallopt (malloc.h), and bytes.
 _KEEP_FREED = {
     -1: 2**30,  # M_TRIM_THRESHOLD: free memory that is kept
@@ -174,9 +177,9 @@ def interrupts_wait() -> Iterator[Callable[[], bool]]:
 
     in_main = threading.current_thread() is threading.main_thread()
     usual = {
-        number: handler
-        for number, handler in _USUAL.items()
-        if in_main and signal.getsignal(number) is handler
+        number: signal.getsignal(number)
+        for number, handlers in _USUAL.items()
+        if in_main and signal.getsignal(number) in handlers
     }
     for number in usual:
         signal.signal(number, ask)

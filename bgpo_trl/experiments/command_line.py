@@ -5,13 +5,16 @@ Nothing here imports TorchRL or MuJoCo, so that ``--help`` is quick.
 
 from __future__ import annotations
 
+import contextlib
 import inspect
 import os
 import re
+import signal
 import sys
 import sysconfig
+import threading
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
@@ -40,19 +43,35 @@ def command_line(
         program: Name of the program in messages; by default that of the process.
     """
     kind = get_type_hints(command)["arguments"]
+    resumable = hasattr(kind, "resume")
     try:
-        text = command(_parse(kind, command, options, program))
+        with _terminable() if resumable else contextlib.nullcontext():
+            text = command(_parse(kind, command, options, program))
     except (ValueError, OSError, RuntimeError, ImportError) as error:
         if _is_of_others(error):
             raise
         sys.exit(f"error: {_printable(str(error))}")
     except KeyboardInterrupt:
-        if not hasattr(kind, "resume"):
+        if not resumable:
             sys.exit("interrupted")
         sys.stderr.write("interrupted: the same command with --resume continues\n")
         sys.exit(os.EX_TEMPFAIL)
     if text is not None:
         sys.stdout.write("\n".join(map(_printable, text.split("\n"))) + "\n")
+
+
+@contextlib.contextmanager
+def _terminable() -> Iterator[None]:
+    """Have SIGTERM raise ``KeyboardInterrupt`` in all stages of a run, not in training alone."""
+    in_main = threading.current_thread() is threading.main_thread()
+    if not in_main or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+        yield
+        return
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def _printable(line: str) -> str:

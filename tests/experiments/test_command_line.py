@@ -1,7 +1,9 @@
 """Wrong command lines: one line or tyro's box, and nothing is written."""
 
+import contextlib
 import os
 import runpy
+import signal
 import sys
 import warnings
 from pathlib import Path
@@ -13,6 +15,7 @@ from bgpo_trl import __main__ as bgpo
 from bgpo_trl.configs import BGPOConfig
 from bgpo_trl.experiments.arguments import Arguments
 from bgpo_trl.experiments.command_line import command_line
+from bgpo_trl.machine import interrupts_wait
 from bgpo_trl.runs.directory import EVAL_COLUMNS
 from bgpo_trl.runs.results import read_json
 from suites import opengl
@@ -172,14 +175,23 @@ def test_without_opengl_a_command_that_renders_writes_nothing(
     assert contents(folder) == before
 
 
-def test_an_interrupted_run_exits_with_the_status_for_another_try(capsys):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("training", [True, False])
+def test_an_interrupted_run_exits_with_the_status_for_another_try(capsys, number, training):
+    saved = []
+
     def interrupted(arguments: Arguments):
-        raise KeyboardInterrupt
+        # Training takes its step to the end; stages around it, such as final tests, stop at once.
+        with interrupts_wait() if training else contextlib.nullcontext():
+            signal.raise_signal(number)
+            saved.append(1)
 
     with pytest.raises(SystemExit) as ended:
         command_line(interrupted, [])
     assert ended.value.code == os.EX_TEMPFAIL
     assert "--resume" in capsys.readouterr().err
+    assert saved == [1] * training
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 
 def test_control_characters_are_printed_as_escapes(capsys):
