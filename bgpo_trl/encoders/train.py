@@ -30,7 +30,7 @@ from bgpo_trl.encoders.representation import (
     train_representation,
 )
 from bgpo_trl.files.csv_file import CsvFile
-from bgpo_trl.files.writing import make_folder
+from bgpo_trl.files.writing import check_folder, make_folder, without_folders
 from bgpo_trl.machine import choose_device
 from bgpo_trl.plugins import import_plugin
 from bgpo_trl.scenes import Scene, find_scene
@@ -111,6 +111,7 @@ def train_encoders(
     scene = find_scene(scene)
     tasks = scene.default_tasks if tasks is None else tasks
     make_folder(folder)
+    check_folder(weights.parent)  # before hours of training
     with CsvFile(folder / "train.csv", _COLUMNS) as file:
         fit = {
             "command": command,
@@ -213,7 +214,7 @@ def main(arguments: Arguments) -> None:
     dataset, meta = load_demonstrations(arguments.dataset), read_meta(arguments.dataset)
     scene, weights = find_scene(meta["scene"]), arguments.weights
     play = None if arguments.play is None else load_demonstrations(arguments.play)
-    command = shlex.join(["python", "-m", "bgpo_trl.encoders.train", *sys.argv[1:]])
+    line = shlex.join(["python", "-m", "bgpo_trl.encoders.train", *sys.argv[1:]])
     keep = None
     if arguments.keep is not None:
         keep = load_representation(arguments.keep, scene_version=scene.version)
@@ -223,7 +224,7 @@ def main(arguments: Arguments) -> None:
         default_weights(meta["tasks"], scene=scene) if weights is None else weights,
         arguments.folder,
         arguments.config,
-        command,
+        without_folders(line),
         choose_device(arguments.device),
         tasks=meta["tasks"],
         spread=meta["spread"],

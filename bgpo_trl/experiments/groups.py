@@ -19,7 +19,7 @@ from bgpo_trl.configs import BGPOConfig
 from bgpo_trl.experiments.arguments import BankArguments
 from bgpo_trl.experiments.settings import check_draws, even_starts
 from bgpo_trl.figures.style import COLORS, LINES, save_figure, style_axes
-from bgpo_trl.files.writing import write_json
+from bgpo_trl.files.writing import check_folder, write_json
 from bgpo_trl.seeding import generators
 
 if TYPE_CHECKING:
@@ -288,6 +288,7 @@ def unknown_task(arguments: UnknownTaskArguments) -> str:
     from bgpo_trl.experiments.run import bank_of
 
     check_draws(arguments.seeds, arguments.draws)
+    check_folder(arguments.out)
     bank = bank_of(arguments)
     if len(bank.tasks) < 2:
         raise ValueError("--tasks: name at least two, of which each is left out in turn")

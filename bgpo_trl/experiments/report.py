@@ -47,8 +47,7 @@ from bgpo_trl.figures.success import (
     plot_success_curves,
     plot_success_matrices,
 )
-from bgpo_trl.files.writing import make_folder, write_whole
-from bgpo_trl.runs.provenance import without_folders
+from bgpo_trl.files.writing import make_folder, without_folders, write_whole
 from bgpo_trl.runs.results import archive_run, find_table, read_table
 
 # For a screen: figures of results are kept under version control.

@@ -5,12 +5,15 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from filelock import FileLock, Timeout
+
+_ABSOLUTE = re.compile(r"(?<![^\s'\"`=(])/[^\s'\"`,;:)]+")  # path, from the beginning of a word
 
 
 def make_folder(path: str | os.PathLike[str]) -> Path:
@@ -80,6 +83,23 @@ def no_link(path: str, flags: int) -> int:
         OSError: If it cannot be opened, or is a symbolic link.
     """
     return os.open(path, flags | os.O_NOFOLLOW, 0o666)
+
+
+def without_folders(text: str) -> str:
+    """Return a text for others to read, with its absolute paths shortened.
+
+    Of a path in the working directory, what follows that is left; of another one, the last name.
+
+    Examples:
+        >>> without_folders("python -m bgpo_trl report /scratch/me/runs --out=/tmp/report")
+        'python -m bgpo_trl report .../runs --out=.../report'
+    """
+    return _ABSOLUTE.sub(lambda found: _shortened(Path(found[0])), text)
+
+
+def _shortened(path: Path) -> str:
+    here = Path.cwd()
+    return str(path.relative_to(here)) if path.is_relative_to(here) else f".../{path.name}"
 
 
 def write_whole(path: Path, content: str | bytes) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.metadata
-import re
 import shlex
 import subprocess
 import sys
@@ -11,9 +10,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from bgpo_trl.files.writing import make_folder, write_json, write_whole
-
-_ABSOLUTE = re.compile(r"(?<![^\s'\"`=(])/[^\s'\"`,;:)]+")  # path, from the beginning of a word
+from bgpo_trl.files.writing import make_folder, without_folders, write_json, write_whole
 
 
 def commit_of_code() -> str:
@@ -38,23 +35,6 @@ def versions() -> dict[str, str]:
 def command() -> str:
     """Return the command line of this process, `without_folders` of this machine."""
     return without_folders(shlex.join(["python", *sys.argv]))
-
-
-def without_folders(text: str) -> str:
-    """Return a text for others to read, with its absolute paths shortened.
-
-    Of a path in the working directory, what follows that is left; of another one, the last name.
-
-    Examples:
-        >>> without_folders("python -m bgpo_trl report /scratch/me/runs --out=/tmp/report")
-        'python -m bgpo_trl report .../runs --out=.../report'
-    """
-    return _ABSOLUTE.sub(lambda found: _shortened(Path(found[0])), text)
-
-
-def _shortened(path: Path) -> str:
-    here = Path.cwd()
-    return str(path.relative_to(here)) if path.is_relative_to(here) else f".../{path.name}"
 
 
 def write_measurement(folder: Path, name: str, table: pd.DataFrame, commit: str) -> None:

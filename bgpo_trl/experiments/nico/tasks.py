@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from bgpo_trl.analysis.tables import Table, markdown
-from bgpo_trl.files.writing import write_whole
+from bgpo_trl.files.writing import check_folder, write_whole
 from suites import nico, opengl
 from suites.nico.base import CONTROL_TIMESTEP, TIME_LIMIT, Environment
 from suites.nico.demonstrator import Demonstrator
@@ -130,13 +130,16 @@ def tasks(arguments: TasksArguments) -> str:
 
     Raises:
         ValueError: If there are too few starts, or there is no such folder.
+        OSError: If the folder is read-only.
     """
     if arguments.starts < 2:
         raise ValueError(f"--starts must be at least 2, got {arguments.starts}")
     if arguments.pictures is not None and not arguments.pictures.is_dir():
         raise ValueError(f"there is no folder {arguments.pictures}: make it first")
     if arguments.pictures is not None:
-        opengl.check()  # before minutes of measurements
+        # Before minutes of measurements.
+        check_folder(arguments.pictures)
+        opengl.check()
     names = nico.ALL_TASKS
     starts: dict[str, NDArray[np.float64]] = {}
     table: Table = [["task", "random actions", "demonstrator", "steps"]]
