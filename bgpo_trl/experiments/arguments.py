@@ -70,7 +70,7 @@ class Arguments(BankArguments):
     module of --import adds; DDPG by default."""
     preset: Literal["smoke", "quick", "desk", "paper"] | None = None
     """Size of the run, with its time on two cores: smoke (12 episodes of 2 seeds, every stage in 2
-    minutes), quick (1,800 episodes of 2 seeds, 20 minutes), the default; desk (6,000 episodes of 5
+    minutes), quick (1,800 episodes of 2 seeds, 15 minutes), the default; desk (6,000 episodes of 5
     seeds, two hours) or paper (20,000 episodes of 10 seeds, days)."""
     config: Path | None = None
     """YAML or JSON file of settings, named as in a run's config.json, or a run directory to repeat;

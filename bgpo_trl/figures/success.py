@@ -35,7 +35,7 @@ _Path = str | os.PathLike[str]
 
 
 def plot_success_curves(
-    eval_csv: str | os.PathLike[str] | Sequence[_Path] | Mapping[str, _Path],
+    eval_csv: _Path | Mapping[str, _Path],
     *,
     presented: Mapping[str, int] | None = None,
     random_success: Mapping[str, float] | None = None,
@@ -50,8 +50,8 @@ def plot_success_curves(
     (``ddof=0``), as in the paper.
 
     Args:
-        eval_csv: One or more ``eval.csv`` files, which may hold several algorithms and seeds; or
-            files of one run each, by legend name.
+        eval_csv: An ``eval.csv`` file, which may hold several algorithms and seeds; or files of one
+            run each, by legend name.
         presented: Training episode from which each task is presented, by task name, in the order of
             the panels. Starts after the first are marked with dashed lines.
         random_success: Success rate of a random policy by task, marked with dotted lines.
@@ -63,7 +63,7 @@ def plot_success_curves(
             not positive.
     """
     presented, random_success = presented or {}, random_success or {}
-    tests = _read_tests([eval_csv] if isinstance(eval_csv, str | os.PathLike) else eval_csv)
+    tests = _read_tests(eval_csv)
     tasks = [*presented, *sorted(set(tests["task"]) - set(presented))]
     last = int(tests["episode"].max()) if last is None else last
     window = max(1, round(last / 20)) if window is None else window
@@ -94,14 +94,14 @@ def plot_success_curves(
     return figure
 
 
-def _read_tests(paths: Sequence[_Path] | Mapping[str, _Path]) -> pd.DataFrame:
+def _read_tests(files: _Path | Mapping[str, _Path]) -> pd.DataFrame:
     """Return the test episodes in files; ``name`` is that of the file or of the algorithm."""
-    if not paths:
+    if not isinstance(files, Mapping):
+        table = read_tests(files)
+        return table.assign(name=table["algorithm"])
+    if not files:
         raise ValueError("there are no test episodes to plot: let the run evaluate first.")
-    if isinstance(paths, Mapping):
-        tables = [read_tests(path).assign(name=name) for name, path in paths.items()]
-    else:
-        tables = [table.assign(name=table["algorithm"]) for table in map(read_tests, paths)]
+    tables = [read_tests(path).assign(name=name) for name, path in files.items()]
     return pd.concat(tables, ignore_index=True)
 
 

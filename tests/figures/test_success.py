@@ -261,7 +261,7 @@ def test_lines_pass_through_the_means_and_dots_are_seeds():
 
 
 REFUSED = {
-    "no test episodes": lambda: plot_success_curves([]),
+    "no test episodes": lambda: plot_success_curves({}),
     "row and a column per task, not [2, 2]": lambda: plot_success_matrices({"one": FIRST}, "abc"),
     "not none": lambda: plot_success_matrices({}, "ab"),
     "success must be [seeds, 2] by": lambda: plot_success_bars({"seen": [[0.5]]}, "ab"),
