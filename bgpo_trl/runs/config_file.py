@@ -23,7 +23,7 @@ class Digests(NamedTuple):
 
     Attributes:
         encoders: That of its encoders; None if it used none.
-        bank: That of the demonstrations of its tasks; None in runs of an earlier version.
+        bank: That of the demonstrations of its tasks; None in files that are of no run.
     """
 
     encoders: str | None
@@ -69,7 +69,7 @@ def read_settings(path: Path) -> dict[str, Any]:
 def read_config(path: str | Path, defaults: RunConfig | None = None) -> tuple[RunConfig, Digests]:
     """Read the settings that `Trainer` wrote: the inverse of ``dataclasses.asdict``.
 
-    Settings missing from a run of an earlier version get their defaults.
+    Settings that the file lacks get their defaults.
 
     Args:
         path: The ``config.json`` of a run, or another file that `read_settings` reads.

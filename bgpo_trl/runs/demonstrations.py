@@ -90,10 +90,10 @@ def load_inputs(
     kept = directory / BANK
     path = kept if kept.exists() else bank_path(weights)
     bank = DemonstrationBank.load(path, encoder_id=encoders.identity).for_tasks(tasks)
-    if digests.bank not in (None, bank.identity):  # None: of an earlier version
+    if digests.bank != bank.identity:
         raise ValueError(
-            f"{directory} was trained with the demonstrations {digests.bank[:12]}, not with those "
-            f"in {path} ({bank.identity[:12]}): put its own at {kept}"
+            f"{directory} was trained with the demonstrations {str(digests.bank)[:12]}, not with "
+            f"those in {path} ({bank.identity[:12]}): put its own at {kept}"
         )
     return encoders, bank
 
