@@ -194,8 +194,8 @@ class MinimalBGPO:
                 if len(successes) % settings.test_every == 0:
                     recent = np.mean(successes[-settings.test_every :])
                     rates = self.test(len(successes) // settings.test_every - 1)
-                    print(f"episode {len(successes)}: {int(self.gwr.num_nodes)} nodes, success")
-                    print(f"    in training {recent:.2f}, in tests {rates}", flush=True)
+                    print(f"episode {len(successes)}: {int(self.gwr.num_nodes)} nodes", end=", ")
+                    print(f"success in training {recent:.2f}, in tests {rates}", flush=True)
 
     def inputs(self, latent: Tensor, behavior: Tensor) -> Tensor:
         """Return the input of actor and critic, z and b in place of the state (Eq. 8)."""
