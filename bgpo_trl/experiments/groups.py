@@ -38,8 +38,6 @@ class GroupsArguments(BankArguments):
     """Factor of distances in the activity of GWR-B."""
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
     """Seeds of the draws."""
-    scale: float = 1.0
-    """Factor of the embeddings, on which groups do not depend."""
 
 
 def draw(bank: DemonstrationBank, schedule: TaskSchedule, draws: int, seed: int) -> Iterator[int]:
@@ -110,8 +108,7 @@ def groups(arguments: GroupsArguments) -> str:
 
     check_draws(arguments.seeds, arguments.draws)
     bank, config = bank_of(arguments), BGPOConfig()
-    bank = replace(bank, embedding=arguments.scale * bank.embedding)
-    fine = replace(config.gwr, activity_scale=arguments.activity_scale / arguments.scale)
+    fine = replace(config.gwr, activity_scale=arguments.activity_scale)
     n_tasks, seen, held_out = len(bank.tasks), bank.seen(), bank.held_out()
     forward = even_starts(n_tasks, arguments.draws)
     schedules = {

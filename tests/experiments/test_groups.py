@@ -2,7 +2,6 @@
 
 import json
 
-import pytest
 import torch
 
 from bgpo_trl.data.bank import DemonstrationBank
@@ -38,9 +37,8 @@ def test_a_task_owns_a_group_if_most_of_both_are_in_common():
     assert groups.own_groups(torch.zeros(7, dtype=torch.int64), task) == {0}
 
 
-@pytest.mark.parametrize("scale", [1.0, 0.1])
-def test_the_shipped_tasks_form_six_pure_groups_in_every_schedule(scale):
-    table = groups.groups(groups.GroupsArguments(draws=900, seeds=(0,), scale=scale))
+def test_the_shipped_tasks_form_six_pure_groups_in_every_schedule():
+    table = groups.groups(groups.GroupsArguments(draws=900, seeds=(0,)))
     rows = cells(table)[1:]
     schedules = ["one after the other", "in reverse", "the newest only", "from the start"]
     assert [row[0] for row in rows] == schedules
