@@ -168,8 +168,8 @@ def plot(rows: list[dict[str, Any]]) -> Figure:
 
 def main(arguments: Arguments) -> None:
     """Measure the cost of GWR-B against its nodes; print and write the results."""
-    if not arguments.nodes or min(arguments.nodes) < 2:
-        raise ValueError(f"--nodes must be one or more, of at least 2, got {arguments.nodes}")
+    if len({*arguments.nodes}) < 2 or min(arguments.nodes) < 2:
+        raise ValueError(f"--nodes must be two sizes or more, of at least 2, got {arguments.nodes}")
     for name in ("features", "networks", "rounds"):
         if getattr(arguments, name) < 1:
             raise ValueError(f"--{name} must be at least 1, got {getattr(arguments, name)}")

@@ -118,6 +118,13 @@ def test_results_are_written_and_printed(tmp_path, capsys, monkeypatch):
     assert "exponent from 20 to 40 nodes" in printed
 
 
+@pytest.mark.parametrize("nodes", [(), (20,), (20, 20), (1, 20)])
+def test_an_exponent_needs_two_sizes(tmp_path, nodes):
+    with pytest.raises(ValueError, match="--nodes"):
+        gwr.main(gwr.Arguments(tmp_path / "out", nodes=nodes))
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize("power", [0.5, 1.0, 2.0])
 def test_exponent_of_a_power_law_is_its_power(power):
     rows = [{"nodes": n, "call": {"median": 3 * n**power}} for n in (10, 70, 900)]
