@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -57,6 +59,14 @@ def own_groups(group: Tensor, task: Tensor) -> set[int]:
     return {*(is_own & (counts.sum(0) > 0)).nonzero().flatten().tolist()}
 
 
+def sharing(group: Tensor, task: Tensor) -> set[tuple[int, int]]:
+    """Return the pairs of tasks of which one group holds more than a tenth each."""
+    counts = torch.zeros(int(group.max()) + 1, int(task.max()) + 1)
+    counts.index_put_((group, task), torch.tensor(1.0), accumulate=True)
+    held = counts / counts.sum(0).clamp(min=1) > 0.1
+    return {pair for row in held for pair in combinations(row.nonzero().flatten().tolist(), 2)}
+
+
 def form(
     bank: DemonstrationBank, rows: Sequence[int], config: BGPOConfig
 ) -> tuple[BehaviorGroups, dict[int, int], float]:
@@ -96,7 +106,8 @@ def groups(arguments: GroupsArguments) -> str:
     how many groups there are at the end; how pure they are on held-out demonstrations; how many
     different demonstrations of its own each task needed before it had a group (the most demanding
     task); how long grouping took; the nodes of GWR-B, and in how many held-out demonstrations it
-    infers the task.
+    infers the task. Below the table are the tasks that share a group (`sharing`, of held-out
+    demonstrations), with the number of networks in which they do.
 
     Raises:
         ValueError: If there is nothing to draw, or a bank or task does not exist.
@@ -120,11 +131,13 @@ def groups(arguments: GroupsArguments) -> str:
     table: Table = [
         ["order", "groups, by seed", "purity, %", "needed", "seconds", "nodes", "inferred, %"]
     ]
+    shared: Counter[tuple[int, int]] = Counter()
     for order, schedule in schedules.items():
         columns: list[list[str]] = []
         for seed in arguments.seeds:
             rows = [*draw(seen, schedule, arguments.draws, seed)]
             formed, needed, seconds = form(seen, rows, config)
+            shared.update(sharing(formed.lookup(held_out.embedding).group, held_out.task))
             (random,) = generators([seed], "gwr")
             gwr = GWRB(seen.embedding.shape[-1], fine, generator=random)
             for row in rows:
@@ -141,7 +154,12 @@ def groups(arguments: GroupsArguments) -> str:
                 ]
             )
         table.append([order, *(" ".join(column) for column in zip(*columns, strict=True))])
-    return markdown(table)
+    n_networks = len(schedules) * len(arguments.seeds)
+    lines = [
+        f"{bank.tasks[one]} and {bank.tasks[other]} share a group in {count} of {n_networks}."
+        for (one, other), count in shared.most_common()
+    ]
+    return "\n\n".join([markdown(table), *lines])
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ import json
 import torch
 
 from bgpo_trl.data.bank import DemonstrationBank
-from bgpo_trl.experiments import groups
+from bgpo_trl.experiments import groups, run
 from bgpo_trl.experiments.groups import (
     Detection,
     UnknownTaskArguments,
@@ -35,6 +35,21 @@ def test_a_task_owns_a_group_if_most_of_both_are_in_common():
     task = torch.tensor([0, 0, 0, 1, 1, 1, 2])
     assert groups.own_groups(torch.tensor([0, 0, 2, 0, 1, 1, 1]), task) == {0, 1}
     assert groups.own_groups(torch.zeros(7, dtype=torch.int64), task) == {0}
+
+
+def test_tasks_share_a_group_that_holds_more_than_a_tenth_of_each():
+    task = torch.tensor([0] * 10 + [1] * 5 + [2] * 10)
+    group = torch.tensor([0] * 10 + [0, 0, 1, 1, 1] + [1, *[2] * 9])
+    assert groups.sharing(group, task) == {(0, 1)}  # a tenth of task 2 is not more than a tenth
+    assert groups.sharing(torch.zeros_like(task), task) == {(0, 1), (0, 2), (1, 2)}
+    assert groups.sharing(task, task) == set()
+
+
+def test_the_command_names_the_tasks_that_share_a_group(monkeypatch):
+    bank = places((0.0, 0.0), (0.0, 0.0), (3.0, 0.0))
+    monkeypatch.setattr(run, "bank_of", lambda arguments: bank)
+    lines = groups.groups(groups.GroupsArguments(draws=200, seeds=(0,))).split("\n\n")
+    assert lines[1:] == ["task0 and task1 share a group in 4 of 4."]
 
 
 def test_the_shipped_tasks_form_six_pure_groups_in_every_schedule():
