@@ -159,7 +159,7 @@ def groups(arguments: GroupsArguments) -> str:
         f"{bank.tasks[one]} and {bank.tasks[other]} share a group in {count} of {n_networks}."
         for (one, other), count in shared.most_common()
     ]
-    return "\n\n".join([markdown(table), *lines])
+    return "\n".join([markdown(table), "", *lines]).rstrip()
 
 
 @dataclass(frozen=True)
