@@ -20,7 +20,7 @@ from bgpo_trl.data.dataset import load_demonstrations, read_meta
 from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.encoders.fitting import Log
 from bgpo_trl.encoders.make_bank import make_bank
-from bgpo_trl.encoders.pretrained import bank_path, default_weights
+from bgpo_trl.encoders.pretrained import bank_path
 from bgpo_trl.encoders.probes import probe
 from bgpo_trl.encoders.representation import (
     Representation,
@@ -59,7 +59,7 @@ class Arguments:
     module: Annotated[str | None, tyro.conf.arg(name="import")] = None
     """Module that adds the scene, imported first; here or installed."""
     weights: Path | None = None
-    """File to write; by default the pretrained weights of the scene for the dataset's tasks."""
+    """File to write, with the bank beside it; by default encoders.safetensors in the folder."""
     keep: Path | None = None
     """Encoders to keep: only their inverse model is trained anew, on play."""
     folder: Path = Path("runs/encoders")
@@ -221,7 +221,7 @@ def main(arguments: Arguments) -> None:
     train_encoders(
         dataset,
         play,
-        default_weights(meta["tasks"], scene=scene) if weights is None else weights,
+        arguments.folder / "encoders.safetensors" if weights is None else weights,
         arguments.folder,
         arguments.config,
         without_folders(line),

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from bgpo_trl.data.dataset import load_demonstrations
-from bgpo_trl.encoders import pretrained
+from bgpo_trl.encoders import pretrained, train
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.encoders.representation import load_representation, save_representation
 from bgpo_trl.encoders.train import make_pretrained
@@ -67,6 +67,15 @@ def test_made_encoders_and_bank_are_loaded(made, folder):
         assert json.loads((folder / recorded / "dataset.json").read_text())["tasks"] == [*REVERSED]
     for name in ("embedding", "task", "train"):
         assert getattr(loaded_bank, name).equal(getattr(bank, name))
+
+
+def test_the_command_does_not_overwrite_shipped_weights_unasked(made, folder, monkeypatch):
+    written = []
+    monkeypatch.setattr(train, "train_encoders", lambda *given, **named: written.append(given[2]))
+    asked = train.Arguments(folder / "demonstrations", folder=folder / "own")
+    train.main(asked)
+    train.main(replace(asked, weights=folder / "mine.safetensors"))
+    assert written == [folder / "own" / "encoders.safetensors", folder / "mine.safetensors"]
 
 
 def test_the_same_command_records_and_trains_nothing_again(made, folder, monkeypatch):
