@@ -540,7 +540,7 @@ def test_only_fine_tuning_and_ewc_are_given_boundaries(begin, make_config, tmp_p
     for name in ALGORITHMS:
         with begin(tmp_path / name, make_config(name=name)) as trainer:
             given |= {name} if trainer.algorithm.needs_boundaries else set()
-    assert given == {"fine-tuning", "ewc"}
+    assert given == {"fine-tuning", "fine-tuning-demonstrations", "ewc"}
 
 
 @pytest.mark.parametrize("before", [0, 1])
