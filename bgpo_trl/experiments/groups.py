@@ -52,8 +52,7 @@ def draw(bank: DemonstrationBank, schedule: TaskSchedule, draws: int, seed: int)
 
 def own_groups(group: Tensor, task: Tensor) -> set[int]:
     """Return the tasks most of whose demonstrations are in a group that holds mostly theirs."""
-    counts = torch.zeros(int(group.max()) + 1, int(task.max()) + 1)
-    counts.index_put_((group, task), torch.tensor(1.0), accumulate=True)
+    counts = _counts(group, task)
     largest = counts.argmax(0)
     is_own = counts[largest].argmax(-1) == torch.arange(len(largest))
     return {*(is_own & (counts.sum(0) > 0)).nonzero().flatten().tolist()}
@@ -61,10 +60,15 @@ def own_groups(group: Tensor, task: Tensor) -> set[int]:
 
 def sharing(group: Tensor, task: Tensor) -> set[tuple[int, int]]:
     """Return the pairs of tasks of which one group holds more than a tenth each."""
-    counts = torch.zeros(int(group.max()) + 1, int(task.max()) + 1)
-    counts.index_put_((group, task), torch.tensor(1.0), accumulate=True)
+    counts = _counts(group, task)
     held = counts / counts.sum(0).clamp(min=1) > 0.1
     return {pair for row in held for pair in combinations(row.nonzero().flatten().tolist(), 2)}
+
+
+def _counts(group: Tensor, task: Tensor) -> Tensor:
+    """Return the number of demonstrations by group and task, ``[G, T]``."""
+    counts = torch.zeros(int(group.max()) + 1, int(task.max()) + 1)
+    return counts.index_put_((group, task), torch.tensor(1.0), accumulate=True)
 
 
 def form(

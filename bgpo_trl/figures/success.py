@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pandas as pd
@@ -32,6 +32,7 @@ _GRID_POINTS = 400
 _OVERALL = "All presented tasks"
 
 _Path = str | os.PathLike[str]
+_Key = TypeVar("_Key", str, float)
 
 
 def plot_success_curves(
@@ -259,10 +260,7 @@ def plot_success_bars(success: Mapping[str, ArrayLike], tasks: Sequence[str]) ->
     Raises:
         ValueError: If there are no conditions, or one has not a column per task.
     """
-    found = {name: np.asarray(scores, float) for name, scores in success.items()}
-    if not found or any(s.ndim != 2 or s.shape[1] != len(tasks) for s in found.values()):
-        shapes = [list(scores.shape) for scores in found.values()]
-        raise ValueError(f"success must be [seeds, {len(tasks)}] by condition, got {shapes}")
+    found = _checked(success, tasks)
     width = max(3.6, 1.0 + 0.28 * len(tasks) * len(found))  # inches
     figure = Figure(figsize=(width, 3.2), layout="constrained")
     axes = figure.add_subplot()
@@ -289,12 +287,8 @@ def plot_success_bars(success: Mapping[str, ArrayLike], tasks: Sequence[str]) ->
             )
     names = [readable(task).replace(" to ", "\nto ") for task in tasks]
     axes.set_xticks(range(len(tasks)), names)
-    axes.set_ylim(0, 1.02)
-    axes.set_ylabel("Success rate", fontsize=9)
-    axes.yaxis.set_major_formatter(PercentFormatter(1, decimals=0))
-    style_axes(axes)
+    _finish(figure, axes)
     axes.grid(visible=False, axis="x")
-    add_legend(figure, *axes.get_legend_handles_labels(), width)
     return figure
 
 
@@ -311,12 +305,9 @@ def plot_success_by(
         label: Name of the number.
 
     Raises:
-        ValueError: If there is no number, or one has not a column per task.
+        ValueError: If there are no numbers, or one has not a column per task.
     """
-    found = {number: np.asarray(scores, float) for number, scores in sorted(success.items())}
-    if not found or any(s.ndim != 2 or s.shape[1] != len(tasks) for s in found.values()):
-        shapes = [list(scores.shape) for scores in found.values()]
-        raise ValueError(f"success must be [seeds, {len(tasks)}] by number, got {shapes}")
+    found = _checked(dict(sorted(success.items())), tasks)
     figure = Figure(figsize=(4.2, 3.2), layout="constrained")
     axes = figure.add_subplot()
     for index, task in enumerate(tasks):
@@ -332,9 +323,23 @@ def plot_success_by(
             axes.scatter(numbers, scores[:, index], s=8, alpha=0.5, clip_on=False, **style)
     axes.set_xticks([*found])
     axes.set_xlabel(label, fontsize=9)
+    _finish(figure, axes)
+    return figure
+
+
+def _checked(success: Mapping[_Key, ArrayLike], tasks: Sequence[str]) -> dict[_Key, NDArray]:
+    """Return success by condition as arrays; raise ``ValueError`` if one is not ``[S, T]``."""
+    found = {key: np.asarray(scores, float) for key, scores in success.items()}
+    if not found or any(s.ndim != 2 or s.shape[1] != len(tasks) for s in found.values()):
+        shapes = [list(scores.shape) for scores in found.values()]
+        raise ValueError(f"success must be [seeds, {len(tasks)}] by condition, got {shapes}")
+    return found
+
+
+def _finish(figure: Figure, axes: Axes) -> None:
+    """Give axes of success their scale, and the figure its legend."""
     axes.set_ylim(0, 1.02)
     axes.set_ylabel("Success rate", fontsize=9)
     axes.yaxis.set_major_formatter(PercentFormatter(1, decimals=0))
     style_axes(axes)
-    add_legend(figure, *axes.get_legend_handles_labels(), 4.2)
-    return figure
+    add_legend(figure, *axes.get_legend_handles_labels(), figure.get_figwidth())

@@ -265,7 +265,7 @@ REFUSED = {
     "row and a column per task, not [2, 2]": lambda: plot_success_matrices({"one": FIRST}, "abc"),
     "not none": lambda: plot_success_matrices({}, "ab"),
     "success must be [seeds, 2] by": lambda: plot_success_bars({"seen": [[0.5]]}, "ab"),
-    "success must be [seeds, 2] by number": lambda: plot_success_by({}, "ab", label="x"),
+    "success must be [seeds, 2] by condition, got []": lambda: plot_success_by({}, "ab", label="x"),
     "nothing to show": lambda: plot_frame_strips({"none": np.zeros((0, 2, 2, 3), np.uint8)}),
     "uint8 [T, H, W, 3]": lambda: save_gif(np.zeros((1, 2, 3, 3)), "none.gif"),
     "N, d >= 2, not [1, 4]": lambda: plot_gwr_pca(np.zeros((1, 4)), [0], "ab"),

@@ -1,4 +1,4 @@
-"""What results tell of the code and the command that made them."""
+"""The commit and the command that are stored with results."""
 
 import shlex
 import sys

@@ -1,6 +1,6 @@
 """Rules that every task of the suite keeps, after ``dm_control.suite.tests.suite_test``.
 
-What the base class does in the same way for every task is tested with one task only.
+One task alone is tested for behavior that the base class gives to every task.
 """
 
 import itertools
