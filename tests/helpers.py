@@ -22,6 +22,19 @@ from bgpo_trl.configs import (
     VAEConfig,
 )
 
+DISTINCT = (
+    "bgpo",
+    "bgpo-single",
+    "group-balanced-replay",
+    "maml-demonstrations",
+    "dist-nll-demonstrations",
+    "oracle-demonstrations",
+    "ddpg",
+    "fine-tuning-demonstrations",
+    "ewc",
+)
+"""An algorithm of each kind: others differ in values of settings, or in less to store and learn."""
+
 TINY_ENCODERS = RepresentationConfig(
     vae=VAEConfig(batch_size=4, window=2, steps=4, warmup_steps=1),
     lae=SequenceAutoencoderConfig(batch_size=4, steps=4, warmup_steps=1),

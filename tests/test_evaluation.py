@@ -8,7 +8,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from bgpo_trl.algorithms import ALGORITHMS, entry
+from bgpo_trl.algorithms import entry
 from bgpo_trl.algorithms.algorithm import Policy
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.evaluation import Evaluator, evaluate_random_policy
@@ -18,15 +18,14 @@ from bgpo_trl.seeding import stream_seed
 from bgpo_trl.transforms import TaskSchedule
 from suites import nico
 from tests.algorithms.playing import assert_same
+from tests.helpers import DISTINCT
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 SEEDS = (3, 8)
 EPISODES = 2
 # Until there is data of most tasks, where each has its own.
 STEPS = {"maml": 50, "dist-nll": 80}  # and those named after them
-every_algorithm = pytest.mark.parametrize(
-    "name", [name for name in ALGORITHMS if not name.startswith("without-")]
-)
+every_kind = pytest.mark.parametrize("name", DISTINCT)
 
 
 @pytest.fixture
@@ -213,7 +212,7 @@ def test_the_context_of_the_oracle_is_the_label_and_others_have_none(make):
         assert all(s.policy.context is None for s in take(evaluator, algorithm))
 
 
-@every_algorithm
+@every_kind
 def test_testing_leaves_no_trace_in_training(make, name):
     algorithm, evaluator = make(name=name)
     before, chance = copy.deepcopy(algorithm.state_dict()), torch.random.get_rng_state()
@@ -223,7 +222,7 @@ def test_testing_leaves_no_trace_in_training(make, name):
     assert torch.random.get_rng_state().equal(chance)
 
 
-@every_algorithm
+@every_kind
 def test_a_snapshot_does_not_change_with_further_training(make, name):
     algorithm, evaluator = make(name=name)
     snapshots = take(evaluator, algorithm)
@@ -247,7 +246,7 @@ def test_a_snapshot_does_not_change_with_further_training(make, name):
     assert not later.steps.equal(before.steps)
 
 
-@every_algorithm
+@every_kind
 def test_an_evaluation_depends_on_seed_and_number_alone(make, name):
     algorithm, evaluator = make(name=name)
     turn(algorithm)

@@ -14,7 +14,6 @@ import pytest
 import torch
 
 import bgpo_trl
-from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.algorithm import Policy
 from bgpo_trl.configs import RepresentationConfig
 from bgpo_trl.data.bank import DemonstrationBank
@@ -22,18 +21,18 @@ from bgpo_trl.encoders.pretrained import bank_path
 from bgpo_trl.encoders.representation import save_representation
 from bgpo_trl.training import Trainer
 from suites import nico
-from tests.helpers import contents, edit
+from tests.helpers import DISTINCT, contents, edit
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 ROOT = Path(__file__).parents[1]
 TASKS = nico.PAPER_TASKS
-NAMES = [name for name in ALGORITHMS if name not in ("without-bonus", "without-both")]
+NAMES = [*DISTINCT, "without-gwr"]
 LABELED = [name for name in NAMES if name.startswith(("maml", "dist-nll", "oracle"))]
 METADATA = {
     "scene_version": nico.scene_version(),
     "config": json.dumps(asdict(RepresentationConfig())),
 }
-every_algorithm = pytest.mark.parametrize("name", NAMES)
+every_kind = pytest.mark.parametrize("name", NAMES)
 
 
 def noise(seed, length):
@@ -97,7 +96,7 @@ def load(trainer_of):
     return load
 
 
-@every_algorithm
+@every_kind
 def test_actions_equal_those_of_a_snapshot_bit_for_bit(trainer_of, load, encoders, name):
     algorithm, policy = trainer_of(name).algorithm, load(name, seed=8)
     task = torch.arange(3)[:, None]
@@ -133,7 +132,9 @@ def test_recognition_of_demonstrations_of_any_length(trainer_of, load, encoders,
     assert policy.act(frames[-1]).shape == (4,)
 
 
-@pytest.mark.parametrize("name", ["bgpo", "bgpo-single", "maml", "dist-nll"])
+@pytest.mark.parametrize(
+    "name", ["bgpo", "bgpo-single", "maml-demonstrations", "dist-nll-demonstrations"]
+)
 def test_a_pickled_policy_acts_as_before_and_can_be_conditioned_anew(load, name):
     policy, (frame, *_) = load(name), noise(5, 1)
     unconditioned = pickle.loads(pickle.dumps(policy))
@@ -150,7 +151,7 @@ def test_a_pickled_policy_acts_as_before_and_can_be_conditioned_anew(load, name)
         )
 
 
-@every_algorithm
+@every_kind
 def test_only_algorithms_that_do_not_infer_the_task_need_its_label(load, name):
     policy = load(name)
     if name not in LABELED:
@@ -163,7 +164,7 @@ def test_only_algorithms_that_do_not_infer_the_task_need_its_label(load, name):
     assert (seen.task, seen.node) == (TASKS[1], None)
 
 
-@every_algorithm
+@every_kind
 def test_the_replay_is_loaded_only_for_policies_that_adapt(trainer_of, load, name):
     held = len(trainer_of(name).algorithm.replay)
     assert len(load(name).algorithm.replay) == (held if "maml" in name else 0)

@@ -20,15 +20,14 @@ from bgpo_trl.scenes.nico import NicoEnv
 from bgpo_trl.training import Trainer
 from tests.algorithms.playing import assert_same
 from tests.conftest import of_name
-from tests.helpers import Recorder, contents, rows
+from tests.helpers import DISTINCT, Recorder, contents, rows
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 CSV_FILES = ("train.csv", "eval.csv")
 TASKS = ("grasp_glass", "push_green_to_glass", "push_green_to_white")
 ROUNDED = ("intrinsic_return", "loss_actor", "loss_value")
-NAMES = [name for name in ALGORITHMS if not name.startswith("without-")]
-every_algorithm = pytest.mark.parametrize("name", NAMES)
-every_learner = pytest.mark.parametrize("name", [*NAMES, "bgpo+td3", "bgpo+sac"])
+every_kind = pytest.mark.parametrize("name", DISTINCT)
+every_learner = pytest.mark.parametrize("name", [*DISTINCT, "bgpo+td3", "bgpo+sac"])
 # Algorithms that need data of each task begin to learn later.
 LONGER = {"maml": {"episodes": 16}, "dist-nll": {"episodes": 16}}
 
@@ -76,7 +75,7 @@ def at_step(trainer, n, do):
     trainer.algorithm.store = store_or_not
 
 
-@every_algorithm
+@every_kind
 def test_every_seed_plays_every_episode_once(run_of, make_config, name):
     config = make_config(name=name, **of_name(LONGER, name))
     train = rows(run_of(name) / "train.csv")
@@ -312,7 +311,7 @@ def test_a_run_interrupted_several_times_is_the_same(run_of, begin, make_config,
     assert saved["env_steps"] == sum(steps)
     assert any(saved["evaluator"]["waiting"])  # snapshots of one seed, for an evaluation of both
     assert saved["algorithm"]["learner"]["optimizer"]["state"]  # it has begun to learn
-    if name == "dist-nll":
+    if name.startswith("dist-nll"):
         assert all(saved["algorithm"]["tasks"])
         assert saved["algorithm"]["ended"].any()  # the next update is to distill
     begin(tmp_path, config, resume=True).run()
@@ -522,7 +521,7 @@ def test_tasks_begin_for_each_seed_before_they_are_played(
     assert max(steps) < 20
 
 
-@pytest.mark.parametrize("name", ["bgpo", "maml", "dist-nll", "ewc"])
+@pytest.mark.parametrize("name", ["bgpo", "maml-demonstrations", "dist-nll-demonstrations", "ewc"])
 def test_only_algorithms_that_need_boundaries_depend_on_them(
     run_of, begin, make_config, tmp_path, monkeypatch, name
 ):

@@ -14,10 +14,10 @@ import numpy as np
 
 from suites.nico import kinematics, moves
 from suites.nico.base import NicoTask
-from suites.nico.physics import OBJECT_HALF_HEIGHT, TABLE_HEIGHT, Physics
+from suites.nico.physics import OBJECT_HALF_HEIGHT, OBJECTS, TABLE_HEIGHT, Physics
 
 LIFTED: Final = 0.015  # (m) above the table
-DISPLACED: Final = 0.05  # (m) along the arc
+DISPLACED: Final = 0.05  # (m)
 FIST: Final = 0.6  # (rad) mean curl beyond which the hand is a fist
 
 
@@ -86,7 +86,8 @@ class PushTogether(NicoTask):
 class PushAside(NicoTask):
     """Success: an object stands more than 5 cm to one side of where it started, for two steps.
 
-    The displacement is measured along the arc about the shoulder's yaw axis.
+    The displacement is measured along the arc about the shoulder's yaw axis. The other objects are
+    within 5 cm of where they started: an arm that sweeps the table clear has not pushed one aside.
     """
 
     thing: ClassVar[str]
@@ -94,16 +95,25 @@ class PushAside(NicoTask):
     steady_steps = 2
 
     def succeeded(self, physics: Physics) -> bool:
-        """Return whether the object is far enough to the side and stands upright now."""
+        """Return whether the object, and no other, has moved far, to the side, and stands now."""
         radius, angle = kinematics.to_polar(physics.object_position(self.thing))
         before = kinematics.to_polar(physics.start_position(self.thing))[1]
         left = radius * (angle - before)
         moved = left if self.side == "left" else -left
-        return bool(moved > DISPLACED) and physics.stands(self.thing)
+        if moved <= DISPLACED or not physics.stands(self.thing):
+            return False
+        others = (name for name in OBJECTS if name != self.thing)
+        return all(_displacement(physics, name) <= DISPLACED for name in others)
 
     def demonstration(self, physics: Physics, random: np.random.Generator) -> Sequence[moves.Phase]:
         """Return a push of the object to the side."""
         return moves.push_aside(physics, random, self.thing, -1 if self.side == "left" else 1)
+
+
+def _displacement(physics: Physics, name: str) -> float:
+    """Return how far an object is from where it started (m), also if that is off the table."""
+    moved = physics.object_position(name) - physics.start_position(name)
+    return float(np.linalg.norm(moved))
 
 
 class GraspGlass(Grasp):

@@ -166,6 +166,17 @@ def test_an_object_pushed_aside_must_stand_upright_on_the_table(physics, task, n
     assert not succeeded(task, physics)
 
 
+@pytest.mark.parametrize(("aside", "counts"), [(0.049, True), (0.051, False)])
+@pytest.mark.parametrize("other", ["green_box", "white_box"])
+def test_a_push_aside_leaves_the_other_objects_where_they_stood(physics, other, aside, counts):
+    places = {"glass": (0.42, 0.1), "green_box": (0.42, -0.1), "white_box": (0.42, -0.25)}
+    place(physics, places)
+    move(physics, "glass", (0.42, 0.03))
+    x, y = places[other]
+    move(physics, other, (x + aside, y))
+    assert succeeded("push_glass_right", physics) is counts
+
+
 @pytest.mark.parametrize(
     ("height", "closing", "lifted"), [(0.039, 0.1, False), (0.041, 0.1, True), (0.041, 0.0, False)]
 )
