@@ -57,7 +57,8 @@ ALGORITHMS: dict[str, Entry] = {
     "bgpo-single": Entry(BGPO, _SINGLE),
     "bgpo-paper": Entry(BGPO, replace(_SINGLE, **_PUBLISHED)),
     "maml": Entry(MAML, MAMLConfig()),
-    "maml-demonstrations": Entry(MAML, MAMLConfig(**_SHOWN_TASKS)),
+    # The gradient of the adaptation is larger by the weight of imitation.
+    "maml-demonstrations": Entry(MAML, MAMLConfig(inner_learning_rate=0.02, **_SHOWN_TASKS)),
     "maml-paper": Entry(MAML, MAMLConfig(rl=_PAPER, task_batch_size=256, adaptation_size=256 * 50)),
     "dist-nll": Entry(DistNLL, DistNLLConfig()),
     "dist-nll-demonstrations": Entry(DistNLL, DistNLLConfig(**_SHOWN_TASKS)),

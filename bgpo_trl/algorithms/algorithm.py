@@ -244,19 +244,26 @@ class Algorithm(ABC):
             noise=self.config.demonstration_noise,
         )
 
-    def sample(self, groups: Callable[[int], Tensor], n_rows: int) -> TensorDictBase:
-        """Draw transitions ``[S, E, B]`` for an update, a share of demonstrated ones last.
+    def sample(
+        self,
+        groups: Callable[[int], Tensor],
+        n_rows: int,
+        generator: Sequence[torch.Generator] | None = None,
+    ) -> TensorDictBase:
+        """Draw transitions ``[S, E, B]`` to learn from, a share of demonstrated ones last.
 
         Args:
             groups: Returns the group of each of ``n`` transitions, int64 ``[S, E, n]``, given
                 ``n``; -1 for none.
             n_rows: Number of transitions ``B``.
+            generator: Random generators of the seeds, in place of the replays'.
         """
         if self.shown is None:
-            return self.replay.sample(groups(n_rows))
+            return self.replay.sample(groups(n_rows), generator=generator)
         n_shown = round(self.config.demonstration_share * n_rows)
         played_group, shown_group = groups(n_rows - n_shown), groups(n_shown)
-        played, shown = self.replay.draw(played_group), self.shown.draw(shown_group)
+        played = self.replay.draw(played_group, generator=generator)
+        shown = self.shown.draw(shown_group, generator)
         played["demonstrated"] = torch.zeros_like(played_group, dtype=torch.bool)
         batch = {key: torch.cat([entry, shown[key]], 2) for key, entry in played.items()}
         return TensorDict(batch, batch["demonstrated"].shape)

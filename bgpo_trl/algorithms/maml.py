@@ -27,7 +27,8 @@ class MAML(TaskAlgorithm):
        the tasks' critics on other transitions, and improves the original policy (`MAMLLoss`). Tasks
        with too few transitions are left out.
     3. Test episodes of a task are played by the policy after one gradient step on
-       ``adaptation_size`` transitions of that task.
+       ``adaptation_size`` transitions of that task, of which as many are demonstrated as in an
+       update.
 
     Attributes:
         meta_actor: The policy before adaptation, stacked ``[S]``.
@@ -87,8 +88,11 @@ class MAML(TaskAlgorithm):
         if (tasks >= 0).any():
             draw = int(torch.randint(2**63 - 1, (), generator=generator))
             streams = [torch.Generator().manual_seed(draw) for _ in range(self.n_seeds)]
-            rows = tasks.unsqueeze(-1).expand(-1, -1, self.config.adaptation_size)
-            data = self.replay.sample(rows, generator=streams)
+            data = self.sample(
+                lambda n: tasks.unsqueeze(-1).expand(-1, -1, n),
+                self.config.adaptation_size,
+                streams,
+            )
             adapted = self.loss.adapt(self.to_device(data))
         parameters = {
             key: value[index].detach().to("cpu", copy=True) for key, value in adapted.items()

@@ -97,21 +97,29 @@ class DemonstrationReplay:
         """
         return TensorDict(self.draw(group), group.shape)
 
-    def draw(self, group: Tensor) -> dict[NestedKey, Tensor]:
-        """Return the entries of `sample` by key, without a TensorDict."""
-        shown, steps = self._shown.draw(group), self._steps
-        share = draw_for_rows(torch.rand, group, self._generators, dtype=torch.float64)
-        number = shown["demo_index"]
-        constants = (
-            shown if self._own_constants else self._shown.draw(group, keys=[*self._constant_keys])
-        )
+    def draw(
+        self, group: Tensor, generator: Sequence[torch.Generator] | None = None
+    ) -> dict[NestedKey, Tensor]:
+        """Return the entries of `sample` by key, without a TensorDict.
+
+        Args:
+            group: Group of each row, int64 ``[S, *R]``.
+            generator: Random generators of the seeds, in place of the replay's.
+        """
+        sources = self._generators if generator is None else generator
+        shown, steps = self._shown.draw(group, generator=sources), self._steps
+        share = draw_for_rows(torch.rand, group, sources, dtype=torch.float64)
+        number, constants = shown["demo_index"], shown
+        if not self._own_constants:
+            keys = [*self._constant_keys]
+            constants = self._shown.draw(group, generator=sources, keys=keys)
         n_steps = steps.length[number] - 1
         step = (share * n_steps).long()
         frame = steps.first[number] + step
         ends = (step == n_steps - 1).unsqueeze(-1)
         state = steps.latents(frame)
         if self._noise:
-            noise = draw_for_rows(torch.randn, group, self._generators, state.shape[-1])
+            noise = draw_for_rows(torch.randn, group, sources, state.shape[-1])
             state += noise.mul_(self._noise)
         return {
             self._state_key: state,
