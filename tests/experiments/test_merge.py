@@ -15,10 +15,11 @@ from bgpo_trl.experiments.merge import MergeArguments, merge
 from bgpo_trl.experiments.paper import continual
 from bgpo_trl.experiments.ray_jobs import Job, _episodes, _planned_episodes
 from bgpo_trl.runs.config_file import read_config
-from tests.analysis.runs import edit
-from tests.helpers import contents, rows
+from tests.helpers import contents, edit, rows
 
 ROOT = Path(__file__).parents[2]
+
+pytestmark = pytest.mark.usefixtures("easy_world")
 
 
 def train(out, *seeds):

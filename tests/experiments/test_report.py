@@ -1,8 +1,5 @@
 """Reports and comparisons of runs with success written by hand."""
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -13,8 +10,8 @@ from bgpo_trl.analysis.scores import forward_transfer, since_best_unchanged
 from bgpo_trl.analysis.tables import success_table
 from bgpo_trl.experiments.report import ReportArguments, report
 from bgpo_trl.runs.cost import Cost, write_costs
-from tests.analysis.runs import TASKS, edit, make_run, write_run, write_training
-from tests.helpers import cells, contents
+from tests.analysis.runs import TASKS, make_run, write_run, write_training
+from tests.helpers import cells, contents, edit
 
 STARTS = (0, 14, 26)
 IN_SEQUENCE, FROM_START = "3 tasks, one after the other", "3 tasks, all from the start"
@@ -156,40 +153,24 @@ def test_figures_are_beside_the_tables_and_the_report_on_an_archive_is_the_same(
 
 
 @pytest.mark.parametrize(
-    ("tasks", "title"),
-    [(("juggle",), "1 task, all from the start"), ("abcdefgh", "8 tasks, one after the other")],
+    ("tasks", "seeds", "title", "mean"),
+    [
+        (("juggle",), 1, "1 task, all from the start", "90.0"),  # a single seed has no interval
+        ("abcdefgh", 3, "8 tasks, one after the other", "90.0 [90, 90]"),
+    ],
 )
-def test_any_number_of_tasks_is_reported(tasks, title, tmp_path):
+def test_any_number_of_tasks_and_seeds_is_reported(tasks, seeds, title, mean, tmp_path):
+    starts = range(0, 32, 32 // len(tasks))
     for name, level in {"mine": 9, "bgpo": 2}.items():
-        write_run(tmp_path, name, level, tasks=tasks, starts=range(0, 32, 32 // len(tasks)))
+        write_run(tmp_path, name, [level] * seeds, tasks=tasks, starts=starts)
     report(ReportArguments((tmp_path,)))
     assert "nan" not in text_of(tmp_path)
-    found = table_of(tmp_path, title)
-    assert found["mine"][1:3] == ["3", "90.0 [90, 90]"]
-    assert found["mine"][4 : 4 + len(tasks)] == ["90.0"] * len(tasks)
-    assert found["BGPO"][2] == "20.0 [20, 20]"
-
-
-def test_a_single_seed_has_no_interval(tmp_path):
-    for name, level in {"bgpo": [9], "oracle": [2]}.items():
-        write_run(tmp_path, name, level)
-    report(ReportArguments((tmp_path,)))
-    assert table_of(tmp_path, FROM_START)["BGPO"][1:3] == ["1", "90.0"]
-    (row,) = table_of(tmp_path, f"Differences: {FROM_START}").values()
-    assert row[:4] == ["+70.0", "not decided", "-", "-"]
-    assert "nan" not in text_of(tmp_path)
-
-
-def test_a_run_that_is_read_only_is_reported_elsewhere(tmp_path, monkeypatch):
-    run = write_run(tmp_path, "bgpo", 9, starts=STARTS)
-    before = contents(run)
-    # For root, permissions would not make it so.
-    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != run)
-    with pytest.raises(PermissionError, match=r"read-only.*--out"):
-        report(ReportArguments((run,)))
-    report(ReportArguments((run,), out=tmp_path / "report"))
-    assert "## BGPO: " in text_of(tmp_path / "report")
-    assert contents(run) == before
+    found = table_of(tmp_path, title)["mine"]
+    assert found[1:3] == [str(seeds), mean]
+    assert found[4 : 4 + len(tasks)] == ["90.0"] * len(tasks)
+    if seeds == 1:
+        (row,) = table_of(tmp_path, f"Differences: {title}").values()
+        assert row[:4] == ["-70.0", "not decided", "-", "-"]
 
 
 def test_notes_say_what_is_left_out_without_the_folders_of_this_machine(tmp_path):

@@ -87,12 +87,18 @@ def test_jobs_carry_tasks_module_and_bank(tmp_path, monkeypatch):
     ((job,),) = sweep.make_jobs(arguments).values()
     assert (job.config.tasks, job.config.task_starts) == (tasks, (0, 3_000))
     events = []
+
+    def run_experiment(arguments, *_):
+        events.append((arguments.bank, arguments.resume))
+        arguments.out.mkdir(parents=True, exist_ok=True)
+        (arguments.out / "config.json").touch()
+
     monkeypatch.setattr(sweep, "import_plugin", events.append)
-    monkeypatch.setattr(
-        experiment, "run_experiment", lambda arguments, *_: events.append(arguments.bank)
-    )
-    sweep.play(job)
-    assert events == ["my_tasks", tmp_path / bank]
+    monkeypatch.setattr(experiment, "run_experiment", run_experiment)
+    for _ in range(2):
+        sweep.play(job)
+    path = tmp_path / bank
+    assert events == ["my_tasks", (path, False), "my_tasks", (path, True)]
 
 
 def test_the_benchmark_of_eight_tasks_is_a_grid_with_tests_every_50_episodes(monkeypatch):
