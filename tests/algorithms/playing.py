@@ -25,16 +25,22 @@ CHANGES = {"group-balanced replay": GROUPS, "experts": GROUPS, "all": GROUPS}
 SCHEDULE = TaskSchedule((0, 2, 4))
 
 
-def make_batch(*shape, seed=0):
+def make_batch(*shape, n_state=6, seed=0):
     """Transitions of noise, of which a fifth succeed."""
     generator = torch.Generator().manual_seed(seed)
-    terminated = torch.rand(*shape, 1, generator=generator) < 0.2
-    following = {"state": torch.randn(*shape, 6, generator=generator), "terminated": terminated}
-    following["reward"] = terminated.float()
-    data = {"state": torch.randn(*shape, 6, generator=generator), "next": following}
-    data["label"] = torch.randn(*shape, 2, generator=generator)
-    data["action"] = torch.rand(*shape, 4, generator=generator) * 2 - 1
-    return TensorDict(data, shape)
+
+    def draw(size):
+        return torch.randn(*shape, size, generator=generator)
+
+    ended = torch.rand(*shape, 1, generator=generator) < 0.2
+    following = {
+        "state": draw(n_state),
+        "terminated": ended,
+        "done": ended,
+        "reward": ended.float(),
+    }
+    data = {"state": draw(n_state), "label": draw(2), "action": draw(4).clamp(-1, 1)}
+    return TensorDict({**data, "next": following}, shape)
 
 
 def play(algorithm, n_steps, state=None, hidden=(), watch=lambda chosen: None):

@@ -8,10 +8,9 @@ import pytest
 import torch
 from torchrl.envs import check_env_specs
 
-from bgpo_trl.algorithms import ABLATIONS, ALGORITHMS
+from bgpo_trl.algorithms import ABLATIONS
 from bgpo_trl.algorithms.algorithm import Policy
 from bgpo_trl.algorithms.bgpo import BGPO
-from bgpo_trl.configs import DDPGConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.transforms import BehaviorLookup, GroupLookup, TaskSchedule
 from tests.algorithms.playing import (
@@ -237,20 +236,3 @@ def test_the_four_variants_of_the_paper_differ_by_transforms_only(make_config, m
         parts["world"] = algorithm.world.state_dict()
         first = first or parts
         assert_same(parts, first)
-
-
-def test_the_variants_beyond_the_paper_add_one_thing_at_a_time():
-    published = ALGORITHMS["bgpo-single"].config
-    assert not (
-        published.experts or published.group_balanced_replay or published.demonstration_share
-    )
-    slow = DDPGConfig(noise=0.1, update_every=4)
-    alone = {"demonstration_share": 0.75, "rl": replace(slow, batch_size=384)}
-    shown = {**alone, "rl": slow, "expert_batch_size": 128}
-    for variant, added in {
-        "group-balanced-replay": {"group_balanced_replay": True},
-        "bgpo-experts": {"group_balanced_replay": True, "experts": True},
-        "demonstrations": alone,
-        "bgpo": {"group_balanced_replay": True, "experts": True, **shown},
-    }.items():
-        assert ALGORITHMS[variant].config == replace(published, **added)

@@ -15,6 +15,7 @@ from bgpo_trl.transforms import TaskSchedule
 from tests.algorithms.playing import (
     SCHEDULE,
     assert_same,
+    make_batch,
     perceptron,
     play,
     snapshot,
@@ -40,33 +41,17 @@ def teachers_action(algorithm, seed, task, state):
 
 def test_a_teacher_learns_from_the_transitions_of_its_own_task_only(make):
     """All that happens in task 1 is changed in one of two runs."""
-    generator = torch.Generator().manual_seed(0)
-
-    def draw(*size):
-        return torch.rand(2, *size, generator=generator) * 2 - 1
-
     first, second = make(), make()
     for step in range(40):
-        transition = {
-            "state": draw(SIZE),
-            "action": draw(4),
-            "task": torch.tensor([step % 3, step % 2]),
-            "next": {
-                "state": draw(SIZE),
-                "reward": draw(1),
-                "terminated": draw(1) > 0,
-                "done": torch.zeros(2, 1, dtype=torch.bool),
-            },
-        }
-        transition = TensorDict(transition, [2])
-        first.update()
-        second.update()
-        first.store(transition)
-        others = transition["task"].unsqueeze(-1) != 1
+        transition = make_batch(2, n_state=SIZE, seed=step)
+        transition["task"] = torch.tensor([step % 3, step % 2])
         changed = transition.clone()
         for key in ("state", "action", ("next", "state"), ("next", "reward")):
+            others = transition["task"].unsqueeze(-1) != 1
             changed[key] = transition[key].where(others, -transition[key])
-        second.store(changed)
+        for algorithm, data in ((first, transition), (second, changed)):
+            algorithm.update()
+            algorithm.store(data)
     compared = 0
     for key, value in first.loss.state_dict().items():
         if value.ndim:  # not the discount

@@ -119,7 +119,6 @@ def test_a_demonstrator_that_never_succeeds_is_told_of(tmp_path, monkeypatch):
     tried, percent = map(int, re.search(r"2 of (\d+) .* (\d+)%", str(raised.value)).groups())
     assert tried >= 5
     assert percent == round(200 / tried)
-
     before = open_dataset(tmp_path, read_meta(tmp_path))["length"].clone()
     assert (before > 0).tolist() == [True] * 6 + [False] * 2
     monkeypatch.setattr(Fickle, "times", 99)
@@ -157,9 +156,7 @@ def test_missing_rows_are_recorded_again(recorded, copy):
     pixels[8, :1000] = 7  # as after a kill in the middle of a row
     pixels.flush()
     edit(copy / "dataset.json", checksum=None)
-
     record_demonstrations(copy, **TINY)
-
     assert contents(copy) == contents(recorded)
 
 

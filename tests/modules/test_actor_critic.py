@@ -107,15 +107,6 @@ def test_a_network_can_be_called_with_the_weights_of_any_stack(network, stack):
         assert called[key].equal(expected[key])
 
 
-def test_networks_can_be_called_with_keywords():
-    actor = Actor(3, 2, in_keys=["state"], batch_size=5)  # a number for a shape
-    state = torch.randn(5, 3)
-    expected = actor(TensorDict({"state": state}, [5]))
-    pre_tanh, action = actor(state=state)
-    assert torch.equal(action, expected["action"])
-    assert torch.equal(pre_tanh, expected["pre_tanh_action"])
-
-
 # ---- SAC's policy
 
 

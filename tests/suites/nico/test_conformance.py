@@ -38,7 +38,6 @@ def test_observations_and_actions_have_the_specs_of_the_paper(load):
 def test_state_is_joints_grip_and_objects(load):
     env = load("grasp_glass", seed=0, observation="state")
     state = env.reset().observation["privileged_state"]
-
     angles, positions = env.physics.named.data.qpos, env.physics.named.data
     hand = [angles["thumb_1"], angles["upper_finger_1"], angles["lower_finger_1"]]
     arm = [angles["shoulder_yaw"], angles["shoulder_pitch"], angles["elbow"]]
@@ -50,9 +49,7 @@ def test_state_is_joints_grip_and_objects(load):
 def test_time_out_is_after_50_steps_and_keeps_the_discount(load):
     env = load("grasp_glass", seed=0, observation="state")
     env.reset()
-
     timesteps = [env.step(np.zeros(4)) for _ in range(50)]
-
     assert [timestep.last() for timestep in timesteps] == [False] * 49 + [True]
     assert {timestep.reward for timestep in timesteps} == {0.0}
     assert {timestep.discount for timestep in timesteps} == {1.0}
@@ -93,7 +90,6 @@ def test_to_advance_is_a_step_without_its_observation(load, monkeypatch):
     for action in random_actions(10):
         expected.append((env.step(action).last(), env.physics.get_state()))
     assert [last for last, _ in expected] == [False] * 9 + [True]
-
     monkeypatch.setattr(env.task, "get_observation", None)
     env.physics.set_state(start)
     for action, (last, state) in zip(random_actions(10), expected, strict=True):
@@ -102,8 +98,7 @@ def test_to_advance_is_a_step_without_its_observation(load, monkeypatch):
 
 
 def test_the_duration_of_success_is_part_of_the_state(load, monkeypatch):
-    env = load("grasp_glass", seed=0, observation="state")
-    holds = True
+    env, holds = load("grasp_glass", seed=0, observation="state"), True
     monkeypatch.setattr(env.task, "succeeded", lambda _: holds)
     env.reset()
     for _ in range(env.task.steady_steps - 1):
@@ -112,31 +107,13 @@ def test_the_duration_of_success_is_part_of_the_state(load, monkeypatch):
     holds = False
     env.step(np.zeros(4))
     assert env.physics.steady_steps == 0
-
-    other = load("grasp_glass", seed=1, observation="state")
-    monkeypatch.setattr(other.task, "succeeded", lambda _: True)
-    other.reset()
-    other.physics.set_state(state)
-    timestep = other.step(np.zeros(4))
-
+    holds = True
+    env.physics.set_state(state)
+    timestep = env.step(np.zeros(4))
     assert (timestep.reward, timestep.discount) == (1.0, 0.0)
     # A new episode counts from the beginning.
-    other.reset()
-    assert other.step(np.zeros(4)).reward == 0.0
-
-
-def test_same_seed_same_pixels_and_trajectory(load):
-    def run() -> tuple[np.ndarray, np.ndarray]:
-        env = load("grasp_glass", seed=np.random.RandomState(7), observation="both")
-        pixels, states = [], []
-        for episode in range(2):
-            timesteps = [env.reset(), *map(env.step, random_actions(6, seed=episode))]
-            pixels += [timestep.observation["pixels"] for timestep in timesteps]
-            states += [timestep.observation["privileged_state"] for timestep in timesteps]
-        return np.stack(pixels), np.stack(states)
-
-    for first, second in zip(run(), run(), strict=True):
-        np.testing.assert_array_equal(first, second)
+    env.reset()
+    assert env.step(np.zeros(4)).reward == 0.0
 
 
 def test_starts_depend_on_episode_and_seed_and_not_on_the_task(load):
@@ -329,19 +306,14 @@ def test_objects_are_at_least_4_pixels_wide(load, segmentation):
             assert (shown == name).any(axis=0).sum() >= 4
 
 
-@pytest.mark.parametrize(
-    ("task", "options", "message"),
-    [
-        ("juggle", {}, "choose one of grasp_glass"),
-        ("grasp_glass", {"observation": "sound"}, "observation"),
-        ("grasp_glass", {"spread": -0.01}, "spread"),
-        ("grasp_glass", {"spread": 1.01}, "spread"),
-        ("grasp_glass", {"spread": np.nan}, "spread"),
-    ],
-)
-def test_bad_arguments_are_refused(task, options, message):
-    with pytest.raises(ValueError, match=message):
-        nico.load(task, **options)
+def test_bad_arguments_are_refused():
+    for options in (
+        {"task": "juggle"}, {"observation": "sound"}, {"spread": -0.01}, {"spread": 1.01},
+        {"spread": np.nan},
+    ):  # fmt: skip
+        (name,) = options
+        with pytest.raises(ValueError, match=name):
+            nico.load(**{"task": "grasp_glass", **options})
 
 
 @pytest.mark.parametrize("name", ["ACTION_SCALE", "ARC_RADIUS", "GREEN_JITTER", "SIDE_JITTER"])
@@ -349,7 +321,5 @@ def test_the_scene_version_changes_with_the_constants_of_the_scene(monkeypatch, 
     version = nico.scene_version()
     assert re.fullmatch(r"nico-2-[0-9a-f]{8}", version)
     assert nico.scene_version() == version
-
     monkeypatch.setattr(base, name, getattr(base, name) * 1.01)
-
     assert nico.scene_version() != version

@@ -75,7 +75,6 @@ def test_dm_controls_own_tests_pass(registered, monkeypatch):
     assert len(unmet) == len(UNMET) * len(ours)
     for name in (*unmet, *(name for name in dir(tests) if "visualize" in name)):
         delattr(tests, name)
-
     assert failures(tests) == []
 
 
@@ -130,9 +129,7 @@ def test_torchrl_wraps_seeds_and_checks(load):
 def test_torchrl_finds_registered_tasks(registered, renderer):
     env = DMControlEnv("nico", "push_white_left", renderer=renderer)
     env.set_seed(0)
-
     rollout = env.rollout(3)
-
     assert rollout["pixels"].shape == (3, 32, 64, 3)
     assert rollout["next", "reward"].shape == (3, 1)
     assert {*nico.ALL_TASKS} <= {*dict(DMControlEnv.available_envs)["nico"]}

@@ -43,12 +43,10 @@ def test_a_state_holds_where_objects_stood_at_the_start(load, physics):
         timestep = env.step(demonstrator(timestep))
     state = physics.get_state()
     assert np.abs(physics.object_position("green_box") - start["green_box"]).max() > 0.03
-
     env.reset()
     for name in nico.OBJECTS:
         np.testing.assert_array_equal(physics.start_position(name), physics.object_position(name))
     physics.set_state(state)
-
     for name in nico.OBJECTS:
         np.testing.assert_array_equal(physics.start_position(name), start[name])
 
@@ -101,7 +99,6 @@ def put(physics: Physics, name: str, position: np.ndarray, curl: float) -> None:
 def test_only_an_object_in_the_hand_is_touched_and_held(physics, name, curl, left, touched, held):
     # The palm and an object at the grip point just meet; the boxes are no less wide than the glass.
     put(physics, name, np.array([GRIP[0], GRIP[1] + left, TABLE_HEIGHT + 0.03]), curl)
-
     for other in nico.OBJECTS:
         assert physics.touching("hand", other) is (touched and other == name)
         assert physics.held(other) is (held and other == name)
@@ -110,7 +107,6 @@ def test_only_an_object_in_the_hand_is_touched_and_held(physics, name, curl, lef
 @pytest.mark.parametrize("name", nico.OBJECTS)
 def test_an_object_touched_by_the_palm_from_the_side_is_not_pressed(physics, name):
     put(physics, name, np.array([GRIP[0], GRIP[1], TABLE_HEIGHT + 0.03]), 0.0)
-
     assert physics.touching("palm", name)
     assert not physics.pressed(name)
 
@@ -118,7 +114,6 @@ def test_an_object_touched_by_the_palm_from_the_side_is_not_pressed(physics, nam
 def test_the_hand_ends_at_the_wrist(physics):
     put(physics, "white_box", GRIP, 0.0)
     put(physics, "white_box", physics.named.data.geom_xpos["forearm"].copy(), 0.0)
-
     assert physics.touching("forearm", "white_box")
     assert not physics.touching("hand", "white_box")
 
@@ -128,7 +123,6 @@ def test_the_gap_to_the_hand_is_that_to_its_nearest_part(physics):
     digits = ("thumb", "upper_finger", "lower_finger")
     parts = [f"{digit}_{n}" for digit, n in itertools.product(digits, (1, 2, 3))]
     gaps = [physics.gap(part, "green_box") for part in ("palm", "wrist", *parts)]
-
     assert 0.002 < min(gaps) < max(gaps)
     assert physics.gap("hand", "green_box") == physics.gap("green_box", "hand") == min(gaps)
 

@@ -98,7 +98,6 @@ print(env.reset().observation["pixels"].std() > 20)
 @pytest.mark.parametrize("first", ["", "import mujoco, bgpo_trl, torchrl.envs\n"])
 def test_a_fresh_process_renders_whatever_it_imports_first(first):
     process = run_python(first + "from suites import nico\n" + RENDER)
-
     assert (process.stdout, process.stderr, process.returncode) == ("True\n", "", 0)
 
 
@@ -121,7 +120,6 @@ for _ in range(2):
         print(error)
 """
     process = run_python(code, **environment)
-
     observed, line, again = process.stdout.splitlines()
     assert observed == "privileged_state"
     assert remedy in line
@@ -135,9 +133,7 @@ def test_frames_of_simulations_that_share_a_renderer_do_not_mix(physics, rendere
         other.named.data.qpos["green_box"][:2] = [0.45, 0.1]
     with physics.reset_context():
         pass
-
     first, second = renderer.render(physics.data.ptr), renderer.render(other.data.ptr)
-
     assert (first != second).any()
     np.testing.assert_array_equal(renderer.render(physics.data.ptr), first)
 
@@ -148,7 +144,6 @@ def test_closing_a_renderer_changes_no_frames_of_others(physics, renderer, how):
     other = FrameRenderer(physics.model.ptr, "room")
     other.render(physics.data.ptr)
     renderer.render(physics.data.ptr)  # Its context is current now.
-
     if how == "close":
         other.close()
     elif how == "drop in a cycle":
@@ -224,7 +219,6 @@ def test_size_camera_and_output_can_be_chosen(physics, renderer):
     out = np.zeros((32, 64, 3), np.uint8)
     assert renderer.render(physics.data.ptr, out=out) is out
     np.testing.assert_array_equal(out, renderer.render(physics.data.ptr))
-
     room = FrameRenderer(physics.model.ptr, "room", height=48, width=80)
     frame = room.render(physics.data.ptr)
     room.close()
@@ -239,11 +233,9 @@ def test_closing_an_environment_keeps_a_shared_renderer_open(load):
     env = load("grasp_glass", seed=0)
     own = nico.load("grasp_glass", seed=0)
     first = own.reset().observation["pixels"]
-
     for _ in range(2):
         env.close()
         own.close()
-
     np.testing.assert_array_equal(env.reset().observation["pixels"], first)
     assert own.reset().first()  # With a renderer anew.
 
