@@ -14,58 +14,75 @@ from suites.nico.demonstrator import Demonstrator
 from tests.helpers import contents, edit
 
 TINY = {"per_task": 3, "held_out_per_task": 1, "progress": False}
-ONE = {"tasks": ["grasp_glass"], "per_task": 1, "held_out_per_task": 0, "progress": False}
 KEYS = {"pixels", "state", "action", "length", "task", "train", "seed"}
 
 
 def test_recording_returns_what_loading_does(recorded):
     dataset = load_demonstrations(recorded)
+
     assert set(dataset.keys()) == KEYS
     shapes = {"pixels": (51, 32, 64, 3), "state": (51, 16), "action": (50, 4)}
     for key in KEYS:
         assert dataset[key].shape == (9, *shapes.get(key, ()))
     assert dataset["pixels"].dtype == torch.uint8
     assert dataset["length"].dtype == dataset["task"].dtype == torch.int64
-    assert dataset["task"].tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 2]
-    assert dataset["train"].tolist() == [True, True, False] * 3
-    assert dataset["seed"].tolist() == [0] * 9
     again = record_demonstrations(recorded, **TINY)  # complete: only opened
     for key in KEYS:
         torch.testing.assert_close(again[key], dataset[key], rtol=0, atol=0)
 
 
+def test_tasks_and_held_out_ones_are_marked(recorded):
+    dataset = load_demonstrations(recorded)
+
+    assert dataset["task"].tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 2]
+    assert dataset["train"].tolist() == [True, True, False] * 3
+    assert dataset["seed"].tolist() == [0] * 9
+
+
 def test_demonstrations_differ_from_each_other_and_between_seeds(recorded, tmp_path):
     starts = load_demonstrations(recorded)["state"][:, 0]
-    other = record_demonstrations(tmp_path, seed=1, **ONE)
+    other = record_demonstrations(
+        tmp_path, tasks=["grasp_glass"], per_task=1, held_out_per_task=0, seed=1, progress=False
+    )
+
     assert len(torch.cat([starts, other["state"][:, 0]]).unique(dim=0)) == 10
 
 
-def test_each_demonstration_does_its_task(recorded):
+def test_padding_is_zero_and_the_rest_is_not(recorded):
     for row in load_demonstrations(recorded):
-        length, task, state = int(row["length"]), int(row["task"]), row["state"]
+        length = int(row["length"])
         assert 10 < length <= 51
         assert (row["pixels"][:length].float().std(dim=(1, 2, 3)) > 10).all()
-        assert state[:length].abs().sum(-1).min() > 0
+        assert row["state"][:length].abs().sum(-1).min() > 0
         assert row["action"][: length - 1].abs().sum(-1).min() > 0
         assert row["action"].abs().max() <= 1
-        for key, end in (("pixels", length), ("state", length), ("action", length - 1)):
-            assert not row[key][end:].any()
-        start, last = (state[step, 7:].view(3, 3) for step in (0, length - 1))
+        assert not row["pixels"][length:].any()
+        assert not row["state"][length:].any()
+        assert not row["action"][length - 1 :].any()
+
+
+def test_each_demonstration_does_its_task(recorded):
+    dataset = load_demonstrations(recorded)
+    glass, green, white = dataset["state"][:, :, 7:].unflatten(-1, (3, 3)).unbind(2)
+    last = torch.arange(9), dataset["length"] - 1
+    for row, task in enumerate(dataset["task"].tolist()):
+        frame = last[0][row], last[1][row]
         if task == 0:
-            assert (state[length - 1, 4:7] - last[0]).norm() < 0.04
+            assert (dataset["state"][frame][4:7] - glass[frame]).norm() < 0.04
         else:
+            target = (glass, white)[task - 1]
             # Not further than a standing glass or a box turned by 45 degrees allows.
-            target = (0, 2)[task - 1]
-            assert (last[1] - last[target])[:2].norm() < 0.08
-            assert (start[1] - start[target])[:2].norm() > 0.1
+            assert (green[frame] - target[frame])[:2].norm() < 0.08
+            assert (green[row, 0] - target[row, 0])[:2].norm() > 0.1
 
 
 def test_play_follows_a_demonstration_and_then_moves_at_random(tmp_path):
-    options = {"per_task": 4, "held_out_per_task": 1, "progress": False}
+    options = {"per_task": 6, "held_out_per_task": 1, "progress": False}
     play = record_demonstrations(tmp_path / "play", play=True, **options)
+
     whole = play["length"] == 51
     assert whole.float().mean() > 0.5  # the rest have come far enough to succeed
-    assert len(play["state"][:, 0].unique(dim=0)) == 12
+    assert len(play["state"][:, 0].unique(dim=0)) == 18
     action = play["action"][whole]
     early, late = action[:, :2].std(), action[:, -15:].std()
     assert late > 0.25  # a demonstrator moves by less
@@ -75,11 +92,12 @@ def test_play_follows_a_demonstration_and_then_moves_at_random(tmp_path):
     # Nothing of it passes as demonstrations, and the other way round.
     for wrong in (False, True):
         with pytest.raises(ValueError, match="holds another recording"):
-            changed = options | {"per_task": 4 + wrong}
-            record_demonstrations(tmp_path / "play", play=wrong, **changed)
-    one, again = (record_demonstrations(tmp_path / name, play=True, **ONE) for name in "ab")
+            record_demonstrations(
+                tmp_path / "play", play=wrong, **(options | {"per_task": 6 + wrong})
+            )
+    again = record_demonstrations(tmp_path / "again", play=True, **options)
     for key in KEYS:
-        assert again[key].equal(one[key])
+        assert again[key].equal(play[key])
 
 
 def test_a_demonstration_that_fails_is_tried_again(tmp_path, monkeypatch):
@@ -94,7 +112,10 @@ def test_a_demonstration_that_fails_is_tried_again(tmp_path, monkeypatch):
             return super().__call__(timestep) if len(attempts) > 2 else np.zeros(4)
 
     monkeypatch.setattr(nico_scene, "Demonstrator", ClumsyAtFirst)
-    dataset = record_demonstrations(tmp_path, **ONE)
+    dataset = record_demonstrations(
+        tmp_path, tasks=["grasp_glass"], per_task=1, held_out_per_task=0, progress=False
+    )
+
     assert len(attempts) >= 3
     assert dataset["action"].abs().sum() > 1
 
@@ -114,11 +135,16 @@ class Fickle(nico.TASKS["push_green_to_white"]):
 def test_a_demonstrator_that_never_succeeds_is_told_of(tmp_path, monkeypatch):
     nico.add_task("fickle", Fickle)
     options = {"tasks": ["grasp_glass", "fickle"], "per_task": 4, "held_out_per_task": 1}
-    with pytest.raises(RuntimeError, match=r"'fickle' failed 3 times in a row \(2 of") as raised:
+    with pytest.raises(RuntimeError) as raised:
         record_demonstrations(tmp_path, attempts=3, progress=False, **options)
-    tried, percent = map(int, re.search(r"2 of (\d+) .* (\d+)%", str(raised.value)).groups())
-    assert tried >= 5
-    assert percent == round(200 / tried)
+    told = re.fullmatch(
+        r"the demonstrator of 'fickle' failed 3 times in a row \(2 of (\d+) attempts succeeded, "
+        r"(\d+)%\): fix it, or raise attempts",
+        str(raised.value),
+    )
+    assert int(told[1]) >= 5
+    assert int(told[2]) == round(200 / int(told[1]))
+
     before = open_dataset(tmp_path, read_meta(tmp_path))["length"].clone()
     assert (before > 0).tolist() == [True] * 6 + [False] * 2
     monkeypatch.setattr(Fickle, "times", 99)
@@ -156,28 +182,42 @@ def test_missing_rows_are_recorded_again(recorded, copy):
     pixels[8, :1000] = 7  # as after a kill in the middle of a row
     pixels.flush()
     edit(copy / "dataset.json", checksum=None)
+
     record_demonstrations(copy, **TINY)
+
     assert contents(copy) == contents(recorded)
 
 
-def test_another_recording_is_not_continued(copy):
+@pytest.mark.parametrize("wrong", [{"seed": 1}, {"tasks": ["grasp_glass"]}])
+def test_another_recording_is_not_continued(copy, wrong):
     before = contents(copy)
-    for wrong in ({"seed": 1}, {"tasks": ["grasp_glass"]}):
-        with pytest.raises(ValueError, match="holds another recording"):
-            record_demonstrations(copy, **{**TINY, **wrong})
+
+    with pytest.raises(ValueError, match=r"holds another recording .*; choose another folder or"):
+        record_demonstrations(copy, **{**TINY, **wrong})
+
     assert contents(copy) == before
 
 
-def test_what_cannot_be_recorded_leaves_nothing(tmp_path, monkeypatch):
-    for wrong, message in (
-        ({"held_out_per_task": 3}, "it must be less than per_task, 3"),
-        ({"per_task": 0}, "it must be less than per_task, 0"),
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"held_out_per_task": 3}, "held_out_per_task is 3: it must be less than per_task, 3"),
+        ({"per_task": 0}, "held_out_per_task is 1: it must be less than per_task, 0"),
         ({"seed": -1}, "seed must be at least 0"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            record_demonstrations(tmp_path / "new", **{**TINY, **wrong})
+    ],
+)
+def test_wrong_arguments_are_refused_before_anything_is_written(tmp_path, wrong, message):
+    with pytest.raises(ValueError, match=message):
+        record_demonstrations(tmp_path / "new", **{**TINY, **wrong})
+
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_full_disk_is_noticed_before_recording(tmp_path, monkeypatch):
     usage = shutil.disk_usage(tmp_path)._replace(free=10**6)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
-    with pytest.raises(OSError, match="make room"):
-        record_demonstrations(tmp_path / "new", **TINY)
+
+    with pytest.raises(OSError, match=r"^the dataset takes 0\.0 GB, .* has 0\.0 GB left: make ro"):
+        record_demonstrations(tmp_path, **TINY)
+
     assert not list(tmp_path.iterdir())

@@ -39,7 +39,8 @@ def make_groups(seeds=None, lengths=3, learn=True):
 
 
 def snapshot(gwr):
-    return [gwr.graph(index) for index in range(gwr.batch_size.numel())]
+    indices = range(gwr.batch_size.numel()) if gwr.batch_size else [()]
+    return [[t.clone() for t in gwr.graph(index)] for index in indices]
 
 
 def unchanged(gwr, before):
@@ -49,19 +50,33 @@ def unchanged(gwr, before):
     ]
 
 
+@pytest.mark.parametrize("seeds", [None, [4, 2, 3]])
+@pytest.mark.parametrize("learn", [True, False])
+def test_the_behavior_is_set_at_reset_and_constant_in_the_episode(seeds, learn):
+    env, gwr = make(seeds, learn=learn)
+    check_env_specs(env)
+    start = env.reset()
+    expected = gwr.lookup(start["demo_embedding"])
+    assert start["behavior"].equal(expected.embedding)
+    assert start["behavior_node"].equal(expected.node)
+    steps, _ = play(env, 3, start)  # one episode
+    for key in ("behavior", "behavior_node"):
+        for data in (steps, steps["next"]):
+            dim = len(env.batch_size)
+            assert data[key].equal(start[key].unsqueeze(dim).expand_as(data[key]))
+
+
 def test_behaviors_are_those_of_algorithm_1():
-    seeds, lengths, n_steps = [4, 2, 3], [1, 2, 5], 80
+    seeds, lengths, n_steps = [4, 2, 3], [1, 2, 5], 120
     env, gwr = make(seeds, lengths)
     steps, _ = play(env, n_steps)
     for row, (seed, length) in enumerate(zip(seeds, lengths, strict=True)):
         reference = make_modules([seed])[2]
         for start in range(0, n_steps, length):
-            episode = steps[row, start : start + length]
-            match = reference.adapt(episode["demo_embedding"][:1])  # b is from before adapting
-            for data in (episode, episode["next"]):
-                b = match.embedding.expand(length, -1)
-                torch.testing.assert_close(data["behavior"], b)
-                assert (data["behavior_node"] == match.node).all()
+            phi = steps["demo_embedding"][row, start].unsqueeze(0)
+            match = reference.adapt(phi)  # b is from before adapting
+            torch.testing.assert_close(steps["behavior"][row, start], match.embedding[0])
+            assert steps["behavior_node"][row, start] == match.node[0]
         torch.testing.assert_close(gwr.graph(row).weights, reference.graph(0).weights)
     assert gwr.num_nodes[0] > 5  # it has grown; fixed points would agree in any order
 
@@ -86,13 +101,10 @@ def test_learns_only_from_whole_episodes_and_while_learn_is_set():
 
 def test_learning_needs_a_step_counter_before_it():
     def make(*transforms, learn=True, base=None):
-        env = base or MockEnv()
-        batch_size = env.batch_size
-        source = DemonstrationSource(make_bank(), TaskSchedule((0, 0, 0)), batch_size=batch_size)
-        gwr = make_modules([0, 1] if batch_size else None)[2]
-        lookup = BehaviorLookup(gwr, learn=learn)
+        source = DemonstrationSource(make_bank(), TaskSchedule((0, 0, 0)))
+        lookup = BehaviorLookup(make_modules()[2], learn=learn)
         parts = Compose(*transforms, source, lookup)
-        return TransformedEnv(env, parts, auto_unwrap=False), lookup
+        return TransformedEnv(base or MockEnv(), parts, auto_unwrap=False), lookup
 
     with pytest.raises(ValueError, match=r"put StepCounter\(50\) before"):
         make()[0].reset()
@@ -106,11 +118,16 @@ def test_learning_needs_a_step_counter_before_it():
     with pytest.raises(ValueError, match="put StepCounter before"):
         env.reset()
 
-    limited = [lambda: TransformedEnv(MockEnv(), StepCounter(50))]
     make(StepCounter())[0].reset()  # the environment has a limit of its own
     make(StepCounter(50, step_count_key="time"))[0].reset()
-    make(base=limited[0]())[0].reset()
-    make(base=SerialEnv(2, limited * 2))[0].reset()
+    make(base=TransformedEnv(MockEnv(), StepCounter(50)))[0].reset()
+
+
+def test_a_time_limit_within_workers_suffices():
+    base = SerialEnv(2, lambda: TransformedEnv(MockEnv(), StepCounter(50)))
+    source = DemonstrationSource(make_bank(), TaskSchedule((0, 0, 0)), batch_size=[2])
+    lookup = BehaviorLookup(make_modules([0, 1])[2], learn=True)
+    assert "behavior" in TransformedEnv(base, Compose(source, lookup)).reset()
 
 
 # ---- groups
@@ -124,17 +141,41 @@ def adapt(groups, count):
         groups.adapt(noise + 5 * (number % 3))
 
 
+def copy_of(groups):
+    copy = BehaviorGroups(32, batch_size=groups.batch_size, smallest=4)
+    copy.load_state_dict(groups.state_dict())
+    return copy
+
+
+@pytest.mark.parametrize("seeds", [None, [4, 2, 3]])
+@pytest.mark.parametrize("learn", [True, False])
+def test_the_group_is_set_at_reset_and_constant_in_the_episode(seeds, learn):
+    env, groups = make_groups(seeds, learn=False)
+    check_env_specs(env)
+    env.transform[-1].learn = learn
+    adapt(groups, 15)
+    assert (groups.revision == 0).all()
+    start = env.reset()
+    assert start["group"].equal(torch.zeros(env.batch_size, dtype=torch.int64))
+    assert start["group_novelty"].isfinite().all()
+    for _ in range(6):
+        expected = groups.lookup(start["demo_embedding"])
+        assert start["group"].equal(expected.group)
+        assert start["group_novelty"].equal(expected.novelty)
+        steps, following = play(env, 3, start.clone())  # one episode
+        for key in ("group", "group_novelty"):
+            for data in (steps, steps["next"]):
+                assert (data[key] == start[key].unsqueeze(-1)).all()
+        start = following
+    assert bool((groups.num_groups > 1).all()) == learn
+
+
 def test_groups_learn_from_episodes_that_end_only():
     """Seeds whose episodes end at different times, against groups adapted by hand."""
     env, groups = make_groups([4, 2, 3], lengths=[2, 3, 5])
-    env.transform[-1].learn = False
-    check_env_specs(env)
-    env.transform[-1].learn = True
-    plain = BehaviorGroups(32, batch_size=3, smallest=4)
-    for each in (groups, plain):
-        adapt(each, 15)
+    adapt(groups, 15)
+    plain = copy_of(groups)
     state = env.reset()
-    assert state["group_novelty"].isfinite().all()
     for _ in range(30):
         steps, following = play(env, 1, state.clone())
         ended = steps["next", "done"].flatten()
@@ -142,9 +183,9 @@ def test_groups_learn_from_episodes_that_end_only():
             plain.adapt(state["demo_embedding"], ended)
         assert plain.num_groups.equal(groups.num_groups)
         again = plain.lookup(following["demo_embedding"])
-        for key, expected in (("group", again.group), ("group_novelty", again.novelty)):
-            assert steps["next", key].equal(state[key])
-            assert following[key].equal(expected.where(ended, state[key]))
+        assert following["group"][ended].equal(again.group[ended])
+        assert following["group"][~ended].equal(state["group"][~ended])
+        assert following["group_novelty"][~ended].equal(state["group_novelty"][~ended])
         state = following
     for ours, theirs in zip(groups.get_extra_state(), plain.get_extra_state(), strict=True):
         assert ours["points"].equal(theirs["points"]) and ours["group"].equal(theirs["group"])
