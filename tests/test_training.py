@@ -395,7 +395,7 @@ def test_checkpoints_are_written_when_due_and_like_tests_are_not_in_step_times(
 ):
     clock = [0.0]
     monkeypatch.setattr(training, "time", SimpleNamespace(monotonic=lambda: clock[0]))
-    config = make_config("state", "ddpg", episodes=4, checkpoint_minutes=0.0)
+    config = make_config("state", "ddpg", episodes=4, checkpoint_minutes=1.0)
     trainer = begin(tmp_path, config)
 
     def taking(seconds, function):
@@ -407,7 +407,7 @@ def test_checkpoints_are_written_when_due_and_like_tests_are_not_in_step_times(
 
     for owner, method, seconds in (
         (trainer.algorithm, "act", 0.25),
-        (trainer.evaluator, "run_next", 100.0),
+        (trainer.evaluator, "run", 100.0),
         (trainer, "save", 100.0),
     ):
         monkeypatch.setattr(owner, method, taking(seconds, getattr(owner, method)))
@@ -416,7 +416,8 @@ def test_checkpoints_are_written_when_due_and_like_tests_are_not_in_step_times(
     assert sum(cost.steps for cost in costs.values()) == trainer.env_steps
     assert all(cost.seconds == 0.25 * cost.steps for cost in costs.values())
     numbers = [path.name.split("-")[1] for path in (tmp_path / "checkpoint").glob("*.pt")]
-    assert max(int(number) for number in numbers) == 1 + trainer.env_steps  # one before the first
+    # Before the first step, after the tests of episode 2, and after those of 4, at the end.
+    assert max(int(number) for number in numbers) == 3
 
 
 def test_the_sequential_schedule_trains_the_newest_task_and_tests_all(begin, make_config, tmp_path):
