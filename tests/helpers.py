@@ -3,16 +3,20 @@
 import csv
 import hashlib
 import io
+import itertools
 import json
 import pickle
 import resource
 import shutil
-from collections.abc import Iterator
+import signal
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import pytest
 import torch
+from tensordict import TensorDictBase
 from torchrl.record.loggers.common import Logger
 
 from bgpo_trl.configs import (
@@ -21,6 +25,7 @@ from bgpo_trl.configs import (
     SequenceAutoencoderConfig,
     VAEConfig,
 )
+from bgpo_trl.training import Trainer
 
 DISTINCT = (
     "bgpo",
@@ -114,6 +119,25 @@ def put_checkpoint(run: Path, content: bytes) -> None:
     (run / "checkpoint").mkdir()
     digest = hashlib.sha256(content).hexdigest()[:16]
     (run / "checkpoint" / f"checkpoint-000007-{digest}.pt").write_bytes(content)
+
+
+def at_step(trainer: Trainer, n: int, do: Callable[[], object]) -> None:
+    """Call `do` during the n-th step, when the simulation has moved and the replay has not."""
+    store, steps = trainer.algorithm.store, itertools.count(1)
+
+    def store_after(transition: TensorDictBase) -> None:
+        if next(steps) == n:
+            do()
+        store(transition)
+
+    trainer.algorithm.store = store_after
+
+
+def interrupt(trainer: Trainer, step: int, number: int = signal.SIGINT) -> None:
+    """Run until a signal during a step, which is to end the run after it."""
+    at_step(trainer, step, lambda: signal.raise_signal(number))
+    with pytest.raises(KeyboardInterrupt):
+        trainer.run()
 
 
 class Recorder(Logger):

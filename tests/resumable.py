@@ -1,5 +1,7 @@
 """Runs that `test_resume` starts in separate processes and kills; imports only what they need."""
 
+from functools import partial
+
 import pytest
 import torch
 
@@ -10,6 +12,7 @@ from bgpo_trl.configs import (
     VAEConfig,
 )
 from bgpo_trl.data.recording import record_demonstrations
+from bgpo_trl.encoders import probes
 from bgpo_trl.encoders.train import train_encoders
 from bgpo_trl.scenes import SCENES
 from bgpo_trl.scenes.nico import NICO
@@ -44,4 +47,7 @@ def train_small_encoders(directory):
     options = {"scene": NICO, "progress": False}
     dataset = record_demonstrations(directory / "demonstrations", **RECORDING, **options)
     weights = directory / "encoders.safetensors"
-    train_encoders(dataset, None, weights, directory / "log", ENCODERS, **options)
+    with pytest.MonkeyPatch.context() as patch:
+        short = partial(probes.perceptron_predict, steps=50)
+        patch.setattr(probes, "perceptron_predict", short)
+        train_encoders(dataset, None, weights, directory / "log", ENCODERS, **options)

@@ -38,8 +38,8 @@ def small(example):
     """Settings in which a hundred steps fill the replay, grow GWR-B and clip states and targets."""
     return example.Settings(
         seed=3,
-        episodes=60,
-        task_starts=(0, 15, 30),
+        episodes=50,
+        task_starts=(0, 12, 24),
         test_every=10,
         test_episodes=2,
         max_steps=4,

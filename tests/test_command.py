@@ -44,29 +44,29 @@ def test_help_lists_every_command(monkeypatch, capsys):
         assert f"• {name} {line}" in printed
 
 
-@pytest.mark.parametrize("options", [["--help"], ["continual", "--help"]])
-def test_help_imports_neither_torch_nor_mujoco(options):
-    process = subprocess.run(
-        [sys.executable, "-c", LOADED, *options], capture_output=True, text=True, cwd=ROOT
+def run(code, *arguments):
+    program = [sys.executable, "-c", code, *arguments]
+    process = subprocess.run(program, capture_output=True, text=True, cwd=ROOT)
+    assert process.returncode == 0, process.stderr
+
+
+def test_help_imports_neither_torch_nor_mujoco():
+    run(LOADED, "continual", "--help")
+
+
+def test_commands_import_little_before_they_are_called():
+    """No display, which dm_control opens, to read results; neither TorchRL nor Ray for help."""
+    report, merge, *others = [
+        f"bgpo_trl.{command.COMMANDS[name][0]}"
+        for name in sorted(command.COMMANDS, key=lambda name: name not in ("report", "merge"))
+    ]
+    run(
+        "import importlib, sys\n"
+        f"for name in {[report, merge]}:\n    importlib.import_module(name)\n"
+        "assert 'dm_control' not in sys.modules\n"
+        f"for name in {others}:\n    importlib.import_module(name)\n"
+        "assert not {'torchrl', 'ray'} & sys.modules.keys()"
     )
-    assert process.returncode == 0, process.stderr
-
-
-@pytest.mark.parametrize(
-    ("names", "package"),
-    [
-        (("report", "merge"), "dm_control"),  # opens a display on import
-        (tuple(command.COMMANDS), "torchrl"),
-        (tuple(command.COMMANDS), "ray"),  # an extra
-    ],
-    ids=["no display to read results", "no TorchRL for help", "no Ray for help"],
-)
-def test_commands_import_little_before_they_are_called(names, package):
-    modules = [f"bgpo_trl.{command.COMMANDS[name][0]}" for name in names]
-    code = f"import importlib, sys\nfor name in {modules}:\n    importlib.import_module(name)\n"
-    code += f"assert {package!r} not in sys.modules"
-    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
-    assert process.returncode == 0, process.stderr
 
 
 def test_an_unknown_command_is_refused(monkeypatch, capsys):

@@ -26,7 +26,7 @@ from tests.helpers import UNPICKLED, Malice
 
 FILES = [f"{key}.memmap" for key in ("pixels", "state", "action", "length", "task", "train")]
 FILES += ["dataset.json", "meta.json"]
-examples = pytest.mark.parametrize("n", [30, pytest.param(1_000, marks=pytest.mark.slow)])
+examples = pytest.mark.parametrize("n", [20, pytest.param(1_000, marks=pytest.mark.slow)])
 
 
 damages = st.one_of(
@@ -183,6 +183,8 @@ def test_damaged_tensors(files, read, n):
     @given(damage=damages, of_header=st.booleans())
     @example(damage=("malice", None, None), of_header=False)
     @example(damage=("folder", None, None), of_header=False)
+    @example(damage=("flip", 0.6, 0), of_header=False)
+    @example(damage=("flip", 0.999, 0), of_header=False)
     def holds(damage, of_header):
         how, where, what = damage
         if where is not None and of_header:  # Few of the bytes, but they say what the others are.
@@ -195,14 +197,3 @@ def test_damaged_tensors(files, read, n):
             read_or_refused(lambda: read(copy), expected)
 
     holds()
-
-
-@pytest.mark.parametrize("read", [read_bank, read_encoders])
-@pytest.mark.parametrize("place", [0.3, 0.6, 0.999])
-def test_a_flipped_bit_of_a_number_is_noticed(files, tmp_path, read, place):
-    copy = Path(shutil.copy(files / read.__name__.removeprefix("read_"), tmp_path))
-    header = 8 + int.from_bytes(copy.read_bytes()[:8], "little")
-    where = header / copy.stat().st_size
-    do_damage(copy, ("flip", where + place * (1 - where), 0))
-    with pytest.raises(ValueError, match="is damaged"):
-        read(copy)

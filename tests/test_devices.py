@@ -19,8 +19,9 @@ from bgpo_trl.training import Trainer
 from tests.helpers import TINY_ENCODERS, rows
 from tests.second_device import second_device
 
-ALGORITHMS = ["bgpo", "bgpo+td3", "bgpo+sac", "maml-demonstrations", "dist-nll-demonstrations"]
-ALGORITHMS += ["fine-tuning-demonstrations", "ewc"]
+ALGORITHMS = ("bgpo", "bgpo+td3", "bgpo+sac")
+# The first two need data of each task; the last rests after a boundary, with an empty replay.
+LONGER = ("maml-demonstrations", "dist-nll-demonstrations", "ewc")
 
 
 @pytest.fixture(params=["second", *(["cuda"] if torch.cuda.is_available() else [])])
@@ -50,21 +51,20 @@ def test_tensors_of_two_devices_do_not_mix():
 
 
 @pytest.mark.usefixtures("easy_world")
-@pytest.mark.parametrize("name", ALGORITHMS)
+@pytest.mark.parametrize("name", [*ALGORITHMS, *LONGER])
 def test_a_run_is_the_same_on_every_device(device, name, bank, encoders, make_config, tmp_path):
-    longer = {"episodes": 16} if name.startswith(("maml", "dist-nll")) else {}
-    config = make_config(name=name, **longer)
+    config = make_config(name=name, episodes=16 if name in LONGER else 6, eval_every=3)
     parts = {"bank": bank, "encoders": encoders, "progress": False}
     try:
         for folder, place in (("here", "cpu"), ("there", device)):
             Trainer(config, tmp_path / folder, device=place, **parts).run()
     finally:
         encoders.vae.cpu()
+    assert any(float(row["loss_value"]) > 0 for row in rows(tmp_path / "here" / "train.csv"))
     for name in ("train.csv", "eval.csv"):
         here, there = rows(tmp_path / "here" / name), rows(tmp_path / "there" / name)
         for ours, theirs in zip(here, there, strict=True):
-            assert ours["steps"] == theirs["steps"]
-            assert ours["success"] == theirs["success"]
+            assert (ours["steps"], ours["success"]) == (theirs["steps"], theirs["success"])
             for key in ("return", "intrinsic_return", "loss_actor", "loss_value"):
                 if key in ours:
                     assert float(ours[key]) == pytest.approx(float(theirs[key]), abs=1e-3)

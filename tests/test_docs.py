@@ -26,12 +26,15 @@ ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "suites/nico/README.md")]
 PAGES += sorted((ROOT / "docs").glob("*.md"))
 
-every_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-
 
 def blocks(page, language):
     """Returns the fenced blocks of a language."""
     return re.findall(rf"^```{language}\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE)
+
+
+def without_blocks(page):
+    """Returns the running text of a page."""
+    return re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
 
 
 def commands(page):
@@ -39,8 +42,7 @@ def commands(page):
     text = page.read_text()
     indented = re.findall(r"^    ((?:python|bgpo|make) (?:.*\\\n)*.*)$", text, re.MULTILINE)
     fenced = "\n".join(blocks(page, "bash")).replace("\\\n", " ").splitlines()
-    text = re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
-    inline = re.findall(r"`((?:python|bgpo|make|pytest) [^`]+)`", text)
+    inline = re.findall(r"`((?:python|bgpo|make|pytest) [^`]+)`", without_blocks(page))
     shown = [*(block.replace("\\\n", " ") for block in indented), *fenced, *inline]
     return [shlex.join(shlex.split(line, comments=True)) for line in shown]
 
@@ -88,13 +90,9 @@ def run(script, arguments, monkeypatch):
         runpy.run_module(script, run_name="__main__", alter_sys=True)
 
 
-def test_there_is_something_to_run():
-    assert blocks(PAGES[0], "python")
-    assert {"make run", "make test"} <= {*COMMANDS}
-    assert len(OF_PYTHON) > 5
-
-
-@every_page
+@pytest.mark.parametrize(
+    "page", [page for page in PAGES if blocks(page, "python")], ids=lambda page: page.name
+)
 def test_the_python_of_a_page_runs_from_top_to_bottom(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     namespace = {}
@@ -106,20 +104,28 @@ def test_the_python_of_a_page_runs_from_top_to_bottom(page, tmp_path, monkeypatc
             exec(compile(block, f"{page.name}, python block {number}", "exec"), namespace)
 
 
-@every_page
-def test_no_block_is_of_a_kind_that_is_not_tested(page):
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_all_that_a_page_shows_is_tested_and_what_it_names_exists(page, tmp_path):
     fences = re.findall(r"^```(.*)$", page.read_text(), re.MULTILINE)
-    # Scripts (sh) are run by tests of their own, settings (yaml) are read by the next test.
+    # Scripts (sh) are run by tests of their own.
     assert {*fences[::2]} <= {"python", "bash", "sh", "yaml", "text"}
     assert {*fences[1::2]} <= {""}
+    for block in blocks(page, "yaml"):
+        (tmp_path / "settings.yaml").write_text(block)
+        assert run_config(Arguments(config=tmp_path / "settings.yaml")) != run_config(Arguments())
+    text = without_blocks(page)
+    named = re.findall(
+        r"`((?:suites|bgpo_trl|benchmarks|examples|tests|docs|scripts)/[\w/.-]*)`", text
+    )
+    linked = re.findall(r"\]\(([\w/.-]+)\)", text)
+    missing = [name for name in named if not (ROOT / name).exists()]
+    missing += [name for name in linked if not (page.parent / name).exists()]
+    assert missing == []
 
 
-@every_page
-def test_settings_of_a_page_can_be_read(page, tmp_path):
-    for number, block in enumerate(blocks(page, "yaml")):
-        file = tmp_path / f"{number}.yaml"
-        file.write_text(block)
-        assert run_config(Arguments(config=file)) != run_config(Arguments())
+def test_commands_are_found():
+    assert {"make run", "make test"} <= {*COMMANDS}
+    assert len(OF_PYTHON) > 5
 
 
 @pytest.mark.parametrize("command", OF_PYTHON)
@@ -151,18 +157,6 @@ def test_a_verb_or_tool_is_there(command):
 
 def check_pytest(words):
     assert [word for word in words if "/" in word and not (ROOT / word).exists()] == []
-
-
-@every_page
-def test_the_files_it_names_exist(page):
-    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
-    named = re.findall(
-        r"`((?:suites|bgpo_trl|benchmarks|examples|tests|docs|scripts)/[\w/.-]*)`", text
-    )
-    linked = re.findall(r"\]\(([\w/.-]+)\)", text)
-    missing = [name for name in named if not (ROOT / name).exists()]
-    missing += [name for name in linked if not (page.parent / name).exists()]
-    assert missing == []
 
 
 def test_readme_composes_the_environment_in_which_bgpo_is_trained():

@@ -1,9 +1,8 @@
 """The parts of the package form layers: none imports from a later one."""
 
 import ast
+import functools
 from pathlib import Path
-
-import pytest
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "bgpo_trl"
@@ -31,6 +30,7 @@ LAST = ("__init__", "__main__")
 """The package's face and its command line, which import from anywhere."""
 
 
+@functools.cache
 def imported(path: Path) -> set[str]:
     """Return what a file imports, also inside functions, but not for type checking alone."""
     tree = ast.parse(path.read_text())
@@ -62,11 +62,6 @@ def place(name: str) -> int | None:
     return 100 * LAYERS.index(name)
 
 
-def packages(path: Path) -> set[str]:
-    """Return the packages that a file imports from."""
-    return {module.partition(".")[0] for module in imported(path)}
-
-
 FILES = {path: path.relative_to(PACKAGE).with_suffix("").parts[0] for path in PACKAGE.rglob("*.py")}
 
 
@@ -74,30 +69,26 @@ def test_every_module_belongs_to_a_layer():
     assert set(FILES.values()) == {*LAYERS, *TOP, *OPEN, *LAST} - {"top"}
 
 
-@pytest.mark.parametrize("path", sorted(FILES), ids=lambda path: str(path.relative_to(PACKAGE)))
-def test_no_layer_imports_from_a_later_one(path):
-    name = FILES[path]
-    if name in LAST:
-        return
-    for module in imported(path):
-        package, _, inner = module.partition(".")
-        other = inner.partition(".")[0]
-        if package != "bgpo_trl" or other in ("", name):
-            continue
-        here, there = place(name), place(other)
-        assert there is None or (here is not None and there < here), f"{name} imports {module}"
+def test_no_layer_imports_from_a_later_one():
+    for path, name in FILES.items():
+        for module in imported(path) if name not in LAST else ():
+            package, _, inner = module.partition(".")
+            other = inner.partition(".")[0]
+            if package != "bgpo_trl" or other in ("", name):
+                continue
+            here, there = place(name), place(other)
+            allowed = there is None or (here is not None and there < here)
+            assert allowed, f"{path} imports {module}"
 
 
 def test_the_suite_imports_no_learning_and_the_package_no_scripts():
     for path in (ROOT / "suites").rglob("*.py"):
-        assert not packages(path) & {"bgpo_trl", "torch", "torchrl", "tensordict"}, path
+        packages = {module.partition(".")[0] for module in imported(path)}
+        assert not packages & {"bgpo_trl", "torch", "torchrl", "tensordict"}, path
     for path in FILES:
-        assert not packages(path) & {"benchmarks", "examples", "tests", "scripts"}, path
-
-
-def test_only_the_scene_of_nico_and_its_measurements_import_the_suite():
-    for path in FILES:
-        named = {name for name in imported(path) if name.startswith("suites.nico")}
-        # The doctor looks at a frame of the suite even if PyTorch is broken.
+        packages = {module.partition(".")[0] for module in imported(path)}
+        assert not packages & {"benchmarks", "examples", "tests", "scripts"}, path
+        # Only the scene of NICO and its measurements import the suite, and the doctor, who looks
+        # at a frame of it even if PyTorch is broken.
         if path.parent.name != "nico" and path.name not in ("nico.py", "doctor.py"):
-            assert not named, path
+            assert not any(name.startswith("suites.nico") for name in imported(path)), path

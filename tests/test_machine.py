@@ -19,10 +19,8 @@ CORES = len(os.sched_getaffinity(0))
     ("quota", "cores"),
     [
         ("max 100000", CORES),
-        ("100000 100000", 1),
         ("50000 100000", 1),  # half a core is still one to run on
         ("100000000 100000", CORES),
-        ("nonsense", CORES),
     ],
 )
 def test_a_container_quota_bounds_the_number_of_cores(tmp_path, quota, cores):
@@ -41,19 +39,16 @@ def test_affinity_bounds_the_number_of_cores(tmp_path):
         os.sched_setaffinity(0, before)
 
 
-@pytest.mark.parametrize(("gpu", "device"), [(True, "cuda"), (False, "cpu")])
-def test_auto_chooses_an_available_gpu(monkeypatch, gpu, device):
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: gpu)
-    assert choose_device() == torch.device(device)
+def test_auto_chooses_an_available_gpu(monkeypatch):
+    for gpu, device in ((True, "cuda"), (False, "cpu")):
+        monkeypatch.setattr(torch.cuda, "is_available", lambda gpu=gpu: gpu)
+        assert choose_device() == torch.device(device)
 
 
 FAULTS = """
-import resource, sys, threading
+import resource, threading
 import torch
 from bgpo_trl.machine import keep_freed_memory
-
-if sys.argv[1] == "keep":
-    keep_freed_memory()
 
 def use():
     for _ in range(20):
@@ -65,22 +60,22 @@ def count():
     use()
     print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 
-thread = threading.Thread(target=count)  # as the updates of a training run
-thread.start()
-thread.join()
+for prepare in (lambda: None, keep_freed_memory):
+    prepare()
+    thread = threading.Thread(target=count)  # as the updates of a training run
+    thread.start()
+    thread.join()
 """
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other libraries keep memory or not")
 def test_freed_memory_that_is_kept_is_used_again_without_page_faults():
-    counts = [
-        int(subprocess.check_output([sys.executable, "-c", FAULTS, mode], text=True))
-        for mode in ("return", "keep")
-    ]
-    assert counts[1] < counts[0] / 100
+    printed = subprocess.check_output([sys.executable, "-c", FAULTS], text=True)
+    returned, kept = map(int, printed.split())
+    assert kept < returned / 100
 
 
-@pytest.fixture(params=[1, 3, 20])
+@pytest.fixture(params=[1, 3])
 def threads(request):
     threads = RowPool(request.param, "test")
     yield threads

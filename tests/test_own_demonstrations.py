@@ -47,20 +47,10 @@ def made(tmp_path, monkeypatch):
         write_demonstrations(path, filmed(5, 0, actions), scene="dot", held_out_per_task=2)
         weights, play = tmp_path / "dot.safetensors", None
         if with_play:
-            movements = filmed(4, 2, actions=True)
-            play = write_demonstrations(
-                tmp_path / "play", movements, scene="dot", held_out_per_task=1
-            )
-        train_encoders(
-            load_demonstrations(path),
-            play,
-            weights,
-            tmp_path / "fit",
-            TINY_ENCODERS,
-            progress=False,
-            tasks=TASKS,
-            scene="dot",
-        )
+            movements, options = filmed(4, 2, actions=True), {"held_out_per_task": 1}
+            play = write_demonstrations(tmp_path / "play", movements, scene="dot", **options)
+        parts, options = (load_demonstrations(path), play), {"tasks": TASKS, "progress": False}
+        train_encoders(*parts, weights, tmp_path / "fit", TINY_ENCODERS, scene="dot", **options)
         encoders = load_representation(weights, scene_version="dot-1")
         return encoders, DemonstrationBank.load(bank_path(weights), encoder_id=encoders.identity)
 
@@ -72,7 +62,10 @@ def config_of(make_config, share):
     return replace(config, algorithm=replace(config.algorithm, demonstration_share=share))
 
 
-def test_demonstrations_without_actions_train_encoders_and_runs(made, make_config, tmp_path):
+def test_demonstrations_without_actions_train_encoders_and_runs(
+    made, make_config, tmp_path, refused
+):
+    """But there is no experience of such demonstrations."""
     encoders, bank = made()
     assert encoders.inverse is None and bank.steps is None
     assert bank.tasks == TASKS and len(bank.seen().embedding) == 6
@@ -87,14 +80,9 @@ def test_demonstrations_without_actions_train_encoders_and_runs(made, make_confi
     policy.condition(frames)
     assert abs(float(policy.act(frames[0])[0])) <= 1
 
-
-def test_without_actions_there_is_no_experience_of_demonstrations(
-    made, make_config, tmp_path, refused
-):
-    encoders, bank = made()
-    config = config_of(make_config, 0.25)
+    config, parts = config_of(make_config, 0.25), {"bank": bank, "encoders": encoders}
     refused(
-        lambda: Trainer(config, tmp_path / "run", bank=bank, encoders=encoders, progress=False),
+        lambda: Trainer(config, tmp_path / "shown", **parts),
         "no steps of demonstrations",
         "set demonstration_share to 0",
     )

@@ -14,7 +14,6 @@ from bgpo_trl.evaluation import evaluate_random_policy
 from bgpo_trl.scenes.nico import NicoEnv
 from bgpo_trl.training import Trainer
 from suites import nico
-from suites.nico import moves
 
 
 class AtOnce(nico.NicoTask):
@@ -24,19 +23,10 @@ class AtOnce(nico.NicoTask):
         return physics.time() > 0
 
 
-class PushWhiteToGreen(nico.NicoTask):
-    def succeeded(self, physics):
-        return physics.touching("white_box", "green_box")
-
-    def demonstration(self, physics, random):
-        return moves.push(physics, random, "white_box", "green_box")
-
-
 @pytest.fixture(autouse=True)
 def added():
-    """Add two tasks for the time of a test."""
+    """Add a task for the time of a test."""
     nico.add_task("at_once", AtOnce)
-    nico.add_task("push_white_to_green", PushWhiteToGreen)
 
 
 def bank_of(*tasks, n=6):
@@ -50,18 +40,6 @@ def names_and_embeddings(bank):
     return [
         (bank.tasks[t], *phi) for t, phi in zip(bank.task, bank.embedding.tolist(), strict=True)
     ]
-
-
-@pytest.fixture
-def play(tmp_path, make_config):
-    """Play a run of the oracle on the true state."""
-
-    def play(folder, bank, **changes):
-        config = replace(make_config("state", "oracle"), **changes)
-        Trainer(config, tmp_path / folder, bank=bank, progress=False).run()
-        return tmp_path / folder
-
-    return play
 
 
 def test_an_added_task_can_be_loaded_by_name():
@@ -93,35 +71,30 @@ def test_bad_names_and_classes_of_tasks_are_refused(name, task):
     assert dict(nico.TASKS) == before
 
 
-def test_a_run_does_not_depend_on_tasks_that_are_not_in_it(play):
-    known = bank_of(*nico.PAPER_TASKS)
-    own = bank_of("at_once")
-    runs = [play("alone", known), play("beside", known + own)]
+def test_a_run_does_not_depend_on_tasks_that_are_not_in_it(begin, make_config, tmp_path):
+    config, known = make_config("state", "oracle"), bank_of(*nico.PAPER_TASKS)
+    for folder, bank in (("alone", known), ("beside", known + bank_of("at_once"))):
+        begin(tmp_path / folder, config, bank=bank, encoders=None).run()
     for name in ("train.csv", "eval.csv"):
-        alone, beside = ((run / name).read_text() for run in runs)
+        alone, beside = ((tmp_path / run / name).read_text() for run in ("alone", "beside"))
         assert alone == beside
 
 
-def test_a_run_is_not_resumed_with_other_demonstrations(make_config, tmp_path):
-    config, bank = make_config("state", "oracle", tasks=("at_once",), task_starts=(0,)), bank_of
-    parts = {"resume": True, "progress": False}
-    with Trainer(config, tmp_path, bank=bank("at_once"), **parts) as trainer:
-        trainer.run()
-    with Trainer(config, tmp_path, bank=bank("at_once") + bank("grasp_glass"), **parts):
-        pass  # Demonstrations of tasks that are not in the run do not matter.
-    with pytest.raises(ValueError, match="other settings"):
-        Trainer(config, tmp_path, bank=bank("at_once", n=7), **parts)
-
-
-def test_a_module_may_be_renamed_between_a_run_and_its_resumption(make_config, tmp_path):
-    config = make_config("state", "oracle", tasks=("at_once",), task_starts=(0,))
+def test_a_run_is_resumed_with_its_demonstrations_from_whatever_module(
+    begin, make_config, tmp_path
+):
+    config = make_config("state", "oracle", tasks=("at_once",), task_starts=(0,), episodes=4)
+    parts = {"encoders": None, "resume": True}
     for module in ("my_tasks", "renamed"):
         nico.add_task("at_once", type("Renamed", (AtOnce,), {"__module__": module}))
-        bank = bank_of("at_once")
-        with Trainer(config, tmp_path, bank=bank, resume=True, progress=False) as trainer:
+        with begin(tmp_path, config, bank=bank_of("at_once"), **parts) as trainer:
             trainer.run()
         stored = json.loads((tmp_path / "config.json").read_text())
         assert stored["task_modules"] == {"at_once": module}
+    with begin(tmp_path, config, bank=bank_of("at_once") + bank_of("grasp_glass"), **parts):
+        pass  # Demonstrations of tasks that are not in the run do not matter.
+    with pytest.raises(ValueError, match="other settings"):
+        begin(tmp_path, config, bank=bank_of("at_once", n=7), **parts)
 
 
 def test_a_bank_selects_and_labels_tasks_by_name():

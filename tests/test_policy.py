@@ -4,8 +4,6 @@ import json
 import pickle
 import runpy
 import shutil
-import subprocess
-import sys
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -21,13 +19,13 @@ from bgpo_trl.encoders.pretrained import bank_path
 from bgpo_trl.encoders.representation import save_representation
 from bgpo_trl.training import Trainer
 from suites import nico
-from tests.helpers import DISTINCT, contents, edit
+from tests.helpers import contents, edit
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 ROOT = Path(__file__).parents[1]
 TASKS = nico.PAPER_TASKS
-NAMES = [*DISTINCT, "without-gwr"]
-LABELED = [name for name in NAMES if name.startswith(("maml", "dist-nll", "oracle"))]
+LABELED = ("oracle-demonstrations", "maml-demonstrations", "dist-nll-demonstrations")
+NAMES = ("bgpo", "bgpo-single", "without-gwr", "ewc", *LABELED)
 METADATA = {
     "scene_version": nico.scene_version(),
     "config": json.dumps(asdict(RepresentationConfig())),
@@ -70,18 +68,14 @@ def trainer_of(encoders, tested_bank, make_config, easy_world, tmp_path_factory)
 
     def trainer_of(name):
         if name not in trainers:
-            config = make_config(name=name, episodes=16)
+            # MAML and Dist-NLL need data of each task.
+            config = make_config(name=name, episodes=10 + 6 * (name in LABELED), eval_every=99)
             directory = tmp_path_factory.mktemp(name) / "run"
             weights = directory / "encoders" / "encoders.safetensors"
             save_representation(replace(encoders, metadata=METADATA), weights)
             replace(tested_bank, encoder_id=encoders.identity).save(bank_path(weights))
-            trainers[name] = Trainer(
-                config,
-                directory,
-                bank=tested_bank,
-                encoders=encoders,
-                progress=False,
-            )
+            parts = {"bank": tested_bank, "encoders": encoders, "progress": False}
+            trainers[name] = Trainer(config, directory, **parts)
             trainers[name].run()
         return trainers[name]
 
@@ -97,8 +91,11 @@ def load(trainer_of):
 
 
 @every_kind
-def test_actions_equal_those_of_a_snapshot_bit_for_bit(trainer_of, load, encoders, name):
+def test_a_loaded_policy_acts_as_a_snapshot(trainer_of, load, encoders, name):
+    """The replay is loaded only for policies that adapt."""
     algorithm, policy = trainer_of(name).algorithm, load(name, seed=8)
+    held = len(algorithm.replay) if name.startswith("maml") else 0
+    assert len(policy.algorithm.replay) == held
     task = torch.arange(3)[:, None]
     for number, demonstration in enumerate(DEMONSTRATIONS):
         phi = embed(encoders, demonstration).expand(3, 1, -1)
@@ -114,7 +111,7 @@ def test_actions_equal_those_of_a_snapshot_bit_for_bit(trainer_of, load, encoder
             torch.testing.assert_close(torch.from_numpy(policy.act(frame)), expected)
 
 
-@pytest.mark.parametrize("length", [1, 2, 20, 51, 70])
+@pytest.mark.parametrize("length", [1, 51, 70])
 def test_recognition_of_demonstrations_of_any_length(trainer_of, load, encoders, length):
     algorithm, config = trainer_of("bgpo").algorithm, trainer_of("bgpo").config.algorithm
     policy, frames = load(seed=8), noise(9, 70)[:length]
@@ -132,9 +129,7 @@ def test_recognition_of_demonstrations_of_any_length(trainer_of, load, encoders,
     assert policy.act(frames[-1]).shape == (4,)
 
 
-@pytest.mark.parametrize(
-    "name", ["bgpo", "bgpo-single", "maml-demonstrations", "dist-nll-demonstrations"]
-)
+@pytest.mark.parametrize("name", ["bgpo", "maml-demonstrations"])
 def test_a_pickled_policy_acts_as_before_and_can_be_conditioned_anew(load, name):
     policy, (frame, *_) = load(name), noise(5, 1)
     unconditioned = pickle.loads(pickle.dumps(policy))
@@ -145,10 +140,8 @@ def test_a_pickled_policy_acts_as_before_and_can_be_conditioned_anew(load, name)
         one.condition(DEMONSTRATIONS[2], task=TASKS[2])
     for other in (copied, unconditioned):
         assert (other.act(frame) == policy.act(frame)).all()
-        assert (other.seed, other.episodes, other.tasks) == (
-            *(policy.seed, policy.episodes),
-            policy.tasks,
-        )
+        kept = ("seed", "episodes", "tasks")
+        assert [getattr(other, name) for name in kept] == [getattr(policy, name) for name in kept]
 
 
 @every_kind
@@ -164,12 +157,6 @@ def test_only_algorithms_that_do_not_infer_the_task_need_its_label(load, name):
     assert (seen.task, seen.node) == (TASKS[1], None)
 
 
-@every_kind
-def test_the_replay_is_loaded_only_for_policies_that_adapt(trainer_of, load, name):
-    held = len(trainer_of(name).algorithm.replay)
-    assert len(load(name).algorithm.replay) == (held if "maml" in name else 0)
-
-
 def test_a_loaded_policy_changes_neither_the_run_nor_gwr_b(trainer_of, load):
     run = trainer_of("bgpo").directory
     before = contents(run)
@@ -180,7 +167,7 @@ def test_a_loaded_policy_changes_neither_the_run_nor_gwr_b(trainer_of, load):
     policy.act(frames[0])
     assert policy.algorithm.gwr.num_nodes.equal(nodes)
     assert contents(run) == before
-    assert policy.episodes == 16
+    assert policy.episodes == 10
 
 
 @pytest.mark.parametrize(
@@ -191,28 +178,21 @@ def test_a_loaded_policy_changes_neither_the_run_nor_gwr_b(trainer_of, load):
         noise(0, 2)[:, :, :, :2],
         noise(0, 2).transpose(0, 2, 1, 3),
         noise(0, 2) / 255,
-        np.full((2, 32, 64, 3), np.nan, np.float32),
-        [],
         None,
     ],
 )
 def test_arrays_that_are_no_demonstration_are_refused(load, frames):
     policy, (frame,) = load(), noise(0, 1)
+    with pytest.raises(ValueError, match="has seen no demonstration"):
+        policy.act(frame)
     policy.condition(DEMONSTRATIONS[0])
     before = policy.act(frame)
     with pytest.raises(ValueError, match=r"uint8 \[T, 32, 64, 3\]"):
         policy.condition(frames)
-    np.testing.assert_array_equal(policy.act(frame), before)
-
-
-def test_act_needs_a_demonstration_and_a_frame(load):
-    policy, frames = load(), noise(0, 1)
-    with pytest.raises(ValueError, match="has seen no demonstration"):
-        policy.act(frames[0])
-    policy.condition(DEMONSTRATIONS[0])
-    for wrong in (frames, frames[0] / 255, frames[0, :, :-1], []):
+    for wrong in (frame[None], frame / 255, frame[:, :-1], []):
         with pytest.raises(ValueError, match=r"uint8 \[32, 64, 3\]"):
             policy.act(wrong)
+    np.testing.assert_array_equal(policy.act(frame), before)
 
 
 def rewrite(run, **changes):
@@ -241,16 +221,7 @@ def cut_checkpoints(run):
         (lambda run: rewrite(run, bank="0" * 64), "with the demonstrations 000000000000"),
         (lambda run: rewrite(run, encoders=None), "ground truth"),
         (lambda run: rewrite_algorithm(run, state="state"), "ground truth"),
-        (
-            lambda run: rewrite_algorithm(run, {"hidden_sizes": [32]}),
-            r"hidden_sizes is \[64\] there and \[32\] here",
-        ),
         (lambda run: rewrite_algorithm(run, {"hidden_sizes": [2_000_000_000]}), "hidden_sizes is"),
-        (lambda run: rewrite_algorithm(run, max_steps=7), "max_steps is 6 there and 7 here"),
-        (
-            lambda run: rewrite(run, seeds=[3, 8, 9]),
-            r"seeds is \[3, 8\] there and \[3, 8, 9\] here",
-        ),
         (lambda run: rewrite(run, name="mine"), "'mine'"),
     ],
 )
@@ -263,7 +234,7 @@ def test_a_run_that_cannot_be_loaded_is_refused_in_one_line(trainer_of, tmp_path
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("seed", [0, -1, 4, "3", 3.5])
+@pytest.mark.parametrize("seed", [4, "3"])
 def test_a_seed_that_is_not_in_the_run_is_refused(load, seed):
     with pytest.raises(ValueError, match="has no seed"):
         load(seed=seed)
@@ -278,12 +249,7 @@ def test_the_one_shot_example_prints_the_recognition_and_the_outcome(trainer_of,
     assert outcome in ("push_green_to_white: success", "push_green_to_white: no success")
 
 
-def test_importing_the_package_does_not_import_torch():
-    code = (
-        "import sys, bgpo_trl; names = dir(bgpo_trl)\n"
-        "assert not {'torch', 'numpy', 'mujoco'} & set(sys.modules)\n"
-        "assert {'TrainedPolicy', '__version__', 'load_run'} <= set(names)"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)
+def test_the_package_lists_its_names():
+    assert {"TrainedPolicy", "__version__", "load_run"} <= set(dir(bgpo_trl))
     with pytest.raises(AttributeError, match="lode_run"):
         _ = bgpo_trl.lode_run

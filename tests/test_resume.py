@@ -3,9 +3,9 @@
 import errno
 import multiprocessing
 import shutil
-import signal
 import time
 from contextlib import ExitStack
+from functools import partial
 
 import numpy as np
 import pytest
@@ -15,9 +15,9 @@ from bgpo_trl.data.dataset import load_demonstrations
 from bgpo_trl.encoders import fitting
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.files.checkpoint import load_checkpoint
-from tests.helpers import largest_file
+from tests.helpers import at_step, interrupt, largest_file
 from tests.resumable import play, train_small_encoders
-from tests.test_training import assert_same_run, at_step
+from tests.test_training import assert_same_run
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 often = pytest.mark.parametrize("times", [2, pytest.param(10, marks=pytest.mark.slow)])
@@ -66,18 +66,16 @@ def assert_same_encoders(first, second):
     assert logs[0] == logs[1]
 
 
-@pytest.fixture
-def make(begin, make_config):
-    def make(directory, config=None, **arguments):
-        return begin(directory, config or make_config(checkpoint_minutes=0.0), **arguments)
-
-    return make
+@pytest.fixture(scope="module")
+def make(easy_world, begin, make_config):
+    """Make the trainer of a small run with a checkpoint after each step."""
+    return partial(begin, config=make_config("state", "ddpg", checkpoint_minutes=0.0))
 
 
 @pytest.fixture(scope="module")
-def uninterrupted(easy_world, begin, make_config, tmp_path_factory):
+def uninterrupted(make, tmp_path_factory):
     directory = tmp_path_factory.mktemp("uninterrupted")
-    begin(directory, make_config(checkpoint_minutes=0.0)).run()
+    make(directory).run()
     return directory
 
 
@@ -90,10 +88,10 @@ def learned(tmp_path_factory):
 
 @often
 def test_a_run_killed_several_times_equals_an_uninterrupted_run(
-    make, make_config, bank, encoders, tmp_path, times
+    begin, make_config, bank, encoders, tmp_path, times
 ):
     config = make_config(episodes=2 * times + 4, checkpoint_minutes=0.0)
-    make(tmp_path / "straight", config).run()
+    begin(tmp_path / "straight", config).run()
     torch.save((config, bank, encoders), tmp_path / "parts.pt")
     run = tmp_path / "killed"
 
@@ -143,10 +141,7 @@ def test_a_run_ended_by_a_full_disk_can_be_resumed(uninterrupted, make, tmp_path
 
 
 def test_a_run_is_resumed_from_the_checkpoint_before_a_damaged_one(uninterrupted, make, tmp_path):
-    trainer = make(tmp_path)
-    at_step(trainer, 20, lambda: signal.raise_signal(signal.SIGINT))
-    with pytest.raises(KeyboardInterrupt):
-        trainer.run()
+    interrupt(make(tmp_path), 20)
     _, newest = sorted((tmp_path / "checkpoint").iterdir())
     newest.write_bytes(newest.read_bytes()[: newest.stat().st_size // 2])
     with pytest.warns(UserWarning, match=f"{newest.name} is damaged"):

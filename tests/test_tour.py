@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import nbformat
-import pytest
 from nbclient import NotebookClient
 
 NOTEBOOK = Path(__file__).parents[1] / "examples" / "tour.ipynb"
@@ -14,29 +13,19 @@ SHORTER = {
 }
 
 
-@pytest.fixture(scope="module")
-def cells(tmp_path_factory):
+def test_it_prints_what_it_says_and_shows_figures_and_a_film(tmp_path):
     notebook = nbformat.read(NOTEBOOK, as_version=4)
     nbformat.validate(notebook)
     assert all(not cell.outputs for cell in notebook.cells if cell.cell_type == "code")
-    runs = tmp_path_factory.mktemp("runs")
     for cell in notebook.cells:
         for shown, tested in SHORTER.items():
-            cell.source = cell.source.replace(shown, tested.replace("RUNS", str(runs / "tour")))
+            cell.source = cell.source.replace(shown, tested.replace("RUNS", str(tmp_path)))
     folder = {"metadata": {"path": str(NOTEBOOK.parent)}}
     NotebookClient(notebook, timeout=300, kernel_name="python3", resources=folder).execute()
-    assert (runs / "tour" / "eval.csv").exists()
-    return [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert (tmp_path / "eval.csv").exists()
 
-
-def printed(cells):
-    return "".join(
-        output.text for cell in cells for output in cell.outputs if output.get("name") == "stdout"
-    )
-
-
-def test_it_prints_what_it_says(cells):
-    text = printed(cells)
+    outputs = [out for cell in notebook.cells for out in cell.get("outputs", ())]
+    text = "".join(output.text for output in outputs if output.get("name") == "stdout")
     for task in ("grasp_glass", "push_green_to_glass", "push_green_to_white"):
         assert f"{task}: the nearest demonstration of the bank is one of {task}\n" in text
     n_groups = int(text.split(" groups, purity on held-out demonstrations 100%\n")[0].split()[-1])
@@ -44,14 +33,5 @@ def test_it_prints_what_it_says(cells):
     assert "after 2 episodes: " in text
     assert "Recognition(node=" in text
     assert text.count("success after ") == 3
-
-
-def test_it_shows_figures_and_a_film(cells):
-    kinds = [
-        kind
-        for cell in cells
-        for output in cell.outputs
-        for kind in output.get("data", {})
-        if kind.startswith("image/")
-    ]
+    kinds = [kind for output in outputs for kind in output.get("data", {}) if "image" in kind]
     assert kinds == ["image/png"] * 3 + ["image/gif", "image/png"]

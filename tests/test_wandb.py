@@ -3,12 +3,12 @@
 import hashlib
 import json
 import os
-import signal
 import struct
 import sys
 import time
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -22,7 +22,7 @@ from bgpo_trl.figures.style import save_figure
 from bgpo_trl.figures.success import plot_success_curves
 from bgpo_trl.runs.dashboard import wandb_logger
 from bgpo_trl.runs.directory import flatten
-from bgpo_trl.training import Trainer
+from tests.helpers import interrupt
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 TASKS = ("grasp_glass", "push_green_to_glass", "push_green_to_white")
@@ -82,55 +82,31 @@ def sessions(directory: Path) -> list[list[Record]]:
     return [records(file) for file in sorted(files, key=lambda file: file.stat().st_mtime_ns)]
 
 
-def history(session: list[Record]) -> list[dict]:
-    return [
-        {
-            "/".join(item.nested_key) or item.key: json.loads(item.value_json)
-            for item in record.history.item
-        }
-        for record in session
-        if record.WhichOneof("record_type") == "history"
-    ]
+def values(items) -> dict[str, Any]:
+    """Return the values of a record by their names."""
+    return {"/".join(item.nested_key) or item.key: json.loads(item.value_json) for item in items}
 
 
-def evaluations(session: list[Record]) -> list[dict]:
-    """Return the metrics that were logged together."""
-    return [row for row in history(session) if any(key.startswith("eval/") for key in row)]
+def history(session: list[Record]) -> list[dict[str, Any]]:
+    """Return what was logged together."""
+    return [values(record.history.item) for record in session if record.HasField("history")]
 
 
 def step_metrics(session: list[Record]) -> dict[str, str]:
     """Return the step metric of each curve."""
-    metrics = [r.metric for r in session if r.WhichOneof("record_type") == "metric"]
+    metrics = [record.metric for record in session if record.HasField("metric")]
     return {metric.name: metric.step_metric for metric in metrics if metric.step_metric}
 
 
 @pytest.fixture(scope="module")
-def make(easy_world, bank, encoders, make_config):
-    def make(directory, *, resume=False, **changes):
-        start = partial(wandb_logger, directory, "offline", group="continual-bgpo", tags=["bgpo"])
-        parts = {"bank": bank, "encoders": encoders, "progress": False}
-        return Trainer(make_config(**changes), directory, resume=resume, loggers=[start], **parts)
-
-    return make
-
-
-@pytest.fixture(scope="module")
-def run(make, tmp_path_factory):
+def run(easy_world, begin, make_config, tmp_path_factory):
     """A whole run that was interrupted once, with a figure and a video at its end."""
     directory = tmp_path_factory.mktemp("runs") / "run"
-    with make(directory) as interrupted:
-        act, steps = interrupted.algorithm.act, []
-
-        def act_or_interrupt(state):
-            steps.append(None)
-            if len(steps) == 12:
-                signal.raise_signal(signal.SIGINT)
-            return act(state)
-
-        interrupted.algorithm.act = act_or_interrupt
-        with pytest.raises(KeyboardInterrupt):
-            interrupted.run()
-    with make(directory, resume=True) as resumed:
+    start = partial(wandb_logger, directory, "offline", group="continual-bgpo", tags=["bgpo"])
+    config = make_config("state", "ddpg")
+    with begin(directory, config, loggers=[start]) as interrupted:
+        interrupt(interrupted, 12)
+    with begin(directory, config, loggers=[start], resume=True) as resumed:
         resumed.run()
         final = pd.DataFrame({"task": TASKS, "success": [0.5, 0.25, 0.75]})
         resumed.dashboard.log_final(final, 10)
@@ -143,81 +119,42 @@ def run(make, tmp_path_factory):
     return directory
 
 
-def test_the_curves_are_the_means_of_the_csv_files(run):
-    """Also of the training episodes on both sides of the interruption."""
-    first, second = map(evaluations, sessions(run))
-    assert len(first) > 0
-    train, tests = (pd.read_csv(run / f"{name}.csv") for name in ("train", "eval"))
-    logged = {row["eval/step"]: row for row in first + second}
-    assert list(logged) == [2, 4, 6, 8, 10]
-    for episode, row in logged.items():
-        tested = tests[tests["episode"] == episode]
-        played = train[train["episode"].isin([episode - 1, episode])]
-        for group, table in (("eval", tested), ("train", played)):
-            for task in TASKS:
-                of_task = table["success"][table["task"] == task]
-                if len(of_task):
-                    assert row[f"{group}/success/{task}"] == pytest.approx(of_task.mean())
-                else:
-                    assert f"{group}/success/{task}" not in row
-            assert row[f"{group}/success_mean"] == pytest.approx(table["success"].mean())
-        for column in ("env_steps", "loss_actor", "loss_value", "intrinsic_return", "num_nodes"):
-            assert row[f"train/{column}"] == pytest.approx(played[column].mean())
-
-
-def test_a_run_has_few_curves(run):
-    curves = {key for session in sessions(run) for row in history(session) for key in row}
-    success = {"success_mean", "success/step", "step", *(f"success/{task}" for task in TASKS)}
-    columns = {"return", "steps", "env_steps", "intrinsic_return", "num_nodes", "num_groups"}
-    columns |= {"loss_actor", "loss_value"}
-    media = {key for key in curves if key.startswith("figures/")}
-    assert {key for key in curves - media if not key.startswith("_")} == {
-        *(f"{group}/{name}" for group in ("eval", "train", "final") for name in success),
-        *(f"train/{name}" for name in columns),
-        "eval/success_sd",
-    }
-
-
-def test_the_summary_is_the_mean_of_the_last_evaluation(run):
-    summary = {
-        "/".join(item.nested_key) or item.key: json.loads(item.value_json)
-        for record in sessions(run)[-1]
-        for item in record.summary.update
-    }
-    tests = pd.read_csv(run / "eval.csv")
-    last = tests["success"][tests["episode"] == 10].mean()
-    assert summary["eval/success_mean"] == pytest.approx(last)
-    assert summary["final/success_mean"] == pytest.approx(0.5)
-
-
-def test_every_curve_is_drawn_over_training_episodes(run):
+def test_curves_are_drawn_over_training_episodes_of_both_sessions(run):
+    tests = pd.read_csv(run / "eval.csv").groupby("episode")["success"].mean()
+    logged = {}
     for session in sessions(run):
         drawn_over = step_metrics(session)
-        for row in evaluations(session):
-            steps = {drawn_over[key] for key in row if "/" in key and not key.endswith("/step")}
-            assert len({row[step] for step in steps}) == 1
+        for row in history(session):
+            if "eval/success_mean" in row:
+                steps = {drawn_over[key] for key in row if "/" in key and not key.endswith("/step")}
+                (episode,) = {row[step] for step in steps}
+                logged[episode] = row["eval/success_mean"]
+    assert logged == pytest.approx(tests.to_dict())
+    assert list(logged) == [2, 4, 6, 8, 10]
+    last = [record.summary.update for record in sessions(run)[-1] if record.HasField("summary")]
+    summary = {name: value for items in last for name, value in values(items).items()}
+    assert summary["eval/success_mean"] == pytest.approx(tests[10])
+    assert summary["final/success_mean"] == pytest.approx(0.5)
 
 
 def test_both_sessions_belong_to_the_same_run_with_its_settings(run):
     settings = dict(flatten(json.loads((run / "config.json").read_text())))
-    started = [r.run for session in sessions(run) for r in session if r.HasField("run")]
-    assert len({record.run_id for record in started}) == 1
-    for record in started:
-        assert (record.resume, record.run_group, [*record.tags]) == (
-            True,
-            "continual-bgpo",
-            ["bgpo"],
-        )
+    identities = set()
     for session in sessions(run):
+        (started,) = [record.run for record in session if record.HasField("run")]
+        identities.add(started.run_id)
+        assert (started.resume, started.run_group) == (True, "continual-bgpo")
+        assert [*started.tags] == ["bgpo"]
         saved = {
-            item.key: json.loads(item.value_json)
+            name: value
             for record in session
             if record.HasField("config")
-            for item in record.config.update
+            for name, value in values(record.config.update).items()
         }
         assert {"commit", "versions.torch"} <= saved.keys()
         for name, value in settings.items():
             assert saved[name] == (json.dumps(value) if isinstance(value, list) else value)
+    assert len(identities) == 1
 
 
 def test_all_files_are_in_the_run_and_name_no_place_of_this_machine(run):

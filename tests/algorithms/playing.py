@@ -2,7 +2,10 @@
 
 import numpy as np
 import torch
+from tensordict import TensorDict
+from torch.nn.functional import layer_norm
 
+from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
 from bgpo_trl.transforms import TaskSchedule
 
 # By name: state, meaning of the context, and the algorithm whose settings it has.
@@ -22,6 +25,24 @@ CHANGES = {"group-balanced replay": GROUPS, "experts": GROUPS, "all": GROUPS}
 SCHEDULE = TaskSchedule((0, 2, 4))
 
 
+def make_batch(*shape, n_state=6, seed=0):
+    """Transitions of noise, of which a fifth succeed."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def draw(size):
+        return torch.randn(*shape, size, generator=generator)
+
+    ended = torch.rand(*shape, 1, generator=generator) < 0.2
+    following = {
+        "state": draw(n_state),
+        "terminated": ended,
+        "done": ended,
+        "reward": ended.float(),
+    }
+    data = {"state": draw(n_state), "label": draw(2), "action": draw(4).clamp(-1, 1)}
+    return TensorDict({**data, "next": following}, shape)
+
+
 def play(algorithm, n_steps, state=None, hidden=(), watch=lambda chosen: None):
     """Trains for some steps; the algorithm gets none of the `hidden` entries.
 
@@ -38,8 +59,51 @@ def play(algorithm, n_steps, state=None, hidden=(), watch=lambda chosen: None):
     return torch.stack(transitions, dim=1), state
 
 
+def save_and_restore(algorithm, state, other, folder):
+    """Restore `other` from a checkpoint of `algorithm`; return the tensordict in flight."""
+    parts = {"algorithm": algorithm.state_dict(), "world": algorithm.world.state_dict()}
+    save_checkpoint(folder, {**parts, "state": state.to_dict()})
+    saved = load_checkpoint(folder)
+    other.world.load_state_dict(saved["world"])
+    other.load_state_dict(saved["algorithm"])
+    return TensorDict(saved["state"], state.batch_size)
+
+
+def spy_batches(algorithm):
+    """The batches that an algorithm learns from, as they come."""
+    batches, learn = [], algorithm.learn
+
+    def spy(batch):
+        batches.append(batch.clone())
+        return learn(batch)
+
+    algorithm.learn = spy
+    return batches
+
+
+def snapshot(algorithm, index, embedding=0.0, seed=0):
+    """The policy of a seed for two test episodes of each task, all shown the same embedding."""
+    shape = (algorithm.n_tasks, 2)
+    task = torch.arange(algorithm.n_tasks).unsqueeze(1).expand(shape)
+    generator = torch.Generator().manual_seed(seed)
+    return algorithm.snapshot(index, torch.full((*shape, 32), embedding), task, generator)
+
+
 def weights(algorithm):
     return list(algorithm.learner.loss.parameters())
+
+
+def weights_of(parameters, *index):
+    """Copies of the weights of one network of a stack, by name."""
+    flat = dict(parameters.flatten_keys(".").items())
+    return {key: value.detach()[index].clone() for key, value in flat.items()}
+
+
+def perceptron(weights, x, normalize=False):
+    """The output of a network with one hidden layer, from its weights by name."""
+    hidden = x @ weights["mlp.layers.0.weight"] + weights["mlp.layers.0.bias"]
+    hidden = layer_norm(hidden, hidden.shape[-1:]) if normalize else hidden
+    return hidden.relu() @ weights["mlp.layers.1.weight"] + weights["mlp.layers.1.bias"]
 
 
 def assert_same(first, second):

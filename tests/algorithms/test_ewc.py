@@ -8,6 +8,7 @@ from bgpo_trl.algorithms.ewc import EWCLearner, diagonal_fisher
 from bgpo_trl.algorithms.rl import LearnerSpec, make_ddpg
 from bgpo_trl.configs import DDPGConfig
 from bgpo_trl.modules.actor_critic import Actor
+from tests.algorithms.playing import make_batch
 
 N_STATE = 6
 
@@ -18,16 +19,6 @@ def make_learner(weight=1.0, seeds=(3, 8)):
         config, LearnerSpec(seeds, ["state"], N_STATE, (0.0, 1.0), torch.device("cpu"))
     )
     return EWCLearner(ddpg.actor, ddpg.loss, config, weight=weight)
-
-
-def make_batch(*shape, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    terminated = torch.rand(*shape, 1, generator=generator) < 0.2
-    following = {"state": torch.randn(*shape, N_STATE, generator=generator)}
-    following |= {"terminated": terminated, "reward": terminated.float()}
-    data = {"state": torch.randn(*shape, N_STATE, generator=generator), "next": following}
-    data["action"] = torch.rand(*shape, 4, generator=generator) * 2 - 1
-    return TensorDict(data, shape)
 
 
 def actor_weights(learner):

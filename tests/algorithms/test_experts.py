@@ -8,10 +8,10 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tensordict import TensorDict
 
 from bgpo_trl.algorithms.experts import ActiveGroups, Experts
 from bgpo_trl.algorithms.rl import RL, LearnerSpec, make_learner
+from tests.algorithms.playing import make_batch
 
 every_rl = pytest.mark.parametrize("name", RL)
 SEEDS = (3, 8)
@@ -21,7 +21,7 @@ PARENTS = {0: 0, 1: 0, 2: 1, 3: 1, 4: 3, 5: 4}
 # ---- which groups are active
 
 
-@settings(max_examples=60)
+@settings(max_examples=40)
 @given(
     most=st.integers(1, 4),
     rest_after=st.integers(1, 9),
@@ -67,21 +67,10 @@ def make(name="ddpg", most=2, seeds=SEEDS, rest_after=99):
     )
 
 
-def make_batch(seed):
-    generator = torch.Generator().manual_seed(seed)
-    shape = (2, 6, 8)
-    terminated = torch.rand(*shape, 1, generator=generator) < 0.2
-    following = {"state": torch.randn(*shape, 6, generator=generator), "terminated": terminated}
-    data = {"state": torch.randn(*shape, 6, generator=generator)}
-    data |= {"next": {**following, "reward": terminated.float()}}
-    data["action"] = torch.rand(*shape, 4, generator=generator) * 2 - 1
-    return TensorDict(data, shape)
-
-
 def learn(experts, seed, rows=slice(None)):
     """An update in which what a group sees depends on nothing but the seed and the group."""
     group = experts.active.group
-    data = make_batch(seed)[rows]
+    data = make_batch(2, 6, 8, seed=seed)[rows]
     batch = data[torch.arange(len(group)).unsqueeze(1), group.clamp(min=0)].clone()
     weight = (group >= 0).float().unsqueeze(-1).expand(-1, -1, 8)
     experts.learner.learn(batch.set("priority_weight", weight))
@@ -97,26 +86,31 @@ def slot_of(experts, seed, group):
 
 def tensors_of(experts, seed, slot):
     """Copies of all that makes up one expert: networks, targets, moments of Adam."""
-    learner, shape = experts.learner, experts.active.group.shape
+    loss, optimizer = experts.learner.loss, experts.learner.optimizer
     tensors = {
         key: value
-        for key, value in learner.loss.state_dict().items()
+        for key, value in loss.state_dict().items()
         if not key.endswith("_extra_state") and value.ndim > 1
     }
-    if "log_alpha" in dict(learner.loss.named_parameters()):
-        assert "log_alpha" in tensors
-    for name, parameter in learner.loss.named_parameters():
+    for name, parameter in loss.named_parameters():
+        assert name in tensors
         for moment in ("exp_avg", "exp_avg_sq"):
-            value = learner.optimizer.state.get(parameter, {}).get(moment)
+            value = optimizer.state.get(parameter, {}).get(moment)
             tensors[f"{moment} of {name}"] = torch.zeros_like(parameter) if value is None else value
     for value in tensors.values():
-        assert value.shape[:2] == shape
+        assert value.shape[:2] == experts.active.group.shape
     return {key: value[seed, slot].clone() for key, value in tensors.items()}
 
 
 def differing(ours, theirs):
     assert ours.keys() == theirs.keys()
     return {key for key, value in ours.items() if not value.equal(theirs[key])}
+
+
+def assert_actor(experts, seed, group, tensors):
+    """Assert that tests of a group have the actor of these `tensors_of` an expert."""
+    for key, value in experts.actor_weights(seed, group).items():
+        assert value.equal(tensors[f"actor_network_params.{key}"]), (group, key)
 
 
 @every_rl
@@ -173,39 +167,32 @@ def test_a_new_group_starts_from_the_one_it_parted_from_without_its_moments(name
 def test_tests_see_the_weights_of_a_group_wherever_they_are(name):
     experts = make(name)
     start = tensors_of(experts, 1, 0)
-    for key, value in experts.actor_weights(1, 3).items():  # before anything was played
-        assert value.equal(start[f"actor_network_params.{key}"])
+    assert_actor(experts, 1, 3, start)  # before anything was played
     kept = {}
     for step, group in enumerate((0, 1, 2, 4)):
-        (_, slot) = experts.play([0, group]).tolist()
+        experts.play([0, group])
         learn(experts, step)
-        kept[group] = tensors_of(experts, 1, slot)
-        for other in experts.active.group[1].tolist():
-            if other >= 0:
-                kept[other] = tensors_of(experts, 1, slot_of(experts, 1, other))
-    copies = {group: experts.actor_weights(1, group) for group in (*kept, 3, 5)}
+        for slot, active in enumerate(experts.active.groups[1]):
+            kept[active] = tensors_of(experts, 1, slot)
+    copies = {group: experts.actor_weights(1, group) for group in range(6)}
     for group, like in {0: 0, 1: 1, 2: 2, 3: 1, 4: 4, 5: 4}.items():
-        for key, value in copies[group].items():
-            assert value.equal(kept[like][f"actor_network_params.{key}"]), (group, key)
+        assert_actor(experts, 1, group, kept[like])
     before = copy.deepcopy(copies)
     learn(experts, 20)
-    for group, weights in copies.items():  # they are copies
-        for key, value in weights.items():
-            assert value.equal(before[group][key])
+    assert not any(differing(copies[group], before[group]) for group in copies)  # they are copies
 
 
-@every_rl
-def test_a_stack_is_as_wide_as_groups_are_active(name):
-    experts = make(name, most=3, rest_after=4)
+def test_a_stack_is_as_wide_as_groups_are_active():
+    experts = make("sac", most=3, rest_after=4)
     widths = []
     for step, groups in enumerate([(0, 0), (0, 1), (2, 1), (3, 1), (4, 1), *[(4, 1)] * 3]):
         experts.play(groups)
         learn(experts, step)
         widths.append(width_of(experts))
-        assert {p.shape[:2] for p in experts.learner.loss.parameters()} == {(2, width_of(experts))}
+        assert {p.shape[:2] for p in experts.learner.loss.parameters()} == {(2, widths[-1])}
         for state in experts.learner.optimizer.state.values():
-            assert state["exp_avg"].shape[:2] == (2, width_of(experts))
-            assert int(state["step"]) == step + 1 if name != "td3" else True
+            assert state["exp_avg"].shape[:2] == (2, widths[-1])
+            assert int(state["step"]) == step + 1
     assert widths == [1, 2, 2, 3, 3, 3, 2, 1]
 
 
@@ -220,8 +207,7 @@ def test_a_group_that_ends_is_put_aside_and_comes_back_as_it_was(name):
     assert experts.active.groups[0] == [0, 2]
     assert not differing(tensors_of(experts, 0, 1), kept[2])
     for group, like in {**kept, 3: kept[1]}.items():  # 3 parted from 1
-        for key, value in experts.actor_weights(0, group).items():
-            assert value.equal(like[f"actor_network_params.{key}"])
+        assert_actor(experts, 0, group, like)
     experts.play([1, 0])
     for group, tensors in kept.items():
         assert not differing(tensors_of(experts, 0, slot_of(experts, 0, group)), tensors)
@@ -251,15 +237,14 @@ def test_a_seed_of_a_batch_is_that_seed_alone(name):
 
 
 @every_rl
-@pytest.mark.parametrize("n_steps", [1, 13])
-def test_restored_experts_go_on_bit_for_bit(name, n_steps):
+def test_restored_experts_go_on_bit_for_bit(name):
     def play(experts, steps):
         for step in steps:
             experts.play([step % 5, step % 3])
             learn(experts, step)
 
     experts, restored = make(name), make(name, seeds=(0, 1))
-    play(experts, range(n_steps))
+    play(experts, range(13))
     play(restored, range(4))
     file = io.BytesIO()
     torch.save({"learner": experts.learner.state_dict(), "experts": experts.state_dict()}, file)
@@ -268,7 +253,7 @@ def test_restored_experts_go_on_bit_for_bit(name, n_steps):
     restored.load_state_dict(state["experts"])
     restored.learner.load_state_dict(state["learner"])
     for one in (experts, restored):
-        play(one, range(n_steps, n_steps + 12))
+        play(one, range(13, 25))
     assert restored.active.group.equal(experts.active.group)
     for seed in range(2):
         for slot in range(len(experts.active.groups[seed])):
@@ -279,24 +264,14 @@ def test_restored_experts_go_on_bit_for_bit(name, n_steps):
             assert not differing(ours, theirs)
 
 
-@every_rl
-def test_an_expert_that_rests_is_left_as_it_is_and_one_that_does_not_is_not(name):
-    experts = make(name, most=3, rest_after=5)
-    for step, group in enumerate([0, 1, 1]):
+def test_an_expert_that_rests_is_left_as_it_is_and_one_that_does_not_is_not():
+    experts, seen = make("td3", most=3, rest_after=5), {}
+    # Group 0 rests from the fifth step after its own until it is played again.
+    for step, group in enumerate([0, 1, 1, 1, 1, *[1] * 7, 0, 0]):
         experts.play([group, 0])
         learn(experts, step)
-    before = experts.actor_weights(0, 0)
-    for step in (3, 4):  # since TD3 updates the actor every other time
-        experts.play([1, 0])
-        learn(experts, step)
-    learnt = experts.actor_weights(0, 0)
-    assert differing(before, learnt)
-    for step in range(5, 12):
-        experts.play([1, 0])
-        learn(experts, step)
-        assert experts.active.groups == [[1], [0]]
-        assert not differing(experts.actor_weights(0, 0), learnt)
-    for step in (12, 13):
-        experts.play([0, 0])
-        learn(experts, step)
-    assert differing(experts.actor_weights(0, 0), learnt)
+        seen[step] = experts.actor_weights(0, 0)
+        assert (experts.active.groups[0] == [1]) == (5 <= step < 12)
+    assert differing(seen[2], seen[4])
+    assert not any(differing(seen[step], seen[4]) for step in range(5, 12))
+    assert differing(seen[13], seen[4])

@@ -8,42 +8,28 @@ import torch
 from tensordict import TensorDict
 
 from bgpo_trl.algorithms.algorithm import Policy
-from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
 from bgpo_trl.modules.actor_critic import Actor
 from bgpo_trl.modules.gaussian_actors import MultiHeadActor
+from bgpo_trl.seeding import generators
 from bgpo_trl.transforms import TaskSchedule
-from tests.algorithms.playing import assert_same, play
+from tests.algorithms.playing import (
+    assert_same,
+    perceptron,
+    play,
+    save_and_restore,
+    snapshot,
+    weights_of,
+)
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 SEEDS = (4, 6)
-SCHEDULE = TaskSchedule((0, 2, 4))
-AT_ONCE = TaskSchedule((0, 0, 0))
 SIZE, N_TASKS = 16, 3  # of the ground truth, and tasks
 both = pytest.mark.parametrize("name", ["maml", "dist-nll"])
-with_demonstrations = pytest.mark.parametrize(
-    ("name", "changes"),
-    [
-        ("maml", {}),
-        ("dist-nll", {}),
-        ("maml-demonstrations", {"state": "latent", "task_batch_size": 8}),
-        ("dist-nll-demonstrations", {"state": "latent"}),
-    ],
-)
 
 
 @pytest.fixture
 def make(make_task_algorithm):
-    def make(name, schedule=SCHEDULE, **changes):
-        return make_task_algorithm(name, schedule=schedule, **changes)
-
-    return make
-
-
-def snapshot(algorithm, index, embedding=0.0):
-    shape = (algorithm.n_tasks, 2)
-    task = torch.arange(algorithm.n_tasks).unsqueeze(1).expand(shape)
-    shown = torch.full((*shape, 32), embedding)
-    return algorithm.snapshot(index, shown, task, torch.Generator().manual_seed(0))
+    return make_task_algorithm
 
 
 def networks(loss):
@@ -51,29 +37,26 @@ def networks(loss):
     return {key: value for key, value in loss.state_dict().items() if value.ndim > 1}
 
 
-@with_demonstrations
-def test_a_seed_learns_in_a_batch_as_it_does_alone(make, name, changes):
-    batch = make(name, **changes)
-    together, _ = play(batch, 40)
-    losses = []
-    for index, seed in enumerate(SEEDS):
-        alone = make(name, seeds=(seed,), **changes)
-        data = play(alone, 40)[0][0]
-        for key in ("task", "demo_index", "step_count", ("next", "terminated")):
-            assert together[index][key].equal(data[key]), key
-        for key in ("action", batch.config.state, ("next", "reward")):
-            torch.testing.assert_close(together[index][key], data[key], rtol=1e-4, atol=1e-4)
-        theirs = networks(alone.loss)
-        for key, ours in networks(batch.loss).items():
-            torch.testing.assert_close(ours[index], theirs[key][0], rtol=1e-4, atol=1e-4, msg=key)
-        frozen, frozen_alone = snapshot(batch, index).parameters, snapshot(alone, 0).parameters
-        for key, value in frozen.items():
-            torch.testing.assert_close(value, frozen_alone[key], rtol=1e-4, atol=1e-4)
-        losses.append(alone.update())
-    assert together["task"].unique().tolist() == [0, 1, 2]
-    for key, value in batch.update().items():
-        expected = torch.cat([loss[key] for loss in losses])
-        torch.testing.assert_close(value, expected, rtol=1e-3, atol=1e-4)
+@both
+def test_training_episodes_are_played_by_the_network_of_their_task_with_noise(make, name):
+    algorithm, noise = make(name), generators(SEEDS, "exploration")
+    clamped, tasks = set(), set()
+
+    def watch(chosen):
+        for index, source in enumerate(noise):
+            task = int(chosen["task"][index])
+            network = weights_of(algorithm.loss.actor_network_params, index, task)
+            action = perceptron(network, chosen["state"][index]).tanh()
+            noisy = action + 0.3 * torch.randn(4, generator=source)
+            torch.testing.assert_close(chosen["action"][index], noisy.clamp(-1, 1))
+            clamped.add(bool((noisy.abs() > 1).any()))
+            tasks.add(task)
+
+    play(algorithm, 40, watch=watch)
+    assert clamped == {True, False}
+    assert tasks == {0, 1, 2}
+    ours, theirs = (weights_of(algorithm.loss.actor_network_params, 0, task) for task in (0, 1))
+    assert not ours["mlp.layers.1.weight"].equal(theirs["mlp.layers.1.weight"])
 
 
 @both
@@ -83,7 +66,7 @@ def test_the_first_update_comes_after_the_warm_up_when_some_task_fills_a_batch_f
 ):
     """Three tasks can have three transitions each without four of any."""
     ddpg = replace(make(name).config.rl, warmup_steps=warmup)
-    algorithm = make(name, TaskSchedule((0,) * n_tasks), rl=ddpg)
+    algorithm = make(name, schedule=TaskSchedule((0,) * n_tasks), rl=ddpg)
     start = deepcopy(algorithm.learner.state_dict())
     _, state = play(algorithm, expected)  # with an update before each step
     assert_same(algorithm.learner.state_dict(), start)
@@ -94,7 +77,7 @@ def test_the_first_update_comes_after_the_warm_up_when_some_task_fills_a_batch_f
 @both
 def test_tasks_that_are_never_presented_make_no_difference(make, name):
     ddpg = replace(make(name).config.rl, warmup_steps=10)  # as many as three tasks need
-    three, one = (make(name, TaskSchedule(s), rl=ddpg) for s in ((0, 99, 99), (0,)))
+    three, one = (make(name, schedule=TaskSchedule(s), rl=ddpg) for s in ((0, 99, 99), (0,)))
     start = deepcopy(networks(three.loss))
     ours, theirs = play(three, 30)[0], play(one, 30)[0]
     torch.testing.assert_close(ours["action"], theirs["action"], rtol=1e-4, atol=1e-5)
@@ -133,29 +116,17 @@ def test_networks_stay_as_they_were_until_there_is_data_of_their_task(make, name
 
 
 @both
-def test_preparing_a_test_leaves_no_trace_and_is_not_changed_later(make, name):
+def test_snapshots_are_copies_that_act_as_plain_networks_and_leave_no_trace(make, name):
     algorithm = make(name)
     _, state = play(algorithm, 40)
     before = deepcopy(algorithm.state_dict())
     gradients = [deepcopy(p.grad) for p in algorithm.loss.parameters()]
-    frozen = snapshot(algorithm, 1).parameters
+    frozen = [snapshot(algorithm, index) for index in range(2)]
     assert_same(algorithm.state_dict(), before)
     assert_same([p.grad for p in algorithm.loss.parameters()], gradients)
-    copied = deepcopy(frozen)
-    play(algorithm, 20, state)
-    assert_same(frozen, copied)
-    later = snapshot(algorithm, 1).parameters
-    assert not any(value.requires_grad for value in frozen.values())
-    assert any(not value.equal(later[key]) for key, value in frozen.items())
 
-
-@both
-def test_snapshots_act_as_plain_ones_with_these_weights(make, name):
-    algorithm = make(name)
-    play(algorithm, 40)
-    frozen = [snapshot(algorithm, index) for index in range(2)]
-    state = torch.randn(2, N_TASKS, 5, SIZE, generator=torch.Generator().manual_seed(0))
-    actions = Policy.stack(frozen).act(state)
+    shown = torch.randn(2, N_TASKS, 5, SIZE, generator=torch.Generator().manual_seed(0))
+    actions = Policy.stack(frozen).act(shown)
     for index in range(2):
         if name == "maml":  # a network for each task
             alone = Actor(SIZE, in_keys=["state"], hidden_sizes=(64,), batch_size=[N_TASKS])
@@ -164,8 +135,16 @@ def test_snapshots_act_as_plain_ones_with_these_weights(make, name):
             for _ in range(N_TASKS):
                 alone.add_head()
         alone.load_state_dict(frozen[index].parameters)
-        expected = alone(TensorDict({"state": state[index]}, [N_TASKS, 5]))["action"]
+        expected = alone(TensorDict({"state": shown[index]}, [N_TASKS, 5]))["action"]
         torch.testing.assert_close(actions[index], expected)
+
+    parameters = frozen[1].parameters
+    copied = deepcopy(parameters)
+    play(algorithm, 20, state)
+    assert_same(parameters, copied)
+    later = snapshot(algorithm, 1).parameters
+    assert not any(value.requires_grad for value in parameters.values())
+    assert any(not value.equal(later[key]) for key, value in parameters.items())
 
 
 @both
@@ -181,19 +160,18 @@ def test_demonstrations_are_never_read(make, name):
         assert_same(snapshot(seeing, index).parameters, nothing.parameters)
 
 
-@with_demonstrations
-@pytest.mark.parametrize("n_steps", [5, 30])
-def test_a_restored_run_continues_as_the_saved_one(make, tmp_path, name, changes, n_steps):
-    algorithm = make(name, **changes)
-    _, state = play(algorithm, n_steps)
-    parts = {"algorithm": algorithm.state_dict(), "world": algorithm.world.state_dict()}
-    save_checkpoint(tmp_path, {**parts, "state": state.to_dict()})
-    other = make(name, seeds=(5, 7), **changes)  # other weights, streams and simulations
-    saved = load_checkpoint(tmp_path)
-    other.world.load_state_dict(saved["world"])
-    other.load_state_dict(saved["algorithm"])
+@pytest.mark.parametrize(
+    ("name", "changes"),
+    [("maml-demonstrations", {"task_batch_size": 8}), ("dist-nll-demonstrations", {})],
+)
+def test_a_restored_run_continues_as_the_saved_one(make, tmp_path, name, changes):
+    algorithm = make(name, state="latent", **changes)
+    _, state = play(algorithm, 30)
+    # Of other weights, streams and simulations.
+    other = make(name, seeds=(5, 7), state="latent", **changes)
+    restored_state = save_and_restore(algorithm, state, other, tmp_path)
     ours, _ = play(algorithm, 20, state)
-    theirs, _ = play(other, 20, TensorDict(saved["state"], [2]))
+    theirs, _ = play(other, 20, restored_state)
     assert (ours == theirs).all()
     assert_same(algorithm.state_dict(), other.state_dict())
     assert_same(snapshot(algorithm, 1).parameters, snapshot(other, 1).parameters)

@@ -81,8 +81,3 @@ def write_training(directory, seeds, tasks=TASKS):
                 f"{min(episode, len(tasks))},0.5,0.25"
             )
     (directory / "train.csv").write_text("\n".join(lines) + "\n")
-
-
-def edit(path, **changes):
-    """Changes entries of a JSON file."""
-    path.write_text(json.dumps(json.loads(path.read_text()) | changes))

@@ -16,6 +16,7 @@ from tests.analysis.runs import SUCCESS as SUCCESS_OF_RUN
 # comes in after 20.
 EPISODES = [10, 20, 30, 40]
 SUCCESS = np.array([[0.0, NAN], [0.8, NAN], [0.6, 0.0], [0.4, 0.5]])
+INF = np.inf
 
 
 def test_evaluation_matrix_by_hand():
@@ -25,28 +26,23 @@ def test_evaluation_matrix_by_hand():
     np.testing.assert_allclose(both, [[0.4, NAN], [0.5, 0.25]])
 
 
-def test_each_seed_is_measured_separately():
-    seeds = np.stack([SUCCESS, 0.5 * SUCCESS, np.nan_to_num(SUCCESS)])
-    matrix = scores.evaluation_matrix(seeds, EPISODES, [20, 40], window=10)
-    assert matrix.shape == (3, 2, 2)
-    change = [scores.change_since_learned(of_seed) for of_seed in matrix]
-    np.testing.assert_allclose(scores.change_since_learned(matrix), change)
-    best = [scores.forgetting_since_best(of_seed) for of_seed in seeds]
-    np.testing.assert_allclose(scores.forgetting_since_best(seeds), best)
-
-
 def test_changes_since_tasks_were_learned_by_hand():
-    matrix = [[0.8, NAN, NAN], [0.7, 0.9, NAN], [0.4, 1.0, 0.3]]
-    # Task 1 has lost 0.4, task 2 has gained 0.1; of task 3 nothing can be said.
-    assert scores.change_since_learned(matrix) == pytest.approx([-0.4, 0.1, 0])
+    matrix = [[0.8, NAN, NAN], [0.7, 0.9, NAN], [0.0, 1.0, 0.3]]
+    # Task 1 has lost 0.8, task 2 has gained 0.1; of task 3 nothing can be said.
+    expected = [-0.8, 0.1, 0]
+    assert scores.change_since_learned(matrix) == pytest.approx(expected)
+    of_seeds = scores.change_since_learned([matrix, np.multiply(matrix, 0.5)])
+    np.testing.assert_allclose(of_seeds, [expected, np.multiply(expected, 0.5)])
     with pytest.raises(ValueError, match="one phase per task"):
         scores.change_since_learned(matrix[1:])
 
 
 def test_forgetting_since_the_best_so_far_by_hand():
     # Task 1 was at 0.8 and is at 0.4; task 2 is at its best.
-    assert scores.forgetting_since_best(SUCCESS) == pytest.approx((0.4 + 0) / 2)
+    of_seeds = scores.forgetting_since_best([SUCCESS, 0.5 * SUCCESS])
+    np.testing.assert_allclose(of_seeds, [(0.4 + 0) / 2, (0.2 + 0) / 2])
     assert scores.forgetting_since_best(SUCCESS[:1]) == 0  # a task never tested is left out
+    assert scores.forgetting_since_best([[0.6], [0.0]]) == 0.6
 
 
 def test_what_noise_alone_leaves_of_the_best_equals_the_sum_over_all_outcomes():
@@ -66,20 +62,16 @@ def test_what_noise_alone_leaves_of_the_best_equals_the_sum_over_all_outcomes():
     assert found == pytest.approx([np.mean(expected)] * 2, abs=0.01)
 
 
-def test_a_success_of_zero_is_not_treated_as_missing():
-    matrix = [[0.8, NAN], [0.0, 0.5]]
-    assert scores.change_since_learned(matrix) == pytest.approx([-0.8, 0])
-    assert scores.trailing_mean([[1.0], [0.0]], 2).tolist() == [[1], [0.5]]
-    assert scores.area_under_curve([0.0, 0.0], [10, 20]) == 0
-    assert scores.forgetting_since_best([[0.6], [0.0]]) == 0.6
-
-
 def test_area_under_curve_by_hand():
     # Triangle to 10, then two trapezoids; the last interval is twice as long.
     area = (10 * 0.2 + 10 * (0.4 + 0.8) / 2 + 20 * (0.8 + 0.6) / 2) / 40
-    assert scores.area_under_curve([0.4, 0.8, 0.6], [10, 20, 40]) == pytest.approx(area)
-    several = scores.area_under_curve([[0.4, 0.8, 0.6], [1, 1, 1]], [10, 20, 40])
-    assert several.tolist() == pytest.approx([area, 1 - 10 * 0.5 / 40])
+    several = scores.area_under_curve([[0.4, 0.8, 0.6], [1, 1, 1], [0, 0, 0]], [10, 20, 40])
+    assert several.tolist() == pytest.approx([area, 1 - 10 * 0.5 / 40, 0])
+    # Of a run, it starts when a task is presented. Task b: tests after 5, ..., 20 episodes of its
+    # presence, the curve rising from 0.
+    b = (5 * 0.2 + 5 * 0.5 + 5 * 0.65 + 5 * 0.8) / 20
+    c = (5 * 0.0 + 5 * 0.2) / 10
+    np.testing.assert_allclose(scores.area_scores(make_run())[0, 1:], [b, c])
 
 
 def test_episodes_until_overall_success_reaches_a_rate():
@@ -91,44 +83,36 @@ def test_episodes_until_overall_success_reaches_a_rate():
     # Over three evaluations: 1/2, 3/4, 5/6, (1 + 0) / 2, (1 + 1/2) / 2.
     assert scores.overall_episodes_to(seeds, episodes) == 30
     assert scores.overall_episodes_to(seeds, episodes, 0.7) == 20
-    assert scores.overall_episodes_to(seeds[:, :2], episodes[:2]) == np.inf
+    assert scores.overall_episodes_to(seeds[:, :2], episodes[:2]) == INF
 
 
-def test_own_episodes_until_half_of_the_last_twenty_succeed():
+def test_own_episodes_until_a_rate_of_the_last_succeed():
     # The tenth success is the thirteenth episode, but twenty are needed for a rate.
-    early = [0, 0, 0] + [1] * 10 + [0] * 7
-    assert scores.trials_to(early) == 20
+    assert scores.trials_to([0, 0, 0] + [1] * 10 + [0] * 7) == 20
     # 9 of episodes 1 to 20 succeed and 9 of 2 to 21; of 3 to 22, 10 do.
     late = [0, 0] + [0, 1] * 9 + [0, 1]
     assert scores.trials_to(late) == 22
-    assert scores.trials_to(late[:-1]) == np.inf
-    assert scores.trials_to([1] * 19) == scores.trials_to([]) == np.inf
-
-
-def test_another_rate_over_another_window():
+    assert scores.trials_to(late[:-1]) == INF
+    assert scores.trials_to([1] * 19) == scores.trials_to([]) == INF
     outcomes = [1, 0, 1, 0, 1, 1, 1, 1, 0]
     assert scores.trials_to(outcomes, 0.8, window=5) == 7  # episodes 3 to 7
-    assert scores.trials_to(outcomes, 1.0, window=2) == 6
     assert scores.trials_to(outcomes, window=1) == 1
     with pytest.raises(ValueError, match="at least 1 episode, not 0"):
         scores.trials_to(outcomes, window=0)
 
 
 def test_learning_times_relative_to_the_first_task():
-    inf = np.inf
-    seeds = [[100, 50, 300], [40, 40, inf], [50, 100, 100]]
+    seeds = [[100, 50, 300], [40, 40, INF], [50, 100, 100]]
     # By seed 0.5, 1 and 2; 3, never and 2.
     assert scores.times_the_first(seeds).tolist() == [1, 3]
     # A seed without the first task says nothing; half of the others never learn the third.
-    assert scores.times_the_first([*seeds[:2], [inf, 20, 20]]).tolist() == [0.75, inf]
-    np.testing.assert_array_equal(scores.times_the_first([[inf, 20, inf]]), [NAN, NAN])
+    assert scores.times_the_first([*seeds[:2], [INF, 20, 20]]).tolist() == [0.75, INF]
+    np.testing.assert_array_equal(scores.times_the_first([[INF, 20, INF]]), [NAN, NAN])
 
 
 def test_trailing_mean_by_hand():
-    np.testing.assert_allclose(
-        scores.trailing_mean(SUCCESS, 3),
-        [[0, NAN], [0.4, NAN], [1.4 / 3, 0], [0.6, 0.25]],
-    )
+    expected = [[0, NAN], [0.4, NAN], [1.4 / 3, 0], [0.6, 0.25]]
+    np.testing.assert_allclose(scores.trailing_mean(SUCCESS, 3), expected)
     np.testing.assert_array_equal(scores.trailing_mean(SUCCESS, 1), SUCCESS)
 
 
@@ -139,43 +123,26 @@ def test_late_scores_average_the_last_tenth_of_training():
     assert scores.late_window(run) == 20
     np.testing.assert_allclose(scores.late_scores(run), [[0.3], [0.3]])
     # A tenth of 30 episodes has no test but the last.
-    np.testing.assert_allclose(scores.late_scores(make_run()), [[0.5, 0.9, 0.4]] * 2)
-
-
-def test_late_scores_of_an_untested_seed_are_refused():
+    run = make_run()
+    np.testing.assert_allclose(scores.late_scores(run), [[0.5, 0.9, 0.4]] * 2)
+    run.config["seeds"].append(7)
+    with pytest.raises(ValueError, match="no late test of seed 7"):
+        scores.late_scores(run)
     run = make_run()
     run.curves.success[1, -1, 2] = NAN
     with pytest.raises(ValueError, match="no late test of seed 1"):
         scores.late_scores(run)
-    run = make_run()
-    run.config["seeds"].append(7)
-    with pytest.raises(ValueError, match="no late test of seed 7"):
-        scores.late_scores(run)
-
-
-def test_area_scores_start_when_a_task_is_presented():
-    # Task b: tests after 5, ..., 20 episodes of its presence, the curve rising from 0.
-    b = (5 * 0.2 + 5 * 0.5 + 5 * 0.65 + 5 * 0.8) / 20
-    c = (5 * 0.0 + 5 * 0.2) / 10
-    np.testing.assert_allclose(scores.area_scores(make_run())[0, 1:], [b, c])
-
-
-def test_the_success_matrix_by_hand():
-    matrix = scores.success_matrix(make_run())
-    by_hand = [[0.8, NAN, NAN], [0.7, 0.6, NAN], [0.5, 0.9, 0.4]]
-    np.testing.assert_allclose(matrix, [by_hand, by_hand])
 
 
 def test_the_success_matrix_averages_the_last_fifth_of_a_phase():
+    by_hand = [[0.8, NAN, NAN], [0.7, 0.6, NAN], [0.5, 0.9, 0.4]]
+    np.testing.assert_allclose(scores.success_matrix(make_run()), [by_hand, by_hand])
     success = np.linspace(0, 1, 100)[:, None] * [1, 1]
     success[:50, 1] = NAN
     run = make_run(success, (0, 250), "ab")  # 50 tests a phase: those of the last 50 episodes
     matrix = scores.success_matrix(run)[0]
     np.testing.assert_allclose(matrix[0, 0], success[40:50, 0].mean())
     np.testing.assert_allclose(matrix[1], success[90:].mean(0))
-
-
-def test_the_success_matrix_needs_tasks_one_after_the_other():
     with pytest.raises(ValueError, match=r"starts its tasks at \[0, 0, 10\]: only for tasks one"):
         scores.success_matrix(make_run(starts=(0, 0, 10)))
     with pytest.raises(ValueError, match=r"no test .* more often"):
@@ -206,9 +173,8 @@ def test_own_episodes_by_task_and_seed(tmp_path):
     assert scores.own_episodes(run) is None
     seeds = [[learned(20), learned(30), never], [learned(40), learned(40), learned(30)]]
     write_training(directory, [*seeds, [never, learned(20), [0] * 10 + [1] * 20]])
-    inf = np.inf
-    assert scores.own_episodes(run).tolist() == [[20, 30, inf], [40, 40, 30], [inf, 20, 20]]
-    assert scores.own_episodes(run, 0.8)[2].tolist() == [inf, inf, 26]
+    assert scores.own_episodes(run).tolist() == [[20, 30, INF], [40, 40, 30], [INF, 20, 20]]
+    assert scores.own_episodes(run, 0.8)[2].tolist() == [INF, INF, 26]
 
 
 def test_success_lengths_average_late_successes(tmp_path):
@@ -235,24 +201,22 @@ def test_final_tests_by_seed_and_task(tmp_path):
         scores.final_shares(run, "held-out", "success")
 
 
-def test_expected_own_episodes_by_hand():
-    episodes = [5, 10, 20, 30]
-    # Alone until 10, one of two until 20, then one of three.
-    expected = {0: [5, 10, 15, 15 + 10 / 3], 1: [0, 0, 5, 5 + 10 / 3], 2: [0, 0, 0, 10 / 3]}
-    for task, own in expected.items():
-        np.testing.assert_allclose(expected_own_episodes(STARTS, task, episodes), own)
-    from_the_start = expected_own_episodes((0, 0, 4), 1, episodes)
-    np.testing.assert_allclose(from_the_start, [2 + 1 / 3, 4, 2 + 16 / 3, 2 + 26 / 3])
-
-
-def test_expected_own_episodes_of_the_sequential_schedule():
-    episodes = [5, 10, 20, 30]
-    expected = {0: [5, 10, 10, 10], 1: [0, 0, 10, 10], 2: [0, 0, 0, 10]}
-    for task, own in expected.items():
-        found = expected_own_episodes(STARTS, task, episodes, practised=False)
-        np.testing.assert_allclose(found, own)
-    two = expected_own_episodes((0, 4, 4), 2, episodes, practised=False)
-    np.testing.assert_allclose(two, [0.5, 3, 8, 13])
+@pytest.mark.parametrize(
+    ("starts", "task", "practised", "expected"),
+    [
+        # Alone until 10, one of two until 20, then one of three.
+        (STARTS, 0, True, [5, 10, 15, 15 + 10 / 3]),
+        (STARTS, 1, True, [0, 0, 5, 5 + 10 / 3]),
+        (STARTS, 2, True, [0, 0, 0, 10 / 3]),
+        ((0, 0, 4), 1, True, [2 + 1 / 3, 4, 2 + 16 / 3, 2 + 26 / 3]),
+        (STARTS, 0, False, [5, 10, 10, 10]),
+        (STARTS, 1, False, [0, 0, 10, 10]),
+        ((0, 4, 4), 2, False, [0.5, 3, 8, 13]),
+    ],
+)
+def test_expected_own_episodes_by_hand(starts, task, practised, expected):
+    found = expected_own_episodes(starts, task, [5, 10, 20, 30], practised=practised)
+    np.testing.assert_allclose(found, expected)
 
 
 # The reference plays each task in every third episode, all alike: after 5/3, 10/3, 5, ... own
@@ -260,15 +224,12 @@ def test_expected_own_episodes_of_the_sequential_schedule():
 RISING = [[0.3] * 3, *[[0.6] * 3] * 5]
 
 
-def test_areas_are_taken_over_the_own_episodes_of_a_phase():
+def test_forward_transfer_compares_areas_over_the_own_episodes_of_a_phase():
     ours, theirs = own_areas(make_run(), make_run(RISING, (0, 0, 0), "cba"))
     # Task b: 0.4 after 2.5 own episodes, 0.6 after 5; task c: 0 after 5/3, 0.4 after 10/3.
     np.testing.assert_allclose(ours, [[0.5, 0.2]] * 2)
     # The reference is at 0.45 after 2.5 and at 0.6 after 5; at 0.3 after 5/3 and at 0.6 after 10/3.
     np.testing.assert_allclose(theirs, [[(0.45 + 0.6) / 2, 0.45]] * 2)
-
-
-def test_forward_transfer_by_hand():
     gain = forward_transfer(make_run(), make_run(RISING, (0, 0, 0)))
     expected = ((0.5 - 0.525) / (1 - 0.525) + (0.2 - 0.45) / (1 - 0.45)) / 2
     assert gain == pytest.approx([expected] * 3)  # the seeds are equal
@@ -300,14 +261,15 @@ def test_seeds_of_run_and_reference_widen_the_interval():
 @pytest.mark.slow
 def test_the_interval_of_forward_transfer_has_its_nominal_coverage():
     rng, covered, n = np.random.default_rng(0), 0, 1_500
-    truth = forward_transfer(make_run(), make_run(RISING, (0, 0, 0))).value
+    exact = make_run(), make_run(RISING, (0, 0, 0))
+    truth = forward_transfer(*exact).value
     for _ in range(n):
-        pair = make_run(), make_run(RISING, (0, 0, 0))
-        for index, run in enumerate(pair):
+        noisy = []
+        for run in exact:
             levels = 0.05 * rng.normal(size=(6, 1, 3))
-            noisy = run.curves.success[:1] + levels + 0.05 * rng.normal(size=(6, 6, 3))
-            curves = replace(run.curves, seeds=tuple(range(6)), success=noisy)
-            pair = (*pair[:index], replace(run, curves=curves), *pair[index + 1 :])
-        found = forward_transfer(*pair)
+            success = run.curves.success[:1] + levels + 0.05 * rng.normal(size=(6, 6, 3))
+            curves = replace(run.curves, seeds=tuple(range(6)), success=success)
+            noisy.append(replace(run, curves=curves))
+        found = forward_transfer(*noisy)
         covered += found.low <= truth <= found.high
     assert covered / n == pytest.approx(0.95, abs=0.02)

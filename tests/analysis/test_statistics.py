@@ -74,10 +74,15 @@ def test_the_verdict_follows_from_the_intervals(low, high, narrow, verdict):
     assert found.note == {"not decided": "not decided (about 33 seeds would)"}.get(verdict, verdict)
 
 
-def test_permutation_p_by_hand():
+def test_p_values_by_hand():
     assert statistics.permutation_p([0, 0], [1, 1]) == pytest.approx(2 / 6)
     assert statistics.permutation_p(np.zeros(5), np.ones(5)) == pytest.approx(2 / 252)
     assert statistics.permutation_p([0, 1], [1, 0]) == 1
+    assert statistics.holm([0.01, 0.04, 0.03]) == pytest.approx([0.03, 0.06, 0.06])
+    assert statistics.holm([0.5, 0.6]) == [1, 1]
+    found = statistics.holm([0.02, np.nan, 0.01])
+    assert found[::2] == pytest.approx([0.02, 0.02]) and np.isnan(found[1])
+    assert statistics.holm([]) == []
 
 
 def test_the_seeds_needed_reach_the_stated_power():
@@ -93,14 +98,6 @@ def test_the_seeds_needed_reach_the_stated_power():
         decided = np.abs(value) + t[0] * error < statistics.MARGIN
         decided |= np.abs(value) > t[1] * error
         assert decided.mean() == pytest.approx(0.8, abs=0.05)
-
-
-def test_holm_by_hand():
-    assert statistics.holm([0.01, 0.04, 0.03]) == pytest.approx([0.03, 0.06, 0.06])
-    assert statistics.holm([0.5, 0.6]) == [1, 1]
-    found = statistics.holm([0.02, np.nan, 0.01])
-    assert found[::2] == pytest.approx([0.02, 0.02]) and np.isnan(found[1])
-    assert statistics.holm([]) == []
 
 
 def test_estimates_are_rounded_and_clipped():

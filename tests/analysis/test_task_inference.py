@@ -43,11 +43,8 @@ def bank(*demonstrations):
 SEEN = bank((0, 0), (0, 0), (0, 1), (1, 1), (1, 1), (1, 0))
 
 
-def test_matches_are_counted_by_node_and_task():
+def test_matches_are_counted_by_network_node_and_task():
     assert match_counts(network((0, 1, 2)), SEEN, 2).tolist() == [[2, 1], [1, 2], [0, 0]]
-
-
-def test_matches_are_counted_for_each_network_of_a_batch():
     gwr = network((0, 1, 2), (2, 1), batch_size=[2])
     assert match_counts(gwr, SEEN, 3).tolist() == [
         [[2, 1, 0], [1, 2, 0], [0, 0, 0]],

@@ -13,21 +13,9 @@ from benchmarks.speed.versions import Training
 
 
 def weights(ours: Ours) -> list[torch.Tensor]:
-    loss = ours.loss
-    return [
-        tensor
-        for params in (
-            loss.actor_network_params,
-            loss.value_network_params,
-            loss.target_actor_network_params,
-            loss.target_value_network_params,
-        )
-        for tensor in params.values(True, True)
-    ]
-
-
-def floor_weights(floor: Floor) -> list[torch.Tensor]:
-    return [*floor.actor, *floor.critic, *floor.target_actor, *floor.target_critic]
+    networks = ("actor_network", "value_network", "target_actor_network", "target_value_network")
+    params = [getattr(ours.loss, f"{name}_params") for name in networks]
+    return [tensor for of_network in params for tensor in of_network.values(True, True)]
 
 
 def test_the_floor_is_our_arithmetic_without_clipping_and_penalty(monkeypatch):
@@ -40,7 +28,8 @@ def test_the_floor_is_our_arithmetic_without_clipping_and_penalty(monkeypatch):
         batch = ours.sample()
         floor.learn(*floor_batch(batch))
         ours.learn(batch)
-    for mine, theirs, before in zip(weights(ours), floor_weights(floor), start, strict=True):
+    learned = [*floor.actor, *floor.critic, *floor.target_actor, *floor.target_critic]
+    for mine, theirs, before in zip(weights(ours), learned, start, strict=True):
         torch.testing.assert_close(mine.detach(), theirs.detach(), rtol=1e-4, atol=1e-5)
         assert not torch.equal(mine, before)
 
@@ -86,15 +75,10 @@ def test_contenders_take_turns_and_only_rounds_after_the_warmup_count():
     assert times == {"a": [1.0, 1.0], "b": [3.0, 3.0]}
 
 
-def test_quartiles_by_hand():
+def test_quartiles_and_ratios_by_hand():
     assert Timing.of([5.0, 1.0, 3.0, 2.0, 4.0]) == Timing(median=3.0, low=2.0, high=4.0)
-
-
-def test_a_slow_spell_of_the_machine_leaves_the_ratio_as_it_is():
-    a, b = [1.0, 10.0, 1.0], [2.0, 20.0, 2.0]
-    assert ratio(b, a) == Timing(2.0, 2.0, 2.0)
-    with pytest.raises(ValueError):
-        ratio(a, b[:2])
+    # A slow spell of the machine leaves a ratio as it is.
+    assert ratio([2.0, 20.0, 2.0], [1.0, 10.0, 1.0]) == Timing(2.0, 2.0, 2.0)
 
 
 def test_results_are_written_and_printed(tmp_path, capsys, monkeypatch):
@@ -112,10 +96,7 @@ def test_results_are_written_and_printed(tmp_path, capsys, monkeypatch):
         assert row["bytes_per_node"] > 4 * 4
     assert (result["exponent"]["from"], result["exponent"]["to"]) == (20, 40)
     assert (tmp_path / "gwr.png").read_bytes().startswith(b"\x89PNG")
-    printed = capsys.readouterr().out
-    assert "| 1 | 40 |" in printed
-    assert "| 2 | 30 |" in printed
-    assert "exponent from 20 to 40 nodes" in printed
+    assert "| 2 | 30 |" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("nodes", [(), (20,), (20, 20), (1, 20)])
@@ -125,10 +106,9 @@ def test_an_exponent_needs_two_sizes(tmp_path, nodes):
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("power", [0.5, 1.0, 2.0])
-def test_exponent_of_a_power_law_is_its_power(power):
-    rows = [{"nodes": n, "call": {"median": 3 * n**power}} for n in (10, 70, 900)]
-    assert gwr.slope(rows, "call") == pytest.approx(power)
+def test_exponent_of_a_power_law_is_its_power():
+    rows = [{"nodes": n, "call": {"median": 3 * n**0.5}} for n in (10, 70, 900)]
+    assert gwr.slope(rows, "call") == pytest.approx(0.5)
 
 
 def test_networks_are_full_and_as_asked_for():

@@ -51,36 +51,26 @@ def test_no_number_is_off_by_more_than_half_a_code(steps, padded):
     assert latent.abs().max() > 5.08  # so that some are clipped
 
 
-def test_some_demonstrations_are_those_of_the_rows(steps):
-    some = steps.select(torch.tensor([3, 0]))
-    assert some.length.tolist() == [6, 4]
-    for row, origin in enumerate((3, 0)):
-        assert some.latents(frames(some, row)).equal(steps.latents(frames(steps, origin)))
-    masked = steps.select(torch.tensor([False, False, True, True, False]))
-    assert masked.length.tolist() == [2, 6]
-
-
-def test_the_steps_of_two_are_those_of_one_after_the_other(steps):
+def test_some_demonstrations_are_those_of_the_rows_one_after_the_other(steps):
     both = steps.select(torch.tensor([3])) + steps.select(torch.tensor([2, 1, 0]))
     assert both.length.tolist() == [6, 2, 0, 4]
     for row, origin in enumerate((3, 2, 1, 0)):
         assert both.latents(frames(both, row)).equal(steps.latents(frames(steps, origin)))
         assert both.actions(frames(both, row)).equal(steps.actions(frames(steps, origin)))
+    masked = steps.select(torch.tensor([False, False, True, True, False]))
+    assert masked.length.tolist() == [2, 6]
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
+def test_steps_that_do_not_fit_together_are_refused(steps):
+    for changes in (
         {"latent": torch.zeros(12, 64)},
         {"first": torch.zeros(4, dtype=torch.int64)},
         {"first": torch.tensor([0, 4, 4, -1, 12])},
         {"length": torch.tensor([4, 0, 2, 7, 0])},
         {"length": LENGTH.float()},
-    ],
-)
-def test_steps_that_do_not_fit_together_are_refused(steps, changes):
-    with pytest.raises(ValueError, match="of its steps do not match"):
-        replace(steps, **changes)
+    ):
+        with pytest.raises(ValueError, match="of its steps do not match"):
+            replace(steps, **changes)
 
 
 # ---- in the bank
@@ -111,6 +101,8 @@ def test_steps_go_with_their_demonstrations(with_steps):
         (with_steps.of_task(0), [0, 3]),
         (with_steps.for_tasks(with_steps.tasks[2:]), [2]),
     ):
+        assert part.embedding.equal(with_steps.embedding[rows])
+        assert part.train.equal(with_steps.train[rows])
         assert part.steps.first.tolist() == steps.first[rows].tolist()
         assert part.steps.length.tolist() == steps.length[rows].tolist()
     both = with_steps + with_steps.seen()
@@ -137,13 +129,10 @@ def test_steps_of_other_demonstrations_are_refused(with_steps, tmp_path):
     tensors, meta = load_tensors(tmp_path / "bank")
     meta.pop("sha256", None)
     short = {f"steps.{key}": tensors[f"steps.{key}"][1:].clone() for key in ("first", "length")}
-    for damage in (
-        short,
-        {"steps.latent": tensors["steps.latent"].float()},
-        {"steps.other": torch.zeros(5)},
-    ):
+    floats = {"steps.latent": tensors["steps.latent"].float()}
+    for damage in (short, floats, {"steps.other": torch.zeros(5)}):
         save_tensors(tmp_path / "damaged", tensors | damage, meta)
-        with pytest.raises(ValueError, match=r"damaged is damaged or not a bank .* make it again"):
+        with pytest.raises(ValueError, match=r"damaged or not a bank .* make it again"):
             DemonstrationBank.load(tmp_path / "damaged", encoder_id="x")
 
 
@@ -224,45 +213,19 @@ def test_the_command_keeps_the_names_of_the_tasks(tmp_path, encoders, monkeypatc
     assert found.train.tolist() == [True, False]
 
 
-def test_a_bank_says_which_encoders_embedded_it(plain_bank, tmp_path):
-    path, unknown = tmp_path / "bank.safetensors", replace(plain_bank, encoder_id=None)
-    plain_bank.save(path)
-    loaded = DemonstrationBank.load(path, encoder_id="abc")
-    for part in (loaded, loaded.seen(), loaded.for_tasks(loaded.tasks[1:]), loaded + plain_bank):
-        assert part.encoder_id == "abc"
+def test_a_bank_remembers_encoders_and_scene_and_joins_none_of_others(with_steps, tmp_path):
+    path, unknown = tmp_path / "bank.safetensors", replace(with_steps, encoder_id=None)
+    assert with_steps.scene_version is None
+    one = replace(with_steps, scene_version="nico-1")
+    one.save(path)
+    loaded = DemonstrationBank.load(path, encoder_id="x")
+    for part in (loaded, loaded.seen(), loaded.for_tasks(loaded.tasks[1:]), loaded + one):
+        assert (part.encoder_id, part.scene_version) == ("x", "nico-1")
+    assert loaded.identity == one.identity
     with pytest.raises(ValueError, match="set encoder_id"):
         unknown.save(path)
-    assert DemonstrationBank.load(path, encoder_id="abc").identity == plain_bank.identity
-    for other in (unknown, replace(plain_bank, encoder_id="xyz")):
-        with pytest.raises(ValueError, match="embedded by the encoders abc, the other by"):
-            plain_bank + other
-
-
-@pytest.fixture
-def plain_bank() -> DemonstrationBank:
-    generator = torch.Generator().manual_seed(0)
-    return DemonstrationBank(
-        embedding=torch.randn(6, 32, generator=generator),
-        task=torch.tensor([0, 0, 1, 1, 2, 2]),
-        train=torch.tensor([True, False] * 3),
-        encoder_id="abc",
-    )
-
-
-def test_a_bank_is_split_into_seen_and_held_out(plain_bank):
-    torch.testing.assert_close(plain_bank.seen().embedding, plain_bank.embedding[[0, 2, 4]])
-    torch.testing.assert_close(plain_bank.held_out().embedding, plain_bank.embedding[[1, 3, 5]])
-    assert plain_bank.seen().task.tolist() == plain_bank.held_out().task.tolist() == [0, 1, 2]
-    assert plain_bank.seen().train.all()
-    assert not plain_bank.held_out().train.any()
-
-
-def test_a_bank_remembers_its_scene_and_joins_none_of_another(plain_bank, tmp_path):
-    assert plain_bank.scene_version is None
-    for version in (None, "nico-1"):
-        bank = replace(plain_bank, scene_version=version)
-        bank.save(tmp_path / "bank.safetensors")
-        loaded = DemonstrationBank.load(tmp_path / "bank.safetensors", encoder_id="abc")
-        assert loaded.scene_version == version
+    for other in (unknown, replace(with_steps, encoder_id="xyz")):
+        with pytest.raises(ValueError, match="embedded by the encoders x, the other by"):
+            with_steps + other
     with pytest.raises(ValueError, match="shows the scene nico-1, the other nico-2"):
-        loaded + replace(plain_bank, scene_version="nico-2")
+        loaded + replace(with_steps, scene_version="nico-2")

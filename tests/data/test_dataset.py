@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -30,46 +30,43 @@ def truncate(path: Path) -> None:
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (truncate, r"pixels\.memmap is missing or truncated; remove .*"),
-        (lambda p: (p / "dataset.json").write_text("{"), r"dataset\.json is damaged; remove .*"),
-        (lambda p: (p / "dataset.json").unlink(), r"copy is not a dataset of demonstrations; .*"),
-        (lambda p: edit(p / "dataset.json", checksum=None), r"is not complete; resume it with .*"),
-        (
-            lambda p: edit(p / "dataset.json", scene_version="old"),
-            r"was recorded in scene 'old', this is nico",
-        ),
+        (truncate, r"pixels\.memmap is missing or truncated"),
+        (lambda p: (p / "dataset.json").write_text("{"), r"dataset\.json is damaged"),
+        (lambda p: (p / "dataset.json").unlink(), "not a dataset of demonstrations"),
+        (lambda p: edit(p / "dataset.json", checksum=None), "not complete; resume it"),
+        (lambda p: edit(p / "dataset.json", scene_version="old"), "recorded in scene 'old'"),
     ],
 )
 def test_what_is_not_whole_is_refused_in_one_line(copy, damage, message):
     damage(copy)
-
     with pytest.raises(ValueError, match=message) as error:
         load_demonstrations(copy)
-
     assert "\n" not in str(error.value)
     if "resume" not in message:
         assert "record it again with `python -m bgpo_trl.data.recording PATH`" in str(error.value)
 
 
-@pytest.mark.parametrize("key", sorted(KEYS))
-def test_a_flipped_byte_is_noticed(copy, key):
-    values = np.memmap(copy / f"{key}.memmap", np.uint8, "r+")
-    values[len(values) // 2] ^= 1
-    values.flush()
+def test_a_flipped_byte_is_noticed(copy):
+    for key in sorted(KEYS):
+        values = np.memmap(copy / f"{key}.memmap", np.uint8, "r+")
+        values[len(values) // 2] ^= 1
+        values.flush()
+        with pytest.raises(ValueError, match=r"is damaged \(checksum differs\)"):
+            load_demonstrations(copy)
+        values[len(values) // 2] ^= 1
+        values.flush()
+    assert len(load_demonstrations(copy)) == 9
 
-    with pytest.raises(ValueError, match=r"is damaged \(checksum differs\); remove it and .*$"):
-        load_demonstrations(copy)
-    assert len(load_demonstrations(copy, verify=False)) == 9
 
-
-@pytest.mark.parametrize("meta", ["{", '{"_type": "os.system"}', None])
-def test_what_says_how_to_read_the_tensors_is_not_believed(recorded, copy, meta):
+def test_what_says_how_to_read_the_tensors_is_not_believed(recorded, copy):
     """TensorDict's own file is not under the checksum, and may name what to unpickle."""
-    (copy / "meta.json").unlink() if meta is None else (copy / "meta.json").write_text(meta)
-    found, expected = load_demonstrations(copy), load_demonstrations(recorded)
-    assert set(found.keys()) == KEYS
-    for key in KEYS:
-        torch.testing.assert_close(found[key], expected[key], rtol=0, atol=0)
+    expected = load_demonstrations(recorded)
+    for meta in ("{", '{"_type": "os.system"}', None):
+        (copy / "meta.json").unlink() if meta is None else (copy / "meta.json").write_text(meta)
+        found = load_demonstrations(copy)
+        assert set(found.keys()) == KEYS
+        for key in KEYS:
+            torch.testing.assert_close(found[key], expected[key], rtol=0, atol=0)
 
 
 TASKS = ("grasp_glass", "push_green_to_white")
@@ -119,26 +116,6 @@ def test_a_dataset_has_the_given_entries_in_order_and_zeros_beyond_them(tmp_path
     assert read_meta(tmp_path / "own")["tasks"] == [*TASKS]
 
 
-def test_recorded_demonstrations_written_again_are_the_same_dataset(recorded, tmp_path):
-    shown = load_demonstrations(recorded)
-    names = read_meta(recorded)["tasks"]
-    episodes = {name: [] for name in names}
-    for row in shown:
-        length = int(row["length"])
-        taken = {"pixels": length, "action": length - 1, "state": length}
-        values = {key: row[key][:n].numpy() for key, n in taken.items()}
-        episodes[names[int(row["task"])]].append(values)
-
-    again = write(tmp_path / "again", episodes)
-
-    longest = int(shown["length"].max())
-    for key in ("pixels", "state"):
-        assert again[key].equal(shown[key][:, :longest])
-    assert again["action"].equal(shown["action"][:, : longest - 1])
-    for key in ("length", "task", "train"):
-        assert again[key].equal(shown[key])
-
-
 class OnDemand(Sequence):
     """Episodes that are made when they are indexed."""
 
@@ -163,32 +140,21 @@ def changed(**entries):
     return episodes
 
 
-def missing():
-    episodes = episodes_of()
-    episodes[TASKS[1]][2] = None
-    return episodes
-
-
-NAMED = "episode 2 of 'push_green_to_white' "
+MISSING = {**episodes_of(), TASKS[1]: [episode_of(2), episode_of(7), None, episode_of(3)]}
 
 
 @pytest.mark.parametrize(
     ("episodes", "cause", "remedy"),
     [
-        (missing(), NAMED + "is missing", "leave the episode out"),
-        (changed(pixels=None), NAMED + "has 'action', 'state'", "give 'pixels'"),
-        (changed(actions=0), NAMED + "has 'pixels'", "give 'pixels', and if known 'action'"),
-        (changed(action=None), NAMED + "has 'pixels', 'state'", "of all episodes or of none"),
-        (
-            changed(pixels=np.zeros((6, 48, 64, 3), np.uint8)),
-            NAMED + "has frames of 48 x 64 pixels, the scene 'nico' of 32 x 64",
-            "resize_frames",
-        ),
-        (changed(pixels=np.zeros((6, 32, 64, 3))), NAMED + "has pixels float64", "give uint8"),
+        (MISSING, "episode 2 of 'push_green_to_white' is missing", "leave the episode out"),
+        (changed(pixels=None), "has 'action', 'state'", "give 'pixels'"),
+        (changed(actions=0), "has 'pixels'", "give 'pixels', and if known 'action'"),
+        (changed(action=None), "has 'pixels', 'state'", "of all episodes or of none"),
+        (changed(pixels=np.zeros((6, 48, 64, 3), np.uint8)), "48 x 64", "resize_frames"),
+        (changed(pixels=np.zeros((6, 32, 64, 3))), "has pixels float64", "give uint8"),
         (changed(pixels=np.zeros((6, 32, 64), np.uint8)), "[6, 32, 64]", "[T, H, W, 3]"),
         (changed(pixels=np.zeros((1, 32, 64, 3), np.uint8)), "[1, 32, 64, 3]", "two frames"),
-        (changed(action=np.zeros((6, 4))), NAMED + "has the action float64 [6, 4]", "[5, 4]"),
-        (changed(action=np.zeros((5, 3))), "[5, 3]", "give [5, 4] numbers"),
+        (changed(action=np.zeros((6, 4))), "has the action float64 [6, 4]", "[5, 4]"),
         (changed(action=[["left"] * 4] * 5), "has the action", "give [5, 4] numbers"),
         (changed(action=np.full((5, 4), -1.5)), "an action of size 1.5", "scale actions"),
         (changed(action=np.full((5, 4), np.nan)), "not finite", "mend it"),
@@ -205,14 +171,16 @@ def test_invalid_episodes_are_refused_before_anything_is_written(
     refused(lambda: write(tmp_path / "made" / "own", episodes), cause, remedy)
 
 
-@pytest.mark.parametrize("options", [{"held_out_per_task": -1}, {"spread": 1.5}, {"scene": "mars"}])
-def test_invalid_arguments_are_refused_before_anything_is_written(tmp_path, options):
-    with pytest.raises(ValueError):
-        write(tmp_path / "own", episodes_of(), **options)
+def test_what_cannot_be_written_leaves_nothing(tmp_path, monkeypatch):
+    for options in ({"held_out_per_task": -1}, {"spread": 1.5}, {"scene": "mars"}):
+        with pytest.raises(ValueError):
+            write(tmp_path / "own", episodes_of(), **options)
+    usage = shutil.disk_usage(tmp_path)._replace(free=1000)
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "disk_usage", lambda _: usage)
+        with pytest.raises(OSError, match="make room or choose another folder"):
+            write(tmp_path / "own", episodes_of())
     assert not [*tmp_path.iterdir()]
-
-
-def test_a_folder_that_exists_is_kept_as_it_is(tmp_path):
     write(tmp_path / "own", episodes_of())
     before = contents(tmp_path)
     with pytest.raises(ValueError, match="exists: choose another folder, or remove it"):
@@ -226,16 +194,9 @@ def test_resized_frames_are_means_of_areas():
     assert resize_frames(frame, (1, 2)).tolist() == [[[[8, 8, 10], [14, 14, 16]]]]
 
 
+@settings(max_examples=20)
 @given(arrays(np.uint8, (3, 4, 6, 3)), st.integers(1, 3), st.integers(1, 3))
 def test_resizing_keeps_enlarged_frames(frames, by_height, by_width):
     large = frames.repeat(by_height, 1).repeat(by_width, 2)
     np.testing.assert_array_equal(resize_frames(large, (4, 6)), frames)
     np.testing.assert_array_equal(resize_frames(frames, large.shape[1:3]), large)
-
-
-def test_nothing_is_left_if_the_disk_is_full(tmp_path, monkeypatch):
-    usage = shutil.disk_usage(tmp_path)._replace(free=1000)
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
-    with pytest.raises(OSError, match="make room or choose another folder"):
-        write(tmp_path / "own", episodes_of())
-    assert not [*tmp_path.iterdir()]

@@ -1,6 +1,7 @@
 """Transitions of shown demonstrations, against the bank's own steps."""
 
 import io
+import itertools
 from dataclasses import replace
 
 import pytest
@@ -71,29 +72,22 @@ def test_transitions_are_the_steps_of_what_was_shown_in_the_rows_group(shown, ba
     for _ in range(60):
         drawn = shown.sample(GROUP)
         assert drawn["priority_weight"].tolist() == [[1, 1, 1, 0, 0], [1, 1, 1, 1, 0]]
-        for (seed, row), group in zip(
-            torch.cartesian_prod(torch.arange(2), torch.arange(5)).tolist(),
-            GROUP.flatten().tolist(),
-            strict=True,
-        ):
-            if (seed, group) not in told:
+        for seed, row in itertools.product(range(2), range(5)):
+            key = seed, int(GROUP[seed, row])
+            if key not in told:
                 continue
             one = drawn[seed, row]
             index = int(one["behavior"][0])
             assert one["behavior"][1] == one["label"] == seed
-            rewards = told[seed, group][index]
-            (place,) = (
-                t
-                for t, (latent, _, _, _) in enumerate(transitions(steps, index))
-                if latent.equal(one["latent"])
-            )
-            _, action, following, ends = transitions(steps, index)[place]
+            of_index = transitions(steps, index)
+            (place,) = (t for t, step in enumerate(of_index) if step[0].equal(one["latent"]))
+            _, action, following, ends = of_index[place]
             assert one["action"].equal(action)
             assert one["next", "latent"].equal(following)
             assert one["next", "terminated"].tolist() == [ends]
-            reward = float(one["next", "reward"])
-            assert min(abs(reward - r) for r in (rewards if ends else {0.0})) < 1e-6
-            found[seed, group].add((index, place))
+            rewards = told[key][index] if ends else {0.0}
+            assert min(abs(float(one["next", "reward"]) - r) for r in rewards) < 1e-6
+            found[key].add((index, place))
     for key, of_group in told.items():
         every = {(i, t) for i in of_group for t in range(int(steps.length[i]) - 1)}
         assert found[key] == every

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
-from bgpo_trl.data.replay import GroupReplay, draw_for_rows
+from bgpo_trl.data.replay import GroupReplay
 
 KEYS = ["latent", ("next", "terminated")]
 
@@ -87,18 +87,6 @@ def test_a_row_is_drawn_from_what_is_left_of_its_group(
                 assert bool(drawn["next", "terminated"][seed, row]) == (seed == 1)
 
 
-def test_all_that_a_group_holds_is_drawn_equally_often():
-    replay = make(20)
-    fill(replay, [(step % 3, 0) for step in range(30)])
-    drawn = replay.sample(torch.tensor([[2] * 30_000, [0] * 30_000]))["latent"].squeeze(-1)
-    count = drawn[0].round().long().bincount(minlength=30)
-    held = torch.arange(11, 30, 3)  # of the last 20 steps, every third
-    assert count.nonzero().flatten().equal(held)
-    expected = 30_000 / len(held)
-    assert ((count[held] - expected).abs() < 5 * expected**0.5).all()
-    assert drawn[1].round().long().unique().equal(torch.arange(10, 30))
-
-
 def test_entries_are_drawn_as_they_are_sampled_also_some_of_them():
     groups, asked = [(0, 1), (1, 1), (0, 0), (2, 1)], torch.tensor([[0, 1, 0, -1], [1, 1, 0, 7]])
     first, second, third = make(), make(), make()
@@ -110,22 +98,6 @@ def test_entries_are_drawn_as_they_are_sampled_also_some_of_them():
     filled = drawn["priority_weight"] > 0
     for entries in (drawn, some):
         assert all(entry[filled].equal(sampled[key][filled]) for key, entry in entries.items())
-
-
-def test_a_seed_of_a_stack_is_that_seed_alone():
-    together = make(7, n_seeds=3)
-    alone = [GroupReplay(7, generator=[stream], keys=KEYS) for stream in generators(3)]
-    groups = torch.randint(3, (20, 3), generator=torch.Generator().manual_seed(5))
-    asked = torch.tensor([[0, 1, 2, 0, -1]])
-    for step, group in enumerate(groups):
-        data, mask = transition(step, 3), torch.tensor([True, step % 2 == 0, True])
-        together.add(data, group, mask)
-        for seed, replay in enumerate(alone):
-            rows = slice(seed, seed + 1)
-            replay.add(data[rows], group[rows], mask[rows])
-        drawn = together.sample(asked.expand(3, -1))
-        for seed, replay in enumerate(alone):
-            assert (replay.sample(asked)[0] == drawn[seed]).all()
 
 
 def test_some_seeds_draw_what_they_would_draw_with_all():
@@ -154,35 +126,25 @@ def test_samples_share_nothing_with_the_buffer():
     assert not drawn.requires_grad
 
 
-def test_rows_without_a_group_draw_nothing():
-    asked = torch.tensor([[0, -1, 1, -1], [-1, -1, -1, -1]])
-    ours, theirs = generators(2), generators(2)
-    shares = draw_for_rows(torch.rand, asked, ours, dtype=torch.float64)
-    assert shares[0, [0, 2]].equal(torch.rand(2, generator=theirs[0], dtype=torch.float64))
-    assert not shares[0, [1, 3]].any()
-    assert not shares[1].any()
-    for one, other in zip(ours, theirs, strict=True):
-        assert one.get_state().equal(other.get_state())
-
-
-@pytest.mark.parametrize("n_first", [5, 1024, 2500])
+@pytest.mark.parametrize("n_first", [5, 1100])  # rows of a group grow by 1024
 def test_a_group_is_forgotten_when_overwritten_and_can_return(n_first):
-    replay = GroupReplay(3000, generator=generators(1), keys=["latent"])
+    size = 1300
+    replay = GroupReplay(size, generator=generators(1), keys=["latent"])
 
     def store(group, n, first):
         for step in range(n):
             replay.add(TensorDict({"latent": torch.full([1, 1], first + step)}, [1]), group)
 
-    old, new = torch.tensor([0]), torch.tensor([1])
+    old, new, both = torch.tensor([0]), torch.tensor([1]), torch.tensor([[0, 1]])
     store(old, n_first, 0.0)
-    store(new, 3000 - n_first // 2, 10_000.0)
-    assert replay.sizes(torch.tensor([[0, 1]])).tolist() == [[n_first // 2, 3000 - n_first // 2]]
+    store(new, size - n_first // 2, 10_000.0)
+    assert replay.sizes(both).tolist() == [[n_first // 2, size - n_first // 2]]
     drawn = replay.sample(torch.zeros(1, 500, dtype=torch.int64))["latent"]
     assert drawn.min() >= n_first - n_first // 2
     assert drawn.max() < n_first
-    store(new, 3000, 20_000.0)
+    store(new, size, 20_000.0)
     for _ in range(2):  # the second time, nothing is left to forget
-        assert replay.sizes(torch.tensor([[0, 1]])).tolist() == [[0, 3000]]
+        assert replay.sizes(both).tolist() == [[0, size]]
         assert not replay.sample(torch.zeros(1, 9, dtype=torch.int64))["priority_weight"].any()
     store(old, 2, 30_000.0)
     drawn = replay.sample(torch.zeros(1, 99, dtype=torch.int64))
@@ -190,11 +152,10 @@ def test_a_group_is_forgotten_when_overwritten_and_can_return(n_first):
     assert (drawn["priority_weight"] == 1).all()
 
 
-@pytest.mark.parametrize("n_steps", [0, 1, 6, 25])
+@pytest.mark.parametrize("n_steps", [0, 25])
 def test_a_restored_replay_continues_as_the_saved_one(n_steps):
     replay, restored = make(10), make(10, first=9)
-    groups = [(step % 3, step % 2) for step in range(n_steps)]
-    fill(replay, groups)
+    fill(replay, [(step % 3, step % 2) for step in range(n_steps)])
     fill(restored, [(4, 4)] * 3)
     asked = torch.tensor([[0, 1, 2, 1], [1, 0, 1, -1]])
     if n_steps:
@@ -229,8 +190,7 @@ def test_a_cleared_seed_draws_nothing_and_then_only_what_it_stores_anew(restored
         fill(one, [(0, 0)] * 13)
     replay.clear(1)
     if restored:
-        state = through_a_file(replay.state_dict())
-        replay = make(10, first=9)
+        state, replay = through_a_file(replay.state_dict()), make(10, first=9)
         replay.load_state_dict(state)
     assert replay.sizes(torch.zeros(2, 1).long()).tolist() == [[10], [0]]
     with pytest.raises(ValueError, match="every seed needs a transition"):
@@ -242,7 +202,7 @@ def test_a_cleared_seed_draws_nothing_and_then_only_what_it_stores_anew(restored
     for one in (replay, untouched):
         fill(one, [(1, 0)] * 2)
     kept, group = replay.contents(1)
-    assert kept["latent"].equal(transition(0, 2)["latent"][[1]].add(torch.tensor([[0], [1]])))
+    assert kept["latent"].flatten().tolist() == pytest.approx([0.01, 1.01])
     assert group.tolist() == [0, 0]
     asked = torch.tensor([[0, 1, 0, 1], [0, 0, 0, 1]])
     drawn = replay.sample(asked)
@@ -251,14 +211,14 @@ def test_a_cleared_seed_draws_nothing_and_then_only_what_it_stores_anew(restored
     assert drawn["priority_weight"][1].tolist() == [1, 1, 1, 0]
 
 
-@pytest.mark.parametrize("memory", [float("nan"), float("inf")])
-def test_rows_of_the_only_seed_are_zeros_where_memory_is_not(monkeypatch, memory):
-    replay = make(10, n_seeds=1)
+def test_rows_of_the_only_seed_are_zeros_where_memory_is_not(monkeypatch):
+    replay, restored = make(10, n_seeds=1), make(10, n_seeds=1)
     fill(replay, [(0,)])
     replay.clear(0)
     state = through_a_file(replay.state_dict())
-    restored = make(10, n_seeds=1)
-    monkeypatch.setattr(torch, "empty", lambda *shape, dtype: torch.full(shape, memory).to(dtype))
+    monkeypatch.setattr(
+        torch, "empty", lambda *shape, dtype: torch.full(shape, torch.nan).to(dtype)
+    )
     restored.load_state_dict(state)
     assert not restored.sample(torch.tensor([[-1]]))["latent"].any()
 
@@ -267,10 +227,7 @@ BAD = {
     "batch size": (transition(0, 3), None),
     "found no 'latent'": (transition(0, 2).exclude("latent"), None),
     "latent.*as stored before": (transition(0, 2).set("latent", torch.zeros(2, 5)), None),
-    "terminated.*bool": (
-        transition(0, 2).set(("next", "terminated"), torch.zeros(2, 1)),
-        None,
-    ),
+    "terminated.*bool": (transition(0, 2).set(("next", "terminated"), torch.zeros(2, 1)), None),
     "mask": (transition(0, 2), torch.ones(2)),
 }
 

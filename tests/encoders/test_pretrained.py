@@ -1,14 +1,12 @@
 """Encoders and the bank of their embeddings, which are made, shipped and loaded together."""
 
-import json
 import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
 
-from bgpo_trl.data.dataset import load_demonstrations
+from bgpo_trl.data.dataset import load_demonstrations, read_meta
 from bgpo_trl.encoders import pretrained, train
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.encoders.representation import load_representation, save_representation
@@ -64,9 +62,8 @@ def test_made_encoders_and_bank_are_loaded(made, folder):
     assert loaded_encoders.metadata["command"] == "a command"
     assert loaded_bank.tasks == bank.tasks == REVERSED
     for recorded in ("demonstrations", "demonstrations-play"):
-        assert json.loads((folder / recorded / "dataset.json").read_text())["tasks"] == [*REVERSED]
-    for name in ("embedding", "task", "train"):
-        assert getattr(loaded_bank, name).equal(getattr(bank, name))
+        assert read_meta(folder / recorded)["tasks"] == [*REVERSED]
+    assert loaded_bank.identity == bank.identity
 
 
 def test_the_command_does_not_overwrite_shipped_weights_unasked(made, folder, monkeypatch):
@@ -82,25 +79,19 @@ def test_the_same_command_records_and_trains_nothing_again(made, folder, monkeyp
     def refuse(*arguments):
         raise AssertionError("recorded again")
 
+    def make(**changes):
+        paths = folder / "encoders" / "some.safetensors", folder / "demonstrations"
+        return make_pretrained(*paths, folder=folder / "log", **{**ARGUMENTS, **changes})
+
     for name in ("demonstrate", "play"):
         monkeypatch.setattr(f"bgpo_trl.data.recording._Recorder.{name}", refuse)
     play = load_demonstrations(folder / "demonstrations-play")
     assert (len(play), int((~play["train"]).sum())) == (6, 3)
-    encoders, bank = make_pretrained(
-        folder / "encoders" / "some.safetensors",
-        folder / "demonstrations",
-        folder=folder / "log",
-        **ARGUMENTS,
-    )
+    encoders, bank = make()
     assert encoders.identity == made[0].identity
     assert bank.embedding.equal(made[1].embedding)
     with pytest.raises(ValueError, match="holds another recording"):
-        make_pretrained(
-            folder / "encoders" / "some.safetensors",
-            folder / "demonstrations",
-            folder=folder / "log",
-            **{**ARGUMENTS, "per_task": 4},
-        )
+        make(per_task=4)
 
 
 def test_files_that_do_not_belong_together_are_refused(made, copy, monkeypatch):
@@ -122,11 +113,9 @@ def test_files_that_do_not_belong_together_are_refused(made, copy, monkeypatch):
 @pytest.mark.parametrize(
     ("tasks", "name"),
     [
-        (nico.PAPER_TASKS, "nico"),
         (("grasp_glass",), "nico"),
         (("juggle", "grasp_glass"), "nico"),
         (nico.ALL_TASKS, "nico_eight"),
-        (("press_white",), "nico_eight"),
         (("juggle", "press_white"), "nico_eight"),
     ],
 )
@@ -147,12 +136,9 @@ def test_a_bank_is_used_with_the_encoders_that_embedded_it(tmp_path):
         encoders, bank = pretrained_for(nico.PAPER_TASKS, path)
         assert encoders.identity == load_representation(weights).identity
         assert bank.tasks == nico.PAPER_TASKS
-
-
-def test_an_unreadable_bank_gets_the_default_encoders(tmp_path: Path):
-    assert pretrained.weights_of_bank(tmp_path / "nothing") == pretrained.default_weights()
-    (tmp_path / "rubbish").write_bytes(b"rubbish")
-    assert pretrained.weights_of_bank(tmp_path / "rubbish") == pretrained.default_weights()
+    path.write_bytes(b"rubbish")
+    for unreadable in (path, tmp_path / "nothing"):
+        assert pretrained.weights_of_bank(unreadable) == pretrained.default_weights()
 
 
 @pytest.fixture(scope="module")
@@ -168,7 +154,7 @@ def mixed(shipped):
     return (own + bank.for_tasks([TASKS[1]])).for_tasks([TASKS[1], "juggle"])
 
 
-@pytest.mark.parametrize("tasks", [TASKS, TASKS[1:], TASKS[::-1]])
+@pytest.mark.parametrize("tasks", [TASKS, TASKS[:0:-1]])
 def test_shipped_demonstrations_are_not_copied(shipped, tmp_path, tasks):
     encoders, bank = shipped
     bank = bank.for_tasks(tasks)
@@ -182,61 +168,45 @@ def test_own_demonstrations_move_with_the_run(shipped, mixed, tmp_path):
     encoders, _ = shipped
     (tmp_path / "run").mkdir()
     keep_inputs(tmp_path / "run", mixed, encoders)
-    shutil.move(tmp_path / "run", tmp_path / "moved")
+    (tmp_path / "run").rename(tmp_path / "moved")
     digests = Digests(encoders.identity, mixed.identity)
     found = load_inputs(tmp_path / "moved", mixed.tasks, digests)[1]
-    assert found.tasks == mixed.tasks
-    for name in ("embedding", "task", "train"):
-        assert getattr(found, name).equal(getattr(mixed, name))
-    assert found.identity == mixed.identity
-    shutil.rmtree(tmp_path / "moved")
+    assert (found.tasks, found.identity) == (mixed.tasks, mixed.identity)
 
 
-def test_demonstrations_of_another_run_are_refused(shipped, mixed, tmp_path):
-    encoders, _ = shipped
+def test_inputs_of_another_run_or_scene_are_refused(shipped, mixed, tmp_path):
+    encoders, bank = shipped
     digests = Digests(encoders.identity, mixed.identity)
-    with pytest.raises(ValueError, match=r"^the bank has no demonstration of 'juggle'"):
+    with pytest.raises(ValueError, match="the bank has no demonstration of 'juggle'"):
         load_inputs(tmp_path, mixed.tasks, digests)
-    with pytest.raises(
-        ValueError,
-        match=rf"demonstrations {mixed.identity[:12]}, not with .*: put its own at .*run",
-    ) as error:
+    with pytest.raises(ValueError, match=f"demonstrations {mixed.identity[:12]}, not") as error:
         load_inputs(tmp_path / "run", TASKS, digests)
     assert str(error.value).endswith(str(tmp_path / "run" / BANK))
 
-
-ONE, TWO, THREE = TASKS
-
-
-@pytest.fixture
-def own(bank, encoders, monkeypatch, tmp_path):
-    """Path of a bank of two tasks, one of them shipped under the same name."""
-    bank = replace(bank, encoder_id=encoders.identity)
-    monkeypatch.setattr(experiment, "load_pretrained", lambda *_, **__: (encoders, bank))
-    path = tmp_path / "own.safetensors"
-    other = replace(bank, embedding=bank.embedding + 1)
-    renamed = replace(other.for_tasks([ONE, TWO]), tasks=("juggle", TWO))
-    renamed.save(path)
-    return path
-
-
-def test_tasks_that_the_bank_lacks_are_taken_from_the_package(own, bank):
-    found = experiment.pretrained_for(["juggle", TWO, THREE], own)[1]
-    assert found.tasks == ("juggle", TWO, THREE)
-    for task, name, offset in ((0, ONE, 1), (1, TWO, 1), (2, THREE, 0)):
-        shipped = bank.for_tasks([name])
-        assert found.of_task(task).embedding.equal(shipped.embedding + offset)
-        assert found.of_task(task).train.equal(shipped.train)
-    assert experiment.pretrained_for([TWO])[1].embedding.equal(bank.for_tasks([TWO]).embedding)
-
-
-def test_other_encoders_and_a_changed_scene_are_told_apart(shipped, tmp_path):
-    encoders, bank = shipped
     foreign = replace(encoders, metadata={**encoders.metadata, "scene_version": "mars-1"})
     own_weights(tmp_path).parent.mkdir()
     save_representation(foreign, own_weights(tmp_path))
     digests = Digests(foreign.identity, bank.identity)
-    with pytest.raises(ValueError, match=r"was trained in the scene mars-1, this is .*: use the"):
+    with pytest.raises(ValueError, match="was trained in the scene mars-1"):
         load_inputs(tmp_path, TASKS, digests)
-    with pytest.raises(ValueError, match=r"was trained with the encoders 0123, not with .*: put"):
+    with pytest.raises(ValueError, match="was trained with the encoders 0123"):
         load_inputs(tmp_path, TASKS, digests._replace(encoders="0123"))
+
+
+def test_tasks_that_the_bank_lacks_are_taken_from_the_package(
+    bank, encoders, monkeypatch, tmp_path
+):
+    """Of two tasks in the bank, one is shipped under the same name."""
+    one, two, three = TASKS
+    shipped = replace(bank, encoder_id=encoders.identity)
+    monkeypatch.setattr(experiment, "load_pretrained", lambda *_, **__: (encoders, shipped))
+    other = replace(shipped, embedding=bank.embedding + 1).for_tasks([one, two])
+    replace(other, tasks=("juggle", two)).save(tmp_path / "own.safetensors")
+
+    found = experiment.pretrained_for(["juggle", two, three], tmp_path / "own.safetensors")[1]
+    assert found.tasks == ("juggle", two, three)
+    for task, (name, offset) in enumerate([(one, 1), (two, 1), (three, 0)]):
+        expected = bank.for_tasks([name])
+        assert found.of_task(task).embedding.equal(expected.embedding + offset)
+        assert found.of_task(task).train.equal(expected.train)
+    assert experiment.pretrained_for([two])[1].embedding.equal(bank.for_tasks([two]).embedding)

@@ -52,9 +52,9 @@ TINY = replace(TINY_ENCODERS, checkpoint_every=1, log_every=2)
 DIRECTIONS = np.array([[1, 0, 0, 0], [-1, 0, 0, 1], [0, 1, -1, 0]])  # of both squares, by task
 
 
-def squares(n: int, seed: int = 0) -> TensorDict:
+def squares(n: int) -> TensorDict:
     """Demonstrations of three ways to move a red and a green square of 8 pixels."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     pixels = np.zeros((n, 51, 32, 64, 3), np.uint8)
     action = np.zeros((n, 50, 4), np.float32)
     state = np.zeros((n, 51, 16), np.float32)
@@ -63,27 +63,18 @@ def squares(n: int, seed: int = 0) -> TensorDict:
     for i in range(n):
         place = rng.uniform([16, 8, 16, 8], [40, 16, 40, 16])  # x, y, x, y of the corners
         for t in range(length[i]):
-            frame = np.full((32, 64, 3), 60, np.uint8)
+            pixels[i, t] = 60
             for corner, color in ((place[:2], (230, 30, 30)), (place[2:], (30, 230, 30))):
                 x, y = np.round(corner).astype(int)
-                frame[y : y + 8, x : x + 8] = color
-            pixels[i, t] = frame
+                pixels[i, t, y : y + 8, x : x + 8] = color
             state[i, t, :4] = place / 32
             state[i, t, 7:9], state[i, t, 10:12] = place[:2] / 100, place[2:] / 100
             if t < length[i] - 1:
                 action[i, t] = 0.6 * DIRECTIONS[task[i]] + rng.uniform(-0.4, 0.4, 4)
                 place = np.clip(place + 4 * action[i, t], 0, [55, 23, 55, 23])
-    return TensorDict(
-        {
-            "pixels": torch.from_numpy(pixels),
-            "action": torch.from_numpy(action),
-            "length": torch.from_numpy(length),
-            "state": torch.from_numpy(state),
-            "task": torch.from_numpy(task),
-            "train": torch.arange(n) < 0.8 * n,
-        },
-        [n],
-    )
+    arrays = {"pixels": pixels, "action": action, "length": length, "state": state, "task": task}
+    entries = {key: torch.from_numpy(values) for key, values in arrays.items()}
+    return TensorDict({**entries, "train": torch.arange(n) < 0.8 * n}, [n])
 
 
 @pytest.fixture(scope="module")
@@ -93,14 +84,17 @@ def dataset() -> TensorDict:
 
 @pytest.fixture(scope="module")
 def trained(dataset: TensorDict) -> Representation:
-    return train_representation(dataset, CONFIG, scene_version="squares", progress=False)
+    return train(dataset, CONFIG)
+
+
+def train(dataset: TensorDict, config: RepresentationConfig = TINY, **options) -> Representation:
+    options = {"scene_version": "squares", "progress": False, **options}
+    return train_representation(dataset, config, **options)
 
 
 @pytest.fixture(scope="module")
 def tiny() -> Representation:
-    return train_representation(
-        squares(8), TINY, scene_version="squares", command="make weights", progress=False
-    )
+    return train(squares(8), command="make weights")
 
 
 def same(a: Representation, b: Representation) -> bool:
@@ -147,23 +141,16 @@ def test_latents_are_standardized_and_frames_beyond_the_length_ignored(
     assert torch.equal(embed_demonstrations(trained, part), phi)
 
 
-def test_held_out_demonstrations_do_not_change_the_weights(tiny: Representation) -> None:
+def test_weights_depend_on_seed_and_training_part_and_not_on_global_state(
+    tiny: Representation,
+) -> None:
     data = squares(8)
     data["pixels"][~data["train"]] = 0
-    other = train_representation(data, TINY, scene_version="squares", progress=False)
-    assert same(tiny, other)
-
-
-def test_weights_depend_on_the_seed_and_not_on_global_state(tiny: Representation) -> None:
     torch.manual_seed(77)
     state = torch.get_rng_state()
-    again = train_representation(squares(8), TINY, scene_version="squares", progress=False)
+    assert same(tiny, train(data))
     assert torch.equal(torch.get_rng_state(), state)
-    assert same(tiny, again)
-    other = train_representation(
-        squares(8), replace(TINY, seed=1), scene_version="squares", progress=False
-    )
-    assert not same(tiny, other)
+    assert not same(tiny, train(data, replace(TINY, seed=1)))
 
 
 @pytest.mark.parametrize("stop", [("vae", 2), ("lae", 2)])
@@ -174,45 +161,29 @@ def test_interrupted_training_continues_to_the_same_weights(
         if (row["stage"], row["step"]) == stop:
             raise KeyboardInterrupt
 
-    arguments = {"scene_version": "squares", "checkpoint": tmp_path, "progress": False}
     with pytest.raises(KeyboardInterrupt):
-        train_representation(squares(8), TINY, log=interrupt, **arguments)
+        train(squares(8), log=interrupt, checkpoint=tmp_path)
+    with pytest.raises(ValueError, match="another configuration"):
+        train(squares(8), replace(TINY, seed=3), checkpoint=tmp_path)
     rows: list[dict] = []
-    resumed = train_representation(squares(8), TINY, log=rows.append, **arguments)
-    assert same(tiny, resumed)
+    assert same(tiny, train(squares(8), log=rows.append, checkpoint=tmp_path))
     left = ["vae"] * (2 if stop[0] == "vae" else 0) + ["lae"] * 2 + ["inverse"] * 2
     assert [row["stage"] for row in rows] == left
 
 
-def test_checkpoint_of_another_configuration_is_refused(tmp_path: Path) -> None:
-    arguments = {"scene_version": "squares", "checkpoint": tmp_path, "progress": False}
-    train_representation(squares(8), TINY, **arguments)
-    with pytest.raises(ValueError, match="another configuration"):
-        train_representation(squares(8), replace(TINY, seed=3), **arguments)
-
-
-def test_the_frame_encoder_learns_from_the_training_part_of_play(
-    tiny: Representation,
-) -> None:
-    def train(play: TensorDict) -> Representation:
-        return train_representation(
-            squares(8), TINY, play=play, scene_version="squares", progress=False
-        )
-
+def test_the_frame_encoder_learns_from_the_training_part_of_play(tiny: Representation) -> None:
     play = squares(10)
-    trained, held_out_changed = train(play), play.clone()
+    trained, held_out_changed = train(squares(8), play=play), play.clone()
     assert not trained.vae.mean_frame.equal(tiny.vae.mean_frame)
     together = torch.cat([valid_frames(d[d["train"]]) for d in (squares(8), play)])
     torch.testing.assert_close(trained.vae.mean_frame, mean_frame(together))
     held_out_changed["pixels"][~play["train"]] = 0
-    assert same(trained, train(held_out_changed))
+    assert same(trained, train(squares(8), play=held_out_changed))
 
 
 def test_the_inverse_model_alone_is_trained_as_with_the_other_encoders(tmp_path: Path) -> None:
     play, more = squares(10), squares(14)
-    trained = train_representation(
-        squares(8), TINY, play=play, scene_version="squares", command="first", progress=False
-    )
+    trained = train(squares(8), play=play, command="first")
     assert same(trained, retrain_inverse(trained, play, TINY, progress=False))
     with_more = retrain_inverse(trained, more, TINY, command="then", progress=False)
     assert not same(trained, with_more)
@@ -220,11 +191,11 @@ def test_the_inverse_model_alone_is_trained_as_with_the_other_encoders(tmp_path:
     assert with_more.metadata == {**trained.metadata, "command": "first; then"}
 
     weights = tmp_path / "weights.safetensors"
-    train = partial(train_encoders, squares(8), weights=weights, config=TINY, keep=trained)
-    written, _ = train(more, folder=tmp_path / "more")
+    again = partial(train_encoders, squares(8), weights=weights, config=TINY, keep=trained)
+    written, _ = again(more, folder=tmp_path / "more")
     assert same(written, with_more) and same(load_representation(weights), with_more)
     with pytest.raises(ValueError, match="give the folder of recorded play"):
-        train(None, folder=tmp_path / "nothing")
+        again(None, folder=tmp_path / "nothing")
     assert not (tmp_path / "nothing").exists()
 
 
@@ -251,8 +222,7 @@ def test_configurations_and_datasets_that_cannot_be_trained_on_are_refused() -> 
     for window in (1, 3):  # at least a transition, and a divisor of the batch size
         with pytest.raises(ValueError, match="window"):
             replace(TINY.vae, window=window)
-    config = replace(TINY, vae=replace(TINY.vae, window=16, batch_size=16))
     with pytest.raises(ValueError, match="16 frames"):
-        train_representation(squares(8), config, scene_version="squares", progress=False)
+        train(squares(8), replace(TINY, vae=replace(TINY.vae, window=16, batch_size=16)))
     with pytest.raises(ValueError, match="held-out"):
         split(squares(8).set("train", torch.ones(8, dtype=torch.bool)))

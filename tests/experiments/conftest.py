@@ -2,6 +2,7 @@
 
 import shutil
 from dataclasses import replace
+from functools import cache
 
 import pytest
 import torch
@@ -15,7 +16,6 @@ from bgpo_trl.experiments import measure, privileged_information, settings
 from bgpo_trl.experiments import run as experiment
 from bgpo_trl.figures import groups, gwr
 from bgpo_trl.policy import LoadedRun
-from bgpo_trl.training import Trainer
 from suites import nico
 from suites.nico.base import STATE_CENTER, STATE_SCALE
 
@@ -32,7 +32,7 @@ def tiny(monkeypatch, encoders, bank, make_config):
         small = replace(entry, config=make_config(name=name).algorithm)
         monkeypatch.setitem(ALGORITHMS, name, small)
     chance = torch.tensor([0.1, 0.2, 0.3])
-    monkeypatch.setattr(measure, "evaluate_random_policy", lambda **_: chance)
+    monkeypatch.setattr(measure, "evaluate_random_policy", lambda tasks, **_: chance[: len(tasks)])
     test = measure._final_tests
     monkeypatch.setattr(measure, "_final_tests", lambda *run, episodes: test(*run, episodes=2))
 
@@ -64,18 +64,15 @@ def undrawn(tiny, monkeypatch):
 
 
 @pytest.fixture(scope="session")
-def finished_runs(bank, encoders, make_config, tmp_path_factory):
+def finished_runs(begin, make_config, tmp_path_factory):
     """Trains an algorithm once, and returns the run directory."""
-    directories = {}
 
+    @cache
     def finished(name):
-        if name not in directories:
-            directories[name] = tmp_path_factory.mktemp(name)
-            config = make_config(name=name)
-            parts = {"bank": bank, "encoders": encoders, "progress": False}
-            with Trainer(config, directories[name], **parts) as trainer:
-                trainer.run()
-        return directories[name]
+        directory = tmp_path_factory.mktemp(name)
+        with begin(directory, make_config(name=name)) as trainer:
+            trainer.run()
+        return directory
 
     return finished
 

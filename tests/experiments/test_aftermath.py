@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from functools import cache
+from itertools import product
 
 import numpy as np
 import pytest
@@ -15,38 +16,25 @@ from bgpo_trl.experiments.nico.scripted import play
 from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
 from bgpo_trl.runs.results import read_table
 from suites import nico
-from tests.helpers import cells
+from tests.helpers import cells, edit
 
 NUMBER = aftermath._NUMBER
-in_every_task = pytest.mark.parametrize("task", nico.ALL_TASKS)
 
 
 @cache
 def demonstrated(task):
-    """A success of the demonstrator."""
+    """A success of the demonstrator, played once."""
     episodes = aftermath.scripted_episodes((task,), [1, 2], 1, 50, "demonstrators")
     return next(episode for episode in episodes if episode.success)
 
 
-def outcome(task, episode, **changes):
-    return CRITERIA[task].judge(Continuation(), replace(episode, **changes))
-
-
-def ending(episode, change):
-    """The last state of an episode after a change."""
-    physics = Continuation().begin(episode.end)
-    change(physics)
-    return physics.get_state()
-
-
-@in_every_task
+@pytest.mark.parametrize("task", nico.ALL_TASKS)
 def test_successes_of_demonstrators_last(task):
-    holds, distance = outcome(task, demonstrated(task))
-    assert holds
-    if CRITERIA[task].distance == "gap":
-        assert distance < 0.005
-    else:
-        assert distance > {"lift": 0.1, "displacement": 0.03}[CRITERIA[task].distance]
+    holds, distance = CRITERIA[task].judge(Continuation(), demonstrated(task))
+    low, high = {"gap": (-1, 0.005), "lift": (0.1, 1), "displacement": (0.03, 1)}[
+        CRITERIA[task].distance
+    ]
+    assert holds and low < distance < high
 
 
 def throw(physics):
@@ -86,7 +74,6 @@ def raise_arm(physics):
     [
         ("grasp_glass", "push_glass_right", lambda _: None, False),  # only touched
         ("grasp_glass", "push_glass_right", throw, False),
-        ("lift_green", "push_green_to_white", lambda _: None, False),
         ("push_green_to_glass", "push_green_to_glass", apart(0.0, 0.01), True),
         ("push_green_to_glass", "push_green_to_glass", apart(0.0, 0.025), False),
         ("push_green_to_glass", "push_green_to_glass", apart(1.0), False),  # they touch, and part
@@ -97,8 +84,10 @@ def raise_arm(physics):
     ],
 )
 def test_a_success_has_to_last(task, shown, change, lasts):
-    episode = demonstrated(shown)
-    assert outcome(task, episode, end=ending(episode, change)).holds == lasts
+    then, episode = Continuation(), demonstrated(shown)
+    physics = then.begin(episode.end)
+    change(physics)
+    assert CRITERIA[task].judge(then, replace(episode, end=physics.get_state())).holds == lasts
 
 
 def test_an_object_that_comes_back_is_not_pushed_aside():
@@ -164,9 +153,8 @@ def test_own_tasks_need_a_criterion(monkeypatch):
     episode = replace(demonstrated("press_white"), task="juggle")
     with pytest.raises(ValueError, match="juggle"):
         aftermath.judge("policy", [episode])
-    assert aftermath.judge("policy", [replace(episode, success=False)]) == []
     monkeypatch.setitem(CRITERIA, "juggle", CRITERIA["press_white"])
-    (row,) = aftermath.judge("policy", [episode])
+    (row,) = aftermath.judge("policy", [episode, replace(episode, success=False)])
     assert row[:5] == ("policy", episode.seed, "juggle", True, "gap")
 
 
@@ -190,34 +178,27 @@ def test_the_table_equals_that_by_hand():
 def test_the_command_has_a_row_for_each_success(run_of, tmp_path):
     """Of the demonstrators' successes, since untrained policies have none."""
     run, out = run_of("oracle"), tmp_path / "out"
-    config = json.loads((run / "config.json").read_text())
-    config["algorithm"]["max_steps"] = 50
-    (run / "config.json").write_text(json.dumps(config))
+    algorithm = json.loads((run / "config.json").read_text())["algorithm"]
+    edit(run / "config.json", algorithm={**algorithm, "max_steps": 50})
     state = load_checkpoint(run / "checkpoint")
     state["settings"]["algorithm"]["max_steps"] = 50
     save_checkpoint(run / "checkpoint", state)
-    printed = aftermath.aftermath(
-        AftermathArguments(run=run, demonstrators=True, episodes=1, out=out)
-    )
-    table = cells(printed)[1:]
+    arguments = AftermathArguments(run=run, demonstrators=True, episodes=1, out=out)
+    table = cells(aftermath.aftermath(arguments))[1:]
     actors = ("policy", "demonstrators", "random actions")
-    assert [row[:2] for row in table] == [
-        [actor, task] for actor in actors for task in nico.PAPER_TASKS
-    ]
+    assert [tuple(row[:2]) for row in table] == [*product(actors, nico.PAPER_TASKS)]
     rows = read_table(out / "aftermath.csv")
     for actor, task, successes, *_ in table:
         found = rows[(rows["actor"] == actor) & (rows["task"] == task)]
         assert successes == f"{len(found)} of 2"
     assert (rows["actor"] == "demonstrators").sum() >= 4
-    assert set(rows["holds"]) <= {"True", "False"}
     assert set(json.loads((out / "aftermath.json").read_text())) == {"commit", "command"}
 
 
-def test_demonstrators_and_random_actions_start_alike_without_a_run(monkeypatch, tmp_path):
+def test_demonstrators_and_random_actions_start_alike_without_a_run(monkeypatch):
     monkeypatch.setattr(nico, "ALL_TASKS", ("press_white",))
-    arguments = AftermathArguments(demonstrators=True, episodes=1, seeds=(4,), out=tmp_path)
-    episodes = aftermath.episodes_of(arguments)
+    episodes = aftermath.episodes_of(AftermathArguments(demonstrators=True, episodes=1, seeds=(4,)))
     assert list(episodes) == ["demonstrators", "random actions"]
     (first,), (second,) = episodes.values()
     assert (first.start == second.start).all()
-    assert first.seed == 4
+    assert first.seed == second.seed == 4

@@ -16,7 +16,6 @@ from bgpo_trl.configs import BGPOConfig
 from bgpo_trl.experiments.arguments import Arguments
 from bgpo_trl.experiments.command_line import command_line
 from bgpo_trl.machine import interrupts_wait
-from bgpo_trl.runs.directory import EVAL_COLUMNS
 from bgpo_trl.runs.results import read_json
 from suites import opengl
 from tests.helpers import contents
@@ -28,14 +27,11 @@ ROOT = Path(__file__).parents[2]
 def folder(tiny, tmp_path, monkeypatch):
     """The current folder, with a file, an empty folder and runs that are not whole."""
     monkeypatch.chdir(tmp_path)
-    for name in ("empty", "run", "damaged", "unevaluated"):
+    for name in ("empty", "run", "damaged"):
         (tmp_path / name).mkdir()
     (tmp_path / "file").touch()
     (tmp_path / "run" / "config.json").write_text('{"episodes": 50, "name": "bgpo"}')
     (tmp_path / "damaged" / "config.json").write_text('{"episodes": ')
-    header = ",".join(EVAL_COLUMNS) + "\n"
-    (tmp_path / "damaged" / "eval.csv").write_text(header + "bgpo,0,ten,5,grasp_glass,1,1,5\n")
-    (tmp_path / "unevaluated" / "eval.csv").write_text(header)
     return tmp_path
 
 
@@ -57,43 +53,29 @@ def exit_code(monkeypatch, command):
 CASES = [
     # settings of a run
     ("continual.py --episodes 0", "episodes"),
-    ("bgpo continual --seeds 1 1", "seeds"),
     ("bgpo continual --threads 0", "threads"),
     ("concurrent_tasks.py --device cuda:99", "cuda:99"),
     ("bgpo continual --config new", "--config"),
-    ("bgpo continual --config damaged", "config.json is damaged"),
     ("ablation.py --algorithm maml", "--algorithm"),
     ("bgpo ablation --variant any", "--variant"),
-    ("bgpo continual --algorithm maml --rl td3", "MAML"),
     ("bgpo eight-tasks --eval-every 0", "eval_every"),
-    ("bgpo privileged-information --inputs", "--inputs"),
     ("bgpo privileged-information --inputs smell", "--inputs"),
-    ("bgpo privileged-information --threads 0", "threads"),
     ("speed/steps.py ppo", "no algorithm 'ppo'"),
     # tasks and their demonstrations
     ("bgpo continual --tasks juggle", "'juggle'"),
     ("bgpo continual --import juggling", "--import juggling"),
     ("bgpo continual --bank file", "file is damaged or not a bank"),
     ("bgpo continual --bank new --train-encoders", "--bank"),
-    ("bgpo watch run --import juggling", "--import juggling"),
     # where results go
     ("continual.py --out file/run", "cannot make the folder file/run"),
-    ("bgpo continual --out unevaluated", "unevaluated holds a run"),
     ("bgpo continual --preset quick --out run --resume", "other settings"),
     ("bgpo continual --out damaged --resume", "config.json is damaged"),
-    ("bgpo privileged-information --out file", "cannot make the folder"),
     # runs that are read
     ("bgpo report", "name a run"),
     ("bgpo report run empty", "--out: several folders are given"),
-    ("bgpo report file", "file is not a directory"),
     ("bgpo report run", "run holds no test episode"),
-    ("bgpo report damaged", "config.json is damaged"),
     ("bgpo report run --compare", "--compare"),
-    ("bgpo report empty nowhere --compare", "empty/config.json is missing"),
     ("bgpo report run run --compare --every 0", "--every"),
-    ("bgpo looking empty", "empty holds no run"),
-    ("bgpo one-shot empty", "empty holds no run"),
-    ("bgpo watch empty", "empty holds no run"),
     ("bgpo aftermath empty", "empty holds no run"),
     ("bgpo aftermath", "nobody acts"),
     # measurements
@@ -112,67 +94,52 @@ CASES = [
     ("bgpo_trl.encoders.train empty", "empty is not a dataset"),
     ("bgpo_trl.encoders.probes empty --weights file", "empty is not a dataset"),
     ("suites.nico.explore --out a.jpeg", "cannot write a.jpeg"),
+    # flags, in tyro's box
+    ("bgpo continual --presett quick", "--presett"),
+    ("bgpo continual --algorithm.betta 0.2", "--algorithm.betta"),
+    ("bgpo continual --algorithm.beta 0.2 --presett quick", "--presett"),
+    ("bgpo continual --algorithm.beta -1", "beta must be at least 0"),
+    ("bgpo continual --episodes 1.5", "--episodes"),
+    ("bgpo privileged-information ddpg --gamma 1.5", "gamma must be between 0 and 1"),
+    ("bgpo watch", "Run directory"),
+    ("bgpo_trl.encoders.train empty --config.vae.batch-size 0", "batch_size must be at least"),
 ]
 
 
 @pytest.mark.parametrize(("command", "cause"), CASES, ids=[case[0] for case in CASES])
-def test_a_wrong_command_line_ends_in_one_line_and_writes_nothing(
+def test_a_wrong_command_line_ends_in_a_line_or_a_box_and_writes_nothing(
     folder, monkeypatch, capsys, command, cause
 ):
     before = contents(folder)
-    message = exit_code(monkeypatch, command)
-    assert isinstance(message, str), capsys.readouterr().err
-    assert message.startswith("error: ") and "\n" not in message
-    assert cause in message
-    assert capsys.readouterr() == ("", "")
-    assert contents(folder) == before
-
-
-@pytest.mark.parametrize(
-    ("command", "named"),
-    [
-        ("bgpo continual --presett quick", "--presett"),
-        ("bgpo continual --algorithm.beta 0.2 --presett quick", "--presett"),
-        ("bgpo continual --algorithm.betta 0.2", "--algorithm.betta"),
-        ("bgpo continual --algorithm.beta -1", "beta must be at least 0"),
-        ("continual.py --preset huge", "desk"),
-        ("bgpo continual --episodes 1.5", "--episodes"),
-        ("bgpo privileged-information ddpg --gamma 1.5", "gamma must be between 0 and 1"),
-        ("bgpo watch", "Run directory"),
-        ("bgpo_trl.encoders.train empty --config.vae.batch-size 0", "batch_size must be at least"),
-    ],
-)
-def test_a_wrong_flag_is_named(folder, monkeypatch, capsys, command, named):
-    before = contents(folder)
-    assert exit_code(monkeypatch, command) == 2
+    ended = exit_code(monkeypatch, command)
     out, message = capsys.readouterr()
-    assert named in " ".join(message.replace("│", " ").split())
-    assert "Traceback" not in message
+    if ended == 2:
+        message = " ".join(message.replace("│", " ").split())
+        assert "Traceback" not in message
+    else:
+        assert not message
+        message = ended
+        assert message.startswith("error: ") and "\n" not in message
+    assert cause in message
     assert not out
     assert contents(folder) == before
 
 
-@pytest.mark.parametrize(
-    "command",
-    [
+def test_without_opengl_a_command_that_renders_writes_nothing(folder, run_of, monkeypatch, capsys):
+    run_of("bgpo")
+    before = contents(folder)
+    monkeypatch.setattr(opengl, "refusal", "MUJOCO_GL is 'vulkan': do not set it")
+    for command in (
         "bgpo continual --train-encoders --out new",
         "bgpo sweep --preset quick --out new",
         "bgpo tasks --pictures empty",
         "bgpo_trl.data.recording new",
         "suites.nico.explore --out new.gif",
         *(f"bgpo {name} runs/bgpo" for name in ("watch", "looking", "aftermath", "one-shot")),
-    ],
-)
-def test_without_opengl_a_command_that_renders_writes_nothing(
-    folder, run_of, monkeypatch, capsys, command
-):
-    run_of("bgpo")
-    before = contents(folder)
-    monkeypatch.setattr(opengl, "refusal", "MUJOCO_GL is 'vulkan': do not set it")
-    message = exit_code(monkeypatch, command)
-    assert message == "error: MUJOCO_GL is 'vulkan': do not set it"
-    assert capsys.readouterr() == ("", "")
-    assert contents(folder) == before
+    ):
+        assert exit_code(monkeypatch, command) == "error: MUJOCO_GL is 'vulkan': do not set it"
+        assert capsys.readouterr() == ("", "")
+        assert contents(folder) == before
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

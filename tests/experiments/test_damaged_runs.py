@@ -17,7 +17,7 @@ from bgpo_trl.experiments.watch import WatchArguments, watch
 from bgpo_trl.figures.gwr import draw_growth
 from bgpo_trl.runs.config_file import read_config
 from suites import nico
-from tests.helpers import CHECKPOINTS, contents, put_checkpoint
+from tests.helpers import CHECKPOINTS, contents, edit, put_checkpoint
 
 TASKS = nico.PAPER_TASKS
 FINAL = "seed,demonstrations,task,episodes,success,task_inference\n"
@@ -50,12 +50,8 @@ def check_refused(call):
     assert re.search(r": (let|put|name|resume|remove|use|choose|give|only|there is no)", message)
 
 
-def edit(file, **changes):
-    def do(run):
-        content = json.loads((run / file).read_text())
-        (run / file).write_text(json.dumps({**content, **changes}))
-
-    return do
+def settings(**changes):
+    return lambda run: edit(run / "config.json", **changes)
 
 
 def write(name, content):
@@ -90,27 +86,25 @@ REPORTED = {
     **damages("final.csv"),
     **damages("config.json"),
     **damages("summary.json"),
-    "starts of other tasks": edit("config.json", task_starts=[0, 1]),
-    "tasks by number": edit("config.json", tasks=[1, 2, 3]),
-    "nodes in words": edit("summary.json", nodes="many"),
-    "training of a longer run": edit("config.json", episodes=20),
+    "starts of other tasks": settings(task_starts=[0, 1]),
+    "tasks by number": settings(tasks=[1, 2, 3]),
+    "nodes in words": lambda run: edit(run / "summary.json", nodes="many"),
+    "training of a longer run": settings(episodes=20),
     "success that is no number": replaced("final.csv", "0.5", "nan"),
     "inference that is no number": replaced("final.csv", "0.25", "perhaps"),
     "a row cut short": replaced("final.csv", ",20,0.5,0.25", ""),
     "no held-out tests": without_lines("final.csv", "held-out"),
     "a seed without late tests": without_lines("eval.csv", "bgpo,8,10"),
-    "control characters": lambda run: (run / "eval.csv").write_text(
-        (run / "eval.csv").read_text().replace(TASKS[0], "\x1b[31mred")
-    ),
+    "control characters": replaced("eval.csv", TASKS[0], "\x1b[31mred"),
 }
 # These files are optional, and nothing in the summary is required.
 for _name in ("final.csv missing", "summary.json missing", "summary.json of something else"):
     del REPORTED[_name]
 
 
-@pytest.mark.parametrize("damage", REPORTED.values(), ids=REPORTED.keys())
+@pytest.mark.parametrize("damage", REPORTED)
 def test_a_damaged_run_is_not_reported(run, damage):
-    damage(run)
+    REPORTED[damage](run)
     before = contents(run)
     check_refused(lambda: report(ReportArguments((run,))))
     assert contents(run) == before
@@ -133,43 +127,37 @@ LOADED = {
         f"a checkpoint that is {name}": partial(put_checkpoint, content=content)
         for name, content in CHECKPOINTS.items()
     },
-    "edited settings": edit("config.json", eval_episodes=7),
-    "no starts": edit("config.json", task_starts=[]),
+    "edited settings": settings(eval_episodes=7),
+    "no starts": settings(task_starts=[]),
 }
+COMMANDS = {
+    "watch.demonstrate": (watch, WatchArguments),
+    "one_shot.measure": (one_shot, OneShotArguments),
+    "nico.looking.measure_looking": (looking, TrainedArguments),
+    "nico.aftermath.episodes_of": (aftermath, AftermathArguments),
+}
+"""Commands that test policies, by the function that begins the work."""
 
 
-@pytest.mark.parametrize(
-    ("command", "arguments"),
-    [(watch, WatchArguments), (one_shot, OneShotArguments), (looking, TrainedArguments)],
-    ids=["watch", "one_shot", "looking"],
-)
-@pytest.mark.parametrize("damage", LOADED.values(), ids=LOADED.keys())
-def test_a_damaged_run_is_neither_filmed_nor_tested(run, damage, command, arguments, tmp_path):
-    damage(run)
-    check_refused(lambda: command(arguments(run=run, out=tmp_path / "out")))
+@pytest.mark.parametrize("damage", LOADED)
+def test_a_damaged_run_is_neither_filmed_nor_tested(run, damage, tmp_path):
+    LOADED[damage](run)
+    for command, arguments in COMMANDS.values():
+        check_refused(lambda c=command, a=arguments: c(a(run=run, out=tmp_path / "out")))
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("out", ["here", "here/new"])
-@pytest.mark.parametrize(
-    ("command", "arguments", "work"),
-    [
-        (watch, WatchArguments, "watch.demonstrate"),
-        (one_shot, OneShotArguments, "one_shot.measure"),
-        (looking, TrainedArguments, "nico.looking.measure_looking"),
-        (aftermath, AftermathArguments, "nico.aftermath.episodes_of"),
-    ],
-    ids=["watch", "one_shot", "looking", "aftermath"],
-)
-def test_a_read_only_folder_is_refused_before_the_work(
-    run, command, arguments, work, out, tmp_path, monkeypatch
-):
+def test_a_read_only_folder_is_refused_before_the_work(run, out, tmp_path, monkeypatch):
     (tmp_path / "here").mkdir()
-    monkeypatch.setattr(f"bgpo_trl.experiments.{work}", lambda *_: pytest.fail("has begun"))
     # For root, permissions would not make it so.
     monkeypatch.setattr(os, "access", lambda path, mode: path != tmp_path / "here")
+    for work, (command, arguments) in COMMANDS.items():
+        monkeypatch.setattr(f"bgpo_trl.experiments.{work}", lambda *_: pytest.fail("has begun"))
+        with pytest.raises(PermissionError, match=r"read-only.*--out"):
+            command(arguments(run=run, out=tmp_path / out))
     with pytest.raises(PermissionError, match=r"read-only.*--out"):
-        command(arguments(run=run, out=tmp_path / out))
+        report(ReportArguments((run,), out=tmp_path / "here"))
     assert not list((tmp_path / "here").iterdir())
 
 
@@ -182,9 +170,9 @@ GROWTH = {
 }
 
 
-@pytest.mark.parametrize("damage", GROWTH.values(), ids=GROWTH.keys())
+@pytest.mark.parametrize("damage", GROWTH)
 def test_growth_is_not_drawn_from_damaged_files(run, bank, damage, tmp_path):
     config = read_config(run / "config.json")[0]
-    damage(run)
+    GROWTH[damage](run)
     check_refused(lambda: draw_growth(run, config, bank, tmp_path / "out"))
     assert not (tmp_path / "out").exists()

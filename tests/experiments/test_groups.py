@@ -48,10 +48,8 @@ def test_tasks_share_a_group_that_holds_more_than_a_tenth_of_each():
 def test_the_command_names_the_tasks_that_share_a_group(monkeypatch):
     bank = places((0.0, 0.0), (0.0, 0.0), (3.0, 0.0))
     monkeypatch.setattr(run, "bank_of", lambda arguments: bank)
-    lines = groups.groups(groups.GroupsArguments(draws=200, seeds=(0,))).splitlines()
-    assert [line for line in lines if "share" in line] == [
-        "task0 and task1 share a group in 4 of 4."
-    ]
+    printed = groups.groups(groups.GroupsArguments(draws=200, seeds=(0,)))
+    assert printed.splitlines()[-1] == "task0 and task1 share a group in 4 of 4."
 
 
 def test_the_shipped_tasks_form_six_pure_groups_in_every_schedule():

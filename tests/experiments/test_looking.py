@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from itertools import product
 
 import numpy as np
 import pytest
@@ -15,14 +16,13 @@ from bgpo_trl.experiments.nico import looking
 from bgpo_trl.experiments.nico.looking import Row
 from bgpo_trl.runs.results import read_table
 from bgpo_trl.scenes.nico import HidingEnv, NicoEnv
-from bgpo_trl.training import Trainer
 from suites import nico
 from suites.nico.rendering import FrameRenderer
 from tests.helpers import cells
 
 GLASS_Y = 8  # of the state
 VIEWS = ["seen", "places hidden", "objects hidden"]
-every_kind = pytest.mark.parametrize("hidden", ["places", "objects"])
+CONDITIONS = [*VIEWS, "random actions"]
 
 
 class Turn(nico.NicoTask):
@@ -54,38 +54,21 @@ def remember(state):
     return turn(torch.ones_like(state[..., 0]))
 
 
-def by_condition(run, episodes=8):
-    rows = looking.measure_looking(run, episodes)
-    assert [(row.condition, row.seed) for row in rows] == [
-        (condition, seed) for condition in [*VIEWS, looking.RANDOM] for seed in (3, 8)
-    ]
-    return {
-        c: [row.success for row in rows if row.condition == c] for c in [*VIEWS, "random actions"]
+@pytest.mark.parametrize("act", [look, remember])
+def test_only_a_policy_that_uses_the_places_fails_without_them(scripted_run, act):
+    """Starts are the same in all conditions, so one that acts blindly succeeds as often in all."""
+    rows = looking.measure_looking(scripted_run("turn", Turn, act), 8)
+    found = {
+        row.condition: [r.success for r in rows if r.condition == row.condition] for row in rows
     }
-
-
-def test_a_policy_that_uses_the_places_fails_without_them(scripted_run):
-    found = by_condition(scripted_run("turn", Turn, look))
-    assert min(found["seen"]) > 0.5
-    assert found["places hidden"] == found["objects hidden"] == [0, 0]
-
-
-def test_the_starts_are_the_same_in_all_conditions(scripted_run):
-    found = by_condition(scripted_run("turn", Turn, remember))
-    assert found["seen"] == found["places hidden"] == found["objects hidden"]
-    assert 0 < found["seen"][0] < 1 and found["seen"][0] != found["seen"][1]
-
-
-def scene(physics, poses):
-    """A frame and the state of the scene with the objects elsewhere, by a complete update."""
-    other = nico.Physics.from_xml_string(nico.scene_xml())
-    other.data.qpos[:] = physics.data.qpos
-    for name, (place, turned) in zip(nico.OBJECTS, poses, strict=True):
-        x, y, z, w = turned.as_quat()
-        other.named.data.qpos[name] = [*place, w, x, y, z]
-    other.forward()
-    frame = FrameRenderer(other.model.ptr).render(other.data.ptr)
-    return frame, other.privileged_state().astype(np.float32)
+    assert [*found] == CONDITIONS
+    seen, *hidden = (found[view] for view in VIEWS)
+    if act is look:
+        assert min(seen) > 0.5
+        assert hidden == [[0, 0]] * 2
+    else:
+        assert hidden == [seen] * 2
+        assert 0 < seen[0] < 1 and seen[0] != seen[1]
 
 
 def poses(physics):
@@ -94,12 +77,18 @@ def poses(physics):
 
 
 def check(env, row, expected):
-    frame, state = scene(env.simulations[row].environment.physics, expected)
+    """Compare what is observed with a scene whose objects are in these poses."""
+    shown = nico.Physics.from_xml_string(nico.scene_xml())
+    shown.data.qpos[:] = env.simulations[row].environment.physics.data.qpos
+    for name, (place, turned) in zip(nico.OBJECTS, expected, strict=True):
+        shown.named.data.qpos[name] = [*place, *turned.as_quat()[[3, 0, 1, 2]]]
+    shown.forward()
+    frame = FrameRenderer(shown.model.ptr).render(shown.data.ptr)
     np.testing.assert_array_equal(env.frames()[row], frame)
-    np.testing.assert_allclose(env._current["state"][row], state, atol=1e-6)
+    np.testing.assert_allclose(env._current["state"][row], shown.privileged_state(), atol=1e-6)
 
 
-@every_kind
+@pytest.mark.parametrize("hidden", ["places", "objects"])
 def test_observations_show_objects_at_nominal_places(hidden):
     env = HidingEnv(batch_size=[2], seed=4, observation="both", hidden=hidden)
     state = env.reset()
@@ -135,36 +124,35 @@ def test_observations_show_objects_at_nominal_places(hidden):
     env.close()
 
 
-@every_kind
-def test_the_simulation_is_that_of_the_plain_environment(hidden):
-    envs = [NicoEnv(batch_size=[2], seed=4), HidingEnv(batch_size=[2], seed=4, hidden=hidden)]
+def test_the_simulation_is_that_of_the_plain_environment():
+    views = ({"hidden": "places"}, {"hidden": "objects"})
+    envs = [
+        NicoEnv(batch_size=[2], seed=4),
+        *(HidingEnv(batch_size=[2], seed=4, **v) for v in views),
+    ]
     states = [env.reset(TensorDict({"task": torch.tensor([0, 2])}, [2])) for env in envs]
-    assert not states[0]["pixels"].equal(states[1]["pixels"])
     generator = torch.Generator().manual_seed(0)
-    for _ in range(10):
+    for _ in range(5):
         action = torch.rand(2, 4, generator=generator) * 2 - 1
-        states = [
-            env.step(state.set("action", action))["next"]
-            for env, state in zip(envs, states, strict=True)
-        ]
-        true, hiding = (env.simulation_state() for env in envs)
-        for plain, other in zip(true["simulations"], hiding["simulations"], strict=True):
-            assert plain["physics"].equal(other["physics"])
-        assert states[0]["done"].equal(states[1]["done"])
+        for env, state in zip(envs, states, strict=True):
+            env.step(state.set("action", action))
+        true, *others = (env.simulation_state()["simulations"] for env in envs)
+        for hiding in others:
+            for plain, other in zip(true, hiding, strict=True):
+                assert plain["physics"].equal(other["physics"])
     for env in envs:
         env.close()
 
 
 def test_the_table_equals_that_by_hand():
-    success = {
-        "seen": [[0.5, 1.0], [0.7, 1.0], [0.6, 1.0]],
-        "hidden": [[0.0, 0.2], [0.0, 0.2], [0.0, 0.5]],
-    }
     rows = [
-        Row(condition, seed, task, 10, success[condition][seed][column])
-        for condition in success
-        for seed in range(3)
-        for column, task in enumerate("ab")
+        Row(condition, seed, task, 10, success)
+        for condition, of_seeds in (
+            ("seen", [(0.5, 1.0), (0.7, 1.0), (0.6, 1.0)]),
+            ("hidden", [(0.0, 0.2), (0.0, 0.2), (0.0, 0.5)]),
+        )
+        for seed, of_tasks in enumerate(of_seeds)
+        for task, success in zip("ab", of_tasks, strict=True)
     ]
     # The t value for three seeds is 4.303: .6 +- 4.303 x .1 / sqrt(3), .3 +- 4.303 x .1.
     assert looking.looking_table(rows) == [
@@ -177,42 +165,25 @@ def test_the_table_equals_that_by_hand():
     assert looking.looking_table(one)[3] == ["all", "85.0", "10.0"]
 
 
-@pytest.mark.parametrize("name", ["bgpo", "maml", "dist-nll"])
-def test_the_command_tests_every_seed_in_every_condition(run_of, tmp_path, name):
-    out, conditions = tmp_path / "out", [*VIEWS, looking.RANDOM]
-    printed = looking.looking(TrainedArguments(run=run_of(name), episodes=1, out=out))
+def test_the_command_tests_every_seed_in_every_condition(run_of, tmp_path):
+    out = tmp_path / "out"
+    printed = looking.looking(TrainedArguments(run=run_of("bgpo"), episodes=1, out=out))
     rows = read_table(out / "looking.csv")
-    assert rows[["condition", "seed", "task"]].to_numpy().tolist() == [
-        [condition, seed, task]
-        for condition in conditions
-        for seed in "38"
-        for task in nico.PAPER_TASKS
-    ]
+    found = [*rows[["condition", "seed", "task"]].itertuples(index=False, name=None)]
+    assert found == [*product(CONDITIONS, "38", nico.PAPER_TASKS)]
     assert set(rows["success"]) <= {"0.0", "1.0"}
     assert (out / "looking.png").exists()
     assert set(json.loads((out / "looking.json").read_text())) == {"commit", "command"}
     head, *lines = cells(printed)
-    assert head == ["success, %", *conditions]
+    assert head == ["success, %", *CONDITIONS]
     assert [row[0] for row in lines] == [*nico.PAPER_TASKS, "all"]
 
 
-@pytest.fixture
-def trained(bank, shipped, make_config, tmp_path):
-    """Trains a run on the ground truth."""
-
-    def train(encoders):
-        config = make_config("state", "oracle", episodes=4)
-        with Trainer(
-            config, tmp_path / "run", bank=bank, encoders=encoders, progress=False
-        ) as trainer:
-            trainer.run()
-        return tmp_path / "run"
-
-    return train
-
-
-def test_a_run_without_encoders_is_refused(trained, refused):
-    arguments = TrainedArguments(run=trained(None), episodes=1)
+def test_a_run_without_encoders_is_refused(begin, make_config, shipped, tmp_path, refused):
+    run = tmp_path / "run"
+    with begin(run, make_config("state", "oracle", episodes=4), encoders=None) as trainer:
+        trainer.run()
+    arguments = TrainedArguments(run=run, episodes=1)
     refused(lambda: looking.looking(arguments), "was trained without encoders", "give its Trainer")
 
 

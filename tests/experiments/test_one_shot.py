@@ -1,7 +1,7 @@
 """Success against the share of the demonstration that is shown."""
 
-import csv
 import json
+from itertools import product
 
 import numpy as np
 import pandas as pd
@@ -13,6 +13,7 @@ from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.experiments import one_shot
 from bgpo_trl.experiments.one_shot import OneShotArguments
 from suites import nico
+from tests.helpers import cells, rows
 
 TASKS = nico.PAPER_TASKS
 
@@ -22,38 +23,27 @@ def test_every_seed_is_tested_with_every_share_of_every_task(run_of, tmp_path):
         run=run_of("bgpo"), shares=(0.5, 1.0), episodes=2, out=tmp_path / "out"
     )
     printed = one_shot.one_shot(arguments)
-    with (tmp_path / "out" / "one_shot.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert [(row["share"], row["seed"], row["task"]) for row in rows] == [
-        (share, seed, task) for share in ("0.5", "1.0") for seed in "38" for task in TASKS
-    ]
-    for row in rows:
+    found = rows(tmp_path / "out" / "one_shot.csv")
+    conditions = [(row["share"], row["seed"], row["task"]) for row in found]
+    assert conditions == [*product(("0.5", "1.0"), "38", TASKS)]
+    for row in found:
         assert row["episodes"] == "2"
         assert float(row["success"]) in (0, 0.5, 1)
         assert float(row["task_inference"]) in (0, 0.5, 1)
         assert 0 < float(row["activity"]) < 1
     assert (tmp_path / "out" / "one_shot.png").exists()
-    assert set(json.loads((tmp_path / "out" / "one_shot.json").read_text())) == {
-        "commit",
-        "command",
-    }
-    lines = printed.splitlines()
-    assert [line.split("|")[1:3] for line in lines[2:]] == [
-        [f" {task} ", f" {share} "] for task in ("all", *TASKS) for share in ("50%", "100%")
-    ]
+    origin = json.loads((tmp_path / "out" / "one_shot.json").read_text())
+    assert set(origin) == {"commit", "command"}
+    shown = [tuple(row[:2]) for row in cells(printed)[1:]]
+    assert shown == [*product(("all", *TASKS), ("50%", "100%"))]
 
 
-@pytest.mark.parametrize("name", ["oracle", "without-both"])
-def test_cells_of_gwr_are_empty_without_it(run_of, tmp_path, name):
-    printed = one_shot.one_shot(
-        OneShotArguments(run=run_of(name), shares=(1.0,), episodes=1, out=tmp_path)
-    )
-    with (tmp_path / "one_shot.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert len(rows) == 6
-    assert {(row["task_inference"], row["activity"]) for row in rows} == {("", "")}
-    for line in printed.splitlines()[2:]:
-        assert [cell.strip() for cell in line.split("|")[4:]] == ["", "", ""]
+def test_cells_of_gwr_are_empty_without_it(run_of, tmp_path):
+    arguments = OneShotArguments(run=run_of("oracle"), shares=(1.0,), episodes=1, out=tmp_path)
+    printed = one_shot.one_shot(arguments)
+    found = [(row["task_inference"], row["activity"]) for row in rows(tmp_path / "one_shot.csv")]
+    assert found == [("", "")] * 6
+    assert all(row[3:] == ["", ""] for row in cells(printed)[1:])
 
 
 def test_policies_are_shown_the_beginning_of_new_demonstrations(run_of, tmp_path, monkeypatch):
@@ -66,8 +56,7 @@ def test_policies_are_shown_the_beginning_of_new_demonstrations(run_of, tmp_path
         return snapshot(index, embedding, task, generator)
 
     monkeypatch.setattr(policy.algorithm, "snapshot", spy)
-    table = one_shot.measure(policy, (0.3, 1.0), 2, 4)
-    rows = [*table.itertuples(index=False, name=None)]
+    table = one_shot.measure(policy, (0.3, 1.0), 2, 4).set_index(["share", "seed", "task"])
     shown = record_demonstrations(
         tmp_path / "again", per_task=2, held_out_per_task=0, seed=4, progress=False
     )
@@ -87,21 +76,18 @@ def test_policies_are_shown_the_beginning_of_new_demonstrations(run_of, tmp_path
                 inferred, activity = [], []
                 for phi in embedding[label]:
                     distance, node = (weights - phi).norm(dim=-1).min(0)
-                    tasks = [
-                        t for n, t in zip(nearest, seen.task.tolist(), strict=True) if n == node
-                    ]
+                    tasks = seen.task[torch.tensor(nearest) == node].tolist()
                     majority = max(range(3), key=tasks.count) if tasks else -1
                     inferred.append(majority == label)
                     activity.append(float(torch.exp(-0.25 * distance)))  # activity_scale
-                (found,) = [
-                    row
-                    for row in rows
-                    if row[:3] == (share, policy.config.seeds[index], TASKS[label])
-                ]
-                assert found[5:] == pytest.approx((np.mean(inferred), np.mean(activity)), abs=1e-5)
+                found = table.loc[(share, policy.config.seeds[index], TASKS[label])]
+                expected = np.mean(inferred), np.mean(activity)
+                measured = found["task_inference"], found["activity"]
+                assert measured == pytest.approx(expected, abs=1e-5)
 
 
-def table():
+def test_means_equal_those_by_hand():
+    names = ["share", "seed", "task", "episodes", "success", "task_inference", "activity"]
     rows = [
         (0.5, 0, "a", 4, 0.25, 1.0, 0.5),
         (0.5, 0, "b", 4, 0.75, 0.0, 0.7),
@@ -112,12 +98,7 @@ def table():
         (1.0, 0, "b", 4, 1.0, 1.0, 1.0),
         (1.0, 1, "b", 4, 1.0, 1.0, 1.0),
     ]
-    names = ["share", "seed", "task", "episodes", "success", "task_inference", "activity"]
-    return one_shot.means(pd.DataFrame(rows, columns=names))
-
-
-def test_means_equal_those_by_hand():
-    means = table()
+    means = one_shot.means(pd.DataFrame(rows, columns=names))
     assert list(means) == ["all", "a", "b"]
     assert means["all"][0.5] == pytest.approx(np.array([[0.5, 0.5, 0.6], [0.25, 0.5, 0.5]]))
     assert means["a"][1.0] == pytest.approx(np.array([[1, 1, 1], [0.5, 1, 1]]))

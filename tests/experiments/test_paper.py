@@ -1,6 +1,5 @@
 """The paper's experiments: what they run and which files they write."""
 
-import csv
 import importlib.metadata
 import json
 import os
@@ -16,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from bgpo_trl.algorithms import ABLATIONS, ALGORITHMS
+from bgpo_trl.analysis.comparison import NAMES
 from bgpo_trl.experiments import run as experiment
 from bgpo_trl.experiments.arguments import AblationArguments, Arguments
 from bgpo_trl.experiments.paper import ablation, concurrent, continual
@@ -23,25 +23,28 @@ from bgpo_trl.experiments.report import ReportArguments, report
 from bgpo_trl.files.checkpoint import load_checkpoint
 from bgpo_trl.runs.results import read_final_tests, read_table, read_tests
 from suites import nico
-from tests.helpers import Recorder, contents
+from tests.helpers import Recorder, cells, contents, rows
 
 ROOT = Path(__file__).parents[2]
 TASKS = nico.PAPER_TASKS
+FIGURES = ("success.png", "gwr.png", "gwr_growth.png", "groups.png", "episodes.png")
 WITH_GROUPS = ("bgpo", "bgpo-experts", "group-balanced-replay")
 WITHOUT_GWR = ("maml", "dist-nll", "oracle", "ddpg", "fine-tuning", "ewc")
 WITHOUT_GWR += ("without-gwr", "without-both")
+
+
+def json_of(run, name):
+    return json.loads((run / f"{name}.json").read_text())
 
 
 def test_an_experiment_writes_curves_figures_and_a_summary(tiny, tmp_path):
     run = tmp_path / "a run"
     printed = concurrent(Arguments(out=run))
     assert "GWR-B nodes: [" in printed and "groups of behaviors: [" in printed
-    assert f"curve and figures: {run}" in printed
     assert shlex.split(printed)[-3:] == ["bgpo", "report", str(run)]
-    for name in ("success.png", "gwr.png", "gwr_growth.png", "groups.png", "episodes.png"):
-        assert (run / "figures" / name).read_bytes().startswith(b"\x89PNG")
-    assert json.loads((run / "config.json").read_text())["task_starts"] == [0, 0, 0]
-    assert set(read_tests(run / "eval.csv")["task"]) == set(TASKS)
+    figures = {path.name for path in (run / "figures").iterdir()}
+    assert figures == {*FIGURES, *(f"{task}.gif" for task in TASKS)}
+    assert json_of(run, "config")["task_starts"] == [0, 0, 0]
 
     tests = read_final_tests(run / "final.csv")
     keys = tests[["seed", "demonstrations", "task"]].itertuples(index=False, name=None)
@@ -50,12 +53,11 @@ def test_an_experiment_writes_curves_figures_and_a_summary(tiny, tmp_path):
     )
     assert set(2 * tests["success"]) <= {0, 1, 2}
     assert tests["task_inference"].between(0, 1).all()
-    summary = json.loads((run / "summary.json").read_text())
+    summary = json_of(run, "summary")
     assert re.fullmatch(r"|[0-9a-f]{7,}(-dirty)?", summary["commit"])
     assert summary["versions"]["torch"] == importlib.metadata.version("torch")
-    assert summary["random_success"] == pytest.approx(
-        dict(zip(TASKS, [0.1, 0.2, 0.3], strict=True))
-    )
+    by_chance = dict(zip(TASKS, [0.1, 0.2, 0.3], strict=True))
+    assert summary["random_success"] == pytest.approx(by_chance)
     nodes = read_table(run / "gwr.csv")
     assert nodes.shape == (summary["nodes"][0], 34)
     assert set(nodes["task"]) <= {"-1", "0", "1", "2"}
@@ -71,38 +73,36 @@ def test_an_experiment_writes_curves_figures_and_a_summary(tiny, tmp_path):
 def test_every_algorithm_runs_and_is_reported_under_its_name(tiniest, tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
     if name in ABLATIONS:
-        printed, run = ablation(AblationArguments(variant=name)), f"runs/ablation-{name}-quick"
+        kind, printed = "ablation", ablation(AblationArguments(variant=name))
     else:
-        printed, run = concurrent(Arguments(algorithm=name)), f"runs/concurrent-{name}-quick"
-    run = Path(run)
+        kind, printed = "concurrent", concurrent(Arguments(algorithm=name))
+    run = Path("runs", f"{kind}-{name}-quick")
     assert f"curve and figures: {run}" in printed
-    config = json.loads((run / "config.json").read_text())
+    config = json_of(run, "config")
     assert (config["name"], config["task_starts"]) == (name, [0, 0, 0])
     for file in ("train.csv", "eval.csv"):
         table = read_table(run / file)
         assert (set(table["algorithm"]), set(table["task"])) == ({name}, set(TASKS))
-    learner = load_checkpoint(run / "checkpoint")["algorithm"]
     with_gwr, with_groups = not name.startswith(WITHOUT_GWR), name in WITH_GROUPS
-    summary = json.loads((run / "summary.json").read_text())
-    assert (summary["nodes"] is not None) == ("gwr" in learner) == with_gwr
-    assert (summary["groups"] is not None) == ("groups" in learner) == with_groups
+    summary = json_of(run, "summary")
+    assert (summary["nodes"] is not None) == with_gwr
+    assert (summary["groups"] is not None) == with_groups
     for file in ("gwr.csv", "figures/gwr.png"):
         assert (run / file).exists() == with_gwr
     assert (run / "figures/groups.png").exists() == with_groups
-    assert ("GWR-B" in printed) == ("task inference" in printed) == with_gwr
+    assert ("GWR-B" in printed) == with_gwr
     tests = read_final_tests(run / "final.csv")
     assert (tests["task_inference"].notna() == with_gwr).all()
 
     reported = report(ReportArguments((run,)))
-    assert ("## GWR-B, by seed" in reported) == with_gwr
     assert ("one for all" in reported) == (with_gwr and not with_groups)
     assert "nan" not in reported
     trained = tests.groupby(["task", "demonstrations"])["success"].mean()
-    lines = [line.split(" | ") for line in reported.splitlines() if line.startswith("| ")]
+    found = {row[0]: row for row in cells(reported.split(f"## {NAMES[name]}: ")[1])}
     for task in TASKS:
-        (row,) = (line for line in lines if line[0] == f"| {task}")
-        for cell, kind in ((row[5], "seen"), (row[6], "held-out")):
-            assert float(cell) == pytest.approx(100 * trained[task, kind], abs=0.05)
+        shown = [float(cell) for cell in found[task][5:7]]
+        expected = [100 * trained[task, kind] for kind in ("seen", "held-out")]
+        assert shown == pytest.approx(expected, abs=0.05)
 
 
 def test_a_finished_run_is_only_changed_by_making_it_longer(undrawn, tmp_path, monkeypatch):
@@ -131,19 +131,18 @@ def test_a_finished_run_is_only_changed_by_making_it_longer(undrawn, tmp_path, m
     assert (run / "final.csv").exists()
     assert (run / "train.csv").read_text() == played
 
-    for _ in range(2):
-        printed = continual(replace(again, episodes=9))
-        settings = json.loads((run / "config.json").read_text())
-        assert (settings["episodes"], settings["task_starts"]) == (9, [0, 2, 4])
-        assert settings["eval_every"] == 2
-        assert json.loads((run / "summary.json").read_text())["episodes"] == 9
-        train = (run / "train.csv").read_text()
-        assert train.startswith(played)
-        assert train.count("\n") == 1 + 2 * 9
-    assert printed.startswith(f"{run} is finished, all 9 episodes")
+    continual(replace(again, episodes=9))
+    config = json_of(run, "config")
+    kept = (config["episodes"], config["task_starts"], config["eval_every"])
+    assert kept == (9, [0, 2, 4], 2)
+    assert json_of(run, "summary")["episodes"] == 9
+    train = (run / "train.csv").read_text()
+    assert train.startswith(played)
+    assert train.count("\n") == 1 + 2 * 9
+    assert continual(replace(again, episodes=9)).startswith(f"{run} is finished, all 9 episodes")
 
 
-def test_resume_alone_takes_the_settings_of_the_run(undrawn, tmp_path, monkeypatch):
+def test_a_run_is_continued_and_repeated_with_its_own_settings(undrawn, tmp_path, monkeypatch):
     """A run of other settings than the preset's, also when it is extended, and in its folder."""
     run = tmp_path / "run"
     begun = Arguments(
@@ -154,78 +153,60 @@ def test_resume_alone_takes_the_settings_of_the_run(undrawn, tmp_path, monkeypat
     alone = Arguments(out=run, resume=True)
     assert continual(alone).startswith(f"{run} is finished, all 4 episodes")
     continual(replace(alone, episodes=5))
-    config = json.loads((run / "config.json").read_text())
+    config = json_of(run, "config")
     assert (config["name"], config["algorithm"]["beta"]) == ("bgpo-single", 0.3)
     assert (run / "train.csv").read_text().startswith(played)
-    assert (run / "train.csv").read_text().count("\n") == 1 + 2 * 5
     before = contents(run)
     with pytest.raises(ValueError, match="holds a run with other settings"):
         continual(replace(alone, algorithm="bgpo"))
     monkeypatch.chdir(run)
     assert continual(Arguments(resume=True)).startswith(f"{run} is finished, all 5 episodes")
     assert contents(run) == before
-    changed = json.loads((run / "summary.json").read_text())["changed"]
-    assert changed == {"beta": 0.3}
+    assert json_of(run, "summary")["changed"] == {"beta": 0.3}
 
-
-def test_the_config_of_a_run_repeats_it(undrawn, tmp_path):
-    first, second = tmp_path / "first", tmp_path / "second"
-    continual(
-        Arguments(out=first, episodes=4, seeds=(8,), hyperparameters=("--algorithm.beta", "0.3"))
-    )
-    continual(Arguments(out=second, config=first))
-    for name in ("config.json", "train.csv", "eval.csv"):
-        assert (second / name).read_bytes() == (first / name).read_bytes()
+    again = tmp_path / "again"
+    continual(Arguments(out=again, config=run))
+    assert (again / "config.json").read_bytes() == (run / "config.json").read_bytes()
+    repeated, extended = ((path / "train.csv").read_text().split("\n") for path in (again, run))
+    assert sorted(repeated) == sorted(extended)  # in which episodes played early are logged late
 
 
 def test_the_directory_is_locked_from_the_encoders_to_the_figures(
     undrawn, tmp_path, monkeypatch, other_process
 ):
-    events, steps = [], ["load_pretrained", "measure", "draw"]
-    for name in steps:
+    refusals = []
+    for name in ("load_pretrained", "draw"):
         function = getattr(experiment, name)
 
-        def do(*args, name=name, function=function, **kwargs):
-            other = other_process(tmp_path / "run")
-            assert "is in use by another process" in other.communicate()[1]
-            events.append(name)
+        def do(*args, function=function, **kwargs):
+            refusals.append(other_process(tmp_path / "run").communicate()[1])
             return function(*args, **kwargs)
 
         monkeypatch.setattr(experiment, name, do)
-    continual(Arguments(out=tmp_path / "run"))
-    assert events == steps
+    continual(Arguments(out=tmp_path / "run", episodes=2))
+    assert ["is in use by another process" in refusal for refusal in refusals] == [True, True]
     assert not (tmp_path / "run" / "lock").exists()
 
 
-@pytest.fixture
-def started(monkeypatch):
-    """Recorders in place of the loggers that a command starts, with what they are started with."""
-    started = []
+def test_dashboards_get_evaluations_final_tests_and_figures(tiniest, monkeypatch, tmp_path):
+    run, started = tmp_path / "run", []
 
     def start(directory, *mode, **options):
-        started.append((Recorder(), (directory, *mode), options))
-        return started[-1][0]
+        assert directory == run
+        started.append(Recorder())
+        return started[-1]
 
     monkeypatch.setattr(experiment, "wandb_logger", start)
     monkeypatch.setattr(experiment, "tensorboard_logger", start)
-    return started
-
-
-def test_dashboards_get_evaluations_final_tests_and_figures(tiniest, started, tmp_path):
-    run = tmp_path / "run"
     arguments = Arguments(out=run, wandb="offline", tensorboard=True)
     continual(arguments)
-    figures = ["episodes.png", "groups.png", "gwr.png", "gwr_growth.png", "success.png"]
-    figures += [f"{task}.gif" for task in TASKS]
-    shown = [(f"figures/{Path(n).stem}", run / "figures" / n) for n in sorted(figures)]
-    for task in TASKS:
-        assert (run / "figures" / f"{task}.gif").read_bytes().startswith(b"GIF89a")
+    shown = [(f"figures/{path.stem}", path) for path in sorted((run / "figures").iterdir())]
     trained = read_final_tests(run / "final.csv").query("demonstrations == 'held-out'")
     means = {f"final/success/{task}": s.mean() for task, s in trained.groupby("task")["success"]}
     means["final/success_mean"] = trained["success"].mean()
     tested = sorted(set(read_tests(run / "eval.csv")["episode"]))
-    assert [first[0] for _, first, _ in started] == [run, run]
-    for recorder, *_ in started:
+    assert len(started) == 2
+    for recorder in started:
         assert [step for _, step in recorder.metrics] == [*tested, 6]
         assert recorder.metrics[-1][0] == pytest.approx(means)
         assert recorder.media == shown
@@ -233,17 +214,14 @@ def test_dashboards_get_evaluations_final_tests_and_figures(tiniest, started, tm
 
     (run / "summary.json").unlink()  # as if it had been killed when training was over
     continual(replace(arguments, tensorboard=False, resume=True))
-    resumed = started[-1][0]
-    assert [step for _, step in resumed.metrics] == [6]
-    assert resumed.media == shown
+    assert len(started) == 3
+    assert [step for _, step in started[-1].metrics] == [6]
+    assert started[-1].media == shown
 
-
-def test_a_refused_run_starts_no_logger(undrawn, started, tmp_path):
-    continual(Arguments(out=tmp_path / "run"))
     for again in ({}, {"resume": True, "seeds": (4,)}):
         with pytest.raises(ValueError, match="holds a run"):
-            continual(Arguments(out=tmp_path / "run", wandb="offline", tensorboard=True, **again))
-    assert started == []
+            continual(replace(arguments, **again))
+    assert len(started) == 3  # a run that is refused starts no logger
 
 
 @pytest.mark.slow
@@ -266,19 +244,10 @@ def test_the_smoke_preset_passes_every_stage_although_it_is_interrupted(tmp_path
     )
     assert result.returncode == 0, result.stderr
     assert result.stdout.endswith("curve and figures: run; in numbers: bgpo report run\n")
-    for name in (
-        *("config.json", "train.csv", "eval.csv", "figures/success.png", "figures/gwr.png"),
-        *(
-            "encoders/encoders.safetensors",
-            "encoders/encoders_bank.safetensors",
-            "encoders/probes.json",
-        ),
-        "demonstrations/dataset.json",
-    ):
+    for name in ("figures/gwr.png", "demonstrations/dataset.json", "encoders/probes.json"):
         assert (tmp_path / "run" / name).stat().st_size > 0
-    with open(tmp_path / "run" / "train.csv", newline="") as file:
-        episodes = [(row["seed"], int(row["episode"])) for row in csv.DictReader(file)]
-    assert sorted(episodes) == [(seed, n) for seed in "01" for n in range(1, 13)]
+    played = [(row["seed"], int(row["episode"])) for row in rows(tmp_path / "run" / "train.csv")]
+    assert sorted(played) == [(seed, n) for seed in "01" for n in range(1, 13)]
 
 
 def test_a_run_that_was_interrupted_while_it_made_encoders_is_resumed(

@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 
 import pytest
+import yaml
 
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.configs import PRESETS
@@ -15,18 +16,13 @@ from suites import nico
 ONE, TWO, THREE = nico.PAPER_TASKS
 
 
-def test_a_preset_alone_is_not_changed():
-    for name, preset in PRESETS.items():
-        assert run_config(Arguments(preset=name)) == preset
+def test_presets_and_algorithms_change_nothing_else():
     assert run_config(Arguments()) == PRESETS["quick"]
-
-
-@pytest.mark.parametrize("name", ALGORITHMS)
-def test_another_algorithm_changes_nothing_else(name):
-    entry = ALGORITHMS[name]
     for preset, config in PRESETS.items():
-        expected = replace(config, name=name, algorithm=entry.config)
-        assert run_config(Arguments(algorithm=name, preset=preset)) == expected
+        assert run_config(Arguments(preset=preset)) == config
+        for name, entry in ALGORITHMS.items():
+            expected = replace(config, name=name, algorithm=entry.config)
+            assert run_config(Arguments(algorithm=name, preset=preset)) == expected
 
 
 @pytest.mark.parametrize(
@@ -44,21 +40,13 @@ def test_another_length_scales_the_task_starts(preset, episodes, starts, eval_ev
     )
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"seeds": (7, 9)},
-        {"task_starts": (0, 5, 5)},
-        {"schedule": "sequential"},
-        {"eval_every": 7, "eval_episodes": 3, "checkpoint_minutes": 1.0},
-    ],
-)
-def test_a_flag_changes_its_setting_alone(changes):
-    config = run_config(Arguments(preset="desk", **changes))
-    assert config == replace(PRESETS["desk"], **changes)
+def test_a_flag_changes_its_setting_alone():
+    changes = {"seeds": (7, 9), "task_starts": (0, 5, 5), "schedule": "sequential", "eval_every": 7}
+    changes |= {"eval_episodes": 3, "checkpoint_minutes": 1.0, "spread": 0.5, "held_out": "test"}
+    for name, value in changes.items():
+        config = run_config(Arguments(preset="desk", **{name: value}))
+        assert config == replace(PRESETS["desk"], **{name: value})
 
-
-def test_hyperparameters_are_flags():
     flags = ("--algorithm.beta", "0.2", "--algorithm.rl.hidden-sizes", "32", "16")
     config = run_config(Arguments(algorithm="bgpo-single", hyperparameters=flags))
     expected = run_config(Arguments(algorithm="bgpo-single"))
@@ -70,7 +58,6 @@ def test_hyperparameters_are_flags():
     ("tasks", "episodes", "starts"),
     [
         ((TWO,), None, (0,)),
-        ((TWO, ONE), None, (0, 900)),
         ((TWO, ONE), 100, (0, 50)),
         ((THREE, ONE, TWO), None, (0, 570, 1_050)),  # as many as the preset has
         (("all",), 4_000, tuple(range(0, 4_000, 500))),
@@ -83,31 +70,19 @@ def test_tasks_start_in_their_order_at_even_intervals(tasks, episodes, starts):
     assert at_once(config).task_starts == (0,) * len(starts)
 
 
-def write(path, content):
-    path.write_text(json.dumps(content))
-    return path
-
-
-def test_the_config_of_a_run_is_read_whole(tmp_path):
-    stored = run_config(Arguments(preset="desk", algorithm="maml", seeds=(4,), tasks=(TWO, ONE)))
-    write(tmp_path / "config.json", settings_of(stored, Digests("some", "bank")))
-    for path in (tmp_path, tmp_path / "config.json"):
-        assert run_config(Arguments(config=path)) == stored
-
-
 def test_a_file_changes_the_preset_and_flags_change_the_file(tmp_path):
+    path = tmp_path / "mine.json"
     content = {"name": "bgpo-single", "eval_every": 6, "algorithm": {"beta": 0.2, "rl": {"tau": 1}}}
-    path = write(tmp_path / "mine.json", content)
+    path.write_text(json.dumps(content))
     single = ALGORITHMS["bgpo-single"].config
     algorithm = replace(single, beta=0.2, rl=replace(single.rl, tau=1.0))
     expected = replace(PRESETS["desk"], name="bgpo-single", eval_every=6, algorithm=algorithm)
-    assert run_config(Arguments(config=path, preset="desk")) == expected
-    flags = Arguments(
-        config=path, preset="desk", eval_every=9, hyperparameters=("--algorithm.beta", "0.7")
-    )
-    algorithm = replace(algorithm, beta=0.7)
-    assert run_config(flags) == replace(expected, eval_every=9, algorithm=algorithm)
-    other = run_config(Arguments(config=path, preset="desk", algorithm="maml"))
+    of_file = Arguments(config=path, preset="desk")
+    assert run_config(of_file) == expected
+    flags = replace(of_file, eval_every=9, hyperparameters=("--algorithm.beta", "0.7"))
+    changed = replace(expected, eval_every=9, algorithm=replace(algorithm, beta=0.7))
+    assert run_config(flags) == changed
+    other = run_config(replace(of_file, algorithm="maml"))
     assert (other.name, other.algorithm) == ("maml", ALGORITHMS["maml"].config)
 
 
@@ -127,18 +102,9 @@ algorithm:
 def test_yaml_json_and_flags_store_the_same_settings(tmp_path):
     in_yaml, in_json = tmp_path / "mine.yaml", tmp_path / "mine.json"
     in_yaml.write_text(YAML)
-    write(
-        in_json,
-        {
-            "name": "bgpo-single",
-            "seeds": [3, 5],
-            "tasks": ["grasp_glass", "push_green_to_glass"],
-            "task_starts": [0, 300],
-            "episodes": 600,
-            "spread": 1,
-            "algorithm": {"beta": 0.2, "rl": {"name": "sac", "learning_rate": 0.0003}},
-        },
-    )
+    content = yaml.safe_load(YAML)
+    content["algorithm"]["rl"]["learning_rate"] = 0.0003  # in YAML 1.1, the above is a text
+    in_json.write_text(json.dumps(content))
     flags = Arguments(
         algorithm="bgpo-single",
         rl="sac",
@@ -148,8 +114,8 @@ def test_yaml_json_and_flags_store_the_same_settings(tmp_path):
         spread=1.0,
         hyperparameters=("--algorithm.beta", "0.2", "--algorithm.rl.learning-rate", "3e-4"),
     )
-    by_file = [Arguments(config=path) for path in (in_yaml, in_json)]
-    stored = [settings_of(run_config(given), Digests("a", "b")) for given in (*by_file, flags)]
+    asked = (flags, Arguments(config=in_yaml), Arguments(config=in_json))
+    stored = [settings_of(run_config(given), Digests("a", "b")) for given in asked]
     assert stored[0] == stored[1] == stored[2]
     assert stored[0]["algorithm"]["beta"] == 0.2
 
@@ -160,38 +126,29 @@ def test_yaml_json_and_flags_store_the_same_settings(tmp_path):
         ("seeds: [0, 1\nepisodes: 5", "line 2"),
         ("- seeds", "name: value"),
         ("episods: 5", "unknown setting episods"),
-        ("episodes: many", "episodes is 'many'"),
         ("tasks: &all [*all]", "tasks is"),
         ("seeds: !!python/tuple [1]", "line 1"),
     ],
 )
-def test_a_yaml_file_that_is_damaged_or_has_wrong_settings_is_refused(tmp_path, content, cause):
+def test_a_yaml_file_that_is_damaged_or_has_wrong_settings_is_refused(
+    tmp_path, refused, content, cause
+):
     path = tmp_path / "mine.yaml"
     path.write_text(content)
-    with pytest.raises(ValueError, match=r"mine\.yaml") as raised:
-        run_config(Arguments(config=path))
-    assert cause in str(raised.value)
-    assert "\n" not in str(raised.value)
+    refused(lambda: run_config(Arguments(config=path)), cause, "mine.yaml")
 
 
 @pytest.mark.parametrize(
-    "wrong",
+    ("wrong", "cause"),
     [
-        {"episodes": 0},
-        {"task_starts": (0, 5)},
-        {"episodes": 10, "eval_every": 50},
-        {"tasks": ("dance",)},
-        {"tasks": (ONE, ONE)},
-        {"rl": "ppo"},
-        {"algorithm": "bgpo-paper", "rl": "sac"},
-        {"algorithm": "maml", "rl": "td3"},
+        ({"episodes": 10, "eval_every": 50}, "eval_every"),
+        ({"tasks": ("dance",)}, "'dance'"),
+        ({"rl": "ppo"}, "'ppo'"),
+        ({"algorithm": "bgpo-paper", "rl": "sac"}, "bgpo-paper"),
+        ({"algorithm": "maml", "rl": "td3"}, "MAML"),
+        ({"task_starts": (0, 5, 5)}, "--task-starts"),  # where all tasks begin at once
     ],
 )
-def test_wrong_settings_are_refused(wrong):
-    with pytest.raises(ValueError):
-        run_config(Arguments(**wrong))
-
-
-def test_task_starts_are_refused_where_all_tasks_begin_at_once():
-    with pytest.raises(ValueError, match="--task-starts"):
-        run_config(Arguments(task_starts=(0, 5, 5)), from_start=True)
+def test_wrong_settings_are_refused(wrong, cause):
+    with pytest.raises(ValueError, match=cause):
+        run_config(Arguments(**wrong), from_start="task_starts" in wrong)

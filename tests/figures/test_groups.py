@@ -60,20 +60,15 @@ def test_counts_are_drawn_as_means_shaded_from_the_lowest_to_the_highest_seed(pa
     for panel in figure.axes:
         assert [text.get_text() for text in panel.texts] == ["task 2"]
         assert list(panel.lines[1].get_xdata()) == [3, 3]
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["BGPO"]
-
-
-def test_the_number_of_groups_is_drawn_for_each_seed(path):
-    start, other, first = plot_groups(read_groups(path, TASKS), PRESENTED).axes[0].lines
-    assert set(start.get_xdata()) == {3}
-    assert first.get_ydata().tolist() == [1, 1, 1, 2, 2, 2, 2, 2]
-    assert other.get_ydata().tolist() == [1, 1, 1, 1, 1, 1, 3, 3, 3]
 
 
 def test_a_group_has_a_row_with_a_mark_for_each_episode(path):
     table = read_groups(path, TASKS)
-    figure = plot_groups(table[table["episode"] < 9], PRESENTED)
-    _, first, second = figure.axes
+    numbers, first, second = plot_groups(table[table["episode"] < 9], PRESENTED).axes
+    start, of_second, of_first = numbers.lines
+    assert set(start.get_xdata()) == {3}
+    assert of_first.get_ydata().tolist() == [1, 1, 1, 2, 2, 2, 2, 2]
+    assert of_second.get_ydata().tolist() == [1, 1, 1, 1, 1, 1, 3, 3]
     # The one episode of task 2 is drawn over those of task 1.
     row = [(0, BLUE, episode) for episode in (1, 2, 3, 6, 8)] + [(0, ORANGE, 4)]
     assert marks(first) == [*row, (1, ORANGE, 5), (1, ORANGE, 7)]
@@ -86,8 +81,6 @@ def test_a_group_has_a_row_with_a_mark_for_each_episode(path):
     assert [(bar.get_x(), bar.get_width()) for bar in first.patches] == [(1, 7), (5, 2)]
     assert [(bar.get_x(), bar.get_width()) for bar in second.patches] == [(1, 6), (8, 0)]
     assert [text.get_text() for text in second.get_yticklabels()] == ["0", "2"]
-    labels = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert labels == ["task 1: grasp glass", "task 2: push green to white"]
 
 
 def test_runs_without_episodes_or_groups_are_refused(path):

@@ -35,45 +35,32 @@ def test_axes_are_labeled_with_the_share_of_variance():
     (axes,) = plot_gwr_pca(weights, np.zeros(4, dtype=int), ["a"]).axes
     assert axes.get_xlabel() == "Principal component 1 (90% of variance)"
     assert axes.get_ylabel() == "Principal component 2 (10% of variance)"
-    np.testing.assert_allclose(
-        np.asarray(axes.collections[0].get_offsets()), weights[:, :2], atol=1e-12
-    )
+    points = np.asarray(axes.collections[0].get_offsets())
+    np.testing.assert_allclose(points, weights[:, :2], atol=1e-12)
 
 
-def test_nodes_are_colored_by_task():
-    weights = np.array([[3.0, 0], [-3, 0], [0, 1], [0, -1], [0, 0]])
-    (axes,) = plot_gwr_pca(weights, [1, 0, 1, -1, 0], TASKS).axes
-    nodes = {
-        group.get_label(): np.asarray(group.get_offsets()).round(9).tolist()
-        for group in axes.collections
-    }
-    assert nodes == {
-        "task 1: grasp glass (2)": [[-3, 0], [0, 0]],
-        "task 2: push green to white (2)": [[3, 0], [0, 1]],
-        "no demonstration (1)": [[0, -1]],
-    }
-    assert len({to_hex(group.get_facecolor()[0]) for group in axes.collections}) == 3
-
-
-def test_groups_are_shown_in_a_second_panel():
+def test_nodes_are_colored_by_task_and_in_a_second_panel_by_group():
     weights = np.array([[3.0, 0], [-3, 0], [0, 1], [0, -1], [0, 0]])
     figure = plot_gwr_pca(weights, [1, 0, 1, -1, 0], TASKS, torch.tensor([2, 0, 2, 0, 0]))
-    by_task, by_group = figure.axes
-    nodes = {
-        group.get_label(): np.asarray(group.get_offsets()).round(9).tolist()
-        for group in by_group.collections
-    }
-    assert nodes == {
-        "group 0 (3)": [[-3, 0], [0, -1], [0, 0]],
-        "group 2 (2)": [[3, 0], [0, 1]],
-    }
-    colors = [to_hex(c.get_facecolor()[0]) for a in figure.axes for c in a.collections]
+    assert [
+        {
+            kind.get_label(): np.asarray(kind.get_offsets()).round(9).tolist()
+            for kind in a.collections
+        }
+        for a in figure.axes
+    ] == [
+        {
+            "task 1: grasp glass (2)": [[-3, 0], [0, 0]],
+            "task 2: push green to white (2)": [[3, 0], [0, 1]],
+            "no demonstration (1)": [[0, -1]],
+        },
+        {"group 0 (3)": [[-3, 0], [0, -1], [0, 0]], "group 2 (2)": [[3, 0], [0, 1]]},
+    ]
+    colors = [to_hex(kind.get_facecolor()[0]) for a in figure.axes for kind in a.collections]
     assert len(set(colors)) == 5  # groups are no tasks
-    legends = [[text.get_text() for text in a.get_legend().get_texts()] for a in figure.axes]
-    assert legends == [[c.get_label() for c in a.collections] for a in figure.axes]
     FigureCanvasAgg(figure).draw()
-    heights = [axes.get_position().bounds[1::2] for axes in (by_task, by_group)]
-    assert heights[0] == pytest.approx(heights[1])
+    by_task, by_group = figure.axes
+    assert by_task.get_position().height == pytest.approx(by_group.get_position().height)
     assert by_task.get_xlim() == by_group.get_xlim()
 
 
@@ -85,18 +72,14 @@ GRAPHS = {
 }
 
 
-def places(axes):
-    """Returns the nodes drawn, those of one kind after those of another."""
-    return np.concatenate([np.asarray(c.get_offsets()) for c in axes.collections[1:]])
-
-
 def test_growth_panels_share_the_components_of_the_last_graph():
     early, late, _ = plot_gwr_growth(GRAPHS, [[1, 2]], TASKS).axes
     # Of the four that match, the mean is (0.5, 2); components are the second and the first axis.
-    expected = {"late": [(-2, -0.5), (-2, 0.5), (2, -0.5), (2, 0.5), (88, 0)]}
-    expected["early"] = [(-1, 0), (3, 0)]
-    assert places(late) == pytest.approx(np.array(expected["late"]))
-    assert places(early) == pytest.approx(np.array(expected["early"]))
+    shown = [(-2, -0.5), (-2, 0.5), (2, -0.5), (2, 0.5), (88, 0)]
+    for axes, expected in ((late, shown), (early, [(-1, 0), (3, 0)])):
+        # The edges, then the nodes of one kind after those of another.
+        nodes = np.concatenate([np.asarray(c.get_offsets()) for c in axes.collections[1:]])
+        assert nodes == pytest.approx(np.array(expected))
     assert (early.get_xlim(), early.get_ylim()) == (late.get_xlim(), late.get_ylim())
     assert late.get_xlabel() == "component 1 (94% of variance)"  # 16 of 17
     assert early.get_title() == "episode 10: 2 nodes, 1 outside"

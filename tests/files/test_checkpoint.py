@@ -1,3 +1,5 @@
+"""Checkpoints: what is saved is loaded, and no crash or full disk loses the one before."""
+
 import errno
 import warnings
 from collections import OrderedDict
@@ -19,27 +21,24 @@ def files(directory: Path) -> list[Path]:
 
 
 def test_a_state_is_loaded_as_it_was_saved(tmp_path):
-    generator = torch.Generator().manual_seed(3)
-    numpy_generator = np.random.default_rng(3)
+    generator, numpy_generator = torch.Generator().manual_seed(3), np.random.default_rng(3)
     layer = torch.nn.Linear(2, 2)
     optimizer = torch.optim.Adam(layer.parameters())
     layer(torch.ones(2)).sum().backward()
     optimizer.step()
-    save_checkpoint(
-        tmp_path,
-        {
-            "torch": generator.get_state(),
-            "numpy": numpy_generator.bit_generator.state,
-            "layer": layer.state_dict(),
-            "optimizer": optimizer.state_dict(),
-            "plain": {"int": 10**30, "float": float("-inf"), "list": [True, None, ("a", 0.1)]},
-            "pixels": torch.arange(6, dtype=torch.uint8).reshape(2, 3),
-        },
-    )
+    plain = {"int": 10**30, "float": float("-inf"), "list": [True, None, ("a", 0.1)]}
+    state = {
+        "torch": generator.get_state(),
+        "numpy": numpy_generator.bit_generator.state,
+        "layer": layer.state_dict(),
+        "optimizer": optimizer.state_dict(),
+        "plain": plain,
+        "pixels": torch.arange(6, dtype=torch.uint8).reshape(2, 3),
+    }
+    path = save_checkpoint(tmp_path, state)
     expected = torch.rand(3, generator=generator), numpy_generator.random(3)
 
     state = load_checkpoint(tmp_path)
-
     generator.set_state(state["torch"])
     numpy_generator.bit_generator.state = state["numpy"]
     assert torch.equal(torch.rand(3, generator=generator), expected[0])
@@ -48,12 +47,19 @@ def test_a_state_is_loaded_as_it_was_saved(tmp_path):
     fresh = torch.optim.Adam(torch.nn.Linear(2, 2).parameters())
     fresh.load_state_dict(state["optimizer"])
     assert torch.equal(fresh.state_dict()["state"][0]["exp_avg"], torch.full((2, 2), 0.1))
-    assert state["plain"] == {"int": 10**30, "float": -np.inf, "list": [True, None, ("a", 0.1)]}
-    assert state["pixels"].dtype == torch.uint8
-    assert state["pixels"].tolist() == [[0, 1, 2], [3, 4, 5]]
+    assert state["plain"] == plain
+
+    # Tensors that are mapped from the file do not change it, and outlive it.
+    before = path.read_bytes()
+    mapped = load_checkpoint(tmp_path, mmap=True)["pixels"]
+    assert mapped.dtype == torch.uint8 and mapped.tolist() == [[0, 1, 2], [3, 4, 5]]
+    mapped.zero_()
+    assert path.read_bytes() == before
+    path.unlink()
+    assert mapped.sum() == 0
 
 
-def test_the_newest_is_loaded_and_the_one_before_is_kept(tmp_path):
+def test_the_newest_is_loaded_the_one_before_kept_and_leftovers_of_a_kill_ignored(tmp_path):
     directory = tmp_path / "run" / "checkpoint"
     assert not has_checkpoint(directory)
     paths = [save_checkpoint(directory, {"episode": episode}) for episode in range(12)]
@@ -61,8 +67,15 @@ def test_the_newest_is_loaded_and_the_one_before_is_kept(tmp_path):
     assert load_checkpoint(directory) == {"episode": 11}
     assert files(directory) == paths[-2:]
 
+    (directory / "checkpoint.tmp").write_bytes(b"half a checkpoint")
+    (directory / "checkpoint-notes.pt").write_bytes(b"not ours")
+    assert load_checkpoint(directory) == {"episode": 11}
+    newest = save_checkpoint(directory, {"episode": 12})
+    assert load_checkpoint(directory) == {"episode": 12}
+    assert files(directory) == [paths[-1], newest, directory / "checkpoint-notes.pt"]
 
-@settings(max_examples=60, deadline=None)
+
+@settings(max_examples=25)
 @given(where=st.floats(0, 1, exclude_max=True), bit=st.integers(-1, 7))
 def test_a_damaged_checkpoint_is_skipped_with_a_warning(where, bit, tmp_path_factory):
     directory = tmp_path_factory.mktemp("checkpoint")
@@ -88,76 +101,41 @@ def test_a_damaged_checkpoint_is_skipped_with_a_warning(where, bit, tmp_path_fac
         assert load_checkpoint(directory)["episode"] == 3
 
 
+@pytest.mark.filterwarnings("ignore:.*damaged:UserWarning")
 def test_without_an_intact_checkpoint_loading_is_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"no intact checkpoint.*start a new run"):
-        load_checkpoint(tmp_path)
-    with pytest.raises(ValueError, match="no intact checkpoint"):
-        load_checkpoint(tmp_path / "nowhere")
     for episode in range(2):
-        save_checkpoint(tmp_path, {"episode": episode}).write_bytes(b"")
-    with (
-        pytest.warns(UserWarning, match="damaged"),
-        pytest.raises(ValueError, match=r"no intact checkpoint") as error,
-    ):
-        load_checkpoint(tmp_path)
-    assert "\n" not in str(error.value)
+        save_checkpoint(tmp_path / "damaged", {"episode": episode}).write_bytes(b"")
+    for name in ("damaged", "nowhere"):
+        with pytest.raises(ValueError, match=r"^[^\n]*no intact checkpoint[^\n]*a new run[^\n]*$"):
+            load_checkpoint(tmp_path / name)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=15)
 @given(room=st.floats(0, 1, exclude_max=True))
 def test_a_full_disk_keeps_earlier_checkpoints(room, tmp_path_factory):
     directory = tmp_path_factory.mktemp("checkpoint")
-    kept = [
-        save_checkpoint(directory, {"weight": torch.ones(5000), "episode": episode})
-        for episode in (1, 2)
-    ]
+    first, second, third = ({"weight": torch.ones(5000), "episode": n} for n in (1, 2, 3))
+    kept = [save_checkpoint(directory, state) for state in (first, second)]
     size = int(room * kept[-1].stat().st_size)
     with largest_file(size), pytest.raises(OSError, match="earlier ones are kept") as error:
-        save_checkpoint(directory, {"weight": torch.ones(5000), "episode": 3})
+        save_checkpoint(directory, third)
     assert error.value.errno == errno.EFBIG
     assert files(directory) == kept
     assert load_checkpoint(directory)["episode"] == 2
-    save_checkpoint(directory, {"weight": torch.ones(5000), "episode": 3})
+    save_checkpoint(directory, third)
     assert load_checkpoint(directory)["episode"] == 3
 
 
-def test_leftovers_of_a_killed_save_are_ignored(tmp_path):
-    save_checkpoint(tmp_path, {"episode": 1})
-    (tmp_path / "checkpoint.tmp").write_bytes(b"half a checkpoint")
-    (tmp_path / "checkpoint-notes.pt").write_bytes(b"not ours")
-    assert load_checkpoint(tmp_path) == {"episode": 1}
-    save_checkpoint(tmp_path, {"episode": 2})
-    assert load_checkpoint(tmp_path) == {"episode": 2}
-    assert (tmp_path / "checkpoint-notes.pt").exists()
-    assert not (tmp_path / "checkpoint.tmp").exists()
-
-
 @pytest.mark.parametrize(
-    ("state", "message"),
+    ("state", "cause"),
     [
         ({"rng": np.random.default_rng(0)}, r"state\['rng'\] is a Generator"),
         ({"a": [0.0, {"b": np.float64(1)}]}, r"state\['a'\]\[1\]\['b'\] is a float64"),
-        ({"path": Path()}, r"state\['path'\] is a PosixPath"),
-        ({"array": np.zeros(2)}, r"state\['array'\] is a ndarray"),
         ({"a": OrderedDict({(1, 2): 0})}, r"state\['a'\] has the key \(1, 2\)"),
         (torch.nn.Linear(1, 1), "state is a Linear"),
     ],
 )
-def test_a_state_that_could_not_be_loaded_is_not_saved(state: Any, message: str, tmp_path):
-    directory = tmp_path / "checkpoint"
-    with pytest.raises(ValueError, match=message):
-        save_checkpoint(directory, state)
-    assert not directory.exists()
-
-
-def test_memory_mapped_tensors_do_not_change_the_file(tmp_path):
-    state = {"weights": torch.arange(5.0), "nested": [{"frames": torch.ones(3, dtype=torch.uint8)}]}
-    path = save_checkpoint(tmp_path, state)
-    before = path.read_bytes()
-    loaded = load_checkpoint(tmp_path, mmap=True)
-    assert loaded["weights"].equal(state["weights"])
-    assert loaded["nested"][0]["frames"].equal(state["nested"][0]["frames"])
-    loaded["weights"].zero_()
-    assert path.read_bytes() == before
-    path.unlink()
-    assert loaded["nested"][0]["frames"].sum() == 3
+def test_a_state_that_could_not_be_loaded_is_not_saved(state: Any, cause: str, tmp_path):
+    with pytest.raises(ValueError, match=cause):
+        save_checkpoint(tmp_path / "checkpoint", state)
+    assert not (tmp_path / "checkpoint").exists()

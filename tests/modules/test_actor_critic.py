@@ -18,8 +18,8 @@ def generators(n: int) -> list[torch.Generator]:
     return [torch.Generator().manual_seed(seed) for seed in range(n)]
 
 
-@pytest.mark.parametrize("batch_size", [(), (4,), (2, 3)])
-@pytest.mark.parametrize("batch", [(), (7,), (5, 7)])
+@pytest.mark.parametrize("batch_size", [(), (2, 3)])
+@pytest.mark.parametrize("batch", [(), (5, 7)])
 @pytest.mark.parametrize("out_features", [1, 5, 32])  # sizes with different kernels
 def test_stacked_layer_applies_each_matrix_to_its_own_slice(batch_size, batch, out_features):
     layer = StackedLinear(3, out_features, batch_size)
@@ -29,14 +29,11 @@ def test_stacked_layer_applies_each_matrix_to_its_own_slice(batch_size, batch, o
     indices = itertools.product(*map(range, batch_size))
     reference = torch.stack([x[i] @ layer.weight[i] + layer.bias[i] for i in indices]).view(y.shape)
     torch.testing.assert_close(y, reference)
-    wrt = x, layer.weight, layer.bias
-    upstream = torch.randn(y.shape)
-    for ours, plain in zip(
-        torch.autograd.grad(y, wrt, upstream),
-        torch.autograd.grad(reference, wrt, upstream),
-        strict=True,
-    ):
-        torch.testing.assert_close(ours, plain, rtol=1e-4, atol=1e-4)
+    with torch.no_grad():
+        torch.testing.assert_close(layer(x), reference)
+    wrt, upstream = (x, layer.weight, layer.bias), torch.randn(y.shape)
+    ours, plain = (torch.autograd.grad(value, wrt, upstream) for value in (y, reference))
+    torch.testing.assert_close(ours, plain, rtol=1e-4, atol=1e-4)
 
 
 def test_initial_weights_are_those_of_each_generator_alone():
@@ -45,6 +42,8 @@ def test_initial_weights_are_those_of_each_generator_alone():
         alone = StackedMLP(6, 2, hidden_sizes=(8, 4), generator=generator)
         for mine, theirs in zip(stacked.parameters(), alone.parameters(), strict=True):
             assert torch.equal(mine[i], theirs)
+    with pytest.raises(ValueError, match="needs 3, got 2"):
+        StackedLinear(2, 2, (3,), generators(2))
 
 
 def test_initial_weights_are_uniform_within_one_over_root_of_inputs():
@@ -108,22 +107,6 @@ def test_a_network_can_be_called_with_the_weights_of_any_stack(network, stack):
         assert called[key].equal(expected[key])
 
 
-def test_networks_can_be_called_with_keywords_and_name_a_missing_entry():
-    actor = Actor(3, 2, in_keys=["state"], batch_size=5)  # a number for a shape
-    state = torch.randn(5, 3)
-    expected = actor(TensorDict({"state": state}, [5]))
-    pre_tanh, action = actor(state=state)
-    assert torch.equal(action, expected["action"])
-    assert torch.equal(pre_tanh, expected["pre_tanh_action"])
-    with pytest.raises(ValueError, match="Actor found no 'state'"):
-        actor(TensorDict({"latent": state}, [5]))
-
-
-def test_as_many_generators_as_layers_are_needed():
-    with pytest.raises(ValueError, match="needs 3, got 2"):
-        StackedLinear(2, 2, (3,), generators(2))
-
-
 # ---- SAC's policy
 
 
@@ -164,27 +147,18 @@ def test_log_probabilities_and_their_gradients_stay_finite_where_the_tanh_satura
 # ---- the policy with a head for each task
 
 
-def generator(seed):
-    return torch.Generator().manual_seed(seed)
-
-
-def multi_head(n_heads, seed=0, **arguments):
-    arguments = {"in_keys": ["state"], "hidden_sizes": (64,), **arguments}
-    actor = MultiHeadActor(5, 2, generator=generator(seed), **arguments)
-    for head in range(n_heads):
-        actor.add_head(generator(100 * seed + head))
+def multi_head(n_heads, hidden_sizes=(64,)):
+    actor = MultiHeadActor(5, 2, in_keys=["state"], hidden_sizes=hidden_sizes)
+    for _ in range(n_heads):
+        actor.add_head()
     return actor
 
 
-def states(*shape, scale=1.0):
-    return TensorDict({"state": scale * torch.randn(*shape, 5, generator=generator(9))}, shape)
-
-
-@pytest.mark.parametrize("hidden_sizes", [(8,), (16, 8), (16, 12, 8)])
+@pytest.mark.parametrize("hidden_sizes", [(8,), (16, 12, 8)])
 def test_a_head_maps_the_output_of_the_trunk_to_mean_and_deviation(hidden_sizes):
-    actor = multi_head(3, hidden_sizes=hidden_sizes)
+    actor = multi_head(3, hidden_sizes)
     assert [layer.out_features for layer in actor.trunk.layers] == list(hidden_sizes)
-    data = actor(states(3, 7))
+    data = actor(TensorDict({"state": torch.randn(3, 7, 5)}, [3, 7]))
     for task, head in enumerate(actor.heads):
         x = data["state"][task]
         for layer in actor.trunk.layers:
@@ -194,24 +168,17 @@ def test_a_head_maps_the_output_of_the_trunk_to_mean_and_deviation(hidden_sizes)
         # Log-scales are spread evenly between those of the narrowest and of the widest.
         torch.testing.assert_close(data["scale"][task].log10(), scale.sigmoid() - 1)
     assert data["action"].equal(data["loc"])
-    for key in actor.out_keys:
-        assert data[key].shape == (3, 7, 2)
 
 
 def test_a_new_head_changes_neither_the_others_nor_the_trunk():
     actor = multi_head(2)
-    state = states(3, 7)
     kept = {key: value.clone() for key, value in actor.state_dict().items()}
     parameters = [id(p) for p in actor.parameters()]
-    before = actor(state[:2].clone())
-    head = actor.add_head(generator(7))
-
+    head = actor.add_head(torch.Generator().manual_seed(7))
     assert actor.heads[2] is head
     assert [id(p) for p in actor.parameters()][: len(parameters)] == parameters
     assert len(list(actor.parameters())) == len(parameters) + 2
     for key, value in kept.items():
         assert actor.state_dict()[key].equal(value)
-    after = actor(state.clone())
-    for key in actor.out_keys:
-        assert after[key][:2].equal(before[key])
-        assert not after[key][2].equal(after[key][1])
+    again = multi_head(0).add_head(torch.Generator().manual_seed(7))
+    assert again.weight.equal(head.weight)

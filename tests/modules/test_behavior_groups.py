@@ -8,7 +8,6 @@ import torch
 
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.modules.behavior_groups import BehaviorGroups
-from bgpo_trl.modules.density_clusters import density_clusters, local_whitening
 from bgpo_trl.transforms import TaskSchedule
 from suites import nico
 
@@ -37,33 +36,26 @@ def test_inputs_are_unknown_and_of_group_0_before_the_first_clustering():
     assert not match.known.any()
     assert groups.num_groups.tolist() == [1, 1, 1]
     assert groups.numbers(0) == [0]
-    one = BehaviorGroups(4)
-    show(one, around(0, 9))
-    assert not one.lookup(around(0, 9)).known.any()
+    one, few = BehaviorGroups(4), around(0, 9)
+    show(one, few.repeat(10, 1))  # again and again adds nothing
+    assert not one.lookup(few).known.any()
     show(one, around(0, 1, seed=1))
-    assert one.lookup(around(0, 9)).known.all()
-    assert int(one.num_groups) == 1
+    assert one.lookup(few).known.all()
+    assert (int(one.num_groups), int(one.revision)) == (1, 0)
 
 
 def test_new_behavior_gets_its_group_within_thirty_demonstrations():
     groups = BehaviorGroups(4)
-    assert set(show(groups, around(0, 120))) == {0}
+    assert set(show(groups, around(0, 60))) == {0}
     played = show(groups, around(1, 30))
     assert played[0] == 0 and played[-1] == 1
     assert played == sorted(played)
     assert int(groups.num_groups) == 2
     assert groups.parent(0, 1) == 0
-    assert group_of(groups, around(0, 50, seed=1)) == [0]
-    assert group_of(groups, around(1, 50, seed=1)) == [1]
-    assert show(groups, around(2, 30))[-1] == 2
-
-
-def test_repeated_demonstrations_form_no_group():
-    groups = BehaviorGroups(4)
-    few = around(0, 9)
-    show(groups, few.repeat(10, 1))
-    assert not groups.lookup(few).known.any()
-    assert int(groups.revision) == 0
+    before = groups.get_extra_state()
+    for place in (0, 1):
+        assert group_of(groups, around(place, 50, seed=1)) == [place]
+    torch.testing.assert_close(groups.get_extra_state(), before, rtol=0, atol=0)
 
 
 def test_novelty_is_relative_to_the_extent_of_the_group():
@@ -82,12 +74,11 @@ def test_novelty_is_relative_to_the_extent_of_the_group():
 
 
 def test_groups_do_not_depend_on_the_scale_of_inputs():
-    inputs = torch.cat([around(place, 40) for place in range(3)]).double()
+    inputs = torch.cat([around(place, 30) for place in range(3)]).double()
     found = []
-    for scale in (0.1, 0.3, 1, 3, 10):
+    for scale in (0.1, 1, 10):
         groups = BehaviorGroups(4)
-        played = show(groups, scale * inputs)
-        found.append((played, groups.lookup(scale * inputs).group.tolist()))
+        found.append((show(groups, scale * inputs), groups.lookup(scale * inputs).group.tolist()))
     assert all(result == found[0] for result in found)
     assert len(set(found[0][1])) == 3
 
@@ -132,17 +123,6 @@ def test_merged_groups_keep_the_number_of_the_one_shown_most(often):
     assert groups.parent(0, 2) == numbers[often]
 
 
-def test_groups_are_the_density_clusters_of_all_demonstrations():
-    inputs = torch.cat([around(place, 50) for place in range(4)]).double()
-    inputs = inputs[torch.randperm(200, generator=torch.Generator().manual_seed(0))]
-    groups = BehaviorGroups(4)
-    show(groups, inputs)
-    labels = density_clusters(inputs.numpy() @ local_whitening(inputs.numpy()))
-    pairs = {*zip(labels.tolist(), groups.lookup(inputs).group.tolist(), strict=True)}
-    assert len({label for label, _ in pairs if label >= 0}) == 4
-    assert len([pair for pair in pairs if pair[0] >= 0]) == 4
-
-
 def test_behaviors_that_differ_in_a_small_feature_have_their_groups():
     """All vary in four wide features, so that plain distances know one group."""
     generator = torch.Generator().manual_seed(0)
@@ -158,9 +138,9 @@ def test_behaviors_that_differ_in_a_small_feature_have_their_groups():
 
 def test_masked_networks_in_a_batch_equal_networks_alone():
     generator = torch.Generator().manual_seed(0)
-    places = torch.randint(4, (160, 3), generator=generator)
-    inputs = PLACES[places] + torch.randn(160, 3, 4, generator=generator)
-    masks = torch.rand(160, 3, generator=generator) < 0.6
+    places = torch.randint(4, (140, 3), generator=generator)
+    inputs = PLACES[places] + torch.randn(140, 3, 4, generator=generator)
+    masks = torch.rand(140, 3, generator=generator) < 0.6
     together, alone = BehaviorGroups(4, batch_size=[3]), [BehaviorGroups(4) for _ in range(3)]
     for phi, mask in zip(inputs, masks, strict=True):
         phi[~mask] = torch.nan
@@ -177,24 +157,11 @@ def test_masked_networks_in_a_batch_equal_networks_alone():
     assert together.revision.tolist() == [int(groups.revision) for groups in alone]
     assert together.num_groups.min() > 2
     shown = 12 * torch.rand(3, 50, 4, generator=generator)
-    match = together.lookup(shown)
-    part = together.lookup(shown, torch.tensor([True, False, True]))
-    for i, groups in enumerate(alone):
-        assert match.group[i].equal(groups.lookup(shown[i]).group)
-        assert match.novelty[i].equal(groups.lookup(shown[i]).novelty)
-        assert part.group[i].equal(match.group[i]) == (i != 1)
-        assert [together.parent(i, n) for n in groups.numbers(0)] == [
-            groups.parent(0, n) for n in groups.numbers(0)
-        ]
-    assert (part.group[1] == -1).all() and part.novelty[1].isnan().all()
-
-
-def test_lookup_changes_nothing():
-    groups = BehaviorGroups(4)
-    show(groups, torch.cat([around(0, 30), around(1, 25)]))
-    before = groups.get_extra_state()
-    groups.lookup(around(2, 50))
-    torch.testing.assert_close(groups.get_extra_state(), before, rtol=0, atol=0)
+    match = together.lookup(shown, torch.tensor([True, False, True]))
+    assert (match.group[1] == -1).all() and match.novelty[1].isnan().all()
+    for i in (0, 2):
+        own = alone[i].lookup(shown[i])
+        assert match.group[i].equal(own.group) and match.novelty[i].equal(own.novelty)
 
 
 def test_loaded_groups_continue_identically():
@@ -220,12 +187,6 @@ def test_loaded_groups_continue_identically():
             assert groups.parent(network, number) == restored.parent(network, number)
 
 
-@pytest.mark.parametrize("options", [{"smallest": 3}, {"smallest": 4.5}, {"evidence": 0}])
-def test_settings_out_of_range_are_rejected(options):
-    with pytest.raises(ValueError, match="smallest must be"):
-        BehaviorGroups(2, **options)
-
-
 @pytest.mark.parametrize(
     "phi", [torch.zeros(3, 5), torch.full((3, 4), torch.nan), torch.zeros(2, 4)], ids=str
 )
@@ -235,15 +196,9 @@ def test_bad_inputs_are_rejected_and_change_nothing(phi):
         with pytest.raises(ValueError, match="phi must"):
             call(phi)
     assert all(len(state["points"]) == 0 for state in groups.get_extra_state())
-
-
-@pytest.mark.parametrize("pair", [(0, 0), (0, 5), (-1, 0)])
-def test_only_two_different_groups_can_be_joined(pair):
-    groups = BehaviorGroups(4)
-    show(groups, torch.cat([around(0, 40), around(1, 60)]))
-    with pytest.raises(ValueError, match="groups to join must be"):
-        groups.join(0, *pair)
-    assert int(groups.num_groups) == 2
+    for options in ({"smallest": 3}, {"smallest": 4.5}, {"evidence": 0}):
+        with pytest.raises(ValueError, match="smallest must be"):
+            BehaviorGroups(2, **options)
 
 
 def test_damaged_states_and_those_of_other_sizes_are_rejected_and_change_nothing():
@@ -263,44 +218,38 @@ def test_damaged_states_and_those_of_other_sizes_are_rejected_and_change_nothing
 
 def test_joined_groups_stay_joined_when_clustered_anew():
     groups = BehaviorGroups(4, batch_size=[2])
-    inputs = torch.cat([around(place, 60) for place in range(3)])
-    for phi in inputs:
-        groups.adapt(phi.expand(2, -1))
+    for place, count in ((0, 60), (1, 60), (2, 70)):
+        for phi in around(place, count):
+            groups.adapt(phi.expand(2, -1))
     assert groups.numbers(0) == groups.numbers(1) == [0, 1, 2]
+    for pair in ((0, 0), (0, 5), (-1, 0)):
+        with pytest.raises(ValueError, match="groups to join must be"):
+            groups.join(0, *pair)
     revision = groups.revision
-    groups.join(0, 2, 0)
+    groups.join(0, 0, 2)
     assert groups.revision.tolist() == [revision[0] + 1, revision[1]]
     assert groups.num_groups.tolist() == [2, 3]
-    (merged,) = {*groups.numbers(0)} - {1}
-    for seed in (1, 2, 3):  # clustered anew, soon with a fourth group
-        for place, expected in enumerate((merged, 1, merged)):
+    assert groups.numbers(0) == [1, 2]  # 2 was shown more often than 0
+    for seed in (1, 2):  # clustered anew, soon with a fourth group
+        for place, expected in enumerate((2, 1, 2)):
             group = groups.lookup(around(place, 9, seed).expand(2, -1, -1)).group
             assert {*group[0].tolist()} == {expected}
             assert {*group[1].tolist()} == {place}
-        for phi in torch.cat([around(place, 25, seed) for place in (0, 2, 3)]):
+        for phi in torch.cat([around(place, 25, seed) for place in (2, 0, 3)]):
             groups.adapt(phi.expand(2, -1))
     assert groups.num_groups.tolist() == [3, 4]
     restored = BehaviorGroups(4, batch_size=[2])
     restored.load_state_dict(groups.state_dict())
-    for phi in around(1, 40, seed=9):
-        for each in (groups, restored):
+    for each in (groups, restored):
+        for phi in around(1, 20, seed=9):
             each.adapt(phi.expand(2, -1))
-    assert restored.num_groups.tolist() == groups.num_groups.tolist() == [3, 4]
-    assert restored.numbers(0) == groups.numbers(0)
-
-
-def test_joined_groups_keep_the_number_of_the_one_shown_most():
-    groups = BehaviorGroups(4)
-    show(groups, torch.cat([around(0, 40), around(1, 60)]))
-    groups.join(0, 0, 1)
-    assert groups.numbers(0) == [1]
-    assert group_of(groups, around(0, 9, seed=2)) == [1]
+        assert each.num_groups.tolist() == [3, 4]
 
 
 # ---- the shipped banks
 
 
-@pytest.mark.parametrize("order", ["forward", "reversed", "from the start"])
+@pytest.mark.parametrize("order", ["reversed", "from the start"])
 def test_groups_of_shipped_demonstrations_contain_one_task_each(order):
     """Draws as in a run; labels are used for the draws and the count alone.
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.spatial.distance import pdist
+from scipy.spatial.distance import pdist, squareform
 
 from bgpo_trl.modules.density_clusters import (
     density_clusters,
@@ -22,7 +22,7 @@ def blobs(sizes, d=6, seed=0):
     return CENTERS[labels][:, :d] + rng.normal(size=(len(labels), d)), labels
 
 
-@settings(max_examples=30)
+@settings(max_examples=20)
 @given(
     sizes=st.lists(st.integers(14, 60), min_size=2, max_size=5),
     exponent=st.sampled_from([-1, -0.5, 0, 0.5, 1]),
@@ -40,13 +40,9 @@ def test_separate_clusters_are_found_at_any_scale_and_place(sizes, exponent, see
 def shapes():
     rng = np.random.default_rng(4)
     turn = rng.uniform(0, 2, size=300)
-    yield "ball", rng.normal(size=(400, 8))
-    yield "cube", rng.uniform(size=(400, 3))
     yield "line", rng.normal(size=(400, 1))
-    yield "heavy tails", rng.standard_t(4, size=(400, 5))
     yield "flat", rng.normal(size=(400, 10)) * 0.5 ** np.arange(10)
     yield "arc", np.stack([np.sin(turn), np.cos(turn)], 1) + 0.1 * rng.normal(size=(300, 2))
-    yield "skewed", rng.gamma(1, size=(400, 4))
     yield "corners of a simplex", np.eye(40)
     yield "grid", np.argwhere(np.ones((15, 15))).astype(float)
 
@@ -56,7 +52,7 @@ def test_unimodal_points_are_one_cluster(name, points):
     assert not density_clusters(points).any()
 
 
-@pytest.mark.parametrize("d", [2, 3, 4, 6, 8, 16, 32])
+@pytest.mark.parametrize("d", [2, 4, 8, 32])
 @pytest.mark.parametrize("n_points", [40, 150, 600])
 def test_chance_splits_no_points_with_a_single_mode(n_points, d):
     rng = np.random.default_rng(d)
@@ -108,9 +104,9 @@ def test_clusters_do_not_depend_on_the_order_of_points():
 
 @pytest.mark.parametrize("d", [1, 2, 5])
 def test_intrinsic_dimension_of_a_cube_is_that_of_its_space(d):
-    points = np.zeros((1_500, 7))
-    points[:, :d] = np.random.default_rng(0).uniform(size=(1_500, d))
-    distances = np.sort(np.linalg.norm(points[:, None] - points, axis=-1))[:, 1:11]
+    points = np.zeros((1_000, 7))
+    points[:, :d] = np.random.default_rng(0).uniform(size=(1_000, d))
+    distances = np.sort(squareform(pdist(points)))[:, 1:11]
     assert intrinsic_dimension(distances, 7) == pytest.approx(d, rel=0.15)
     assert intrinsic_dimension(np.ones((4, 10)), 7) == 7
 
@@ -137,19 +133,6 @@ def test_whitened_distances_do_not_depend_on_scale_rotation_and_place():
     other = 50 * points @ turn + 7
     ours, theirs = points @ local_whitening(points), other @ local_whitening(other)
     np.testing.assert_allclose(pdist(ours), pdist(theirs), rtol=1e-8)
-
-
-def test_whitening_uncovers_clusters_that_differ_in_a_small_feature():
-    """Four features in which all points vary hide a fifth that tells the clusters apart."""
-    rng = np.random.default_rng(0)
-    labels = np.repeat([0, 1], 150)
-    points = np.concatenate([rng.normal(size=(300, 4)), 0.14 * rng.normal(size=(300, 1))], 1)
-    points[:, 4] += 1.4 * labels
-    assert not density_clusters(points).any()
-    found = density_clusters(points @ local_whitening(points))
-    inside = found >= 0
-    assert found.max() == 1
-    assert (found[inside] == labels[inside]).all() and inside.mean() > 0.75
 
 
 @pytest.mark.parametrize("constant", [0, 3])

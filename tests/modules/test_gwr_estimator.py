@@ -30,13 +30,12 @@ def rows():
     ("model", "expected_failed_checks"),
     [
         (GWRBEstimator(), {}),
-        (GWRBEstimator(GWRBConfig(activity_scale=2.0), max_nodes=3), {}),
         (
             GWRBEstimator(GWRBConfig(max_age=3, habituation_threshold=1.0)),
             {"check_clustering": GAPS},
         ),
     ],
-    ids=["table 1", "capped", "growing"],
+    ids=["table 1", "growing"],
 )
 @pytest.mark.filterwarnings("ignore")  # of which scikit-learn's checks raise some on purpose
 def test_scikit_learns_own_checks_pass(model, expected_failed_checks, monkeypatch):

@@ -28,23 +28,6 @@ def test_only_demonstrated_actions_are_imitated():
     torch.testing.assert_close(loss(batch)["loss_actor"], -0.3 + 2.0 * distance / 6)
 
 
-def test_a_flat_q_leaves_only_the_gradient_of_the_penalty():
-    batch = make_batch(8)
-    weights = torch.linspace(0, 2, 8)
-    batch["priority_weight"] = weights
-    for penalty in (0.5, 0.0):
-        loss = make_loss("ddpg", pre_tanh_penalty=penalty)
-        constant_critics(loss, online=0.3, target=0.3)
-        pre_tanh = loss.actor_network(batch.clone())["pre_tanh_action"].detach()
-        result = loss(batch)
-        magnitude = pre_tanh.square().mean().sqrt()
-        torch.testing.assert_close(result["pre_tanh_magnitude"], magnitude)
-        result["loss_actor"].backward()
-        output_bias = loss.actor_network_params["mlp", "layers", "1", "bias"]
-        expected = weights.unsqueeze(-1) * 2 * penalty * pre_tanh / pre_tanh.numel()
-        torch.testing.assert_close(output_bias.grad, expected.sum(0))
-
-
 class PlainDDPG:
     """DDPG in plain torch, sharing nothing with the code under test but the initial weights."""
 

@@ -13,24 +13,15 @@ from bgpo_trl.objectives.off_policy import ForeachSoftUpdate
 N_STATES, N_ACTIONS, TASKS = 3, 2, 3
 
 
-def transitions(*shape, n_states=3, seed=0, dtype=torch.float64):
+def transitions(*shape, seed=0):
     generator = torch.Generator().manual_seed(seed)
 
     def draw(size):
-        return torch.randn(*shape, size, generator=generator, dtype=torch.float64).to(dtype)
+        return torch.randn(*shape, size, generator=generator, dtype=torch.float64)
 
-    return TensorDict(
-        {
-            "state": draw(n_states),
-            "action": draw(2).clamp(-1, 1),
-            "next": {
-                "state": draw(n_states),
-                "reward": draw(1).gt(1).to(dtype),
-                "terminated": draw(1) > 1,
-            },
-        },
-        shape,
-    )
+    following = {"state": draw(3), "reward": draw(1).gt(1).double(), "terminated": draw(1) > 1}
+    data = {"state": draw(3), "action": draw(2).clamp(-1, 1), "next": following}
+    return TensorDict(data, shape)
 
 
 def stack_loss(n_seeds=2, **arguments):
@@ -90,30 +81,14 @@ def ordered(parameters):
     return [flat[f"mlp.layers.{i}.{name}"] for i in range(2) for name in ("weight", "bias")]
 
 
-SEEDS_AND_TASKS = [(seed, task) for seed in range(2) for task in range(TASKS)]
-
-
-@pytest.mark.parametrize("penalty", [0.0, 0.2])
-def test_adapting_is_a_plain_gradient_step_on_each_task_of_each_seed(penalty):
-    loss = stack_loss(inner_learning_rate=0.3, pre_tanh_penalty=penalty)
-    batch = transitions(2, TASKS, 8)
-    adapted = ordered(loss.adapt(batch))
-    for seed, task in SEEDS_AND_TASKS:
-        start = one_of(loss.meta_network.parameters(), seed)
-        critic = one_of(loss.value_network_params.parameters(), seed, task)
-        assert [w.shape for w in critic] == [(5, 8), (8,), (8, 1), (1,)]
-        expected = plain_adapted(start, critic, batch["state"][seed, task], 0.3, penalty)
-        for ours, theirs, before in zip(adapted, expected, start, strict=True):
-            torch.testing.assert_close(ours[seed, task], theirs)
-            assert not torch.allclose(theirs, before, rtol=1e-3)
-
-
-@pytest.mark.parametrize("rate", [0.0, 0.5])
-@pytest.mark.parametrize("penalty", [0.0, 0.1])
+@pytest.mark.parametrize(("rate", "penalty"), [(0.0, 0.1), (0.5, 0.0), (0.5, 0.1)])
 def test_the_outer_loss_and_gradient_are_those_of_plain_autograd(rate, penalty):
     """Second derivatives through tanh and layer normalization included."""
     loss = stack_loss(inner_learning_rate=rate, pre_tanh_penalty=penalty)
     batch = transitions(2, TASKS, 8)
+    halves = batch["state"].chunk(2, -2)
+    support_batch = batch[..., :4]
+    ours_adapted = ordered(loss.adapt(support_batch))
     value, _ = loss.loss_actor(batch)
     value.backward()
     total = 0.0
@@ -122,8 +97,10 @@ def test_the_outer_loss_and_gradient_are_those_of_plain_autograd(rate, penalty):
         of_seed = 0.0
         for task in range(TASKS):
             critic = one_of(loss.value_network_params.parameters(), seed, task)
-            support, query = batch["state"][seed, task].chunk(2)
+            support, query = (half[seed, task] for half in halves)
             adapted = plain_adapted(start, critic, support, rate, penalty)
+            for ours, theirs in zip(ours_adapted, adapted, strict=True):
+                torch.testing.assert_close(ours[seed, task], theirs)
             of_seed = of_seed + plain_policy_loss(adapted, critic, query, penalty)
         gradients = torch.autograd.grad(of_seed, start)
         for ours, theirs in zip(loss.meta_network.parameters(), gradients, strict=True):
@@ -169,12 +146,6 @@ def test_target_actions_are_those_of_a_slow_copy_of_the_adapted_policies():
     torch.testing.assert_close(value, expected)
     torch.testing.assert_close(entries["target_value"], plain_entries["target_value"])
     assert entries["target_value"].std() > 0.01
-    # The meta policy itself would aim elsewhere.
-    for ours, meta in zip(
-        ordered(plain.target_actor_network_params), loss.meta_network.parameters(), strict=True
-    ):
-        ours.data.copy_(meta.data.unsqueeze(1))
-    assert not torch.allclose(plain.loss_value(batch)[0], value)
 
 
 def test_the_actors_loss_stores_the_adapted_policies_and_trains_the_meta_policy_only():
@@ -278,17 +249,13 @@ def test_each_seed_of_a_stack_has_the_gradient_that_it_has_alone():
     torch.testing.assert_close(whole.detach(), values)
 
 
-@pytest.mark.parametrize(
-    "shapes", [([2], [3, 2], [3, 2]), ([2], [2], [2]), ([], [3], [2]), ([], [], [])]
-)
-def test_batch_sizes_that_do_not_fit_are_refused(shapes):
-    meta, adapted, value = shapes
-    policies = [Actor(3, batch_size=shape) for shape in (meta, adapted)]
-    with pytest.raises(ValueError, match="batch sizes"):
-        MAMLLoss(*policies, Critic(3, batch_size=value))
-
-
-def test_a_negative_rate_and_batches_without_halves_are_refused():
+def test_what_does_not_fit_is_refused():
+    for meta, adapted, value in (
+        ([2], [3, 2], [3, 2]), ([2], [2], [2]), ([], [3], [2]), ([], [], []),
+    ):  # fmt: skip
+        policies = [Actor(3, batch_size=shape) for shape in (meta, adapted)]
+        with pytest.raises(ValueError, match="batch sizes"):
+            MAMLLoss(*policies, Critic(3, batch_size=value))
     with pytest.raises(ValueError, match="inner_learning_rate"):
         stack_loss(inner_learning_rate=-0.1)
     with pytest.raises(ValueError, match="even number"):

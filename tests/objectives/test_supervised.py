@@ -99,9 +99,7 @@ def test_action_inference_loss_is_the_squared_error() -> None:
 
 
 def test_noise_comes_from_the_generator_alone() -> None:
-    torch.manual_seed(0)
-    vae = VAE()
-    results = []
+    vae, results = VAE(), []
     for global_seed in (1, 2):
         torch.manual_seed(global_seed)
         loss = VAEInverseLoss(vae, generator=torch.Generator().manual_seed(5))
@@ -138,20 +136,20 @@ def test_sequence_loss_by_hand() -> None:
     assert loss(data[:1])[key].item() == pytest.approx(9 / 4)
 
 
-@pytest.mark.parametrize("filler", [0.0, 100.0, float("nan")])
-def test_sequence_loss_and_gradient_ignore_padding(filler: float) -> None:
+def test_sequence_loss_and_gradient_ignore_padding() -> None:
     torch.manual_seed(0)
     loss = SequenceReconstructionLoss(SequenceAutoencoder())
     length = torch.tensor([7, 1, 51])
     latent = torch.randn(3, 51, 64)
     beyond = (torch.arange(51) >= length.unsqueeze(-1)).unsqueeze(-1)
     gradients = []
-    for z in (latent, latent.masked_fill(beyond, filler)):
+    for z in (latent, latent.masked_fill(beyond, 100.0), latent.masked_fill(beyond, math.nan)):
         loss.zero_grad()
         value = loss(TensorDict({"latent": z, "length": length}, [3]))["loss_reconstruction"]
         value.backward()
         gradients.append([value.detach(), *(p.grad.clone() for p in loss.parameters())])
-    torch.testing.assert_close(*gradients)
+    torch.testing.assert_close(gradients[1], gradients[0])
+    torch.testing.assert_close(gradients[2], gradients[0])
 
 
 # Two tasks, three states of each, two action components.
@@ -181,29 +179,14 @@ def given_batch():
     return TensorDict(batch, [2, 3])
 
 
-def expected_loss():
-    total = 0.0
-    for of_task in zip(MEAN, SCALE, ACTION, strict=True):
-        for m, s, a in zip(*of_task, strict=True):
-            for mean, scale, action in zip(m, s, a, strict=True):
-                nll = 0.5 * math.log(2 * math.pi * scale**2)
-                nll += (action - mean) ** 2 / (2 * scale**2)
-                total += nll / 3  # a mean over the states, a sum over the rest
-    return total
-
-
 def test_the_loss_is_the_negative_log_likelihood_of_the_teachers_actions():
     batch = given_batch()
-    losses = DistillationLoss(Given())(batch)
-    assert losses["loss_distillation"].shape == ()
-    assert losses["loss_distillation"].item() == pytest.approx(expected_loss(), rel=1e-5)
-    assert set(batch.keys()) == {"parameters", "teacher_action"}
-
-
-def test_gradients_are_those_of_the_student_and_the_teacher_has_none():
-    batch = given_batch()
-    DistillationLoss(Given())(batch)["loss_distillation"].backward()
     mean, scale, action = (torch.tensor(values) for values in (MEAN, SCALE, ACTION))
+    nll = 0.5 * (2 * math.pi * scale**2).log() + (action - mean) ** 2 / (2 * scale**2)
+    loss = DistillationLoss(Given())(batch)["loss_distillation"]
+    torch.testing.assert_close(loss, nll.sum() / 3)  # a mean over the states, a sum over the rest
+    assert set(batch.keys()) == {"parameters", "teacher_action"}
+    loss.backward()
     error = mean - action
     expected = torch.stack([error / scale**2, 1 / scale - error**2 / scale**3], -1) / 3
     torch.testing.assert_close(batch["parameters"].grad, expected)
@@ -221,9 +204,9 @@ def test_weights_are_factors_of_the_losses_of_states():
     assert (batch["parameters"].grad[0] != 0).any() and (batch["parameters"].grad[1] == 0).all()
 
 
-@pytest.mark.parametrize("entry", ["teacher_action", "priority_weight"])
-def test_entries_that_would_broadcast_are_refused(entry):
-    batch = given_batch()
-    batch[entry] = torch.ones(2, 3, 1)
-    with pytest.raises(ValueError, match=entry):
-        DistillationLoss(Given())(batch)
+def test_entries_that_would_broadcast_are_refused():
+    for entry in ("teacher_action", "priority_weight"):
+        batch = given_batch()
+        batch[entry] = torch.ones(2, 3, 1)
+        with pytest.raises(ValueError, match=entry):
+            DistillationLoss(Given())(batch)

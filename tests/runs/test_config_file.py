@@ -17,17 +17,14 @@ def write(path, config, **changes):
     return path
 
 
-@pytest.mark.parametrize(
-    ("name", "rl"), [*((name, "ddpg") for name in ALGORITHMS), *(("bgpo", rl) for rl in RL)]
-)
-def test_settings_are_read_as_they_were_written(tmp_path, name, rl):
-    rl = replace(RL[rl].config, hidden_sizes=(5, 7), gamma=0.5)
-    algorithm = replace(ALGORITHMS[name].config, state="state", rl=rl)
-    config = replace(PRESETS["quick"], name=name, algorithm=algorithm, checkpoint_minutes=3)
-    read, digests = read_config(write(tmp_path / "config.json", config))
-    assert (read, digests) == (config, Digests(encoders="abc", bank="def"))
-    assert type(read.algorithm) is type(algorithm) and type(read.algorithm.rl) is type(rl)
-    assert isinstance(read.algorithm.rl.hidden_sizes, tuple)
+def test_settings_are_read_as_they_were_written(tmp_path):
+    for name, rl in [*((name, "ddpg") for name in ALGORITHMS), *(("bgpo", rl) for rl in RL)]:
+        rl = replace(RL[rl].config, hidden_sizes=(5, 7), gamma=0.5)
+        algorithm = replace(ALGORITHMS[name].config, state="state", rl=rl)
+        config = replace(PRESETS["quick"], name=name, algorithm=algorithm, checkpoint_minutes=3)
+        read, digests = read_config(write(tmp_path / "config.json", config))
+        assert (read, digests) == (config, Digests(encoders="abc", bank="def"))
+        assert type(read.algorithm) is type(algorithm) and type(read.algorithm.rl) is type(rl)
 
 
 @dataclass(frozen=True)
@@ -36,25 +33,14 @@ class CoarseConfig(BGPOConfig):
 
 
 @pytest.mark.parametrize("coarse", [None, GWRBConfig(activity_threshold=0.777)])
-def test_an_optional_setting_is_read(tmp_path, coarse):
+def test_hyperparameters_of_an_unknown_algorithm_have_the_stored_class(tmp_path, coarse):
     config = RunConfig(name="mine", algorithm=CoarseConfig(coarse=coarse))
     path = write(tmp_path / "config.json", config)
-    assert read_config(path)[0].algorithm.coarse == coarse
+    read = read_config(path)[0].algorithm
+    assert type(read) is CoarseConfig and read.coarse == coarse
     path.write_text(path.read_text().replace("null", "7").replace("0.777", '"high"'))
     with pytest.raises(ValueError, match=r"algorithm\.coarse"):
         read_config(path)
-
-
-@dataclass(frozen=True)
-class OwnConfig(BGPOConfig):
-    curiosity: float = 0.5
-
-
-def test_hyperparameters_of_an_unknown_algorithm_have_the_stored_class(tmp_path):
-    config = RunConfig(name="mine", algorithm=OwnConfig(curiosity=2.0))
-    read, _ = read_config(write(tmp_path / "config.json", config))
-    assert read == config
-    assert type(read.algorithm) is OwnConfig
 
 
 @dataclass(frozen=True)
@@ -67,13 +53,10 @@ class MixedConfig(BGPOConfig):
     rate: int | float = 0.5
 
 
-@pytest.mark.parametrize(
-    ("algorithm", "said"),
-    [(ListConfig(), r"algorithm.widths is \[1, 2\]"), (MixedConfig(), "algorithm.rate is 0.5")],
-)
-def test_settings_that_could_not_be_read_are_not_written(algorithm, said):
-    with pytest.raises(ValueError, match=rf"^config.json cannot hold the setting {said}: annotate"):
-        settings_of(RunConfig(algorithm=algorithm), Digests("abc", "def"))
+def test_settings_that_could_not_be_read_are_not_written():
+    for algorithm, said in ((ListConfig(), r"widths is \[1, 2\]"), (MixedConfig(), "rate is 0.5")):
+        with pytest.raises(ValueError, match=rf"cannot hold the setting algorithm.{said}"):
+            settings_of(RunConfig(algorithm=algorithm), Digests("abc", "def"))
 
 
 def test_missing_settings_get_their_defaults(tmp_path):
@@ -92,20 +75,17 @@ def nested(**rl):
     ("changes", "said"),
     [
         ({"color": 1}, "unknown setting color"),
-        (nested(momentum=0.9), r"unknown setting algorithm.rl.momentum"),
-        (nested(gamma="0.9"), r"algorithm.rl.gamma is '0.9'"),
+        (nested(momentum=0.9), "unknown setting algorithm.rl.momentum"),
+        (nested(gamma="0.9"), "algorithm.rl.gamma is '0.9'"),
         (nested(hidden_sizes=[5, 0.5]), "algorithm.rl.hidden_sizes is 0.5"),
         (nested(name="ppo"), "algorithm.rl.name is 'ppo', not a known RL algorithm"),
         ({"algorithm": 3}, "no settings of a run"),
         ({"name": "mine", "algorithm_class": "os.path"}, "of 'mine', whose hyperparameters no im"),
     ],
 )
-def test_invalid_settings_are_refused(tmp_path, changes, said):
+def test_invalid_settings_are_refused(tmp_path, refused, changes, said):
     path = write(tmp_path / "config.json", RunConfig(), **changes)
-    with pytest.raises(ValueError, match=said) as error:
-        read_config(path)
-    assert "\n" not in str(error.value)
-    assert str(path) in str(error.value)
+    refused(lambda: read_config(path), said, str(path))
 
 
 class Juggle(nico.NicoTask):

@@ -4,6 +4,7 @@ import json
 import shutil
 import signal
 from dataclasses import asdict, replace
+from functools import partial
 
 import pytest
 import torch
@@ -11,10 +12,16 @@ import torch
 from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
 from bgpo_trl.runs.directory import EVAL_COLUMNS, TRAIN_COLUMNS, RunLogger, check_settings
 from tests.algorithms.playing import assert_same
-from tests.helpers import CHECKPOINTS, UNPICKLED, put_checkpoint, rows
+from tests.helpers import CHECKPOINTS, UNPICKLED, edit, put_checkpoint, rows
 from tests.test_training import at_step
 
 pytestmark = pytest.mark.usefixtures("easy_world")
+
+
+def interrupt(trainer, step):
+    at_step(trainer, step, lambda: signal.raise_signal(signal.SIGINT))
+    with pytest.raises(KeyboardInterrupt):
+        trainer.run()
 
 
 @pytest.fixture(scope="module")
@@ -22,9 +29,7 @@ def interrupted(easy_world, begin, tmp_path_factory):
     """A run that was interrupted half-way, with rows after its last checkpoint."""
     directory = tmp_path_factory.mktemp("interrupted") / "run"
     with begin(directory) as trainer:
-        at_step(trainer, 25, lambda: signal.raise_signal(signal.SIGINT))
-        with pytest.raises(KeyboardInterrupt):
-            trainer.run()
+        interrupt(trainer, 25)
     for name in ("train.csv", "eval.csv"):
         with (directory / name).open("a") as file:
             file.write("bgpo,3,9,9,grasp_glass,1,1.0,5\n" * 2)
@@ -34,12 +39,6 @@ def interrupted(easy_world, begin, tmp_path_factory):
 @pytest.fixture
 def run(interrupted, tmp_path):
     return shutil.copytree(interrupted, tmp_path / "run")
-
-
-def interrupt(trainer, step):
-    at_step(trainer, step, lambda: signal.raise_signal(signal.SIGINT))
-    with pytest.raises(KeyboardInterrupt):
-        trainer.run()
 
 
 def test_one_process_at_a_time_uses_a_run_directory(run, begin, other_process, refused):
@@ -66,21 +65,16 @@ def cut(name):
     return lambda run: (run / name).write_bytes((run / name).read_bytes()[:-200])
 
 
-def edit_settings(run):
-    settings = json.loads((run / "config.json").read_text())
-    (run / "config.json").write_text(json.dumps({**settings, "task_starts": [0, 1, 2]}))
+DAMAGES = [
+    (remove("checkpoint"), "has rows of a run, but no checkpoint"),
+    (remove("config.json"), "has a checkpoint, but no config.json"),
+    (remove("config.json", "train.csv", "eval.csv"), "but no config.json"),
+    (remove("train.csv"), "train.csv has 0 bytes and no"),
+    (cut("eval.csv"), "bytes and no row that ends at"),
+]
 
 
-DAMAGES = {
-    "no checkpoint": (remove("checkpoint"), "has rows of a run, but no checkpoint"),
-    "no settings": (remove("config.json"), "has a checkpoint, but no config.json"),
-    "checkpoint alone": (remove("config.json", "train.csv", "eval.csv"), "but no config.json"),
-    "no training episodes": (remove("train.csv"), "train.csv has 0 bytes and no"),
-    "fewer tests": (cut("eval.csv"), "bytes and no row that ends at"),
-}
-
-
-@pytest.mark.parametrize(("damage", "cause"), DAMAGES.values(), ids=DAMAGES.keys())
+@pytest.mark.parametrize(("damage", "cause"), DAMAGES)
 def test_a_run_that_lacks_a_file_is_refused_unchanged(run, begin, refused, damage, cause):
     damage(run)
     refused(lambda: begin(run, resume=True), cause, "as the run left it")
@@ -89,43 +83,35 @@ def test_a_run_that_lacks_a_file_is_refused_unchanged(run, begin, refused, damag
 
 
 def test_the_settings_in_the_checkpoint_are_compared(run, begin, make_config, refused):
-    edit_settings(run)
-    config = make_config(task_starts=(0, 1, 2))
-    refused(
-        lambda: begin(run, config, resume=True),
-        "run/checkpoint holds a run with other settings (task_starts is [0, 2, 4] there and [0, 1,",
-        "put config.json back as the run left it",
-    )
+    edit(run / "config.json", task_starts=[0, 1, 2])
+    resume = partial(begin, run, make_config(task_starts=(0, 1, 2)), resume=True)
+    refused(resume, "checkpoint holds a run with other settings (task_starts", "put config.json")
 
 
-@pytest.mark.parametrize("content", CHECKPOINTS.values(), ids=CHECKPOINTS.keys())
-def test_a_run_is_not_resumed_from_a_checkpoint_of_something_else(run, begin, refused, content):
-    put_checkpoint(run, content)
-    refused(lambda: begin(run, resume=True), "checkpoint", "put it back as the run left it")
+def test_a_run_is_not_resumed_from_a_checkpoint_of_something_else(run, begin, refused):
+    resume = partial(begin, run, resume=True)
+    state = load_checkpoint(run / "checkpoint")
+    for name in ("world", "algorithm", "evaluator"):
+        save_checkpoint(run / "checkpoint", {**state, name: {}})
+        refused(resume, "does not fit", "use the version of the code")
+    for content in CHECKPOINTS.values():
+        put_checkpoint(run, content)
+        refused(resume, "checkpoint", "put it back as the run left it")
     assert not UNPICKLED
 
 
-@pytest.mark.parametrize("name", ["world", "algorithm", "evaluator"])
-def test_a_run_is_not_resumed_from_half_a_checkpoint(run, begin, refused, name):
-    state = load_checkpoint(run / "checkpoint")
-    save_checkpoint(run / "checkpoint", {**state, name: {}})
-    refused(lambda: begin(run, resume=True), "does not fit", "use the version of the code")
-
-
-@pytest.mark.parametrize("sizes", [{"hidden_sizes": (2_000_000_000,)}, {"replay_size": 10**15}])
-def test_sizes_that_are_not_the_checkpoints_take_no_memory(run, begin, make_config, refused, sizes):
+@pytest.mark.parametrize(
+    ("name", "size"), [("hidden_sizes", (2_000_000_000,)), ("replay_size", 10**15)]
+)
+def test_sizes_that_are_not_the_checkpoints_take_no_memory(
+    run, begin, make_config, refused, name, size
+):
     config = make_config()
-    rl = replace(config.algorithm.rl, **sizes)
+    rl = replace(config.algorithm.rl, **{name: size})
     config = replace(config, algorithm=replace(config.algorithm, rl=rl))
-    settings = json.loads((run / "config.json").read_text())
-    settings["algorithm"] = json.loads(json.dumps(asdict(config.algorithm)))
-    (run / "config.json").write_text(json.dumps(settings))
-    (name,) = sizes
-    refused(
-        lambda: begin(run, config, resume=True),
-        f"algorithm.rl.{name} is",
-        "config.json back",
-    )
+    edit(run / "config.json", algorithm=asdict(config.algorithm))
+    resume = partial(begin, run, config, resume=True)
+    refused(resume, f"algorithm.rl.{name} is", "put config.json back")
 
 
 def test_a_run_extended_in_steps_equals_a_longer_run(begin, make_config, tmp_path):
@@ -170,16 +156,7 @@ def test_only_the_number_of_episodes_may_grow(begin, make_config, tmp_path):
 
 
 CONFIG = {"gamma": 0.98, "network": {"hidden": [64]}}
-ROW = {
-    "algorithm": "bgpo",
-    "seed": 2,
-    "episode": 7,
-    "env_steps": 210,
-    "task": "grasp_glass",
-    "success": True,
-    "return": 1.0,
-    "steps": 28,
-}
+ROW = dict(zip(EVAL_COLUMNS, ("bgpo", 2, 7, 210, "grasp_glass", True, 1.0, 28), strict=True))
 
 
 def test_a_run_writes_its_settings_and_two_csv_files(tmp_path):
@@ -198,8 +175,8 @@ def test_a_run_writes_its_settings_and_two_csv_files(tmp_path):
     assert tests == [",".join(EVAL_COLUMNS), cells]
 
 
-@pytest.mark.parametrize("logged", [("success",), ("loss_meta", "loss_meta")])
-def test_a_column_that_is_there_already_is_refused(logged, tmp_path):
-    with pytest.raises(ValueError, match=logged[0]):
-        RunLogger(tmp_path / "run", config=CONFIG, logged=logged)
+def test_a_column_that_is_there_already_is_refused(tmp_path):
+    for logged in (("success",), ("loss_meta", "loss_meta")):
+        with pytest.raises(ValueError, match=logged[0]):
+            RunLogger(tmp_path / "run", config=CONFIG, logged=logged)
     assert not (tmp_path / "run").exists()

@@ -56,25 +56,22 @@ def test_a_compressed_table_is_read_in_place_of_a_missing_one(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("kind", "cells", "line"),
+    ("kind", "valid", "wrong"),
     [
-        (COUNT, ["0", "12", "1.5"], 4),
-        (COUNT, ["-1", "3"], 2),
-        (COUNT, ["9007199254740992"], 2),
-        (SHARE, ["0", "1", "1.01"], 4),
-        (SHARE, ["0.5", "nan"], 3),
-        (SHARE, ["0.5", ""], 3),
-        (AMOUNT, ["1e3", "inf"], 3),
-        (("a", "b"), ["b", "c"], 3),
+        (COUNT, ["0", "12"], ["1.5", "-1", "9007199254740992"]),
+        (SHARE, ["0", "0.5", "1"], ["1.01", "nan", ""]),
+        (AMOUNT, ["1e3"], ["inf"]),
+        (("a", "b"), ["b"], ["c"]),
     ],
 )
-def test_an_invalid_cell_is_reported_with_its_line(tmp_path, kind, cells, line):
-    path = tmp_path / "x.csv"
-    path.write_text("other,cell\n" + "".join(f"1,{cell}\n" for cell in cells))
-    with pytest.raises(ValueError, match=rf"x\.csv, line {line} is damaged"):
-        read_table(path, {"cell": kind})
-    path.write_text("other,cell\n" + "".join(f"1,{cell}\n" for cell in cells[: line - 2]))
-    assert len(read_table(path, {"cell": kind})) == line - 2
+def test_an_invalid_cell_is_reported_with_its_line(tmp_path, kind, valid, wrong):
+    path, text = tmp_path / "x.csv", "".join(f"1,{cell}\n" for cell in ("cell", *valid))
+    path.write_text(text)
+    assert len(read_table(path, {"cell": kind})) == len(valid)
+    for cell in wrong:
+        path.write_text(f"{text}1,{cell}\n1,{cell}\n")
+        with pytest.raises(ValueError, match=rf"x\.csv, line {2 + len(valid)} is damaged"):
+            read_table(path, {"cell": kind})
 
 
 def test_a_line_with_too_many_cells_is_refused(tmp_path):

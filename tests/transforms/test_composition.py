@@ -24,7 +24,7 @@ AT_START = {
 }
 
 
-@pytest.mark.parametrize("seeds", [None, [0], [0, 1, 2]])
+@pytest.mark.parametrize("seeds", [None, [0, 1, 2]])
 def test_all_entries_exist_from_the_start(seeds):
     env = make_env(seeds, vae=make_modules()[0], del_keys=True)
     check_env_specs(env, break_when_any_done="both")
@@ -50,13 +50,11 @@ def test_a_partial_reset_changes_only_its_rows():
     assert not before["lae_h"][1].equal(fresh["lae_h"][1])
 
 
-@pytest.mark.parametrize(("real", "n_steps"), [(False, 30), (True, 6)])
-def test_a_row_of_a_batch_is_that_seed_alone(real, n_steps):
-    vae = make_modules()[0] if real else None
+def test_a_row_of_a_batch_is_that_seed_alone():
     seeds, lengths = [4, 2, 3], [1, 3, 9]
-    together, _ = play(make_env(seeds, lengths, vae=vae), n_steps)
+    together, _ = play(make_env(seeds, lengths), 30)
     for row, (seed, length) in enumerate(zip(seeds, lengths, strict=True)):
-        alone, _ = play(make_env([seed], [length], vae=vae), n_steps)
+        alone, _ = play(make_env([seed], [length]), 30)
         for key, value in alone[0].items(True, True):
             torch.testing.assert_close(together[row][key], value)
 
@@ -83,10 +81,9 @@ def test_collected_data_is_not_overwritten():
     assert (torch.stack(kept) == torch.stack(copies)).all()
 
 
-@pytest.mark.parametrize("n_steps", [6, 7])  # at the start and in the middle of an episode
-def test_resumes_from_a_state_dict(n_steps):
+def test_resumes_from_a_state_dict():
     env = make_env([0, 1], [2, 3])
-    _, data = play(env, n_steps)
+    _, data = play(env, 7)  # in the middle of an episode of both
     saved, state, base = data.clone(), copy.deepcopy(env.state_dict()), copy.copy(env.base_env)
     expected, _ = play(env, 12, data)
     resumed = make_env([8, 9], [2, 3])

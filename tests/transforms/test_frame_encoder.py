@@ -8,9 +8,13 @@ from bgpo_trl.transforms import FrameEncoder
 from tests.transforms.environment import MockEnv, TopRow, make_modules, play
 
 
-@pytest.mark.parametrize("seeds", [None, [4, 2, 3]])
-@pytest.mark.parametrize("keys", [("pixels", "latent"), (("agent", "pixels"), ("agent", "latent"))])
-@pytest.mark.parametrize("del_keys", [False, True])
+@pytest.mark.parametrize(
+    ("seeds", "keys", "del_keys"),
+    [
+        (None, ("pixels", "latent"), False),
+        ([4, 2, 3], (("agent", "pixels"), ("agent", "latent")), True),
+    ],
+)
 def test_every_frame_is_encoded_from_the_reset_on(seeds, keys, del_keys):
     vae, in_key, out_key = make_modules()[0], *keys
     encoder = FrameEncoder(vae, in_key, out_key, del_keys=del_keys)

@@ -15,47 +15,29 @@ from suites.nico import base, kinematics
 from suites.nico.demonstrator import Demonstrator
 from suites.nico.physics import OBJECT_HALF_HEIGHT, OBJECTS, TABLE_HEIGHT, Physics
 
-all_tasks = pytest.mark.parametrize("task", nico.ALL_TASKS)
-
 
 def random_actions(count: int, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).uniform(-1.0, 1.0, (count, 4))
 
 
-def test_the_first_tasks_are_those_of_the_paper():
+def test_observations_and_actions_have_the_specs_of_the_paper(load):
     assert nico.PAPER_TASKS == ("grasp_glass", "push_green_to_glass", "push_green_to_white")
     assert nico.ALL_TASKS[:3] == nico.PAPER_TASKS
-    assert len(nico.ALL_TASKS) == len(set(nico.ALL_TASKS)) == 8
-
-
-@all_tasks
-def test_observations_and_rewards_match_their_specs(load, task):
-    env = load(task, seed=0, observation="both")
-    specs = env.observation_spec()
+    env = load("push_white_left", seed=0, observation="both")
+    specs, action = env.observation_spec(), env.action_spec()
     assert (specs["pixels"].shape, specs["pixels"].dtype) == ((32, 64, 3), np.uint8)
     assert (specs["privileged_state"].shape, specs["privileged_state"].dtype) == ((16,), np.float64)
-    assert (env.action_spec().shape, env.action_spec().dtype) == ((4,), np.float64)
-    assert (env.action_spec().minimum.tolist(), env.action_spec().maximum.tolist()) == (
-        [-1.0] * 4,
-        [1.0] * 4,
-    )
-
-    timesteps = [env.reset(), *(env.step(action) for action in random_actions(12))]
-
-    for timestep in timesteps:
+    assert (action.shape, action.dtype) == ((4,), np.float64)
+    assert (action.minimum.tolist(), action.maximum.tolist()) == ([-1.0] * 4, [1.0] * 4)
+    for timestep in (env.reset(), *map(env.step, random_actions(3))):
         assert timestep.observation.keys() == specs.keys()
         for key, value in timestep.observation.items():
             specs[key].validate(value)
-        if not timestep.first():
-            env.reward_spec().validate(timestep.reward)
-            env.discount_spec().validate(timestep.discount)
-            assert timestep.reward in (0.0, 1.0)
 
 
 def test_state_is_joints_grip_and_objects(load):
     env = load("grasp_glass", seed=0, observation="state")
     state = env.reset().observation["privileged_state"]
-
     angles, positions = env.physics.named.data.qpos, env.physics.named.data
     hand = [angles["thumb_1"], angles["upper_finger_1"], angles["lower_finger_1"]]
     arm = [angles["shoulder_yaw"], angles["shoulder_pitch"], angles["elbow"]]
@@ -67,43 +49,35 @@ def test_state_is_joints_grip_and_objects(load):
 def test_time_out_is_after_50_steps_and_keeps_the_discount(load):
     env = load("grasp_glass", seed=0, observation="state")
     env.reset()
-
     timesteps = [env.step(np.zeros(4)) for _ in range(50)]
-
     assert [timestep.last() for timestep in timesteps] == [False] * 49 + [True]
     assert {timestep.reward for timestep in timesteps} == {0.0}
     assert {timestep.discount for timestep in timesteps} == {1.0}
     assert env.step(np.zeros(4)).first()
 
 
-@all_tasks
 @pytest.mark.parametrize("steps", [1, 2])
-def test_success_has_discount_0_even_on_the_last_step(load, monkeypatch, task, steps):
-    env = load(task, seed=0, observation="state", time_limit=0.4)
+def test_success_has_discount_0_even_on_the_last_step(load, monkeypatch, steps):
+    env = load("grasp_glass", seed=0, observation="state", time_limit=0.4)
     monkeypatch.setattr(env.task, "steady_steps", 1)
     monkeypatch.setattr(env.task, "succeeded", lambda _: False)
     env.reset()
     for _ in range(steps - 1):
         env.step(np.zeros(4))
-
     monkeypatch.setattr(env.task, "succeeded", lambda _: True)
     timestep = env.step(np.zeros(4))
-
     assert timestep.last()
     assert (timestep.reward, timestep.discount) == (1.0, 0.0)
 
 
-@all_tasks
+@pytest.mark.parametrize("task", nico.ALL_TASKS)
 def test_success_must_hold_for_consecutive_steps(load, monkeypatch, task):
     env = load(task, seed=0, observation="state")
-    needed = env.task.steady_steps
-    assert needed == (3 if task in ("grasp_glass", "lift_green") else 2)
+    needed = 3 if task in ("grasp_glass", "lift_green") else 2
     now = iter([True] * (needed - 1) + [False] + [True] * needed)
     monkeypatch.setattr(env.task, "succeeded", lambda _: next(now))
     env.reset()
-
     timesteps = [env.step(np.zeros(4)) for _ in range(2 * needed)]
-
     assert [timestep.reward for timestep in timesteps] == [0.0] * (2 * needed - 1) + [1.0]
     assert [timestep.last() for timestep in timesteps] == [False] * (2 * needed - 1) + [True]
 
@@ -116,7 +90,6 @@ def test_to_advance_is_a_step_without_its_observation(load, monkeypatch):
     for action in random_actions(10):
         expected.append((env.step(action).last(), env.physics.get_state()))
     assert [last for last, _ in expected] == [False] * 9 + [True]
-
     monkeypatch.setattr(env.task, "get_observation", None)
     env.physics.set_state(start)
     for action, (last, state) in zip(random_actions(10), expected, strict=True):
@@ -125,8 +98,7 @@ def test_to_advance_is_a_step_without_its_observation(load, monkeypatch):
 
 
 def test_the_duration_of_success_is_part_of_the_state(load, monkeypatch):
-    env = load("grasp_glass", seed=0, observation="state")
-    holds = True
+    env, holds = load("grasp_glass", seed=0, observation="state"), True
     monkeypatch.setattr(env.task, "succeeded", lambda _: holds)
     env.reset()
     for _ in range(env.task.steady_steps - 1):
@@ -135,44 +107,26 @@ def test_the_duration_of_success_is_part_of_the_state(load, monkeypatch):
     holds = False
     env.step(np.zeros(4))
     assert env.physics.steady_steps == 0
-
-    other = load("grasp_glass", seed=1, observation="state")
-    monkeypatch.setattr(other.task, "succeeded", lambda _: True)
-    other.reset()
-    other.physics.set_state(state)
-    timestep = other.step(np.zeros(4))
-
+    holds = True
+    env.physics.set_state(state)
+    timestep = env.step(np.zeros(4))
     assert (timestep.reward, timestep.discount) == (1.0, 0.0)
     # A new episode counts from the beginning.
-    other.reset()
-    assert other.step(np.zeros(4)).reward == 0.0
+    env.reset()
+    assert env.step(np.zeros(4)).reward == 0.0
 
 
-def test_same_seed_same_pixels_and_trajectory(load):
-    def run() -> tuple[np.ndarray, np.ndarray]:
-        env = load("grasp_glass", seed=np.random.RandomState(7), observation="both")
-        pixels, states = [], []
-        for episode in range(2):
-            timesteps = [env.reset(), *map(env.step, random_actions(6, seed=episode))]
-            pixels += [timestep.observation["pixels"] for timestep in timesteps]
-            states += [timestep.observation["privileged_state"] for timestep in timesteps]
-        return np.stack(pixels), np.stack(states)
-
-    for first, second in zip(run(), run(), strict=True):
-        np.testing.assert_array_equal(first, second)
-
-
-@all_tasks
-def test_starts_depend_on_episode_and_seed_and_not_on_the_task(load, task):
+def test_starts_depend_on_episode_and_seed_and_not_on_the_task(load):
     def starts(name: str, seed: int, count: int) -> list[np.ndarray]:
         env = load(name, seed=seed, observation="state")
         return [env.reset().observation["privileged_state"] for _ in range(count)]
 
-    found = [*starts(task, 0, 5), *starts(task, 1, 1)]
+    found = [*starts("grasp_glass", 0, 5), *starts("grasp_glass", 1, 1)]
     table_heights = [9, 12, 15]
     for first, second in itertools.combinations(found, 2):
         assert (np.delete(first - second, table_heights) != 0).all()
-    np.testing.assert_array_equal(found[:5], starts("grasp_glass", 0, 5))
+    for task in nico.ALL_TASKS[1:]:
+        np.testing.assert_array_equal(found[:2], starts(task, 0, 2))
 
 
 def test_observations_share_no_memory(load):
@@ -201,7 +155,7 @@ def test_objects_start_apart_and_upright_on_the_table(load, spread):
     physics = env.physics
     low, high = physics.model.jnt_range[:12].T
     tasks = [task(random=0) for task in nico.TASKS.values()]
-    for _ in range(200):
+    for _ in range(80):
         env.reset()
         for name in OBJECTS:
             position = physics.object_position(name)
@@ -324,24 +278,21 @@ def segmentation(physics):
     renderer.close()
 
 
-def hand_bodies() -> list[str]:
+def test_the_hand_stays_in_view_in_demonstrations(load, segmentation):
     digits = ("thumb", "upper_finger", "lower_finger")
-    return ["hand", *(f"{digit}_{segment}" for digit in digits for segment in (1, 2, 3))]
-
-
-@all_tasks
-def test_the_hand_stays_in_view_in_demonstrations(load, segmentation, task):
-    env = load(task, seed=0, observation="state")
-    demonstrator = Demonstrator(env, seed=0)
+    hand = ["hand", *(f"{digit}_{segment}" for digit in digits for segment in (1, 2, 3))]
     in_view = []
-    for _ in range(6):
-        timestep = env.reset()
-        demonstrator.reset()
-        in_view.append(np.isin(segmentation(), hand_bodies()).sum() >= 4)
-        while not timestep.last():
-            timestep = env.step(demonstrator(timestep))
-            in_view.append(np.isin(segmentation(), hand_bodies()).sum() >= 4)
-    assert len(in_view) > 100
+    for task in nico.ALL_TASKS:
+        env = load(task, seed=0, observation="state")
+        demonstrator = Demonstrator(env, seed=0)
+        for _ in range(2):
+            timestep = env.reset()
+            demonstrator.reset()
+            in_view.append(np.isin(segmentation(), hand).sum() >= 4)
+            while not timestep.last():
+                timestep = env.step(demonstrator(timestep))
+                in_view.append(np.isin(segmentation(), hand).sum() >= 4)
+    assert len(in_view) > 200
     assert np.mean(in_view) >= 0.98
 
 
@@ -355,19 +306,14 @@ def test_objects_are_at_least_4_pixels_wide(load, segmentation):
             assert (shown == name).any(axis=0).sum() >= 4
 
 
-@pytest.mark.parametrize(
-    ("task", "options", "message"),
-    [
-        ("juggle", {}, r"^no NICO task 'juggle'; choose one of grasp_glass, .*$"),
-        ("grasp_glass", {"observation": "sound"}, "observation"),
-        ("grasp_glass", {"spread": -0.01}, "spread"),
-        ("grasp_glass", {"spread": 1.01}, "spread"),
-        ("grasp_glass", {"spread": np.nan}, "spread"),
-    ],
-)
-def test_bad_arguments_are_refused(task, options, message):
-    with pytest.raises(ValueError, match=message):
-        nico.load(task, **options)
+def test_bad_arguments_are_refused():
+    for options in (
+        {"task": "juggle"}, {"observation": "sound"}, {"spread": -0.01}, {"spread": 1.01},
+        {"spread": np.nan},
+    ):  # fmt: skip
+        (name,) = options
+        with pytest.raises(ValueError, match=name):
+            nico.load(**{"task": "grasp_glass", **options})
 
 
 @pytest.mark.parametrize("name", ["ACTION_SCALE", "ARC_RADIUS", "GREEN_JITTER", "SIDE_JITTER"])
@@ -375,7 +321,5 @@ def test_the_scene_version_changes_with_the_constants_of_the_scene(monkeypatch, 
     version = nico.scene_version()
     assert re.fullmatch(r"nico-2-[0-9a-f]{8}", version)
     assert nico.scene_version() == version
-
     monkeypatch.setattr(base, name, getattr(base, name) * 1.01)
-
     assert nico.scene_version() != version

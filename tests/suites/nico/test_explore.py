@@ -34,19 +34,16 @@ def test_pictures_become_a_strip_or_an_animation(pictures, tmp_path):
     assert strip.shape == (400, 6 * 320, 3)
     np.testing.assert_array_equal(strip[:, :320], np.asarray(pictures[0]))
     np.testing.assert_array_equal(strip[:, -320:], np.asarray(pictures[-1]))
-
     write_pictures(tmp_path / "episode.gif", pictures)
     with Image.open(tmp_path / "episode.gif") as animation:
         assert animation.n_frames == len(pictures)
         assert animation.info["duration"] == 200  # (ms), the time of a step
-
     with pytest.raises(ValueError, match="png"):
         write_pictures(tmp_path / "episode.jpg", pictures)
 
 
 def test_random_actions_and_demonstrations_differ(pictures):
     random = picture_episode("push_green_to_white", random=True, seed=0)
-
     assert np.asarray(random[0]).tolist() == np.asarray(pictures[0]).tolist()
     assert np.asarray(random[8]).tolist() != np.asarray(pictures[8]).tolist()
 
@@ -64,8 +61,6 @@ def test_a_window_opens_only_on_a_screen(tmp_path, monkeypatch, out, screen, sho
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(explore, "has_screen", lambda: screen)
     monkeypatch.setattr(explore, "view", lambda *args, **kwargs: viewed.append(args))
-
     main(Arguments(task="grasp_glass", out=out))
-
     assert viewed == ([("grasp_glass",)] if shown else [])
     assert [path.name for path in tmp_path.iterdir()] == ([written] if written else [])

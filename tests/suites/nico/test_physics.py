@@ -11,10 +11,8 @@ from suites.nico import kinematics
 from suites.nico.demonstrator import Demonstrator
 from suites.nico.physics import TABLE_HEIGHT, Physics
 
-all_tasks = pytest.mark.parametrize("task", nico.ALL_TASKS)
 
-
-@all_tasks
+@pytest.mark.parametrize("task", ["grasp_glass", "push_white_left"])
 def test_a_simulation_continues_bit_for_bit_from_its_state(load, task):
     env = load(task, seed=0, observation="state")
     other = nico.load(task, seed=1, observation="state").physics
@@ -45,18 +43,15 @@ def test_a_state_holds_where_objects_stood_at_the_start(load, physics):
         timestep = env.step(demonstrator(timestep))
     state = physics.get_state()
     assert np.abs(physics.object_position("green_box") - start["green_box"]).max() > 0.03
-
     env.reset()
     for name in nico.OBJECTS:
         np.testing.assert_array_equal(physics.start_position(name), physics.object_position(name))
     physics.set_state(state)
-
     for name in nico.OBJECTS:
         np.testing.assert_array_equal(physics.start_position(name), start[name])
 
 
-@pytest.mark.parametrize("within_reset", [False, True])
-def test_the_same_actions_from_a_restored_state_give_the_same_observations(load, within_reset):
+def test_a_state_can_be_restored_within_a_reset(load):
     env = load("push_green_to_white", seed=0, observation="state")
     env.reset()
     actions = np.random.default_rng(0).uniform(-1.0, 1.0, (20, 4))
@@ -64,30 +59,20 @@ def test_the_same_actions_from_a_restored_state_give_the_same_observations(load,
         env.step(action)
     state = env.physics.get_state()
     seen = [env.step(action).observation["privileged_state"] for action in actions[:10]]
-
-    if within_reset:
-        with env.physics.reset_context():
-            env.physics.set_state(state)
-    else:
+    with env.physics.reset_context():
         env.physics.set_state(state)
     np.testing.assert_array_equal(env.physics.get_state(), state)
     again = [env.step(action).observation["privileged_state"] for action in actions[:10]]
-
     np.testing.assert_array_equal(again, seen)
 
 
-def test_parts_of_the_state_can_be_chosen(physics):
+def test_parts_of_the_state_can_be_chosen_and_have_their_length(physics):
     part = mujoco.mjtState.mjSTATE_QPOS.value
     with physics.reset_context():
         pass
     angles = physics.get_state(part)
-
     physics.set_state(angles + 0.01, part)
-
     np.testing.assert_array_equal(physics.data.qpos, angles + 0.01)
-
-
-def test_a_state_of_another_length_is_refused(physics):
     with pytest.raises(ValueError, match="266 numbers"):
         physics.set_state(np.zeros(33))
 
@@ -114,7 +99,6 @@ def put(physics: Physics, name: str, position: np.ndarray, curl: float) -> None:
 def test_only_an_object_in_the_hand_is_touched_and_held(physics, name, curl, left, touched, held):
     # The palm and an object at the grip point just meet; the boxes are no less wide than the glass.
     put(physics, name, np.array([GRIP[0], GRIP[1] + left, TABLE_HEIGHT + 0.03]), curl)
-
     for other in nico.OBJECTS:
         assert physics.touching("hand", other) is (touched and other == name)
         assert physics.held(other) is (held and other == name)
@@ -123,7 +107,6 @@ def test_only_an_object_in_the_hand_is_touched_and_held(physics, name, curl, lef
 @pytest.mark.parametrize("name", nico.OBJECTS)
 def test_an_object_touched_by_the_palm_from_the_side_is_not_pressed(physics, name):
     put(physics, name, np.array([GRIP[0], GRIP[1], TABLE_HEIGHT + 0.03]), 0.0)
-
     assert physics.touching("palm", name)
     assert not physics.pressed(name)
 
@@ -131,7 +114,6 @@ def test_an_object_touched_by_the_palm_from_the_side_is_not_pressed(physics, nam
 def test_the_hand_ends_at_the_wrist(physics):
     put(physics, "white_box", GRIP, 0.0)
     put(physics, "white_box", physics.named.data.geom_xpos["forearm"].copy(), 0.0)
-
     assert physics.touching("forearm", "white_box")
     assert not physics.touching("hand", "white_box")
 
@@ -141,23 +123,19 @@ def test_the_gap_to_the_hand_is_that_to_its_nearest_part(physics):
     digits = ("thumb", "upper_finger", "lower_finger")
     parts = [f"{digit}_{n}" for digit, n in itertools.product(digits, (1, 2, 3))]
     gaps = [physics.gap(part, "green_box") for part in ("palm", "wrist", *parts)]
-
     assert 0.002 < min(gaps) < max(gaps)
     assert physics.gap("hand", "green_box") == physics.gap("green_box", "hand") == min(gaps)
 
 
-@pytest.mark.parametrize(
-    "query",
-    [
-        lambda physics: physics.gap("hand", "cup"),
-        lambda physics: physics.touching("cup", "hand"),
-        lambda physics: physics.held("palm"),  # a part of the robot, not an object
-        lambda physics: physics.pressed("cup"),
-        lambda physics: physics.object_position("cup"),
-        lambda physics: physics.start_position("palm"),
-        lambda physics: physics.stands("cup"),
-    ],
-)
-def test_unknown_names_are_refused(physics, query):
-    with pytest.raises(ValueError, match=r"^no .*'(cup|palm)' .* one of .*white_box$"):
-        query(physics)
+def test_unknown_names_are_refused(physics):
+    for query in (
+        lambda: physics.gap("hand", "cup"),
+        lambda: physics.touching("cup", "hand"),
+        lambda: physics.held("palm"),  # a part of the robot, not an object
+        lambda: physics.pressed("cup"),
+        lambda: physics.object_position("cup"),
+        lambda: physics.start_position("palm"),
+        lambda: physics.stands("cup"),
+    ):
+        with pytest.raises(ValueError, match=r"no .*'(cup|palm)' .* one of .*white_box"):
+            query()

@@ -53,9 +53,7 @@ def move(physics: Physics, name: str, pose: Sequence[float] | np.ndarray) -> Non
 def test_push_is_done_when_the_green_box_touches_the_target(physics, target, gap, touches):
     # Half the box and the radius of the glass, or half the other box.
     place(physics, {"green_box": (0.40, 0.0), target: (0.40 + 0.05 + gap, 0.0)})
-
     done = {task for task in nico.PAPER_TASKS if succeeded(task, physics)}
-
     task = {"glass": "push_green_to_glass", "white_box": "push_green_to_white"}[target]
     assert done == ({task} if touches else set())
 
@@ -78,7 +76,6 @@ def test_push_to_glass_also_counts_for_a_lying_glass(physics, x, y, touches):
     # Along x a lying glass is as wide as a standing one; along y it is 0.07 m long.
     glass = (x, y, TABLE_HEIGHT + 0.025, *LYING)
     place(physics, {"green_box": (0.40, 0.0), "glass": glass})
-
     assert succeeded("push_green_to_glass", physics) is touches
 
 
@@ -104,7 +101,6 @@ CLOSED, OPEN = 0.7, 0.0
 )
 def test_grasp_needs_both_sides_of_a_closing_hand(physics, thumb, upper, lower, closing, held):
     place(physics, {"glass": GLASS}, arm=ARM, curls=(thumb, upper, lower), closing=closing)
-
     assert succeeded("grasp_glass", physics) is held
 
 
@@ -185,7 +181,6 @@ def test_the_green_box_is_lifted_1_5_cm_above_the_table_in_a_closing_hand(
 ):
     box = (GRIP[0], GRIP[1], TABLE_HEIGHT + height)  # whose center is 0.025 m high on the table
     place(physics, {"green_box": box}, arm=ARM, curls=(CLOSED,) * 3, closing=closing)
-
     assert succeeded("lift_green", physics) is lifted
 
 
@@ -201,7 +196,6 @@ def test_the_white_box_is_pressed_by_the_fist_on_its_top(physics, above, curl, p
     top = np.array([0.42, -0.2, TABLE_HEIGHT + 0.05 + above])
     arm = kinematics.inverse(top, (0.02, 0.12))
     place(physics, {"white_box": top[:2]}, arm=arm, curls=(curl,) * 3)
-
     assert succeeded("press_white", physics) is pressed
 
 
