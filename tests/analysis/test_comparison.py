@@ -53,10 +53,10 @@ def test_changed_hyperparameters_are_part_of_a_name(tmp_path):
     edit(changed / "summary.json", changed={"beta": 0.2, "rl.name": "td3"})
     plain = write_run(tmp_path, "bgpo", 8, directory="b")
     (setting,) = settings_in(tmp_path)[0].values()
-    assert {name: run.directory for name, run in setting.runs.items()} == {
-        "BGPO": plain,
-        "BGPO, beta 0.2, rl.name td3": changed,
-    }
+    assert [(name, run.directory) for name, run in setting.runs.items()] == [
+        ("BGPO", plain),
+        ("BGPO, beta 0.2, rl.name td3", changed),
+    ]
     assert setting.find("bgpo") == ("BGPO", setting.runs["BGPO"])
     (alone,) = settings_in(changed)[0].values()
     assert alone.find("bgpo") is None

@@ -172,7 +172,7 @@ def test_own_episodes_by_task_and_seed(tmp_path):
     run = read_run(directory)
     assert scores.own_episodes(run) is None
     seeds = [[learned(20), learned(30), never], [learned(40), learned(40), learned(30)]]
-    write_training(directory, [*seeds, [never, learned(20), [0] * 10 + [1] * 20]])
+    write_training(directory, [*seeds, [[], learned(20), [0] * 10 + [1] * 20]])
     assert scores.own_episodes(run).tolist() == [[20, 30, INF], [40, 40, 30], [INF, 20, 20]]
     assert scores.own_episodes(run, 0.8)[2].tolist() == [INF, INF, 26]
 

@@ -102,6 +102,7 @@ def test_the_seeds_needed_reach_the_stated_power():
 
 def test_estimates_are_rounded_and_clipped():
     assert statistics.Estimate(0.98, 0.94, 1.02).percent() == "98.0 [94, 100]"
+    assert statistics.Estimate(0.02, -0.02, 0.06).percent() == "2.0 [0, 6]"
     assert statistics.Estimate(-0.0001, -0.1, 0.104).points() == "+0.0 [-10, +10]"
     assert statistics.Estimate(0.0123, -0.001, 0.02).points() == "+1.2 [+0, +2]"
 

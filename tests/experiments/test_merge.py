@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 from collections import Counter
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -100,9 +101,13 @@ def test_runs_that_are_not_one_run_are_not_merged(jobs, tmp_path, refused, choos
 def test_merging_replaces_no_other_results(jobs, tmp_path, refused):
     other = train(tmp_path / "other", 5)
     for out in (jobs[0], other):
-        refused(lambda out=out: merge(MergeArguments(jobs, out)), "--out", "name another directory")
+        call = partial(merge, MergeArguments(jobs, out))
+        refused(call, "--out", "is a run of its own, name another directory")
     merge(MergeArguments((*jobs, other), tmp_path / "all"))
-    refused(lambda: merge(MergeArguments(jobs, tmp_path / "all")), "holds other results", "another")
+    again = partial(merge, MergeArguments(jobs, tmp_path / "all"))
+    refused(again, "holds other results", "another")  # of more seeds
+    edit(tmp_path / "all" / "config.json", seeds=[8, 3], eval_every=3)
+    refused(again, "holds other results", "another")
 
 
 def test_the_documented_slurm_array_requeues_interrupted_jobs_alone(tmp_path):

@@ -90,6 +90,7 @@ def test_a_process_waits_until_the_last_holder_releases_a_reentrant_lock(other_p
     second = lock_directory(tmp_path / "." / ".." / tmp_path.name)
     first.__enter__(), second.__enter__()
     first.__exit__(None, None, None)
+    assert (tmp_path / "lock").exists()
     process = other_process(tmp_path, wait=True)
     assert process.stdout.readline() == "waits\n"
     assert not select.select([process.stdout], [], [], 0.5)[0]
