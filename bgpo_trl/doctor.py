@@ -13,6 +13,7 @@ import shutil
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -104,6 +105,10 @@ def check_versions() -> str:
 
 def check_frame(path: Path | None = None) -> str:
     """Draw the robot's view before and after a movement; optionally write the first to a PNG."""
+    with suppress(Exception):  # reported by the checks that need it
+        # Triton, which TensorDict imports beside torch for CUDA, crashes once Mesa has loaded LLVM.
+        import tensordict  # noqa: F401
+
     import numpy as np
     from PIL import Image
 
