@@ -118,3 +118,21 @@ def test_a_broken_torch_and_an_unknown_backend_are_each_reported(tmp_path):
     assert [level for level, _ in found.values()][:4] == ["ok", "wrong", "wrong", "wrong"]
     assert "'vulkan'" in found["OpenGL"][1]
     assert "libcudart is missing" in found["threads"][1]
+
+
+def test_tensordict_is_imported_before_the_first_frame_is_drawn():
+    """With torch for CUDA it imports Triton, which crashes once Mesa has loaded its LLVM."""
+    code = (
+        "import sys\n"
+        "from bgpo_trl.doctor import check_frame\n"
+        "from suites.nico.rendering import FrameRenderer\n"
+        "make = FrameRenderer.__init__\n"
+        "def checked(*args):\n"
+        "    print('tensordict' in sys.modules)\n"
+        "    make(*args)\n"
+        "FrameRenderer.__init__ = checked\n"
+        "assert 'tensordict' not in sys.modules\n"
+        "check_frame()\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    assert (done.returncode, done.stdout) == (0, "True\n"), done.stderr

@@ -50,6 +50,8 @@ _PUBLISHED: Any = {"rl": _PAPER, "gwr": GWRBConfig(activity_scale=1.0), "behavio
 _SHOWN: Any = {"demonstration_share": 0.75, "rl": BGPOConfig().rl}
 _SHOWN_TASKS: Any = {**_SHOWN, "task_batch_size": 128}
 _SHOWN_SINGLE: Any = {**_SHOWN, "rl": replace(BGPOConfig().rl, batch_size=384)}  # of three tasks
+# Imitation makes the gradient by which MAML adapts as much larger.
+_INNER = MAMLConfig.inner_learning_rate / BGPOConfig().rl.imitation
 
 ALGORITHMS: dict[str, Entry] = {
     "bgpo": Entry(BGPO, BGPOConfig()),
@@ -57,8 +59,7 @@ ALGORITHMS: dict[str, Entry] = {
     "bgpo-single": Entry(BGPO, _SINGLE),
     "bgpo-paper": Entry(BGPO, replace(_SINGLE, **_PUBLISHED)),
     "maml": Entry(MAML, MAMLConfig()),
-    # The gradient of the adaptation is larger by the weight of imitation.
-    "maml-demonstrations": Entry(MAML, MAMLConfig(inner_learning_rate=0.02, **_SHOWN_TASKS)),
+    "maml-demonstrations": Entry(MAML, MAMLConfig(inner_learning_rate=_INNER, **_SHOWN_TASKS)),
     "maml-paper": Entry(MAML, MAMLConfig(rl=_PAPER, task_batch_size=256, adaptation_size=256 * 50)),
     "dist-nll": Entry(DistNLL, DistNLLConfig()),
     "dist-nll-demonstrations": Entry(DistNLL, DistNLLConfig(**_SHOWN_TASKS)),

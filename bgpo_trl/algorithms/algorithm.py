@@ -248,6 +248,7 @@ class Algorithm(ABC):
         self,
         groups: Callable[[int], Tensor],
         n_rows: int,
+        *,
         generator: Sequence[torch.Generator] | None = None,
     ) -> TensorDictBase:
         """Draw transitions ``[S, E, B]`` to learn from, a share of demonstrated ones last.
@@ -263,7 +264,7 @@ class Algorithm(ABC):
         n_shown = round(self.config.demonstration_share * n_rows)
         played_group, shown_group = groups(n_rows - n_shown), groups(n_shown)
         played = self.replay.draw(played_group, generator=generator)
-        shown = self.shown.draw(shown_group, generator)
+        shown = self.shown.draw(shown_group, generator=generator)
         played["demonstrated"] = torch.zeros_like(played_group, dtype=torch.bool)
         batch = {key: torch.cat([entry, shown[key]], 2) for key, entry in played.items()}
         return TensorDict(batch, batch["demonstrated"].shape)

@@ -91,7 +91,7 @@ class MAML(TaskAlgorithm):
             data = self.sample(
                 lambda n: tasks.unsqueeze(-1).expand(-1, -1, n),
                 self.config.adaptation_size,
-                streams,
+                generator=streams,
             )
             adapted = self.loss.adapt(self.to_device(data))
         parameters = {

@@ -98,7 +98,7 @@ class DemonstrationReplay:
         return TensorDict(self.draw(group), group.shape)
 
     def draw(
-        self, group: Tensor, generator: Sequence[torch.Generator] | None = None
+        self, group: Tensor, *, generator: Sequence[torch.Generator] | None = None
     ) -> dict[NestedKey, Tensor]:
         """Return the entries of `sample` by key, without a TensorDict.
 
