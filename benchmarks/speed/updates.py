@@ -4,12 +4,15 @@ An update samples 128 transitions and makes one gradient step of actor and criti
 their targets. All contenders have networks of BGPO's default size (96 inputs, 4 actions, 256 hidden
 units, no layer norm) and draw from 50,000 random transitions; those "without sampling" reuse one
 batch, which stays in the cache. Only this package and the floor step several seeds together. BGPO's
-learner has two hidden layers and layer norm in the critic, as in its runs.
+learner has two hidden layers and layer norm in the critic, as in its runs; "2 x 4 experts" are two
+seeds of four experts each.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
+from typing import cast
 
 import numpy as np
 import torch
@@ -21,7 +24,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.modules import MLP, TanhModule, ValueOperator
 
 from bgpo_trl.algorithms.rl import LearnerSpec, make_learner
-from bgpo_trl.configs import BGPOConfig
+from bgpo_trl.configs import BGPOConfig, DDPGConfig
 from bgpo_trl.data.replay import GroupReplay
 from bgpo_trl.modules.actor_critic import Actor, Critic
 from bgpo_trl.objectives.ddpg import DDPGLoss
@@ -59,8 +62,10 @@ def contenders(seeds: int = 10, transitions: int = 50_000) -> dict[str, Contende
         "ours, 1 seed, without sampling": (_repeat(lambda: fixed_single.learn(batch_single), 4), 4),
         f"floor, {seeds} seeds, without sampling": (_on_tensors(floor, batch), seeds),
         "TorchRL loop": (_repeat(TorchRLLoop(transitions).update, 4), 4),
-        "BGPO's learner, 2 seeds of 4 experts, without sampling": (bgpo_learner(2, 4), 2),
     }
+    for n, experts, mode in ((1, 1, ""), (1, 1, ", compiled"), (2, 4, ""), (2, 4, ", compiled")):
+        learn = bgpo_learner(n, experts, compiles=bool(mode))
+        found[f"BGPO's learner, {n} x {experts} experts, without sampling{mode}"] = (learn, n)
     try:
         found["Stable-Baselines3"] = stable_baselines3(transitions, updates=4), 4
     except ImportError:
@@ -131,14 +136,15 @@ class Ours:
         self.target_update.step()
 
 
-def bgpo_learner(seeds: int, experts: int) -> Callable[[], object]:
+def bgpo_learner(seeds: int, experts: int, compiles: bool) -> Callable[[], object]:
     """Return an update of BGPO's learner, with its default networks, on a constant batch."""
     config, shape = BGPOConfig(), (seeds, experts, BGPOConfig().expert_batch_size)
+    rl = replace(cast(DDPGConfig, config.rl), compile=compiles)
     keys = ["latent", "behavior"]
     spec = LearnerSpec(
         range(seeds), keys, LATENT + BEHAVIOR, (0.0, 1.1), torch.device("cpu"), range(experts)
     )
-    learner = make_learner(config.rl, spec)
+    learner = make_learner(rl, spec)
     batch = random_transitions(*shape, generator=torch.Generator().manual_seed(0))
     batch["demonstrated"] = torch.arange(shape[-1]).expand(shape) % 4 > 0
     return lambda: learner.learn(batch)

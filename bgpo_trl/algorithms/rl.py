@@ -15,6 +15,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
+from bgpo_trl.algorithms.compilation import CompiledGradients
 from bgpo_trl.configs import DDPGConfig, RLConfig
 from bgpo_trl.modules.actor_critic import Actor, Critic
 from bgpo_trl.objectives.ddpg import DDPGLoss
@@ -38,7 +39,8 @@ class Learner:
     Args:
         actor: Writes the ``action`` without noise; its weights lead with ``[S, E]``.
         loss: Returns entries ``loss_...`` ``[S, E]`` to minimize (``reduction="none"``).
-        config: Hyperparameters, of which ``gamma``, ``tau`` and ``learning_rate`` are read here.
+        config: Hyperparameters, of which ``gamma``, ``tau``, ``learning_rate`` and DDPG's
+            ``compile`` are read here.
         noise: Standard deviation of the Gaussian exploration noise.
     """
 
@@ -50,6 +52,10 @@ class Learner:
         self.target_update = ForeachSoftUpdate(loss, tau=config.tau)
         learned = [p for p in loss.parameters() if p.requires_grad]
         self.optimizer = torch.optim.Adam(learned, lr=config.learning_rate, fused=True)
+        compiles = isinstance(config, DDPGConfig) and config.compile
+        self.compute_gradients = (
+            CompiledGradients(self.losses, learned) if compiles else self._compute_gradients
+        )
 
     def act(
         self, tensordict: TensorDictBase, generators: Sequence[torch.Generator], expert: Tensor
@@ -76,13 +82,18 @@ class Learner:
 
         Losses are sums over the experts of a seed, ``[S]``.
         """
-        parts = self.losses(batch)
-        self.optimizer.zero_grad()
-        torch.stack([part.sum() for part in parts.values()]).sum().backward()
+        parts = self.compute_gradients(batch)
         self.optimizer.step()
         if self.actor_is_due:
             self.target_update.step()
-        return {key: value.detach().sum(1) for key, value in parts.items()}
+        return {key: value.sum(1) for key, value in parts.items()}
+
+    def _compute_gradients(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        """Set the gradients of the parameters and return the losses ``[S, E]``, detached."""
+        parts = self.losses(batch)
+        self.optimizer.zero_grad()
+        torch.stack([part.sum() for part in parts.values()]).sum().backward()
+        return {key: value.detach() for key, value in parts.items()}
 
     def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """Return the losses ``[S, E]`` to minimize on transitions ``[S, E, B]``."""

@@ -96,6 +96,8 @@ class DDPGConfig(RLConfig):
     """Standard deviation of the Gaussian exploration noise. Ours: not given in the paper."""
     pre_tanh_penalty: float = 0.01
     """Weight of the squared pre-tanh actions. Ours: otherwise all actions saturate."""
+    compile: bool = False
+    """Whether updates are compiled, which needs a C++ compiler (docs/speed.md)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
