@@ -43,11 +43,13 @@ class Arguments:
     """Turns of each version."""
     steps: int = 10
     """Steps in each turn."""
+    compile: bool = False
+    """Whether the other version compiles its updates."""
 
 
-def start(folder: Path, arguments: Arguments) -> subprocess.Popen[str]:
+def start(folder: Path, arguments: Arguments, *, compiles: bool) -> subprocess.Popen[str]:
     """Start a process that trains with the version in a folder."""
-    numbers = map(str, (arguments.experts, arguments.rows, arguments.steps))
+    numbers = map(str, (arguments.experts, arguments.rows, arguments.steps, int(compiles)))
     return subprocess.Popen(
         [sys.executable, Path(__file__).resolve(), "--work", *numbers],
         env={**os.environ, "PYTHONPATH": str(folder.resolve()), "OMP_NUM_THREADS": "1"},
@@ -65,7 +67,7 @@ def ask(process: subprocess.Popen[str], seeds: int) -> list[float]:
     return [float(part) for part in process.stdout.readline().split()]
 
 
-def work(experts: int, rows: int, steps: int) -> None:
+def work(experts: int, rows: int, steps: int, compiles: int) -> None:
     """Time some steps for each number of seeds in the input, with the version in use."""
     import bgpo_trl.machine as machine
 
@@ -76,14 +78,14 @@ def work(experts: int, rows: int, steps: int) -> None:
     for line in sys.stdin:
         seeds = int(line)
         if seeds not in training:
-            training[seeds] = Training(seeds, experts, rows)
+            training[seeds] = Training(seeds, experts, rows, bool(compiles))
         print(*training[seeds].time(steps), flush=True)
 
 
 class Training:
     """BGPO in training on the paper's tasks, as in a run."""
 
-    def __init__(self, seeds: int, experts: int, rows: int) -> None:
+    def __init__(self, seeds: int, experts: int, rows: int, compiles: bool) -> None:
         from bgpo_trl.algorithms import entry
         from bgpo_trl.encoders.pretrained import load_pretrained
         from bgpo_trl.transforms import TaskSchedule
@@ -91,9 +93,10 @@ class Training:
 
         encoders, bank = load_pretrained()
         known, parts = entry("bgpo"), {"seeds": range(seeds), "bank": bank.seen()}
+        rl = replace(known.config.rl, warmup_steps=WARM_UP - 1, hidden_sizes=HIDDEN)
         config = replace(
             known.config,
-            rl=replace(known.config.rl, warmup_steps=WARM_UP - 1, hidden_sizes=HIDDEN),
+            rl=replace(rl, compile=True) if compiles else rl,  # a setting of later versions
             active_groups=experts,
             expert_batch_size=rows,
             demonstration_share=SHARE,
@@ -135,7 +138,9 @@ def main(arguments: Arguments) -> None:
     """Print the table."""
     print("| seeds | part | before (ms) | after (ms) | after / before | quartiles |")
     print("|---:|---|---:|---:|---:|---:|")
-    with start(arguments.before, arguments) as one, start(arguments.after, arguments) as other:
+    before = start(arguments.before, arguments, compiles=False)
+    after = start(arguments.after, arguments, compiles=arguments.compile)
+    with before as one, after as other:
         for seeds in arguments.seeds:
             rounds = range(arguments.rounds)
             times = np.array([[ask(one, seeds), ask(other, seeds)] for _ in rounds])
