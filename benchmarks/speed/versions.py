@@ -10,6 +10,7 @@ the same hidden layers on as many transitions, in their own version of the world
 from __future__ import annotations
 
 import os
+import resource
 import subprocess
 import sys
 import time
@@ -22,6 +23,7 @@ import numpy as np
 import tyro
 
 PARTS = ("act", "environment", "store", "sample", "learn", "whole step")
+MEMORY = "peak memory, MB"  # of a process, with the numbers of seeds before
 HIDDEN, SHARE, WARM_UP = (256, 256), 0.25, 131  # SHARE: of demonstrated transitions
 
 
@@ -61,7 +63,7 @@ def start(folder: Path, arguments: Arguments, *, compiles: bool) -> subprocess.P
 
 
 def ask(process: subprocess.Popen[str], seeds: int) -> list[float]:
-    """Return the CPU times (ms) of the parts of a step in a process."""
+    """Return the CPU times (ms) of the parts of a step in a process, and its peak memory (MB)."""
     assert process.stdin and process.stdout
     print(seeds, file=process.stdin, flush=True)
     return [float(part) for part in process.stdout.readline().split()]
@@ -79,7 +81,9 @@ def work(experts: int, rows: int, steps: int, compiles: int) -> None:
         seeds = int(line)
         if seeds not in training:
             training[seeds] = Training(seeds, experts, rows, bool(compiles))
-        print(*training[seeds].time(steps), flush=True)
+        times = training[seeds].time(steps)
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3  # kilobytes on Linux
+        print(*times, peak, flush=True)
 
 
 class Training:
@@ -136,7 +140,7 @@ class Training:
 
 def main(arguments: Arguments) -> None:
     """Print the table."""
-    print("| seeds | part | before (ms) | after (ms) | after / before | quartiles |")
+    print("| seeds | part, ms | before | after | after / before | quartiles |")
     print("|---:|---|---:|---:|---:|---:|")
     before = start(arguments.before, arguments, compiles=False)
     after = start(arguments.after, arguments, compiles=arguments.compile)
@@ -144,7 +148,7 @@ def main(arguments: Arguments) -> None:
         for seeds in arguments.seeds:
             rounds = range(arguments.rounds)
             times = np.array([[ask(one, seeds), ask(other, seeds)] for _ in rounds])
-            for part, taken in zip(PARTS, times.transpose(2, 0, 1), strict=True):
+            for part, taken in zip([*PARTS, MEMORY], times.transpose(2, 0, 1), strict=True):
                 before, after = np.median(taken, 0)
                 low, ratio, high = np.percentile(taken[:, 1] / taken[:, 0], [25, 50, 75])
                 print(
