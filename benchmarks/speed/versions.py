@@ -23,8 +23,10 @@ import numpy as np
 import tyro
 
 PARTS = ("act", "environment", "store", "sample", "learn", "whole step")
+BARE = "products of learn"
 MEMORY = "peak memory, MB"  # of a process, with the numbers of seeds before
 HIDDEN, SHARE, WARM_UP = (256, 256), 0.25, 131  # SHARE: of demonstrated transitions
+STATE, ACTION = 96, 4  # sizes of a policy's input, latent and behavior, and output
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,7 @@ def start(folder: Path, arguments: Arguments, *, compiles: bool) -> subprocess.P
 
 
 def ask(process: subprocess.Popen[str], seeds: int) -> list[float]:
-    """Return the CPU times (ms) of the parts of a step in a process, and its peak memory (MB)."""
+    """Return the CPU times (ms) of a step's parts and products, and the peak memory (MB)."""
     assert process.stdin and process.stdout
     print(seeds, file=process.stdin, flush=True)
     return [float(part) for part in process.stdout.readline().split()]
@@ -81,9 +83,35 @@ def work(experts: int, rows: int, steps: int, compiles: int) -> None:
         seeds = int(line)
         if seeds not in training:
             training[seeds] = Training(seeds, experts, rows, bool(compiles))
-        times = training[seeds].time(steps)
+        times = [*training[seeds].time(steps), time_products(seeds * experts, rows, steps)]
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3  # kilobytes on Linux
         print(*times, peak, flush=True)
+
+
+def time_products(networks: int, rows: int, repeats: int) -> float:
+    """Return the CPU time (ms) of the products of matrices that an update needs, and no more.
+
+    Five networks are evaluated: the targets, the critic on stored actions and on the actor's, and
+    the actor. Actor and critic have gradients of their weights, the critic also of the action.
+    """
+    import torch
+
+    def layers(inputs: int, outputs: int) -> list[tuple[int, int]]:
+        return [*zip((inputs, *HIDDEN), (*HIDDEN, outputs), strict=True)]
+
+    actor, critic = layers(STATE, ACTION), layers(STATE + ACTION, 1)
+    forward = [(rows, i, o) for i, o in 2 * actor + 3 * critic]
+    of_weights = [(i, rows, o) for i, o in actor + critic]
+    of_inputs = [(rows, o, i) for i, o in actor[1:] + critic[1:] + critic]
+    pairs = [
+        (torch.randn(networks, n, k), torch.randn(networks, k, m))
+        for n, k, m in forward + of_weights + of_inputs
+    ]
+    start = time.process_time()
+    for _ in range(repeats):
+        for one, other in pairs:
+            torch.bmm(one, other)
+    return 1_000 * (time.process_time() - start) / repeats
 
 
 class Training:
@@ -148,7 +176,7 @@ def main(arguments: Arguments) -> None:
         for seeds in arguments.seeds:
             rounds = range(arguments.rounds)
             times = np.array([[ask(one, seeds), ask(other, seeds)] for _ in rounds])
-            for part, taken in zip([*PARTS, MEMORY], times.transpose(2, 0, 1), strict=True):
+            for part, taken in zip([*PARTS, BARE, MEMORY], times.transpose(2, 0, 1), strict=True):
                 before, after = np.median(taken, 0)
                 low, ratio, high = np.percentile(taken[:, 1] / taken[:, 0], [25, 50, 75])
                 print(
