@@ -124,6 +124,7 @@ def test_wrong_statements_about_a_dataset(recorded, expected, n):
     @settings(max_examples=n)
     @given(key=st.sampled_from(known), value=json_values)
     @example(key="rows", value=10**30)
+    @example(key="rows", value=True)
     @example(key="scene_version", value="two\nlines")
     @example(key="tasks", value=[])
     def holds(key, value):

@@ -159,9 +159,9 @@ def _is_complete(meta: Mapping[str, Any]) -> bool:
         and isinstance(meta.get("scene_version"), str)
         and isinstance(meta.get("frame_shape"), list)
         and len(meta["frame_shape"]) == 2
-        and all(isinstance(size, int) and 0 < size < 2**13 for size in meta["frame_shape"])
-        and all(isinstance(meta.get(name), int) and 0 <= meta[name] < 2**20 for name in sizes)
-        and isinstance(meta.get("rows"), int)
+        and all(type(size) is int and 0 < size < 2**13 for size in meta["frame_shape"])
+        and all(type(meta.get(name)) is int and 0 <= meta[name] < 2**20 for name in sizes)
+        and type(meta.get("rows")) is int  # not a bool
         and 0 < meta["rows"] < 2**31
     )
 
