@@ -44,6 +44,7 @@ def without_compiler(monkeypatch):
     monkeypatch.setattr(torch, "compile", compile)
 
 
+@pytest.mark.filterwarnings("error:updates are traced")  # it must be compiled
 @pytest.mark.slow  # compiling takes 30 s where nothing is cached
 def test_one_update_compiled_is_the_same_to_1e_5():
     plain, compiled = make(), make(compile=True)
@@ -56,9 +57,13 @@ def test_one_update_compiled_is_the_same_to_1e_5():
 
 
 @pytest.mark.filterwarnings("ignore:updates are traced")
-def test_the_traced_losses_are_the_losses_bit_by_bit(without_compiler):
+def test_the_traced_losses_are_the_losses_bit_by_bit(without_compiler, monkeypatch):
     """With other numbers of experts, with weights restored, and with the former shape again."""
-    plain, traced = make(), make(compile=True)
+    plain, traced, evaluated = make(), make(compile=True), []
+    loss = traced.loss.loss_actor
+    monkeypatch.setattr(
+        traced.loss, "loss_actor", lambda batch: evaluated.append(batch.shape[1]) or loss(batch)
+    )
     for update, experts in enumerate((2, 2, 3, 3, 2, 1, 2)):
         for learner in (plain, traced):
             learner.resize(experts)
@@ -68,6 +73,7 @@ def test_the_traced_losses_are_the_losses_bit_by_bit(without_compiler):
         if update == 3:
             for learner in (plain, traced):
                 learner.load_state_dict(make((0, 1, 2), learning_rate=0.1).state_dict())
+    assert evaluated == [2, 3, 1]  # once for each shape
 
 
 @pytest.mark.filterwarnings("ignore:updates are traced")
