@@ -144,10 +144,10 @@ class Evaluator:
                 f"snapshot of {type(algorithm).__name__} must return a Policy (self.policy(...)), "
                 f"got {type(policy).__name__}"
             )
-        if policy.context is not None and policy.context.shape[:2] != drawn.shape:
+        if policy.network.shape != drawn.shape:
             raise TypeError(
-                f"the context of a Policy of {type(algorithm).__name__} must be "
-                f"{list(drawn.shape)} and its features, got {list(policy.context.shape)}"
+                f"the network of a Policy of {type(algorithm).__name__} must be one for each test "
+                f"episode, {list(drawn.shape)}, got {list(policy.network.shape)}"
             )
         return Snapshot(
             number=number,
@@ -178,7 +178,7 @@ class Evaluator:
         Success and length are 0 for tasks not yet presented. ``device`` is that of the networks.
         ``watch`` is called at the start and after each step, for looking at `simulation`.
         """
-        policy = Policy.stack([snapshot.policy for snapshot in snapshots], device)
+        policies = [snapshot.policy.to(device) for snapshot in snapshots]
         starts = [
             start_seeds(seed, snapshot.number, self.shape[1:])
             for seed, snapshot in zip(self.seeds, snapshots, strict=True)
@@ -193,7 +193,8 @@ class Evaluator:
         watch()
         for _ in range(self.max_steps):
             seen = state[self._state_key].to(device)
-            state.set("action", policy.act(seen).cpu())
+            actions = [policy.act(of_seed) for policy, of_seed in zip(policies, seen, strict=True)]
+            state.set("action", torch.stack(actions).cpu())
             state.set("_step", active)
             state = self.env.step(state)["next"]
             watch()

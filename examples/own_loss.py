@@ -12,7 +12,7 @@ from bgpo_trl.algorithms.rl import RL, Learner, LearnerSpec, RLEntry
 from bgpo_trl.configs import DDPGConfig, RunConfig
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.modules.actor_critic import Actor
-from bgpo_trl.objectives.off_policy import OffPolicyLoss
+from bgpo_trl.objectives.ddpg import OffPolicyLoss
 from bgpo_trl.training import Trainer
 
 

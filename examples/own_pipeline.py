@@ -14,8 +14,7 @@ from bgpo_trl.configs import GWRBConfig
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.modules.actor_critic import Actor, Critic
 from bgpo_trl.modules.gwr import GWRB
-from bgpo_trl.objectives.ddpg import DDPGLoss
-from bgpo_trl.objectives.off_policy import ForeachSoftUpdate
+from bgpo_trl.objectives.ddpg import DDPGLoss, ForeachSoftUpdate
 from bgpo_trl.scenes.nico import NicoEnv
 from bgpo_trl.transforms import BehaviorLookup, DemonstrationSource, FrameEncoder, TaskSchedule
 

@@ -9,11 +9,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import torch
+from bgpo_trl.algorithms.twin_critics import TD3Learner, make_td3
 from torch import Tensor
 
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.rl import RL, LearnerSpec, RLEntry
-from bgpo_trl.algorithms.twin_critics import TD3Learner, make_td3
 from bgpo_trl.configs import RunConfig, TD3Config
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.training import Trainer

@@ -17,8 +17,7 @@ import pytest
 import torch
 from hypothesis import settings
 
-from bgpo_trl.algorithms import entry
-from bgpo_trl.algorithms.rl import RL
+from bgpo_trl.algorithms import ALGORITHMS, entry
 from bgpo_trl.configs import BGPOConfig, RepresentationConfig, RunConfig
 from bgpo_trl.data.bank import DemonstrationBank, DemonstrationSteps
 from bgpo_trl.encoders.representation import Representation
@@ -92,18 +91,17 @@ def bank():
 
 @pytest.fixture(scope="session")
 def make_config():
-    """Make the settings of a run of two seeds and 10 episodes, with some of them changed.
-
-    ``bgpo+td3`` is BGPO with TD3.
-    """
+    """Make the settings of a run of two seeds and 10 episodes, with some of them changed."""
 
     def make(state="latent", name="bgpo", **changes):
-        name, _, rl = name.partition("+")
         small = {"hidden_sizes": (64,), "batch_size": 16, "warmup_steps": 8, "replay_size": 200}
-        rl = replace(RL[rl or "ddpg"].config, **small)
-        settings = {"state": state, "max_steps": 6, "rl": rl, **of_name(SMALL, name)}
+        small |= {"clone_episodes": 2}
         # Demonstrations are latents; without noise, a test can identify them among other data.
         share = 0.25 if entry(name).config.demonstration_share and state == "latent" else 0.0
+        if not share:
+            small["proposals"] = "actor"
+        rl = replace(entry(name).config.rl, **small)
+        settings = {"state": state, "max_steps": 6, "rl": rl, **of_name(SMALL, name)}
         settings |= {"demonstration_share": share, "demonstration_noise": 0.0}
         if isinstance(entry(name).config, BGPOConfig):
             settings |= {"expert_batch_size": 8, "group_size": 4}
@@ -182,8 +180,8 @@ def easy_world():
 
 @pytest.fixture(autouse=True)
 def restored_registries() -> Iterator[None]:
-    """Remove tasks, scenes and RL algorithms that a test has added."""
-    registries: list[dict[str, Any]] = [nico._TASKS, RL, SCENES]
+    """Remove tasks, scenes and algorithms that a test has added."""
+    registries: list[dict[str, Any]] = [nico._TASKS, ALGORITHMS, SCENES]
     before = [dict(registry) for registry in registries]
     yield
     for registry, entries in zip(registries, before, strict=True):

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from bgpo_trl.objectives.off_policy import ForeachSoftUpdate
 from tensordict import TensorDict
 from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv
 
@@ -19,12 +20,11 @@ from bgpo_trl.configs import RunConfig
 from bgpo_trl.files.checkpoint import load_checkpoint
 from bgpo_trl.machine import choose_device, set_threads
 from bgpo_trl.modules.actor_critic import Actor, Critic
-from bgpo_trl.modules.gaussian_actors import MultiHeadActor
 from bgpo_trl.modules.gwr import GWRB
+from bgpo_trl.modules.multi_head_actor import MultiHeadActor
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
 from bgpo_trl.objectives.ddpg import DDPGLoss
-from bgpo_trl.objectives.off_policy import ForeachSoftUpdate
 from bgpo_trl.objectives.supervised import (
     DistillationLoss,
     SequenceReconstructionLoss,

@@ -13,7 +13,7 @@ from bgpo_trl.algorithms.algorithm import Policy
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.evaluation import Evaluator, evaluate_random_policy
 from bgpo_trl.modules.actor_critic import Actor
-from bgpo_trl.modules.gaussian_actors import MultiHeadActor
+from bgpo_trl.modules.multi_head_actor import MultiHeadActor
 from bgpo_trl.seeding import stream_seed
 from bgpo_trl.transforms import TaskSchedule
 from suites import nico

@@ -26,7 +26,7 @@ pytestmark = pytest.mark.usefixtures("easy_world")
 CSV_FILES = ("train.csv", "eval.csv")
 TASKS = ("grasp_glass", "push_green_to_glass", "push_green_to_white")
 ROUNDED = ("intrinsic_return", "loss_actor", "loss_value")
-LEARNERS = (*DISTINCT, "bgpo+td3", "bgpo+sac")
+LEARNERS = DISTINCT
 # Algorithms that need data of each task begin to learn later.
 LONGER = {"maml": {"episodes": 16}, "dist-nll": {"episodes": 16}}
 

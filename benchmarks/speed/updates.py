@@ -26,8 +26,7 @@ from bgpo_trl.algorithms.rl import LearnerSpec, make_learner
 from bgpo_trl.configs import BGPOConfig, DDPGConfig
 from bgpo_trl.data.replay import GroupReplay
 from bgpo_trl.modules.actor_critic import Actor, Critic
-from bgpo_trl.objectives.ddpg import DDPGLoss
-from bgpo_trl.objectives.off_policy import ForeachSoftUpdate
+from bgpo_trl.objectives.ddpg import DDPGLoss, ForeachSoftUpdate
 from bgpo_trl.seeding import generators
 
 Contender = tuple[Callable[[], object], int]

@@ -6,24 +6,24 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-from bgpo_trl.algorithms import twin_critics  # adds TD3 and SAC
 from bgpo_trl.algorithms.algorithm import Algorithm
 from bgpo_trl.algorithms.bgpo import BGPO
 from bgpo_trl.algorithms.dist_nll import DistNLL
 from bgpo_trl.algorithms.ewc import EWC, FineTuning
 from bgpo_trl.algorithms.maml import MAML
 from bgpo_trl.configs import (
+    SHOWN,
     AlgorithmConfig,
     BGPOConfig,
-    DDPGConfig,
     DistNLLConfig,
     EWCConfig,
     FineTuningConfig,
     GWRBConfig,
     MAMLConfig,
+    RLConfig,
 )
 
-__all__ = ["ABLATIONS", "ALGORITHMS", "Algorithm", "Entry", "entry", "twin_critics"]
+__all__ = ["ABLATIONS", "ALGORITHMS", "Algorithm", "Entry", "entry"]
 
 
 @dataclass(frozen=True)
@@ -36,30 +36,37 @@ class Entry:
     """The default hyperparameters."""
 
 
-_ALONE: Any = {"demonstration_share": 0.0, "expert_batch_size": 64, "rl": DDPGConfig()}
+_ALONE: Any = {"demonstration_share": 0.0, "expert_batch_size": 64, "rl": RLConfig()}
 _SINGLE = BGPOConfig(experts=False, group_balanced_replay=False, **_ALONE)
-_PAPER = DDPGConfig(
+_PAPER = RLConfig(
     hidden_sizes=(64,),
     critic_layer_norm=False,
     batch_size=256,
     clip_targets=False,
-    imitation=0.0,
     pre_tanh_penalty=0.0,
 )
 _PUBLISHED: Any = {"rl": _PAPER, "gwr": GWRBConfig(activity_scale=1.0), "behavior_scale": 1.0}
-_SHOWN: Any = {"demonstration_share": 0.75, "rl": BGPOConfig().rl}
+_SHOWN: Any = {"demonstration_share": 0.5, "rl": SHOWN}
 _SHOWN_TASKS: Any = {**_SHOWN, "task_batch_size": 128}
-_SHOWN_SINGLE: Any = {**_SHOWN, "rl": replace(BGPOConfig().rl, batch_size=384)}  # of three tasks
-# Imitation makes the gradient by which MAML adapts as much larger.
-_INNER = MAMLConfig.inner_learning_rate / BGPOConfig().rl.imitation
+_SHOWN_SINGLE: Any = {**_SHOWN, "rl": replace(SHOWN, batch_size=384)}  # of three tasks
+_CLONE: Any = {"rl": replace(SHOWN, proposals="clone")}
+# MAML adapts one policy, which imitates and ascends its critics at once. Imitation makes the
+# gradient by which it adapts as much larger.
+_MAML: Any = {
+    **_SHOWN_TASKS,
+    "rl": replace(SHOWN, proposals="actor"),
+    "imitation": 50.0,
+    "inner_learning_rate": MAMLConfig.inner_learning_rate / 50.0,
+}
 
 ALGORITHMS: dict[str, Entry] = {
     "bgpo": Entry(BGPO, BGPOConfig()),
+    "clone": Entry(BGPO, BGPOConfig(**_CLONE)),
     "bgpo-experts": Entry(BGPO, BGPOConfig(**_ALONE)),
     "bgpo-single": Entry(BGPO, _SINGLE),
     "bgpo-paper": Entry(BGPO, replace(_SINGLE, **_PUBLISHED)),
     "maml": Entry(MAML, MAMLConfig()),
-    "maml-demonstrations": Entry(MAML, MAMLConfig(inner_learning_rate=_INNER, **_SHOWN_TASKS)),
+    "maml-demonstrations": Entry(MAML, MAMLConfig(**_MAML)),
     "maml-paper": Entry(MAML, MAMLConfig(rl=_PAPER, task_batch_size=256, adaptation_size=256 * 50)),
     "dist-nll": Entry(DistNLL, DistNLLConfig()),
     "dist-nll-demonstrations": Entry(DistNLL, DistNLLConfig(**_SHOWN_TASKS)),
@@ -78,14 +85,14 @@ ALGORITHMS: dict[str, Entry] = {
     "group-balanced-replay": Entry(BGPO, replace(_SINGLE, group_balanced_replay=True)),
     "demonstrations": Entry(BGPO, replace(_SINGLE, **_SHOWN_SINGLE)),
 }
-"""BGPO; ``bgpo-experts``, BGPO without demonstrations; ``bgpo-single``, which in addition has only
-one actor and one critic; the paper's baselines, without and with demonstrations; two references,
-DDPG with the task's label (``oracle``) and without context (``ddpg``); two baselines of continual
-learning, which are given the boundaries of tasks (``fine-tuning``, ``ewc``). Names in
-``-demonstrations`` learn from demonstrations as BGPO does. Names in ``-paper`` follow the
-publication: networks of 64 units, batches of 256, no stabilizers. The others are ``bgpo-single``
-without GWR-B, the intrinsic reward or both, or with one addition of this package. Modules of own
-algorithms may add entries."""
+"""BGPO; ``clone``, BGPO without reward, which imitates alone; ``bgpo-experts``, BGPO without
+demonstrations as experience; ``bgpo-single``, which in addition has only one actor and one critic;
+the paper's baselines, without and with demonstrations; two references, DDPG with the task's label
+(``oracle``) and without context (``ddpg``); two baselines of continual learning, which are given
+the boundaries of tasks (``fine-tuning``, ``ewc``). Names in ``-demonstrations`` learn from
+demonstrations as BGPO does. Names in ``-paper`` follow the publication: networks of 64 units,
+batches of 256, no stabilizers. The others are ``bgpo-single`` without GWR-B, the intrinsic reward
+or both, or with one addition of this package. Modules of own algorithms may add entries."""
 
 ABLATIONS = (
     "bgpo-single",

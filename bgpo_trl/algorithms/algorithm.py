@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.func import functional_call
 from torchrl.envs import EnvBase, TransformedEnv
 
+from bgpo_trl.algorithms.proposal_trials import ProposalTrials
 from bgpo_trl.algorithms.rl import Learner
 from bgpo_trl.configs import AlgorithmConfig
 from bgpo_trl.data.bank import DemonstrationBank
@@ -36,43 +37,49 @@ class Policy:
     Attributes:
         actor: Network, called with ``parameters`` instead of its weights.
         state_key: Key of the state.
-        parameters: By name in the actor. Leading dimensions: none, ``[T]`` (one network per task)
-            or ``[T, M]`` (one per episode). In a stack of seeds, ``[S]`` comes first.
-        context: Input besides the state, ``[T, M, C]``; None if the actor reads no context.
+        parameters: By name in the actor, ``[U, ...]`` of ``U`` networks.
+        network: Which of the networks plays each test episode, int64 ``[*B]``.
+        context: Input besides the state, ``[*B, C]``; None if the actor reads no context.
     """
 
     actor: TensorDictModuleBase
     state_key: NestedKey
     parameters: dict[str, Tensor]
+    network: Tensor
     context: Tensor | None = None
 
-    @classmethod
-    def stack(cls, policies: Sequence[Policy], device: torch.device | str = "cpu") -> Policy:
-        """Stack the policies of several seeds as one, ``[S]``, on a device."""
-        first = policies[0]
-        contexts = [policy.context for policy in policies if policy.context is not None]
-        return cls(
-            first.actor,
-            first.state_key,
-            {
-                key: torch.stack([policy.parameters[key] for policy in policies]).to(device)
-                for key in first.parameters
-            },
-            torch.stack(contexts).to(device) if contexts else None,
+    def to(self, device: torch.device | str) -> Policy:
+        """Return the policy with its tensors on a device."""
+        return replace(
+            self,
+            parameters={key: value.to(device) for key, value in self.parameters.items()},
+            network=self.network.to(device),
+            context=None if self.context is None else self.context.to(device),
         )
 
     @torch.no_grad()
     def act(self, state: Tensor) -> Tensor:
-        """Return actions ``[..., T, M, A]`` in [-1, 1] for states ``[..., T, M, features]``."""
+        """Return actions ``[*B, A]`` in [-1, 1] for states ``[*B, features]``."""
         inputs: TensorDictBase = TensorDict({self.state_key: state}, state.shape[:-1])
         if self.context is not None:
             inputs["context"] = self.context
-        functional_call(self.actor, self.parameters, (inputs,))
-        return inputs["action"]
+        actions: list[tuple[Tensor, Tensor]] = []
+        for number in self.network.unique().tolist():
+            rows = self.network == number
+            weights = {key: value[number] for key, value in self.parameters.items()}
+            actions.append((rows, functional_call(self.actor, weights, (inputs[rows],))["action"]))
+        action = state.new_empty(*state.shape[:-1], actions[0][1].shape[-1])
+        for rows, of_rows in actions:
+            action[rows] = of_rows
+        return action
 
     def state_dict(self) -> dict[str, Any]:
-        """Return parameters and context, the arguments of `Algorithm.policy`."""
-        return {"parameters": self.parameters, "context": self.context}
+        """Return parameters, networks and context, the arguments of `Algorithm.policy`."""
+        return {
+            "parameters": self.parameters,
+            "network": self.network,
+            "context": self.context,
+        }
 
 
 class Algorithm(ABC):
@@ -100,6 +107,7 @@ class Algorithm(ABC):
         state_size: Number of features of the state.
         learner: The RL algorithm: losses of actor and critic, optimizer, target networks.
         replay: Transitions of training episodes.
+        proposals: Who plays an episode, the clone or what critics choose; None with one proposal.
         shown: Transitions of the demonstrations shown so far, or None without a
             ``demonstration_share``.
         test_actor: Network of test episodes, called with the parameters of a `Policy`.
@@ -155,6 +163,11 @@ class Algorithm(ABC):
                 "demonstrations of this robot"
             )
         self._noise = generators(seeds, "exploration")
+        self.proposals: ProposalTrials | None = None
+        if (rl := config.rl).proposals == "both":
+            self.proposals = ProposalTrials(
+                len(seeds), clone_episodes=rl.clone_episodes, clone_share=rl.clone_share
+            )
 
     @abstractmethod
     def make_env(self, base_env: EnvBase, source: DemonstrationSource) -> TransformedEnv:
@@ -216,9 +229,45 @@ class Algorithm(ABC):
             generator: Source of randomness for algorithms that adapt before testing.
         """
 
-    def policy(self, parameters: dict[str, Tensor], context: Tensor | None = None) -> Policy:
-        """Return a policy of `test_actor` with these parameters and this context."""
-        return Policy(self.test_actor, self.config.state, parameters, context)
+    def act_by(self, tensordict: TensorDictBase, groups: Sequence[int], expert: Tensor) -> Tensor:
+        """Return actions of a training step ``[S, A]``, and choose who plays episodes that begin.
+
+        Args:
+            tensordict: Inputs of the policies and ``"step_count"``, ``[S]``.
+            groups: Group or task of each seed's episode.
+            expert: Place of its networks, int64 ``[S]``.
+        """
+        only_clone = None
+        if self.proposals is not None:
+            for seed in (tensordict["step_count"].flatten() == 0).nonzero().flatten().tolist():
+                self.proposals.begin(seed, groups[seed])
+            only_clone = torch.tensor(self.proposals.only_clone)
+        seen = self.to_device(tensordict.select(*self.learner.policy.in_keys))
+        return self.learner.act(seen, self._noise, expert, only_clone)
+
+    def count_episodes(self, transition: TensorDictBase) -> None:
+        """Count the successes of episodes that end, by who played them."""
+        if self.proposals is None:
+            return
+        end = transition.get("next")
+        for seed in end["done"].flatten().nonzero().flatten().tolist():
+            self.proposals.end(seed, bool(end["success"][seed]))
+
+    @property
+    def imitates(self) -> bool:
+        """Whether a policy imitates demonstrated actions."""
+        return self.config.rl.proposals != "actor"
+
+    def replay_keys(self, constant_keys: Sequence[NestedKey] = ()) -> list[NestedKey]:
+        """Return the entries of a transition to store, of which some are constant in an episode."""
+        following = (self.config.state, "reward", "terminated", "done")
+        return [self.config.state, *constant_keys, "action", *(("next", key) for key in following)]
+
+    def policy(
+        self, parameters: dict[str, Tensor], network: Tensor, context: Tensor | None = None
+    ) -> Policy:
+        """Return a policy of `test_actor`; arguments as for `Policy`."""
+        return Policy(self.test_actor, self.config.state, parameters, network, context)
 
     def demonstrations(
         self, constant_keys: Sequence[NestedKey] = (), own_constants: bool = True
@@ -241,7 +290,8 @@ class Algorithm(ABC):
             state_key=self.config.state,
             constant_keys=constant_keys,
             own_constants=own_constants,
-            noise=self.config.demonstration_noise,
+            n_steps=self.config.rl.n_steps,
+            gamma=self.config.rl.gamma,
         )
 
     def sample(
@@ -253,6 +303,8 @@ class Algorithm(ABC):
     ) -> TensorDictBase:
         """Draw transitions ``[S, E, B]`` to learn from, a share of demonstrated ones last.
 
+        With something that `imitates`, ``"imitation"`` has as many demonstrated states and actions.
+
         Args:
             groups: Returns the group of each of ``n`` transitions, int64 ``[S, E, n]``, given
                 ``n``; -1 for none.
@@ -262,12 +314,14 @@ class Algorithm(ABC):
         if self.shown is None:
             return self.replay.sample(groups(n_rows), generator=generator)
         n_shown = round(self.config.demonstration_share * n_rows)
-        played_group, shown_group = groups(n_rows - n_shown), groups(n_shown)
-        played = self.replay.draw(played_group, generator=generator)
-        shown = self.shown.draw(shown_group, generator=generator)
-        played["demonstrated"] = torch.zeros_like(played_group, dtype=torch.bool)
+        played = self.replay.draw(groups(n_rows - n_shown), generator=generator)
+        shown = self.shown.draw(groups(n_shown), generator=generator)
         batch = {key: torch.cat([entry, shown[key]], 2) for key, entry in played.items()}
-        return TensorDict(batch, batch["demonstrated"].shape)
+        if self.imitates:
+            noise = self.config.demonstration_noise
+            imitated = self.shown.draw_actions(groups(n_rows), noise, generator=generator)
+            batch |= {("imitation", key): entry for key, entry in imitated.items()}
+        return TensorDict(batch, batch["priority_weight"].shape)
 
     def learn(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """Take a gradient step on a batch and update the targets; return the losses of `update`."""
@@ -293,5 +347,7 @@ class Algorithm(ABC):
 
     def _learned(self) -> dict[str, Any]:
         """Return the parts that learning changes."""
-        parts = {name: getattr(self, name, None) for name in ("learner", "replay", "shown")}
+        parts = {
+            name: getattr(self, name, None) for name in ("learner", "replay", "shown", "proposals")
+        }
         return {name: part for name, part in parts.items() if part is not None}

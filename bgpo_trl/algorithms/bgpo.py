@@ -77,18 +77,20 @@ class BGPO(Algorithm):
             return_bounds=(0.0, self._highest_return()),
             device=self.device,
         )
-        self.learner = self._make_learner(spec)
+        self.learner = self.make_learner(spec)
         n_active = config.active_groups if config.grouped else 1
         self.active = ActiveGroups(len(seeds), n_active, config.rest_after)
         self.experts: Experts | None = None
         if config.experts and (groups := self.groups) is not None:
             self.experts = Experts(self.learner, self.active, groups.parent)
-        self.test_actor = self.learner.actor
+        self.test_actor = self.learner.policy
         self.replay = GroupReplay(
             rl.replay_size,
             generator=generators(seeds, "replay"),
-            keys=[*keys, "action", *(("next", key) for key in (keys[0], "reward", "terminated"))],
+            keys=self.replay_keys(keys[1:]),
             source_key="demo_index" if config.grouped else None,
+            n_steps=rl.n_steps,
+            gamma=rl.gamma,
         )
         self.shown = self.demonstrations(keys[1:], own_constants=not config.experts)
         self.trials: GroupTrials | None = None
@@ -97,7 +99,8 @@ class BGPO(Algorithm):
             starts = steps.latents(steps.first)
             self.trials = GroupTrials(starts, seeds=seeds, smallest=config.group_size)
 
-    def _make_learner(self, spec: LearnerSpec) -> Learner:
+    def make_learner(self, spec: LearnerSpec) -> Learner:
+        """Return the learner; an own RL algorithm overrides this."""
         return make_learner(self.config.rl, spec)
 
     def make_env(self, base_env: EnvBase, source: DemonstrationSource) -> TransformedEnv:
@@ -141,8 +144,7 @@ class BGPO(Algorithm):
             expert = torch.zeros(self.n_seeds, dtype=torch.int64)
             for seed, group in enumerate(groups):
                 self.active.play(seed, group)
-        seen = self.to_device(tensordict.select(*self.in_keys))
-        return tensordict.set("action", self.learner.act(seen, self._noise, expert))
+        return tensordict.set("action", self.act_by(tensordict, groups, expert))
 
     def _playing(self, tensordict: TensorDictBase) -> list[int]:
         """Return the groups that act; update the groups of episodes that begin."""
@@ -168,6 +170,7 @@ class BGPO(Algorithm):
         self.replay.add(transition, group)
         if self.shown is not None:
             self._store_demonstration(self.shown, transition, group)
+        self.count_episodes(transition)
         self._join_groups(transition)
         self._follow_groups()
 
@@ -193,6 +196,9 @@ class BGPO(Algorithm):
             pair = self.trials.same_task(seed)
             if pair is not None and {*pair} <= {*self.groups.numbers(seed)}:
                 self.groups.join(seed, *pair)
+                gone = {*pair} - {*self.groups.numbers(seed)}
+                if self.proposals is not None and len(gone) == 1:
+                    self.proposals.merge(seed, *({*pair} - gone), *gone)
 
     def _follow_groups(self) -> None:
         """Assign what is stored to the groups of today; put experts of former groups aside."""
@@ -229,28 +235,23 @@ class BGPO(Algorithm):
     def snapshot(
         self, index: int, embedding: Tensor, task: Tensor, generator: torch.Generator
     ) -> Policy:
-        """Copy the policy of one seed; with experts, that of each episode, ``[T, M, ...]``."""
+        """Copy the policies of one seed, with experts those of the groups of the demonstrations."""
         del generator
+        group = torch.zeros_like(task)
         if self.experts is not None and self.groups is not None:
             shown = embedding.expand(self.n_seeds, *embedding.shape)
             group = self.groups.lookup(shown).group[index]
-            numbers = group.unique().tolist()
-            experts = {number: self.actor_weights(index, number) for number in numbers}
-            each = [experts[number] for number in group.flatten().tolist()]
-            parameters = {
-                key: torch.stack([weights[key] for weights in each]).unflatten(0, group.shape)
-                for key in each[0]
-            }
-        else:
-            parameters = self.actor_weights(index)
-        context = self.context(index, embedding, task)
-        return self.policy(parameters, context)
+        numbers, network = group.unique(return_inverse=True)
+        each = [self.actor_weights(index, number) for number in numbers.tolist()]
+        parameters = {key: torch.stack([weights[key] for weights in each]) for key in each[0]}
+        return self.policy(parameters, network, self.context(index, embedding, task))
 
     def actor_weights(self, index: int, group: int = 0) -> dict[str, Tensor]:
-        """Copy the weights of the policy of one seed to the CPU; with experts, that of a group."""
+        """Copy the weights of the policy of a group of one seed to the CPU."""
+        only_clone = self.proposals is not None and self.proposals.clone_is_better(index, group)
         if self.experts is not None:
-            return self.experts.actor_weights(index, group)
-        return self.learner.actor_weights(self.learner.read(index, 0))
+            return self.learner.expert_weights(self.experts.find(index, group), only_clone)
+        return self.learner.expert_weights(self.learner.read(index, 0), only_clone)
 
     def context(self, index: int, embedding: Tensor, task: Tensor) -> Tensor | None:
         """Return the context of test episodes, ``[*B, C]``; None for a policy without context.

@@ -11,10 +11,10 @@ from torch import Tensor
 from torch.func import functional_call
 
 from bgpo_trl.algorithms.algorithm import Policy
-from bgpo_trl.algorithms.rl import make_ddpg
-from bgpo_trl.algorithms.task_algorithm import TaskAlgorithm, networks_of
+from bgpo_trl.algorithms.rl import make_learner
+from bgpo_trl.algorithms.task_algorithm import TaskAlgorithm
 from bgpo_trl.configs import DistNLLConfig
-from bgpo_trl.modules.gaussian_actors import MultiHeadActor
+from bgpo_trl.modules.multi_head_actor import MultiHeadActor
 from bgpo_trl.objectives.supervised import DistillationLoss
 from bgpo_trl.seeding import generators
 
@@ -32,8 +32,7 @@ class DistNLL(TaskAlgorithm):
     4. Test episodes are played by the multi-task policy with the head of the true label.
 
     Attributes:
-        teacher: The tasks' policies, stacked ``[S, T]``.
-        critic: Their Q-functions, stacked ``[S, T]``.
+        learner: The teachers, stacked ``[S, T]``.
         students: The multi-task policy of each seed; not stacked, since seeds end their episodes at
             different times.
     """
@@ -43,10 +42,7 @@ class DistNLL(TaskAlgorithm):
 
     def __init__(self, config: DistNLLConfig, **arguments: Any) -> None:
         super().__init__(config, **arguments)
-        self.learner = make_ddpg(config.rl, self.spec)
-        self.loss, self.teacher = self.learner.loss, self.learner.actor
-        self.training_actor = self.teacher
-        self.critic = self.loss.value_network
+        self.learner = make_learner(config.rl, self.spec)
         streams = generators(self.seeds, "student")
         network = partial(
             MultiHeadActor,
@@ -65,10 +61,8 @@ class DistNLL(TaskAlgorithm):
             for student in self.students
         ]
         self._ended = torch.zeros(self.n_seeds, dtype=torch.bool)
-        # Called with the parameters of a `Policy`.
-        self.test_actor = network(batch_size=[self.n_seeds]).to(self.device)
-        for _ in range(self.n_tasks):
-            self.test_actor.add_head()
+        # Called with the parameters of a `Policy`: the trunk and one head.
+        self.test_actor = self.spec.actor(config.rl)
 
     def store(self, transition: TensorDictBase) -> None:
         """Add a transition of each seed to the replay of its task."""
@@ -98,12 +92,13 @@ class DistNLL(TaskAlgorithm):
         drawn = self.replay.sample(rows, seeds=[index]).squeeze(0)
         # The weights are 0 where the replay holds no transition of a task any more.
         batch = self.to_device(drawn.select(self.config.state, "priority_weight"))
-        teachers = networks_of(
-            self.loss.actor_network_params, torch.tensor(index), torch.tensor(tasks)
-        )
+        alone = [self.proposals and self.proposals.clone_is_better(index, t) for t in tasks]
+        seed = torch.full((len(tasks),), index, device=self.device)
         with torch.no_grad():
-            shown = batch.copy()
-            functional_call(self.teacher, teachers, (shown,))
+            teachers = self.learner.policy_weights(
+                seed, torch.tensor(tasks, device=self.device), torch.tensor([*map(bool, alone)])
+            )
+            shown = functional_call(self.learner.policy, teachers, (batch.copy(),))
         batch.set("teacher_action", shown["action"])
         for part in batch.split(self.config.distillation_batch_size, dim=1):
             loss = self._distillation[index](part)["loss_distillation"]
@@ -114,19 +109,28 @@ class DistNLL(TaskAlgorithm):
     def snapshot(
         self, index: int, embedding: Tensor, task: Tensor, generator: torch.Generator
     ) -> Policy:
-        """Copy the multi-task policy of one seed, its heads in the order of the tasks.
+        """Copy the multi-task policy of one seed as a policy for each task: the trunk and its head.
 
         The head of a task without data is zero.
         """
-        del embedding, task, generator
-        like = self.test_actor.state_dict()
-        weights = {key: torch.zeros_like(value[0]).cpu() for key, value in like.items()}
-        for key, value in self.students[index].state_dict().items():
-            if key.startswith("heads."):
-                _, head, name = key.split(".")
-                key = f"heads.{self._head_tasks[index][int(head)]}.{name}"
-            weights[key] = value.to("cpu", copy=True)
-        return self.policy(weights)
+        del embedding, generator
+        student, heads = self.students[index], self._head_tasks[index]
+        trunk = {f"mlp.{key}": value for key, value in student.trunk.state_dict().items()}
+        last, n_actions = len(student.trunk.layers), self.scene.action_size
+        of_each = []
+        for number in range(self.n_tasks):
+            head = dict(student.heads[heads.index(number)].state_dict()) if number in heads else {}
+            weight = trunk["mlp.layers.0.weight"].new_zeros(student.trunk.out_features, n_actions)
+            output = {
+                # The second half of a head's outputs is the scale.
+                f"mlp.layers.{last}.weight": head.get("weight", weight)[..., :n_actions],
+                f"mlp.layers.{last}.bias": head.get("bias", weight[0])[..., :n_actions],
+            }
+            of_each.append(trunk | output)
+        parameters = {
+            key: torch.stack([weights[key] for weights in of_each]).cpu() for key in of_each[0]
+        }
+        return self.policy(parameters, task)
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that future actions, updates and snapshots depend on."""

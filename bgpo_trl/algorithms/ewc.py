@@ -11,9 +11,8 @@ from torch import Tensor
 from torch.func import functional_call
 
 from bgpo_trl.algorithms.bgpo import BGPO
-from bgpo_trl.algorithms.rl import Learner, LearnerSpec, make_learner
-from bgpo_trl.configs import DDPGConfig, EWCConfig, FineTuningConfig
-from bgpo_trl.objectives.off_policy import OffPolicyLoss
+from bgpo_trl.algorithms.rl import Learner, LearnerSpec
+from bgpo_trl.configs import EWCConfig, FineTuningConfig
 from bgpo_trl.seeding import generators
 
 __all__ = ["EWC", "EWCLearner", "FineTuning", "diagonal_fisher"]
@@ -90,9 +89,9 @@ class EWC(FineTuning):
     config: EWCConfig
     learner: EWCLearner
 
-    def _make_learner(self, spec: LearnerSpec) -> Learner:
-        ddpg = make_learner(self.config.rl, spec)
-        return EWCLearner(ddpg.actor, ddpg.loss, self.config.rl, weight=self.config.ewc_weight)
+    def make_learner(self, spec: LearnerSpec) -> Learner:
+        """Return a learner with the penalty of EWC."""
+        return EWCLearner(super().make_learner(spec), weight=self.config.ewc_weight)
 
     def begin_task(self, index: int, task: int) -> None:
         """Consolidate the policy of the seed in the task that ends, and empty its replay.
@@ -114,15 +113,17 @@ class EWCLearner(Learner):
     information times the squared distance from the anchor, the weights at the latest boundary. It
     is 0 before the first one.
 
-    Arguments as for `Learner`, with the ``weight`` lambda of the penalty.
+    Args:
+        learner: Learner without the penalty, whose networks it trains.
+        weight: Weight lambda of the penalty.
 
     Attributes:
         anchor: The actors' weights at the latest boundary of each seed, by name, ``[S, E, ...]``.
         fisher: Diagonal of the Fisher information, summed over boundaries, in the same form.
     """
 
-    def __init__(self, actor: Any, loss: OffPolicyLoss, config: DDPGConfig, *, weight: float):
-        super().__init__(actor, loss, config, noise=config.noise)
+    def __init__(self, learner: Learner, *, weight: float) -> None:
+        super().__init__(learner.policy, learner.sources, learner.loss, learner.config)
         self.weight = weight
         self.anchor = {key: value.detach().clone() for key, value in self._weights().items()}
         self.fisher = {key: torch.zeros_like(value) for key, value in self.anchor.items()}
@@ -147,7 +148,7 @@ class EWCLearner(Learner):
             inputs: The actor's inputs ``[N]`` in states of the task that ends.
         """
         weights = {key: value[index, 0].detach() for key, value in self._weights().items()}
-        for key, value in diagonal_fisher(self.actor, weights, inputs).items():
+        for key, value in diagonal_fisher(self.loss.actor_network, weights, inputs).items():
             self.anchor[key][index, 0] = weights[key]
             self.fisher[key][index, 0] += value
 

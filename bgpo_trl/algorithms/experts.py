@@ -105,7 +105,7 @@ class Experts:
 
     The learner's networks are a stack ``[S, E]``, those of the active groups: ``E`` follows their
     number, so that an update costs as much as groups are active. When a group rests, its expert
-    (networks, targets, moments, noise) is put aside until the group is played again, and does not
+    (networks, targets, moments) is put aside until the group is played again, and does not
     change until then. A new group starts from its parent's networks, without moments.
 
     Args:
@@ -135,13 +135,6 @@ class Experts:
         self.active.rest(seed, group)
         self._arrange()
 
-    def actor_weights(self, seed: int, group: int) -> dict[str, Tensor]:
-        """Copy the weights of a group's policy to the CPU, given the position of the seed.
-
-        A group without an expert (not yet played) uses that of its nearest ancestor.
-        """
-        return self.learner.actor_weights(self._find(seed, group))
-
     def state_dict(self) -> dict[str, Any]:
         """Return the active groups, and the experts put aside."""
         return {"active": self.active.state_dict(), "inactive": [{**row} for row in self._inactive]}
@@ -169,11 +162,11 @@ class Experts:
 
     def _start(self, seed: int, group: int) -> Expert:
         """Return the expert with which a group becomes active."""
-        expert = self._find(seed, group)
+        expert = self.find(seed, group)
         return expert if group in self._inactive[seed] else {**expert, "moments": {}}
 
-    def _find(self, seed: int, group: int) -> Expert:
-        """Return the expert of a group, or of its nearest ancestor that has one."""
+    def find(self, seed: int, group: int) -> Expert:
+        """Return the expert of a group, or of its nearest ancestor that has one (has played)."""
         inactive, placed = self._inactive[seed], self._placed[seed]
         while group and group not in inactive and group not in placed:
             group = self._parent(seed, group)

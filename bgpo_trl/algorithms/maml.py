@@ -32,7 +32,6 @@ class MAML(TaskAlgorithm):
 
     Attributes:
         meta_actor: The policy before adaptation, stacked ``[S]``.
-        critic: The Q-functions, stacked ``[S, T]``.
     """
 
     config: MAMLConfig
@@ -40,27 +39,31 @@ class MAML(TaskAlgorithm):
 
     def __init__(self, config: MAMLConfig, **arguments: Any) -> None:
         super().__init__(config, **arguments)
-        ddpg = config.rl
+        rl = config.rl
         self.meta_actor = Actor(
             self.state_size,
             self.scene.action_size,
             batch_size=[self.n_seeds],
             generator=generators(self.seeds, "actor"),
             in_keys=self.spec.in_keys,
-            hidden_sizes=ddpg.hidden_sizes,
+            hidden_sizes=rl.hidden_sizes,
         ).to(self.device)
-        self.critic = self.spec.critic(ddpg)
         self.loss = MAMLLoss(
             self.meta_actor,
-            self.spec.actor(Actor, ddpg),
-            self.critic,
+            self.spec.actor(rl),
+            self.spec.critic(rl),
             inner_learning_rate=config.inner_learning_rate,
-            pre_tanh_penalty=ddpg.pre_tanh_penalty,
-            **self.spec.loss_options(ddpg),
+            imitation=config.imitation,
+            **self.spec.loss_options(rl),
         )
         # Called with adapted parameters.
-        self.training_actor = self.test_actor = self.meta_actor
-        self.learner = Learner(self.meta_actor, self.loss, ddpg, noise=ddpg.noise)
+        self.test_actor = self.meta_actor
+        self.learner = Learner(self.meta_actor, {"": "actor_network_params"}, self.loss, rl)
+
+    @property
+    def imitates(self) -> bool:
+        """Whether the policy imitates demonstrated actions."""
+        return self.config.imitation > 0
 
     def update(self) -> dict[str, Tensor]:
         """Make one update of each seed."""
@@ -74,11 +77,11 @@ class MAML(TaskAlgorithm):
     def snapshot(
         self, index: int, embedding: Tensor, task: Tensor, generator: torch.Generator
     ) -> Policy:
-        """Copy the policy adapted to each task, ``[T, ...]``.
+        """Copy the policy adapted to each task.
 
         A task with too few transitions gets the policy without adaptation.
         """
-        del embedding, task
+        del embedding
         meta = dict(self.meta_actor.named_parameters())
         adapted = {
             key: value.detach().unsqueeze(1).expand(-1, self.n_tasks, *value.shape[1:])
@@ -97,4 +100,4 @@ class MAML(TaskAlgorithm):
         parameters = {
             key: value[index].detach().to("cpu", copy=True) for key, value in adapted.items()
         }
-        return self.policy(parameters)
+        return self.policy(parameters, task)

@@ -1,6 +1,6 @@
-"""The RL algorithm f_RL of Alg. 1: exploration and gradient steps, by default of DDPG.
+"""The learner: networks of all seeds, exploration, and gradient steps of DDPG and of a clone.
 
-Another one is added as an entry of `RL` under the ``name`` of its config, as
+An own RL algorithm f_RL is a `Learner` that an own `BGPO` makes, as
 ``examples/own_rl_algorithm.py`` does.
 """
 
@@ -8,95 +8,131 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import chain
 from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
+from torch.func import functional_call
 
-from bgpo_trl.algorithms.compilation import CompiledGradients
-from bgpo_trl.configs import DDPGConfig, RLConfig
-from bgpo_trl.modules.actor_critic import Actor, Critic
-from bgpo_trl.objectives.ddpg import DDPGLoss
-from bgpo_trl.objectives.off_policy import ForeachSoftUpdate, OffPolicyLoss
+from bgpo_trl.configs import RLConfig
+from bgpo_trl.modules.actor_critic import Actor, Critic, ProposalPolicy
+from bgpo_trl.objectives.ddpg import DDPGLoss, ForeachSoftUpdate
 from bgpo_trl.seeding import generators, normal
 
-__all__ = ["RL", "Expert", "Learner", "LearnerSpec", "RLEntry", "make_learner"]
+__all__ = ["Expert", "Learner", "LearnerSpec", "make_learner"]
 
 
 Expert = dict[str, dict[str, Tensor]]
-"""One expert of a learner: ``networks`` with targets, ``moments`` of Adam, state of its ``noise``,
-each by name."""
+"""One expert of a learner: ``networks`` with targets, and ``moments`` of Adam, each by name."""
 
 
 class Learner:
-    """Policies of all seeds with the exploration and gradient steps of DDPG.
+    """Policies of all seeds with their exploration and gradient steps.
 
     One Adam optimizer minimizes the sum of the losses. It treats each weight independently, so it
     is equivalent to one optimizer per seed.
 
     Args:
-        actor: Writes the ``action`` without noise; its weights lead with ``[S, E]``.
+        policy: Writes the ``action`` without noise; its weights lead with ``[S, E]``.
+        sources: Parameters in the loss, such as ``"actor_network_params"``, by the name of the
+            submodule of ``policy`` that they belong to; by ``""`` for the policy itself.
         loss: Returns entries ``loss_...`` ``[S, E]`` to minimize (``reduction="none"``).
-        config: Hyperparameters, of which ``gamma``, ``tau``, ``learning_rate`` and DDPG's
-            ``compile`` are read here.
-        noise: Standard deviation of the Gaussian exploration noise.
+        config: Hyperparameters.
     """
 
     def __init__(
-        self, actor: Any, loss: OffPolicyLoss, config: RLConfig, *, noise: float = 0.0
+        self, policy: Any, sources: dict[str, str], loss: DDPGLoss, config: RLConfig
     ) -> None:
         loss.make_value_estimator(gamma=config.gamma)
-        self.actor, self.loss, self.config, self.noise = actor, loss, config, noise
+        self.policy, self.loss, self.config, self.sources = policy, loss, config, sources
+        self._prefixes = {f"{source}.": f"{at}." if at else "" for at, source in sources.items()}
         self.target_update = ForeachSoftUpdate(loss, tau=config.tau)
         learned = [p for p in loss.parameters() if p.requires_grad]
+        self._latest: dict[str, Tensor] = {}
         self.optimizer = torch.optim.Adam(learned, lr=config.learning_rate, fused=True)
-        compiles = isinstance(config, DDPGConfig) and config.compile
-        self.compute_gradients = (
-            CompiledGradients(self.losses, learned) if compiles else self._compute_gradients
-        )
 
+    @torch.no_grad()
     def act(
-        self, tensordict: TensorDictBase, generators: Sequence[torch.Generator], expert: Tensor
+        self,
+        tensordict: TensorDictBase,
+        generators: Sequence[torch.Generator],
+        expert: Tensor,
+        only_clone: Tensor | None = None,
     ) -> Tensor:
         """Return actions of a training step, ``[S, A]`` in [-1, 1], on the CPU.
 
-        The policies' inputs are ``[S]``, with one generator of exploration noise per seed;
-        ``expert`` ``[S]`` selects the expert that acts.
+        Args:
+            tensordict: Inputs of the policies, ``[S]``.
+            generators: Generator of exploration noise of each seed.
+            expert: Which expert of each seed acts, int64 ``[S]``.
+            only_clone: Seeds in which the clone acts, bool ``[S]``; see `ProposalPolicy`.
         """
-        action = self.actor(self._for_all(tensordict))["action"]
-        return self.explore(of_expert(action, expert), generators)
-
-    def _for_all(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Expand inputs ``[S]`` to all experts, ``[S, E]``."""
-        return tensordict.unsqueeze(1).expand(*self.actor.batch_size)
+        seed = torch.arange(len(expert), device=tensordict.device)
+        weights = self.policy_weights(seed, expert.to(seed.device), only_clone)
+        inputs = tensordict.select(*self.policy.in_keys)
+        action = functional_call(self.policy, weights, (inputs,), strict=True)["action"]
+        return self.explore(action, generators)
 
     def explore(self, action: Tensor, generators: Sequence[torch.Generator]) -> Tensor:
         """Add Gaussian noise to actions ``[S, A]`` and clip them to [-1, 1]."""
-        noise = self.noise * normal(generators, action.shape[1:])
+        noise = self.config.noise * normal(generators, action.shape[1:])
         return (action.cpu() + noise).clamp(-1.0, 1.0)
+
+    def policy_weights(
+        self, seed: Tensor, expert: Tensor, only_clone: Tensor | None = None
+    ) -> dict[str, Tensor]:
+        """Copy the weights of the policies ``[*B]`` of experts, by name in `policy`.
+
+        Args:
+            seed: Position of the seed of each policy, int64 ``[*B]``.
+            expert: Place of its expert in the stack, int64 ``[*B]``.
+            only_clone: Whether its clone acts alone, bool ``[*B]``; by default not.
+        """
+        networks = self._of_policy(self._stacked()["networks"])
+        weights = {name: value[seed, expert] for name, value in networks.items()}
+        return self._with_choice(weights, seed.shape, only_clone)
+
+    def _of_policy(self, networks: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Return the tensors of the loss that the policy uses, by name in `policy`."""
+        return {
+            at + name.removeprefix(source): value
+            for name, value in networks.items()
+            for source, at in self._prefixes.items()
+            if name.startswith(source)
+        }
+
+    def _with_choice(
+        self, weights: dict[str, Tensor], shape: torch.Size, only_clone: Tensor | None
+    ) -> dict[str, Tensor]:
+        if isinstance(self.policy, ProposalPolicy):
+            none = torch.zeros(shape, dtype=torch.bool)
+            device = next(iter(weights.values())).device
+            weights["only_clone"] = (none if only_clone is None else only_clone).to(device)
+        return weights
 
     def learn(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """Take a gradient step on transitions ``[S, E, B]``, update the targets; return the losses.
 
-        Losses are sums over the experts of a seed, ``[S]``.
+        Losses are sums over the experts of a seed, ``[S]``, the latest of each kind.
         """
-        parts = self.compute_gradients(batch)
-        self.optimizer.step()
-        if self.actor_is_due:
-            self.target_update.step()
-        return {key: value.sum(1) for key, value in parts.items()}
-
-    def _compute_gradients(self, batch: TensorDictBase) -> dict[str, Tensor]:
-        """Set the gradients of the parameters and return the losses ``[S, E]``, detached."""
         parts = self.losses(batch)
         self.optimizer.zero_grad()
         torch.stack([part.sum() for part in parts.values()]).sum().backward()
-        return {key: value.detach() for key, value in parts.items()}
+        self.optimizer.step()
+        self.target_update.step()
+        self._latest |= {key: value.detach().sum(1) for key, value in parts.items()}
+        return {**self._latest}
 
     def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
-        """Return the losses ``[S, E]`` to minimize on transitions ``[S, E, B]``."""
+        """Return the losses ``[S, E]`` to minimize on transitions ``[S, E, B]``.
+
+        Those of actor and clone are due in one of ``policy_delay`` updates.
+        """
+        if self.config.proposals == "clone":
+            return {"loss_clone": self.loss.loss_clone(batch)}
+        if (int(self.loss.n_calls) + 1) % self.config.policy_delay:
+            return {"loss_value": self.loss.loss_value(batch)[0]}
         return {str(k): v for k, v in self.loss(batch).items() if str(k).startswith("loss_")}
 
     def clear_momentum(self, index: int) -> None:
@@ -111,7 +147,7 @@ class Learner:
     def _stacked(self) -> dict[str, dict[str, Tensor]]:
         """Return the tensors that have a row for each expert, ``[S, E, ...]``, as in `Expert`."""
         parameters = dict(self.loss.named_parameters())
-        named, stack = {**parameters, **dict(self.loss.named_buffers())}, self.actor.batch_size
+        named, stack = {**parameters, **dict(self.loss.named_buffers())}, self.loss.batch_size
         return {
             "networks": {k: v for k, v in named.items() if v.shape[: len(stack)] == stack},
             "moments": {
@@ -125,12 +161,10 @@ class Learner:
     @torch.no_grad()
     def read(self, seed: int, slot: int) -> Expert:
         """Copy an expert, given its place in the stack."""
-        expert = {
+        return {
             part: {name: tensor[seed, slot].clone() for name, tensor in tensors.items()}
             for part, tensors in self._stacked().items()
         }
-        noise = self.loss.noise
-        return {**expert, "noise": {} if noise is None else {"state": noise.get(seed, slot)}}
 
     @torch.no_grad()
     def write(self, seed: int, slot: int, expert: Expert) -> None:
@@ -138,8 +172,6 @@ class Learner:
         for part, tensors in self._stacked().items():
             for name, tensor in tensors.items():
                 tensor[seed, slot] = expert[part].get(name, 0.0)
-        if self.loss.noise is not None:
-            self.loss.noise.set(seed, slot, expert["noise"]["state"])
 
     @torch.no_grad()
     def resize(self, width: int) -> None:
@@ -148,7 +180,7 @@ class Learner:
         Tensors keep their identity, so that optimizer, targets and policy follow. Copies have no
         moments.
         """
-        now = self.actor.batch_size[1]
+        now = self.loss.batch_size[1]
         if width == now:
             return
         self.optimizer.zero_grad()
@@ -159,37 +191,27 @@ class Learner:
                 if part == "moments":
                     resized[:, now:] = 0.0
                 tensor.data = resized
-        self.loss.batch_size = self.actor.batch_size
-        if self.loss.noise is not None:
-            self.loss.noise.resize(width)
+        self.loss.batch_size = torch.Size([self.loss.batch_size[0], width])
 
-    def actor_weights(self, expert: Expert) -> dict[str, Tensor]:
-        """Copy the weights of an expert's policy to the CPU, by name in the actor."""
-        networks = expert["networks"]
-        return {
-            name: networks[f"actor_network_params.{name}"].to("cpu", copy=True)
-            for name, _ in self.actor.named_parameters()
-        }
-
-    @property
-    def actor_is_due(self) -> bool:
-        """Whether the next update also updates the actor and the target networks."""
-        return True
+    def expert_weights(self, expert: Expert, only_clone: bool = False) -> dict[str, Tensor]:
+        """Copy the weights of an expert's policy to the CPU, by name in `policy`."""
+        weights = self._of_policy(expert["networks"])
+        copies = {name: value.to("cpu", copy=True) for name, value in weights.items()}
+        return self._with_choice(copies, torch.Size(), torch.tensor(only_clone))
 
     def state_dict(self) -> dict[str, Any]:
         """Return the states of loss (with targets) and optimizer."""
-        return {"loss": dict(self.loss.state_dict()), "optimizer": self.optimizer.state_dict()}
+        return {
+            "loss": dict(self.loss.state_dict()),
+            "optimizer": self.optimizer.state_dict(),
+            "latest": {**self._latest},
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a `state_dict`."""
         self.loss.load_state_dict(state["loss"])
         self.optimizer.load_state_dict(state["optimizer"])
-
-
-def of_expert(values: Tensor, expert: Tensor) -> Tensor:
-    """Select one expert of each seed from ``[S, E, ...]``."""
-    seed = torch.arange(len(values), device=values.device)
-    return values[seed, expert.to(values.device)]
+        self._latest = {**state["latest"]}
 
 
 @dataclass(frozen=True)
@@ -215,26 +237,24 @@ class LearnerSpec:
         """Return one generator per expert of each seed, for one purpose."""
         return [generators([s], f"{name} {e}")[0] for s in self.seeds for e in self.experts]
 
-    def actor(self, network: Callable[..., Any], config: RLConfig) -> Any:
-        """Return policies ``[S, E]`` of a class such as `Actor`."""
-        return self._network(network, config, self._shape, self.generators("actor"))
+    def actor(self, config: RLConfig, name: str = "actor") -> Actor:
+        """Return policies ``[S, E]``, whose initial weights come from the stream ``name``."""
+        return self._network(Actor, config, self._shape, self.generators(name))
 
     def critic(self, config: RLConfig) -> Critic:
-        """Return Q-functions ``[S, E]``."""
-        norm, streams = config.critic_layer_norm, self.generators("critic")
-        return self._network(Critic, config, self._shape, streams, layer_norm=norm)
-
-    def twin_critics(self, config: RLConfig) -> Critic:
-        """Return Q-functions ``[S, E, 2]``."""
-        first, second = (self.generators(name) for name in ("critic", "second critic"))
-        norm, streams = config.critic_layer_norm, [*chain(*zip(first, second, strict=True))]
-        return self._network(Critic, config, [*self._shape, 2], streams, layer_norm=norm)
+        """Return Q-functions ``[S, E]``, or ``[S, E, N]`` if there are several critics."""
+        shape = [*self._shape, config.critics] if config.critics > 1 else self._shape
+        names = ["critic", *(f"critic {number} of" for number in range(1, config.critics))]
+        each = zip(*(self.generators(name) for name in names), strict=True)
+        norm, streams = config.critic_layer_norm, [stream for of in each for stream in of]
+        return self._network(Critic, config, shape, streams, layer_norm=norm)
 
     def loss_options(self, config: RLConfig) -> dict[str, Any]:
         """Return the common arguments of the losses."""
         return {
+            "n_critics": config.critics,
             "return_bounds": self.return_bounds if config.clip_targets else None,
-            "imitation": config.imitation,
+            "pre_tanh_penalty": config.pre_tanh_penalty,
             "constant_keys": self.in_keys[1:],
             "reduction": "none",
         }
@@ -263,43 +283,18 @@ class LearnerSpec:
         return made.to(self.device)
 
 
-def make_ddpg(config: DDPGConfig, spec: LearnerSpec) -> Learner:
-    """Return a DDPG learner (Lillicrap et al., 2016)."""
-    actor = spec.actor(Actor, config)
-    loss = DDPGLoss(
-        actor,
-        spec.critic(config),
-        pre_tanh_penalty=config.pre_tanh_penalty,
-        **spec.loss_options(config),
-    )
-    return Learner(actor, loss, config, noise=config.noise)
-
-
-@dataclass(frozen=True)
-class RLEntry:
-    """RL algorithm and its default hyperparameters."""
-
-    make: Callable[[Any, LearnerSpec], Learner]
-    """Called with a config and the spec."""
-    config: RLConfig
-    """Its default hyperparameters; those of a run are of the same class."""
-
-
-RL: dict[str, RLEntry] = {"ddpg": RLEntry(make_ddpg, DDPGConfig())}
-"""RL algorithms by the ``name`` of their config; `bgpo_trl.algorithms.twin_critics` adds TD3 and
-SAC."""
-
-
 def make_learner(config: RLConfig, spec: LearnerSpec) -> Learner:
-    """Return the learner of a config.
-
-    Raises:
-        ValueError: If `RL` has none under its name.
-    """
-    entry = RL.get(config.name)
-    if entry is None or not isinstance(config, type(entry.config)):
-        raise ValueError(
-            f"{type(config).__name__} is of no known RL algorithm (its name is {config.name!r}): "
-            "add it to bgpo_trl.algorithms.rl.RL under that name"
-        )
-    return entry.make(config, spec)
+    """Return the learner of a config: DDPG, a clone of demonstrations, or both."""
+    actor, critic = spec.actor(config), spec.critic(config)
+    clone = None if config.proposals == "actor" else spec.actor(config, "clone")
+    loss = DDPGLoss(actor, critic, clone, **spec.loss_options(config))
+    if clone is None:
+        return Learner(actor, {"": "actor_network_params"}, loss, config)
+    if config.proposals == "clone":
+        return Learner(clone, {"": "clone_network_params"}, loss, config)
+    sources = {
+        "actor": "actor_network_params",
+        "clone": "clone_network_params",
+        "critic": "target_value_network_params",
+    }
+    return Learner(ProposalPolicy(actor, clone, critic), sources, loss, config)

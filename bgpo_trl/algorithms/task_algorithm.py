@@ -6,9 +6,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torch.func import functional_call
 from torchrl.envs import EnvBase, TransformedEnv
 
 from bgpo_trl.algorithms.algorithm import Algorithm
@@ -16,11 +14,10 @@ from bgpo_trl.algorithms.environments import training_env
 from bgpo_trl.algorithms.rl import LearnerSpec
 from bgpo_trl.configs import DistNLLConfig, MAMLConfig
 from bgpo_trl.data.replay import GroupReplay
-from bgpo_trl.objectives.off_policy import OffPolicyLoss
 from bgpo_trl.seeding import generators
 from bgpo_trl.transforms import DemonstrationSource
 
-__all__ = ["TaskAlgorithm", "networks_of"]
+__all__ = ["TaskAlgorithm"]
 
 
 class TaskAlgorithm(Algorithm):
@@ -31,13 +28,9 @@ class TaskAlgorithm(Algorithm):
 
     Attributes:
         spec: Shapes and inputs of the networks, one per task.
-        loss: Its ``actor_network_params`` are the policies of training episodes.
-        training_actor: Network that is called with some of these parameters.
     """
 
     config: MAMLConfig | DistNLLConfig
-    loss: OffPolicyLoss
-    training_actor: TensorDictModuleBase
 
     def __init__(self, config: MAMLConfig | DistNLLConfig, **arguments: Any) -> None:
         super().__init__(config, **arguments)
@@ -50,11 +43,12 @@ class TaskAlgorithm(Algorithm):
             device=self.device,
             experts=range(self.n_tasks),
         )
-        keys = [config.state, "action"]
         self.replay = GroupReplay(
             config.rl.replay_size,
             generator=generators(self.seeds, "replay"),
-            keys=[*keys, *(("next", key) for key in (config.state, "reward", "terminated"))],
+            keys=self.replay_keys(),
+            n_steps=config.rl.n_steps,
+            gamma=config.rl.gamma,
         )
         self.shown = self.demonstrations()
         self._tasks = torch.arange(self.n_tasks).expand(self.n_seeds, -1)
@@ -74,12 +68,8 @@ class TaskAlgorithm(Algorithm):
     @torch.no_grad()
     def act(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the ``action`` ``[S, A]`` of the tasks' policies with exploration noise."""
-        seen = self.to_device(tensordict.select(self.config.state))
-        policies = networks_of(
-            self.loss.actor_network_params, torch.arange(self.n_seeds), tensordict["task"]
-        )
-        functional_call(self.training_actor, policies, (seen,))
-        return tensordict.set("action", self.learner.explore(seen["action"], self._noise))
+        task = tensordict["task"]
+        return tensordict.set("action", self.act_by(tensordict, task.tolist(), task))
 
     def store(self, transition: TensorDictBase) -> None:
         """Store a transition of each seed and, at the end of an episode, its demonstration."""
@@ -88,6 +78,7 @@ class TaskAlgorithm(Algorithm):
         if self.shown is not None:
             ended = transition.get(("next", "done")).flatten()
             self.shown.add(transition, torch.ones(self.n_seeds), task, ended)
+        self.count_episodes(transition)
 
     def ready(self) -> bool:
         """Return whether there are enough transitions for an update."""
@@ -102,9 +93,3 @@ class TaskAlgorithm(Algorithm):
         """Draw transitions ``[S, T, B]`` for an update, none of tasks that are not ready."""
         tasks = self.ready_tasks().unsqueeze(-1)
         return self.sample(lambda n: tasks.expand(-1, -1, n), self.config.task_batch_size)
-
-
-def networks_of(parameters: TensorDictBase, seed: Tensor, task: Tensor) -> dict[str, Tensor]:
-    """Select networks from parameters ``[S, T, ...]`` by position of the seed and task, int64."""
-    flat = parameters.flatten_keys(".")
-    return {str(key): value[seed, task] for key, value in flat.items()}

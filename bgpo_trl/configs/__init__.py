@@ -1,17 +1,15 @@
 """Defaults, each with its source: section or table of the paper, or "ours" and why."""
 
 from bgpo_trl.configs.algorithms import (
+    SHOWN,
     AlgorithmConfig,
     BGPOConfig,
-    DDPGConfig,
     DistNLLConfig,
     EWCConfig,
     FineTuningConfig,
     GWRBConfig,
     MAMLConfig,
     RLConfig,
-    SACConfig,
-    TD3Config,
 )
 from bgpo_trl.configs.encoders import (
     STAGE_PRESETS,
@@ -25,10 +23,10 @@ from bgpo_trl.configs.runs import PRESETS, RunConfig
 
 __all__ = [
     "PRESETS",
+    "SHOWN",
     "STAGE_PRESETS",
     "AlgorithmConfig",
     "BGPOConfig",
-    "DDPGConfig",
     "DistNLLConfig",
     "EWCConfig",
     "FineTuningConfig",
@@ -38,9 +36,7 @@ __all__ = [
     "RLConfig",
     "RepresentationConfig",
     "RunConfig",
-    "SACConfig",
     "SequenceAutoencoderConfig",
     "StageConfig",
-    "TD3Config",
     "VAEConfig",
 ]

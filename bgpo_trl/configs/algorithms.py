@@ -36,10 +36,19 @@ def positive(config: object, *names: str) -> None:
 
 @dataclass(frozen=True)
 class RLConfig:
-    """Hyperparameters common to all RL algorithms f_RL of Alg. 1."""
+    """Hyperparameters of the learner: the RL algorithm f_RL of Alg. 1, and the clone beside it.
 
-    name: str = ""
-    """Key in `bgpo_trl.algorithms.rl.RL`, which identifies the class in ``config.json``."""
+    The defaults are DDPG (Lillicrap et al., 2016), the paper's f_RL: one critic, one-step returns,
+    no clone. `SHOWN` has those of learning from demonstrations.
+    """
+
+    proposals: Literal["actor", "clone", "both"] = "actor"
+    """Policies that propose an action: the actor that RL trains; a clone of the demonstrations
+    shown, without reward; or both, of which critics take the better one (`ProposalPolicy`)."""
+    critics: int = 1
+    """Number of critics. With several, targets are the lower value of two of them."""
+    n_steps: int = 1
+    """Steps of the returns in the critics' targets (1 in the paper)."""
     hidden_sizes: tuple[int, ...] = (256, 256)
     """Hidden layers of actor and critic. Ours: the 64 units of Sec. IV-A limit the success, and a
     second layer helps to read places from latents (docs/learning.md)."""
@@ -59,92 +68,57 @@ class RLConfig:
     clip_targets: bool = True
     """Whether bootstrapped targets are clipped to the attainable returns. Ours: otherwise Q grows
     to hundreds."""
-    imitation: float = 50.0
-    """Weight of the squared distance to demonstrated actions in the actor's loss, of no effect
-    without a ``demonstration_share``. Ours: with a tenth of it, the critic pulls the policy away
-    from what was demonstrated (docs/learning.md)."""
+    noise: float = 0.3
+    """Standard deviation of the Gaussian exploration noise. Ours: not given in the paper."""
+    pre_tanh_penalty: float = 0.01
+    """Weight of the squared pre-tanh actions. Ours: otherwise all actions saturate."""
     warmup_steps: int = 256
     """Environment steps of each seed before the first update. Ours: not given in the paper."""
     update_every: int = 1
     """Environment steps of each seed per update (1 in Alg. 1)."""
+    policy_delay: int = 1
+    """Updates of the critics per update of actor and clone."""
+    clone_episodes: int = 20
+    """With both proposals, episodes of a group that its clone plays alone before the critics
+    choose."""
+    clone_share: float = 0.25
+    """With both proposals, share of later training episodes that the clone plays alone, so that
+    what it achieves is known (`ProposalTrials`)."""
 
     def __post_init__(self) -> None:
         positive(self, "learning_rate")
-        at_least(self, 0, "imitation")
+        at_least(self, 0, "noise", "pre_tanh_penalty")
         whole(self, 1, "batch_size", "warmup_steps", "replay_size", "update_every")
+        whole(self, 1, "critics", "n_steps", "policy_delay")
+        whole(self, 0, "clone_episodes")
         # With a smaller replay, learning would never begin.
         least = max(self.batch_size, self.warmup_steps)
         sizes = bool(self.hidden_sizes) and all(
             isinstance(size, Integral) and size >= 1 for size in self.hidden_sizes
         )
+        known = ("actor", "clone", "both")
         check(
             self,
+            ("proposals", self.proposals in known, " or ".join(known)),
+            ("critics", self.critics > 1 or self.proposals != "both", "2 or more to choose"),
             ("hidden_sizes", sizes, "one or more whole numbers, of at least 1"),
             ("gamma", 0 <= self.gamma <= 1, "between 0 and 1"),
             ("tau", 0 < self.tau <= 1, "above 0 and at most 1"),
             ("replay_size", self.replay_size >= least, f"{least} (batch, warm-up) or more"),
+            ("clone_share", 0 <= self.clone_share < 1, "at least 0 and below 1"),
         )
 
 
-@dataclass(frozen=True)
-class DDPGConfig(RLConfig):
-    """DDPG (Lillicrap et al., 2016), the paper's f_RL."""
-
-    name: str = "ddpg"
-    """See `RLConfig`."""
-    noise: float = 0.3
-    """Standard deviation of the Gaussian exploration noise. Ours: not given in the paper."""
-    pre_tanh_penalty: float = 0.01
-    """Weight of the squared pre-tanh actions. Ours: otherwise all actions saturate."""
-    compile: bool = False
-    """Whether updates are compiled, which needs a C++ compiler (docs/speed.md)."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        at_least(self, 0, "noise", "pre_tanh_penalty")
-
-
-@dataclass(frozen=True)
-class TD3Config(RLConfig):
-    """TD3 (Fujimoto et al., 2018): two critics, delayed actor updates, target policy smoothing."""
-
-    name: str = "td3"
-    """See `RLConfig`."""
-    noise: float = 0.3
-    """Standard deviation of the Gaussian exploration noise. Ours: as in DDPG."""
-    pre_tanh_penalty: float = 0.01
-    """Weight of the squared pre-tanh actions. Ours: as in DDPG."""
-    policy_delay: int = 2
-    """Updates of the critics per update of actor and target networks (Fujimoto et al.)."""
-    policy_noise: float = 0.2
-    """Standard deviation of the noise on the target action (Fujimoto et al.)."""
-    noise_clip: float = 0.5
-    """Bound of the noise on the target action (Fujimoto et al.)."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        at_least(self, 0, "noise", "pre_tanh_penalty", "policy_noise", "noise_clip")
-        whole(self, 1, "policy_delay")
-
-
-@dataclass(frozen=True)
-class SACConfig(RLConfig):
-    """SAC (Haarnoja et al., 2018): two critics, a stochastic actor, a learned temperature."""
-
-    name: str = "sac"
-    """See `RLConfig`."""
-    alpha_init: float = 0.1
-    """Initial temperature. Ours: 1 would long outweigh a return of 1."""
-    target_entropy: float = -1.0
-    """Entropy maintained by the temperature, in nats for each component of an action (Haarnoja et
-    al.)."""
-    entropy_in_target: bool = False
-    """Whether the critics' targets include the entropy. Ours: False as in Ball et al. (2023),
-    unlike Haarnoja et al.; with entropy, values exceed the attainable returns."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        positive(self, "alpha_init")
+SHOWN = RLConfig(
+    proposals="both",
+    critics=5,
+    n_steps=3,
+    learning_rate=3e-4,
+    gamma=0.97,
+    noise=0.1,
+    policy_delay=2,
+)
+"""Learner from demonstrations and reward. Ours, from `docs/learning.md`."""
 
 
 @dataclass(frozen=True)
@@ -158,14 +132,14 @@ class AlgorithmConfig:
     """Steps of an episode (Sec. IV-B)."""
     state_limit: float = 5.0
     """Bound of the observed state, in standard deviations. Ours."""
-    rl: RLConfig = field(default_factory=DDPGConfig)
+    rl: RLConfig = field(default_factory=RLConfig)
     """The RL algorithm f_RL; DDPG in the paper."""
     demonstration_share: float = 0.0
     """Share of an update's transitions taken from the demonstrations shown so far in training, with
     actions inferred by the inverse model. Ours: the paper has none."""
     demonstration_noise: float = 0.2
-    """Standard deviation of the noise added to demonstrated states when they are sampled. Ours:
-    keeps policies from learning a few demonstrations by heart (docs/learning.md)."""
+    """Standard deviation of the noise added to the demonstrated states that a policy imitates.
+    Ours: keeps policies from learning a few demonstrations by heart (docs/learning.md)."""
 
     def __post_init__(self) -> None:
         known = self.state in ("latent", "state")
@@ -175,6 +149,8 @@ class AlgorithmConfig:
             ("state", known, "latent or state"),
             ("demonstration_share", 0 <= share < 1, "at least 0 and below 1"),
         )
+        shown = share > 0 or self.rl.proposals == "actor"
+        check(self, ("demonstration_share", shown, "above 0, for a clone to imitate"))
         whole(self, 1, "max_steps")
         positive(self, "state_limit")
         at_least(self, 0, "demonstration_noise")
@@ -190,14 +166,6 @@ def _check_played(config: AlgorithmConfig, rows: int) -> None:
     """Raise ``ValueError`` if demonstrations leave none of an update's transitions to training."""
     leaves = round(config.demonstration_share * rows) < rows
     check(config, ("demonstration_share", leaves, f"less, to leave some of {rows} transitions"))
-
-
-def _refuse_all_but_ddpg(who: str, rl: RLConfig) -> None:
-    if not isinstance(rl, DDPGConfig):
-        raise ValueError(
-            f"{who} is defined over DDPG, not {rl.name!r}: keep its rl; BGPO, its ablations and "
-            "the references take any"
-        )
 
 
 @dataclass(frozen=True)
@@ -273,13 +241,11 @@ class BGPOConfig(AlgorithmConfig):
     group_balanced_replay: bool = True
     """Whether an update draws equally from the groups played last. Ours: the paper draws uniformly
     from all transitions."""
-    demonstration_share: float = 0.75
+    demonstration_share: float = 0.5
     """See `AlgorithmConfig`. Ours: what demonstrations show is rarely found by chance."""
-    rl: RLConfig = field(default_factory=lambda: DDPGConfig(noise=0.1, update_every=4))
-    """See `AlgorithmConfig`. Ours: exploration noise on the scale of demonstrated actions, since
-    what to explore is near them; an update every four steps, since hardly less is learned from
-    demonstrations than by one every step (docs/learning.md). Without demonstrations, 0.3 and 1."""
-    active_groups: int = 4
+    rl: RLConfig = SHOWN
+    """See `AlgorithmConfig`."""
+    active_groups: int = 1
     """Largest number of groups per update, those played last. Ours: bounds the cost of an
     update."""
     rest_after: int = 500
@@ -324,7 +290,7 @@ class FineTuningConfig(BGPOConfig):
     """See `BGPOConfig`; only False."""
     demonstration_share: float = 0.0
     """See `AlgorithmConfig`; of the demonstrations shown since the latest boundary."""
-    rl: RLConfig = field(default_factory=DDPGConfig)
+    rl: RLConfig = field(default_factory=RLConfig)
     """See `AlgorithmConfig`."""
 
     def __post_init__(self) -> None:
@@ -342,12 +308,11 @@ class EWCConfig(FineTuningConfig):
     fisher_samples: int = 2_560
     """Transitions from which the Fisher information of a task is estimated (Continual World)."""
 
-    rl: DDPGConfig = field(default_factory=DDPGConfig)
+    rl: RLConfig = field(default_factory=RLConfig)
     """DDPG, whose learner it uses."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _refuse_all_but_ddpg("EWC", self.rl)
         at_least(self, 0, "ewc_weight")
         whole(self, 1, "fisher_samples")
 
@@ -362,18 +327,24 @@ class MAMLConfig(AlgorithmConfig):
     task_batch_size: int = 64
     """Transitions of each task per update: half to adapt to, half to evaluate the adapted policy.
     Ours: with three tasks, as many transitions as in an update of BGPO."""
+    imitation: float = 0.0
+    """Weight of the squared distance to demonstrated actions in the policy's loss. Ours: with
+    demonstrations, where a critic alone hardly changes the policy (docs/learning.md)."""
     adaptation_size: int = 256
     """Transitions of the test task to adapt to before its test episodes. Ours: Sec. IV-B has "256
     adaptation trajectories", about 50 times as much."""
 
-    rl: DDPGConfig = field(default_factory=DDPGConfig)
+    rl: RLConfig = field(default_factory=RLConfig)
     """DDPG, whose learner it uses."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _refuse_all_but_ddpg("MAML", self.rl)
-        at_least(self, 0, "inner_learning_rate")
+        at_least(self, 0, "inner_learning_rate", "imitation")
         whole(self, 1, "adaptation_size")
+        alone = self.rl.proposals == "actor"
+        check(self, ("rl", alone, "of an actor without clone, since MAML adapts one policy"))
+        needs = self.demonstration_share > 0 or not self.imitation
+        check(self, ("imitation", needs, "0 without a demonstration_share"))
         whole(self, 2, "task_batch_size")
         check(self, ("task_batch_size", self.task_batch_size % 2 == 0, "even"))
         _check_played(self, self.task_batch_size)
@@ -394,12 +365,11 @@ class DistNLLConfig(AlgorithmConfig):
     learning_rate: float = 1e-3
     """Learning rate of Adam for the multi-task policy. Ours: the teachers'."""
 
-    rl: DDPGConfig = field(default_factory=DDPGConfig)
+    rl: RLConfig = field(default_factory=RLConfig)
     """DDPG, by which the teachers learn."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _refuse_all_but_ddpg("Dist-NLL", self.rl)
         whole(self, 1, "task_batch_size", "samples", "distillation_batch_size")
         _check_played(self, self.task_batch_size)
         positive(self, "learning_rate")

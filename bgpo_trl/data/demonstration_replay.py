@@ -29,7 +29,8 @@ class DemonstrationReplay:
         constant_keys: Entries that are constant within an episode, stored with each demonstration.
         own_constants: Whether a transition comes with the constant entries of its own
             demonstration, or else with those of any one of its group.
-        noise: Standard deviation of Gaussian noise added to each sampled state, not to the next.
+        n_steps: Largest number of steps of a drawn transition, as in `GroupReplay`.
+        gamma: Discount of the reward of a transition of several steps.
         capacity: Demonstrations kept for each seed; the oldest are overwritten.
 
     Raises:
@@ -44,7 +45,8 @@ class DemonstrationReplay:
         state_key: NestedKey = "latent",
         constant_keys: Sequence[NestedKey] = (),
         own_constants: bool = True,
-        noise: float = 0.0,
+        n_steps: int = 1,
+        gamma: float = 1.0,
         capacity: int = 100_000,
     ) -> None:
         if bank.steps is None:
@@ -60,7 +62,8 @@ class DemonstrationReplay:
                 "`python -m bgpo_trl.encoders.make_bank`, or set demonstration_share to 0"
             )
         self._steps = bank.steps
-        self._generators, self._noise = list(generator), noise
+        self._generators = list(generator)
+        self._n_steps, self._gamma = n_steps, gamma
         self._own_constants = own_constants
         self._state_key, self._constant_keys = state_key, list(constant_keys)
         self._shown = GroupReplay(
@@ -92,8 +95,8 @@ class DemonstrationReplay:
 
         Returns:
             Batch size ``[S, *R]`` as in `GroupReplay.sample`, with the state, the constant entries,
-            ``"action"``, ``"priority_weight"``, ``"demonstrated"`` (true) and, under ``"next"``,
-            the state, ``"reward"`` and ``"terminated"``.
+            ``"action"``, ``"priority_weight"`` and, under ``"next"``, the state, ``"reward"``,
+            ``"terminated"`` and ``"done"``.
         """
         return TensorDict(self.draw(group), group.shape)
 
@@ -107,6 +110,53 @@ class DemonstrationReplay:
             generator: Random generators of the seeds, in place of the replay's.
         """
         sources = self._generators if generator is None else generator
+        entries, reward, frame, left = self._draw_frames(group, sources)
+        n_taken = left.clamp(max=self._n_steps)
+        ends = (left == n_taken).unsqueeze(-1)
+        reward = reward * self._gamma ** (n_taken - 1)
+        several = {"steps_to_next_obs": n_taken.unsqueeze(-1)} if self._n_steps > 1 else {}
+        return {
+            **entries,
+            **several,
+            self._state_key: self._steps.latents(frame),
+            ("next", self._state_key): self._steps.latents(frame + n_taken),
+            ("next", "reward"): reward.unsqueeze(-1) * ends,
+            ("next", "terminated"): ends,
+            ("next", "done"): ends,
+        }
+
+    def draw_actions(
+        self,
+        group: Tensor,
+        noise: float,
+        *,
+        generator: Sequence[torch.Generator] | None = None,
+    ) -> dict[NestedKey, Tensor]:
+        """Draw states and actions to imitate, as `draw` does.
+
+        Args:
+            group: Group of each row, int64 ``[S, *R]``.
+            noise: Standard deviation of Gaussian noise added to the states.
+            generator: Random generators of the seeds, in place of the replay's.
+
+        Returns:
+            By key: the state, the constant entries, ``"action"``, ``"priority_weight"``.
+        """
+        sources = self._generators if generator is None else generator
+        entries, _, frame, _ = self._draw_frames(group, sources)
+        state = self._steps.latents(frame)
+        drawn = draw_for_rows(torch.randn, group, sources, state.shape[-1])
+        return {**entries, self._state_key: state + noise * drawn}
+
+    def _draw_frames(
+        self, group: Tensor, sources: Sequence[torch.Generator]
+    ) -> tuple[dict[NestedKey, Tensor], Tensor, Tensor, Tensor]:
+        """Draw a frame of a demonstration for each row ``[S, *R]``.
+
+        Returns:
+            Action, weight and constant entries by key; the reward of the demonstration; the
+            position of the frame; the number of steps from it to the end.
+        """
         shown, steps = self._shown.draw(group, generator=sources), self._steps
         share = draw_for_rows(torch.rand, group, sources, dtype=torch.float64)
         number, constants = shown["demo_index"], shown
@@ -116,21 +166,12 @@ class DemonstrationReplay:
         n_steps = steps.length[number] - 1
         step = (share * n_steps).long()
         frame = steps.first[number] + step
-        ends = (step == n_steps - 1).unsqueeze(-1)
-        state = steps.latents(frame)
-        if self._noise:
-            noise = draw_for_rows(torch.randn, group, sources, state.shape[-1])
-            state += noise.mul_(self._noise)
-        return {
-            self._state_key: state,
+        entries: dict[NestedKey, Tensor] = {
             "action": steps.actions(frame),
             "priority_weight": shown["priority_weight"],
-            "demonstrated": torch.ones(group.shape, dtype=torch.bool),
             **{key: constants[key] for key in self._constant_keys},
-            ("next", self._state_key): steps.latents(frame + 1),
-            ("next", "reward"): shown["reward"].unsqueeze(-1) * ends,
-            ("next", "terminated"): ends,
         }
+        return entries, shown["reward"], frame, n_steps - step
 
     def regroup(self, seed: int, group: Tensor) -> None:
         """Assign demonstrations of a seed to groups anew, from the group of each in the bank."""

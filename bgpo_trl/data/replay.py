@@ -37,6 +37,9 @@ class GroupReplay:
         keys: Entries to store.
         source_key: Entry, int64 ``[S]``, that determines the group of a transition, such as the
             number of its demonstration; only `regroup` needs it.
+        n_steps: Largest number of steps of a drawn transition; above 1, ``("next", "done")`` must
+            be stored.
+        gamma: Discount of the rewards of these steps.
 
     Raises:
         ValueError: If ``capacity`` or the number of generators is not positive.
@@ -57,8 +60,10 @@ class GroupReplay:
         generator: Sequence[torch.Generator],
         keys: Sequence[NestedKey],
         source_key: NestedKey | None = None,
+        n_steps: int = 1,
+        gamma: float = 1.0,
     ) -> None:
-        self.capacity = capacity
+        self.capacity, self.n_steps, self.gamma = capacity, n_steps, gamma
         self._generators = list(generator)
         self._keys, self._source_key = list(keys), source_key
         n_seeds = len(self._generators)
@@ -134,10 +139,15 @@ class GroupReplay:
             seeds: Positions of the ``S`` seeds to draw for; ``None`` for all.
             generator: Random generators of these seeds, in place of the replay's.
 
+        With ``n_steps`` above 1, a drawn transition goes on for as many steps, or to the end of its
+        episode or of what is stored. Its entries under ``"next"`` are those after the last step,
+        except ``"reward"``, the discounted sum of the rewards.
+
         Returns:
             Batch size ``[S, *R]``, with ``"priority_weight"``, the weight of a transition in
             TorchRL's losses: 1, or 0 for rows without a group or of an empty group, whose other
-            entries are undefined.
+            entries are undefined; with ``n_steps`` above 1, with ``"steps_to_next_obs"``
+            ``[S, *R, 1]``, the number of steps.
 
         Raises:
             ValueError: If one of these seeds holds no transition and has a row with a group.
@@ -158,21 +168,55 @@ class GroupReplay:
         if empty and group[empty].ge(0).any():
             raise ValueError("every seed needs a transition before the first sample")
         sources = [self._generators[seed] for seed in seeds] if generator is None else generator
-        rows, weight = self._located(group.flatten(1), seeds, sources)
+        steps, weight = self._located(group.flatten(1), seeds, sources)
+        first = rows = self._rows_of(steps, seeds)
         drawn: dict[NestedKey, Tensor] = {}
+        if self.n_steps > 1:
+            rows, reward, n_taken = self._last_rows(steps, seeds)
         for key, stored in self._rows.items():
             if (key != self._source_key or key in self._keys) and (keys is None or key in keys):
-                entry = stored.index_select(0, rows).view(*group.shape, *stored.shape[1:])
+                at = rows if isinstance(key, tuple) and key[0] == "next" else first
+                entry = stored.index_select(0, at).view(*group.shape, *stored.shape[1:])
                 for i in empty:
                     entry[i] = 0  # the NaN of uninitialized memory would outlast a weight of 0
                 drawn[key] = entry
+        if self.n_steps > 1:
+            drawn["next", "reward"] = reward.view(*group.shape, 1)
+            drawn["steps_to_next_obs"] = n_taken.view(*group.shape, 1)
         drawn["priority_weight"] = weight.view(group.shape)
         return drawn
 
+    def _last_rows(
+        self, steps: NDArray[np.int64], seeds: Sequence[int]
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Follow transitions that begin at ``steps`` ``[S, R]`` for up to ``n_steps``.
+
+        Returns:
+            The row of the last step of each, the sum of the discounted rewards, the number of
+            steps, ``[S * R]``.
+        """
+        end = np.array([self._n_added[seed] for seed in seeds])[:, None]
+        last, goes_on = steps, torch.ones(steps.size, dtype=torch.bool)
+        reward, n_taken = torch.zeros(steps.size), torch.zeros(steps.size, dtype=torch.int64)
+        for step in range(self.n_steps):
+            at = np.minimum(steps + step, end - 1)
+            goes_on &= torch.from_numpy(at == steps + step).view(-1)
+            rows = self._rows_of(at, seeds)
+            reward += self.gamma**step * goes_on * self._rows["next", "reward"][rows].flatten()
+            n_taken += goes_on
+            last = np.where(goes_on.view(steps.shape).numpy(), at, last)
+            goes_on &= ~self._rows["next", "done"][rows].flatten()
+        return self._rows_of(last, seeds), reward, n_taken
+
+    def _rows_of(self, steps: NDArray[np.int64], seeds: Sequence[int]) -> Tensor:
+        """Return the rows of the buffer ``[S * R]`` that hold these steps ``[S, R]`` of seeds."""
+        rows = steps % self.capacity * len(self._generators) + np.array(seeds)[:, None]
+        return torch.from_numpy(rows).view(-1)
+
     def _located(
         self, group: Tensor, seeds: Sequence[int], sources: Sequence[torch.Generator]
-    ) -> tuple[Tensor, Tensor]:
-        """Draw rows of the buffer for groups ``[S, R]``; return them, ``[S * R]``, and weights."""
+    ) -> tuple[NDArray[np.int64], Tensor]:
+        """Draw a step for each row ``[S, R]``; return the steps and the weights, ``[S, R]``."""
         shares_of_all = draw_for_rows(torch.rand, group, sources, dtype=torch.float64).numpy()
         oldest, wanted = self._oldest(), group.numpy()
         steps, weight = np.empty(wanted.shape, np.int64), np.ones(wanted.shape, np.float32)
@@ -185,10 +229,7 @@ class GroupReplay:
                     steps[i, rows] = held[(shares[rows] * len(held)).astype(np.int64)]
                 else:
                     steps[i, rows], weight[i, rows] = oldest[seed], 0.0
-        steps %= self.capacity
-        steps *= len(self._generators)
-        steps += np.array(seeds)[:, None]
-        return torch.from_numpy(steps).view(-1), torch.from_numpy(weight)
+        return steps, torch.from_numpy(weight)
 
     def contents(self, seed: int) -> tuple[TensorDict, Tensor]:
         """Copy all transitions held for a seed, oldest first, and the group of each, ``[N]``."""

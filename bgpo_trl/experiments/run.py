@@ -11,7 +11,7 @@ from shlex import quote
 import torch
 from torchrl.record.loggers.common import Logger
 
-from bgpo_trl.algorithms import ALGORITHMS, Algorithm
+from bgpo_trl.algorithms import Algorithm
 from bgpo_trl.configs import STAGE_PRESETS, RunConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.encoders.pretrained import load_pretrained, weights_of_bank
@@ -78,11 +78,8 @@ def run_experiment(
     set_threads(arguments.threads)
     keep_freed_memory()
     device = choose_device(arguments.device)
-    registered = ALGORITHMS.get(config.name)
-    usual = registered is None or registered.config.rl.name == config.algorithm.rl.name
-    rl = "" if usual else f"-{config.algorithm.rl.name}"
     size = arguments.preset or (arguments.config.stem if arguments.config else "quick")
-    group = f"{name}-{config.name}{rl}"
+    group = f"{name}-{config.name}"
     out = named_directory(arguments) or Path("runs") / f"{group}-{size}"
     loggers = _loggers(arguments, config, out, group, size)
     if arguments.resume:

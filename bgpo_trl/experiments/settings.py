@@ -106,17 +106,11 @@ def named_directory(arguments: Arguments) -> Path | None:
 
 def _with_algorithm(config: RunConfig, arguments: Arguments) -> RunConfig:
     from bgpo_trl.algorithms import ALGORITHMS
-    from bgpo_trl.algorithms.rl import RL
 
-    if arguments.algorithm is not None:
-        entry = chosen(ALGORITHMS, arguments.algorithm, "--algorithm")
-        config = replace(config, name=arguments.algorithm, algorithm=entry.config)
-    if arguments.rl in (None, config.algorithm.rl.name):
+    if arguments.algorithm is None:
         return config
-    rl = chosen(RL, arguments.rl, "--rl").config
-    if config.name.endswith("-paper"):
-        raise ValueError(f"--rl: {config.name} uses DDPG, as published: leave --rl out")
-    return replace(config, algorithm=replace(config.algorithm, rl=rl))
+    entry = chosen(ALGORITHMS, arguments.algorithm, "--algorithm")
+    return replace(config, name=arguments.algorithm, algorithm=entry.config)
 
 
 def _in_scene(config: RunConfig, scene: Scene) -> RunConfig:
@@ -218,19 +212,15 @@ def as_begun(config: RunConfig, directory: Path, *, keep_eval_every: bool = Fals
 def changed_hyperparameters(config: RunConfig) -> dict[str, Any]:
     """Return the hyperparameters of a run that are not the usual ones of its algorithm, by name."""
     from bgpo_trl.algorithms import ALGORITHMS
-    from bgpo_trl.algorithms.rl import RL
 
     if config.name not in ALGORITHMS:
         return {}
-    usual, rl = ALGORITHMS[config.name].config, config.algorithm.rl.name
-    changed = {}
-    if rl != usual.rl.name and rl in RL:
-        changed, usual = {"rl.name": rl}, replace(usual, rl=RL[rl].config)
+    usual = ALGORITHMS[config.name].config
     scene = find_scene(config.scene)
     if scene.name != RunConfig().scene:
         usual = _in_scene(replace(config, algorithm=usual), scene).algorithm
     different = differing_settings(asdict(usual), asdict(config.algorithm))
-    return changed | {name: value for name, _, value in different}
+    return {name: value for name, _, value in different}
 
 
 def is_finished(directory: Path, config: RunConfig) -> bool:

@@ -17,7 +17,7 @@ from torch import Tensor
 from bgpo_trl.errors import missing_key
 from bgpo_trl.modules.stacked_mlp import StackedMLP
 
-__all__ = ["Actor", "Critic", "StackedNetwork"]
+__all__ = ["Actor", "Critic", "ProposalPolicy", "StackedNetwork"]
 
 
 class StackedNetwork(TensorDictModuleBase):
@@ -126,3 +126,63 @@ class Critic(StackedNetwork):
         """Write the values of states and actions; return the same tensordict."""
         value = self.mlp(self.input(tensordict))
         return tensordict.set("state_action_value", value)
+
+
+class ProposalPolicy(TensorDictModuleBase):
+    """Policy that takes the better of two proposals, as critics value them.
+
+    At each step, an actor and a clone of demonstrations propose an action. The policy takes that of
+    the actor if the lowest value of all critics is higher for it, else that of the clone (Hu et
+    al., 2024, "Imitation Bootstrapped Reinforcement Learning"). `DDPGLoss` bootstraps from the same
+    choice.
+
+    Reads the ``in_keys`` of the actor; writes ``"action"`` ``[*S, *B, A]``.
+
+    Args:
+        actor: Policy that writes ``"action"``, with ``batch_size`` ``[*S]``.
+        clone: Policy with the same keys and ``batch_size``.
+        critic: Q-functions of ``batch_size`` ``[*S, N]``.
+
+    Attributes:
+        only_clone: Where the policy takes the action of the clone whatever the critics say, bool
+            ``[*S]``.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> def network(kind, *ensemble):
+        ...     return kind(6, 4, in_keys=["state"], batch_size=(10, *ensemble))
+        >>> policy = ProposalPolicy(network(Actor), network(Actor), network(Critic, 5))
+        >>> policy(TensorDict({"state": torch.zeros(10, 6)}, 10))["action"].shape
+        torch.Size([10, 4])
+    """
+
+    only_clone: Tensor
+
+    def __init__(self, actor: Actor, clone: Actor, critic: Critic) -> None:
+        super().__init__()
+        self.in_keys, self.out_keys = actor.in_keys, ["action"]
+        self.actor, self.clone, self.critic = actor, clone, critic
+        self.register_buffer("only_clone", torch.zeros(actor.batch_size, dtype=torch.bool))
+
+    @property
+    def batch_size(self) -> torch.Size:
+        """Leading dimensions ``S`` of the weights."""
+        return self.actor.batch_size
+
+    @dispatch(auto_batch_size=False)
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the actions of states; return the same tensordict."""
+        inputs = tensordict.select(*self.in_keys)
+        cloned, own = (net(inputs.copy())["action"] for net in (self.clone, self.actor))
+        if self.only_clone.all():
+            return tensordict.set("action", cloned)
+        dim = len(self.batch_size)
+        both = inputs.unsqueeze(dim).expand(*inputs.shape[:dim], 2, *inputs.shape[dim:]).clone()
+        both.set("action", torch.stack([cloned, own], dim))
+        of_each = both.unsqueeze(dim)
+        of_each = of_each.expand(*self.critic.batch_size, *both.shape[dim:])
+        value = self.critic(of_each)["state_action_value"].amin(dim)
+        value_of_clone, value_of_actor = value.unbind(dim)
+        only_clone = self.only_clone.reshape(*self.batch_size, *[1] * (own.ndim - dim))
+        takes_actor = (value_of_actor > value_of_clone) & ~only_clone
+        return tensordict.set("action", torch.where(takes_actor, own, cloned))

@@ -6,7 +6,7 @@ from copy import deepcopy
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torch.func import functional_call, grad
@@ -23,7 +23,8 @@ class MAMLLoss(DDPGLoss):
     """Loss of a policy after its adaptation to each task (Finn et al., 2017, Alg. 3).
 
     With ``L_i(theta) = -mean Q_i(s, pi_theta(s))``, the actor's loss in `DDPGLoss` (with its
-    penalty) for the critic of task i, it
+    penalty) for the critics of task i, plus ``imitation`` times the mean squared distance to the
+    task's demonstrated actions, it
 
     1. adapts the policy to each task, ``theta_i = theta - inner_learning_rate * grad L_i(theta)``,
        on the first half of the task's transitions;
@@ -45,15 +46,14 @@ class MAMLLoss(DDPGLoss):
         meta_network: Policy with ``batch_size`` ``[*S]``.
         actor_network: The same policy with ``batch_size`` ``[*S, T]``. It stays as it is; a copy of
             it, with the parameters ``actor_network_params``, holds the adapted policies.
-        value_network: Q-functions with ``batch_size`` ``[*S, T]``.
+        value_network: Q-functions with ``batch_size`` ``[*S, T]``, or ``[*S, T, N]``.
         inner_learning_rate: Step size of the adaptation.
+        imitation: Weight of the distance to the actions of ``"imitation"``, 0 for none.
         **ddpg: Other arguments of `DDPGLoss`.
 
     Raises:
         ValueError: If ``inner_learning_rate`` is negative, or the batch sizes do not fit.
     """
-
-    actor_keys = ()
 
     def __init__(
         self,
@@ -62,11 +62,12 @@ class MAMLLoss(DDPGLoss):
         value_network: TensorDictModuleBase,
         *,
         inner_learning_rate: float = MAMLConfig.inner_learning_rate,
+        imitation: float = MAMLConfig.imitation,
         **ddpg: Any,
     ) -> None:
         networks: list[Any] = [meta_network, actor_network, value_network]
         shapes = [torch.Size(getattr(network, "batch_size", ())) for network in networks]
-        if not shapes[1] or shapes[1][:-1] != shapes[0] or shapes[2] != shapes[1]:
+        if not shapes[1] or shapes[1][:-1] != shapes[0] or shapes[2][: len(shapes[1])] != shapes[1]:
             raise ValueError(
                 "meta_network, actor_network and value_network must have the batch sizes [*S], "
                 f"[*S, T] and [*S, T], got {', '.join(str([*shape]) for shape in shapes)}"
@@ -80,7 +81,12 @@ class MAMLLoss(DDPGLoss):
                 parameter.copy_(start[name].unsqueeze(len(shapes[0])))
         super().__init__(actor_network, value_network, **ddpg)
         self.meta_network = meta_network
-        self.inner_learning_rate = inner_learning_rate
+        self.inner_learning_rate, self.imitation = inner_learning_rate, imitation
+
+    @property
+    def out_keys(self) -> list[NestedKey]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Entries that `forward` returns."""
+        return [key for key in super().out_keys if key != "pre_tanh_magnitude"]
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Compute the loss of the adapted policies, reduced, and store these in ``actor_network``.
@@ -112,8 +118,14 @@ class MAMLLoss(DDPGLoss):
         """Return ``L_i`` ``[*S, T]`` of policies with parameters ``[*S, T, ...]``, one per task."""
         data = self.current(tensordict)
         functional_call(self.actor_network, parameters, (data,))
-        value = self.values("value_network", data, frozen=True)
-        return self.mean_per_seed(self.actor_objective(value, data, tensordict), tensordict)
+        loss = self.mean_per_seed(self.actor_objective(data), tensordict)
+        if not self.imitation:
+            return loss
+        shown = tensordict.get(self.tensor_keys.imitation)
+        data = functional_call(self.actor_network, parameters, (self.current(shown),))
+        names = self.tensor_keys
+        distance = (data.get(names.action) - shown.get(names.action)).square().sum(-1)
+        return loss + self.imitation * self.mean_per_seed(distance, shown)
 
     def _each_task(self) -> Parameters:
         n_stacked = len(self.batch_size) - 1

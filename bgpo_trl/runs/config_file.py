@@ -11,7 +11,7 @@ from typing import Any, Literal, NamedTuple, get_args, get_origin, get_type_hint
 
 import yaml
 
-from bgpo_trl.configs import AlgorithmConfig, RLConfig, RunConfig
+from bgpo_trl.configs import AlgorithmConfig, RunConfig
 from bgpo_trl.runs.results import read_json
 from bgpo_trl.scenes import SCENES, find_scene
 
@@ -200,13 +200,6 @@ def _algorithm_config(name: object, stored: object) -> type[AlgorithmConfig] | N
 
 def _read(hint: Any, value: Any, where: str) -> Any:
     """Convert a JSON value to its annotated type; ``where`` names it in errors."""
-    if hint is RLConfig and isinstance(value, dict):
-        from bgpo_trl.algorithms.rl import RL
-
-        name = value.get("name")
-        if name not in RL:
-            raise ValueError(f"{where}name is {name!r}, not a known RL algorithm")
-        hint = type(RL[name].config)
     if is_dataclass(hint) and isinstance(value, dict):
         hints = get_type_hints(hint)
         unknown = sorted(value.keys() - hints.keys(), key=str)

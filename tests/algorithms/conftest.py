@@ -18,14 +18,13 @@ def make_bgpo(bank, encoders, make_config, in_world):
         seeds=(3, 8),
         schedule=SCHEDULE,
         bank=bank,
-        rl=None,
         config=None,
         known=0,
         **changes,
     ):
         state, _, name = VARIANTS[variant]
         changes = {**({} if config is None else {"rl": config}), **changes}
-        config = make_config(state, name if rl is None else f"{name}+{rl}").algorithm
+        config = make_config(state, name).algorithm
         config = replace(config, **{**CHANGES.get(variant, {}), **changes})
         bank = bank.for_tasks(bank.tasks[: schedule.n_tasks])
         algorithm = BGPO(config, seeds=seeds, bank=bank.seen(), encoders=encoders)

@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict
 
 from bgpo_trl.configs import DistNLLConfig
-from bgpo_trl.modules.gaussian_actors import MultiHeadActor
+from bgpo_trl.modules.multi_head_actor import MultiHeadActor
 from bgpo_trl.seeding import generators
 from bgpo_trl.transforms import TaskSchedule
 from tests.algorithms.playing import (

@@ -9,7 +9,7 @@ from tensordict import TensorDict
 
 from bgpo_trl.algorithms.algorithm import Policy
 from bgpo_trl.modules.actor_critic import Actor
-from bgpo_trl.modules.gaussian_actors import MultiHeadActor
+from bgpo_trl.modules.multi_head_actor import MultiHeadActor
 from bgpo_trl.seeding import generators
 from bgpo_trl.transforms import TaskSchedule
 from tests.algorithms.playing import (

@@ -10,7 +10,7 @@ from torch.distributions import Normal, TanhTransform, TransformedDistribution
 from torch.func import functional_call
 
 from bgpo_trl.modules.actor_critic import Actor, Critic
-from bgpo_trl.modules.gaussian_actors import GaussianActor, MultiHeadActor
+from bgpo_trl.modules.multi_head_actor import GaussianActor, MultiHeadActor
 from bgpo_trl.modules.stacked_mlp import StackedLinear, StackedMLP
 
 

@@ -6,16 +6,12 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from bgpo_trl.modules.actor_critic import Actor, Critic
-from bgpo_trl.modules.gaussian_actors import GaussianActor
-from bgpo_trl.objectives.ddpg import DDPGLoss
-from bgpo_trl.objectives.off_policy import ForeachSoftUpdate
-from bgpo_trl.objectives.twin_critics import SACLoss, TD3Loss
+from bgpo_trl.objectives.ddpg import DDPGLoss, ForeachSoftUpdate
 
 SIZES = {"state": 6, "label": 2}
 STATE, ACTION = SIZES["state"], 4
-LOSSES = {"ddpg": (DDPGLoss, Actor), "td3": (TD3Loss, Actor), "sac": (SACLoss, GaussianActor)}
-every_loss = pytest.mark.parametrize("name", LOSSES)
-twin_losses = pytest.mark.parametrize("name", ["td3", "sac"])
+N_CRITICS = {"ddpg": 1, "ensemble": 3, "clone": 3}
+every_loss = pytest.mark.parametrize("name", N_CRITICS)
 
 
 def stream(seed: int) -> torch.Generator:
@@ -24,29 +20,24 @@ def stream(seed: int) -> torch.Generator:
 
 def make_loss(name, seeds=(0,), *, stacked=False, in_keys=("state",), layer_norm=False, **options):
     """Make a loss of one seed, or of a stack of seeds; a seed starts the same in either."""
-    kind, actor = LOSSES[name]
-    shape = [len(seeds)] if stacked else []
-    twins = [2] if kind.twin_critics else []
-    if kind.twin_critics:
-        noise = [stream(seed + 50) for seed in seeds]
-        options["generator"] = noise if stacked else noise[0]
-    if name == "sac":
-        options = {"entropy_in_target": True, **options}
+    shape, n_critics = [len(seeds)] if stacked else [], N_CRITICS[name]
     size = sum(SIZES[key] for key in in_keys)
     network = {"in_keys": list(in_keys), "hidden_sizes": (16,)}
-    of_critics = [stream(100 * (seed + 1) + i) for seed in seeds for i in range(len(twins) + 1)]
-    loss = kind(
-        actor(size, ACTION, batch_size=shape, generator=[*map(stream, seeds)], **network),
-        Critic(
-            size,
-            ACTION,
-            layer_norm=layer_norm,
-            batch_size=[*shape, *twins],
-            generator=of_critics,
-            **network,
-        ),
-        **options,
+
+    def actor(first: int) -> Actor:
+        streams = [stream(seed + first) for seed in seeds]
+        return Actor(size, ACTION, batch_size=shape, generator=streams, **network)
+
+    critic = Critic(
+        size,
+        ACTION,
+        layer_norm=layer_norm,
+        batch_size=[*shape, *([n_critics] if n_critics > 1 else [])],
+        generator=[stream(100 * (seed + 1) + i) for seed in seeds for i in range(n_critics)],
+        **network,
     )
+    options["n_critics"] = n_critics
+    loss = DDPGLoss(actor(0), critic, actor(50) if name == "clone" else None, **options)
     loss.make_value_estimator(gamma=0.98)
     ForeachSoftUpdate(loss, tau=0.005)
     return loss
@@ -61,12 +52,15 @@ def make_batch(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float32) -
     def inputs() -> dict[str, Tensor]:
         return {key: normal(size) for key, size in SIZES.items()}
 
+    def acted() -> dict[str, Tensor]:
+        return {**inputs(), "action": normal(ACTION).clamp(-1, 1)}
+
     terminated = torch.rand(*shape, 1, generator=generator) < 0.2
     truncated = torch.rand(*shape, 1, generator=generator) < 0.2
     reward = torch.rand(*shape, 1, generator=generator).to(dtype) * terminated
     following = {"reward": reward, "done": terminated | truncated, "terminated": terminated}
-    transition = {**inputs(), "action": normal(ACTION).clamp(-1, 1)}
-    return TensorDict({**transition, "next": {**inputs(), **following}}, shape)
+    following |= inputs()
+    return TensorDict({**acted(), "imitation": acted(), "next": following}, shape)
 
 
 def total(losses: TensorDict) -> Tensor:
@@ -80,7 +74,7 @@ def gradients(loss, batch: TensorDict) -> list[Tensor]:
 
 
 def constant_critics(loss, online, target) -> None:
-    """Make Q equal to ``online`` and target Q to ``target`` everywhere; pairs for twin critics."""
+    """Make Q equal to ``online`` and target Q to ``target`` everywhere; triples for ensembles."""
     for parameters, values in (
         (loss.value_network_params, online),
         (loss.target_value_network_params, target),

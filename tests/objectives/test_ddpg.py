@@ -1,31 +1,195 @@
-"""The DDPG loss: imitation and penalty by hand, and training beside a plain DDPG."""
+"""The DDPG loss by hand, beside TorchRL's, and in training beside a plain DDPG."""
 
 import copy
+import math
+from functools import partial
 
+import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
+from torchrl import objectives
+from torchrl.objectives.value import TD0Estimator
 
-from bgpo_trl.objectives.ddpg import DDPGLoss
-from bgpo_trl.objectives.off_policy import ForeachSoftUpdate
+from bgpo_trl.configs import RLConfig
+from bgpo_trl.modules.actor_critic import Actor, Critic, ProposalPolicy
+from bgpo_trl.objectives.ddpg import DDPGLoss, ForeachSoftUpdate
 from tests.objectives.losses import (
+    ACTION,
+    STATE,
     constant_critics,
+    every_loss,
+    gradients,
     make_batch,
     make_loss,
     total,
 )
 
+BOTH_INPUTS = ("state", "label")
+# reward, done, terminated -> target with gamma 0.98 and a next value of 0.3
+TRANSITIONS = [
+    (0.0, False, False, 0.294),
+    (0.0, True, False, 0.294),  # truncated: the bootstrap goes on
+    (0.0, True, True, 0.0),
+    (0.3, True, True, 0.3),
+    (1.0, False, False, 1.294),
+    (-16.0, False, False, -15.706),  # as Pendulum's may be
+]
 
-def test_only_demonstrated_actions_are_imitated():
-    """With a flat Q, the actor's loss is -Q plus the weighted distance, by hand."""
-    batch = make_batch(6)
-    loss = make_loss("ddpg", pre_tanh_penalty=0.0, imitation=2.0)
-    constant_critics(loss, online=0.3, target=0.3)
-    torch.testing.assert_close(loss(batch)["loss_actor"], torch.tensor(-0.3))
-    batch["demonstrated"] = torch.arange(6) >= 4
-    action = loss.actor_network(batch.clone())["action"]
-    distance = (action - batch["action"])[4:].square().sum()
-    torch.testing.assert_close(loss(batch)["loss_actor"], -0.3 + 2.0 * distance / 6)
+
+def constant(name, *values):
+    """Values of a critic, or of three equal ones."""
+    return values if name == "ddpg" else tuple((value,) * 3 for value in values)
+
+
+@pytest.mark.parametrize(
+    ("name", "target_values"),
+    [("ddpg", 0.3), ("ensemble", (0.3, 0.5, 0.9)), ("ensemble", (0.5, 0.3, 0.9))],
+)
+@pytest.mark.parametrize("bounds", [None, (0.0, 1.1), (-0.2, 0.2)])
+def test_targets_and_value_loss_by_hand(name, target_values, bounds):
+    """The first pair bootstraps from its smaller value; targets have bounds only where given."""
+    loss = make_loss(name, **({} if bounds is None else {"return_bounds": bounds}))
+    online = 0.2 if name == "ddpg" else (0.2, 0.6, 0.1)
+    constant_critics(loss, online, target_values)
+    loss.n_calls += 2  # of three pairs, the first one is next
+    reward, done, terminated, target = (torch.tensor(c) for c in zip(*TRANSITIONS, strict=True))
+    batch = make_batch(len(TRANSITIONS))
+    for key, value in {"reward": reward, "done": done, "terminated": terminated}.items():
+        batch["next", key] = value.unsqueeze(-1)
+    target = target if bounds is None else target.clamp(*bounds)
+    squares = (torch.tensor(online).reshape(-1, 1) - target).square()
+    result = loss(batch)
+    torch.testing.assert_close(result["target_value"], target)
+    torch.testing.assert_close(result["target_value_max"], target.max())
+    pre_tanh = loss.actor_network(batch.clone())["pre_tanh_action"].detach()
+    torch.testing.assert_close(result["pre_tanh_magnitude"], pre_tanh.square().mean().sqrt())
+    torch.testing.assert_close(result["loss_value"], squares.sum(0).mean())
+    torch.testing.assert_close(batch["td_error"], squares.amax(0))
+    torch.testing.assert_close(result["td_error_max"], squares.max())
+
+
+def test_all_pairs_of_critics_take_turns():
+    loss = make_loss("ensemble", pre_tanh_penalty=0.0)
+    constant_critics(loss, (1.0, 10.0, 100.0), (0.1, 0.2, 0.3))
+    batch = make_batch(4)
+    batch["next", "terminated"].zero_()
+    batch["next", "reward"].zero_()
+    results = [loss(batch.clone()) for _ in range(6)]
+    lower = [result["target_value"][0].item() / 0.98 for result in results]
+    mean = [-result["loss_actor"].item() for result in results]
+    # The pairs (0, 2), (1, 2), (0, 1), and again.
+    assert lower == pytest.approx([0.1, 0.2, 0.1] * 2)
+    assert mean == pytest.approx([50.5, 55.0, 5.5] * 2)
+
+
+def flat_networks(actions, weights):
+    """A loss whose actor and clone do two given actions everywhere, and whose Q is linear in them.
+
+    Critic i is the first component of the action times its weight, and so is its target.
+    """
+    loss = make_loss("clone", pre_tanh_penalty=0.0)
+    for name, action in zip(("actor", "clone"), actions, strict=True):
+        for tensor in getattr(loss, f"{name}_network_params").values(True, True):
+            tensor.data.zero_()
+        bias = getattr(loss, f"{name}_network_params")["mlp", "layers", "1", "bias"]
+        bias.data[0] = math.atanh(action)
+    loss.target_actor_network_params.data.copy_(loss.actor_network_params.data)
+    for parameters in (loss.value_network_params, loss.target_value_network_params):
+        for tensor in parameters.values(True, True):
+            tensor.data.zero_()
+        first, last = (parameters["mlp", "layers", str(layer), "weight"] for layer in (0, 1))
+        first.data[:, STATE, 0] = 1.0  # a hidden unit that is the action, if positive
+        last.data[:, 0, 0] = torch.tensor(weights)
+    return loss
+
+
+@pytest.mark.parametrize(
+    ("weights", "best"),
+    [
+        ((1.0, 2.0, 3.0), 0.6 * 1.0),  # the pair (0, 2) prefers the larger action, the clone's
+        ((-1.0, 2.0, -3.0), 0.2 * -3.0),  # the smaller one, the actor's
+    ],
+)
+def test_targets_are_of_the_proposal_that_the_pair_prefers(weights, best):
+    loss = flat_networks((0.2, 0.6), weights)
+    batch = make_batch(4)
+    batch["next", "terminated"].zero_()
+    batch["next", "reward"].zero_()
+    target = loss(batch)["target_value"]
+    torch.testing.assert_close(target, torch.full((4,), 0.98 * best))
+
+
+@pytest.mark.parametrize(
+    ("weights", "only_clone", "chosen"),
+    [
+        ((1.0, 2.0, 3.0), False, 0.6),
+        ((-1.0, -2.0, -3.0), False, 0.2),
+        # The lowest value of the three decides: -0.6 for the actor, -1.8 for the clone.
+        ((1.0, 2.0, -3.0), False, 0.2),
+        ((-1.0, -2.0, -3.0), True, 0.6),
+    ],
+)
+def test_the_policy_takes_the_proposal_whose_lowest_value_is_higher(weights, only_clone, chosen):
+    loss = flat_networks((0.2, 0.6), weights)
+    parts = {"actor": "actor_network", "clone": "clone_network", "critic": "value_network"}
+    networks = {}
+    for name, attribute in parts.items():
+        networks[name] = copy.deepcopy(getattr(loss, attribute))
+        getattr(loss, f"{attribute}_params").data.to_module(networks[name])
+    policy = ProposalPolicy(**networks)
+    policy.only_clone.fill_(only_clone)
+    for shape in ((3,), ()):
+        action = policy(TensorDict({"state": torch.randn(*shape, STATE)}, shape))["action"]
+        torch.testing.assert_close(action[..., 0], torch.full(shape, chosen))
+
+
+def test_a_stack_of_policies_chooses_for_each_as_one_would():
+    def network(kind, *ensemble):
+        return kind(STATE, ACTION, in_keys=["state"], hidden_sizes=(16,), batch_size=(4, *ensemble))
+
+    stack = ProposalPolicy(network(Actor), network(Actor), network(Critic, 3))
+    stack.only_clone[1] = True
+    state = torch.randn(4, 50, STATE)
+    together = stack(TensorDict({"state": state}, (4, 50)))["action"]
+    names = [*stack.state_dict()]
+    for row in range(4):
+        weights = {name: stack.state_dict()[name][row] for name in names}
+        data = TensorDict({"state": state[row]}, 50)
+        alone = torch.func.functional_call(stack, weights, (data,))["action"]
+        torch.testing.assert_close(together[row], alone)
+    cloned = stack.clone(TensorDict({"state": state}, (4, 50)))["action"]
+    taken = (together == cloned).all(-1).float().mean(-1)
+    assert taken[1] == 1 and (taken[[0, 2, 3]] < 1).all() and (taken > 0).all()
+
+
+def test_the_clone_learns_the_distance_to_demonstrated_actions():
+    loss, batch = make_loss("clone"), make_batch(6)
+    shown = batch["imitation"]
+    action = loss.clone_network(shown.select("state"))["action"]
+    distance = (action - shown["action"]).square().sum(-1)
+    torch.testing.assert_close(loss(batch)["loss_clone"], distance.mean())
+    shown["priority_weight"] = weights = torch.arange(6.0)
+    torch.testing.assert_close(loss(batch)["loss_clone"], (distance * weights).mean())
+    with pytest.raises(ValueError, match="imitation"):
+        loss(batch.exclude("imitation"))
+
+
+def test_without_options_it_is_torchrls_loss():
+    loss = make_loss("ddpg", pre_tanh_penalty=0.0)
+    actor, critic = copy.deepcopy(loss.actor_network), copy.deepcopy(loss.value_network)
+    reference = objectives.DDPGLoss(actor, critic, delay_actor=True)
+    reference.make_value_estimator(objectives.ValueEstimators.TD0, gamma=0.98)
+    objectives.SoftUpdate(reference, tau=0.005)
+    batch = make_batch(16)
+    mine, theirs = loss(batch.clone()), reference(batch.clone())
+    for key in ("loss_actor", "loss_value"):
+        torch.testing.assert_close(mine[key], theirs[key], rtol=1e-4, atol=1e-5)
+    total(mine).backward()
+    total(theirs).backward()
+    for ours, other in zip(loss.parameters(), reference.parameters(), strict=True):
+        torch.testing.assert_close(ours.grad, other.grad, rtol=1e-3, atol=1e-5)
 
 
 class PlainDDPG:
@@ -100,3 +264,214 @@ def test_trains_as_a_plain_ddpg_does():
         for mine, theirs in zip(network.values(True, True), reference.parameters(), strict=True):
             theirs = theirs.T if theirs.ndim == 2 else theirs
             torch.testing.assert_close(mine.data, theirs.data, rtol=1e-4, atol=2e-5)
+
+
+@every_loss
+def test_each_seed_of_a_stack_learns_as_it_does_alone(name):
+    close = partial(torch.testing.assert_close, rtol=1e-4, atol=1e-4)
+    seeds = (0, 1, 2)
+    stacked, *alone = losses = [
+        make_loss(name, seeds, stacked=True),
+        *(make_loss(name, (seed,)) for seed in seeds),
+    ]
+    optimizers = [torch.optim.Adam(list(loss.parameters()), lr=1e-3) for loss in losses]
+    updates = [ForeachSoftUpdate(loss, tau=0.005) for loss in losses]
+    for step in range(10):
+        batch = make_batch(len(seeds), 32, seed=step)
+        results = [loss(data) for loss, data in zip(losses, [batch, *batch.unbind(0)], strict=True)]
+        for loss, result in zip(losses, results, strict=True):
+            loss.zero_grad()
+            total(result).backward()
+        for key, together in results[0].items():
+            apart = torch.stack([result[key] for result in results[1:]])
+            close(together, apart.sum(0) if key.startswith("loss_") else apart)
+        for index, one in enumerate(alone):
+            for ours, theirs in zip(stacked.parameters(), one.parameters(), strict=True):
+                if step == 0:
+                    torch.testing.assert_close(ours.grad[index], theirs.grad)
+                close(ours[index], theirs)
+        for optimizer, update in zip(optimizers, updates, strict=True):
+            optimizer.step()
+            update.step()
+
+
+@every_loss
+def test_each_network_learns_from_its_own_loss(name):
+    loss = make_loss(name)
+    parts = {
+        "loss_actor": list(loss.actor_network_params.parameters()),
+        "loss_value": list(loss.value_network_params.parameters()),
+        **({"loss_clone": [*loss.clone_network_params.parameters()]} if name == "clone" else {}),
+    }
+    for key, learning in parts.items():
+        loss.zero_grad()
+        loss(make_batch(16))[key].backward()
+        for other, parameters in parts.items():
+            for parameter in parameters:
+                assert (parameter.grad is None) == (other != key)
+        assert all(parameter.grad.any() for parameter in learning)
+
+
+@every_loss
+def test_constant_entries_are_not_needed_under_next(name):
+    plain = make_loss(name, in_keys=BOTH_INPUTS)
+    lean = make_loss(name, in_keys=BOTH_INPUTS, constant_keys=["label"])
+    batch = make_batch(8)
+    without = batch.exclude(("next", "label"))
+    with pytest.raises(ValueError, match="under 'next', found no 'label'"):
+        plain(without)
+    target = lean(without)["target_value"]
+    batch["next", "label"] = batch["label"]
+    fresh = make_loss(name, in_keys=BOTH_INPUTS)  # whose turn it is with the same pair
+    torch.testing.assert_close(target, fresh(batch)["target_value"])
+
+
+@every_loss
+def test_entries_may_have_other_names(name):
+    batch = make_batch(4)
+    expected = make_loss(name)(batch.clone())
+    other = batch.exclude(("next", "reward"), ("next", "terminated"))
+    other["next", "pay"] = batch["next", "reward"]
+    other["next", "won"] = batch["next", "terminated"]
+    loss = make_loss(name)
+    loss.set_keys(reward="pay", terminated="won", priority="error")
+    result = loss(other)
+    assert set(result.keys()) == set(loss.out_keys)
+    for key, value in result.items():
+        assert value.equal(expected[key]), key
+    assert other["error"].amax().equal(expected["td_error_max"])
+    loss.make_value_estimator(gamma=0.5)  # keeps the names
+    assert not loss(other)["target_value"].equal(expected["target_value"])
+    with pytest.raises(ValueError, match="not an accepted"):
+        loss.set_keys(prize="pay")
+
+
+@every_loss
+def test_the_discount_is_that_of_the_value_estimator(name):
+    by_default = DDPGLoss(Actor(STATE), Critic(STATE)).value_estimator.gamma.item()
+    assert by_default == pytest.approx(RLConfig.gamma)
+    batch = make_batch(4)
+    batch["next", "terminated"].zero_()
+    batch["next", "reward"].zero_()
+    loss = make_loss(name)
+    constant_critics(loss, *constant(name, 0.0, 0.5))
+    for estimator in (None, objectives.ValueEstimators.TD0, TD0Estimator):
+        loss.make_value_estimator(estimator, gamma=0.5)
+        torch.testing.assert_close(loss(batch)["target_value"], torch.full((4,), 0.25))
+    for gamma in (1.5, math.nan):
+        with pytest.raises(ValueError, match="gamma"):
+            loss.make_value_estimator(gamma=gamma)
+    with pytest.raises(NotImplementedError):
+        loss.make_value_estimator(objectives.ValueEstimators.GAE)
+
+
+@every_loss
+def test_targets_of_several_steps_are_discounted_as_often(name):
+    loss = make_loss(name)
+    constant_critics(loss, *constant(name, 0.0, 0.5))
+    batch = make_batch(8)
+    batch["next", "terminated"].zero_()
+    steps = torch.arange(1, 9).unsqueeze(-1)
+    target = loss(batch.set("steps_to_next_obs", steps))["target_value"]
+    expected = batch["next", "reward"] + 0.5 * 0.98**steps
+    torch.testing.assert_close(target, expected.squeeze(-1))
+
+
+@every_loss
+@pytest.mark.parametrize("change", [copy.deepcopy, lambda loss: loss.double().float()])
+def test_a_copied_or_cast_loss_still_follows_its_parameters(name, change):
+    loss, batch = make_loss(name), make_batch(16)
+    loss(batch.clone())  # networks that were made for it must not outlive the change
+    loss, fresh = change(loss), make_loss(name, (1,))
+    loss.load_state_dict(fresh.state_dict())
+    mine, theirs = loss(batch.clone()), fresh(batch.clone())
+    for key, value in theirs.items():
+        torch.testing.assert_close(mine[key], value)
+    for grad, other in zip(gradients(loss, batch), gradients(fresh, batch), strict=True):
+        torch.testing.assert_close(grad, other)
+
+
+@every_loss
+def test_soft_updates_are_torchrls_also_after_a_cast(name):
+    losses = make_loss(name), make_loss(name)
+    updates = ForeachSoftUpdate(losses[0], tau=0.1), objectives.SoftUpdate(losses[1], tau=0.1)
+    before = losses[0].target_value_network_params.clone()
+    for loss, update in zip(losses, updates, strict=True):
+        loss.double()
+        for parameter in loss.parameters():
+            parameter.data.add_(1.0)
+        for _ in range(3):
+            update.step()
+    expected = losses[1].state_dict()
+    for entry, value in losses[0].state_dict().items():
+        torch.testing.assert_close(value, expected[entry])
+    moved = losses[0].target_value_network_params.sub(before).values(True, True)
+    assert all(torch.allclose(value, torch.full_like(value, 1 - 0.9**3)) for value in moved)
+
+
+def test_bad_arguments_are_refused():
+    policy = Actor(3, 2, in_keys=["state"], batch_size=(3,))
+    critics = Critic(3, 2, in_keys=["state"], batch_size=(3,))
+    # A container hides the batch size, and with it the seeds whose losses are summed.
+    for actor_network, value_network in (
+        (TensorDictSequential(policy), critics),
+        (policy, Critic(3, 2, in_keys=["state"], batch_size=(2,))),
+    ):
+        with pytest.raises(ValueError, match="batch_size"):
+            DDPGLoss(actor_network, value_network)
+    with pytest.raises(ValueError, match="clone_network"):
+        DDPGLoss(policy, critics, Actor(3, 2, in_keys=["state"]))
+    for option, value in (
+        ("return_bounds", (1.0, 1.0)),
+        ("pre_tanh_penalty", math.nan),
+        ("constant_keys", ["lable"]),
+    ):
+        with pytest.raises(ValueError, match=option):
+            DDPGLoss(policy, critics, **{option: value})
+
+
+def test_weights_are_factors_of_each_transitions_losses():
+    loss, batch = make_loss("ddpg", pre_tanh_penalty=0.5), make_batch(8)
+    weights = torch.linspace(0, 2, 8)
+    plain = loss(batch.clone())
+    error = (plain["pred_value"] - plain["target_value"]).square()
+    data = loss.actor_network(batch.select("state"))
+    value = loss.value_network(data)["state_action_value"].squeeze(-1)
+    penalty = 0.5 * data["pre_tanh_action"].square().mean(-1)
+    batch["priority_weight"] = weights
+    result = loss(batch)
+    torch.testing.assert_close(result["loss_value"], (weights * error).mean())
+    torch.testing.assert_close(result["loss_actor"], (weights * (penalty - value)).mean())
+    loss.use_prioritized_weights = False
+    torch.testing.assert_close(loss(batch)["loss_value"], error.mean())
+
+
+@pytest.mark.parametrize("layer_norm", [False, True])
+def test_seeds_of_weight_zero_have_no_gradient_and_change_no_others(layer_norm):
+    """`TaskReplay` gives zeros for tasks without data."""
+    loss = make_loss("ddpg", range(4), stacked=True, layer_norm=layer_norm)
+    batch, idle, active = make_batch(4, 32), [1, 3], [0, 2]
+    everything = gradients(loss, batch)
+    batch["priority_weight"] = torch.tensor([1.0, 0, 1, 0]).unsqueeze(-1).expand(4, 32).clone()
+    weighted = gradients(loss, batch)
+    for index in idle:
+        batch[index] = batch[index].apply(torch.zeros_like)
+    for grad, zeroed, unweighted in zip(weighted, gradients(loss, batch), everything, strict=True):
+        assert unweighted.flatten(1).any(-1).all()
+        for of_weighted in (grad, zeroed):
+            assert not of_weighted[idle].any()
+            assert of_weighted[active].equal(unweighted[active])
+
+
+def test_an_actor_without_pre_tanh_actions_needs_no_penalty_and_reports_no_magnitude():
+    actor = TensorDictModule(torch.nn.Linear(STATE, ACTION), ["state"], ["action"])
+    critic, batch = Critic(STATE, ACTION, in_keys=["state"]), make_batch(4)
+    loss = DDPGLoss(actor, critic)
+    with pytest.raises(ValueError, match="pre_tanh_penalty=0"):
+        loss(batch.clone())
+    loss.set_keys(pre_tanh_action="action")
+    action = actor(batch.select("state"))["action"]
+    magnitude = loss(batch.clone())["pre_tanh_magnitude"]
+    torch.testing.assert_close(magnitude, action.square().mean().sqrt().detach())
+    free = DDPGLoss(actor, critic, pre_tanh_penalty=0)
+    assert set(free.out_keys) == set(free(batch).keys())

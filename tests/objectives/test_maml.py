@@ -6,9 +6,8 @@ from tensordict import TensorDict
 from torch.nn.functional import layer_norm
 
 from bgpo_trl.modules.actor_critic import Actor, Critic
-from bgpo_trl.objectives.ddpg import DDPGLoss
+from bgpo_trl.objectives.ddpg import DDPGLoss, ForeachSoftUpdate
 from bgpo_trl.objectives.maml import MAMLLoss
-from bgpo_trl.objectives.off_policy import ForeachSoftUpdate
 
 N_STATES, N_ACTIONS, TASKS = 3, 2, 3
 
