@@ -89,7 +89,7 @@ class LoadedRun:
         algorithm = make(
             config.algorithm,
             seeds=config.seeds,
-            bank=bank.seen(),
+            bank=bank.seen(config.demonstrations),
             encoders=encoders,
             scene=find_scene(config.scene),
         )

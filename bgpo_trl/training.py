@@ -153,7 +153,8 @@ class Trainer:
         make: Callable[..., Algorithm] | None,
         device: torch.device | str,
     ) -> None:
-        config, seen = self.config, bank.seen()
+        config = self.config
+        seen = bank.seen(config.demonstrations)
         self._schedule = TaskSchedule(config.task_starts, cumulative=config.schedule == "practised")
         make = entry(config.name).make if make is None else make
         self.algorithm = make(

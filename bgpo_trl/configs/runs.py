@@ -42,6 +42,9 @@ class RunConfig:
     held_out: Literal["validation", "test"] = "validation"
     """Half of the held-out demonstrations that test episodes show: ``"validation"`` for choosing
     settings, ``"test"`` for reporting results. Ours."""
+    demonstrations: int | None = None
+    """Demonstrations of each task that training episodes show, the first of the bank; None for all
+    of them. Ours."""
     checkpoint_minutes: float = 10.0
     """Minutes between checkpoints. Ours."""
     name: str = "bgpo"
@@ -55,6 +58,8 @@ class RunConfig:
         check(self, ("task_starts", whole_starts, "whole numbers"))
         whole(self, 1, "episodes", "eval_every", "eval_episodes")
         at_least(self, 0, "checkpoint_minutes")
+        if self.demonstrations is not None:
+            whole(self, 1, "demonstrations")
         check(self, ("held_out", self.held_out in ("validation", "test"), "validation or test"))
         schedules = ("practised", "sequential")
         check(self, ("schedule", self.schedule in schedules, " or ".join(schedules)))

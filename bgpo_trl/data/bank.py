@@ -143,9 +143,24 @@ class DemonstrationBank:
         """Digest of the demonstrations, without the names of their tasks."""
         return digest(self._tensors())
 
-    def seen(self) -> DemonstrationBank:
-        """Return the demonstrations for training episodes."""
-        return self._select(self.train)
+    def seen(self, most: int | None = None) -> DemonstrationBank:
+        """Return the demonstrations for training episodes, the first ``most`` of each task.
+
+        Raises:
+            ValueError: If a task has fewer than ``most``.
+        """
+        seen = self._select(self.train)
+        if most is None:
+            return seen
+        few = (seen.task.bincount(minlength=len(self.tasks)) < most).nonzero().flatten().tolist()
+        if few:
+            raise ValueError(
+                f"the bank has fewer than {most} demonstrations of {self.tasks[few[0]]!r} for "
+                "training: choose fewer"
+            )
+        task = seen.task.unsqueeze(-1)
+        place = (task == torch.arange(len(self.tasks))).cumsum(0).gather(-1, task).flatten()
+        return seen._select(place <= most)
 
     def held_out(self, part: Literal["validation", "test"] | None = None) -> DemonstrationBank:
         """Return the demonstrations for test episodes, or a part of them.

@@ -122,6 +122,15 @@ def test_the_halves_of_the_held_out_ones_take_turns_and_are_all_of_them(bank):
                 assert half.of_task(task).embedding.equal(every[first::2])
 
 
+def test_few_demonstrations_are_the_first_of_each_task(bank):
+    few, seen = bank.seen(3), bank.seen()
+    for task in range(len(bank.tasks)):
+        assert few.of_task(task).embedding.equal(seen.of_task(task).embedding[:3])
+    assert bank.seen(8).embedding.equal(seen.embedding)  # all that there are
+    with pytest.raises(ValueError, match="fewer than 9 demonstrations of 'grasp_glass'"):
+        bank.seen(9)
+
+
 def test_steps_of_other_demonstrations_are_refused(with_steps, tmp_path):
     with pytest.raises(ValueError, match="steps of 3 demonstrations, but embeddings of 5"):
         replace(with_steps, steps=with_steps.seen().steps)
