@@ -57,13 +57,9 @@ class BGPO(Algorithm):
                 generator=generators(seeds, "gwr"),
             )
         if config.grouped:
-            self.groups = BehaviorGroups(
-                embedding_size,
-                batch_size=[len(seeds)],
-                smallest=config.group_size,
-                evidence=config.group_evidence,
-            )
-        self._revision = torch.zeros(len(seeds), dtype=torch.int64)
+            sizes = {"smallest": config.group_size, "evidence": config.group_evidence}
+            self.groups = [BehaviorGroups(embedding_size, **sizes) for _ in seeds]
+        self._revision = [0] * len(seeds)
         sizes = {None: 0, "label": self.n_tasks}
         context_size = sizes.get(config.context, embedding_size)
         self.in_keys = [config.state, *(["context"] if context_size else [])]
@@ -81,8 +77,10 @@ class BGPO(Algorithm):
         n_active = config.active_groups if config.grouped else 1
         self.active = ActiveGroups(len(seeds), n_active, config.rest_after)
         self.experts: Experts | None = None
-        if config.experts and (groups := self.groups) is not None:
-            self.experts = Experts(self.learner, self.active, groups.parent)
+        if config.experts:
+            self.experts = Experts(
+                self.learner, self.active, lambda seed, group: self.groups[seed].parent[group]
+            )
         self.test_actor = self.learner.actor
         self.replay = GroupReplay(
             rl.replay_size,
@@ -147,16 +145,14 @@ class BGPO(Algorithm):
     def _playing(self, tensordict: TensorDictBase) -> list[int]:
         """Return the groups that act; update the groups of episodes that begin."""
         groups, trials = self._groups_of(tensordict), self.trials
-        if trials is None or self.groups is None:
+        if trials is None:
             return groups
         begins = tensordict["step_count"].flatten() == 0
-        if begins.any():
-            # The end of the last episode may have joined groups after the lookup of this one.
-            match = self.groups.lookup(tensordict["demo_embedding"], begins)
-            tensordict["group"] = torch.where(begins, match.group, tensordict["group"])
         for seed in begins.nonzero().flatten().tolist():
-            start, group = tensordict[self.config.state][seed], int(tensordict["group"][seed])
-            trials.begin(seed, start, group)
+            # The end of the last episode may have joined groups after the lookup of this one.
+            group = self.groups[seed].lookup(tensordict["demo_embedding"][seed]).group
+            tensordict["group"][seed] = group
+            trials.begin(seed, tensordict[self.config.state][seed], int(group))
         return [trials.playing(seed) for seed in range(self.n_seeds)]
 
     def store(self, transition: TensorDictBase) -> None:
@@ -184,30 +180,28 @@ class BGPO(Algorithm):
 
     def _join_groups(self, transition: TensorDictBase) -> None:
         """Count the episodes that end; join groups that turn out to be one task."""
-        if self.trials is None or self.groups is None:
+        if self.trials is None:
             return
         end = transition.get("next")
         for seed in end["done"].flatten().nonzero().flatten().tolist():
             success = bool(end["success"][seed])
             self.trials.end(seed, int(transition["demo_index"][seed]), success)
             pair = self.trials.same_task(seed)
-            if pair is not None and {*pair} <= {*self.groups.numbers(seed)}:
-                self.groups.join(seed, *pair)
+            if pair is not None and {*pair} <= {*self.groups[seed].numbers}:
+                self.groups[seed].join(*pair)
 
     def _follow_groups(self) -> None:
         """Assign what is stored to the groups of today; put experts of former groups aside."""
-        if self.groups is None or (changed := self.groups.revision != self._revision).sum() == 0:
-            return
-        self._revision = self.groups.revision
-        shown = self.bank.embedding.expand(self.n_seeds, *self.bank.embedding.shape)
-        group_of = self.groups.lookup(shown, changed).group
-        for seed in changed.nonzero().flatten().tolist():
+        for seed, groups in enumerate(self.groups):
+            if groups.revision == self._revision[seed]:
+                continue
+            self._revision[seed] = groups.revision
+            group_of, known = groups.lookup(self.bank.embedding).group, groups.numbers
             for replay in (self.replay, self.shown):
                 if replay is not None:
-                    replay.regroup(seed, group_of[seed])
-            known = self.groups.numbers(seed)
+                    replay.regroup(seed, group_of)
             if self.trials is not None:
-                self.trials.regroup(seed, group_of[seed], known)
+                self.trials.regroup(seed, group_of, known)
             for group in [*self.active.groups[seed]]:
                 if group not in known:
                     (self.experts or self.active).rest(seed, group)
@@ -231,9 +225,8 @@ class BGPO(Algorithm):
     ) -> Policy:
         """Copy the policy of one seed; with experts, that of each episode, ``[T, M, ...]``."""
         del generator
-        if self.experts is not None and self.groups is not None:
-            shown = embedding.expand(self.n_seeds, *embedding.shape)
-            group = self.groups.lookup(shown).group[index]
+        if self.experts is not None:
+            group = self.groups[index].lookup(embedding).group
             numbers = group.unique().tolist()
             experts = {number: self.actor_weights(index, number) for number in numbers}
             each = [experts[number] for number in group.flatten().tolist()]
@@ -268,15 +261,20 @@ class BGPO(Algorithm):
             behavior = self.gwr.lookup(shown, mask=only).embedding[index]
         return self.config.behavior_scale * behavior
 
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything that future actions, updates and snapshots depend on."""
+        return {**super().state_dict(), "groups": [groups.state_dict() for groups in self.groups]}
+
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a `state_dict`."""
         super().load_state_dict(state)
-        if self.groups is not None:
-            self._revision = self.groups.revision
+        for groups, saved in zip(self.groups, state["groups"], strict=True):
+            groups.load_state_dict(saved)
+        self._revision = [groups.revision for groups in self.groups]
 
     def _learned(self) -> dict[str, Any]:
         # Experts come first, since they determine the shape of the learner's networks.
         played = {"active": self.active} if self.experts is None else {"experts": self.experts}
-        parts = {"gwr": self.gwr, "groups": self.groups, "trials": self.trials}
+        parts = {"gwr": self.gwr, "trials": self.trials}
         found = {key: part for key, part in parts.items() if part is not None}
         return {**played, **super()._learned(), **found}

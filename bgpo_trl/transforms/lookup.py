@@ -11,6 +11,7 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 
 from bgpo_trl.errors import missing_key
+from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.seeding import generators
 from bgpo_trl.transforms._episode import EpisodeTransform, ending, unbounded
 
@@ -28,8 +29,7 @@ class DemonstrationLookup(EpisodeTransform):
     ``clone`` looks up in the same network, and with ``learn=True`` teaches it too.
 
     Args:
-        network: One network, or one per row. Its ``batch_size`` must be the environment's; if it
-            does not learn here, the leading dimensions suffice.
+        network: What to look up in, for each row of the environment.
         learn: Adapt the network. May be changed at any time; independent of ``train()`` and
             ``eval()``, which TorchRL calls on all transforms. Set it to False for
             ``check_env_specs`` if episodes can end within the three steps of the check.
@@ -80,17 +80,24 @@ class DemonstrationLookup(EpisodeTransform):
         if self.learn:
             ended = ending(tensordict, next_tensordict)
             if ended.any():
-                self.network.adapt(tensordict.get(self.in_keys[0]), mask=ended)
+                self._adapt(tensordict.get(self.in_keys[0]), ended)
         return next_tensordict
+
+    def _adapt(self, embedding: Tensor, ended: Tensor) -> None:
+        """Learn the demonstrations ``[*B, d]`` of the rows that have ended, bool ``[*B]``."""
+        self.network.adapt(embedding, mask=ended)
+
+    def _fits(self, batch_size: torch.Size) -> bool:
+        """Return whether there is a network for each row of an environment."""
+        return batch_size == self.network.batch_size
 
     def _demonstration_spec(self, observation_spec: Composite) -> TensorSpec:
         """Return the spec of the demonstration's embedding, after checking the batch size."""
         demonstration = self._read_spec(observation_spec, self.in_keys[0], "DemonstrationSource")
-        if self.learn and observation_spec.shape != self.network.batch_size:
+        if self.learn and not self._fits(observation_spec.shape):
             raise ValueError(
-                f"{type(self.network).__name__} was made for "
-                f"batch_size={tuple(self.network.batch_size)}, but the environment to learn from "
-                f"has {tuple(observation_spec.shape)}: make both the same"
+                f"{type(self).__name__} is to learn from an environment of batch_size="
+                f"{tuple(observation_spec.shape)}: give it a network for each of these rows"
             )
         return demonstration
 
@@ -148,8 +155,9 @@ class BehaviorLookup(DemonstrationLookup):
 class GroupLookup(DemonstrationLookup):
     """Group of an episode's demonstration, which selects the expert and the replay.
 
-    For the arguments, see `DemonstrationLookup`, whose ``network`` is a `BehaviorGroups`. With a
-    novelty above 1, the demonstration belongs to no known group and is played by the nearest.
+    For the arguments, see `DemonstrationLookup`, whose ``network`` is a list of `BehaviorGroups`,
+    one for each row. With a novelty above 1, the demonstration belongs to no known group and is
+    played by the nearest.
 
     Reads ``demo_embedding`` float32 ``[*B, 32]`` and ``done``; writes ``group`` int64 ``[*B]`` and
     ``group_novelty`` float32 ``[*B]``.
@@ -161,18 +169,37 @@ class GroupLookup(DemonstrationLookup):
         >>> from bgpo_trl.transforms import DemonstrationSource, TaskSchedule
         >>> bank = SimpleNamespace(embedding=torch.rand(6, 32), task=torch.arange(6) % 3)
         >>> source = DemonstrationSource(bank, TaskSchedule())
-        >>> lookup = GroupLookup(BehaviorGroups(32), learn=True)
+        >>> lookup = GroupLookup([BehaviorGroups(32)], learn=True)
         >>> env = TransformedEnv(PendulumEnv(), Compose(StepCounter(50), source, lookup))
         >>> env.rollout(50)["group"].unique()
         tensor([0])
     """
 
     written = ("group", "group_novelty")
+    network: Sequence[BehaviorGroups]
 
     def look_up(self, embedding: Tensor) -> tuple[Tensor, Tensor]:
         """Return group and novelty for embeddings ``[*B, 32]``."""
-        match = self.network.lookup(embedding)
-        return match.group, match.novelty
+        pairs = zip(self.network, self._of_rows(embedding), strict=True)
+        matches, shape = [groups.lookup(phi) for groups, phi in pairs], embedding.shape[:-1]
+        group = torch.stack([match.group for match in matches]).view(shape)
+        return group, torch.stack([match.novelty for match in matches]).view(shape)
+
+    def _of_rows(self, embedding: Tensor) -> Tensor:
+        """Return embeddings ``[*B, d]`` by row, ``[S, *, d]``."""
+        n_rows = len(self.network)
+        if n_rows > 1 and embedding.shape[0] != n_rows:
+            raise ValueError(
+                f"there are groups for {n_rows} rows, not for embeddings {[*embedding.shape]}"
+            )
+        return embedding.reshape(n_rows, -1, embedding.shape[-1])
+
+    def _adapt(self, embedding: Tensor, ended: Tensor) -> None:
+        for row in ended.flatten().nonzero().flatten().tolist():
+            self.network[row].adapt(self._of_rows(embedding)[row, 0])
+
+    def _fits(self, batch_size: torch.Size) -> bool:
+        return batch_size.numel() == len(self.network) and len(batch_size) <= 1
 
     def _entries(self, observation_spec: Composite) -> dict[NestedKey, TensorSpec]:
         demonstration = self._demonstration_spec(observation_spec)
