@@ -12,7 +12,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 
 from bgpo_trl.algorithms.algorithm import Algorithm, Policy
 from bgpo_trl.algorithms.environments import training_env
-from bgpo_trl.algorithms.experts import ActiveGroups, Experts, GroupTrials
+from bgpo_trl.algorithms.experts import ActiveGroups, Experts
 from bgpo_trl.algorithms.rl import Learner, LearnerSpec, make_learner
 from bgpo_trl.configs import BGPOConfig
 from bgpo_trl.data.bank import DemonstrationSteps
@@ -20,7 +20,7 @@ from bgpo_trl.data.demonstration_replay import DemonstrationReplay
 from bgpo_trl.data.replay import GroupReplay
 from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.modules.gwr import GWRB
-from bgpo_trl.seeding import generators
+from bgpo_trl.seeding import generators, stream_seed
 from bgpo_trl.transforms import DemonstrationSource
 from bgpo_trl.transforms.behavior_matching import matching_reward
 
@@ -38,8 +38,8 @@ class BGPO(Algorithm):
     Attributes:
         active: The groups played lately.
         experts: The networks of each group; None for one pair of networks.
-        trials: Trials by which groups of one task are joined; None without experts or
-            demonstrations.
+        starts: First latent of each demonstration, ``[N, 64]``, by which other groups' experts are
+            tried (`BehaviorGroups`); None without experts or demonstrations.
     """
 
     config: BGPOConfig
@@ -57,8 +57,15 @@ class BGPO(Algorithm):
                 generator=generators(seeds, "gwr"),
             )
         if config.grouped:
-            sizes = {"smallest": config.group_size, "evidence": config.group_evidence}
-            self.groups = [BehaviorGroups(embedding_size, **sizes) for _ in seeds]
+            self.groups = [
+                BehaviorGroups(
+                    embedding_size,
+                    smallest=config.group_size,
+                    evidence=config.group_evidence,
+                    seed=stream_seed(seed, "trials"),
+                )
+                for seed in seeds
+            ]
         self._revision = [0] * len(seeds)
         sizes = {None: 0, "label": self.n_tasks}
         context_size = sizes.get(config.context, embedding_size)
@@ -89,11 +96,10 @@ class BGPO(Algorithm):
             source_key="demo_index" if config.grouped else None,
         )
         self.shown = self.demonstrations(keys[1:], own_constants=not config.experts)
-        self.trials: GroupTrials | None = None
+        self.starts: Tensor | None = None
         if self.shown is not None and config.experts:
             steps = cast(DemonstrationSteps, self.bank.steps)
-            starts = steps.latents(steps.first)
-            self.trials = GroupTrials(starts, seeds=seeds, smallest=config.group_size)
+            self.starts = steps.latents(steps.first)
 
     def _make_learner(self, spec: LearnerSpec) -> Learner:
         return make_learner(self.config.rl, spec)
@@ -110,6 +116,7 @@ class BGPO(Algorithm):
             behavior_scale=self.config.behavior_scale,
             gwr=self.gwr,
             groups=self.groups,
+            starts=self.starts,
             beta=self.beta,
         )
 
@@ -123,16 +130,16 @@ class BGPO(Algorithm):
         success = 1.0 + self.beta
         return max(success, self.beta + self.config.rl.gamma * success)
 
-    def _groups_of(self, tensordict: TensorDictBase) -> list[int]:
-        return tensordict["group"].tolist() if self.config.grouped else [0] * self.n_seeds
+    def _number(self, tensordict: TensorDictBase, key: str) -> Tensor:
+        """Return an entry of `GroupLookup`, int64 ``[S]``; 0 without groups."""
+        if self.groups:
+            return tensordict[key]
+        return torch.zeros(self.n_seeds, dtype=torch.int64)
 
     @torch.no_grad()
     def act(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the ``action`` ``[S, A]`` of the group's policy with exploration noise.
-
-        Where groups have just been joined, the ``group`` of an episode that begins is updated.
-        """
-        groups = self._playing(tensordict)
+        """Write the ``action`` ``[S, A]`` of the episode's ``expert`` with exploration noise."""
+        groups = self._number(tensordict, "expert").tolist()
         if self.experts is not None:
             expert = self.experts.play(groups)
         else:
@@ -142,29 +149,15 @@ class BGPO(Algorithm):
         seen = self.to_device(tensordict.select(*self.in_keys))
         return tensordict.set("action", self.learner.act(seen, self._noise, expert))
 
-    def _playing(self, tensordict: TensorDictBase) -> list[int]:
-        """Return the groups that act; update the groups of episodes that begin."""
-        groups, trials = self._groups_of(tensordict), self.trials
-        if trials is None:
-            return groups
-        begins = tensordict["step_count"].flatten() == 0
-        for seed in begins.nonzero().flatten().tolist():
-            # The end of the last episode may have joined groups after the lookup of this one.
-            group = self.groups[seed].lookup(tensordict["demo_embedding"][seed]).group
-            tensordict["group"][seed] = group
-            trials.begin(seed, tensordict[self.config.state][seed], int(group))
-        return [trials.playing(seed) for seed in range(self.n_seeds)]
-
     def store(self, transition: TensorDictBase) -> None:
         """Store a transition of each seed and, at the end of an episode, its demonstration.
 
         Where demonstrations have changed their groups, all that is stored follows.
         """
-        group = torch.tensor(self._groups_of(transition))
+        group = self._number(transition, "group")
         self.replay.add(transition, group)
         if self.shown is not None:
             self._store_demonstration(self.shown, transition, group)
-        self._join_groups(transition)
         self._follow_groups()
 
     def _store_demonstration(
@@ -178,32 +171,18 @@ class BGPO(Algorithm):
                 reward += self.beta * matching_reward(transition["behavior"], phi)
             shown.add(transition, reward, group, ended)
 
-    def _join_groups(self, transition: TensorDictBase) -> None:
-        """Count the episodes that end; join groups that turn out to be one task."""
-        if self.trials is None:
-            return
-        end = transition.get("next")
-        for seed in end["done"].flatten().nonzero().flatten().tolist():
-            success = bool(end["success"][seed])
-            self.trials.end(seed, int(transition["demo_index"][seed]), success)
-            pair = self.trials.same_task(seed)
-            if pair is not None and {*pair} <= {*self.groups[seed].numbers}:
-                self.groups[seed].join(*pair)
-
     def _follow_groups(self) -> None:
         """Assign what is stored to the groups of today; put experts of former groups aside."""
         for seed, groups in enumerate(self.groups):
             if groups.revision == self._revision[seed]:
                 continue
             self._revision[seed] = groups.revision
-            group_of, known = groups.lookup(self.bank.embedding).group, groups.numbers
+            group_of = groups.lookup(self.bank.embedding).group
             for replay in (self.replay, self.shown):
                 if replay is not None:
                     replay.regroup(seed, group_of)
-            if self.trials is not None:
-                self.trials.regroup(seed, group_of, known)
             for group in [*self.active.groups[seed]]:
-                if group not in known:
+                if group not in groups.numbers:
                     (self.experts or self.active).rest(seed, group)
 
     def update(self) -> dict[str, Tensor]:
@@ -275,6 +254,5 @@ class BGPO(Algorithm):
     def _learned(self) -> dict[str, Any]:
         # Experts come first, since they determine the shape of the learner's networks.
         played = {"active": self.active} if self.experts is None else {"experts": self.experts}
-        parts = {"gwr": self.gwr, "trials": self.trials}
-        found = {key: part for key, part in parts.items() if part is not None}
-        return {**played, **super()._learned(), **found}
+        gwr = {} if self.gwr is None else {"gwr": self.gwr}
+        return {**played, **super()._learned(), **gwr}

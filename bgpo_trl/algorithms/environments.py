@@ -48,6 +48,7 @@ def training_env(
     behavior_scale: float = 1.0,
     gwr: GWRB | None = None,
     groups: Sequence[BehaviorGroups] = (),
+    starts: Tensor | None = None,
     beta: float = 0.0,
 ) -> TransformedEnv:
     """Return the environment of training episodes: simulations ``[S]`` within transforms.
@@ -65,6 +66,7 @@ def training_env(
         behavior_scale: Factor of behavior or embedding in the context.
         gwr: GWR-B, which learns each demonstration.
         groups: Groups of behaviors of each seed, which learn each demonstration; empty for none.
+        starts: First latent of each demonstration, for trials of experts; see `GroupLookup`.
         beta: Weight of the intrinsic reward; with 0, it is neither added nor measured.
 
     Raises:
@@ -80,7 +82,7 @@ def training_env(
     elif context == "embedding":
         transforms.append(RenameTransform(["demo_embedding"], ["behavior"], create_copy=True))
     if groups:
-        transforms.append(GroupLookup(groups, learn=True))  # demo_embedding -> group
+        transforms.append(GroupLookup(groups, learn=True, starts=starts))  # -> group, expert
     if beta:
         transforms.append(match_behavior(beta, encoders))  # reward + beta * exp(-||b - phi_g||)
     if context == "label":

@@ -14,9 +14,11 @@ from torch import Tensor
 
 from bgpo_trl.errors import as_shape
 from bgpo_trl.modules.density_clusters import density_clusters, local_whitening
+from bgpo_trl.modules.group_trials import GroupTrials
 
 _KNOWN_SHARE = 0.99  # of a group's own demonstrations that are to count as known
-_ARRAYS = ("points", "shown", "group", "member", "cluster")  # of the state
+_FITTING_SHARE = 0.9  # of a group's own demonstrations whose starts are to count as fitting
+_ARRAYS = ("points", "starts", "shown", "group", "member", "cluster")  # of the state
 _LISTS = ("parent", "links")
 
 
@@ -63,18 +65,31 @@ class BehaviorGroups:
     4. Groups that turn out to be one behavior can be joined (`join`), and stay so: the clusters of
        their densest demonstrations are one group from then on.
 
+    A task that looks different from different starts, such as a push to the left or to the right,
+    forms several groups. The expert of each does not know what to do where the group's own
+    demonstrations never began. Where the starts of demonstrations are given, too,
+
+    5. a start *fits* a group if its distance to the nearest start of the group's demonstrations is
+       at most the 90 % quantile of this distance among those starts themselves;
+    6. where a start does not fit the group shown, the episode is played by the expert of that group
+       or of one that it fits, whichever `GroupTrials.select` draws (`expert`);
+    7. two groups whose experts succeed after each other's demonstrations are joined (`end`).
+
     Each seed has groups of its own.
 
     Args:
         n_features: Size d of an input.
         smallest: Least number of different demonstrations of a group.
         evidence: Depth of a significant valley, in multiples of what chance explains.
+        seed: Seed of the trials.
 
     Raises:
         ValueError: If ``smallest`` is below 4 or ``evidence`` is not positive.
 
     Attributes:
+        trials: Successes of the experts of groups after demonstrations of others.
         points: The different demonstrations, in the order in which they were first shown, [n, d].
+        starts: First state of each, [n, f]; f is 0 if they are not given.
         shown: How often each was shown, [n].
         group: Group of each, [n].
         member: Whether it is in the cluster of the group, [n]; False for outliers, and for those
@@ -96,6 +111,7 @@ class BehaviorGroups:
     """
 
     points: NDArray[np.float64]
+    starts: NDArray[np.float32]
     shown: NDArray[np.int64]
     group: NDArray[np.int64]
     member: NDArray[np.bool_]
@@ -104,7 +120,9 @@ class BehaviorGroups:
     links: list[tuple[int, int]]
     revision: int
 
-    def __init__(self, n_features: int, *, smallest: int = 10, evidence: float = 1.0) -> None:
+    def __init__(
+        self, n_features: int, *, smallest: int = 10, evidence: float = 1.0, seed: int = 0
+    ) -> None:
         (self.n_features,) = as_shape([n_features], "n_features")
         if not (smallest >= 4 and smallest == int(smallest) and 0 < evidence < np.inf):
             raise ValueError(
@@ -113,7 +131,9 @@ class BehaviorGroups:
             )
         self.smallest, self.evidence = int(smallest), float(evidence)
         self._k = self.smallest // 2  # neighbors by which distances to a group are measured
-        self.points, self.member = np.empty((0, self.n_features)), np.empty(0, np.bool_)
+        self.trials = GroupTrials(seed)
+        self.points, self.starts = np.empty((0, self.n_features)), np.empty((0, 0), np.float32)
+        self.member = np.empty(0, np.bool_)
         self.shown, self.group, self.cluster = (np.empty(0, np.int64) for _ in range(3))
         self.parent, self.links, self.revision = [0], [], 0
         # Linear map [d, d] after which distances are measured.
@@ -153,19 +173,60 @@ class BehaviorGroups:
             batch_size=shape,
         )
 
-    def adapt(self, phi: Tensor) -> GroupMatch:
-        """Find the group of one demonstration ``[d]`` and learn from it.
+    def fits(self, start: Tensor, group: int) -> bool:
+        """Return whether a start ``[f]`` fits a group; all do if there are too few to compare."""
+        rows = np.flatnonzero(self.group == group)
+        if len(rows) < self.smallest or not self.starts.size:
+            return True
+        starts = torch.from_numpy(self.starts[rows])
+        apart = torch.cdist(starts, starts).fill_diagonal_(torch.inf).amin(-1)
+        return bool(torch.cdist(start[None], starts).amin() <= apart.quantile(_FITTING_SHARE))
+
+    def expert(self, start: Tensor, group: int) -> tuple[int, bool]:
+        """Return the group whose expert is to play an episode.
+
+        Args:
+            start: First state of the episode, ``[f]``.
+            group: Group of its demonstration.
+
+        Returns:
+            The number of the group that plays, and whether the start fits ``group``.
+        """
+        if self.fits(start, group):
+            return group, True
+        others = [other for other in self.numbers if other != group and self.fits(start, other)]
+        return self.trials.select(group, others), False
+
+    def end(self, group: int, expert: int, *, fits: bool, success: bool) -> None:
+        """Count an episode, given the results of `expert`; join groups that are one task."""
+        if {group, expert} <= {*self.numbers}:
+            self.trials.count(group, expert, fits=fits, success=success)
+        if (pair := self.trials.same_task()) is not None:
+            self.join(*pair)
+
+    def adapt(self, phi: Tensor, start: Tensor | None = None) -> GroupMatch:
+        """Find the group of one demonstration and learn from it.
+
+        Args:
+            phi: Embedding of the demonstration, ``[d]``.
+            start: Its first state, ``[f]``; given for all demonstrations or for none.
 
         Returns:
             The match ``[]`` from before learning.
 
         Raises:
-            ValueError: As from `lookup`; nothing has changed then.
+            ValueError: As from `lookup`, or if starts differ in size; nothing has changed then.
         """
         if phi.ndim != 1:
             raise ValueError(f"phi must be [{self.n_features}], got {[*phi.shape]}")
+        first = np.empty(0, np.float32) if start is None else start.cpu().numpy()
+        if len(self.points) and first.shape != self.starts.shape[1:]:
+            raise ValueError(
+                f"the starts of earlier demonstrations have {self.starts.shape[1]} features, this "
+                f"one has {[*first.shape]}: give one of the same size for each, or for none"
+            )
         match = self.lookup(phi)
-        is_new = self._show(self._checked(phi), int(match.group))
+        is_new = self._show(self._checked(phi), first, int(match.group))
         n_clustered = len(self.cluster)
         due = n_clustered + max(self.smallest, n_clustered // 100)
         if is_new and len(self.points) >= due:
@@ -182,6 +243,7 @@ class BehaviorGroups:
             **{name: torch.from_numpy(getattr(self, name).copy()) for name in _ARRAYS},
             **{name: [*getattr(self, name)] for name in _LISTS},
             "revision": self.revision,
+            "trials": self.trials.state_dict(),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -197,12 +259,13 @@ class BehaviorGroups:
                 f"the state has {arrays['points'].shape[-1]} features, these groups "
                 f"{self.n_features}: build them with the same size"
             )
-        sizes = {len(arrays[name]) for name in ("points", "shown", "group", "member")}
+        sizes = {len(arrays[name]) for name in _ARRAYS if name != "cluster"}
         if len(sizes) > 1 or not {*arrays["group"].tolist()} <= {*range(len(state["parent"]))}:
             raise ValueError("a group is missing in the state: load one that state_dict returned")
         vars(self).update(arrays)
         self.parent, self.links = [*state["parent"]], [*state["links"]]
         self.revision = state["revision"]
+        self.trials.load_state_dict(state["trials"])
         self._fit_metric(len(self.cluster))
         self._measure()
 
@@ -238,13 +301,15 @@ class BehaviorGroups:
             novelty[group == number] = kth / self._reach[number]
         return group, novelty
 
-    def _show(self, point: NDArray[np.float64], group: int) -> bool:
-        """Count a demonstration ``[d]``; return whether it is new."""
+    def _show(self, point: NDArray[np.float64], start: NDArray[np.float32], group: int) -> bool:
+        """Count a demonstration ``[d]`` with its start ``[f]``; return whether it is new."""
         same = (self.points == point).all(1)
         is_new = not same.any()
         if is_new:
             same = np.append(same, True)
             self.points = np.concatenate([self.points, point[None]])
+            starts = self.starts.reshape(len(self.starts), len(start))  # of no width before
+            self.starts = np.concatenate([starts, start[None]])
             self.shown, self.group = np.append(self.shown, 0), np.append(self.group, group)
             self.member = np.append(self.member, False)
         self.shown[same] += 1
@@ -282,6 +347,7 @@ class BehaviorGroups:
         self._measure()
         self.group[~inside] = self._lookup(self.points[~inside])[0]
         self.revision += int((self.group != before).any())
+        self.trials.keep(self.numbers)
 
     def _linked(self) -> NDArray[np.int64]:
         """Return the clusters, of which linked ones have the same label."""

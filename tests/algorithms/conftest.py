@@ -31,7 +31,9 @@ def make_bgpo(bank, encoders, make_config, in_world):
         algorithm = BGPO(config, seeds=seeds, bank=bank.seen(), encoders=encoders)
         for seed, groups in zip(seeds, algorithm.groups, strict=False):
             for row in range(known):
-                groups.adapt(bank.seen().embedding[(seed + row) % len(bank.seen().task)])
+                shown = (seed + row) % len(bank.seen().task)
+                start = None if algorithm.starts is None else algorithm.starts[shown]
+                groups.adapt(bank.seen().embedding[shown], start)
         return in_world(algorithm, seeds, schedule, bank)
 
     return make

@@ -9,7 +9,7 @@ from bgpo_trl.configs import BGPOConfig
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.modules.gwr import GWRB
 from bgpo_trl.transforms import TaskSchedule
-from tests.algorithms.playing import assert_same, play, save_and_restore, spy_batches
+from tests.algorithms.playing import assert_same, perceptron, play, save_and_restore, spy_batches
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 
@@ -48,7 +48,7 @@ def test_joined_groups_have_one_expert_and_one_replay(make_bgpo, bank):
     shown, groups = bank.seen().embedding, algorithm.groups[1]
     before, pair = groups.lookup(shown).group, groups.numbers[:2]
     pairs = iter([tuple(pair)])
-    algorithm.trials.same_task = lambda seed: next(pairs, None) if seed == 1 else None
+    groups.trials.same_task = lambda: next(pairs, None)
     play(algorithm, 7, state)
     assert next(pairs, None) is None
     after = groups.lookup(shown).group
@@ -63,20 +63,44 @@ def test_joined_groups_have_one_expert_and_one_replay(make_bgpo, bank):
         assert joined in group
 
 
-def test_another_group_plays_where_demonstrations_of_the_group_never_began(make_bgpo):
+def test_who_plays_is_decided_at_reset_and_acts_until_the_end(make_bgpo, bank):
+    """Another expert than the group's in each episode; actions are those of its networks."""
     algorithm = make_bgpo("all", known=15)
-    began = []
-    algorithm.trials.begin = lambda seed, start, group: began.append((seed, start.clone(), group))
-    algorithm.trials.playing = lambda seed: algorithm.groups[seed].numbers[-1]
-    data, _ = play(algorithm, 30)
+    began, ended, played = [], [], []
+    for seed, groups in enumerate(algorithm.groups):
+
+        def expert(start, group, seed=seed, groups=groups):
+            began.append((seed, start.clone(), group))
+            return groups.numbers[group == groups.numbers[0]], False
+
+        groups.expert = expert
+        groups.end = lambda *played, seed=seed, **of: ended.append((seed, *played, of))
+    algorithm.learner.noise = 0.0
+
+    def watch(state):
+        for seed in range(2):
+            weights = algorithm.actor_weights(seed, int(state["expert"][seed]))
+            x = torch.cat([state["latent"][seed], state["context"][seed]])
+            torch.testing.assert_close(state["action"][seed], perceptron(weights, x).tanh())
+        played.append(algorithm.active.group)
+
+    data, _ = play(algorithm, 30, watch=watch)
     starts = data["step_count"].squeeze(-1) == 0
-    assert len(began) == starts.sum() > 2
-    for seed, start, group in began:
+    assert len(began) - 2 <= starts.sum() and starts.sum() > 4
+    for seed, start, group in began[: int(starts.sum())]:
         rows = (data["latent"][seed] == start).all(-1) & starts[seed]
         assert rows.any() and (data["group"][seed][rows] == group).any()
-    for seed, active in enumerate(algorithm.active.group.tolist()):
-        assert algorithm.groups[seed].numbers[-1] in active
-    assert {*data["group"].unique().tolist()} - {*algorithm.active.group.unique().tolist()}
+    assert (data["group"] != data["expert"]).all()
+    assert not data["group_fits"].any()
+    ends = data[data["next", "done"].squeeze(-1)]
+    assert sorted((group, expert) for _, group, expert, _ in ended) == sorted(
+        zip(ends["group"].tolist(), ends["expert"].tolist(), strict=True)
+    )
+    successes = [of["success"] for *_, of in ended]
+    assert sum(successes) == ends["next", "success"].sum() > 0
+    entries, group = algorithm.replay.contents(0)
+    shown = bank.seen().embedding[entries["demo_index"]]
+    assert group.equal(algorithm.groups[0].lookup(shown).group)
 
 
 @pytest.mark.parametrize("variant", ["group-balanced replay", "all"])
