@@ -188,11 +188,11 @@ class TrainedPolicy:
             recognized["behavior"] = match.embedding[index]
             recognized["node"] = int(match.node[index])
             recognized["activity"] = float(match.activity[index])
-        if algorithm.groups is not None:
-            member = algorithm.groups.lookup(shown)
-            recognized["group"] = int(member.group[index])
-            recognized["group_novelty"] = float(member.novelty[index])
-            recognized["known"] = bool(member.known[index])
+        if algorithm.groups:
+            member = algorithm.groups[index].lookup(embedding)
+            recognized["group"] = int(member.group)
+            recognized["group_novelty"] = float(member.novelty)
+            recognized["known"] = bool(member.known)
         return Recognition(embedding, **recognized, task=task)
 
     @torch.no_grad()

@@ -280,7 +280,7 @@ class Trainer:
         pays = "episode_extrinsic_reward" in end
         extrinsic = end["episode_extrinsic_reward" if pays else "episode_reward"]
         nodes = 0 if algorithm.gwr is None else int(algorithm.gwr.num_nodes[index])
-        groups = 1 if algorithm.groups is None else int(algorithm.groups.num_groups[index])
+        groups = len(algorithm.groups[index].numbers) if algorithm.groups else 1
         row = {
             "algorithm": self.config.name,
             "seed": self.config.seeds[index],

@@ -109,7 +109,7 @@ def plain_policy(algorithm, snapshot, index, task, episode, phi):
     policy = Actor(n_features, **{**size, "in_keys": algorithm.in_keys})
     group = 0
     if algorithm.config.experts:
-        group = int(algorithm.groups.lookup(phi.expand(algorithm.n_seeds, -1)).group[index])
+        group = int(algorithm.groups[index].lookup(phi).group)
     policy.load_state_dict(algorithm.actor_weights(index, group))
     context = {}
     if snapshot.policy.context is not None:

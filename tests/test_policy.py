@@ -123,7 +123,7 @@ def test_recognition_of_demonstrations_of_any_length(trainer_of, load, encoders,
     assert seen.behavior.equal(graph.weights[best])
     activity = torch.exp(-config.gwr.activity_scale * distance)
     assert seen.activity == pytest.approx(float(activity))
-    member = algorithm.groups.lookup(seen.embedding.expand(2, -1))[1]
+    member = algorithm.groups[1].lookup(seen.embedding)
     assert (seen.group, seen.group_novelty) == (int(member.group), float(member.novelty))
     assert seen.known == (seen.group_novelty <= 1)
     assert policy.act(frames[-1]).shape == (4,)

@@ -103,7 +103,7 @@ class Algorithm(ABC):
 
     Attributes:
         gwr: GWR-B, or None.
-        groups: Groups of behaviors, or None.
+        groups: Groups of behaviors of each seed; empty for an algorithm without groups.
         state_size: Number of features of the state.
         learner: The RL algorithm: losses of actor and critic, optimizer, target networks.
         replay: Transitions of training episodes.
@@ -118,7 +118,7 @@ class Algorithm(ABC):
     """
 
     gwr: GWRB | None = None
-    groups: BehaviorGroups | None = None
+    groups: Sequence[BehaviorGroups] = ()
     needs_label: bool = True
     needs_replay: bool = True
     logged: tuple[str, ...] = ()

@@ -12,7 +12,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 
 from bgpo_trl.algorithms.algorithm import Algorithm, Policy
 from bgpo_trl.algorithms.environments import training_env
-from bgpo_trl.algorithms.experts import ActiveGroups, Experts, GroupTrials
+from bgpo_trl.algorithms.experts import ActiveGroups, Experts
 from bgpo_trl.algorithms.rl import Learner, LearnerSpec, make_learner
 from bgpo_trl.configs import BGPOConfig
 from bgpo_trl.data.bank import DemonstrationSteps
@@ -20,7 +20,7 @@ from bgpo_trl.data.demonstration_replay import DemonstrationReplay
 from bgpo_trl.data.replay import GroupReplay
 from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.modules.gwr import GWRB
-from bgpo_trl.seeding import generators
+from bgpo_trl.seeding import generators, stream_seed
 from bgpo_trl.transforms import DemonstrationSource
 from bgpo_trl.transforms.behavior_matching import matching_reward
 
@@ -38,8 +38,8 @@ class BGPO(Algorithm):
     Attributes:
         active: The groups played lately.
         experts: The networks of each group; None for one pair of networks.
-        trials: Trials by which groups of one task are joined; None without experts or
-            demonstrations.
+        starts: First latent of each demonstration, ``[N, 64]``, by which other groups' experts are
+            tried (`BehaviorGroups`); None without experts or demonstrations.
     """
 
     config: BGPOConfig
@@ -57,13 +57,16 @@ class BGPO(Algorithm):
                 generator=generators(seeds, "gwr"),
             )
         if config.grouped:
-            self.groups = BehaviorGroups(
-                embedding_size,
-                batch_size=[len(seeds)],
-                smallest=config.group_size,
-                evidence=config.group_evidence,
-            )
-        self._revision = torch.zeros(len(seeds), dtype=torch.int64)
+            self.groups = [
+                BehaviorGroups(
+                    embedding_size,
+                    smallest=config.group_size,
+                    evidence=config.group_evidence,
+                    seed=stream_seed(seed, "trials"),
+                )
+                for seed in seeds
+            ]
+        self._revision = [0] * len(seeds)
         sizes = {None: 0, "label": self.n_tasks}
         context_size = sizes.get(config.context, embedding_size)
         self.in_keys = [config.state, *(["context"] if context_size else [])]
@@ -81,8 +84,10 @@ class BGPO(Algorithm):
         n_active = config.active_groups if config.grouped else 1
         self.active = ActiveGroups(len(seeds), n_active, config.rest_after)
         self.experts: Experts | None = None
-        if config.experts and (groups := self.groups) is not None:
-            self.experts = Experts(self.learner, self.active, groups.parent)
+        if config.experts:
+            self.experts = Experts(
+                self.learner, self.active, lambda seed, group: self.groups[seed].parent[group]
+            )
         self.test_actor = self.learner.policy
         self.replay = GroupReplay(
             rl.replay_size,
@@ -93,11 +98,10 @@ class BGPO(Algorithm):
             gamma=rl.gamma,
         )
         self.shown = self.demonstrations(keys[1:], own_constants=not config.experts)
-        self.trials: GroupTrials | None = None
+        self.starts: Tensor | None = None
         if self.shown is not None and config.experts:
             steps = cast(DemonstrationSteps, self.bank.steps)
-            starts = steps.latents(steps.first)
-            self.trials = GroupTrials(starts, seeds=seeds, smallest=config.group_size)
+            self.starts = steps.latents(steps.first)
 
     def make_learner(self, spec: LearnerSpec) -> Learner:
         """Return the learner; an own RL algorithm overrides this."""
@@ -115,6 +119,7 @@ class BGPO(Algorithm):
             behavior_scale=self.config.behavior_scale,
             gwr=self.gwr,
             groups=self.groups,
+            starts=self.starts,
             beta=self.beta,
         )
 
@@ -128,16 +133,16 @@ class BGPO(Algorithm):
         success = 1.0 + self.beta
         return max(success, self.beta + self.config.rl.gamma * success)
 
-    def _groups_of(self, tensordict: TensorDictBase) -> list[int]:
-        return tensordict["group"].tolist() if self.config.grouped else [0] * self.n_seeds
+    def _number(self, tensordict: TensorDictBase, key: str) -> Tensor:
+        """Return an entry of `GroupLookup`, int64 ``[S]``; 0 without groups."""
+        if self.groups:
+            return tensordict[key]
+        return torch.zeros(self.n_seeds, dtype=torch.int64)
 
     @torch.no_grad()
     def act(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the ``action`` ``[S, A]`` of the group's policy with exploration noise.
-
-        Where groups have just been joined, the ``group`` of an episode that begins is updated.
-        """
-        groups = self._playing(tensordict)
+        """Write the ``action`` ``[S, A]`` of the episode's ``expert`` with exploration noise."""
+        groups = self._number(tensordict, "expert").tolist()
         if self.experts is not None:
             expert = self.experts.play(groups)
         else:
@@ -146,32 +151,16 @@ class BGPO(Algorithm):
                 self.active.play(seed, group)
         return tensordict.set("action", self.act_by(tensordict, groups, expert))
 
-    def _playing(self, tensordict: TensorDictBase) -> list[int]:
-        """Return the groups that act; update the groups of episodes that begin."""
-        groups, trials = self._groups_of(tensordict), self.trials
-        if trials is None or self.groups is None:
-            return groups
-        begins = tensordict["step_count"].flatten() == 0
-        if begins.any():
-            # The end of the last episode may have joined groups after the lookup of this one.
-            match = self.groups.lookup(tensordict["demo_embedding"], begins)
-            tensordict["group"] = torch.where(begins, match.group, tensordict["group"])
-        for seed in begins.nonzero().flatten().tolist():
-            start, group = tensordict[self.config.state][seed], int(tensordict["group"][seed])
-            trials.begin(seed, start, group)
-        return [trials.playing(seed) for seed in range(self.n_seeds)]
-
     def store(self, transition: TensorDictBase) -> None:
         """Store a transition of each seed and, at the end of an episode, its demonstration.
 
         Where demonstrations have changed their groups, all that is stored follows.
         """
-        group = torch.tensor(self._groups_of(transition))
+        group = self._number(transition, "group")
         self.replay.add(transition, group)
         if self.shown is not None:
             self._store_demonstration(self.shown, transition, group)
         self.count_episodes(transition)
-        self._join_groups(transition)
         self._follow_groups()
 
     def _store_demonstration(
@@ -185,37 +174,20 @@ class BGPO(Algorithm):
                 reward += self.beta * matching_reward(transition["behavior"], phi)
             shown.add(transition, reward, group, ended)
 
-    def _join_groups(self, transition: TensorDictBase) -> None:
-        """Count the episodes that end; join groups that turn out to be one task."""
-        if self.trials is None or self.groups is None:
-            return
-        end = transition.get("next")
-        for seed in end["done"].flatten().nonzero().flatten().tolist():
-            success = bool(end["success"][seed])
-            self.trials.end(seed, int(transition["demo_index"][seed]), success)
-            pair = self.trials.same_task(seed)
-            if pair is not None and {*pair} <= {*self.groups.numbers(seed)}:
-                self.groups.join(seed, *pair)
-                gone = {*pair} - {*self.groups.numbers(seed)}
-                if self.proposals is not None and len(gone) == 1:
-                    self.proposals.merge(seed, *({*pair} - gone), *gone)
-
     def _follow_groups(self) -> None:
         """Assign what is stored to the groups of today; put experts of former groups aside."""
-        if self.groups is None or (changed := self.groups.revision != self._revision).sum() == 0:
-            return
-        self._revision = self.groups.revision
-        shown = self.bank.embedding.expand(self.n_seeds, *self.bank.embedding.shape)
-        group_of = self.groups.lookup(shown, changed).group
-        for seed in changed.nonzero().flatten().tolist():
+        for seed, groups in enumerate(self.groups):
+            if groups.revision == self._revision[seed]:
+                continue
+            self._revision[seed] = groups.revision
+            group_of = groups.lookup(self.bank.embedding).group
             for replay in (self.replay, self.shown):
                 if replay is not None:
-                    replay.regroup(seed, group_of[seed])
-            known = self.groups.numbers(seed)
-            if self.trials is not None:
-                self.trials.regroup(seed, group_of[seed], known)
+                    replay.regroup(seed, group_of)
+            if self.proposals is not None:
+                self.proposals.keep(seed, groups.numbers)
             for group in [*self.active.groups[seed]]:
-                if group not in known:
+                if group not in groups.numbers:
                     (self.experts or self.active).rest(seed, group)
 
     def update(self) -> dict[str, Tensor]:
@@ -238,9 +210,8 @@ class BGPO(Algorithm):
         """Copy the policies of one seed, with experts those of the groups of the demonstrations."""
         del generator
         group = torch.zeros_like(task)
-        if self.experts is not None and self.groups is not None:
-            shown = embedding.expand(self.n_seeds, *embedding.shape)
-            group = self.groups.lookup(shown).group[index]
+        if self.experts is not None:
+            group = self.groups[index].lookup(embedding).group
         numbers, network = group.unique(return_inverse=True)
         each = [self.actor_weights(index, number) for number in numbers.tolist()]
         parameters = {key: torch.stack([weights[key] for weights in each]) for key in each[0]}
@@ -269,15 +240,19 @@ class BGPO(Algorithm):
             behavior = self.gwr.lookup(shown, mask=only).embedding[index]
         return self.config.behavior_scale * behavior
 
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything that future actions, updates and snapshots depend on."""
+        return {**super().state_dict(), "groups": [groups.state_dict() for groups in self.groups]}
+
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a `state_dict`."""
         super().load_state_dict(state)
-        if self.groups is not None:
-            self._revision = self.groups.revision
+        for groups, saved in zip(self.groups, state["groups"], strict=True):
+            groups.load_state_dict(saved)
+        self._revision = [groups.revision for groups in self.groups]
 
     def _learned(self) -> dict[str, Any]:
         # Experts come first, since they determine the shape of the learner's networks.
         played = {"active": self.active} if self.experts is None else {"experts": self.experts}
-        parts = {"gwr": self.gwr, "groups": self.groups, "trials": self.trials}
-        found = {key: part for key, part in parts.items() if part is not None}
-        return {**played, **super()._learned(), **found}
+        gwr = {} if self.gwr is None else {"gwr": self.gwr}
+        return {**played, **super()._learned(), **gwr}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 import torch
@@ -46,7 +47,8 @@ def training_env(
     context: Literal["behavior", "embedding", "label"] | None = None,
     behavior_scale: float = 1.0,
     gwr: GWRB | None = None,
-    groups: BehaviorGroups | None = None,
+    groups: Sequence[BehaviorGroups] = (),
+    starts: Tensor | None = None,
     beta: float = 0.0,
 ) -> TransformedEnv:
     """Return the environment of training episodes: simulations ``[S]`` within transforms.
@@ -63,7 +65,8 @@ def training_env(
             embedding phi in its place, the task's label one-hot, or nothing.
         behavior_scale: Factor of behavior or embedding in the context.
         gwr: GWR-B, which learns each demonstration.
-        groups: Groups of behaviors, which learn each demonstration; None for none.
+        groups: Groups of behaviors of each seed, which learn each demonstration; empty for none.
+        starts: First latent of each demonstration, for trials of experts; see `GroupLookup`.
         beta: Weight of the intrinsic reward; with 0, it is neither added nor measured.
 
     Raises:
@@ -78,8 +81,8 @@ def training_env(
         transforms.append(BehaviorLookup(gwr, learn=True))  # demo_embedding -> behavior
     elif context == "embedding":
         transforms.append(RenameTransform(["demo_embedding"], ["behavior"], create_copy=True))
-    if groups is not None:
-        transforms.append(GroupLookup(groups, learn=True))  # demo_embedding -> group
+    if groups:
+        transforms.append(GroupLookup(groups, learn=True, starts=starts))  # -> group, expert
     if beta:
         transforms.append(match_behavior(beta, encoders))  # reward + beta * exp(-||b - phi_g||)
     if context == "label":

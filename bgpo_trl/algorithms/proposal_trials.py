@@ -73,15 +73,6 @@ class ProposalTrials:
         (cloned, of_clone), (chosen, of_choice) = record.clone, record.choice
         return of_choice < _ENOUGH or chosen * of_clone < cloned * of_choice
 
-    def merge(self, seed: int, kept: int, merged: int) -> None:
-        """Add the counts of a group to those of the group that it has become a part of."""
-        record = self._groups[seed].pop(merged, None)
-        if record is not None:
-            into = self._groups[seed].setdefault(kept, _Record())
-            into.episodes += record.episodes
-            for ours, theirs in ((into.clone, record.clone), (into.choice, record.choice)):
-                ours[:] = [sum(pair) for pair in zip(ours, theirs, strict=True)]
-
     def keep(self, seed: int, groups: Sequence[int]) -> None:
         """Forget all other groups of a seed."""
         known = {*groups}

@@ -61,14 +61,12 @@ def task_inference_accuracy(
 
 
 @torch.no_grad()
-def group_purity(groups: BehaviorGroups, bank: DemonstrationBank, n_tasks: int) -> Tensor:
-    """Return the share of demonstrations of the majority task of their group, ``[*S]``.
+def group_purity(groups: BehaviorGroups, bank: DemonstrationBank, n_tasks: int) -> float:
+    """Return the share of demonstrations of the majority task of their group.
 
     A group's majority task is that of which it holds the largest share.
     """
-    batch = groups.batch_size
-    group = groups.lookup(bank.embedding.expand(*batch, *bank.embedding.shape)).group
-    counts = torch.zeros(*batch, int(group.max()) + 1, n_tasks)
-    for index in np.ndindex(*batch):
-        counts[index].index_put_((group[index], bank.task), torch.tensor(1.0), accumulate=True)
-    return _shares(counts).amax(-1).sum(-1) / len(bank.task.unique())
+    group = groups.lookup(bank.embedding).group
+    counts = torch.zeros(int(group.max()) + 1, n_tasks)
+    counts.index_put_((group, bank.task), torch.tensor(1.0), accumulate=True)
+    return float(_shares(counts).amax(-1).sum(-1) / len(bank.task.unique()))

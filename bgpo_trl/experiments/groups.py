@@ -93,9 +93,9 @@ def form(
         begun = time.perf_counter()
         groups.adapt(bank.embedding[row])
         seconds += time.perf_counter() - begun
-        if int(groups.revision) == revision:
+        if groups.revision == revision:
             continue
-        revision = int(groups.revision)
+        revision = groups.revision
         so_far = torch.tensor([*shown])
         task = bank.task[so_far]
         for own in own_groups(groups.lookup(bank.embedding[so_far]).group, task) - needed.keys():
@@ -149,8 +149,8 @@ def groups(arguments: GroupsArguments) -> str:
             inferred = task_inference_accuracy(gwr, seen, held_out, n_tasks)
             columns.append(
                 [
-                    f"{int(formed.num_groups)}",
-                    f"{100 * float(group_purity(formed, held_out, n_tasks)):.4g}",
+                    f"{len(formed.numbers)}",
+                    f"{100 * group_purity(formed, held_out, n_tasks):.4g}",
                     f"{max(needed.values())}" if len(needed) == n_tasks else "never",
                     f"{seconds:.1f}",
                     f"{int(gwr.num_nodes)}",
@@ -254,16 +254,14 @@ def leave_one_out(
         )
     from bgpo_trl.modules.behavior_groups import BehaviorGroups
 
-    groups = BehaviorGroups(learned.shape[-1], batch_size=[len(seeds)])
-    streams = generators(seeds, "leave one out")
-    rows = torch.stack([torch.randint(len(learned), (draws,), generator=s) for s in streams])
-    for row in rows.T:
-        groups.adapt(learned[row])
-
-    def novelty(embedding: Tensor) -> Tensor:
-        return groups.lookup(embedding.expand(len(seeds), *embedding.shape)).novelty
-
-    return Detection(novelty(known), novelty(unknown))
+    of_known, of_unknown = [], []
+    for stream in generators(seeds, "leave one out"):
+        groups = BehaviorGroups(learned.shape[-1])
+        for phi in learned[torch.randint(len(learned), (draws,), generator=stream)]:
+            groups.adapt(phi)
+        of_known.append(groups.lookup(known).novelty)
+        of_unknown.append(groups.lookup(unknown).novelty)
+    return Detection(torch.stack(of_known), torch.stack(of_unknown))
 
 
 @dataclass(frozen=True)

@@ -67,10 +67,12 @@ def measure(
         "nodes": None if gwr is None else gwr.num_nodes.tolist(),
         "groups": None,
     }
-    if algorithm.groups is not None:
-        purity = group_purity(algorithm.groups, bank.held_out(config.held_out), len(config.tasks))
-        summary["groups"] = algorithm.groups.num_groups.tolist()
-        summary["group_purity"] = purity.tolist()
+    if algorithm.groups:
+        held_out = bank.held_out(config.held_out)
+        summary["groups"] = [len(groups.numbers) for groups in algorithm.groups]
+        summary["group_purity"] = [
+            group_purity(groups, held_out, len(config.tasks)) for groups in algorithm.groups
+        ]
     return summary
 
 
@@ -134,9 +136,10 @@ def draw(
         draw_growth(out, config, bank)
         lines.append(f"GWR-B nodes: {gwr.num_nodes.tolist()}")
         lines.append(f"task inference on held-out demonstrations: {accuracy.mean():.1%}")
-    if trainer.algorithm.groups is not None:
+    if trainer.algorithm.groups:
         draw_groups(out, presented, out / "figures" / "groups.png")
-        lines.append(f"groups of behaviors: {trainer.algorithm.groups.num_groups.tolist()}")
+        numbers = [len(groups.numbers) for groups in trainer.algorithm.groups]
+        lines.append(f"groups of behaviors: {numbers}")
     return lines
 
 

@@ -278,9 +278,8 @@ def draw_nodes(
     weights, groups = algorithm.gwr.graph(0).weights, None
     node_tasks = majority_task(match_counts(algorithm.gwr, bank.seen(), len(tasks))[0])
     node_tasks = node_tasks[: len(weights)]
-    if algorithm.groups is not None:
-        batch = algorithm.groups.batch_size
-        groups = algorithm.groups.lookup(weights.expand(*batch, *weights.shape)).group[0]
+    if algorithm.groups:
+        groups = algorithm.groups[0].lookup(weights).group
     write_nodes(run / "gwr.csv", weights, node_tasks, groups)
     save_figure(plot_gwr_pca(weights, node_tasks, tasks, groups), run / "figures" / "gwr.png")
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -11,14 +10,15 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 from tensordict import TensorClass
-from torch import Tensor, nn
+from torch import Tensor
 
 from bgpo_trl.errors import as_shape
 from bgpo_trl.modules.density_clusters import density_clusters, local_whitening
-from bgpo_trl.modules.gwr import as_mask
+from bgpo_trl.modules.group_trials import GroupTrials
 
 _KNOWN_SHARE = 0.99  # of a group's own demonstrations that are to count as known
-_ARRAYS = ("points", "shown", "group", "member", "cluster")  # of the state
+_FITTING_SHARE = 0.9  # of a group's own demonstrations whose starts are to count as fitting
+_ARRAYS = ("points", "starts", "shown", "group", "member", "cluster")  # of the state
 _LISTS = ("parent", "links")
 
 
@@ -26,8 +26,8 @@ class GroupMatch(TensorClass["tensor_only"]):
     """Group of each input.
 
     Attributes:
-        group: Number of the group within its network, int64 ``[*batch]``. Numbers count up from 0
-            in order of appearance and are never used again.
+        group: Number of the group, int64 ``[*batch]``. Numbers count up from 0 in order of
+            appearance and are never used again.
         novelty: Distance to the group's demonstrations relative to the group's own extent,
             float32 ``[*batch]``: above 1, the input lies farther out than 99 % of them and belongs
             to no known group. Infinite as long as there are too few demonstrations for a group.
@@ -42,8 +42,8 @@ class GroupMatch(TensorClass["tensor_only"]):
         return self.novelty <= 1.0
 
 
-class BehaviorGroups(nn.Module):
-    """Groups of similar behaviors, for one network or a batch of independent ones.
+class BehaviorGroups:
+    """Groups of similar behaviors, found in the demonstrations that are shown one after another.
 
     A group is a cluster of the different demonstrations shown so far, separated from the others by
     a valley of significantly lower density (`density_clusters`). No distance is given: the same
@@ -65,14 +65,40 @@ class BehaviorGroups(nn.Module):
     4. Groups that turn out to be one behavior can be joined (`join`), and stay so: the clusters of
        their densest demonstrations are one group from then on.
 
+    A task that looks different from different starts, such as a push to the left or to the right,
+    forms several groups. The expert of each does not know what to do where the group's own
+    demonstrations never began. Where the starts of demonstrations are given, too,
+
+    5. a start *fits* a group if its distance to the nearest start of the group's demonstrations is
+       at most the 90 % quantile of this distance among those starts themselves;
+    6. where a start does not fit the group shown, the episode is played by the expert of that group
+       or of one that it fits, whichever `GroupTrials.select` draws (`expert`);
+    7. two groups whose experts succeed after each other's demonstrations are joined (`end`).
+
+    Each seed has groups of its own.
+
     Args:
         n_features: Size d of an input.
-        batch_size: Shape of the batch (the seeds), or its length; ``()`` is a single set of groups.
         smallest: Least number of different demonstrations of a group.
         evidence: Depth of a significant valley, in multiples of what chance explains.
+        seed: Seed of the trials.
 
     Raises:
         ValueError: If ``smallest`` is below 4 or ``evidence`` is not positive.
+
+    Attributes:
+        trials: Successes of the experts of groups after demonstrations of others.
+        points: The different demonstrations, in the order in which they were first shown, [n, d].
+        starts: First state of each, [n, f]; f is 0 if they are not given.
+        shown: How often each was shown, [n].
+        group: Group of each, [n].
+        member: Whether it is in the cluster of the group, [n]; False for outliers, and for those
+            that have come since all were clustered.
+        cluster: Cluster of each of those that there were when they were last clustered; -1 for
+            outliers.
+        parent: Parent of each group, by number; that of group 0 is 0.
+        links: Pairs of demonstrations whose clusters are one group.
+        revision: How often earlier demonstrations have changed their groups.
 
     Examples:
         >>> groups = BehaviorGroups(3)
@@ -80,183 +106,66 @@ class BehaviorGroups(nn.Module):
         >>> inputs[1::2] += 10
         >>> for x in inputs:
         ...     match = groups.adapt(x)
-        >>> groups.num_groups, groups.lookup(torch.tensor([[0.0] * 3, [10.0] * 3, [5.0] * 3])).known
-        (tensor(2), tensor([ True,  True, False]))
+        >>> groups.numbers, groups.lookup(torch.tensor([[0.0] * 3, [10.0] * 3, [5.0] * 3])).known
+        ([0, 1], tensor([ True,  True, False]))
     """
 
+    points: NDArray[np.float64]
+    starts: NDArray[np.float32]
+    shown: NDArray[np.int64]
+    group: NDArray[np.int64]
+    member: NDArray[np.bool_]
+    cluster: NDArray[np.int64]
+    parent: list[int]
+    links: list[tuple[int, int]]
+    revision: int
+
     def __init__(
-        self,
-        n_features: int,
-        *,
-        batch_size: int | Sequence[int] = (),
-        smallest: int = 10,
-        evidence: float = 1.0,
+        self, n_features: int, *, smallest: int = 10, evidence: float = 1.0, seed: int = 0
     ) -> None:
-        super().__init__()
         (self.n_features,) = as_shape([n_features], "n_features")
-        self.batch_size = as_shape(batch_size, "batch_size")
         if not (smallest >= 4 and smallest == int(smallest) and 0 < evidence < np.inf):
             raise ValueError(
                 "smallest must be a whole number of at least 4 and evidence positive, got "
                 f"{smallest} and {evidence}"
             )
         self.smallest, self.evidence = int(smallest), float(evidence)
-        self._networks = [self._network() for _ in range(self.batch_size.numel())]
+        self._k = self.smallest // 2  # neighbors by which distances to a group are measured
+        self.trials = GroupTrials(seed)
+        self.points, self.starts = np.empty((0, self.n_features)), np.empty((0, 0), np.float32)
+        self.member = np.empty(0, np.bool_)
+        self.shown, self.group, self.cluster = (np.empty(0, np.int64) for _ in range(3))
+        self.parent, self.links, self.revision = [0], [], 0
+        # Linear map [d, d] after which distances are measured.
+        self._metric = np.eye(self.n_features)
+        # By group, the 99 % quantile of its members' distances to their k-th neighbor in it.
+        self._reach: dict[int, float] = {}
 
     @property
-    def num_groups(self) -> Tensor:
-        """Number of groups of each network now, at least 1, int64 ``[*batch_size]``."""
-        return self._per_network([len(network.reach) or 1 for network in self._networks])
+    def numbers(self) -> list[int]:
+        """Numbers of the groups, ascending; group 0 alone before the first clustering."""
+        return sorted(self._reach) or [0]
 
-    @property
-    def revision(self) -> Tensor:
-        """How often earlier demonstrations have changed their groups, int64 ``[*batch_size]``."""
-        return self._per_network([network.revision for network in self._networks])
-
-    def numbers(self, network: int) -> list[int]:
-        """Return the numbers of the groups of a network in the flattened batch, ascending."""
-        return sorted(self._networks[network].reach) or [0]
-
-    def parent(self, network: int, group: int) -> int:
-        """Return the parent of a group (0 for the first) of a network in the flattened batch."""
-        return self._networks[network].parent[group]
-
-    def join(self, network: int, first: int, second: int) -> None:
-        """Join two groups of a network in the flattened batch, given their numbers.
+    def join(self, first: int, second: int) -> None:
+        """Join two groups, given their numbers, from now on.
 
         Raises:
             ValueError: If there is no such group, or both are the same.
         """
-        missing = {first, second} - {*self.numbers(network)}
-        if missing or first == second:
+        if {first, second} - {*self.numbers} or first == second:
             raise ValueError(
-                f"groups to join must be two of {self.numbers(network)}, got {first} and {second}"
+                f"groups to join must be two of {self.numbers}, got {first} and {second}"
             )
-        self._networks[network].join(first, second)
+        self.links.append((self._densest(first), self._densest(second)))
+        self._arrange()
 
-    def forward(self, phi: Tensor) -> GroupMatch:
-        """Call `lookup`."""
-        return self.lookup(phi)
-
-    def lookup(self, phi: Tensor, mask: Tensor | None = None) -> GroupMatch:
-        """Return the groups ``[*batch_size, *extra]`` of inputs ``[*batch_size, *extra, d]``.
-
-        Args:
-            phi: Inputs.
-            mask: Networks that take part, bool ``[*batch_size]``; None: all. The others' groups are
-                -1, their novelties NaN.
+    def lookup(self, phi: Tensor) -> GroupMatch:
+        """Return the groups ``[*B]`` of inputs ``[*B, d]``.
 
         Raises:
-            ValueError: If phi or mask has the wrong shape, or a phi that takes part holds NaN or
-                Inf.
+            ValueError: If an input has another number of features, or holds NaN or Inf.
         """
-        n_batch = len(self.batch_size)
-        if phi.shape[:n_batch] != self.batch_size or phi.ndim == n_batch:
-            raise ValueError(
-                f"phi must lead with {[*self.batch_size]}, one for each network, got {[*phi.shape]}"
-            )
-        inputs, active = self._checked(phi, mask)
-        inputs = inputs.reshape(len(active), -1, self.n_features)
-        group, novelty = np.full(inputs.shape[:2], -1), np.full(inputs.shape[:2], np.nan)
-        for i in np.flatnonzero(active):
-            group[i], novelty[i] = self._networks[i].lookup(inputs[i])
-        return self._match(group, novelty, phi)
-
-    def adapt(self, phi: Tensor, mask: Tensor | None = None) -> GroupMatch:
-        """Find the group of one input per network and learn from it.
-
-        Args:
-            phi: Inputs ``[*batch_size, d]``.
-            mask: Networks that take part, bool ``[*batch_size]``; None: all.
-
-        Returns:
-            Matches ``[*batch_size]`` from before learning; -1 and NaN where ``mask`` is False.
-
-        Raises:
-            ValueError: If phi or mask has the wrong shape, or a phi that takes part holds NaN or
-                Inf.
-        """
-        if phi.shape != (*self.batch_size, self.n_features):
-            raise ValueError(
-                f"phi must be {[*self.batch_size, self.n_features]}, got {[*phi.shape]}"
-            )
-        inputs, active = self._checked(phi, mask)
-        inputs = inputs.reshape(len(active), 1, self.n_features)
-        group, novelty = np.full(len(active), -1), np.full(len(active), np.nan)
-        for i in np.flatnonzero(active):
-            network = self._networks[i]
-            (group[i],), (novelty[i],) = network.lookup(inputs[i])
-            is_new = network.show(inputs[i], int(group[i]))
-            n_clustered = len(network.cluster)
-            due = n_clustered + max(self.smallest, n_clustered // 100)
-            if is_new and len(network.points) >= due:
-                network.fit_metric(len(network.points))
-                network.cluster = density_clusters(
-                    network.places(network.points), smallest=self.smallest, evidence=self.evidence
-                )
-                network.arrange()
-        return self._match(group, novelty, phi)
-
-    def get_extra_state(self) -> list[dict[str, Any]]:
-        """Return demonstrations and groups of each network, for ``state_dict``."""
-        return [
-            {
-                **{name: torch.from_numpy(getattr(network, name).copy()) for name in _ARRAYS},
-                **{name: [*getattr(network, name)] for name in _LISTS},
-                "revision": network.revision,
-            }
-            for network in self._networks
-        ]
-
-    def set_extra_state(self, state: list[dict[str, Any]]) -> None:
-        """Restore the result of `get_extra_state`.
-
-        Raises:
-            ValueError: If it is damaged, or of another number of networks or features; nothing has
-                changed then.
-        """
-        sizes = [entry["points"].shape[-1] for entry in state]
-        if sizes != [self.n_features] * len(self._networks):
-            raise ValueError(
-                f"the state has groups of {len(sizes)} networks of {set(sizes)} features, this "
-                f"BehaviorGroups {len(self._networks)} of {self.n_features}: build it with the "
-                "same sizes"
-            )
-        self._networks = [self._network(entry) for entry in state]
-
-    def _network(self, state: dict[str, Any] | None = None) -> _Network:
-        """Return a network in the given state, or an empty one."""
-        k = self.smallest // 2
-        if state is None:
-            none = np.empty(0, np.int64)
-            return _Network(k, np.empty((0, self.n_features)), none, none, none.astype(bool), none)
-        arrays: dict[str, Any] = {name: state[name].numpy().copy() for name in _ARRAYS}
-        lists: dict[str, Any] = {name: [*state[name]] for name in _LISTS}
-        network = _Network(k, **arrays, **lists, revision=state["revision"])
-        sizes = {len(arrays[name]) for name in ("points", "shown", "group", "member")}
-        if len(sizes) > 1 or not {*network.group.tolist()} <= {*range(len(network.parent))}:
-            raise ValueError("a group is missing in the state: load one that state_dict returned")
-        network.fit_metric(len(network.cluster))
-        network.measure()
-        return network
-
-    def _checked(
-        self, phi: Tensor, mask: Tensor | None
-    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Return inputs as an array, and which networks take part ``[networks]``."""
-        active = torch.ones(self.batch_size, dtype=torch.bool)
-        if mask is not None:
-            active = as_mask(mask, self.batch_size).cpu()
-        inputs = phi.detach().cpu().double().numpy()
-        if phi.shape[-1:] != (self.n_features,) or not np.isfinite(inputs[active.numpy()]).all():
-            raise ValueError(
-                f"phi must be {self.n_features} features without NaN and Inf, got {[*phi.shape]}"
-            )
-        return inputs, active.flatten().numpy()
-
-    def _match(
-        self, group: NDArray[np.int64], novelty: NDArray[np.float64], phi: Tensor
-    ) -> GroupMatch:
+        group, novelty = self._lookup(self._checked(phi).reshape(-1, self.n_features))
         shape = phi.shape[:-1]
         return GroupMatch(
             group=torch.from_numpy(group).view(shape).to(phi.device),
@@ -264,84 +173,147 @@ class BehaviorGroups(nn.Module):
             batch_size=shape,
         )
 
-    def _per_network(self, numbers: list[int]) -> Tensor:
-        return torch.tensor(numbers).view(self.batch_size)
+    def fits(self, start: Tensor, group: int) -> bool:
+        """Return whether a start ``[f]`` fits a group; all do if there are too few to compare."""
+        rows = np.flatnonzero(self.group == group)
+        if len(rows) < self.smallest or not self.starts.size:
+            return True
+        starts = torch.from_numpy(self.starts[rows])
+        apart = torch.cdist(starts, starts).fill_diagonal_(torch.inf).amin(-1)
+        return bool(torch.cdist(start[None], starts).amin() <= apart.quantile(_FITTING_SHARE))
 
+    def expert(self, start: Tensor, group: int) -> tuple[int, bool]:
+        """Return the group whose expert is to play an episode.
 
-@dataclass
-class _Network:
-    """Groups of one network.
+        Args:
+            start: First state of the episode, ``[f]``.
+            group: Group of its demonstration.
 
-    Attributes:
-        k: Neighbors by which distances to a group are measured.
-        points: The different demonstrations, in the order in which they were first shown, [n, d].
-        shown: How often each was shown, [n].
-        group: Group of each, [n].
-        member: Whether it is in the cluster of the group, [n]; False for outliers, and for those
-            that have come since all were clustered.
-        cluster: Cluster of each of those that there were when they were last clustered; -1 for
-            outliers.
-        parent: Parent of each group, by number.
-        links: Pairs of demonstrations whose clusters are one group.
-        revision: See `BehaviorGroups.revision`.
-        reach: By group, the 99 % quantile of its members' distances to their k-th neighbor in it.
-        metric: Linear map [d, d] after which distances are measured.
-    """
+        Returns:
+            The number of the group that plays, and whether the start fits ``group``.
+        """
+        if self.fits(start, group):
+            return group, True
+        others = [other for other in self.numbers if other != group and self.fits(start, other)]
+        return self.trials.select(group, others), False
 
-    k: int
-    points: NDArray[np.float64]
-    shown: NDArray[np.int64]
-    group: NDArray[np.int64]
-    member: NDArray[np.bool_]
-    cluster: NDArray[np.int64]
-    parent: list[int] = field(default_factory=lambda: [0])
-    links: list[tuple[int, int]] = field(default_factory=list)
-    revision: int = 0
-    reach: dict[int, float] = field(default_factory=dict)
-    metric: NDArray[np.float64] = field(init=False)
+    def end(self, group: int, expert: int, *, fits: bool, success: bool) -> None:
+        """Count an episode, given the results of `expert`; join groups that are one task."""
+        if {group, expert} <= {*self.numbers}:
+            self.trials.count(group, expert, fits=fits, success=success)
+        if (pair := self.trials.same_task()) is not None:
+            self.join(*pair)
 
-    def __post_init__(self) -> None:
-        self.metric = np.eye(self.points.shape[1])
+    def adapt(self, phi: Tensor, start: Tensor | None = None) -> GroupMatch:
+        """Find the group of one demonstration and learn from it.
 
-    def fit_metric(self, n_points: int) -> None:
+        Args:
+            phi: Embedding of the demonstration, ``[d]``.
+            start: Its first state, ``[f]``; given for all demonstrations or for none.
+
+        Returns:
+            The match ``[]`` from before learning.
+
+        Raises:
+            ValueError: As from `lookup`, or if starts differ in size; nothing has changed then.
+        """
+        if phi.ndim != 1:
+            raise ValueError(f"phi must be [{self.n_features}], got {[*phi.shape]}")
+        first = np.empty(0, np.float32) if start is None else start.cpu().numpy()
+        if len(self.points) and first.shape != self.starts.shape[1:]:
+            raise ValueError(
+                f"the starts of earlier demonstrations have {self.starts.shape[1]} features, this "
+                f"one has {[*first.shape]}: give one of the same size for each, or for none"
+            )
+        match = self.lookup(phi)
+        is_new = self._show(self._checked(phi), first, int(match.group))
+        n_clustered = len(self.cluster)
+        due = n_clustered + max(self.smallest, n_clustered // 100)
+        if is_new and len(self.points) >= due:
+            self._fit_metric(len(self.points))
+            self.cluster = density_clusters(
+                self._places(self.points), smallest=self.smallest, evidence=self.evidence
+            )
+            self._arrange()
+        return match
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return a copy of demonstrations and groups."""
+        return {
+            **{name: torch.from_numpy(getattr(self, name).copy()) for name in _ARRAYS},
+            **{name: [*getattr(self, name)] for name in _LISTS},
+            "revision": self.revision,
+            "trials": self.trials.state_dict(),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore a `state_dict`.
+
+        Raises:
+            ValueError: If it is damaged, or of another number of features; nothing has changed
+                then.
+        """
+        arrays: dict[str, Any] = {name: state[name].numpy().copy() for name in _ARRAYS}
+        if arrays["points"].shape[-1] != self.n_features:
+            raise ValueError(
+                f"the state has {arrays['points'].shape[-1]} features, these groups "
+                f"{self.n_features}: build them with the same size"
+            )
+        sizes = {len(arrays[name]) for name in _ARRAYS if name != "cluster"}
+        if len(sizes) > 1 or not {*arrays["group"].tolist()} <= {*range(len(state["parent"]))}:
+            raise ValueError("a group is missing in the state: load one that state_dict returned")
+        vars(self).update(arrays)
+        self.parent, self.links = [*state["parent"]], [*state["links"]]
+        self.revision = state["revision"]
+        self.trials.load_state_dict(state["trials"])
+        self._fit_metric(len(self.cluster))
+        self._measure()
+
+    def _checked(self, phi: Tensor) -> NDArray[np.float64]:
+        """Return inputs as an array."""
+        inputs = phi.detach().cpu().double().numpy()
+        if phi.shape[-1:] != (self.n_features,) or not np.isfinite(inputs).all():
+            raise ValueError(
+                f"phi must be {self.n_features} features without NaN and Inf, got {[*phi.shape]}"
+            )
+        return inputs
+
+    def _fit_metric(self, n_points: int) -> None:
         """Measure distances as the first demonstrations suggest, all that are being clustered."""
         if n_points > 1:
-            self.metric = local_whitening(self.points[:n_points])
+            self._metric = local_whitening(self.points[:n_points])
 
-    def places(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _places(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return points where their Euclidean distances are those of the metric."""
-        return points @ self.metric
+        return points @ self._metric
 
-    def lookup(self, inputs: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    def _lookup(self, inputs: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return group and novelty ``[m]`` of inputs ``[m, d]``."""
-        if not self.reach:
+        if not self._reach:
             return np.zeros(len(inputs), np.int64), np.full(len(inputs), np.inf)
         members, of_member = self.points[self.member], self.group[self.member]
-        distances = cdist(self.places(inputs), self.places(members))
+        distances = cdist(self._places(inputs), self._places(members))
         group = of_member[distances.argmin(1)]
         novelty = np.empty(len(inputs))
         for number in np.unique(group):
             to_group = distances[np.ix_(group == number, of_member == number)]
-            kth = np.partition(to_group, self.k - 1, axis=1)[:, self.k - 1]
-            novelty[group == number] = kth / self.reach[number]
+            kth = np.partition(to_group, self._k - 1, axis=1)[:, self._k - 1]
+            novelty[group == number] = kth / self._reach[number]
         return group, novelty
 
-    def show(self, point: NDArray[np.float64], group: int) -> bool:
-        """Count a demonstration ``[1, d]``; return whether it is new."""
+    def _show(self, point: NDArray[np.float64], start: NDArray[np.float32], group: int) -> bool:
+        """Count a demonstration ``[d]`` with its start ``[f]``; return whether it is new."""
         same = (self.points == point).all(1)
         is_new = not same.any()
         if is_new:
             same = np.append(same, True)
-            self.points = np.concatenate([self.points, point])
+            self.points = np.concatenate([self.points, point[None]])
+            starts = self.starts.reshape(len(self.starts), len(start))  # of no width before
+            self.starts = np.concatenate([starts, start[None]])
             self.shown, self.group = np.append(self.shown, 0), np.append(self.group, group)
             self.member = np.append(self.member, False)
         self.shown[same] += 1
         return is_new
-
-    def join(self, first: int, second: int) -> None:
-        """Join two groups from now on."""
-        self.links.append((self._densest(first), self._densest(second)))
-        self.arrange()
 
     def _densest(self, group: int) -> int:
         """Return the demonstration of a group whose k-th neighbor in it is the nearest."""
@@ -350,10 +322,10 @@ class _Network:
 
     def _kth_distances(self, rows: NDArray[np.int64]) -> NDArray[np.floating]:
         """Return the distance of each of some demonstrations to its k-th neighbor among them."""
-        points = self.places(self.points[rows])
-        return np.partition(cdist(points, points), self.k, axis=1)[:, self.k]
+        points = self._places(self.points[rows])
+        return np.partition(cdist(points, points), self._k, axis=1)[:, self._k]
 
-    def arrange(self) -> None:
+    def _arrange(self) -> None:
         """Turn the clusters into groups, matched with the groups so far."""
         before = self.group
         labels = np.full(len(self.points), -1)
@@ -372,23 +344,24 @@ class _Network:
                 self.parent.append(int(common[cluster].argmax()))
         self.group = np.array([number.get(label, -1) for label in labels.tolist()])
         self.member = inside
-        self.measure()
-        self.group[~inside] = self.lookup(self.points[~inside])[0]
+        self._measure()
+        self.group[~inside] = self._lookup(self.points[~inside])[0]
         self.revision += int((self.group != before).any())
+        self.trials.keep(self.numbers)
 
     def _linked(self) -> NDArray[np.int64]:
         """Return the clusters, of which linked ones have the same label."""
         labels, inside = self.cluster.copy(), np.flatnonzero(self.cluster >= 0)
         for link in self.links:
-            ends, others = self.places(self.points[[*link]]), self.places(self.points[inside])
+            ends, others = self._places(self.points[[*link]]), self._places(self.points[inside])
             nearest = cdist(ends, others).argmin(1)
             one, other = labels[inside[nearest]]
             labels[labels == other] = one
         return labels
 
-    def measure(self) -> None:
+    def _measure(self) -> None:
         """Measure the reach of each group."""
-        self.reach = {}
+        self._reach = {}
         for number in np.unique(self.group[self.member]).tolist():
             members = np.flatnonzero(self.member & (self.group == number))
-            self.reach[number] = float(np.quantile(self._kth_distances(members), _KNOWN_SHARE))
+            self._reach[number] = float(np.quantile(self._kth_distances(members), _KNOWN_SHARE))

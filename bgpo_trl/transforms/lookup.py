@@ -11,8 +11,9 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 
 from bgpo_trl.errors import missing_key
+from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.seeding import generators
-from bgpo_trl.transforms._episode import EpisodeTransform, ending, unbounded
+from bgpo_trl.transforms._episode import EpisodeTransform, ending, starting, unbounded
 
 __all__ = ["BehaviorLookup", "DemonstrationLookup", "GroupLookup"]
 
@@ -28,8 +29,7 @@ class DemonstrationLookup(EpisodeTransform):
     ``clone`` looks up in the same network, and with ``learn=True`` teaches it too.
 
     Args:
-        network: One network, or one per row. Its ``batch_size`` must be the environment's; if it
-            does not learn here, the leading dimensions suffice.
+        network: What to look up in, for each row of the environment.
         learn: Adapt the network. May be changed at any time; independent of ``train()`` and
             ``eval()``, which TorchRL calls on all transforms. Set it to False for
             ``check_env_specs`` if episodes can end within the three steps of the check.
@@ -63,7 +63,7 @@ class DemonstrationLookup(EpisodeTransform):
         """Look up the demonstrations of any TensorDict, without learning."""
         embedding = tensordict.get(self.in_keys[0], None)
         if embedding is None:
-            raise missing_key(type(self).__name__, tensordict, self.in_keys)
+            raise missing_key(type(self).__name__, tensordict, self.in_keys[:1])
         for key, value in zip(self.out_keys, self.look_up(embedding), strict=True):
             # The network may compute in another dtype than the one that the spec announces.
             tensordict.set(key, value.to(embedding.dtype) if value.is_floating_point() else value)
@@ -80,17 +80,26 @@ class DemonstrationLookup(EpisodeTransform):
         if self.learn:
             ended = ending(tensordict, next_tensordict)
             if ended.any():
-                self.network.adapt(tensordict.get(self.in_keys[0]), mask=ended)
+                self._learn(tensordict, next_tensordict, ended)
         return next_tensordict
+
+    def _learn(
+        self, tensordict: TensorDictBase, next_tensordict: TensorDictBase, ended: Tensor
+    ) -> None:
+        """Learn from the episodes of the rows that ``ended``, bool ``[*B]``."""
+        self.network.adapt(tensordict.get(self.in_keys[0]), mask=ended)
+
+    def _fits(self, batch_size: torch.Size) -> bool:
+        """Return whether there is a network for each row of an environment."""
+        return batch_size == self.network.batch_size
 
     def _demonstration_spec(self, observation_spec: Composite) -> TensorSpec:
         """Return the spec of the demonstration's embedding, after checking the batch size."""
         demonstration = self._read_spec(observation_spec, self.in_keys[0], "DemonstrationSource")
-        if self.learn and observation_spec.shape != self.network.batch_size:
+        if self.learn and not self._fits(observation_spec.shape):
             raise ValueError(
-                f"{type(self.network).__name__} was made for "
-                f"batch_size={tuple(self.network.batch_size)}, but the environment to learn from "
-                f"has {tuple(observation_spec.shape)}: make both the same"
+                f"{type(self).__name__} is to learn from an environment of batch_size="
+                f"{tuple(observation_spec.shape)}: give it a network for each of these rows"
             )
         return demonstration
 
@@ -146,13 +155,29 @@ class BehaviorLookup(DemonstrationLookup):
 
 
 class GroupLookup(DemonstrationLookup):
-    """Group of an episode's demonstration, which selects the expert and the replay.
+    """Group of an episode's demonstration, and the group whose expert plays the episode.
 
-    For the arguments, see `DemonstrationLookup`, whose ``network`` is a `BehaviorGroups`. With a
-    novelty above 1, the demonstration belongs to no known group and is played by the nearest.
+    At reset, the demonstration's group is looked up. Without ``starts``, its expert plays; with a
+    novelty above 1, the demonstration belongs to no known group and is played by the nearest. With
+    ``starts`` and ``learn=True``, experts of other groups are tried where the episode starts unlike
+    the demonstrations of the group (`BehaviorGroups.expert`). When the episode ends, the groups
+    learn its demonstration, count its success, and may be joined.
 
-    Reads ``demo_embedding`` float32 ``[*B, 32]`` and ``done``; writes ``group`` int64 ``[*B]`` and
-    ``group_novelty`` float32 ``[*B]``.
+    Reads ``demo_embedding`` float32 ``[*B, 32]`` and ``done``, and with ``starts`` also ``latent``
+    float32 ``[*B, 64]``, ``demo_index`` int64 ``[*B]`` and ``success`` bool ``[*B, 1]``. Writes
+    ``group`` int64 ``[*B]``, ``group_novelty`` float32 ``[*B]``, ``group_fits`` bool ``[*B]``,
+    False in a trial, and ``expert`` int64 ``[*B]``, the number of the group whose expert plays.
+
+    Args:
+        network: Groups of each row.
+        learn: As for `DemonstrationLookup`.
+        starts: First latent of each demonstration by its index, float32 ``[N, 64]``.
+        in_keys: Keys of embedding, latent, index and success; the last three are read with
+            ``starts``.
+        out_keys: Entries written.
+
+    Raises:
+        ValueError: As from `DemonstrationLookup`.
 
     Examples:
         >>> from types import SimpleNamespace
@@ -161,23 +186,81 @@ class GroupLookup(DemonstrationLookup):
         >>> from bgpo_trl.transforms import DemonstrationSource, TaskSchedule
         >>> bank = SimpleNamespace(embedding=torch.rand(6, 32), task=torch.arange(6) % 3)
         >>> source = DemonstrationSource(bank, TaskSchedule())
-        >>> lookup = GroupLookup(BehaviorGroups(32), learn=True)
+        >>> lookup = GroupLookup([BehaviorGroups(32)], learn=True)
         >>> env = TransformedEnv(PendulumEnv(), Compose(StepCounter(50), source, lookup))
-        >>> env.rollout(50)["group"].unique()
+        >>> env.rollout(50)["expert"].unique()
         tensor([0])
     """
 
-    written = ("group", "group_novelty")
+    written = ("group", "group_novelty", "group_fits", "expert")
+    network: Sequence[BehaviorGroups]
 
-    def look_up(self, embedding: Tensor) -> tuple[Tensor, Tensor]:
-        """Return group and novelty for embeddings ``[*B, 32]``."""
-        match = self.network.lookup(embedding)
-        return match.group, match.novelty
+    def __init__(
+        self,
+        network: Sequence[BehaviorGroups],
+        *,
+        learn: bool,
+        starts: Tensor | None = None,
+        in_keys: Sequence[NestedKey] = ("demo_embedding", "latent", "demo_index", "success"),
+        out_keys: Sequence[NestedKey] | None = None,
+    ) -> None:
+        super().__init__(network, learn=learn, in_keys=in_keys, out_keys=out_keys)
+        self.starts = starts
+
+    def look_up(self, embedding: Tensor) -> tuple[Tensor, ...]:
+        """Return the ``out_keys`` for embeddings ``[*B, 32]``; the expert is that of the group."""
+        pairs = zip(self.network, self._of_rows(embedding), strict=True)
+        matches, shape = [groups.lookup(phi) for groups, phi in pairs], embedding.shape[:-1]
+        group = torch.stack([match.group for match in matches]).view(shape)
+        novelty = torch.stack([match.novelty for match in matches]).view(shape)
+        return group, novelty, torch.ones_like(group, dtype=torch.bool), group.clone()
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        self.forward(tensordict_reset)
+        if self.learn and self.starts is not None:
+            latent = self._of_rows(tensordict_reset.get(self.in_keys[1]))[:, 0]
+            group, _, fits, expert = self._written(tensordict_reset)
+            for row in starting(tensordict).flatten().nonzero().flatten().tolist():
+                expert[row], fits[row] = self.network[row].expert(latent[row], int(group[row]))
+        return tensordict_reset
+
+    def _learn(
+        self, tensordict: TensorDictBase, next_tensordict: TensorDictBase, ended: Tensor
+    ) -> None:
+        phi = self._of_rows(tensordict.get(self.in_keys[0]))[:, 0]
+        group, _, fits, expert = self._written(tensordict)
+        for row in ended.flatten().nonzero().flatten().tolist():
+            groups = self.network[row]
+            if self.starts is None:
+                groups.adapt(phi[row])
+                continue
+            index = int(tensordict.get(self.in_keys[2]).flatten()[row])
+            success = bool(next_tensordict.get(self.in_keys[3]).flatten()[row])
+            groups.adapt(phi[row], self.starts[index])
+            groups.end(int(group[row]), int(expert[row]), fits=bool(fits[row]), success=success)
+
+    def _written(self, tensordict: TensorDictBase) -> list[Tensor]:
+        """Return views of the entries written, by row ``[S]``."""
+        return [tensordict.get(key).view(-1) for key in self.out_keys]
 
     def _entries(self, observation_spec: Composite) -> dict[NestedKey, TensorSpec]:
         demonstration = self._demonstration_spec(observation_spec)
-        group_key, novelty_key = self.out_keys
+        dtypes = (torch.int64, demonstration.dtype, torch.bool, torch.int64)
         return {
-            group_key: unbounded(observation_spec, dtype=torch.int64),
-            novelty_key: unbounded(observation_spec, dtype=demonstration.dtype),
+            key: unbounded(observation_spec, dtype=dtype)
+            for key, dtype in zip(self.out_keys, dtypes, strict=True)
         }
+
+    def _fits(self, batch_size: torch.Size) -> bool:
+        return batch_size.numel() == len(self.network) and len(batch_size) <= 1
+
+    def _of_rows(self, entry: Tensor) -> Tensor:
+        """Return an entry ``[*B, f]`` by row, ``[S, *, f]``."""
+        n_rows = len(self.network)
+        if n_rows > 1 and entry.shape[0] != n_rows:
+            raise ValueError(
+                f"there are groups for {n_rows} rows, not for embeddings {[*entry.shape]}"
+            )
+        return entry.reshape(n_rows, -1, entry.shape[-1])

@@ -28,10 +28,11 @@ def make_bgpo(bank, encoders, make_config, in_world):
         config = replace(config, **{**CHANGES.get(variant, {}), **changes})
         bank = bank.for_tasks(bank.tasks[: schedule.n_tasks])
         algorithm = BGPO(config, seeds=seeds, bank=bank.seen(), encoders=encoders)
-        if algorithm.groups is not None:
+        for seed, groups in zip(seeds, algorithm.groups, strict=False):
             for row in range(known):
-                shown = [(seed + row) % len(bank.seen().task) for seed in seeds]
-                algorithm.groups.adapt(bank.seen().embedding[shown])
+                shown = (seed + row) % len(bank.seen().task)
+                start = None if algorithm.starts is None else algorithm.starts[shown]
+                groups.adapt(bank.seen().embedding[shown], start)
         return in_world(algorithm, seeds, schedule, bank)
 
     return make

@@ -70,10 +70,10 @@ def test_bgpo_never_reads_the_label(make_bgpo, variant):
     for key in ("action", "latent", "behavior", "demo_index", ("next", "reward")):
         assert seeing[key].equal(not_seeing[key]), key
     assert_same(weights(algorithm), weights(blind))
-    if algorithm.groups is not None:
+    for ours, theirs in zip(algorithm.groups, blind.groups, strict=True):
         assert_same(algorithm.gwr.graph(0), blind.gwr.graph(0))
-        assert algorithm.groups.num_groups.equal(blind.groups.num_groups)
-        assert algorithm.groups.num_groups.min() > 1
+        assert ours.numbers == theirs.numbers
+        assert len(ours.numbers) > 1
 
 
 @pytest.mark.parametrize("variant", ["ground truth, label", "latent, nothing"])
@@ -118,14 +118,14 @@ def test_test_episodes_are_played_by_the_expert_of_their_demonstration(make_bgpo
     """By hand: the group of each demonstration, its expert's weights, what they do."""
     algorithm = make_bgpo("experts", schedule=TaskSchedule((0, 0, 0)), known=15)
     play(algorithm, 60)
-    assert algorithm.groups.num_groups.min() > 2
+    assert all(len(groups.numbers) > 2 for groups in algorithm.groups)
     shown = bank.held_out()
     embedding, task = shown.embedding.view(3, 4, 32), shown.task.view(3, 4)
     state = torch.randn(2, 3, 4, 64, generator=torch.Generator().manual_seed(0))
     before = deepcopy(algorithm.state_dict())
     actions = act_in_tests(algorithm, state, embedding, task)
     assert_same(algorithm.state_dict(), before)
-    groups = algorithm.groups.lookup(embedding.expand(2, 3, 4, 32)).group
+    groups = torch.stack([of_seed.lookup(embedding).group for of_seed in algorithm.groups])
     behaviors = algorithm.gwr.lookup(embedding.expand(2, 3, 4, 32)).embedding
     assert all(len(of_seed.unique()) > 1 for of_seed in groups)
     for seed, t, m in torch.cartesian_prod(*map(torch.arange, groups.shape)).tolist():
@@ -192,10 +192,10 @@ def test_each_seed_of_a_batch_learns_as_it_would_alone(make_bgpo):
             close(together[index][key], data[key])
         for ours, theirs in zip(weights(batch), weights(alone), strict=True):
             close(ours[index], theirs[0])
-        n_groups, graph = int(alone.groups.num_groups), alone.gwr.graph(0)
+        n_groups, graph = len(alone.groups[0].numbers), alone.gwr.graph(0)
         torch.testing.assert_close(batch.gwr.graph(index), graph, rtol=1e-5, atol=1e-5)
         assert len(graph.weights) > 2
-        assert n_groups == batch.groups.num_groups[index] > 2
+        assert n_groups == len(batch.groups[index].numbers) > 2
         for group in range(n_groups):
             close(batch.actor_weights(index, group), alone.actor_weights(0, group))
 

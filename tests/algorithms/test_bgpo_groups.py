@@ -9,7 +9,7 @@ from bgpo_trl.configs import BGPOConfig
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.modules.gwr import GWRB
 from bgpo_trl.transforms import TaskSchedule
-from tests.algorithms.playing import assert_same, play, save_and_restore, spy_batches
+from tests.algorithms.playing import assert_same, perceptron, play, save_and_restore, spy_batches
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 
@@ -18,7 +18,7 @@ def test_a_restored_run_continues_as_the_saved_one(make_bgpo, tmp_path):
     options = {"rl": "sac", "schedule": TaskSchedule((0, 0, 0))}
     algorithm = make_bgpo("all", known=15, **options)
     _, state = play(algorithm, 60)
-    assert algorithm.groups.num_groups.min() > 2  # more than are active
+    assert all(len(groups.numbers) > 2 for groups in algorithm.groups)  # more than are active
     # Of other weights, streams and simulations.
     other = make_bgpo("all", seeds=(5, 7), **options)
     play(other, 6)
@@ -28,14 +28,15 @@ def test_a_restored_run_continues_as_the_saved_one(make_bgpo, tmp_path):
     assert (ours == theirs).all()
     assert_same(algorithm.learner.state_dict(), other.learner.state_dict())
     assert_same(algorithm.experts.state_dict(), other.experts.state_dict())
-    assert other.groups.num_groups.equal(algorithm.groups.num_groups)
+    for ours, theirs in zip(algorithm.groups, other.groups, strict=True):
+        assert_same(ours.state_dict(), theirs.state_dict())
 
 
 def test_with_one_group_it_is_the_plain_learner_bit_for_bit(make_bgpo):
     lonely = {"group_size": 99, "active_groups": 4, "expert_batch_size": 16}
     plain, one = make_bgpo("latent, b", rl="sac"), make_bgpo("experts", rl="sac", **lonely)
     ours, theirs = play(plain, 30)[0], play(one, 30)[0]
-    assert one.groups.num_groups.tolist() == [1, 1]
+    assert all(groups.numbers == [0] for groups in one.groups)
     for key in ("action", "latent", "behavior", "demo_index", ("next", "reward")):
         assert ours[key].equal(theirs[key]), key
     assert_same(plain.learner.state_dict(), one.learner.state_dict())
@@ -44,17 +45,17 @@ def test_with_one_group_it_is_the_plain_learner_bit_for_bit(make_bgpo):
 def test_joined_groups_have_one_expert_and_one_replay(make_bgpo, bank):
     algorithm = make_bgpo("all", schedule=TaskSchedule((0, 0, 0)), known=15)
     _, state = play(algorithm, 60)
-    shown = bank.seen().embedding.expand(2, -1, -1)
-    before, pair = algorithm.groups.lookup(shown).group[1], algorithm.groups.numbers(1)[:2]
+    shown, groups = bank.seen().embedding, algorithm.groups[1]
+    before, pair = groups.lookup(shown).group, groups.numbers[:2]
     pairs = iter([tuple(pair)])
-    algorithm.trials.same_task = lambda seed: next(pairs, None) if seed == 1 else None
+    groups.trials.same_task = lambda: next(pairs, None)
     play(algorithm, 7, state)
     assert next(pairs, None) is None
-    after = algorithm.groups.lookup(shown).group[1]
+    after = groups.lookup(shown).group
     (joined,) = after[(before == pair[0]) | (before == pair[1])].unique().tolist()
     assert joined in pair
     (other,) = {*pair} - {joined}
-    assert other not in algorithm.groups.numbers(1)
+    assert other not in groups.numbers
     assert other not in algorithm.active.group[1]
     for replay in (algorithm.replay, algorithm.shown._shown):
         entries, group = replay.contents(1)
@@ -62,20 +63,44 @@ def test_joined_groups_have_one_expert_and_one_replay(make_bgpo, bank):
         assert joined in group
 
 
-def test_another_group_plays_where_demonstrations_of_the_group_never_began(make_bgpo):
+def test_who_plays_is_decided_at_reset_and_acts_until_the_end(make_bgpo, bank):
+    """Another expert than the group's in each episode; actions are those of its networks."""
     algorithm = make_bgpo("all", known=15)
-    began = []
-    algorithm.trials.begin = lambda seed, start, group: began.append((seed, start.clone(), group))
-    algorithm.trials.playing = lambda seed: algorithm.groups.numbers(seed)[-1]
-    data, _ = play(algorithm, 30)
+    began, ended, played = [], [], []
+    for seed, groups in enumerate(algorithm.groups):
+
+        def expert(start, group, seed=seed, groups=groups):
+            began.append((seed, start.clone(), group))
+            return groups.numbers[group == groups.numbers[0]], False
+
+        groups.expert = expert
+        groups.end = lambda *played, seed=seed, **of: ended.append((seed, *played, of))
+    algorithm.learner.noise = 0.0
+
+    def watch(state):
+        for seed in range(2):
+            weights = algorithm.actor_weights(seed, int(state["expert"][seed]))
+            x = torch.cat([state["latent"][seed], state["context"][seed]])
+            torch.testing.assert_close(state["action"][seed], perceptron(weights, x).tanh())
+        played.append(algorithm.active.group)
+
+    data, _ = play(algorithm, 30, watch=watch)
     starts = data["step_count"].squeeze(-1) == 0
-    assert len(began) == starts.sum() > 2
-    for seed, start, group in began:
+    assert len(began) - 2 <= starts.sum() and starts.sum() > 4
+    for seed, start, group in began[: int(starts.sum())]:
         rows = (data["latent"][seed] == start).all(-1) & starts[seed]
         assert rows.any() and (data["group"][seed][rows] == group).any()
-    for seed, active in enumerate(algorithm.active.group.tolist()):
-        assert algorithm.groups.numbers(seed)[-1] in active
-    assert {*data["group"].unique().tolist()} - {*algorithm.active.group.unique().tolist()}
+    assert (data["group"] != data["expert"]).all()
+    assert not data["group_fits"].any()
+    ends = data[data["next", "done"].squeeze(-1)]
+    assert sorted((group, expert) for _, group, expert, _ in ended) == sorted(
+        zip(ends["group"].tolist(), ends["expert"].tolist(), strict=True)
+    )
+    successes = [of["success"] for *_, of in ended]
+    assert sum(successes) == ends["next", "success"].sum() > 0
+    entries, group = algorithm.replay.contents(0)
+    shown = bank.seen().embedding[entries["demo_index"]]
+    assert group.equal(algorithm.groups[0].lookup(shown).group)
 
 
 @pytest.mark.parametrize("variant", ["group-balanced replay", "all"])
@@ -113,24 +138,23 @@ def test_an_update_sees_as_much_of_each_group_played_last(make_bgpo, bank, varia
 def test_what_is_stored_is_of_the_group_that_its_demonstration_has_today(make_bgpo, bank):
     """Groups split while they are played."""
     algorithm = make_bgpo("all", schedule=TaskSchedule((0, 0, 0)), known=9)
-    shown = bank.seen().embedding.expand(2, -1, -1)
     n_groups, played, state = set(), [set(), set()], None
     for _ in range(30):
         data, state = play(algorithm, 4, state)
-        n_groups |= {*algorithm.groups.num_groups.tolist()}
-        group_of = algorithm.groups.lookup(shown).group
-        for seed in range(2):
+        for seed, groups in enumerate(algorithm.groups):
+            n_groups.add(len(groups.numbers))
+            group_of = groups.lookup(bank.seen().embedding).group
             played[seed] |= {*data["group"][seed].tolist()}
-            known = {*algorithm.groups.numbers(seed), -1}
+            known = {*groups.numbers, -1}
             assert {*algorithm.active.group[seed].tolist()} <= known
             for replay in (algorithm.replay, algorithm.shown._shown):
                 if len(replay):
                     entries, group = replay.contents(seed)
-                    assert group.equal(group_of[seed][entries["demo_index"]])
+                    assert group.equal(group_of[entries["demo_index"]])
                     counts = replay.sizes(torch.arange(9).expand(2, 9))[seed]
                     assert counts.equal(group.bincount(minlength=9))
     assert n_groups >= {1, 3}
-    assert algorithm.groups.revision.min() > 0
+    assert all(groups.revision > 0 for groups in algorithm.groups)
     assert all(len(groups) > 2 for groups in played)
 
 

@@ -78,7 +78,7 @@ def test_tasks_count_equally_whatever_their_number_of_demonstrations():
     for _ in range(3):
         groups.adapt(PLACES[0])
     shown = bank(*[(0, 0)] * 9, (1, 1))
-    assert group_purity(groups, shown, 2).item() == 0.5
+    assert group_purity(groups, shown, 2) == 0.5
     gwr = network((0, 1))
     both = bank(*[(0, 0)] * 9, (0, 1))
     assert task_inference_accuracy(gwr, both, both, 2).item() == 0.5

@@ -30,18 +30,17 @@ def group_of(groups, demonstrations):
 
 
 def test_inputs_are_unknown_and_of_group_0_before_the_first_clustering():
-    groups = BehaviorGroups(4, batch_size=[3])
+    groups = BehaviorGroups(4)
     match = groups.lookup(torch.rand(3, 5, 4))
     assert match.group.equal(torch.zeros(3, 5, dtype=torch.int64))
     assert not match.known.any()
-    assert groups.num_groups.tolist() == [1, 1, 1]
-    assert groups.numbers(0) == [0]
+    assert groups.numbers == [0]
     one, few = BehaviorGroups(4), around(0, 9)
     show(one, few.repeat(10, 1))  # again and again adds nothing
     assert not one.lookup(few).known.any()
     show(one, around(0, 1, seed=1))
     assert one.lookup(few).known.all()
-    assert (int(one.num_groups), int(one.revision)) == (1, 0)
+    assert (one.numbers, one.revision) == ([0], 0)
 
 
 def test_new_behavior_gets_its_group_within_thirty_demonstrations():
@@ -50,19 +49,19 @@ def test_new_behavior_gets_its_group_within_thirty_demonstrations():
     played = show(groups, around(1, 30))
     assert played[0] == 0 and played[-1] == 1
     assert played == sorted(played)
-    assert int(groups.num_groups) == 2
-    assert groups.parent(0, 1) == 0
-    before = groups.get_extra_state()
+    assert groups.numbers == [0, 1]
+    assert groups.parent[1] == 0
+    before = groups.state_dict()
     for place in (0, 1):
         assert group_of(groups, around(place, 50, seed=1)) == [place]
-    torch.testing.assert_close(groups.get_extra_state(), before, rtol=0, atol=0)
+    torch.testing.assert_close(groups.state_dict(), before, rtol=0, atol=0)
 
 
 def test_novelty_is_relative_to_the_extent_of_the_group():
     groups = BehaviorGroups(4)
     wide = 4 * (around(1, 100) - PLACES[1])
     show(groups, torch.cat([around(0, 100), wide - 60]))
-    assert int(groups.num_groups) == 2
+    assert len(groups.numbers) == 2
     ours = around(0, 400, seed=1)
     assert 0.9 < float(groups.lookup(ours).known.float().mean()) < 1.0
     # Seven deviations from the first group are far, from the second they are not.
@@ -89,8 +88,8 @@ def test_larger_part_of_a_split_group_keeps_the_number(sizes):
     order = torch.randperm(120, generator=torch.Generator().manual_seed(0))
     groups = BehaviorGroups(4, smallest=40)
     assert set(show(groups, inputs[order])) == {0}  # until it splits with the last of them
-    assert groups.numbers(0) == [0, 1]
-    assert groups.parent(0, 1) == 0
+    assert groups.numbers == [0, 1]
+    assert groups.parent[1] == 0
     larger = sizes.index(75)
     assert group_of(groups, around(larger, 9, seed=2)) == [0]
     assert group_of(groups, around(1 - larger, 9, seed=2)) == [1]
@@ -107,20 +106,20 @@ def test_merged_groups_keep_the_number_of_the_one_shown_most(often):
     parts = line(0, 4, 50), line(8, 12, 50)
     groups = BehaviorGroups(1)
     show(groups, torch.cat(parts))
-    assert int(groups.num_groups) == 2
+    assert len(groups.numbers) == 2
     numbers = [group_of(groups, part)[0] for part in parts]
     assert sorted(numbers) == [0, 1]
     show(groups, parts[often].repeat(3, 1))
-    assert int(groups.revision) == 1
+    assert groups.revision == 1
     show(groups, line(4, 8, 60))
-    assert int(groups.num_groups) == 1
-    assert groups.numbers(0) == [numbers[often]]
+    assert len(groups.numbers) == 1
+    assert groups.numbers == [numbers[often]]
     assert group_of(groups, torch.linspace(0, 12, 50).unsqueeze(-1)) == [numbers[often]]
-    assert int(groups.revision) > 1
+    assert groups.revision > 1
     # Numbers are never used again: the next new group is 2, though only one is left.
     show(groups, line(40, 44, 40))
-    assert groups.numbers(0) == sorted([numbers[often], 2])
-    assert groups.parent(0, 2) == numbers[often]
+    assert groups.numbers == sorted([numbers[often], 2])
+    assert groups.parent[2] == numbers[often]
 
 
 def test_behaviors_that_differ_in_a_small_feature_have_their_groups():
@@ -132,70 +131,40 @@ def test_behaviors_that_differ_in_a_small_feature_have_their_groups():
     groups = BehaviorGroups(5)
     show(groups, inputs[:300])
     found = groups.lookup(inputs[300:])
-    assert int(groups.num_groups) == 2
+    assert len(groups.numbers) == 2
     assert len({*zip(which[300:].tolist(), found.group.tolist(), strict=True)}) == 2
 
 
-def test_masked_networks_in_a_batch_equal_networks_alone():
-    generator = torch.Generator().manual_seed(0)
-    places = torch.randint(4, (140, 3), generator=generator)
-    inputs = PLACES[places] + torch.randn(140, 3, 4, generator=generator)
-    masks = torch.rand(140, 3, generator=generator) < 0.6
-    together, alone = BehaviorGroups(4, batch_size=[3]), [BehaviorGroups(4) for _ in range(3)]
-    for phi, mask in zip(inputs, masks, strict=True):
-        phi[~mask] = torch.nan
-        match = together.adapt(phi, mask)
-        for i, active in enumerate(mask.tolist()):
-            if not active:
-                assert int(match.group[i]) == -1
-                assert match.novelty[i].isnan()
-                continue
-            own = alone[i].adapt(phi[i])
-            assert int(own.group) == int(match.group[i])
-            assert own.novelty.equal(match.novelty[i])
-    assert together.num_groups.tolist() == [int(groups.num_groups) for groups in alone]
-    assert together.revision.tolist() == [int(groups.revision) for groups in alone]
-    assert together.num_groups.min() > 2
-    shown = 12 * torch.rand(3, 50, 4, generator=generator)
-    match = together.lookup(shown, torch.tensor([True, False, True]))
-    assert (match.group[1] == -1).all() and match.novelty[1].isnan().all()
-    for i in (0, 2):
-        own = alone[i].lookup(shown[i])
-        assert match.group[i].equal(own.group) and match.novelty[i].equal(own.novelty)
-
-
-def test_loaded_groups_continue_identically():
-    groups, restored = (BehaviorGroups(4, batch_size=[2]) for _ in range(2))
-    inputs = torch.stack([torch.cat([around(p, 40, seed=s) for p in (0, 1, 2)]) for s in (0, 1)], 1)
-    only_first = torch.tensor([True, False])
-    for phi in inputs[:55]:
-        groups.adapt(phi, only_first)  # so that one of them is still empty
+@pytest.mark.parametrize("n_shown", [0, 55])
+def test_loaded_groups_continue_identically(n_shown):
+    groups, restored = BehaviorGroups(4), BehaviorGroups(4)
+    inputs = torch.cat([around(place, 40) for place in (0, 1, 2)])
+    show(groups, inputs[:n_shown])
     file = io.BytesIO()
     torch.save(groups.state_dict(), file)
     file.seek(0)
     restored.load_state_dict(torch.load(file, weights_only=True))
-    assert restored.num_groups.equal(groups.num_groups)
-    for phi in inputs[55:]:
+    assert restored.numbers == groups.numbers
+    for phi in inputs[n_shown:]:
         ours, theirs = groups.adapt(phi), restored.adapt(phi)
         assert ours.group.equal(theirs.group)
         assert ours.novelty.equal(theirs.novelty)
-    assert restored.num_groups.equal(groups.num_groups)
-    assert restored.revision.equal(groups.revision)
-    assert groups.num_groups.tolist() == [3, 2]
-    for network in range(2):
-        for number in groups.numbers(network):
-            assert groups.parent(network, number) == restored.parent(network, number)
+    assert restored.numbers == groups.numbers == [0, 1, 2]
+    assert restored.revision == groups.revision
+    assert restored.parent == groups.parent
 
 
 @pytest.mark.parametrize(
-    "phi", [torch.zeros(3, 5), torch.full((3, 4), torch.nan), torch.zeros(2, 4)], ids=str
+    "phi", [torch.zeros(5), torch.full((4,), torch.nan), torch.zeros(2, 5)], ids=str
 )
 def test_bad_inputs_are_rejected_and_change_nothing(phi):
-    groups = BehaviorGroups(4, batch_size=[3])
+    groups = BehaviorGroups(4)
     for call in (groups.lookup, groups.adapt):
         with pytest.raises(ValueError, match="phi must"):
             call(phi)
-    assert all(len(state["points"]) == 0 for state in groups.get_extra_state())
+    with pytest.raises(ValueError, match="phi must"):
+        groups.adapt(torch.zeros(2, 4))
+    assert len(groups.points) == 0
     for options in ({"smallest": 3}, {"smallest": 4.5}, {"evidence": 0}):
         with pytest.raises(ValueError, match="smallest must be"):
             BehaviorGroups(2, **options)
@@ -204,46 +173,39 @@ def test_bad_inputs_are_rejected_and_change_nothing(phi):
 def test_damaged_states_and_those_of_other_sizes_are_rejected_and_change_nothing():
     groups = BehaviorGroups(4)
     show(groups, around(0, 12))
-    (state,) = before = groups.get_extra_state()
+    before = groups.state_dict()
     for bad in (
-        BehaviorGroups(4, batch_size=2).get_extra_state(),
-        BehaviorGroups(3).get_extra_state(),
-        [{**state, "group": state["group"] + 1}],
-        [{**state, "member": state["member"][1:]}],
+        BehaviorGroups(3).state_dict(),
+        {**before, "group": before["group"] + 1},
+        {**before, "member": before["member"][1:]},
     ):
         with pytest.raises(ValueError, match="state"):
-            groups.set_extra_state(bad)
-    torch.testing.assert_close(groups.get_extra_state(), before, rtol=0, atol=0)
+            groups.load_state_dict(bad)
+    torch.testing.assert_close(groups.state_dict(), before, rtol=0, atol=0)
 
 
 def test_joined_groups_stay_joined_when_clustered_anew():
-    groups = BehaviorGroups(4, batch_size=[2])
-    for place, count in ((0, 60), (1, 60), (2, 70)):
-        for phi in around(place, count):
-            groups.adapt(phi.expand(2, -1))
-    assert groups.numbers(0) == groups.numbers(1) == [0, 1, 2]
+    joined, plain = BehaviorGroups(4), BehaviorGroups(4)
+    shown = torch.cat([around(0, 60), around(1, 60), around(2, 70)])
+    assert show(joined, shown) == show(plain, shown)
+    assert joined.numbers == [0, 1, 2]
     for pair in ((0, 0), (0, 5), (-1, 0)):
         with pytest.raises(ValueError, match="groups to join must be"):
-            groups.join(0, *pair)
-    revision = groups.revision
-    groups.join(0, 0, 2)
-    assert groups.revision.tolist() == [revision[0] + 1, revision[1]]
-    assert groups.num_groups.tolist() == [2, 3]
-    assert groups.numbers(0) == [1, 2]  # 2 was shown more often than 0
+            joined.join(*pair)
+    joined.join(0, 2)
+    assert joined.revision == plain.revision + 1
+    assert joined.numbers == [1, 2]  # 2 was shown more often than 0
     for seed in (1, 2):  # clustered anew, soon with a fourth group
         for place, expected in enumerate((2, 1, 2)):
-            group = groups.lookup(around(place, 9, seed).expand(2, -1, -1)).group
-            assert {*group[0].tolist()} == {expected}
-            assert {*group[1].tolist()} == {place}
-        for phi in torch.cat([around(place, 25, seed) for place in (2, 0, 3)]):
-            groups.adapt(phi.expand(2, -1))
-    assert groups.num_groups.tolist() == [3, 4]
-    restored = BehaviorGroups(4, batch_size=[2])
-    restored.load_state_dict(groups.state_dict())
-    for each in (groups, restored):
-        for phi in around(1, 20, seed=9):
-            each.adapt(phi.expand(2, -1))
-        assert each.num_groups.tolist() == [3, 4]
+            assert group_of(joined, around(place, 9, seed)) == [expected]
+            assert group_of(plain, around(place, 9, seed)) == [place]
+        for groups in (joined, plain):
+            show(groups, torch.cat([around(place, 25, seed) for place in (2, 0, 3)]))
+    restored = BehaviorGroups(4)
+    restored.load_state_dict(joined.state_dict())
+    for groups, n_groups in ((joined, 3), (restored, 3), (plain, 4)):
+        show(groups, around(1, 20, seed=9))
+        assert len(groups.numbers) == n_groups
 
 
 # ---- the shipped banks
@@ -267,7 +229,7 @@ def test_groups_of_shipped_demonstrations_contain_one_task_each(order):
     for available in schedule.available(torch.arange(each * n_tasks + 60)):
         task = rng.choice(available.nonzero().flatten())
         groups.adapt(seen.embedding[int(rng.choice(rows[task]))])
-    assert n_tasks <= int(groups.num_groups) <= 2 * n_tasks + 2
+    assert n_tasks <= len(groups.numbers) <= 2 * n_tasks + 2
     group = groups.lookup(held_out.embedding).group
     majority = {int(g): held_out.task[group == g].mode().values.item() for g in group.unique()}
     assert {*majority.values()} == {*range(n_tasks)}

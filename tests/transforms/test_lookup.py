@@ -1,5 +1,7 @@
 """Behavior and group of an episode, and when GWR-B and the groups learn from it."""
 
+from copy import deepcopy
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -21,7 +23,7 @@ def compose(lookup, seeds, lengths):
     source = DemonstrationSource(
         make_bank(),
         TaskSchedule((0, 0, 0)),
-        batch_size=lookup.network.batch_size,
+        batch_size=[] if seeds is None else [len(seeds)],
         generator=generators(seeds or [0]),
     )
     return TransformedEnv(MockEnv(seeds, lengths), Compose(StepCounter(50), source, lookup))
@@ -33,8 +35,7 @@ def make(seeds=None, lengths=3, learn=True):
 
 
 def make_groups(seeds=None, lengths=3, learn=True):
-    batch_size = [] if seeds is None else [len(seeds)]
-    groups = BehaviorGroups(32, batch_size=batch_size, smallest=4)
+    groups = [BehaviorGroups(32, smallest=4) for _ in seeds or [0]]
     return compose(GroupLookup(groups, learn=learn), seeds, lengths), groups
 
 
@@ -137,14 +138,14 @@ def adapt(groups, count):
     """Adapt all rows to ``count`` demonstrations around three places."""
     generator = torch.Generator().manual_seed(0)
     for number in range(count):
-        noise = torch.rand(*groups.batch_size, 32, generator=generator)
-        groups.adapt(noise + 5 * (number % 3))
+        for of_row in groups:
+            of_row.adapt(torch.rand(32, generator=generator) + 5 * (number % 3))
 
 
-def copy_of(groups):
-    copy = BehaviorGroups(32, batch_size=groups.batch_size, smallest=4)
-    copy.load_state_dict(groups.state_dict())
-    return copy
+def look_up(groups, phi):
+    """Groups and novelties ``[S, *B]`` of embeddings ``[S, *B, 32]``, row by row."""
+    matches = [of_row.lookup(of) for of_row, of in zip(groups, phi, strict=True)]
+    return torch.stack([m.group for m in matches]), torch.stack([m.novelty for m in matches])
 
 
 @pytest.mark.parametrize("seeds", [None, [4, 2, 3]])
@@ -154,43 +155,42 @@ def test_the_group_is_set_at_reset_and_constant_in_the_episode(seeds, learn):
     check_env_specs(env)
     env.transform[-1].learn = learn
     adapt(groups, 15)
-    assert (groups.revision == 0).all()
+    assert all(of_row.revision == 0 for of_row in groups)
     start = env.reset()
     assert start["group"].equal(torch.zeros(env.batch_size, dtype=torch.int64))
     assert start["group_novelty"].isfinite().all()
     for _ in range(6):
-        expected = groups.lookup(start["demo_embedding"])
-        assert start["group"].equal(expected.group)
-        assert start["group_novelty"].equal(expected.novelty)
+        group, novelty = look_up(groups, start["demo_embedding"].view(len(groups), 32))
+        assert start["group"].flatten().equal(group)
+        assert start["group_novelty"].flatten().equal(novelty)
         steps, following = play(env, 3, start.clone())  # one episode
         for key in ("group", "group_novelty"):
             for data in (steps, steps["next"]):
                 assert (data[key] == start[key].unsqueeze(-1)).all()
         start = following
-    assert bool((groups.num_groups > 1).all()) == learn
+    assert all((len(of_row.numbers) > 1) == learn for of_row in groups)
 
 
 def test_groups_learn_from_episodes_that_end_only():
     """Seeds whose episodes end at different times, against groups adapted by hand."""
     env, groups = make_groups([4, 2, 3], lengths=[2, 3, 5])
     adapt(groups, 15)
-    plain = copy_of(groups)
+    plain = deepcopy(groups)
     state = env.reset()
     for _ in range(30):
         steps, following = play(env, 1, state.clone())
         ended = steps["next", "done"].flatten()
-        if ended.any():
-            plain.adapt(state["demo_embedding"], ended)
-        assert plain.num_groups.equal(groups.num_groups)
-        again = plain.lookup(following["demo_embedding"])
-        assert following["group"][ended].equal(again.group[ended])
+        for row in ended.nonzero().flatten().tolist():
+            plain[row].adapt(state["demo_embedding"][row])
+        group, _ = look_up(plain, following["demo_embedding"])
+        assert following["group"][ended].equal(group[ended])
         assert following["group"][~ended].equal(state["group"][~ended])
         assert following["group_novelty"][~ended].equal(state["group_novelty"][~ended])
         state = following
-    for ours, theirs in zip(groups.get_extra_state(), plain.get_extra_state(), strict=True):
-        assert ours["points"].equal(theirs["points"]) and ours["group"].equal(theirs["group"])
-        assert len(ours["points"]) > 14
-    assert groups.num_groups.min() > 1
+    for ours, theirs in zip(groups, plain, strict=True):
+        assert str(ours.state_dict()) == str(theirs.state_dict())
+        assert len(ours.points) > 14
+        assert len(ours.numbers) > 1
 
 
 def test_outside_an_environment_it_only_looks_up():
@@ -199,20 +199,22 @@ def test_outside_an_environment_it_only_looks_up():
     adapt(groups, 15)
     lookup = GroupLookup(groups, learn=True)
     found = lookup(TensorDict({"demo_embedding": phi}, [2, 5]))
-    expected = groups.lookup(phi)
-    assert found["group"].equal(expected.group)
-    assert found["group_novelty"].equal(expected.novelty)
+    group, novelty = look_up(groups, phi)
+    assert found["group"].equal(group)
+    assert found["group_novelty"].equal(novelty)
     assert found["group_novelty"].isfinite().all()
-    assert all(len(state["points"]) == 15 for state in groups.get_extra_state())
+    assert all(len(of_row.points) == 15 for of_row in groups)
+    with pytest.raises(ValueError, match="groups for 2 rows"):
+        lookup(TensorDict({"demo_embedding": phi.transpose(0, 1)}, [5, 2]))
 
 
 def test_bad_batch_sizes_and_missing_entries_are_refused():
     env, _ = make_groups([4, 2])
-    other = BehaviorGroups(32, batch_size=[3])
+    other = [BehaviorGroups(32) for _ in range(3)]
     env.append_transform(GroupLookup(other, learn=True, out_keys=("other", "novelty")))
     with pytest.raises(ValueError, match="batch_size"):
         env.reset()
-    lookup = GroupLookup(BehaviorGroups(32), learn=True)
+    lookup = GroupLookup([BehaviorGroups(32)], learn=True)
     with pytest.raises(ValueError, match="'demo_embedding'"):
         lookup(TensorDict(batch_size=[]))
     with pytest.raises(ValueError, match="put DemonstrationSource before it"):
