@@ -12,8 +12,9 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torch.func import functional_call
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import EnvBase, Transform, TransformedEnv
 
+from bgpo_trl.algorithms.environments import training_env
 from bgpo_trl.algorithms.rl import Learner
 from bgpo_trl.configs import AlgorithmConfig
 from bgpo_trl.data.bank import DemonstrationBank
@@ -36,43 +37,51 @@ class Policy:
     Attributes:
         actor: Network, called with ``parameters`` instead of its weights.
         state_key: Key of the state.
-        parameters: By name in the actor. Leading dimensions: none, ``[T]`` (one network per task)
-            or ``[T, M]`` (one per episode). In a stack of seeds, ``[S]`` comes first.
-        context: Input besides the state, ``[T, M, C]``; None if the actor reads no context.
+        parameters: By name in the actor, those of one network, or of several, ``[E, ...]``. In a
+            stack of seeds, those of each seed, ``[S, ...]``, or of each episode, ``[S, *B, ...]``.
+        context: Input besides the state, ``[*B, C]``; None if the actor reads no context.
+        network: Which of the ``E`` networks plays each episode, int64 ``[*B]``; None for one.
     """
 
     actor: TensorDictModuleBase
     state_key: NestedKey
     parameters: dict[str, Tensor]
     context: Tensor | None = None
+    network: Tensor | None = None
 
     @classmethod
     def stack(cls, policies: Sequence[Policy], device: torch.device | str = "cpu") -> Policy:
         """Stack the policies of several seeds as one, ``[S]``, on a device."""
         first = policies[0]
+        weights = [policy._of_episodes() for policy in policies]
         contexts = [policy.context for policy in policies if policy.context is not None]
         return cls(
             first.actor,
             first.state_key,
-            {
-                key: torch.stack([policy.parameters[key] for policy in policies]).to(device)
-                for key in first.parameters
-            },
+            {key: torch.stack([one[key] for one in weights]).to(device) for key in weights[0]},
             torch.stack(contexts).to(device) if contexts else None,
         )
 
+    def _of_episodes(self) -> dict[str, Tensor]:
+        if self.network is None:
+            return self.parameters
+        return {key: value[self.network] for key, value in self.parameters.items()}
+
     @torch.no_grad()
     def act(self, state: Tensor) -> Tensor:
-        """Return actions ``[..., T, M, A]`` in [-1, 1] for states ``[..., T, M, features]``."""
+        """Return actions ``[*B, A]`` in [-1, 1] for states ``[*B, features]``.
+
+        A stack of seeds has ``[S]`` before ``B``.
+        """
         inputs: TensorDictBase = TensorDict({self.state_key: state}, state.shape[:-1])
         if self.context is not None:
             inputs["context"] = self.context
-        functional_call(self.actor, self.parameters, (inputs,))
+        functional_call(self.actor, self._of_episodes(), (inputs,))
         return inputs["action"]
 
     def state_dict(self) -> dict[str, Any]:
-        """Return parameters and context, the arguments of `Algorithm.policy`."""
-        return {"parameters": self.parameters, "context": self.context}
+        """Return the arguments of `Algorithm.policy`."""
+        return {"parameters": self.parameters, "context": self.context, "network": self.network}
 
 
 class Algorithm(ABC):
@@ -97,6 +106,9 @@ class Algorithm(ABC):
     Attributes:
         gwr: GWR-B, or None.
         groups: Groups of behaviors of each seed; empty for an algorithm without groups.
+        conditioning: Transforms from the demonstration and task of an episode to what policies are
+            conditioned on, such as ``context``: in training and in tests alike.
+        beta: Weight of the intrinsic reward.
         state_size: Number of features of the state.
         learner: The RL algorithm: losses of actor and critic, optimizer, target networks.
         replay: Transitions of training episodes.
@@ -111,6 +123,8 @@ class Algorithm(ABC):
 
     gwr: GWRB | None = None
     groups: Sequence[BehaviorGroups] = ()
+    conditioning: Sequence[Transform] = ()
+    beta: float = 0.0
     needs_label: bool = True
     needs_replay: bool = True
     logged: tuple[str, ...] = ()
@@ -156,12 +170,40 @@ class Algorithm(ABC):
             )
         self._noise = generators(seeds, "exploration")
 
-    @abstractmethod
     def make_env(self, base_env: EnvBase, source: DemonstrationSource) -> TransformedEnv:
         """Return the environment of training episodes: simulations ``[S]`` within transforms.
 
-        ``source`` is the transform that draws task and demonstration of each episode.
+        ``source`` is the transform that draws task and demonstration of each episode. By default,
+        it is `training_env` with `conditioning`.
         """
+        return training_env(
+            self.config,
+            base_env,
+            source,
+            self.encoders,
+            state=self.scene.state,
+            conditioning=self.conditioning,
+            beta=self.beta,
+        )
+
+    @torch.no_grad()
+    def condition(self, index: int, embedding: Tensor, task: Tensor) -> TensorDictBase:
+        """Return what the policy of one seed is conditioned on, ``[*B]``; learn nothing.
+
+        Args:
+            index: Position of the seed in the batch.
+            embedding: phi of the demonstrations, ``[*B, 32]``.
+            task: Their labels, int64 ``[*B]``.
+
+        Returns:
+            ``demo_embedding``, ``task`` and the entries that `conditioning` writes.
+        """
+        shape = (self.n_seeds, *task.shape)
+        shown = {"demo_embedding": embedding.expand(*shape, -1), "task": task.expand(shape)}
+        conditioned: TensorDictBase = TensorDict(shown, shape)
+        for transform in self.conditioning:
+            conditioned = transform(conditioned)
+        return conditioned[index]
 
     @abstractmethod
     def act(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -211,14 +253,19 @@ class Algorithm(ABC):
 
         Args:
             index: Position of the seed in the batch.
-            embedding: phi of the demonstration of each test episode, ``[T, M, 32]``.
-            task: Their labels, int64 ``[T, M]``; ignored by BGPO.
+            embedding: phi of the demonstration of each test episode, ``[*B, 32]``.
+            task: Their labels, int64 ``[*B]``; ignored by BGPO.
             generator: Source of randomness for algorithms that adapt before testing.
         """
 
-    def policy(self, parameters: dict[str, Tensor], context: Tensor | None = None) -> Policy:
-        """Return a policy of `test_actor` with these parameters and this context."""
-        return Policy(self.test_actor, self.config.state, parameters, context)
+    def policy(
+        self,
+        parameters: dict[str, Tensor],
+        context: Tensor | None = None,
+        network: Tensor | None = None,
+    ) -> Policy:
+        """Return a policy of `test_actor`, given the attributes of `Policy`."""
+        return Policy(self.test_actor, self.config.state, parameters, context, network)
 
     def demonstrations(
         self, constant_keys: Sequence[NestedKey] = (), own_constants: bool = True

@@ -14,6 +14,7 @@ from bgpo_trl.algorithms.algorithm import Policy
 from bgpo_trl.algorithms.rl import make_ddpg
 from bgpo_trl.algorithms.task_algorithm import TaskAlgorithm, networks_of
 from bgpo_trl.configs import DistNLLConfig
+from bgpo_trl.modules.actor_critic import Actor
 from bgpo_trl.modules.gaussian_actors import MultiHeadActor
 from bgpo_trl.objectives.supervised import DistillationLoss
 from bgpo_trl.seeding import generators
@@ -66,9 +67,12 @@ class DistNLL(TaskAlgorithm):
         ]
         self._ended = torch.zeros(self.n_seeds, dtype=torch.bool)
         # Called with the parameters of a `Policy`.
-        self.test_actor = network(batch_size=[self.n_seeds]).to(self.device)
-        for _ in range(self.n_tasks):
-            self.test_actor.add_head()
+        self.test_actor = Actor(
+            self.state_size,
+            self.scene.action_size,
+            in_keys=[self.config.state],
+            hidden_sizes=self.config.rl.hidden_sizes,
+        ).to(self.device)
 
     def store(self, transition: TensorDictBase) -> None:
         """Add a transition of each seed to the replay of its task."""
@@ -114,19 +118,19 @@ class DistNLL(TaskAlgorithm):
     def snapshot(
         self, index: int, embedding: Tensor, task: Tensor, generator: torch.Generator
     ) -> Policy:
-        """Copy the multi-task policy of one seed, its heads in the order of the tasks.
+        """Copy the multi-task policy of one seed, as one network for each task.
 
-        The head of a task without data is zero.
+        The network of a task without data is zero.
         """
-        del embedding, task, generator
-        like = self.test_actor.state_dict()
-        weights = {key: torch.zeros_like(value[0]).cpu() for key, value in like.items()}
-        for key, value in self.students[index].state_dict().items():
-            if key.startswith("heads."):
-                _, head, name = key.split(".")
-                key = f"heads.{self._head_tasks[index][int(head)]}.{name}"
-            weights[key] = value.to("cpu", copy=True)
-        return self.policy(weights)
+        del embedding, generator
+        tasks, student = self._head_tasks[index], self.students[index]
+        like = {key: torch.zeros_like(value) for key, value in self.test_actor.named_parameters()}
+        each = [
+            student.policy(tasks.index(number)) if number in tasks else like
+            for number in range(self.n_tasks)
+        ]
+        parameters = {key: torch.stack([one[key] for one in each]).cpu() for key in like}
+        return self.policy(parameters, network=task)
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that future actions, updates and snapshots depend on."""

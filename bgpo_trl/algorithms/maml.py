@@ -74,11 +74,11 @@ class MAML(TaskAlgorithm):
     def snapshot(
         self, index: int, embedding: Tensor, task: Tensor, generator: torch.Generator
     ) -> Policy:
-        """Copy the policy adapted to each task, ``[T, ...]``.
+        """Copy the policy adapted to each task; episodes are played by that of their task.
 
         A task with too few transitions gets the policy without adaptation.
         """
-        del embedding, task
+        del embedding
         meta = dict(self.meta_actor.named_parameters())
         adapted = {
             key: value.detach().unsqueeze(1).expand(-1, self.n_tasks, *value.shape[1:])
@@ -97,4 +97,4 @@ class MAML(TaskAlgorithm):
         parameters = {
             key: value[index].detach().to("cpu", copy=True) for key, value in adapted.items()
         }
-        return self.policy(parameters)
+        return self.policy(parameters, network=task)
