@@ -126,15 +126,13 @@ class TrainedPolicy:
         config = run.config.algorithm
         self._observe = Compose([encode(config, run.encoders), clip(config)])
         self._policy: Policy | None = None
-        self._task = 0
 
     def __reduce__(self) -> tuple[Any, ...]:
         shown = None if self._policy is None else self._policy.state_dict()
-        return TrainedPolicy, (self._run, self.seed), (shown, self._task)
+        return TrainedPolicy, (self._run, self.seed), shown
 
-    def __setstate__(self, state: tuple[dict[str, Any] | None, int]) -> None:
-        shown, self._task = state
-        self._policy = None if shown is None else self.algorithm.policy(**shown)
+    def __setstate__(self, shown: dict[str, Any]) -> None:
+        self._policy = self.algorithm.policy(**shown)
 
     @torch.no_grad()
     def condition(
@@ -159,7 +157,7 @@ class TrainedPolicy:
                 missing; the policy is unchanged then.
         """
         frames = self._frames(demonstration, "a demonstration is uint8 [T, {}], T at least 1", 4)
-        algorithm, n_seeds, n_tasks = self.algorithm, len(self.config.seeds), len(self.tasks)
+        algorithm, index = self.algorithm, self._index
         if task is None and algorithm.needs_label:
             raise ValueError(
                 f"{self.config.name} does not infer the task: name it, task=... as one of "
@@ -172,27 +170,18 @@ class TrainedPolicy:
         (embedding,) = embed_demonstrations(self.encoders, TensorDict(shown, [1]))
         if generator is None:
             generator = torch.Generator().manual_seed(stream_seed(self.seed, "one-shot"))
-        # `snapshot` expects test episodes of every task.
-        policy = algorithm.snapshot(
-            self._index,
-            embedding.expand(n_tasks, 1, -1),
-            torch.arange(n_tasks).unsqueeze(-1),
-            generator,
-        )
-        self._policy = Policy.stack([policy], algorithm.device)
-        self._task = self.tasks.index(label)
-        shown, index = embedding.expand(n_seeds, -1), self._index
-        recognized: dict[str, Any] = {}
+        number = torch.tensor(self.tasks.index(label))
+        policy = algorithm.snapshot(index, embedding, number, generator)
+        self._policy = policy.to(algorithm.device)
+        given, recognized = algorithm.condition(index, embedding, number), dict[str, Any]()
         if algorithm.gwr is not None:
-            match = algorithm.gwr.lookup(shown)
-            recognized["behavior"] = match.embedding[index]
-            recognized["node"] = int(match.node[index])
-            recognized["activity"] = float(match.activity[index])
+            match = algorithm.gwr.lookup(embedding.expand(algorithm.n_seeds, -1))[index]
+            recognized["behavior"], recognized["node"] = given["behavior"], int(match.node)
+            recognized["activity"] = float(match.activity)
         if algorithm.groups:
-            member = algorithm.groups[index].lookup(embedding)
-            recognized["group"] = int(member.group)
-            recognized["group_novelty"] = float(member.novelty)
-            recognized["known"] = bool(member.known)
+            recognized["group"] = int(given["group"])
+            recognized["group_novelty"] = float(given["group_novelty"])
+            recognized["known"] = recognized["group_novelty"] <= 1.0
         return Recognition(embedding, **recognized, task=task)
 
     @torch.no_grad()
@@ -212,8 +201,7 @@ class TrainedPolicy:
         state = self._observe(TensorDict({"pixels": seen}))[self.config.algorithm.state].to(
             self.algorithm.device
         )
-        action = self._policy.act(state.expand(1, len(self.tasks), 1, -1))
-        return action[0, self._task, 0].cpu().numpy()
+        return self._policy.act(state).cpu().numpy()
 
     def _frames(self, frames: ArrayLike, wanted: str, ndim: int) -> Tensor:
         array = np.asarray(frames)

@@ -4,9 +4,9 @@ from functools import partial
 
 import torch
 from tensordict.nn import TensorDictModule
+from torchrl.envs import RenameTransform
 
 from bgpo_trl.algorithms import Algorithm
-from bgpo_trl.algorithms.environments import training_env
 from bgpo_trl.configs import RunConfig
 from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.encoders.pretrained import load_pretrained
@@ -18,13 +18,12 @@ from bgpo_trl.training import Trainer
 class NearestNeighbors(Algorithm):
     """k nearest neighbors (Pari et al., 2021): states ``[M, 96]`` with actions ``[M, 4]``."""
 
+    conditioning = (RenameTransform(["demo_embedding"], ["context"], create_copy=True),)
+
     def __init__(self, config, *, states, actions, **others):
         super().__init__(config, **others)
         self.scale, self.states, self.actions = states.std(0), states / states.std(0), actions
         self.test_actor = TensorDictModule(self.choose, ["latent", "context"], ["action"])
-
-    def make_env(self, base_env, source):  # pixels -> latent, and the demonstrations
-        return training_env(self.config, base_env, source, self.encoders)
 
     def choose(self, latent, demonstration):
         state = torch.cat([latent, demonstration], -1) / self.scale
@@ -32,7 +31,7 @@ class NearestNeighbors(Algorithm):
         return (nearness.softmax(-1).unsqueeze(-1) * self.actions[row]).sum(-2)
 
     def act(self, td):
-        return td.set("action", self.choose(td["latent"], td["demo_embedding"]))
+        return td.set("action", self.choose(td["latent"], td["context"]))
 
     def store(self, transition): ...  # There is nothing to update.
 
@@ -40,7 +39,7 @@ class NearestNeighbors(Algorithm):
         return {}
 
     def snapshot(self, index, embedding, task, generator):
-        return self.policy({}, context=embedding)
+        return self.policy({}, self.condition(index, embedding, task)["context"])
 
 
 if __name__ == "__main__":

@@ -12,8 +12,9 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torch.func import functional_call
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import EnvBase, Transform, TransformedEnv
 
+from bgpo_trl.algorithms.environments import training_env
 from bgpo_trl.algorithms.proposal_trials import ProposalTrials
 from bgpo_trl.algorithms.rl import Learner
 from bgpo_trl.configs import AlgorithmConfig
@@ -37,24 +38,24 @@ class Policy:
     Attributes:
         actor: Network, called with ``parameters`` instead of its weights.
         state_key: Key of the state.
-        parameters: By name in the actor, ``[U, ...]`` of ``U`` networks.
-        network: Which of the networks plays each test episode, int64 ``[*B]``.
+        parameters: By name in the actor, those of one network, or of several, ``[U, ...]``.
         context: Input besides the state, ``[*B, C]``; None if the actor reads no context.
+        network: Which of the ``U`` networks plays each episode, int64 ``[*B]``; None for one.
     """
 
     actor: TensorDictModuleBase
     state_key: NestedKey
     parameters: dict[str, Tensor]
-    network: Tensor
     context: Tensor | None = None
+    network: Tensor | None = None
 
     def to(self, device: torch.device | str) -> Policy:
         """Return the policy with its tensors on a device."""
         return replace(
             self,
             parameters={key: value.to(device) for key, value in self.parameters.items()},
-            network=self.network.to(device),
             context=None if self.context is None else self.context.to(device),
+            network=None if self.network is None else self.network.to(device),
         )
 
     @torch.no_grad()
@@ -63,6 +64,8 @@ class Policy:
         inputs: TensorDictBase = TensorDict({self.state_key: state}, state.shape[:-1])
         if self.context is not None:
             inputs["context"] = self.context
+        if self.network is None:
+            return functional_call(self.actor, self.parameters, (inputs,))["action"]
         actions: list[tuple[Tensor, Tensor]] = []
         for number in self.network.unique().tolist():
             rows = self.network == number
@@ -74,12 +77,8 @@ class Policy:
         return action
 
     def state_dict(self) -> dict[str, Any]:
-        """Return parameters, networks and context, the arguments of `Algorithm.policy`."""
-        return {
-            "parameters": self.parameters,
-            "network": self.network,
-            "context": self.context,
-        }
+        """Return the arguments of `Algorithm.policy`."""
+        return {"parameters": self.parameters, "context": self.context, "network": self.network}
 
 
 class Algorithm(ABC):
@@ -104,6 +103,9 @@ class Algorithm(ABC):
     Attributes:
         gwr: GWR-B, or None.
         groups: Groups of behaviors of each seed; empty for an algorithm without groups.
+        conditioning: Transforms from the demonstration and task of an episode to what policies are
+            conditioned on, such as ``context``: in training and in tests alike.
+        beta: Weight of the intrinsic reward.
         state_size: Number of features of the state.
         learner: The RL algorithm: losses of actor and critic, optimizer, target networks.
         replay: Transitions of training episodes.
@@ -119,6 +121,8 @@ class Algorithm(ABC):
 
     gwr: GWRB | None = None
     groups: Sequence[BehaviorGroups] = ()
+    conditioning: Sequence[Transform] = ()
+    beta: float = 0.0
     needs_label: bool = True
     needs_replay: bool = True
     logged: tuple[str, ...] = ()
@@ -169,12 +173,40 @@ class Algorithm(ABC):
                 len(seeds), clone_episodes=rl.clone_episodes, clone_share=rl.clone_share
             )
 
-    @abstractmethod
     def make_env(self, base_env: EnvBase, source: DemonstrationSource) -> TransformedEnv:
         """Return the environment of training episodes: simulations ``[S]`` within transforms.
 
-        ``source`` is the transform that draws task and demonstration of each episode.
+        ``source`` is the transform that draws task and demonstration of each episode. By default,
+        it is `training_env` with `conditioning`.
         """
+        return training_env(
+            self.config,
+            base_env,
+            source,
+            self.encoders,
+            state=self.scene.state,
+            conditioning=self.conditioning,
+            beta=self.beta,
+        )
+
+    @torch.no_grad()
+    def condition(self, index: int, embedding: Tensor, task: Tensor) -> TensorDictBase:
+        """Return what the policy of one seed is conditioned on, ``[*B]``; learn nothing.
+
+        Args:
+            index: Position of the seed in the batch.
+            embedding: phi of the demonstrations, ``[*B, 32]``.
+            task: Their labels, int64 ``[*B]``.
+
+        Returns:
+            ``demo_embedding``, ``task`` and the entries that `conditioning` writes.
+        """
+        shape = (self.n_seeds, *task.shape)
+        shown = {"demo_embedding": embedding.expand(*shape, -1), "task": task.expand(shape)}
+        conditioned: TensorDictBase = TensorDict(shown, shape)
+        for transform in self.conditioning:
+            conditioned = transform(conditioned)
+        return conditioned[index]
 
     @abstractmethod
     def act(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -224,8 +256,8 @@ class Algorithm(ABC):
 
         Args:
             index: Position of the seed in the batch.
-            embedding: phi of the demonstration of each test episode, ``[T, M, 32]``.
-            task: Their labels, int64 ``[T, M]``; ignored by BGPO.
+            embedding: phi of the demonstration of each test episode, ``[*B, 32]``.
+            task: Their labels, int64 ``[*B]``; ignored by BGPO.
             generator: Source of randomness for algorithms that adapt before testing.
         """
 
@@ -264,10 +296,13 @@ class Algorithm(ABC):
         return [self.config.state, *constant_keys, "action", *(("next", key) for key in following)]
 
     def policy(
-        self, parameters: dict[str, Tensor], network: Tensor, context: Tensor | None = None
+        self,
+        parameters: dict[str, Tensor],
+        context: Tensor | None = None,
+        network: Tensor | None = None,
     ) -> Policy:
-        """Return a policy of `test_actor`; arguments as for `Policy`."""
-        return Policy(self.test_actor, self.config.state, parameters, network, context)
+        """Return a policy of `test_actor`, given the attributes of `Policy`."""
+        return Policy(self.test_actor, self.config.state, parameters, context, network)
 
     def demonstrations(
         self, constant_keys: Sequence[NestedKey] = (), own_constants: bool = True

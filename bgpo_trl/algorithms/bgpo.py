@@ -7,11 +7,9 @@ from typing import Any, cast
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torch.nn.functional import one_hot
-from torchrl.envs import EnvBase, TransformedEnv
 
 from bgpo_trl.algorithms.algorithm import Algorithm, Policy
-from bgpo_trl.algorithms.environments import training_env
+from bgpo_trl.algorithms.environments import conditioning_on
 from bgpo_trl.algorithms.experts import ActiveGroups, Experts
 from bgpo_trl.algorithms.rl import Learner, LearnerSpec, make_learner
 from bgpo_trl.configs import BGPOConfig
@@ -21,7 +19,6 @@ from bgpo_trl.data.replay import GroupReplay
 from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.modules.gwr import GWRB
 from bgpo_trl.seeding import generators, stream_seed
-from bgpo_trl.transforms import DemonstrationSource
 from bgpo_trl.transforms.behavior_matching import matching_reward
 
 
@@ -49,6 +46,7 @@ class BGPO(Algorithm):
         super().__init__(config, **arguments)
         seeds, embedding_size = self.seeds, self.bank.embedding.shape[-1]
         self.needs_label = config.context == "label"
+        self.beta = config.beta if config.context in ("behavior", "embedding") else 0.0
         if config.context == "behavior":
             self.gwr = GWRB(
                 embedding_size,
@@ -102,31 +100,18 @@ class BGPO(Algorithm):
         if self.shown is not None and config.experts:
             steps = cast(DemonstrationSteps, self.bank.steps)
             self.starts = steps.latents(steps.first)
+        self.conditioning = conditioning_on(
+            config.context,
+            n_tasks=self.n_tasks,
+            behavior_scale=config.behavior_scale,
+            gwr=self.gwr,
+            groups=self.groups,
+            starts=self.starts,
+        )
 
     def make_learner(self, spec: LearnerSpec) -> Learner:
         """Return the learner; an own RL algorithm overrides this."""
         return make_learner(self.config.rl, spec)
-
-    def make_env(self, base_env: EnvBase, source: DemonstrationSource) -> TransformedEnv:
-        """Return the environment of training episodes, see `training_env`."""
-        return training_env(
-            self.config,
-            base_env,
-            source,
-            self.encoders,
-            state=self.scene.state,
-            context=self.config.context,
-            behavior_scale=self.config.behavior_scale,
-            gwr=self.gwr,
-            groups=self.groups,
-            starts=self.starts,
-            beta=self.beta,
-        )
-
-    @property
-    def beta(self) -> float:
-        """Weight of the intrinsic reward; 0 where there is no behavior to match."""
-        return self.config.beta if self.config.context in ("behavior", "embedding") else 0.0
 
     def _highest_return(self) -> float:
         """Return the highest attainable return: a success now, or after the bonus of a time-out."""
@@ -207,15 +192,14 @@ class BGPO(Algorithm):
     def snapshot(
         self, index: int, embedding: Tensor, task: Tensor, generator: torch.Generator
     ) -> Policy:
-        """Copy the policies of one seed, with experts those of the groups of the demonstrations."""
+        """Copy the policies of one seed, with experts those of the demonstrations' groups."""
         del generator
-        group = torch.zeros_like(task)
-        if self.experts is not None:
-            group = self.groups[index].lookup(embedding).group
+        given = self.condition(index, embedding, task)
+        group = torch.zeros_like(task) if self.experts is None else given["group"]
         numbers, network = group.unique(return_inverse=True)
         each = [self.actor_weights(index, number) for number in numbers.tolist()]
-        parameters = {key: torch.stack([weights[key] for weights in each]) for key in each[0]}
-        return self.policy(parameters, network, self.context(index, embedding, task))
+        parameters = {key: torch.stack([one[key] for one in each]) for key in each[0]}
+        return self.policy(parameters, given.get("context", None), network)
 
     def actor_weights(self, index: int, group: int = 0) -> dict[str, Tensor]:
         """Copy the weights of the policy of a group of one seed to the CPU."""
@@ -223,22 +207,6 @@ class BGPO(Algorithm):
         if self.experts is not None:
             return self.learner.expert_weights(self.experts.find(index, group), only_clone)
         return self.learner.expert_weights(self.learner.read(index, 0), only_clone)
-
-    def context(self, index: int, embedding: Tensor, task: Tensor) -> Tensor | None:
-        """Return the context of test episodes, ``[*B, C]``; None for a policy without context.
-
-        ``embedding`` is ``[*B, 32]``. The labels ``[*B]`` are read if they are the context.
-        """
-        if self.config.context is None:
-            return None
-        if self.needs_label:
-            return one_hot(task, self.n_tasks).float()
-        behavior = embedding
-        if self.gwr is not None:
-            only = torch.arange(self.n_seeds) == index
-            shown = embedding.expand(self.n_seeds, *embedding.shape)
-            behavior = self.gwr.lookup(shown, mask=only).embedding[index]
-        return self.config.behavior_scale * behavior
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that future actions, updates and snapshots depend on."""

@@ -14,6 +14,7 @@ from bgpo_trl.algorithms.algorithm import Policy
 from bgpo_trl.algorithms.rl import make_learner
 from bgpo_trl.algorithms.task_algorithm import TaskAlgorithm
 from bgpo_trl.configs import DistNLLConfig
+from bgpo_trl.modules.actor_critic import Actor
 from bgpo_trl.modules.multi_head_actor import MultiHeadActor
 from bgpo_trl.objectives.supervised import DistillationLoss
 from bgpo_trl.seeding import generators
@@ -61,8 +62,13 @@ class DistNLL(TaskAlgorithm):
             for student in self.students
         ]
         self._ended = torch.zeros(self.n_seeds, dtype=torch.bool)
-        # Called with the parameters of a `Policy`: the trunk and one head.
-        self.test_actor = self.spec.actor(config.rl)
+        # Called with the parameters of a `Policy`.
+        self.test_actor = Actor(
+            self.state_size,
+            self.scene.action_size,
+            in_keys=[self.config.state],
+            hidden_sizes=self.config.rl.hidden_sizes,
+        ).to(self.device)
 
     def store(self, transition: TensorDictBase) -> None:
         """Add a transition of each seed to the replay of its task."""
@@ -109,28 +115,19 @@ class DistNLL(TaskAlgorithm):
     def snapshot(
         self, index: int, embedding: Tensor, task: Tensor, generator: torch.Generator
     ) -> Policy:
-        """Copy the multi-task policy of one seed as a policy for each task: the trunk and its head.
+        """Copy the multi-task policy of one seed, as one network for each task.
 
-        The head of a task without data is zero.
+        The network of a task without data is zero.
         """
         del embedding, generator
-        student, heads = self.students[index], self._head_tasks[index]
-        trunk = {f"mlp.{key}": value for key, value in student.trunk.state_dict().items()}
-        last, n_actions = len(student.trunk.layers), self.scene.action_size
-        of_each = []
-        for number in range(self.n_tasks):
-            head = dict(student.heads[heads.index(number)].state_dict()) if number in heads else {}
-            weight = trunk["mlp.layers.0.weight"].new_zeros(student.trunk.out_features, n_actions)
-            output = {
-                # The second half of a head's outputs is the scale.
-                f"mlp.layers.{last}.weight": head.get("weight", weight)[..., :n_actions],
-                f"mlp.layers.{last}.bias": head.get("bias", weight[0])[..., :n_actions],
-            }
-            of_each.append(trunk | output)
-        parameters = {
-            key: torch.stack([weights[key] for weights in of_each]).cpu() for key in of_each[0]
-        }
-        return self.policy(parameters, task)
+        tasks, student = self._head_tasks[index], self.students[index]
+        like = {key: torch.zeros_like(value) for key, value in self.test_actor.named_parameters()}
+        each = [
+            student.policy(tasks.index(number)) if number in tasks else like
+            for number in range(self.n_tasks)
+        ]
+        parameters = {key: torch.stack([one[key] for one in each]).cpu() for key in like}
+        return self.policy(parameters, network=task)
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that future actions, updates and snapshots depend on."""

@@ -34,7 +34,7 @@ from bgpo_trl.transforms import (
     GroupLookup,
 )
 
-__all__ = ["observation_env", "training_env"]
+__all__ = ["conditioning_on", "observation_env", "training_env"]
 
 
 def training_env(
@@ -44,11 +44,7 @@ def training_env(
     encoders: Representation | None,
     *,
     state: StateColumns | None = None,
-    context: Literal["behavior", "embedding", "label"] | None = None,
-    behavior_scale: float = 1.0,
-    gwr: GWRB | None = None,
-    groups: Sequence[BehaviorGroups] = (),
-    starts: Tensor | None = None,
+    conditioning: Sequence[Transform] = (),
     beta: float = 0.0,
 ) -> TransformedEnv:
     """Return the environment of training episodes: simulations ``[S]`` within transforms.
@@ -61,12 +57,7 @@ def training_env(
         source: Draws the task and the demonstration of each episode.
         encoders: Trained encoders; None if neither latents nor the intrinsic reward are used.
         state: Scale of the ground truth; None if policies do not read it.
-        context: What the policy's ``"context"`` is: the behavior b of ``gwr``, the demonstration's
-            embedding phi in its place, the task's label one-hot, or nothing.
-        behavior_scale: Factor of behavior or embedding in the context.
-        gwr: GWR-B, which learns each demonstration.
-        groups: Groups of behaviors of each seed, which learn each demonstration; empty for none.
-        starts: First latent of each demonstration, for trials of experts; see `GroupLookup`.
+        conditioning: Transforms of the demonstration; see `Algorithm`. They are copied.
         beta: Weight of the intrinsic reward; with 0, it is neither added nor measured.
 
     Raises:
@@ -76,23 +67,51 @@ def training_env(
         encode(config, encoders, state),  # pixels -> latent
         StepCounter(config.max_steps),
         source,  # -> task, demo_embedding
+        *(transform.clone() for transform in conditioning),  # -> behavior, group, expert, context
     ]
+    if beta:
+        transforms.append(match_behavior(beta, encoders))  # reward + beta * exp(-||b - phi_g||)
+    transforms.append(clip(config))
+    rewards = ["reward", "extrinsic_reward", "intrinsic_reward"] if beta else ["reward"]
+    transforms.append(sum_rewards(*rewards))
+    return TransformedEnv(base_env, Compose(transforms))
+
+
+def conditioning_on(
+    context: Literal["behavior", "embedding", "label"] | None,
+    *,
+    n_tasks: int,
+    behavior_scale: float = 1.0,
+    gwr: GWRB | None = None,
+    groups: Sequence[BehaviorGroups] = (),
+    starts: Tensor | None = None,
+) -> list[Transform]:
+    """Return the transforms by which policies are conditioned on a demonstration.
+
+    Within an environment, GWR-B and groups learn from it when the episode ends. Called on a
+    TensorDict, the same transforms only look up.
+
+    Args:
+        context: What the policy's ``"context"`` is: the behavior b of ``gwr``, the demonstration's
+            embedding phi in its place, the task's label one-hot, or nothing.
+        n_tasks: Number of labels.
+        behavior_scale: Factor of behavior or embedding in the context.
+        gwr: GWR-B.
+        groups: Groups of behaviors of each seed; empty for none.
+        starts: First latent of each demonstration, for trials of experts; see `GroupLookup`.
+    """
+    transforms: list[Transform] = []
     if gwr is not None:
         transforms.append(BehaviorLookup(gwr, learn=True))  # demo_embedding -> behavior
     elif context == "embedding":
         transforms.append(RenameTransform(["demo_embedding"], ["behavior"], create_copy=True))
     if groups:
         transforms.append(GroupLookup(groups, learn=True, starts=starts))  # -> group, expert
-    if beta:
-        transforms.append(match_behavior(beta, encoders))  # reward + beta * exp(-||b - phi_g||)
     if context == "label":
-        transforms.append(label_as_context(source.schedule.n_tasks))
+        transforms.append(label_as_context(n_tasks))  # task -> context
     elif context is not None:
         transforms.append(behavior_as_context(behavior_scale))  # behavior -> context
-    transforms.append(clip(config))
-    rewards = ["reward", "extrinsic_reward", "intrinsic_reward"] if beta else ["reward"]
-    transforms.append(sum_rewards(*rewards))
-    return TransformedEnv(base_env, Compose(transforms))
+    return transforms
 
 
 def observation_env(

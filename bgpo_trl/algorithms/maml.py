@@ -77,7 +77,7 @@ class MAML(TaskAlgorithm):
     def snapshot(
         self, index: int, embedding: Tensor, task: Tensor, generator: torch.Generator
     ) -> Policy:
-        """Copy the policy adapted to each task.
+        """Copy the policy adapted to each task; episodes are played by that of their task.
 
         A task with too few transitions gets the policy without adaptation.
         """
@@ -100,4 +100,4 @@ class MAML(TaskAlgorithm):
         parameters = {
             key: value[index].detach().to("cpu", copy=True) for key, value in adapted.items()
         }
-        return self.policy(parameters, task)
+        return self.policy(parameters, network=task)

@@ -7,15 +7,12 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.envs import EnvBase, TransformedEnv
 
 from bgpo_trl.algorithms.algorithm import Algorithm
-from bgpo_trl.algorithms.environments import training_env
 from bgpo_trl.algorithms.rl import LearnerSpec
 from bgpo_trl.configs import DistNLLConfig, MAMLConfig
 from bgpo_trl.data.replay import GroupReplay
 from bgpo_trl.seeding import generators
-from bgpo_trl.transforms import DemonstrationSource
 
 __all__ = ["TaskAlgorithm"]
 
@@ -60,10 +57,6 @@ class TaskAlgorithm(Algorithm):
                 f"replay_size must be at least {self._enough}, so that a batch of one of "
                 f"{self.n_tasks} tasks is full and learning begins, got {config.rl.replay_size}"
             )
-
-    def make_env(self, base_env: EnvBase, source: DemonstrationSource) -> TransformedEnv:
-        """Return an environment without context."""
-        return training_env(self.config, base_env, source, self.encoders, state=self.scene.state)
 
     @torch.no_grad()
     def act(self, tensordict: TensorDictBase) -> TensorDictBase:

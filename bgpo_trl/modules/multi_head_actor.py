@@ -70,6 +70,20 @@ class MultiHeadActor(StackedNetwork):
         self.heads.append(head.to(reference.device, reference.dtype))
         return head
 
+    def policy(self, head: int) -> dict[str, Tensor]:
+        """Return the weights of the `Actor` that acts as a head does on average, by name."""
+        layers = [*self.trunk.layers, self.heads[head]]
+        weights = {
+            f"mlp.layers.{number}.{name}": value.detach()
+            for number, layer in enumerate(layers)
+            for name, value in layer.named_parameters()
+        }
+        last = f"mlp.layers.{len(layers) - 1}."
+        return {
+            key: value[..., : self.action_dim] if key.startswith(last) else value
+            for key, value in weights.items()
+        }
+
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the distributions of actions; return the same tensordict."""

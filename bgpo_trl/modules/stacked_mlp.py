@@ -165,7 +165,7 @@ class StackedMLP(nn.Module):
         generator: torch.Generator | Sequence[torch.Generator] | None = None,
     ) -> None:
         super().__init__()
-        self.layer_norm, self.out_features = layer_norm, out_features
+        self.layer_norm = layer_norm
         sizes = [in_features, *hidden_sizes, out_features]
         self.layers = nn.ModuleList(
             StackedLinear(n_in, n_out, batch_size, generator) for n_in, n_out in pairwise(sizes)

@@ -57,6 +57,12 @@ def test_each_variant_is_an_environment_with_the_input_it_is_named_after(make_bg
     if "behavior" in start:
         assert start["context"].equal(0.25 * start["behavior"])
         assert start["behavior"].equal(start["demo_embedding"]) == (told == "phi")
+    # In tests and one-shot use, policies are conditioned by the same transforms.
+    for index in range(2):
+        given = algorithm.condition(index, start["demo_embedding"][index], start["task"][index])
+        for key, value in given.items():
+            assert value.equal(start[key][index]), key
+        assert ("context" in given, "expert" in given) == ("context" in start, "expert" in start)
 
 
 @pytest.mark.parametrize("variant", ["latent, phi", "all"])
@@ -216,10 +222,10 @@ def test_what_an_algorithm_lacks_is_refused(make_config, bank, in_world):
 def test_the_four_variants_of_the_paper_differ_by_transforms_only(make_config, make_bgpo):
     """The same weights, streams, simulations and starts, and transforms of their own."""
     of_each = {
-        "bgpo-single": ["BehaviorLookup", "BehaviorMatchingReward"],
-        "without-bonus": ["BehaviorLookup"],
-        "without-gwr": ["RenameTransform", "BehaviorMatchingReward"],
-        "without-both": ["RenameTransform"],
+        "bgpo-single": ["BehaviorLookup", "ObservationNorm", "BehaviorMatchingReward"],
+        "without-bonus": ["BehaviorLookup", "ObservationNorm"],
+        "without-gwr": ["RenameTransform", "ObservationNorm", "BehaviorMatchingReward"],
+        "without-both": ["RenameTransform", "ObservationNorm"],
     }
     assert tuple(of_each) == ABLATIONS[:4]
     first = None
@@ -229,7 +235,7 @@ def test_the_four_variants_of_the_paper_differ_by_transforms_only(make_config, m
         plain = replace(config, beta=0.1, context="behavior")
         assert plain == make_config(name="bgpo-single").algorithm
         found = [type(transform).__name__ for transform in algorithm.world.env.transform]
-        assert found[3:-3] == transforms
+        assert found[3:-2] == transforms
         start = algorithm.world.env.reset()
         parts = {key: start[key] for key in ("latent", "task", "demo_index", "demo_embedding")}
         parts |= {key: algorithm.state_dict()[key] for key in ("learner", "noise")}
