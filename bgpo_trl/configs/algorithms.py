@@ -116,6 +116,7 @@ SHOWN = RLConfig(
     learning_rate=3e-4,
     gamma=0.97,
     noise=0.1,
+    update_every=2,
     policy_delay=2,
 )
 """Learner from demonstrations and reward. Ours, from `docs/learning.md`."""
