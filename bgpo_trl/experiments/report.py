@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
@@ -21,7 +21,13 @@ from bgpo_trl.analysis.comparison import (
     run_directories,
     under_equal_conditions,
 )
-from bgpo_trl.analysis.scores import Values, evaluation_matrix, late_scores, success_matrix
+from bgpo_trl.analysis.scores import (
+    Values,
+    evaluation_matrix,
+    late_scores,
+    success_matrix,
+    success_steps,
+)
 from bgpo_trl.analysis.tables import (
     COST_NOTE,
     DIFFERENCE_NOTES,
@@ -43,6 +49,7 @@ from bgpo_trl.figures.groups import draw_groups, plot_counts, read_counts
 from bgpo_trl.figures.gwr import plot_gwr_pca
 from bgpo_trl.figures.style import COLORS, save_figure
 from bgpo_trl.figures.success import (
+    plot_step_curves,
     plot_success_by,
     plot_success_curves,
     plot_success_matrices,
@@ -97,18 +104,25 @@ def draw_curves(setting: Setting, out: Path) -> dict[str, Path]:
     """Draw the learning curves of a setting, some runs to a figure; paths by caption."""
     figures: dict[str, Path] = {}
     for start in range(0, len(setting.runs), _CURVES):
-        names = list(setting.runs)[start : start + _CURVES]
-        path = out / f"{setting.slug}{f'-{1 + start // _CURVES}' if start else ''}.png"
-        first = setting.runs[names[0]]
-        figure = plot_success_curves(
-            {name: setting.runs[name].directory / "eval.csv" for name in names},
-            presented=presented(first),
-            random_success=first.summary.get("random_success"),
-            window=3 * first.eval_every,
-            last=first.last,
-        )
-        save_figure(figure, path, _DPI)
-        figures[f"mean and one standard deviation over seeds: {', '.join(names)}"] = path
+        runs = dict(list(setting.runs.items())[start : start + _CURVES])
+        part = f"-{1 + start // _CURVES}" if start else ""
+        first, names = next(iter(runs.values())), ", ".join(runs)
+        shown: dict[str, Any] = {
+            "presented": presented(first),
+            "window": 3 * first.eval_every,
+            "last": first.last,
+        }
+        path = out / f"{setting.slug}{part}.png"
+        tests = {name: run.directory / "eval.csv" for name, run in runs.items()}
+        random = first.summary.get("random_success")
+        save_figure(plot_success_curves(tests, random_success=random, **shown), path, _DPI)
+        figures[f"mean and one standard deviation over seeds: {names}"] = path
+        solving = {n: tests[n] for n, run in runs.items() if np.isfinite(success_steps(run)).any()}
+        if solving:
+            path = out / f"{setting.slug}-steps{part}.png"
+            steps = first.summary.get("demonstrated_steps")
+            save_figure(plot_step_curves(solving, demonstrated=steps, **shown), path, _DPI)
+            figures[f"steps of a success, shown likewise: {', '.join(solving)}"] = path
     return figures
 
 

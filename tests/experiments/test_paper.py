@@ -43,7 +43,9 @@ def test_an_experiment_writes_curves_figures_and_a_summary(tiny, tmp_path):
     assert "GWR-B nodes: [" in printed and "groups of behaviors: [" in printed
     assert shlex.split(printed)[-3:] == ["bgpo", "report", str(run)]
     figures = {path.name for path in (run / "figures").iterdir()}
-    assert figures == {*FIGURES, *(f"{task}.gif" for task in TASKS)}
+    solved = read_tests(run / "eval.csv")["success"].any()
+    steps = ["steps.png"] if solved else []
+    assert figures == {*FIGURES, *steps, *(f"{task}.gif" for task in TASKS)}
     assert json_of(run, "config")["task_starts"] == [0, 0, 0]
 
     tests = read_final_tests(run / "final.csv")
@@ -53,6 +55,7 @@ def test_an_experiment_writes_curves_figures_and_a_summary(tiny, tmp_path):
     )
     assert set(2 * tests["success"]) <= {0, 1, 2}
     assert tests["task_inference"].between(0, 1).all()
+    assert (tests["steps"].notna() == (tests["success"] > 0)).all()
     summary = json_of(run, "summary")
     assert re.fullmatch(r"|[0-9a-f]{7,}(-dirty)?", summary["commit"])
     assert summary["versions"]["torch"] == importlib.metadata.version("torch")

@@ -18,6 +18,7 @@ from bgpo_trl.figures.frames import plot_frame_strips, save_gif
 from bgpo_trl.figures.gwr import plot_gwr_growth, plot_gwr_pca
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.figures.success import (
+    plot_step_curves,
     plot_success_bars,
     plot_success_by,
     plot_success_curves,
@@ -29,12 +30,13 @@ TASKS = ["grasp_glass", "push_green_to_glass", "push_green_to_white"]
 
 @pytest.fixture
 def write(tmp_path):
-    """Writes an eval.csv from algorithm, seed, episode, task and success of each test."""
+    """Writes an eval.csv from algorithm, seed, episode, task, success and steps (30) of tests."""
 
-    def write(rows: Iterable[tuple[str, int, int, str, int]]) -> Path:
+    def write(rows: Iterable[tuple[str, int, int, str, int] | tuple[str, int, int, str, int, int]]):
         lines = ["algorithm,seed,episode,env_steps,task,success,return,steps"]
-        for algorithm, seed, episode, task, success in rows:
-            lines.append(f"{algorithm},{seed},{episode},{30 * episode},{task},{success},0.0,30")
+        for algorithm, seed, episode, task, success, *steps in rows:
+            cells = (algorithm, seed, episode, 30 * episode, task, success, 0.0, *(steps or [30]))
+            lines.append(",".join(map(str, cells)))
         (tmp_path / "eval.csv").write_text("\n".join(lines) + "\n")
         return tmp_path / "eval.csv"
 
@@ -107,6 +109,21 @@ def test_task_starts_and_random_success_are_marked(run):
     assert labels == ["BGPO (2 seeds)", "MAML (2 seeds)", "Dist-NLL (2 seeds)", "random policy"]
 
 
+def test_steps_are_means_over_successes(write):
+    rows = [("bgpo", 0, 1, "a", 1, 20), ("bgpo", 0, 2, "a", 0, 50), ("bgpo", 0, 3, "a", 1, 10)]
+    rows += [("bgpo", 1, 1, "a", 0, 50), ("bgpo", 1, 3, "a", 1, 30), ("bgpo", 1, 3, "b", 0, 50)]
+    figure = plot_step_curves(write(rows), demonstrated={"a": 28.0}, window=2)
+    overall, a, b = figure.axes
+    # Seed 0: 20, 20, 10 (the failure has no steps, and episode 1 is out of the window).
+    assert curve(overall) == curve(a) == {1: 20, 2: 20, 3: (10 + 30) / 2}
+    assert curve(b) == {}
+    assert [len(axes.lines) for axes in (overall, a, b)] == [2, 2, 1]  # one is for the legend
+    assert list(a.lines[1].get_ydata()) == [28, 28]
+    assert figure.legends[0].get_texts()[1].get_text() == "demonstrations"
+    for panel in figure.axes:
+        assert panel.get_ylim() == pytest.approx((0, 33))
+
+
 def test_the_same_data_gives_the_same_file_without_global_state(run, tmp_path):
     before = dict(mpl.rcParams)
     for name in ("first", "second"):
@@ -164,6 +181,8 @@ def test_no_label_is_cut_off_or_overlaps_another(n_tasks, algorithms, write):
     check_labels(
         plot_success_curves(write(rows), presented=presented, random_success={tasks[0]: 0.1})
     )
+    won = write((*row[:4], 1) for row in rows)
+    check_labels(plot_step_curves(won, presented=presented, demonstrated={tasks[0]: 28.0}))
     nodes, numbers = np.random.default_rng(0).normal(size=(50, 8)), np.arange(50)
     check_labels(plot_gwr_pca(nodes, numbers % (n_tasks + 1) - 1, tasks, numbers % n_tasks))
     panels = {f"Dist-NLL + demonstrations {number}": np.eye(n_tasks) for number in range(5)}
