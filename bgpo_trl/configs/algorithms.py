@@ -153,7 +153,7 @@ class AlgorithmConfig:
 
     state: Literal["latent", "state"] = "latent"
     """Observation of the policy: the latent z of a frame (Alg. 1) or, for
-    `bgpo privileged-information`, the ground truth."""
+    the study of privileged information, the ground truth."""
     max_steps: int = 50
     """Steps of an episode (Sec. IV-B)."""
     state_limit: float = 5.0

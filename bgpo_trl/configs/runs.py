@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from numbers import Integral
 from typing import Literal
 
 from bgpo_trl.configs.algorithms import AlgorithmConfig, BGPOConfig, at_least, check, whole
-from bgpo_trl.seeding import check_seeds
 
 PAPER_TASKS = ("grasp_glass", "push_green_to_glass", "push_green_to_white")
 """Names of the paper's tasks, in its order."""
+
+
+def check_seeds(seeds: Sequence[int]) -> None:
+    """Raise ``ValueError`` unless seeds are whole numbers, different, and none is negative."""
+    if not all(isinstance(seed, Integral) for seed in seeds):
+        raise ValueError(f"seeds must be whole numbers, got {seeds}")
+    if not seeds or len(set(seeds)) < len(seeds) or min(seeds) < 0:
+        raise ValueError(f"seeds must be one or more, all different and none negative: {seeds}")
 
 
 @dataclass(frozen=True)

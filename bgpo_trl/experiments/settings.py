@@ -9,14 +9,16 @@ from typing import Any, TypeVar
 
 import tyro
 
+from bgpo_trl.algorithms import ALGORITHMS
+from bgpo_trl.algorithms.rl import RL
 from bgpo_trl.configs import PRESETS, RunConfig
+from bgpo_trl.configs.runs import check_seeds
 from bgpo_trl.experiments.arguments import Arguments
 from bgpo_trl.plugins import import_plugin
 from bgpo_trl.runs.config_file import read_config, read_settings
 from bgpo_trl.runs.directory import differing_settings
 from bgpo_trl.runs.results import read_json
 from bgpo_trl.scenes import Scene, find_scene
-from bgpo_trl.seeding import check_seeds
 
 _Entry = TypeVar("_Entry")
 # Flags of the settings of the same name.
@@ -71,8 +73,6 @@ def run_config(arguments: Arguments, *, from_start: bool = False) -> RunConfig:
 
 def _begin(arguments: Arguments) -> RunConfig:
     """Return the settings that flags change: of a run to be resumed, of a file, or a preset's."""
-    from bgpo_trl.algorithms import ALGORITHMS
-
     path, preset = arguments.config, PRESETS[arguments.preset or "quick"]
     if path is None:
         out = named_directory(arguments)
@@ -105,9 +105,6 @@ def named_directory(arguments: Arguments) -> Path | None:
 
 
 def _with_algorithm(config: RunConfig, arguments: Arguments) -> RunConfig:
-    from bgpo_trl.algorithms import ALGORITHMS
-    from bgpo_trl.algorithms.rl import RL
-
     if arguments.algorithm is not None:
         entry = chosen(ALGORITHMS, arguments.algorithm, "--algorithm")
         config = replace(config, name=arguments.algorithm, algorithm=entry.config)
@@ -217,9 +214,6 @@ def as_begun(config: RunConfig, directory: Path, *, keep_eval_every: bool = Fals
 
 def changed_hyperparameters(config: RunConfig) -> dict[str, Any]:
     """Return the hyperparameters of a run that are not the usual ones of its algorithm, by name."""
-    from bgpo_trl.algorithms import ALGORITHMS
-    from bgpo_trl.algorithms.rl import RL
-
     if config.name not in ALGORITHMS:
         return {}
     usual, rl = ALGORITHMS[config.name].config, config.algorithm.rl.name

@@ -1,25 +1,23 @@
-"""Figures of success: learning curves (Figs. 6, 8, 9), steps, matrices by phase, conditions."""
+"""Figures of success and its steps: learning curves (Figs. 6, 8, 9), matrices by phase."""
 
 from __future__ import annotations
 
 import math
 import os
 from collections.abc import Mapping, Sequence
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
-from matplotlib.ticker import MaxNLocator, PercentFormatter
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike, NDArray
 
-from bgpo_trl.analysis import statistics
 from bgpo_trl.figures.style import (
     COLORS,
     LINES,
-    MARKERS,
     add_legend,
     mark_starts,
     readable,
@@ -32,7 +30,6 @@ _GRID_POINTS = 400
 _OVERALL = "All presented tasks"
 
 _Path = str | os.PathLike[str]
-_Key = TypeVar("_Key", str, float)
 
 
 def plot_success_curves(
@@ -305,104 +302,3 @@ def _label_tasks(panel: Axes, tasks: Sequence[str], *, names: bool) -> None:
     panel.set_yticks(range(len(tasks)), rows if names else numbers)
     panel.tick_params(labelsize=8, length=0)
     panel.spines[:].set_visible(False)
-
-
-_WIDTH = 0.8  # of the bars of a task, whose centers are 1 apart
-
-
-def plot_success_bars(success: Mapping[str, ArrayLike], tasks: Sequence[str]) -> Figure:
-    """Plot the success on each task as a group of bars, one for each condition.
-
-    Bars are means over seeds, with 95 % t intervals if there are at least two seeds, and a dot for
-    each seed.
-
-    Args:
-        success: Success in [0, 1] of each seed and task, ``[S, T]``, by condition.
-        tasks: Names of the tasks.
-
-    Raises:
-        ValueError: If there are no conditions, or one has not a column per task.
-    """
-    found = _checked(success, tasks)
-    width = max(3.6, 1.0 + 0.28 * len(tasks) * len(found))  # inches
-    figure = Figure(figsize=(width, 3.2), layout="constrained")
-    axes = figure.add_subplot()
-    slim = _WIDTH / len(found)
-    for number, (name, scores) in enumerate(found.items()):
-        mean = scores.mean(0)
-        places = np.arange(len(tasks)) + (number - (len(found) - 1) / 2) * slim
-        color = COLORS[number % len(COLORS)]
-        axes.bar(places, mean, slim * 0.9, color=color, alpha=0.75, label=name)
-        if len(scores) > 1:
-            low, high = np.clip(np.transpose([statistics.mean(s)[1:] for s in scores.T]), 0.0, 1.0)
-            axes.errorbar(
-                places, mean, [mean - low, high - mean], fmt="none", ecolor="0.2", elinewidth=0.9
-            )
-            around = np.linspace(-0.2, 0.2, len(scores)) * slim
-            axes.scatter(
-                np.add.outer(around, places),
-                scores,
-                s=4,
-                color="0.2",
-                linewidths=0,
-                zorder=3,
-                clip_on=False,
-            )
-    names = [readable(task).replace(" to ", "\nto ") for task in tasks]
-    axes.set_xticks(range(len(tasks)), names)
-    _finish(figure, axes)
-    axes.grid(visible=False, axis="x")
-    return figure
-
-
-def plot_success_by(
-    success: Mapping[float, ArrayLike], tasks: Sequence[str], *, label: str
-) -> Figure:
-    """Plot the success on each task against a number, as lines.
-
-    Lines are means over seeds; dots are single seeds.
-
-    Args:
-        success: Success in [0, 1] of each seed and task, ``[S, T]``, by the number.
-        tasks: Names of the tasks.
-        label: Name of the number.
-
-    Raises:
-        ValueError: If there are no numbers, or one has not a column per task.
-    """
-    found = _checked(dict(sorted(success.items())), tasks)
-    figure = Figure(figsize=(4.2, 3.2), layout="constrained")
-    axes = figure.add_subplot()
-    for index, task in enumerate(tasks):
-        style: dict[str, Any] = {
-            "color": COLORS[index % len(COLORS)],
-            "marker": MARKERS[index % len(MARKERS)],
-        }
-        means = [scores[:, index].mean() for scores in found.values()]
-        line = LINES[index % len(LINES)]
-        axes.plot([*found], means, label=readable(task), linestyle=line, markersize=5, **style)
-        for number, scores in found.items():
-            numbers = np.full(len(scores), number)
-            axes.scatter(numbers, scores[:, index], s=8, alpha=0.5, clip_on=False, **style)
-    axes.set_xticks([*found])
-    axes.set_xlabel(label, fontsize=9)
-    _finish(figure, axes)
-    return figure
-
-
-def _checked(success: Mapping[_Key, ArrayLike], tasks: Sequence[str]) -> dict[_Key, NDArray]:
-    """Return success by condition as arrays; raise ``ValueError`` if one is not ``[S, T]``."""
-    found = {key: np.asarray(scores, float) for key, scores in success.items()}
-    if not found or any(s.ndim != 2 or s.shape[1] != len(tasks) for s in found.values()):
-        shapes = [list(scores.shape) for scores in found.values()]
-        raise ValueError(f"success must be [seeds, {len(tasks)}] by condition, got {shapes}")
-    return found
-
-
-def _finish(figure: Figure, axes: Axes) -> None:
-    """Give axes of success their scale, and the figure its legend."""
-    axes.set_ylim(0, 1.02)
-    axes.set_ylabel("Success rate", fontsize=9)
-    axes.yaxis.set_major_formatter(PercentFormatter(1, decimals=0))
-    style_axes(axes)
-    add_legend(figure, *axes.get_legend_handles_labels(), figure.get_figwidth())

@@ -11,6 +11,8 @@ from typing import Any, Literal, NamedTuple, get_args, get_origin, get_type_hint
 
 import yaml
 
+from bgpo_trl.algorithms import ALGORITHMS
+from bgpo_trl.algorithms.rl import RL
 from bgpo_trl.configs import AlgorithmConfig, RLConfig, RunConfig
 from bgpo_trl.runs.results import read_json
 from bgpo_trl.scenes import SCENES, find_scene
@@ -191,8 +193,6 @@ def _algorithm_config(name: object, stored: object) -> type[AlgorithmConfig] | N
         kind = getattr(sys.modules.get(module), attribute, None)
         if isinstance(kind, type) and issubclass(kind, AlgorithmConfig):
             return kind
-    from bgpo_trl.algorithms import ALGORITHMS
-
     if not isinstance(name, str) or name not in ALGORITHMS:
         return None
     return type(ALGORITHMS[name].config)
@@ -201,8 +201,6 @@ def _algorithm_config(name: object, stored: object) -> type[AlgorithmConfig] | N
 def _read(hint: Any, value: Any, where: str) -> Any:
     """Convert a JSON value to its annotated type; ``where`` names it in errors."""
     if hint is RLConfig and isinstance(value, dict):
-        from bgpo_trl.algorithms.rl import RL
-
         name = value.get("name")
         if name not in RL:
             raise ValueError(f"{where}name is {name!r}, not a known RL algorithm")

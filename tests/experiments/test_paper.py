@@ -14,11 +14,11 @@ from pathlib import Path
 
 import pytest
 
-from bgpo_trl.algorithms import ABLATIONS, ALGORITHMS
+from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.analysis.comparison import NAMES
 from bgpo_trl.experiments import run as experiment
-from bgpo_trl.experiments.arguments import AblationArguments, Arguments
-from bgpo_trl.experiments.paper import ablation, concurrent, continual
+from bgpo_trl.experiments.arguments import Arguments
+from bgpo_trl.experiments.paper import concurrent, continual
 from bgpo_trl.experiments.report import ReportArguments, report
 from bgpo_trl.files.checkpoint import load_checkpoint
 from bgpo_trl.runs.results import read_final_tests, read_table, read_tests
@@ -75,11 +75,8 @@ def test_an_experiment_writes_curves_figures_and_a_summary(tiny, tmp_path):
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_every_algorithm_runs_and_is_reported_under_its_name(tiniest, tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
-    if name in ABLATIONS:
-        kind, printed = "ablation", ablation(AblationArguments(variant=name))
-    else:
-        kind, printed = "concurrent", concurrent(Arguments(algorithm=name))
-    run = Path("runs", f"{kind}-{name}-quick")
+    printed = concurrent(Arguments(algorithm=name))
+    run = Path("runs", f"concurrent-{name}-quick")
     assert f"curve and figures: {run}" in printed
     config = json_of(run, "config")
     assert (config["name"], config["task_starts"]) == (name, [0, 0, 0])

@@ -243,36 +243,3 @@ def test_two_runs_are_compared_seed_by_seed_on_the_episodes_of_both(tmp_path):
     other = write_run(tmp_path, "ddpg", 3, tasks=("pull",), starts=(0,))
     with pytest.raises(ValueError, match="only runs of the same tasks"):
         compared(first, other, anyway=True)
-
-
-def test_success_is_shown_by_the_setting_in_which_runs_differ(tmp_path):
-    for spread, level in ((1.0, [5, 7, 6]), (0.25, [9, 9, 9]), (0.0, [10, 10, 10])):
-        write_run(tmp_path, "bgpo", level, directory=f"spread-{spread}", spread=spread)
-    edit(tmp_path / "spread-1.0" / "summary.json", random_success=dict.fromkeys(TASKS, 0.04))
-    archive = tmp_path / "archive"
-    text = report(ReportArguments((tmp_path,), by="spread", archive=archive))
-    assert text == text_of(archive)
-    found = table_of(archive, "Success by spread: BGPO")
-    assert [*found] == ["0", "0.25", "1"]
-    assert found["0"] == ["3", *["100.0 [100, 100]"] * 4, "-"]
-    assert found["1"] == ["3", *["60.0 [35, 85]"] * 4, "4 4 4"]
-    assert (archive / "by-spread.png").exists()
-
-
-@pytest.mark.parametrize(
-    ("name", "changes", "cause"),
-    [
-        ("oracle", {"spread": 0.5}, "one algorithm"),
-        ("bgpo", {"spread": 0.5, "held_out": "test"}, "held_out"),
-        ("bgpo", {"spread": 1.0}, "have 1.0"),
-        ("bgpo", {"spread": "wide"}, "no number"),
-        ("bgpo", {}, "no number"),
-    ],
-)
-def test_runs_that_differ_in_more_than_one_number_are_refused(name, changes, cause, tmp_path):
-    write_run(tmp_path, "bgpo", 9, directory="a", spread=1.0)
-    write_run(tmp_path, name, 9, directory="b", **changes)
-    before = contents(tmp_path)
-    with pytest.raises(ValueError, match=cause):
-        report(ReportArguments((tmp_path,), by="spread", archive=tmp_path / "archive"))
-    assert contents(tmp_path) == before

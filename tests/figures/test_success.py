@@ -19,8 +19,6 @@ from bgpo_trl.figures.gwr import plot_gwr_growth, plot_gwr_pca
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.figures.success import (
     plot_step_curves,
-    plot_success_bars,
-    plot_success_by,
     plot_success_curves,
     plot_success_matrices,
 )
@@ -207,40 +205,10 @@ def test_a_panel_shows_the_matrix_as_colors_and_numbers():
     assert [label.get_text() for label in two.get_yticklabels()] == ["1", "2"]
 
 
-def test_bars_are_means_with_their_intervals():
-    success = {"seen": [[0.5, 1.0], [0.7, 1.0], [0.6, 1.0]], "hidden": [[0.0, 0.2]]}
-    (axes,) = plot_success_bars(success, ["grasp_glass", "push_green_to_white"]).axes
-    heights = [bar.get_height() for bar in axes.patches]
-    assert heights == pytest.approx([0.6, 1.0, 0.0, 0.2])
-    centers = [bar.get_x() + bar.get_width() / 2 for bar in axes.patches]
-    assert centers == pytest.approx([-0.2, 0.8, 0.2, 1.2])
-    # The t value for three seeds is 4.303; one seed has no interval and no dots.
-    intervals, dots = axes.collections
-    found = np.array([segment[:, 1] for segment in intervals.get_segments()])
-    half = 4.303 * 0.1 / np.sqrt(3)
-    assert found == pytest.approx(np.array([[0.6 - half, 0.6 + half], [1, 1]]), abs=1e-3)
-    assert sorted(dots.get_offsets()[:, 1]) == pytest.approx([0.5, 0.6, 0.7, 1, 1, 1])
-
-
-def test_lines_pass_through_the_means_and_dots_are_seeds():
-    success = {1.0: [[0.2, 0.9], [0.6, 0.7]], 0.0: [[1.0, 0.5], [0.8, 0.5]]}
-    figure = plot_success_by(success, ["grasp_glass", "lift_green"], label="Spread")
-    (axes,) = figure.axes
-    lines = {str(line.get_label()): line.get_xydata() for line in axes.lines}
-    assert lines["grasp glass"] == pytest.approx(np.array([[0, 0.9], [1, 0.4]]))
-    assert lines["lift green"] == pytest.approx(np.array([[0, 0.5], [1, 0.8]]))
-    dots = np.concatenate([found.get_offsets() for found in axes.collections])
-    expected = [(number, rate) for number, scores in success.items() for rate in np.ravel(scores)]
-    assert sorted(map(tuple, dots.tolist())) == sorted(expected)
-    assert axes.get_xlabel() == "Spread"
-
-
 REFUSED = {
     "no test episodes": lambda: plot_success_curves({}),
     "row and a column per task, not [2, 2]": lambda: plot_success_matrices({"one": FIRST}, "abc"),
     "not none": lambda: plot_success_matrices({}, "ab"),
-    "success must be [seeds, 2] by": lambda: plot_success_bars({"seen": [[0.5]]}, "ab"),
-    "success must be [seeds, 2] by condition, got []": lambda: plot_success_by({}, "ab", label="x"),
     "nothing to show": lambda: plot_frame_strips({"none": np.zeros((0, 2, 2, 3), np.uint8)}),
     "uint8 [T, H, W, 3]": lambda: save_gif(np.zeros((1, 2, 3, 3)), "none.gif"),
     "N, d >= 2, not [1, 4]": lambda: plot_gwr_pca(np.zeros((1, 4)), [0], "ab"),
