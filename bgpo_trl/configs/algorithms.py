@@ -7,6 +7,8 @@ from math import inf
 from numbers import Integral
 from typing import Literal
 
+from bgpo_trl.configs.settings import Settings
+
 
 def check(config: object, *needs: tuple[str, bool, str]) -> None:
     """Raise ``ValueError`` for the first (field, condition, description) that does not hold."""
@@ -35,7 +37,7 @@ def positive(config: object, *names: str) -> None:
 
 
 @dataclass(frozen=True)
-class RLConfig:
+class RLConfig(Settings):
     """Hyperparameters common to all RL algorithms f_RL of Alg. 1."""
 
     name: str = ""
@@ -69,14 +71,13 @@ class RLConfig:
     """Environment steps of each seed per update (1 in Alg. 1)."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         positive(self, "learning_rate")
         at_least(self, 0, "imitation")
         whole(self, 1, "batch_size", "warmup_steps", "replay_size", "update_every")
         # With a smaller replay, learning would never begin.
         least = max(self.batch_size, self.warmup_steps)
-        sizes = bool(self.hidden_sizes) and all(
-            isinstance(size, Integral) and size >= 1 for size in self.hidden_sizes
-        )
+        sizes = min(self.hidden_sizes, default=0) >= 1
         check(
             self,
             ("hidden_sizes", sizes, "one or more whole numbers, of at least 1"),
@@ -148,7 +149,7 @@ class SACConfig(RLConfig):
 
 
 @dataclass(frozen=True)
-class AlgorithmConfig:
+class AlgorithmConfig(Settings):
     """Hyperparameters common to all algorithms, which are thus compared on equal terms."""
 
     state: Literal["latent", "state"] = "latent"
@@ -168,11 +169,10 @@ class AlgorithmConfig:
     keeps policies from learning a few demonstrations by heart (docs/learning.md)."""
 
     def __post_init__(self) -> None:
-        known = self.state in ("latent", "state")
+        super().__post_init__()
         share = self.demonstration_share
         check(
             self,
-            ("state", known, "latent or state"),
             ("demonstration_share", 0 <= share < 1, "at least 0 and below 1"),
         )
         whole(self, 1, "max_steps")
@@ -201,7 +201,7 @@ def _refuse_all_but_ddpg(who: str, rl: RLConfig) -> None:
 
 
 @dataclass(frozen=True)
-class GWRBConfig:
+class GWRBConfig(Settings):
     """Constants of GWR-B, by default those of Table 1; see `GWRB` for the learning rule."""
 
     activity_threshold: float = 0.8
@@ -231,6 +231,7 @@ class GWRBConfig:
     """Age kappa beyond which an edge is removed (Table 1)."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         positive(self, "activity_scale", "tau_best", "tau_neighbor")
         at_least(self, 0, "habituation_threshold", "lr_neighbor")
         whole(self, 1, "max_age")

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 from numbers import Integral
 from typing import Literal
 
-from bgpo_trl.configs.algorithms import AlgorithmConfig, BGPOConfig, at_least, check, whole
+from bgpo_trl.configs.algorithms import AlgorithmConfig, BGPOConfig, at_least, check
+from bgpo_trl.configs.settings import Settings
 
 PAPER_TASKS = ("grasp_glass", "push_green_to_glass", "push_green_to_white")
 """Names of the paper's tasks, in its order."""
@@ -22,7 +23,7 @@ def check_seeds(seeds: Sequence[int]) -> None:
 
 
 @dataclass(frozen=True)
-class RunConfig:
+class RunConfig(Settings):
     """One run of an experiment: its seeds, length, tasks and schedule."""
 
     seeds: tuple[int, ...] = tuple(range(10))
@@ -58,21 +59,16 @@ class RunConfig:
     """The algorithm's hyperparameters."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         check_seeds(self.seeds)
-        whole_starts = all(isinstance(start, Integral) for start in self.task_starts)
-        check(self, ("task_starts", whole_starts, "whole numbers"))
-        whole(self, 1, "episodes", "eval_every", "eval_episodes")
+        at_least(self, 1, "episodes", "eval_every", "eval_episodes")
         at_least(self, 0, "checkpoint_minutes")
-        check(self, ("held_out", self.held_out in ("validation", "test"), "validation or test"))
-        schedules = ("practised", "sequential")
-        check(self, ("schedule", self.schedule in schedules, " or ".join(schedules)))
-        check(self, ("tasks", not isinstance(self.tasks, str), "a tuple of names"))
         distinct = len(set(self.tasks)) == len(self.tasks)
-        check(self, ("tasks", distinct, "names of different tasks"))
-        check(self, ("spread", 0.0 <= self.spread <= 1.0, "from 0 (nominal places) to 1"))
         starts = self.task_starts
         check(
             self,
+            ("tasks", distinct, "names of different tasks"),
+            ("spread", 0.0 <= self.spread <= 1.0, "from 0 (nominal places) to 1"),
             ("task_starts", len(starts) == len(self.tasks), "one episode for each of the tasks"),
             ("task_starts", min(starts, default=-1) == 0, "at least 0, and one of them 0"),
         )
