@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from numbers import Integral
 from typing import Literal
 
+from tyro.conf import Fixed
+
 from bgpo_trl.configs.algorithms import AlgorithmConfig, BGPOConfig, at_least, check
 from bgpo_trl.configs.settings import Settings
 
@@ -24,15 +26,18 @@ def check_seeds(seeds: Sequence[int]) -> None:
 
 @dataclass(frozen=True)
 class RunConfig(Settings):
-    """One run of an experiment: its seeds, length, tasks and schedule."""
+    """One run of an experiment: its seeds, length, tasks and schedule.
+
+    All settings but those marked as fixed are flags of the command line. On these, others depend.
+    """
 
     seeds: tuple[int, ...] = tuple(range(10))
     """Seeds, run as one batch (Sec. IV: 10)."""
-    episodes: int = 20_000
+    episodes: Fixed[int] = 20_000
     """Training episodes of each seed (Figs. 6 and 8)."""
-    scene: str = "nico"
+    scene: Fixed[str] = "nico"
     """Name of the robot with its tasks in `bgpo_trl.scenes.SCENES`."""
-    tasks: tuple[str, ...] = PAPER_TASKS
+    tasks: Fixed[tuple[str, ...]] = PAPER_TASKS
     """Names of the tasks, as in the scene and the CSV files; by default the paper's three."""
     task_starts: tuple[int, ...] = (0, 7_000, 13_000)
     """Episode from which each task is presented (Sec. IV-C); all 0 is the concurrent setting."""
@@ -53,7 +58,7 @@ class RunConfig(Settings):
     settings, ``"test"`` for reporting results. Ours."""
     checkpoint_minutes: float = 10.0
     """Minutes between checkpoints. Ours."""
-    name: str = "bgpo"
+    name: Fixed[str] = "bgpo"
     """Name of the algorithm or variant, as in the CSV files."""
     algorithm: AlgorithmConfig = field(default_factory=BGPOConfig)
     """The algorithm's hyperparameters."""

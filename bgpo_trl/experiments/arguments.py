@@ -7,11 +7,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
-from bgpo_trl.configs import BGPOConfig, RepresentationConfig
+from bgpo_trl.configs import BGPOConfig, RepresentationConfig, RunConfig
+
+SETTINGS: Any = tyro.conf.SuppressFixed[RunConfig]
+"""The settings of a run, for their flags."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,9 +51,9 @@ class Arguments(BankArguments):
     summary.json, checkpoint/ and figures/, among them success.png (success on each task against
     training episodes), gwr.png (nodes of GWR-B in behavior space, Fig. 7) and groups.png.
 
-    Flags go before the file of --config, and this before --preset. Hyperparameters of the
-    algorithm are flags too, by their names in config.json, such as --algorithm.beta 0.2 or
-    --algorithm.rl.noise 0.1.
+    Flags go before the file of --config, and this before --preset. All settings of config.json are
+    flags, such as --seeds 0 1, --algorithm.beta 0.2 or --algorithm.rl.noise 0.1; --help lists these
+    flags last.
     """
 
     algorithm: str | None = None
@@ -75,27 +78,9 @@ class Arguments(BankArguments):
     out: Path | None = None
     """Run directory; runs/EXPERIMENT-ALGORITHM[-RL]-PRESET by default, with the name of the file
     of --config for PRESET."""
-    seeds: tuple[int, ...] | None = None
-    """Seeds; the preset's by default."""
-    schedule: Literal["practised", "sequential"] | None = None
-    """Tasks of training episodes: all presented so far (practised, the default) or only the newest
-    (sequential, as in Continual World and COOM)."""
-    spread: float | None = None
-    """Share of the whole range of start states, from 0 (nominal places) to 1, the default."""
     episodes: int | None = None
     """Training episodes; the preset's by default. The task starts are scaled in proportion. With
     --resume, a larger number extends the run, whose task starts are kept."""
-    task_starts: tuple[int, ...] | None = None
-    """Episodes after which tasks are presented, one for each; the preset's by default."""
-    eval_every: int | None = None
-    """Training episodes between evaluations; the preset's by default."""
-    eval_episodes: int | None = None
-    """Test episodes of each task in an evaluation; the preset's by default."""
-    checkpoint_minutes: float | None = None
-    """Minutes between checkpoints; the preset's by default."""
-    held_out: Literal["validation", "test"] | None = None
-    """Half of the held-out demonstrations to test on: validation, the default, to choose settings;
-    test to report results."""
     resume: bool = False
     """Continue the run in the directory, or begin it if there is none. With --out, or in a run's
     folder, and with neither --preset nor --config, its settings are those of the run."""
@@ -114,8 +99,13 @@ class Arguments(BankArguments):
     threads: int = 1
     """Threads of PyTorch; more than one slows these small networks down. Physics always uses all
     cores."""
-    hyperparameters: tyro.conf.Suppress[tuple[str, ...]] = ()
-    """Flags of single hyperparameters, which `run_config` reads."""
+    settings: tyro.conf.Suppress[tuple[str, ...]] = ()
+    """Flags of single settings of `RunConfig`, which `run_config` reads."""
+
+    def gives(self, setting: str) -> bool:
+        """Return whether a setting of `RunConfig` is among the flags."""
+        names = (flag.partition("=")[0].replace("-", "_") for flag in self.settings)
+        return f"__{setting}" in names
 
 
 @dataclass(frozen=True)

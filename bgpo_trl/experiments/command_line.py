@@ -12,10 +12,14 @@ import threading
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
 
 import tyro
+
+from bgpo_trl.configs import PRESETS
+from bgpo_trl.experiments.arguments import SETTINGS
 
 
 def command_line(
@@ -78,16 +82,21 @@ def _printable(line: str) -> str:
 
 
 def _parse(kind: type, options: Sequence[str] | None, program: str | None, line: str) -> Any:
-    """Return the arguments; flags ``--algorithm.*`` are left to `run_config` where it is used."""
+    """Return the arguments; flags of single settings are left to `run_config`."""
     unprefixed: Any = Annotated[kind, tyro.conf.OmitArgPrefixes]
     description = "\n\n".join(filter(None, (line, inspect.getdoc(kind))))
-    settings: dict[str, Any] = {"prog": program, "description": description, "args": options}
-    if hasattr(kind, "hyperparameters"):
-        arguments, rest = tyro.cli(unprefixed, **settings, return_unknown_args=True)
-        flags = [word for word in rest if word.startswith("--")]
-        if not rest or (rest[0] in flags and all(f.startswith("--algorithm.") for f in flags)):
-            return replace(arguments, hyperparameters=tuple(rest))
-    return tyro.cli(unprefixed, **settings)
+    options = sys.argv[1:] if options is None else options
+    parse: Any = partial(tyro.cli, unprefixed, prog=program, description=description, args=options)
+    if "settings" not in get_type_hints(kind):
+        return parse()
+    if {"-h", "--help"} & {*options}:
+        with contextlib.suppress(SystemExit):
+            parse()
+        described = "Settings, with the defaults of --preset quick and --algorithm bgpo:"
+        quick = PRESETS["quick"]
+        tyro.cli(SETTINGS, prog=program, description=described, default=quick, args=["--help"])
+    arguments, rest = parse(return_unknown_args=True)
+    return replace(arguments, settings=tuple(rest))
 
 
 def _is_of_others(error: BaseException) -> bool:

@@ -157,9 +157,9 @@ def _continued(arguments: Arguments, config: RunConfig, out: Path) -> RunConfig:
             f"{out} holds the beginning of new encoders: add --train-encoders, or name another "
             "directory"
         )
-    continued = as_begun(config, out, keep_eval_every=arguments.eval_every is not None)
-    if arguments.task_starts is not None:  # the run's, or `Trainer` refuses them
-        continued = replace(continued, task_starts=arguments.task_starts)
+    continued = as_begun(config, out, keep_eval_every=arguments.gives("eval_every"))
+    if arguments.gives("task_starts"):  # the run's, or `Trainer` refuses them
+        continued = replace(continued, task_starts=config.task_starts)
     return continued
 
 

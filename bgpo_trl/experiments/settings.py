@@ -13,7 +13,7 @@ from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.rl import RL
 from bgpo_trl.configs import PRESETS, RunConfig
 from bgpo_trl.configs.runs import check_seeds
-from bgpo_trl.experiments.arguments import Arguments
+from bgpo_trl.experiments.arguments import SETTINGS, Arguments
 from bgpo_trl.plugins import import_plugin
 from bgpo_trl.runs.config_file import read_config, read_settings
 from bgpo_trl.runs.directory import differing_settings
@@ -21,20 +21,11 @@ from bgpo_trl.runs.results import read_json
 from bgpo_trl.scenes import Scene, find_scene
 
 _Entry = TypeVar("_Entry")
-# Flags of the settings of the same name.
-_PLAIN = (
-    "seeds",
-    "task_starts",
-    "schedule",
-    "spread",
-    "eval_every",
-    "eval_episodes",
-    "checkpoint_minutes",
-    "held_out",
-)
 
 
-def run_config(arguments: Arguments, *, from_start: bool = False) -> RunConfig:
+def run_config(
+    arguments: Arguments, *, from_start: bool = False, changes: Mapping[str, Any] | None = None
+) -> RunConfig:
     """Return the settings that a command line asks for.
 
     Imports the module of own tasks and algorithms first.
@@ -42,6 +33,7 @@ def run_config(arguments: Arguments, *, from_start: bool = False) -> RunConfig:
     Args:
         arguments: The command line.
         from_start: Whether all tasks are presented from the start.
+        changes: Settings to change, as by flags; those that are None are left.
 
     Raises:
         ValueError: If the settings are invalid, or a file, task or algorithm does not exist.
@@ -55,14 +47,14 @@ def run_config(arguments: Arguments, *, from_start: bool = False) -> RunConfig:
         config = _with_tasks(config, chosen_tasks(arguments.tasks, scene, config.tasks))
     if arguments.episodes is not None:
         config = _with_episodes(config, arguments.episodes)
-    given = {name: getattr(arguments, name) for name in _PLAIN}
-    config = replace(config, **{name: value for name, value in given.items() if value is not None})
+    given = {name: value for name, value in (changes or {}).items() if value is not None}
+    config = replace(config, **given)
+    if arguments.settings:
+        config = tyro.cli(SETTINGS, default=config, args=arguments.settings)
     if from_start:
-        if any(arguments.task_starts or ()):
+        if any(config.task_starts) and (arguments.gives("task_starts") or "task_starts" in given):
             raise ValueError("--task-starts: all tasks are presented from the start here")
         config = at_once(config)
-    if arguments.hyperparameters:
-        config = tyro.cli(RunConfig, default=config, args=arguments.hyperparameters)
     if config.eval_every > config.episodes:
         raise ValueError(
             f"eval_every must be at most the {config.episodes} episodes of the run, got "

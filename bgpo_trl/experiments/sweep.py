@@ -85,15 +85,17 @@ def _config(arguments: SweepArguments, setting: Setting, name: str) -> RunConfig
         Arguments(
             algorithm=name,
             preset=arguments.preset,
-            seeds=arguments.seeds,
             episodes=arguments.episodes,
-            eval_every=arguments.eval_every,
-            held_out=arguments.held_out,
             scene=arguments.scene,
             tasks=tasks,
-            schedule="sequential" if setting.endswith("sequential") else "practised",
         ),
         from_start=setting.endswith(("concurrent", "ablation")),
+        changes={
+            "seeds": arguments.seeds,
+            "eval_every": arguments.eval_every,
+            "held_out": arguments.held_out,
+            "schedule": "sequential" if setting.endswith("sequential") else "practised",
+        },
     )
 
 

@@ -118,7 +118,9 @@ def test_a_finished_run_is_only_changed_by_making_it_longer(undrawn, tmp_path, m
             assert continual(same).startswith(f"{run} is finished, all 6 episodes")
     assert contents(run) == before
 
-    others = [{"episodes": 5}, {"seeds": (3,)}, {"eval_every": 3}, {"episodes": 9, "eval_every": 3}]
+    seed, every = ("--seeds", "3"), ("--eval-every", "3")
+    others = [{"episodes": 5}, {"settings": seed}, {"settings": every}]
+    others.append({"episodes": 9, "settings": every})
     for other in others:
         with pytest.raises(ValueError, match="holds a run with other settings"):
             continual(replace(again, **other))
@@ -146,7 +148,7 @@ def test_a_run_is_continued_and_repeated_with_its_own_settings(undrawn, tmp_path
     """A run of other settings than the preset's, also when it is extended, and in its folder."""
     run = tmp_path / "run"
     begun = Arguments(
-        out=run, algorithm="bgpo-single", episodes=4, hyperparameters=("--algorithm.beta", "0.3")
+        out=run, algorithm="bgpo-single", episodes=4, settings=("--algorithm.beta", "0.3")
     )
     continual(begun)
     played = (run / "train.csv").read_text()
@@ -218,7 +220,7 @@ def test_dashboards_get_evaluations_final_tests_and_figures(tiniest, monkeypatch
     assert [step for _, step in started[-1].metrics] == [6]
     assert started[-1].media == shown
 
-    for again in ({}, {"resume": True, "seeds": (4,)}):
+    for again in ({}, {"resume": True, "settings": ("--seeds", "4")}):
         with pytest.raises(ValueError, match="holds a run"):
             continual(replace(arguments, **again))
     assert len(started) == 3  # a run that is refused starts no logger
