@@ -1,70 +1,120 @@
 """The command ``bgpo``, also ``python -m bgpo_trl``.
 
-A sub-command is imported when it is chosen: the list of all is there at once.
+A sub-command's arguments are read before its code is imported, so that ``--help`` is quick.
 """
 
 from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Callable
+from typing import NamedTuple
 
-import tyro
+from bgpo_trl.doctor import DoctorArguments
+from bgpo_trl.experiments import arguments
+from bgpo_trl.experiments.command_line import command_line
 
+
+class Command(NamedTuple):
+    """A sub-command.
+
+    Attributes:
+        group: Title under which it is listed.
+        module: Module in which a function has its name.
+        kind: Dataclass of its arguments, whose docstring is the help.
+        line: A line about it.
+    """
+
+    group: str
+    module: str
+    kind: type
+    line: str
+
+
+_MAKE, _RUN, _LOOK = "make data", "run", "look"
 COMMANDS = {
-    "continual": ("experiments.paper", "Train on tasks presented one after the other (Fig. 8)."),
-    "concurrent": ("experiments.paper", "Train on all tasks from the start (Fig. 6)."),
-    "ablation": ("experiments.paper", "Train BGPO without some of its parts (Fig. 9)."),
-    "sweep": ("experiments.sweep", "Run algorithms in settings over many seeds on Ray."),
-    "eight-tasks": ("experiments.sweep", "Run the benchmark of eight tasks, as a sweep."),
-    "merge": ("experiments.merge", "Merge runs of different seeds into one."),
-    "report": ("experiments.report", "Write tables and figures of runs, or compare two."),
-    "watch": ("experiments.watch", "Film what a run has learned."),
-    "looking": ("experiments.nico.looking", "Test a run of NICO with the objects' places hidden."),
-    "aftermath": (
-        "experiments.nico.aftermath",
-        "Test whether successes of a run of NICO last.",
-    ),
-    "one-shot": ("experiments.one_shot", "Test a run with demonstrations cut short."),
-    "unknown-task": ("experiments.groups", "Measure how well new tasks are detected."),
-    "groups": ("experiments.groups", "Measure the groups that form from demonstrations."),
-    "privileged-information": (
-        "experiments.privileged_information",
-        "Train with less and less given information.",
-    ),
-    "tasks": ("experiments.nico.tasks", "Measure NICO's tasks and their demonstrators."),
-    "doctor": ("doctor", "Check this machine and installation."),
+    name: Command(group, f"bgpo_trl.{module}", kind, line)
+    for group, name, module, kind, line in (
+        (
+            *(_MAKE, "record", "experiments.make_data", arguments.RecordArguments),
+            "Record demonstrations, or random play.",
+        ),
+        (
+            *(_MAKE, "encoders", "experiments.make_data", arguments.EncodersArguments),
+            "Train encoders on recordings.",
+        ),
+        (
+            *(_MAKE, "bank", "experiments.make_data", arguments.MakeBankArguments),
+            "Embed recorded demonstrations, for --bank of a run.",
+        ),
+        (
+            *(_MAKE, "probes", "experiments.make_data", arguments.ProbesArguments),
+            "Evaluate trained encoders.",
+        ),
+        (
+            *(_RUN, "continual", "experiments.paper", arguments.Arguments),
+            "Train on tasks presented one after the other (Fig. 8).",
+        ),
+        (
+            *(_RUN, "concurrent", "experiments.paper", arguments.Arguments),
+            "Train on all tasks from the start (Figs. 6 and 9).",
+        ),
+        (
+            *(_RUN, "sweep", "experiments.sweep", arguments.SweepArguments),
+            "Run algorithms in settings over many seeds on Ray.",
+        ),
+        (
+            *(_RUN, "doctor", "doctor", DoctorArguments),
+            "Check this machine and installation.",
+        ),
+        (
+            *(_LOOK, "report", "experiments.report", arguments.ReportArguments),
+            "Write tables and figures of runs, or compare two; copy runs, to share them.",
+        ),
+        (
+            *(_LOOK, "watch", "experiments.watch", arguments.WatchArguments),
+            "Film what a run has learned.",
+        ),
+        (
+            *(_LOOK, "groups", "experiments.groups", arguments.GroupsArguments),
+            "Measure the groups that form from demonstrations.",
+        ),
+        (
+            *(_LOOK, "merge", "experiments.merge", arguments.MergeArguments),
+            "Merge runs of different seeds into one.",
+        ),
+    )
 }
-"""Module of each sub-command, whose function has its name, and a line about it."""
+"""The sub-commands by name."""
 
 
 def main() -> None:
     """Run the sub-command that the command line names."""
     name, *options = sys.argv[1:] or ["--help"]
     sys.argv = ["-m", "bgpo_trl", *sys.argv[1:]]  # stored with results, to repeat them
-    if name not in COMMANDS:
-        listed = {command: _listed(line) for command, (_, line) in COMMANDS.items()}
-        description = "BGPO: behavior self-organization for continual robot learning."
-        tyro.extras.subcommand_cli_from_dict(
-            listed, prog="bgpo", description=description, args=[name, *options]
-        )
+    if name in ("-h", "--help"):
+        sys.stdout.write(_listed())
         return
-    try:
-        from bgpo_trl.experiments.command_line import command_line
+    if name not in COMMANDS:
+        sys.stderr.write(f"bgpo: there is no command {name!r}\n{_listed()}")
+        sys.exit(2)
+    command = COMMANDS[name]
+    command_line(
+        lambda given: getattr(importlib.import_module(command.module), name)(given),
+        options,
+        kind=command.kind,
+        program=f"bgpo {name}",
+        line=command.line,
+    )
 
-        module = importlib.import_module(f"bgpo_trl.{COMMANDS[name][0]}")
-    except KeyboardInterrupt:
-        sys.exit("interrupted")
-    command = getattr(module, name.replace("-", "_"))
-    command_line(command, options, program=f"bgpo {name}")
 
-
-def _listed(line: str) -> Callable[[], None]:
-    def command() -> None:
-        pass
-
-    command.__doc__ = line
-    return command
+def _listed() -> str:
+    """Return the sub-commands by group."""
+    lines = ["usage: bgpo COMMAND [OPTIONS], bgpo COMMAND --help", ""]
+    lines.append("BGPO: behavior self-organization for continual robot learning.")
+    for group in dict.fromkeys(command.group for command in COMMANDS.values()):
+        lines += ["", group]
+        lines += [f"  {name:<12}{c.line}" for name, c in COMMANDS.items() if c.group == group]
+    return "\n".join(lines) + "\n"
 
 
 if __name__ == "__main__":

@@ -30,7 +30,11 @@ _FEW_FRAMES = 100.0  # frames a second below which rendering limits a run more t
 
 @dataclass(frozen=True)
 class DoctorArguments:
-    """Checks of this machine."""
+    """Check this machine and installation, a line for each check.
+
+    A line begins with ok; note, for usable with a limitation; or wrong, for unusable, with which
+    the exit status is 1.
+    """
 
     frame: Path | None = None
     """PNG file to write what the robot sees to."""
@@ -45,11 +49,7 @@ class Limited(Exception):
 
 
 def doctor(arguments: DoctorArguments) -> None:
-    """Check this machine and installation, a line for each check.
-
-    A line begins with ok; note, for usable with a limitation; or wrong, for unusable, with which
-    the exit status is 1.
-    """
+    """Check this machine and installation, and print a line for each check."""
     name, frame = arguments.scene, arguments.frame
     checks: dict[str, Callable[[], str]] = {
         "versions": check_versions,

@@ -144,11 +144,12 @@ class Evaluator:
                 f"snapshot of {type(algorithm).__name__} must return a Policy (self.policy(...)), "
                 f"got {type(policy).__name__}"
             )
-        if policy.network.shape != drawn.shape:
-            raise TypeError(
-                f"the network of a Policy of {type(algorithm).__name__} must be one for each test "
-                f"episode, {list(drawn.shape)}, got {list(policy.network.shape)}"
-            )
+        for name, entry in (("network", policy.network), ("context", policy.context)):
+            if entry is not None and entry.shape[:2] != drawn.shape:
+                raise TypeError(
+                    f"the {name} of a Policy of {type(algorithm).__name__} must be given for each "
+                    f"test episode, {list(drawn.shape)}, got {list(entry.shape)}"
+                )
         return Snapshot(
             number=number,
             episode=episode,

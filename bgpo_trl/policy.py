@@ -175,9 +175,9 @@ class TrainedPolicy:
         self._policy = policy.to(algorithm.device)
         given, recognized = algorithm.condition(index, embedding, number), dict[str, Any]()
         if algorithm.gwr is not None:
-            match = algorithm.gwr.lookup(embedding.expand(algorithm.n_seeds, -1))[index]
-            recognized["behavior"], recognized["node"] = given["behavior"], int(match.node)
-            recognized["activity"] = float(match.activity)
+            match = algorithm.gwr.lookup(embedding.expand(algorithm.n_seeds, -1))
+            recognized["behavior"], recognized["node"] = given["behavior"], int(match.node[index])
+            recognized["activity"] = float(match.activity[index])
         if algorithm.groups:
             recognized["group"] = int(given["group"])
             recognized["group_novelty"] = float(given["group_novelty"])

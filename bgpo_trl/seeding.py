@@ -13,14 +13,6 @@ import torch
 from torch import Tensor
 
 
-def check_seeds(seeds: Sequence[int]) -> None:
-    """Raise ``ValueError`` unless seeds are whole numbers, different, and none is negative."""
-    if not all(isinstance(seed, Integral) for seed in seeds):
-        raise ValueError(f"seeds must be whole numbers, got {seeds}")
-    if not seeds or len(set(seeds)) < len(seeds) or min(seeds) < 0:
-        raise ValueError(f"seeds must be one or more, all different and none negative: {seeds}")
-
-
 def stream_seed(seed: int, name: str) -> int:
     """Return a seed below 2**32 for a stream such as ``"exploration"``, given the run's seed."""
     sequence = np.random.SeedSequence([seed, zlib.crc32(name.encode())])

@@ -95,7 +95,7 @@ class Trainer:
             raise ValueError(
                 f"the bank was embedded by the encoders {bank.encoder_id}, these are "
                 f"{used}: load both together (load_pretrained), or embed anew "
-                "(bgpo_trl.encoders.make_bank)"
+                "(`bgpo bank`)"
             )
         self._scene = find_scene(config.scene)
         self._scene.check_tasks(config.tasks)

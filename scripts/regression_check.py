@@ -26,7 +26,7 @@ _SHORT = "--preset quick --episodes 40 --seeds 0 1"
 RUNS = {
     "smoke": "continual.py --preset smoke",
     "bgpo": f"continual.py {_SHORT}",
-    "gwr": f"ablation.py --variant without-bonus {_SHORT}",
+    "gwr": f"concurrent_tasks.py --algorithm without-bonus {_SHORT}",
     "maml": f"continual.py --algorithm maml {_SHORT}",
     "dist-nll": f"continual.py --algorithm dist-nll {_SHORT}",
     "td3": f"continual.py --rl td3 {_SHORT}",

@@ -3,7 +3,9 @@
 import math
 from dataclasses import asdict
 
+import numpy as np
 import pytest
+import torch
 
 from bgpo_trl.configs import (
     AlgorithmConfig,
@@ -86,6 +88,29 @@ def test_a_bad_value_is_refused_with_the_name_of_its_field(refused, config, name
 def test_task_starts_are_whole_numbers_from_0_one_for_each_task(starts):
     with pytest.raises(ValueError, match="task_starts must be "):
         RunConfig(task_starts=starts)
+
+
+def test_numbers_and_sequences_of_other_libraries_become_plain():
+    rl = DDPGConfig(hidden_sizes=np.array([5, 7]), gamma=np.float64(0.5), compile=np.bool_(True))
+    label = np.str_("label")
+    of_rl = BGPOConfig(rl=rl, max_steps=torch.tensor(9), beta=np.int64(0), context=label)
+    few = {"seeds": range(2), "episodes": np.int32(7), "task_starts": np.zeros(1, int)}
+    given = RunConfig(**few, tasks=["grasp"], algorithm=of_rl)
+    rl = DDPGConfig(hidden_sizes=(5, 7), gamma=0.5, compile=True)
+    of_rl = BGPOConfig(rl=rl, max_steps=9, beta=0.0, context="label")
+    few = {"seeds": (0, 1), "episodes": 7, "task_starts": (0,)}
+    assert repr(given) == repr(RunConfig(**few, tasks=("grasp",), algorithm=of_rl))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"episodes": True}, {"seeds": 3}, {"tasks": "grasp"}, {"spread": "1"}, {"algorithm": 5}],
+    ids=str,
+)
+def test_a_value_of_another_type_is_refused(wrong):
+    (name,) = wrong
+    with pytest.raises(ValueError, match=f"{name} must be .*, got {wrong[name]}"):
+        RunConfig(**wrong)
 
 
 def test_experts_and_demonstrations_restrict_other_settings():

@@ -199,7 +199,8 @@ def read_run(directory: Path) -> Run:
         )
     path = directory / "summary.json"
     lists: dict[str, Any] = dict.fromkeys(("nodes", "groups", "group_purity"), list | None)
-    summary = read_json(path, {**lists, "changed": dict | None}) if path.exists() else {}
+    maps: dict[str, Any] = dict.fromkeys(("changed", "demonstrated_steps"), dict | None)
+    summary = read_json(path, lists | maps) if path.exists() else {}
     return Run(directory, config, summary, read_curves(directory / "eval.csv", tasks))
 
 

@@ -308,27 +308,39 @@ def own_episodes(run: Run, threshold: float = 0.5) -> Values | None:
     return times.unstack("task").reindex(columns=list(run.tasks)).fillna(np.inf).to_numpy()
 
 
-def success_lengths(run: Run) -> dict[str, float]:
-    """Return the mean length in steps of each task's successful tests in the last 10 % of training.
+def success_steps(run: Run) -> Values:
+    """Return the mean steps of the successful tests in the last 10 % of training, ``[S, T]``.
 
-    Tasks without a success, or without lengths, are left out.
+    NaN for tasks without a success, and in runs without the steps of tests.
+
+    Raises:
+        ValueError: If ``eval.csv`` is missing or damaged.
     """
     tests = read_tests(run.directory / "eval.csv")
-    if "steps" not in tests:
-        return {}
     late = in_window(tests["episode"], run.last, late_window(run))
     won = tests[late & (tests["success"] == 1)]
-    steps = pd.to_numeric(won["steps"], errors="coerce").groupby(won["task"]).mean()
-    return {str(task): float(length) for task, length in steps.dropna().items()}
+    return _by_seed_and_task(won.groupby(["seed", "task"])["steps"].mean(), run)
 
 
-def final_shares(run: Run, kind: str, column: str) -> Values | None:
+def demonstrated_steps(run: Run) -> Values:
+    """Return the mean steps of the demonstrations of each task, ``[T]``; NaN where unknown."""
+    steps = run.summary.get("demonstrated_steps") or {}
+    return np.array([steps.get(task, np.nan) for task in run.tasks], float)
+
+
+def _by_seed_and_task(values: pd.Series, run: Run) -> Values:
+    """Return values by seed and task as an array ``[S, T]``; NaN where there are none."""
+    every = pd.MultiIndex.from_product([run.curves.seeds, run.tasks], names=["seed", "task"])
+    return values.reindex(every).to_numpy(float).reshape(len(run.curves.seeds), len(run.tasks))
+
+
+def final_means(run: Run, kind: str, column: str) -> Values | None:
     """Return a column of the final tests, ``[S, T]``; None without tests or without its values.
 
     Args:
         run: The run.
         kind: ``seen`` or ``held-out``, the demonstrations of the tests.
-        column: ``success`` or ``task_inference``.
+        column: ``success``, ``steps`` (NaN for tasks without a success) or ``task_inference``.
 
     Raises:
         ValueError: If the file is damaged, or lacks tests of a seed and task.
@@ -337,16 +349,13 @@ def final_shares(run: Run, kind: str, column: str) -> Values | None:
     if not find_table(path):
         return None
     tests = read_final_tests(path)
-    tests = tests[tests["demonstrations"] == kind]
-    every = pd.MultiIndex.from_product([run.curves.seeds, run.tasks], names=["seed", "task"])
-    found = tests.groupby(["seed", "task"])
-    if not every.isin(found.size().index).all():
+    found = tests[tests["demonstrations"] == kind].groupby(["seed", "task"])
+    if np.isnan(_by_seed_and_task(found.size(), run)).any():
         raise ValueError(
             f"{path} lacks tests with {kind} demonstrations: remove it and resume the run"
         )
-    shares = found[column].mean().reindex(every).to_numpy(float)
-    shape = len(run.curves.seeds), len(run.tasks)
-    return None if np.isnan(shares).any() else shares.reshape(shape)
+    values = _by_seed_and_task(found[column].mean(), run)
+    return None if np.isnan(values).all() else values
 
 
 def expected_own_episodes(

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import stats
 
 MARGIN = 0.05
 """Two runs count as equivalent if their difference is within this margin, stated beforehand."""
@@ -66,8 +67,6 @@ class Contrast:
         """Return the value with its t interval."""
         if not 0 < confidence < 1:
             raise ValueError(f"confidence must be between 0 and 1, got {confidence}")
-        from scipy import stats  # A second to import: the help of commands need not wait for it.
-
         # Without any spread, the degrees of freedom are 0 / 0 and the interval is a point.
         half = self.error and self.error * float(stats.t.ppf((1 + confidence) / 2, self.freedom))
         return Estimate(self.value, self.value - half, self.value + half)
@@ -173,8 +172,6 @@ def permutation_p(first: ArrayLike, second: ArrayLike, rng: int | np.random.Gene
     Raises:
         ValueError: If scores are missing or not finite.
     """
-    from scipy import stats
-
     samples = _checked(first), _checked(second)
     if min(map(len, samples)) < 2:
         return math.nan
@@ -226,8 +223,6 @@ def seeds_needed(*samples: ArrayLike) -> int | None:
 
 def _power(confidence: float, freedom: Array, distance: Array) -> Array:
     """Return the power of one-sided t tests at distances from the bound in standard errors."""
-    from scipy import stats
-
     # Beyond this distance the power is 1, and SciPy's becomes NaN.
     distance = np.clip(distance, -1e3, 1e3)
     return stats.nct.sf(stats.t.ppf(confidence, freedom), freedom, distance)

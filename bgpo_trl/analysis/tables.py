@@ -14,15 +14,16 @@ from bgpo_trl.analysis.scores import (
     area_scores,
     best_scores,
     change_since_learned,
+    demonstrated_steps,
     episodes_to_80,
-    final_shares,
+    final_means,
     forgetting_since_best,
     forward_transfer,
     late_scores,
     own_episodes,
     since_best_unchanged,
-    success_lengths,
     success_matrix,
+    success_steps,
     times_the_first,
     trailing_mean,
 )
@@ -36,8 +37,9 @@ SUCCESS_NOTES = (
     "The seed is the unit: its score is the mean over tasks of the success in tests over the last "
     "10 % of training, its area the mean height of the tasks' curves of test success since they "
     "were presented. Given are means over seeds and 95 % intervals (Student's t), in percent.",
-    "Worst task: that with the lowest mean. Episodes to 80 %: until the mean over seeds and "
-    "presented tasks of three tests.",
+    "Worst task: that with the lowest mean. Steps: of the successful tests among these, and of the "
+    "demonstrations; means over the tasks with a success. Episodes to 80 %: until the mean over "
+    "seeds and presented tasks of three tests.",
 )
 DIFFERENCE_NOTES = (
     "Differences of the seeds' scores in points, with 95 % intervals (Welch's t). Above, below: "
@@ -95,7 +97,7 @@ def success_table(setting: Setting) -> Table:
     """Return the table of success of a setting's runs."""
     numbers = range(1, len(setting.first.tasks) + 1)
     rows = [["", "knows of tasks", "seeds", "success", "worst task"]]
-    rows[0] += [*(f"task {number}" for number in numbers), "area"]
+    rows[0] += [*(f"task {number}" for number in numbers), "steps", "demonstrated", "area"]
     rows[0] += ["episodes to 80 %"] if setting.from_start else []
     for name, run in setting.runs.items():
         late, area = late_scores(run), area_scores(run)
@@ -103,12 +105,25 @@ def success_table(setting: Setting) -> Table:
         row = [name, _knows(run), str(len(late)), statistics.mean(late.mean(1)).percent()]
         row += [f"{statistics.mean(late[:, worst]).percent()}, task {worst + 1}"]
         row += [f"{100 * share:.1f}" for share in late.mean(0)]
+        steps, demonstrated = _task_means(success_steps(run)), demonstrated_steps(run)
+        solved = ~np.isnan(steps)
+        row += [_mean_cell(steps[solved]), _mean_cell(demonstrated[solved])]
         row += [statistics.mean(area.mean(1)).percent()]
         if setting.from_start:
             reached = episodes_to_80(run)
             row += [f"{reached:.0f}" if np.isfinite(reached) else "not reached"]
         rows.append(row)
     return rows
+
+
+def _task_means(steps: Values) -> Values:
+    """Return the means over seeds of steps ``[S, T]``; NaN for tasks that no seed solves."""
+    return np.ma.masked_invalid(steps).mean(0).filled(np.nan)
+
+
+def _mean_cell(steps: Values) -> str:
+    """Format the mean of the steps of some tasks; "-" without tasks, or where one is unknown."""
+    return f"{steps.mean():.1f}" if len(steps) and np.isfinite(steps).all() else "-"
 
 
 def _knows(run: Run) -> str:
@@ -261,7 +276,7 @@ def groups_table(setting: Setting) -> Table:
         if run.summary.get("nodes") is None:
             continue
         groups, purity = run.summary.get("groups"), run.summary.get("group_purity")
-        inferred = final_shares(run, "held-out", "task_inference")
+        inferred = final_means(run, "held-out", "task_inference")
         of_seeds = [] if inferred is None else (100 * inferred.mean(1)).tolist()
         rows.append(
             [
@@ -305,10 +320,16 @@ def _costs(run: Run) -> dict[int, Cost]:
 def task_table(run: Run) -> Table:
     """Return the table of a run, task by task."""
     late, best, own = late_scores(run), best_scores(run), own_episodes(run)
-    seen, held_out = (final_shares(run, kind, "success") for kind in ("seen", "held-out"))
-    inferred, steps = final_shares(run, "held-out", "task_inference"), success_lengths(run)
+    seen, held_out = (final_means(run, kind, "success") for kind in ("seen", "held-out"))
+    inferred = final_means(run, "held-out", "task_inference")
+    trained = final_means(run, "held-out", "steps")
+    steps = [
+        *(None if found is None else _task_means(found) for found in (success_steps(run), trained)),
+        demonstrated_steps(run),
+    ]
     rows = [["task", "last 10 %", "by seed", "best 10 %", "own episodes to 50 %"]]
-    rows[0] += ["trained, seen", "trained, held-out", "inferred", "steps to success"]
+    rows[0] += ["trained, seen", "trained, held-out", "inferred"]
+    rows[0] += ["steps", "steps, trained", "steps, demonstrated"]
     # The last row is the mean over tasks.
     for index, task in enumerate([*run.tasks, None]):
         chosen = slice(None) if task is None else slice(index, index + 1)
@@ -324,7 +345,7 @@ def task_table(run: Run) -> Table:
                     "" if shares is None else f"{100 * shares[:, chosen].mean():.{digits}f}"
                     for shares, digits in ((seen, 1), (held_out, 1), (inferred, 2))
                 ),
-                f"{steps[task]:.1f}" if task in steps else "",
+                *("" if of_tasks is None else _mean_cell(of_tasks[chosen]) for of_tasks in steps),
             ]
         )
     return rows

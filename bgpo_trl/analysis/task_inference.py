@@ -5,16 +5,13 @@ Tasks count alike, however many demonstrations a bank holds of each.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import torch
 from torch import Tensor
 
-if TYPE_CHECKING:
-    from bgpo_trl.data.bank import DemonstrationBank
-    from bgpo_trl.modules.behavior_groups import BehaviorGroups
-    from bgpo_trl.modules.gwr import GWRB
+from bgpo_trl.data.bank import DemonstrationBank
+from bgpo_trl.modules.behavior_groups import BehaviorGroups
+from bgpo_trl.modules.gwr import GWRB
 
 
 @torch.no_grad()

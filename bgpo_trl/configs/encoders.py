@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from bgpo_trl.configs.algorithms import at_least, check, positive, whole
+from bgpo_trl.configs.algorithms import at_least, check, positive
+from bgpo_trl.configs.settings import Settings
 
 
 @dataclass(frozen=True)
-class VAEConfig:
+class VAEConfig(Settings):
     """Training of the VAE and its inverse model (stage 1a)."""
 
     latent_size: int = 64
@@ -36,16 +37,17 @@ class VAEConfig:
     """Factor of the inverse model's ``1/2 ||a_hat - a||^2``. Ours: not given in the paper."""
 
     def __post_init__(self) -> None:
-        whole(self, 1, "latent_size", "batch_size", "warmup_steps", "steps")
+        super().__post_init__()
+        at_least(self, 1, "latent_size", "batch_size", "warmup_steps", "steps")
         positive(self, "learning_rate")
         at_least(self, 0, "reconstruction_weight", "kl_weight", "inverse_weight")
-        whole(self, 2, "window")
+        at_least(self, 2, "window")
         divides = self.batch_size % self.window == 0
         check(self, ("window", divides, f"a divisor of batch_size {self.batch_size}"))
 
 
 @dataclass(frozen=True)
-class SequenceAutoencoderConfig:
+class SequenceAutoencoderConfig(Settings):
     """Training of the LSTM autoencoder on latent sequences (stage 1b)."""
 
     embedding_size: int = 32
@@ -60,12 +62,13 @@ class SequenceAutoencoderConfig:
     """Gradient steps. Ours: not given in the paper."""
 
     def __post_init__(self) -> None:
-        whole(self, 1, "embedding_size", "batch_size", "warmup_steps", "steps")
+        super().__post_init__()
+        at_least(self, 1, "embedding_size", "batch_size", "warmup_steps", "steps")
         positive(self, "learning_rate")
 
 
 @dataclass(frozen=True)
-class InverseModelConfig:
+class InverseModelConfig(Settings):
     """Training of the inverse model on the latents of play (stage 1c). Ours."""
 
     hidden_size: int = 512
@@ -85,13 +88,14 @@ class InverseModelConfig:
     """Gradient steps."""
 
     def __post_init__(self) -> None:
-        whole(self, 1, "hidden_size", "batch_size", "warmup_steps", "steps")
+        super().__post_init__()
+        at_least(self, 1, "hidden_size", "batch_size", "warmup_steps", "steps")
         positive(self, "learning_rate", "largest_action")
         at_least(self, 0, "noise")
 
 
 @dataclass(frozen=True)
-class RepresentationConfig:
+class RepresentationConfig(Settings):
     """Stage 1: both encoders, and the inverse model."""
 
     vae: VAEConfig = field(default_factory=VAEConfig)
@@ -108,8 +112,9 @@ class RepresentationConfig:
     """Steps between rows of the log. Ours."""
 
     def __post_init__(self) -> None:
-        whole(self, 0, "seed")
-        whole(self, 1, "checkpoint_every", "log_every")
+        super().__post_init__()
+        at_least(self, 0, "seed")
+        at_least(self, 1, "checkpoint_every", "log_every")
 
 
 @dataclass(frozen=True)

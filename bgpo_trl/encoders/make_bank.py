@@ -1,29 +1,19 @@
-"""Embed recorded demonstrations for a run with ``--bank``.
-
-python -m bgpo_trl.encoders.make_bank data/own own_bank.safetensors
-"""
+"""Embedding of recorded demonstrations."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import torch
-import tyro
 from tensordict import TensorDictBase
 
 from bgpo_trl.configs.runs import PAPER_TASKS
 from bgpo_trl.data.bank import DemonstrationBank, DemonstrationSteps
-from bgpo_trl.data.dataset import load_demonstrations, read_meta
-from bgpo_trl.encoders.pretrained import default_weights
 from bgpo_trl.encoders.representation import (
     Representation,
     encode_frames,
-    load_representation,
 )
-from bgpo_trl.plugins import import_plugin
 
 
 @torch.no_grad()
@@ -65,40 +55,3 @@ def make_bank(
         spread,
         representation.metadata.get("scene_version"),
     )
-
-
-def main(
-    dataset: tyro.conf.Positional[Path],
-    out: tyro.conf.Positional[Path],
-    weights: Path | None = None,
-    module: Annotated[str | None, tyro.conf.arg(name="import")] = None,
-    actions: Literal["inferred", "recorded"] = "inferred",
-) -> None:
-    """Embed a recorded dataset with trained encoders.
-
-    Args:
-        dataset: Folder of the recorded demonstrations.
-        out: Bank to write.
-        weights: Encoder weights; by default those that come with the scene.
-        module: Module that adds the scene, imported first; here or installed.
-        actions: Actions of the stored demonstrations, inferred from frames or recorded.
-    """
-    import_plugin(module)
-    meta = read_meta(dataset)
-    weights = default_weights(scene=meta["scene"]) if weights is None else weights
-    encoders = load_representation(weights, scene_version=meta["scene_version"])
-    bank = make_bank(
-        encoders,
-        load_demonstrations(dataset),
-        tasks=meta["tasks"],
-        actions=actions,
-        spread=meta["spread"],
-    )
-    bank.save(out)
-
-
-if __name__ == "__main__":
-    try:
-        tyro.cli(main)
-    except (ValueError, OSError) as error:
-        sys.exit(f"error: {error}")

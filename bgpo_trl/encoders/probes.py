@@ -1,7 +1,5 @@
 """Probes of the latents and of the embeddings, on held-out demonstrations.
 
-    python -m bgpo_trl.encoders.probes data/nico data/nico-play-long
-
 Policies observe only latents and behaviors, so information that these lack cannot be learned
 later. Every probe is fitted on training demonstrations and evaluated on held-out ones. No other
 part of the encoders' training reads the ground-truth ``state``.
@@ -10,24 +8,17 @@ part of the encoders' training reads the ground-truth ``state``.
 from __future__ import annotations
 
 import io
-import sys
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 import matplotlib.image
 import torch
-import tyro
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from bgpo_trl.data.dataset import load_demonstrations, read_meta
-from bgpo_trl.encoders.pretrained import default_weights
 from bgpo_trl.encoders.representation import (
     Representation,
     encode_frames,
-    load_representation,
     mean_frame,
     split,
     valid_frames,
@@ -38,8 +29,7 @@ from bgpo_trl.modules.inverse_model import InverseModel
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
 from bgpo_trl.objectives.supervised import SequenceReconstructionLoss
-from bgpo_trl.plugins import import_plugin
-from bgpo_trl.scenes import StateColumns, find_scene
+from bgpo_trl.scenes import StateColumns
 
 
 def probe(
@@ -273,39 +263,3 @@ def _probe_sequences(
 
 def _mean(values: Tensor) -> float:
     return values.double().mean().item()
-
-
-@dataclass(frozen=True)
-class Arguments:
-    """Evaluate trained encoders with probes."""
-
-    dataset: tyro.conf.Positional[Path]
-    """Folder of the recorded demonstrations."""
-    play: tyro.conf.Positional[Path | None] = None
-    """Folder of recorded play."""
-    module: Annotated[str | None, tyro.conf.arg(name="import")] = None
-    """Module that adds the scene, imported first; here or installed."""
-    weights: Path | None = None
-    """Encoder weights; by default those of the scene for the dataset's tasks."""
-    out: Path = Path("runs/probes")
-    """Folder for probes.json and reconstructions.png."""
-
-
-def main(arguments: Arguments) -> None:
-    """Run the command line."""
-    import_plugin(arguments.module)
-    meta = read_meta(arguments.dataset)
-    scene, weights = find_scene(meta["scene"]), arguments.weights
-    if weights is None:
-        weights = default_weights(meta["tasks"], scene=scene)
-    representation = load_representation(weights, scene_version=scene.version)
-    play = None if arguments.play is None else load_demonstrations(arguments.play)
-    dataset = load_demonstrations(arguments.dataset)
-    probe(representation, dataset, arguments.out, play=play, columns=scene.state)
-
-
-if __name__ == "__main__":
-    try:
-        main(tyro.cli(Arguments, description=Arguments.__doc__))
-    except (ValueError, OSError) as error:
-        sys.exit(f"error: {error}")

@@ -1,22 +1,17 @@
-"""Train encoders on recordings: ``python -m bgpo_trl.encoders.train data/nico``."""
+"""Training of the encoders on recordings, from the recordings to the bank."""
 
 from __future__ import annotations
 
-import shlex
-import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import torch
-import tyro
 from tensordict import TensorDictBase
 
 from bgpo_trl.configs import RepresentationConfig
 from bgpo_trl.data.bank import DemonstrationBank
-from bgpo_trl.data.dataset import load_demonstrations, read_meta
 from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.encoders.fitting import Log
 from bgpo_trl.encoders.make_bank import make_bank
@@ -24,15 +19,12 @@ from bgpo_trl.encoders.pretrained import bank_path
 from bgpo_trl.encoders.probes import probe
 from bgpo_trl.encoders.representation import (
     Representation,
-    load_representation,
     retrain_inverse,
     save_representation,
     train_representation,
 )
 from bgpo_trl.files.csv_file import CsvFile
-from bgpo_trl.files.writing import check_folder, make_folder, without_folders
-from bgpo_trl.machine import choose_device
-from bgpo_trl.plugins import import_plugin
+from bgpo_trl.files.writing import check_folder, make_folder
 from bgpo_trl.scenes import Scene, find_scene
 
 _COLUMNS = (
@@ -46,28 +38,6 @@ _COLUMNS = (
     "kl",
     "inverse",
 )
-
-
-@dataclass(frozen=True)
-class Arguments:
-    """Train both encoders on recorded demonstrations and play, then probe them."""
-
-    dataset: tyro.conf.Positional[Path]
-    """Folder of the recorded demonstrations."""
-    play: tyro.conf.Positional[Path | None] = None
-    """Folder of recorded play; without it, the frame encoder learns from demonstrations only."""
-    module: Annotated[str | None, tyro.conf.arg(name="import")] = None
-    """Module that adds the scene, imported first; here or installed."""
-    weights: Path | None = None
-    """File to write, with the bank beside it; by default encoders.safetensors in the folder."""
-    keep: Path | None = None
-    """Encoders to keep: only their inverse model is trained anew, on play."""
-    folder: Path = Path("runs/encoders")
-    """Folder for checkpoints, log and probes; the same folder resumes an interrupted training."""
-    config: RepresentationConfig = field(default_factory=RepresentationConfig)
-    """Hyperparameters."""
-    device: str = "auto"
-    """Device to train on: cpu, cuda, or auto for a GPU if there is one."""
 
 
 def train_encoders(
@@ -206,37 +176,3 @@ def _log_of(file: CsvFile) -> Log:
         file.write(row)
 
     return log
-
-
-def main(arguments: Arguments) -> None:
-    """Run the command line."""
-    import_plugin(arguments.module)
-    dataset, meta = load_demonstrations(arguments.dataset), read_meta(arguments.dataset)
-    scene, weights = find_scene(meta["scene"]), arguments.weights
-    play = None if arguments.play is None else load_demonstrations(arguments.play)
-    line = shlex.join(["python", "-m", "bgpo_trl.encoders.train", *sys.argv[1:]])
-    keep = None
-    if arguments.keep is not None:
-        keep = load_representation(arguments.keep, scene_version=scene.version)
-    train_encoders(
-        dataset,
-        play,
-        arguments.folder / "encoders.safetensors" if weights is None else weights,
-        arguments.folder,
-        arguments.config,
-        without_folders(line),
-        choose_device(arguments.device),
-        tasks=meta["tasks"],
-        spread=meta["spread"],
-        keep=keep,
-        scene=scene,
-    )
-
-
-if __name__ == "__main__":
-    try:
-        main(tyro.cli(Arguments, description=Arguments.__doc__))
-    except (ValueError, OSError) as error:
-        sys.exit(f"error: {error}")
-    except KeyboardInterrupt:
-        sys.exit("interrupted: the same command continues the training")

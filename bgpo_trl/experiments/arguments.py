@@ -1,12 +1,20 @@
-"""Arguments that several commands share, in a module that is quick to import."""
+"""Arguments of the commands, whose docstrings are the help.
+
+Nothing here imports TorchRL or MuJoCo, so that ``--help`` is quick.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
+
+from bgpo_trl.configs import BGPOConfig, RepresentationConfig, RunConfig
+
+SETTINGS: Any = tyro.conf.SuppressFixed[RunConfig]
+"""The settings of a run, for their flags."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,20 +27,6 @@ class ImportArguments:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainedArguments(ImportArguments):
-    """Tests of the policies of a run."""
-
-    run: tyro.conf.Positional[Path]
-    """Run directory."""
-    episodes: int = 20
-    """Test episodes per task and seed, in each condition."""
-    out: Path | None = None
-    """Folder to write to; the run directory by default."""
-    threads: int = 1
-    """Threads of PyTorch."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class BankArguments(ImportArguments):
     """Tasks and their demonstrations."""
 
@@ -42,19 +36,24 @@ class BankArguments(ImportArguments):
     """Tasks in the order of presentation, or "all" for all of the scene; by default its usual ones,
     for NICO the paper's three. In runs, unless there are three, they start at even intervals."""
     encoders: Path | None = None
-    """Encoders trained by bgpo_trl.encoders.train, with their bank beside them; those that come
+    """Encoders trained by `bgpo encoders`, with their bank beside them; those that come
     with the scene by default. With --resume, the run's own."""
     bank: Path | None = None
-    """Demonstrations embedded by bgpo_trl.encoders.make_bank; for tasks missing in it, those beside
+    """Demonstrations embedded by `bgpo bank`; for tasks missing in it, those beside
     the encoders are used. With --resume, the run's own by default."""
 
 
 @dataclass(frozen=True)
 class Arguments(BankArguments):
-    """A run. Flags go before the file of --config, and this before --preset.
+    """Train an algorithm to the end, test it and draw the figures.
 
-    Hyperparameters of the algorithm are flags too, by their names in config.json, such as
-    --algorithm.beta 0.2 or --algorithm.rl.noise 0.1.
+    Writes a run directory: config.json, train.csv, eval.csv, final.csv, gwr.csv, cost.csv,
+    summary.json, checkpoint/ and figures/, among them success.png (success on each task against
+    training episodes), gwr.png (nodes of GWR-B in behavior space, Fig. 7) and groups.png.
+
+    Flags go before the file of --config, and this before --preset. All settings of config.json are
+    flags, such as --seeds 0 1, --algorithm.beta 0.2 or --algorithm.rl.noise 0.1; --help lists these
+    flags last.
     """
 
     algorithm: str | None = None
@@ -63,8 +62,9 @@ class Arguments(BankArguments):
     published; oracle and ddpg: DDPG with the task label as context, and without context;
     fine-tuning and ewc: DDPG without context that is given task boundaries, best with --schedule
     sequential; maml, dist-nll, oracle or fine-tuning followed by -demonstrations: with
-    demonstrations as experience; a variant of `bgpo ablation`; or one that the module of --import
-    adds."""
+    demonstrations as experience. Ablations (Fig. 9): without-bonus, without-gwr, without-both:
+    bgpo-single without the intrinsic reward, GWR-B or both; group-balanced-replay, demonstrations:
+    bgpo-single with that addition. Or one that the module of --import adds."""
     rl: str | None = None
     """The RL algorithm of BGPO, its ablations and the references: ddpg, td3, sac, or one that the
     module of --import adds; DDPG by default."""
@@ -78,27 +78,9 @@ class Arguments(BankArguments):
     out: Path | None = None
     """Run directory; runs/EXPERIMENT-ALGORITHM[-RL]-PRESET by default, with the name of the file
     of --config for PRESET."""
-    seeds: tuple[int, ...] | None = None
-    """Seeds; the preset's by default."""
-    schedule: Literal["practised", "sequential"] | None = None
-    """Tasks of training episodes: all presented so far (practised, the default) or only the newest
-    (sequential, as in Continual World and COOM)."""
-    spread: float | None = None
-    """Share of the whole range of start states, from 0 (nominal places) to 1, the default."""
     episodes: int | None = None
     """Training episodes; the preset's by default. The task starts are scaled in proportion. With
     --resume, a larger number extends the run, whose task starts are kept."""
-    task_starts: tuple[int, ...] | None = None
-    """Episodes after which tasks are presented, one for each; the preset's by default."""
-    eval_every: int | None = None
-    """Training episodes between evaluations; the preset's by default."""
-    eval_episodes: int | None = None
-    """Test episodes of each task in an evaluation; the preset's by default."""
-    checkpoint_minutes: float | None = None
-    """Minutes between checkpoints; the preset's by default."""
-    held_out: Literal["validation", "test"] | None = None
-    """Half of the held-out demonstrations to test on: validation, the default, to choose settings;
-    test to report results."""
     resume: bool = False
     """Continue the run in the directory, or begin it if there is none. With --out, or in a run's
     folder, and with neither --preset nor --config, its settings are those of the run."""
@@ -117,18 +99,221 @@ class Arguments(BankArguments):
     threads: int = 1
     """Threads of PyTorch; more than one slows these small networks down. Physics always uses all
     cores."""
-    hyperparameters: tyro.conf.Suppress[tuple[str, ...]] = ()
-    """Flags of single hyperparameters, which `run_config` reads."""
+    settings: tyro.conf.Suppress[tuple[str, ...]] = ()
+    """Flags of single settings of `RunConfig`, which `run_config` reads."""
+
+    def gives(self, setting: str) -> bool:
+        """Return whether a setting of `RunConfig` is among the flags."""
+        names = (flag.partition("=")[0].replace("-", "_") for flag in self.settings)
+        return f"__{setting}" in names
 
 
 @dataclass(frozen=True)
-class AblationArguments(Arguments):
-    """A variant of BGPO."""
+class RecordArguments(ImportArguments):
+    """Record demonstrations, or random play.
 
-    variant: str = "bgpo-single"
-    """bgpo-single: the paper's algorithm, with our stabilizers; without-bonus, without-gwr,
-    without-both: without the intrinsic reward, GWR-B or both. group-balanced-replay,
-    demonstrations: bgpo-single with that addition; bgpo-experts: with experts, and replay balanced
-    by group; bgpo: with all three."""
-    continual: bool = False
-    """Tasks one after the other instead of all from the start."""
+    The same command resumes an interrupted recording.
+    """
+
+    path: tyro.conf.Positional[Path]
+    """Folder of the dataset."""
+    scene: str = "nico"
+    """Robot, nico or one that the module of --import adds."""
+    tasks: tuple[str, ...] | None = None
+    """Tasks to demonstrate; by default the usual ones of the scene, for NICO the paper's three."""
+    per_task: int = 1_200
+    """Demonstrations of each task."""
+    held_out_per_task: int = 200
+    """How many of those are held out for test episodes."""
+    play: bool = False
+    """Record random play instead of demonstrations."""
+    spread: float = 1.0
+    """Share of the whole range of start states."""
+    seed: int = 0
+    """Seed of the start states and of the noise."""
+
+
+@dataclass(frozen=True)
+class EncodersArguments(ImportArguments):
+    """Train both encoders on recorded demonstrations and play, then probe them.
+
+    The same command resumes an interrupted training.
+    """
+
+    dataset: tyro.conf.Positional[Path]
+    """Folder of the recorded demonstrations."""
+    play: tyro.conf.Positional[Path | None] = None
+    """Folder of recorded play; without it, the frame encoder learns from demonstrations only."""
+    weights: Path | None = None
+    """File to write, with the bank beside it; by default encoders.safetensors in the folder."""
+    keep: Path | None = None
+    """Encoders to keep: only their inverse model is trained anew, on play."""
+    folder: Path = Path("runs/encoders")
+    """Folder for checkpoints, log and probes."""
+    config: RepresentationConfig = field(default_factory=RepresentationConfig)
+    """Hyperparameters."""
+    device: str = "auto"
+    """Device to train on: cpu, cuda, or auto for a GPU if there is one."""
+
+
+@dataclass(frozen=True)
+class MakeBankArguments(ImportArguments):
+    """Embed recorded demonstrations with trained encoders, for --bank of a run."""
+
+    dataset: tyro.conf.Positional[Path]
+    """Folder of the recorded demonstrations."""
+    out: tyro.conf.Positional[Path]
+    """Bank to write."""
+    weights: Path | None = None
+    """Encoder weights; by default those that come with the scene."""
+    actions: Literal["inferred", "recorded"] = "inferred"
+    """Actions of the stored demonstrations, inferred from frames or recorded."""
+
+
+@dataclass(frozen=True)
+class ProbesArguments(ImportArguments):
+    """Evaluate trained encoders: what can be read from latents, embeddings and inferred actions.
+
+    Writes probes.json and reconstructions.png.
+    """
+
+    dataset: tyro.conf.Positional[Path]
+    """Folder of the recorded demonstrations."""
+    play: tyro.conf.Positional[Path | None] = None
+    """Folder of recorded play."""
+    weights: Path | None = None
+    """Encoder weights; by default those of the scene for the dataset's tasks."""
+    out: Path = Path("runs/probes")
+    """Folder to write to."""
+
+
+Setting = Literal[
+    "concurrent",
+    "continual",
+    "sequential",
+    "ablation",
+    "eight",
+    "eight-reversed",
+    "eight-sequential",
+    "eight-concurrent",
+]
+"""How tasks are presented in a sweep."""
+
+
+@dataclass(frozen=True)
+class SweepArguments(BankArguments):
+    """Run algorithms in settings over many seeds on Ray, in blocks that are merged at the end.
+
+    The same command resumes an interrupted sweep without repeating finished jobs, and seeds may be
+    added. A job whose worker or machine is lost continues elsewhere from its last checkpoint. On a
+    cluster, all machines need Ray and bgpo_trl, and must see --out at the same path.
+    """
+
+    algorithms: tuple[str, ...] = ("bgpo",)
+    """Algorithms, as in `bgpo concurrent`."""
+    settings: tuple[Setting, ...] = ("concurrent",)
+    """Tasks all from the start (concurrent); one after another, with earlier ones practised
+    (continual) or not (sequential); or the variants of BGPO instead of the algorithms (ablation).
+    Or the suite's eight tasks instead of --tasks: one after another, in reverse order, without
+    practising earlier ones, or all from the start."""
+    preset: Literal["quick", "desk", "paper"] = "desk"
+    """Size of the runs."""
+    seeds: tuple[int, ...] | None = None
+    """Seeds; the preset's by default."""
+    block: int = 5
+    """Seeds per job. Another number makes other runs."""
+    episodes: int | None = None
+    """Training episodes; the preset's by default. The task starts are scaled in proportion."""
+    eval_every: int | None = None
+    """Training episodes between evaluations; the preset's by default."""
+    held_out: Literal["validation", "test"] = "validation"
+    """Half of the held-out demonstrations to test on: validation to choose settings, test to report
+    results."""
+    out: Path = Path("runs/sweep")
+    """Parent of the run directories."""
+    address: str = "local"
+    """Address of a Ray cluster; "local" starts Ray on this machine."""
+    cpus_per_run: float = 1
+    """Cores that Ray reserves per run."""
+    gpus_per_run: float = 0
+    """GPUs per run, or a share of one; with 0, networks are on the CPU."""
+
+
+@dataclass(frozen=True)
+class MergeArguments:
+    """Merge finished runs that differ only in their seeds, such as the jobs of a cluster.
+
+    Writes config.json, train.csv, eval.csv, final.csv, cost.csv and summary.json as one run of all
+    seeds would have. `bgpo report` reads the directory; `bgpo watch` and the tests of policies need
+    one of the runs.
+    """
+
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Run directories, two or more."""
+    out: Path
+    """Run directory of all seeds. An earlier result of merging some of the runs is replaced."""
+
+
+@dataclass(frozen=True)
+class ReportArguments:
+    """Write tables and figures of runs: those in a folder, or single ones, of any algorithms.
+
+    Prints and writes tables.md: success, differences between algorithms, forgetting and transfer,
+    learning times, groups of behaviors, cost, each run task by task, and the paper's claims as far
+    as there are runs for them; beside it, figures. The report of a single run is written into its
+    directory. With --archive, first copies what reports read of the runs, compressed, and writes
+    the report beside the copies. docs/benchmark.md defines the measures.
+    """
+
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Folders of runs, or run directories."""
+    out: Path | None = None
+    """Folder of the report; by default that of the runs."""
+    archive: Path | None = None
+    """Folder for compact copies of the runs, on which the report is then made."""
+    anyway: bool = False
+    """Compare also runs under different conditions, such as other encoders or tests."""
+    compare: bool = False
+    """Only print the differences between two runs, task by task."""
+    every: int | None = None
+    """With --compare, also over each part of training of so many episodes."""
+
+
+@dataclass(frozen=True)
+class WatchArguments(ImportArguments):
+    """Film the trained policies of a run beside new demonstrations that they are shown.
+
+    Writes film.gif, and its frames as a strip film.png, into the run's figures/: for each task the
+    demonstration, the policy's observations and a view of the robot, framed green on success and
+    red on timeout. NICO starts from the same scene in every task, so only the demonstration makes
+    the difference. If the run saved graphs, also writes gwr_growth.png, the growth of GWR-B.
+    """
+
+    run: tyro.conf.Positional[Path]
+    """Run directory."""
+    run_seed: int | None = None
+    """Seed of the run whose policy acts; the first by default."""
+    scene_seed: int = 1
+    """Seed of demonstrations and starts; the pretrained encoders were trained on seed 0."""
+    out: Path | None = None
+    """Folder for the pictures; figures/ of the run by default."""
+
+
+@dataclass(frozen=True)
+class GroupsArguments(BankArguments):
+    """Measure the groups of behaviors that form from demonstrations, without learning a policy.
+
+    Shows demonstrations in the order of training episodes, in four schedules, and prints by seed:
+    how many groups there are at the end; how pure they are on held-out demonstrations; how many
+    different demonstrations of its own each task needed before it had a group (the most demanding
+    task); how long grouping took; the nodes of GWR-B, and in how many held-out demonstrations it
+    infers the task. Below the table are the tasks that share a group (`sharing`, of held-out
+    demonstrations), with the number of networks in which they do.
+    """
+
+    draws: int = 1_800
+    """Demonstrations that each network is shown."""
+    activity_scale: float = BGPOConfig().gwr.activity_scale
+    """Factor of distances in the activity of GWR-B."""
+    seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
+    """Seeds of the draws."""

@@ -1,14 +1,10 @@
-"""Command lines: a function of one dataclass of arguments, called with those that are given.
-
-Nothing here imports TorchRL or MuJoCo, so that ``--help`` is quick.
-"""
+"""Command lines: a function of one dataclass of arguments, called with those that are given."""
 
 from __future__ import annotations
 
 import contextlib
 import inspect
 import os
-import re
 import signal
 import sys
 import sysconfig
@@ -16,19 +12,23 @@ import threading
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
 
 import tyro
 
-_SECTIONS = r"\n(?:Args|Returns|Raises):"
+from bgpo_trl.configs import PRESETS
+from bgpo_trl.experiments.arguments import SETTINGS
 
 
 def command_line(
     command: Callable[..., str | None],
     options: Sequence[str] | None = None,
     *,
+    kind: type | None = None,
     program: str | None = None,
+    line: str = "",
 ) -> None:
     """Call a function with the arguments of the command line, and print what it returns.
 
@@ -38,15 +38,17 @@ def command_line(
     module named with ``--import``, keeps its traceback.
 
     Args:
-        command: Function of one dataclass, ``arguments``. Its docstring is shown by ``--help``.
+        command: Function of one dataclass, ``arguments``.
         options: Arguments; by default those of the process.
+        kind: The dataclass, by default the annotated one. ``--help`` shows its docstring.
         program: Name of the program in messages; by default that of the process.
+        line: First line of the help.
     """
-    kind = get_type_hints(command)["arguments"]
+    kind = get_type_hints(command)["arguments"] if kind is None else kind
     resumable = hasattr(kind, "resume")
     try:
         with _terminable() if resumable else contextlib.nullcontext():
-            text = command(_parse(kind, command, options, program))
+            text = command(_parse(kind, options, program, line))
     except (ValueError, OSError, RuntimeError, ImportError) as error:
         if _is_of_others(error):
             raise
@@ -79,19 +81,22 @@ def _printable(line: str) -> str:
     return "".join(char if char.isprintable() else ascii(char)[1:-1] for char in line)
 
 
-def _parse(
-    kind: type, command: Callable[..., Any], options: Sequence[str] | None, program: str | None
-) -> Any:
-    """Return the arguments; flags ``--algorithm.*`` are left to `run_config` where it is used."""
+def _parse(kind: type, options: Sequence[str] | None, program: str | None, line: str) -> Any:
+    """Return the arguments; flags of single settings are left to `run_config`."""
     unprefixed: Any = Annotated[kind, tyro.conf.OmitArgPrefixes]
-    description = re.split(_SECTIONS, inspect.getdoc(command) or "")[0]
-    settings: dict[str, Any] = {"prog": program, "description": description, "args": options}
-    if hasattr(kind, "hyperparameters"):
-        arguments, rest = tyro.cli(unprefixed, **settings, return_unknown_args=True)
-        flags = [word for word in rest if word.startswith("--")]
-        if not rest or (rest[0] in flags and all(f.startswith("--algorithm.") for f in flags)):
-            return replace(arguments, hyperparameters=tuple(rest))
-    return tyro.cli(unprefixed, **settings)
+    description = "\n\n".join(filter(None, (line, inspect.getdoc(kind))))
+    options = sys.argv[1:] if options is None else options
+    parse: Any = partial(tyro.cli, unprefixed, prog=program, description=description, args=options)
+    if "settings" not in get_type_hints(kind):
+        return parse()
+    if {"-h", "--help"} & {*options}:
+        with contextlib.suppress(SystemExit):
+            parse()
+        described = "Settings, with the defaults of --preset quick and --algorithm bgpo:"
+        quick = PRESETS["quick"]
+        tyro.cli(SETTINGS, prog=program, description=described, default=quick, args=["--help"])
+    arguments, rest = parse(return_unknown_args=True)
+    return replace(arguments, settings=tuple(rest))
 
 
 def _is_of_others(error: BaseException) -> bool:

@@ -2,31 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING
-
-from bgpo_trl.files.checkpoint import has_checkpoint
-
-if TYPE_CHECKING:
-    from bgpo_trl.data.bank import DemonstrationBank
-    from bgpo_trl.evaluation import Evaluator, Snapshot
-    from bgpo_trl.policy import LoadedRun, TrainedPolicy
-    from bgpo_trl.scenes import Scene
-    from bgpo_trl.training import Trainer
-
-
-def load_blocks(run: Path) -> list[LoadedRun]:
-    """Load all seeds of a run: the run itself, or the blocks of which it was merged.
-
-    Raises:
-        ValueError: As for `load_all_seeds`.
-    """
-    from bgpo_trl.policy import load_all_seeds
-
-    blocks = sorted(path for path in run.glob("seeds-*") if has_checkpoint(path / "checkpoint"))
-    if not blocks or has_checkpoint(run / "checkpoint"):
-        blocks = [run]
-    return [load_all_seeds(block) for block in blocks]
+from bgpo_trl.data.bank import DemonstrationBank
+from bgpo_trl.evaluation import Evaluator, Snapshot
+from bgpo_trl.policy import LoadedRun, TrainedPolicy
+from bgpo_trl.scenes import Scene
+from bgpo_trl.training import Trainer
+from bgpo_trl.transforms import TaskSchedule
 
 
 def evaluator_of(
@@ -46,9 +27,6 @@ def evaluator_of(
         starts: Episode from which each task is presented; by default all are.
         scene: Robot to test, that of the run if None.
     """
-    from bgpo_trl.evaluation import Evaluator
-    from bgpo_trl.transforms import TaskSchedule
-
     config = run.config
     return Evaluator(
         config.algorithm,

@@ -17,17 +17,21 @@ from bgpo_trl.figures.frames import plot_frame_strips, save_gif
 from bgpo_trl.figures.groups import draw_groups
 from bgpo_trl.figures.gwr import draw_growth, draw_nodes
 from bgpo_trl.figures.style import save_figure
-from bgpo_trl.figures.success import plot_success_curves
+from bgpo_trl.figures.success import plot_step_curves, plot_success_curves
 from bgpo_trl.files.progress import progress_bar
 from bgpo_trl.runs.provenance import command, write_table
+from bgpo_trl.runs.results import read_tests
 from bgpo_trl.training import Trainer
 
 # Number of the evaluation after training; it seeds start states that training never tested.
 _LAST = 2**31
-FINAL_COLUMNS = ("seed", "demonstrations", "task", "episodes", "success", "task_inference")
-"""Columns of ``final.csv``, one row per seed, kind of demonstrations and task."""
+FINAL_COLUMNS = (
+    *("seed", "demonstrations", "task", "episodes", "success", "steps", "task_inference"),
+)
+"""Columns of ``final.csv``, one row per seed, kind of demonstrations and task. ``steps`` is the
+mean length of the successful tests, empty without one."""
 
-_Row = tuple[int, str, str, int, float, float | str]
+_Row = tuple[int, str, str, int, float, float | str, float | str]
 
 
 def measure(
@@ -62,6 +66,7 @@ def measure(
         "command": command(),
         "episodes": config.episodes,
         "random_success": dict(zip(config.tasks, random_success.tolist(), strict=True)),
+        "demonstrated_steps": demonstrated_steps(bank.seen()),
         "needs_label": algorithm.needs_label,
         "needs_boundaries": algorithm.needs_boundaries,
         "nodes": None if gwr is None else gwr.num_nodes.tolist(),
@@ -76,6 +81,19 @@ def measure(
     return summary
 
 
+def demonstrated_steps(bank: DemonstrationBank) -> dict[str, float]:
+    """Return the mean number of steps of the demonstrations of each task.
+
+    Tasks of which no steps are stored are left out.
+    """
+    if bank.steps is None:
+        return {}
+    frames = {name: bank.steps.length[bank.task == n] for n, name in enumerate(bank.tasks)}
+    kept = {name: of_task[of_task > 0] for name, of_task in frames.items()}
+    # A demonstration has a frame before its first step.
+    return {name: float(k.double().mean()) - 1 for name, k in kept.items() if len(k)}
+
+
 def _final_tests(trainer: Trainer, bank: DemonstrationBank, *, episodes: int) -> list[_Row]:
     """Return the rows of ``final.csv``, after as many test episodes of each task and kind."""
     algorithm, config, seen = trainer.algorithm, trainer.config, bank.seen()
@@ -87,7 +105,8 @@ def _final_tests(trainer: Trainer, bank: DemonstrationBank, *, episodes: int) ->
     ):
         evaluator = evaluator_of(trainer, tested, episodes, starts=config.task_starts)
         snapshots = snapshots_of(trainer, evaluator, _LAST)
-        success = evaluator.run(snapshots, algorithm.device, watch=bar.update).success
+        result = evaluator.run(snapshots, algorithm.device, watch=bar.update)
+        success = result.success
         bar.set_postfix_str(f"success {success.float().mean():.2f}, {kind}", refresh=False)
         bar.update(half * n_steps - bar.n)  # episodes may all end earlier
         for task, name in enumerate(config.tasks):
@@ -97,14 +116,16 @@ def _final_tests(trainer: Trainer, bank: DemonstrationBank, *, episodes: int) ->
                 accuracy = task_inference_accuracy(gwr, seen, of_task, len(config.tasks))
                 inferred = [round(share, 4) for share in accuracy.tolist()]
             for index, seed in enumerate(config.seeds):
-                share = round(success[index, task].float().mean().item(), 4)
-                rows.append((seed, kind, name, episodes, share, inferred[index]))
+                won = success[index, task]
+                share, of_won = won.float().mean().item(), result.steps[index, task][won].double()
+                steps = round(of_won.mean().item(), 2) if len(of_won) else ""
+                rows.append((seed, kind, name, episodes, round(share, 4), steps, inferred[index]))
     bar.close()
     return rows
 
 
 def draw(
-    trainer: Trainer, bank: DemonstrationBank, out: Path, random_success: Mapping[str, float]
+    trainer: Trainer, bank: DemonstrationBank, out: Path, summary: Mapping[str, Any]
 ) -> list[str]:
     """Draw the figures of the run, and describe its GWR-B.
 
@@ -112,7 +133,7 @@ def draw(
         trainer: The trainer after training.
         bank: Training and held-out demonstrations.
         out: Folder for ``figures/`` and ``gwr.csv``.
-        random_success: Success of a random policy, by task.
+        summary: Result of `measure`.
 
     Returns:
         Lines about GWR-B, its task inference and its groups.
@@ -120,9 +141,14 @@ def draw(
     config, lines = trainer.config, list[str]()
     presented = dict(zip(config.tasks, config.task_starts, strict=True))
     figure = plot_success_curves(
-        out / "eval.csv", presented=presented, random_success=random_success
+        out / "eval.csv", presented=presented, random_success=summary["random_success"]
     )
     save_figure(figure, out / "figures" / "success.png")
+    if (read_tests(out / "eval.csv")["success"] == 1).any():
+        figure = plot_step_curves(
+            out / "eval.csv", presented=presented, demonstrated=summary["demonstrated_steps"]
+        )
+        save_figure(figure, out / "figures" / "steps.png")
     episodes = record_episodes(trainer, bank)
     save_figure(plot_frame_strips(episodes), out / "figures" / "episodes.png")
     for title, frames in episodes.items():

@@ -3,33 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import chain, combinations
 from pathlib import Path
 from shlex import quote
-from typing import Annotated, Any
+from typing import Any
 
 import pandas as pd
-import tyro
 
+from bgpo_trl.configs.runs import check_seeds
+from bgpo_trl.experiments.arguments import MergeArguments
 from bgpo_trl.files.writing import lock_directory, make_folder, write_json, write_whole
 from bgpo_trl.runs.cost import read_costs, total_cost, write_costs
 from bgpo_trl.runs.directory import differing_settings
 from bgpo_trl.runs.provenance import command
 from bgpo_trl.runs.results import read_json, read_table
-from bgpo_trl.seeding import check_seeds
 
 _ENTRIES = {"seeds": list, "episodes": int}
-
-
-@dataclass(frozen=True)
-class MergeArguments:
-    """Finished runs that differ only in their seeds."""
-
-    runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """Run directories, two or more."""
-    out: Path
-    """Run directory of all seeds. An earlier result of merging some of the runs is replaced."""
 
 
 def merge(arguments: MergeArguments) -> str:

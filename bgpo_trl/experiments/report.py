@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Any
 
 import numpy as np
-import tyro
 
 from bgpo_trl.analysis import statistics
 from bgpo_trl.analysis.comparison import (
@@ -21,7 +20,13 @@ from bgpo_trl.analysis.comparison import (
     run_directories,
     under_equal_conditions,
 )
-from bgpo_trl.analysis.scores import Values, evaluation_matrix, late_scores, success_matrix
+from bgpo_trl.analysis.scores import (
+    Values,
+    evaluation_matrix,
+    late_scores,
+    success_matrix,
+    success_steps,
+)
 from bgpo_trl.analysis.tables import (
     COST_NOTE,
     DIFFERENCE_NOTES,
@@ -39,11 +44,12 @@ from bgpo_trl.analysis.tables import (
     success_table,
     task_table,
 )
+from bgpo_trl.experiments.arguments import ReportArguments
 from bgpo_trl.figures.groups import draw_groups, plot_counts, read_counts
 from bgpo_trl.figures.gwr import plot_gwr_pca
 from bgpo_trl.figures.style import COLORS, save_figure
 from bgpo_trl.figures.success import (
-    plot_success_by,
+    plot_step_curves,
     plot_success_curves,
     plot_success_matrices,
 )
@@ -54,26 +60,6 @@ from bgpo_trl.runs.results import archive_run, find_table, read_table
 _DPI = 150
 # Curves that can be distinguished in one figure.
 _CURVES = len(COLORS)
-
-
-@dataclass(frozen=True)
-class ReportArguments:
-    """Finished runs."""
-
-    runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """Folders of runs, or run directories."""
-    out: Path | None = None
-    """Folder of the report; by default that of the runs."""
-    archive: Path | None = None
-    """Folder for compact copies of the runs, on which the report is then made."""
-    anyway: bool = False
-    """Compare also runs under different conditions, such as other encoders or tests."""
-    by: str | None = None
-    """Show success by a setting in which runs of one algorithm differ, such as spread."""
-    compare: bool = False
-    """Only print the differences between two runs, task by task."""
-    every: int | None = None
-    """With --compare, also over each part of training of so many episodes."""
 
 
 @dataclass(frozen=True)
@@ -97,18 +83,25 @@ def draw_curves(setting: Setting, out: Path) -> dict[str, Path]:
     """Draw the learning curves of a setting, some runs to a figure; paths by caption."""
     figures: dict[str, Path] = {}
     for start in range(0, len(setting.runs), _CURVES):
-        names = list(setting.runs)[start : start + _CURVES]
-        path = out / f"{setting.slug}{f'-{1 + start // _CURVES}' if start else ''}.png"
-        first = setting.runs[names[0]]
-        figure = plot_success_curves(
-            {name: setting.runs[name].directory / "eval.csv" for name in names},
-            presented=presented(first),
-            random_success=first.summary.get("random_success"),
-            window=3 * first.eval_every,
-            last=first.last,
-        )
-        save_figure(figure, path, _DPI)
-        figures[f"mean and one standard deviation over seeds: {', '.join(names)}"] = path
+        runs = dict(list(setting.runs.items())[start : start + _CURVES])
+        part = f"-{1 + start // _CURVES}" if start else ""
+        first, names = next(iter(runs.values())), ", ".join(runs)
+        shown: dict[str, Any] = {
+            "presented": presented(first),
+            "window": 3 * first.eval_every,
+            "last": first.last,
+        }
+        path = out / f"{setting.slug}{part}.png"
+        tests = {name: run.directory / "eval.csv" for name, run in runs.items()}
+        random = first.summary.get("random_success")
+        save_figure(plot_success_curves(tests, random_success=random, **shown), path, _DPI)
+        figures[f"mean and one standard deviation over seeds: {names}"] = path
+        solving = {n: tests[n] for n, run in runs.items() if np.isfinite(success_steps(run)).any()}
+        if solving:
+            path = out / f"{setting.slug}-steps{part}.png"
+            steps = first.summary.get("demonstrated_steps")
+            save_figure(plot_step_curves(solving, demonstrated=steps, **shown), path, _DPI)
+            figures[f"steps of a success, shown likewise: {', '.join(solving)}"] = path
     return figures
 
 
@@ -242,55 +235,6 @@ def make_report(
     return sections, {run.directory: run for s in settings for run in s.runs.values()}
 
 
-def runs_by(directories: Sequence[Path], name: str) -> dict[float, Run]:
-    """Return the runs of an algorithm by the number in which alone they differ, in its order.
-
-    Raises:
-        ValueError: If a run is damaged or not finished, has another algorithm or other conditions
-            than the first, or if its setting is not a number, or that of another run.
-    """
-    runs = [read_run(directory) for directory in directories]
-    first, found = runs[0], dict[float, Run]()
-    for run in runs:
-        value = run.config.get(name)
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise ValueError(f"--by {name}: it is {value!r} in {run.directory}, and no number")
-        if run.unfinished:
-            raise ValueError(f"{run.directory} {run.unfinished}: let the run finish")
-        if run.title != first.title:
-            raise ValueError(f"--by takes runs of one algorithm: {first.title}, {run.title}")
-        differing = differing_conditions(first, run, (name,))
-        if differing:
-            raise ValueError(f"{differing}: with --by {name}, they may differ in that alone")
-        if value in found:
-            raise ValueError(f"--by {name}: {found[value].directory}, {run.directory} have {value}")
-        found[value] = run
-    return dict(sorted(found.items()))
-
-
-def section_by(runs: dict[float, Run], name: str, out: Path) -> Section:
-    """Return the section of success by a number, and draw its figure."""
-    first = next(iter(runs.values()))
-    scores = {value: late_scores(run) for value, run in runs.items()}
-    table: Table = [[name, "seeds", "success", *first.tasks, "random actions"]]
-    for value, run in runs.items():
-        success, random = scores[value], run.summary.get("random_success") or {}
-        cells = [statistics.mean(column).percent() for column in (success.mean(1), *success.T)]
-        by_chance = " ".join(f"{100 * random[task]:.0f}" for task in first.tasks if task in random)
-        table.append([f"{value:g}", str(len(success)), *cells, by_chance or "-"])
-    path = out / f"by-{name}.png"
-    label = name.replace("_", " ").capitalize()
-    save_figure(plot_success_by(scores, first.tasks, label=label), path, _DPI)
-    commands = {value: run.summary.get("command") for value, run in runs.items()}
-    notes = [
-        f"{first.last:,} episodes each; success in percent, in tests over the last 10 % of "
-        "training, means over seeds with 95 % intervals (Student's t).",
-        *(f"{value:g}: `{command}`" for value, command in commands.items() if command),
-    ]
-    caption = f"means over seeds, and each seed, by {name}"
-    return Section(f"Success by {name}: {first.title}", table, {caption: path}, notes)
-
-
 def text_of(sections: Sequence[Section], out: Path) -> str:
     """Return sections in Markdown; figures are linked from the folder ``out``.
 
@@ -315,8 +259,7 @@ def report(arguments: ReportArguments) -> str:
     learning times, groups of behaviors, cost, each run task by task, and the paper's claims as far
     as there are runs for them; beside it, figures. The report of a single run is written into its
     directory. With --archive, first copies what reports read of the runs, compressed, and writes
-    the report beside the copies. With --by, writes only the success by a setting, as a table and a
-    figure. docs/benchmark.md defines the measures.
+    the report beside the copies. docs/benchmark.md defines the measures.
 
     Raises:
         ValueError: If a run is damaged, none is finished, or conditions differ.
@@ -333,20 +276,12 @@ def report(arguments: ReportArguments) -> str:
         if len({directory.name for directory in directories}) < len(directories):
             raise ValueError("--archive: runs of the same name are given, use one folder for each")
         # Refuses before copying.
-        if arguments.by is None:
-            read_settings(directories, anyway=arguments.anyway)
-        else:
-            runs_by(directories, arguments.by)
+        read_settings(directories, anyway=arguments.anyway)
         copies = [arguments.archive / directory.name for directory in directories]
         for directory, copy in zip(directories, copies, strict=True):
             archive_run(directory, copy)
         directories = copies
     out = arguments.out or arguments.archive or named[0]
-    if arguments.by is not None:
-        found = runs_by(directories, arguments.by)
-        text = text_of([section_by(found, arguments.by, make_folder(out))], out)
-        write_whole(out / "tables.md", text)
-        return text
     sections, runs = make_report(directories, out, anyway=arguments.anyway)
     for directory in directories if directories == named else ():
         run = runs.get(directory)

@@ -49,8 +49,8 @@ def run_experiment(
 ) -> str:
     """Train to the end, run the final tests and draw the figures.
 
-    In addition to the files of `Trainer`, the run directory gets ``final.csv`` (success of the
-    trained policies with demonstrations seen in training and with held-out ones, and task
+    In addition to the files of `Trainer`, the run directory gets ``final.csv`` (success and steps
+    of the trained policies with demonstrations seen in training and with held-out ones, and task
     inference), ``gwr.csv`` (nodes of the first seed's GWR-B), ``figures/`` (including a video of a
     test episode of each task; also on dashboards) and finally ``summary.json`` (commit,
     versions of packages, changed hyperparameters, command, success of a random policy, nodes of
@@ -105,7 +105,7 @@ def run_experiment(
             code = {"commit": commit, "versions": versions()}
             changed = changed_hyperparameters(config)
             summary = {**code, "changed": changed, **measure(trainer, bank, out)}
-            lines = draw(trainer, bank, out, summary["random_success"])
+            lines = draw(trainer, bank, out, summary)
             for path in sorted((out / "figures").iterdir()):
                 trainer.dashboard.log_media(f"figures/{path.stem}", path)
             # Written last, as the mark of a complete run.
@@ -154,9 +154,9 @@ def _continued(arguments: Arguments, config: RunConfig, out: Path) -> RunConfig:
             f"{out} holds the beginning of new encoders: add --train-encoders, or name another "
             "directory"
         )
-    continued = as_begun(config, out, keep_eval_every=arguments.eval_every is not None)
-    if arguments.task_starts is not None:  # the run's, or `Trainer` refuses them
-        continued = replace(continued, task_starts=arguments.task_starts)
+    continued = as_begun(config, out, keep_eval_every=arguments.gives("eval_every"))
+    if arguments.gives("task_starts"):  # the run's, or `Trainer` refuses them
+        continued = replace(continued, task_starts=config.task_starts)
     return continued
 
 

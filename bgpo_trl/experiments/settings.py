@@ -9,30 +9,22 @@ from typing import Any, TypeVar
 
 import tyro
 
+from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.configs import PRESETS, RunConfig
-from bgpo_trl.experiments.arguments import Arguments
+from bgpo_trl.configs.runs import check_seeds
+from bgpo_trl.experiments.arguments import SETTINGS, Arguments
 from bgpo_trl.plugins import import_plugin
 from bgpo_trl.runs.config_file import read_config, read_settings
 from bgpo_trl.runs.directory import differing_settings
 from bgpo_trl.runs.results import read_json
 from bgpo_trl.scenes import Scene, find_scene
-from bgpo_trl.seeding import check_seeds
 
 _Entry = TypeVar("_Entry")
-# Flags of the settings of the same name.
-_PLAIN = (
-    "seeds",
-    "task_starts",
-    "schedule",
-    "spread",
-    "eval_every",
-    "eval_episodes",
-    "checkpoint_minutes",
-    "held_out",
-)
 
 
-def run_config(arguments: Arguments, *, from_start: bool = False) -> RunConfig:
+def run_config(
+    arguments: Arguments, *, from_start: bool = False, changes: Mapping[str, Any] | None = None
+) -> RunConfig:
     """Return the settings that a command line asks for.
 
     Imports the module of own tasks and algorithms first.
@@ -40,6 +32,7 @@ def run_config(arguments: Arguments, *, from_start: bool = False) -> RunConfig:
     Args:
         arguments: The command line.
         from_start: Whether all tasks are presented from the start.
+        changes: Settings to change, as by flags; those that are None are left.
 
     Raises:
         ValueError: If the settings are invalid, or a file, task or algorithm does not exist.
@@ -53,14 +46,14 @@ def run_config(arguments: Arguments, *, from_start: bool = False) -> RunConfig:
         config = _with_tasks(config, chosen_tasks(arguments.tasks, scene, config.tasks))
     if arguments.episodes is not None:
         config = _with_episodes(config, arguments.episodes)
-    given = {name: getattr(arguments, name) for name in _PLAIN}
-    config = replace(config, **{name: value for name, value in given.items() if value is not None})
+    given = {name: value for name, value in (changes or {}).items() if value is not None}
+    config = replace(config, **given)
+    if arguments.settings:
+        config = tyro.cli(SETTINGS, default=config, args=arguments.settings)
     if from_start:
-        if any(arguments.task_starts or ()):
+        if any(config.task_starts) and (arguments.gives("task_starts") or "task_starts" in given):
             raise ValueError("--task-starts: all tasks are presented from the start here")
         config = at_once(config)
-    if arguments.hyperparameters:
-        config = tyro.cli(RunConfig, default=config, args=arguments.hyperparameters)
     if config.eval_every > config.episodes:
         raise ValueError(
             f"eval_every must be at most the {config.episodes} episodes of the run, got "
@@ -71,8 +64,6 @@ def run_config(arguments: Arguments, *, from_start: bool = False) -> RunConfig:
 
 def _begin(arguments: Arguments) -> RunConfig:
     """Return the settings that flags change: of a run to be resumed, of a file, or a preset's."""
-    from bgpo_trl.algorithms import ALGORITHMS
-
     path, preset = arguments.config, PRESETS[arguments.preset or "quick"]
     if path is None:
         out = named_directory(arguments)
@@ -105,8 +96,6 @@ def named_directory(arguments: Arguments) -> Path | None:
 
 
 def _with_algorithm(config: RunConfig, arguments: Arguments) -> RunConfig:
-    from bgpo_trl.algorithms import ALGORITHMS
-
     if arguments.algorithm is None:
         return config
     entry = chosen(ALGORITHMS, arguments.algorithm, "--algorithm")
@@ -211,8 +200,6 @@ def as_begun(config: RunConfig, directory: Path, *, keep_eval_every: bool = Fals
 
 def changed_hyperparameters(config: RunConfig) -> dict[str, Any]:
     """Return the hyperparameters of a run that are not the usual ones of its algorithm, by name."""
-    from bgpo_trl.algorithms import ALGORITHMS
-
     if config.name not in ALGORITHMS:
         return {}
     usual = ALGORITHMS[config.name].config

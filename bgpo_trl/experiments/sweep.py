@@ -13,14 +13,15 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
+from bgpo_trl.algorithms import ABLATIONS
 from bgpo_trl.configs import RunConfig
-from bgpo_trl.experiments.arguments import Arguments, BankArguments
+from bgpo_trl.experiments.arguments import Arguments, Setting, SweepArguments
 from bgpo_trl.experiments.merge import merge_runs
 from bgpo_trl.experiments.ray_jobs import Job, connected, play_jobs
+from bgpo_trl.experiments.run import pretrained_for, run_experiment
 from bgpo_trl.experiments.settings import run_config
 from bgpo_trl.files.writing import lock_directory
 from bgpo_trl.plugins import import_plugin
@@ -30,51 +31,6 @@ from bgpo_trl.runs.results import read_json
 from bgpo_trl.scenes import find_scene
 from suites import opengl
 
-Setting = Literal[
-    "concurrent",
-    "continual",
-    "sequential",
-    "ablation",
-    "eight",
-    "eight-reversed",
-    "eight-sequential",
-    "eight-concurrent",
-]
-
-
-@dataclass(frozen=True)
-class SweepArguments(BankArguments):
-    """A grid of runs."""
-
-    algorithms: tuple[str, ...] = ("bgpo",)
-    """Algorithms, as in `bgpo concurrent`."""
-    settings: tuple[Setting, ...] = ("concurrent",)
-    """Tasks all from the start (concurrent); one after another, with earlier ones practised
-    (continual) or not (sequential); or the variants of BGPO instead of the algorithms (ablation).
-    Or the suite's eight tasks instead of --tasks: one after another, in reverse order, without
-    practising earlier ones, or all from the start."""
-    preset: Literal["quick", "desk", "paper"] = "desk"
-    """Size of the runs."""
-    seeds: tuple[int, ...] | None = None
-    """Seeds; the preset's by default."""
-    block: int = 5
-    """Seeds per job. Another number makes other runs."""
-    episodes: int | None = None
-    """Training episodes; the preset's by default. The task starts are scaled in proportion."""
-    eval_every: int | None = None
-    """Training episodes between evaluations; the preset's by default."""
-    held_out: Literal["validation", "test"] = "validation"
-    """Half of the held-out demonstrations to test on: validation to choose settings, test to report
-    results."""
-    out: Path = Path("runs/sweep")
-    """Parent of the run directories."""
-    address: str = "local"
-    """Address of a Ray cluster; "local" starts Ray on this machine."""
-    cpus_per_run: float = 1
-    """Cores that Ray reserves per run."""
-    gpus_per_run: float = 0
-    """GPUs per run, or a share of one; with 0, networks are on the CPU."""
-
 
 def make_jobs(arguments: SweepArguments) -> dict[Path, list[Job]]:
     """Return the jobs of the grid, by the directory that they are merged into.
@@ -82,8 +38,6 @@ def make_jobs(arguments: SweepArguments) -> dict[Path, list[Job]]:
     Raises:
         ValueError: If the settings are invalid, or the grid is empty.
     """
-    from bgpo_trl.algorithms import ABLATIONS
-
     if arguments.block < 1:
         raise ValueError(f"block must be at least 1, got {arguments.block}")
     if arguments.cpus_per_run <= 0 or arguments.gpus_per_run < 0:
@@ -131,15 +85,17 @@ def _config(arguments: SweepArguments, setting: Setting, name: str) -> RunConfig
         Arguments(
             algorithm=name,
             preset=arguments.preset,
-            seeds=arguments.seeds,
             episodes=arguments.episodes,
-            eval_every=arguments.eval_every,
-            held_out=arguments.held_out,
             scene=arguments.scene,
             tasks=tasks,
-            schedule="sequential" if setting.endswith("sequential") else "practised",
         ),
         from_start=setting.endswith(("concurrent", "ablation")),
+        changes={
+            "seeds": arguments.seeds,
+            "eval_every": arguments.eval_every,
+            "held_out": arguments.held_out,
+            "schedule": "sequential" if setting.endswith("sequential") else "practised",
+        },
     )
 
 
@@ -170,8 +126,6 @@ def check_directories(
 
 def play(job: Job) -> None:
     """Play a job to its end, from its last checkpoint if there is one."""
-    from bgpo_trl.experiments.run import run_experiment
-
     import_plugin(job.module)
     arguments = Arguments(
         out=job.directory, resume=holds_run(job.directory), bank=job.bank, encoders=job.encoders
@@ -190,8 +144,6 @@ def sweep(arguments: SweepArguments) -> str:
         ValueError: If the settings are invalid, or a directory holds another run.
         RuntimeError: If a job fails, such as on a full disk, after the others have finished.
     """
-    from bgpo_trl.experiments.run import pretrained_for
-
     import_plugin(arguments.module)
     jobs = make_jobs(arguments)
     digests = {
@@ -229,38 +181,3 @@ def sweep(arguments: SweepArguments) -> str:
     if failed:
         raise RuntimeError("; ".join(f"{job} failed: {why}" for job, why in failed.items()))
     return "\n".join(lines)
-
-
-@dataclass(frozen=True)
-class EightTasksArguments(SweepArguments):
-    """The grid of the benchmark of eight tasks, or a part of it."""
-
-    algorithms: tuple[str, ...] = (
-        "bgpo",
-        "bgpo-experts",
-        "bgpo-single",
-        "maml",
-        "maml-demonstrations",
-        "dist-nll",
-        "dist-nll-demonstrations",
-        "oracle",
-    )
-    settings: tuple[Setting, ...] = ("eight", "eight-reversed", "eight-concurrent")
-    seeds: tuple[int, ...] | None = (10, 11, 12, 13, 14)
-    """Seeds."""
-    episodes: int | None = 4_000
-    """Training episodes. The task starts are scaled in proportion."""
-    eval_every: int | None = None
-    """Training episodes between evaluations; by default 50, or fewer in shorter runs."""
-    held_out: Literal["validation", "test"] = "test"
-    out: Path = Path("runs/eight")
-
-
-def eight_tasks(arguments: EightTasksArguments) -> str:
-    """Run the benchmark of eight tasks (docs/benchmark.md) as a sweep; `bgpo report runs/eight`.
-
-    The same command resumes an interrupted grid.
-    """
-    if arguments.eval_every is None:
-        arguments = replace(arguments, eval_every=min(50, arguments.episodes or 50))
-    return sweep(arguments)

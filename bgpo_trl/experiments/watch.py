@@ -5,24 +5,20 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
-import tyro
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont, ImageOps
 
-from bgpo_trl.experiments.arguments import ImportArguments
+from bgpo_trl.data.recording import record_demonstrations
+from bgpo_trl.experiments.arguments import WatchArguments
 from bgpo_trl.figures.frames import plot_frame_strips, save_gif
+from bgpo_trl.figures.gwr import draw_growth
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.files.writing import check_folder
 from bgpo_trl.plugins import import_plugin
-from bgpo_trl.scenes import Scene, find_scene
-
-if TYPE_CHECKING:
-    from bgpo_trl.policy import TrainedPolicy
-    from bgpo_trl.scenes import Simulation
+from bgpo_trl.policy import TrainedPolicy, load_run
+from bgpo_trl.scenes import Scene, Simulation, find_scene
 
 __all__ = ["Episode", "WatchArguments", "compose", "demonstrate", "play", "watch"]
 
@@ -30,20 +26,6 @@ _HEIGHT = 128  # (pixels) of each picture
 _BORDER, _CAPTION, _GAP = 4, 18, 8
 _COLORS = {None: "#999999", True: "#009E73", False: "#D55E00"}
 _FPS = 10  # twice as fast as NICO moves
-
-
-@dataclass(frozen=True)
-class WatchArguments(ImportArguments):
-    """A film of a run."""
-
-    run: tyro.conf.Positional[Path]
-    """Run directory."""
-    run_seed: int | None = None
-    """Seed of the run whose policy acts; the first by default."""
-    scene_seed: int = 1
-    """Seed of demonstrations and starts; the pretrained encoders were trained on seed 0."""
-    out: Path | None = None
-    """Folder for the pictures; figures/ of the run by default."""
 
 
 @dataclass(frozen=True)
@@ -74,8 +56,6 @@ def demonstrate(
     tasks: Sequence[str], seed: int, spread: float = 1.0, scene: Scene | str = "nico"
 ) -> dict[str, NDArray]:
     """Return a new demonstration of each task, uint8 ``[T, H, W, 3]``."""
-    from bgpo_trl.data.recording import record_demonstrations
-
     with tempfile.TemporaryDirectory() as folder:
         recorded = record_demonstrations(
             folder,
@@ -183,9 +163,6 @@ def watch(arguments: WatchArguments) -> str:
         ValueError: If the directory holds no run that can be loaded, or the run has no such seed.
         OSError: If the pictures cannot be written.
     """
-    from bgpo_trl.figures.gwr import draw_growth
-    from bgpo_trl.policy import load_run
-
     run, out = arguments.run, arguments.out or arguments.run / "figures"
     import_plugin(arguments.module)
     policy = load_run(run, seed=arguments.run_seed)

@@ -1,25 +1,23 @@
-"""Figures of success: learning curves (Figs. 6, 8, 9), matrices by phase, success by condition."""
+"""Figures of success and its steps: learning curves (Figs. 6, 8, 9), matrices by phase."""
 
 from __future__ import annotations
 
 import math
 import os
 from collections.abc import Mapping, Sequence
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
-from matplotlib.ticker import MaxNLocator, PercentFormatter
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike, NDArray
 
-from bgpo_trl.analysis import statistics
 from bgpo_trl.figures.style import (
     COLORS,
     LINES,
-    MARKERS,
     add_legend,
     mark_starts,
     readable,
@@ -27,12 +25,11 @@ from bgpo_trl.figures.style import (
 )
 from bgpo_trl.runs.results import read_tests
 
-_CHANCE: dict[str, Any] = {"color": "0.35", "linestyle": ":", "linewidth": 1.2}
+_DOTTED: dict[str, Any] = {"color": "0.35", "linestyle": ":", "linewidth": 1.2}
 _GRID_POINTS = 400
 _OVERALL = "All presented tasks"
 
 _Path = str | os.PathLike[str]
-_Key = TypeVar("_Key", str, float)
 
 
 def plot_success_curves(
@@ -63,8 +60,74 @@ def plot_success_curves(
         ValueError: If a file is not an ``eval.csv``, there are no test episodes, or the window is
             not positive.
     """
-    presented, random_success = presented or {}, random_success or {}
+    figure, window = _plot_curves(
+        _read_tests(eval_csv),
+        "success",
+        presented or {},
+        (random_success or {}, "random policy"),
+        window,
+        last,
+    )
+    figure.supxlabel(f"Training episode (success: mean over the last {window:,})", fontsize=9)
+    figure.supylabel("Success rate", fontsize=9)
+    for panel in figure.axes:
+        # The room above 1 takes the labels of the dashed lines.
+        panel.set(ylim=(0, 1.1), yticks=np.linspace(0, 1, 6))
+    return figure
+
+
+def plot_step_curves(
+    eval_csv: _Path | Mapping[str, _Path],
+    *,
+    presented: Mapping[str, int] | None = None,
+    demonstrated: Mapping[str, float] | None = None,
+    window: int | None = None,
+    last: int | None = None,
+) -> Figure:
+    """Plot the steps that a success takes against training episodes, as `plot_success_curves` does.
+
+    Test episodes without success are left out.
+
+    Args:
+        eval_csv: See `plot_success_curves`.
+        presented: See `plot_success_curves`.
+        demonstrated: Mean steps of the demonstrations by task, marked with dotted lines.
+        window: See `plot_success_curves`.
+        last: See `plot_success_curves`.
+
+    Raises:
+        ValueError: If a file is not an ``eval.csv``, the steps of no success are known, or the
+            window is not positive.
+    """
     tests = _read_tests(eval_csv)
+    tests["steps"] = tests["steps"].where(tests["success"] == 1)
+    if tests["steps"].isna().all():
+        raise ValueError("there is no success with steps to plot: let the run train longer")
+    demonstrated = demonstrated or {}
+    figure, window = _plot_curves(
+        tests, "steps", presented or {}, (demonstrated, "demonstrations"), window, last
+    )
+    figure.supxlabel(f"Training episode (steps: mean over the last {window:,})", fontsize=9)
+    figure.supylabel("Steps of a success", fontsize=9)
+    highest = max([tests["steps"].max(), *demonstrated.values()])
+    for panel in figure.axes:
+        panel.set_ylim(0, 1.1 * highest)
+    return figure
+
+
+def _plot_curves(
+    tests: pd.DataFrame,
+    column: str,
+    presented: Mapping[str, int],
+    reference: tuple[Mapping[str, float], str],
+    window: int | None,
+    last: int | None,
+) -> tuple[Figure, int]:
+    """Return a figure of the trailing means of a column, and their window.
+
+    ``reference`` holds values by task, marked with dotted lines, and their legend name.
+    """
+    values, reference_name = reference
     tasks = [*presented, *sorted(set(tests["task"]) - set(presented))]
     last = int(tests["episode"].max()) if last is None else last
     window = max(1, round(last / 20)) if window is None else window
@@ -81,18 +144,23 @@ def plot_success_curves(
         for index, (name, seeds) in enumerate(seeds_of.items()):
             of_run = of_panel[of_panel["name"] == name]
             curves = [
-                _trailing_mean(of_run[of_run["seed"] == seed], grid, window) for seed in seeds
+                _trailing_mean(of_run[of_run["seed"] == seed], column, grid, window)
+                for seed in seeds
             ]
-            _draw_curve(panel, grid, np.array(curves), name, index)
+            _draw_curve(panel, grid, np.array(curves), name, index, float(tests[column].max()))
         starts = {name: episode for name, episode in presented.items() if task in (None, name)}
         mark_starts(panel, starts, tasks, last)
-        if task is not None and task in random_success:
-            panel.axhline(random_success[task], **_CHANCE)
+        if task is not None and task in values:
+            panel.axhline(values[task], **_DOTTED)
         title = _OVERALL if task is None else f"Task {tasks.index(task) + 1}: {readable(task)}"
         _style_panel(panel, title, last)
     _tidy_panels(panels, len(tasks))
-    _add_labels(figure, window, chance=bool(random_success))
-    return figure
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    if values:
+        handles += figure.axes[0].plot([], [], **_DOTTED)
+        labels += [reference_name]
+    add_legend(figure, handles, labels, figure.get_figwidth())
+    return figure, window
 
 
 def _read_tests(files: _Path | Mapping[str, _Path]) -> pd.DataFrame:
@@ -119,8 +187,7 @@ def _make_panels(n_tasks: int) -> tuple[Figure, NDArray]:
 def _style_panel(panel: Axes, title: str, last: int) -> None:
     panel.set_title(title, fontsize=9)
     style_axes(panel)
-    # The room above 1 takes the labels of the dashed lines.
-    panel.set(xlim=(0, last), ylim=(0, 1.1), yticks=np.linspace(0, 1, 6))
+    panel.set_xlim(0, last)
     panel.xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10], integer=True))
     panel.xaxis.set_major_formatter("{x:,.0f}")
 
@@ -134,16 +201,6 @@ def _tidy_panels(panels: NDArray, n_tasks: int) -> None:
             panel.tick_params(labelbottom=True)
 
 
-def _add_labels(figure: Figure, window: int, *, chance: bool) -> None:
-    figure.supxlabel(f"Training episode (success: mean over the last {window:,})", fontsize=9)
-    figure.supylabel("Success rate", fontsize=9)
-    handles, labels = figure.axes[0].get_legend_handles_labels()
-    if chance:
-        handles += figure.axes[0].plot([], [], **_CHANCE)
-        labels += ["random policy"]
-    add_legend(figure, handles, labels, figure.get_figwidth())
-
-
 def _grid(tested: NDArray, last: int) -> NDArray:
     """Return the episodes at which curves are drawn: those with tests, or fewer."""
     grid = np.sort(tested[tested <= last])
@@ -152,18 +209,21 @@ def _grid(tested: NDArray, last: int) -> NDArray:
     return grid
 
 
-def _trailing_mean(tests: pd.DataFrame, grid: NDArray, window: int) -> NDArray:
-    """Return a seed's success rate at each grid point; NaN without test episodes in the window."""
-    tests = tests.sort_values("episode")
+def _trailing_mean(tests: pd.DataFrame, column: str, grid: NDArray, window: int) -> NDArray:
+    """Return a seed's trailing mean at each grid point; NaN without values in the window."""
+    tests = tests[tests[column].notna()].sort_values("episode")
     episodes = tests["episode"].to_numpy()
-    successes = np.cumsum([0.0, *tests["success"]])
+    total = np.cumsum([0.0, *tests[column]])
     stop = np.searchsorted(episodes, grid, side="right")
     start = np.searchsorted(episodes, grid - window, side="right")
     count = stop - start
-    return np.where(count > 0, (successes[stop] - successes[start]) / np.maximum(count, 1), np.nan)
+    return np.where(count > 0, (total[stop] - total[start]) / np.maximum(count, 1), np.nan)
 
 
-def _draw_curve(axes: Axes, grid: NDArray, curves: NDArray, name: str, index: int) -> None:
+def _draw_curve(
+    axes: Axes, grid: NDArray, curves: NDArray, name: str, index: int, top: float
+) -> None:
+    """Draw the mean of curves ``[S, E]``, and their spread as far as it is between 0 and top."""
     seeds = np.ma.masked_invalid(curves)
     mean, spread = seeds.mean(axis=0).filled(np.nan), seeds.std(axis=0).filled(np.nan)
     color = COLORS[index % len(COLORS)]
@@ -171,7 +231,7 @@ def _draw_curve(axes: Axes, grid: NDArray, curves: NDArray, name: str, index: in
     axes.plot(
         grid, mean, color=color, linestyle=LINES[index % len(LINES)], linewidth=1.6, label=label
     )
-    low, high = np.clip(mean - spread, 0, 1), np.clip(mean + spread, 0, 1)
+    low, high = np.clip(mean - spread, 0, top), np.clip(mean + spread, 0, top)
     axes.fill_between(grid, low, high, color=color, alpha=0.18, linewidth=0)
 
 
@@ -242,104 +302,3 @@ def _label_tasks(panel: Axes, tasks: Sequence[str], *, names: bool) -> None:
     panel.set_yticks(range(len(tasks)), rows if names else numbers)
     panel.tick_params(labelsize=8, length=0)
     panel.spines[:].set_visible(False)
-
-
-_WIDTH = 0.8  # of the bars of a task, whose centers are 1 apart
-
-
-def plot_success_bars(success: Mapping[str, ArrayLike], tasks: Sequence[str]) -> Figure:
-    """Plot the success on each task as a group of bars, one for each condition.
-
-    Bars are means over seeds, with 95 % t intervals if there are at least two seeds, and a dot for
-    each seed.
-
-    Args:
-        success: Success in [0, 1] of each seed and task, ``[S, T]``, by condition.
-        tasks: Names of the tasks.
-
-    Raises:
-        ValueError: If there are no conditions, or one has not a column per task.
-    """
-    found = _checked(success, tasks)
-    width = max(3.6, 1.0 + 0.28 * len(tasks) * len(found))  # inches
-    figure = Figure(figsize=(width, 3.2), layout="constrained")
-    axes = figure.add_subplot()
-    slim = _WIDTH / len(found)
-    for number, (name, scores) in enumerate(found.items()):
-        mean = scores.mean(0)
-        places = np.arange(len(tasks)) + (number - (len(found) - 1) / 2) * slim
-        color = COLORS[number % len(COLORS)]
-        axes.bar(places, mean, slim * 0.9, color=color, alpha=0.75, label=name)
-        if len(scores) > 1:
-            low, high = np.clip(np.transpose([statistics.mean(s)[1:] for s in scores.T]), 0.0, 1.0)
-            axes.errorbar(
-                places, mean, [mean - low, high - mean], fmt="none", ecolor="0.2", elinewidth=0.9
-            )
-            around = np.linspace(-0.2, 0.2, len(scores)) * slim
-            axes.scatter(
-                np.add.outer(around, places),
-                scores,
-                s=4,
-                color="0.2",
-                linewidths=0,
-                zorder=3,
-                clip_on=False,
-            )
-    names = [readable(task).replace(" to ", "\nto ") for task in tasks]
-    axes.set_xticks(range(len(tasks)), names)
-    _finish(figure, axes)
-    axes.grid(visible=False, axis="x")
-    return figure
-
-
-def plot_success_by(
-    success: Mapping[float, ArrayLike], tasks: Sequence[str], *, label: str
-) -> Figure:
-    """Plot the success on each task against a number, as lines.
-
-    Lines are means over seeds; dots are single seeds.
-
-    Args:
-        success: Success in [0, 1] of each seed and task, ``[S, T]``, by the number.
-        tasks: Names of the tasks.
-        label: Name of the number.
-
-    Raises:
-        ValueError: If there are no numbers, or one has not a column per task.
-    """
-    found = _checked(dict(sorted(success.items())), tasks)
-    figure = Figure(figsize=(4.2, 3.2), layout="constrained")
-    axes = figure.add_subplot()
-    for index, task in enumerate(tasks):
-        style: dict[str, Any] = {
-            "color": COLORS[index % len(COLORS)],
-            "marker": MARKERS[index % len(MARKERS)],
-        }
-        means = [scores[:, index].mean() for scores in found.values()]
-        line = LINES[index % len(LINES)]
-        axes.plot([*found], means, label=readable(task), linestyle=line, markersize=5, **style)
-        for number, scores in found.items():
-            numbers = np.full(len(scores), number)
-            axes.scatter(numbers, scores[:, index], s=8, alpha=0.5, clip_on=False, **style)
-    axes.set_xticks([*found])
-    axes.set_xlabel(label, fontsize=9)
-    _finish(figure, axes)
-    return figure
-
-
-def _checked(success: Mapping[_Key, ArrayLike], tasks: Sequence[str]) -> dict[_Key, NDArray]:
-    """Return success by condition as arrays; raise ``ValueError`` if one is not ``[S, T]``."""
-    found = {key: np.asarray(scores, float) for key, scores in success.items()}
-    if not found or any(s.ndim != 2 or s.shape[1] != len(tasks) for s in found.values()):
-        shapes = [list(scores.shape) for scores in found.values()]
-        raise ValueError(f"success must be [seeds, {len(tasks)}] by condition, got {shapes}")
-    return found
-
-
-def _finish(figure: Figure, axes: Axes) -> None:
-    """Give axes of success their scale, and the figure its legend."""
-    axes.set_ylim(0, 1.02)
-    axes.set_ylabel("Success rate", fontsize=9)
-    axes.yaxis.set_major_formatter(PercentFormatter(1, decimals=0))
-    style_axes(axes)
-    add_legend(figure, *axes.get_legend_handles_labels(), figure.get_figwidth())

@@ -144,7 +144,7 @@ class DDPGLoss(LossModule):
         self,
         actor_network: Any,  # a TensorDictModuleBase; TorchRL's methods ask for a TensorDictModule
         value_network: Any,
-        clone_network: Any = None,
+        clone_network: Any | None = None,
         *,
         n_critics: int = 1,
         return_bounds: tuple[float, float] | None = None,
@@ -180,7 +180,7 @@ class DDPGLoss(LossModule):
         self.convert_to_functional(actor_network, "actor_network", create_target_params=delay_actor)
         self.convert_to_functional(value_network, "value_network", create_target_params=True)
         self.has_clone = clone_network is not None
-        if self.has_clone:
+        if clone_network is not None:
             self.convert_to_functional(clone_network, "clone_network")
         self.return_bounds, self.pre_tanh_penalty = return_bounds, pre_tanh_penalty
         self.reduction = reduction
@@ -284,7 +284,7 @@ class DDPGLoss(LossModule):
         if self.has_clone:
             proposals.append(self.call_network("clone_network", successor.copy()))
         dim, keys = len(self.batch_size), self.value_network.in_keys
-        data = torch.stack([proposal.select(*keys) for proposal in proposals], dim)
+        data: TensorDictBase = TensorDict.stack([one.select(*keys) for one in proposals], dim)
         values = self.values("target_value_network", data, critics=self.pair)
         return (values.amin(dim) if self.ensemble else values).amax(dim)
 

@@ -7,10 +7,11 @@ import re
 import sys
 from dataclasses import asdict, is_dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
+from typing import Any, NamedTuple, get_args, get_type_hints
 
 import yaml
 
+from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.configs import AlgorithmConfig, RunConfig
 from bgpo_trl.runs.results import read_json
 from bgpo_trl.scenes import SCENES, find_scene
@@ -109,8 +110,8 @@ def read_config(path: str | Path, defaults: RunConfig | None = None) -> tuple[Ru
             known = isinstance(module, str) and module != "__main__"
             where = f"the module {module!r}" if known else "a script or notebook"
             raise LookupError(f"has the task {unknown!r}, added by {where}")
-        algorithm = _read(kind, values, "algorithm.")
-        return _read(RunConfig, {**settings, "algorithm": algorithm}, ""), digests
+        algorithm = _built(kind, values, "algorithm")
+        return _built(RunConfig, {**settings, "algorithm": algorithm}), digests
     except (FileNotFoundError, NotADirectoryError):
         raise ValueError(f"{path.parent} holds no run: there is no {path.name}") from None
     except LookupError as error:
@@ -132,9 +133,6 @@ def settings_of(config: RunConfig, digests: Digests) -> dict[str, Any]:
     Args:
         config: The run.
         digests: Digests of its encoders and demonstrations.
-
-    Raises:
-        ValueError: If a hyperparameter is of a type that `read_config` would not restore.
     """
     kind = type(config.algorithm)
     settings = {
@@ -143,20 +141,12 @@ def settings_of(config: RunConfig, digests: Digests) -> dict[str, Any]:
         "task_modules": dict(find_scene(config.scene).modules(config.tasks)),
         **digests._asdict(),
     }
-    settings = _as_json(settings)
-    try:
-        _read(kind, settings["algorithm"], "algorithm.")
-    except ValueError as error:
-        raise ValueError(
-            f"config.json cannot hold the setting {error}: annotate it as a number, a string, a "
-            "bool, a dataclass of these, a tuple of one of them (tuple[int, ...]), or one or None"
-        ) from None
-    return settings
+    return _as_json(settings)
 
 
 def _as_json(settings: dict[str, Any]) -> dict[str, Any]:
     """Return settings as JSON stores them, tuples as lists."""
-    return json.loads(json.dumps(settings, default=str))
+    return json.loads(json.dumps(settings))
 
 
 def _merged(defaults: dict[str, Any], settings: dict[str, Any]) -> dict[str, Any]:
@@ -191,30 +181,23 @@ def _algorithm_config(name: object, stored: object) -> type[AlgorithmConfig] | N
         kind = getattr(sys.modules.get(module), attribute, None)
         if isinstance(kind, type) and issubclass(kind, AlgorithmConfig):
             return kind
-    from bgpo_trl.algorithms import ALGORITHMS
-
     if not isinstance(name, str) or name not in ALGORITHMS:
         return None
     return type(ALGORITHMS[name].config)
 
 
-def _read(hint: Any, value: Any, where: str) -> Any:
-    """Convert a JSON value to its annotated type; ``where`` names it in errors."""
-    if is_dataclass(hint) and isinstance(value, dict):
-        hints = get_type_hints(hint)
-        unknown = sorted(value.keys() - hints.keys(), key=str)
-        if unknown:
-            raise ValueError(f"unknown setting {where}{unknown[0]}")
-        read = {key: _read(hints[key], item, f"{where}{key}.") for key, item in value.items()}
-        return hint(**read)  # pyright: ignore[reportCallIssue]
-    if type(None) in get_args(hint):
-        return None if value is None else _read(get_args(hint)[0], value, where)
-    if get_origin(hint) is tuple and isinstance(value, list):
-        return tuple(_read(get_args(hint)[0], item, where) for item in value)
-    if get_origin(hint) is Literal and value in get_args(hint):
-        return value
-    if hint is float and type(value) is int:
-        return float(value)
-    if isinstance(hint, type) and (type(value) is hint or is_dataclass(value)):
-        return value
-    raise ValueError(f"{where.rstrip('.')} is {value!r}")
+def _built(kind: type, values: dict[str, Any], where: str = "") -> Any:
+    """Return settings of a class from a file; ``where`` names them in errors."""
+    hints, prefix = get_type_hints(kind), f"{where}." if where else ""
+    unknown = sorted(values.keys() - hints.keys(), key=str)
+    if unknown:
+        raise ValueError(f"unknown setting {prefix}{unknown[0]}")
+    settings = dict(values)
+    for name, value in values.items():
+        inner = next((t for t in (hints[name], *get_args(hints[name])) if is_dataclass(t)), None)
+        if isinstance(inner, type) and isinstance(value, dict):
+            settings[name] = _built(inner, value, f"{prefix}{name}")
+    try:
+        return kind(**settings)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}" if where else str(error)) from None

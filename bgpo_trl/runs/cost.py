@@ -83,7 +83,7 @@ def read_costs(path: str | os.PathLike[str]) -> dict[int, Cost]:
         ValueError: If the file is missing or damaged.
     """
     columns = {"tasks": COUNT, "steps": COUNT, "seconds": AMOUNT, "megabytes": AMOUNT}
-    table = read_table(path, columns, "remove the file, and costs are counted anew")
+    table = read_table(path, columns, remedy="remove the file, and costs are counted anew")
     rows = table[list(columns)].sort_values("tasks").itertuples(index=False)
     return {int(tasks): Cost(int(steps), *amounts) for tasks, steps, *amounts in rows}
 

@@ -53,6 +53,7 @@ EVAL = {"algorithm": TEXT, **TRAIN}
 """Columns of ``eval.csv`` that every run has."""
 _FINAL = {"seed": COUNT, "demonstrations": TEXT, "task": TEXT, "success": SHARE}
 _FINAL["task_inference"] = replace(SHARE, may_be_empty=True)  # of algorithms without GWR-B
+_STEPS = {"steps": replace(AMOUNT, may_be_empty=True)}
 
 
 @dataclass(frozen=True)
@@ -88,6 +89,7 @@ def find_table(path: str | os.PathLike[str]) -> Path | None:
 def read_table(
     path: str | os.PathLike[str],
     columns: Mapping[str, Cells] | None = None,
+    optional: Mapping[str, Cells] | None = None,
     remedy: str = "resume the run, which writes it again, or take the line out",
 ) -> pd.DataFrame:
     """Return a CSV file of a run, plain or compressed.
@@ -95,18 +97,20 @@ def read_table(
     Args:
         path: The CSV file; where it is not there, ``path`` with ``.gz`` is read.
         columns: Required columns and what their cells may hold. Other columns are kept as text.
+        optional: Further columns; those that the file lacks are NaN.
         remedy: Advice for a damaged line, the end of the error message.
 
     Raises:
         ValueError: If the file is missing or not CSV, lacks a column or has an invalid cell.
     """
-    path, columns = find_table(path) or Path(path), columns or {}
+    path, columns, optional = find_table(path) or Path(path), dict(columns or {}), optional or {}
     table = _read_text(path)
     missing = sorted(set(columns).difference(table.columns))
     if len(table.columns) and missing:
         raise ValueError(f"{path} lacks the columns {', '.join(missing)}: name another run")
     if missing:
-        return pd.DataFrame(columns=pd.Index(columns))
+        return pd.DataFrame(columns=pd.Index([*columns, *optional]))
+    columns |= {name: cells for name, cells in optional.items() if name in table}
     damaged = pd.Series(False, index=table.index)
     for name, cells in columns.items():
         if isinstance(cells, Numbers):
@@ -118,7 +122,8 @@ def read_table(
         line = 2 + int(damaged.to_numpy().argmax())
         raise ValueError(f"{path}, line {line} is damaged: {remedy}")
     whole = [n for n, cells in columns.items() if isinstance(cells, Numbers) and cells.whole]
-    return table.astype(dict.fromkeys(whole, np.int64))
+    lacking = {name: np.nan for name in optional if name not in table}
+    return table.astype(dict.fromkeys(whole, np.int64)).assign(**lacking)
 
 
 def _read_text(path: Path) -> pd.DataFrame:
@@ -169,10 +174,12 @@ def _missing(path: Path) -> ValueError:
 def read_tests(path: str | os.PathLike[str]) -> pd.DataFrame:
     """Return an ``eval.csv``, one row per test episode.
 
+    ``steps`` is NaN if it is not stored.
+
     Raises:
         ValueError: If the file is missing or empty, or a row is invalid.
     """
-    table = read_table(path, EVAL)
+    table = read_table(path, EVAL, _STEPS)
     if table.empty:
         raise ValueError(f"{path} holds no test episode: let the run evaluate first")
     return table
@@ -181,12 +188,14 @@ def read_tests(path: str | os.PathLike[str]) -> pd.DataFrame:
 def read_final_tests(path: str | os.PathLike[str]) -> pd.DataFrame:
     """Return a ``final.csv``, one row per seed, task and kind of demonstrations.
 
-    ``task_inference`` is NaN for algorithms without GWR-B.
+    ``task_inference`` is NaN for algorithms without GWR-B. ``steps``, those of a success, is NaN
+    without one, and if it is not stored.
 
     Raises:
         ValueError: If the file is missing, or a row is invalid.
     """
-    return read_table(path, _FINAL, "remove the file and resume the run, which tests again")
+    remedy = "remove the file and resume the run, which tests again"
+    return read_table(path, _FINAL, _STEPS, remedy)
 
 
 def read_json(

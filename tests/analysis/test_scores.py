@@ -9,7 +9,7 @@ import pytest
 from bgpo_trl.analysis import scores
 from bgpo_trl.analysis.comparison import read_run
 from bgpo_trl.analysis.scores import expected_own_episodes, forward_transfer, own_areas
-from tests.analysis.runs import NAN, STARTS, TASKS, make_run, write_run, write_training
+from tests.analysis.runs import NAN, STARTS, make_run, write_run, write_training
 from tests.analysis.runs import SUCCESS as SUCCESS_OF_RUN
 
 # Two tasks in the order of their presentation, evaluated after 10, 20, 30 and 40 episodes; task 2
@@ -177,28 +177,31 @@ def test_own_episodes_by_task_and_seed(tmp_path):
     assert scores.own_episodes(run, 0.8)[2].tolist() == [INF, INF, 26]
 
 
-def test_success_lengths_average_late_successes(tmp_path):
+def test_steps_of_late_successes_by_seed_and_task(tmp_path):
     path = write_run(tmp_path, "bgpo", [2, 4, 0]) / "eval.csv"
     # Tests 0 and 1 of seed 0 and 0 to 3 of seed 1 succeed, in 5, 6, ... steps.
-    expected = (5 + 6 + 5 + 6 + 7 + 8) / 6
-    lengths = scores.success_lengths(read_run(path.parent))
-    assert lengths == pytest.approx(dict.fromkeys(TASKS, expected))
+    expected = [[(5 + 6) / 2] * 3, [(5 + 6 + 7 + 8) / 4] * 3, [NAN] * 3]
+    np.testing.assert_allclose(scores.success_steps(read_run(path.parent)), expected)
     rows = [line.rsplit(",", 1)[0] for line in path.read_text().splitlines()]
     path.write_text("\n".join(rows) + "\n")
-    assert scores.success_lengths(read_run(path.parent)) == {}
+    assert np.isnan(scores.success_steps(read_run(path.parent))).all()
+    run = make_run(tasks="abc", demonstrated_steps={"c": 3.0, "a": 1.0, "other": 9.0})
+    np.testing.assert_array_equal(scores.demonstrated_steps(run), [1, NAN, 3])
 
 
 def test_final_tests_by_seed_and_task(tmp_path):
     run = read_run(write_run(tmp_path, "bgpo", [5, 5], tasks=("b", "a"), starts=(0, 0)))
-    assert scores.final_shares(run, "seen", "success") is None
-    head = "seed,demonstrations,task,episodes,success,task_inference\n"
+    assert scores.final_means(run, "seen", "success") is None
+    head = "seed,demonstrations,task,episodes,success,steps,task_inference\n"
     cells = {(0, "a"): 0.1, (0, "b"): 0.2, (1, "a"): 0.3, (1, "b"): 0.4}
-    rows = [f"{seed},seen,{task},20,{share},\n" for (seed, task), share in cells.items()]
+    steps = {(0, "a"): "", (0, "b"): 12.5, (1, "a"): 9, (1, "b"): 8}
+    rows = [f"{s},seen,{task},20,{share},{steps[s, task]},\n" for (s, task), share in cells.items()]
     (run.directory / "final.csv").write_text(head + "".join(rows))
-    assert scores.final_shares(run, "seen", "success").tolist() == [[0.2, 0.1], [0.4, 0.3]]
-    assert scores.final_shares(run, "seen", "task_inference") is None
+    assert scores.final_means(run, "seen", "success").tolist() == [[0.2, 0.1], [0.4, 0.3]]
+    np.testing.assert_array_equal(scores.final_means(run, "seen", "steps"), [[12.5, NAN], [8, 9]])
+    assert scores.final_means(run, "seen", "task_inference") is None
     with pytest.raises(ValueError, match="lacks tests with held-out demonstrations: remove it"):
-        scores.final_shares(run, "held-out", "success")
+        scores.final_means(run, "held-out", "success")
 
 
 @pytest.mark.parametrize(

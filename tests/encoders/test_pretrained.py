@@ -7,11 +7,13 @@ import pytest
 import torch
 
 from bgpo_trl.data.dataset import load_demonstrations, read_meta
-from bgpo_trl.encoders import pretrained, train
+from bgpo_trl.encoders import pretrained
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.encoders.representation import load_representation, save_representation
 from bgpo_trl.encoders.train import make_pretrained
+from bgpo_trl.experiments import make_data
 from bgpo_trl.experiments import run as experiment
+from bgpo_trl.experiments.arguments import EncodersArguments
 from bgpo_trl.experiments.run import pretrained_for
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.runs.config_file import Digests
@@ -68,10 +70,10 @@ def test_made_encoders_and_bank_are_loaded(made, folder):
 
 def test_the_command_does_not_overwrite_shipped_weights_unasked(made, folder, monkeypatch):
     written = []
-    monkeypatch.setattr(train, "train_encoders", lambda *given, **named: written.append(given[2]))
-    asked = train.Arguments(folder / "demonstrations", folder=folder / "own")
-    train.main(asked)
-    train.main(replace(asked, weights=folder / "mine.safetensors"))
+    monkeypatch.setattr(make_data, "train_encoders", lambda *given, **_: written.append(given[2]))
+    asked = EncodersArguments(folder / "demonstrations", folder=folder / "own")
+    make_data.encoders(asked)
+    make_data.encoders(replace(asked, weights=folder / "mine.safetensors"))
     assert written == [folder / "own" / "encoders.safetensors", folder / "mine.safetensors"]
 
 

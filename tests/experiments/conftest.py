@@ -4,6 +4,7 @@ import shutil
 from dataclasses import replace
 from functools import cache
 
+import privileged_information
 import pytest
 import torch
 from tensordict.nn import TensorDictModule
@@ -12,7 +13,7 @@ from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.algorithm import Policy
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.encoders import pretrained
-from bgpo_trl.experiments import measure, privileged_information, settings
+from bgpo_trl.experiments import measure, settings
 from bgpo_trl.experiments import run as experiment
 from bgpo_trl.figures import groups, gwr
 from bgpo_trl.policy import LoadedRun
@@ -24,7 +25,7 @@ from suites.nico.base import STATE_CENTER, STATE_SCALE
 def tiny(monkeypatch, encoders, bank, make_config):
     """Untrained encoders, runs of a second and two final test episodes of each task."""
     config = make_config(episodes=6)
-    for module in (experiment, pretrained):
+    for module in (experiment, pretrained, privileged_information):
         monkeypatch.setattr(module, "load_pretrained", lambda *_, **__: (encoders, bank))
     for module in (settings, privileged_information):
         monkeypatch.setattr(module, "PRESETS", {"quick": config, "desk": config})

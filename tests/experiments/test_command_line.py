@@ -56,10 +56,8 @@ CASES = [
     ("bgpo continual --threads 0", "threads"),
     ("concurrent_tasks.py --device cuda:99", "cuda:99"),
     ("bgpo continual --config new", "--config"),
-    ("ablation.py --algorithm maml", "--algorithm"),
-    ("bgpo ablation --variant any", "--variant"),
-    ("bgpo eight-tasks --eval-every 0", "eval_every"),
-    ("bgpo privileged-information --inputs smell", "--inputs"),
+    ("eight_tasks.py --eval-every 0", "eval_every"),
+    ("studies/privileged_information.py --inputs smell", "--inputs"),
     ("speed/steps.py ppo", "no algorithm 'ppo'"),
     # tasks and their demonstrations
     ("bgpo continual --tasks juggle", "'juggle'"),
@@ -76,23 +74,23 @@ CASES = [
     ("bgpo report run", "run holds no test episode"),
     ("bgpo report run --compare", "--compare"),
     ("bgpo report run run --compare --every 0", "--every"),
-    ("bgpo aftermath empty", "empty holds no run"),
-    ("bgpo aftermath", "nobody acts"),
+    ("studies/aftermath.py empty", "empty holds no run"),
+    ("studies/aftermath.py", "nobody acts"),
     # measurements
-    ("bgpo aftermath --demonstrators --episodes 0", "--episodes"),
+    ("studies/aftermath.py --demonstrators --episodes 0", "--episodes"),
     ("bgpo groups --draws 0", "--draws"),
-    ("bgpo unknown-task --seeds 0 0", "seeds"),
-    ("bgpo unknown-task --tasks grasp_glass", "--tasks"),
-    ("bgpo tasks --starts 1", "--starts"),
-    ("bgpo tasks --pictures no-such-folder", "no-such-folder"),
+    ("studies/unknown_task.py --seeds 0 0", "seeds"),
+    ("studies/unknown_task.py --tasks grasp_glass", "--tasks"),
+    ("studies/tasks.py --starts 1", "--starts"),
+    ("studies/tasks.py --pictures no-such-folder", "no-such-folder"),
     ("speed/throughput.py --parts", "--parts"),
     ("speed/gwr.py --networks 0", "--networks"),
     # encoders
-    ("bgpo_trl.data.recording file", "cannot make the folder file"),
-    ("bgpo_trl.data.recording new --per-task 0", "held_out_per_task"),
-    ("bgpo_trl.encoders.make_bank absent new", "there is no dataset at absent"),
-    ("bgpo_trl.encoders.train empty", "empty is not a dataset"),
-    ("bgpo_trl.encoders.probes empty --weights file", "empty is not a dataset"),
+    ("bgpo record file", "cannot make the folder file"),
+    ("bgpo record new --per-task 0", "held_out_per_task"),
+    ("bgpo bank absent new", "there is no dataset at absent"),
+    ("bgpo encoders empty", "empty is not a dataset"),
+    ("bgpo probes empty --weights file", "empty is not a dataset"),
     ("suites.nico.explore --out a.jpeg", "cannot write a.jpeg"),
     # flags, in tyro's box
     ("bgpo continual --presett quick", "--presett"),
@@ -100,9 +98,9 @@ CASES = [
     ("bgpo continual --algorithm.beta 0.2 --presett quick", "--presett"),
     ("bgpo continual --algorithm.beta -1", "beta must be at least 0"),
     ("bgpo continual --episodes 1.5", "--episodes"),
-    ("bgpo privileged-information ddpg --gamma 1.5", "gamma must be between 0 and 1"),
+    ("studies/privileged_information.py ddpg --gamma 1.5", "gamma must be between 0 and 1"),
     ("bgpo watch", "Run directory"),
-    ("bgpo_trl.encoders.train empty --config.vae.batch-size 0", "batch_size must be at least"),
+    ("bgpo encoders empty --config.vae.batch-size 0", "batch_size must be at least"),
 ]
 
 
@@ -132,10 +130,11 @@ def test_without_opengl_a_command_that_renders_writes_nothing(folder, run_of, mo
     for command in (
         "bgpo continual --train-encoders --out new",
         "bgpo sweep --preset quick --out new",
-        "bgpo tasks --pictures empty",
-        "bgpo_trl.data.recording new",
+        "studies/tasks.py --pictures empty",
+        "bgpo record new",
         "suites.nico.explore --out new.gif",
-        *(f"bgpo {name} runs/bgpo" for name in ("watch", "looking", "aftermath", "one-shot")),
+        "bgpo watch runs/bgpo",
+        *(f"studies/{name}.py runs/bgpo" for name in ("looking", "aftermath", "one_shot")),
     ):
         assert exit_code(monkeypatch, command) == "error: MUJOCO_GL is 'vulkan': do not set it"
         assert capsys.readouterr() == ("", "")

@@ -7,11 +7,11 @@ import warnings
 from functools import partial
 
 import pytest
+from aftermath import AftermathArguments, aftermath
+from looking import looking
+from one_shot import OneShotArguments, one_shot
+from shared import TrainedArguments
 
-from bgpo_trl.experiments.arguments import TrainedArguments
-from bgpo_trl.experiments.nico.aftermath import AftermathArguments, aftermath
-from bgpo_trl.experiments.nico.looking import looking
-from bgpo_trl.experiments.one_shot import OneShotArguments, one_shot
 from bgpo_trl.experiments.report import ReportArguments, report
 from bgpo_trl.experiments.watch import WatchArguments, watch
 from bgpo_trl.figures.gwr import draw_growth
@@ -131,10 +131,10 @@ LOADED = {
     "no starts": settings(task_starts=[]),
 }
 COMMANDS = {
-    "watch.demonstrate": (watch, WatchArguments),
+    "bgpo_trl.experiments.watch.demonstrate": (watch, WatchArguments),
     "one_shot.measure": (one_shot, OneShotArguments),
-    "nico.looking.measure_looking": (looking, TrainedArguments),
-    "nico.aftermath.episodes_of": (aftermath, AftermathArguments),
+    "looking.measure_looking": (looking, TrainedArguments),
+    "aftermath.episodes_of": (aftermath, AftermathArguments),
 }
 """Commands that test policies, by the function that begins the work."""
 
@@ -153,7 +153,7 @@ def test_a_read_only_folder_is_refused_before_the_work(run, out, tmp_path, monke
     # For root, permissions would not make it so.
     monkeypatch.setattr(os, "access", lambda path, mode: path != tmp_path / "here")
     for work, (command, arguments) in COMMANDS.items():
-        monkeypatch.setattr(f"bgpo_trl.experiments.{work}", lambda *_: pytest.fail("has begun"))
+        monkeypatch.setattr(work, lambda *_: pytest.fail("has begun"))
         with pytest.raises(PermissionError, match=r"read-only.*--out"):
             command(arguments(run=run, out=tmp_path / out))
     with pytest.raises(PermissionError, match=r"read-only.*--out"):

@@ -25,7 +25,8 @@ pytestmark = pytest.mark.usefixtures("easy_world")
 
 def train(out, *seeds):
     """Do the job of a seed, as a command line with --resume does."""
-    arguments = Arguments(algorithm="ddpg", seeds=seeds, out=out, resume=True, preset="quick")
+    flags = ("--seeds", *map(str, seeds))
+    arguments = Arguments(algorithm="ddpg", settings=flags, out=out, resume=True, preset="quick")
     continual(arguments)
     return out
 

@@ -5,12 +5,12 @@ import sys
 from dataclasses import replace
 
 import pytest
+from one_shot import OneShotArguments, one_shot
 
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.rl import RL
 from bgpo_trl.experiments import run as experiment
 from bgpo_trl.experiments.arguments import Arguments
-from bgpo_trl.experiments.one_shot import OneShotArguments, one_shot
 from bgpo_trl.experiments.paper import continual
 from bgpo_trl.experiments.report import ReportArguments, report
 from bgpo_trl.experiments.watch import WatchArguments, watch

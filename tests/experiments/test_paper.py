@@ -14,11 +14,11 @@ from pathlib import Path
 
 import pytest
 
-from bgpo_trl.algorithms import ABLATIONS, ALGORITHMS
+from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.analysis.comparison import NAMES
 from bgpo_trl.experiments import run as experiment
-from bgpo_trl.experiments.arguments import AblationArguments, Arguments
-from bgpo_trl.experiments.paper import ablation, concurrent, continual
+from bgpo_trl.experiments.arguments import Arguments
+from bgpo_trl.experiments.paper import concurrent, continual
 from bgpo_trl.experiments.report import ReportArguments, report
 from bgpo_trl.files.checkpoint import load_checkpoint
 from bgpo_trl.runs.results import read_final_tests, read_table, read_tests
@@ -43,7 +43,9 @@ def test_an_experiment_writes_curves_figures_and_a_summary(tiny, tmp_path):
     assert "GWR-B nodes: [" in printed and "groups of behaviors: [" in printed
     assert shlex.split(printed)[-3:] == ["bgpo", "report", str(run)]
     figures = {path.name for path in (run / "figures").iterdir()}
-    assert figures == {*FIGURES, *(f"{task}.gif" for task in TASKS)}
+    solved = read_tests(run / "eval.csv")["success"].any()
+    steps = ["steps.png"] if solved else []
+    assert figures == {*FIGURES, *steps, *(f"{task}.gif" for task in TASKS)}
     assert json_of(run, "config")["task_starts"] == [0, 0, 0]
 
     tests = read_final_tests(run / "final.csv")
@@ -53,6 +55,7 @@ def test_an_experiment_writes_curves_figures_and_a_summary(tiny, tmp_path):
     )
     assert set(2 * tests["success"]) <= {0, 1, 2}
     assert tests["task_inference"].between(0, 1).all()
+    assert (tests["steps"].notna() == (tests["success"] > 0)).all()
     summary = json_of(run, "summary")
     assert re.fullmatch(r"|[0-9a-f]{7,}(-dirty)?", summary["commit"])
     assert summary["versions"]["torch"] == importlib.metadata.version("torch")
@@ -72,11 +75,8 @@ def test_an_experiment_writes_curves_figures_and_a_summary(tiny, tmp_path):
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_every_algorithm_runs_and_is_reported_under_its_name(tiniest, tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
-    if name in ABLATIONS:
-        kind, printed = "ablation", ablation(AblationArguments(variant=name))
-    else:
-        kind, printed = "concurrent", concurrent(Arguments(algorithm=name))
-    run = Path("runs", f"{kind}-{name}-quick")
+    printed = concurrent(Arguments(algorithm=name))
+    run = Path("runs", f"concurrent-{name}-quick")
     assert f"curve and figures: {run}" in printed
     config = json_of(run, "config")
     assert (config["name"], config["task_starts"]) == (name, [0, 0, 0])
@@ -118,7 +118,9 @@ def test_a_finished_run_is_only_changed_by_making_it_longer(undrawn, tmp_path, m
             assert continual(same).startswith(f"{run} is finished, all 6 episodes")
     assert contents(run) == before
 
-    others = [{"episodes": 5}, {"seeds": (3,)}, {"eval_every": 3}, {"episodes": 9, "eval_every": 3}]
+    seed, every = ("--seeds", "3"), ("--eval-every", "3")
+    others = [{"episodes": 5}, {"settings": seed}, {"settings": every}]
+    others.append({"episodes": 9, "settings": every})
     for other in others:
         with pytest.raises(ValueError, match="holds a run with other settings"):
             continual(replace(again, **other))
@@ -146,7 +148,7 @@ def test_a_run_is_continued_and_repeated_with_its_own_settings(undrawn, tmp_path
     """A run of other settings than the preset's, also when it is extended, and in its folder."""
     run = tmp_path / "run"
     begun = Arguments(
-        out=run, algorithm="bgpo-single", episodes=4, hyperparameters=("--algorithm.beta", "0.3")
+        out=run, algorithm="bgpo-single", episodes=4, settings=("--algorithm.beta", "0.3")
     )
     continual(begun)
     played = (run / "train.csv").read_text()
@@ -218,7 +220,7 @@ def test_dashboards_get_evaluations_final_tests_and_figures(tiniest, monkeypatch
     assert [step for _, step in started[-1].metrics] == [6]
     assert started[-1].media == shown
 
-    for again in ({}, {"resume": True, "seeds": (4,)}):
+    for again in ({}, {"resume": True, "settings": ("--seeds", "4")}):
         with pytest.raises(ValueError, match="holds a run"):
             continual(replace(arguments, **again))
     assert len(started) == 3  # a run that is refused starts no logger

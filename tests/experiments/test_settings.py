@@ -44,11 +44,14 @@ def test_a_flag_changes_its_setting_alone():
     changes = {"seeds": (7, 9), "task_starts": (0, 5, 5), "schedule": "sequential", "eval_every": 7}
     changes |= {"eval_episodes": 3, "checkpoint_minutes": 1.0, "spread": 0.5, "held_out": "test"}
     for name, value in changes.items():
-        config = run_config(Arguments(preset="desk", **{name: value}))
+        config = run_config(Arguments(preset="desk"), changes={"seeds": None, name: value})
         assert config == replace(PRESETS["desk"], **{name: value})
+        values = map(str, value if isinstance(value, tuple) else [value])
+        flags = (f"--{name.replace('_', '-')}", *values)
+        assert run_config(Arguments(preset="desk", settings=flags)) == config
 
     flags = ("--algorithm.beta", "0.2", "--algorithm.rl.hidden-sizes", "32", "16")
-    config = run_config(Arguments(algorithm="bgpo-single", hyperparameters=flags))
+    config = run_config(Arguments(algorithm="bgpo-single", settings=flags))
     expected = run_config(Arguments(algorithm="bgpo-single"))
     rl = replace(expected.algorithm.rl, hidden_sizes=(32, 16))
     assert config == replace(expected, algorithm=replace(expected.algorithm, beta=0.2, rl=rl))
@@ -79,7 +82,7 @@ def test_a_file_changes_the_preset_and_flags_change_the_file(tmp_path):
     expected = replace(PRESETS["desk"], name="bgpo-single", eval_every=6, algorithm=algorithm)
     of_file = Arguments(config=path, preset="desk")
     assert run_config(of_file) == expected
-    flags = replace(of_file, eval_every=9, hyperparameters=("--algorithm.beta", "0.7"))
+    flags = replace(of_file, settings=("--algorithm.beta", "0.7", "--eval-every=9"))
     changed = replace(expected, eval_every=9, algorithm=replace(algorithm, beta=0.7))
     assert run_config(flags) == changed
     other = run_config(replace(of_file, algorithm="maml"))
@@ -108,11 +111,12 @@ def test_yaml_json_and_flags_store_the_same_settings(tmp_path):
     flags = Arguments(
         algorithm="bgpo-single",
         rl="sac",
-        seeds=(3, 5),
         tasks=("grasp_glass", "push_green_to_glass"),
         episodes=600,
-        spread=1.0,
-        hyperparameters=("--algorithm.beta", "0.2", "--algorithm.rl.learning-rate", "3e-4"),
+        settings=(
+            *("--seeds", "3", "5", "--spread", "1"),
+            *("--algorithm.beta", "0.2", "--algorithm.rl.learning-rate", "3e-4"),
+        ),
     )
     asked = (flags, Arguments(config=in_yaml), Arguments(config=in_json))
     stored = [settings_of(run_config(given), Digests("a", "b")) for given in asked]
@@ -126,7 +130,7 @@ def test_yaml_json_and_flags_store_the_same_settings(tmp_path):
         ("seeds: [0, 1\nepisodes: 5", "line 2"),
         ("- seeds", "name: value"),
         ("episods: 5", "unknown setting episods"),
-        ("tasks: &all [*all]", "tasks is"),
+        ("tasks: &all [*all]", "tasks must be"),
         ("seeds: !!python/tuple [1]", "line 1"),
     ],
 )
@@ -141,14 +145,15 @@ def test_a_yaml_file_that_is_damaged_or_has_wrong_settings_is_refused(
 @pytest.mark.parametrize(
     ("wrong", "cause"),
     [
-        ({"episodes": 10, "eval_every": 50}, "eval_every"),
+        ({"episodes": 10, "settings": ("--eval-every", "50")}, "eval_every"),
         ({"tasks": ("dance",)}, "'dance'"),
         ({"rl": "ppo"}, "'ppo'"),
         ({"algorithm": "bgpo-paper", "rl": "sac"}, "bgpo-paper"),
         ({"algorithm": "maml", "rl": "td3"}, "MAML"),
-        ({"task_starts": (0, 5, 5)}, "--task-starts"),  # where all tasks begin at once
+        # Where all tasks begin at once.
+        ({"settings": ("--task-starts", "0", "5", "5")}, "--task-starts"),
     ],
 )
 def test_wrong_settings_are_refused(wrong, cause):
     with pytest.raises(ValueError, match=cause):
-        run_config(Arguments(**wrong), from_start="task_starts" in wrong)
+        run_config(Arguments(**wrong), from_start=cause == "--task-starts")

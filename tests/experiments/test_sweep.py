@@ -8,7 +8,9 @@ from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
 
+import eight_tasks
 import pytest
+from eight_tasks import EightTasksArguments
 
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.configs import PRESETS
@@ -17,7 +19,7 @@ from bgpo_trl.experiments import ray_jobs as jobs
 from bgpo_trl.experiments import run as experiment
 from bgpo_trl.experiments.ray_jobs import Job
 from bgpo_trl.experiments.report import ReportArguments, report
-from bgpo_trl.experiments.sweep import EightTasksArguments, SweepArguments
+from bgpo_trl.experiments.sweep import SweepArguments
 from bgpo_trl.runs.config_file import Digests, settings_of
 from bgpo_trl.runs.cost import Cost, read_costs, write_costs
 from suites import nico
@@ -105,7 +107,7 @@ def test_the_benchmark_of_eight_tasks_is_a_grid_with_tests_every_50_episodes(mon
     asked = []
     monkeypatch.setattr(sweep, "sweep", lambda arguments: asked.append(arguments) or "done")
     for episodes in (4_000, 20):
-        assert sweep.eight_tasks(EightTasksArguments(episodes=episodes)) == "done"
+        assert eight_tasks.eight_tasks(EightTasksArguments(episodes=episodes)) == "done"
     assert [arguments.eval_every for arguments in asked] == [50, 20]
     grid = sweep.make_jobs(asked[0])
     assert len(grid) == 3 * 8

@@ -18,8 +18,7 @@ from bgpo_trl.figures.frames import plot_frame_strips, save_gif
 from bgpo_trl.figures.gwr import plot_gwr_growth, plot_gwr_pca
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.figures.success import (
-    plot_success_bars,
-    plot_success_by,
+    plot_step_curves,
     plot_success_curves,
     plot_success_matrices,
 )
@@ -29,12 +28,13 @@ TASKS = ["grasp_glass", "push_green_to_glass", "push_green_to_white"]
 
 @pytest.fixture
 def write(tmp_path):
-    """Writes an eval.csv from algorithm, seed, episode, task and success of each test."""
+    """Writes an eval.csv from algorithm, seed, episode, task, success and steps (30) of tests."""
 
-    def write(rows: Iterable[tuple[str, int, int, str, int]]) -> Path:
+    def write(rows: Iterable[tuple[str, int, int, str, int] | tuple[str, int, int, str, int, int]]):
         lines = ["algorithm,seed,episode,env_steps,task,success,return,steps"]
-        for algorithm, seed, episode, task, success in rows:
-            lines.append(f"{algorithm},{seed},{episode},{30 * episode},{task},{success},0.0,30")
+        for algorithm, seed, episode, task, success, *steps in rows:
+            cells = (algorithm, seed, episode, 30 * episode, task, success, 0.0, *(steps or [30]))
+            lines.append(",".join(map(str, cells)))
         (tmp_path / "eval.csv").write_text("\n".join(lines) + "\n")
         return tmp_path / "eval.csv"
 
@@ -107,6 +107,21 @@ def test_task_starts_and_random_success_are_marked(run):
     assert labels == ["BGPO (2 seeds)", "MAML (2 seeds)", "Dist-NLL (2 seeds)", "random policy"]
 
 
+def test_steps_are_means_over_successes(write):
+    rows = [("bgpo", 0, 1, "a", 1, 20), ("bgpo", 0, 2, "a", 0, 50), ("bgpo", 0, 3, "a", 1, 10)]
+    rows += [("bgpo", 1, 1, "a", 0, 50), ("bgpo", 1, 3, "a", 1, 30), ("bgpo", 1, 3, "b", 0, 50)]
+    figure = plot_step_curves(write(rows), demonstrated={"a": 28.0}, window=2)
+    overall, a, b = figure.axes
+    # Seed 0: 20, 20, 10 (the failure has no steps, and episode 1 is out of the window).
+    assert curve(overall) == curve(a) == {1: 20, 2: 20, 3: (10 + 30) / 2}
+    assert curve(b) == {}
+    assert [len(axes.lines) for axes in (overall, a, b)] == [2, 2, 1]  # one is for the legend
+    assert list(a.lines[1].get_ydata()) == [28, 28]
+    assert figure.legends[0].get_texts()[1].get_text() == "demonstrations"
+    for panel in figure.axes:
+        assert panel.get_ylim() == pytest.approx((0, 33))
+
+
 def test_the_same_data_gives_the_same_file_without_global_state(run, tmp_path):
     before = dict(mpl.rcParams)
     for name in ("first", "second"):
@@ -164,6 +179,8 @@ def test_no_label_is_cut_off_or_overlaps_another(n_tasks, algorithms, write):
     check_labels(
         plot_success_curves(write(rows), presented=presented, random_success={tasks[0]: 0.1})
     )
+    won = write((*row[:4], 1) for row in rows)
+    check_labels(plot_step_curves(won, presented=presented, demonstrated={tasks[0]: 28.0}))
     nodes, numbers = np.random.default_rng(0).normal(size=(50, 8)), np.arange(50)
     check_labels(plot_gwr_pca(nodes, numbers % (n_tasks + 1) - 1, tasks, numbers % n_tasks))
     panels = {f"Dist-NLL + demonstrations {number}": np.eye(n_tasks) for number in range(5)}
@@ -188,40 +205,10 @@ def test_a_panel_shows_the_matrix_as_colors_and_numbers():
     assert [label.get_text() for label in two.get_yticklabels()] == ["1", "2"]
 
 
-def test_bars_are_means_with_their_intervals():
-    success = {"seen": [[0.5, 1.0], [0.7, 1.0], [0.6, 1.0]], "hidden": [[0.0, 0.2]]}
-    (axes,) = plot_success_bars(success, ["grasp_glass", "push_green_to_white"]).axes
-    heights = [bar.get_height() for bar in axes.patches]
-    assert heights == pytest.approx([0.6, 1.0, 0.0, 0.2])
-    centers = [bar.get_x() + bar.get_width() / 2 for bar in axes.patches]
-    assert centers == pytest.approx([-0.2, 0.8, 0.2, 1.2])
-    # The t value for three seeds is 4.303; one seed has no interval and no dots.
-    intervals, dots = axes.collections
-    found = np.array([segment[:, 1] for segment in intervals.get_segments()])
-    half = 4.303 * 0.1 / np.sqrt(3)
-    assert found == pytest.approx(np.array([[0.6 - half, 0.6 + half], [1, 1]]), abs=1e-3)
-    assert sorted(dots.get_offsets()[:, 1]) == pytest.approx([0.5, 0.6, 0.7, 1, 1, 1])
-
-
-def test_lines_pass_through_the_means_and_dots_are_seeds():
-    success = {1.0: [[0.2, 0.9], [0.6, 0.7]], 0.0: [[1.0, 0.5], [0.8, 0.5]]}
-    figure = plot_success_by(success, ["grasp_glass", "lift_green"], label="Spread")
-    (axes,) = figure.axes
-    lines = {str(line.get_label()): line.get_xydata() for line in axes.lines}
-    assert lines["grasp glass"] == pytest.approx(np.array([[0, 0.9], [1, 0.4]]))
-    assert lines["lift green"] == pytest.approx(np.array([[0, 0.5], [1, 0.8]]))
-    dots = np.concatenate([found.get_offsets() for found in axes.collections])
-    expected = [(number, rate) for number, scores in success.items() for rate in np.ravel(scores)]
-    assert sorted(map(tuple, dots.tolist())) == sorted(expected)
-    assert axes.get_xlabel() == "Spread"
-
-
 REFUSED = {
     "no test episodes": lambda: plot_success_curves({}),
     "row and a column per task, not [2, 2]": lambda: plot_success_matrices({"one": FIRST}, "abc"),
     "not none": lambda: plot_success_matrices({}, "ab"),
-    "success must be [seeds, 2] by": lambda: plot_success_bars({"seen": [[0.5]]}, "ab"),
-    "success must be [seeds, 2] by condition, got []": lambda: plot_success_by({}, "ab", label="x"),
     "nothing to show": lambda: plot_frame_strips({"none": np.zeros((0, 2, 2, 3), np.uint8)}),
     "uint8 [T, H, W, 3]": lambda: save_gif(np.zeros((1, 2, 3, 3)), "none.gif"),
     "N, d >= 2, not [1, 4]": lambda: plot_gwr_pca(np.zeros((1, 4)), [0], "ab"),

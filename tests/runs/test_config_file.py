@@ -53,10 +53,10 @@ class MixedConfig(BGPOConfig):
     rate: int | float = 0.5
 
 
-def test_settings_that_could_not_be_read_are_not_written():
-    for algorithm, said in ((ListConfig(), r"widths is \[1, 2\]"), (MixedConfig(), "rate is 0.5")):
-        with pytest.raises(ValueError, match=rf"cannot hold the setting algorithm.{said}"):
-            settings_of(RunConfig(algorithm=algorithm), Digests("abc", "def"))
+def test_settings_that_could_not_be_read_are_not_made():
+    for kind, name in ((ListConfig, "widths"), (MixedConfig, "rate")):
+        with pytest.raises(ValueError, match=f"{name} is annotated .*, which config.json cannot"):
+            kind()
 
 
 def test_missing_settings_get_their_defaults(tmp_path):
@@ -76,8 +76,8 @@ def nested(**rl):
     [
         ({"color": 1}, "unknown setting color"),
         (nested(momentum=0.9), "unknown setting algorithm.rl.momentum"),
-        (nested(gamma="0.9"), "algorithm.rl.gamma is '0.9'"),
-        (nested(hidden_sizes=[5, 0.5]), "algorithm.rl.hidden_sizes is 0.5"),
+        (nested(gamma="0.9"), "algorithm.rl: gamma must be a number, got 0.9"),
+        (nested(hidden_sizes=[5, 0.5]), "algorithm.rl: hidden_sizes must be a tuple, each a whole"),
         (nested(name="ppo"), "algorithm.rl.name is 'ppo', not a known RL algorithm"),
         ({"algorithm": 3}, "no settings of a run"),
         ({"name": "mine", "algorithm_class": "os.path"}, "of 'mine', whose hyperparameters no im"),

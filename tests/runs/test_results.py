@@ -12,12 +12,14 @@ from bgpo_trl.runs.results import (
     SHARE,
     archive_run,
     read_curves,
+    read_final_tests,
     read_table,
     read_tests,
 )
 from tests.analysis.runs import write_run, write_training
 from tests.helpers import contents
 
+NAN = np.nan
 HEAD = "algorithm,seed,episode,env_steps,task,success,return,steps\n"
 
 
@@ -72,6 +74,17 @@ def test_an_invalid_cell_is_reported_with_its_line(tmp_path, kind, valid, wrong)
         path.write_text(f"{text}1,{cell}\n1,{cell}\n")
         with pytest.raises(ValueError, match=rf"x\.csv, line {2 + len(valid)} is damaged"):
             read_table(path, {"cell": kind})
+
+
+def test_steps_may_be_empty_or_missing_but_not_damaged(tmp_path):
+    head, row = "seed,demonstrations,task,success,task_inference", "0,seen,a,0.5,"
+    path = tmp_path / "final.csv"
+    for more, cell, steps in (("", "", NAN), (",steps", ",", NAN), (",steps", ",12.5", 12.5)):
+        path.write_text(f"{head}{more}\n{row}{cell}\n")
+        np.testing.assert_array_equal(read_final_tests(path)["steps"], [steps])
+    path.write_text(f"{head},steps\n{row},-3\n")
+    with pytest.raises(ValueError, match="line 2 is damaged: remove the file and resume"):
+        read_final_tests(path)
 
 
 def test_a_line_with_too_many_cells_is_refused(tmp_path):

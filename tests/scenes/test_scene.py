@@ -6,6 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
+from one_shot import OneShotArguments, one_shot
 from tensordict import TensorDict
 from torchrl.envs import check_env_specs
 
@@ -15,7 +16,6 @@ from bgpo_trl.data.dataset import load_demonstrations, write_demonstrations
 from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.encoders.train import make_pretrained, train_encoders
 from bgpo_trl.evaluation import evaluate_random_policy
-from bgpo_trl.experiments.one_shot import OneShotArguments, one_shot
 from bgpo_trl.experiments.watch import WatchArguments, watch
 from bgpo_trl.policy import load_run
 from bgpo_trl.runs.results import TRAIN, read_table

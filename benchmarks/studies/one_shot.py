@@ -1,32 +1,36 @@
-"""Success and task inference against the share of the demonstration that is shown."""
+"""Success and task inference against the share of the demonstration that is shown.
+
+python benchmarks/studies/one_shot.py runs/continual-bgpo-quick
+"""
 
 from __future__ import annotations
 
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 import torch
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
+from shared import TrainedArguments
 
 from bgpo_trl.analysis.tables import Table, markdown
 from bgpo_trl.analysis.task_inference import task_inference_accuracy
-from bgpo_trl.experiments.arguments import TrainedArguments
+from bgpo_trl.data.bank import DemonstrationBank
+from bgpo_trl.data.recording import record_demonstrations
+from bgpo_trl.encoders.representation import embed_demonstrations
+from bgpo_trl.evaluation import Evaluator, Snapshot
+from bgpo_trl.experiments.command_line import command_line
 from bgpo_trl.experiments.episodes import evaluator_of
 from bgpo_trl.figures.style import COLORS, add_legend, readable, save_figure, style_axes
 from bgpo_trl.files.writing import check_folder
 from bgpo_trl.machine import set_threads
 from bgpo_trl.plugins import import_plugin
+from bgpo_trl.policy import TrainedPolicy, load_run
 from bgpo_trl.runs.provenance import commit_of_code, write_measurement
 from bgpo_trl.seeding import stream_seed
-
-if TYPE_CHECKING:
-    from bgpo_trl.evaluation import Evaluator
-    from bgpo_trl.policy import TrainedPolicy
 
 # Number of the evaluation; it seeds start states that neither training nor final tests used.
 _NUMBER = 2**31 + 1
@@ -60,9 +64,6 @@ def show(
         A row of each seed and task, with the success, the share of demonstrations whose task was
         inferred, and the mean activity; the last two are NaN without GWR-B.
     """
-    from bgpo_trl.data.bank import DemonstrationBank
-    from bgpo_trl.evaluation import Snapshot
-
     algorithm, seeds = policy.algorithm, policy.config.seeds
     n_tasks, n_seeds = len(task), len(seeds)
     snapshots = []
@@ -101,9 +102,6 @@ def measure(
     Raises:
         ValueError: If a share is not in (0, 1], or ``episodes`` is less than 1.
     """
-    from bgpo_trl.data.recording import record_demonstrations
-    from bgpo_trl.encoders.representation import embed_demonstrations
-
     if not shares or not all(0 < share <= 1 for share in shares):
         raise ValueError(f"--shares are in (0, 1], got {', '.join(map(str, shares)) or 'none'}")
     if episodes < 1:
@@ -190,8 +188,6 @@ def one_shot(arguments: OneShotArguments) -> str:
         ValueError: If the run cannot be loaded, or a share is not in (0, 1].
         OSError: If the results cannot be written.
     """
-    from bgpo_trl.policy import load_run
-
     commit, out = commit_of_code(), arguments.out or arguments.run
     import_plugin(arguments.module)
     set_threads(arguments.threads)
@@ -208,3 +204,7 @@ def one_shot(arguments: OneShotArguments) -> str:
             from_gwr = ["", ""] if np.isnan(inferred) else [f"{inferred:.1%}", f"{activity:.2f}"]
             table.append([task, f"{share:.0%}", f"{success:.1%}", *from_gwr])
     return markdown(table)
+
+
+if __name__ == "__main__":
+    command_line(one_shot)

@@ -4,16 +4,15 @@ import json
 import shutil
 from itertools import product
 
+import looking
 import numpy as np
 import pytest
 import torch
+from looking import Row, plot_bars
 from scipy.spatial.transform import Rotation
+from shared import TrainedArguments, load_blocks
 from tensordict import TensorDict
 
-from bgpo_trl.experiments.arguments import TrainedArguments
-from bgpo_trl.experiments.episodes import load_blocks
-from bgpo_trl.experiments.nico import looking
-from bgpo_trl.experiments.nico.looking import Row
 from bgpo_trl.runs.results import read_table
 from bgpo_trl.scenes.nico import HidingEnv, NicoEnv
 from suites import nico
@@ -195,3 +194,18 @@ def test_a_merged_run_is_tested_by_its_blocks(run_of):
         shutil.copytree(run, merged / block)
     shutil.copy(run / "config.json", merged)
     assert [loaded.config.seeds for loaded in load_blocks(merged)] == [(3, 8), (3, 8)]
+
+
+def test_bars_are_means_with_their_intervals():
+    success = {"seen": [[0.5, 1.0], [0.7, 1.0], [0.6, 1.0]], "hidden": [[0.0, 0.2]]}
+    (axes,) = plot_bars(success, ["grasp_glass", "push_green_to_white"]).axes
+    heights = [bar.get_height() for bar in axes.patches]
+    assert heights == pytest.approx([0.6, 1.0, 0.0, 0.2])
+    centers = [bar.get_x() + bar.get_width() / 2 for bar in axes.patches]
+    assert centers == pytest.approx([-0.2, 0.8, 0.2, 1.2])
+    # The t value for three seeds is 4.303; one seed has no interval and no dots.
+    intervals, dots = axes.collections
+    found = np.array([segment[:, 1] for segment in intervals.get_segments()])
+    half = 4.303 * 0.1 / np.sqrt(3)
+    assert found == pytest.approx(np.array([[0.6 - half, 0.6 + half], [1, 1]]), abs=1e-3)
+    assert sorted(dots.get_offsets()[:, 1]) == pytest.approx([0.5, 0.6, 0.7, 1, 1, 1])

@@ -1,9 +1,9 @@
 """The tables and the pictures of the suite's tasks."""
 
 import numpy as np
+import tasks as nico_tasks
 from PIL import Image
 
-from bgpo_trl.experiments.nico import tasks as nico_tasks
 from suites import nico
 
 

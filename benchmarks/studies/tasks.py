@@ -1,4 +1,7 @@
-"""Tasks of the suite: demonstrators, random actions, and the spread of the starts."""
+"""Tasks of the suite: demonstrators, random actions, and the spread of the starts.
+
+python benchmarks/studies/tasks.py
+"""
 
 from __future__ import annotations
 
@@ -13,6 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from bgpo_trl.analysis.tables import Table, markdown
+from bgpo_trl.experiments.command_line import command_line
 from bgpo_trl.files.writing import check_folder, write_whole
 from suites import nico, opengl
 from suites.nico.base import CONTROL_TIMESTEP, TIME_LIMIT, Environment
@@ -172,3 +176,7 @@ def tasks(arguments: TasksArguments) -> str:
             write_whole(path, content.getvalue())
             found += f"\npicture: {path}"
     return "\n\n".join([markdown(table), markdown(spread), found])
+
+
+if __name__ == "__main__":
+    command_line(tasks)

@@ -4,14 +4,14 @@ import json
 from itertools import product
 
 import numpy as np
+import one_shot
 import pandas as pd
 import pytest
 import torch
+from one_shot import OneShotArguments
 
 from bgpo_trl import load_run
 from bgpo_trl.data.recording import record_demonstrations
-from bgpo_trl.experiments import one_shot
-from bgpo_trl.experiments.one_shot import OneShotArguments
 from suites import nico
 from tests.helpers import cells, rows
 

@@ -4,13 +4,13 @@ import json
 from dataclasses import replace
 
 import pytest
-
-from bgpo_trl.configs import DDPGConfig
-from bgpo_trl.experiments.privileged_information import (
+from privileged_information import (
     INPUTS,
     InformationArguments,
     privileged_information,
 )
+
+from bgpo_trl.configs import DDPGConfig
 from bgpo_trl.files.checkpoint import load_checkpoint
 from bgpo_trl.runs.results import read_table
 from suites import nico

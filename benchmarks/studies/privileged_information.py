@@ -1,4 +1,7 @@
-"""Which part limits learning: one learner with less and less given information."""
+"""Which part limits learning: one learner with less and less given information.
+
+python benchmarks/studies/privileged_information.py
+"""
 
 from __future__ import annotations
 
@@ -9,15 +12,19 @@ from typing import Annotated, Any
 
 from tyro.conf import subcommand
 
+from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.analysis.comparison import read_run
 from bgpo_trl.analysis.scores import episodes_to_80, late_scores
 from bgpo_trl.analysis.statistics import mean
 from bgpo_trl.analysis.tables import Table, markdown
 from bgpo_trl.configs import PRESETS, DDPGConfig, SACConfig, TD3Config
+from bgpo_trl.encoders.pretrained import load_pretrained
+from bgpo_trl.experiments.command_line import command_line
 from bgpo_trl.experiments.settings import chosen
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.figures.success import plot_success_curves
 from bgpo_trl.machine import choose_device, set_threads
+from bgpo_trl.training import Trainer
 
 INPUTS: dict[str, tuple[str, dict[str, Any]]] = {
     "state+label": ("oracle", {"state": "state"}),
@@ -69,10 +76,6 @@ def privileged_information(arguments: InformationArguments) -> str:
     Raises:
         ValueError: If an input is unknown or repeated, or a directory holds another run.
     """
-    from bgpo_trl.algorithms import ALGORITHMS
-    from bgpo_trl.encoders.pretrained import load_pretrained
-    from bgpo_trl.training import Trainer
-
     names = arguments.inputs
     if not names or len(set(names)) < len(names):
         raise ValueError(f"--inputs: name some of {', '.join(INPUTS)}, each once")
@@ -109,3 +112,7 @@ def privileged_information(arguments: InformationArguments) -> str:
         last = "not reached" if math.isinf(reached) else f"{reached:.0f}"
         table.append([name, *shares, mean(late.mean(1)).percent(), last])
     return markdown(table)
+
+
+if __name__ == "__main__":
+    command_line(privileged_information)

@@ -1,37 +1,44 @@
 """The test of looking: success of a trained policy that is not shown where the objects are.
 
+    python benchmarks/studies/looking.py runs/continual-bgpo-quick
+
 A policy that has learned one movement for all starts succeeds without looking. The simulation is
 always the true one; what is altered is the picture of it that the policy gets.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike, NDArray
+from shared import (
+    TrainedArguments,
+    load_blocks_of_nico,
+    play,
+    random_actions,
+    style_success,
+)
 
 from bgpo_trl.analysis import statistics
 from bgpo_trl.analysis.tables import Table, markdown
-from bgpo_trl.experiments.arguments import TrainedArguments
+from bgpo_trl.evaluation import start_seeds
+from bgpo_trl.experiments.command_line import command_line
 from bgpo_trl.experiments.episodes import evaluator_of, snapshots_of
-from bgpo_trl.experiments.nico.scripted import load_blocks_of_nico, play, random_actions
-from bgpo_trl.figures.style import save_figure
-from bgpo_trl.figures.success import plot_success_bars
+from bgpo_trl.figures.style import COLORS, readable, save_figure
 from bgpo_trl.files.progress import progress_bar
 from bgpo_trl.files.writing import check_folder
 from bgpo_trl.machine import set_threads
 from bgpo_trl.plugins import import_plugin
+from bgpo_trl.policy import LoadedRun
 from bgpo_trl.runs.provenance import commit_of_code, write_measurement
+from bgpo_trl.scenes.nico import NICO, Hidden, HidingEnv
 from suites import opengl
-
-if TYPE_CHECKING:
-    from bgpo_trl.policy import LoadedRun
-    from bgpo_trl.scenes.nico import Hidden
 
 VIEWS: dict[str, Hidden | None] = {
     "seen": None,
@@ -72,8 +79,6 @@ def measure_looking(
     Raises:
         ValueError: If ``episodes`` is less than 1.
     """
-    from bgpo_trl.scenes.nico import NICO, HidingEnv
-
     if episodes < 1:
         raise ValueError(f"--episodes must be at least 1, got {episodes}")
     config, found = run.config, {}
@@ -98,8 +103,6 @@ def measure_looking(
 
 def _by_chance(run: LoadedRun, seed: int, episodes: int) -> NDArray[np.float64]:
     """Return the success of random actions from a seed's starts, ``[T]``."""
-    from bgpo_trl.evaluation import start_seeds
-
     tasks, max_steps = run.config.tasks, run.config.algorithm.max_steps
     starts = start_seeds(seed, _NUMBER, (len(tasks), episodes))
     played = play(tasks, starts, seed, random_actions, max_steps, run.config.spread)
@@ -129,6 +132,51 @@ def looking_table(rows: Iterable[Row]) -> Table:
     return table
 
 
+_WIDTH = 0.8  # of the bars of a task, whose centers are 1 apart
+
+
+def plot_bars(success: Mapping[str, ArrayLike], tasks: Sequence[str]) -> Figure:
+    """Plot the success on each task as a group of bars, one for each condition.
+
+    Bars are means over seeds, with 95 % t intervals if there are at least two seeds, and a dot for
+    each seed.
+
+    Args:
+        success: Success in [0, 1] of each seed and task, ``[S, T]``, by condition.
+        tasks: Names of the tasks.
+    """
+    found = {name: np.asarray(scores, float) for name, scores in success.items()}
+    width = max(3.6, 1.0 + 0.28 * len(tasks) * len(found))  # inches
+    figure = Figure(figsize=(width, 3.2), layout="constrained")
+    axes = figure.add_subplot()
+    slim = _WIDTH / len(found)
+    for number, (name, scores) in enumerate(found.items()):
+        mean = scores.mean(0)
+        places = np.arange(len(tasks)) + (number - (len(found) - 1) / 2) * slim
+        color = COLORS[number % len(COLORS)]
+        axes.bar(places, mean, slim * 0.9, color=color, alpha=0.75, label=name)
+        if len(scores) > 1:
+            low, high = np.clip(np.transpose([statistics.mean(s)[1:] for s in scores.T]), 0.0, 1.0)
+            axes.errorbar(
+                places, mean, [mean - low, high - mean], fmt="none", ecolor="0.2", elinewidth=0.9
+            )
+            around = np.linspace(-0.2, 0.2, len(scores)) * slim
+            axes.scatter(
+                np.add.outer(around, places),
+                scores,
+                s=4,
+                color="0.2",
+                linewidths=0,
+                zorder=3,
+                clip_on=False,
+            )
+    names = [readable(task).replace(" to ", "\nto ") for task in tasks]
+    axes.set_xticks(range(len(tasks)), names)
+    style_success(figure, axes)
+    axes.grid(visible=False, axis="x")
+    return figure
+
+
 def looking(arguments: TrainedArguments) -> str:
     """Test the policies of a run with the places of the objects hidden from them.
 
@@ -154,5 +202,9 @@ def looking(arguments: TrainedArguments) -> str:
             rows += measure_looking(run, arguments.episodes, bar.update)
     write_measurement(out, "looking", pd.DataFrame(rows), commit)
     tasks, success = success_by_condition(rows)
-    save_figure(plot_success_bars(success, tasks), out / "looking.png")
+    save_figure(plot_bars(success, tasks), out / "looking.png")
     return markdown(looking_table(rows))
+
+
+if __name__ == "__main__":
+    command_line(looking)

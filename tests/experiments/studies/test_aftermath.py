@@ -5,14 +5,14 @@ from dataclasses import replace
 from functools import cache
 from itertools import product
 
+import aftermath
 import numpy as np
 import pytest
 import torch
+from aftermath import CRITERIA, AftermathArguments, Continuation, Row
+from shared import play
 
 from bgpo_trl.evaluation import start_seeds
-from bgpo_trl.experiments.nico import aftermath
-from bgpo_trl.experiments.nico.aftermath import CRITERIA, AftermathArguments, Continuation, Row
-from bgpo_trl.experiments.nico.scripted import play
 from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
 from bgpo_trl.runs.results import read_table
 from suites import nico

@@ -1,25 +1,54 @@
-"""Runs of NICO, and episodes from the starts of their tests, played by scripted policies."""
+"""What studies of trained runs share: arguments, loading, episodes of scripted policies."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+import tyro
 from dm_env import TimeStep
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import PercentFormatter
 from numpy.typing import NDArray
 
-from bgpo_trl.experiments.episodes import load_blocks
+from bgpo_trl.experiments.arguments import ImportArguments
+from bgpo_trl.figures.style import add_legend, style_axes
+from bgpo_trl.files.checkpoint import has_checkpoint
+from bgpo_trl.policy import LoadedRun, load_all_seeds
 from suites import nico
 from suites.nico.base import Environment
 
-if TYPE_CHECKING:
-    from bgpo_trl.policy import LoadedRun
-
 Actor = Callable[[TimeStep], NDArray]
 """Scripted policy: maps a time step to an action ``[4]``."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainedArguments(ImportArguments):
+    """Tests of the policies of a run."""
+
+    run: tyro.conf.Positional[Path]
+    """Run directory."""
+    episodes: int = 20
+    """Test episodes per task and seed, in each condition."""
+    out: Path | None = None
+    """Folder to write to; the run directory by default."""
+    threads: int = 1
+    """Threads of PyTorch."""
+
+
+def load_blocks(run: Path) -> list[LoadedRun]:
+    """Load all seeds of a run: the run itself, or the blocks of which it was merged.
+
+    Raises:
+        ValueError: As for `load_all_seeds`.
+    """
+    blocks = sorted(path for path in run.glob("seeds-*") if has_checkpoint(path / "checkpoint"))
+    if not blocks or has_checkpoint(run / "checkpoint"):
+        blocks = [run]
+    return [load_all_seeds(block) for block in blocks]
 
 
 def load_blocks_of_nico(run: Path) -> list[LoadedRun]:
@@ -98,3 +127,12 @@ def random_actions(env: Environment, seed: int) -> Actor:
     del env
     random = np.random.default_rng(seed)
     return lambda _: random.uniform(-1.0, 1.0, 4)
+
+
+def style_success(figure: Figure, axes: Axes) -> None:
+    """Give axes of success their scale, and the figure its legend."""
+    axes.set_ylim(0, 1.02)
+    axes.set_ylabel("Success rate", fontsize=9)
+    axes.yaxis.set_major_formatter(PercentFormatter(1, decimals=0))
+    style_axes(axes)
+    add_legend(figure, *axes.get_legend_handles_labels(), figure.get_figwidth())

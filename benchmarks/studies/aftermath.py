@@ -1,5 +1,7 @@
 """The aftermath of successes: simulations continued from the states in which episodes succeed.
 
+    python benchmarks/studies/aftermath.py runs/continual-bgpo-quick
+
 A task's condition has to hold for two or three steps, and a learner finds the cheapest thing that
 pays. Here a grasped object is lifted, and what was pushed is left alone for two seconds.
 """
@@ -12,29 +14,29 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 import tyro
 from numpy.typing import NDArray
+from shared import Episode, TrainedArguments, load_blocks_of_nico, play, random_actions
 
 from bgpo_trl.analysis.tables import Table, markdown
-from bgpo_trl.experiments.arguments import TrainedArguments
+from bgpo_trl.evaluation import start_seeds
+from bgpo_trl.experiments.command_line import command_line
 from bgpo_trl.experiments.episodes import evaluator_of, snapshots_of
-from bgpo_trl.experiments.nico.scripted import Episode, load_blocks_of_nico, play, random_actions
 from bgpo_trl.files.writing import check_folder
 from bgpo_trl.machine import set_threads
 from bgpo_trl.plugins import import_plugin
+from bgpo_trl.policy import LoadedRun
 from bgpo_trl.runs.provenance import commit_of_code, write_measurement
+from bgpo_trl.scenes.nico import NicoSimulation
 from suites import nico
 from suites.nico import kinematics
 from suites.nico.base import CONTROL_TIMESTEP, TIME_LIMIT, Environment
 from suites.nico.demonstrator import Demonstrator
 from suites.nico.physics import HAND, OBJECT_HALF_HEIGHT, TABLE_HEIGHT
-
-if TYPE_CHECKING:
-    from bgpo_trl.policy import LoadedRun
 
 LIFT = 0.05  # (m) over the object's place on the table
 GAP = 0.015  # (m) between things that still count as together
@@ -201,8 +203,6 @@ class Row(NamedTuple):
 
 def policy_episodes(run: LoadedRun, episodes: int) -> list[Episode]:
     """Return the test episodes of all seeds' trained policies, as many of each task and seed."""
-    from bgpo_trl.scenes.nico import NicoSimulation  # with TorchRL, for which --help does not wait
-
     held_out = run.bank.held_out(run.config.held_out)
     evaluator, first = evaluator_of(run, held_out, episodes), list[NDArray]()
 
@@ -242,8 +242,6 @@ def scripted_episodes(
     spread: float = 1.0,
 ) -> list[Episode]:
     """Return the episodes of an entry of `SCRIPTED`, in the starts of `policy_episodes`."""
-    from bgpo_trl.evaluation import start_seeds
-
     starts = {seed: start_seeds(seed, _NUMBER, (len(tasks), episodes)) for seed in seeds}
     return [
         episode
@@ -269,7 +267,7 @@ def check_criteria(tasks: Iterable[str]) -> None:
     if missing:
         raise ValueError(
             f"nothing says what a success of {missing[0]} is worth: add a Criterion to "
-            "bgpo_trl.experiments.nico.aftermath.CRITERIA in the module of --import"
+            "aftermath.CRITERIA in the module of --import"
         )
 
 
@@ -377,3 +375,9 @@ def aftermath(arguments: AftermathArguments) -> str:
     write_measurement(out, "aftermath", table, commit)
     counts = {actor: Counter(e.task for e in of_actor) for actor, of_actor in episodes.items()}
     return markdown(aftermath_table(rows, counts))
+
+
+if __name__ == "__main__":
+    import aftermath as module  # the one whose CRITERIA a module of --import extends
+
+    command_line(module.aftermath)

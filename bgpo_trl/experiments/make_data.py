@@ -1,0 +1,75 @@
+"""Commands that make data: recordings, encoders, and banks of embedded demonstrations."""
+
+from __future__ import annotations
+
+from bgpo_trl.data.dataset import load_demonstrations, read_meta
+from bgpo_trl.data.recording import record_demonstrations
+from bgpo_trl.encoders.make_bank import make_bank
+from bgpo_trl.encoders.pretrained import default_weights
+from bgpo_trl.encoders.probes import probe
+from bgpo_trl.encoders.representation import load_representation
+from bgpo_trl.encoders.train import train_encoders
+from bgpo_trl.experiments.arguments import (
+    EncodersArguments,
+    MakeBankArguments,
+    ProbesArguments,
+    RecordArguments,
+)
+from bgpo_trl.machine import choose_device
+from bgpo_trl.plugins import import_plugin
+from bgpo_trl.runs.provenance import command
+from bgpo_trl.scenes import find_scene
+
+
+def record(arguments: RecordArguments) -> None:
+    """Record demonstrations, or random play; see `record_demonstrations`."""
+    import_plugin(arguments.module)
+    options = {name: value for name, value in vars(arguments).items() if name != "module"}
+    record_demonstrations(**options)
+
+
+def encoders(arguments: EncodersArguments) -> None:
+    """Train both encoders on recordings, and embed these; see `train_encoders`."""
+    import_plugin(arguments.module)
+    dataset, meta = load_demonstrations(arguments.dataset), read_meta(arguments.dataset)
+    scene, weights, keep = find_scene(meta["scene"]), arguments.weights, arguments.keep
+    train_encoders(
+        dataset,
+        None if arguments.play is None else load_demonstrations(arguments.play),
+        arguments.folder / "encoders.safetensors" if weights is None else weights,
+        arguments.folder,
+        arguments.config,
+        command(),
+        choose_device(arguments.device),
+        tasks=meta["tasks"],
+        spread=meta["spread"],
+        keep=None if keep is None else load_representation(keep, scene_version=scene.version),
+        scene=scene,
+    )
+
+
+def bank(arguments: MakeBankArguments) -> None:
+    """Embed a recorded dataset with trained encoders; see `make_bank`."""
+    import_plugin(arguments.module)
+    meta, weights = read_meta(arguments.dataset), arguments.weights
+    weights = default_weights(scene=meta["scene"]) if weights is None else weights
+    made = make_bank(
+        load_representation(weights, scene_version=meta["scene_version"]),
+        load_demonstrations(arguments.dataset),
+        tasks=meta["tasks"],
+        actions=arguments.actions,
+        spread=meta["spread"],
+    )
+    made.save(arguments.out)
+
+
+def probes(arguments: ProbesArguments) -> None:
+    """Evaluate trained encoders with probes; see `probe`."""
+    import_plugin(arguments.module)
+    meta, weights = read_meta(arguments.dataset), arguments.weights
+    scene = find_scene(meta["scene"])
+    weights = default_weights(meta["tasks"], scene=scene) if weights is None else weights
+    representation = load_representation(weights, scene_version=scene.version)
+    play = None if arguments.play is None else load_demonstrations(arguments.play)
+    dataset = load_demonstrations(arguments.dataset)
+    probe(representation, dataset, arguments.out, play=play, columns=scene.state)

@@ -1,1 +1,0 @@
-"""Measurements that only make sense for NICO's table."""
