@@ -46,7 +46,9 @@ _PAPER = DDPGConfig(
     imitation=0.0,
     pre_tanh_penalty=0.0,
 )
-_PUBLISHED: Any = {"rl": _PAPER, "gwr": GWRBConfig(activity_scale=1.0), "behavior_scale": 1.0}
+_LITERAL: Any = {"rl": _PAPER, "timeouts_bootstrap": False, "state_limit": None}
+_PUBLISHED: Any = {**_LITERAL, "gwr": GWRBConfig(activity_scale=1.0), "behavior_scale": 1.0}
+_OF_TASKS: Any = {**_LITERAL, "task_batch_size": 256, "share_batch": True}
 _SHOWN: Any = {"demonstration_share": 0.75, "rl": BGPOConfig().rl}
 _SHOWN_TASKS: Any = {**_SHOWN, "task_batch_size": 128}
 _SHOWN_SINGLE: Any = {**_SHOWN, "rl": replace(BGPOConfig().rl, batch_size=384)}  # of three tasks
@@ -60,12 +62,12 @@ ALGORITHMS: dict[str, Entry] = {
     "bgpo-paper": Entry(BGPO, replace(_SINGLE, **_PUBLISHED)),
     "maml": Entry(MAML, MAMLConfig()),
     "maml-demonstrations": Entry(MAML, MAMLConfig(inner_learning_rate=_INNER, **_SHOWN_TASKS)),
-    "maml-paper": Entry(MAML, MAMLConfig(rl=_PAPER, task_batch_size=256, adaptation_size=256 * 50)),
+    "maml-paper": Entry(
+        MAML, MAMLConfig(**_OF_TASKS, adaptation_size=256 * 50, adapt_to_latest=True)
+    ),
     "dist-nll": Entry(DistNLL, DistNLLConfig()),
     "dist-nll-demonstrations": Entry(DistNLL, DistNLLConfig(**_SHOWN_TASKS)),
-    "dist-nll-paper": Entry(
-        DistNLL, DistNLLConfig(rl=_PAPER, task_batch_size=256, distillation_batch_size=1_000)
-    ),
+    "dist-nll-paper": Entry(DistNLL, DistNLLConfig(**_OF_TASKS, distillation_batch_size=256)),
     "oracle": Entry(BGPO, replace(_SINGLE, context="label")),
     "oracle-demonstrations": Entry(BGPO, replace(_SINGLE, context="label", **_SHOWN_SINGLE)),
     "ddpg": Entry(BGPO, replace(_SINGLE, context=None)),
@@ -83,9 +85,9 @@ one actor and one critic; the paper's baselines, without and with demonstrations
 DDPG with the task's label (``oracle``) and without context (``ddpg``); two baselines of continual
 learning, which are given the boundaries of tasks (``fine-tuning``, ``ewc``). Names in
 ``-demonstrations`` learn from demonstrations as BGPO does. Names in ``-paper`` follow the
-publication: networks of 64 units, batches of 256, no stabilizers. The others are ``bgpo-single``
-without GWR-B, the intrinsic reward or both, or with one addition of this package. Modules of own
-algorithms may add entries."""
+publication (docs/protocol.md): networks of 64 units, batches of 256, no stabilizers. The others are
+``bgpo-single`` without GWR-B, the intrinsic reward or both, or with one addition of this package.
+Modules of own algorithms may add entries."""
 
 ABLATIONS = (
     "bgpo-single",

@@ -13,6 +13,8 @@ class VAEConfig:
 
     latent_size: int = 64
     """Dimensions of z (Sec. IV-A)."""
+    keypoints: bool = True
+    """Whether half of z are coordinates of keypoints. Ours: Sec. IV-A has a dense layer alone."""
     batch_size: int = 128
     """Frames per step, in ``batch_size / window`` windows. Ours: 256 in Sec. IV-A; on two cores
     more steps are a better use of the time."""
@@ -22,7 +24,9 @@ class VAEConfig:
     learning_rate: float = 2e-3
     """Peak learning rate of Adam. Ours: 1e-4 in Sec. IV-A, too low for so few steps."""
     warmup_steps: int = 100
-    """Steps of linear warm-up, before cosine decay to zero. Ours."""
+    """Steps of linear warm-up. Ours."""
+    decay: bool = True
+    """Whether a cosine decays the rate to zero. Ours."""
     steps: int = 4_000
     """Gradient steps. Ours: not given in the paper."""
     bfloat16: bool = False
@@ -55,7 +59,9 @@ class SequenceAutoencoderConfig:
     learning_rate: float = 1e-3
     """Peak learning rate of Adam (Sec. IV-A)."""
     warmup_steps: int = 100
-    """Steps of linear warm-up, before cosine decay to zero. Ours."""
+    """Steps of linear warm-up. Ours."""
+    decay: bool = True
+    """Whether a cosine decays the rate to zero. Ours."""
     steps: int = 5_000
     """Gradient steps. Ours: not given in the paper."""
 
@@ -80,12 +86,15 @@ class InverseModelConfig:
     learning_rate: float = 2e-3
     """Peak learning rate of Adam."""
     warmup_steps: int = 100
-    """Steps of linear warm-up, before cosine decay to zero."""
+    """Steps of linear warm-up."""
+    decay: bool = True
+    """Whether a cosine decays the rate to zero."""
     steps: int = 6_000
-    """Gradient steps."""
+    """Gradient steps; 0 for no inverse model, hence a bank without steps of demonstrations."""
 
     def __post_init__(self) -> None:
-        whole(self, 1, "hidden_size", "batch_size", "warmup_steps", "steps")
+        whole(self, 1, "hidden_size", "batch_size", "warmup_steps")
+        whole(self, 0, "steps")
         positive(self, "learning_rate", "largest_action")
         at_least(self, 0, "noise")
 
