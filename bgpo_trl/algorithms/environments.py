@@ -99,7 +99,7 @@ def observation_env(
     state: StateColumns | None = None,
 ) -> TransformedEnv:
     """Return the environment of test episodes, whose policies are already conditioned."""
-    return TransformedEnv(base_env, Compose(encode(config, encoders, state), *clip(config)))
+    return TransformedEnv(base_env, Compose([encode(config, encoders, state), *clip(config)]))
 
 
 def encode(
