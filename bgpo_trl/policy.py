@@ -124,7 +124,7 @@ class TrainedPolicy:
         self._index = run.config.seeds.index(seed)
         self.episodes = run.episodes[self._index]
         config = run.config.algorithm
-        self._observe = Compose([encode(config, run.encoders), clip(config)])
+        self._observe = Compose([encode(config, run.encoders), *clip(config)])
         self._policy: Policy | None = None
 
     def __reduce__(self) -> tuple[Any, ...]:

@@ -121,6 +121,15 @@ def test_experts_and_demonstrations_restrict_other_settings():
         BGPOConfig(group_balanced_replay=False)
 
 
+@pytest.mark.parametrize(
+    ("config", "name"),
+    [(MAMLConfig, "share_batch"), (MAMLConfig, "adapt_to_latest"), (DistNLLConfig, "share_batch")],
+)
+def test_what_the_paper_has_does_not_mix_with_demonstrations_as_experience(config, name):
+    with pytest.raises(ValueError, match=f"{name} must be off with demonstrations"):
+        config(demonstration_share=0.75, **{name: True})
+
+
 def test_config_files_hold_every_number_that_acts():
     assert None not in asdict(RunConfig()).values()
     assert None not in asdict(BGPOConfig()).values()

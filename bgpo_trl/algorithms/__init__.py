@@ -45,7 +45,9 @@ _PAPER = RLConfig(
     clip_targets=False,
     pre_tanh_penalty=0.0,
 )
-_PUBLISHED: Any = {"rl": _PAPER, "gwr": GWRBConfig(activity_scale=1.0), "behavior_scale": 1.0}
+_LITERAL: Any = {"rl": _PAPER, "timeouts_bootstrap": False, "state_limit": None}
+_PUBLISHED: Any = {**_LITERAL, "gwr": GWRBConfig(activity_scale=1.0), "behavior_scale": 1.0}
+_OF_TASKS: Any = {**_LITERAL, "task_batch_size": 256, "share_batch": True}
 _SHOWN: Any = {"demonstration_share": 0.5, "rl": SHOWN}
 _SHOWN_TASKS: Any = {**_SHOWN, "task_batch_size": 128}
 _SHOWN_SINGLE: Any = {**_SHOWN, "rl": replace(SHOWN, batch_size=384)}  # of three tasks
@@ -67,12 +69,12 @@ ALGORITHMS: dict[str, Entry] = {
     "bgpo-paper": Entry(BGPO, replace(_SINGLE, **_PUBLISHED)),
     "maml": Entry(MAML, MAMLConfig()),
     "maml-demonstrations": Entry(MAML, MAMLConfig(**_MAML)),
-    "maml-paper": Entry(MAML, MAMLConfig(rl=_PAPER, task_batch_size=256, adaptation_size=256 * 50)),
+    "maml-paper": Entry(
+        MAML, MAMLConfig(**_OF_TASKS, adaptation_size=256 * 50, adapt_to_latest=True)
+    ),
     "dist-nll": Entry(DistNLL, DistNLLConfig()),
     "dist-nll-demonstrations": Entry(DistNLL, DistNLLConfig(**_SHOWN_TASKS)),
-    "dist-nll-paper": Entry(
-        DistNLL, DistNLLConfig(rl=_PAPER, task_batch_size=256, distillation_batch_size=1_000)
-    ),
+    "dist-nll-paper": Entry(DistNLL, DistNLLConfig(**_OF_TASKS, distillation_batch_size=256)),
     "oracle": Entry(BGPO, replace(_SINGLE, context="label")),
     "oracle-demonstrations": Entry(BGPO, replace(_SINGLE, context="label", **_SHOWN_SINGLE)),
     "ddpg": Entry(BGPO, replace(_SINGLE, context=None)),
@@ -90,9 +92,10 @@ demonstrations as experience; ``bgpo-single``, which in addition has only one ac
 the paper's baselines, without and with demonstrations; two references, DDPG with the task's label
 (``oracle``) and without context (``ddpg``); two baselines of continual learning, which are given
 the boundaries of tasks (``fine-tuning``, ``ewc``). Names in ``-demonstrations`` learn from
-demonstrations as BGPO does. Names in ``-paper`` follow the publication: networks of 64 units,
-batches of 256, no stabilizers. The others are ``bgpo-single`` without GWR-B, the intrinsic reward
-or both, or with one addition of this package. Modules of own algorithms may add entries."""
+demonstrations as BGPO does. Names in ``-paper`` follow the publication (docs/protocol.md): networks
+of 64 units, batches of 256, no stabilizers. The others are ``bgpo-single`` without GWR-B, the
+intrinsic reward or both, or with one addition of this package. Modules of own algorithms may add
+entries."""
 
 ABLATIONS = (
     "bgpo-single",

@@ -116,7 +116,8 @@ class BGPO(Algorithm):
     def _highest_return(self) -> float:
         """Return the highest attainable return: a success now, or after the bonus of a time-out."""
         success = 1.0 + self.beta
-        return max(success, self.beta + self.config.rl.gamma * success)
+        after = success if self.config.timeouts_bootstrap else 0.0
+        return max(success, self.beta + self.config.rl.gamma * after)
 
     def _number(self, tensordict: TensorDictBase, key: str) -> Tensor:
         """Return an entry of `GroupLookup`, int64 ``[S]``; 0 without groups."""

@@ -65,13 +65,13 @@ def training_env(
     """
     transforms: list[Transform] = [
         encode(config, encoders, state),  # pixels -> latent
-        StepCounter(config.max_steps),
+        StepCounter(config.max_steps, "truncated" if config.timeouts_bootstrap else "terminated"),
         source,  # -> task, demo_embedding
         *(transform.clone() for transform in conditioning),  # -> behavior, group, expert, context
     ]
     if beta:
         transforms.append(match_behavior(beta, encoders))  # reward + beta * exp(-||b - phi_g||)
-    transforms.append(clip(config))
+    transforms.extend(clip(config))
     rewards = ["reward", "extrinsic_reward", "intrinsic_reward"] if beta else ["reward"]
     transforms.append(sum_rewards(*rewards))
     return TransformedEnv(base_env, Compose(transforms))
@@ -121,7 +121,7 @@ def observation_env(
     state: StateColumns | None = None,
 ) -> TransformedEnv:
     """Return the environment of test episodes, whose policies are already conditioned."""
-    return TransformedEnv(base_env, Compose([encode(config, encoders, state), clip(config)]))
+    return TransformedEnv(base_env, Compose([encode(config, encoders, state), *clip(config)]))
 
 
 def encode(
@@ -171,13 +171,14 @@ def behavior_as_context(scale: float) -> ObservationNorm:
     return ObservationNorm(0.0, scale, ["behavior"], ["context"])
 
 
-def clip(config: AlgorithmConfig) -> ClipTransform:
-    """Return the transform that bounds the observed state to ``config.state_limit``.
+def clip(config: AlgorithmConfig) -> list[Transform]:
+    """Return the transform that bounds the observed state to ``config.state_limit``, or none.
 
     An object knocked off the table is dozens of deviations away and would dominate. Clip after
     `BehaviorMatchingReward`, since demonstrations are embedded without clipping.
     """
-    return ClipTransform([config.state], low=-config.state_limit, high=config.state_limit)
+    limit = config.state_limit
+    return [] if limit is None else [ClipTransform([config.state], low=-limit, high=limit)]
 
 
 def sum_rewards(*keys: str) -> RewardSum:

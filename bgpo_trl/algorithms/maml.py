@@ -28,7 +28,7 @@ class MAML(TaskAlgorithm):
        with too few transitions are left out.
     3. Test episodes of a task are played by the policy after one gradient step on
        ``adaptation_size`` transitions of that task, of which as many are demonstrated as in an
-       update.
+       update, or on the latest ones (``adapt_to_latest``).
 
     Attributes:
         meta_actor: The policy before adaptation, stacked ``[S]``.
@@ -71,7 +71,7 @@ class MAML(TaskAlgorithm):
             return {}
         batch = self.sample_tasks()
         # Demonstrations come last; interleaving gives each half the same share of them.
-        order = torch.arange(self.config.task_batch_size).view(-1, 2).T.flatten()
+        order = torch.arange(batch.batch_size[-1]).view(-1, 2).T.flatten()
         return self.learn(batch[..., order])
 
     def snapshot(
@@ -89,13 +89,15 @@ class MAML(TaskAlgorithm):
         }
         tasks = self.ready_tasks()
         if (tasks >= 0).any():
-            draw = int(torch.randint(2**63 - 1, (), generator=generator))
-            streams = [torch.Generator().manual_seed(draw) for _ in range(self.n_seeds)]
-            data = self.sample(
-                lambda n: tasks.unsqueeze(-1).expand(-1, -1, n),
-                self.config.adaptation_size,
-                generator=streams,
-            )
+            n_rows = self.config.adaptation_size
+            if self.config.adapt_to_latest:
+                data = self.replay.latest(tasks, n_rows)
+            else:
+                draw = int(torch.randint(2**63 - 1, (), generator=generator))
+                streams = [torch.Generator().manual_seed(draw) for _ in range(self.n_seeds)]
+                data = self.sample(
+                    lambda n: tasks.unsqueeze(-1).expand(-1, -1, n), n_rows, generator=streams
+                )
             adapted = self.loss.adapt(self.to_device(data))
         parameters = {
             key: value[index].detach().to("cpu", copy=True) for key, value in adapted.items()

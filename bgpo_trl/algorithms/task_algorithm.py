@@ -83,6 +83,17 @@ class TaskAlgorithm(Algorithm):
         return torch.where(full, self._tasks, -1)
 
     def sample_tasks(self) -> TensorDictBase:
-        """Draw transitions ``[S, T, B]`` for an update, none of tasks that are not ready."""
-        tasks = self.ready_tasks().unsqueeze(-1)
-        return self.sample(lambda n: tasks.expand(-1, -1, n), self.config.task_batch_size)
+        """Draw transitions ``[S, T, B]`` for an update, none of tasks that are not ready.
+
+        ``B`` is even if ``task_batch_size`` is. Where the tasks of a seed share it, rows beyond a
+        task's share weigh nothing, and the others so much more that means are over them alone.
+        """
+        tasks, size = self.ready_tasks().unsqueeze(-1), self.config.task_batch_size
+        if not self.config.share_batch:
+            return self.sample(lambda n: tasks.expand(-1, -1, n), size)
+        share = size // (tasks >= 0).sum(1, keepdim=True).clamp_min(1)
+        share -= share % (2 - size % 2)
+        n_rows = int(share.max())
+        rows = torch.where(torch.arange(n_rows) < share, tasks, -1)
+        batch = self.replay.sample(rows)
+        return batch.set("priority_weight", batch["priority_weight"] * (n_rows / share))

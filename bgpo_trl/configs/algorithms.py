@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from math import inf
-from numbers import Integral
 from typing import Literal
 
 from bgpo_trl.configs.settings import Settings
@@ -123,8 +122,11 @@ class AlgorithmConfig(Settings):
     the study of privileged information, the ground truth."""
     max_steps: int = 50
     """Steps of an episode (Sec. IV-B)."""
-    state_limit: float = 5.0
-    """Bound of the observed state, in standard deviations. Ours."""
+    timeouts_bootstrap: bool = True
+    """Whether a time-out is bootstrapped from, as it is no end of the task. Ours: in Alg. 1, it is
+    terminal."""
+    state_limit: float | None = 5.0
+    """Bound of the observed state, in standard deviations; None for none, as in the paper. Ours."""
     rl: RLConfig = field(default_factory=RLConfig)
     """The RL algorithm f_RL; DDPG in the paper."""
     demonstration_share: float = 0.0
@@ -144,7 +146,8 @@ class AlgorithmConfig(Settings):
         shown = share > 0 or self.rl.proposals == "actor"
         check(self, ("demonstration_share", shown, "above 0, for a clone to imitate"))
         at_least(self, 1, "max_steps")
-        positive(self, "state_limit")
+        if self.state_limit is not None:
+            positive(self, "state_limit")
         at_least(self, 0, "demonstration_noise")
         if share and self.rl.warmup_steps < self.max_steps:
             # Else, seeds would learn from demonstrations sooner or later than each would alone.
@@ -158,6 +161,11 @@ def _check_played(config: AlgorithmConfig, rows: int) -> None:
     """Raise ``ValueError`` if demonstrations leave none of an update's transitions to training."""
     leaves = round(config.demonstration_share * rows) < rows
     check(config, ("demonstration_share", leaves, f"less, to leave some of {rows} transitions"))
+
+
+def _check_literal(config: AlgorithmConfig, name: str, given: bool) -> None:
+    """Raise ``ValueError`` where what the paper has meets demonstrations, which it has not."""
+    check(config, (name, not (given and config.demonstration_share), "off with demonstrations"))
 
 
 @dataclass(frozen=True)
@@ -323,9 +331,13 @@ class MAMLConfig(AlgorithmConfig):
     imitation: float = 0.0
     """Weight of the squared distance to demonstrated actions in the policy's loss. Ours: with
     demonstrations, where a critic alone hardly changes the policy (docs/learning.md)."""
+    share_batch: bool = False
+    """Whether the tasks share ``task_batch_size`` transitions in equal parts."""
     adaptation_size: int = 256
     """Transitions of the test task to adapt to before its test episodes. Ours: Sec. IV-B has "256
     adaptation trajectories", about 50 times as much."""
+    adapt_to_latest: bool = False
+    """Whether these are the latest transitions of the task, instead of being drawn from all."""
 
     rl: RLConfig = field(default_factory=RLConfig)
     """DDPG, whose learner it uses."""
@@ -341,6 +353,8 @@ class MAMLConfig(AlgorithmConfig):
         at_least(self, 2, "task_batch_size")
         check(self, ("task_batch_size", self.task_batch_size % 2 == 0, "even"))
         _check_played(self, self.task_batch_size)
+        _check_literal(self, "share_batch", self.share_batch)
+        _check_literal(self, "adapt_to_latest", self.adapt_to_latest)
 
 
 @dataclass(frozen=True)
@@ -350,11 +364,13 @@ class DistNLLConfig(AlgorithmConfig):
     task_batch_size: int = 64
     """Transitions of each task in an update of its teacher. Ours: with three tasks, as many
     transitions as in an update of BGPO."""
+    share_batch: bool = False
+    """Whether the tasks share ``task_batch_size`` transitions in equal parts."""
     samples: int = 1_000
     """States of each task from which its head learns at the end of an episode (Sec. IV-B)."""
     distillation_batch_size: int = 125
-    """States of each task per gradient step, hence eight steps per episode. Ours: not given in the
-    paper."""
+    """States of each task per gradient step, hence eight steps per episode; the last step has what
+    is left. Ours: 256 in the paper."""
     learning_rate: float = 1e-3
     """Learning rate of Adam for the multi-task policy. Ours: the teachers'."""
 
@@ -365,9 +381,5 @@ class DistNLLConfig(AlgorithmConfig):
         super().__post_init__()
         at_least(self, 1, "task_batch_size", "samples", "distillation_batch_size")
         _check_played(self, self.task_batch_size)
+        _check_literal(self, "share_batch", self.share_batch)
         positive(self, "learning_rate")
-        if self.samples % self.distillation_batch_size:
-            raise ValueError(
-                f"samples ({self.samples}) must be a multiple of distillation_batch_size "
-                f"({self.distillation_batch_size})"
-            )

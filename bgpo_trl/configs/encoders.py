@@ -14,6 +14,8 @@ class VAEConfig(Settings):
 
     latent_size: int = 64
     """Dimensions of z (Sec. IV-A)."""
+    keypoints: bool = True
+    """Whether half of z are coordinates of keypoints. Ours: Sec. IV-A has a dense layer alone."""
     batch_size: int = 128
     """Frames per step, in ``batch_size / window`` windows. Ours: 256 in Sec. IV-A; on two cores
     more steps are a better use of the time."""
@@ -23,7 +25,9 @@ class VAEConfig(Settings):
     learning_rate: float = 2e-3
     """Peak learning rate of Adam. Ours: 1e-4 in Sec. IV-A, too low for so few steps."""
     warmup_steps: int = 100
-    """Steps of linear warm-up, before cosine decay to zero. Ours."""
+    """Steps of linear warm-up. Ours."""
+    decay: bool = True
+    """Whether a cosine decays the rate to zero. Ours."""
     steps: int = 4_000
     """Gradient steps. Ours: not given in the paper."""
     bfloat16: bool = False
@@ -57,7 +61,9 @@ class SequenceAutoencoderConfig(Settings):
     learning_rate: float = 1e-3
     """Peak learning rate of Adam (Sec. IV-A)."""
     warmup_steps: int = 100
-    """Steps of linear warm-up, before cosine decay to zero. Ours."""
+    """Steps of linear warm-up. Ours."""
+    decay: bool = True
+    """Whether a cosine decays the rate to zero. Ours."""
     steps: int = 5_000
     """Gradient steps. Ours: not given in the paper."""
 
@@ -83,13 +89,16 @@ class InverseModelConfig(Settings):
     learning_rate: float = 2e-3
     """Peak learning rate of Adam."""
     warmup_steps: int = 100
-    """Steps of linear warm-up, before cosine decay to zero."""
+    """Steps of linear warm-up."""
+    decay: bool = True
+    """Whether a cosine decays the rate to zero."""
     steps: int = 6_000
-    """Gradient steps."""
+    """Gradient steps; 0 for no inverse model, hence a bank without steps of demonstrations."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        at_least(self, 1, "hidden_size", "batch_size", "warmup_steps", "steps")
+        at_least(self, 1, "hidden_size", "batch_size", "warmup_steps")
+        at_least(self, 0, "steps")
         positive(self, "learning_rate", "largest_action")
         at_least(self, 0, "noise")
 

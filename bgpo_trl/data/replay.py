@@ -213,6 +213,29 @@ class GroupReplay:
         rows = steps % self.capacity * len(self._generators) + np.array(seeds)[:, None]
         return torch.from_numpy(rows).view(-1)
 
+    def latest(self, group: Tensor, n_rows: int) -> TensorDict:
+        """Copy the latest transitions of groups int64 ``[S, G]`` (-1 for none), ``[S, G, n_rows]``.
+
+        ``"priority_weight"`` is as in `sample`; where a group holds fewer transitions, these weigh
+        so much more that means over ``n_rows`` are means over them.
+        """
+        steps = np.zeros((*group.shape, n_rows), np.int64)
+        weight = np.zeros(steps.shape, np.float32)
+        for seed, oldest in enumerate(self._oldest()):
+            for place, number in enumerate(group[seed].tolist()):
+                held = self._index[seed].steps_of(number, oldest)[-n_rows:]
+                if len(held):
+                    steps[seed, place, : len(held)] = held
+                    weight[seed, place, : len(held)] = n_rows / len(held)
+            steps[seed] = steps[seed] % self.capacity * len(self._generators) + seed
+        rows, counts = torch.from_numpy(steps).flatten(), torch.from_numpy(weight)
+        drawn = TensorDict({"priority_weight": counts}, counts.shape)
+        for key, stored in self._rows.items():
+            entry = stored.index_select(0, rows).view(*counts.shape, *stored.shape[1:])
+            entry[counts == 0] = 0  # the NaN of uninitialized memory would outlast a weight of 0
+            drawn[key] = entry
+        return drawn
+
     def _located(
         self, group: Tensor, seeds: Sequence[int], sources: Sequence[torch.Generator]
     ) -> tuple[NDArray[np.int64], Tensor]:

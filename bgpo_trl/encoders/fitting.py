@@ -26,9 +26,13 @@ Log = Callable[[dict[str, Any]], None]
 """Consumer of a training log's rows: ``stage``, ``step``, ``learning_rate`` and the losses."""
 
 
+Schedule = VAEConfig | SequenceAutoencoderConfig | InverseModelConfig
+"""Steps and learning rates of a stage."""
+
+
 @dataclass(frozen=True)
 class Fit:
-    """Training loop of both encoders: Adam with warm-up and cosine decay.
+    """Training loop of both encoders: Adam, by default with warm-up and cosine decay.
 
     Attributes:
         config: Hyperparameters; the seed and the intervals apply to every stage.
@@ -49,7 +53,7 @@ class Fit:
         stage: str,
         loss: LossModule,
         sample: Callable[[torch.Generator], TensorDict],
-        schedule: VAEConfig | SequenceAutoencoderConfig | InverseModelConfig,
+        schedule: Schedule,
         generator: torch.Generator,
         bfloat16: bool = False,
     ) -> None:
@@ -81,7 +85,7 @@ class Fit:
             total=schedule.steps,
         )
         for step in bar:
-            rate = schedule.learning_rate * _decay(step, schedule.steps, schedule.warmup_steps)
+            rate = schedule.learning_rate * _factor(step, schedule)
             for group in optimizer.param_groups:
                 group["lr"] = rate
             batch = sample(generator).to(self.device)
@@ -133,5 +137,9 @@ class Fit:
         return saved["step"]
 
 
-def _decay(step: int, steps: int, warmup_steps: int) -> float:
-    return min(1.0, (step + 1) / warmup_steps) * (1 + math.cos(math.pi * step / steps)) / 2
+def _factor(step: int, schedule: Schedule) -> float:
+    """Return the share of the peak learning rate at a step."""
+    warmup = min(1.0, (step + 1) / schedule.warmup_steps)
+    return (
+        warmup * (1 + math.cos(math.pi * step / schedule.steps)) / 2 if schedule.decay else warmup
+    )

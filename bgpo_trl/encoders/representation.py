@@ -91,7 +91,7 @@ def train_representation(
             demonstrations never visit. The inverse model then learns from the actions of play
             alone, so that it has seen none of the actions that it infers for demonstrations;
             without play, it learns from those of demonstrations. If what it would learn from lacks
-            actions, there is none.
+            actions, or it gets no steps, there is none.
         scene_version: Version of the scene of the frames, stored with the weights.
         spread: Share of the range of start states of the recordings, stored with the weights.
         command: Command line, stored with the weights.
@@ -118,7 +118,7 @@ def train_representation(
     lae = _train_lae(latent, train.get("length"), config.lae, fit, config.seed)
     own = seen[-1]
     inverse = None
-    if "action" in own:
+    if config.inverse.steps and "action" in own:
         if play is not None:
             latent = encode_frames(vae, own)
         inverse = _train_inverse(latent, own, config.inverse, fit, config.seed).cpu()
@@ -222,6 +222,7 @@ def load_representation(path: str | Path, *, scene_version: str | None = None) -
             config["vae"]["latent_size"],
             len(tensors["vae.inverse_head.bias"]),
             tensors["vae.mean_frame"].shape[:2],
+            config["vae"].get("keypoints", True),
         )
         lae = SequenceAutoencoder(vae.latent_size, config["lae"]["embedding_size"])
         inverse = None
@@ -318,7 +319,8 @@ def _train_vae(datasets: Sequence[TensorDictBase], config: VAEConfig, fit: Fit, 
 
     generator = torch.Generator().manual_seed(seed)
     frame_shape = frames.shape[1:3]
-    vae = _initialized(seed, VAE, config.latent_size, action.shape[-1], frame_shape)
+    sizes = (config.latent_size, action.shape[-1], frame_shape, config.keypoints)
+    vae = _initialized(seed, VAE, *sizes)
     vae.mean_frame.copy_(mean_frame(frames))
     loss = VAEInverseLoss(
         vae,

@@ -39,7 +39,8 @@ class VAE(nn.Module):
     Half of the latent's dimensions are coordinates of keypoints: the mean of each is the expected
     position under the softmax of a feature map (Finn et al., 2016), and the decoder draws a blob
     there (Jakab et al., 2018). The paper has none; a dense layer alone encodes places in a way from
-    which a policy learns to read them more slowly (docs/learning.md).
+    which a policy learns to read them more slowly (docs/learning.md). Without keypoints, the dense
+    layer gives all means, as in the paper.
 
     Frames are uint8 ``[..., H, W, 3]``, and tensors channels-last like them; height and width are
     padded to multiples of 8 inside. Latents are ``[..., latent_size]``, on the scale of mu unless
@@ -50,10 +51,11 @@ class VAE(nn.Module):
             keypoints.
         action_size: Dimensions of an action (paper: 4).
         frame_shape: Height and width of a frame, at least 16 each (paper: 32 and 64).
+        keypoints: Whether there are keypoints.
 
     Raises:
-        ValueError: If there is no action or no keypoint, or frames are too small; from methods, if
-            frames have another dtype or shape, or latents another size.
+        ValueError: If there is no action, latents are too small for a keypoint, or frames are too
+            small; from methods, if frames have another dtype or shape, or latents another size.
 
     Attributes:
         mean_frame: Buffer ``[H, W, 3]`` in [0, 1], set before training; grey until then.
@@ -77,6 +79,7 @@ class VAE(nn.Module):
         latent_size: int = 64,
         action_size: int = 4,
         frame_shape: Sequence[int] = FRAME_SHAPE,
+        keypoints: bool = True,
     ) -> None:
         if latent_size < 4 or action_size < 1:
             raise ValueError(
@@ -96,9 +99,10 @@ class VAE(nn.Module):
         self._coarse_shape = (_CHANNELS[3], *(size // _POOLED for size in self._padded))
         coarse_size = math.prod(self._coarse_shape)
         self.encoder = nn.ModuleList(nn.Conv2d(a, b, 3, padding=1) for a, b in pairwise(_CHANNELS))
-        self.n_keypoints = latent_size // 4
-        self.keypoint_maps = nn.Conv2d(_CHANNELS[2], self.n_keypoints, 1)
-        self.log_sharpness = nn.Parameter(torch.full((self.n_keypoints, 1, 1), math.log(3.0)))
+        self.n_keypoints = latent_size // 4 if keypoints else 0
+        if keypoints:
+            self.keypoint_maps = nn.Conv2d(_CHANNELS[2], self.n_keypoints, 1)
+            self.log_sharpness = nn.Parameter(torch.full((self.n_keypoints, 1, 1), math.log(3.0)))
         self.mean_head = nn.Linear(coarse_size, latent_size - 2 * self.n_keypoints)
         self.log_variance_head = nn.Linear(coarse_size, latent_size)
         # Little noise at first (sigma 0.14): with noise as large as the signal, the decoder would
@@ -110,7 +114,8 @@ class VAE(nn.Module):
             nn.ConvTranspose2d(b, a, 4, stride=2, padding=1)
             for b, a in pairwise(reversed(_CHANNELS))
         )
-        self.place = nn.Conv2d(_CHANNELS[1] + self.n_keypoints, _CHANNELS[1], 3, padding=1)
+        if keypoints:
+            self.place = nn.Conv2d(_CHANNELS[1] + self.n_keypoints, _CHANNELS[1], 3, padding=1)
         self.inverse_head = nn.Linear(2 * latent_size, action_size)
         # Coordinates of the rows and columns of the map of keypoints.
         (height, width), (rows, columns) = self._map_reach, self._map_shape
@@ -136,8 +141,9 @@ class VAE(nn.Module):
         x = x.unflatten(-1, self._coarse_shape).contiguous(memory_format=torch.channels_last)
         for convolution in self.decoder[:-1]:
             x = F.relu(convolution(x))
-        x = torch.cat([x, self._blobs(flat).to(x.dtype)], 1)
-        x = F.relu(self.place(x.contiguous(memory_format=torch.channels_last)))
+        if self.n_keypoints:
+            x = torch.cat([x, self._blobs(flat).to(x.dtype)], 1)
+            x = F.relu(self.place(x.contiguous(memory_format=torch.channels_last)))
         # eps: without it, pixels that are nearly always black or white could not change.
         height, width = self.frame_shape
         x = self.decoder[-1](x).permute(0, 2, 3, 1)[:, :height, :width]
@@ -207,6 +213,8 @@ class VAE(nn.Module):
         x = F.max_pool2d(_convolution(x.permute(0, 3, 1, 2), first), 2).relu_()
         fine = _convolution(x, second).relu_()
         coarse = F.max_pool2d(_convolution(F.max_pool2d(fine, 2), third), 2).relu_().flatten(1)
+        if not self.n_keypoints:
+            return self.mean_head(coarse).to(self.mean_frame.dtype), coarse
         maps = self.log_sharpness.exp() * self.keypoint_maps(fine)
         weight = maps.flatten(2).to(self.mean_frame.dtype).softmax(-1).view(maps.shape)
         x, y = (weight.sum(2) * self._column).sum(-1), (weight.sum(3) * self._row).sum(-1)

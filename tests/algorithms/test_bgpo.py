@@ -106,6 +106,22 @@ def act_in_tests(algorithm, state, embedding, task):
     return Policy.stack(policies).act(state)
 
 
+@pytest.mark.parametrize("bootstraps", [True, False])
+def test_a_time_out_is_terminal_unless_it_bootstraps_and_pays_the_bonus_in_both(
+    make_bgpo, bootstraps
+):
+    algorithm = make_bgpo("latent, b", max_steps=3, timeouts_bootstrap=bootstraps)
+    data, _ = play(algorithm, 40)
+    end = data["next"]
+    late = (end["step_count"] == 3) & ~end["success"]
+    assert late.sum() > 5
+    assert (end["terminated"][late] == (not bootstraps)).all()
+    assert end["done"][late].all()
+    assert (end["intrinsic_reward"][late] > 0).all()
+    stored = algorithm.replay.contents(1)[0]["next", "terminated"]
+    assert stored.equal(end["terminated"][1])
+
+
 @pytest.mark.parametrize("variant", ["latent, label", "latent, nothing", "all"])
 def test_only_a_variant_with_a_label_acts_by_it(make_bgpo, bank, variant):
     algorithm = make_bgpo(variant, schedule=TaskSchedule((0, 0, 0)))
@@ -148,6 +164,7 @@ def test_test_episodes_are_played_by_the_expert_of_their_demonstration(make_bgpo
         ("latent, phi", {"beta": 0.3}, 0.3 + 0.95 * 1.3),
         ("latent, b", {"beta": 0.0}, 1.0),
         ("latent, nothing", {"beta": 0.3}, 1.0),
+        ("latent, phi", {"timeouts_bootstrap": False}, 1.1),
     ],
 )
 def test_targets_are_clipped_to_the_attainable_returns(make_bgpo, variant, changes, highest):

@@ -1,5 +1,6 @@
 """BGPO with groups of behaviors: experts, balanced replay, and demonstrations as experience."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -189,8 +190,9 @@ def test_nothing_is_known_of_tasks_that_have_not_been_presented(make_bgpo, bank)
         assert_same(*(policy.state_dict() for policy in policies))
 
 
-def test_the_bonus_is_for_latents_as_they_are_and_the_policy_sees_them_clipped(
-    make_bgpo, encoders, bank, monkeypatch
+@pytest.mark.parametrize("limit", [5.0, None])
+def test_the_bonus_is_for_latents_as_they_are_and_the_policy_sees_them_clipped_if_there_is_a_limit(
+    make_bgpo, encoders, bank, monkeypatch, limit
 ):
     """Latents much longer than they should be: phi_g is still that of a demonstration."""
     raw, latent = [], encoders.vae.latent
@@ -201,17 +203,18 @@ def test_the_bonus_is_for_latents_as_they_are_and_the_policy_sees_them_clipped(
         return stretch
 
     monkeypatch.setattr(encoders.vae, "latent", stretched)
-    algorithm = make_bgpo("all", seeds=(3,))
+    algorithm = make_bgpo("all", seeds=(3,), state_limit=limit)
     assert algorithm.world.env.observation_spec["latent"].shape == (1, 64)
+    bound = math.inf if limit is None else limit
     raw.clear()  # what was seen to make the specs
     data = play(algorithm, 25)[0][0]
     frames, trajectory, n_ended, n_clipped = iter(raw), [], 0, 0
     trajectory.append(next(frames))
     for step in data:
-        assert step["latent"].equal(trajectory[-1].clamp(-5, 5))
+        assert step["latent"].equal(trajectory[-1].clamp(-bound, bound))
         n_clipped += int((trajectory[-1].abs() > 5).sum())
         trajectory.append(next(frames))
-        assert step["next", "latent"].equal(trajectory[-1].clamp(-5, 5))
+        assert step["next", "latent"].equal(trajectory[-1].clamp(-bound, bound))
         if step["next", "done"]:
             length = torch.tensor([len(trajectory)])
             phi_g = encoders.lae.encode(torch.stack(trajectory)[None], length)[0]

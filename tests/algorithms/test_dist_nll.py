@@ -193,7 +193,15 @@ def test_a_task_of_which_nothing_is_known_has_a_head_that_does_nothing(make):
         assert bool(frozen["mlp.layers.1.weight"][task].any()) == (task == 0)
 
 
-def test_samples_that_cannot_be_cut_in_batches_are_refused():
-    for size in (0, 7):
-        with pytest.raises(ValueError, match=rf"distillation_batch_size.*\b{size}\b"):
-            DistNLLConfig(samples=24, distillation_batch_size=size)
+def test_the_last_batch_of_a_distillation_has_what_is_left(make):
+    algorithm, sizes = make(samples=24, distillation_batch_size=7), []
+    for loss in algorithm._distillation:
+        loss.register_forward_pre_hook(lambda _, inputs: sizes.append(inputs[0].shape[-1]))
+    play(algorithm, 40)
+    assert len(sizes) > 8
+    assert sizes == [7, 7, 7, 3] * (len(sizes) // 4)
+
+
+def test_batches_of_nothing_are_refused():
+    with pytest.raises(ValueError, match=r"distillation_batch_size.*\b0\b"):
+        DistNLLConfig(distillation_batch_size=0)

@@ -39,6 +39,20 @@ def test_testing_adapts_by_one_plain_step_on_transitions_of_the_task(make_task_a
             assert frozen[key][2].equal(before)
 
 
+def test_testing_adapts_to_the_latest_transitions_of_the_task(make_task_algorithm):
+    algorithm = make_task_algorithm("maml", adaptation_size=9, adapt_to_latest=True)
+    data, _ = play(algorithm, 40)
+    adapted_to, adapt = [], algorithm.loss.adapt
+    algorithm.loss.adapt = lambda data: (adapted_to.append(data), adapt(data))[1]
+    first, second = (snapshot(algorithm, 1, seed=seed).parameters for seed in (5, 6))
+    assert all(value.equal(second[key]) for key, value in first.items())
+    for index in range(2):
+        for task in range(N_TASKS):
+            seen = data["state"][index][data["task"][index] == task][-9:]
+            assert adapted_to[0]["state"][index, task, : len(seen)].equal(seen)
+            assert adapted_to[0]["priority_weight"][index, task].sum().round() == 9
+
+
 def test_each_half_of_a_tasks_batch_has_its_share_of_demonstrations(make_task_algorithm, bank):
     """One half is to adapt to, the other to judge the adapted policy by."""
     algorithm = make_task_algorithm("maml-demonstrations", state="latent", task_batch_size=8)

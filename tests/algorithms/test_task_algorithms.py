@@ -17,6 +17,7 @@ from tests.algorithms.playing import (
     play,
     save_and_restore,
     snapshot,
+    spy_batches,
     weights_of,
 )
 
@@ -88,6 +89,36 @@ def test_tasks_that_are_never_presented_make_no_difference(make, name):
         torch.testing.assert_close(value[:, 0], alone[key][:, 0], rtol=1e-4, atol=1e-5)
         if "value" in key:
             assert value[:, 1:].equal(start[key][:, 1:])
+
+
+@both
+def test_tasks_can_share_a_batch_in_equal_parts(make, name):
+    """By hand: 24 transitions are 24 of one task, 12 of each of two, 8 of each of three."""
+    schedule = TaskSchedule((0, 3, 6))
+    algorithm = make(name, schedule=schedule, task_batch_size=24, share_batch=True)
+    batches, found = spy_batches(algorithm), set()
+    data, _ = play(algorithm, 150)
+    for batch in batches:
+        n_rows = batch.shape[-1]
+        for index in range(2):
+            counts = (batch["priority_weight"][index] > 0).sum(-1).tolist()
+            share = 24 // sum(count > 0 for count in counts)
+            assert {*counts} <= {0, share}
+            assert n_rows >= share
+            for task in range(N_TASKS):
+                weight = batch["priority_weight"][index, task]
+                # Means over all rows are means over those that count.
+                torch.testing.assert_close(
+                    weight.sum(), torch.tensor(float(n_rows * (counts[task] > 0)))
+                )
+                own = data["state"][index][data["task"][index] == task]
+                states = batch["state"][index, task][weight > 0].unsqueeze(1)
+                assert (states == own).all(-1).any(-1).all()
+            if name == "maml":  # to adapt to, and to evaluate
+                halves = (batch["priority_weight"][index] > 0).unflatten(-1, (2, -1)).sum(-1)
+                assert halves[:, 0].equal(halves[:, 1])
+            found.add(tuple(counts))
+    assert {(24, 0, 0), (12, 12, 0), (8, 8, 8)} <= found
 
 
 @both

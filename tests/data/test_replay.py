@@ -100,6 +100,22 @@ def test_entries_are_drawn_as_they_are_sampled_also_some_of_them():
         assert all(entry[filled].equal(sampled[key][filled]) for key, entry in entries.items())
 
 
+def test_the_latest_transitions_of_a_group_and_their_weights_by_hand():
+    replay = make(capacity=5)
+    fill(replay, [(0, 1), (0, 1), (1, 1), (0, 0), (0, 1), (1, 1), (0, 0)])  # the last five are left
+    drawn = replay.latest(torch.tensor([[0, 1], [7, -1]]), 2)
+    assert drawn["latent"][0].squeeze(-1).tolist() == [[4, 6], [2, 5]]
+    assert drawn["priority_weight"].tolist() == [[[1, 1], [1, 1]], [[0, 0], [0, 0]]]
+    assert not drawn["latent"][1].any()
+    longer = replay.latest(torch.tensor([[1], [1]]), 4)
+    assert longer["latent"][0].flatten().tolist() == [2, 5, 0, 0]
+    assert longer["priority_weight"][0].tolist() == [[2, 2, 0, 0]]
+    torch.testing.assert_close(longer["latent"][1].flatten(), torch.tensor([2.01, 4.01, 5.01, 0]))
+    torch.testing.assert_close(longer["priority_weight"][1], torch.tensor([[4 / 3] * 3 + [0.0]]))
+    with_nothing = make().latest(torch.tensor([[0], [-1]]), 3)
+    assert not with_nothing["priority_weight"].any()
+
+
 def test_some_seeds_draw_what_they_would_draw_with_all():
     some, every = make(n_seeds=3), make(n_seeds=3)
     for replay in (some, every):

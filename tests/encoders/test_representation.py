@@ -25,6 +25,7 @@ from bgpo_trl.encoders.representation import (
     load_representation,
     mean_frame,
     retrain_inverse,
+    save_representation,
     split,
     train_representation,
     valid_frames,
@@ -103,6 +104,30 @@ def same(a: Representation, b: Representation) -> bool:
         for m, n in ((a.vae, b.vae), (a.lae, b.lae), (a.inverse, b.inverse))
         for x, y in zip(m.state_dict().values(), n.state_dict().values(), strict=True)
     )
+
+
+def test_encoders_as_published_have_constant_rates_no_keypoints_and_no_inverse_model(
+    tmp_path: Path,
+) -> None:
+    published = replace(
+        TINY,
+        vae=replace(TINY.vae, keypoints=False, warmup_steps=1, decay=False),
+        lae=replace(TINY.lae, warmup_steps=1, decay=False),
+        inverse=replace(TINY.inverse, steps=0),
+        log_every=1,
+    )
+    rows = []
+    made = train(squares(8), published, log=rows.append)
+    rates = {stage: getattr(published, stage).learning_rate for stage in ("vae", "lae")}
+    assert {row["stage"] for row in rows} == rates.keys()
+    assert all(row["learning_rate"] == rates[row["stage"]] for row in rows)
+    assert made.inverse is None
+    save_representation(made, tmp_path / "encoders.safetensors")
+    read = load_representation(tmp_path / "encoders.safetensors")
+    assert read.inverse is None
+    assert read.identity == made.identity
+    latent = read.vae.latent(squares(8)["pixels"][:, 0])
+    assert latent.equal(made.vae.latent(squares(8)["pixels"][:, 0]))
 
 
 def test_encoders_capture_frames_places_actions_and_tasks(

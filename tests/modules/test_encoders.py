@@ -36,6 +36,24 @@ def test_the_encoder_is_that_of_the_paper(vae: VAE) -> None:
     assert mu.shape == log_variance.shape == (5, 64)
 
 
+def test_without_keypoints_all_means_are_those_of_a_dense_layer() -> None:
+    """Plain reference of encoder and decoder, layer by layer."""
+    torch.manual_seed(0)
+    vae, pixels = VAE(keypoints=False), frames(5)
+    x = (pixels.float() / 255 - 0.5).permute(0, 3, 1, 2).contiguous()
+    for layer in vae.encoder:
+        x = F.max_pool2d(F.relu(F.conv2d(x, layer.weight.contiguous(), layer.bias, padding=1)), 2)
+    mu = vae.encode(pixels)[0]
+    torch.testing.assert_close(mu, vae.mean_head(x.flatten(1)))
+    assert mu.shape == (5, 64)
+    x = F.relu(vae.decoder_dense(mu)).unflatten(-1, (128, 4, 8))
+    for layer in vae.decoder[:-1]:
+        x = F.relu(layer(x))
+    x = torch.sigmoid(vae.decoder[-1](x)).permute(0, 2, 3, 1)
+    torch.testing.assert_close(vae.decode(mu), x)
+    assert not any("keypoint" in name or "place" in name for name in vae.state_dict())
+
+
 def test_keypoints_are_expected_places_and_decode_to_blobs_there(vae: VAE) -> None:
     """One bright cell in a map of keypoint k: its place in the latent, and the blob's maximum."""
     for cell in [(0, 0), (15, 31), (4, 20)]:

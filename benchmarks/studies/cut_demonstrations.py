@@ -1,0 +1,214 @@
+r"""Measure what BGPO infers from demonstrations that are cut short, of known and of unknown tasks.
+
+No policy is learned: GWR-B and the groups of behaviors grow from training demonstrations, all tasks
+from the start. New demonstrations are recorded and cut after shares of their frames.
+
+    python benchmarks/studies/cut_demonstrations.py benchmarks/results/cut-demonstrations
+    python benchmarks/studies/cut_demonstrations.py benchmarks/results/cut-demonstrations-eight \
+        --tasks all --draws 3200
+
+Writes ``known.csv`` (by share, seed and task: in which share of demonstrations the node and the
+group are those of the task, the activity, and the share that belongs to no known group) and
+``unknown.csv`` (by task left out, share and seed: how well novelty tells the task from the others),
+and prints both as tables of means over seeds.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import torch
+import tyro
+from scipy import stats
+from tensordict import TensorDict
+from torch import Tensor
+from torch.nn.functional import one_hot
+
+from bgpo_trl.analysis.tables import Table, markdown
+from bgpo_trl.configs import BGPOConfig
+from bgpo_trl.data.bank import DemonstrationBank
+from bgpo_trl.data.recording import record_demonstrations
+from bgpo_trl.encoders.pretrained import load_pretrained
+from bgpo_trl.encoders.representation import encode_frames
+from bgpo_trl.files.writing import make_folder
+from bgpo_trl.modules.behavior_groups import BehaviorGroups
+from bgpo_trl.modules.gwr import GWRB
+from bgpo_trl.runs.provenance import write_table
+from bgpo_trl.scenes.nico import NICO
+from bgpo_trl.seeding import generators, stream_seed
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Demonstrations that are cut short."""
+
+    out: tyro.conf.Positional[Path]
+    """Folder of the results."""
+    tasks: tuple[str, ...] = NICO.default_tasks
+    """Names of the tasks, or "all"."""
+    draws: int = 1_800
+    """Demonstrations that each network is shown."""
+    per_task: int = 100
+    """New demonstrations of each task."""
+    shares: tuple[float, ...] = (0.25, 0.5, 0.75, 1.0)
+    """Shares of the frames that are seen, from the start."""
+    seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
+    """Seeds of the networks."""
+    recording_seed: int = 1
+    """Seed of the new demonstrations; those of the shipped banks have 0."""
+
+
+@dataclass(frozen=True)
+class Networks:
+    """GWR-B and groups of all seeds, grown from demonstrations of a bank."""
+
+    gwr: GWRB
+    groups: BehaviorGroups
+    bank: DemonstrationBank
+
+    @classmethod
+    def grow(cls, bank: DemonstrationBank, seeds: tuple[int, ...], draws: int) -> Networks:
+        """Show each network training demonstrations, drawn uniformly."""
+        config, size = BGPOConfig(), bank.embedding.shape[-1]
+        batch = [len(seeds)]
+        gwr = GWRB(size, config.gwr, batch_size=batch, generator=generators(seeds, "gwr"))
+        groups = BehaviorGroups(
+            size,
+            batch_size=batch,
+            smallest=config.group_size,
+            evidence=config.group_evidence,
+        )
+        draw = [np.random.default_rng(stream_seed(seed, "demonstrations")) for seed in seeds]
+        shown = np.stack([rng.integers(len(bank.task), size=draws) for rng in draw])
+        for rows in torch.from_numpy(shown).T:
+            gwr.adapt(bank.embedding[rows])
+            groups.adapt(bank.embedding[rows])
+        return cls(gwr, groups, bank)
+
+    def right(self, node: Tensor, known: Tensor, task: Tensor) -> Tensor:
+        """Return where a node or group of demonstrations is one of their task, bool ``[S, N]``.
+
+        A node or group is of the task of which it holds the largest share of the bank.
+
+        Args:
+            node: Node or group of the demonstrations, int64 ``[S, N]``.
+            known: The same of the bank's, ``[S, M]``.
+            task: Tasks of the demonstrations, ``[N]``.
+        """
+        labels = one_hot(self.bank.task, len(self.bank.tasks)).double()
+        share = labels / labels.sum(0)
+        right = torch.zeros(node.shape, dtype=torch.bool)
+        for index, (own, of_bank) in enumerate(zip(node, known, strict=True)):
+            size = int(max(own.max(), of_bank.max())) + 1
+            held = torch.zeros(size, share.shape[-1], dtype=share.dtype)
+            held.index_add_(0, of_bank, share)
+            right[index] = (held.argmax(-1)[own] == task) & (held.sum(-1)[own] > 0)
+        return right
+
+
+def record(arguments: Arguments, tasks: tuple[str, ...]) -> TensorDict:
+    """Record new demonstrations."""
+    with tempfile.TemporaryDirectory() as folder:
+        return record_demonstrations(
+            folder,
+            tasks=tasks,
+            per_task=arguments.per_task,
+            held_out_per_task=0,
+            seed=arguments.recording_seed,
+        ).to_tensordict()
+
+
+def known_tasks(
+    networks: Networks, phi: Tensor, task: Tensor, seeds: tuple[int, ...]
+) -> pd.DataFrame:
+    """Return a row of each seed and task for demonstrations ``[N, 32]``."""
+    gwr, groups, seen = networks.gwr, networks.groups, networks.bank.embedding
+    shown, of_bank = (e.expand(len(seeds), *e.shape) for e in (phi, seen))
+    match, member = gwr.lookup(shown), groups.lookup(shown)
+    columns = {
+        "node_right": networks.right(match.node, gwr.lookup(of_bank).node, task).double(),
+        "activity": match.activity.double(),
+        "group_right": networks.right(member.group, groups.lookup(of_bank).group, task).double(),
+        "of_no_group": (~member.known).double(),
+    }
+    rows = [
+        {"seed": seed, "task": name}
+        | {key: float(values[index, task == label].mean()) for key, values in columns.items()}
+        for index, seed in enumerate(seeds)
+        for label, name in enumerate(networks.bank.tasks)
+    ]
+    return pd.DataFrame(rows)
+
+
+def unknown_task(
+    networks: Networks, known: Tensor, unknown: Tensor, seeds: tuple[int, ...]
+) -> pd.DataFrame:
+    """Return a row of each seed: how novelty tells an unknown task from the known ones."""
+    novelty = [
+        networks.groups.lookup(phi.expand(len(seeds), *phi.shape)).novelty
+        for phi in (known, unknown)
+    ]
+    rows = []
+    for seed, ours, theirs in zip(seeds, *novelty, strict=True):
+        wins = stats.mannwhitneyu(theirs, ours).statistic
+        rows.append(
+            {
+                "seed": seed,
+                "area": wins / (len(ours) * len(theirs)),
+                "detected": float((theirs > 1).float().mean()),
+                "false_alarms": float((ours > 1).float().mean()),
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+@torch.no_grad()
+def study(arguments: Arguments) -> str:
+    """Measure both; write the files and return the tables."""
+    torch.set_num_threads(1)
+    out, seeds = make_folder(arguments.out), arguments.seeds
+    tasks = NICO.all_tasks if arguments.tasks == ("all",) else arguments.tasks
+    encoders, bank = load_pretrained(tasks=tasks)
+    seen = bank.for_tasks(tasks).seen()
+    new = record(arguments, tasks)
+    latent, length, task = encode_frames(encoders.vae, new), new["length"], new["task"]
+    embedded = {
+        share: encoders.lae.encode(latent, length.mul(share).round().long().clamp(min=1))
+        for share in arguments.shares
+    }
+    networks = Networks.grow(seen, seeds, arguments.draws)
+    known = pd.concat(
+        known_tasks(networks, phi, task, seeds).assign(share=share)
+        for share, phi in embedded.items()
+    )
+    parts = []
+    for label, name in enumerate(tasks):
+        without = Networks.grow(
+            seen.for_tasks([other for other in tasks if other != name]), seeds, arguments.draws
+        )
+        for share, phi in embedded.items():
+            found = unknown_task(without, phi[task != label], phi[task == label], seeds)
+            parts.append(found.assign(left_out=name, share=share))
+    unknown = pd.concat(parts)
+    write_table(out / "known.csv", known.round(4))
+    write_table(out / "unknown.csv", unknown.round(4))
+    return f"{_table(known, 'task')}\n\n{_table(unknown, 'left_out')}"
+
+
+def _table(rows: pd.DataFrame, by: str) -> str:
+    """Return means over seeds of each share and task, and over all tasks."""
+    measures = [str(name) for name in rows if name not in ("seed", "share", by)]
+    table: Table = [[by, "seen", *measures]]
+    for name, part in [("all", rows), *rows.groupby(by, sort=False)]:
+        for share, of_share in part.groupby("share"):
+            means = of_share[measures].mean()
+            table.append([str(name), f"{share:.0%}", *(f"{means[m]:.3f}" for m in measures)])
+    return markdown(table)
+
+
+if __name__ == "__main__":
+    print(study(tyro.cli(Arguments)))
