@@ -114,7 +114,7 @@ class Trial:
             observation="pixels",
         )
         config = BGPOConfig()
-        transforms = Compose(encode(config, self.encoders), StepCounter(50), clip(config))
+        transforms = Compose([encode(config, self.encoders), StepCounter(50), *clip(config)])
         return TransformedEnv(simulation, transforms)
 
     @torch.no_grad()

@@ -284,7 +284,7 @@ class DDPGLoss(LossModule):
         if self.has_clone:
             proposals.append(self.call_network("clone_network", successor.copy()))
         dim, keys = len(self.batch_size), self.value_network.in_keys
-        data: TensorDictBase = TensorDict.stack([one.select(*keys) for one in proposals], dim)
+        data = TensorDict.maybe_dense_stack([one.select(*keys) for one in proposals], dim)
         values = self.values("target_value_network", data, critics=self.pair)
         return (values.amin(dim) if self.ensemble else values).amax(dim)
 
