@@ -78,10 +78,6 @@ COMMANDS = {
             *(_LOOK, "groups", "experiments.groups", arguments.GroupsArguments),
             "Measure the groups that form from demonstrations.",
         ),
-        (
-            *(_LOOK, "merge", "experiments.merge", arguments.MergeArguments),
-            "Merge runs of different seeds into one.",
-        ),
     )
 }
 """The sub-commands by name."""

@@ -283,11 +283,6 @@ def load_all_seeds(path: str | Path, *, make: Callable[..., Algorithm] | None = 
                 "module that adds it with --import, or give make= as for its Trainer"
             ) from None
     if not has_checkpoint(path / "checkpoint"):
-        blocks = sorted(block.parent.name for block in path.glob("seeds-*/checkpoint"))
-        if blocks:
-            raise ValueError(
-                f"{path} was merged: name one of its blocks, such as {path / blocks[0]}"
-            )
         raise ValueError(f"{path} has no checkpoint: let the run reach its first one, or keep it")
     encoders, bank = load_inputs(path, config.tasks, digests, config.scene)
     saved = load_checkpoint(path / "checkpoint", mmap=True, newest=True)

@@ -40,7 +40,7 @@ class TrainedArguments(ImportArguments):
 
 
 def load_blocks(run: Path) -> list[LoadedRun]:
-    """Load all seeds of a run: the run itself, or the blocks of which it was merged.
+    """Load all seeds of a run: the run itself, or the runs of single seeds in its folder.
 
     Raises:
         ValueError: As for `load_all_seeds`.

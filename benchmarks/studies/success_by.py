@@ -17,7 +17,13 @@ from numpy.typing import ArrayLike
 from shared import style_success
 
 from bgpo_trl.analysis import statistics
-from bgpo_trl.analysis.comparison import Run, differing_conditions, read_run, run_directories
+from bgpo_trl.analysis.comparison import (
+    Run,
+    differing_conditions,
+    joined,
+    read_run,
+    run_directories,
+)
 from bgpo_trl.analysis.scores import late_scores
 from bgpo_trl.analysis.tables import Table
 from bgpo_trl.experiments.command_line import command_line
@@ -45,7 +51,7 @@ def runs_by(directories: Sequence[Path], name: str) -> dict[float, Run]:
         ValueError: If a run is damaged or not finished, has another algorithm or other conditions
             than the first, or if its setting is not a number, or that of another run.
     """
-    runs = [read_run(directory) for directory in directories]
+    runs = joined(map(read_run, directories))
     first, found = runs[0], dict[float, Run]()
     for run in runs:
         value = run.config.get(name)

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+import pandas as pd
 
 from bgpo_trl.files.csv_file import has_rows
 from bgpo_trl.runs.results import Curves, find_table, read_curves, read_json
@@ -38,31 +42,45 @@ NAMES = {
 
 # Entries of config.json that belong to an algorithm or to keeping its run. All others, such as
 # encoders, starts, and the half of the demonstrations to test on, are conditions of a comparison.
-_OF_THE_RUN = (
-    "name",
-    "algorithm",
-    "algorithm_class",
-    "seeds",
-    "checkpoint_minutes",
-    "task_modules",
-)
+_OF_KEEPING = ("seeds", "checkpoint_minutes", "task_modules")
 _USUAL = "practised"
+_OF_THE_RUN = ("name", "algorithm", "algorithm_class", *_OF_KEEPING)
 _OF_THE_SETTING = ("tasks", "task_starts", "schedule", "episodes")
 
 
 @dataclass(frozen=True)
 class Run:
-    """Settings, summary and curves of one run."""
+    """Settings, summary and curves of a run, or of runs that differ in their seeds alone."""
 
-    directory: Path
+    directories: tuple[Path, ...]
     config: dict[str, Any]
     summary: dict[str, Any]
     curves: Curves
 
     @property
+    def directory(self) -> Path:
+        """The first directory."""
+        return self.directories[0]
+
+    @property
+    def name(self) -> str:
+        """Name of the directory, or of the folder of several."""
+        return (self.directory if len(self.directories) == 1 else self.directory.parent).name
+
+    def paths(self, name: str) -> list[Path]:
+        """Return the paths of a table in all directories; none unless each has it."""
+        paths = [directory / name for directory in self.directories]
+        return paths if all(map(find_table, paths)) else []
+
+    def table(self, name: str, read: Callable[[Path], pd.DataFrame]) -> pd.DataFrame:
+        """Return the rows of a table in all directories."""
+        paths = [directory / name for directory in self.directories]
+        return pd.concat([read(path) for path in paths], ignore_index=True)
+
+    @property
     def algorithm(self) -> str:
         """Name of the algorithm; the directory's where ``config.json`` has none."""
-        return self.config.get("name") or self.directory.name
+        return self.config.get("name") or self.name
 
     @property
     def changed(self) -> dict[str, Any]:
@@ -201,11 +219,49 @@ def read_run(directory: Path) -> Run:
     lists: dict[str, Any] = dict.fromkeys(("nodes", "groups", "group_purity"), list | None)
     maps: dict[str, Any] = dict.fromkeys(("changed", "demonstrated_steps"), dict | None)
     summary = read_json(path, lists | maps) if path.exists() else {}
-    return Run(directory, config, summary, read_curves(directory / "eval.csv", tasks))
+    return Run((directory,), config, summary, read_curves(directory / "eval.csv", tasks))
+
+
+def joined(runs: Iterable[Run]) -> list[Run]:
+    """Return runs, of which those that differ in their seeds alone are one.
+
+    Runs that share a seed, or were tested at other times, stay apart.
+    """
+    groups: dict[str, list[Run]] = {}
+    for run in runs:
+        alike = {name: run.config[name] for name in run.config if name not in _OF_KEEPING}
+        key = json.dumps([alike, run.changed], sort_keys=True)
+        groups.setdefault(key, []).append(run)
+    found: list[Run] = []
+    for parts in groups.values():
+        seeds = [seed for run in parts for seed in run.config["seeds"]]
+        tests = {tuple(run.curves.episodes.tolist()) for run in parts}
+        found += [_joined(parts)] if len(tests) == 1 and len({*seeds}) == len(seeds) else parts
+    return found
+
+
+def _joined(parts: list[Run]) -> Run:
+    """Return runs of different seeds as one."""
+    if len(parts) == 1:
+        return parts[0]
+    first, summary = parts[0], dict(parts[0].summary)
+    for key in ("nodes", "groups", "group_purity"):  # a value per seed, or None
+        values = [run.summary.get(key) for run in parts]
+        summary[key] = None if None in values else [v for of_run in values for v in of_run or ()]
+    for key in ("commit", "command"):
+        told = dict.fromkeys(run.summary.get(key) or "" for run in parts)
+        summary[key] = "; ".join(filter(None, told))
+    curves = replace(
+        first.curves,
+        seeds=tuple(seed for run in parts for seed in run.curves.seeds),
+        success=np.concatenate([run.curves.success for run in parts]),
+    )
+    config = {**first.config, "seeds": [seed for run in parts for seed in run.config["seeds"]]}
+    return Run(tuple(run.directory for run in parts), config, summary, curves)
 
 
 def run_directories(paths: Iterable[Path]) -> list[Path]:
-    """Return the run directories among some paths and, of other folders, directly in them.
+    """Return the run directories among some paths and, of other folders, in them.
 
     Raises:
         ValueError: If a path is not a directory, or holds no run.
@@ -214,12 +270,17 @@ def run_directories(paths: Iterable[Path]) -> list[Path]:
     for path in paths:
         if not path.is_dir():
             raise ValueError(f"{path} is not a directory: name a run, or a folder of runs")
-        inside = [path] if (path / "config.json").exists() else sorted(path.glob("*/"))
-        runs = [directory for directory in inside if (directory / "config.json").exists()]
+        runs = _runs_in(path)
         if not runs:
             raise ValueError(f"{path} holds no run: name a run, or a folder of runs")
         found += runs
     return found
+
+
+def _runs_in(path: Path) -> list[Path]:
+    if (path / "config.json").exists():
+        return [path]
+    return [run for folder in sorted(path.glob("*/")) for run in _runs_in(folder)]
 
 
 def read_settings(
@@ -227,7 +288,8 @@ def read_settings(
 ) -> tuple[list[Setting], str]:
     """Read runs and sort them by setting: their tasks, and how these are presented.
 
-    Runs that are not finished, or not begun, are left out.
+    Runs that differ in their seeds alone are joined. Runs that are not finished, or not begun, are
+    left out.
 
     Args:
         directories: Run directories.
@@ -259,7 +321,7 @@ def read_settings(
     left_out = "; ".join(waiting) + f": let the run{'s' * (len(waiting) > 1)} finish"
     if not groups:
         raise ValueError(left_out if waiting else "there are no runs: name a run")
-    found = [_setting(runs, anyway) for runs in groups.values()]
+    found = [_setting(joined(runs), anyway) for runs in groups.values()]
     found.sort(key=lambda setting: (len(setting.first.tasks), setting.from_start))
     settings: list[Setting] = []
     for setting in found:
@@ -286,7 +348,7 @@ def _setting(runs: list[Run], anyway: bool) -> Setting:
     names = [run.title for run in runs]
     return Setting(
         {
-            name if names.count(name) == 1 else f"{name} ({run.directory.name})": run
+            name if names.count(name) == 1 else f"{name} ({run.name})": run
             for name, run in zip(names, runs, strict=True)
         },
         notes,

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from bgpo_trl.analysis.comparison import Run
 from bgpo_trl.analysis.statistics import Estimate, contrast
-from bgpo_trl.runs.results import TRAIN, find_table, read_final_tests, read_table, read_tests
+from bgpo_trl.runs.results import TRAIN, read_final_tests, read_table, read_tests
 
 Values = NDArray[np.float64]
 
@@ -297,15 +297,15 @@ def own_episodes(run: Run, threshold: float = 0.5) -> Values | None:
     See `trials_to`; infinite where that was not reached. None if the run has no
     ``train.csv``.
     """
-    path = run.directory / "train.csv"
-    if not find_table(path):
+    if not run.paths("train.csv"):
         return None
-    table = read_table(path, TRAIN).sort_values(["seed", "episode"])
+    table = run.table("train.csv", lambda path: read_table(path, TRAIN))
+    table = table.sort_values(["seed", "episode"])
     table = table[table["episode"] <= run.last]
     if table.empty:
         return None
     times = table.groupby(["seed", "task"])["success"].agg(trials_to, threshold)
-    return times.unstack("task").reindex(columns=list(run.tasks)).fillna(np.inf).to_numpy()
+    return np.nan_to_num(_by_seed_and_task(times, run), nan=np.inf)
 
 
 def success_steps(run: Run) -> Values:
@@ -316,7 +316,7 @@ def success_steps(run: Run) -> Values:
     Raises:
         ValueError: If ``eval.csv`` is missing or damaged.
     """
-    tests = read_tests(run.directory / "eval.csv")
+    tests = run.table("eval.csv", read_tests)
     late = in_window(tests["episode"], run.last, late_window(run))
     won = tests[late & (tests["success"] == 1)]
     return _by_seed_and_task(won.groupby(["seed", "task"])["steps"].mean(), run)
@@ -345,14 +345,14 @@ def final_means(run: Run, kind: str, column: str) -> Values | None:
     Raises:
         ValueError: If the file is damaged, or lacks tests of a seed and task.
     """
-    path = run.directory / "final.csv"
-    if not find_table(path):
+    if not run.paths("final.csv"):
         return None
-    tests = read_final_tests(path)
+    tests = run.table("final.csv", read_final_tests)
     found = tests[tests["demonstrations"] == kind].groupby(["seed", "task"])
     if np.isnan(_by_seed_and_task(found.size(), run)).any():
         raise ValueError(
-            f"{path} lacks tests with {kind} demonstrations: remove it and resume the run"
+            f"{run.directory / 'final.csv'} lacks tests with {kind} demonstrations: remove it and "
+            "resume the run"
         )
     values = _by_seed_and_task(found[column].mean(), run)
     return None if np.isnan(values).all() else values

@@ -27,8 +27,7 @@ from bgpo_trl.analysis.scores import (
     times_the_first,
     trailing_mean,
 )
-from bgpo_trl.runs.cost import Cost, read_costs
-from bgpo_trl.runs.results import find_table
+from bgpo_trl.runs.cost import Cost, read_costs, total_cost
 
 Table = list[list[str]]
 """Rows of cells; the first row holds the column names."""
@@ -313,8 +312,7 @@ def _cost_cell(cost: Cost | None) -> str:
 
 
 def _costs(run: Run) -> dict[int, Cost]:
-    path = run.directory / "cost.csv"
-    return read_costs(path) if find_table(path) else {}
+    return total_cost([read_costs(path) for path in run.paths("cost.csv")])
 
 
 def task_table(run: Run) -> Table:

@@ -202,7 +202,7 @@ Setting = Literal[
 
 @dataclass(frozen=True)
 class SweepArguments(BankArguments):
-    """Run algorithms in settings over many seeds on Ray, in blocks that are merged at the end.
+    """Run algorithms in settings over many seeds on Ray, in blocks of seeds.
 
     The same command resumes an interrupted sweep without repeating finished jobs, and seeds may be
     added. A job whose worker or machine is lost continues elsewhere from its last checkpoint. On a
@@ -240,27 +240,13 @@ class SweepArguments(BankArguments):
 
 
 @dataclass(frozen=True)
-class MergeArguments:
-    """Merge finished runs that differ only in their seeds, such as the jobs of a cluster.
-
-    Writes config.json, train.csv, eval.csv, final.csv, cost.csv and summary.json as one run of all
-    seeds would have. `bgpo report` reads the directory; `bgpo watch` and the tests of policies need
-    one of the runs.
-    """
-
-    runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """Run directories, two or more."""
-    out: Path
-    """Run directory of all seeds. An earlier result of merging some of the runs is replaced."""
-
-
-@dataclass(frozen=True)
 class ReportArguments:
     """Write tables and figures of runs: those in a folder, or single ones, of any algorithms.
 
     Prints and writes tables.md: success, differences between algorithms, forgetting and transfer,
     learning times, groups of behaviors, cost, each run task by task, and the paper's claims as far
-    as there are runs for them; beside it, figures. The report of a single run is written into its
+    as there are runs for them; beside it, figures. Runs that differ in their seeds alone, such as
+    the jobs of a cluster, are reported as one. The report of a single run is written into its
     directory. With --archive, first copies what reports read of the runs, compressed, and writes
     the report beside the copies. docs/benchmark.md defines the measures.
     """

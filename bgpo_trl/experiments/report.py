@@ -14,6 +14,7 @@ from bgpo_trl.analysis.comparison import (
     Run,
     Setting,
     differing_conditions,
+    joined,
     read_run,
     read_settings,
     reference_of,
@@ -92,7 +93,7 @@ def draw_curves(setting: Setting, out: Path) -> dict[str, Path]:
             "last": first.last,
         }
         path = out / f"{setting.slug}{part}.png"
-        tests = {name: run.directory / "eval.csv" for name, run in runs.items()}
+        tests = {name: run.paths("eval.csv") for name, run in runs.items()}
         random = first.summary.get("random_success")
         save_figure(plot_success_curves(tests, random_success=random, **shown), path, _DPI)
         figures[f"mean and one standard deviation over seeds: {names}"] = path
@@ -117,8 +118,13 @@ def draw_counts(setting: Setting, out: Path) -> dict[str, Path]:
     """Draw the numbers of nodes and groups over training; paths by caption, none without GWR-B."""
     counts = {}
     for name, run in setting.runs.items():
-        if find_table(run.directory / "train.csv") and run.summary.get("nodes") is not None:
-            counts[name] = read_counts(run.directory / "train.csv", run.last)
+        parts = [read_counts(path, run.last) for path in run.paths("train.csv")]
+        if parts and run.summary.get("nodes") is not None:
+            last = min(part["num_nodes"].shape[1] for part in parts)
+            counts[name] = {
+                column: np.concatenate([part[column][:, :last] for part in parts])
+                for column in parts[0]
+            }
     if not counts:
         return {}
     path = out / f"{setting.slug}-counts.png"
@@ -232,7 +238,8 @@ def make_report(
             if missing:
                 about.append(f"{missing} further claims need runs that are not here.")
             sections.append(Section(f"The paper's claims, {number} tasks", table, notes=about))
-    return sections, {run.directory: run for s in settings for run in s.runs.values()}
+    runs = [run for setting in settings for run in setting.runs.values()]
+    return sections, {directory: run for run in runs for directory in run.directories}
 
 
 def text_of(sections: Sequence[Section], out: Path) -> str:
@@ -273,11 +280,11 @@ def report(arguments: ReportArguments) -> str:
         raise ValueError("--out: several folders are given, name that of the report")
     directories = run_directories(named)
     if arguments.archive is not None:
-        if len({directory.name for directory in directories}) < len(directories):
+        copies = [arguments.archive / name for folder in named for name in _names_in(folder)]
+        if len({*copies}) < len(copies):
             raise ValueError("--archive: runs of the same name are given, use one folder for each")
         # Refuses before copying.
         read_settings(directories, anyway=arguments.anyway)
-        copies = [arguments.archive / directory.name for directory in directories]
         for directory, copy in zip(directories, copies, strict=True):
             archive_run(directory, copy)
         directories = copies
@@ -290,6 +297,12 @@ def report(arguments: ReportArguments) -> str:
     text = text_of(sections, out)
     write_whole(out / "tables.md", text)
     return text
+
+
+def _names_in(folder: Path) -> list[Path]:
+    """Return the paths of the runs in a folder, relative to it; of a run, its name."""
+    runs = run_directories([folder])
+    return [Path(folder.name)] if runs == [folder] else [run.relative_to(folder) for run in runs]
 
 
 def compare(paths: Sequence[Path], *, every: int | None = None, anyway: bool = False) -> str:
@@ -312,7 +325,7 @@ def compare(paths: Sequence[Path], *, every: int | None = None, anyway: bool = F
         raise ValueError(f"--compare: name two run directories, got {len(paths)}")
     if every is not None and every < 1:
         raise ValueError(f"--every must be at least 1 episode, got {every}")
-    first, second = map(read_run, paths)
+    first, second = map(_one_run, paths)
     if first.tasks != second.tasks:
         differing = differing_conditions(first, second)
         raise ValueError(f"{differing}: only runs of the same tasks in the same order are compared")
@@ -328,6 +341,14 @@ def compare(paths: Sequence[Path], *, every: int | None = None, anyway: bool = F
         rows += _differences(f"to {end}", first.tasks, *(matrix[:, 0] for matrix in matrices))
     rows += _differences("last 10 %", first.tasks, *map(late_scores, runs))
     return "\n\n".join([*notes, markdown(rows)])
+
+
+def _one_run(path: Path) -> Run:
+    """Return the run in a directory, or that of runs in it that differ in their seeds alone."""
+    runs = joined(map(read_run, run_directories([path])))
+    if len(runs) > 1:
+        raise ValueError(f"--compare: {path} holds {len(runs)} runs, name one of them")
+    return runs[0]
 
 
 def _differences(period: str, tasks: tuple[str, ...], first: Values, second: Values) -> Table:

@@ -1,12 +1,11 @@
-"""Sweeps on Ray: algorithms in settings over many seeds, in blocks of seeds that are merged.
+"""Sweeps on Ray: algorithms in settings over many seeds, in blocks of seeds.
 
     bgpo sweep --algorithms bgpo maml dist-nll --settings concurrent continual \
         --seeds 0 1 2 3 4 5 6 7 8 9 --block 5 --preset desk
 
 runs twelve jobs, as many at a time as there are cores. A job is a block of seeds of one algorithm
 in one setting, with a run directory such as ``runs/sweep/concurrent-bgpo/seeds-0-1-2-3-4``.
-Finished blocks are merged into ``runs/sweep/concurrent-bgpo``, which holds the files of one run of
-all seeds: ``bgpo report runs/sweep`` reads it.
+``bgpo report runs/sweep`` joins the blocks.
 """
 
 from __future__ import annotations
@@ -19,11 +18,9 @@ from pathlib import Path
 from bgpo_trl.algorithms import ABLATIONS
 from bgpo_trl.configs import RunConfig
 from bgpo_trl.experiments.arguments import Arguments, Setting, SweepArguments
-from bgpo_trl.experiments.merge import merge_runs
 from bgpo_trl.experiments.ray_jobs import Job, connected, play_jobs
 from bgpo_trl.experiments.run import pretrained_for, run_experiment
 from bgpo_trl.experiments.settings import run_config
-from bgpo_trl.files.writing import lock_directory
 from bgpo_trl.plugins import import_plugin
 from bgpo_trl.runs.config_file import Digests, settings_of
 from bgpo_trl.runs.directory import check_settings, holds_run
@@ -33,7 +30,7 @@ from suites import opengl
 
 
 def make_jobs(arguments: SweepArguments) -> dict[Path, list[Job]]:
-    """Return the jobs of the grid, by the directory that they are merged into.
+    """Return the jobs of the grid, by the folder of their directories.
 
     Raises:
         ValueError: If the settings are invalid, or the grid is empty.
@@ -47,7 +44,7 @@ def make_jobs(arguments: SweepArguments) -> dict[Path, list[Job]]:
     for setting in arguments.settings:
         for name in ablation if setting == "ablation" else arguments.algorithms:
             config = _config(arguments, setting, name)
-            merged = arguments.out.absolute() / f"{setting}-{name}"
+            folder = arguments.out.absolute() / f"{setting}-{name}"
             blocks = [
                 config.seeds[first : first + arguments.block]
                 for first in range(0, len(config.seeds), arguments.block)
@@ -56,9 +53,9 @@ def make_jobs(arguments: SweepArguments) -> dict[Path, list[Job]]:
                 None if path is None else path.absolute()
                 for path in (arguments.bank, arguments.encoders)
             )
-            jobs[merged] = [
+            jobs[folder] = [
                 Job(
-                    merged / "-".join(["seeds", *map(str, block)]),
+                    folder / "-".join(["seeds", *map(str, block)]),
                     replace(config, seeds=block),
                     module=arguments.module,
                     bank=bank,
@@ -111,17 +108,19 @@ def check_directories(
     Raises:
         ValueError: If a directory holds another run.
     """
-    for merged, group in jobs.items():
-        of_tasks = digests[group[0].config.tasks]
+    for folder, group in jobs.items():
+        if (folder / "config.json").exists():
+            raise ValueError(f"{folder} is not a run of a sweep: choose another --out")
+        seeds = {seed for job in group for seed in job.config.seeds}
+        ours = {job.directory / "config.json" for job in group}
+        for other in {*folder.glob("*/config.json")} - ours:
+            if shared := seeds.intersection(read_json(other, {"seeds": list})["seeds"]):
+                raise ValueError(
+                    f"{other.parent} has seed {min(shared)} in another block: add whole blocks, or "
+                    "choose another --out"
+                )
         for job in group:
-            check_settings(job.directory, settings_of(job.config, of_tasks))
-        path = merged / "config.json"
-        if path.exists():  # merged before, possibly from other blocks
-            if not any(merged.glob("seeds-*")):
-                raise ValueError(f"{merged} is not a run of a sweep: choose another --out")
-            seeds = read_json(path)["seeds"]
-            settings = {**settings_of(group[0].config, of_tasks), "seeds": seeds}
-            check_settings(merged, settings)
+            check_settings(job.directory, settings_of(job.config, digests[job.config.tasks]))
 
 
 def play(job: Job) -> None:
@@ -134,11 +133,7 @@ def play(job: Job) -> None:
 
 
 def sweep(arguments: SweepArguments) -> str:
-    """Run algorithms in settings over many seeds on Ray, in blocks that are merged at the end.
-
-    The same command resumes an interrupted sweep without repeating finished jobs, and seeds may be
-    added. A job whose worker or machine is lost continues elsewhere from its last checkpoint. On a
-    cluster, all machines need Ray and bgpo_trl, and must see --out at the same path.
+    """Run the jobs of a grid that are not finished.
 
     Raises:
         ValueError: If the settings are invalid, or a directory holds another run.
@@ -162,7 +157,6 @@ def sweep(arguments: SweepArguments) -> str:
     }
     check_directories(jobs, digests)
     todo = [job for group in jobs.values() for job in group if not job.finished]
-    lines = [f"jobs: {sum(map(len, jobs.values()))}, to run: {len(todo)}"]
     failed: dict[Job, str] = {}
     if todo:
         if arguments.address == "local":  # The machines of a cluster are not this one.
@@ -173,11 +167,6 @@ def sweep(arguments: SweepArguments) -> str:
                 failed = play_jobs(todo, play, **resources)
         except KeyboardInterrupt:
             sys.exit("interrupted: the same command continues")
-    for directory, group in jobs.items():
-        if failed.keys().isdisjoint(group):
-            with lock_directory(directory, wait=True):
-                merge_runs([job.directory for job in group], directory)
-            lines.append(f"{directory}: blocks of seeds: {len(group)}")
     if failed:
         raise RuntimeError("; ".join(f"{job} failed: {why}" for job, why in failed.items()))
-    return "\n".join(lines)
+    return f"jobs: {sum(map(len, jobs.values()))}, run: {len(todo)}; bgpo report {arguments.out}"

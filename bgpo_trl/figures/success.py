@@ -33,7 +33,7 @@ _Path = str | os.PathLike[str]
 
 
 def plot_success_curves(
-    eval_csv: _Path | Mapping[str, _Path],
+    eval_csv: _Path | Mapping[str, _Path | Sequence[_Path]],
     *,
     presented: Mapping[str, int] | None = None,
     random_success: Mapping[str, float] | None = None,
@@ -48,8 +48,8 @@ def plot_success_curves(
     (``ddof=0``), as in the paper.
 
     Args:
-        eval_csv: An ``eval.csv`` file, which may hold several algorithms and seeds; or files of one
-            run each, by legend name.
+        eval_csv: An ``eval.csv`` file, which may hold several algorithms and seeds; or the file or
+            files of each run, by legend name.
         presented: Training episode from which each task is presented, by task name, in the order of
             the panels. Starts after the first are marked with dashed lines.
         random_success: Success rate of a random policy by task, marked with dotted lines.
@@ -77,7 +77,7 @@ def plot_success_curves(
 
 
 def plot_step_curves(
-    eval_csv: _Path | Mapping[str, _Path],
+    eval_csv: _Path | Mapping[str, _Path | Sequence[_Path]],
     *,
     presented: Mapping[str, int] | None = None,
     demonstrated: Mapping[str, float] | None = None,
@@ -163,14 +163,18 @@ def _plot_curves(
     return figure, window
 
 
-def _read_tests(files: _Path | Mapping[str, _Path]) -> pd.DataFrame:
+def _read_tests(files: _Path | Mapping[str, _Path | Sequence[_Path]]) -> pd.DataFrame:
     """Return the test episodes in files; ``name`` is that of the file or of the algorithm."""
     if not isinstance(files, Mapping):
         table = read_tests(files)
         return table.assign(name=table["algorithm"])
     if not files:
         raise ValueError("there are no test episodes to plot: let the run evaluate first.")
-    tables = [read_tests(path).assign(name=name) for name, path in files.items()]
+    tables = [
+        read_tests(path).assign(name=name)
+        for name, of_run in files.items()
+        for path in ([of_run] if isinstance(of_run, str | os.PathLike) else of_run)
+    ]
     return pd.concat(tables, ignore_index=True)
 
 

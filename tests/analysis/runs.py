@@ -31,7 +31,7 @@ def make_run(success=SUCCESS, starts=STARTS, tasks="abc", name="bgpo", directory
     config = {"name": name, "task_starts": list(starts), "tasks": list(tasks), "eval_every": 5}
     config |= {"seeds": [0, 1], "episodes": int(episodes[-1])}
     curves = Curves((0, 1), tuple(tasks), episodes, np.array([success, success]))
-    return Run(Path(directory), config, summary, curves)
+    return Run((Path(directory),), config, summary, curves)
 
 
 def write_run(

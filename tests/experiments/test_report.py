@@ -1,5 +1,7 @@
 """Reports and comparisons of runs with success written by hand."""
 
+import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -166,6 +168,43 @@ def test_figures_are_beside_the_tables_and_the_report_on_an_archive_is_the_same(
     for name in figures:
         assert f"]({name})" in text_of(reported)
         assert (tmp_path / "again" / name).read_bytes() == (reported / name).read_bytes()
+
+
+def split(run, folder):
+    """Write a run of three seeds as three runs."""
+    for seed in range(3):
+        part = shutil.copytree(run, folder / run.name / f"seeds-{seed}")
+        for name in ("eval.csv", "train.csv", "final.csv"):
+            head, *rows = (run / name).read_text().splitlines(keepends=True)
+            place = head.split(",").index("seed")
+            kept = [row for row in rows if row.split(",")[place] == str(seed)]
+            (part / name).write_text("".join([head, *kept]))
+        edit(part / "config.json", seeds=[seed])
+        summary = json.loads((run / "summary.json").read_text())
+        lists = {name: [summary[name][seed]] for name in ("nodes", "groups", "group_purity")}
+        edit(part / "summary.json", **lists)
+        write_costs(part / "cost.csv", {1: Cost(10, 0.1, 2 / 3), 3: Cost(20, 0.3, 3.0)})
+
+
+def test_runs_that_differ_in_their_seeds_alone_are_reported_as_one(reported, tmp_path):
+    split(reported / "continual-bgpo", tmp_path)
+    alone = report(ReportArguments((reported / "continual-bgpo",), out=tmp_path / "whole"))
+    archive = tmp_path / "archive"
+    parts = tmp_path / "continual-bgpo"
+    assert report(ReportArguments((parts,), archive=archive)) == alone
+    assert report(ReportArguments((archive,), out=tmp_path / "again")) == alone
+    other = write_run(tmp_path / "other", "oracle", [5, 5, 5], starts=STARTS)
+    assert compared(other, parts).replace(str(parts), "x") == compared(
+        other, reported / "continual-bgpo"
+    ).replace(str(reported / "continual-bgpo"), "x")
+
+    # A seed that two runs share, and a run of other settings.
+    shutil.copytree(parts / "seeds-0", parts / "more")
+    with pytest.raises(ValueError, match="holds 4 runs, name one of them"):
+        compared(other, parts)
+    edit(parts / "more" / "config.json", seeds=[7], algorithm={"max_steps": 50, "beta": 7})
+    with pytest.raises(ValueError, match="holds 2 runs"):
+        compared(other, parts)
 
 
 @pytest.mark.parametrize(

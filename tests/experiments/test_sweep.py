@@ -1,8 +1,12 @@
-"""The grid of a sweep and the merging of its blocks of seeds, without Ray."""
+"""The grid of a sweep, and jobs on a cluster without Ray."""
 
 import contextlib
 import json
+import os
+import re
+import subprocess
 import sys
+from collections import Counter
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -13,18 +17,17 @@ import pytest
 from eight_tasks import EightTasksArguments
 
 from bgpo_trl.algorithms import ALGORITHMS
+from bgpo_trl.analysis.comparison import joined, read_run, run_directories
 from bgpo_trl.configs import PRESETS
-from bgpo_trl.experiments import merge, sweep
 from bgpo_trl.experiments import ray_jobs as jobs
-from bgpo_trl.experiments import run as experiment
+from bgpo_trl.experiments import sweep
 from bgpo_trl.experiments.ray_jobs import Job
-from bgpo_trl.experiments.report import ReportArguments, report
 from bgpo_trl.experiments.sweep import SweepArguments
 from bgpo_trl.runs.config_file import Digests, settings_of
-from bgpo_trl.runs.cost import Cost, read_costs, write_costs
 from suites import nico
-from tests.helpers import contents, rows
+from tests.helpers import contents
 
+ROOT = Path(__file__).parents[2]
 SOME = Digests("some", "bank")
 BY_TASKS = {nico.PAPER_TASKS: SOME}
 HEAD = "algorithm,seed,episode,env_steps,task,success,return,steps"
@@ -33,30 +36,14 @@ FEW = {"algorithms": ("bgpo", "maml"), "seeds": (4, 0, 2), "block": 2, "preset":
 
 
 def write_run(job):
-    """Write the files of a finished job, with results that follow from seed and episode."""
-    config, folder, seeds = job.config, job.directory, job.config.seeds
-    (folder / "figures").mkdir(parents=True, exist_ok=True)
+    """Write the files by which a finished job is known and tested."""
+    config, folder = job.config, job.directory
+    folder.mkdir(parents=True, exist_ok=True)
     (folder / "config.json").write_text(json.dumps(settings_of(config, SOME)))
-    summary = {"commit": f"c{seeds[0] // 2}", "command": "a", "random_success": {"x": 0.5}}
-    of_groups = {"nodes": [100 + seed for seed in seeds], "groups": [3 + seed for seed in seeds]}
-    of_groups["group_purity"] = [1 - seed / 8 for seed in seeds]
-    summary |= of_groups if config.name == "bgpo" else {"nodes": None, "groups": None}
-    (folder / "summary.json").write_text(json.dumps(summary))
-    (folder / "gwr.csv").write_text(f"task,w0,w1\n0,1,2\n1,2,5\n2,0,{seeds[0]}\n")
-    write_costs(folder / "cost.csv", {3: Cost(7, 0.5 * len(seeds), 2.0 * len(seeds))})
-    for name in ("episodes.png", "success.png"):
-        (folder / "figures" / name).write_text(str(seeds[0]))
-    train, tests = [HEAD + ",loss_actor,num_nodes,num_groups"], [HEAD]
-    for episode, seed in product(range(1, config.episodes + 1), seeds):
-        row = f"{config.name},{seed},{episode},{7 * episode},{{}},{(seed + episode) % 2},0.1,5"
-        train.append(row.format(nico.PAPER_TASKS[episode % 3]) + f",{seed}.25,9,3")
-        if episode % config.eval_every == 0:
-            tests += [row.format(task) for task in nico.PAPER_TASKS] * 2
-    final = ["seed,demonstrations,task,success,task_inference"]
-    for kind, task, seed in product(("seen", "held-out"), nico.PAPER_TASKS, seeds):
-        final.append(f"{seed},{kind},{task},0.{seed},1.0")
-    for name, lines in (("train.csv", train), ("eval.csv", tests), ("final.csv", final)):
-        (folder / name).write_text("\n".join(lines) + "\n")
+    tests = [HEAD]
+    for episode, seed in product(range(config.eval_every, config.episodes + 1), config.seeds):
+        tests += [f"{config.name},{seed},{episode},9,{task},1,1,5" for task in config.tasks]
+    (folder / "eval.csv").write_text("\n".join(tests) + "\n")
 
 
 def test_a_job_is_a_block_of_seeds_of_an_algorithm_in_a_setting(tmp_path):
@@ -96,7 +83,7 @@ def test_jobs_carry_tasks_module_and_bank(tmp_path, monkeypatch):
         (arguments.out / "config.json").touch()
 
     monkeypatch.setattr(sweep, "import_plugin", events.append)
-    monkeypatch.setattr(experiment, "run_experiment", run_experiment)
+    monkeypatch.setattr(sweep, "run_experiment", run_experiment)
     for _ in range(2):
         sweep.play(job)
     path = tmp_path / bank
@@ -105,7 +92,7 @@ def test_jobs_carry_tasks_module_and_bank(tmp_path, monkeypatch):
 
 def test_the_benchmark_of_eight_tasks_is_a_grid_with_tests_every_50_episodes(monkeypatch):
     asked = []
-    monkeypatch.setattr(sweep, "sweep", lambda arguments: asked.append(arguments) or "done")
+    monkeypatch.setattr(eight_tasks, "sweep", lambda arguments: asked.append(arguments) or "done")
     for episodes in (4_000, 20):
         assert eight_tasks.eight_tasks(EightTasksArguments(episodes=episodes)) == "done"
     assert [arguments.eval_every for arguments in asked] == [50, 20]
@@ -162,58 +149,6 @@ def test_directories_of_other_runs_are_refused(tmp_path):
     assert contents(tmp_path) == before
 
 
-def test_merged_blocks_equal_one_run_of_all_seeds(tmp_path, monkeypatch):
-    monkeypatch.setattr(sys, "argv", ["-m", "bgpo_trl", "sweep", "--block", "2"])
-    arguments = SweepArguments(out=tmp_path / "blocks", episodes=6, **FEW)
-    for merged, group in sweep.make_jobs(arguments).items():
-        whole = Job(tmp_path / "whole" / merged.name, replace(group[0].config, seeds=(4, 0, 2)))
-        for job in (*group, whole):
-            write_run(job)
-        merge.merge_runs([job.directory for job in group], merged)
-        for name in ("train.csv", "eval.csv", "final.csv"):
-            theirs = rows(whole.directory / name)
-            theirs.sort(key=lambda row: (int(row["seed"]), int(row.get("episode", 0))))
-            assert rows(merged / name) == theirs != []
-        of_blocks, of_whole = (
-            {name: json.loads((run / f"{name}.json").read_text()) for name in ("config", "summary")}
-            for run in (merged, whole.directory)
-        )
-        told = {"commit": "c2 c1", "command": "python -m bgpo_trl sweep --block 2"}
-        assert of_blocks == {**of_whole, "summary": of_whole["summary"] | told}
-        assert read_costs(merged / "cost.csv") == {3: Cost(14, 1.5, 6.0)}  # of two blocks
-        figures = {path.name: path.read_text() for path in (merged / "figures").iterdir()}
-        assert figures == {"episodes.png": "4"}
-        assert (merged / "gwr.csv").read_text() == (whole.directory / "gwr.csv").read_text()
-    texts = []
-    for folder in ("blocks", "whole"):
-        report(ReportArguments((tmp_path / folder,)))
-        text = (tmp_path / folder / "tables.md").read_text()
-        texts.append(text.partition("## GWR-B, by seed")[0])
-    assert texts[0] == texts[1]
-
-
-def test_merging_again_changes_nothing_and_a_gap_is_not_merged(tmp_path):
-    merged, group = sweep.make_jobs(SweepArguments(out=tmp_path, episodes=4, **FEW)).popitem()
-    for job in group:
-        write_run(job)
-    blocks = [job.directory for job in group]
-    merge.merge_runs(blocks, merged)
-    before = contents(tmp_path)
-    merge.merge_runs(blocks, merged)
-    assert contents(tmp_path) == before
-    train = blocks[1] / "train.csv"
-    lines = train.read_text().splitlines(keepends=True)
-    for broken in (lines[:-1], [*lines, lines[-1]], [*lines[:-1], lines[1]]):
-        train.write_text("".join(broken))
-        with pytest.raises(ValueError, match="do not have each episode of each seed once"):
-            merge.merge_runs(blocks, merged)
-        train.write_text("".join(lines))
-        assert contents(tmp_path) == before
-    (blocks[0] / "final.csv").unlink()
-    with pytest.raises(ValueError, match=r"final\.csv is missing"):
-        merge.merge_runs(blocks, merged)
-
-
 def test_a_sweep_runs_each_job_once(tmp_path, monkeypatch):
     """In this process."""
     played, broken = [], ["concurrent-bgpo/seeds-4-0"]
@@ -237,29 +172,63 @@ def test_a_sweep_runs_each_job_once(tmp_path, monkeypatch):
     monkeypatch.setattr(sweep, "play_jobs", play_jobs)
     monkeypatch.setattr(sweep, "play", play)
     some = [SimpleNamespace(identity=digest) for digest in SOME]
-    monkeypatch.setattr(experiment, "pretrained_for", lambda tasks, bank, **_: some)
+    monkeypatch.setattr(sweep, "pretrained_for", lambda tasks, bank, **_: some)
 
     arguments = SweepArguments(out=tmp_path, episodes=4, **FEW)
     with pytest.raises(RuntimeError, match=f"^{broken[0]} failed: no space left$"):
         sweep.sweep(arguments)
     blocks = [f"concurrent-{name}/seeds-{s}" for name in ("bgpo", "maml") for s in ("4-0", "2")]
     assert played == blocks
-    assert not (tmp_path / "concurrent-bgpo" / "eval.csv").exists()
-    assert (tmp_path / "concurrent-maml" / "eval.csv").exists()
     assert "OSError: no space left" in (tmp_path / broken[0] / "log.txt").read_text()
 
     broken.clear(), played.clear()
     sweep.sweep(arguments)
     assert played == blocks[:1]
-    assert (tmp_path / "concurrent-bgpo" / "eval.csv").exists()
 
     played.clear()
     before = contents(tmp_path)
-    assert sweep.sweep(arguments).startswith("jobs: 4, to run: 0\n")
+    assert sweep.sweep(arguments).startswith("jobs: 4, run: 0;")
     assert contents(tmp_path) == before
     assert not played
 
-    sweep.sweep(replace(arguments, algorithms=("maml",), seeds=(4, 0, 2, 5, 3, 1), block=2))
-    assert played == [f"concurrent-maml/seeds-{block}" for block in ("2-5", "3-1")]
-    seeds = [row["seed"] for row in rows(tmp_path / "concurrent-maml" / "train.csv")]
-    assert seeds == sorted(4 * "012345")
+    with pytest.raises(ValueError, match="seeds-2 has seed 2 in another block: add whole blocks"):
+        sweep.sweep(replace(arguments, seeds=(4, 0, 2, 5)))
+    sweep.sweep(replace(arguments, algorithms=("maml",), seeds=(5, 3)))
+    assert played == ["concurrent-maml/seeds-5-3"]
+    bgpo, maml = joined(map(read_run, run_directories([tmp_path])))
+    assert sorted(bgpo.curves.seeds) == [0, 2, 4]
+    assert sorted(maml.curves.seeds) == [0, 2, 3, 4, 5]
+
+
+def test_the_documented_slurm_array_requeues_interrupted_jobs_alone(tmp_path):
+    page = (ROOT / "docs" / "benchmark.md").read_text()
+    (script,) = re.findall(r"^```sh\n(#!/bin/bash\n.*?)^```", page, re.DOTALL | re.MULTILINE)
+    (tmp_path / "array.sh").write_text(script)
+    # Each job is interrupted once; the last one fails then.
+    programs = {
+        "srun": 'exec "$@"',
+        "scontrol": 'echo "$2" >> queue',
+        "bgpo": 'echo "$@" >> calls\n'
+        'if [ "$(grep -c -- "--seeds $SLURM_ARRAY_TASK_ID " calls)" -eq 1 ]; then exit 75; fi\n'
+        "exit $((SLURM_ARRAY_TASK_ID == 14))",
+    }
+    for name, text in programs.items():
+        (tmp_path / name).write_text(f"#!/bin/bash\n{text}\n")
+        (tmp_path / name).chmod(0o755)
+    first, last = map(int, re.findall(r"--array=(\d+)-(\d+)", script)[0])
+    queue, ended, requeued = [*range(first, last + 1)], Counter(), tmp_path / "queue"
+    while queue:
+        seed = queue.pop(0)
+        environment = {"SLURM_ARRAY_TASK_ID": str(seed), "SLURM_JOB_ID": str(seed)}
+        environment["PATH"] = f"{tmp_path}:{os.environ['PATH']}"
+        job = subprocess.run(["bash", "array.sh"], cwd=tmp_path, env=environment, check=False)
+        ended[seed, job.returncode] += 1
+        if requeued.exists():
+            queue += map(int, requeued.read_text().split())
+            requeued.unlink()
+    again = {(seed, 75): 1 for seed in range(first, last + 1)}
+    assert ended == again | {(seed, int(seed == 14)): 1 for seed in range(first, last + 1)}
+    calls = (tmp_path / "calls").read_text().splitlines()
+    assert Counter(calls) == dict.fromkeys(calls, 2)
+    for call in calls:
+        assert "--resume" in call and re.search(r"--seeds (\d+) --out .*/seeds-\1$", call)
