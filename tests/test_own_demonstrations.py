@@ -24,9 +24,9 @@ def filmed(n, seed, actions=False):
     """Demonstrations of both tasks."""
     simulation, episodes = SavedDot(), {name: [] for name in TASKS}
     simulation.seed(seed)
-    for task, (name, direction) in enumerate(zip(TASKS, (-1.0, 1.0), strict=True)):
+    for name, direction in zip(TASKS, (-1.0, 1.0), strict=True):
         for _ in range(n):
-            simulation.reset(task)
+            simulation.reset(name)
             frames, steps, success = [simulation.frame()], [], False
             while not success:
                 steps.append([direction * simulation.random.uniform(0.4, 0.6)])

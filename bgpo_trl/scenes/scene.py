@@ -84,8 +84,8 @@ class Scene:
         action_size: Number of components of an action, each in [-1, 1].
         max_steps: Length of the longest episode.
         has_spread: Whether starts can be drawn from a share of their range.
-        demonstrator: Function from a simulation at the start of an episode, the number of the
-            task and the seed of its noise to a function that returns the next action ``[A]``.
+        demonstrator: Function from a simulation at the start of an episode, the name of the task
+            and the seed of its noise to a function that returns the next action ``[A]``.
         state: Meaning of the ground truth.
         weights: Encoders that come with it.
         modules: Modules that define tasks which are not the scene's own, by name of the task.
@@ -101,7 +101,7 @@ class Scene:
     action_size: int
     max_steps: int = 50
     has_spread: bool = False
-    demonstrator: Callable[[Simulation, int, int], Callable[[], NDArray[Any]]] | None = None
+    demonstrator: Callable[[Simulation, str, int], Callable[[], NDArray[Any]]] | None = None
     state: StateColumns | None = None
     weights: Weights | None = None
     modules: Callable[[Sequence[str]], Mapping[str, str]] = lambda _: {}

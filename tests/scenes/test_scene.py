@@ -85,6 +85,17 @@ def test_an_environment_of_a_simulation_keeps_the_promises_to_torchrl():
     assert env.simulations[0].place == place - 0.5
 
 
+def test_simulations_and_demonstrators_are_told_the_name_of_the_task(tmp_path):
+    """Not its position, which is another one in every run."""
+    env = scene().simulate(["right", "left"], batch_size=[3])
+    env.reset(TensorDict({"task": torch.tensor([0, 1, 0])}, [3]))
+    assert [simulation.task for simulation in env.simulations] == ["right", "left", "right"]
+    options = {"tasks": ["right"], "per_task": 2, "held_out_per_task": 1, "progress": False}
+    shown = record_demonstrations(tmp_path, scene=scene(), **options)
+    for row in shown:
+        assert (row["action"][: int(row["length"]) - 1] > 0).all()
+
+
 class Falling(Dot):
     def step(self, action):
         return super().step(action)._replace(success=False, failure=True)
