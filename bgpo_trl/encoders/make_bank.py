@@ -14,7 +14,6 @@ import torch
 import tyro
 from tensordict import TensorDictBase
 
-from bgpo_trl.configs.runs import PAPER_TASKS
 from bgpo_trl.data.bank import DemonstrationBank, DemonstrationSteps
 from bgpo_trl.data.dataset import load_demonstrations, read_meta
 from bgpo_trl.encoders.pretrained import default_weights
@@ -24,6 +23,7 @@ from bgpo_trl.encoders.representation import (
     load_representation,
 )
 from bgpo_trl.plugins import import_plugin
+from bgpo_trl.scenes import find_scene
 
 
 @torch.no_grad()
@@ -31,7 +31,7 @@ def make_bank(
     representation: Representation,
     dataset: TensorDictBase,
     *,
-    tasks: Sequence[str] = PAPER_TASKS,
+    tasks: Sequence[str],
     actions: Literal["inferred", "recorded"] = "inferred",
     spread: float = 1.0,
 ) -> DemonstrationBank:
@@ -63,7 +63,7 @@ def make_bank(
         None if action is None else DemonstrationSteps.of(latent, action, length * train),
         representation.identity,
         spread,
-        representation.metadata.get("scene_version"),
+        representation.metadata.get("scene"),
     )
 
 
@@ -86,7 +86,7 @@ def main(
     import_plugin(module)
     meta = read_meta(dataset)
     weights = default_weights(scene=meta["scene"]) if weights is None else weights
-    encoders = load_representation(weights, scene_version=meta["scene_version"])
+    encoders = load_representation(weights, scene=find_scene(meta["scene"]))
     bank = make_bank(
         encoders,
         load_demonstrations(dataset),

@@ -298,7 +298,7 @@ def main(arguments: Arguments) -> None:
     scene, weights = find_scene(meta["scene"]), arguments.weights
     if weights is None:
         weights = default_weights(meta["tasks"], scene=scene)
-    representation = load_representation(weights, scene_version=scene.version)
+    representation = load_representation(weights, scene=scene)
     play = None if arguments.play is None else load_demonstrations(arguments.play)
     dataset = load_demonstrations(arguments.dataset)
     probe(representation, dataset, arguments.out, play=play, columns=scene.state)

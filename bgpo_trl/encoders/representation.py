@@ -37,6 +37,7 @@ from bgpo_trl.objectives.supervised import (
     SequenceReconstructionLoss,
     VAEInverseLoss,
 )
+from bgpo_trl.scenes import Scene
 
 Network = TypeVar("Network", bound=nn.Module)
 
@@ -50,7 +51,8 @@ class Representation:
         lae: Sequence encoder; ``lae.encode(latent, length)`` is the embedding phi.
         inverse: Inverse model on latents; it infers the actions of demonstrations for a bank. None
             if it was trained on nothing: no recorded actions were known.
-        metadata: ``scene_version``, ``spread``, ``config`` (JSON), ``seed``, ``command``.
+        metadata: ``scene`` (`Scene.identity`), ``spread``, ``config`` (JSON), ``seed`` and
+            ``command``.
     """
 
     vae: VAE
@@ -68,13 +70,31 @@ class Representation:
         """Digest of all weights; it identifies the encoders that made an embedding."""
         return digest(_tensors(self))
 
+    def check_scene(self, scene: Scene, what: object, remedy: str) -> None:
+        """Raise ``ValueError`` unless the encoders are of a scene, and of its frames' size.
+
+        Args:
+            scene: The robot.
+            what: Name of the encoders, such as their path, which begins the message.
+            remedy: What to do if they are of another version of the scene.
+        """
+        scene.check_identity(self.metadata.get("scene"), what, remedy)
+        found, wanted = [*self.vae.frame_shape], [*scene.frame_shape]
+        if self.inverse is not None:  # else, no actions were known
+            found, wanted = [*found, self.vae.action_size], [*wanted, scene.action_size]
+        if found != wanted:
+            raise ValueError(
+                f"{what} has frames of {found[:2]} and {found[2:]} actions, the scene {wanted[:2]} "
+                f"and {wanted[2:]}: {remedy}, and change the scene's version with its sizes"
+            )
+
 
 def train_representation(
     dataset: TensorDictBase,
     config: RepresentationConfig | None = None,
     *,
     play: TensorDictBase | None = None,
-    scene_version: str,
+    scene: str,
     spread: float = 1.0,
     command: str = "",
     checkpoint: str | Path | None = None,
@@ -92,7 +112,7 @@ def train_representation(
             alone, so that it has seen none of the actions that it infers for demonstrations;
             without play, it learns from those of demonstrations. If what it would learn from lacks
             actions, there is none.
-        scene_version: Version of the scene of the frames, stored with the weights.
+        scene: Identity of the scene of the frames (`Scene.identity`), stored with the weights.
         spread: Share of the range of start states of the recordings, stored with the weights.
         command: Command line, stored with the weights.
         checkpoint: Folder for checkpoints, from which an interrupted training is resumed and then
@@ -123,7 +143,7 @@ def train_representation(
             latent = encode_frames(vae, own)
         inverse = _train_inverse(latent, own, config.inverse, fit, config.seed).cpu()
     metadata = {
-        "scene_version": scene_version,
+        "scene": scene,
         "spread": str(spread),
         "config": json.dumps(asdict(config)),
         "seed": str(config.seed),
@@ -202,10 +222,10 @@ def save_representation(representation: Representation, path: str | Path) -> Non
     save_tensors(path, _tensors(representation), representation.metadata)
 
 
-def load_representation(path: str | Path, *, scene_version: str | None = None) -> Representation:
+def load_representation(path: str | Path, *, scene: Scene | None = None) -> Representation:
     """Read encoders written by `save_representation`; they are in eval mode, without gradients.
 
-    By default, any version of the scene is accepted.
+    By default, those of any scene are accepted.
 
     Raises:
         ValueError: If the file is missing, damaged, or belongs to another scene.
@@ -217,7 +237,6 @@ def load_representation(path: str | Path, *, scene_version: str | None = None) -
         if any(value.dtype != torch.float32 for value in tensors.values()):
             raise ValueError("weights are float32")
         config = json.loads(metadata["config"])
-        trained_on = metadata["scene_version"]
         vae = VAE(
             config["vae"]["latent_size"],
             len(tensors["vae.inverse_head.bias"]),
@@ -237,10 +256,8 @@ def load_representation(path: str | Path, *, scene_version: str | None = None) -
         raise ValueError(f"no encoder weights at {path}: {remedy}") from None
     except Exception as error:
         raise ValueError(f"{path} is damaged or holds no encoder weights: {remedy}") from error
-    if scene_version is not None and trained_on != scene_version:
-        raise ValueError(
-            f"{path} was trained on scene {trained_on}, this is scene {scene_version}: {remedy}"
-        )
+    if scene is not None:
+        encoders.check_scene(scene, path, remedy)
     for _, module in encoders.networks():
         module.eval().requires_grad_(False)
     return encoders

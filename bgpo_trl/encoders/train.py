@@ -124,7 +124,7 @@ def train_encoders(
             representation = retrain_inverse(keep, play, config, **fit)
         else:
             representation = train_representation(
-                dataset, config, play=play, scene_version=scene.version, spread=spread, **fit
+                dataset, config, play=play, scene=scene.identity, spread=spread, **fit
             )
     save_representation(representation, weights)
     bank = make_bank(representation, dataset, tasks=tasks, spread=spread)
@@ -217,7 +217,7 @@ def main(arguments: Arguments) -> None:
     line = shlex.join(["python", "-m", "bgpo_trl.encoders.train", *sys.argv[1:]])
     keep = None
     if arguments.keep is not None:
-        keep = load_representation(arguments.keep, scene_version=scene.version)
+        keep = load_representation(arguments.keep, scene=scene)
     train_encoders(
         dataset,
         play,

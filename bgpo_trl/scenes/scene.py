@@ -72,7 +72,7 @@ class Scene:
     ``weights``, encoders are trained or named.
 
     Attributes:
-        name: Name in settings, datasets and on command lines.
+        name: Name in settings, files and on command lines, without spaces.
         version: Version of everything that frames and dynamics depend on. Datasets, encoders and
             banks of another version are refused.
         tasks: Names of all tasks; may grow while the program runs.
@@ -107,6 +107,10 @@ class Scene:
     modules: Callable[[Sequence[str]], Mapping[str, str]] = lambda _: {}
 
     def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or len(self.name.split()) != 1:
+            raise ValueError(f"the name of a scene is a word without spaces, got {self.name!r}")
+        if not isinstance(self.version, str) or not self.version.isprintable() or not self.version:
+            raise ValueError(f"the version of a scene is a printable string, got {self.version!r}")
         if min(self.frame_shape) < 16 or len(self.frame_shape) != 2:
             raise ValueError(
                 f"frame_shape is {self.frame_shape}: a height and a width of at least 16 pixels"
@@ -117,6 +121,26 @@ class Scene:
                 f"{self.max_steps}"
             )
         self.check_tasks(self.default_tasks)
+
+    @property
+    def identity(self) -> str:
+        """Name and version, by which encoders and banks say whose frames they are made of."""
+        return f"{self.name} {self.version}"
+
+    def check_identity(self, found: str | None, what: object, remedy: str) -> None:
+        """Raise ``ValueError`` if something was made for another robot, or version of this one.
+
+        Args:
+            found: Identity of the scene that it was made for, as stored with it.
+            what: Its name, such as a path, which begins the message.
+            remedy: What to do if it was made for another version.
+        """
+        if found == self.identity:
+            return
+        name = "" if found is None else found.partition(" ")[0]
+        if name != self.name:
+            remedy = f"name the scene {name!r} (--scene {name}), or take what is of {self.name!r}"
+        raise ValueError(f"{what} is of the scene {found}, this is {self.identity}: {remedy}")
 
     @property
     def all_tasks(self) -> tuple[str, ...]:
@@ -157,6 +181,7 @@ class Scene:
     def check_tasks(self, tasks: Sequence[str]) -> None:
         """Raise ``ValueError`` if a task does not exist or is named twice."""
         for position, name in enumerate(tasks):
+            check_name(name)
             if name not in self.tasks:
                 raise ValueError(
                     f"the scene {self.name!r} has no task {name!r}: choose one of "
@@ -171,6 +196,14 @@ class Scene:
             raise ValueError(f"spread is {spread}: choose a number from 0 (nominal places) to 1")
         if spread != 1.0 and not self.has_spread:
             raise ValueError(f"the starts of the scene {self.name!r} have no spread: leave it at 1")
+
+
+def check_name(task: object) -> None:
+    """Raise ``ValueError`` unless it can be the name of a task: printable, no space at its ends."""
+    if not isinstance(task, str) or not task.isprintable() or task.strip() != task or not task:
+        raise ValueError(
+            f"the name of a task is a printable string that no space begins or ends, got {task!r}"
+        )
 
 
 SCENES: dict[str, Scene | str] = {"nico": "bgpo_trl.scenes.nico:NICO"}

@@ -31,7 +31,6 @@ from bgpo_trl.encoders.representation import (
 )
 from bgpo_trl.encoders.train import train_encoders
 from bgpo_trl.scenes.nico import NICO
-from suites import nico
 from tests.helpers import TINY_ENCODERS
 
 CONFIG = RepresentationConfig(
@@ -88,7 +87,7 @@ def trained(dataset: TensorDict) -> Representation:
 
 
 def train(dataset: TensorDict, config: RepresentationConfig = TINY, **options) -> Representation:
-    options = {"scene_version": "squares", "progress": False, **options}
+    options = {"scene": "squares 1", "progress": False, **options}
     return train_representation(dataset, config, **options)
 
 
@@ -204,7 +203,7 @@ def test_training_writes_weights_log_and_probes(tmp_path: Path) -> None:
     play = squares(10)
     play["state"][..., 7:] = 1.0  # on the table
     trained, _ = train_encoders(squares(8), play, weights, folder, TINY, "make weights")
-    loaded = load_representation(weights, scene_version=nico.scene_version())
+    loaded = load_representation(weights, scene=NICO)
     assert same(trained, loaded)
     assert loaded.metadata["command"] == "make weights"
     rows = list(csv.DictReader((folder / "train.csv").open()))
