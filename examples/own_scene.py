@@ -126,7 +126,7 @@ if __name__ == "__main__":
     small = RepresentationConfig(
         vae=VAEConfig(steps=300, batch_size=32),
         lae=SequenceAutoencoderConfig(steps=300, batch_size=64),
-        inverse=InverseModelConfig(steps=1_000, largest_action=1.0),
+        inverse=InverseModelConfig(steps=1_000),
     )
     encoders, bank = make_pretrained(
         OUT / "encoders.safetensors",

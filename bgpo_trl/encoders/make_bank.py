@@ -32,7 +32,7 @@ def make_bank(
     dataset: TensorDictBase,
     *,
     tasks: Sequence[str],
-    actions: Literal["inferred", "recorded"] = "inferred",
+    actions: Literal["inferred", "recorded"] = "recorded",
     spread: float = 1.0,
 ) -> DemonstrationBank:
     """Embed demonstrations; keep the latents and actions of the training ones.
@@ -42,16 +42,16 @@ def make_bank(
         dataset: Reads ``pixels`` ``[N, T, H, W, 3]``, ``length``, ``task`` and ``train`` ``[N]``,
             and ``action`` ``[N, T - 1, A]``.
         tasks: Task names, in the order of their labels.
-        actions: ``"inferred"`` stores the actions that the inverse model infers from the
-            frames, the only actions that an observer of a demonstration has; ``"recorded"`` stores
-            the true ones, for comparison. Without an inverse model, or recorded actions, the bank
-            has no steps: embeddings alone, without demonstrations as experience.
+        actions: ``"recorded"`` stores the actions of the dataset, or if it has none those that
+            the inverse model infers from the frames; ``"inferred"`` always the latter, the only
+            actions that an observer of a demonstration has. Without either, the bank has no steps:
+            embeddings alone, without demonstrations as experience.
         spread: Share of the range of start states that the dataset was recorded over.
     """
     length = dataset["length"]
     latent = encode_frames(representation.vae, dataset)
     action = dataset.get("action", None)
-    if actions == "inferred":
+    if actions == "inferred" or action is None:
         inverse = representation.inverse
         action = None if inverse is None else inverse(latent, length)
     train = dataset["train"].clone()
@@ -72,7 +72,7 @@ def main(
     out: tyro.conf.Positional[Path],
     weights: Path | None = None,
     module: Annotated[str | None, tyro.conf.arg(name="import")] = None,
-    actions: Literal["inferred", "recorded"] = "inferred",
+    actions: Literal["inferred", "recorded"] | None = None,
 ) -> None:
     """Embed a recorded dataset with trained encoders.
 
@@ -81,17 +81,19 @@ def main(
         out: Bank to write.
         weights: Encoder weights; by default those that come with the scene.
         module: Module that adds the scene, imported first; here or installed.
-        actions: Actions of the stored demonstrations, inferred from frames or recorded.
+        actions: Actions of the stored demonstrations, recorded or inferred from frames; by default
+            as the scene says.
     """
     import_plugin(module)
     meta = read_meta(dataset)
-    weights = default_weights(scene=meta["scene"]) if weights is None else weights
-    encoders = load_representation(weights, scene=find_scene(meta["scene"]))
+    scene = find_scene(meta["scene"])
+    weights = default_weights(scene=scene) if weights is None else weights
+    encoders = load_representation(weights, scene=scene)
     bank = make_bank(
         encoders,
         load_demonstrations(dataset),
         tasks=meta["tasks"],
-        actions=actions,
+        actions=scene.bank_actions if actions is None else actions,
         spread=meta["spread"],
     )
     bank.save(out)

@@ -126,17 +126,19 @@ def train_representation(
 
     Raises:
         ValueError: If the dataset or the configuration cannot be trained on, or ``checkpoint``
-            belongs to a training with another configuration.
+            belongs to a training with another configuration; or if ``largest_action`` leaves no
+            action to learn from, or more than a twentieth of those demonstrated out.
     """
     config = config or RepresentationConfig()
     train, _ = split(dataset)
+    seen = [train] if play is None else [train, split(play)[0]]
+    own = seen[-1]
+    _check_actions(train, own, config.inverse)
     folder = Path(checkpoint) if checkpoint else None
     fit = Fit(config, folder, log, progress, device)
-    seen = [train] if play is None else [train, split(play)[0]]
     vae = _train_vae(seen, config.vae, fit, config.seed)
     latent = encode_frames(vae, train)
     lae = _train_lae(latent, train.get("length"), config.lae, fit, config.seed)
-    own = seen[-1]
     inverse = None
     if "action" in own:
         if play is not None:
@@ -175,6 +177,7 @@ def retrain_inverse(
     own, _ = split(play)
     if "action" not in own:
         raise ValueError("the inverse model learns from actions, which this play lacks: record it")
+    _check_actions(None, own, config.inverse)
     vae = representation.vae.to(device)
     latent = encode_frames(vae, own)
     fit = Fit(config, folder, log, progress, device)
@@ -361,6 +364,41 @@ def _actions_of_frames(dataset: TensorDictBase, own: TensorDictBase) -> Tensor:
     return torch.nn.functional.pad(action, (0, 0, 0, 1))[valid_steps(length, n_frames)]
 
 
+def _steps_to_infer(episodes: TensorDictBase, config: InverseModelConfig) -> tuple[Tensor, Tensor]:
+    """Return which steps have an action, and which a small enough one, both bool ``[N, T - 1]``."""
+    action = episodes.get("action")
+    limit = 1.0 if config.largest_action is None else config.largest_action
+    valid = valid_steps(episodes.get("length") - 1, action.shape[1])
+    return valid, action.abs().amax(-1) <= limit
+
+
+def _check_actions(
+    shown: TensorDictBase | None, own: TensorDictBase, config: InverseModelConfig
+) -> None:
+    """Check, before hours of training, that the inverse model sees what it is to infer.
+
+    Args:
+        shown: Demonstrations.
+        own: Episodes that it learns from.
+        config: Its settings.
+
+    Raises:
+        ValueError: If there is nothing to learn from, or hardly what demonstrations do.
+    """
+    for episodes, most in ((shown, 0.05), (own, 1.0)):
+        if episodes is None or "action" not in episodes:
+            continue
+        valid, small = _steps_to_infer(episodes, config)
+        left_out = float((valid & ~small).sum() / valid.sum())
+        if left_out > most or left_out == 1:
+            component = int(episodes.get("action")[valid].abs().mean(0).argmax())
+            raise ValueError(
+                f"largest_action {config.largest_action} leaves {left_out:.0%} of the actions out, "
+                f"most by component {component}, and the inverse model would never see them: raise "
+                "it (--config.inverse.largest-action, or largest_action of the scene), 1 keeps all"
+            )
+
+
 def _train_inverse(
     latent: Tensor,
     episodes: TensorDictBase,
@@ -370,12 +408,8 @@ def _train_inverse(
 ) -> InverseModel:
     """Train the inverse model on the latents ``[N, T, 64]`` and actions of episodes."""
     length, action = episodes.get("length"), episodes.get("action")
-    slow = action.abs().amax(-1) <= config.largest_action
-    chosen = (slow & valid_steps(length - 1, action.shape[1])).nonzero()
-    if not len(chosen):
-        raise ValueError(
-            f"no recorded action is as small as largest_action {config.largest_action}"
-        )
+    valid, slow = _steps_to_infer(episodes, config)
+    chosen = (slow & valid).nonzero()
 
     def sample(generator: torch.Generator) -> TensorDict:
         drawn = torch.randint(len(chosen), (config.batch_size,), generator=generator)

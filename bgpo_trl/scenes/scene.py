@@ -6,7 +6,7 @@ import importlib
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from numpy.typing import NDArray
 
@@ -83,6 +83,12 @@ class Scene:
         frame_shape: Height and width of a frame, at least 16 each.
         action_size: Number of components of an action, each in [-1, 1].
         max_steps: Length of the longest episode.
+        largest_action: Actions with a larger component are left out of the training of the inverse
+            model. Below 1 only if demonstrators never exceed it: errors of faster movements, as in
+            play, would prevail in the loss.
+        bank_actions: Actions of demonstrations as experience: those recorded with them, inferred
+            where there are none; or always those that the inverse model infers, the only ones that
+            an observer has.
         has_spread: Whether starts can be drawn from a share of their range.
         demonstrator: Function from a simulation at the start of an episode, the name of the task
             and the seed of its noise to a function that returns the next action ``[A]``.
@@ -100,6 +106,8 @@ class Scene:
     frame_shape: tuple[int, int]
     action_size: int
     max_steps: int = 50
+    largest_action: float = 1.0
+    bank_actions: Literal["recorded", "inferred"] = "recorded"
     has_spread: bool = False
     demonstrator: Callable[[Simulation, str, int], Callable[[], NDArray[Any]]] | None = None
     state: StateColumns | None = None
@@ -119,6 +127,11 @@ class Scene:
             raise ValueError(
                 f"action_size and max_steps must be at least 1, got {self.action_size} and "
                 f"{self.max_steps}"
+            )
+        if not 0 < self.largest_action <= 1 or self.bank_actions not in ("recorded", "inferred"):
+            raise ValueError(
+                "largest_action lies above 0 and at most at 1, bank_actions are 'recorded' or "
+                f"'inferred', got {self.largest_action} and {self.bank_actions!r}"
             )
         self.check_tasks(self.default_tasks)
 
