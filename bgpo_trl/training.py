@@ -99,11 +99,11 @@ class Trainer:
             )
         self._scene = find_scene(config.scene)
         self._scene.check_tasks(config.tasks)
-        if bank.scene_version not in (None, self._scene.version):
-            raise ValueError(
-                f"the demonstrations are of the scene {bank.scene_version}, the run is in "
-                f"{self._scene.version}: record and embed some of this scene"
-            )
+        remedy = "record demonstrations of this scene, train encoders on them and embed them"
+        if bank.scene is not None:
+            self._scene.check_identity(bank.scene, "the bank", remedy)
+        if encoders is not None:
+            encoders.check_scene(self._scene, "the file of the encoders", remedy)
         if bank.spread < config.spread:
             raise ValueError(
                 f"the bank was recorded at spread {bank.spread}, the run is at {config.spread}: "

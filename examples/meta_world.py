@@ -89,14 +89,13 @@ class MetaWorld(Simulation):
     The start of an episode depends on the seed and the number of the episode alone.
 
     Args:
-        tasks: Names of the tasks, in the order of their numbers.
         worlds: Worlds by task, shared with other simulations; those missing are made when needed.
     """
 
-    def __init__(self, tasks: Sequence[str], worlds: dict[str, World] | None = None) -> None:
-        self.tasks, self.worlds = tuple(tasks), {} if worlds is None else worlds
+    def __init__(self, worlds: dict[str, World] | None = None) -> None:
+        self.worlds = {} if worlds is None else worlds
         self._data: dict[str, mujoco.MjData] = {}
-        self._task = self._seed = self._episode = self._held = 0
+        self._task, self._seed, self._episode, self._held = FIVE[0], 0, 0, 0
         self._actions: list[list[float]] = []
         self._state: dict[str, Any] = {}
         self.observation = np.zeros(39)
@@ -104,24 +103,23 @@ class MetaWorld(Simulation):
     @property
     def world(self) -> World:
         """World of the current task."""
-        name = self.tasks[self._task]
-        if name not in self.worlds:
-            self.worlds[name] = World(name)
-        return self.worlds[name]
+        if self._task not in self.worlds:
+            self.worlds[self._task] = World(self._task)
+        return self.worlds[self._task]
 
     def seed(self, seed: int) -> None:
         """Seed the draws of all following starts."""
         self._seed, self._episode = seed, 0
 
-    def reset(self, task: int) -> None:
+    def reset(self, task: str) -> None:
         """Begin an episode of a task."""
         self._task, self._episode, self._held, self._actions = task, self._episode + 1, 0, []
-        name, start = self.tasks[task], np.random.SeedSequence([self._seed, self._episode])
-        if name not in self._data:
-            self._data[name] = mujoco.MjData(self.world.model)
+        start = np.random.SeedSequence([self._seed, self._episode])
+        if task not in self._data:
+            self._data[task] = mujoco.MjData(self.world.model)
         self._state = copy(self.world.start)
         with self.world.entered(self._state) as env:
-            env.data = self._data[name]
+            env.data = self._data[task]
             env.seed(int(start.generate_state(1)[0]))
             env.reset()
             mujoco.mj_forward(env.model, env.data)  # some tasks move an object without it
@@ -140,7 +138,7 @@ class MetaWorld(Simulation):
 
     def frame(self) -> NDArray[np.uint8]:
         """Return both views, side by side, ``[32, 64, 3]``."""
-        return self.world.camera.frame(self._data[self.tasks[self._task]])
+        return self.world.camera.frame(self._data[self._task])
 
     def state(self) -> NDArray[Any]:
         """Return position of the hand (m), opening of the gripper, position of the object (m)."""
@@ -149,8 +147,8 @@ class MetaWorld(Simulation):
     def save(self) -> dict[str, Any]:
         """Return what the episode depends on, from which it can be played again."""
         actions = [list(action) for action in self._actions]
-        numbers = {"task": self._task, "seed": self._seed, "episode": self._episode}
-        return {**numbers, "actions": actions}
+        start = {"task": self._task, "seed": self._seed, "episode": self._episode}
+        return {**start, "actions": actions}
 
     def load(self, state: dict[str, Any]) -> None:
         """Play the saved episode again."""
@@ -162,11 +160,11 @@ class MetaWorld(Simulation):
             self.step(np.array(action))
 
 
-def demonstrator(simulation: Simulation, task: int, seed: int) -> Callable[[], NDArray[np.float64]]:
+def demonstrator(simulation: Simulation, task: str, seed: int) -> Callable[[], NDArray[np.float64]]:
     """Return Meta-World's scripted policy of a task, with noise."""
     if not isinstance(simulation, MetaWorld):
         raise TypeError(f"the policies of Meta-World act in a MetaWorld, got {simulation!r}")
-    policy, noise = ENV_POLICY_MAP[f"{simulation.tasks[task]}-v3"](), np.random.default_rng(seed)
+    policy, noise = ENV_POLICY_MAP[f"{task}-v3"](), np.random.default_rng(seed)
 
     def act() -> NDArray[np.float64]:
         with warnings.catch_warnings():
@@ -180,7 +178,7 @@ def demonstrator(simulation: Simulation, task: int, seed: int) -> Callable[[], N
 def make_env(tasks: Sequence[str], **arguments: Any) -> SimulationEnv:
     """Return simulations of some tasks; arguments as for `SimulationEnv`."""
     sizes = {"frame_shape": FRAME_SHAPE, "action_size": 4, "state_size": 7}
-    return SimulationEnv(partial(MetaWorld, tasks, {}), tasks, **sizes, **arguments)
+    return SimulationEnv(partial(MetaWorld, {}), tasks, **sizes, **arguments)
 
 
 SCENES["metaworld"] = Scene(

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import tyro
 
-from bgpo_trl.configs import InverseModelConfig, RepresentationConfig, VAEConfig
+from bgpo_trl.configs import RepresentationConfig, VAEConfig
 from bgpo_trl.encoders.pretrained import bank_path
 from bgpo_trl.encoders.train import make_pretrained
 from bgpo_trl.experiments.arguments import Arguments
@@ -22,7 +22,6 @@ from bgpo_trl.plugins import import_plugin
 
 ENCODERS = RepresentationConfig(
     vae=VAEConfig(steps=2_000, bfloat16=True),
-    inverse=InverseModelConfig(largest_action=1.0),  # Meta-World's policies move at full speed.
 )
 
 

@@ -53,7 +53,7 @@ class Reacher(Simulation):
     """The arm, whose joints move by up to 0.2 rad a step."""
 
     def __init__(self):
-        self.random, self.task = np.random.RandomState(0), 0
+        self.random, self.task = np.random.RandomState(0), TASKS[0]
         self.env = suite.load("reacher", "easy", task_kwargs={"random": self.random})
         self.physics = self.env.physics
 
@@ -79,7 +79,7 @@ class Reacher(Simulation):
 
     def way(self):
         """Way of the joints to the goal (rad), the shorter one around."""
-        goal = np.array([np.pi if self.task == 0 else 0.0, 0.0])
+        goal = np.array([np.pi if self.task == "stretch_left" else 0.0, 0.0])
         return (goal - self.physics.data.qpos + np.pi) % (2 * np.pi) - np.pi
 
     # With these two, runs can be resumed.
@@ -126,7 +126,7 @@ if __name__ == "__main__":
     small = RepresentationConfig(
         vae=VAEConfig(steps=300, batch_size=32),
         lae=SequenceAutoencoderConfig(steps=300, batch_size=64),
-        inverse=InverseModelConfig(steps=1_000, largest_action=1.0),
+        inverse=InverseModelConfig(steps=1_000),
     )
     encoders, bank = make_pretrained(
         OUT / "encoders.safetensors",

@@ -19,6 +19,7 @@ from hypothesis import settings
 
 from bgpo_trl.algorithms import ALGORITHMS, entry
 from bgpo_trl.configs import BGPOConfig, RepresentationConfig, RunConfig
+from bgpo_trl.configs.runs import PAPER_TASKS
 from bgpo_trl.data.bank import DemonstrationBank, DemonstrationSteps
 from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.figures import style
@@ -67,7 +68,7 @@ def encoders():
     for module in (vae, lae, inverse):
         module.eval().requires_grad_(False)
     metadata = {
-        "scene_version": NICO.version,
+        "scene": NICO.identity,
         "spread": "1.0",
         "config": json.dumps(asdict(RepresentationConfig())),
         "seed": "0",
@@ -86,7 +87,7 @@ def bank():
     action = torch.rand(36, 5, 4, generator=generator) * 2 - 1
     train = torch.arange(36) < 24
     steps = DemonstrationSteps.of(latent, action, (3 + torch.arange(36) % 4) * train)
-    return DemonstrationBank(embedding, task, train, steps=steps)
+    return DemonstrationBank(embedding, task, train, PAPER_TASKS, steps=steps)
 
 
 @pytest.fixture(scope="session")

@@ -19,6 +19,7 @@ from bgpo_trl.runs.dashboard import wandb_logger
 from bgpo_trl.runs.directory import EVAL_COLUMNS, RunLogger
 from bgpo_trl.runs.results import read_curves, read_json, read_table
 from suites import nico
+from tests.scenes.dot import scene
 
 HEADER = ",".join(EVAL_COLUMNS) + "\n"
 TINY = {"per_task": 2, "held_out_per_task": 1, "progress": False}
@@ -48,7 +49,7 @@ def folder(tmp_path) -> Path:
 
 def bank() -> DemonstrationBank:
     task = torch.arange(3)
-    return DemonstrationBank(torch.zeros(3, 32), task, task > 0, encoder_id="x")
+    return DemonstrationBank(torch.zeros(3, 32), task, task > 0, nico.PAPER_TASKS, encoder_id="x")
 
 
 def load_bank(path):
@@ -114,8 +115,8 @@ CASES = {
     "a bank for encoders": (
         lambda f: load_representation(f / "bank"), "damaged or holds no", "--train-enc"),
     "encoders of another scene": (
-        lambda f: load_representation(default_weights(), scene_version="mars"), "is scene mars",
-        "--train-encoders"),
+        lambda f: load_representation(default_weights(), scene=scene()), "this is dot dot-1",
+        "--scene nico"),
     "no bank": (lambda f: load_bank(f / "a"), "there is no demonstration bank", "--train-encoders"),
     "encoders for a bank": (
         lambda f: load_bank(default_weights()), "not a bank", "--train-encoders"),

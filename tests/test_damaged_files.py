@@ -22,6 +22,7 @@ from bgpo_trl.encoders.representation import (
 from bgpo_trl.modules.inverse_model import InverseModel
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
+from bgpo_trl.scenes.nico import NICO
 from tests.helpers import UNPICKLED, Malice
 
 FILES = [f"{key}.memmap" for key in ("pixels", "state", "action", "length", "task", "train")]
@@ -148,13 +149,13 @@ def files(tmp_path_factory) -> Path:
         "lae": {"embedding_size": 2},
         "inverse": {"hidden_size": 512},
     }
-    metadata = {"scene_version": "some", "config": json.dumps(config), "seed": "0", "command": ""}
+    metadata = {"scene": NICO.identity, "config": json.dumps(config), "seed": "0", "command": ""}
     small = Representation(VAE(4), SequenceAutoencoder(4, 2), InverseModel(4), metadata)
     save_representation(small, folder / "encoders")
     task, length = torch.arange(3), torch.tensor([0, 2, 3])
     steps = DemonstrationSteps.of(torch.rand(3, 3, 2), torch.rand(3, 2, 4), length)
     bank = DemonstrationBank(
-        torch.rand(3, 2), task, task > 0, steps=steps, encoder_id="x", scene_version="some"
+        torch.rand(3, 2), task, task > 0, ("a", "b, c", "d"), steps, "x", scene="some 1"
     )
     bank.save(folder / "bank")
     return folder
@@ -163,14 +164,14 @@ def files(tmp_path_factory) -> Path:
 def read_bank(path: Path) -> dict[str, torch.Tensor]:
     bank = dict(vars(DemonstrationBank.load(path, encoder_id="x")))
     bank |= vars(bank.pop("steps"))
-    texts = {key: bank[key] for key in ("encoder_id", "scene_version")}
+    texts = {key: bank[key] for key in ("encoder_id", "scene")}
     texts["tasks"] = ",".join(bank["tasks"])
     bank["spread"] = torch.tensor(bank["spread"])
     return bank | {key: torch.tensor(list(text.encode())) for key, text in texts.items()}
 
 
 def read_encoders(path: Path) -> dict[str, torch.Tensor]:
-    encoders = load_representation(path, scene_version="some")
+    encoders = load_representation(path, scene=NICO)
     return {**encoders.vae.state_dict(), **encoders.lae.state_dict(prefix="lae.")}
 
 

@@ -84,7 +84,7 @@ def test_encoders_trained_elsewhere_come_back_to_the_cpu(device, tmp_path):
     found = []
     for place in ("cpu", device):
         trained = train_representation(
-            data, TINY_ENCODERS, scene_version="noise", device=place, progress=False
+            data, TINY_ENCODERS, scene="noise 1", device=place, progress=False
         )
         save_representation(trained, tmp_path / "weights.safetensors")
         found.append(load_representation(tmp_path / "weights.safetensors"))

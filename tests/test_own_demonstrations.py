@@ -12,7 +12,7 @@ from bgpo_trl.data.dataset import load_demonstrations, write_demonstrations
 from bgpo_trl.encoders.pretrained import bank_path
 from bgpo_trl.encoders.representation import load_representation
 from bgpo_trl.encoders.train import train_encoders
-from bgpo_trl.scenes import SCENES
+from bgpo_trl.scenes import SCENES, find_scene
 from bgpo_trl.training import Trainer
 from tests.helpers import TINY_ENCODERS
 from tests.scenes.dot import SavedDot, scene
@@ -24,9 +24,9 @@ def filmed(n, seed, actions=False):
     """Demonstrations of both tasks."""
     simulation, episodes = SavedDot(), {name: [] for name in TASKS}
     simulation.seed(seed)
-    for task, (name, direction) in enumerate(zip(TASKS, (-1.0, 1.0), strict=True)):
+    for name, direction in zip(TASKS, (-1.0, 1.0), strict=True):
         for _ in range(n):
-            simulation.reset(task)
+            simulation.reset(name)
             frames, steps, success = [simulation.frame()], [], False
             while not success:
                 steps.append([direction * simulation.random.uniform(0.4, 0.6)])
@@ -51,7 +51,7 @@ def made(tmp_path, monkeypatch):
             play = write_demonstrations(tmp_path / "play", movements, scene="dot", **options)
         parts, options = (load_demonstrations(path), play), {"tasks": TASKS, "progress": False}
         train_encoders(*parts, weights, tmp_path / "fit", TINY_ENCODERS, scene="dot", **options)
-        encoders = load_representation(weights, scene_version="dot-1")
+        encoders = load_representation(weights, scene=find_scene("dot"))
         return encoders, DemonstrationBank.load(bank_path(weights), encoder_id=encoders.identity)
 
     return make

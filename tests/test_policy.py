@@ -17,6 +17,7 @@ from bgpo_trl.configs import RepresentationConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.encoders.pretrained import bank_path
 from bgpo_trl.encoders.representation import save_representation
+from bgpo_trl.scenes.nico import NICO
 from bgpo_trl.training import Trainer
 from suites import nico
 from tests.helpers import contents, edit
@@ -27,7 +28,7 @@ TASKS = nico.PAPER_TASKS
 LABELED = ("oracle-demonstrations", "maml-demonstrations", "dist-nll-demonstrations")
 NAMES = ("bgpo", "bgpo-single", "without-gwr", "ewc", *LABELED)
 METADATA = {
-    "scene_version": nico.scene_version(),
+    "scene": NICO.identity,
     "config": json.dumps(asdict(RepresentationConfig())),
 }
 every_kind = pytest.mark.parametrize("name", NAMES)
@@ -57,6 +58,7 @@ def tested_bank(encoders, bank):
         torch.cat([seen.embedding, phi]),
         torch.cat([seen.task, torch.arange(3)]),
         torch.cat([seen.train, torch.zeros(3, dtype=torch.bool)]),
+        TASKS,
         steps=bank.steps.select(torch.arange(27)),  # those of held-out ones are not read
     )
 

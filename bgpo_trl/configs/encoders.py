@@ -81,9 +81,8 @@ class InverseModelConfig(Settings):
     """Units of each of the two hidden layers."""
     noise: float = 0.1
     """Standard deviation of the noise added to the standardized latents."""
-    largest_action: float = 0.6
-    """Actions with a larger component are left out: demonstrators move slowly, and errors of fast
-    movements would prevail in the loss."""
+    largest_action: float | None = None
+    """Actions with a larger component are left out; None is the scene's ``largest_action``."""
     batch_size: int = 512
     """Windows per step."""
     learning_rate: float = 2e-3
@@ -99,7 +98,9 @@ class InverseModelConfig(Settings):
         super().__post_init__()
         at_least(self, 1, "hidden_size", "batch_size", "warmup_steps")
         at_least(self, 0, "steps")
-        positive(self, "learning_rate", "largest_action")
+        positive(self, "learning_rate")
+        if self.largest_action is not None:
+            positive(self, "largest_action")
         at_least(self, 0, "noise")
 
 

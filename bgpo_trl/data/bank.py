@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,8 +11,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from bgpo_trl.configs.runs import PAPER_TASKS
 from bgpo_trl.files.tensor_file import digest, load_tensors, save_tensors
+from bgpo_trl.scenes.scene import check_name
 
 _LATENT_CODES, _ACTION_CODES = 25.0, 127.0
 """Int8 codes per standard deviation of a latent (range +-5.08) and per unit of action."""
@@ -110,22 +111,27 @@ class DemonstrationBank:
         encoder_id: Identity of the encoders that embedded them (`Representation.identity`), or
             ``None`` if unknown.
         spread: Share of the range of start states that the demonstrations were recorded over.
-        scene_version: Version of the scene that they show, or ``None`` if unknown.
+        scene: Identity of the scene that they show (`Scene.identity`), or ``None`` if unknown.
 
     Raises:
-        ValueError: If a label has no name, or ``steps`` are of another number of demonstrations.
+        ValueError: If a label has no name, a name is given twice, or ``steps`` are of another
+            number of demonstrations.
     """
 
     embedding: Tensor
     task: Tensor
     train: Tensor
-    tasks: tuple[str, ...] = PAPER_TASKS
+    tasks: tuple[str, ...]
     steps: DemonstrationSteps | None = None
     encoder_id: str | None = None
     spread: float = 1.0
-    scene_version: str | None = None
+    scene: str | None = None
 
     def __post_init__(self) -> None:
+        for name in self.tasks:
+            check_name(name)
+        if len({*self.tasks}) < len(self.tasks):
+            raise ValueError(f"a task is named twice in {', '.join(self.tasks)}: name each once")
         unknown = self.task[(self.task < 0) | (self.task >= len(self.tasks))]
         if len(unknown):
             raise ValueError(
@@ -211,10 +217,10 @@ class DemonstrationBank:
                 f"one bank was embedded by the encoders {self.encoder_id}, the other by "
                 f"{other.encoder_id}: embed both by the same (bgpo_trl.encoders.make_bank)"
             )
-        if self.scene_version != other.scene_version:
+        if self.scene != other.scene:
             raise ValueError(
-                f"one bank shows the scene {self.scene_version}, the other {other.scene_version}: "
-                "record both in the same"
+                f"one bank shows the scene {self.scene}, the other {other.scene}: record both in "
+                "the same"
             )
         tasks = tuple(dict.fromkeys((*self.tasks, *other.tasks)))
         label = torch.tensor([tasks.index(name) for name in other.tasks])
@@ -226,7 +232,7 @@ class DemonstrationBank:
             None if self.steps is None or other.steps is None else self.steps + other.steps,
             self.encoder_id,
             min(self.spread, other.spread),
-            self.scene_version,
+            self.scene,
         )
 
     def _select(self, rows: Tensor) -> DemonstrationBank:
@@ -239,7 +245,7 @@ class DemonstrationBank:
         )
 
     def save(self, path: str | Path) -> None:
-        """Write the bank as safetensors, with the scene version and the encoders' identity.
+        """Write the bank as safetensors, with the identities of scene and encoders.
 
         Raises:
             ValueError: If ``encoder_id`` is unknown.
@@ -249,11 +255,11 @@ class DemonstrationBank:
             raise ValueError("set encoder_id: a saved bank says which encoders embedded it")
         meta = {
             "encoder_id": self.encoder_id,
-            "tasks": ",".join(self.tasks),
+            "tasks": json.dumps(self.tasks),
             "spread": str(self.spread),
         }
-        if self.scene_version is not None:
-            meta["scene_version"] = self.scene_version
+        if self.scene is not None:
+            meta["scene"] = self.scene
         save_tensors(path, self._tensors(), meta)
 
     def _tensors(self) -> dict[str, Tensor]:
@@ -275,24 +281,24 @@ class DemonstrationBank:
         )
         try:
             tensors, meta = load_tensors(path)
-            if not meta.get("tasks"):
-                raise ValueError("its task names are missing")
+            tasks = json.loads(meta["tasks"])
+            if not isinstance(tasks, list) or not all(isinstance(name, str) for name in tasks):
+                raise ValueError("its tasks are no list of names")
             columns = {k.removeprefix("steps."): t for k, t in tensors.items() if "." in k}
             rows = {key: tensor for key, tensor in tensors.items() if "." not in key}
             steps = DemonstrationSteps(**columns) if columns else None
-            tasks = tuple(meta["tasks"].split(","))
             spread = float(meta["spread"])
             bank = cls(
                 **rows,
-                tasks=tasks,
+                tasks=tuple(tasks),
                 steps=steps,
                 encoder_id=encoder_id,
                 spread=spread,
-                scene_version=meta.get("scene_version"),
+                scene=meta.get("scene"),
             )
         except FileNotFoundError:
             raise ValueError(f"there is no demonstration bank at {path}; {remedy}") from None
-        except (ValueError, TypeError, KeyError) as error:
+        except (ValueError, TypeError, KeyError, RecursionError) as error:
             raise ValueError(f"{path} is damaged or not a bank ({error}); {remedy}") from None
         embedding, task, train = bank.embedding, bank.task, bank.train
         if not (

@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 from tensordict import MemoryMappedTensor, TensorDict
 
+from bgpo_trl.errors import as_shape
 from bgpo_trl.files.writing import make_folder, new_folder, write_json
 from bgpo_trl.scenes import SCENES, Scene, find_scene
 
@@ -273,13 +274,19 @@ def resize_frames(pixels: NDArray[np.uint8], frame_shape: Sequence[int]) -> NDAr
     A pixel is the rounded mean of the pixels below it. Height and width are scaled independently:
     crop the frames before, if their ratio is not to change.
 
+    Raises:
+        ValueError: If the frames are not uint8 ``[T, H, W, 3]``, or a side is below 1.
+
     Examples:
         >>> resize_frames(np.full((1, 64, 64, 3), 7, np.uint8), (32, 64)).shape
         (1, 32, 64, 3)
     """
-    frames = torch.from_numpy(np.asarray(pixels).copy()).permute(0, 3, 1, 2)
+    pixels = np.asarray(pixels)
+    _check_pixels(pixels, least=0)
+    height, width = as_shape([*frame_shape], "frame_shape")
+    frames = torch.from_numpy(pixels.copy()).permute(0, 3, 1, 2)
     parts = [
-        torch.nn.functional.interpolate(part.float(), tuple(frame_shape), mode="area").round()
+        torch.nn.functional.interpolate(part.float(), (height, width), mode="area").round()
         for part in frames.split(64)
     ]
     return torch.cat(parts).to(torch.uint8).permute(0, 2, 3, 1).contiguous().numpy()
@@ -335,14 +342,21 @@ def _check_keys(episode: object, keys: set[str] | None) -> None:
         )
 
 
+def _check_pixels(pixels: NDArray[Any], least: int) -> None:
+    """Raise ``ValueError`` unless frames are colors of 8 bits; others mean what nobody knows."""
+    shape = pixels.shape
+    if pixels.dtype != np.uint8 or len(shape) != 4 or shape[-1] != 3 or shape[0] < least:
+        raise ValueError(
+            f"has pixels {pixels.dtype} {[*shape]}: give uint8 [T, H, W, 3] (0 to 255), at least "
+            f"{least} frames"
+        )
+
+
 def _check_frames(scene: Scene, pixels: Any) -> int:
     """Return the number of frames."""
     pixels = np.asarray(pixels)
+    _check_pixels(pixels, least=2)
     shape = pixels.shape
-    if pixels.dtype != np.uint8 or len(shape) != 4 or shape[-1] != 3 or shape[0] < 2:
-        raise ValueError(
-            f"has pixels {pixels.dtype} {[*shape]}: give uint8 [T, H, W, 3], at least two frames"
-        )
     if shape[1:3] != tuple(scene.frame_shape):
         height, width = scene.frame_shape
         raise ValueError(

@@ -11,13 +11,13 @@ import importlib.util
 import io
 import itertools
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self, cast
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -43,21 +43,34 @@ def read_lerobot(
     image_key: str | None = None,
     action_key: str | None = "action",
     state_key: str | None = None,
+    success_key: str | None = "next.success",
     frame_shape: Sequence[int] | None = None,
+    episodes: Collection[int] | None = None,
+    tasks: Collection[str] | None = None,
+    stride: int = 1,
+    combine: Callable[[NDArray[np.float32]], ArrayLike] | None = None,
 ) -> dict[str, list[Episode]]:
     """Read a LeRobot dataset of version 3 as episodes for `write_demonstrations`.
 
-    All frames are held in memory. Actions must have the meaning of the scene's, in [-1, 1]: scale
-    them, or leave them out. Frames that are stored as video are decoded with PyAV, which is no part
-    of the extra.
+    The frames of the chosen episodes are held in memory, in the size of ``frame_shape``. Actions
+    must have the meaning of the scene's, in [-1, 1]: scale them, or leave them out. Frames that are
+    stored as video are decoded with PyAV, which is no part of the extra.
 
     Args:
         path: Folder of the LeRobot dataset.
-        image_key: Name of the camera; may be left out if there is one.
-        action_key: Feature with the actions; None, or a name that is not there, leaves them out.
+        image_key: Name of the camera; may be left out if there is one, apart from depth maps.
+        action_key: Feature with the actions; None leaves them out.
         state_key: Feature with the scene's ground truth; None leaves it out.
+        success_key: Feature that is true in a frame of each episode that succeeded, if the dataset
+            has it. Failed episodes are refused; with None, they are read.
         frame_shape: Height and width to which frames are resized, see `resize_frames`; by default
             they stay as they are.
+        episodes: Numbers of the episodes to read; None: all.
+        tasks: Descriptions of the tasks to read; None: all.
+        stride: Read every so many-th frame: 3 turns 30 frames a second into 10.
+        combine: With a stride, function from the actions between two frames that are read,
+            ``[stride, A]``, to one action ``[A]``, such as their sum if they are displacements,
+            or the last if they are targets.
 
     Returns:
         Episodes in their order by the description of their task: ``pixels`` uint8
@@ -66,13 +79,29 @@ def read_lerobot(
 
     Raises:
         ValueError: If the folder is no LeRobot dataset of version 3, a file is damaged or missing,
-            or an episode is incomplete.
+            an episode is incomplete or failed, a frame is missing or not at its time, images have
+            more than 8 bits a color, or a feature, episode or task to read is not there.
     """
+    wanted = {"action": action_key, "state": state_key}
+    chosen = {key: name for key, name in wanted.items() if name is not None}
+    if stride < 1 or ("action" in chosen and stride > 1 and combine is None):
+        raise ValueError(
+            f"with stride {stride}, say how actions become one: combine=lambda a: a.sum(0) if they "
+            "are displacements, a[-1] if they are targets; or leave them out, action_key=None"
+        )
     reader = _Reader(Path(path), image_key, frame_shape)
-    if state_key is not None and state_key not in reader.features:
-        raise ValueError(f"{path} has no {state_key!r}, only {', '.join(reader.features)}")
-    wanted = (("action", action_key), ("state", state_key))
-    return reader.read({key: name for key, name in wanted if name and name in reader.features})
+    reader.check_numeric(chosen)
+    found = reader.read(chosen, success_key, episodes, tasks, stride)
+    if "action" in chosen and stride > 1 and combine is not None:
+        for episode in itertools.chain(*found.values()):
+            between = episode["action"].reshape(-1, stride, episode["action"].shape[-1])
+            combined = [np.asarray(combine(some), np.float32) for some in between]
+            episode["action"] = np.reshape(combined, between.shape[::2])
+    return found
+
+
+class _WrongError(ValueError):
+    """What is wrong with a file, in words."""
 
 
 @contextlib.contextmanager
@@ -80,11 +109,19 @@ def _reading(source: object) -> Iterator[None]:
     """Turn whatever goes wrong with a file into one line."""
     try:
         yield
+    except _WrongError as error:
+        raise _WrongError(f"{source}: {error}") from None
     except FileNotFoundError:
-        raise ValueError(f"{source} is missing: give the folder of a whole dataset") from None
+        raise _WrongError(f"{source} is missing: give the folder of a whole dataset") from None
     except Exception as error:
+        if isinstance(source, Path) and source.is_file():
+            with source.open("rb") as file:
+                if file.read(len(_LFS)) == _LFS:
+                    raise _WrongError(
+                        f"{source} is a pointer of Git LFS: get the file itself, git lfs pull"
+                    ) from None
         cause = " ".join(f"{type(error).__name__}: {error}".split())
-        raise ValueError(f"{source} is damaged or of another format: {cause}") from error
+        raise _WrongError(f"{source} is damaged or of another format: {cause}") from error
 
 
 class _Reader:
@@ -98,106 +135,263 @@ class _Reader:
             info = json.loads(file.read_text())
             self.fps, version = float(info["fps"]), str(info["codebase_version"])
             self.features = {name: str(f["dtype"]) for name, f in info["features"].items()}
+            depth = {name for name, f in info["features"].items() if _is_depth(f)}
+            self.n_episodes = int(info["total_episodes"])
         if not version.startswith("v3."):
             raise ValueError(
                 f"{path} has version {version}, not 3: convert it with LeRobot's "
                 "convert_dataset_v21_to_v30"
             )
-        cameras = [name for name, dtype in self.features.items() if dtype in ("image", "video")]
+        pictures = [name for name, dtype in self.features.items() if dtype in ("image", "video")]
+        cameras = [name for name in pictures if name not in depth]
+        if not cameras:
+            raise ValueError(
+                f"{path} has no camera of colors, only {', '.join(self.features) or 'nothing'}: "
+                "demonstrations are frames, record some"
+            )
         if image_key is None and len(cameras) == 1:
             image_key = cameras[0]
-        if image_key is None or image_key not in cameras:
+        if image_key not in cameras:
+            lacks = "is to be read" if image_key is None else f"is no camera called {image_key!r}"
+            lacks = f"has a depth map {image_key!r}" if image_key in depth else f"there {lacks}"
             raise ValueError(
-                f"{path} has the cameras {', '.join(cameras) or 'none'}: name one as image_key"
+                f"{path}: {lacks}: give one of its cameras as image_key: {', '.join(cameras)}"
             )
         self.path, self.image_key, self.frame_shape = path, image_key, frame_shape
         self.is_video = self.features[image_key] == "video"
+        self._images: tuple[Path | None, Sequence[Any]] = (None, [])
         if self.is_video and importlib.util.find_spec("av") is None:
             raise ValueError(
                 f"{path} has its frames as video: pip install av (PyAV) to decode them, or decode "
                 "them yourself for write_demonstrations"
             )
 
-    def read(self, chosen: Mapping[str, str]) -> dict[str, list[Episode]]:
-        """Return the episodes by task, with some of the features under other keys."""
-        file = self.path / "meta" / "tasks.parquet"
-        with _reading(file):
-            tasks = pd.read_parquet(file)["task_index"]
-            names = {int(index): str(name) for name, index in tasks.items()}
-        images = [] if self.is_video else [self.image_key]
-        rows = self._table(
-            "data", ["episode_index", "frame_index", "task_index", *chosen.values(), *images]
-        )
-        by_episode = dict(iter(rows.sort_values("frame_index").groupby("episode_index")))
-        prefix = f"videos/{self.image_key}/"
-        videos = [prefix + name for name in ("chunk_index", "file_index", "from_timestamp")]
-        columns = ["episode_index", "length", *(videos if self.is_video else [])]
-        metadata = self._table("meta/episodes", columns).sort_values("episode_index")
-        episodes: dict[str, list[Episode]] = {name: [] for name in names.values()}
-        for number, length, *place in metadata.itertuples(index=False):
-            found = by_episode.get(number, rows[:0])
-            if not length or [*found["frame_index"]] != [*range(length)]:
+    def check_numeric(self, chosen: Mapping[str, str]) -> None:
+        """Raise ``ValueError`` unless there are features of numbers with the chosen names."""
+        for key, name in chosen.items():
+            if not self.features.get(name, "").startswith(("float", "int", "uint")):
+                numbers = [n for n, dtype in self.features.items() if dtype.startswith("float")]
                 raise ValueError(
-                    f"episode {number} of {self.path} has {len(found)} of {length} frames: get it "
+                    f"{self.path} has no numbers {name!r}: give the {key}s' feature as {key}_key, "
+                    f"one of {', '.join(numbers) or 'none'}, or None if there is none"
+                )
+
+    def read(
+        self,
+        chosen: Mapping[str, str],
+        success_key: str | None,
+        episodes: Collection[int] | None,
+        tasks: Collection[str] | None,
+        stride: int,
+    ) -> dict[str, list[Episode]]:
+        """Return the episodes by task, with some of the features under other keys."""
+        names = self._task_names()
+        success = [] if success_key not in self.features else [str(success_key)]
+        indices = ["episode_index", "frame_index", "task_index"]
+        rows = self._table("data", [*indices, "timestamp", *chosen.values(), *success])
+        rows = rows.assign(**{name: _scalars(rows[name]) for name in [*indices, "timestamp"]})
+        metadata = self._metadata({*rows["episode_index"]})
+        by_episode = dict(iter(rows.sort_values("frame_index").groupby("episode_index")))
+        for asked, there, what in (
+            (episodes, metadata["episode_index"].tolist(), "episode"),
+            (tasks, [*names.values()], "task"),
+        ):
+            missing = [one for one in asked or () if one not in there]
+            if missing:
+                raise ValueError(
+                    f"{self.path} has no {what} {missing[0]!r}: choose among {_some(there)}"
+                )
+        found: dict[str, list[Episode]] = {
+            name: [] for name in names.values() if tasks is None or name in tasks
+        }
+        failed = []
+        for number, length, *place in metadata.itertuples(index=False):
+            own = by_episode.get(number, rows[:0])
+            if not length or [*own["frame_index"]] != [*range(length)]:
+                raise ValueError(
+                    f"episode {number} of {self.path} has {len(own)} of {length} frames: get it "
                     "again, or remove the episode with LeRobot's tools"
                 )
-            labels = {*found["task_index"]}
+            labels = {*own["task_index"]}
             if len(labels) > 1 or not labels <= {*names}:
                 raise ValueError(
                     f"episode {number} of {self.path} has the tasks {sorted(labels)}: give each "
                     "episode one task that tasks.parquet names"
                 )
-            with _reading(f"episode {number} of {self.path}"):
-                episode = self._episode(found, chosen, place)
-            episodes[names[labels.pop()]].append(episode)
-        return episodes
+            name = names[labels.pop()]
+            if name not in found or (episodes is not None and number not in episodes):
+                continue
+            if success and not _scalars(own[success[0]]).any():
+                failed.append(number)
+            elif not failed:
+                with _reading(f"episode {number} of {self.path}"):
+                    found[name].append(self._episode(own, chosen, place, stride))
+        if failed:
+            raise ValueError(
+                f"{self.path} has episodes that failed, without {success_key!r}: {_some(failed)}; "
+                "name the others as episodes=..., or read all with success_key=None"
+            )
+        return found
+
+    def _task_names(self) -> dict[int, str]:
+        """Return the descriptions of the tasks, by index."""
+        file = self.path / "meta" / "tasks.parquet"
+        with _reading(file):
+            # Written by pandas, descriptions are the index; by others, a column.
+            tasks = pd.read_parquet(file)
+            texts = [*tasks.get("task", tasks.index)]
+            indices = [int(index) for index in _scalars(tasks["task_index"])]
+            if not all(isinstance(text, str) for text in texts):
+                raise _WrongError(f"its tasks are {_some(texts)}, not descriptions")
+            if len({*texts}) < len(texts) or len({*indices}) < len(indices):
+                raise _WrongError("it has a task or an index twice")
+        return dict(zip(indices, texts, strict=True))
+
+    def _metadata(self, recorded: set[int]) -> pd.DataFrame:
+        """Return number and length of each episode and, for videos, its place."""
+        prefix = f"videos/{self.image_key}/"
+        videos = [prefix + name for name in ("chunk_index", "file_index", "from_timestamp")]
+        columns = ["episode_index", "length", *(videos if self.is_video else [])]
+        metadata = self._table("meta/episodes", columns).sort_values("episode_index")[columns]
+        described = metadata["episode_index"].tolist()
+        if len({*described}) < len(described) or not (
+            {*described} == recorded and len(described) == self.n_episodes
+        ):
+            lacking = sorted({*described} ^ recorded)
+            which = f", episodes {_some(lacking)} in one alone" if lacking else ""
+            raise ValueError(
+                f"{self.path} has {self.n_episodes} episodes by meta/info.json, {len(described)} "
+                f"by meta/episodes and {len(recorded)} by data{which}: get it again whole"
+            )
+        return metadata
 
     def _table(self, folder: str, columns: list[str]) -> pd.DataFrame:
-        """Return columns of all Parquet files of a folder."""
+        """Return columns of all Parquet files of a folder, with ``file`` and ``row`` in it."""
         files = sorted((self.path / folder).glob("*/*.parquet")) or [self.path / folder]
         tables = []
         for file in files:
             with _reading(file):
                 if not file.is_file():
                     raise FileNotFoundError
-                tables.append(pq.ParquetFile(file).read(columns).to_pandas()[columns])
+                table = pq.ParquetFile(file).read(columns).to_pandas()[columns]
+                tables.append(table.assign(file=[file] * len(table), row=range(len(table))))
         return pd.concat(tables)
 
     def _episode(
-        self, rows: pd.DataFrame, chosen: Mapping[str, str], place: Sequence[Any]
+        self, rows: pd.DataFrame, chosen: Mapping[str, str], place: Sequence[Any], stride: int
     ) -> Episode:
         """Return an episode from its rows and, for a video, the place of its first frame."""
-        length = len(rows)
+        times = rows["timestamp"].to_numpy(np.float64)
+        planned = np.arange(len(rows)) / self.fps
+        if not (np.abs(times - times[0] - planned) <= 0.5 / self.fps).all():
+            late = int((np.abs(times - times[0] - planned) > 0.5 / self.fps).argmax())
+            raise _WrongError(
+                f"frame {late} is at {times[late]:.3f} s instead of {planned[late]:.3f} s: frames "
+                "have to follow each other evenly"
+            )
+        n_read = (len(rows) - 1) // stride + 1
+        frames = self._frames(rows[::stride], times[::stride], place)
+        if self.frame_shape is not None:
+            frames = (resize_frames(frame[None], self.frame_shape)[0] for frame in frames)
+        episode: Episode = {"pixels": np.stack([*frames])}
+        for key, name in chosen.items():
+            found = np.stack([np.atleast_1d(row) for row in rows[name]])
+            values = found.astype(np.float32)
+            if found.dtype.kind in "iu" and not np.array_equal(values, found):
+                raise _WrongError(f"{name} has whole numbers that are not exact as float32")
+            is_action = key == "action"
+            episode[key] = values[: (n_read - 1) * stride] if is_action else values[::stride]
+        return episode
+
+    def _frames(
+        self, rows: pd.DataFrame, times: NDArray[np.float64], place: Sequence[Any]
+    ) -> Iterator[NDArray[np.uint8]]:
+        """Return the frames of some rows of an episode, uint8 ``[H, W, 3]``."""
         if self.is_video:
             chunk, file, start = place
             video = self.path / _VIDEO.format(self.image_key, int(chunk), int(file))
-            frames = [*itertools.islice(_decode(video, start - 0.5 / self.fps), length)]
-        else:
-            frames = [
-                np.asarray(Image.open(io.BytesIO(image["bytes"])).convert("RGB"))
-                for image in rows[self.image_key]
-            ]
-        if len(frames) < length:
-            raise ValueError(f"its video has {len(frames)} of {length} frames")
-        pixels = np.stack(frames)
-        if self.frame_shape is not None:
-            pixels = resize_frames(pixels, self.frame_shape)
-        episode: Episode = {"pixels": pixels}
-        for key, name in chosen.items():
-            values = np.stack([np.atleast_1d(row) for row in rows[name]]).astype(np.float32)
-            episode[key] = values[: length - (key == "action")]
-        return episode
+            with _reading(video):
+                if not video.is_file():
+                    raise FileNotFoundError
+                yield from _frames_at(video, start + times, 0.5 / self.fps)
+            return
+        for file, row in zip(rows["file"], rows["row"], strict=True):
+            if self._images[0] != file:
+                column = pq.ParquetFile(file).read([self.image_key]).column(0).to_pylist()
+                self._images = file, column
+            yield _rgb(self._image(self._images[1][row]))
+
+    def _image(self, image: Mapping[str, Any]) -> bytes:
+        """Return the content of an image, which is in its row or in a file of the dataset."""
+        if image["bytes"] is not None:
+            return image["bytes"]
+        file = (self.path / str(image["path"])).resolve()
+        if not file.is_relative_to(self.path.resolve()) or not file.is_file():
+            raise _WrongError(f"its image {image['path']!r} is no file of the dataset")
+        return file.read_bytes()
 
 
-def _decode(path: Path, start: float) -> Iterator[NDArray[np.uint8]]:
-    """Decode the frames of a video from a time (s) on."""
+_LFS = b"version https://git-lfs"
+
+
+def _is_depth(feature: Mapping[str, Any]) -> bool:
+    """Return whether ``info.json`` calls a feature a depth map."""
+    parts = [feature, *(part for part in feature.values() if isinstance(part, Mapping))]
+    return any(value for part in parts for key, value in part.items() if "is_depth" in key)
+
+
+def _scalars(column: pd.Series) -> NDArray[Any]:
+    """Return a column of numbers, of which each may be in a list of its own."""
+    return np.array([np.asarray(cell).item() for cell in column])
+
+
+def _some(values: Sequence[Any]) -> str:
+    """Return the first of some values for a message."""
+    return ", ".join(map(str, values[:12])) + (", ..." if len(values) > 12 else "")
+
+
+def _rgb(content: bytes) -> NDArray[np.uint8]:
+    """Return an image of 8 bits a color as ``[H, W, 3]``; refuse what would have to be scaled."""
+    image = Image.open(io.BytesIO(content))
+    sixteen = content.startswith(b"\x89PNG") and content[24] > 8  # Pillow drops half of them
+    if sixteen or image.mode not in ("1", "L", "P", "RGB", "LA", "RGBA"):
+        raise _WrongError(
+            f"its images are of mode {image.mode}, of more than 8 bits: make them uint8 by a scale "
+            "of yours, or choose another camera"
+        )
+    if image.has_transparency_data and np.asarray(image.convert("RGBA"))[..., 3].min() < 255:
+        raise _WrongError("its images are transparent: put them on a background of yours")
+    return np.asarray(image.convert("RGB"))
+
+
+def _frames_at(
+    path: Path, times: NDArray[np.float64], tolerance: float
+) -> Iterator[NDArray[np.uint8]]:
+    """Decode the frames of a video that are nearest to some times (s), which ascend.
+
+    Raises:
+        ValueError: If the nearest frame is farther than the tolerance.
+    """
     av = importlib.import_module("av")
     with av.open(str(path)) as video:
         stream = video.streams.video[0]
-        video.seek(max(0, int(start / stream.time_base)), stream=stream)  # to the keyframe before
-        for frame in video.decode(stream):
-            if frame.time >= start:
-                yield frame.to_ndarray(format="rgb24")
+        name = stream.format.name
+        if name.startswith("gray") and name != "gray":
+            raise _WrongError(f"its frames are {name}, of more than 8 bits, as of a depth map")
+        start = max(0, int((times[0] - tolerance) / stream.time_base))
+        video.seek(start, stream=stream)  # to the keyframe before
+        frames = video.decode(stream)
+        frame = next(frames, None)
+        following = next(frames, None)
+        for time in times:
+            while frame and following and abs(following.time - time) <= abs(frame.time - time):
+                frame, following = following, next(frames, None)
+            if frame is None or abs(frame.time - time) > tolerance:
+                raise _WrongError(
+                    f"there is no frame at {time:.3f} s: it was never encoded, and those after it "
+                    "would be taken for those before; get or record it again"
+                )
+            yield frame.to_ndarray(format="rgb24")
 
 
 _DATA = "data/chunk-{:03d}/file-{:03d}.parquet"

@@ -156,7 +156,7 @@ class _Recorder:
         self.scene, self.simulation = scene, simulation
         self.seed, self.attempts = seed, attempts
 
-    def demonstrate(self, task: int, row: int) -> tuple[dict[str, np.ndarray] | None, int]:
+    def demonstrate(self, task: str, row: int) -> tuple[dict[str, np.ndarray] | None, int]:
         """Return the first success, or ``None``, and the number of attempts."""
         sequence = np.random.SeedSequence([self.seed, row])
         for attempt in range(1, self.attempts + 1):
@@ -166,7 +166,7 @@ class _Recorder:
                 return episode, attempt
         return None, self.attempts
 
-    def play(self, task: int, row: int) -> dict[str, np.ndarray]:
+    def play(self, task: str, row: int) -> dict[str, np.ndarray]:
         """Return an episode that follows a demonstration, then moves at random.
 
         The movement is jerky in some episodes and smooth in others.
@@ -192,7 +192,7 @@ class _Recorder:
         return self._perform(task, start, noise, deviate)[0]
 
     def _perform(
-        self, task: int, start: int, noise: int, policy_of: Callable[[_Policy], _Policy]
+        self, task: str, start: int, noise: int, policy_of: Callable[[_Policy], _Policy]
     ) -> tuple[dict[str, np.ndarray], bool]:
         """Return an episode from the start with seed ``start``, and whether it succeeded.
 
@@ -239,9 +239,9 @@ def _record_rows(
     for row in bar:
         task = row // per_task
         if play:
-            episode = recorder.play(task, row)
+            episode = recorder.play(tasks[task], row)
         else:
-            episode, tries = recorder.demonstrate(task, row)
+            episode, tries = recorder.demonstrate(tasks[task], row)
             tried[task] += tries
             if episode is None:
                 raise RuntimeError(

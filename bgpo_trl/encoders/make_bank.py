@@ -8,7 +8,6 @@ from typing import Literal
 import torch
 from tensordict import TensorDictBase
 
-from bgpo_trl.configs.runs import PAPER_TASKS
 from bgpo_trl.data.bank import DemonstrationBank, DemonstrationSteps
 from bgpo_trl.encoders.representation import (
     Representation,
@@ -21,8 +20,8 @@ def make_bank(
     representation: Representation,
     dataset: TensorDictBase,
     *,
-    tasks: Sequence[str] = PAPER_TASKS,
-    actions: Literal["inferred", "recorded"] = "inferred",
+    tasks: Sequence[str],
+    actions: Literal["inferred", "recorded"] = "recorded",
     spread: float = 1.0,
 ) -> DemonstrationBank:
     """Embed demonstrations; keep the latents and actions of the training ones.
@@ -32,16 +31,16 @@ def make_bank(
         dataset: Reads ``pixels`` ``[N, T, H, W, 3]``, ``length``, ``task`` and ``train`` ``[N]``,
             and ``action`` ``[N, T - 1, A]``.
         tasks: Task names, in the order of their labels.
-        actions: ``"inferred"`` stores the actions that the inverse model infers from the
-            frames, the only actions that an observer of a demonstration has; ``"recorded"`` stores
-            the true ones, for comparison. Without an inverse model, or recorded actions, the bank
-            has no steps: embeddings alone, without demonstrations as experience.
+        actions: ``"recorded"`` stores the actions of the dataset, or if it has none those that
+            the inverse model infers from the frames; ``"inferred"`` always the latter, the only
+            actions that an observer of a demonstration has. Without either, the bank has no steps:
+            embeddings alone, without demonstrations as experience.
         spread: Share of the range of start states that the dataset was recorded over.
     """
     length = dataset["length"]
     latent = encode_frames(representation.vae, dataset)
     action = dataset.get("action", None)
-    if actions == "inferred":
+    if actions == "inferred" or action is None:
         inverse = representation.inverse
         action = None if inverse is None else inverse(latent, length)
     train = dataset["train"].clone()
@@ -53,5 +52,5 @@ def make_bank(
         None if action is None else DemonstrationSteps.of(latent, action, length * train),
         representation.identity,
         spread,
-        representation.metadata.get("scene_version"),
+        representation.metadata.get("scene"),
     )

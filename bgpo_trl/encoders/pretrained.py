@@ -35,14 +35,11 @@ def load_pretrained(
     """
     scene = find_scene(scene)
     weights = default_weights(tasks, scene=scene) if weights is None else Path(weights)
-    encoders = load_representation(weights, scene_version=scene.version)
+    encoders = load_representation(weights, scene=scene)
     path = bank_path(weights)
     bank = DemonstrationBank.load(path, encoder_id=encoders.identity)
-    if bank.scene_version not in (None, scene.version):
-        raise ValueError(
-            f"{path} shows the scene {bank.scene_version}, this is {scene.version}: record and "
-            "embed demonstrations of this scene"
-        )
+    if bank.scene is not None:
+        scene.check_identity(bank.scene, path, "record and embed demonstrations of this scene")
     return encoders, bank
 
 

@@ -37,6 +37,7 @@ from bgpo_trl.objectives.supervised import (
     SequenceReconstructionLoss,
     VAEInverseLoss,
 )
+from bgpo_trl.scenes import Scene
 
 Network = TypeVar("Network", bound=nn.Module)
 
@@ -50,7 +51,8 @@ class Representation:
         lae: Sequence encoder; ``lae.encode(latent, length)`` is the embedding phi.
         inverse: Inverse model on latents; it infers the actions of demonstrations for a bank. None
             if it was trained on nothing: no recorded actions were known.
-        metadata: ``scene_version``, ``spread``, ``config`` (JSON), ``seed``, ``command``.
+        metadata: ``scene`` (`Scene.identity`), ``spread``, ``config`` (JSON), ``seed`` and
+            ``command``.
     """
 
     vae: VAE
@@ -68,13 +70,31 @@ class Representation:
         """Digest of all weights; it identifies the encoders that made an embedding."""
         return digest(_tensors(self))
 
+    def check_scene(self, scene: Scene, what: object, remedy: str) -> None:
+        """Raise ``ValueError`` unless the encoders are of a scene, and of its frames' size.
+
+        Args:
+            scene: The robot.
+            what: Name of the encoders, such as their path, which begins the message.
+            remedy: What to do if they are of another version of the scene.
+        """
+        scene.check_identity(self.metadata.get("scene"), what, remedy)
+        found, wanted = [*self.vae.frame_shape], [*scene.frame_shape]
+        if self.inverse is not None:  # else, no actions were known
+            found, wanted = [*found, self.vae.action_size], [*wanted, scene.action_size]
+        if found != wanted:
+            raise ValueError(
+                f"{what} has frames of {found[:2]} and {found[2:]} actions, the scene {wanted[:2]} "
+                f"and {wanted[2:]}: {remedy}, and change the scene's version with its sizes"
+            )
+
 
 def train_representation(
     dataset: TensorDictBase,
     config: RepresentationConfig | None = None,
     *,
     play: TensorDictBase | None = None,
-    scene_version: str,
+    scene: str,
     spread: float = 1.0,
     command: str = "",
     checkpoint: str | Path | None = None,
@@ -92,7 +112,7 @@ def train_representation(
             alone, so that it has seen none of the actions that it infers for demonstrations;
             without play, it learns from those of demonstrations. If what it would learn from lacks
             actions, or it gets no steps, there is none.
-        scene_version: Version of the scene of the frames, stored with the weights.
+        scene: Identity of the scene of the frames (`Scene.identity`), stored with the weights.
         spread: Share of the range of start states of the recordings, stored with the weights.
         command: Command line, stored with the weights.
         checkpoint: Folder for checkpoints, from which an interrupted training is resumed and then
@@ -106,24 +126,26 @@ def train_representation(
 
     Raises:
         ValueError: If the dataset or the configuration cannot be trained on, or ``checkpoint``
-            belongs to a training with another configuration.
+            belongs to a training with another configuration; or if ``largest_action`` leaves no
+            action to learn from, or more than a twentieth of those demonstrated out.
     """
     config = config or RepresentationConfig()
     train, _ = split(dataset)
+    seen = [train] if play is None else [train, split(play)[0]]
+    own = seen[-1]
+    _check_actions(train, own, config.inverse)
     folder = Path(checkpoint) if checkpoint else None
     fit = Fit(config, folder, log, progress, device)
-    seen = [train] if play is None else [train, split(play)[0]]
     vae = _train_vae(seen, config.vae, fit, config.seed)
     latent = encode_frames(vae, train)
     lae = _train_lae(latent, train.get("length"), config.lae, fit, config.seed)
-    own = seen[-1]
     inverse = None
     if config.inverse.steps and "action" in own:
         if play is not None:
             latent = encode_frames(vae, own)
         inverse = _train_inverse(latent, own, config.inverse, fit, config.seed).cpu()
     metadata = {
-        "scene_version": scene_version,
+        "scene": scene,
         "spread": str(spread),
         "config": json.dumps(asdict(config)),
         "seed": str(config.seed),
@@ -155,6 +177,7 @@ def retrain_inverse(
     own, _ = split(play)
     if "action" not in own:
         raise ValueError("the inverse model learns from actions, which this play lacks: record it")
+    _check_actions(None, own, config.inverse)
     vae = representation.vae.to(device)
     latent = encode_frames(vae, own)
     fit = Fit(config, folder, log, progress, device)
@@ -202,10 +225,10 @@ def save_representation(representation: Representation, path: str | Path) -> Non
     save_tensors(path, _tensors(representation), representation.metadata)
 
 
-def load_representation(path: str | Path, *, scene_version: str | None = None) -> Representation:
+def load_representation(path: str | Path, *, scene: Scene | None = None) -> Representation:
     """Read encoders written by `save_representation`; they are in eval mode, without gradients.
 
-    By default, any version of the scene is accepted.
+    By default, those of any scene are accepted.
 
     Raises:
         ValueError: If the file is missing, damaged, or belongs to another scene.
@@ -217,7 +240,6 @@ def load_representation(path: str | Path, *, scene_version: str | None = None) -
         if any(value.dtype != torch.float32 for value in tensors.values()):
             raise ValueError("weights are float32")
         config = json.loads(metadata["config"])
-        trained_on = metadata["scene_version"]
         vae = VAE(
             config["vae"]["latent_size"],
             len(tensors["vae.inverse_head.bias"]),
@@ -238,10 +260,8 @@ def load_representation(path: str | Path, *, scene_version: str | None = None) -
         raise ValueError(f"no encoder weights at {path}: {remedy}") from None
     except Exception as error:
         raise ValueError(f"{path} is damaged or holds no encoder weights: {remedy}") from error
-    if scene_version is not None and trained_on != scene_version:
-        raise ValueError(
-            f"{path} was trained on scene {trained_on}, this is scene {scene_version}: {remedy}"
-        )
+    if scene is not None:
+        encoders.check_scene(scene, path, remedy)
     for _, module in encoders.networks():
         module.eval().requires_grad_(False)
     return encoders
@@ -346,6 +366,41 @@ def _actions_of_frames(dataset: TensorDictBase, own: TensorDictBase) -> Tensor:
     return torch.nn.functional.pad(action, (0, 0, 0, 1))[valid_steps(length, n_frames)]
 
 
+def _steps_to_infer(episodes: TensorDictBase, config: InverseModelConfig) -> tuple[Tensor, Tensor]:
+    """Return which steps have an action, and which a small enough one, both bool ``[N, T - 1]``."""
+    action = episodes.get("action")
+    limit = 1.0 if config.largest_action is None else config.largest_action
+    valid = valid_steps(episodes.get("length") - 1, action.shape[1])
+    return valid, action.abs().amax(-1) <= limit
+
+
+def _check_actions(
+    shown: TensorDictBase | None, own: TensorDictBase, config: InverseModelConfig
+) -> None:
+    """Check, before hours of training, that the inverse model sees what it is to infer.
+
+    Args:
+        shown: Demonstrations.
+        own: Episodes that it learns from.
+        config: Its settings.
+
+    Raises:
+        ValueError: If there is nothing to learn from, or hardly what demonstrations do.
+    """
+    for episodes, most in ((shown, 0.05), (own, 1.0)):
+        if episodes is None or "action" not in episodes:
+            continue
+        valid, small = _steps_to_infer(episodes, config)
+        left_out = float((valid & ~small).sum() / valid.sum())
+        if left_out > most or left_out == 1:
+            component = int(episodes.get("action")[valid].abs().mean(0).argmax())
+            raise ValueError(
+                f"largest_action {config.largest_action} leaves {left_out:.0%} of the actions out, "
+                f"most by component {component}, and the inverse model would never see them: raise "
+                "it (--config.inverse.largest-action, or largest_action of the scene), 1 keeps all"
+            )
+
+
 def _train_inverse(
     latent: Tensor,
     episodes: TensorDictBase,
@@ -355,12 +410,8 @@ def _train_inverse(
 ) -> InverseModel:
     """Train the inverse model on the latents ``[N, T, 64]`` and actions of episodes."""
     length, action = episodes.get("length"), episodes.get("action")
-    slow = action.abs().amax(-1) <= config.largest_action
-    chosen = (slow & valid_steps(length - 1, action.shape[1])).nonzero()
-    if not len(chosen):
-        raise ValueError(
-            f"no recorded action is as small as largest_action {config.largest_action}"
-        )
+    valid, slow = _steps_to_infer(episodes, config)
+    chosen = (slow & valid).nonzero()
 
     def sample(generator: torch.Generator) -> TensorDict:
         drawn = torch.randint(len(chosen), (config.batch_size,), generator=generator)

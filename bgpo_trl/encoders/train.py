@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -80,6 +81,9 @@ def train_encoders(
         raise ValueError("to train the inverse model alone, give the folder of recorded play")
     scene = find_scene(scene)
     tasks = scene.default_tasks if tasks is None else tasks
+    if config.inverse.largest_action is None:
+        inverse = replace(config.inverse, largest_action=scene.largest_action)
+        config = replace(config, inverse=inverse)
     make_folder(folder)
     check_folder(weights.parent)  # before hours of training
     with CsvFile(folder / "train.csv", _COLUMNS) as file:
@@ -94,10 +98,11 @@ def train_encoders(
             representation = retrain_inverse(keep, play, config, **fit)
         else:
             representation = train_representation(
-                dataset, config, play=play, scene_version=scene.version, spread=spread, **fit
+                dataset, config, play=play, scene=scene.identity, spread=spread, **fit
             )
     save_representation(representation, weights)
-    bank = make_bank(representation, dataset, tasks=tasks, spread=spread)
+    actions = scene.bank_actions
+    bank = make_bank(representation, dataset, tasks=tasks, actions=actions, spread=spread)
     bank.save(bank_path(weights))
     play = None if keep else play
     probe(representation, dataset, folder, play=play, columns=scene.state)

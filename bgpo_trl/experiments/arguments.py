@@ -166,8 +166,9 @@ class MakeBankArguments(ImportArguments):
     """Bank to write."""
     weights: Path | None = None
     """Encoder weights; by default those that come with the scene."""
-    actions: Literal["inferred", "recorded"] = "inferred"
-    """Actions of the stored demonstrations, inferred from frames or recorded."""
+    actions: Literal["inferred", "recorded"] | None = None
+    """Actions of the stored demonstrations, inferred from frames or recorded; by default as the
+    scene says."""
 
 
 @dataclass(frozen=True)

@@ -44,7 +44,7 @@ def command_line(
         program: Name of the program in messages; by default that of the process.
         line: First line of the help.
     """
-    kind = get_type_hints(command)["arguments"] if kind is None else kind
+    kind = kind or get_type_hints(command)["arguments"]
     resumable = hasattr(kind, "resume")
     try:
         with _terminable() if resumable else contextlib.nullcontext():

@@ -43,7 +43,7 @@ def encoders(arguments: EncodersArguments) -> None:
         choose_device(arguments.device),
         tasks=meta["tasks"],
         spread=meta["spread"],
-        keep=None if keep is None else load_representation(keep, scene_version=scene.version),
+        keep=None if keep is None else load_representation(keep, scene=scene),
         scene=scene,
     )
 
@@ -52,12 +52,13 @@ def bank(arguments: MakeBankArguments) -> None:
     """Embed a recorded dataset with trained encoders; see `make_bank`."""
     import_plugin(arguments.module)
     meta, weights = read_meta(arguments.dataset), arguments.weights
-    weights = default_weights(scene=meta["scene"]) if weights is None else weights
+    scene = find_scene(meta["scene"])
+    weights = default_weights(scene=scene) if weights is None else weights
     made = make_bank(
-        load_representation(weights, scene_version=meta["scene_version"]),
+        load_representation(weights, scene=scene),
         load_demonstrations(arguments.dataset),
         tasks=meta["tasks"],
-        actions=arguments.actions,
+        actions=scene.bank_actions if arguments.actions is None else arguments.actions,
         spread=meta["spread"],
     )
     made.save(arguments.out)
@@ -69,7 +70,7 @@ def probes(arguments: ProbesArguments) -> None:
     meta, weights = read_meta(arguments.dataset), arguments.weights
     scene = find_scene(meta["scene"])
     weights = default_weights(meta["tasks"], scene=scene) if weights is None else weights
-    representation = load_representation(weights, scene_version=scene.version)
+    representation = load_representation(weights, scene=scene)
     play = None if arguments.play is None else load_demonstrations(arguments.play)
     dataset = load_demonstrations(arguments.dataset)
     probe(representation, dataset, arguments.out, play=play, columns=scene.state)

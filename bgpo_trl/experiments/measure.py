@@ -13,7 +13,7 @@ from bgpo_trl.analysis.task_inference import group_purity, task_inference_accura
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.evaluation import evaluate_random_policy
 from bgpo_trl.experiments.episodes import evaluator_of, snapshots_of
-from bgpo_trl.figures.frames import plot_frame_strips, save_gif
+from bgpo_trl.figures.frames import file_names, plot_frame_strips, save_gif
 from bgpo_trl.figures.groups import draw_groups
 from bgpo_trl.figures.gwr import draw_growth, draw_nodes
 from bgpo_trl.figures.style import save_figure
@@ -151,8 +151,8 @@ def draw(
         save_figure(figure, out / "figures" / "steps.png")
     episodes = record_episodes(trainer, bank)
     save_figure(plot_frame_strips(episodes), out / "figures" / "episodes.png")
-    for title, frames in episodes.items():
-        save_gif(frames, out / "figures" / f"{title.split()[0]}.gif")
+    for name, frames in zip(file_names(config.tasks), episodes.values(), strict=True):
+        save_gif(frames, out / "figures" / f"{name}.gif")
     gwr = trainer.algorithm.gwr
     if gwr is not None:
         draw_nodes(out, trainer.algorithm, bank, config.tasks)

@@ -78,7 +78,7 @@ def play(policy: TrainedPolicy, task: str, demonstration: NDArray, seed: int) ->
     env = find_scene(config.scene).simulate([task], batch_size=1, spread=config.spread)
     simulation = env.simulations[0]
     simulation.seed(seed)
-    simulation.reset(0)
+    simulation.reset(task)
     seen, views, success = [simulation.frame()], [_view(simulation)], False
     for _ in range(config.algorithm.max_steps):
         success, failure = simulation.step(policy.act(seen[-1]).astype(np.float64))

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,20 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from bgpo_trl.files.writing import make_folder, write_whole
+
+
+def file_names(tasks: Sequence[str]) -> list[str]:
+    """Return a name for a file of each task: its own, of which no sign or length is a problem.
+
+    Examples:
+        >>> file_names(["grasp_glass", "put a/b, then c", "put a/b: then c"])
+        ['grasp_glass', 'put_a_b_then_c-1', 'put_a_b_then_c-2']
+    """
+    plain = [re.sub(r"[^\w-]+", "_", name)[:60] for name in tasks]
+    return [
+        name if name == short else f"{short}-{number}"
+        for number, (name, short) in enumerate(zip(tasks, plain, strict=True))
+    ]
 
 
 def plot_frame_strips(episodes: Mapping[str, NDArray], n_frames: int = 8) -> Figure:

@@ -50,8 +50,7 @@ def keep_inputs(
                 return
         except ValueError:  # missing, damaged, of other encoders or of other tasks
             continue
-    version = find_scene(scene).version
-    bank = replace(bank, encoder_id=encoders.identity, scene_version=version)
+    bank = replace(bank, encoder_id=encoders.identity, scene=find_scene(scene).identity)
     bank.save(directory / BANK)
 
 
@@ -81,12 +80,8 @@ def load_inputs(
             f"{directory} was trained with the encoders {str(digests.encoders)[:12]}, not with "
             f"{weights} ({encoders.identity[:12]}): put its own there"
         )
-    learned, version = encoders.metadata.get("scene_version"), find_scene(scene).version
-    if learned != version:
-        raise ValueError(
-            f"{directory} was trained in the scene {learned}, this is {version}: use the version "
-            "of the scene that it was trained in"
-        )
+    remedy = "use the version of the scene that it was trained in"
+    encoders.check_scene(find_scene(scene), directory, remedy)
     kept = directory / BANK
     path = kept if kept.exists() else bank_path(weights)
     bank = DemonstrationBank.load(path, encoder_id=encoders.identity).for_tasks(tasks)

@@ -36,12 +36,12 @@ class NicoSimulation(Simulation):
     """NICO at the table, with one physics for all tasks.
 
     Args:
-        tasks: Names of the tasks, in the order of their numbers.
+        tasks: Names of the tasks.
         spread: Share of the whole range of start states.
 
     Attributes:
-        environments: Environment of each task.
-        environment: That of the current one.
+        environments: Environment of each task, by name.
+        task: Name of the current task.
         timestep: First time step of the episode.
         renderer: Renderer of the frames, which other simulations may share.
     """
@@ -51,8 +51,8 @@ class NicoSimulation(Simulation):
     def __init__(self, tasks: Sequence[str], *, spread: float = 1.0) -> None:
         physics = nico.Physics.from_xml_string(nico.scene_xml())
         random = np.random.RandomState(0)  # All tasks draw from one source.
-        self.environments = [
-            nico.load(
+        self.environments = {
+            task: nico.load(
                 task,
                 seed=random,
                 spread=spread,
@@ -61,18 +61,23 @@ class NicoSimulation(Simulation):
                 physics=physics,
             )
             for task in tasks
-        ]
-        self.environment: Environment = self.environments[0]
+        }
+        self.task = tasks[0]
         self.timestep: TimeStep
         self._room: FrameRenderer | None = None
+
+    @property
+    def environment(self) -> Environment:
+        """Environment of the current task."""
+        return self.environments[self.task]
 
     def seed(self, seed: int) -> None:
         """Seed the draws of all following starts."""
         self.environment.task.random.seed(seed)
 
-    def reset(self, task: int) -> None:
+    def reset(self, task: str) -> None:
         """Begin an episode of a task."""
-        self.environment = self.environments[task]
+        self.task = task
         self.timestep = self.environment.reset()
 
     def step(self, action: NDArray[np.float64]) -> Outcome:
@@ -110,17 +115,17 @@ class NicoSimulation(Simulation):
     def save(self) -> dict[str, Any]:
         """Return the state of physics and random numbers."""
         return {
-            "task": self.environments.index(self.environment),
+            "task": self.task,
             "physics": torch.from_numpy(self.environment.physics.get_state()),
             "random": random_state(self.environment.task.random),
         }
 
     def load(self, state: dict[str, Any]) -> None:
         """Continue from what `save` returned."""
-        self.environment = self.environments[state["task"]]
+        self.task = state["task"]
         self.environment.physics.set_state(state["physics"].numpy())
         set_random_state(self.environment.task.random, state["random"])
-        for environment in self.environments:
+        for environment in self.environments.values():
             environment._reset_next_step = False
 
 
@@ -214,7 +219,7 @@ class HidingSimulation(NicoSimulation):
         self._nominal = np.hstack([nico.nominal_places(), [[1.0, 0.0, 0.0, 0.0]] * len(OBJECTS)])
         self._start = self._nominal
 
-    def reset(self, task: int) -> None:
+    def reset(self, task: str) -> None:
         """Begin an episode of a task."""
         super().reset(task)
         self._start = self.environment.physics.data.qpos[self._poses].copy()
@@ -277,7 +282,7 @@ def _moved(poses: NDArray, start: NDArray, now: NDArray) -> NDArray:
 _FIRST_OBJECT = 7  # column of the state, after four joints (rad) and the grip point (m)
 
 
-def _demonstrator(simulation: Simulation, task: int, seed: int) -> Callable[[], NDArray[Any]]:
+def _demonstrator(simulation: Simulation, task: str, seed: int) -> Callable[[], NDArray[Any]]:
     """Return NICO's demonstrator at the start of an episode."""
     if not isinstance(simulation, NicoSimulation):
         raise TypeError(f"NICO's demonstrator acts in a NicoSimulation, got {simulation!r}")
@@ -320,6 +325,8 @@ NICO = Scene(
     frame_shape=FRAME_SHAPE,
     action_size=4,
     max_steps=50,
+    largest_action=0.6,
+    bank_actions="inferred",
     has_spread=True,
     demonstrator=_demonstrator,
     state=StateColumns(

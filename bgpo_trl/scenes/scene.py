@@ -6,7 +6,7 @@ import importlib
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from numpy.typing import NDArray
 
@@ -72,7 +72,7 @@ class Scene:
     ``weights``, encoders are trained or named.
 
     Attributes:
-        name: Name in settings, datasets and on command lines.
+        name: Name in settings, files and on command lines, without spaces.
         version: Version of everything that frames and dynamics depend on. Datasets, encoders and
             banks of another version are refused.
         tasks: Names of all tasks; may grow while the program runs.
@@ -83,9 +83,15 @@ class Scene:
         frame_shape: Height and width of a frame, at least 16 each.
         action_size: Number of components of an action, each in [-1, 1].
         max_steps: Length of the longest episode.
+        largest_action: Actions with a larger component are left out of the training of the inverse
+            model. Below 1 only if demonstrators never exceed it: errors of faster movements, as in
+            play, would prevail in the loss.
+        bank_actions: Actions of demonstrations as experience: those recorded with them, inferred
+            where there are none; or always those that the inverse model infers, the only ones that
+            an observer has.
         has_spread: Whether starts can be drawn from a share of their range.
-        demonstrator: Function from a simulation at the start of an episode, the number of the
-            task and the seed of its noise to a function that returns the next action ``[A]``.
+        demonstrator: Function from a simulation at the start of an episode, the name of the task
+            and the seed of its noise to a function that returns the next action ``[A]``.
         state: Meaning of the ground truth.
         weights: Encoders that come with it.
         modules: Modules that define tasks which are not the scene's own, by name of the task.
@@ -100,13 +106,19 @@ class Scene:
     frame_shape: tuple[int, int]
     action_size: int
     max_steps: int = 50
+    largest_action: float = 1.0
+    bank_actions: Literal["recorded", "inferred"] = "recorded"
     has_spread: bool = False
-    demonstrator: Callable[[Simulation, int, int], Callable[[], NDArray[Any]]] | None = None
+    demonstrator: Callable[[Simulation, str, int], Callable[[], NDArray[Any]]] | None = None
     state: StateColumns | None = None
     weights: Weights | None = None
     modules: Callable[[Sequence[str]], Mapping[str, str]] = lambda _: {}
 
     def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or len(self.name.split()) != 1:
+            raise ValueError(f"the name of a scene is a word without spaces, got {self.name!r}")
+        if not isinstance(self.version, str) or not self.version.isprintable() or not self.version:
+            raise ValueError(f"the version of a scene is a printable string, got {self.version!r}")
         if min(self.frame_shape) < 16 or len(self.frame_shape) != 2:
             raise ValueError(
                 f"frame_shape is {self.frame_shape}: a height and a width of at least 16 pixels"
@@ -116,7 +128,32 @@ class Scene:
                 f"action_size and max_steps must be at least 1, got {self.action_size} and "
                 f"{self.max_steps}"
             )
+        if not 0 < self.largest_action <= 1 or self.bank_actions not in ("recorded", "inferred"):
+            raise ValueError(
+                "largest_action lies above 0 and at most at 1, bank_actions are 'recorded' or "
+                f"'inferred', got {self.largest_action} and {self.bank_actions!r}"
+            )
         self.check_tasks(self.default_tasks)
+
+    @property
+    def identity(self) -> str:
+        """Name and version, by which encoders and banks say whose frames they are made of."""
+        return f"{self.name} {self.version}"
+
+    def check_identity(self, found: str | None, what: object, remedy: str) -> None:
+        """Raise ``ValueError`` if something was made for another robot, or version of this one.
+
+        Args:
+            found: Identity of the scene that it was made for, as stored with it.
+            what: Its name, such as a path, which begins the message.
+            remedy: What to do if it was made for another version.
+        """
+        if found == self.identity:
+            return
+        name = "" if found is None else found.partition(" ")[0]
+        if name != self.name:
+            remedy = f"name the scene {name!r} (--scene {name}), or take what is of {self.name!r}"
+        raise ValueError(f"{what} is of the scene {found}, this is {self.identity}: {remedy}")
 
     @property
     def all_tasks(self) -> tuple[str, ...]:
@@ -157,6 +194,7 @@ class Scene:
     def check_tasks(self, tasks: Sequence[str]) -> None:
         """Raise ``ValueError`` if a task does not exist or is named twice."""
         for position, name in enumerate(tasks):
+            check_name(name)
             if name not in self.tasks:
                 raise ValueError(
                     f"the scene {self.name!r} has no task {name!r}: choose one of "
@@ -171,6 +209,14 @@ class Scene:
             raise ValueError(f"spread is {spread}: choose a number from 0 (nominal places) to 1")
         if spread != 1.0 and not self.has_spread:
             raise ValueError(f"the starts of the scene {self.name!r} have no spread: leave it at 1")
+
+
+def check_name(task: object) -> None:
+    """Raise ``ValueError`` unless it can be the name of a task: printable, no space at its ends."""
+    if not isinstance(task, str) or not task.isprintable() or task.strip() != task or not task:
+        raise ValueError(
+            f"the name of a task is a printable string that no space begins or ends, got {task!r}"
+        )
 
 
 SCENES: dict[str, Scene | str] = {"nico": "bgpo_trl.scenes.nico:NICO"}

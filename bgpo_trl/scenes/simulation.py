@@ -47,8 +47,8 @@ class Simulation(ABC):
         """Seed the draws of all following starts, for all tasks alike; below 2**32."""
 
     @abstractmethod
-    def reset(self, task: int) -> None:
-        """Begin an episode of the task with that number, from a start drawn at random."""
+    def reset(self, task: str) -> None:
+        """Begin an episode of the task with that name, from a start drawn at random."""
 
     @abstractmethod
     def step(self, action: NDArray[np.float64]) -> Outcome:
@@ -250,7 +250,7 @@ class SimulationEnv(EnvBase):
                     )
                 self._task[rows] = chosen[rows]
         for row in np.flatnonzero(rows).tolist():
-            self.simulations[row].reset(int(self._task[row]))
+            self.simulations[row].reset(self.tasks[self._task[row]])
             self._record(row)
         self._begun |= rows
         self._success[rows] = self._failure[rows] = False

@@ -84,7 +84,7 @@ def test_bgpo_never_reads_the_label(make_bgpo, variant):
 
 @pytest.mark.parametrize("variant", ["ground truth, label", "latent, nothing"])
 def test_a_reference_learns_the_same_from_whatever_demonstrations(make_bgpo, bank, variant):
-    other = DemonstrationBank(-3 * bank.embedding.flip(0), bank.task, bank.train)
+    other = DemonstrationBank(-3 * bank.embedding.flip(0), bank.task, bank.train, bank.tasks)
     schedule = TaskSchedule((0, 0, 0))
     algorithm = make_bgpo(variant, schedule=schedule)
     elsewhere = make_bgpo(variant, schedule=schedule, bank=other)

@@ -9,6 +9,7 @@ from bgpo_trl.analysis.task_inference import (
     match_counts,
     task_inference_accuracy,
 )
+from bgpo_trl.configs.runs import PAPER_TASKS
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.modules.gwr import GWRB
@@ -37,7 +38,9 @@ def network(*nodes, batch_size=()):
 def bank(*demonstrations):
     """Demonstrations as (position in PLACES, task), a little off their place."""
     place, task = map(torch.tensor, zip(*demonstrations, strict=True))
-    return DemonstrationBank(PLACES[place] + 0.1, task, torch.ones(len(task), dtype=torch.bool))
+    return DemonstrationBank(
+        PLACES[place] + 0.1, task, torch.ones(len(task), dtype=torch.bool), PAPER_TASKS
+    )
 
 
 SEEN = bank((0, 0), (0, 0), (0, 1), (1, 1), (1, 1), (1, 0))

@@ -80,7 +80,9 @@ def test_steps_that_do_not_fit_together_are_refused(steps):
 def with_steps(steps):
     embedding = torch.rand(5, 32, generator=torch.Generator().manual_seed(1))
     task = torch.tensor([0, 1, 2, 0, 1])
-    return DemonstrationBank(embedding, task, LENGTH > 0, steps=steps, encoder_id="x")
+    return DemonstrationBank(
+        embedding, task, LENGTH > 0, nico.PAPER_TASKS, steps=steps, encoder_id="x"
+    )
 
 
 def test_a_bank_is_read_with_the_steps_that_were_written(with_steps, tmp_path):
@@ -145,6 +147,20 @@ def test_steps_of_other_demonstrations_are_refused(with_steps, tmp_path):
             DemonstrationBank.load(tmp_path / "damaged", encoder_id="x")
 
 
+def test_names_of_tasks_may_be_sentences(with_steps, tmp_path):
+    """Joined by commas, "put it down" would be the third of four names."""
+    names = ("lift the cup, put it down", "put it down", "wipe")
+    named = replace(with_steps, tasks=names)
+    named.save(tmp_path / "bank")
+    read = DemonstrationBank.load(tmp_path / "bank", encoder_id="x")
+    assert read.tasks == names
+    for name in names:
+        assert read.for_tasks([name]).embedding.equal(named.for_tasks([name]).embedding)
+    for wrong in (("a", "a", "b"), ("a", " b", "c"), ("a", "b\n", "c"), ("a", "", "c")):
+        with pytest.raises(ValueError, match=r"named twice|printable"):
+            replace(named, tasks=wrong)
+
+
 def test_a_bank_is_made_of_what_the_encoders_see(encoders):
     generator = torch.Generator().manual_seed(4)
     length = torch.tensor([5, 3, 4])
@@ -156,7 +172,8 @@ def test_a_bank_is_made_of_what_the_encoders_see(encoders):
         "train": torch.tensor([True, True, False]),
     }
     inferred, recorded = (
-        make_bank(encoders, dataset, actions=actions) for actions in ("inferred", "recorded")
+        make_bank(encoders, dataset, tasks=nico.PAPER_TASKS, actions=actions)
+        for actions in ("inferred", "recorded")
     )
     assert inferred.steps.length.tolist() == [5, 3, 0]  # nothing of what is held out
     assert_same(replace(inferred.steps, action=recorded.steps.action), recorded.steps)
@@ -214,7 +231,7 @@ def test_the_command_keeps_the_names_of_the_tasks(tmp_path, encoders, monkeypatc
     record_demonstrations(
         folder, tasks=["push_again"], per_task=2, held_out_per_task=1, progress=False
     )
-    monkeypatch.setattr(command, "load_representation", lambda path, scene_version: encoders)
+    monkeypatch.setattr(command, "load_representation", lambda path, scene: encoders)
     command.main(folder, out)
     found = DemonstrationBank.load(out, encoder_id=encoders.identity)
     assert found.tasks == ("push_again",)
@@ -224,17 +241,17 @@ def test_the_command_keeps_the_names_of_the_tasks(tmp_path, encoders, monkeypatc
 
 def test_a_bank_remembers_encoders_and_scene_and_joins_none_of_others(with_steps, tmp_path):
     path, unknown = tmp_path / "bank.safetensors", replace(with_steps, encoder_id=None)
-    assert with_steps.scene_version is None
-    one = replace(with_steps, scene_version="nico-1")
+    assert with_steps.scene is None
+    one = replace(with_steps, scene="nico 1")
     one.save(path)
     loaded = DemonstrationBank.load(path, encoder_id="x")
     for part in (loaded, loaded.seen(), loaded.for_tasks(loaded.tasks[1:]), loaded + one):
-        assert (part.encoder_id, part.scene_version) == ("x", "nico-1")
+        assert (part.encoder_id, part.scene) == ("x", "nico 1")
     assert loaded.identity == one.identity
     with pytest.raises(ValueError, match="set encoder_id"):
         unknown.save(path)
     for other in (unknown, replace(with_steps, encoder_id="xyz")):
         with pytest.raises(ValueError, match="embedded by the encoders x, the other by"):
             with_steps + other
-    with pytest.raises(ValueError, match="shows the scene nico-1, the other nico-2"):
-        loaded + replace(with_steps, scene_version="nico-2")
+    with pytest.raises(ValueError, match="shows the scene nico 1, the other nico 2"):
+        loaded + replace(with_steps, scene="nico 2")

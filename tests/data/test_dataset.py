@@ -153,7 +153,7 @@ MISSING = {**episodes_of(), TASKS[1]: [episode_of(2), episode_of(7), None, episo
         (changed(pixels=np.zeros((6, 48, 64, 3), np.uint8)), "48 x 64", "resize_frames"),
         (changed(pixels=np.zeros((6, 32, 64, 3))), "has pixels float64", "give uint8"),
         (changed(pixels=np.zeros((6, 32, 64), np.uint8)), "[6, 32, 64]", "[T, H, W, 3]"),
-        (changed(pixels=np.zeros((1, 32, 64, 3), np.uint8)), "[1, 32, 64, 3]", "two frames"),
+        (changed(pixels=np.zeros((1, 32, 64, 3), np.uint8)), "[1, 32, 64, 3]", "at least 2"),
         (changed(action=np.zeros((6, 4))), "has the action float64 [6, 4]", "[5, 4]"),
         (changed(action=[["left"] * 4] * 5), "has the action", "give [5, 4] numbers"),
         (changed(action=np.full((5, 4), -1.5)), "an action of size 1.5", "scale actions"),
@@ -186,6 +186,23 @@ def test_what_cannot_be_written_leaves_nothing(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="exists: choose another folder, or remove it"):
         write(tmp_path / "own", episodes_of(seed=1))
     assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize(
+    "frames",
+    [
+        np.full((1, 4, 4, 3), 0.5, np.float32),  # was black
+        np.full((1, 4, 4, 3), 3_000, np.uint16),  # was noise
+        np.full((1, 4, 4, 3), np.nan),  # was black
+        np.zeros((4, 4, 3), np.uint8),
+        np.zeros((1, 4, 4, 4), np.uint8),
+    ],
+)
+def test_frames_that_resizing_would_have_to_convert_are_refused(frames):
+    with pytest.raises(ValueError, match=r"give uint8 \[T, H, W, 3\] \(0 to 255\)"):
+        resize_frames(frames, (2, 2))
+    with pytest.raises(ValueError, match="frame_shape must be a whole number, at least 1"):
+        resize_frames(np.zeros((1, 4, 4, 3), np.uint8), (0, 2))
 
 
 def test_resized_frames_are_means_of_areas():

@@ -1,5 +1,6 @@
 """Demonstrations written as a LeRobot dataset, and read from one."""
 
+import io
 import json
 import shutil
 import sys
@@ -8,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from PIL import Image
 from tensordict import TensorDict
 
 pa = pytest.importorskip("pyarrow")
@@ -22,6 +24,7 @@ from tests.helpers import edit  # noqa: E402
 TASKS = ("grasp_glass", "push_green_to_white")
 STATE = "observation.environment_state"
 CAMERA = "observation.images.camera"
+DATA = "data/chunk-000/file-000.parquet"
 EPISODES = "meta/episodes/chunk-000/file-000.parquet"
 LENGTHS = (5, 2, 4)
 
@@ -53,7 +56,8 @@ def test_what_is_written_is_read_again(tmp_path, keys):
     dataset = dataset_of(keys)
     write_lerobot(tmp_path / "lerobot", dataset, tasks=TASKS, fps=5)
 
-    found = read_lerobot(tmp_path / "lerobot", state_key=STATE if "state" in keys else None)
+    named = {"state_key": STATE} if "state" in keys else {"action_key": None}
+    found = read_lerobot(tmp_path / "lerobot", **named)
 
     assert [*found] == [*TASKS]
     for (task, number), row in zip([(1, 0), (0, 0), (1, 1)], dataset, strict=True):
@@ -128,7 +132,7 @@ def test_frames_of_another_size_are_resized_if_asked(written, tmp_path):
         write_demonstrations(tmp_path / "own", small, scene="nico", held_out_per_task=1)
 
 
-def edit_rows(path, change, file="data/chunk-000/file-000.parquet"):
+def edit_rows(path, change, file=DATA):
     rows = pq.read_table(path / file).to_pandas()
     pq.write_table(pa.Table.from_pandas(change(rows)), path / file)
 
@@ -145,7 +149,7 @@ def replaced(column, values):
     return lambda path: edit_rows(path, lambda rows: rows.assign(**{column: values}))
 
 
-INFO = "meta/info.json"
+INFO, TASK_FILE = "meta/info.json", "meta/tasks.parquet"
 IMAGE = {"dtype": "image", "shape": [32, 64, 3], "names": None}
 
 
@@ -153,7 +157,28 @@ IMAGE = {"dtype": "image", "shape": [32, 64, 3], "names": None}
     ("damage", "cause", "remedy"),
     [
         (without(6), "episode 1", "has 1 of 2 frames"),
-        (without([5, 6]), "episode 1", "has 0 of 2 frames"),
+        (without([5, 6]), "3 by meta/episodes and 2 by data, episodes 1", "get it again"),
+        (
+            lambda p: edit_rows(p, lambda rows: rows.drop(index=1), EPISODES),
+            "2 by meta/episodes and 3 by data, episodes 1",
+            "get it again",
+        ),
+        (edit_info(total_episodes=4), "has 4 episodes by meta/info.json, 3 by", "get it again"),
+        (
+            replaced("timestamp", [0, 0.2, 0.6, 0.8, 1, 0, 0.2, 0, 0.2, 0.4, 0.6]),
+            "frame 2 is at 0.600 s instead of 0.400 s",
+            "evenly",
+        ),
+        (
+            lambda p: (p / INFO).write_text("version https://git-lfs.github.com/spec/v1\noid sha"),
+            "info.json is a pointer of Git LFS",
+            "git lfs pull",
+        ),
+        (
+            lambda p: pq.write_table(pa.table({"task_index": [0, 1]}), p / TASK_FILE),
+            "its tasks are 0, 1, not descriptions",
+            "tasks.parquet",
+        ),
         (replaced("task_index", range(11)), "has the tasks [0, 1, 2, 3, 4]", "one task"),
         (
             lambda p: edit_rows(p, lambda rows: rows.drop(columns="frame_index")),
@@ -166,8 +191,8 @@ IMAGE = {"dtype": "image", "shape": [32, 64, 3], "names": None}
         (lambda p: shutil.rmtree(p / "data"), "data is missing", "give the folder of a whole"),
         (lambda p: (p / "meta/tasks.parquet").write_bytes(b"PAR1"), "tasks.parquet", "damaged"),
         (edit_info(codebase_version="v2.1"), "version v2.1, not 3", "convert it"),
-        (edit_info(features={}), "cameras none", "image_key"),
-        (edit_info(features={"a": IMAGE, "b": IMAGE}), "cameras a, b", "image_key"),
+        (edit_info(features={}), "has no camera of colors, only nothing", "record some"),
+        (edit_info(features={"a": IMAGE, "b": IMAGE}), "a, b", "image_key"),
     ],
 )
 def test_incomplete_and_damaged_datasets_are_refused(written, refused, damage, cause, remedy):
@@ -176,13 +201,120 @@ def test_incomplete_and_damaged_datasets_are_refused(written, refused, damage, c
 
 
 def test_unknown_features_are_refused(written, refused, monkeypatch):
-    refused(lambda: read_lerobot(written, image_key="wrist"), "cameras", "image_key")
-    refused(lambda: read_lerobot(written, state_key="joints"), "no 'joints'", STATE)
+    for wrong, cause in (
+        ({"image_key": "wrist"}, "there is no camera called 'wrist': give one of its cameras"),
+        ({"state_key": "joints"}, "no numbers 'joints': give the states' feature as state_key"),
+        ({"action_key": "actoin"}, "no numbers 'actoin': give the actions' feature as action_key"),
+        ({"action_key": CAMERA}, f"no numbers '{CAMERA}'"),
+        ({"episodes": [1, 3]}, "no episode 3: choose among 0, 1, 2"),
+        ({"tasks": ["wipe"]}, "no task 'wipe': choose among grasp_glass"),
+        ({"stride": 2}, "say how actions become one"),
+        ({"stride": 0}, "stride 0"),
+    ):
+        with pytest.raises(ValueError, match=cause):
+            read_lerobot(written, **wrong)
     found = read_lerobot(written, action_key=None)
     assert {*found[TASKS[0]][0]} == {"pixels"}
     edit_info(features={"camera": {**IMAGE, "dtype": "video"}})(written)
     monkeypatch.setitem(sys.modules, "av", None)
     refused(lambda: read_lerobot(written), "has its frames as video", "pip install av")
+
+
+def test_failed_episodes_are_no_demonstrations_unless_asked_for(written, refused):
+    features = json.loads((written / INFO).read_text())["features"]
+    success = {"dtype": "bool", "shape": [1], "names": None}
+    edit_info(features={**features, "next.success": success})(written)
+    outcomes = [False] * 4 + [True] + [False] * 6  # of the first episode alone
+    replaced("next.success", outcomes)(written)
+    refused(lambda: read_lerobot(written), "failed, without 'next.success': 1, 2", "episodes=...")
+    assert [len(some) for some in read_lerobot(written, episodes=[0]).values()] == [0, 1]
+    assert [len(some) for some in read_lerobot(written, success_key=None).values()] == [1, 2]
+
+
+def test_some_episodes_tasks_and_frames_are_read(written):
+    dataset, first = dataset_of(), slice(0, 5, 2)
+    found = read_lerobot(written, tasks=TASKS[1:], stride=2, combine=lambda a: a.sum(0))
+    assert [*found] == [TASKS[1]]
+    one, two = found[TASKS[1]]
+    np.testing.assert_array_equal(one["pixels"], dataset["pixels"][0, first])
+    summed = dataset["action"][0].unflatten(0, (2, 2)).sum(1)  # frames 0 to 2 and 2 to 4
+    np.testing.assert_array_equal(one["action"], summed)
+    assert len(two["pixels"]) == 2 and two["action"].shape == (1, 4)  # of frames 0 to 3
+    last = read_lerobot(written, episodes=[0], stride=2, combine=lambda a: a[-1])[TASKS[1]][0]
+    np.testing.assert_array_equal(last["action"], dataset["action"][0, 1::2])
+
+
+def test_tasks_and_numbers_may_be_stored_as_other_libraries_do(written):
+    expected = read_lerobot(written)
+    tasks = pa.table({"task": [*TASKS], "task_index": [0, 1]})  # without an index of pandas
+    pq.write_table(tasks, written / TASK_FILE)
+    edit_rows(written, lambda rows: rows.assign(task_index=[[i] for i in rows["task_index"]]))
+    found = read_lerobot(written)
+    assert [*found] == [*TASKS]
+    for name in TASKS:
+        for one, other in zip(found[name], expected[name], strict=True):
+            np.testing.assert_array_equal(one["pixels"], other["pixels"])
+
+
+def saved(image, kind="png"):
+    content = io.BytesIO()
+    image.save(content, kind)
+    return content.getvalue()
+
+
+def test_images_may_lie_in_files_of_the_dataset_alone(written):
+    expected = read_lerobot(written)[TASKS[0]][0]["pixels"]
+    rows = pq.read_table(written / DATA).to_pandas()
+    (written / "images").mkdir()
+    for number, image in enumerate(rows[CAMERA]):
+        (written / "images" / f"{number}.png").write_bytes(image["bytes"])
+    beside = [{"bytes": None, "path": f"images/{number}.png"} for number in range(11)]
+    replaced(CAMERA, beside)(written)
+    np.testing.assert_array_equal(read_lerobot(written)[TASKS[0]][0]["pixels"], expected)
+    (written.parent / "secret.png").write_bytes(rows[CAMERA][0]["bytes"])
+    replaced(CAMERA, [{"bytes": None, "path": "../secret.png"}] * 11)(written)
+    with pytest.raises(ValueError, match=r"episode 0 of .*'../secret.png' is no file of the data"):
+        read_lerobot(written)
+
+
+SIZE = (64, 32)
+CLEAR = Image.new("RGBA", SIZE, (10, 20, 30, 128))
+
+
+@pytest.mark.parametrize(
+    ("content", "cause"),
+    [
+        (saved(Image.new("I;16", SIZE, 3_000)), "of mode I;16, of more than 8 bits"),
+        (saved(Image.new("I", SIZE, 3_000), "tiff"), "of mode I, of more than 8 bits"),
+        (saved(Image.new("F", SIZE, 0.5), "tiff"), "of mode F, of more than 8 bits"),
+        (saved(CLEAR), "its images are transparent"),
+    ],
+)
+def test_images_that_would_have_to_be_converted_are_refused(written, refused, content, cause):
+    """They were black or white: Pillow cuts what exceeds 255."""
+    replaced(CAMERA, [{"bytes": content}] * 11)(written)
+    refused(lambda: read_lerobot(written), "episode 0", cause)
+
+
+def test_gray_opaque_and_palette_images_are_exact(written):
+    plain = Image.new("RGB", SIZE, (10, 20, 30))
+    gray = Image.new("L", SIZE, 7)
+    for image, color in (
+        (gray, 7),
+        (plain.convert("RGBA"), (10, 20, 30)),
+        (plain.quantize(), (10, 20, 30)),
+    ):
+        replaced(CAMERA, [{"bytes": saved(image)}] * 11)(written)
+        assert (read_lerobot(written)[TASKS[0]][0]["pixels"] == color).all()
+
+
+def test_depth_maps_are_no_cameras(written):
+    features = json.loads((written / INFO).read_text())["features"]
+    depth = {**IMAGE, "info": {"is_depth_map": True}}
+    edit_info(features={**features, "depth": depth})(written)
+    assert {*read_lerobot(written)} == {*TASKS}  # the other camera is the only one
+    with pytest.raises(ValueError, match=f"has a depth map 'depth'.*{CAMERA}"):
+        read_lerobot(written, image_key="depth")
 
 
 def test_invalid_arguments_are_refused_before_anything_is_written(tmp_path):
@@ -198,31 +330,59 @@ def test_invalid_arguments_are_refused_before_anything_is_written(tmp_path):
     assert not [*tmp_path.iterdir()]
 
 
-def test_frames_of_a_video_are_decoded_from_the_first_of_the_episode(written):
+GRAYS = np.arange(11) * 20 + 20
+
+
+def film(path, kept=range(11), size=(64, 32), pix_fmt="yuv420p", codec="mpeg4"):
+    """Turn the images of a dataset into a film, in which the first episode ends at 1 s."""
     av = pytest.importorskip("av")
-    grays = np.arange(11) * 20 + 20
-    path = written / f"videos/{CAMERA}/chunk-000/file-000.mp4"
-    path.parent.mkdir(parents=True)
-    with av.open(str(path), "w") as video:
-        stream = video.add_stream("mpeg4", rate=5)
-        stream.width, stream.height, stream.pix_fmt = 64, 32, "yuv420p"
+    file = path / f"videos/{CAMERA}/chunk-000/file-000.mp4"
+    file.parent.mkdir(parents=True)
+    with av.open(str(file), "w") as video:
+        stream = video.add_stream(codec, rate=5)
+        (stream.width, stream.height), stream.pix_fmt = size, pix_fmt
         stream.bit_rate = 8_000_000
-        for gray in grays:
-            frame = np.full((32, 64, 3), gray, np.uint8)
-            video.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
+        for number in kept:
+            frame = np.full((*size[::-1], 3), GRAYS[number], np.uint8)
+            frame = av.VideoFrame.from_ndarray(frame, format="rgb24")
+            frame.pts = number
+            video.mux(stream.encode(frame))
         video.mux(stream.encode())
-    edit_rows(written, lambda rows: rows.drop(columns=CAMERA))
+    edit_rows(path, lambda rows: rows.drop(columns=CAMERA))
     places = {"chunk_index": 0, "file_index": 0, "from_timestamp": (0.0, 1.0, 1.4)}
     places = {f"videos/{CAMERA}/{key}": value for key, value in places.items()}
-    edit_rows(written, lambda rows: rows.assign(**places), EPISODES)
-    features = json.loads((written / INFO).read_text())["features"]
-    edit_info(features={**features, CAMERA: {**IMAGE, "dtype": "video"}})(written)
+    edit_rows(path, lambda rows: rows.assign(**places), EPISODES)
+    features = json.loads((path / INFO).read_text())["features"]
+    edit_info(features={**features, CAMERA: {**IMAGE, "dtype": "video"}})(path)
+    return file
+
+
+def test_frames_of_a_video_are_decoded_from_the_first_of_the_episode(written):
+    path = film(written)
 
     found = read_lerobot(written)
 
     read = [found[TASKS[1]][0], found[TASKS[0]][0], found[TASKS[1]][1]]
     shown = np.concatenate([episode["pixels"].mean((1, 2, 3)) for episode in read])
-    np.testing.assert_allclose(shown, grays, atol=6)
+    np.testing.assert_allclose(shown, GRAYS, atol=6)
+    every_other = read_lerobot(written, stride=2, combine=lambda a: a[0])[TASKS[1]][0]["pixels"]
+    np.testing.assert_allclose(every_other.mean((1, 2, 3)), GRAYS[:5:2], atol=6)
     path.unlink()
-    with pytest.raises(ValueError, match=r"episode 0 of .* is "):
+    with pytest.raises(ValueError, match=r"episode 0 of .*file-000.mp4 is missing: give the"):
+        read_lerobot(written)
+
+
+@pytest.mark.parametrize(
+    ("gap", "episode", "time"), [(2, 0, "0.400"), (5, 1, "1.000"), (10, 2, "2.000")]
+)
+def test_a_video_that_lacks_a_frame_is_refused(written, refused, gap, episode, time):
+    """Read one after the other, all later frames would be off by one against the actions."""
+    film(written, kept=[number for number in range(11) if number != gap])
+    cause = f"there is no frame at {time} s"
+    refused(lambda: read_lerobot(written), f"episode {episode} of ", cause)
+
+
+def test_a_video_of_numbers_of_sixteen_bits_is_refused(written):
+    film(written, pix_fmt="gray16le", codec="ffv1")
+    with pytest.raises(ValueError, match="its frames are gray16le, of more than 8 bits"):
         read_lerobot(written)

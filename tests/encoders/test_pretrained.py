@@ -99,7 +99,9 @@ def test_the_same_command_records_and_trains_nothing_again(made, folder, monkeyp
 def test_files_that_do_not_belong_together_are_refused(made, copy, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setitem(SCENES, "nico", replace(NICO, version="another"))
-        with pytest.raises(ValueError, match="scene another"):
+        with pytest.raises(
+            ValueError, match=r"is of the scene nico nico-2.*this is nico another: train new"
+        ):
             load_pretrained(copy)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(5)
@@ -185,11 +187,11 @@ def test_inputs_of_another_run_or_scene_are_refused(shipped, mixed, tmp_path):
         load_inputs(tmp_path / "run", TASKS, digests)
     assert str(error.value).endswith(str(tmp_path / "run" / BANK))
 
-    foreign = replace(encoders, metadata={**encoders.metadata, "scene_version": "mars-1"})
+    foreign = replace(encoders, metadata={**encoders.metadata, "scene": "nico mars-1"})
     own_weights(tmp_path).parent.mkdir()
     save_representation(foreign, own_weights(tmp_path))
     digests = Digests(foreign.identity, bank.identity)
-    with pytest.raises(ValueError, match="was trained in the scene mars-1"):
+    with pytest.raises(ValueError, match="is of the scene nico mars-1, this is nico nico-2"):
         load_inputs(tmp_path, TASKS, digests)
     with pytest.raises(ValueError, match="was trained with the encoders 0123"):
         load_inputs(tmp_path, TASKS, digests._replace(encoders="0123"))

@@ -17,6 +17,7 @@ from bgpo_trl.configs import (
     SequenceAutoencoderConfig,
     VAEConfig,
 )
+from bgpo_trl.encoders.make_bank import make_bank
 from bgpo_trl.encoders.probes import probe
 from bgpo_trl.encoders.representation import (
     Representation,
@@ -32,8 +33,8 @@ from bgpo_trl.encoders.representation import (
 )
 from bgpo_trl.encoders.train import train_encoders
 from bgpo_trl.scenes.nico import NICO
-from suites import nico
 from tests.helpers import TINY_ENCODERS
+from tests.scenes.dot import scene
 
 CONFIG = RepresentationConfig(
     vae=VAEConfig(
@@ -49,7 +50,8 @@ CONFIG = RepresentationConfig(
     inverse=InverseModelConfig(hidden_size=64, batch_size=128, steps=300, warmup_steps=10),
     checkpoint_every=50,
 )
-TINY = replace(TINY_ENCODERS, checkpoint_every=1, log_every=2)
+ALL_ACTIONS = replace(TINY_ENCODERS.inverse, largest_action=1.0)
+TINY = replace(TINY_ENCODERS, inverse=ALL_ACTIONS, checkpoint_every=1, log_every=2)
 DIRECTIONS = np.array([[1, 0, 0, 0], [-1, 0, 0, 1], [0, 1, -1, 0]])  # of both squares, by task
 
 
@@ -89,7 +91,7 @@ def trained(dataset: TensorDict) -> Representation:
 
 
 def train(dataset: TensorDict, config: RepresentationConfig = TINY, **options) -> Representation:
-    options = {"scene_version": "squares", "progress": False, **options}
+    options = {"scene": "squares 1", "progress": False, **options}
     return train_representation(dataset, config, **options)
 
 
@@ -229,7 +231,7 @@ def test_training_writes_weights_log_and_probes(tmp_path: Path) -> None:
     play = squares(10)
     play["state"][..., 7:] = 1.0  # on the table
     trained, _ = train_encoders(squares(8), play, weights, folder, TINY, "make weights")
-    loaded = load_representation(weights, scene_version=nico.scene_version())
+    loaded = load_representation(weights, scene=NICO)
     assert same(trained, loaded)
     assert loaded.metadata["command"] == "make weights"
     rows = list(csv.DictReader((folder / "train.csv").open()))
@@ -241,6 +243,49 @@ def test_training_writes_weights_log_and_probes(tmp_path: Path) -> None:
         loaded, squares(8), play=play, columns=NICO.state
     )
     assert (folder / "reconstructions.png").exists()
+
+
+def with_a_gripper(n: int) -> TensorDict:
+    """Demonstrations whose last action opens or closes a gripper, at its ends, as most do."""
+    dataset = squares(n)
+    dataset["action"][..., 3] = torch.where(dataset["task"] == 0, 1.0, -1.0).unsqueeze(-1)
+    return dataset
+
+
+def test_actions_that_the_inverse_model_would_never_see_are_refused_before_training() -> None:
+    log: list[dict] = []
+    for config, part, share in ((0.6, with_a_gripper(8), "100%"), (0.6, squares(8), "9.%")):
+        limited = replace(TINY, inverse=replace(TINY.inverse, largest_action=config))
+        match = f"largest_action 0.6 leaves {share} of the actions out, most by component . and"
+        for play in (None, squares(8)):
+            with pytest.raises(ValueError, match=match):
+                train(part, limited, play=play, log=log.append)
+    with pytest.raises(ValueError, match="leaves 100% of the actions out, most by component 3"):
+        play = with_a_gripper(8)
+        train(squares(8).exclude("action"), limited, play=play, log=log.append)
+    assert not log
+
+
+def test_actions_of_any_size_are_learned_from_and_recorded_ones_are_used(tmp_path: Path) -> None:
+    """NICO's limit, below which all its demonstrators stay, is NICO's alone."""
+    robot = scene(frame_shape=(32, 64), action_size=4)
+    shown = with_a_gripper(8)
+    config = replace(TINY, inverse=replace(TINY.inverse, largest_action=None))
+    options = {"scene": robot, "tasks": ("left", "right", "up"), "progress": False}
+    robot = replace(robot, tasks=options["tasks"])
+    trained, bank = train_encoders(
+        shown, None, tmp_path / "weights", tmp_path / "run", config, **options
+    )
+    assert json.loads(trained.metadata["config"])["inverse"]["largest_action"] == 1.0
+    assert trained.inverse is not None and bank.steps is not None
+    moves = torch.arange(int(bank.steps.length[0]) - 1)
+    kept = bank.steps.actions(moves + bank.steps.first[0])
+    torch.testing.assert_close(kept, shown["action"][0, moves], rtol=0, atol=0.5 / 127)
+    assert kept[:, 3].unique().tolist() == [1.0]
+    inferred = make_bank(trained, shown, tasks=options["tasks"], actions="inferred")
+    assert not inferred.steps.action.equal(bank.steps.action)
+    unknown = make_bank(trained, shown.exclude("action"), tasks=options["tasks"])
+    assert unknown.steps.action.equal(inferred.steps.action)
 
 
 def test_configurations_and_datasets_that_cannot_be_trained_on_are_refused() -> None:

@@ -22,7 +22,7 @@ def worlds():
 
 @pytest.fixture
 def simulation(worlds):
-    return MetaWorld(FIVE, worlds)
+    return MetaWorld(worlds)
 
 
 def act_at_random(simulation, steps, seed=0):
@@ -35,13 +35,13 @@ def assert_same(a, b):
     assert np.array_equal(a.frame(), b.frame())
 
 
-@pytest.mark.parametrize("task", range(5))
+@pytest.mark.parametrize("task", FIVE)
 def test_a_start_depends_on_seed_and_episode_alone(simulation, worlds, task):
     simulation.seed(3)
-    simulation.reset((task + 1) % 5)
+    simulation.reset(FIVE[FIVE.index(task) - 1])
     act_at_random(simulation, 5)
     simulation.reset(task)
-    other = MetaWorld(FIVE, worlds)
+    other = MetaWorld(worlds)
     other.seed(3)
     other.reset(task)
     act_at_random(other, 7)
@@ -53,9 +53,9 @@ def test_a_start_depends_on_seed_and_episode_alone(simulation, worlds, task):
     assert not np.array_equal(simulation.observation[4:7], first)
 
 
-@pytest.mark.parametrize("task", range(5))
+@pytest.mark.parametrize("task", FIVE)
 def test_simulations_of_one_world_do_not_influence_each_other(simulation, worlds, task):
-    beside, alone = MetaWorld(FIVE, worlds), MetaWorld(FIVE)
+    beside, alone = MetaWorld(worlds), MetaWorld()
     for each, seed in ((simulation, 1), (beside, 2), (alone, 1)):
         each.seed(seed)
         each.reset(task)
@@ -67,13 +67,13 @@ def test_simulations_of_one_world_do_not_influence_each_other(simulation, worlds
         assert_same(simulation, alone)
 
 
-@pytest.mark.parametrize("task", range(5))
+@pytest.mark.parametrize("task", FIVE)
 def test_a_saved_episode_continues_bit_by_bit(simulation, task):
     simulation.seed(8)
-    simulation.reset((task + 2) % 5)
+    simulation.reset(FIVE[FIVE.index(task) - 2])
     simulation.reset(task)
     act_at_random(simulation, 9)
-    resumed = MetaWorld(FIVE)
+    resumed = MetaWorld()
     resumed.load(simulation.save())
 
     assert resumed.save() == simulation.save()
@@ -87,14 +87,14 @@ def test_a_saved_episode_continues_bit_by_bit(simulation, task):
 
 def test_a_simulation_saved_before_its_first_episode_keeps_its_seed(simulation):
     simulation.seed(5)
-    resumed = MetaWorld(FIVE)
+    resumed = MetaWorld()
     resumed.load(simulation.save())
     for each in (simulation, resumed):
-        each.reset(0)
+        each.reset(FIVE[0])
     assert_same(simulation, resumed)
 
 
-@pytest.mark.parametrize("task", range(5))
+@pytest.mark.parametrize("task", FIVE)
 def test_demonstrators_succeed_and_random_actions_do_not(simulation, task):
     solved, lucky = 0, 0
     for start in range(20):
@@ -110,7 +110,7 @@ def test_demonstrators_succeed_and_random_actions_do_not(simulation, task):
 
 def test_success_has_to_last_for_two_actions(simulation, monkeypatch):
     simulation.seed(0)
-    simulation.reset(0)
+    simulation.reset(FIVE[0])
     reports = iter([False] * 3 + [True] * 4 + [False] * 4 + [True] + [False] * 3 + [True])
 
     def step(env, action):

@@ -2,6 +2,7 @@
 
 import torch
 
+from bgpo_trl.configs.runs import PAPER_TASKS
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.experiments import groups
 from bgpo_trl.transforms import TaskSchedule
@@ -11,7 +12,7 @@ from tests.helpers import cells
 
 def test_draws_are_of_the_tasks_available():
     task = torch.tensor([0, 1, 0, 1, 2, 2])
-    bank = DemonstrationBank(torch.zeros(6, 2), task, torch.ones(6, dtype=torch.bool))
+    bank = DemonstrationBank(torch.zeros(6, 2), task, torch.ones(6, dtype=torch.bool), PAPER_TASKS)
     rows = torch.tensor([*groups.draw(bank, TaskSchedule((0, 20, 40)), 200, 4)])
     drawn = task[rows]
     assert drawn[:20].unique().tolist() == [0] and drawn[20:40].unique().tolist() == [0, 1]

@@ -9,10 +9,10 @@ from bgpo_trl.seeding import random_state, set_random_state
 
 
 class Dot(Simulation):
-    """A dot that is to reach the left (task 0) or the right edge; it falls off at 1.5."""
+    """A dot that is to reach the left or the right edge; it falls off at 1.5."""
 
     def __init__(self):
-        self.random, self.task, self.place = np.random.RandomState(0), 0, 0.0
+        self.random, self.task, self.place = np.random.RandomState(0), "left", 0.0
 
     def seed(self, seed):
         self.random.seed(seed)
@@ -22,7 +22,7 @@ class Dot(Simulation):
 
     def step(self, action):
         self.place += 0.5 * float(action[0])
-        toward = self.place if self.task else -self.place
+        toward = self.place if self.task == "right" else -self.place
         return Outcome(bool(toward > 0.7), bool(toward < -1.5))
 
     def frame(self):
@@ -45,7 +45,7 @@ class SavedDot(Dot):
 
 def demonstrate(simulation, task, seed):
     random = np.random.default_rng(seed)
-    return lambda: np.array([(0.3 if task else -0.3) + 0.05 * random.standard_normal()])
+    return lambda: np.array([(0.3 if task == "right" else -0.3) + 0.05 * random.standard_normal()])
 
 
 def scene(make=Dot, **changes):

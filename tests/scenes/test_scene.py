@@ -14,15 +14,18 @@ from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.configs import RunConfig
 from bgpo_trl.data.dataset import load_demonstrations, write_demonstrations
 from bgpo_trl.data.recording import record_demonstrations
+from bgpo_trl.encoders.pretrained import bank_path, load_pretrained
+from bgpo_trl.encoders.representation import save_representation
 from bgpo_trl.encoders.train import make_pretrained, train_encoders
 from bgpo_trl.evaluation import evaluate_random_policy
+from bgpo_trl.experiments.measure import draw
 from bgpo_trl.experiments.watch import WatchArguments, watch
 from bgpo_trl.policy import load_run
 from bgpo_trl.runs.results import TRAIN, read_table
 from bgpo_trl.scenes import SCENES, SimulationEnv, StateColumns, find_scene
 from bgpo_trl.training import Trainer
 from tests.helpers import TINY_ENCODERS
-from tests.scenes.dot import Dot, SavedDot, scene
+from tests.scenes.dot import Dot, SavedDot, demonstrate, scene
 
 TASKS = ("left", "right")
 
@@ -85,6 +88,17 @@ def test_an_environment_of_a_simulation_keeps_the_promises_to_torchrl():
     assert env.simulations[0].place == place - 0.5
 
 
+def test_simulations_and_demonstrators_are_told_the_name_of_the_task(tmp_path):
+    """Not its position, which is another one in every run."""
+    env = scene().simulate(["right", "left"], batch_size=[3])
+    env.reset(TensorDict({"task": torch.tensor([0, 1, 0])}, [3]))
+    assert [simulation.task for simulation in env.simulations] == ["right", "left", "right"]
+    options = {"tasks": ["right"], "per_task": 2, "held_out_per_task": 1, "progress": False}
+    shown = record_demonstrations(tmp_path, scene=scene(), **options)
+    for row in shown:
+        assert (row["action"][: int(row["length"]) - 1] > 0).all()
+
+
 class Falling(Dot):
     def step(self, action):
         return super().step(action)._replace(success=False, failure=True)
@@ -138,6 +152,76 @@ def test_demonstrations_have_the_shapes_of_the_scene(tmp_path):
         length = int(row["length"])
         expected = row["state"][0, 0] + moved[: length - 1]
         torch.testing.assert_close(row["state"].flatten()[1:length], expected, atol=1e-6, rtol=0)
+
+
+def test_encoders_of_another_robot_are_refused_whatever_its_version(pretrained, tmp_path):
+    encoders, bank = pretrained
+    other = replace(scene(), name="cart")  # also of version "dot-1", as everyone writes "1"
+    weights = tmp_path / "encoders.safetensors"
+    save_representation(encoders, weights)
+    bank.save(bank_path(weights))
+    for call in (
+        lambda: load_pretrained(weights, scene=other),
+        lambda: other.check_identity(bank.scene, "the bank", "train"),
+        lambda: encoders.check_scene(other, "the encoders", "train"),
+    ):
+        with pytest.raises(
+            ValueError, match=r"of the scene dot dot-1, this is cart dot-1.*--scene dot"
+        ):
+            call()
+    unlabeled = replace(bank, scene=None)
+    with pytest.raises(ValueError, match=r"encoders is of the scene dot dot-1, this is nico"):
+        tasks = {"tasks": ("grasp_glass", "push_green_to_glass"), "scene": "nico"}
+        Trainer(config(**tasks), tmp_path / "run", bank=unlabeled, encoders=encoders)
+    large = scene(frame_shape=(24, 24))
+    with pytest.raises(
+        ValueError, match=r"frames of \[16, 24\] and \[1\] actions, the scene \[24, 24\]"
+    ):
+        load_pretrained(weights, scene=large)
+
+
+@pytest.mark.parametrize("wrong", [{"name": "two dots"}, {"name": ""}, {"version": 1}])
+def test_a_scene_has_a_name_and_a_version_that_files_can_hold(wrong):
+    with pytest.raises(ValueError, match="of a scene is a"):
+        replace(scene(), **wrong)
+
+
+SENTENCES = {"left": "move left, then stop", "right": "move right/away, then stop"}
+
+
+class Told(SavedDot):
+    """A dot whose tasks are named by sentences."""
+
+    def reset(self, task):
+        super().reset({name: short for short, name in SENTENCES.items()}[task])
+
+
+def test_a_run_of_tasks_named_by_sentences_is_loaded_and_filmed(tmp_path, monkeypatch):
+    names = tuple(SENTENCES.values())
+    short = {name: task for task, name in SENTENCES.items()}
+    told = replace(
+        scene(Told, demonstrator=lambda robot, task, seed: demonstrate(robot, short[task], seed)),
+        tasks=names,
+        default_tasks=names,
+    )
+    monkeypatch.setitem(SCENES, "dot", told)
+    made = make_pretrained(
+        tmp_path / "encoders.safetensors",
+        tmp_path / "demonstrations",
+        folder=tmp_path / "log",
+        scene=told,
+        config=TINY_ENCODERS,
+        per_task=4,
+        held_out_per_task=2,
+        progress=False,
+    )
+    options = {"bank": made[1], "encoders": made[0], "progress": False}
+    with Trainer(config(tasks=names), tmp_path / "run", **options) as trainer:
+        trainer.run()
+        draw(trainer, made[1], tmp_path / "run", dict.fromkeys(names, 0.0))
+    assert load_run(tmp_path / "run").bank.tasks == names
+    films = [*(tmp_path / "run" / "figures").glob("move*.gif")]
+    assert len(films) == 2
 
 
 def test_a_run_learns_on_another_robot_and_is_loaded_and_filmed(pretrained, tmp_path, monkeypatch):
@@ -267,6 +351,8 @@ def test_a_run_whose_simulation_cannot_be_saved_is_not_resumed(pretrained, tmp_p
 def test_demonstrations_of_another_robot_are_refused(pretrained, bank, encoders, tmp_path):
     known = replace(pretrained[1], tasks=("grasp_glass", "push_green_to_glass"))
     run = config(scene="nico", tasks=known.tasks)
-    with pytest.raises(ValueError, match="demonstrations are of the scene dot-1, the run is in"):
+    with pytest.raises(
+        ValueError, match=r"the bank is of the scene dot dot-1, this is nico .*--scene dot"
+    ):
         Trainer(run, tmp_path / "run", bank=known, encoders=pretrained[0])
     assert not (tmp_path / "run").exists()
