@@ -44,11 +44,11 @@ def command_line(
         program: Name of the program in messages; by default that of the process.
         line: First line of the help.
     """
-    kind = kind or get_type_hints(command)["arguments"]
-    resumable = hasattr(kind, "resume")
+    asked: type = get_type_hints(command)["arguments"] if kind is None else kind
+    resumable = hasattr(asked, "resume")
     try:
         with _terminable() if resumable else contextlib.nullcontext():
-            text = command(_parse(kind, options, program, line))
+            text = command(_parse(asked, options, program, line))
     except (ValueError, OSError, RuntimeError, ImportError) as error:
         if _is_of_others(error):
             raise
