@@ -119,6 +119,7 @@ class Trainer:
         self._later: list[dict[str, Any]] = []
         self._settings = settings_of(config, Digests(used, bank.identity))
         self._state: TensorDictBase | None = None
+        self._losses: dict[str, torch.Tensor] = {}
         with ExitStack() as opened:
             opened.enter_context(lock_directory(self.directory))
             # Before anything is made of the sizes in the settings, which may not be the run's.
@@ -205,7 +206,6 @@ class Trainer:
             initial=int(episodes.clamp(max=n_episodes).sum()),
             unit="episode",
         )
-        losses: dict[str, torch.Tensor] = {}
         n_tasks = self._n_tasks
         # Spares the garbage collector all objects that live until the end.
         gc.freeze()
@@ -217,7 +217,8 @@ class Trainer:
                     due = self.env_steps % self.config.algorithm.rl.update_every == 0
                     update = background.submit(algorithm.update) if due else None
                     transition, state = env.step_and_maybe_reset(state)
-                    losses = (update and update.result()) or losses
+                    # Some losses are of every other update; rows have the latest of each.
+                    self._losses |= update.result() if update else {}
                     algorithm.store(transition)
                     self._cost.add_step(n_tasks, time.monotonic() - started)
                     self.env_steps += 1
@@ -226,7 +227,7 @@ class Trainer:
                         self._cost.measure(n_tasks, algorithm.state_dict())
                         n_tasks = self._n_tasks
                     for index in torch.nonzero(episodes > before).flatten().tolist():
-                        self._end_of_episode(index, transition, losses)
+                        self._end_of_episode(index, transition)
                         self._begin_tasks(index)
                         if before[index] < n_episodes:
                             bar.set_postfix_str(self._success_so_far(), refresh=False)
@@ -271,9 +272,7 @@ class Trainer:
         rate = sum(self._successes) / len(self._successes)
         return f"success {rate:.2f}{self._tested}"
 
-    def _end_of_episode(
-        self, index: int, transition: TensorDictBase, losses: dict[str, torch.Tensor]
-    ) -> None:
+    def _end_of_episode(self, index: int, transition: TensorDictBase) -> None:
         algorithm, end = self.algorithm, transition.get("next")[index]
         episode = int(self.world.source.episode[index])
         intrinsic = end.get("episode_intrinsic_reward", 0.0)  # not measured in every variant
@@ -296,7 +295,7 @@ class Trainer:
             "num_groups": groups,
         }
         for name in ("loss_actor", "loss_value", *algorithm.logged):
-            loss = losses.get(name, torch.zeros(()))
+            loss = self._losses.get(name, torch.zeros(()))
             row[name] = float(loss[index] if loss.ndim else loss)
         self._log(row)
         if index == 0 and algorithm.gwr is not None and episode in self._growth_moments:
@@ -358,6 +357,7 @@ class Trainer:
             "evaluator": self.evaluator.state_dict(),
             "state": self._state.clone().to_dict(),
             "env_steps": self.env_steps,
+            "losses": self._losses,
             "later": self._later,
             "settings": self._settings,
             "position": self.logger.position(),
@@ -371,4 +371,4 @@ class Trainer:
         self.algorithm.load_state_dict(state["algorithm"])
         self.evaluator.load_state_dict(state["evaluator"], self.algorithm)
         self._state = TensorDict(state["state"], self.world.env.batch_size)
-        self.env_steps = state["env_steps"]
+        self.env_steps, self._losses = state["env_steps"], state["losses"]

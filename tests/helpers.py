@@ -72,7 +72,8 @@ def cells(text: str) -> list[list[str]]:
 def edit(path: Path, **changes: object) -> None:
     """Change entries of a JSON file; None removes an entry."""
     found = {**json.loads(path.read_text()), **changes}
-    path.write_text(json.dumps({k: v for k, v in found.items() if v is not None}))
+    removed = {key for key, value in changes.items() if value is None}
+    path.write_text(json.dumps({k: v for k, v in found.items() if k not in removed}))
 
 
 @contextmanager

@@ -49,7 +49,6 @@ class Learner:
         self._prefixes = {f"{source}.": f"{at}." if at else "" for at, source in sources.items()}
         self.target_update = ForeachSoftUpdate(loss, tau=config.tau)
         learned = [p for p in loss.parameters() if p.requires_grad]
-        self._latest: dict[str, Tensor] = {}
         self.optimizer = torch.optim.Adam(learned, lr=config.learning_rate, fused=True)
 
     @torch.no_grad()
@@ -114,15 +113,14 @@ class Learner:
     def learn(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """Take a gradient step on transitions ``[S, E, B]``, update the targets; return the losses.
 
-        Losses are sums over the experts of a seed, ``[S]``, the latest of each kind.
+        Losses are sums over the experts of a seed, ``[S]``.
         """
         parts = self.losses(batch)
         self.optimizer.zero_grad()
         torch.stack([part.sum() for part in parts.values()]).sum().backward()
         self.optimizer.step()
         self.target_update.step()
-        self._latest |= {key: value.detach().sum(1) for key, value in parts.items()}
-        return {**self._latest}
+        return {key: value.detach().sum(1) for key, value in parts.items()}
 
     def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """Return the losses ``[S, E]`` to minimize on transitions ``[S, E, B]``.
@@ -201,17 +199,12 @@ class Learner:
 
     def state_dict(self) -> dict[str, Any]:
         """Return the states of loss (with targets) and optimizer."""
-        return {
-            "loss": dict(self.loss.state_dict()),
-            "optimizer": self.optimizer.state_dict(),
-            "latest": {**self._latest},
-        }
+        return {"loss": dict(self.loss.state_dict()), "optimizer": self.optimizer.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a `state_dict`."""
         self.loss.load_state_dict(state["loss"])
         self.optimizer.load_state_dict(state["optimizer"])
-        self._latest = {**state["latest"]}
 
 
 @dataclass(frozen=True)

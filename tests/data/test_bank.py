@@ -7,9 +7,10 @@ import torch
 
 from bgpo_trl.data.bank import DemonstrationBank, DemonstrationSteps
 from bgpo_trl.data.recording import record_demonstrations
-from bgpo_trl.encoders import make_bank as command
 from bgpo_trl.encoders.make_bank import make_bank
 from bgpo_trl.encoders.pretrained import load_pretrained
+from bgpo_trl.experiments import make_data
+from bgpo_trl.experiments.arguments import MakeBankArguments
 from bgpo_trl.files.tensor_file import load_tensors, save_tensors
 from suites import nico
 
@@ -231,8 +232,8 @@ def test_the_command_keeps_the_names_of_the_tasks(tmp_path, encoders, monkeypatc
     record_demonstrations(
         folder, tasks=["push_again"], per_task=2, held_out_per_task=1, progress=False
     )
-    monkeypatch.setattr(command, "load_representation", lambda path, scene: encoders)
-    command.main(folder, out)
+    monkeypatch.setattr(make_data, "load_representation", lambda path, scene: encoders)
+    make_data.bank(MakeBankArguments(dataset=folder, out=out))
     found = DemonstrationBank.load(out, encoder_id=encoders.identity)
     assert found.tasks == ("push_again",)
     assert found.task.tolist() == [0, 0]

@@ -18,7 +18,7 @@ from bgpo_trl.encoders.pretrained import bank_path, load_pretrained
 from bgpo_trl.encoders.representation import save_representation
 from bgpo_trl.encoders.train import make_pretrained, train_encoders
 from bgpo_trl.evaluation import evaluate_random_policy
-from bgpo_trl.experiments.measure import draw
+from bgpo_trl.experiments.measure import draw, measure
 from bgpo_trl.experiments.watch import WatchArguments, watch
 from bgpo_trl.policy import load_run
 from bgpo_trl.runs.results import TRAIN, read_table
@@ -218,7 +218,8 @@ def test_a_run_of_tasks_named_by_sentences_is_loaded_and_filmed(tmp_path, monkey
     options = {"bank": made[1], "encoders": made[0], "progress": False}
     with Trainer(config(tasks=names), tmp_path / "run", **options) as trainer:
         trainer.run()
-        draw(trainer, made[1], tmp_path / "run", dict.fromkeys(names, 0.0))
+        summary = measure(trainer, made[1], tmp_path / "run")
+        draw(trainer, made[1], tmp_path / "run", summary)
     assert load_run(tmp_path / "run").bank.tasks == names
     films = [*(tmp_path / "run" / "figures").glob("move*.gif")]
     assert len(films) == 2
