@@ -15,9 +15,10 @@ from torch import Tensor, nn
 
 from bgpo_trl.errors import as_shape
 from bgpo_trl.modules.density_clusters import density_clusters, local_whitening
-from bgpo_trl.modules.gwr import as_mask
+from bgpo_trl.modules.gwr import Numbers, as_mask, as_tensor
 
 _KNOWN_SHARE = 0.99  # of a group's own demonstrations that are to count as known
+_ROUNDING = 1e-4  # of a vector's length; shipped demonstrations differ by 600 times as much
 _ARRAYS = ("points", "shown", "group", "member", "cluster")  # of the state
 _LISTS = ("parent", "links")
 
@@ -51,7 +52,8 @@ class BehaviorGroups(nn.Module):
     since most features of an embedding vary within each behavior, and those that tell behaviors
     apart may be the small ones.
 
-    1. A demonstration that is shown again adds nothing. With every ``smallest`` new ones (beyond
+    1. A demonstration that is shown again, or differs from an earlier one by no more than rounding
+       (a ten-thousandth of its length), adds nothing. With every ``smallest`` new ones (beyond
        ``100 * smallest``: with every hundredth part more), all are clustered anew; until the first
        time, all are of group 0.
     2. An input belongs to the group of the nearest clustered demonstration. Its novelty is the
@@ -134,11 +136,11 @@ class BehaviorGroups(nn.Module):
             )
         self._networks[network].join(first, second)
 
-    def forward(self, phi: Tensor) -> GroupMatch:
+    def forward(self, phi: Numbers) -> GroupMatch:
         """Call `lookup`."""
         return self.lookup(phi)
 
-    def lookup(self, phi: Tensor, mask: Tensor | None = None) -> GroupMatch:
+    def lookup(self, phi: Numbers, mask: Numbers | None = None) -> GroupMatch:
         """Return the groups ``[*batch_size, *extra]`` of inputs ``[*batch_size, *extra, d]``.
 
         Args:
@@ -150,7 +152,7 @@ class BehaviorGroups(nn.Module):
             ValueError: If phi or mask has the wrong shape, or a phi that takes part holds NaN or
                 Inf.
         """
-        n_batch = len(self.batch_size)
+        n_batch, phi = len(self.batch_size), as_tensor(phi, "phi")
         if phi.shape[:n_batch] != self.batch_size or phi.ndim == n_batch:
             raise ValueError(
                 f"phi must lead with {[*self.batch_size]}, one for each network, got {[*phi.shape]}"
@@ -162,7 +164,7 @@ class BehaviorGroups(nn.Module):
             group[i], novelty[i] = self._networks[i].lookup(inputs[i])
         return self._match(group, novelty, phi)
 
-    def adapt(self, phi: Tensor, mask: Tensor | None = None) -> GroupMatch:
+    def adapt(self, phi: Numbers, mask: Numbers | None = None) -> GroupMatch:
         """Find the group of one input per network and learn from it.
 
         Args:
@@ -176,6 +178,7 @@ class BehaviorGroups(nn.Module):
             ValueError: If phi or mask has the wrong shape, or a phi that takes part holds NaN or
                 Inf.
         """
+        phi = as_tensor(phi, "phi")
         if phi.shape != (*self.batch_size, self.n_features):
             raise ValueError(
                 f"phi must be {[*self.batch_size, self.n_features]}, got {[*phi.shape]}"
@@ -241,7 +244,7 @@ class BehaviorGroups(nn.Module):
         return network
 
     def _checked(
-        self, phi: Tensor, mask: Tensor | None
+        self, phi: Tensor, mask: Numbers | None
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Return inputs as an array, and which networks take part ``[networks]``."""
         active = torch.ones(self.batch_size, dtype=torch.bool)
@@ -328,7 +331,10 @@ class _Network:
 
     def show(self, point: NDArray[np.float64], group: int) -> bool:
         """Count a demonstration ``[1, d]``; return whether it is new."""
-        same = (self.points == point).all(1)
+        # A demonstration embedded in another batch is rounded otherwise. As a second point so near
+        # the first, it would say that the data hardly have a dimension.
+        off = np.linalg.norm(self.points - point, axis=1)
+        same = off <= _ROUNDING * np.linalg.norm(point)
         is_new = not same.any()
         if is_new:
             same = np.append(same, True)
