@@ -53,12 +53,13 @@ def doctor(arguments: DoctorArguments) -> None:
     name, frame = arguments.scene, arguments.frame
     checks: dict[str, Callable[[], str]] = {
         "versions": check_versions,
-        "OpenGL": partial(check_frame, frame if name == "nico" else None),
+        "OpenGL": partial(check_frame, frame),
         "frames/s": partial(check_frame_rate, name),
         "threads": check_threads,
         "disk": partial(check_disk, Path.cwd()),
     }
     if name != "nico":
+        del checks["OpenGL"]  # of NICO's renderer
         checks = {name: partial(check_scene, name, arguments.module, frame), **checks}
     wrong = False
     for subject, check in checks.items():

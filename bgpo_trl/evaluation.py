@@ -246,11 +246,15 @@ def evaluate_random_policy(
     episodes: int,
     seed: int = 0,
     spread: float = 1.0,
-    max_steps: int = 50,
+    max_steps: int | None = None,
     scene: Scene | str = "nico",
 ) -> Tensor:
-    """Return the success rate of uniformly random actions on each task, float32 ``[T]``."""
+    """Return the success rate of uniformly random actions on each task, float32 ``[T]``.
+
+    Episodes have ``max_steps``, by default those of the scene.
+    """
     shape, scene = (len(tasks), episodes), find_scene(scene)
+    max_steps = scene.max_steps if max_steps is None else max_steps
     env = scene.simulate(
         tasks,
         batch_size=shape,

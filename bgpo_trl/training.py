@@ -99,6 +99,11 @@ class Trainer:
             )
         self._scene = find_scene(config.scene)
         self._scene.check_tasks(config.tasks)
+        if config.algorithm.max_steps > self._scene.max_steps:
+            raise ValueError(
+                f"the algorithm's max_steps is {config.algorithm.max_steps}, episodes of the scene "
+                f"{self._scene.name!r} have at most {self._scene.max_steps}: set it to that"
+            )
         remedy = "record demonstrations of this scene, train encoders on them and embed them"
         if bank.scene is not None:
             self._scene.check_identity(bank.scene, "the bank", remedy)

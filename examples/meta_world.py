@@ -189,6 +189,7 @@ SCENES["metaworld"] = Scene(
     make_env=make_env,
     frame_shape=FRAME_SHAPE,
     action_size=4,
+    rate=20.0,
     demonstrator=demonstrator,
     state=StateColumns(
         center=(0.0, 0.65, 0.2, 0.7, 0.0, 0.8, 0.12),

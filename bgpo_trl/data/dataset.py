@@ -319,12 +319,22 @@ def _check_episodes(
             episode = episodes[name][number]
             try:
                 _check_keys(episode, keys)
-                lengths.append(_check_frames(scene, episode["pixels"]))
-                _check_numbers(scene, episode, lengths[-1])
+                lengths.append(check_episode(scene, episode))
             except ValueError as error:
                 raise ValueError(f"episode {number} of {name!r} {error}") from None
             keys = set(episode)
     return keys or set(), lengths
+
+
+def check_episode(scene: Scene, episode: Mapping[str, Any]) -> int:
+    """Return the number of frames of an episode, checked as `write_demonstrations` says.
+
+    Raises:
+        ValueError: If an entry has another type, shape or range; the message begins with a verb.
+    """
+    length = _check_frames(scene, episode["pixels"])
+    _check_numbers(scene, episode, length)
+    return length
 
 
 def _check_keys(episode: object, keys: set[str] | None) -> None:

@@ -13,6 +13,7 @@ import tyro
 from tensordict import TensorDict
 
 from bgpo_trl.data.dataset import (
+    check_episode,
     checksum_of,
     is_dataset,
     layout_of,
@@ -198,27 +199,37 @@ class _Recorder:
 
         ``policy_of`` returns the policy that acts, given the demonstrator with that noise.
         """
+        from bgpo_trl.scenes.simulation import checked_frame, checked_outcome
+
         simulation, scene = self.simulation, self.scene
         simulation.seed(start)
         simulation.reset(task)
         assert scene.demonstrator is not None  # checked before
         act = policy_of(scene.demonstrator(simulation, task, noise))
-        frames, states, actions = [simulation.frame()], [self._state()], []
+        shape = scene.frame_shape
+        frames, states, actions = [checked_frame(simulation, shape)], [self._state()], []
         success = False
         for _ in range(scene.max_steps):
             actions.append(act())
-            success, failure = simulation.step(actions[-1])
-            frames.append(simulation.frame())
+            success, failure = checked_outcome(simulation, simulation.step(actions[-1]))
+            frames.append(checked_frame(simulation, shape))
             states.append(self._state())
             if success or failure:
                 break
         episode = {"pixels": np.stack(frames), "action": np.stack(actions)}
         if scene.state is not None:
             episode["state"] = np.stack(states)
+        try:
+            check_episode(scene, episode)
+        except ValueError as error:
+            raise ValueError(f"an episode of the demonstrator of {task!r} {error}") from None
         return episode, success
 
     def _state(self) -> np.ndarray:
-        return np.empty(0) if self.scene.state is None else self.simulation.state().copy()
+        from bgpo_trl.scenes.simulation import checked_state
+
+        columns = self.scene.state
+        return np.empty(0) if columns is None else checked_state(self.simulation, columns.size)
 
 
 def _record_rows(

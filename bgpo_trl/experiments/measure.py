@@ -21,6 +21,7 @@ from bgpo_trl.figures.success import plot_step_curves, plot_success_curves
 from bgpo_trl.files.progress import progress_bar
 from bgpo_trl.runs.provenance import command, write_table
 from bgpo_trl.runs.results import read_tests
+from bgpo_trl.scenes import find_scene
 from bgpo_trl.training import Trainer
 
 # Number of the evaluation after training; it seeds start states that training never tested.
@@ -152,7 +153,7 @@ def draw(
     episodes = record_episodes(trainer, bank)
     save_figure(plot_frame_strips(episodes), out / "figures" / "episodes.png")
     for name, frames in zip(file_names(config.tasks), episodes.values(), strict=True):
-        save_gif(frames, out / "figures" / f"{name}.gif")
+        save_gif(frames, out / "figures" / f"{name}.gif", fps=find_scene(config.scene).rate or 5.0)
     gwr = trainer.algorithm.gwr
     if gwr is not None:
         draw_nodes(out, trainer.algorithm, bank, config.tasks)

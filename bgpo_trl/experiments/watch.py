@@ -25,7 +25,8 @@ __all__ = ["Episode", "WatchArguments", "compose", "demonstrate", "play", "watch
 _HEIGHT = 128  # (pixels) of each picture
 _BORDER, _CAPTION, _GAP = 4, 18, 8
 _COLORS = {None: "#999999", True: "#009E73", False: "#D55E00"}
-_FPS = 10  # twice as fast as NICO moves
+_SPEED = 2  # times as fast as the robot
+_USUAL_RATE = 5.0  # (Hz) of robots whose rate is unknown
 
 
 @dataclass(frozen=True)
@@ -73,16 +74,20 @@ def demonstrate(
 
 def play(policy: TrainedPolicy, task: str, demonstration: NDArray, seed: int) -> Episode:
     """Show the policy a demonstration, and return its episode from the start with that seed."""
+    from bgpo_trl.scenes.simulation import checked_frame, checked_outcome
+
     policy.condition(demonstration, task=task)
     config = policy.config
-    env = find_scene(config.scene).simulate([task], batch_size=1, spread=config.spread)
+    scene = find_scene(config.scene)
+    env, shape = scene.simulate([task], batch_size=1, spread=config.spread), scene.frame_shape
     simulation = env.simulations[0]
     simulation.seed(seed)
     simulation.reset(task)
-    seen, views, success = [simulation.frame()], [_view(simulation)], False
+    seen, views, success = [checked_frame(simulation, shape)], [_view(simulation)], False
     for _ in range(config.algorithm.max_steps):
-        success, failure = simulation.step(policy.act(seen[-1]).astype(np.float64))
-        seen.append(simulation.frame())
+        action = policy.act(seen[-1]).astype(np.float64)
+        success, failure = checked_outcome(simulation, simulation.step(action))
+        seen.append(checked_frame(simulation, shape))
         views.append(_view(simulation))
         if success or failure:
             break
@@ -101,7 +106,7 @@ def _view(simulation: Simulation) -> NDArray | None:
     return np.asarray(view.resize((width, _HEIGHT), Image.Resampling.LANCZOS))
 
 
-def compose(episodes: Sequence[Episode]) -> NDArray:
+def compose(episodes: Sequence[Episode], fps: float = 10.0) -> NDArray:
     """Return a frame per step with the episodes below one another, uint8 ``[T, H, W, 3]``.
 
     The frames continue to the end of the longest episode, and the last one is held for two seconds.
@@ -122,7 +127,7 @@ def compose(episodes: Sequence[Episode]) -> NDArray:
     sample = [np.asarray(picture) for picture in pictures[:: max(1, steps // 4)] + pictures[-1:]]
     palette = Image.fromarray(np.concatenate(sample)).quantize(128)
     frames = [p.quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures]
-    frames += frames[-1:] * 2 * _FPS
+    frames += frames[-1:] * round(2 * fps)
     return np.stack([np.asarray(frame.convert("RGB")) for frame in frames])
 
 
@@ -170,7 +175,8 @@ def watch(arguments: WatchArguments) -> str:
     config, seed = policy.config, arguments.scene_seed
     shown = demonstrate(policy.tasks, seed, config.spread, config.scene)
     episodes = [play(policy, task, frames, seed) for task, frames in shown.items()]
-    save_gif(compose(episodes), out / "film.gif", fps=_FPS, scale=1)
+    fps = _SPEED * (find_scene(config.scene).rate or _USUAL_RATE)
+    save_gif(compose(episodes, fps), out / "film.gif", fps=fps, scale=1)
     strips = {}
     for episode in episodes:
         strips[f"{episode.task}: the demonstration"] = episode.demonstration

@@ -65,7 +65,7 @@ def save_gif(
     Args:
         frames: The frames, at least one.
         path: File ending in ``.gif``; its folder is made if missing.
-        fps: Frames per second; the default is the robot's speed, a step every 0.2 s.
+        fps: Frames per second; the default is NICO's speed, a step every 0.2 s.
         scale: Pixels of the GIF per pixel of a frame, along each axis.
 
     Raises:

@@ -15,9 +15,11 @@ from torch import Tensor
 from bgpo_trl.errors import as_shape
 from bgpo_trl.modules.density_clusters import density_clusters, local_whitening
 from bgpo_trl.modules.group_trials import GroupTrials
+from bgpo_trl.modules.gwr import Numbers, as_tensor
 
 _KNOWN_SHARE = 0.99  # of a group's own demonstrations that are to count as known
 _FITTING_SHARE = 0.9  # of a group's own demonstrations whose starts are to count as fitting
+_ROUNDING = 1e-4  # of a vector's length; shipped demonstrations differ by 600 times as much
 _ARRAYS = ("points", "starts", "shown", "group", "member", "cluster")  # of the state
 _LISTS = ("parent", "links")
 
@@ -51,7 +53,8 @@ class BehaviorGroups:
     since most features of an embedding vary within each behavior, and those that tell behaviors
     apart may be the small ones.
 
-    1. A demonstration that is shown again adds nothing. With every ``smallest`` new ones (beyond
+    1. A demonstration that is shown again, or differs from an earlier one by no more than rounding
+       (a ten-thousandth of its length), adds nothing. With every ``smallest`` new ones (beyond
        ``100 * smallest``: with every hundredth part more), all are clustered anew; until the first
        time, all are of group 0.
     2. An input belongs to the group of the nearest clustered demonstration. Its novelty is the
@@ -159,12 +162,13 @@ class BehaviorGroups:
         self.links.append((self._densest(first), self._densest(second)))
         self._arrange()
 
-    def lookup(self, phi: Tensor) -> GroupMatch:
+    def lookup(self, phi: Numbers) -> GroupMatch:
         """Return the groups ``[*B]`` of inputs ``[*B, d]``.
 
         Raises:
             ValueError: If an input has another number of features, or holds NaN or Inf.
         """
+        phi = as_tensor(phi, "phi")
         group, novelty = self._lookup(self._checked(phi).reshape(-1, self.n_features))
         shape = phi.shape[:-1]
         return GroupMatch(
@@ -204,7 +208,7 @@ class BehaviorGroups:
         if (pair := self.trials.same_task()) is not None:
             self.join(*pair)
 
-    def adapt(self, phi: Tensor, start: Tensor | None = None) -> GroupMatch:
+    def adapt(self, phi: Numbers, start: Tensor | None = None) -> GroupMatch:
         """Find the group of one demonstration and learn from it.
 
         Args:
@@ -217,6 +221,7 @@ class BehaviorGroups:
         Raises:
             ValueError: As from `lookup`, or if starts differ in size; nothing has changed then.
         """
+        phi = as_tensor(phi, "phi")
         if phi.ndim != 1:
             raise ValueError(f"phi must be [{self.n_features}], got {[*phi.shape]}")
         first = np.empty(0, np.float32) if start is None else start.cpu().numpy()
@@ -303,7 +308,10 @@ class BehaviorGroups:
 
     def _show(self, point: NDArray[np.float64], start: NDArray[np.float32], group: int) -> bool:
         """Count a demonstration ``[d]`` with its start ``[f]``; return whether it is new."""
-        same = (self.points == point).all(1)
+        # A demonstration embedded in another batch is rounded otherwise. As a second point so near
+        # the first, it would say that the data hardly have a dimension.
+        off = np.linalg.norm(self.points - point, axis=1)
+        same = off <= _ROUNDING * np.linalg.norm(point)
         is_new = not same.any()
         if is_new:
             same = np.append(same, True)

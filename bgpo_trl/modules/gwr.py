@@ -7,10 +7,10 @@ that grows when required", 2002.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from reprlib import repr as short_repr
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -295,6 +295,13 @@ class GWRB(nn.Module):
             changes.append(_Change() if n_nodes < 2 else self._learn(i, x, c, other, a))
         self._move(networks, phi, changes)
         return match
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        """Convert the weights, such as for ``to``; refuse types too coarse to learn in."""
+        dtype = fn(self._weights.new_zeros(0)).dtype
+        if dtype not in (torch.float32, torch.float64):
+            raise ValueError(f"GWR-B learns in float32 or float64, not in {dtype}: leave it there")
+        return super()._apply(fn, recurse)
 
     def _taking_part(self, mask: Numbers | None) -> Tensor:
         """Return the indices of the networks that a mask selects, int64 ``[A]``."""

@@ -325,6 +325,7 @@ NICO = Scene(
     frame_shape=FRAME_SHAPE,
     action_size=4,
     max_steps=50,
+    rate=5.0,
     largest_action=0.6,
     bank_actions="inferred",
     has_spread=True,

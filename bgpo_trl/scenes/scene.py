@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -43,6 +44,12 @@ class StateColumns:
             raise ValueError(
                 f"center has {len(self.center)} columns, scale has {len(self.scale)}: give as many"
             )
+        for column, (center, scale) in enumerate(zip(self.center, self.scale, strict=True)):
+            if not (math.isfinite(center) and 0 < scale < math.inf):
+                raise ValueError(
+                    f"column {column} of the ground truth has the center {center} and the scale "
+                    f"{scale}: give finite numbers, the scale above 0, such as 1 for a constant"
+                )
 
     @property
     def size(self) -> int:
@@ -79,10 +86,12 @@ class Scene:
         default_tasks: Names of the tasks of an experiment by default.
         own_tasks: Names of the tasks that come with the scene; the default ones if None.
         make_env: Constructor of the environment, see `simulate`. It is `SimulationEnv` around a
-            `Simulation`, or an ``EnvBase`` with the same keys, attributes and methods.
+            `Simulation`, or an ``EnvBase`` with the same keys, attributes and methods. Without one,
+            the scene serves demonstrations, encoders, banks and trained policies.
         frame_shape: Height and width of a frame, at least 16 each.
         action_size: Number of components of an action, each in [-1, 1].
         max_steps: Length of the longest episode.
+        rate: Actions per second, the speed of films; None if it is unknown.
         largest_action: Actions with a larger component are left out of the training of the inverse
             model. Below 1 only if demonstrators never exceed it: errors of faster movements, as in
             play, would prevail in the loss.
@@ -102,10 +111,11 @@ class Scene:
     tasks: Collection[str]
     default_tasks: tuple[str, ...]
     own_tasks: tuple[str, ...] | None = None
-    make_env: Callable[..., SimulationEnv]
+    make_env: Callable[..., SimulationEnv] | None = None
     frame_shape: tuple[int, int]
     action_size: int
     max_steps: int = 50
+    rate: float | None = None
     largest_action: float = 1.0
     bank_actions: Literal["recorded", "inferred"] = "recorded"
     has_spread: bool = False
@@ -128,6 +138,8 @@ class Scene:
                 f"action_size and max_steps must be at least 1, got {self.action_size} and "
                 f"{self.max_steps}"
             )
+        if self.rate is not None and not 0 < self.rate < math.inf:
+            raise ValueError(f"rate is {self.rate}: give the actions per second, or None")
         if not 0 < self.largest_action <= 1 or self.bank_actions not in ("recorded", "inferred"):
             raise ValueError(
                 "largest_action lies above 0 and at most at 1, bank_actions are 'recorded' or "
@@ -186,6 +198,8 @@ class Scene:
         self.check_spread(spread)
         if observation != "pixels" and self.state is None:
             raise ValueError(f"the scene {self.name!r} has no ground truth: observe pixels")
+        if self.make_env is None:
+            raise ValueError(f"the scene {self.name!r} has no simulation: give it a make_env")
         options: dict[str, Any] = {"spread": spread} if self.has_spread else {}
         return self.make_env(
             tasks, batch_size=batch_size, seed=seed, observation=observation, **options

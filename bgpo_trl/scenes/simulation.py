@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
+from reprlib import repr as short_repr
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -17,7 +18,15 @@ from bgpo_trl.errors import as_shape, missing_key
 from bgpo_trl.machine import RowPool, usable_cores
 from bgpo_trl.seeding import Seeding, row_seeds
 
-__all__ = ["Observation", "Outcome", "Simulation", "SimulationEnv"]
+__all__ = [
+    "Observation",
+    "Outcome",
+    "Simulation",
+    "SimulationEnv",
+    "checked_frame",
+    "checked_outcome",
+    "checked_state",
+]
 
 Observation = Literal["pixels", "state", "both"]
 
@@ -82,6 +91,55 @@ class Simulation(ABC):
 
     def _lacks(self, method: str) -> NotImplementedError:
         return NotImplementedError(f"{type(self).__name__} does not define {method}")
+
+
+def checked_frame(simulation: Simulation, frame_shape: Sequence[int]) -> NDArray[np.uint8]:
+    """Return a simulation's frame; NumPy would convert others, and fractions would become black.
+
+    Raises:
+        ValueError: If it is not uint8 ``[H, W, 3]`` of the height and width given.
+    """
+    frame, shape = np.asarray(simulation.frame()), (*frame_shape, 3)
+    if frame.dtype != np.uint8 or frame.shape != shape:
+        raise ValueError(
+            f"{type(simulation).__name__}.frame() returned {frame.dtype} {[*frame.shape]}: return "
+            f"uint8 {[*shape]}, as the scene's frame_shape says"
+        )
+    return frame
+
+
+def checked_state(simulation: Simulation, size: int) -> NDArray[np.float32]:
+    """Return a simulation's ground truth, float32 ``[size]``.
+
+    Raises:
+        ValueError: If it is something else than so many finite numbers.
+    """
+    found = simulation.state()
+    state = np.asarray(found)
+    if state.dtype.kind not in "fiu" or state.shape != (size,) or not np.isfinite(state).all():
+        what = "nothing" if found is None else f"{state.dtype} {[*state.shape]}"
+        if state.dtype.kind == "f" and state.shape == (size,):
+            what = f"{state.tolist()}"
+        raise ValueError(
+            f"{type(simulation).__name__}.state() returned {what}: return {size} finite numbers, "
+            "as the scene's StateColumns say"
+        )
+    return state.astype(np.float32)
+
+
+def checked_outcome(simulation: Simulation, outcome: object) -> Outcome:
+    """Return what a simulation's ``step`` returned.
+
+    Raises:
+        ValueError: If it is no `Outcome` of two bools; a tuple of Gym would succeed at each step.
+    """
+    if not isinstance(outcome, Outcome) or not all(type(o) in (bool, np.bool_) for o in outcome):
+        found = " ".join(short_repr(outcome).split())
+        raise ValueError(
+            f"{type(simulation).__name__}.step() returned {found}: return an Outcome, "
+            "whose success and failure are True or False"
+        )
+    return outcome
 
 
 class SimulationEnv(EnvBase):
@@ -218,16 +276,11 @@ class SimulationEnv(EnvBase):
     def _record(self, row: int) -> None:
         simulation = self.simulations[row]
         if "pixels" in self._current:
-            frame, shape = simulation.frame(), self._current["pixels"].shape[1:]
-            # NumPy would convert and broadcast others: fractions would become black.
-            if frame.dtype != np.uint8 or frame.shape != shape:
-                raise ValueError(
-                    f"{type(simulation).__name__}.frame() returned {frame.dtype} "
-                    f"{[*frame.shape]}: return uint8 {[*shape]}, as the scene's frame_shape says"
-                )
-            self._current["pixels"][row] = frame
+            shape = self._current["pixels"].shape[1:3]
+            self._current["pixels"][row] = checked_frame(simulation, shape)
         if "state" in self._current:
-            self._current["state"][row] = simulation.state()
+            size = self._current["state"].shape[1]
+            self._current["state"][row] = checked_state(simulation, size)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         del kwargs
@@ -288,7 +341,8 @@ class SimulationEnv(EnvBase):
         """Step simulations in all threads and draw their frames in this one."""
 
         def step(row: int) -> Outcome:
-            return self.simulations[row].step(actions[row])
+            simulation = self.simulations[row]
+            return checked_outcome(simulation, simulation.step(actions[row]))
 
         def record(row: int, outcome: Outcome) -> None:
             self._record(row)

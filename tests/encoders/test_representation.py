@@ -256,7 +256,7 @@ def test_actions_that_the_inverse_model_would_never_see_are_refused_before_train
     log: list[dict] = []
     for config, part, share in ((0.6, with_a_gripper(8), "100%"), (0.6, squares(8), "9.%")):
         limited = replace(TINY, inverse=replace(TINY.inverse, largest_action=config))
-        match = f"largest_action 0.6 leaves {share} of the actions out, most by component . and"
+        match = f"largest_action 0.6 leaves {share} of the actions out, most by component .,"
         for play in (None, squares(8)):
             with pytest.raises(ValueError, match=match):
                 train(part, limited, play=play, log=log.append)

@@ -235,3 +235,27 @@ def test_groups_of_shipped_demonstrations_contain_one_task_each(order):
     assert {*majority.values()} == {*range(n_tasks)}
     of_group = torch.tensor([majority[int(g)] for g in group])
     assert float((of_group == held_out.task).float().mean()) > 0.99
+
+
+def test_vectors_embedded_twice_are_one_demonstration_whatever_their_rounding():
+    """In another batch, the last digits of an embedding are others."""
+    once, twice = BehaviorGroups(4), BehaviorGroups(4)
+    points = torch.cat([around(0, 40), around(1, 40, seed=1)])
+    show(once, points)
+    noise = torch.Generator().manual_seed(0)
+    for point in points:
+        twice.adapt(point)
+        twice.adapt(point + 1e-6 * point.norm() * torch.randn(4, generator=noise))
+    assert len(twice.numbers) == len(once.numbers) == 2
+    assert twice.state_dict()["shown"].tolist() == [2] * len(points)
+
+
+def test_inputs_may_be_lists_and_arrays():
+    of_tensors, of_others = BehaviorGroups(4), BehaviorGroups(4)
+    for number, point in enumerate(torch.cat([around(0, 30), around(1, 30, seed=1)])):
+        of_tensors.adapt(point)
+        of_others.adapt(point.numpy() if number % 2 else point.tolist())
+    for place in PLACES[:2]:
+        assert of_others.lookup(place.tolist()).group == of_tensors.lookup(place).group
+    with pytest.raises(ValueError, match="phi must be a tensor, an array, or lists"):
+        of_others.adapt([[1.0], [2.0, 3.0]])

@@ -493,3 +493,12 @@ def test_bad_input_is_rejected_and_changes_nothing(phi, mask):
 def test_arguments_out_of_range_are_rejected(name, value):
     with pytest.raises(ValueError, match=rf"^{name} must be"):
         GWRB(4, **{"batch_size": [3], name: value})
+
+
+def test_types_too_coarse_to_learn_in_are_refused():
+    gwr = GWRB(2, init="data")
+    gwr.adapt([0.0, 1.0])
+    for convert in (gwr.half, gwr.bfloat16, lambda: torch.nn.ModuleList([gwr]).half()):
+        with pytest.raises(ValueError, match="GWR-B learns in float32 or float64, not in"):
+            convert()
+    assert gwr.double().lookup([0.0, 1.0]).embedding.dtype == torch.float64

@@ -22,7 +22,7 @@ from bgpo_trl.experiments.measure import draw, measure
 from bgpo_trl.experiments.watch import WatchArguments, watch
 from bgpo_trl.policy import load_run
 from bgpo_trl.runs.results import TRAIN, read_table
-from bgpo_trl.scenes import SCENES, SimulationEnv, StateColumns, find_scene
+from bgpo_trl.scenes import SCENES, Outcome, SimulationEnv, StateColumns, find_scene
 from bgpo_trl.training import Trainer
 from tests.helpers import TINY_ENCODERS
 from tests.scenes.dot import Dot, SavedDot, demonstrate, scene
@@ -313,6 +313,115 @@ def test_frames_of_another_kind_than_the_scenes_are_refused(frame, found):
 
     with pytest.raises(ValueError, match=rf"Odd.frame\(\) returned {found}: return uint8 \[16, 24"):
         scene(Odd).simulate(TASKS).reset()
+
+
+COLUMNS = StateColumns(center=(0.0,), scale=(1.0,))
+STATE_SHAPE = {"frame_shape": (16, 24), "action_size": 1, "state_size": 1}
+
+
+def recorded(path, robot, **options):
+    return record_demonstrations(
+        path, scene=robot, per_task=2, held_out_per_task=1, progress=False, **options
+    )
+
+
+@pytest.mark.parametrize(
+    ("outcome", "found"),
+    [
+        (True, "True"),  # is a sequence of nothing, and was an error of unpacking
+        ((np.zeros(1), 0.0, False, False, {}), r"\(array\(\[0"),  # Gym's
+        ((True, False), r"\(True, False\)"),
+        (Outcome(success=0.5), r"Outcome\(success=0.5"),  # paid half a reward
+        (Outcome(success=np.nan), r"Outcome\(success=nan"),
+        (None, "None"),
+    ],
+)
+def test_outcomes_of_another_kind_are_refused(tmp_path, outcome, found):
+    class Odd(Dot):
+        def step(self, action):
+            return outcome
+
+    message = rf"Odd.step\(\) returned {found}.*: return an Outcome, whose success and failure"
+    env = scene(Odd).simulate(TASKS)
+    with pytest.raises(ValueError, match=message):
+        env.rollout(2)
+    with pytest.raises(ValueError, match=message):
+        recorded(tmp_path, scene(Odd))
+
+
+@pytest.mark.parametrize(
+    ("state", "found"),
+    [
+        (None, "nothing"),  # a forgotten return was NaN
+        ([np.nan], r"\[nan\]"),
+        ([0.0, 1.0], r"float64 \[2\]"),
+        (0.0, r"float64 \[\]"),
+        (["far"], r"<U3 \[1\]"),
+    ],
+)
+def test_a_ground_truth_of_another_kind_is_refused(tmp_path, state, found):
+    class Odd(Dot):
+        def state(self):
+            return state
+
+    odd = scene(Odd, state=COLUMNS)
+    odd = replace(odd, make_env=partial(SimulationEnv, Odd, **STATE_SHAPE))
+    message = rf"Odd.state\(\) returned {found}: return 1 finite numbers"
+    with pytest.raises(ValueError, match=message):
+        odd.simulate(TASKS, observation="state").reset()
+    with pytest.raises(ValueError, match=message):
+        recorded(tmp_path, odd)
+
+
+@pytest.mark.parametrize("column", [(0.0, 0.0), (0.0, np.inf), (np.nan, 1.0), (0.0, -1.0)])
+def test_a_ground_truth_is_divided_by_numbers_above_zero(column):
+    """The deviation of a constant column is 0, and policies observed NaN."""
+    center, scale = column
+    with pytest.raises(ValueError, match=r"column 1 .* the scale .*, such as 1 for a constant"):
+        StateColumns(center=(0.0, center), scale=(1.0, scale))
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        (np.array([1.5]), "has an action of size 1.5: scale actions"),
+        (np.array([np.nan]), "has a action that is not finite"),
+        (np.array([0.5, 0.5]), r"has the action float64 \[\d+, 2\]"),
+    ],
+)
+def test_actions_of_a_demonstrator_are_checked_as_those_of_a_dataset(tmp_path, action, message):
+    bold = scene(demonstrator=lambda robot, task, seed: lambda: action)
+    with pytest.raises(ValueError, match=f"an episode of the demonstrator of 'right' {message}"):
+        recorded(tmp_path, bold, tasks=["right"])
+
+
+def test_a_scene_without_a_simulation_serves_demonstrations(tmp_path):
+    bare = replace(scene(), make_env=None)
+    frames = np.zeros((3, 16, 24, 3), np.uint8)
+    episodes = {name: [{"pixels": frames}] * 2 for name in TASKS}
+    written = write_demonstrations(tmp_path / "own", episodes, scene=bare, held_out_per_task=1)
+    assert len(written) == 4
+    with pytest.raises(ValueError, match="the scene 'dot' has no simulation: give it a make_env"):
+        bare.simulate(TASKS)
+
+
+def test_episodes_are_no_longer_than_those_of_the_scene(pretrained, tmp_path, monkeypatch):
+    monkeypatch.setitem(SCENES, "dot", scene())
+    algorithm = replace(config().algorithm, max_steps=13)
+    with pytest.raises(
+        ValueError, match="max_steps is 13, episodes of the scene 'dot' have at most 12"
+    ):
+        train(tmp_path / "run", pretrained, algorithm=replace(algorithm, demonstration_share=0.0))
+
+    class Stuck(Dot):
+        steps = 0
+
+        def step(self, action):
+            Stuck.steps += 1
+            return Outcome(success=False)
+
+    evaluate_random_policy(tasks=TASKS, episodes=1, scene=scene(Stuck))
+    assert Stuck.steps == 2 * 12
 
 
 def test_a_ground_truth_that_the_simulation_does_not_have_is_named():
