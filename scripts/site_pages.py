@@ -31,9 +31,7 @@ REFERENCE = {
         "encoders.representation",
     ],
     "objectives": [
-        "objectives.off_policy",
         "objectives.ddpg",
-        "objectives.twin_critics",
         "objectives.maml",
         "objectives.supervised",
     ],

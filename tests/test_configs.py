@@ -10,15 +10,13 @@ import torch
 from bgpo_trl.configs import (
     AlgorithmConfig,
     BGPOConfig,
-    DDPGConfig,
     DistNLLConfig,
     GWRBConfig,
     MAMLConfig,
     RepresentationConfig,
+    RLConfig,
     RunConfig,
-    SACConfig,
     SequenceAutoencoderConfig,
-    TD3Config,
     VAEConfig,
 )
 
@@ -27,7 +25,7 @@ BAD = {
     VAEConfig: {"batch_size": 0, "window": 3, "learning_rate": -1e-3, "kl_weight": NAN},
     SequenceAutoencoderConfig: {"steps": 0, "warmup_steps": 0},
     RepresentationConfig: {"seed": -1, "log_every": 0},
-    DDPGConfig: {
+    RLConfig: {
         "hidden_sizes": (64, 0),
         "batch_size": 1.5,
         "learning_rate": math.inf,
@@ -36,9 +34,11 @@ BAD = {
         "noise": -0.1,
         "warmup_steps": 0,
         "replay_size": 100,
+        "critics": 0,
+        "n_steps": 0,
+        "policy_delay": 0,
+        "clone_share": 1.0,
     },
-    TD3Config: {"policy_delay": 0, "noise_clip": NAN},
-    SACConfig: {"alpha_init": 0.0},
     AlgorithmConfig: {"state": "pixels", "max_steps": 0, "demonstration_share": 1.0},
     GWRBConfig: {
         "activity_scale": 0.0,
@@ -91,12 +91,14 @@ def test_task_starts_are_whole_numbers_from_0_one_for_each_task(starts):
 
 
 def test_numbers_and_sequences_of_other_libraries_become_plain():
-    rl = DDPGConfig(hidden_sizes=np.array([5, 7]), gamma=np.float64(0.5), compile=np.bool_(True))
+    rl = RLConfig(
+        hidden_sizes=np.array([5, 7]), gamma=np.float64(0.5), clip_targets=np.bool_(False)
+    )
     label = np.str_("label")
     of_rl = BGPOConfig(rl=rl, max_steps=torch.tensor(9), beta=np.int64(0), context=label)
     few = {"seeds": range(2), "episodes": np.int32(7), "task_starts": np.zeros(1, int)}
     given = RunConfig(**few, tasks=["grasp"], algorithm=of_rl)
-    rl = DDPGConfig(hidden_sizes=(5, 7), gamma=0.5, compile=True)
+    rl = RLConfig(hidden_sizes=(5, 7), gamma=0.5, clip_targets=False)
     of_rl = BGPOConfig(rl=rl, max_steps=9, beta=0.0, context="label")
     few = {"seeds": (0, 1), "episodes": 7, "task_starts": (0,)}
     assert repr(given) == repr(RunConfig(**few, tasks=("grasp",), algorithm=of_rl))
@@ -115,8 +117,8 @@ def test_a_value_of_another_type_is_refused(wrong):
 
 def test_experts_and_demonstrations_restrict_other_settings():
     with pytest.raises(ValueError, match=r"warmup_steps \(49\) must be at least max_steps"):
-        BGPOConfig(rl=DDPGConfig(warmup_steps=49))
-    BGPOConfig(rl=DDPGConfig(warmup_steps=49), experts=False, demonstration_share=0.0)
+        BGPOConfig(rl=RLConfig(warmup_steps=49))
+    BGPOConfig(rl=RLConfig(warmup_steps=49), experts=False, demonstration_share=0.0)
     with pytest.raises(ValueError, match="group_balanced_replay must be "):
         BGPOConfig(group_balanced_replay=False)
 

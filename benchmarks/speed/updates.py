@@ -1,17 +1,17 @@
-"""One DDPG update: this package, a TorchRL loop, Stable-Baselines3, and a floor in bare torch.
+"""One update: this package, a TorchRL loop, Stable-Baselines3, and a floor in bare torch.
 
 An update samples 128 transitions and makes one gradient step of actor and critic and one step of
-their targets. All contenders have networks of BGPO's default size (96 inputs, 4 actions, 256 hidden
-units, no layer norm) and draw from 50,000 random transitions; those "without sampling" reuse one
-batch, which stays in the cache. Only this package and the floor step several seeds together. BGPO's
-learner has two hidden layers and layer norm in the critic, as in its runs.
+their targets. All contenders have networks of 96 inputs, 4 actions and 256 hidden units, without
+layer norm, and draw from 50,000 random transitions; those "without sampling" reuse one batch, which
+stays in the cache. Only this package and the floor step several seeds together. BGPO's learner has
+five critics, two hidden layers, and layer norm in the critics, as in its runs.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,7 +23,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.modules import MLP, TanhModule, ValueOperator
 
 from bgpo_trl.algorithms.rl import LearnerSpec, make_learner
-from bgpo_trl.configs import BGPOConfig, DDPGConfig
+from bgpo_trl.configs import SHOWN, BGPOConfig
 from bgpo_trl.data.replay import GroupReplay
 from bgpo_trl.modules.actor_critic import Actor, Critic
 from bgpo_trl.objectives.ddpg import DDPGLoss, ForeachSoftUpdate
@@ -60,11 +60,13 @@ def contenders(seeds: int = 10, transitions: int = 50_000) -> dict[str, Contende
         "ours, 1 seed, without sampling": (_repeat(lambda: fixed_single.learn(batch_single), 4), 4),
         f"floor, {seeds} seeds, without sampling": (_on_tensors(floor, batch), seeds),
         "TorchRL loop": (_repeat(TorchRLLoop(transitions).update, 4), 4),
-        "BGPO's learner, 2 seeds of 4 experts, without sampling": (bgpo_learner(2, 4), 2),
-        "the same, compiled": (bgpo_learner(2, 4, compiles=True), 2),
+        "BGPO's learner, 2 seeds, without sampling": (bgpo_learner(2), 2),
+        "its clone alone": (bgpo_learner(2, proposals="clone"), 2),
     }
     try:
-        found["Stable-Baselines3"] = stable_baselines3(transitions, updates=4), 4
+        for name in ("DDPG", "TD3"):
+            call = stable_baselines3(name, transitions, updates=4)
+            found[f"Stable-Baselines3, {name}"] = call, 4
     except ImportError:
         print(
             "Skipping Stable-Baselines3; to include it: pip install -c constraints.txt "
@@ -133,17 +135,15 @@ class Ours:
         self.target_update.step()
 
 
-def bgpo_learner(seeds: int, experts: int, *, compiles: bool = False) -> Callable[[], object]:
+def bgpo_learner(seeds: int, **changes: Any) -> Callable[[], object]:
     """Return an update of BGPO's learner, with its default networks, on a constant batch."""
-    config, shape = BGPOConfig(), (seeds, experts, BGPOConfig().expert_batch_size)
-    rl = replace(cast(DDPGConfig, config.rl), compile=compiles)
-    keys = ["latent", "behavior"]
     spec = LearnerSpec(
-        range(seeds), keys, LATENT + BEHAVIOR, (0.0, 1.1), torch.device("cpu"), range(experts)
+        range(seeds), ["latent", "behavior"], LATENT + BEHAVIOR, (0.0, 1.1), torch.device("cpu")
     )
-    learner = make_learner(rl, spec)
+    learner = make_learner(replace(SHOWN, **changes), spec)
+    shape = (seeds, 1, BGPOConfig().expert_batch_size)
     batch = random_transitions(*shape, generator=torch.Generator().manual_seed(0))
-    batch["demonstrated"] = torch.arange(shape[-1]).expand(shape) % 4 > 0
+    batch["imitation"] = batch.select("latent", "behavior", "action")
     return lambda: learner.learn(batch)
 
 
@@ -267,10 +267,11 @@ class TorchRLLoop:
         self.target_update.step()
 
 
-def stable_baselines3(transitions: int, updates: int) -> Callable[[], object]:
-    """Return a call that makes updates with the DDPG of Stable-Baselines3.
+def stable_baselines3(name: str, transitions: int, updates: int) -> Callable[[], object]:
+    """Return a call that makes updates with an algorithm of Stable-Baselines3.
 
     Args:
+        name: ``"DDPG"`` or ``"TD3"``.
         transitions: Number of random transitions in the replay buffer.
         updates: Updates per call.
 
@@ -278,7 +279,7 @@ def stable_baselines3(transitions: int, updates: int) -> Callable[[], object]:
         ImportError: If Stable-Baselines3 is not installed.
     """
     import gymnasium
-    from stable_baselines3 import DDPG
+    import stable_baselines3 as sb3
     from stable_baselines3.common.logger import Logger
 
     class Nowhere(gymnasium.Env):
@@ -287,7 +288,7 @@ def stable_baselines3(transitions: int, updates: int) -> Callable[[], object]:
         observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (LATENT + BEHAVIOR,))
         action_space = gymnasium.spaces.Box(-1.0, 1.0, (ACTION,))
 
-    model = DDPG(
+    model = getattr(sb3, name)(
         "MlpPolicy",
         Nowhere(),
         policy_kwargs={"net_arch": [HIDDEN]},

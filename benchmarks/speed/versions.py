@@ -47,13 +47,11 @@ class Arguments:
     """Turns of each version."""
     steps: int = 10
     """Steps in each turn."""
-    compile: bool = False
-    """Whether the other version compiles its updates."""
 
 
-def start(folder: Path, arguments: Arguments, *, compiles: bool) -> subprocess.Popen[str]:
+def start(folder: Path, arguments: Arguments) -> subprocess.Popen[str]:
     """Start a process that trains with the version in a folder."""
-    numbers = map(str, (arguments.experts, arguments.rows, arguments.steps, int(compiles)))
+    numbers = map(str, (arguments.experts, arguments.rows, arguments.steps))
     return subprocess.Popen(
         [sys.executable, Path(__file__).resolve(), "--work", *numbers],
         env={**os.environ, "PYTHONPATH": str(folder.resolve()), "OMP_NUM_THREADS": "1"},
@@ -71,7 +69,7 @@ def ask(process: subprocess.Popen[str], seeds: int) -> list[float]:
     return [float(part) for part in process.stdout.readline().split()]
 
 
-def work(experts: int, rows: int, steps: int, compiles: int) -> None:
+def work(experts: int, rows: int, steps: int) -> None:
     """Time some steps for each number of seeds in the input, with the version in use."""
     import bgpo_trl.machine as machine
 
@@ -82,7 +80,7 @@ def work(experts: int, rows: int, steps: int, compiles: int) -> None:
     for line in sys.stdin:
         seeds = int(line)
         if seeds not in training:
-            training[seeds] = Training(seeds, experts, rows, bool(compiles))
+            training[seeds] = Training(seeds, experts, rows)
         times = [*training[seeds].time(steps), time_products(seeds * experts, rows, steps)]
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3  # kilobytes on Linux
         print(*times, peak, flush=True)
@@ -117,7 +115,7 @@ def time_products(networks: int, rows: int, repeats: int) -> float:
 class Training:
     """BGPO in training on the paper's tasks, as in a run."""
 
-    def __init__(self, seeds: int, experts: int, rows: int, compiles: bool) -> None:
+    def __init__(self, seeds: int, experts: int, rows: int) -> None:
         from bgpo_trl.algorithms import entry
         from bgpo_trl.encoders.pretrained import load_pretrained
         from bgpo_trl.transforms import TaskSchedule
@@ -128,7 +126,7 @@ class Training:
         rl = replace(known.config.rl, warmup_steps=WARM_UP - 1, hidden_sizes=HIDDEN)
         config = replace(
             known.config,
-            rl=replace(rl, compile=True) if compiles else rl,  # a setting of later versions
+            rl=rl,
             active_groups=experts,
             expert_batch_size=rows,
             demonstration_share=SHARE,
@@ -170,8 +168,8 @@ def main(arguments: Arguments) -> None:
     """Print the table."""
     print("| seeds | part, ms | before | after | after / before | quartiles |")
     print("|---:|---|---:|---:|---:|---:|")
-    before = start(arguments.before, arguments, compiles=False)
-    after = start(arguments.after, arguments, compiles=arguments.compile)
+    before = start(arguments.before, arguments)
+    after = start(arguments.after, arguments)
     with before as one, after as other:
         for seeds in arguments.seeds:
             rounds = range(arguments.rounds)

@@ -8,16 +8,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any
-
-from tyro.conf import subcommand
+from typing import Any
 
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.analysis.comparison import read_run
 from bgpo_trl.analysis.scores import episodes_to_80, late_scores
 from bgpo_trl.analysis.statistics import mean
 from bgpo_trl.analysis.tables import Table, markdown
-from bgpo_trl.configs import PRESETS, DDPGConfig, SACConfig, TD3Config
+from bgpo_trl.configs import PRESETS, RLConfig
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.experiments.command_line import command_line
 from bgpo_trl.experiments.settings import chosen
@@ -49,12 +47,8 @@ class InformationArguments:
     """Seeds, run as one batch."""
     out: Path = Path("runs/privileged-information")
     """Parent of the run directories."""
-    rl: (
-        Annotated[DDPGConfig, subcommand("ddpg")]
-        | Annotated[TD3Config, subcommand("td3")]
-        | Annotated[SACConfig, subcommand("sac")]
-    ) = field(default_factory=DDPGConfig)
-    """The RL algorithm."""
+    rl: RLConfig = field(default_factory=RLConfig)
+    """The learner."""
     resume: bool = False
     """Continue interrupted runs and only read finished ones."""
     device: str = "auto"
@@ -71,7 +65,7 @@ def privileged_information(arguments: InformationArguments) -> str:
     task's label; latents and the label; latents and the demonstration's embedding phi; or, as in
     BGPO with one policy, latents and the behavior of GWR-B. A drop from one to the next points to
     the limiting part: frame encoder, sequence encoder or self-organization. Prints a table.
-    Settings of the learner follow its name: --inputs state+label ddpg --hidden-sizes 64
+    Settings of the learner: --inputs state+label --rl.hidden-sizes 64
 
     Raises:
         ValueError: If an input is unknown or repeated, or a directory holds another run.

@@ -56,9 +56,9 @@ class RunConfig(Settings):
     held_out: Literal["validation", "test"] = "validation"
     """Half of the held-out demonstrations that test episodes show: ``"validation"`` for choosing
     settings, ``"test"`` for reporting results. Ours."""
-    demonstrations: int | None = None
-    """Demonstrations of each task that training episodes show, the first of the bank; None for all
-    of them. Ours."""
+    demonstrations: int = 0
+    """Demonstrations of each task that training episodes show, the first of the bank; 0 for all of
+    them. Ours."""
     checkpoint_minutes: float = 10.0
     """Minutes between checkpoints. Ours."""
     name: Fixed[str] = "bgpo"
@@ -71,8 +71,7 @@ class RunConfig(Settings):
         check_seeds(self.seeds)
         at_least(self, 1, "episodes", "eval_every", "eval_episodes")
         at_least(self, 0, "checkpoint_minutes")
-        if self.demonstrations is not None:
-            at_least(self, 1, "demonstrations")
+        at_least(self, 0, "demonstrations")
         distinct = len(set(self.tasks)) == len(self.tasks)
         starts = self.task_starts
         check(

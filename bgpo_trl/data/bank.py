@@ -149,14 +149,14 @@ class DemonstrationBank:
         """Digest of the demonstrations, without the names of their tasks."""
         return digest(self._tensors())
 
-    def seen(self, most: int | None = None) -> DemonstrationBank:
-        """Return the demonstrations for training episodes, the first ``most`` of each task.
+    def seen(self, most: int = 0) -> DemonstrationBank:
+        """Return the demonstrations for training episodes, or the first ``most`` of each task.
 
         Raises:
             ValueError: If a task has fewer than ``most``.
         """
         seen = self._select(self.train)
-        if most is None:
+        if not most:
             return seen
         few = (seen.task.bincount(minlength=len(self.tasks)) < most).nonzero().flatten().tolist()
         if few:

@@ -8,7 +8,7 @@ import torch
 
 from benchmarks.speed import throughput
 from benchmarks.speed.bare_process import SUBSTEPS
-from bgpo_trl.configs import BGPOConfig, DDPGConfig
+from bgpo_trl.configs import BGPOConfig, RLConfig
 from suites import nico
 
 frames = throughput.frames
@@ -55,7 +55,9 @@ def test_ratios_are_against_the_named_contenders(monkeypatch):
 
 def test_results_are_written_and_printed(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(torch, "set_num_threads", lambda n: None)
-    short = BGPOConfig(max_steps=3, rl=DDPGConfig(warmup_steps=3))
+    short = BGPOConfig(
+        max_steps=3, rl=RLConfig(warmup_steps=3), demonstration_share=0.0, experts=False
+    )
     monkeypatch.setattr(throughput, "BGPOConfig", lambda: short)
     throughput.main(
         throughput.Arguments(

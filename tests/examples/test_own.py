@@ -4,15 +4,26 @@ import csv
 import runpy
 from collections import Counter
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 from tensordict import TensorDict
 
-from bgpo_trl.algorithms.rl import LearnerSpec, make_learner
+from bgpo_trl.algorithms.rl import LearnerSpec
+from bgpo_trl.configs import RLConfig
 from bgpo_trl.seeding import generators
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+def learner_of(example, algorithm, rl, seeds):
+    """The learner that an example's algorithm makes, of policies of three numbers."""
+    kind = runpy.run_path(str(EXAMPLES / f"{example}.py"))[algorithm]
+    spec = LearnerSpec(seeds, ["state"], 3, (0.0, 1.0), torch.device("cpu"))
+    made = kind.__new__(kind)
+    made.config = SimpleNamespace(rl=rl)
+    return made.make_learner(spec)
 
 
 @pytest.mark.parametrize(("name", "seeds"), [("own_loss", "0"), ("own_rl_algorithm", "01")])
@@ -20,13 +31,12 @@ def test_it_runs_and_every_task_is_tested(name, seeds, capsys):
     runpy.run_path(str(EXAMPLES / f"{name}.py"), run_name="__main__")
     tests = list(csv.DictReader(capsys.readouterr().out.splitlines()))
     played = [(row["algorithm"], row["seed"], row["episode"]) for row in tests if row["seed"]]
-    assert Counter(played) == {("oracle", seed, n): 3 for n in "24" for seed in seeds}
+    own = "awac" if name == "own_loss" else "epsilon"
+    assert Counter(played) == {(own, seed, n): 3 for n in "24" for seed in seeds}
 
 
 def test_the_actor_imitates_good_actions_most():
-    config = runpy.run_path(str(EXAMPLES / "own_loss.py"))["AWACConfig"](hidden_sizes=(8,))
-    spec = LearnerSpec([4, 7], ["state"], 3, (0.0, 1.0), torch.device("cpu"))
-    learner = make_learner(config, spec)
+    learner = learner_of("own_loss", "AWAC", RLConfig(hidden_sizes=(8,)), [4, 7])
     generator = torch.Generator().manual_seed(0)
     state, following = torch.randn(2, 2, 1, 16, 3, generator=generator).unbind(0)
     action = torch.rand(2, 1, 16, 4, generator=generator) * 2 - 1
@@ -48,20 +58,18 @@ def test_the_actor_imitates_good_actions_most():
     assert all(p.grad.any() for p in learner.loss.actor_network_params.parameters())
     assert all(p.grad is None for p in learner.loss.value_network_params.parameters())
 
-    policy = [p.clone() for p in learner.actor.parameters()]
+    policy = [p.clone() for p in learner.policy.parameters()]
     learner.learn(batch)
-    assert not any(p.equal(q) for p, q in zip(policy, learner.actor.parameters(), strict=True))
+    assert not any(p.equal(q) for p, q in zip(policy, learner.policy.parameters(), strict=True))
 
 
 def test_it_acts_at_random_now_and_then():
-    config = runpy.run_path(str(EXAMPLES / "own_rl_algorithm.py"))["EpsilonConfig"](
-        noise=0.0, epsilon=0.5
-    )
-    spec = LearnerSpec([4], ["state"], 3, (0.0, 1.0), torch.device("cpu"))
-    learner = make_learner(config, spec)
+    names = runpy.run_path(str(EXAMPLES / "own_rl_algorithm.py"))
+    rl = names["EpsilonRLConfig"](noise=0.0, epsilon=0.5)
+    learner = learner_of("own_rl_algorithm", "EpsilonBGPO", rl, [4])
     data, sources = TensorDict({"state": torch.randn(1, 3)}, [1]), generators([4], "exploration")
     with torch.no_grad():
-        usual = learner.actor(data.unsqueeze(1))["action"].squeeze(1)
+        usual = learner.policy(data.unsqueeze(1))["action"].squeeze(1)
         expert = torch.tensor([0])
         drawn = torch.cat([learner.act(data, sources, expert) for _ in range(400)])
     random = drawn[(drawn != usual).any(-1)]

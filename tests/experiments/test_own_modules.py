@@ -8,7 +8,6 @@ import pytest
 from one_shot import OneShotArguments, one_shot
 
 from bgpo_trl.algorithms import ALGORITHMS
-from bgpo_trl.algorithms.rl import RL
 from bgpo_trl.experiments import run as experiment
 from bgpo_trl.experiments.arguments import Arguments
 from bgpo_trl.experiments.paper import continual
@@ -19,25 +18,24 @@ from suites import nico
 from suites.nico import nico as suite_nico
 
 MODULE = """
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from bgpo_trl.algorithms import ALGORITHMS, Entry
 from bgpo_trl.algorithms.bgpo import BGPO
-from bgpo_trl.algorithms.rl import RL, RLEntry
-from bgpo_trl.algorithms.twin_critics import make_td3
-from bgpo_trl.configs import BGPOConfig, TD3Config
+from bgpo_trl.configs import BGPOConfig, RLConfig
 from suites import nico
 from suites.nico import moves
 
 
 @dataclass(frozen=True)
-class QuietConfig(TD3Config):
-    name: str = "quiet"
+class QuietConfig(RLConfig):
+    quiet: float = 0.75
 
 
 @dataclass(frozen=True)
 class MineConfig(BGPOConfig):
     share: float = 0.5
+    rl: QuietConfig = field(default_factory=QuietConfig)
 
 
 class Mine(BGPO):
@@ -54,9 +52,10 @@ class AtOnce(nico.NicoTask):
         return moves.push(physics, random, "white_box", "green_box")
 
 
-RL["quiet"] = RLEntry(make_td3, QuietConfig())
 published = ALGORITHMS["bgpo-single"].config
-small = QuietConfig(hidden_sizes=(64,), batch_size=16, warmup_steps=8, replay_size=200)
+small = QuietConfig(
+    hidden_sizes=(64,), batch_size=16, warmup_steps=8, replay_size=200, quiet=0.5
+)
 ALGORITHMS["mine"] = Entry(
     Mine, MineConfig(**{**vars(published), "max_steps": 6, "rl": small}, share=0.25)
 )
@@ -76,7 +75,7 @@ def folder(undrawn, shipped, tmp_path, monkeypatch):
 
 def forget():
     """Forgets the module, as a new process would."""
-    ALGORITHMS.pop("mine", None), RL.pop("quiet", None), suite_nico._TASKS.pop("at_once", None)
+    ALGORITHMS.pop("mine", None), suite_nico._TASKS.pop("at_once", None)
     sys.modules.pop("mine_at_once", None)
 
 
@@ -91,7 +90,8 @@ def test_a_task_and_an_algorithm_of_a_module_are_trained_reported_filmed_and_tes
     continual(replace(asked, module="mine_at_once"))
     run = folder / "runs" / "continual-mine-quick"
     assert set(read_table(run / "eval.csv")["algorithm"]) == {"mine"}
-    assert json.loads((run / "config.json").read_text())["algorithm"]["share"] == 0.25
+    stored = json.loads((run / "config.json").read_text())["algorithm"]
+    assert (stored["share"], stored["rl"]["quiet"]) == (0.25, 0.5)
 
     forget()
     assert "| at_once |" in report(ReportArguments((run,)))  # needs no module

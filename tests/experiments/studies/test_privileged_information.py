@@ -10,7 +10,7 @@ from privileged_information import (
     privileged_information,
 )
 
-from bgpo_trl.configs import DDPGConfig
+from bgpo_trl.configs import RLConfig
 from bgpo_trl.files.checkpoint import load_checkpoint
 from bgpo_trl.runs.results import read_table
 from suites import nico
@@ -18,7 +18,7 @@ from tests.helpers import cells, contents
 
 
 def test_each_input_has_a_run_and_a_row(tiny, tmp_path):
-    ddpg = DDPGConfig(hidden_sizes=(7,), batch_size=16, warmup_steps=8, replay_size=200)
+    ddpg = RLConfig(hidden_sizes=(7,), batch_size=16, warmup_steps=8, replay_size=200)
     arguments = InformationArguments(episodes=2, seeds=(1,), out=tmp_path, rl=ddpg)
     printed = privileged_information(arguments)
     head, *rows = cells(printed)
