@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field
 from typing import Any
@@ -81,11 +80,6 @@ class ProposalTrials:
             into.episodes += record.episodes
             for ours, theirs in ((into.clone, record.clone), (into.choice, record.choice)):
                 ours[:] = [sum(pair) for pair in zip(ours, theirs, strict=True)]
-
-    def keep(self, seed: int, groups: Sequence[int]) -> None:
-        """Forget all other groups of a seed."""
-        known = {*groups}
-        self._groups[seed] = {g: r for g, r in self._groups[seed].items() if g in known}
 
     def state_dict(self) -> dict[str, Any]:
         """Return what is counted, and the present episodes."""
