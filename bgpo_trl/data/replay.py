@@ -202,7 +202,8 @@ class GroupReplay:
             at = np.minimum(steps + step, end - 1)
             goes_on &= torch.from_numpy(at == steps + step).view(-1)
             rows = self._rows_of(at, seeds)
-            reward += self.gamma**step * goes_on * self._rows["next", "reward"][rows].flatten()
+            paid = self._rows["next", "reward"][rows].flatten()
+            reward += self.gamma**step * torch.where(goes_on, paid, 0.0)  # no NaN of empty rows
             n_taken += goes_on
             last = np.where(goes_on.view(steps.shape).numpy(), at, last)
             goes_on &= ~self._rows["next", "done"][rows].flatten()

@@ -17,16 +17,17 @@ VARIANTS = {
     "latent, b": ("latent", "b", "bgpo-single"),
     "group-balanced replay": ("latent", "b", "group-balanced-replay"),
     "experts": ("latent", "b", "bgpo-experts"),
+    "clone": ("latent", "b", "clone"),
     "all": ("latent", "b", "bgpo"),
 }
 # More groups than are active.
 GROUPS = {"group_size": 4, "group_evidence": 0.5, "active_groups": 2}
-CHANGES = {"group-balanced replay": GROUPS, "experts": GROUPS, "all": GROUPS}
+CHANGES = dict.fromkeys(("group-balanced replay", "experts", "clone", "all"), GROUPS)
 SCHEDULE = TaskSchedule((0, 2, 4))
 
 
 def make_batch(*shape, n_state=6, seed=0):
-    """Transitions of noise, of which a fifth succeed."""
+    """Transitions of noise, of which a fifth succeed, and actions of noise to imitate."""
     generator = torch.Generator().manual_seed(seed)
 
     def draw(size):
@@ -39,8 +40,10 @@ def make_batch(*shape, n_state=6, seed=0):
         "done": ended,
         "reward": ended.float(),
     }
-    data = {"state": draw(n_state), "label": draw(2), "action": draw(4).clamp(-1, 1)}
-    return TensorDict({**data, "next": following}, shape)
+    data, shown = (
+        {"state": draw(n_state), "label": draw(2), "action": draw(4).clamp(-1, 1)} for _ in range(2)
+    )
+    return TensorDict({**data, "imitation": shown, "next": following}, shape)
 
 
 def play(algorithm, n_steps, state=None, hidden=(), watch=lambda chosen: None):
@@ -104,6 +107,17 @@ def perceptron(weights, x, normalize=False):
     hidden = x @ weights["mlp.layers.0.weight"] + weights["mlp.layers.0.bias"]
     hidden = layer_norm(hidden, hidden.shape[-1:]) if normalize else hidden
     return hidden.relu() @ weights["mlp.layers.1.weight"] + weights["mlp.layers.1.bias"]
+
+
+def choice(actor, clone, critics, x, only_clone=False):
+    """The action of the better of two proposals in one state, from the weights of each network."""
+    own, cloned = (perceptron(network, x).tanh() for network in (actor, clone))
+
+    def lowest(action):
+        inputs = torch.cat([x, action])
+        return min(float(perceptron(critic, inputs, normalize=True)) for critic in critics)
+
+    return own if not only_clone and lowest(own) > lowest(cloned) else cloned
 
 
 def assert_same(first, second):

@@ -9,7 +9,6 @@ import torch
 from torchrl.envs import check_env_specs
 
 from bgpo_trl.algorithms import ABLATIONS
-from bgpo_trl.algorithms.algorithm import Policy
 from bgpo_trl.algorithms.bgpo import BGPO
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.transforms import BehaviorLookup, GroupLookup, TaskSchedule
@@ -18,6 +17,7 @@ from tests.algorithms.playing import (
     SCHEDULE,
     VARIANTS,
     assert_same,
+    choice,
     perceptron,
     play,
     weights,
@@ -39,7 +39,8 @@ def test_each_variant_is_an_environment_with_the_input_it_is_named_after(make_bg
     sizes = {"state": 16, "latent": 64, "context": 3 if told == "label" else 32}
     keys = [state] if told == "nothing" else [state, "context"]
     start = algorithm.act(algorithm.world.env.reset())
-    actor, critic = algorithm.learner.actor, algorithm.learner.loss.value_network
+    actor = algorithm.learner.loss.actor_network
+    critic = algorithm.learner.loss.value_network
     assert actor.in_keys == keys
     assert critic.in_keys == [*keys, "action"]
     assert actor.mlp.layers[0].in_features == sum(sizes[key] for key in keys)
@@ -99,11 +100,12 @@ def test_a_reference_learns_the_same_from_whatever_demonstrations(make_bgpo, ban
 
 
 def act_in_tests(algorithm, state, embedding, task):
-    policies = [
-        algorithm.snapshot(index, embedding, task, torch.Generator())
-        for index in range(algorithm.n_seeds)
-    ]
-    return Policy.stack(policies).act(state)
+    return torch.stack(
+        [
+            algorithm.snapshot(index, embedding, task, torch.Generator()).act(of_seed)
+            for index, of_seed in enumerate(state)
+        ]
+    )
 
 
 @pytest.mark.parametrize("bootstraps", [True, False])
@@ -136,10 +138,30 @@ def test_only_a_variant_with_a_label_acts_by_it(make_bgpo, bank, variant):
     assert first.equal(other) == (variant != "all")
 
 
-def test_test_episodes_are_played_by_the_expert_of_their_demonstration(make_bgpo, bank):
+def act_by_hand(weights, x):
+    """The action of a policy of test episodes, from its weights."""
+    if "only_clone" not in weights:
+        return perceptron(weights, x).tanh()
+    actor, clone, critics = (
+        {key.removeprefix(part): v for key, v in weights.items() if key.startswith(part)}
+        for part in ("actor.", "clone.", "critic.")
+    )
+    each = [{key: value[number] for key, value in critics.items()} for number in range(5)]
+    return choice(actor, clone, each, x, bool(weights["only_clone"]))
+
+
+@pytest.mark.parametrize("variant", ["experts", "all"])
+def test_test_episodes_are_played_by_the_expert_of_their_demonstration(make_bgpo, bank, variant):
     """By hand: the group of each demonstration, its expert's weights, what they do."""
-    algorithm = make_bgpo("experts", schedule=TaskSchedule((0, 0, 0)), known=15)
+    algorithm = make_bgpo(variant, schedule=TaskSchedule((0, 0, 0)), known=15)
     play(algorithm, 60)
+    proposals, groups = algorithm.proposals, algorithm.groups[0].numbers
+    if proposals is not None:
+        assert all(proposals.clone_is_better(0, group) for group in groups)
+        for _ in range(60):  # in one group, what critics choose succeeds, and the clone does not
+            proposals.end(0, not proposals.begin(0, groups[0]))
+        worse = {group: proposals.clone_is_better(0, group) for group in groups}
+        assert worse == {group: group != groups[0] for group in groups}
     assert all(len(groups.numbers) > 2 for groups in algorithm.groups)
     shown = bank.held_out()
     embedding, task = shown.embedding.view(3, 4, 32), shown.task.view(3, 4)
@@ -153,14 +175,14 @@ def test_test_episodes_are_played_by_the_expert_of_their_demonstration(make_bgpo
     for seed, t, m in torch.cartesian_prod(*map(torch.arange, groups.shape)).tolist():
         network = algorithm.actor_weights(seed, int(groups[seed, t, m]))
         x = torch.cat([state[seed, t, m], 0.25 * behaviors[seed, t, m]])
-        torch.testing.assert_close(actions[seed, t, m], perceptron(network, x).tanh())
+        torch.testing.assert_close(actions[seed, t, m], act_by_hand(network, x))
 
 
 @pytest.mark.parametrize(
     ("variant", "changes", "highest"),
     [
-        # A success now, or a time-out with its bonus and a success after it, 0.95 as much worth.
-        ("all", {}, 0.1 + 0.95 * 1.1),
+        # A success now, or a time-out with its bonus and a success after it, gamma as much worth.
+        ("all", {}, 0.1 + 0.97 * 1.1),
         ("latent, phi", {"beta": 0.3}, 0.3 + 0.95 * 1.3),
         ("latent, b", {"beta": 0.0}, 1.0),
         ("latent, nothing", {"beta": 0.3}, 1.0),
@@ -175,12 +197,12 @@ def test_targets_are_clipped_to_the_attainable_returns(make_bgpo, variant, chang
         for key, value in algorithm.learner.loss.state_dict().items()
         if key.startswith("target_value") and key.endswith("bias")
     ][-1]
-    n_experts = algorithm.learner.actor.batch_size[1]
+    n_experts = algorithm.learner.loss.batch_size[1]
     for bias, expected in ((50.0, highest), (-50.0, 0.0)):
         target_bias.fill_(bias)
         batch = algorithm.replay.sample(torch.zeros(2, 32, dtype=torch.int64))
         batch = batch.view(2, n_experts, -1)
-        target = algorithm.learner.loss(batch)["target_value"].unsqueeze(-1)
+        target = algorithm.learner.loss.loss_value(batch)[1]["target_value"].unsqueeze(-1)
         terminated = batch["next", "terminated"]
         # A success has nothing to come: its return is its reward.
         returns = torch.where(terminated, batch["next", "reward"], expected)
@@ -204,10 +226,10 @@ def test_each_seed_of_a_batch_learns_as_it_would_alone(make_bgpo):
     """Weights and groups; the rows of whole runs, of all kinds, are in ``test_training.py``."""
     seeds = (1, 2)  # no pixel of theirs is so near an edge that rounding moves it across
     close = partial(torch.testing.assert_close, rtol=1e-4, atol=1e-4)
-    batch = make_bgpo("all", seeds=seeds, rl="sac", known=15)
+    batch = make_bgpo("all", seeds=seeds, known=15)
     together = play(batch, 45)[0]
     for index, seed in enumerate(seeds):
-        alone = make_bgpo("all", seeds=(seed,), rl="sac", known=15)
+        alone = make_bgpo("all", seeds=(seed,), known=15)
         data = play(alone, 45)[0][0]
         for key in ("task", "demo_index", "step_count", "group", ("next", "terminated")):
             assert together[index][key].equal(data[key]), key
@@ -223,7 +245,7 @@ def test_each_seed_of_a_batch_learns_as_it_would_alone(make_bgpo):
             close(batch.actor_weights(index, group), alone.actor_weights(0, group))
 
 
-def test_what_an_algorithm_lacks_is_refused(make_config, bank, in_world):
+def test_what_an_algorithm_lacks_is_refused(make_config, bank, encoders, in_world):
     for state in ("latent", "state"):
         config = make_config(state, "without-gwr").algorithm
         with pytest.raises(ValueError, match="needs trained encoders"):
@@ -231,6 +253,31 @@ def test_what_an_algorithm_lacks_is_refused(make_config, bank, in_world):
     config = replace(make_config("state", "oracle").algorithm, demonstration_share=0.25)
     with pytest.raises(ValueError, match="demonstrations are latents"):
         BGPO(config, seeds=(0,), bank=bank.seen())
+    config, without = make_config().algorithm, replace(bank.seen(), steps=None)
+    with pytest.raises(ValueError, match=r"^the bank has no steps of demonstrations[^\n]*$"):
+        BGPO(config, seeds=(0,), bank=without, encoders=encoders)
+    with pytest.raises(
+        ValueError, match=r"^demonstration_share must be above 0, for a clone[^\n]*$"
+    ):
+        replace(config, demonstration_share=0.0)
+
+
+def test_the_clone_never_reads_a_reward(make_bgpo):
+    usual, blind = (make_bgpo("clone", known=15) for _ in range(2))
+    store = blind.store
+
+    def without_reward(transition):
+        transition["next", "reward"] = torch.full_like(transition["next", "reward"], torch.nan)
+        store(transition)
+
+    blind.store = without_reward
+    start = [weight.detach().clone() for weight in weights(usual)]
+    ours, theirs = (play(algorithm, 40)[0] for algorithm in (usual, blind))
+    assert ours["action"].equal(theirs["action"])
+    assert_same(weights(usual), weights(blind))
+    moved = [not now.equal(then) for now, then in zip(weights(usual), start, strict=True)]
+    names = [name for name, _ in usual.learner.loss.named_parameters()]
+    assert moved == [name.startswith("clone_network") for name in names]
 
 
 # ---- the ablations

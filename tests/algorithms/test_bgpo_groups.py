@@ -16,7 +16,7 @@ pytestmark = pytest.mark.usefixtures("easy_world")
 
 
 def test_a_restored_run_continues_as_the_saved_one(make_bgpo, tmp_path):
-    options = {"rl": "sac", "schedule": TaskSchedule((0, 0, 0))}
+    options = {"schedule": TaskSchedule((0, 0, 0))}
     algorithm = make_bgpo("all", known=15, **options)
     _, state = play(algorithm, 60)
     assert all(len(groups.numbers) > 2 for groups in algorithm.groups)  # more than are active
@@ -35,7 +35,7 @@ def test_a_restored_run_continues_as_the_saved_one(make_bgpo, tmp_path):
 
 def test_with_one_group_it_is_the_plain_learner_bit_for_bit(make_bgpo):
     lonely = {"group_size": 99, "active_groups": 4, "expert_batch_size": 16}
-    plain, one = make_bgpo("latent, b", rl="sac"), make_bgpo("experts", rl="sac", **lonely)
+    plain, one = make_bgpo("latent, b"), make_bgpo("experts", **lonely)
     ours, theirs = play(plain, 30)[0], play(one, 30)[0]
     assert all(groups.numbers == [0] for groups in one.groups)
     for key in ("action", "latent", "behavior", "demo_index", ("next", "reward")):
@@ -58,6 +58,7 @@ def test_joined_groups_have_one_expert_and_one_replay(make_bgpo, bank):
     (other,) = {*pair} - {joined}
     assert other not in groups.numbers
     assert other not in algorithm.active.group[1]
+    assert other not in algorithm.proposals.state_dict()["groups"][1]
     for replay in (algorithm.replay, algorithm.shown._shown):
         entries, group = replay.contents(1)
         assert group.equal(after[entries["demo_index"]])
@@ -133,6 +134,10 @@ def test_an_update_sees_as_much_of_each_group_played_last(make_bgpo, bank, varia
                     assert (of_group, demonstrated[row]) == (not is_shown, is_shown)
                 else:  # nothing is known of the group, or no demonstration of it was over
                     assert is_shown or not (past == group).any()
+            if variant == "all":
+                imitated = batch["imitation"][seed]
+                drawn = imitated["latent"][imitated["priority_weight"] > 0]
+                assert (drawn.unsqueeze(1) == frames).all(-1).any(-1).all()
     assert n_full > 20
 
 

@@ -15,6 +15,7 @@ from bgpo_trl.transforms import TaskSchedule
 from tests.algorithms.playing import (
     SCHEDULE,
     assert_same,
+    choice,
     make_batch,
     perceptron,
     play,
@@ -36,7 +37,9 @@ def make(make_task_algorithm):
 
 def teachers_action(algorithm, seed, task, state):
     """Actions of a teacher, computed from its weights."""
-    return perceptron(weights_of(algorithm.loss.actor_network_params, seed, task), state).tanh()
+    return perceptron(
+        weights_of(algorithm.learner.loss.actor_network_params, seed, task), state
+    ).tanh()
 
 
 def test_a_teacher_learns_from_the_transitions_of_its_own_task_only(make):
@@ -53,9 +56,9 @@ def test_a_teacher_learns_from_the_transitions_of_its_own_task_only(make):
             algorithm.update()
             algorithm.store(data)
     compared = 0
-    for key, value in first.loss.state_dict().items():
+    for key, value in first.learner.loss.state_dict().items():
         if value.ndim:  # not the discount
-            differs = (value != second.loss.state_dict()[key]).flatten(2).any(-1)
+            differs = (value != second.learner.loss.state_dict()[key]).flatten(2).any(-1)
             assert differs.tolist() == 2 * [[False, True, False]], key
             compared += 1
     assert compared == 16
@@ -160,9 +163,36 @@ def test_students_learn_from_their_teachers_at_the_end_of_each_episode(make, sch
         frozen = snapshot(algorithm, index).parameters
         for position, task in enumerate(order):
             for name, value in students[index].heads[position].state_dict().items():
-                mean = value[..., :4]  # of the action; the other half is its deviation
-                found = frozen[f"mlp.layers.1.{name}"][task]
-                torch.testing.assert_close(found, mean, rtol=1e-4, atol=1e-5)
+                expected = frozen[f"mlp.layers.1.{name}"][task]
+                torch.testing.assert_close(expected, value[..., :4], rtol=1e-4, atol=1e-5)
+            for name, value in students[index].trunk.state_dict().items():
+                expected = frozen[f"mlp.{name}"][task]
+                torch.testing.assert_close(expected, value, rtol=1e-4, atol=1e-5)
+
+
+def test_students_learn_what_their_teachers_do_in_tests(make):
+    """The clone of one task, and what the critics choose in the others."""
+    algorithm, taught = make("dist-nll-demonstrations", state="latent"), []
+    play(algorithm, 60)
+    algorithm.proposals.clone_is_better = lambda seed, task: task == 0
+    learn = algorithm._distillation[1]
+    algorithm._distillation[1] = lambda part: taught.append(part.clone()) or learn(part)
+    algorithm._distill(1)
+    loss, chosen = algorithm.learner.loss, set()
+    assert len(algorithm._head_tasks[1]) == N_TASKS
+    for row, task in enumerate(algorithm._head_tasks[1]):
+        actor, clone = (
+            weights_of(parameters, 1, task)
+            for parameters in (loss.actor_network_params, loss.clone_network_params)
+        )
+        critics = [weights_of(loss.target_value_network_params, 1, task, n) for n in range(5)]
+        for part in taught:
+            for state, told in zip(part["latent"][row], part["teacher_action"][row], strict=True):
+                action = choice(actor, clone, critics, state, only_clone=task == 0)
+                torch.testing.assert_close(told, action, rtol=1e-4, atol=1e-5)
+                is_own = action.equal(perceptron(actor, state).tanh())
+                chosen.add((task > 0, is_own))
+    assert chosen == {(False, False), (True, False), (True, True)}
 
 
 def test_no_end_of_an_episode_is_missed_between_updates(make, monkeypatch):

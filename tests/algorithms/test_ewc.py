@@ -5,20 +5,17 @@ from tensordict import TensorDict
 from torch.func import functional_call
 
 from bgpo_trl.algorithms.ewc import EWCLearner, diagonal_fisher
-from bgpo_trl.algorithms.rl import LearnerSpec, make_ddpg
-from bgpo_trl.configs import DDPGConfig
+from bgpo_trl.algorithms.rl import LearnerSpec, make_learner
+from bgpo_trl.configs import RLConfig
 from bgpo_trl.modules.actor_critic import Actor
 from tests.algorithms.playing import make_batch
 
 N_STATE = 6
 
 
-def make_learner(weight=1.0, seeds=(3, 8)):
-    config = DDPGConfig(hidden_sizes=(16,))
-    ddpg = make_ddpg(
-        config, LearnerSpec(seeds, ["state"], N_STATE, (0.0, 1.0), torch.device("cpu"))
-    )
-    return EWCLearner(ddpg.actor, ddpg.loss, config, weight=weight)
+def make(weight=1.0, seeds=(3, 8)):
+    spec = LearnerSpec(seeds, ["state"], N_STATE, (0.0, 1.0), torch.device("cpu"))
+    return EWCLearner(make_learner(RLConfig(hidden_sizes=(16,)), spec), weight=weight)
 
 
 def actor_weights(learner):
@@ -41,12 +38,12 @@ def test_the_fisher_information_is_that_of_a_plain_loop():
 
 
 def test_the_penalty_is_that_of_equation_3_for_each_seed():
-    learner, inputs = make_learner(weight=5.0), make_batch(30).select("state")
+    learner, inputs = make(weight=5.0), make_batch(30).select("state")
     assert not learner.penalty().any()
     learner.consolidate(1, inputs)
     assert not learner.penalty().any()
     anchor = {key: value.detach().clone() for key, value in actor_weights(learner).items()}
-    fisher = diagonal_fisher(learner.actor, {k: v[1, 0] for k, v in anchor.items()}, inputs)
+    fisher = diagonal_fisher(learner.policy, {k: v[1, 0] for k, v in anchor.items()}, inputs)
     with torch.no_grad():
         for value in actor_weights(learner).values():
             value.add_(torch.randn(value.shape, generator=torch.Generator().manual_seed(4)))
@@ -64,7 +61,7 @@ def test_the_penalty_is_that_of_equation_3_for_each_seed():
 
 
 def test_a_second_boundary_adds_its_information_and_moves_the_anchor():
-    learner, inputs = make_learner(), make_batch(30).select("state")
+    learner, inputs = make(), make_batch(30).select("state")
     learner.consolidate(0, inputs)
     first = {key: value.clone() for key, value in learner.fisher.items()}
     for seed in range(5):
@@ -73,7 +70,7 @@ def test_a_second_boundary_adds_its_information_and_moves_the_anchor():
     weights = {key: value.detach().clone() for key, value in actor_weights(learner).items()}
     learner.consolidate(0, inputs)
     assert not learner.penalty().any()
-    second = diagonal_fisher(learner.actor, {k: v[0, 0] for k, v in weights.items()}, inputs)
+    second = diagonal_fisher(learner.policy, {k: v[0, 0] for k, v in weights.items()}, inputs)
     for key, value in learner.fisher.items():
         torch.testing.assert_close(value[0, 0], first[key][0, 0] + second[key])
         assert learner.anchor[key][0].equal(weights[key][0])
@@ -82,7 +79,7 @@ def test_a_second_boundary_adds_its_information_and_moves_the_anchor():
 
 def test_weights_of_high_fisher_information_move_less():
     """States of the old task lack the first feature, whose weights are thus free to change."""
-    free, held = make_learner(weight=0.0), make_learner(weight=1e4)
+    free, held = make(weight=0.0), make(weight=1e4)
     inputs = make_batch(200).select("state")
     inputs["state"][:, 0] = 0.0
     for index in range(2):

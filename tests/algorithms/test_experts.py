@@ -10,10 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bgpo_trl.algorithms.experts import ActiveGroups, Experts
-from bgpo_trl.algorithms.rl import RL, LearnerSpec, make_learner
+from bgpo_trl.algorithms.rl import LearnerSpec, make_learner
+from bgpo_trl.configs import SHOWN, RLConfig
 from tests.algorithms.playing import make_batch
 
-every_rl = pytest.mark.parametrize("name", RL)
+KINDS = {"actor": RLConfig(), "both": SHOWN}  # by their proposals
+every_kind = pytest.mark.parametrize("name", KINDS)
 SEEDS = (3, 8)
 PARENTS = {0: 0, 1: 0, 2: 1, 3: 1, 4: 3, 5: 4}
 
@@ -57,8 +59,8 @@ def test_the_groups_played_last_are_active(most, rest_after, played, n_rows, res
 # ---- their networks
 
 
-def make(name="ddpg", most=2, seeds=SEEDS, rest_after=99):
-    config = replace(RL[name].config, hidden_sizes=(8,))
+def make(name="actor", most=2, seeds=SEEDS, rest_after=99):
+    config = replace(KINDS[name], hidden_sizes=(8,))
     spec = LearnerSpec(seeds, ["state"], 6, (0.0, 1.1), torch.device("cpu"))
     return Experts(
         make_learner(config, spec),
@@ -73,11 +75,12 @@ def learn(experts, seed, rows=slice(None)):
     data = make_batch(2, 6, 8, seed=seed)[rows]
     batch = data[torch.arange(len(group)).unsqueeze(1), group.clamp(min=0)].clone()
     weight = (group >= 0).float().unsqueeze(-1).expand(-1, -1, 8)
-    experts.learner.learn(batch.set("priority_weight", weight))
+    batch["priority_weight"] = batch["imitation", "priority_weight"] = weight
+    experts.learner.learn(batch)
 
 
 def width_of(experts):
-    return experts.learner.actor.batch_size[1]
+    return experts.learner.loss.batch_size[1]
 
 
 def slot_of(experts, seed, group):
@@ -107,13 +110,26 @@ def differing(ours, theirs):
     return {key for key, value in ours.items() if not value.equal(theirs[key])}
 
 
-def assert_actor(experts, seed, group, tensors):
-    """Assert that tests of a group have the actor of these `tensors_of` an expert."""
-    for key, value in experts.actor_weights(seed, group).items():
-        assert value.equal(tensors[f"actor_network_params.{key}"]), (group, key)
+def policy_of(experts, seed, group):
+    """Copies of the weights with which tests of a group are played."""
+    return experts.learner.expert_weights(experts.find(seed, group))
 
 
-@every_rl
+def assert_policy(experts, seed, group, tensors):
+    """Assert that tests of a group are played by the networks of these `tensors_of` an expert."""
+    of_policy = policy_of(experts, seed, group)
+    assert not of_policy.pop("only_clone", None)
+    for part, source in experts.learner.sources.items():
+        start = f"{part}." if part else ""
+        own = [key for key in of_policy if key.startswith(start)]
+        assert own
+        for key in own:
+            value = of_policy.pop(key)
+            assert value.equal(tensors[f"{source}.{key.removeprefix(start)}"]), (group, key)
+    assert not of_policy
+
+
+@every_kind
 def test_what_is_put_aside_comes_back_as_it_was(name):
     """Six groups in two slots: whatever else was played and learned, bit for bit."""
     experts, left = make(name), [{}, {}]
@@ -136,7 +152,7 @@ def test_what_is_put_aside_comes_back_as_it_was(name):
     assert returned > 30
 
 
-@every_rl
+@every_kind
 def test_a_new_group_starts_from_the_one_it_parted_from_without_its_moments(name):
     experts = make(name)
     experts.play([0, 0])
@@ -163,27 +179,27 @@ def test_a_new_group_starts_from_the_one_it_parted_from_without_its_moments(name
     assert all(" of " in key for key in differing(grandchild, parent))
 
 
-@every_rl
+@every_kind
 def test_tests_see_the_weights_of_a_group_wherever_they_are(name):
     experts = make(name)
     start = tensors_of(experts, 1, 0)
-    assert_actor(experts, 1, 3, start)  # before anything was played
+    assert_policy(experts, 1, 3, start)  # before anything was played
     kept = {}
     for step, group in enumerate((0, 1, 2, 4)):
         experts.play([0, group])
         learn(experts, step)
         for slot, active in enumerate(experts.active.groups[1]):
             kept[active] = tensors_of(experts, 1, slot)
-    copies = {group: experts.actor_weights(1, group) for group in range(6)}
+    copies = {group: policy_of(experts, 1, group) for group in range(6)}
     for group, like in {0: 0, 1: 1, 2: 2, 3: 1, 4: 4, 5: 4}.items():
-        assert_actor(experts, 1, group, kept[like])
+        assert_policy(experts, 1, group, kept[like])
     before = copy.deepcopy(copies)
     learn(experts, 20)
     assert not any(differing(copies[group], before[group]) for group in copies)  # they are copies
 
 
 def test_a_stack_is_as_wide_as_groups_are_active():
-    experts = make("sac", most=3, rest_after=4)
+    experts = make(most=3, rest_after=4)
     widths = []
     for step, groups in enumerate([(0, 0), (0, 1), (2, 1), (3, 1), (4, 1), *[(4, 1)] * 3]):
         experts.play(groups)
@@ -196,7 +212,7 @@ def test_a_stack_is_as_wide_as_groups_are_active():
     assert widths == [1, 2, 2, 3, 3, 3, 2, 1]
 
 
-@every_rl
+@every_kind
 def test_a_group_that_ends_is_put_aside_and_comes_back_as_it_was(name):
     experts = make(name, most=3)
     for step, group in enumerate([0, 1, 2, 1]):
@@ -207,13 +223,13 @@ def test_a_group_that_ends_is_put_aside_and_comes_back_as_it_was(name):
     assert experts.active.groups[0] == [0, 2]
     assert not differing(tensors_of(experts, 0, 1), kept[2])
     for group, like in {**kept, 3: kept[1]}.items():  # 3 parted from 1
-        assert_actor(experts, 0, group, like)
+        assert_policy(experts, 0, group, like)
     experts.play([1, 0])
     for group, tensors in kept.items():
         assert not differing(tensors_of(experts, 0, slot_of(experts, 0, group)), tensors)
 
 
-@every_rl
+@every_kind
 def test_a_seed_of_a_batch_is_that_seed_alone(name):
     """Also where the other has more active groups, or its groups rest."""
     together = make(name, most=3, rest_after=7)
@@ -231,12 +247,12 @@ def test_a_seed_of_a_batch_is_that_seed_alone(name):
         learn(alone, step, slice(1, 2))
     assert len(widths) > 3
     for group in range(6):
-        ours = together.actor_weights(1, group)
-        for key, value in alone.actor_weights(0, group).items():
+        ours = policy_of(together, 1, group)
+        for key, value in policy_of(alone, 0, group).items():
             torch.testing.assert_close(ours[key], value, rtol=1e-4, atol=1e-5)
 
 
-@every_rl
+@every_kind
 def test_restored_experts_go_on_bit_for_bit(name):
     def play(experts, steps):
         for step in steps:
@@ -260,17 +276,17 @@ def test_restored_experts_go_on_bit_for_bit(name):
             ours, theirs = (tensors_of(one, seed, slot) for one in (experts, restored))
             assert not differing(ours, theirs)
         for group in range(6):
-            ours, theirs = (one.actor_weights(seed, group) for one in (experts, restored))
+            ours, theirs = (policy_of(one, seed, group) for one in (experts, restored))
             assert not differing(ours, theirs)
 
 
 def test_an_expert_that_rests_is_left_as_it_is_and_one_that_does_not_is_not():
-    experts, seen = make("td3", most=3, rest_after=5), {}
+    experts, seen = make("both", most=3, rest_after=5), {}
     # Group 0 rests from the fifth step after its own until it is played again.
     for step, group in enumerate([0, 1, 1, 1, 1, *[1] * 7, 0, 0]):
         experts.play([group, 0])
         learn(experts, step)
-        seen[step] = experts.actor_weights(0, 0)
+        seen[step] = policy_of(experts, 0, 0)
         assert (experts.active.groups[0] == [1]) == (5 <= step < 12)
     assert differing(seen[2], seen[4])
     assert not any(differing(seen[step], seen[4]) for step in range(5, 12))

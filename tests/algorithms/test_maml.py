@@ -93,5 +93,4 @@ def test_testing_adapts_to_as_many_demonstrations_of_the_task_as_training(
     steps = bank.seen().steps
     latents = steps.latents(torch.arange(len(steps.latent)))
     is_shown = (first["latent"].unsqueeze(-2) == latents).all(-1).any(-1)
-    assert is_shown.equal(first["demonstrated"])
     assert (is_shown.sum(-1) == 5).all()  # a share of .25

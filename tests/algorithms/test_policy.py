@@ -1,4 +1,4 @@
-"""Policies of test episodes, one by one and stacked."""
+"""Policies of test episodes."""
 
 import itertools
 
@@ -13,36 +13,21 @@ KEYS = ["state", "context"]
 TEMPLATE = Actor(3 + 2, 4, in_keys=KEYS, hidden_sizes=(8,))
 
 
-NETWORK = torch.tensor([[0, 1], [1, 1], [2, 0]])
-
-
-def make(seed, batch_size):
-    """A policy of one network or of three, conditioned for 3 x 2 episodes."""
-    generator = torch.Generator().manual_seed(seed)
-    actor = Actor(5, 4, in_keys=KEYS, hidden_sizes=(8,), batch_size=batch_size, generator=generator)
+@pytest.mark.parametrize("number", [1, 3])
+def test_each_test_episode_is_played_by_its_network(number):
+    """With its own context; the template keeps its weights."""
+    generator = torch.Generator().manual_seed(0)
+    actor = Actor(5, 4, in_keys=KEYS, hidden_sizes=(8,), batch_size=(number,), generator=generator)
     parameters = {key: value.detach() for key, value in actor.named_parameters()}
-    context = torch.randn(3, 2, 2, generator=generator)
-    return Policy(TEMPLATE, "state", parameters, context, NETWORK if batch_size else None)
-
-
-@pytest.mark.parametrize("batch_size", [(), (3,)])
-def test_a_stack_acts_as_each_of_its_policies_does(batch_size):
-    policies = [make(seed, batch_size) for seed in (1, 2)]
-    state = torch.randn(2, 3, 2, 3, generator=torch.Generator().manual_seed(0))
-    actions = Policy.stack(policies).act(state)
-    assert not actions.requires_grad
-    for seed, task, episode in itertools.product(range(2), range(3), range(2)):
-        policy, where = policies[seed], NETWORK[task, episode] if batch_size else ()
-        alone = Actor(5, 4, in_keys=KEYS, hidden_sizes=(8,))
-        alone.load_state_dict({k: v[where] for k, v in policy.parameters.items()})
-        one = {"state": state[seed, task, episode], "context": policy.context[task, episode]}
-        action = alone(TensorDict(one))["action"].detach()
-        torch.testing.assert_close(actions[seed, task, episode], action)
-        torch.testing.assert_close(policy.act(state[seed])[task, episode], action)
-
-
-def test_the_template_keeps_its_weights():
+    network = torch.arange(6).view(3, 2) % number
+    context, state = torch.randn(3, 2, 5, generator=generator).split([2, 3], -1)
     before = [p.clone() for p in TEMPLATE.parameters()]
-    make(1, ()).act(torch.zeros(3, 2, 3))
+    actions = Policy(TEMPLATE, "state", parameters, context, network).act(state)
+    assert not actions.requires_grad
+    for where in itertools.product(range(3), range(2)):
+        alone = Actor(5, 4, in_keys=KEYS, hidden_sizes=(8,))
+        alone.load_state_dict({k: v[network[where]] for k, v in parameters.items()})
+        one = TensorDict({"state": state[where], "context": context[where]})
+        torch.testing.assert_close(actions[where], alone(one)["action"].detach())
     for ours, theirs in zip(TEMPLATE.parameters(), before, strict=True):
         assert ours.equal(theirs)

@@ -7,7 +7,6 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from bgpo_trl.algorithms.algorithm import Policy
 from bgpo_trl.modules.actor_critic import Actor
 from bgpo_trl.seeding import generators
 from bgpo_trl.transforms import TaskSchedule
@@ -45,7 +44,7 @@ def test_training_episodes_are_played_by_the_network_of_their_task_with_noise(ma
     def watch(chosen):
         for index, source in enumerate(noise):
             task = int(chosen["task"][index])
-            network = weights_of(algorithm.loss.actor_network_params, index, task)
+            network = weights_of(algorithm.learner.loss.actor_network_params, index, task)
             action = perceptron(network, chosen["state"][index]).tanh()
             noisy = action + 0.3 * torch.randn(4, generator=source)
             torch.testing.assert_close(chosen["action"][index], noisy.clamp(-1, 1))
@@ -55,7 +54,9 @@ def test_training_episodes_are_played_by_the_network_of_their_task_with_noise(ma
     play(algorithm, 40, watch=watch)
     assert clamped == {True, False}
     assert tasks == {0, 1, 2}
-    ours, theirs = (weights_of(algorithm.loss.actor_network_params, 0, task) for task in (0, 1))
+    ours, theirs = (
+        weights_of(algorithm.learner.loss.actor_network_params, 0, task) for task in (0, 1)
+    )
     assert not ours["mlp.layers.1.weight"].equal(theirs["mlp.layers.1.weight"])
 
 
@@ -78,11 +79,11 @@ def test_the_first_update_comes_after_the_warm_up_when_some_task_fills_a_batch_f
 def test_tasks_that_are_never_presented_make_no_difference(make, name):
     ddpg = replace(make(name).config.rl, warmup_steps=10)  # as many as three tasks need
     three, one = (make(name, schedule=TaskSchedule(s), rl=ddpg) for s in ((0, 99, 99), (0,)))
-    start = deepcopy(networks(three.loss))
+    start = deepcopy(networks(three.learner.loss))
     ours, theirs = play(three, 30)[0], play(one, 30)[0]
     torch.testing.assert_close(ours["action"], theirs["action"], rtol=1e-4, atol=1e-5)
-    alone = networks(one.loss)
-    for key, value in networks(three.loss).items():
+    alone = networks(one.learner.loss)
+    for key, value in networks(three.learner.loss).items():
         if value.shape[1] != N_TASKS:  # MAML's own policy, which all tasks share
             torch.testing.assert_close(value, alone[key], rtol=1e-4, atol=1e-5)
             continue
@@ -125,7 +126,9 @@ def test_tasks_can_share_a_batch_in_equal_parts(make, name):
 def test_networks_stay_as_they_were_until_there_is_data_of_their_task(make, name):
     """But for MAML's policies, which start from one that learns from all tasks."""
     algorithm = make(name)
-    own = [v for key, v in networks(algorithm.loss).items() if name != "maml" or "value" in key]
+    own = [
+        v for key, v in networks(algorithm.learner.loss).items() if name != "maml" or "value" in key
+    ]
     start = [value.clone() for value in own]
     counts, learned = torch.zeros(2, N_TASKS).long(), torch.zeros(2, N_TASKS).bool()
     stages, state = [], algorithm.world.env.reset()
@@ -150,18 +153,17 @@ def test_snapshots_are_copies_that_act_as_plain_networks_and_leave_no_trace(make
     algorithm = make(name)
     _, state = play(algorithm, 40)
     before = deepcopy(algorithm.state_dict())
-    gradients = [deepcopy(p.grad) for p in algorithm.loss.parameters()]
+    gradients = [deepcopy(p.grad) for p in algorithm.learner.loss.parameters()]
     frozen = [snapshot(algorithm, index) for index in range(2)]
     assert_same(algorithm.state_dict(), before)
-    assert_same([p.grad for p in algorithm.loss.parameters()], gradients)
+    assert_same([p.grad for p in algorithm.learner.loss.parameters()], gradients)
 
     shown = torch.randn(2, N_TASKS, 2, SIZE, generator=torch.Generator().manual_seed(0))
-    actions = Policy.stack(frozen).act(shown)
-    for index in range(2):
+    for policy, state in zip(frozen, shown, strict=True):
         alone = Actor(SIZE, in_keys=["state"], hidden_sizes=(64,), batch_size=[N_TASKS])
-        alone.load_state_dict(frozen[index].parameters)
-        expected = alone(TensorDict({"state": shown[index]}, [N_TASKS, 2]))["action"]
-        torch.testing.assert_close(actions[index], expected)
+        alone.load_state_dict(policy.parameters)
+        expected = alone(TensorDict({"state": state}, [N_TASKS, 2]))["action"]
+        torch.testing.assert_close(policy.act(state), expected)
 
     parameters = frozen[1].parameters
     copied = deepcopy(parameters)
@@ -179,7 +181,7 @@ def test_demonstrations_are_never_read(make, name):
     theirs, _ = play(blind, 40, hidden=["demo_embedding"])
     for key in ("action", "state", "demo_index", ("next", "reward")):
         assert ours[key].equal(theirs[key]), key
-    assert_same(dict(seeing.loss.state_dict()), dict(blind.loss.state_dict()))
+    assert_same(dict(seeing.learner.loss.state_dict()), dict(blind.learner.loss.state_dict()))
     for index in range(2):
         nothing = snapshot(blind, index, embedding=float("nan"))
         assert_same(snapshot(seeing, index).parameters, nothing.parameters)
@@ -213,4 +215,4 @@ def test_a_replay_too_small_to_fill_a_batch_is_refused(make, make_config):
 
 @both
 def test_targets_are_clipped_to_the_attainable_returns(make, name):
-    assert make(name).loss.return_bounds == (0.0, 1.0)
+    assert make(name).learner.loss.return_bounds == (0.0, 1.0)

@@ -38,30 +38,40 @@ def show(replay, *shown):
 
 
 @pytest.fixture
-def shown(bank):
-    replay = make(bank.seen())
-    show(
-        replay,
-        [(3, 1.0, 0), (5, 1.02, 0)],
-        [(7, 1.05, 1), (9, 1.0, 0)],
-        [(3, 1.07, 0), (11, 1.1, 2)],
-    )
-    return replay
+def make_shown(bank):
+    def make_shown(**options):
+        replay = make(bank.seen(), **options)
+        show(
+            replay,
+            [(3, 1.0, 0), (5, 1.02, 0)],
+            [(7, 1.05, 1), (9, 1.0, 0)],
+            [(3, 1.07, 0), (11, 1.1, 2)],
+        )
+        return replay
+
+    return make_shown
+
+
+@pytest.fixture
+def shown(make_shown):
+    return make_shown()
 
 
 GROUP = torch.tensor([[0, 0, 1, -1, 2], [0, 2, 2, 0, 1]])
 
 
-def transitions(steps, index):
-    """All of a demonstration's, from its frames: latent, action, next latent, whether it ends."""
+def transitions(steps, index, n_steps):
+    """All of a demonstration's, from its frames: latent, action, steps, next latent, the end."""
     frames = torch.arange(int(steps.length[index])) + steps.first[index]
     latents, actions = steps.latents(frames), steps.actions(frames)
     n = len(frames) - 1
-    return [(latents[t], actions[t], latents[t + 1], t == n - 1) for t in range(n)]
+    of_each = [(t, min(n_steps, n - t)) for t in range(n)]
+    return [(latents[t], actions[t], k, latents[t + k], t + k == n) for t, k in of_each]
 
 
-def test_transitions_are_the_steps_of_what_was_shown_in_the_rows_group(shown, bank):
-    steps = bank.seen().steps
+@pytest.mark.parametrize("n_steps", [1, 3])
+def test_transitions_are_the_steps_of_what_was_shown_in_the_rows_group(make_shown, bank, n_steps):
+    shown, steps = make_shown(n_steps=n_steps, gamma=0.5), bank.seen().steps
     told = {  # seed and group: demonstrations with their rewards
         (0, 0): {3: {1.0, 1.07}},
         (0, 1): {7: {1.05}},
@@ -79,13 +89,14 @@ def test_transitions_are_the_steps_of_what_was_shown_in_the_rows_group(shown, ba
             one = drawn[seed, row]
             index = int(one["behavior"][0])
             assert one["behavior"][1] == one["label"] == seed
-            of_index = transitions(steps, index)
+            of_index = transitions(steps, index, n_steps)
             (place,) = (t for t, step in enumerate(of_index) if step[0].equal(one["latent"]))
-            _, action, following, ends = of_index[place]
+            _, action, n_taken, following, ends = of_index[place]
             assert one["action"].equal(action)
+            assert one.get("steps_to_next_obs", torch.tensor([1])).tolist() == [n_taken]
             assert one["next", "latent"].equal(following)
             assert one["next", "terminated"].tolist() == [ends]
-            rewards = told[key][index] if ends else {0.0}
+            rewards = {0.5 ** (n_taken - 1) * r for r in told[key][index]} if ends else {0.0}
             assert min(abs(float(one["next", "reward"]) - r) for r in rewards) < 1e-6
             found[key].add((index, place))
     for key, of_group in told.items():
@@ -93,20 +104,26 @@ def test_transitions_are_the_steps_of_what_was_shown_in_the_rows_group(shown, ba
         assert found[key] == every
 
 
-def test_noise_is_on_states_alone_and_a_seeds_own_however_many_slots_are_free(bank):
-    quiet, noisy, wide = (make(bank.seen(), noise=noise) for noise in (0.0, 0.4, 0.4))
-    for replay in (quiet, noisy, wide):
-        show(replay, [(3, 1.0, 0), (5, 1.0, 0)], [(4, 1.0, 0), (6, 1.0, 0)])
+def test_what_is_to_be_imitated_are_the_same_draws_with_noise_on_the_states_alone(make_shown):
+    """A seed's own noise, however many slots are free."""
+    plain, quiet, noisy, wide = (make_shown(n_steps=3) for _ in range(4))
     group = torch.zeros(2, 4_000, dtype=torch.int64)
-    plain, drawn = quiet.sample(group), noisy.sample(group)
-    for key in ("action", ("next", "latent"), ("next", "reward"), "behavior"):
-        assert plain[key].equal(drawn[key])
-    noise = drawn["latent"] - plain["latent"]
+    sampled, still, drawn = (
+        plain.draw(group),
+        quiet.draw_actions(group, 0.0),
+        noisy.draw_actions(group, 0.4),
+    )
+    assert {*drawn} == {"latent", "action", "priority_weight", *CONSTANT}
+    for key, value in still.items():
+        assert sampled[key].equal(value)
+        assert drawn[key].equal(value) == (key != "latent")
+    noise = drawn["latent"] - still["latent"]
     assert float(noise.mean()) == pytest.approx(0.0, abs=0.01)
     assert float(noise.std()) == pytest.approx(0.4, abs=0.01)
     free = torch.full([2, 4_000], -1)
-    spread = wide.sample(torch.stack([group, free], -1).view(2, -1))
-    assert spread[:, ::2]["latent"].equal(drawn["latent"])
+    spread = wide.draw_actions(torch.stack([group, free], -1).view(2, -1), 0.4)
+    assert spread["latent"][:, ::2].equal(drawn["latent"])
+    assert not spread["priority_weight"][:, 1::2].any()
 
 
 def test_constants_are_of_any_demonstration_of_the_group_if_not_its_own(bank):

@@ -87,6 +87,59 @@ def test_a_row_is_drawn_from_what_is_left_of_its_group(
                 assert bool(drawn["next", "terminated"][seed, row]) == (seed == 1)
 
 
+@settings(max_examples=80)
+@given(
+    capacity=st.integers(1, 12),
+    n_steps=st.integers(2, 4),
+    played=st.lists(
+        st.tuples(
+            st.integers(0, 2), st.sampled_from(["on", "on", "success", "time-out"]), st.booleans()
+        ),
+        min_size=1,
+        max_size=40,
+    ),
+    restored=st.booleans(),
+)
+def test_a_transition_of_several_steps_is_a_plain_walk(capacity, n_steps, played, restored):
+    """To the end of its episode, or to the newest step; whatever has been overwritten."""
+    keys = ["latent", *(("next", key) for key in ("latent", "reward", "terminated", "done"))]
+
+    def make_replay(first):
+        sources = generators(2, first)
+        return GroupReplay(capacity, generator=sources, keys=keys, n_steps=n_steps, gamma=0.5)
+
+    replay, held = make_replay(0), [[], []]
+    for step, (group, ends, both) in enumerate(played):
+        # Latents are numbers of steps, and rewards tell steps apart, also those before the end.
+        flags = {"terminated": ends == "success", "done": ends != "on"}
+        both = both or step == 0
+        for kept in held[: 1 + both]:
+            kept.append((group, step, step + 1, (step % 7) / 7, *flags.values()))
+            del kept[:-capacity]
+        following = {key: torch.full([2, 1], value) for key, value in flags.items()}
+        following |= {"latent": torch.full([2, 1], step + 1.0)}
+        following |= {"reward": torch.full([2, 1], (step % 7) / 7)}
+        data = TensorDict({"latent": torch.full([2, 1], float(step)), "next": following}, [2])
+        replay.add(data, torch.tensor([group, group]), torch.tensor([True, both]))
+    if restored:
+        state, replay = through_a_file(replay.state_dict()), make_replay(7)
+        replay.load_state_dict(state)
+    drawn = replay.sample(torch.arange(3).repeat_interleave(15).expand(2, 45))
+    for seed, kept in enumerate(held):
+        steps = [entry[1] for entry in kept]
+        for row in drawn[seed][drawn["priority_weight"][seed] > 0]:
+            at = steps.index(int(row["latent"]))
+            walk = kept[at : at + n_steps]
+            n_walked = next((n for n, entry in enumerate(walk, 1) if entry[-1]), len(walk))
+            last = walk[n_walked - 1]
+            reward = sum(0.5**n * entry[3] for n, entry in enumerate(walk[:n_walked]))
+            assert row["steps_to_next_obs"].tolist() == [n_walked]
+            assert row["next", "latent"].tolist() == [last[2]]
+            assert row["next", "reward"].item() == pytest.approx(reward)
+            assert row["next", "terminated"].item() == last[4]
+            assert row["next", "done"].item() == last[5]
+
+
 def test_entries_are_drawn_as_they_are_sampled_also_some_of_them():
     groups, asked = [(0, 1), (1, 1), (0, 0), (2, 1)], torch.tensor([[0, 1, 0, -1], [1, 1, 0, 7]])
     first, second, third = make(), make(), make()
@@ -227,16 +280,23 @@ def test_a_cleared_seed_draws_nothing_and_then_only_what_it_stores_anew(restored
     assert drawn["priority_weight"][1].tolist() == [1, 1, 1, 0]
 
 
-def test_rows_of_the_only_seed_are_zeros_where_memory_is_not(monkeypatch):
-    replay, restored = make(10, n_seeds=1), make(10, n_seeds=1)
-    fill(replay, [(0,)])
+@pytest.mark.parametrize("n_steps", [1, 3])
+def test_rows_of_the_only_seed_are_zeros_where_memory_is_not(monkeypatch, n_steps):
+    keys = ["latent", ("next", "reward"), ("next", "done")]
+    replay, restored = (
+        GroupReplay(10, generator=generators(1), keys=keys, n_steps=n_steps) for _ in range(2)
+    )
+    following = {"reward": torch.ones(1, 1), "done": torch.ones(1, 1, dtype=torch.bool)}
+    data = TensorDict({"latent": torch.ones(1, 1), "next": following}, [1])
+    replay.add(data, torch.tensor([0]))
     replay.clear(0)
     state = through_a_file(replay.state_dict())
     monkeypatch.setattr(
         torch, "empty", lambda *shape, dtype: torch.full(shape, torch.nan).to(dtype)
     )
     restored.load_state_dict(state)
-    assert not restored.sample(torch.tensor([[-1]]))["latent"].any()
+    drawn = restored.sample(torch.tensor([[-1]]))
+    assert not any(drawn[key].any() for key in (*keys, "priority_weight"))
 
 
 BAD = {

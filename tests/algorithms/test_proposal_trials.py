@@ -1,0 +1,92 @@
+"""Who plays an episode, the clone or what critics choose: against plain lists of outcomes."""
+
+import copy
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bgpo_trl.algorithms.proposal_trials import ProposalTrials
+
+
+def play(trials, outcomes, group=7, seed=0):
+    """Play an episode for each outcome; return who played, True for the clone."""
+    played = []
+    for success in outcomes:
+        played.append(trials.begin(seed, group))
+        trials.end(seed, success)
+    return played
+
+
+@settings(max_examples=40)
+@given(
+    first=st.integers(0, 6),
+    share=st.sampled_from([0.0, 0.1, 0.25, 0.4, 0.9]),
+    n_episodes=st.integers(0, 150),
+    rates=st.tuples(st.floats(0, 1), st.floats(0, 1)),
+    seed=st.integers(0, 99),
+    restored=st.booleans(),
+)
+def test_the_clone_has_its_share_of_training_and_tests_until_the_choice_is_as_good(
+    first, share, n_episodes, rates, seed, restored
+):
+    def make():
+        return ProposalTrials(2, clone_episodes=first, clone_share=share)
+
+    trials, rng = make(), np.random.default_rng(seed)
+    outcomes, later = {True: [], False: []}, []
+    for number in range(n_episodes):
+        alone = trials.begin(1, 7)
+        assert trials.only_clone == [False, alone]
+        assert alone or number >= first
+        later += [alone] if number >= first else []
+        assert sum(later) == pytest.approx(share * len(later), abs=1)  # at any time
+        outcomes[alone].append(rng.random() < rates[alone])
+        trials.end(1, outcomes[alone][-1])
+        if restored:
+            state, trials = trials.state_dict(), make()
+            trials.load_state_dict(state)
+    means = {}
+    for alone, of_both in outcomes.items():
+        weight = 0.97 ** np.arange(len(of_both))[::-1]
+        means[alone] = weight @ of_both / weight.sum() if of_both else 0.0
+    if len(outcomes[False]) < 20 or abs(means[True] - means[False]) > 1e-9:
+        expected = len(outcomes[False]) < 20 or means[False] < means[True]
+        assert trials.clone_is_better(1, 7) == expected
+    assert trials.clone_is_better(0, 7) and trials.clone_is_better(1, 3)  # of others, nothing
+
+
+def test_the_rules_by_hand():
+    trials = ProposalTrials(1, clone_episodes=3, clone_share=0.25)
+    assert play(trials, [True] * 11) == [True] * 3 + [False, False, False, True] * 2
+    assert play(trials, [True] * 17).count(False) == 13 and trials.clone_is_better(0, 7)  # 19
+    play(trials, [True])
+    assert not trials.clone_is_better(0, 7)  # 20, and as good
+    while trials.begin(0, 7):
+        trials.end(0, True)
+    trials.end(0, False)
+    assert trials.clone_is_better(0, 7)
+    while not trials.begin(0, 7):
+        trials.end(0, True)
+    trials.end(0, False)  # the clone's latest failure weighs more than the choice's older one
+    assert not trials.clone_is_better(0, 7)
+
+
+def test_a_group_that_joins_another_brings_its_counts():
+    trials = ProposalTrials(1, clone_episodes=2, clone_share=0.0)
+    for group, outcomes in ((7, [True, False, True]), (4, [False, True, False, False])):
+        play(trials, outcomes, group)
+    before = copy.deepcopy(trials.state_dict()["groups"][0])
+    trials.merge(0, 7, 4)
+    trials.merge(0, 7, 9)  # it was never played
+    (counts,) = trials.state_dict()["groups"][0].items()
+    assert counts[0] == 7
+    assert counts[1]["episodes"] == 7
+    for kind in ("clone", "choice"):
+        assert counts[1][kind] == [
+            sum(pair) for pair in zip(before[7][kind], before[4][kind], strict=True)
+        ]
+    trials.merge(0, 5, 7)
+    assert trials.state_dict()["groups"][0] == {5: counts[1]}
+    assert play(trials, [True], group=5) == [False]
