@@ -73,20 +73,11 @@ def test_the_rules_by_hand():
     assert not trials.clone_is_better(0, 7)
 
 
-def test_a_group_that_joins_another_brings_its_counts():
+def test_a_group_that_is_no_more_is_forgotten():
     trials = ProposalTrials(1, clone_episodes=2, clone_share=0.0)
-    for group, outcomes in ((7, [True, False, True]), (4, [False, True, False, False])):
-        play(trials, outcomes, group)
-    before = copy.deepcopy(trials.state_dict()["groups"][0])
-    trials.merge(0, 7, 4)
-    trials.merge(0, 7, 9)  # it was never played
-    (counts,) = trials.state_dict()["groups"][0].items()
-    assert counts[0] == 7
-    assert counts[1]["episodes"] == 7
-    for kind in ("clone", "choice"):
-        assert counts[1][kind] == [
-            sum(pair) for pair in zip(before[7][kind], before[4][kind], strict=True)
-        ]
-    trials.merge(0, 5, 7)
-    assert trials.state_dict()["groups"][0] == {5: counts[1]}
-    assert play(trials, [True], group=5) == [False]
+    for group in (7, 4):
+        play(trials, [True, False, True], group)
+    kept = copy.deepcopy(trials.state_dict()["groups"][0][7])
+    trials.keep(0, [7, 9])
+    assert trials.state_dict()["groups"][0] == {7: kept}
+    assert play(trials, [True], group=4) == [True]  # a number that returns begins anew

@@ -159,11 +159,11 @@ def test_snapshots_are_copies_that_act_as_plain_networks_and_leave_no_trace(make
     assert_same([p.grad for p in algorithm.learner.loss.parameters()], gradients)
 
     shown = torch.randn(2, N_TASKS, 2, SIZE, generator=torch.Generator().manual_seed(0))
-    for policy, state in zip(frozen, shown, strict=True):
+    for policy, of_seed in zip(frozen, shown, strict=True):
         alone = Actor(SIZE, in_keys=["state"], hidden_sizes=(64,), batch_size=[N_TASKS])
         alone.load_state_dict(policy.parameters)
-        expected = alone(TensorDict({"state": state}, [N_TASKS, 2]))["action"]
-        torch.testing.assert_close(policy.act(state), expected)
+        expected = alone(TensorDict({"state": of_seed}, [N_TASKS, 2]))["action"]
+        torch.testing.assert_close(policy.act(of_seed), expected)
 
     parameters = frozen[1].parameters
     copied = deepcopy(parameters)
