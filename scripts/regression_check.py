@@ -29,8 +29,8 @@ RUNS = {
     "gwr": f"concurrent_tasks.py --algorithm without-bonus {_SHORT}",
     "maml": f"continual.py --algorithm maml {_SHORT}",
     "dist-nll": f"continual.py --algorithm dist-nll {_SHORT}",
-    "td3": f"continual.py --rl td3 {_SHORT}",
-    "sac": f"continual.py --rl sac {_SHORT}",
+    "clone": f"continual.py --algorithm clone {_SHORT}",
+    "paper": f"continual.py --algorithm bgpo-paper {_SHORT}",
 }
 """Arguments of each run, by its name."""
 _TABLES = ("train.csv", "eval.csv", "final.csv", "gwr.csv")

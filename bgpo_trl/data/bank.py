@@ -215,7 +215,7 @@ class DemonstrationBank:
         if self.encoder_id != other.encoder_id:
             raise ValueError(
                 f"one bank was embedded by the encoders {self.encoder_id}, the other by "
-                f"{other.encoder_id}: embed both by the same (bgpo_trl.encoders.make_bank)"
+                f"{other.encoder_id}: embed both by the same (`bgpo bank`)"
             )
         if self.scene != other.scene:
             raise ValueError(
@@ -276,9 +276,7 @@ class DemonstrationBank:
         Raises:
             ValueError: If it is missing, damaged, or was made by other encoders.
         """
-        remedy = (
-            "make it again with `python -m bgpo_trl.encoders.make_bank`, or use `--train-encoders`"
-        )
+        remedy = "make it again with `bgpo bank`, or use `--train-encoders`"
         try:
             tensors, meta = load_tensors(path)
             tasks = json.loads(meta["tasks"])

@@ -20,8 +20,7 @@ from bgpo_trl.scenes import SCENES, Scene, find_scene
 
 _META = "dataset.json"
 _REMEDY = (
-    "record it again with `python -m bgpo_trl.data.recording PATH` (a robot other than NICO: "
-    "--scene), or write it again"
+    "record it again with `bgpo record PATH` (a robot other than NICO: --scene), or write it again"
 )
 
 

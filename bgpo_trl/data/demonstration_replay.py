@@ -59,7 +59,7 @@ class DemonstrationReplay:
             row = int((bank.steps.length < 2).nonzero()[0])
             raise ValueError(
                 f"the bank has no steps of demonstration {row} to learn from: make it again with "
-                "`python -m bgpo_trl.encoders.make_bank`, or set demonstration_share to 0"
+                "`bgpo bank`, or set demonstration_share to 0"
             )
         self._steps = bank.steps
         self._generators = list(generator)

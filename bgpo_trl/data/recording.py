@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-import tyro
 from tensordict import TensorDict
 
 from bgpo_trl.data.dataset import (
@@ -24,7 +22,6 @@ from bgpo_trl.data.dataset import (
     write_meta,
 )
 from bgpo_trl.files.progress import progress_bar
-from bgpo_trl.plugins import import_plugin
 from bgpo_trl.scenes import Scene, find_scene
 
 if TYPE_CHECKING:
@@ -268,49 +265,3 @@ def _record_rows(
         dataset["train"][row] = row % per_task < n_shown
         # Written last, since a row whose length is 0 is recorded again.
         dataset["length"][row] = len(episode["pixels"])
-
-
-def main(
-    path: tyro.conf.Positional[Path],
-    scene: str = "nico",
-    tasks: tuple[str, ...] | None = None,
-    module: Annotated[str | None, tyro.conf.arg(name="import")] = None,
-    per_task: int = 1_200,
-    held_out_per_task: int = 200,
-    play: bool = False,
-    spread: float = 1.0,
-    seed: int = 0,
-) -> None:
-    """Record the dataset of demonstrations; the same command resumes an interrupted recording.
-
-    Args:
-        path: Folder of the dataset.
-        scene: Name of the robot.
-        tasks: Tasks to demonstrate; by default the scene's, for NICO the paper's three.
-        module: Module that adds scenes or tasks, imported first; here or installed.
-        per_task: Demonstrations of each task.
-        held_out_per_task: How many of those are held out for test episodes.
-        play: Record random play instead of demonstrations.
-        spread: Share of the whole range of start states.
-        seed: Seed of the start states and of the noise.
-    """
-    import_plugin(module)
-    record_demonstrations(
-        path,
-        scene=scene,
-        tasks=tasks,
-        per_task=per_task,
-        held_out_per_task=held_out_per_task,
-        play=play,
-        spread=spread,
-        seed=seed,
-    )
-
-
-if __name__ == "__main__":
-    try:
-        tyro.cli(main)
-    except (ValueError, OSError, RuntimeError) as error:
-        sys.exit(f"error: {error}")
-    except KeyboardInterrupt:
-        sys.exit("interrupted: the same command continues the recording")

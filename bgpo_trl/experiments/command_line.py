@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, get_type_hints
+from typing import Any, get_type_hints
 
 import tyro
 
@@ -83,10 +83,9 @@ def _printable(line: str) -> str:
 
 def _parse(kind: type, options: Sequence[str] | None, program: str | None, line: str) -> Any:
     """Return the arguments; flags of single settings are left to `run_config`."""
-    unprefixed: Any = Annotated[kind, tyro.conf.OmitArgPrefixes]
     description = "\n\n".join(filter(None, (line, inspect.getdoc(kind))))
     options = sys.argv[1:] if options is None else options
-    parse: Any = partial(tyro.cli, unprefixed, prog=program, description=description, args=options)
+    parse: Any = partial(tyro.cli, kind, prog=program, description=description, args=options)
     if "settings" not in get_type_hints(kind):
         return parse()
     if {"-h", "--help"} & {*options}:

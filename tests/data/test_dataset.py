@@ -43,7 +43,7 @@ def test_what_is_not_whole_is_refused_in_one_line(copy, damage, message):
         load_demonstrations(copy)
     assert "\n" not in str(error.value)
     if "resume" not in message:
-        assert "record it again with `python -m bgpo_trl.data.recording PATH`" in str(error.value)
+        assert "record it again with `bgpo record PATH`" in str(error.value)
 
 
 def test_a_flipped_byte_is_noticed(copy):

@@ -98,7 +98,7 @@ CASES = [
     ("bgpo continual --algorithm.beta 0.2 --presett quick", "--presett"),
     ("bgpo continual --algorithm.beta -1", "beta must be at least 0"),
     ("bgpo continual --episodes 1.5", "--episodes"),
-    ("studies/privileged_information.py ddpg --gamma 1.5", "gamma must be between 0 and 1"),
+    ("studies/privileged_information.py --rl.gamma 1.5", "gamma must be between 0 and 1"),
     ("bgpo watch", "Run directory"),
     ("bgpo encoders empty --config.vae.batch-size 0", "batch_size must be at least"),
 ]

@@ -98,7 +98,7 @@ episodes: 600
 spread: 1  # a whole number for a share
 algorithm:
   beta: 0.2
-  rl: {name: sac, learning_rate: 3e-4}
+  rl: {learning_rate: 3e-4}
 """
 
 
@@ -110,7 +110,6 @@ def test_yaml_json_and_flags_store_the_same_settings(tmp_path):
     in_json.write_text(json.dumps(content))
     flags = Arguments(
         algorithm="bgpo-single",
-        rl="sac",
         tasks=("grasp_glass", "push_green_to_glass"),
         episodes=600,
         settings=(
@@ -147,9 +146,6 @@ def test_a_yaml_file_that_is_damaged_or_has_wrong_settings_is_refused(
     [
         ({"episodes": 10, "settings": ("--eval-every", "50")}, "eval_every"),
         ({"tasks": ("dance",)}, "'dance'"),
-        ({"rl": "ppo"}, "'ppo'"),
-        ({"algorithm": "bgpo-paper", "rl": "sac"}, "bgpo-paper"),
-        ({"algorithm": "maml", "rl": "td3"}, "MAML"),
         # Where all tasks begin at once.
         ({"settings": ("--task-starts", "0", "5", "5")}, "--task-starts"),
     ],

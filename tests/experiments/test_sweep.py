@@ -40,8 +40,8 @@ def write_run(job):
     config, folder = job.config, job.directory
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "config.json").write_text(json.dumps(settings_of(config, SOME)))
-    tests = [HEAD]
-    for episode, seed in product(range(config.eval_every, config.episodes + 1), config.seeds):
+    tests, tested = [HEAD], range(config.eval_every, config.episodes + 1, config.eval_every)
+    for episode, seed in product(tested, config.seeds):
         tests += [f"{config.name},{seed},{episode},9,{task},1,1,5" for task in config.tasks]
     (folder / "eval.csv").write_text("\n".join(tests) + "\n")
 

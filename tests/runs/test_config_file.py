@@ -6,7 +6,6 @@ from dataclasses import asdict, dataclass, field, replace
 import pytest
 
 from bgpo_trl.algorithms import ALGORITHMS
-from bgpo_trl.algorithms.rl import RL
 from bgpo_trl.configs import PRESETS, BGPOConfig, GWRBConfig, RunConfig
 from bgpo_trl.runs.config_file import Digests, read_config, settings_of
 from suites import nico
@@ -18,13 +17,13 @@ def write(path, config, **changes):
 
 
 def test_settings_are_read_as_they_were_written(tmp_path):
-    for name, rl in [*((name, "ddpg") for name in ALGORITHMS), *(("bgpo", rl) for rl in RL)]:
-        rl = replace(RL[rl].config, hidden_sizes=(5, 7), gamma=0.5)
-        algorithm = replace(ALGORITHMS[name].config, state="state", rl=rl)
+    for name, entry in ALGORITHMS.items():
+        rl = replace(entry.config.rl, hidden_sizes=(5, 7), gamma=0.5)
+        algorithm = replace(entry.config, state="state", rl=rl)
         config = replace(PRESETS["quick"], name=name, algorithm=algorithm, checkpoint_minutes=3)
         read, digests = read_config(write(tmp_path / "config.json", config))
         assert (read, digests) == (config, Digests(encoders="abc", bank="def"))
-        assert type(read.algorithm) is type(algorithm) and type(read.algorithm.rl) is type(rl)
+        assert type(read.algorithm) is type(algorithm)
 
 
 @dataclass(frozen=True)
@@ -39,7 +38,7 @@ def test_hyperparameters_of_an_unknown_algorithm_have_the_stored_class(tmp_path,
     read = read_config(path)[0].algorithm
     assert type(read) is CoarseConfig and read.coarse == coarse
     path.write_text(path.read_text().replace("null", "7").replace("0.777", '"high"'))
-    with pytest.raises(ValueError, match=r"algorithm\.coarse"):
+    with pytest.raises(ValueError, match=r"algorithm(: |\.)coarse"):
         read_config(path)
 
 
@@ -78,7 +77,6 @@ def nested(**rl):
         (nested(momentum=0.9), "unknown setting algorithm.rl.momentum"),
         (nested(gamma="0.9"), "algorithm.rl: gamma must be a number, got 0.9"),
         (nested(hidden_sizes=[5, 0.5]), "algorithm.rl: hidden_sizes must be a tuple, each a whole"),
-        (nested(name="ppo"), "algorithm.rl.name is 'ppo', not a known RL algorithm"),
         ({"algorithm": 3}, "no settings of a run"),
         ({"name": "mine", "algorithm_class": "os.path"}, "of 'mine', whose hyperparameters no im"),
     ],
