@@ -29,8 +29,6 @@ RUNS = {
     "gwr": f"concurrent_tasks.py --algorithm without-bonus {_SHORT}",
     "maml": f"continual.py --algorithm maml {_SHORT}",
     "dist-nll": f"continual.py --algorithm dist-nll {_SHORT}",
-    "td3": f"continual.py --rl td3 {_SHORT}",
-    "sac": f"continual.py --rl sac {_SHORT}",
 }
 """Arguments of each run, by its name."""
 _TABLES = ("train.csv", "eval.csv", "final.csv", "gwr.csv")
