@@ -11,7 +11,6 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from bgpo_trl.objectives.off_policy import ForeachSoftUpdate
 from tensordict import TensorDict
 from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv
 

@@ -16,7 +16,6 @@ import tyro
 
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.algorithms.bgpo import BGPO
-from bgpo_trl.algorithms.rl import RL
 from bgpo_trl.experiments.arguments import Arguments
 from bgpo_trl.experiments.settings import run_config
 from bgpo_trl.scenes.nico import NicoEnv
@@ -96,9 +95,8 @@ def run(script, arguments, monkeypatch):
 def test_the_python_of_a_page_runs_from_top_to_bottom(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     namespace = {}
-    # Restores the registries to which pages add entries.
-    registries = mock.patch.dict(ALGORITHMS), mock.patch.dict(RL)
-    with torch.random.fork_rng(devices=[]), registries[0], registries[1]:
+    # Restores the registry to which pages add entries.
+    with torch.random.fork_rng(devices=[]), mock.patch.dict(ALGORITHMS):
         torch.manual_seed(0)
         for number, block in enumerate(blocks(page, "python"), 1):
             exec(compile(block, f"{page.name}, python block {number}", "exec"), namespace)

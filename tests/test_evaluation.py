@@ -12,7 +12,7 @@ from bgpo_trl.algorithms import entry
 from bgpo_trl.algorithms.algorithm import Policy
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.evaluation import Evaluator, evaluate_random_policy
-from bgpo_trl.modules.actor_critic import Actor
+from bgpo_trl.modules.actor_critic import Actor, Critic, ProposalPolicy
 from bgpo_trl.modules.multi_head_actor import MultiHeadActor
 from bgpo_trl.seeding import stream_seed
 from bgpo_trl.transforms import TaskSchedule
@@ -63,19 +63,22 @@ def train(algorithm, n_steps):
         algorithm.store(transition)
 
 
-def last_layers(algorithm):
-    """The last layers of the policies that play test episodes."""
+def last_biases(algorithm):
+    """The biases of the last layers of the policies that play test episodes."""
     if hasattr(algorithm, "students"):
-        return [head for student in algorithm.students for head in student.heads]
-    actor = getattr(algorithm, "meta_actor", None) or algorithm.learner.actor
-    return [actor.mlp.layers[-1]]
+        return [head.bias for student in algorithm.students for head in student.heads]
+    if hasattr(algorithm, "meta_actor"):
+        return [algorithm.meta_actor.mlp.layers[-1].bias]
+    named = algorithm.learner.loss.named_parameters()
+    last = ("actor_network_params.mlp.layers.1.bias", "clone_network_params.mlp.layers.1.bias")
+    return [parameter for name, parameter in named if name in last]
 
 
 @torch.no_grad()
 def turn(algorithm):
     """Make a policy turn the arm after some steps, which depend on its input."""
-    for layer in last_layers(algorithm):
-        layer.bias.add_(0.1)
+    for bias in last_biases(algorithm):
+        bias.add_(0.1)
 
 
 def take(evaluator, algorithm, number=0):
@@ -105,9 +108,12 @@ def plain_policy(algorithm, snapshot, index, task, episode, phi):
         policy = Actor(algorithm.state_size, **size)
         policy.load_state_dict({key: value[task] for key, value in frozen.items()})
         return lambda seen: policy(TensorDict({state: seen}))["action"].detach()
-    n_features = algorithm.learner.actor.mlp.layers[0].in_features
-    policy = Actor(n_features, **{**size, "in_keys": algorithm.in_keys})
-    group = 0
+    n_features = algorithm.learner.loss.actor_network.mlp.layers[0].in_features
+    size["in_keys"], group = algorithm.in_keys, 0
+    policy = Actor(n_features, **size)
+    if algorithm.proposals is not None:
+        critics = Critic(n_features, layer_norm=True, batch_size=(5,), **size)
+        policy = ProposalPolicy(policy, Actor(n_features, **size), critics)
     if algorithm.config.experts:
         group = int(algorithm.groups[index].lookup(phi).group)
     policy.load_state_dict(algorithm.actor_weights(index, group))
@@ -240,14 +246,14 @@ def test_a_snapshot_does_not_change_with_further_training(make, name):
     policies = [replace(s.policy, **copy.deepcopy(s.policy.state_dict())) for s in snapshots]
     nodes = None if algorithm.gwr is None else algorithm.gwr.graph(0).weights
     with torch.no_grad():
-        for layer in last_layers(algorithm):
-            layer.bias.add_(2)
+        for bias in last_biases(algorithm):
+            bias.add_(2)
     train(algorithm, 20)
     if nodes is not None:
         assert not algorithm.gwr.graph(0).weights.equal(nodes)
     for snapshot, policy in zip(take(evaluator, algorithm), policies, strict=True):
         for key, value in policy.parameters.items():
-            assert not snapshot.policy.parameters[key].equal(value), key
+            assert key == "only_clone" or not snapshot.policy.parameters[key].equal(value), key
 
     for snapshot, policy in zip(snapshots, policies, strict=True):
         assert_same(snapshot.policy.state_dict(), policy.state_dict())

@@ -257,7 +257,7 @@ def test_wrong_results_of_an_algorithm_are_refused(
         begin(tmp_path, make_config("state", "ddpg", episodes=2)).run()
 
 
-@pytest.mark.parametrize("name", LEARNERS)
+@pytest.mark.parametrize("name", [*LEARNERS, "clone"])
 def test_a_run_interrupted_several_times_is_the_same(run_of, begin, config_of, tmp_path, name):
     """A signal waits for the end of the step; also if loggers are added to the resumed run."""
     config = config_of(name)

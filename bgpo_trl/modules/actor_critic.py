@@ -156,6 +156,7 @@ class ProposalPolicy(TensorDictModuleBase):
         torch.Size([10, 4])
     """
 
+    in_keys: list[NestedKey]
     only_clone: Tensor
 
     def __init__(self, actor: Actor, clone: Actor, critic: Critic) -> None:

@@ -6,11 +6,10 @@ import math
 import pytest
 import torch
 from tensordict import TensorDict
-from torch.distributions import Normal, TanhTransform, TransformedDistribution
 from torch.func import functional_call
 
 from bgpo_trl.modules.actor_critic import Actor, Critic
-from bgpo_trl.modules.multi_head_actor import GaussianActor, MultiHeadActor
+from bgpo_trl.modules.multi_head_actor import MultiHeadActor
 from bgpo_trl.modules.stacked_mlp import StackedLinear, StackedMLP
 
 
@@ -87,7 +86,7 @@ def test_layer_norm_is_the_textbook_one_before_each_relu():
 
 
 @pytest.mark.parametrize("stack", [(), (3,), (2, 5)])
-@pytest.mark.parametrize("network", [Actor, Critic, GaussianActor, MultiHeadActor])
+@pytest.mark.parametrize("network", [Actor, Critic, MultiHeadActor])
 def test_a_network_can_be_called_with_the_weights_of_any_stack(network, stack):
     """Weights of one seed, of other seeds than its own, and of seeds with several tasks each."""
 
@@ -105,43 +104,6 @@ def test_a_network_can_be_called_with_the_weights_of_any_stack(network, stack):
     assert other.batch_size == stack
     for key in other.out_keys:
         assert called[key].equal(expected[key])
-
-
-# ---- SAC's policy
-
-
-def gaussian(batch_size=(), generator=None):
-    network = {"in_keys": ["state"], "hidden_sizes": (8,), "batch_size": batch_size}
-    return GaussianActor(3, 2, generator=generator, **network)
-
-
-def gaussian_states(*shape, scale=1.0):
-    state = torch.randn(*shape, 3, generator=torch.Generator().manual_seed(0)) * scale
-    return TensorDict({"state": state}, shape)
-
-
-def test_actions_are_those_of_a_squashed_gaussian():
-    actor, noise = gaussian(), torch.randn(50, 2)
-    drawn = actor.sample(gaussian_states(50), noise)
-    pre_tanh = drawn["loc"] + drawn["scale"] * noise
-    assert drawn["action"].equal(pre_tanh.tanh())
-    # In double precision, since PyTorch's own inverts the tanh.
-    policy = TransformedDistribution(
-        Normal(drawn["loc"].double(), drawn["scale"].double()), TanhTransform()
-    )
-    expected = policy.log_prob(pre_tanh.double().tanh()).sum(-1).float()
-    torch.testing.assert_close(drawn["action_log_prob"], expected, rtol=1e-4, atol=1e-4)
-
-
-def test_log_probabilities_and_their_gradients_stay_finite_where_the_tanh_saturates():
-    actor = gaussian()
-    drawn = actor.sample(gaussian_states(20, scale=1e3), torch.full((20, 2), 50.0))
-    assert drawn["action"].abs().max() == 1
-    scale = drawn["scale"].log()
-    assert (scale.min().item(), scale.max().item()) == (pytest.approx(-5), pytest.approx(2))
-    drawn["action_log_prob"].sum().backward()
-    assert torch.isfinite(drawn["action_log_prob"]).all()
-    assert all(torch.isfinite(p.grad).all() for p in actor.parameters())
 
 
 # ---- the policy with a head for each task
