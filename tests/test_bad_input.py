@@ -23,7 +23,7 @@ from bgpo_trl.modules.gwr import GWRB
 from bgpo_trl.modules.multi_head_actor import MultiHeadActor
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
-from bgpo_trl.objectives.ddpg import DDPGLoss
+from bgpo_trl.objectives.ddpg import DDPGLoss, ForeachSoftUpdate
 from bgpo_trl.objectives.supervised import (
     DistillationLoss,
     SequenceReconstructionLoss,

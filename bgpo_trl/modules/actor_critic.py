@@ -161,14 +161,9 @@ class ProposalPolicy(TensorDictModuleBase):
 
     def __init__(self, actor: Actor, clone: Actor, critic: Critic) -> None:
         super().__init__()
-        self.out_keys = ["action"]
+        self.in_keys, self.out_keys = actor.in_keys, ["action"]
         self.actor, self.clone, self.critic = actor, clone, critic
         self.register_buffer("only_clone", torch.zeros(actor.batch_size, dtype=torch.bool))
-
-    @property
-    def in_keys(self) -> list[NestedKey]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Entries that the proposals are made from."""
-        return self.actor.in_keys
 
     @property
     def batch_size(self) -> torch.Size:
