@@ -18,7 +18,7 @@ from torchrl.record.loggers.common import Logger
 from bgpo_trl.algorithms import Algorithm, entry
 from bgpo_trl.configs import RunConfig
 from bgpo_trl.data.bank import DemonstrationBank
-from bgpo_trl.encoders.representation import Representation
+from bgpo_trl.encoders.representation import Representation, check_savable
 from bgpo_trl.evaluation import Evaluator
 from bgpo_trl.files.checkpoint import save_checkpoint
 from bgpo_trl.files.progress import progress_bar
@@ -109,6 +109,7 @@ class Trainer:
             self._scene.check_identity(bank.scene, "the bank", remedy)
         if encoders is not None:
             encoders.check_scene(self._scene, "the file of the encoders", remedy)
+            check_savable(encoders)  # The run could not be loaded.
         if bank.spread < config.spread:
             raise ValueError(
                 f"the bank was recorded at spread {bank.spread}, the run is at {config.spread}: "

@@ -8,7 +8,7 @@ part of the encoders' training reads the ground-truth ``state``.
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import matplotlib.image
@@ -30,6 +30,8 @@ from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
 from bgpo_trl.objectives.supervised import SequenceReconstructionLoss
 from bgpo_trl.scenes import StateColumns
+
+_GOOD_RECONSTRUCTION, _GOOD_NEAREST, _GOOD_INVERSE = 0.5, 0.9, 0.5
 
 
 def probe(
@@ -59,9 +61,11 @@ def probe(
         and ``inverse_r2_<component>`` (actions of the training demonstrations, as they are inferred
         for the bank; components have the names of the joints if there are as many),
         ``reconstruction`` (squared error per frame), ``mean_frame_reconstruction`` (the same for
-        the mean training frame, the level of an untrained VAE), ``sequence_mse`` (of standardized
+        the mean training frame, the level of an untrained VAE), ``moving_reconstruction`` (share
+        of the squared deviation from the mean frame that is reconstructed, of pixels that deviate
+        by a tenth of the range or more), ``sequence_mse`` (of standardized
         latents, so 1 is the level of predicting the mean), ``task_accuracy_linear``,
-        ``task_accuracy_nearest`` and ``active_dimensions``.
+        ``task_accuracy_nearest``, ``task_accuracy_chance`` and ``active_dimensions``.
 
     Raises:
         ValueError: If the dataset has no training or no held-out demonstrations.
@@ -91,6 +95,43 @@ def probe(
         matplotlib.image.imsave(content, picture.numpy(), format="png")
         write_whole(folder / "reconstructions.png", content.getvalue())
     return result
+
+
+def complaints(result: Mapping[str, float]) -> list[str]:
+    """Return what is not good about encoders, a line each with what to do; none if all is good.
+
+    Args:
+        result: Result of `probe`.
+
+    Examples:
+        >>> good = {"task_accuracy_nearest": 0.97, "task_accuracy_chance": 0.5}
+        >>> complaints({**good, "moving_reconstruction": 0.9, "inverse_r2": 0.8})
+        []
+        >>> for line in complaints({**good, "moving_reconstruction": 0.31}):
+        ...     print(line)
+        encoders reconstruct 31 % of what moves in frames: look for the objects in
+        reconstructions.png; train longer (vae.steps), lower vae.kl_weight, or show them larger
+    """
+    nearest, chance = result["task_accuracy_nearest"], result["task_accuracy_chance"]
+    lines = []
+    if result["moving_reconstruction"] < _GOOD_RECONSTRUCTION:
+        lines.append(
+            f"encoders reconstruct {result['moving_reconstruction']:.0%} of what moves in frames: "
+            "look for the objects in reconstructions.png; train longer (vae.steps), lower "
+            "vae.kl_weight, or show them larger"
+        )
+    if chance < 1 and nearest < _GOOD_NEAREST:
+        lines.append(
+            f"{nearest:.0%} of the held-out demonstrations are nearest to one of their own task, "
+            f"{chance:.0%} by chance: groups of behaviors will mix tasks; show objects larger, "
+            "train longer (vae.steps, lae.steps), or record more demonstrations"
+        )
+    if result.get("inverse_r2", 1.0) < _GOOD_INVERSE:
+        lines.append(
+            f"actions inferred from frames have an R2 of {result['inverse_r2']:.2f}: record more "
+            "play, train longer (inverse.steps), or use recorded actions (bank_actions)"
+        )
+    return [line.replace("%", " %") for line in lines]
 
 
 def ridge_predict(x: Tensor, y: Tensor, x_new: Tensor, penalty: float = 1e-4) -> Tensor:
@@ -199,12 +240,16 @@ def _probe_play(vae: VAE, play: TensorDictBase, columns: StateColumns | None) ->
 def _probe_tasks(
     phi: Tensor, task: Tensor, phi_held_out: Tensor, task_held_out: Tensor
 ) -> dict[str, float]:
-    """Return the accuracies of inferring a held-out demonstration's task from its embedding."""
+    """Return the accuracies of inferring a held-out demonstration's task from its embedding.
+
+    Chance is the share of the most frequent task.
+    """
     scores = ridge_predict(phi, torch.nn.functional.one_hot(task).float(), phi_held_out)
     nearest = torch.cdist(phi_held_out, phi).argmin(-1)
     return {
         "task_accuracy_linear": _mean(scores.argmax(-1) == task_held_out),
         "task_accuracy_nearest": _mean(task[nearest] == task_held_out),
+        "task_accuracy_chance": task_held_out.bincount().max().item() / len(task_held_out),
     }
 
 
@@ -240,15 +285,20 @@ def _probe_reconstruction(
     frames, frames_held_out = valid_frames(train), valid_frames(held_out)
     mean = mean_frame(frames)
 
-    def error(chunk: Tensor, guess: Tensor) -> Tensor:
-        return (chunk / 255 - guess).square().sum((-3, -2, -1))
+    def errors(chunk: Tensor) -> Tensor:
+        """Return errors of decoded and of mean frames, of all pixels and of those that deviate."""
+        decoded = (chunk / 255 - vae.decode(vae.encode(chunk)[0])).square()
+        constant = (chunk / 255 - mean).square()
+        moving = constant >= 0.1**2
+        parts = (decoded, constant, decoded * moving, constant * moving)
+        return torch.stack([part.sum((-3, -2, -1)) for part in parts], -1)
 
-    chunks = frames_held_out.split(64)
-    decoded = [error(chunk, vae.decode(vae.encode(chunk)[0])) for chunk in chunks]
-    constant = [error(chunk, mean) for chunk in chunks]
+    means = torch.cat([errors(chunk) for chunk in frames_held_out.split(64)]).double().mean(0)
+    reconstruction, of_mean, left, deviation = means.tolist()
     return {
-        "reconstruction": _mean(torch.cat(decoded)),
-        "mean_frame_reconstruction": _mean(torch.cat(constant)),
+        "reconstruction": reconstruction,
+        "mean_frame_reconstruction": of_mean,
+        "moving_reconstruction": 1 - left / deviation if deviation else 1.0,
     }
 
 

@@ -12,7 +12,7 @@ A dataset is a TensorDict ``[N]`` with ``pixels`` uint8 ``[N, T, H, W, 3]``, ``a
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -220,9 +220,32 @@ def save_representation(representation: Representation, path: str | Path) -> Non
     """Write both encoders and the metadata to one safetensors file; missing folders are made.
 
     Raises:
+        ValueError: As for `check_savable`.
         OSError: If the file cannot be written; an existing file is kept.
     """
+    check_savable(representation)
     save_tensors(path, _tensors(representation), representation.metadata)
+
+
+def check_savable(representation: Representation) -> None:
+    """Raise ``ValueError`` if `load_representation` would not return the same encoders.
+
+    It makes `VAE`, `SequenceAutoencoder` and `InverseModel` of the sizes in the metadata.
+    """
+    try:
+        made = _of_tensors(_tensors(representation), representation.metadata)
+    except Exception as error:
+        cause = " ".join(f"{type(error).__name__}: {error}".split())
+        made, found = None, f"others could not be made of their tensors and metadata ({cause})"
+    else:
+        kinds = [[type(network) for _, network in r.networks()] for r in (representation, made)]
+        found = next((a.__qualname__ for a, b in zip(*kinds, strict=True) if a is not b), "")
+        found = f"{found} is of a class of its own" if found else ""
+    if found:
+        raise ValueError(
+            f"these encoders could be saved, but not loaded again: {found}; train them with "
+            "bgpo_trl.encoders.train"
+        )
 
 
 def load_representation(path: str | Path, *, scene: Scene | None = None) -> Representation:
@@ -237,25 +260,7 @@ def load_representation(path: str | Path, *, scene: Scene | None = None) -> Repr
     remedy = "train new ones with --train-encoders"
     try:
         tensors, metadata = load_tensors(path)
-        if any(value.dtype != torch.float32 for value in tensors.values()):
-            raise ValueError("weights are float32")
-        config = json.loads(metadata["config"])
-        vae = VAE(
-            config["vae"]["latent_size"],
-            len(tensors["vae.inverse_head.bias"]),
-            tensors["vae.mean_frame"].shape[:2],
-            config["vae"].get("keypoints", True),
-        )
-        lae = SequenceAutoencoder(vae.latent_size, config["lae"]["embedding_size"])
-        inverse = None
-        if any(name.startswith("inverse.") for name in tensors):
-            hidden_size = config["inverse"]["hidden_size"]
-            inverse = InverseModel(vae.latent_size, vae.action_size, hidden_size)
-        encoders = Representation(vae, lae, inverse, metadata)
-        for name, module in encoders.networks():
-            module.load_state_dict(
-                {k.removeprefix(name): v for k, v in tensors.items() if k.startswith(name)}
-            )
+        encoders = _of_tensors(tensors, metadata)
     except FileNotFoundError:
         raise ValueError(f"no encoder weights at {path}: {remedy}") from None
     except Exception as error:
@@ -264,6 +269,30 @@ def load_representation(path: str | Path, *, scene: Scene | None = None) -> Repr
         encoders.check_scene(scene, path, remedy)
     for _, module in encoders.networks():
         module.eval().requires_grad_(False)
+    return encoders
+
+
+def _of_tensors(tensors: Mapping[str, Tensor], metadata: dict[str, str]) -> Representation:
+    """Return encoders of the tensors and metadata of a file."""
+    if any(value.dtype != torch.float32 for value in tensors.values()):
+        raise ValueError("weights are float32")
+    config = json.loads(metadata["config"])
+    vae = VAE(
+        config["vae"]["latent_size"],
+        len(tensors["vae.inverse_head.bias"]),
+        tensors["vae.mean_frame"].shape[:2],
+        config["vae"].get("keypoints", True),
+    )
+    lae = SequenceAutoencoder(vae.latent_size, config["lae"]["embedding_size"])
+    inverse = None
+    if any(name.startswith("inverse.") for name in tensors):
+        hidden_size = config["inverse"]["hidden_size"]
+        inverse = InverseModel(vae.latent_size, vae.action_size, hidden_size)
+    encoders = Representation(vae, lae, inverse, metadata)
+    for name, module in encoders.networks():
+        module.load_state_dict(
+            {k.removeprefix(name): v for k, v in tensors.items() if k.startswith(name)}
+        )
     return encoders
 
 

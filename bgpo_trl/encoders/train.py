@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -17,7 +18,7 @@ from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.encoders.fitting import Log
 from bgpo_trl.encoders.make_bank import make_bank
 from bgpo_trl.encoders.pretrained import bank_path
-from bgpo_trl.encoders.probes import probe
+from bgpo_trl.encoders.probes import complaints, probe
 from bgpo_trl.encoders.representation import (
     Representation,
     retrain_inverse,
@@ -56,6 +57,8 @@ def train_encoders(
     scene: Scene | str = "nico",
 ) -> tuple[Representation, DemonstrationBank]:
     """Train, save and probe both encoders, and embed the demonstrations with them.
+
+    Warns of what `complaints` finds.
 
     Args:
         dataset: Demonstrations as in `bgpo_trl.encoders.representation`, with ``state`` and
@@ -105,7 +108,9 @@ def train_encoders(
     bank = make_bank(representation, dataset, tasks=tasks, actions=actions, spread=spread)
     bank.save(bank_path(weights))
     play = None if keep else play
-    probe(representation, dataset, folder, play=play, columns=scene.state)
+    found = probe(representation, dataset, folder, play=play, columns=scene.state)
+    for complaint in complaints(found):
+        warnings.warn(f"{complaint} ({folder})", stacklevel=2)
     return representation, bank
 
 

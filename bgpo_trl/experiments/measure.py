@@ -166,7 +166,17 @@ def draw(
     if trainer.algorithm.groups:
         draw_groups(out, presented, out / "figures" / "groups.png")
         numbers = [len(groups.numbers) for groups in trainer.algorithm.groups]
-        lines.append(f"groups of behaviors: {numbers}")
+        held_out = bank.held_out(config.held_out)
+        purity = np.mean(
+            [
+                group_purity(groups, held_out, len(config.tasks))
+                for groups in trainer.algorithm.groups
+            ]
+        )
+        lines.append(
+            f"groups of behaviors: {numbers}, {purity:.1%} of held-out demonstrations in a "
+            "group of their task"
+        )
     return lines
 
 

@@ -18,7 +18,7 @@ from bgpo_trl.configs import (
     VAEConfig,
 )
 from bgpo_trl.encoders.make_bank import make_bank
-from bgpo_trl.encoders.probes import probe
+from bgpo_trl.encoders.probes import _probe_reconstruction, probe
 from bgpo_trl.encoders.representation import (
     Representation,
     embed_demonstrations,
@@ -32,6 +32,8 @@ from bgpo_trl.encoders.representation import (
     valid_frames,
 )
 from bgpo_trl.encoders.train import train_encoders
+from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
+from bgpo_trl.modules.vae import VAE
 from bgpo_trl.scenes.nico import NICO
 from tests.helpers import TINY_ENCODERS
 from tests.scenes.dot import scene
@@ -286,6 +288,56 @@ def test_actions_of_any_size_are_learned_from_and_recorded_ones_are_used(tmp_pat
     assert not inferred.steps.action.equal(bank.steps.action)
     unknown = make_bank(trained, shown.exclude("action"), tasks=options["tasks"])
     assert unknown.steps.action.equal(inferred.steps.action)
+
+
+class Halving:
+    """A frame encoder that reconstructs half of the deviation from the mean frame."""
+
+    def __init__(self, mean: torch.Tensor) -> None:
+        self.mean = mean
+
+    def encode(self, frames: torch.Tensor) -> tuple[torch.Tensor]:
+        return (frames / 255 - self.mean,)
+
+    def decode(self, deviation: torch.Tensor) -> torch.Tensor:
+        return self.mean + deviation / 2
+
+
+def test_what_moves_is_measured_apart_from_what_stands_still(dataset: TensorDict) -> None:
+    parts = split(dataset)
+    found = _probe_reconstruction(Halving(mean_frame(valid_frames(parts[0]))), *parts)
+    assert found["moving_reconstruction"] == pytest.approx(0.75)
+    share = found["reconstruction"] / found["mean_frame_reconstruction"]
+    assert share == pytest.approx(0.25)
+
+
+def test_training_says_what_is_not_good_about_its_encoders(tmp_path: Path) -> None:
+    """Four steps teach them nothing."""
+    options = {"weights": tmp_path / "weights", "folder": tmp_path, "progress": False}
+    with pytest.warns(UserWarning) as caught:
+        train_encoders(squares(8), None, config=TINY, **options)
+    said = [str(warning.message) for warning in caught]
+    assert any("of what moves in frames: look for the objects in recon" in line for line in said)
+
+
+def test_encoders_that_could_not_be_loaded_again_are_not_saved(
+    tiny: Representation, tmp_path: Path
+) -> None:
+    class Mine(VAE):
+        """A frame encoder of one's own, of the same tensors."""
+
+    mine = Mine()
+    mine.load_state_dict(tiny.vae.state_dict())
+    larger = replace(tiny, lae=SequenceAutoencoder(64, 16))
+    for encoders, cause in (
+        (replace(tiny, vae=mine), "Mine is of a class of its own"),
+        (replace(tiny, vae=torch.nn.Linear(3, 4)), "could not be made"),
+        (replace(larger, metadata=tiny.metadata), "could not be made"),
+        (replace(tiny, metadata={"scene": "squares 1"}), "could not be made .*config"),
+    ):
+        with pytest.raises(ValueError, match=f"could be saved, but not loaded again: .*{cause}"):
+            save_representation(encoders, tmp_path / "weights")
+    assert not (tmp_path / "weights").exists()
 
 
 def test_configurations_and_datasets_that_cannot_be_trained_on_are_refused() -> None:

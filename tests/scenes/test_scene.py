@@ -20,6 +20,7 @@ from bgpo_trl.encoders.train import make_pretrained, train_encoders
 from bgpo_trl.evaluation import evaluate_random_policy
 from bgpo_trl.experiments.measure import draw, measure
 from bgpo_trl.experiments.watch import WatchArguments, watch
+from bgpo_trl.modules.vae import VAE
 from bgpo_trl.policy import load_run
 from bgpo_trl.runs.results import TRAIN, read_table
 from bgpo_trl.scenes import SCENES, Outcome, SimulationEnv, StateColumns, find_scene
@@ -395,6 +396,21 @@ def test_actions_of_a_demonstrator_are_checked_as_those_of_a_dataset(tmp_path, a
         recorded(tmp_path, bold, tasks=["right"])
 
 
+def test_a_run_whose_encoders_could_not_be_loaded_again_does_not_begin(
+    pretrained, tmp_path, monkeypatch
+):
+    class Mine(VAE):
+        """A frame encoder of one's own."""
+
+    monkeypatch.setitem(SCENES, "dot", scene())
+    encoders, bank = pretrained
+    mine = Mine(64, 1, (16, 24))
+    mine.load_state_dict(encoders.vae.state_dict())
+    with pytest.raises(ValueError, match="could be saved, but not loaded again: Mine"):
+        train(tmp_path / "run", (replace(encoders, vae=mine), replace(bank, encoder_id=None)))
+    assert not (tmp_path / "run").exists()
+
+
 def test_a_scene_without_a_simulation_serves_demonstrations(tmp_path):
     bare = replace(scene(), make_env=None)
     frames = np.zeros((3, 16, 24, 3), np.uint8)
@@ -407,11 +423,11 @@ def test_a_scene_without_a_simulation_serves_demonstrations(tmp_path):
 
 def test_episodes_are_no_longer_than_those_of_the_scene(pretrained, tmp_path, monkeypatch):
     monkeypatch.setitem(SCENES, "dot", scene())
-    algorithm = replace(config().algorithm, max_steps=13)
+    algorithm = replace(config().algorithm, max_steps=13, demonstration_share=0.0)
     with pytest.raises(
         ValueError, match="max_steps is 13, episodes of the scene 'dot' have at most 12"
     ):
-        train(tmp_path / "run", pretrained, algorithm=replace(algorithm, demonstration_share=0.0))
+        train(tmp_path / "run", pretrained, algorithm=algorithm)
 
     class Stuck(Dot):
         steps = 0
