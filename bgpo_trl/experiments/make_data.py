@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+from tensordict import TensorDict
+
 from bgpo_trl.data.dataset import load_demonstrations, read_meta
 from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.encoders.make_bank import make_bank
@@ -18,7 +22,7 @@ from bgpo_trl.experiments.arguments import (
 from bgpo_trl.machine import choose_device
 from bgpo_trl.plugins import import_plugin
 from bgpo_trl.runs.provenance import command
-from bgpo_trl.scenes import find_scene
+from bgpo_trl.scenes import Scene, find_scene
 
 
 def record(arguments: RecordArguments) -> None:
@@ -35,7 +39,7 @@ def encoders(arguments: EncodersArguments) -> None:
     scene, weights, keep = find_scene(meta["scene"]), arguments.weights, arguments.keep
     train_encoders(
         dataset,
-        None if arguments.play is None else load_demonstrations(arguments.play),
+        None if arguments.play is None else _play(arguments.play, scene),
         arguments.folder / "encoders.safetensors" if weights is None else weights,
         arguments.folder,
         arguments.config,
@@ -46,6 +50,14 @@ def encoders(arguments: EncodersArguments) -> None:
         keep=None if keep is None else load_representation(keep, scene=scene),
         scene=scene,
     )
+
+
+def _play(path: Path, scene: Scene) -> TensorDict:
+    """Open recorded play of a scene; raise ``ValueError`` if it is of another one."""
+    meta = read_meta(path)
+    recorded_in = f"{meta['scene']} {meta['scene_version']}"
+    scene.check_identity(recorded_in, path, "record play of this scene")
+    return load_demonstrations(path)
 
 
 def bank(arguments: MakeBankArguments) -> None:
@@ -71,6 +83,6 @@ def probes(arguments: ProbesArguments) -> None:
     scene = find_scene(meta["scene"])
     weights = default_weights(meta["tasks"], scene=scene) if weights is None else weights
     representation = load_representation(weights, scene=scene)
-    play = None if arguments.play is None else load_demonstrations(arguments.play)
+    play = None if arguments.play is None else _play(arguments.play, scene)
     dataset = load_demonstrations(arguments.dataset)
     probe(representation, dataset, arguments.out, play=play, columns=scene.state)
