@@ -305,7 +305,8 @@ def own_episodes(run: Run, threshold: float = 0.5) -> Values | None:
     if table.empty:
         return None
     times = table.groupby(["seed", "task"])["success"].agg(trials_to, threshold)
-    return np.nan_to_num(_by_seed_and_task(times, run), nan=np.inf)
+    found = _by_seed_and_task(times, run)
+    return np.where(np.isnan(found), np.inf, found)
 
 
 def success_steps(run: Run) -> Values:
