@@ -65,9 +65,6 @@ class Arguments(BankArguments):
     demonstrations as experience. Ablations (Fig. 9): without-bonus, without-gwr, without-both:
     bgpo-single without the intrinsic reward, GWR-B or both; group-balanced-replay, demonstrations:
     bgpo-single with that addition. Or one that the module of --import adds."""
-    rl: str | None = None
-    """The RL algorithm of BGPO, its ablations and the references: ddpg, td3, sac, or one that the
-    module of --import adds; DDPG by default."""
     preset: Literal["smoke", "quick", "desk", "paper"] | None = None
     """Size of the run, with its time on two cores: smoke (12 episodes of 2 seeds, every stage in 2
     minutes), quick (1,800 episodes of 2 seeds, 15 minutes), the default; desk (6,000 episodes of 5
@@ -76,7 +73,7 @@ class Arguments(BankArguments):
     """YAML or JSON file of settings, named as in a run's config.json, or a run directory to repeat;
     the preset's for those that it lacks."""
     out: Path | None = None
-    """Run directory; runs/EXPERIMENT-ALGORITHM[-RL]-PRESET by default, with the name of the file
+    """Run directory; runs/EXPERIMENT-ALGORITHM-PRESET by default, with the name of the file
     of --config for PRESET."""
     episodes: int | None = None
     """Training episodes; the preset's by default. The task starts are scaled in proportion. With
@@ -89,7 +86,7 @@ class Arguments(BankArguments):
     wandb: Literal["online", "offline"] | None = None
     """Also log means over the seeds to Weights & Biases."""
     wandb_group: str | None = None
-    """Group of the run on Weights & Biases; EXPERIMENT-ALGORITHM[-RL] by default."""
+    """Group of the run on Weights & Biases; EXPERIMENT-ALGORITHM by default."""
     tensorboard: bool = False
     """Also log these means to TensorBoard, into the run directory."""
     per_seed_curves: bool = False
