@@ -197,7 +197,7 @@ WRONG = {
     "learning for other rows": (
         lambda: world(
             source(batch_size=[2]), BehaviorLookup(GWRB(32), learn=True), batch_size=[2]
-        ).reset(), "batch_size=()"),
+        ).reset(), "a network for each"),
     "bonus without latents": (
         lambda: world(
             source(), BehaviorLookup(GWRB(32), learn=True), BehaviorMatchingReward(lae)

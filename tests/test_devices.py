@@ -19,7 +19,7 @@ from bgpo_trl.training import Trainer
 from tests.helpers import TINY_ENCODERS, rows
 from tests.second_device import second_device
 
-ALGORITHMS = ("bgpo", "clone")
+ALGORITHMS = ("bgpo",)
 # The first two need data of each task; the last rests after a boundary, with an empty replay.
 LONGER = ("maml-demonstrations", "dist-nll-demonstrations", "ewc")
 

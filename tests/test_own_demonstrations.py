@@ -59,7 +59,10 @@ def made(tmp_path, monkeypatch):
 
 def config_of(make_config, share):
     config = make_config(scene="dot", tasks=TASKS, task_starts=(0, 2), episodes=4, seeds=(3,))
-    return replace(config, algorithm=replace(config.algorithm, demonstration_share=share))
+    rl = config.algorithm.rl
+    if not share:
+        rl = replace(rl, proposals="actor")
+    return replace(config, algorithm=replace(config.algorithm, demonstration_share=share, rl=rl))
 
 
 def test_demonstrations_without_actions_train_encoders_and_runs(
@@ -84,7 +87,7 @@ def test_demonstrations_without_actions_train_encoders_and_runs(
     refused(
         lambda: Trainer(config, tmp_path / "shown", **parts),
         "no steps of demonstrations",
-        "set demonstration_share to 0",
+        "bgpo-experts",
     )
 
 

@@ -261,7 +261,7 @@ def test_wrong_results_of_an_algorithm_are_refused(
 def test_a_run_interrupted_several_times_is_the_same(run_of, begin, config_of, tmp_path, name):
     """A signal waits for the end of the step; also if loggers are added to the resumed run."""
     config = config_of(name)
-    steps = (1, 12, 22) if of_name(LONGER, name) else (1, 12)
+    steps = (1, 12, 23) if of_name(LONGER, name) else (1, 16)
     for step, number in zip(steps, itertools.cycle((signal.SIGINT, signal.SIGTERM)), strict=False):
         interrupt(begin(tmp_path, config, resume=True), step, number)
         assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

@@ -50,12 +50,11 @@ class Policy:
     network: Tensor | None = None
 
     def to(self, device: torch.device | str) -> Policy:
-        """Return the policy with its tensors on a device."""
+        """Return the policy with weights and context on a device; ``network`` stays on the CPU."""
         return replace(
             self,
             parameters={key: value.to(device) for key, value in self.parameters.items()},
             context=None if self.context is None else self.context.to(device),
-            network=None if self.network is None else self.network.to(device),
         )
 
     @torch.no_grad()
@@ -66,15 +65,15 @@ class Policy:
             inputs["context"] = self.context
         if self.network is None:
             return functional_call(self.actor, self.parameters, (inputs,))["action"]
-        actions: list[tuple[Tensor, Tensor]] = []
-        for number in self.network.unique().tolist():
-            rows = self.network == number
+        network, inputs = self.network.flatten(), inputs.reshape(-1)
+        rows, actions = list[Tensor](), list[Tensor]()
+        for number in network.unique().tolist():
+            rows.append((network == number).nonzero().flatten())
             weights = {key: value[number] for key, value in self.parameters.items()}
-            actions.append((rows, functional_call(self.actor, weights, (inputs[rows],))["action"]))
-        action = state.new_empty(*state.shape[:-1], actions[0][1].shape[-1])
-        for rows, of_rows in actions:
-            action[rows] = of_rows
-        return action
+            played = functional_call(self.actor, weights, (inputs[rows[-1].to(state.device)],))
+            actions.append(played["action"])
+        order = torch.cat(rows).argsort().to(state.device)
+        return torch.cat(actions)[order].view(*self.network.shape, -1)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the arguments of `Algorithm.policy`."""
@@ -318,7 +317,7 @@ class Algorithm(ABC):
         if not self.config.demonstration_share:
             return None
         if self.config.state != "latent":
-            raise ValueError("demonstrations are latents: set demonstration_share to 0")
+            raise ValueError("demonstrations are latents: choose an algorithm without them")
         return DemonstrationReplay(
             self.bank,
             generator=generators(self.seeds, "demonstration replay"),

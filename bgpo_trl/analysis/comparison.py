@@ -17,6 +17,7 @@ from bgpo_trl.runs.results import Curves, find_table, read_curves, read_json
 
 NAMES = {
     "bgpo": "BGPO",
+    "clone": "clone, without reward",
     "dist-nll-demonstrations": "Dist-NLL + demonstrations",
     "maml-demonstrations": "MAML + demonstrations",
     "bgpo-experts": "BGPO without demonstrations",

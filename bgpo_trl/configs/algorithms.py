@@ -144,7 +144,14 @@ class AlgorithmConfig(Settings):
             ("demonstration_share", 0 <= share < 1, "at least 0 and below 1"),
         )
         shown = share > 0 or self.rl.proposals == "actor"
-        check(self, ("demonstration_share", shown, "above 0, for a clone to imitate"))
+        check(
+            self,
+            (
+                "demonstration_share",
+                shown,
+                "above 0 for a clone to imitate (bgpo-experts: without)",
+            ),
+        )
         at_least(self, 1, "max_steps")
         if self.state_limit is not None:
             positive(self, "state_limit")

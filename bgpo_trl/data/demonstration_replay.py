@@ -51,15 +51,15 @@ class DemonstrationReplay:
     ) -> None:
         if bank.steps is None:
             raise ValueError(
-                "the bank has no steps of demonstrations to learn from: set demonstration_share to "
-                "0, or make it again by encoders that were trained with actions "
+                "the bank has no steps of demonstrations to learn from: choose --algorithm "
+                "bgpo-experts, or make the bank again by encoders that were trained with actions "
                 "(docs/extending.md, Your demonstrations)"
             )
         if (bank.steps.length < 2).any():
             row = int((bank.steps.length < 2).nonzero()[0])
             raise ValueError(
                 f"the bank has no steps of demonstration {row} to learn from: make it again with "
-                "`bgpo bank`, or set demonstration_share to 0"
+                "`bgpo bank`, or choose --algorithm bgpo-experts"
             )
         self._steps = bank.steps
         self._generators = list(generator)

@@ -19,7 +19,7 @@ from typing import Any, get_type_hints
 import tyro
 
 from bgpo_trl.configs import PRESETS
-from bgpo_trl.experiments.arguments import SETTINGS
+from bgpo_trl.experiments.arguments import SETTINGS, Arguments
 
 
 def command_line(
@@ -86,7 +86,7 @@ def _parse(kind: type, options: Sequence[str] | None, program: str | None, line:
     description = "\n\n".join(filter(None, (line, inspect.getdoc(kind))))
     options = sys.argv[1:] if options is None else options
     parse: Any = partial(tyro.cli, kind, prog=program, description=description, args=options)
-    if "settings" not in get_type_hints(kind):
+    if not issubclass(kind, Arguments):
         return parse()
     if {"-h", "--help"} & {*options}:
         with contextlib.suppress(SystemExit):

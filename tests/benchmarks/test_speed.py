@@ -36,7 +36,7 @@ def test_the_floor_is_our_arithmetic_without_clipping_and_penalty(monkeypatch):
 
 def test_every_contender_makes_its_updates():
     found = contenders(seeds=2, transitions=BATCH)
-    assert ("Stable-Baselines3" in found) == (find_spec("stable_baselines3") is not None)
+    assert ("Stable-Baselines3, TD3" in found) == (find_spec("stable_baselines3") is not None)
     assert found["ours, 2 seeds"][1] == found["floor, 2 seeds, without sampling"][1] == 2
     for call, count in found.values():
         assert count > 0

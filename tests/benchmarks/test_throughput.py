@@ -73,7 +73,7 @@ def test_results_are_written_and_printed(tmp_path, capsys, monkeypatch):
     inside = [step[f"2 seeds in a batch: {part}"] for part in ("FrameEncoder", "RewardSum")]
     assert sum(row["ms a step of all"] for row in inside) < whole
     rows = list(found["memory"].values())
-    # Two latents, behavior, action, reward, a flag and the group, in the units of the table.
-    size = 4 * (2 * 64 + 32 + 4 + 1) + 1 + 8
+    # Two latents, behavior, action, reward, two flags and the group, in the units of the table.
+    size = 4 * (2 * 64 + 32 + 4 + 1) + 2 + 8
     assert rows[-2]["MB of it replay"] == pytest.approx(4 * 2 * size / 1e6)
     assert "| 2 seeds in a batch |" in capsys.readouterr().out

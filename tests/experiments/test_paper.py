@@ -28,7 +28,7 @@ from tests.helpers import Recorder, cells, contents, rows
 ROOT = Path(__file__).parents[2]
 TASKS = nico.PAPER_TASKS
 FIGURES = ("success.png", "gwr.png", "gwr_growth.png", "groups.png", "episodes.png")
-WITH_GROUPS = ("bgpo", "bgpo-experts", "group-balanced-replay")
+WITH_GROUPS = ("bgpo", "clone", "bgpo-experts", "group-balanced-replay")
 WITHOUT_GWR = ("maml", "dist-nll", "oracle", "ddpg", "fine-tuning", "ewc")
 WITHOUT_GWR += ("without-gwr", "without-both")
 

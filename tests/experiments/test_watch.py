@@ -22,7 +22,6 @@ def undemonstrated(monkeypatch):
     """Demonstrations that take no time and show nothing; films without a long last frame."""
     frames = np.random.default_rng(0).integers(256, size=(7, 32, 64, 3), dtype=np.uint8)
     monkeypatch.setattr(watch, "demonstrate", lambda tasks, *_: dict.fromkeys(tasks, frames))
-    monkeypatch.setattr(watch, "_FPS", 1)
 
 
 @pytest.mark.parametrize("name", ["bgpo", "oracle"])
