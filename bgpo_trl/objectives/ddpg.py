@@ -423,12 +423,12 @@ class DDPGLoss(LossModule):
             frozen: Whether gradients reach the input only, not the parameters.
             members: Positions of some networks of an ensemble; ``None`` for all.
         """
-        stacked = (slice(None),) * len(self.batch_size)
+        dim = len(self.batch_size)
         weights: dict[str, Tensor] = {}
         for key, value in getattr(self, f"{name}_params").items(True, True):
             value = value.detach() if frozen else value
             if members is not None and self.ensemble:
-                value = value[(*stacked, [*members])]
+                value = torch.stack([value.select(dim, member) for member in members], dim)
             weights[key if isinstance(key, str) else ".".join(key)] = value
         network = getattr(self, name.removeprefix("target_"))
         return functional_call(network, weights, (data,), tie_weights=False)
