@@ -29,9 +29,7 @@ def test_gwr_grows_without_a_policy_as_in_a_run(begin, make_config, bank, tmp_pa
 def test_a_node_is_of_the_task_of_which_it_holds_the_largest_share(bank):
     """By hand: task 0 has four demonstrations, tasks 1 and 2 two each; node 3 holds nothing."""
     rows = torch.tensor([0, 3, 6, 9, 1, 4, 2, 5])
-    networks = Networks(
-        GWRB(32, batch_size=[1]), BehaviorGroups(32, batch_size=[1]), bank._select(rows)
-    )
+    networks = Networks(GWRB(32, batch_size=[1]), [BehaviorGroups(32)], bank._select(rows))
     known = torch.tensor([[0, 0, 0, 1, 1, 1, 2, 2]])  # node 1: a quarter of task 0, all of task 1
     node = torch.tensor([[0, 0, 1, 1, 2, 3]])
     task = torch.tensor([0, 1, 1, 0, 2, 0])
