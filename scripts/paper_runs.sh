@@ -8,7 +8,7 @@ seeds=("${@:2}")
 for algorithm in ${ALGORITHMS:-bgpo-paper maml-paper dist-nll-paper}; do
     for seed in "${seeds[@]}"; do
         python -m bgpo_trl continual --algorithm "$algorithm" --preset paper --seeds "$seed" \
-            --eval-every 200 --eval-episodes 10 --held-out test --algorithm.rl.compile \
+            --eval-every 200 --eval-episodes 10 --held-out test \
             --resume --out "$folder/fig8-$algorithm-$seed"
     done
 done

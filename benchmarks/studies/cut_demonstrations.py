@@ -67,7 +67,7 @@ class Networks:
     """GWR-B and groups of all seeds, grown from demonstrations of a bank."""
 
     gwr: GWRB
-    groups: BehaviorGroups
+    groups: list[BehaviorGroups]
     bank: DemonstrationBank
 
     @classmethod
@@ -76,18 +76,22 @@ class Networks:
         config, size = BGPOConfig(), bank.embedding.shape[-1]
         batch = [len(seeds)]
         gwr = GWRB(size, config.gwr, batch_size=batch, generator=generators(seeds, "gwr"))
-        groups = BehaviorGroups(
-            size,
-            batch_size=batch,
-            smallest=config.group_size,
-            evidence=config.group_evidence,
-        )
+        groups = [
+            BehaviorGroups(size, smallest=config.group_size, evidence=config.group_evidence)
+            for _ in seeds
+        ]
         draw = [np.random.default_rng(stream_seed(seed, "demonstrations")) for seed in seeds]
         shown = np.stack([rng.integers(len(bank.task), size=draws) for rng in draw])
         for rows in torch.from_numpy(shown).T:
             gwr.adapt(bank.embedding[rows])
-            groups.adapt(bank.embedding[rows])
+            for of_seed, phi in zip(groups, bank.embedding[rows], strict=True):
+                of_seed.adapt(phi)
         return cls(gwr, groups, bank)
+
+    def grouped(self, phi: Tensor) -> tuple[Tensor, Tensor]:
+        """Return groups and novelties ``[S, N]`` of demonstrations ``[N, 32]``."""
+        matches = [groups.lookup(phi) for groups in self.groups]
+        return torch.stack([m.group for m in matches]), torch.stack([m.novelty for m in matches])
 
     def right(self, node: Tensor, known: Tensor, task: Tensor) -> Tensor:
         """Return where a node or group of demonstrations is one of their task, bool ``[S, N]``.
@@ -126,14 +130,14 @@ def known_tasks(
     networks: Networks, phi: Tensor, task: Tensor, seeds: tuple[int, ...]
 ) -> pd.DataFrame:
     """Return a row of each seed and task for demonstrations ``[N, 32]``."""
-    gwr, groups, seen = networks.gwr, networks.groups, networks.bank.embedding
+    gwr, seen = networks.gwr, networks.bank.embedding
     shown, of_bank = (e.expand(len(seeds), *e.shape) for e in (phi, seen))
-    match, member = gwr.lookup(shown), groups.lookup(shown)
+    match, (group, novelty) = gwr.lookup(shown), networks.grouped(phi)
     columns = {
         "node_right": networks.right(match.node, gwr.lookup(of_bank).node, task).double(),
         "activity": match.activity.double(),
-        "group_right": networks.right(member.group, groups.lookup(of_bank).group, task).double(),
-        "of_no_group": (~member.known).double(),
+        "group_right": networks.right(group, networks.grouped(seen)[0], task).double(),
+        "of_no_group": (novelty > 1).double(),
     }
     rows = [
         {"seed": seed, "task": name}
@@ -148,10 +152,7 @@ def unknown_task(
     networks: Networks, known: Tensor, unknown: Tensor, seeds: tuple[int, ...]
 ) -> pd.DataFrame:
     """Return a row of each seed: how novelty tells an unknown task from the known ones."""
-    novelty = [
-        networks.groups.lookup(phi.expand(len(seeds), *phi.shape)).novelty
-        for phi in (known, unknown)
-    ]
+    novelty = [networks.grouped(phi)[1] for phi in (known, unknown)]
     rows = []
     for seed, ours, theirs in zip(seeds, *novelty, strict=True):
         wins = stats.mannwhitneyu(theirs, ours).statistic

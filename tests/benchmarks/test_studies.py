@@ -1,0 +1,48 @@
+"""The studies: what they measure without a policy is what a run has."""
+
+import pandas as pd
+import pytest
+import torch
+
+from benchmarks.studies.cut_demonstrations import Networks, unknown_task
+from benchmarks.studies.gwr_as_published import Arguments, grow
+from bgpo_trl.modules.behavior_groups import BehaviorGroups
+from bgpo_trl.modules.gwr import GWRB
+
+
+@pytest.mark.usefixtures("easy_world")
+def test_gwr_grows_without_a_policy_as_in_a_run(begin, make_config, bank, tmp_path):
+    config = make_config(name="bgpo-paper", episodes=60)
+    with begin(tmp_path / "run", config) as trainer:
+        trainer.run()
+    rows = pd.read_csv(tmp_path / "run" / "train.csv")
+    arguments = Arguments(tmp_path, seeds=config.seeds, episodes=60, every=1)
+    _, nodes = grow(bank.seen(), config.task_starts, 1.0, arguments)
+    found, expected = (
+        table.sort_values(["seed", "episode"])[column].tolist()
+        for table, column in ((nodes, "nodes"), (rows, "num_nodes"))
+    )
+    assert found == expected
+    assert max(found) > 3
+
+
+def test_a_node_is_of_the_task_of_which_it_holds_the_largest_share(bank):
+    """By hand: task 0 has four demonstrations, tasks 1 and 2 two each; node 3 holds nothing."""
+    rows = torch.tensor([0, 3, 6, 9, 1, 4, 2, 5])
+    networks = Networks(GWRB(32, batch_size=[1]), [BehaviorGroups(32)], bank._select(rows))
+    known = torch.tensor([[0, 0, 0, 1, 1, 1, 2, 2]])  # node 1: a quarter of task 0, all of task 1
+    node = torch.tensor([[0, 0, 1, 1, 2, 3]])
+    task = torch.tensor([0, 1, 1, 0, 2, 0])
+    right = networks.right(node, known, task)
+    assert right.tolist() == [[True, False, True, False, True, False]]
+
+
+def test_an_unknown_task_is_told_by_its_novelty(bank):
+    known = bank.for_tasks(bank.tasks[:2])
+    networks = Networks.grow(known.seen(), (3, 8), 60)
+    far = bank.of_task(2).embedding + 10
+    found = unknown_task(networks, known.seen().embedding, far, (3, 8))
+    assert found["area"].tolist() == [1, 1]
+    assert found["detected"].tolist() == [1, 1]
+    same = unknown_task(networks, known.seen().embedding, known.seen().embedding, (3, 8))
+    assert same["area"].tolist() == [0.5, 0.5]
