@@ -10,8 +10,8 @@ starts each time, without noise.
     python benchmarks/studies/one_task.py --reward 0   # must fall back to the clone
     python benchmarks/studies/one_task.py --gate       # can critics tell success from failure?
 
-With ``--gate``, the clone plays 300 episodes and critics learn its values from 200 of them. For the
-other 100, the table shows how well the lowest value tells, some steps after the start, episodes
+With ``--gate``, the clone plays 200 episodes, from which critics learn its values. For 100 others,
+from other starts, the table shows how well the lowest value tells, some steps after the start, episodes
 that will succeed from those that will not (area under the ROC curve), and its mean beside the mean
 return.
 """
@@ -171,10 +171,19 @@ class Trial:
         self.learner.learn(self.batch(size - n_played, n_played))
         self.n_updates += 1
 
-    def play(self, n_episodes: int, *, learn: bool) -> list[tuple[list[Tensor], bool]]:
-        """Play training episodes; return latents and actions of each, and whether it succeeded."""
+    def play(
+        self, n_episodes: int, *, learn: bool = False, store: bool = True, starts: str = "env"
+    ) -> list[tuple[list[Tensor], bool]]:
+        """Play training episodes; return latents and actions of each, and whether it succeeded.
+
+        Args:
+            n_episodes: Number of episodes.
+            learn: Whether to learn and test meanwhile.
+            store: Whether to add transitions to the replay.
+            starts: Stream of the start states.
+        """
         arguments, rl, owed, tested = self.arguments, self.arguments.rl, 0.0, 0
-        env = self.env(N_SIMULATIONS, stream_seed(arguments.seed, "env"))
+        env = self.env(N_SIMULATIONS, stream_seed(arguments.seed, starts))
         state, episodes, n_begun = env.reset(), [], N_SIMULATIONS
         steps: list[list[Tensor]] = [[] for _ in self.noise]
         while len(episodes) < n_episodes:
@@ -184,7 +193,8 @@ class Trial:
                 steps[row].append(taken)
             transition, state = env.step_and_maybe_reset(state.set("action", action))
             transition["next", "reward"] *= arguments.reward
-            self.replay.add(transition, torch.zeros(N_SIMULATIONS).long())
+            if store:
+                self.replay.add(transition, torch.zeros(N_SIMULATIONS).long())
             for row in transition["next", "done"].flatten().nonzero().flatten().tolist():
                 episodes.append((steps[row], bool(transition["next", "success"][row])))
                 steps[row] = []
@@ -236,9 +246,8 @@ class Trial:
     def gate(self) -> None:
         """Measure how well critics of the clone tell success from failure ahead of time."""
         self.alone[:] = True
-        episodes = self.play(300, learn=False)
-        held_out = episodes[200:]
-        # Those are not to be learned: as many transitions, from a replay of the first 200 alone.
+        self.play(200)
+        held_out = self.play(100, store=False, starts="held-out env")
         loss = self.learner.loss
         optimizer = torch.optim.Adam([*loss.value_network_params.parameters()], lr=3e-4)
         for update in range(1, 4_001):

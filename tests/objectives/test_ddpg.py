@@ -146,20 +146,23 @@ def test_the_policy_takes_the_proposal_whose_lowest_value_is_higher(weights, onl
 
 
 def test_a_stack_of_policies_chooses_for_each_as_one_would():
+    source = torch.Generator().manual_seed(0)
+
     def network(kind, *ensemble):
-        return kind(STATE, ACTION, in_keys=["state"], hidden_sizes=(16,), batch_size=(4, *ensemble))
+        shape = {"hidden_sizes": (16,), "batch_size": (4, *ensemble)}
+        return kind(STATE, ACTION, in_keys=["state"], generator=source, **shape)
 
     stack = ProposalPolicy(network(Actor), network(Actor), network(Critic, 3))
     stack.only_clone[1] = True
-    state = torch.randn(4, 50, STATE)
-    together = stack(TensorDict({"state": state}, (4, 50)))["action"]
+    state = torch.randn(4, 200, STATE, generator=source)
+    together = stack(TensorDict({"state": state}, (4, 200)))["action"]
     names = [*stack.state_dict()]
     for row in range(4):
         weights = {name: stack.state_dict()[name][row] for name in names}
-        data = TensorDict({"state": state[row]}, 50)
+        data = TensorDict({"state": state[row]}, 200)
         alone = torch.func.functional_call(stack, weights, (data,))["action"]
         torch.testing.assert_close(together[row], alone)
-    cloned = stack.clone(TensorDict({"state": state}, (4, 50)))["action"]
+    cloned = stack.clone(TensorDict({"state": state}, (4, 200)))["action"]
     taken = (together == cloned).all(-1).float().mean(-1)
     assert taken[1] == 1 and (taken[[0, 2, 3]] < 1).all() and (taken > 0).all()
 
