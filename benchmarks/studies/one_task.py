@@ -11,9 +11,9 @@ starts each time, without noise.
     python benchmarks/studies/one_task.py --gate       # can critics tell success from failure?
 
 With ``--gate``, the clone plays 200 episodes, from which critics learn its values. For 100 others,
-from other starts, the table shows how well the lowest value tells, some steps after the start, episodes
-that will succeed from those that will not (area under the ROC curve), and its mean beside the mean
-return.
+from other starts, the table shows how well the lowest value tells, some steps after the start,
+episodes that will succeed from those that will not (area under the ROC curve), and its mean beside
+the mean return.
 """
 
 from __future__ import annotations
