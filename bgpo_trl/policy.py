@@ -269,7 +269,9 @@ class TrainedPolicy:
             raise ValueError("the policy has seen no demonstration: show it one with condition()")
         shape, noise = (*self.encoders.vae.frame_shape, 3), torch.Generator().manual_seed(0)
         frames = torch.randint(256, (8, *shape), generator=noise, dtype=torch.uint8)
-        program = torch.export.export(make_fx(self._action)(frames[0]), (frames[0],))
+        # Traced with the weights of today, which may decide what is computed at all.
+        traced = make_fx(lambda frame: self._action(frame))(frames[0])
+        program = torch.export.export(traced, (frames[0],))
         made, scene = program.module(), find_scene(self.config.scene)
         for frame in frames:
             expected = torch.from_numpy(self.act(frame))

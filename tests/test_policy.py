@@ -169,6 +169,7 @@ def test_frames_of_a_camera_are_cropped_turned_and_resized(load):
     np.testing.assert_array_equal(frames, camera[:, 16:80:2, 10:138:2])
     one = policy.preprocess(camera[0], color="rgb", crop=(16, 10, 64, 128))
     np.testing.assert_array_equal(one, frames[0])
+    policy.condition(frames)
     assert policy.act(one).shape == (4,)
     for wrong in (
         {"color": "hsv"},
