@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from tensordict import TensorDict
 from torch import Tensor
+from torch.fx.experimental.proxy_tensor import make_fx
 from torchrl.envs import Compose
 
 from bgpo_trl.algorithms import Algorithm, entry
@@ -19,8 +21,10 @@ from bgpo_trl.algorithms.algorithm import Policy
 from bgpo_trl.algorithms.environments import clip, encode
 from bgpo_trl.configs import RunConfig
 from bgpo_trl.data.bank import DemonstrationBank
+from bgpo_trl.data.dataset import resize_frames
 from bgpo_trl.encoders.representation import Representation, embed_demonstrations
 from bgpo_trl.files.checkpoint import has_checkpoint, load_checkpoint
+from bgpo_trl.files.writing import make_folder
 from bgpo_trl.runs.config_file import read_config
 from bgpo_trl.runs.demonstrations import load_inputs
 from bgpo_trl.runs.directory import check_checkpoint, fitting_checkpoint
@@ -198,10 +202,84 @@ class TrainedPolicy:
         if self._policy is None:
             raise ValueError("the policy has seen no demonstration: show it one with condition()")
         seen = self._frames(frame, "a frame is uint8 [{}]", 3)
-        state = self._observe(TensorDict({"pixels": seen}))[self.config.algorithm.state].to(
-            self.algorithm.device
-        )
-        return self._policy.act(state).cpu().numpy()
+        return self._action(seen).cpu().numpy()
+
+    def _action(self, frame: Tensor) -> Tensor:
+        """Return the action for a frame uint8 ``[H, W, 3]``, on the device of the policy."""
+        assert self._policy is not None
+        state = self._observe(TensorDict({"pixels": frame}))[self.config.algorithm.state]
+        return self._policy.act(state.to(self.algorithm.device))
+
+    def preprocess(
+        self,
+        frames: ArrayLike,
+        *,
+        color: Literal["rgb", "bgr"],
+        crop: tuple[int, int, int, int] | None = None,
+    ) -> NDArray[np.uint8]:
+        """Return frames of a camera or film as `condition` and `act` take them.
+
+        Args:
+            frames: A frame uint8 ``[H', W', 3]``, or several ``[T, H', W', 3]``.
+            color: Order of the channels; OpenCV's is ``"bgr"``.
+            crop: Top, left, height and width (pixels) of what to keep, the same as of the frames
+                that the encoders were trained on; None keeps all.
+
+        Raises:
+            ValueError: If frames have another dtype or shape, there is no such order, or the crop
+                exceeds the frames.
+        """
+        array = np.asarray(frames)
+        if color not in ("rgb", "bgr"):
+            raise ValueError(f"color is {color!r}: choose 'rgb' or, for OpenCV, 'bgr'")
+        if array.dtype != np.uint8 or array.ndim not in (3, 4) or array.shape[-1] != 3:
+            raise ValueError(f"frames are uint8 [..., H, W, 3], got {array.dtype} {[*array.shape]}")
+        if crop is not None:
+            top, left, height, width = crop
+            inside = top + height <= array.shape[-3] and left + width <= array.shape[-2]
+            if not inside or min(top, left) < 0 or min(height, width) < 1:
+                raise ValueError(f"crop {crop} exceeds frames of {[*array.shape[-3:-1]]}")
+            array = array[..., top : top + height, left : left + width, :]
+        array = array[..., ::-1] if color == "bgr" else array
+        several = array if array.ndim == 4 else array[None]
+        resized = resize_frames(several, self.encoders.vae.frame_shape)
+        return resized if array.ndim == 4 else resized[0]
+
+    @torch.no_grad()
+    def export(self, path: str | Path) -> None:
+        """Write the policy, as conditioned, as a program of ``torch.export``.
+
+        The program maps a frame uint8 ``[H, W, 3]`` to an action float32 ``[A]`` in [-1, 1], with
+        frame encoder, clipping and context inside: ``torch.export.load(path).module()(frame)``. It
+        needs no part of this package. Before it is written, its actions are compared with those of
+        `act` on frames of noise.
+
+        Args:
+            path: File ending in ``.pt2``; an existing one is replaced.
+
+        Raises:
+            ValueError: If no demonstration was given before, or the file has another ending.
+            RuntimeError: If the program acts otherwise; nothing is written.
+            OSError: If the file cannot be written.
+        """
+        path = Path(path)
+        if path.suffix != ".pt2":
+            raise ValueError(f"{path} is to hold a program of torch.export: end its name in .pt2")
+        if self._policy is None:
+            raise ValueError("the policy has seen no demonstration: show it one with condition()")
+        shape, noise = (*self.encoders.vae.frame_shape, 3), torch.Generator().manual_seed(0)
+        frames = torch.randint(256, (8, *shape), generator=noise, dtype=torch.uint8)
+        # Traced with the weights of today, which may decide what is computed at all.
+        traced = make_fx(lambda frame: self._action(frame))(frames[0])
+        program = torch.export.export(traced, (frames[0],))
+        made, scene = program.module(), find_scene(self.config.scene)
+        for frame in frames:
+            expected = torch.from_numpy(self.act(frame))
+            if not torch.allclose(made(frame), expected, rtol=0, atol=1e-5):
+                raise RuntimeError("the exported program acts otherwise than the policy")
+        about = {"scene": scene.identity, "rate": scene.rate, "tasks": [*self.tasks]}
+        make_folder(path.parent)
+        torch.export.save(program, path, extra_files={"bgpo_trl.json": json.dumps(about)})
 
     def _frames(self, frames: ArrayLike, wanted: str, ndim: int) -> Tensor:
         array = np.asarray(frames)

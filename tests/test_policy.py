@@ -4,6 +4,8 @@ import json
 import pickle
 import runpy
 import shutil
+import subprocess
+import sys
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -127,6 +129,57 @@ def test_recognition_of_demonstrations_of_any_length(trainer_of, load, encoders,
     assert (seen.group, seen.group_novelty) == (int(member.group), float(member.novelty))
     assert seen.known == (seen.group_novelty <= 1)
     assert policy.act(frames[-1]).shape == (4,)
+
+
+@pytest.mark.parametrize("name", ["bgpo", "without-gwr", "dist-nll-demonstrations"])
+def test_an_exported_policy_acts_as_before_in_a_process_without_the_package(load, tmp_path, name):
+    policy, path = load(name), tmp_path / "policy.pt2"
+    with pytest.raises(ValueError, match="has seen no demonstration"):
+        policy.export(path)
+    policy.condition(DEMONSTRATIONS[1], task=TASKS[1])
+    with pytest.raises(ValueError, match=r"end its name in .pt2"):
+        policy.export(tmp_path / "policy")
+    policy.export(path)
+    frames = noise(7, 3)
+    np.save(tmp_path / "frames.npy", frames)
+    code = (
+        "import sys, numpy as np, torch\n"
+        "about = {'bgpo_trl.json': ''}\n"
+        "act = torch.export.load('policy.pt2', extra_files=about).module()\n"
+        "actions = [act(torch.from_numpy(frame)) for frame in np.load('frames.npy')]\n"
+        "np.save('actions.npy', torch.stack(actions).numpy())\n"
+        "print('bgpo_trl' in sys.modules, about['bgpo_trl.json'])\n"
+    )
+    found = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    imported, about = found.stdout.split(maxsplit=1)
+    assert imported == "False"
+    assert json.loads(about) == {"scene": NICO.identity, "rate": 5.0, "tasks": [*TASKS]}
+    expected = [policy.act(frame) for frame in frames]
+    np.testing.assert_allclose(np.load(tmp_path / "actions.npy"), expected, rtol=0, atol=1e-5)
+    assert np.ptp(expected, axis=0).max() > 1e-4  # the frame matters
+
+
+def test_frames_of_a_camera_are_cropped_turned_and_resized(load):
+    policy = load()
+    camera = np.random.default_rng(0).integers(256, size=(2, 96, 160, 3), dtype=np.uint8)
+    camera[:, 16:80, 10:138] = camera[:, 16:48, 10:74].repeat(2, 1).repeat(2, 2)
+    frames = policy.preprocess(camera[..., ::-1], color="bgr", crop=(16, 10, 64, 128))
+    np.testing.assert_array_equal(frames, camera[:, 16:80:2, 10:138:2])
+    one = policy.preprocess(camera[0], color="rgb", crop=(16, 10, 64, 128))
+    np.testing.assert_array_equal(one, frames[0])
+    policy.condition(frames)
+    assert policy.act(one).shape == (4,)
+    for wrong in (
+        {"color": "hsv"},
+        {"color": "rgb", "crop": (40, 0, 64, 128)},
+        {"color": "rgb", "crop": (-1, 0, 64, 128)},
+        {"color": "rgb", "frames": camera[0] / 255},
+        {"color": "rgb", "frames": camera[0, ..., :1]},
+    ):
+        with pytest.raises(ValueError, match=r"color is 'hsv'|exceeds frames|frames are uint8"):
+            policy.preprocess(**{"frames": camera, **wrong})
 
 
 @pytest.mark.parametrize("name", ["bgpo", "maml-demonstrations"])

@@ -293,7 +293,11 @@ class _Reader:
         frames = self._frames(rows[::stride], times[::stride], place)
         if self.frame_shape is not None:
             frames = (resize_frames(frame[None], self.frame_shape)[0] for frame in frames)
-        episode: Episode = {"pixels": np.stack([*frames])}
+        first = next(frames)
+        pixels = np.empty((n_read, *first.shape), np.uint8)  # filled, since a stack would be twice
+        for number, frame in enumerate(itertools.chain([first], frames)):
+            pixels[number] = frame
+        episode: Episode = {"pixels": pixels}
         for key, name in chosen.items():
             found = np.stack([np.atleast_1d(row) for row in rows[name]])
             values = found.astype(np.float32)
