@@ -175,8 +175,6 @@ class ProposalPolicy(TensorDictModuleBase):
         """Write the actions of states; return the same tensordict."""
         inputs = tensordict.select(*self.in_keys)
         cloned, own = (net(inputs.copy())["action"] for net in (self.clone, self.actor))
-        if self.only_clone.all():
-            return tensordict.set("action", cloned)
         dim = len(self.batch_size)
         both = inputs.unsqueeze(dim).expand(*inputs.shape[:dim], 2, *inputs.shape[dim:]).clone()
         both.set("action", torch.stack([cloned, own], dim))
