@@ -8,6 +8,7 @@ import runpy
 import shlex
 import sys
 from pathlib import Path
+from types import ModuleType
 from unittest import mock
 
 import pytest
@@ -138,6 +139,11 @@ def test_a_command_is_understood(command, monkeypatch, parse_only):
     if script.startswith("examples/"):
         assert not arguments  # and what they do is tested in test_examples.py
     elif arguments[script == "bgpo_trl" :]:  # without, it may be a name rather than a command
+        # A module that the page shows.
+        module = ModuleType("my_algorithm")
+        module.__file__ = str(ROOT / "my_algorithm.py")
+        monkeypatch.setitem(sys.modules, "my_algorithm", module)
+        monkeypatch.setitem(ALGORITHMS, "mine", ALGORITHMS["bgpo"])
         with pytest.raises(Parsed):
             run(script, arguments, monkeypatch)
 

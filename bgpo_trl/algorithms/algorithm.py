@@ -114,7 +114,7 @@ class Algorithm(ABC):
         test_actor: Network of test episodes, called with the parameters of a `Policy`.
         needs_label: Whether policies depend on the task label of a test episode.
         needs_replay: Whether `snapshot` depends on the replay buffer.
-        logged: Further entries of `update` to log, such as ``("loss_alpha",)``: columns of
+        logged: Further entries of `update` to log, such as ``("loss_clone",)``: columns of
             ``train.csv``, 0 where an update has not returned them, and curves of dashboards.
     """
 

@@ -208,6 +208,10 @@ class _Recorder:
         success = False
         for _ in range(scene.max_steps):
             actions.append(act())
+            if not np.isfinite(actions[-1]).all():  # what a simulation makes of it is its own
+                raise ValueError(
+                    f"an episode of the demonstrator of {task!r} has an action that is not finite"
+                )
             success, failure = checked_outcome(simulation, simulation.step(actions[-1]))
             frames.append(checked_frame(simulation, shape))
             states.append(self._state())
