@@ -1,4 +1,4 @@
-"""What studies of trained runs share: arguments, loading, episodes of scripted policies."""
+"""Arguments, loading, and episodes of scripted policies, for all studies of trained runs."""
 
 from __future__ import annotations
 

@@ -52,12 +52,16 @@ class ProposalTrials:
     def begin(self, seed: int, group: int) -> bool:
         """Return whether the clone alone plays the training episode that begins."""
         record = self._groups[seed].setdefault(group, _Record())
-        later = record.episodes - self.clone_episodes
-        # True in one of 1 / clone_share episodes, evenly spread.
-        due = int((later + 1) * self.clone_share) > int(later * self.clone_share)
-        alone = later < 0 or due
+        alone = self.is_clones(record.episodes)
         self._playing[seed] = group, alone
         return alone
+
+    def is_clones(self, episode: int) -> bool:
+        """Return whether the clone plays a group's training episode, counted from 0."""
+        later = episode - self.clone_episodes
+        # One in 1 / clone_share of the later episodes, evenly spread.
+        due = int((later + 1) * self.clone_share) > int(later * self.clone_share)
+        return later < 0 or due
 
     def end(self, seed: int, success: bool) -> None:
         """Count the end of a training episode of a seed."""

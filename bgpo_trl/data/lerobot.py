@@ -101,7 +101,7 @@ def read_lerobot(
 
 
 class _WrongError(ValueError):
-    """What is wrong with a file, in words."""
+    """A file is wrong; the message says in which way."""
 
 
 @contextlib.contextmanager
