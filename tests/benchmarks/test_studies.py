@@ -3,9 +3,13 @@
 import pandas as pd
 import pytest
 import torch
+from tensordict import TensorDict
+from torch.func import functional_call
 
 from benchmarks.studies.cut_demonstrations import Networks, unknown_task
 from benchmarks.studies.gwr_as_published import Arguments, grow
+from benchmarks.studies.trained import POLICIES
+from bgpo_trl.modules.actor_critic import Actor, Critic, ProposalPolicy
 from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.modules.gwr import GWRB
 
@@ -46,3 +50,24 @@ def test_an_unknown_task_is_told_by_its_novelty(bank):
     assert found["detected"].tolist() == [1, 1]
     same = unknown_task(networks, known.seen().embedding, known.seen().embedding, (3, 8))
     assert same["area"].tolist() == [0.5, 0.5]
+
+
+def test_a_policy_of_proposals_is_taken_apart():
+    torch.manual_seed(0)
+    actor, clone = Actor(6, in_keys=["latent"]), Actor(6, in_keys=["latent"])
+    policy = ProposalPolicy(actor, clone, Critic(6, in_keys=["latent"], batch_size=[5]))
+    weights = {**dict(policy.named_parameters()), **dict(policy.named_buffers())}
+    states = TensorDict({"latent": torch.randn(50, 6)}, [50])
+    found = {
+        name: functional_call(policy, change(weights), (states.copy(),))["action"]
+        for name, change in POLICIES.items()
+    }
+    torch.testing.assert_close(found["actor alone"], actor(states.copy())["action"])
+    torch.testing.assert_close(found["clone alone"], clone(states.copy())["action"])
+    of_actor = (found["critics choose"] == found["actor alone"]).all(-1)
+    of_clone = (found["critics choose"] == found["clone alone"]).all(-1)
+    assert (of_actor ^ of_clone).all()
+    assert of_actor.any() and of_clone.any()
+    only = {**weights, "only_clone": torch.tensor(True)}
+    as_tested = functional_call(policy, POLICIES["as in tests"](only), (states.copy(),))["action"]
+    assert as_tested.equal(found["clone alone"])

@@ -1,0 +1,142 @@
+"""Success and steps of trained policies in many tests, and of the two policies they choose from.
+
+    python benchmarks/studies/trained.py runs/continual-bgpo-quick --episodes 200
+
+Starts and held-out demonstrations depend on the seed and the number of tests only. Runs with the
+same seeds and tasks, such as ``bgpo`` and ``clone``, are thus tested from the same starts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import pandas as pd
+import torch
+from shared import TrainedArguments, load_blocks
+from torch import Tensor
+
+from bgpo_trl.analysis.tables import markdown
+from bgpo_trl.evaluation import Snapshot
+from bgpo_trl.experiments.command_line import command_line
+from bgpo_trl.experiments.episodes import evaluator_of, snapshots_of
+from bgpo_trl.files.progress import progress_bar
+from bgpo_trl.files.writing import check_folder
+from bgpo_trl.machine import set_threads
+from bgpo_trl.plugins import import_plugin
+from bgpo_trl.policy import LoadedRun
+from bgpo_trl.runs.provenance import commit_of_code, write_measurement
+
+# Number of the evaluation; it seeds start states that no other test uses.
+_NUMBER = 2**31 + 4
+
+Weights = dict[str, Tensor]
+
+
+def _choice(weights: Weights) -> Weights:
+    return {**weights, "only_clone": torch.zeros_like(weights["only_clone"])}
+
+
+def _clone(weights: Weights) -> Weights:
+    return {**weights, "only_clone": torch.ones_like(weights["only_clone"])}
+
+
+def _actor(weights: Weights) -> Weights:
+    # The actor takes the place of the clone.
+    actor = {n.replace("actor.", "clone.", 1): w for n, w in weights.items() if "actor." in n}
+    return {**_clone(weights), **actor}
+
+
+POLICIES: dict[str, Callable[[Weights], Weights]] = {
+    "as in tests": lambda weights: weights,
+    "critics choose": _choice,
+    "clone alone": _clone,
+    "actor alone": _actor,
+}
+"""Changes of the weights of a `ProposalPolicy`, by the name of the policy that results."""
+
+
+class Row(NamedTuple):
+    """Tests of a seed's policy on a task, a row of ``trained.csv``."""
+
+    policy: str
+    seed: int
+    task: str
+    episodes: int
+    success: float
+    steps: float | None
+    """Mean length of the successful tests; None without one."""
+
+
+def measure_trained(
+    run: LoadedRun, episodes: int, watch: Callable[[], object] = lambda: None
+) -> list[Row]:
+    """Test the policies of all seeds of a run, without noise.
+
+    Policies that do not choose between proposals are tested as they are.
+
+    Args:
+        run: The run.
+        episodes: Test episodes of each task and seed.
+        watch: Called at each step of the policies.
+
+    Raises:
+        ValueError: If ``episodes`` is less than 1.
+    """
+    if episodes < 1:
+        raise ValueError(f"--episodes must be at least 1, got {episodes}")
+    config, rows = run.config, list[Row]()
+    held_out = run.bank.held_out(config.held_out)
+    evaluator = evaluator_of(run, held_out, episodes)
+    snapshots = snapshots_of(run, evaluator, _NUMBER)
+    chooses = all("only_clone" in snapshot.policy.parameters for snapshot in snapshots)
+    for name, change in POLICIES.items() if chooses else [*POLICIES.items()][:1]:
+        tested = [_changed(snapshot, change) for snapshot in snapshots]
+        result = evaluator.run(tested, run.algorithm.device, watch)
+        for i, seed in enumerate(config.seeds):
+            for j, task in enumerate(config.tasks):
+                success, steps = result.success[i, j], result.steps[i, j]
+                mean = round(steps[success].double().mean().item(), 2) if success.any() else None
+                share = round(success.double().mean().item(), 4)
+                rows.append(Row(name, seed, task, episodes, share, mean))
+    evaluator.simulation.close()
+    return rows
+
+
+def _changed(snapshot: Snapshot, change: Callable[[Weights], Weights]) -> Snapshot:
+    policy = snapshot.policy
+    return replace(snapshot, policy=replace(policy, parameters=change(policy.parameters)))
+
+
+def trained(arguments: TrainedArguments) -> str:
+    """Test trained policies often, and the clone, the actor and the critics' choice alone.
+
+    Prints a table of success (%) and steps of a success, means over seeds; writes trained.csv and
+    trained.json (commit and command) into the run directory.
+
+    Raises:
+        ValueError: If the run cannot be loaded, or ``episodes`` is less than 1.
+        OSError: If the results cannot be written.
+    """
+    commit, out = commit_of_code(), arguments.out or arguments.run
+    import_plugin(arguments.module)
+    set_threads(arguments.threads)
+    runs, rows = load_blocks(arguments.run), list[Row]()
+    check_folder(out)
+    for run in runs:
+        steps = len(POLICIES) * (run.config.algorithm.max_steps + 1)
+        with progress_bar("trained", total=steps, unit="step") as bar:
+            rows += measure_trained(run, arguments.episodes, bar.update)
+    table = pd.DataFrame(rows)
+    write_measurement(out, "trained", table, commit)
+    tasks, names = [*table["task"].unique()], [*table["policy"].unique()]
+    means = table.groupby(["task", "policy"])[["success", "steps"]].mean()
+    cells = [
+        [f"{100 * s:.1f} % in {n:.1f}" for s, n in means.loc[t].loc[names].values] for t in tasks
+    ]
+    return markdown([["task", *names], *([t, *row] for t, row in zip(tasks, cells, strict=True))])
+
+
+if __name__ == "__main__":
+    command_line(trained)
