@@ -21,9 +21,9 @@ from bgpo_trl.seeding import Seeding, row_seeds
 __all__ = [
     "Observation",
     "Outcome",
+    "RobotEnv",
     "Simulation",
     "SimulationEnv",
-    "RobotEnv",
     "checked_executed",
     "checked_frame",
     "checked_outcome",
