@@ -111,7 +111,7 @@ def test_own_robot_is_trained_and_tested_without_a_simulation(run):
         for out in [run("own_robot.py")]
         for task in ("left", "right")
     )
-    assert left + right >= 6  # random actions succeed in none
+    assert left + right >= 6  # of random actions, 31 of 400 episodes succeed
     assert not rows("runs/own-robot/run/eval.csv")
     train = rows("runs/own-robot/run/train.csv")
     assert len(train) == 60 and {row["seed"] for row in train} == {"0"}
