@@ -11,6 +11,7 @@ from torchrl.envs import check_env_specs
 
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.configs import RunConfig
+from bgpo_trl.data.dataset import load_demonstrations, write_demonstrations
 from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.encoders.train import make_pretrained
 from bgpo_trl.policy import load_run
@@ -134,3 +135,42 @@ def test_a_start_of_a_task_is_asked_for_by_its_name():
     env = robot_scene().simulate(["right", "left"], batch_size=[1])
     env.reset(TensorDict({"task": torch.tensor([1])}, [1]))
     assert env.simulations[0].task == "left"
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"setup": {"camera": "side", "units": "0.5 m/s"}},
+        {"setup": {"camera": "top", "units": "0.4 m/s"}},
+        {"setup": {"camera": "top"}},
+        {"setup": {}},
+        {"rate": 10.0},
+    ],
+)
+def test_data_and_encoders_of_another_setup_are_refused(tmp_path, monkeypatch, refused, changed):
+    told = {"setup": {"camera": "top", "units": "0.5 m/s"}, "rate": 5.0}
+    robot = robot_scene(**told)
+    monkeypatch.setitem(SCENES, "dot", robot)
+    assert robot.identity == "dot dot-1 (camera: top; rate: 5.0; units: 0.5 m/s)"
+    frames = np.zeros((3, 16, 24, 3), np.uint8)
+    episodes = {name: [{"pixels": frames}] * 2 for name in TASKS}
+    path = tmp_path / "shown"
+    write_demonstrations(path, episodes, scene="dot", held_out_per_task=1)
+    load_demonstrations(path)
+    robot.check_identity(robot_scene(**told).identity, "the file", "train")
+
+    other = robot_scene(**{**told, **changed})
+    monkeypatch.setitem(SCENES, "dot", other)
+    refused(lambda: load_demonstrations(path), robot.full_version, other.full_version)
+    refused(
+        lambda: other.check_identity(robot.identity, "the file", "train anew"),
+        f"the file is of the scene {robot.identity}, this is {other.identity}",
+        "train anew",
+    )
+
+
+def test_a_setup_is_words_and_leaves_the_rate_to_the_scene():
+    assert robot_scene(rate=3.0).identity == "dot dot-1"
+    for wrong in ({"camera": ""}, {"units": 3}, {"camera": "a\nb"}, {"rate": "5"}):
+        with pytest.raises(ValueError, match="setup"):
+            robot_scene(setup=wrong)
