@@ -179,7 +179,11 @@ class Trainer:
             bank=seen,
             spread=config.spread,
         )
-        self.evaluator = Evaluator(
+        self.evaluator = self._make_evaluator(bank) if config.eval_episodes else None
+
+    def _make_evaluator(self, bank: DemonstrationBank) -> Evaluator:
+        config = self.config
+        return Evaluator(
             config.algorithm,
             seeds=config.seeds,
             schedule=self._schedule,
@@ -225,7 +229,7 @@ class Trainer:
                     transition, state = env.step_and_maybe_reset(state)
                     # Some losses are of every other update; rows have the latest of each.
                     self._losses |= update.result() if update else {}
-                    algorithm.store(transition)
+                    algorithm.store(_executed(transition))
                     self._cost.add_step(n_tasks, time.monotonic() - started)
                     self.env_steps += 1
                     self._state = state
@@ -306,7 +310,7 @@ class Trainer:
         self._log(row)
         if index == 0 and algorithm.gwr is not None and episode in self._growth_moments:
             save_graph(self.directory / "gwr", episode, algorithm.gwr)
-        if episode % self.config.eval_every == 0:
+        if self.evaluator is not None and episode % self.config.eval_every == 0:
             self.evaluator.take(algorithm, index, episode, self.env_steps)
 
     def _begin_tasks(self, index: int) -> None:
@@ -326,7 +330,8 @@ class Trainer:
             self._later.append(row)
 
     def _evaluate(self) -> None:
-        while (result := self.evaluator.run_next(self.algorithm.device)) is not None:
+        evaluator, device = self.evaluator, self.algorithm.device
+        while evaluator is not None and (result := evaluator.run_next(device)) is not None:
             rows = [
                 {
                     "algorithm": self.config.name,
@@ -360,7 +365,7 @@ class Trainer:
         state: dict[str, Any] = {
             "algorithm": self.algorithm.state_dict(),
             "world": self.world.state_dict(),
-            "evaluator": self.evaluator.state_dict(),
+            "evaluator": {} if self.evaluator is None else self.evaluator.state_dict(),
             "state": self._state.clone().to_dict(),
             "env_steps": self.env_steps,
             "losses": self._losses,
@@ -375,6 +380,13 @@ class Trainer:
     def _load(self, state: dict[str, Any]) -> None:
         self.world.load_state_dict(state["world"])
         self.algorithm.load_state_dict(state["algorithm"])
-        self.evaluator.load_state_dict(state["evaluator"], self.algorithm)
+        if self.evaluator is not None:
+            self.evaluator.load_state_dict(state["evaluator"], self.algorithm)
         self._state = TensorDict(state["state"], self.world.env.batch_size)
         self.env_steps, self._losses = state["env_steps"], state["losses"]
+
+
+def _executed(transition: TensorDictBase) -> TensorDictBase:
+    """Return a transition with the action that a physical robot executed, see `RobotEnv`."""
+    action = transition.get(("next", "executed_action"), None)
+    return transition if action is None else transition.copy().set("action", action)

@@ -105,6 +105,19 @@ def test_gwr_alone_finds_two_clusters(run):
 
 
 @pytest.mark.slow
+def test_own_robot_is_trained_and_tested_without_a_simulation(run):
+    left, right = (
+        int(re.search(rf"^{task}: (\d+) of 10 tests on the robot succeed$", out, re.M).group(1))
+        for out in [run("own_robot.py")]
+        for task in ("left", "right")
+    )
+    assert left + right >= 6  # of random actions, 31 of 400 episodes succeed
+    assert not rows("runs/own-robot/run/eval.csv")
+    train = rows("runs/own-robot/run/train.csv")
+    assert len(train) == 60 and {row["seed"] for row in train} == {"0"}
+
+
+@pytest.mark.slow
 def test_own_scene_is_learned_from_its_pixels(run):
     out = run("own_scene.py")
 

@@ -52,7 +52,8 @@ class RunConfig(Settings):
     """Training episodes between evaluations (1 in the paper)."""
     eval_episodes: int = 1
     """Test episodes per evaluation, of each task presented so far. Ours: the paper tests one
-    episode of one random task, which is cheaper but noisier."""
+    episode of one random task, which is cheaper but noisier. 0 is for a physical robot: training
+    without tests, by `Trainer` alone."""
     held_out: Literal["validation", "test"] = "validation"
     """Half of the held-out demonstrations that test episodes show: ``"validation"`` for choosing
     settings, ``"test"`` for reporting results. Ours."""
@@ -69,9 +70,9 @@ class RunConfig(Settings):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_seeds(self.seeds)
-        at_least(self, 1, "episodes", "eval_every", "eval_episodes")
+        at_least(self, 1, "episodes", "eval_every")
         at_least(self, 0, "checkpoint_minutes")
-        at_least(self, 0, "demonstrations")
+        at_least(self, 0, "demonstrations", "eval_episodes")
         distinct = len(set(self.tasks)) == len(self.tasks)
         starts = self.task_starts
         check(

@@ -35,7 +35,7 @@ def load_demonstrations(path: str | Path, *, verify: bool = True) -> TensorDict:
     path = Path(path)
     meta = read_meta(path)
     # The scene of demonstrations from elsewhere need not be known here.
-    version = find_scene(meta["scene"]).version if meta["scene"] in SCENES else None
+    version = find_scene(meta["scene"]).full_version if meta["scene"] in SCENES else None
     if version not in (None, meta["scene_version"]):
         raise ValueError(
             f"{path} was recorded in scene {meta['scene_version']!r}, this is {version}; {_REMEDY}"
@@ -68,7 +68,7 @@ def layout_of(
     """
     return {
         "scene": scene.name,
-        "scene_version": scene.version,
+        "scene_version": scene.full_version,
         "frame_shape": [*scene.frame_shape],
         "max_steps": max_steps or scene.max_steps,
         "action_size": scene.action_size if actions else 0,

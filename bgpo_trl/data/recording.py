@@ -196,7 +196,7 @@ class _Recorder:
 
         ``policy_of`` returns the policy that acts, given the demonstrator with that noise.
         """
-        from bgpo_trl.scenes.simulation import checked_frame, checked_outcome
+        from bgpo_trl.scenes.simulation import checked_executed, checked_frame, checked_outcome
 
         simulation, scene = self.simulation, self.scene
         simulation.seed(start)
@@ -212,7 +212,9 @@ class _Recorder:
                 raise ValueError(
                     f"an episode of the demonstrator of {task!r} has an action that is not finite"
                 )
-            success, failure = checked_outcome(simulation, simulation.step(actions[-1]))
+            outcome = checked_outcome(simulation, simulation.step(actions[-1]))
+            actions[-1] = checked_executed(simulation, actions[-1], outcome)
+            success, failure = outcome[:2]
             frames.append(checked_frame(simulation, shape))
             states.append(self._state())
             if success or failure:

@@ -74,6 +74,11 @@ def run_experiment(
         raise ValueError(
             "--bank and --encoders name what is there: leave them or --train-encoders out"
         )
+    if not config.eval_episodes:
+        raise ValueError(
+            "this command draws figures of tests: set eval_episodes to at least 1, or train "
+            "without tests with Trainer (examples/own_robot.py)"
+        )
     commit = commit_of_code()  # read first, since commits may follow during training
     set_threads(arguments.threads)
     keep_freed_memory()

@@ -86,7 +86,7 @@ def play(policy: TrainedPolicy, task: str, demonstration: NDArray, seed: int) ->
     seen, views, success = [checked_frame(simulation, shape)], [_view(simulation)], False
     for _ in range(config.algorithm.max_steps):
         action = policy.act(seen[-1]).astype(np.float64)
-        success, failure = checked_outcome(simulation, simulation.step(action))
+        success, failure = checked_outcome(simulation, simulation.step(action))[:2]
         seen.append(checked_frame(simulation, shape))
         views.append(_view(simulation))
         if success or failure:

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from bgpo_trl.scenes.scene import SCENES, Scene, StateColumns, Weights, find_scene
 
 if TYPE_CHECKING:
-    from bgpo_trl.scenes.simulation import Observation, Outcome, Simulation, SimulationEnv
+    from bgpo_trl.scenes.simulation import Observation, Outcome, RobotEnv, Simulation, SimulationEnv
 else:
 
     def __getattr__(name):
@@ -21,6 +21,7 @@ __all__ = [
     "SCENES",
     "Observation",
     "Outcome",
+    "RobotEnv",
     "Scene",
     "Simulation",
     "SimulationEnv",

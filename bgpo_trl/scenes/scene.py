@@ -82,6 +82,9 @@ class Scene:
         name: Name in settings, files and on command lines, without spaces.
         version: Version of everything that frames and dynamics depend on. Datasets, encoders and
             banks of another version are refused.
+        setup: What else they depend on, in words by name, such as the ``"camera"`` and what an
+            action of 1 is in the robot's ``"units"``. If given, setup and ``rate`` are part of the
+            version in all files, see `full_version`.
         tasks: Names of all tasks; may grow while the program runs.
         default_tasks: Names of the tasks of an experiment by default.
         own_tasks: Names of the tasks that come with the scene; the default ones if None.
@@ -108,6 +111,7 @@ class Scene:
 
     name: str
     version: str
+    setup: Mapping[str, str] = field(default_factory=dict)
     tasks: Collection[str]
     default_tasks: tuple[str, ...]
     own_tasks: tuple[str, ...] | None = None
@@ -129,6 +133,11 @@ class Scene:
             raise ValueError(f"the name of a scene is a word without spaces, got {self.name!r}")
         if not isinstance(self.version, str) or not self.version.isprintable() or not self.version:
             raise ValueError(f"the version of a scene is a printable string, got {self.version!r}")
+        for words in (*self.setup.keys(), *self.setup.values()):
+            if not isinstance(words, str) or not words.isprintable() or not words:
+                raise ValueError(f"the setup of a scene is printable strings, got {words!r}")
+        if "rate" in self.setup:
+            raise ValueError("the rate of a scene is no part of its setup: give it as rate")
         if min(self.frame_shape) < 16 or len(self.frame_shape) != 2:
             raise ValueError(
                 f"frame_shape is {self.frame_shape}: a height and a width of at least 16 pixels"
@@ -150,7 +159,14 @@ class Scene:
     @property
     def identity(self) -> str:
         """Name and version, by which encoders and banks say whose frames they are made of."""
-        return f"{self.name} {self.version}"
+        return f"{self.name} {self.full_version}"
+
+    @property
+    def full_version(self) -> str:
+        """The version and, if there is a setup, in brackets the setup and the rate."""
+        stated = sorted({**self.setup, "rate": f"{self.rate}"}.items())
+        words = "; ".join(f"{name}: {value}" for name, value in stated)
+        return f"{self.version} ({words})" if self.setup else self.version
 
     def check_identity(self, found: str | None, what: object, remedy: str) -> None:
         """Raise ``ValueError`` if something was made for another robot, or version of this one.

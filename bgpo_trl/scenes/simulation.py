@@ -21,8 +21,10 @@ from bgpo_trl.seeding import Seeding, row_seeds
 __all__ = [
     "Observation",
     "Outcome",
+    "RobotEnv",
     "Simulation",
     "SimulationEnv",
+    "checked_executed",
     "checked_frame",
     "checked_outcome",
     "checked_state",
@@ -37,10 +39,13 @@ class Outcome(NamedTuple):
     Attributes:
         success: Whether the task is solved, which ends the episode with reward 1.
         failure: Whether the episode ends without success, for example by a fall.
+        executed: Action ``[A]`` in [-1, 1] that a physical robot executed, where its limits
+            allowed less than was asked for; None for the action itself. See `RobotEnv`.
     """
 
     success: bool
     failure: bool = False
+    executed: NDArray[Any] | None = None
 
 
 class Simulation(ABC):
@@ -133,13 +138,36 @@ def checked_outcome(simulation: Simulation, outcome: object) -> Outcome:
     Raises:
         ValueError: If it is no `Outcome` of two bools; a tuple of Gym would succeed at each step.
     """
-    if not isinstance(outcome, Outcome) or not all(type(o) in (bool, np.bool_) for o in outcome):
+    if not isinstance(outcome, Outcome) or not all(
+        type(o) in (bool, np.bool_) for o in outcome[:2]
+    ):
         found = " ".join(short_repr(outcome).split())
         raise ValueError(
             f"{type(simulation).__name__}.step() returned {found}: return an Outcome, "
             "whose success and failure are True or False"
         )
     return outcome
+
+
+def checked_executed(
+    simulation: Simulation, action: NDArray[np.float64], outcome: Outcome
+) -> NDArray[np.float64]:
+    """Return the action that was executed in a step: the one asked for, unless it says otherwise.
+
+    Raises:
+        ValueError: If it is something else than finite numbers in [-1, 1], as many as asked for.
+    """
+    if outcome.executed is None:
+        return action
+    executed = np.asarray(outcome.executed)
+    kind, wanted = executed.dtype.kind, action.shape
+    # Comparisons with NaN are false.
+    if kind not in "fiu" or executed.shape != wanted or not (np.abs(executed) <= 1).all():
+        raise ValueError(
+            f"{type(simulation).__name__}.step() returned the executed action "
+            f"{short_repr(executed.tolist())}: return {len(action)} numbers in [-1, 1], or None"
+        )
+    return executed.astype(np.float64)
 
 
 class SimulationEnv(EnvBase):
@@ -347,9 +375,15 @@ class SimulationEnv(EnvBase):
         def record(row: int, outcome: Outcome) -> None:
             self._record(row)
             rewards[row] = outcome.success
-            self._success[row], self._failure[row] = outcome
+            self._success[row], self._failure[row] = outcome[:2]
+            self._record_executed(row, actions[row], outcome)
 
         self._threads.each(rows, step, record)
+
+    def _record_executed(self, row: int, action: NDArray[np.float64], outcome: Outcome) -> None:
+        del row, action
+        if outcome.executed is not None:
+            raise ValueError("only a RobotEnv takes the executed action: make the environment one")
 
     def frames(self) -> np.ndarray:
         """Return a copy of the frames that were drawn last, uint8 ``[*B, H, W, 3]``.
@@ -424,3 +458,47 @@ class SimulationEnv(EnvBase):
         self._failure[:] = state["failure"].numpy()
         for key, value in self._current.items():
             value[:] = state["current"][key].numpy()
+
+
+class RobotEnv(SimulationEnv):
+    """One physical robot as an environment: a `SimulationEnv` with a batch of one.
+
+    The robot is a `Simulation` whose methods talk to it:
+
+    - ``reset(task)`` brings it and its objects to a start: by a movement, or by telling a person
+      what to do and waiting. It returns once the robot is ready.
+    - ``step(action)`` scales the action to the robot's units, keeps the limits of joints, speed and
+      workspace, waits for the end of the control period, and returns an `Outcome`: success by a
+      function or a person's key, failure where an episode must end, and the action that was
+      ``executed``. To stop everything, raise an exception.
+    - ``frame()`` returns the camera's frame in the size of the scene.
+    - ``seed(seed)`` may do nothing: starts are as a person makes them.
+
+    ``Scene.make_env`` returns a new environment at each call. Training makes one, if the run has no
+    tests (``RunConfig.eval_episodes=0``); tests on the robot are episodes of the trained policy.
+
+    Writes, besides what `SimulationEnv` writes, ``"executed_action"`` float32 ``[*B, A]``, that of
+    the last step. `Trainer` stores it as the action of the transition.
+
+    Args and errors are those of `SimulationEnv`; a batch of several is refused, too.
+    """
+
+    def __init__(self, *args: Any, batch_size: int | Sequence[int] = (), **kwargs: Any) -> None:
+        count = as_shape(batch_size, "batch_size").numel()
+        if count != 1:
+            raise ValueError(
+                f"there is one robot, and {count} are asked for: train one seed (seeds=(0,)), "
+                "without tests (eval_episodes=0)"
+            )
+        super().__init__(*args, batch_size=batch_size, **kwargs)
+
+    def _make_specs(
+        self, frame_shape: Sequence[int], state_size: int | None, action_size: int
+    ) -> None:
+        super()._make_specs(frame_shape, state_size, action_size)
+        self.observation_spec["executed_action"] = self.action_spec.clone()
+        self._current["executed_action"] = np.zeros((1, action_size), np.float32)
+
+    def _record_executed(self, row: int, action: NDArray[np.float64], outcome: Outcome) -> None:
+        executed = checked_executed(self.simulations[row], action, outcome)
+        self._current["executed_action"][row] = executed

@@ -1,0 +1,176 @@
+"""One physical robot as an environment, with a dot whose motor moves by .2 of what it can."""
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs import check_env_specs
+
+from bgpo_trl.algorithms import ALGORITHMS
+from bgpo_trl.configs import RunConfig
+from bgpo_trl.data.dataset import load_demonstrations, write_demonstrations
+from bgpo_trl.data.recording import record_demonstrations
+from bgpo_trl.encoders.train import make_pretrained
+from bgpo_trl.policy import load_run
+from bgpo_trl.runs.results import EVAL, read_table
+from bgpo_trl.scenes import SCENES, Outcome, RobotEnv, SimulationEnv
+from bgpo_trl.training import Trainer
+from tests.helpers import TINY_ENCODERS
+from tests.scenes.dot import SavedDot, scene
+
+TASKS = ("left", "right")
+LIMIT = np.float32(0.2)
+SHAPE = {"frame_shape": (16, 24), "action_size": 1}
+
+
+class Limited(SavedDot):
+    """Executes at most a fifth of the largest action."""
+
+    def step(self, action):
+        executed = np.clip(action, -0.2, 0.2)
+        return super().step(executed)._replace(executed=executed)
+
+
+def robot_scene(make=Limited, **changes):
+    return replace(scene(make, **changes), make_env=partial(RobotEnv, make, **SHAPE))
+
+
+def stepped(env, action):
+    state = env.reset()
+    state["action"] = torch.full((*env.batch_size, 1), action)
+    return env.step(state)["next"]
+
+
+def test_the_environment_returns_the_executed_action():
+    check_env_specs(RobotEnv(Limited, TASKS, batch_size=[1], **SHAPE))
+    env = robot_scene().simulate(TASKS, batch_size=[1])
+    assert stepped(env, 0.7)["executed_action"].tolist() == [[LIMIT]]
+    assert stepped(env, -0.1)["executed_action"].tolist() == [[np.float32(-0.1)]]
+    free = RobotEnv(SavedDot, TASKS, batch_size=[1], **SHAPE)  # executes what it is told
+    assert stepped(free, 0.7)["executed_action"].tolist() == [[np.float32(0.7)]]
+
+
+@pytest.mark.parametrize("wrong", [[0.1, 0.2], [1.5], [float("nan")], ["fast"]])
+def test_executed_actions_that_are_none_are_refused(wrong):
+    class Wrong(SavedDot):
+        def step(self, action):
+            return Outcome(success=False, executed=wrong)
+
+    with pytest.raises(ValueError, match=r"Wrong.step\(\) returned the executed action"):
+        stepped(robot_scene(Wrong).simulate(TASKS), 0.1)
+
+
+def test_executed_actions_are_not_lost_in_an_environment_of_simulations():
+    with pytest.raises(ValueError, match="only a RobotEnv takes the executed action"):
+        stepped(SimulationEnv(Limited, TASKS, **SHAPE), 0.7)
+
+
+def test_recordings_hold_the_executed_actions(tmp_path):
+    recorded = record_demonstrations(
+        tmp_path / "shown", scene=robot_scene(), per_task=2, held_out_per_task=1, progress=False
+    )  # the demonstrator asks for .3
+    actions = recorded["action"][torch.arange(12) < recorded["length"][:, None] - 1]
+    assert float(actions.abs().max()) == LIMIT
+
+
+def test_a_run_without_tests_learns_from_what_was_executed(tmp_path, monkeypatch):
+    robot = robot_scene()
+    monkeypatch.setitem(SCENES, "dot", robot)
+    encoders, bank = make_pretrained(
+        tmp_path / "encoders.safetensors",
+        tmp_path / "shown",
+        folder=tmp_path / "log",
+        scene=robot,
+        config=TINY_ENCODERS,
+        per_task=6,
+        held_out_per_task=2,
+        progress=False,
+    )
+    run = RunConfig(
+        scene="dot",
+        tasks=TASKS,
+        task_starts=(0, 2),
+        seeds=(3,),
+        episodes=4,
+        eval_episodes=0,
+        algorithm=replace(ALGORITHMS["bgpo"].config, max_steps=12),
+    )
+    parts = {"bank": bank, "encoders": encoders, "progress": False}
+    asked = []
+    with Trainer(run, tmp_path / "run", **parts) as trainer:
+        act = trainer.algorithm.act
+
+        def acted(state):
+            asked.append(act(state)["action"])
+            return state.set("action", asked[-1])
+
+        monkeypatch.setattr(trainer.algorithm, "act", acted)
+        trainer.run()
+        held, _ = trainer.algorithm.replay.contents(0)
+    expected = torch.cat(asked).clamp(-LIMIT, LIMIT)
+    assert torch.cat(asked).abs().max() > LIMIT
+    torch.testing.assert_close(held["action"], expected)
+    assert not len(read_table(tmp_path / "run" / "eval.csv", EVAL))
+    longer = replace(run, episodes=6)  # the dot, unlike most robots, can be saved
+    with Trainer(longer, tmp_path / "run", resume=True, **parts) as trainer:
+        trainer.run()
+    frame = stepped(robot.simulate(TASKS), 0.0)["pixels"].numpy()
+    policy = load_run(tmp_path / "run")
+    policy.condition(frame[None])
+    assert abs(float(policy.act(frame)[0])) <= 1
+
+
+def test_several_robots_are_refused_in_one_line(refused):
+    refused(
+        lambda: robot_scene().simulate(TASKS, batch_size=[2]),
+        "there is one robot, and 2 are asked for",
+        "train one seed (seeds=(0,)), without tests (eval_episodes=0)",
+    )
+
+
+def test_a_start_of_a_task_is_asked_for_by_its_name():
+    env = robot_scene().simulate(["right", "left"], batch_size=[1])
+    env.reset(TensorDict({"task": torch.tensor([1])}, [1]))
+    assert env.simulations[0].task == "left"
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"setup": {"camera": "side", "units": "0.5 m/s"}},
+        {"setup": {"camera": "top", "units": "0.4 m/s"}},
+        {"setup": {"camera": "top"}},
+        {"setup": {}},
+        {"rate": 10.0},
+    ],
+)
+def test_data_and_encoders_of_another_setup_are_refused(tmp_path, monkeypatch, refused, changed):
+    told = {"setup": {"camera": "top", "units": "0.5 m/s"}, "rate": 5.0}
+    robot = robot_scene(**told)
+    monkeypatch.setitem(SCENES, "dot", robot)
+    assert robot.identity == "dot dot-1 (camera: top; rate: 5.0; units: 0.5 m/s)"
+    frames = np.zeros((3, 16, 24, 3), np.uint8)
+    episodes = {name: [{"pixels": frames}] * 2 for name in TASKS}
+    path = tmp_path / "shown"
+    write_demonstrations(path, episodes, scene="dot", held_out_per_task=1)
+    load_demonstrations(path)
+    robot.check_identity(robot_scene(**told).identity, "the file", "train")
+
+    other = robot_scene(**{**told, **changed})
+    monkeypatch.setitem(SCENES, "dot", other)
+    refused(lambda: load_demonstrations(path), robot.full_version, other.full_version)
+    refused(
+        lambda: other.check_identity(robot.identity, "the file", "train anew"),
+        f"the file is of the scene {robot.identity}, this is {other.identity}",
+        "train anew",
+    )
+
+
+def test_a_setup_is_words_and_leaves_the_rate_to_the_scene():
+    assert robot_scene(rate=3.0).identity == "dot dot-1"
+    for wrong in ({"camera": ""}, {"units": 3}, {"camera": "a\nb"}, {"rate": "5"}):
+        with pytest.raises(ValueError, match="setup"):
+            robot_scene(setup=wrong)
