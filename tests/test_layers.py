@@ -88,7 +88,5 @@ def test_the_suite_imports_no_learning_and_the_package_no_scripts():
     for path in FILES:
         packages = {module.partition(".")[0] for module in imported(path)}
         assert not packages & {"benchmarks", "examples", "tests", "scripts"}, path
-        # Only the scene of NICO imports the suite, and the doctor, who looks at a frame of it even
-        # if PyTorch is broken.
-        if path.name not in ("nico.py", "doctor.py"):
+        if path.name != "nico.py":
             assert not any(name.startswith("suites.nico") for name in imported(path)), path

@@ -17,7 +17,7 @@ from typing import Any
 
 from bgpo_trl.configs import RunConfig
 from bgpo_trl.files.progress import progress_bar
-from bgpo_trl.files.writing import lock_directory, no_link
+from bgpo_trl.files.writing import lock_directory
 from bgpo_trl.runs.directory import CSV_FILES
 
 # Bounds the retries of a job that always crashes its worker.
@@ -99,7 +99,7 @@ def work(job: Job, play: Callable[[Job], None], command: Sequence[str]) -> None:
     sys.argv = list(command)
     with (
         lock_directory(job.directory, wait=True),  # A worker that Ray lost may still be writing.
-        open(job.directory / "log.txt", "a", buffering=1, opener=no_link) as log,
+        open(job.directory / "log.txt", "a", buffering=1) as log,
         contextlib.redirect_stdout(log),
         contextlib.redirect_stderr(log),
     ):

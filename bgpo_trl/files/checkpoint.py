@@ -19,8 +19,6 @@ from typing import Any, BinaryIO
 import torch
 from torch import Tensor, nn
 
-from bgpo_trl.files.writing import open_new
-
 _NAME = re.compile(r"checkpoint-\d+-[0-9a-f]{16}\.pt")
 _REMEDY = "put it back as the run left it, or begin a new run in another directory"
 _PLAIN_TYPES = (bool, int, float, str, type(None), Tensor, nn.Parameter)
@@ -60,7 +58,7 @@ def save_checkpoint(directory: str | os.PathLike[str], state: dict[str, Any]) ->
     number = _number(earlier[0]) + 1 if earlier else 1
     try:
         directory.mkdir(parents=True, exist_ok=True)
-        with open_new(temporary) as file:
+        with temporary.open("wb") as file:
             digest = _write(state, file)
         path = directory / f"checkpoint-{number:06d}-{digest}.pt"
         temporary.replace(path)
@@ -91,9 +89,6 @@ def load_checkpoint(
 ) -> dict[str, Any]:
     """Read the newest intact checkpoint; warn about newer ones that are damaged.
 
-    A damaged file gets the suffix ``.damaged``, so that the next checkpoint does not replace the
-    intact one.
-
     With ``mmap``, tensors are mapped from the file lazily, for reading only some of them. With
     ``newest``, only the newest one is read, for what is to be used as it is, not resumed.
 
@@ -111,8 +106,6 @@ def load_checkpoint(
                 "which goes on from the one before"
             )
         warnings.warn(f"{path} is damaged: resuming from the checkpoint before it.", stacklevel=2)
-        with contextlib.suppress(OSError):  # such as in a directory that is read only
-            path.rename(path.with_suffix(".damaged"))
     raise ValueError(
         f"{directory} holds no intact checkpoint to resume from: start a new run in another "
         "directory."

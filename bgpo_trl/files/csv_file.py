@@ -10,8 +10,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
-from bgpo_trl.files.writing import no_link
-
 
 class CsvFile:
     r"""Append-only CSV file with fixed columns that can be truncated to an earlier position.
@@ -45,7 +43,7 @@ class CsvFile:
         header = _csv_line(self.columns)
         self._header_size = len(header)
         try:
-            self._file = open(self.path, "a+b", buffering=0, opener=no_link)  # noqa: SIM115
+            self._file = open(self.path, "a+b", buffering=0)  # noqa: SIM115
         except OSError as error:
             raise OSError(
                 f"cannot write {self.path} ({error.strerror}): choose another run directory"
@@ -55,11 +53,9 @@ class CsvFile:
             content = self._file.read()
             if not header.startswith(content[: len(header)]):
                 found = content[:300].partition(b"\n")[0].decode(errors="replace").strip()
-                # Binary content could hold terminal control sequences.
-                text = found.isascii() and found.isprintable()
                 raise ValueError(
-                    f"{self.path} {f'has the columns {found}' if text else 'is not a CSV file'}, "
-                    f"this run writes {','.join(self.columns)}: choose another run directory."
+                    f"{self.path} begins with {found!r}, not with the columns "
+                    f"{','.join(self.columns)} of this run: choose another run directory."
                 )
             self._file.truncate(content.rfind(b"\n") + 1)
             if len(content) < len(header):

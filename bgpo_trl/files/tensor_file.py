@@ -40,13 +40,7 @@ def save_tensors(
     path = Path(path)
     make_folder(path.parent)
     contiguous = {key: value.contiguous() for key, value in tensors.items()}
-    content = save(contiguous, {**metadata, "sha256": _checksum(contiguous, metadata)})
-    try:
-        write_whole(path, content)
-    except OSError as error:
-        raise OSError(
-            f"cannot write {path} ({error.strerror}): make room, or choose another path"
-        ) from None
+    write_whole(path, save(contiguous, {**metadata, "sha256": _checksum(contiguous, metadata)}))
 
 
 def load_tensors(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], dict[str, str]]:

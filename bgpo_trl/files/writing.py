@@ -9,7 +9,7 @@ import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from filelock import FileLock, Timeout
 
@@ -66,25 +66,6 @@ def new_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise
 
 
-def open_new(path: Path) -> BinaryIO:
-    """Open a file to write it anew; what has its name is removed first, such as a symbolic link.
-
-    Raises:
-        OSError: If it cannot be written.
-    """
-    path.unlink(missing_ok=True)
-    return path.open("xb")
-
-
-def no_link(path: str, flags: int) -> int:
-    """Open a file, as ``opener`` of `open`, but not through a symbolic link.
-
-    Raises:
-        OSError: If it cannot be opened, or is a symbolic link.
-    """
-    return os.open(path, flags | os.O_NOFOLLOW, 0o666)
-
-
 def without_folders(text: str) -> str:
     """Return a text for others to read, with its absolute paths shortened.
 
@@ -105,20 +86,19 @@ def _shortened(path: Path) -> str:
 def write_whole(path: Path, content: str | bytes) -> None:
     """Write a file by way of a temporary one beside it; if it fails, the old one is kept.
 
-    A symbolic link of this name is replaced, and what it points to stays as it is.
-
     Raises:
         OSError: If it cannot be written.
     """
     temporary = path.with_name(f"{path.name}.tmp")
     try:
-        with open_new(temporary) as file:
-            file.write(content.encode() if isinstance(content, str) else content)
+        temporary.write_bytes(content.encode() if isinstance(content, str) else content)
         temporary.replace(path)
-    except OSError:
+    except OSError as error:
         with contextlib.suppress(OSError):
             temporary.unlink()
-        raise
+        raise OSError(
+            error.errno, f"cannot write {path} ({error.strerror}): make room, or choose another"
+        ) from error
 
 
 def write_json(path: Path, content: Any) -> None:

@@ -98,12 +98,7 @@ def write_costs(path: Path, costs: Mapping[int, Cost]) -> None:
         f"{tasks},{cost.steps},{cost.seconds:.3f},{cost.megabytes:.6f}"
         for tasks, cost in sorted(costs.items())
     )
-    try:
-        write_whole(path, "\n".join([",".join(COST_COLUMNS), *rows, ""]))
-    except OSError as error:
-        raise OSError(
-            error.errno, f"cannot write {path} ({error.strerror}): make room, then resume the run"
-        ) from error
+    write_whole(path, "\n".join([",".join(COST_COLUMNS), *rows, ""]))
 
 
 def total_cost(costs: Sequence[Mapping[int, Cost]]) -> dict[int, Cost]:

@@ -231,20 +231,12 @@ class RunLogger:
                 f"train.csv has the column {', '.join(sorted(repeated))} already: choose other "
                 "names for what the algorithm logs"
             )
-        check_settings(self.directory, config, longer=resume)
         if not resume and holds_run(self.directory):
             raise ValueError(
                 f"{self.directory} already holds a run: resume it, or choose another run directory."
             )
         make_folder(self.directory)
-        path = self.directory / "config.json"
-        try:
-            write_json(path, config)
-        except OSError as error:
-            raise OSError(
-                f"cannot write {path} ({error.strerror}): make room, or choose another run "
-                "directory"
-            ) from None
+        write_json(self.directory / "config.json", config)
         self._train = CsvFile(self.directory / "train.csv", columns)
         self._eval = CsvFile(self.directory / "eval.csv", EVAL_COLUMNS)
 

@@ -95,7 +95,6 @@ REPORTED = {
     "a row cut short": replaced("final.csv", ",20,0.5,0.25", ""),
     "no held-out tests": without_lines("final.csv", "held-out"),
     "a seed without late tests": without_lines("eval.csv", "bgpo,8,10"),
-    "control characters": replaced("eval.csv", TASKS[0], "\x1b[31mred"),
 }
 # These files are optional, and nothing in the summary is required.
 for _name in ("final.csv missing", "summary.json missing", "summary.json of something else"):

@@ -54,7 +54,7 @@ def test_values_of_one_element_are_written_as_numbers(tmp_path):
 def test_a_file_with_other_columns_is_refused_unchanged(content, tmp_path, refused):
     path = tmp_path / "eval.csv"
     path.write_text(content)
-    refused(lambda: CsvFile(path, COLUMNS), "has the columns", "choose another run directory")
+    refused(lambda: CsvFile(path, COLUMNS), "begins with", "choose another run directory")
 
 
 def test_a_partial_last_row_is_dropped(tmp_path):

@@ -3,21 +3,9 @@
 import os
 import select
 
-import numpy as np
-import pandas as pd
 import pytest
-import torch
-from matplotlib.figure import Figure
 
-from bgpo_trl.figures.frames import save_gif
-from bgpo_trl.figures.gwr import write_nodes
-from bgpo_trl.figures.style import save_figure
-from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
-from bgpo_trl.files.csv_file import CsvFile
-from bgpo_trl.files.tensor_file import save_tensors
 from bgpo_trl.files.writing import lock_directory, write_whole
-from bgpo_trl.runs.cost import write_costs
-from bgpo_trl.runs.provenance import write_table
 from tests.helpers import largest_file
 
 
@@ -27,48 +15,6 @@ def test_a_failed_write_keeps_the_old_file(tmp_path):
         write_whole(tmp_path / "file", "new")
     assert (tmp_path / "file").read_text() == "old"
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
-
-
-WRITERS = {
-    "text": lambda path: write_whole(path, "new"),
-    "figure": lambda path: save_figure(Figure(), path),
-    "gif": lambda path: save_gif(np.zeros((2, 32, 64, 3), np.uint8), path),
-    "tensors": lambda path: save_tensors(path, {"a": torch.zeros(2)}, {}),
-    "rows": lambda path: write_table(path, pd.DataFrame({"a": [1]})),
-    "costs": lambda path: write_costs(path, {}),
-    "nodes": lambda path: write_nodes(path, torch.zeros(2, 3), torch.zeros(2)),
-}
-
-
-@pytest.mark.parametrize("kind", WRITERS)
-def test_a_symbolic_link_is_replaced_and_not_written_through(tmp_path, kind):
-    WRITERS[kind](tmp_path / "reference")
-    (tmp_path / "private").write_text("private")
-    for name in ("file", "file.tmp"):
-        (tmp_path / "file").unlink(missing_ok=True)
-        (tmp_path / name).symlink_to(tmp_path / "private")
-        WRITERS[kind](tmp_path / "file")
-        assert (tmp_path / "private").read_text() == "private"
-        assert not (tmp_path / "file").is_symlink()
-        assert (tmp_path / "file").read_bytes() == (tmp_path / "reference").read_bytes()
-
-
-def test_a_checkpoint_is_not_written_through_a_symbolic_link(tmp_path):
-    (tmp_path / "private").write_text("private")
-    (tmp_path / "checkpoint").mkdir()
-    (tmp_path / "checkpoint" / "checkpoint.tmp").symlink_to(tmp_path / "private")
-    save_checkpoint(tmp_path / "checkpoint", {"episode": 1})
-    assert (tmp_path / "private").read_text() == "private"
-    assert load_checkpoint(tmp_path / "checkpoint") == {"episode": 1}
-
-
-@pytest.mark.parametrize("exists", [True, False])
-def test_rows_are_not_appended_through_a_symbolic_link(tmp_path, refused, exists):
-    if exists:
-        (tmp_path / "private").touch()
-    (tmp_path / "eval.csv").symlink_to(tmp_path / "private")
-    refused(lambda: CsvFile(tmp_path / "eval.csv", ["a"]), "symbolic links", "choose another")
-    assert (tmp_path / "private").exists() == exists
 
 
 def test_a_second_process_is_refused_until_the_first_is_killed(other_process, refused, tmp_path):
