@@ -155,7 +155,7 @@ class EasySimulation(NicoSimulation):
         self.environment.physics.model.opt.disableflags |= disabled
 
     def step(self, action):
-        success, _ = super().step(action)
+        success = super().step(action).success
         return Outcome(success or self.environment.physics.arm_angles()[0] > 0.1)
 
 
