@@ -75,6 +75,10 @@ COMMANDS = {
             "Film what a run has learned.",
         ),
         (
+            *(_LOOK, "one-shot", "experiments.one_shot", arguments.OneShotArguments),
+            "Show a trained policy a film of a demonstration.",
+        ),
+        (
             *(_LOOK, "groups", "experiments.groups", arguments.GroupsArguments),
             "Measure the groups that form from demonstrations.",
         ),
@@ -95,7 +99,9 @@ def main() -> None:
         sys.exit(2)
     command = COMMANDS[name]
     command_line(
-        lambda given: getattr(importlib.import_module(command.module), name)(given),
+        lambda given: getattr(importlib.import_module(command.module), name.replace("-", "_"))(
+            given
+        ),
         options,
         kind=command.kind,
         program=f"bgpo {name}",

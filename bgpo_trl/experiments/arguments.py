@@ -284,6 +284,24 @@ class WatchArguments(ImportArguments):
 
 
 @dataclass(frozen=True)
+class OneShotArguments(ImportArguments):
+    """Show a trained policy one film, print what it recognizes, and play a task if one is named."""
+
+    run: tyro.conf.Positional[Path]
+    """Run directory."""
+    demonstration: Path
+    """Film of a demonstration, or folder of its frames as images; at the rate of the robot."""
+    crop: tuple[int, int, int, int] | None = None
+    """Top, left, height and width (pixels) of what to keep of the frames."""
+    task: str | None = None
+    """Task by which the simulation counts success; policies of BGPO are not told it."""
+    run_seed: int | None = None
+    """Seed of the run whose policy acts; the first by default."""
+    scene_seed: int = 1
+    """Seed of the start."""
+
+
+@dataclass(frozen=True)
 class GroupsArguments(BankArguments):
     """Measure the groups of behaviors that form from demonstrations, without learning a policy.
 

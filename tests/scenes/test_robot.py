@@ -14,6 +14,8 @@ from bgpo_trl.configs import RunConfig
 from bgpo_trl.data.dataset import load_demonstrations, write_demonstrations
 from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.encoders.train import make_pretrained
+from bgpo_trl.experiments.arguments import Arguments
+from bgpo_trl.experiments.run import run_experiment
 from bgpo_trl.policy import load_run
 from bgpo_trl.runs.results import EVAL, read_table
 from bgpo_trl.scenes import SCENES, Outcome, RobotEnv, SimulationEnv
@@ -174,3 +176,12 @@ def test_a_setup_is_words_and_leaves_the_rate_to_the_scene():
     for wrong in ({"camera": ""}, {"units": 3}, {"camera": "a\nb"}, {"rate": "5"}):
         with pytest.raises(ValueError, match="setup"):
             robot_scene(setup=wrong)
+
+
+def test_the_command_refuses_a_run_without_tests(tmp_path, refused):
+    arguments = Arguments(out=tmp_path / "run")
+    refused(
+        lambda: run_experiment(arguments, "continual", RunConfig(eval_episodes=0)),
+        "this command draws figures of tests",
+        "set eval_episodes to at least 1",
+    )

@@ -1,0 +1,63 @@
+"""`bgpo one-shot`: a film is read exactly or refused; what it prints is what the policy infers."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import bgpo_trl
+from bgpo_trl.experiments.arguments import OneShotArguments
+from bgpo_trl.experiments.one_shot import one_shot, read_film
+
+pytestmark = pytest.mark.usefixtures("easy_world")
+FRAMES = np.random.default_rng(0).integers(256, size=(11, 64, 128, 3), dtype=np.uint8)
+
+
+@pytest.fixture
+def film(tmp_path):
+    """A folder of images; the one without a frame's ending is a note."""
+    folder = tmp_path / "film"
+    folder.mkdir()
+    for number, frame in enumerate(FRAMES):
+        Image.fromarray(frame).save(folder / f"{number:04}.png")
+    (folder / "note.txt").write_text("top camera")
+    return folder
+
+
+def test_it_prints_what_the_policy_infers_and_plays_a_task(run_of, film):
+    run = run_of("bgpo")
+    policy = bgpo_trl.load_run(run)
+    found = policy.condition(policy.preprocess(FRAMES, color="rgb"))
+    told, node, group, hint = one_shot(OneShotArguments(run=run, demonstration=film)).splitlines()
+    assert told == "11 frames of 64 x 128"
+    assert node == f"behavior: node {found.node} of GWR-B, activity {found.activity:.2f}"
+    assert group.startswith(f"group {found.group}, novelty {found.group_novelty:.2f}: ")
+    assert hint == "--task NAME plays it in the simulation"
+
+    task = policy.tasks[1]
+    options = {"run": run, "demonstration": film, "task": task, "crop": (0, 0, 32, 64)}
+    *_, played = one_shot(OneShotArguments(**options)).splitlines()
+    assert played.startswith((f"{task}: success after ", f"{task}: no success after "))
+
+
+def test_frames_are_read_exactly_in_the_order_of_names(film):
+    np.testing.assert_array_equal(read_film(film), FRAMES)
+
+
+def test_what_cannot_be_read_is_refused_in_one_line(film, tmp_path, refused):
+    (tmp_path / "empty").mkdir()
+    refused(lambda: read_film(tmp_path / "empty"), "has no frames", "name a film")
+    refused(lambda: read_film(tmp_path / "none.mp4"), "there is no", "name a film")
+    text = tmp_path / "text.mp4"
+    text.write_text("no film")
+    refused(lambda: read_film(text), str(text), "a folder of its frames")
+    for name, image, cause, remedy in (
+        ("size", Image.fromarray(FRAMES[0, :9]), "differ in size", "make them alike"),
+        ("deep", Image.fromarray(np.zeros((64, 128), np.uint16)), "more than 8 bits", "make it"),
+        ("clear", Image.fromarray(np.zeros((64, 128, 4), np.uint8)), "transparent", "make it RGB"),
+    ):
+        path = film / f"{name}.png"
+        image.save(path)
+        refused(lambda: read_film(film), cause, remedy)
+        path.unlink()
+    (film / "broken.png").write_bytes(b"\x89PNG")
+    refused(lambda: read_film(film), "broken.png is no image", "make it a PNG")
