@@ -41,8 +41,10 @@ class Trainer:
     Each seed of the batch plays ``config.episodes`` training episodes. Seeds that finish early go
     on, unlogged, until the last one finishes; logged values are those of the seed alone. A run
     resumed with more ``config.episodes`` equals a run of that length. A run resumed with further
-    tasks at the end (`bgpo_trl.runs.growth.add_task`) keeps all that it has learned. Updates, one in
-    ``update_every`` steps, run while the environment steps, and learn from all earlier transitions.
+    tasks at the end (`bgpo_trl.runs.growth.add_task`) keeps all that it has learned.
+
+    Updates, one in ``update_every`` steps, run while the environment steps, and learn from all
+    earlier transitions.
 
     Checkpoints are written before the first step and between steps; Ctrl-C and SIGTERM wait for the
     end of the step and save. After any other failure, a resumed run repeats the steps since the
@@ -148,9 +150,8 @@ class Trainer:
             opened.enter_context(self.logger)
             if saved is not None:
                 self.logger.truncate_to(saved["position"])
-            if (
-                saved is None and encoders is not None
-            ):  # Others cannot be loaded to watch demonstrations.
+            # Runs without encoders cannot be loaded to watch demonstrations.
+            if saved is None and encoders is not None:
                 keep_inputs(self.directory, bank, encoders, self._scene)
             self.dashboard = Dashboard(
                 self.directory, loggers, settings=self._settings, per_seed=per_seed_curves

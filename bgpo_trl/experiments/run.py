@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -34,7 +35,7 @@ from bgpo_trl.runs.config_file import read_config
 from bgpo_trl.runs.dashboard import tensorboard_logger, wandb_logger
 from bgpo_trl.runs.demonstrations import BANK, load_inputs, own_weights
 from bgpo_trl.runs.directory import holds_run
-from bgpo_trl.runs.growth import Grown, add_task, distinctness
+from bgpo_trl.runs.growth import Distinctness, Grown, add_task, distinctness
 from bgpo_trl.runs.provenance import command, commit_of_code, versions
 from bgpo_trl.scenes import Scene, find_scene
 from bgpo_trl.training import Trainer
@@ -90,6 +91,7 @@ def run_experiment(
     group = f"{name}-{config.name}"
     out = named_directory(arguments) or Path("runs") / f"{group}-{size}"
     grown: Grown | None = None
+    seen: Distinctness | None = None
     loggers = _loggers(arguments, config, out, group, size)
     if arguments.resume:
         config = _continued(arguments, config, out)
@@ -98,6 +100,9 @@ def run_experiment(
         if arguments.add_task is not None:
             grown = add_task(out, arguments.add_task, config=config, bank=arguments.bank)
             config = grown.config
+            seen = distinctness(grown.bank)
+            if not seen.clear:
+                warnings.warn(f"{arguments.add_task}: {seen}", stacklevel=2)
     elif holds_run(out):
         raise ValueError(f"{out} holds a run: --resume continues it, --out names another directory")
     with lock_directory(out):
@@ -125,8 +130,8 @@ def run_experiment(
                 trainer.dashboard.log_media(f"figures/{path.stem}", path)
             # Written last, as the mark of a complete run.
             write_json(out / "summary.json", summary)
-    if grown is not None:
-        lines.append(f"{arguments.add_task}: {distinctness(grown.bank)}")
+    if seen is not None:
+        lines.append(f"{arguments.add_task}: {seen}")
     lines.append(f"curve and figures: {out}; in numbers: bgpo report {quote(str(out))}")
     return "\n".join(lines)
 
