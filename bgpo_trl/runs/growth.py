@@ -66,8 +66,10 @@ def add_task(
     if not has_checkpoint(folder):
         raise ValueError(f"{directory} has no checkpoint: begin a new run with all of the tasks")
     encoders, shown = load_inputs(directory, saved.tasks, digests, scene)
-    beside = bank_path(weights_of_run(directory, scene, encoders.identity))
-    found = DemonstrationBank.load(bank or beside, encoder_id=encoders.identity)
+    weights = weights_of_run(directory, scene, encoders.identity)
+    assert weights is not None  # `load_inputs` has found them.
+    path = bank_path(weights) if bank is None else bank
+    found = DemonstrationBank.load(path, encoder_id=encoders.identity)
     shown += found.for_tasks((task,))
     state = load_checkpoint(folder, mmap=True)
     check_checkpoint(folder, state, read_json(directory / "config.json"))
