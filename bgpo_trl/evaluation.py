@@ -215,15 +215,27 @@ class Evaluator:
         return {"next": self._next, "waiting": waiting}
 
     def load_state_dict(self, state: dict[str, Any], algorithm: Algorithm) -> None:
-        """Restore a `state_dict`, given the algorithm of its snapshots."""
+        """Restore a `state_dict`, given the algorithm of its snapshots.
+
+        Snapshots of fewer tasks take the further ones as not yet presented.
+        """
         self._next = state["next"]
         self._waiting = [
-            [
-                Snapshot(**{**saved, "policy": algorithm.policy(**saved["policy"])})
-                for saved in of_seed
-            ]
-            for of_seed in state["waiting"]
+            [self._restored(saved, algorithm) for saved in of_seed] for of_seed in state["waiting"]
         ]
+
+    def _restored(self, saved: dict[str, Any], algorithm: Algorithm) -> Snapshot:
+        n_more = self.schedule.n_tasks - len(saved["presented"])
+
+        def padded(entry: Tensor) -> Tensor:  # with the last task's, which are not used
+            return torch.cat([entry, *[entry[-1:]] * n_more])
+
+        policy = dict(saved["policy"])
+        for name in ("context", "network"):
+            if policy[name] is not None:
+                policy[name] = padded(policy[name])
+        presented = torch.cat([saved["presented"], torch.zeros(n_more, dtype=torch.bool)])
+        return Snapshot(**{**saved, "presented": presented, "policy": algorithm.policy(**policy)})
 
 
 def start_seeds(seed: int, number: int, shape: Sequence[int]) -> NDArray[np.int64]:

@@ -40,8 +40,11 @@ class Trainer:
 
     Each seed of the batch plays ``config.episodes`` training episodes. Seeds that finish early go
     on, unlogged, until the last one finishes; logged values are those of the seed alone. A run
-    resumed with more ``config.episodes`` equals a run of that length. Updates, one in
-    ``update_every`` steps, run while the environment steps, and learn from all earlier transitions.
+    resumed with more ``config.episodes`` equals a run of that length. A run resumed with further
+    tasks at the end (`bgpo_trl.runs.growth.add_task`) keeps all that it has learned.
+
+    Updates, one in ``update_every`` steps, run while the environment steps, and learn from all
+    earlier transitions.
 
     Checkpoints are written before the first step and between steps; Ctrl-C and SIGTERM wait for the
     end of the step and save. After any other failure, a resumed run repeats the steps since the
@@ -132,8 +135,11 @@ class Trainer:
             saved = load_last(self.directory, self._settings) if resume else None
             self._make_parts(bank, make, device)
             if saved is not None:
+                self._check_added_tasks(saved, bank)
                 with fitting_checkpoint(self.directory):
                     self._load(saved)
+                if encoders is not None:  # before config.json names tasks that may be added
+                    keep_inputs(self.directory, bank, encoders, self._scene)
             self._cost = CostLog(self.directory / "cost.csv", resume=saved is not None)
             self.logger = RunLogger(
                 self.directory,
@@ -144,7 +150,8 @@ class Trainer:
             opened.enter_context(self.logger)
             if saved is not None:
                 self.logger.truncate_to(saved["position"])
-            if encoders is not None:  # Others cannot be loaded to watch demonstrations.
+            # Runs without encoders cannot be loaded to watch demonstrations.
+            if saved is None and encoders is not None:
                 keep_inputs(self.directory, bank, encoders, self._scene)
             self.dashboard = Dashboard(
                 self.directory, loggers, settings=self._settings, per_seed=per_seed_curves
@@ -193,6 +200,30 @@ class Trainer:
             spread=config.spread,
             scene=self._scene,
         )
+
+    def _check_added_tasks(self, saved: dict[str, Any], bank: DemonstrationBank) -> None:
+        """Raise ``ValueError`` if tasks that a checkpoint lacks would change what was learned."""
+        config, before = self.config, saved["settings"]
+        n_before = len(before["tasks"])
+        if n_before == len(config.tasks):
+            return
+        if not self.algorithm.takes_new_tasks:
+            raise ValueError(
+                f"{config.name} was made for {n_before} tasks and cannot take another one: begin a "
+                "new run with all of the tasks"
+            )
+        known = bank.for_tasks(config.tasks[:n_before])
+        if known.identity != before["bank"] or (bank.task[: len(known.task)] >= n_before).any():
+            raise ValueError(
+                f"the demonstrations of the {n_before} tasks of {self.directory} must stay the "
+                "same and come first in the bank: add tasks with add_task (bgpo_trl.runs.growth)"
+            )
+        begun = int(saved["world"]["source"]["episode"].max())
+        if min(config.task_starts[n_before:]) <= begun:
+            raise ValueError(
+                f"a seed of {self.directory} has begun episode {begun + 1} without the new task: "
+                f"let it start at {begun + 1} or later"
+            )
 
     def run(self) -> None:
         """Train to the end; return at once if a resumed run is complete.

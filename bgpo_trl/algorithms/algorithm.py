@@ -114,6 +114,8 @@ class Algorithm(ABC):
         test_actor: Network of test episodes, called with the parameters of a `Policy`.
         needs_label: Whether policies depend on the task label of a test episode.
         needs_replay: Whether `snapshot` depends on the replay buffer.
+        takes_new_tasks: Whether a `state_dict` can be loaded into an algorithm that was made with
+            further tasks, whose demonstrations come last in its bank.
         logged: Further entries of `update` to log, such as ``("loss_clone",)``: columns of
             ``train.csv``, 0 where an update has not returned them, and curves of dashboards.
     """
@@ -124,6 +126,7 @@ class Algorithm(ABC):
     beta: float = 0.0
     needs_label: bool = True
     needs_replay: bool = True
+    takes_new_tasks: bool = False
     logged: tuple[str, ...] = ()
     learner: Learner
     replay: GroupReplay

@@ -46,6 +46,7 @@ class BGPO(Algorithm):
         super().__init__(config, **arguments)
         seeds, embedding_size = self.seeds, self.bank.embedding.shape[-1]
         self.needs_label = config.context == "label"
+        self.takes_new_tasks = not self.needs_label  # A network that reads labels has a fixed size.
         self.beta = config.beta if config.context in ("behavior", "embedding") else 0.0
         if config.context == "behavior":
             self.gwr = GWRB(

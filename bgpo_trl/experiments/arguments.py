@@ -81,6 +81,10 @@ class Arguments(BankArguments):
     resume: bool = False
     """Continue the run in the directory, or begin it if there is none. With --out, or in a run's
     folder, and with neither --preset nor --config, its settings are those of the run."""
+    add_task: str | None = None
+    """With --resume, a further task for the run, which learns it from the next episode that no seed
+    has begun, and keeps what it has learned. Demonstrations are taken from --bank, embedded by the
+    run's encoders (`bgpo bank`), or from beside these. A finished run needs more --episodes."""
     train_encoders: bool = False
     """Record demonstrations and train new encoders instead of using the pretrained ones."""
     wandb: Literal["online", "offline"] | None = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -34,6 +35,7 @@ from bgpo_trl.runs.config_file import read_config
 from bgpo_trl.runs.dashboard import tensorboard_logger, wandb_logger
 from bgpo_trl.runs.demonstrations import BANK, load_inputs, own_weights
 from bgpo_trl.runs.directory import holds_run
+from bgpo_trl.runs.growth import Distinctness, Grown, add_task, distinctness
 from bgpo_trl.runs.provenance import command, commit_of_code, versions
 from bgpo_trl.scenes import Scene, find_scene
 from bgpo_trl.training import Trainer
@@ -79,6 +81,13 @@ def run_experiment(
             "this command draws figures of tests: set eval_episodes to at least 1, or train "
             "without tests with Trainer (examples/own_robot.py)"
         )
+    if arguments.add_task is not None and (
+        not arguments.resume or arguments.train_encoders or arguments.encoders
+    ):
+        raise ValueError(
+            "--add-task: name a run with --resume and --out, without --encoders and "
+            "--train-encoders, since it keeps its own"
+        )
     commit = commit_of_code()  # read first, since commits may follow during training
     set_threads(arguments.threads)
     keep_freed_memory()
@@ -86,15 +95,26 @@ def run_experiment(
     size = arguments.preset or (arguments.config.stem if arguments.config else "quick")
     group = f"{name}-{config.name}"
     out = named_directory(arguments) or Path("runs") / f"{group}-{size}"
+    grown: Grown | None = None
+    seen: Distinctness | None = None
     loggers = _loggers(arguments, config, out, group, size)
     if arguments.resume:
         config = _continued(arguments, config, out)
-        if is_finished(out, config):
+        if arguments.add_task is None and is_finished(out, config):
             return f"{out} is finished, all {config.episodes} episodes: --episodes makes it longer"
+        if arguments.add_task is not None:
+            grown = add_task(out, arguments.add_task, config=config, bank=arguments.bank)
+            config = grown.config
+            seen = distinctness(grown.bank)
+            if not seen.clear:
+                warnings.warn(f"{arguments.add_task}: {seen}", stacklevel=2)
     elif holds_run(out):
         raise ValueError(f"{out} holds a run: --resume continues it, --out names another directory")
     with lock_directory(out):
-        encoders, bank = _encoders(arguments, config, out, device)
+        if grown is None:
+            encoders, bank = _encoders(arguments, config, out, device)
+        else:
+            encoders, bank = grown.encoders, grown.bank
         with Trainer(
             config,
             out,
@@ -115,6 +135,8 @@ def run_experiment(
                 trainer.dashboard.log_media(f"figures/{path.stem}", path)
             # Written last, as the mark of a complete run.
             write_json(out / "summary.json", summary)
+    if seen is not None:
+        lines.append(f"{arguments.add_task}: {seen}")
     lines.append(f"curve and figures: {out}; in numbers: bgpo report {quote(str(out))}")
     return "\n".join(lines)
 
@@ -171,7 +193,7 @@ def _encoders(
     """Return the pretrained encoders and a bank, or new ones made in the run directory."""
     begun = arguments.resume and arguments.bank is None and (out / "config.json").exists()
     scene, own = find_scene(config.scene), own_weights(out)
-    if begun and own.exists():
+    if begun:
         return load_inputs(out, config.tasks, read_config(out / "config.json")[1], scene)
     if not _makes_encoders(arguments, out):
         bank = _bank(arguments, out)

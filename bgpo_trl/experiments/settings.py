@@ -51,6 +51,8 @@ def run_config(
     if arguments.settings:
         config = tyro.cli(SETTINGS, default=config, args=arguments.settings)
     if from_start:
+        if arguments.add_task is not None:
+            raise ValueError("--add-task: a task that comes later is for `bgpo continual`")
         if any(config.task_starts) and (arguments.gives("task_starts") or "task_starts" in given):
             raise ValueError("--task-starts: all tasks are presented from the start here")
         config = at_once(config)

@@ -39,19 +39,20 @@ def keep_inputs(
     Raises:
         OSError: If a file cannot be written.
     """
-    weights = _weights(directory, scene, encoders.identity)
+    weights = weights_of_run(directory, scene, encoders.identity)
     if weights is None:
         weights = own_weights(directory)
         save_representation(encoders, weights)
-    for path in (directory / BANK, bank_path(weights)):
-        try:
-            there = DemonstrationBank.load(path, encoder_id=encoders.identity)
-            if there.for_tasks(bank.tasks).identity == bank.identity:
-                return
-        except ValueError:  # missing, damaged, of other encoders or of other tasks
-            continue
+    kept = directory / BANK
+    try:
+        path = kept if kept.exists() else bank_path(weights)
+        there = DemonstrationBank.load(path, encoder_id=encoders.identity)
+        if there.for_tasks(bank.tasks).identity == bank.identity:
+            return
+    except ValueError:  # missing, damaged, of other encoders, or without tasks added since
+        pass
     bank = replace(bank, encoder_id=encoders.identity, scene=find_scene(scene).identity)
-    bank.save(directory / BANK)
+    bank.save(kept)
 
 
 def load_inputs(
@@ -68,7 +69,7 @@ def load_inputs(
     Raises:
         ValueError: If one of the files is missing, damaged or another one.
     """
-    weights = _weights(directory, scene, digests.encoders)
+    weights = weights_of_run(directory, scene, digests.encoders)
     if weights is None:
         raise ValueError(
             f"{directory} was trained with the encoders {str(digests.encoders)[:12]}, which do not "
@@ -98,7 +99,7 @@ def own_weights(directory: Path) -> Path:
     return directory / "encoders" / "encoders.safetensors"
 
 
-def _weights(directory: Path, scene: Scene | str, identity: str | None) -> Path | None:
+def weights_of_run(directory: Path, scene: Scene | str, identity: str | None) -> Path | None:
     """Return the path of a run's encoders: its own if it has some, else those of the scene."""
     own = own_weights(directory)
     return own if own.exists() else find_weights(identity, scene)

@@ -41,7 +41,7 @@ def check_settings(
     Args:
         directory: A run directory, which may be missing.
         settings: Settings of a run, as JSON stores them.
-        longer: Whether the existing run may have fewer ``episodes``.
+        longer: Whether the existing run may have fewer ``episodes``, and lack the last tasks.
 
     Raises:
         ValueError: If the directory holds a run with other settings.
@@ -56,7 +56,7 @@ def load_last(directory: Path, settings: Mapping[str, Any]) -> dict[str, Any] | 
 
     Args:
         directory: The run directory.
-        settings: Settings of the run, as JSON stores them; ``episodes`` may have grown.
+        settings: Settings of the run, as JSON stores them; ``episodes`` and tasks may have grown.
 
     Returns:
         The state saved by `Trainer`; ``None`` if nothing has been logged yet.
@@ -81,7 +81,7 @@ def load_last(directory: Path, settings: Mapping[str, Any]) -> dict[str, Any] | 
 
 
 def check_checkpoint(folder: Path, state: Mapping[str, Any], settings: Mapping[str, Any]) -> None:
-    """Check that a checkpoint was saved by `Trainer`, with the given settings or fewer episodes.
+    """Check that a checkpoint is `Trainer`'s, of these settings or fewer episodes or tasks.
 
     Args:
         folder: Folder of the checkpoint.
@@ -146,8 +146,8 @@ def _compare(
     longer: bool,
     remedy: str = "choose another run directory, or the same settings.",
 ) -> None:
-    if longer and type(saved.get("episodes")) is type(settings.get("episodes")) is int:
-        saved = {**saved, "episodes": max(saved["episodes"], settings["episodes"])}
+    if longer:
+        saved = _as_grown(saved, settings)
     differences = [
         f"{name} is {old} there and {new} here"
         for name, old, new in differing_settings(saved, settings)
@@ -156,6 +156,24 @@ def _compare(
         raise ValueError(
             f"{where} holds a run with other settings ({'; '.join(differences)}): {remedy}"
         )
+
+
+def _as_grown(saved: Mapping[str, Any], settings: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return settings with the length and further tasks of others, if they could grow into these.
+
+    Demonstrations of further tasks change the digest of the bank, which `Trainer` checks.
+    """
+    grown = {}
+    if type(saved.get("episodes")) is type(settings.get("episodes")) is int:
+        grown["episodes"] = max(saved["episodes"], settings["episodes"])
+    of_tasks = ("tasks", "task_starts")
+    lists = [(saved.get(name), settings.get(name)) for name in of_tasks]
+    if all(
+        isinstance(old, list) and isinstance(new, list) and old == new[: len(old)] != new
+        for old, new in lists
+    ):
+        grown |= {name: settings.get(name) for name in (*of_tasks, "bank")}
+    return {**saved, **grown}
 
 
 def flatten(settings: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -32,7 +32,7 @@ def tiny(monkeypatch, encoders, bank, make_config):
     for name, entry in ALGORITHMS.items():
         small = replace(entry, config=make_config(name=name).algorithm)
         monkeypatch.setitem(ALGORITHMS, name, small)
-    chance = torch.tensor([0.1, 0.2, 0.3])
+    chance = torch.tensor([0.1, 0.2, 0.3, 0.4])
     monkeypatch.setattr(measure, "evaluate_random_policy", lambda tasks, **_: chance[: len(tasks)])
     test = measure._final_tests
     monkeypatch.setattr(measure, "_final_tests", lambda *run, episodes: test(*run, episodes=2))

@@ -13,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.analysis.comparison import NAMES
@@ -263,3 +264,37 @@ def test_a_run_that_was_interrupted_while_it_made_encoders_is_resumed(
     assert [path.name for path in tmp_path.iterdir()] == ["demonstrations"]
     continual(replace(arguments, train_encoders=True))
     assert (tmp_path / "summary.json").exists()
+
+
+def test_a_task_is_added_to_a_finished_run_and_reported(undrawn, tmp_path, encoders, bank):
+    run = tmp_path / "run"
+    continual(Arguments(out=run))
+    further = replace(
+        bank.of_task(2),
+        task=torch.zeros(12, dtype=torch.int64),
+        tasks=("lift_green",),
+        encoder_id=encoders.identity,
+        scene=encoders.metadata["scene"],
+    )
+    further.save(tmp_path / "further.safetensors")
+    command = Arguments(
+        out=run, resume=True, add_task="lift_green", bank=tmp_path / "further.safetensors"
+    )
+    with pytest.raises(ValueError, match="would end after 6 episodes"):
+        continual(command)
+    command = replace(command, episodes=16)
+    # The new demonstrations are copies of those of another task.
+    with pytest.warns(match="confuse the new task with push_green_to_white"):
+        printed = continual(command)
+    assert "lift_green: nearest demonstration of the same task: 0% of the new" in printed
+    tests = read_final_tests(run / "final.csv")
+    assert set(tests["task"]) == {*TASKS, "lift_green"}
+    assert json_of(run, "config")["tasks"] == [*TASKS, "lift_green"]
+    assert json_of(run, "config")["task_starts"][-1] > 6
+    assert "is finished, all 16 episodes" in continual(Arguments(out=run, resume=True))
+    with pytest.raises(ValueError, match="has the task 'lift_green' already"):
+        continual(command)
+    with pytest.raises(ValueError, match="with --resume and --out"):
+        continual(replace(command, resume=False))
+    with pytest.raises(ValueError, match="is for `bgpo continual`"):
+        concurrent(command)

@@ -1,0 +1,149 @@
+"""A further task for a run that has begun, and whether its encoders tell the task from others."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+
+from bgpo_trl.configs import RunConfig
+from bgpo_trl.data.bank import DemonstrationBank
+from bgpo_trl.encoders.pretrained import bank_path
+from bgpo_trl.encoders.representation import Representation
+from bgpo_trl.files.checkpoint import has_checkpoint, load_checkpoint
+from bgpo_trl.runs.config_file import read_config
+from bgpo_trl.runs.demonstrations import load_inputs, weights_of_run
+from bgpo_trl.runs.directory import check_checkpoint
+from bgpo_trl.runs.results import read_json
+from bgpo_trl.scenes import find_scene
+
+_MOST = 300  # demonstrations of a task that are compared
+_CONFUSED = 0.1  # by how much fewer demonstrations may be nearest to their own task
+
+
+class Grown(NamedTuple):
+    """Arguments with which `Trainer` resumes a run that has got a further task."""
+
+    config: RunConfig
+    encoders: Representation
+    bank: DemonstrationBank
+
+
+def add_task(
+    directory: str | Path,
+    task: str,
+    *,
+    config: RunConfig | None = None,
+    bank: str | Path | None = None,
+) -> Grown:
+    """Return what a run goes on with after it has got a further task; write nothing.
+
+    ``Trainer(grown.config, directory, bank=grown.bank, encoders=grown.encoders, resume=True)`` goes
+    on from the last checkpoint. The task is presented from the first episode that no seed has
+    begun. Seeds alone equal those of a batch if the task starts at the same episode.
+
+    Args:
+        directory: The run, finished or not.
+        task: Name of a task of its scene.
+        config: Settings of the run, by default those in the directory, with more ``episodes`` if it
+            is to play longer.
+        bank: Demonstrations of the task, embedded by the run's encoders; by default those beside
+            the encoders.
+
+    Raises:
+        ValueError: If the run has no checkpoint, its files are missing or damaged, the scene has no
+            such task, the run has it, there is no demonstration of it, or the run ends before.
+    """
+    directory = Path(directory)
+    saved, digests = read_config(directory / "config.json")
+    config, scene = saved if config is None else config, find_scene(saved.scene)
+    if task in saved.tasks:
+        raise ValueError(f"{directory} has the task {task!r} already: resume it without adding one")
+    scene.check_tasks((task,))
+    folder = directory / "checkpoint"
+    if not has_checkpoint(folder):
+        raise ValueError(f"{directory} has no checkpoint: begin a new run with all of the tasks")
+    encoders, shown = load_inputs(directory, saved.tasks, digests, scene)
+    weights = weights_of_run(directory, scene, encoders.identity)
+    assert weights is not None  # `load_inputs` has found them.
+    path = bank_path(weights) if bank is None else bank
+    found = DemonstrationBank.load(path, encoder_id=encoders.identity)
+    shown += found.for_tasks((task,))
+    state = load_checkpoint(folder, mmap=True)
+    check_checkpoint(folder, state, read_json(directory / "config.json"))
+    start = int(state["world"]["source"]["episode"].max()) + 1
+    if start >= config.episodes:
+        raise ValueError(
+            f"{directory} would end after {config.episodes} episodes, before {task!r} can start at "
+            f"episode {start}: choose more (--episodes)"
+        )
+    grown = replace(config, tasks=(*config.tasks, task), task_starts=(*config.task_starts, start))
+    return Grown(grown, encoders, shown)
+
+
+class Distinctness(NamedTuple):
+    """How well embeddings tell the last task of a bank from the others.
+
+    Attributes:
+        new: Share of its demonstrations whose nearest other demonstration is of the same task.
+        old: The same of the other tasks, before it was added.
+        own_distance: Median distances to the nearest other demonstration of the same task, for the
+            last task and the others.
+        other_distance: Median distances to the nearest demonstration of another task, likewise.
+        confused: The task that most of the mistaken demonstrations are nearest to; None without
+            such ones.
+    """
+
+    new: float
+    old: float
+    own_distance: tuple[float, float]
+    other_distance: tuple[float, float]
+    confused: str | None
+
+    @property
+    def clear(self) -> bool:
+        """Whether the last task is told apart about as well as the others."""
+        return self.new >= self.old - _CONFUSED
+
+    def __str__(self) -> str:
+        """Return the measurements and the verdict in a line."""
+        verdict = (
+            "the encoders tell the new task from the others"
+            if self.clear
+            else f"the encoders confuse the new task with {self.confused}: a new run with encoders "
+            "that are trained on it too (bgpo encoders) would learn it better"
+        )
+        return (
+            f"nearest demonstration of the same task: {self.new:.0%} of the new demonstrations, "
+            f"{self.old:.0%} of the old; distance to it {self.own_distance[0]:.2f} and "
+            f"{self.own_distance[1]:.2f}, to another task {self.other_distance[0]:.2f} and "
+            f"{self.other_distance[1]:.2f}; {verdict}"
+        )
+
+
+def distinctness(bank: DemonstrationBank) -> Distinctness:
+    """Measure whether encoders see the last task of a bank, of at most 300 demonstrations each.
+
+    Args:
+        bank: Demonstrations of two or more tasks.
+    """
+    last = len(bank.tasks) - 1
+    rows = torch.cat([torch.nonzero(bank.task == t).flatten()[:_MOST] for t in range(last + 1)])
+    phi, task = bank.embedding[rows], bank.task[rows]
+    distance = torch.cdist(phi, phi).fill_diagonal_(torch.inf)
+    same, is_new = task.unsqueeze(1) == task, task == last
+    own = distance.masked_fill(~same, torch.inf).amin(1)
+    other = distance.masked_fill(same, torch.inf).amin(1)
+    before = distance.masked_fill(same | is_new, torch.inf).amin(1)
+    mistaken = is_new & (other < own)
+    nearest = task[distance.masked_fill(same, torch.inf).argmin(1)][mistaken]
+    # With one old task, no old demonstration could have been mistaken.
+    return Distinctness(
+        new=float((own <= other)[is_new].float().mean()),
+        old=float((own <= before)[~is_new].float().mean()),
+        own_distance=(float(own[is_new].median()), float(own[~is_new].median())),
+        other_distance=(float(other[is_new].median()), float(other[~is_new].median())),
+        confused=bank.tasks[int(nearest.mode().values)] if len(nearest) else None,
+    )
