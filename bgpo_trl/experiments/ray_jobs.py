@@ -47,8 +47,8 @@ class Job:
 
     @property
     def finished(self) -> bool:
-        """Whether the job was run to its end."""
-        return (self.directory / "finished").exists()
+        """Whether the job was run to its end, of which the summary is the mark."""
+        return (self.directory / "summary.json").exists()
 
 
 @contextlib.contextmanager
@@ -111,7 +111,6 @@ def work(job: Job, play: Callable[[Job], None], command: Sequence[str]) -> None:
         except BaseException:
             traceback.print_exc()
             raise
-        (job.directory / "finished").touch()
 
 
 def play_jobs(

@@ -24,7 +24,6 @@ from bgpo_trl.experiments.settings import run_config
 from bgpo_trl.plugins import import_plugin
 from bgpo_trl.runs.config_file import Digests, settings_of
 from bgpo_trl.runs.directory import check_settings, holds_run
-from bgpo_trl.runs.results import read_json
 from bgpo_trl.scenes import find_scene
 from suites import opengl
 
@@ -111,14 +110,6 @@ def check_directories(
     for folder, group in jobs.items():
         if (folder / "config.json").exists():
             raise ValueError(f"{folder} is not a run of a sweep: choose another --out")
-        seeds = {seed for job in group for seed in job.config.seeds}
-        ours = {job.directory / "config.json" for job in group}
-        for other in {*folder.glob("*/config.json")} - ours:
-            if shared := seeds.intersection(read_json(other, {"seeds": list})["seeds"]):
-                raise ValueError(
-                    f"{other.parent} has seed {min(shared)} in another block: add whole blocks, or "
-                    "choose another --out"
-                )
         for job in group:
             check_settings(job.directory, settings_of(job.config, digests[job.config.tasks]))
 
