@@ -66,7 +66,7 @@ CASES = [
     ("bgpo continual --bank new --train-encoders", "--bank"),
     # where results go
     ("continual.py --out file/run", "cannot make the folder file/run"),
-    ("bgpo continual --preset quick --out run --resume", "other settings"),
+    ("bgpo continual --preset quick --out run --resume", "holds no settings of a run"),
     ("bgpo continual --out damaged --resume", "config.json is damaged"),
     # runs that are read
     ("bgpo report", "name a run"),
