@@ -128,7 +128,8 @@ def check_devices() -> str:
 
 def check_disk(folder: Path) -> str:
     """Check that the folder of the runs can be written and has room for them."""
-    message = f"{shutil.disk_usage(folder).free / 1e9:.1f} GB left in {folder}"
-    if not os.access(folder, os.W_OK) or shutil.disk_usage(folder).free < _ROOM:
+    free = shutil.disk_usage(folder).free
+    message = f"{free / 1e9:.1f} GB left in {folder}"
+    if not os.access(folder, os.W_OK) or free < _ROOM:
         raise OSError(f"{message}: make room, or go to a folder that can be written")
     return f"{message}, of which a run of --preset paper takes 9"

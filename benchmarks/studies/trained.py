@@ -2,8 +2,8 @@
 
     python benchmarks/studies/trained.py runs/continual-bgpo-quick --episodes 200
 
-Starts and held-out demonstrations depend on the seed and the number of tests only. Runs with the
-same seeds and tasks, such as ``bgpo`` and ``clone``, are thus tested from the same starts.
+Starts and held-out demonstrations depend on the seed and the number of tests alone, so that runs of
+the same seeds and tasks, such as ``bgpo`` and ``clone``, are tested from the same starts.
 """
 
 from __future__ import annotations
@@ -12,8 +12,10 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
+import numpy as np
 import pandas as pd
 import torch
+from numpy.typing import NDArray
 from shared import TrainedArguments, load_blocks
 from torch import Tensor
 
@@ -44,7 +46,9 @@ def _clone(weights: Weights) -> Weights:
 
 def _actor(weights: Weights) -> Weights:
     # The actor takes the place of the clone.
-    actor = {n.replace("actor.", "clone.", 1): w for n, w in weights.items() if "actor." in n}
+    actor = {
+        n.replace("actor.", "clone.", 1): w for n, w in weights.items() if n.startswith("actor.")
+    }
     return {**_clone(weights), **actor}
 
 
@@ -132,10 +136,13 @@ def trained(arguments: TrainedArguments) -> str:
     write_measurement(out, "trained", table, commit)
     tasks, names = [*table["task"].unique()], [*table["policy"].unique()]
     means = table.groupby(["task", "policy"])[["success", "steps"]].mean()
-    cells = [
-        [f"{100 * s:.1f} % in {n:.1f}" for s, n in means.loc[t].loc[names].values] for t in tasks
-    ]
-    return markdown([["task", *names], *([t, *row] for t, row in zip(tasks, cells, strict=True))])
+    rows_of = [[task, *map(_cell, means.loc[task].loc[names].to_numpy())] for task in tasks]
+    return markdown([["task", *names], *rows_of])
+
+
+def _cell(means: NDArray[np.float64]) -> str:
+    success, steps = means
+    return f"{100 * success:.1f} % in {steps:.1f}" if success else "0.0 %"
 
 
 if __name__ == "__main__":

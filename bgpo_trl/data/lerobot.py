@@ -23,6 +23,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from bgpo_trl.data.dataset import resize_frames
+from bgpo_trl.data.film import UnreadableError, check_depth, decode_image
 from bgpo_trl.files.writing import new_folder, write_json
 
 try:
@@ -100,28 +101,24 @@ def read_lerobot(
     return found
 
 
-class _WrongError(ValueError):
-    """A file is wrong; the message says in which way."""
-
-
 @contextlib.contextmanager
 def _reading(source: object) -> Iterator[None]:
     """Turn whatever goes wrong with a file into one line."""
     try:
         yield
-    except _WrongError as error:
-        raise _WrongError(f"{source}: {error}") from None
+    except UnreadableError as error:
+        raise UnreadableError(f"{source}: {error}") from None
     except FileNotFoundError:
-        raise _WrongError(f"{source} is missing: give the folder of a whole dataset") from None
+        raise UnreadableError(f"{source} is missing: give the folder of a whole dataset") from None
     except Exception as error:
         if isinstance(source, Path) and source.is_file():
             with source.open("rb") as file:
                 if file.read(len(_LFS)) == _LFS:
-                    raise _WrongError(
+                    raise UnreadableError(
                         f"{source} is a pointer of Git LFS: get the file itself, git lfs pull"
                     ) from None
         cause = " ".join(f"{type(error).__name__}: {error}".split())
-        raise _WrongError(f"{source} is damaged or of another format: {cause}") from error
+        raise UnreadableError(f"{source} is damaged or of another format: {cause}") from error
 
 
 class _Reader:
@@ -242,9 +239,9 @@ class _Reader:
             texts = [*tasks.get("task", tasks.index)]
             indices = [int(index) for index in _scalars(tasks["task_index"])]
             if not all(isinstance(text, str) for text in texts):
-                raise _WrongError(f"its tasks are {_some(texts)}, not descriptions")
+                raise UnreadableError(f"its tasks are {_some(texts)}, not descriptions")
             if len({*texts}) < len(texts) or len({*indices}) < len(indices):
-                raise _WrongError("it has a task or an index twice")
+                raise UnreadableError("it has a task or an index twice")
         return dict(zip(indices, texts, strict=True))
 
     def _metadata(self, recorded: set[int]) -> pd.DataFrame:
@@ -285,7 +282,7 @@ class _Reader:
         planned = np.arange(len(rows)) / self.fps
         if not (np.abs(times - times[0] - planned) <= 0.5 / self.fps).all():
             late = int((np.abs(times - times[0] - planned) > 0.5 / self.fps).argmax())
-            raise _WrongError(
+            raise UnreadableError(
                 f"frame {late} is at {times[late]:.3f} s instead of {planned[late]:.3f} s: frames "
                 "have to follow each other evenly"
             )
@@ -302,7 +299,7 @@ class _Reader:
             found = np.stack([np.atleast_1d(row) for row in rows[name]])
             values = found.astype(np.float32)
             if found.dtype.kind in "iu" and not np.array_equal(values, found):
-                raise _WrongError(f"{name} has whole numbers that are not exact as float32")
+                raise UnreadableError(f"{name} has whole numbers that are not exact as float32")
             is_action = key == "action"
             episode[key] = values[: (n_read - 1) * stride] if is_action else values[::stride]
         return episode
@@ -323,7 +320,7 @@ class _Reader:
             if self._images[0] != file:
                 column = pq.ParquetFile(file).read([self.image_key]).column(0).to_pylist()
                 self._images = file, column
-            yield _rgb(self._image(self._images[1][row]))
+            yield decode_image(self._image(self._images[1][row]))
 
     def _image(self, image: Mapping[str, Any]) -> bytes:
         """Return the content of an image, which is in its row or in a file of the dataset."""
@@ -331,7 +328,7 @@ class _Reader:
             return image["bytes"]
         file = (self.path / str(image["path"])).resolve()
         if not file.is_relative_to(self.path.resolve()) or not file.is_file():
-            raise _WrongError(f"its image {image['path']!r} is no file of the dataset")
+            raise UnreadableError(f"its image {image['path']!r} is no file of the dataset")
         return file.read_bytes()
 
 
@@ -354,20 +351,6 @@ def _some(values: Sequence[Any]) -> str:
     return ", ".join(map(str, values[:12])) + (", ..." if len(values) > 12 else "")
 
 
-def _rgb(content: bytes) -> NDArray[np.uint8]:
-    """Return an image of 8 bits a color as ``[H, W, 3]``; refuse what would have to be scaled."""
-    image = Image.open(io.BytesIO(content))
-    sixteen = content.startswith(b"\x89PNG") and content[24] > 8  # Pillow drops half of them
-    if sixteen or image.mode not in ("1", "L", "P", "RGB", "LA", "RGBA"):
-        raise _WrongError(
-            f"its images are of mode {image.mode}, of more than 8 bits: make them uint8 by a scale "
-            "of yours, or choose another camera"
-        )
-    if image.has_transparency_data and np.asarray(image.convert("RGBA"))[..., 3].min() < 255:
-        raise _WrongError("its images are transparent: put them on a background of yours")
-    return np.asarray(image.convert("RGB"))
-
-
 def _frames_at(
     path: Path, times: NDArray[np.float64], tolerance: float
 ) -> Iterator[NDArray[np.uint8]]:
@@ -379,9 +362,7 @@ def _frames_at(
     av = importlib.import_module("av")
     with av.open(str(path)) as video:
         stream = video.streams.video[0]
-        name = stream.format.name
-        if name.startswith("gray") and name != "gray":
-            raise _WrongError(f"its frames are {name}, of more than 8 bits, as of a depth map")
+        check_depth(stream)
         start = max(0, int((times[0] - tolerance) / stream.time_base))
         video.seek(start, stream=stream)  # to the keyframe before
         frames = video.decode(stream)
@@ -391,7 +372,7 @@ def _frames_at(
             while frame and following and abs(following.time - time) <= abs(frame.time - time):
                 frame, following = following, next(frames, None)
             if frame is None or abs(frame.time - time) > tolerance:
-                raise _WrongError(
+                raise UnreadableError(
                     f"there is no frame at {time:.3f} s: it was never encoded, and those after it "
                     "would be taken for those before; get or record it again"
                 )

@@ -100,14 +100,13 @@ def run_experiment(
     loggers = _loggers(arguments, config, out, group, size)
     if arguments.resume:
         config = _continued(arguments, config, out)
-        if arguments.add_task is None and is_finished(out, config):
-            return f"{out} is finished, all {config.episodes} episodes: --episodes makes it longer"
         if arguments.add_task is not None:
             grown = add_task(out, arguments.add_task, config=config, bank=arguments.bank)
-            config = grown.config
-            seen = distinctness(grown.bank)
+            config, seen = grown.config, distinctness(grown.bank)
             if not seen.clear:
                 warnings.warn(f"{arguments.add_task}: {seen}", stacklevel=2)
+        elif is_finished(out, config):
+            return f"{out} is finished, all {config.episodes} episodes: --episodes makes it longer"
     elif holds_run(out):
         raise ValueError(f"{out} holds a run: --resume continues it, --out names another directory")
     with lock_directory(out):

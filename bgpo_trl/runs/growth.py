@@ -13,10 +13,9 @@ from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.encoders.pretrained import bank_path
 from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.files.checkpoint import has_checkpoint, load_checkpoint
-from bgpo_trl.runs.config_file import read_config
+from bgpo_trl.runs.config_file import read_config, settings_of
 from bgpo_trl.runs.demonstrations import load_inputs, weights_of_run
 from bgpo_trl.runs.directory import check_checkpoint
-from bgpo_trl.runs.results import read_json
 from bgpo_trl.scenes import find_scene
 
 _MOST = 300  # demonstrations of a task that are compared
@@ -72,7 +71,7 @@ def add_task(
     found = DemonstrationBank.load(path, encoder_id=encoders.identity)
     shown += found.for_tasks((task,))
     state = load_checkpoint(folder, mmap=True)
-    check_checkpoint(folder, state, read_json(directory / "config.json"))
+    check_checkpoint(folder, state, settings_of(saved, digests))
     start = int(state["world"]["source"]["episode"].max()) + 1
     if start >= config.episodes:
         raise ValueError(

@@ -5,8 +5,9 @@ import pytest
 from PIL import Image
 
 import bgpo_trl
+from bgpo_trl.data.film import read_film
 from bgpo_trl.experiments.arguments import OneShotArguments
-from bgpo_trl.experiments.one_shot import one_shot, read_film
+from bgpo_trl.experiments.one_shot import one_shot
 
 pytestmark = pytest.mark.usefixtures("easy_world")
 FRAMES = np.random.default_rng(0).integers(256, size=(11, 64, 128, 3), dtype=np.uint8)
@@ -50,14 +51,15 @@ def test_what_cannot_be_read_is_refused_in_one_line(film, tmp_path, refused):
     text = tmp_path / "text.mp4"
     text.write_text("no film")
     refused(lambda: read_film(text), str(text), "a folder of its frames")
-    for name, image, cause, remedy in (
-        ("size", Image.fromarray(FRAMES[0, :9]), "differ in size", "make them alike"),
-        ("deep", Image.fromarray(np.zeros((64, 128), np.uint16)), "more than 8 bits", "make it"),
-        ("clear", Image.fromarray(np.zeros((64, 128, 4), np.uint8)), "transparent", "make it RGB"),
+    deep, clear = np.zeros((64, 128), np.uint16), np.zeros((64, 128, 4), np.uint8)
+    for name, pixels, cause, remedy in (
+        ("size", FRAMES[0, :9], "differ in size", "make them alike"),
+        ("deep", deep, "more than 8 bits", "make them uint8"),
+        ("clear", clear, "transparent", "put them on a background"),
     ):
         path = film / f"{name}.png"
-        image.save(path)
+        Image.fromarray(pixels).save(path)
         refused(lambda: read_film(film), cause, remedy)
         path.unlink()
     (film / "broken.png").write_bytes(b"\x89PNG")
-    refused(lambda: read_film(film), "broken.png is no image", "make it a PNG")
+    refused(lambda: read_film(film), "broken.png cannot be decoded", "as PNG")
