@@ -7,7 +7,7 @@ starts each time, without noise.
 
     python benchmarks/studies/one_task.py --task grasp_glass --demonstrations 30
     python benchmarks/studies/one_task.py --rl.critics 2 --rl.gamma 0.99
-    python benchmarks/studies/one_task.py --reward 0   # must fall back to the clone
+    python benchmarks/studies/one_task.py --reward 0   # what critics choose without a reward
     python benchmarks/studies/one_task.py --gate       # can critics tell success from failure?
 
 With ``--gate``, the clone plays 200 episodes, from which critics learn its values. For 100 others,
