@@ -101,4 +101,4 @@ PRESETS: dict[str, RunConfig] = {
     "paper": RunConfig(),
 }
 """Runs by ``--preset``: ``smoke`` passes every stage in minutes, ``quick`` shows learning, ``desk``
-is five seeds in two hours, ``paper`` is the paper's scale."""
+is five seeds in three hours, ``paper`` is the paper's scale."""
