@@ -67,8 +67,8 @@ class Arguments(BankArguments):
     bgpo-single with that addition. Or one that the module of --import adds."""
     preset: Literal["smoke", "quick", "desk", "paper"] | None = None
     """Size of the run, with its time on two cores: smoke (12 episodes of 2 seeds, every stage in 2
-    minutes), quick (1,800 episodes of 2 seeds, half an hour), the default; desk (6,000 episodes of 5
-    seeds, three hours) or paper (20,000 episodes of 10 seeds, days)."""
+    minutes), quick (1,800 episodes of 2 seeds, half an hour), the default; desk (6,000 episodes of
+    5 seeds, three hours) or paper (20,000 episodes of 10 seeds, days)."""
     config: Path | None = None
     """YAML or JSON file of settings, named as in a run's config.json, or a run directory to repeat;
     the preset's for those that it lacks."""
