@@ -56,8 +56,7 @@ _CLONE: Any = {"rl": replace(SHOWN, proposals="clone")}
 # gradient by which it adapts as much larger.
 _MAML: Any = {
     **_SHOWN_TASKS,
-    "rl": replace(SHOWN, proposals="actor"),
-    "imitation": 50.0,
+    "rl": replace(SHOWN, proposals="actor", imitation=50.0, imitation_half_life=None),
     "inner_learning_rate": MAMLConfig.inner_learning_rate / 50.0,
 }
 

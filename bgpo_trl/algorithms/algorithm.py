@@ -170,7 +170,9 @@ class Algorithm(ABC):
             )
         self._noise = generators(seeds, "exploration")
         self.proposals: ProposalTrials | None = None
-        if (rl := config.rl).proposals == "both":
+        if (rl := config.rl).proposals != "actor":
+            self.logged = ("loss_clone",)
+        if rl.proposals == "both":
             self.proposals = ProposalTrials(
                 len(seeds), clone_episodes=rl.clone_episodes, clone_share=rl.clone_share
             )
@@ -287,11 +289,6 @@ class Algorithm(ABC):
         for seed in end["done"].flatten().nonzero().flatten().tolist():
             self.proposals.end(seed, bool(end["success"][seed]))
 
-    @property
-    def imitates(self) -> bool:
-        """Whether a policy imitates demonstrated actions."""
-        return self.config.rl.proposals != "actor"
-
     def replay_keys(self, constant_keys: Sequence[NestedKey] = ()) -> list[NestedKey]:
         """Return the entries of a transition to store, of which some are constant in an episode."""
         following = (self.config.state, "reward", "terminated", "done")
@@ -340,7 +337,7 @@ class Algorithm(ABC):
     ) -> TensorDictBase:
         """Draw transitions ``[S, E, B]`` to learn from, a share of demonstrated ones last.
 
-        With something that `imitates`, ``"imitation"`` has as many demonstrated states and actions.
+        With a policy that imitates, ``"imitation"`` has as many demonstrated states and actions.
 
         Args:
             groups: Returns the group of each of ``n`` transitions, int64 ``[S, E, n]``, given
@@ -354,7 +351,7 @@ class Algorithm(ABC):
         played = self.replay.draw(groups(n_rows - n_shown), generator=generator)
         shown = self.shown.draw(groups(n_shown), generator=generator)
         batch = {key: torch.cat([entry, shown[key]], 2) for key, entry in played.items()}
-        if self.imitates:
+        if self.config.rl.imitates:
             noise = self.config.demonstration_noise
             imitated = self.shown.draw_actions(groups(n_rows), noise, generator=generator)
             batch |= {("imitation", key): entry for key, entry in imitated.items()}

@@ -101,7 +101,8 @@ class Experts:
     The learner's networks are a stack ``[S, E]``, those of the active groups: ``E`` follows their
     number, so that an update costs as much as groups are active. When a group rests, its expert
     (networks, targets, moments) is put aside until the group is played again, and does not
-    change until then. A new group starts from its parent's networks, without moments.
+    change until then. A new group starts from its parent's networks, without moments, and
+    imitates as at first.
 
     Args:
         learner: The learner, of one expert per seed.
@@ -158,7 +159,11 @@ class Experts:
     def _start(self, seed: int, group: int) -> Expert:
         """Return the expert with which a group becomes active."""
         expert = self.find(seed, group)
-        return expert if group in self._inactive[seed] else {**expert, "moments": {}}
+        if group in self._inactive[seed]:
+            return expert
+        # What an expert lacks becomes 0, so that a new group imitates with the full weight.
+        networks = {k: v for k, v in expert["networks"].items() if k != "n_imitated"}
+        return {"networks": networks, "moments": {}}
 
     def find(self, seed: int, group: int) -> Expert:
         """Return the expert of a group, or of its nearest ancestor that has one (has played)."""

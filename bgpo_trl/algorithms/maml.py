@@ -53,17 +53,11 @@ class MAML(TaskAlgorithm):
             self.spec.actor(rl),
             self.spec.critic(rl),
             inner_learning_rate=config.inner_learning_rate,
-            imitation=config.imitation,
             **self.spec.loss_options(rl),
         )
         # Called with adapted parameters.
         self.test_actor = self.meta_actor
         self.learner = Learner(self.meta_actor, {"": "actor_network_params"}, self.loss, rl)
-
-    @property
-    def imitates(self) -> bool:
-        """Whether the policy imitates demonstrated actions."""
-        return self.config.imitation > 0
 
     def update(self) -> dict[str, Tensor]:
         """Make one update of each seed."""

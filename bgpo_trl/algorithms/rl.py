@@ -166,7 +166,7 @@ class Learner:
 
     @torch.no_grad()
     def write(self, seed: int, slot: int, expert: Expert) -> None:
-        """Put an expert into a place of the stack; moments that it lacks are 0."""
+        """Put an expert into a place of the stack; what it lacks is 0."""
         for part, tensors in self._stacked().items():
             for name, tensor in tensors.items():
                 tensor[seed, slot] = expert[part].get(name, 0.0)
@@ -246,6 +246,8 @@ class LearnerSpec:
         """Return the common arguments of the losses."""
         return {
             "n_critics": config.critics,
+            "imitation": config.imitation,
+            "imitation_half_life": config.imitation_half_life,
             "return_bounds": self.return_bounds if config.clip_targets else None,
             "pre_tanh_penalty": config.pre_tanh_penalty,
             "constant_keys": self.in_keys[1:],

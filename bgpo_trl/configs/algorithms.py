@@ -43,6 +43,11 @@ class RLConfig(Settings):
     """Number of critics. With several, targets are the lower value of two of them."""
     n_steps: int = 1
     """Steps of the returns in the critics' targets (1 in the paper)."""
+    imitation: float = 0.0
+    """Weight of the squared distance to demonstrated actions in the actor's loss, at first. Ours:
+    keeps the actor useful while critics know little (docs/learning.md)."""
+    imitation_half_life: float | None = None
+    """Updates of an actor in which the weight of imitation halves; None for never."""
     hidden_sizes: tuple[int, ...] = (256, 256)
     """Hidden layers of actor and critic. Ours: the 64 units of Sec. IV-A limit the success, and a
     second layer helps to read places from latents (docs/learning.md)."""
@@ -82,7 +87,9 @@ class RLConfig(Settings):
     def __post_init__(self) -> None:
         super().__post_init__()
         positive(self, "learning_rate")
-        at_least(self, 0, "noise", "pre_tanh_penalty")
+        if self.imitation_half_life is not None:
+            positive(self, "imitation_half_life")
+        at_least(self, 0, "noise", "pre_tanh_penalty", "imitation")
         at_least(self, 1, "batch_size", "warmup_steps", "replay_size", "update_every")
         at_least(self, 1, "critics", "n_steps", "policy_delay")
         at_least(self, 0, "clone_episodes")
@@ -99,16 +106,25 @@ class RLConfig(Settings):
             ("clone_share", 0 <= self.clone_share < 1, "at least 0 and below 1"),
         )
 
+    @property
+    def imitates(self) -> bool:
+        """Whether a policy imitates demonstrated actions."""
+        return self.proposals != "actor" or self.imitation > 0
+
 
 SHOWN = RLConfig(
     proposals="both",
     critics=5,
     n_steps=3,
+    imitation=0.2,
+    imitation_half_life=5_000.0,
+    hidden_sizes=(128, 128),
     learning_rate=3e-4,
     gamma=0.97,
     noise=0.1,
     update_every=2,
     policy_delay=2,
+    clone_share=0.1,
 )
 """Learner from demonstrations and reward. Ours, from `docs/learning.md`."""
 
@@ -143,13 +159,13 @@ class AlgorithmConfig(Settings):
             self,
             ("demonstration_share", 0 <= share < 1, "at least 0 and below 1"),
         )
-        shown = share > 0 or self.rl.proposals == "actor"
+        shown = share > 0 or not self.rl.imitates
         check(
             self,
             (
                 "demonstration_share",
                 shown,
-                "above 0 for a clone to imitate (bgpo-experts: without)",
+                "above 0 for a policy to imitate (bgpo-experts: without)",
             ),
         )
         at_least(self, 1, "max_steps")
@@ -335,9 +351,6 @@ class MAMLConfig(AlgorithmConfig):
     task_batch_size: int = 64
     """Transitions of each task per update: half to adapt to, half to evaluate the adapted policy.
     Ours: with three tasks, as many transitions as in an update of BGPO."""
-    imitation: float = 0.0
-    """Weight of the squared distance to demonstrated actions in the policy's loss. Ours: with
-    demonstrations, where a critic alone hardly changes the policy (docs/learning.md)."""
     share_batch: bool = False
     """Whether the tasks share ``task_batch_size`` transitions in equal parts."""
     adaptation_size: int = 256
@@ -351,12 +364,10 @@ class MAMLConfig(AlgorithmConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        at_least(self, 0, "inner_learning_rate", "imitation")
+        at_least(self, 0, "inner_learning_rate")
         at_least(self, 1, "adaptation_size")
         alone = self.rl.proposals == "actor"
         check(self, ("rl", alone, "of an actor without clone, since MAML adapts one policy"))
-        needs = self.demonstration_share > 0 or not self.imitation
-        check(self, ("imitation", needs, "0 without a demonstration_share"))
         at_least(self, 2, "task_batch_size")
         check(self, ("task_batch_size", self.task_batch_size % 2 == 0, "even"))
         _check_played(self, self.task_batch_size)

@@ -44,7 +44,7 @@ class TransitionKeys:
     priority_weight: NestedKey = "priority_weight"
     """Factor of each transition's loss."""
     imitation: NestedKey = "imitation"
-    """Nested entry: demonstrated states and actions, for the clone."""
+    """Nested entry: demonstrated states and actions to imitate."""
 
 
 class DDPGLoss(LossModule):
@@ -58,7 +58,11 @@ class DDPGLoss(LossModule):
        of steps of the transition. ``V`` is the lower value of two target critics. All pairs
        take turns, one in each call of `loss_value` (Chen et al., 2021, "Randomized Ensembled Double
        Q-Learning", draw pairs at random).
-    2. *Actor.* The actor ascends the mean of the same two critics.
+    2. *Actor.* The actor ascends the mean of the same two critics. With a weight of ``imitation``,
+       it descends the squared distance to demonstrated actions too (Nair et al., 2018, "Overcoming
+       Exploration in Reinforcement Learning with Demonstrations"). The weight fades (Rajeswaran et
+       al., 2018, "Learning Complex Dexterous Manipulation", likewise), as critics become better
+       than demonstrations.
     3. *Clone*, if there is one. The clone learns demonstrated actions by their squared distance,
        without reward. ``V(s')`` is then the value of the better of two proposals, the target
        actor's action and the clone's action (Hu et al., 2024, "Imitation Bootstrapped Reinforcement
@@ -74,7 +78,7 @@ class DDPGLoss(LossModule):
     ``"steps_to_next_obs"`` ``[*S, *B, 1]``, the power of gamma. A transition of several steps has
     the sum of the discounted rewards of these steps, and the state and ``"terminated"`` *after the
     last one*; `GroupReplay` makes such transitions. (TorchRL's ``MultiStep`` leaves
-    ``"terminated"`` of the first step.) With a clone, reads ``"imitation"``: its inputs,
+    ``"terminated"`` of the first step.) What imitates reads ``"imitation"``: its inputs,
     ``"action"`` and, if present, ``"priority_weight"``. Masks (``loss_mask_key``) are not read.
     Writes ``"td_error"`` ``[*S, *B]``, the largest squared error of the critics. Returns, without a
     batch size,
@@ -92,6 +96,8 @@ class DDPGLoss(LossModule):
         value_network: Q-function with the ``batch_size`` ``[*S]``, or several with ``[*S, N]``.
         clone_network: Policy that imitates, with the inputs of the actor; ``None`` for none.
         n_critics: Number ``N`` of Q-functions.
+        imitation: Weight of the actor's squared distance to demonstrated actions, at first.
+        imitation_half_life: Updates of an actor in which this weight halves; ``None`` for never.
         return_bounds: Lowest and highest attainable return; ``None`` for no clipping. With a reward
             of 0 or 1 that ends the episode and an intrinsic reward of at most ``beta`` at its end,
             returns lie in ``[0, 1 + beta]``; if time-outs pay the intrinsic reward and bootstrap,
@@ -102,9 +108,10 @@ class DDPGLoss(LossModule):
         reduction: ``"sum"`` over ``S``, or ``"none"``.
 
     Raises:
-        ValueError: If ``return_bounds`` is not an increasing pair, the penalty is negative, there
-            is no such ``reduction``, or a ``batch_size`` does not fit; from ``forward``, if an
-            entry is missing, or reward or weights have another shape.
+        ValueError: If ``return_bounds`` is not an increasing pair, a weight is negative, the
+            half-life is not positive, there is no such ``reduction``, or a ``batch_size`` does not
+            fit; from ``forward``, if an entry is missing, or reward or weights have another
+            shape.
 
     Examples:
         >>> import torch
@@ -139,6 +146,7 @@ class DDPGLoss(LossModule):
     clone_network_params: TensorDictParams
     target_clone_network_params: TensorDictParams  # of TorchRL's making: the clone's own
     n_calls: Tensor
+    n_imitated: Tensor
 
     def __init__(
         self,
@@ -147,14 +155,20 @@ class DDPGLoss(LossModule):
         clone_network: Any | None = None,
         *,
         n_critics: int = 1,
+        imitation: float = RLConfig.imitation,
+        imitation_half_life: float | None = RLConfig.imitation_half_life,
         return_bounds: tuple[float, float] | None = None,
         pre_tanh_penalty: float = RLConfig.pre_tanh_penalty,
         constant_keys: Sequence[NestedKey] = (),
         delay_actor: bool = True,
         reduction: str = "sum",
     ) -> None:
-        if not (pre_tanh_penalty >= 0 and math.isfinite(pre_tanh_penalty)):
-            raise ValueError(f"pre_tanh_penalty must be a number >= 0, got {pre_tanh_penalty}")
+        weights = {"imitation": imitation, "pre_tanh_penalty": pre_tanh_penalty}
+        for name, weight in weights.items():
+            if not (weight >= 0 and math.isfinite(weight)):
+                raise ValueError(f"{name} must be a number >= 0, got {weight}")
+        if imitation_half_life is not None and not imitation_half_life > 0:
+            raise ValueError(f"imitation_half_life must be above 0, got {imitation_half_life}")
         if return_bounds is not None and not return_bounds[0] < return_bounds[1]:
             raise ValueError(f"return_bounds must be (low, high) with low < high: {return_bounds}")
         if reduction not in ("sum", "none"):
@@ -182,8 +196,9 @@ class DDPGLoss(LossModule):
         self.has_clone = clone_network is not None
         if clone_network is not None:
             self.convert_to_functional(clone_network, "clone_network")
-        self.return_bounds, self.pre_tanh_penalty = return_bounds, pre_tanh_penalty
-        self.reduction = reduction
+        self.return_bounds, self.reduction = return_bounds, reduction
+        self.imitation, self.imitation_half_life = imitation, imitation_half_life
+        self.pre_tanh_penalty = pre_tanh_penalty
         written = set(actor_network.out_keys)
         read = [*actor_network.in_keys, *(k for k in value_network.in_keys if k not in written)]
         self.input_keys = [*dict.fromkeys(unravel_key(key) for key in read)]
@@ -193,6 +208,8 @@ class DDPGLoss(LossModule):
             raise ValueError(f"constant_keys must be among {self.input_keys}, got {unknown}")
         self._pairs = [*combinations(range(n_critics), 2)] or [(0, 0)]
         self.register_buffer("n_calls", torch.zeros((), dtype=torch.int64))
+        # Of each actor, as actors come to new tasks at different times.
+        self.register_buffer("n_imitated", torch.zeros(self.batch_size, dtype=torch.int64))
 
     @property
     def in_keys(self) -> list[NestedKey]:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -200,7 +217,8 @@ class DDPGLoss(LossModule):
         keys = self.tensor_keys
         read = [*self.input_keys, *self.value_network.in_keys, keys.priority_weight]
         following = [*self.input_keys, keys.reward, keys.done, keys.terminated]
-        shown = [*self.clone_network.in_keys, keys.action] if self.has_clone else []
+        imitates = self.has_clone or self.imitation
+        shown = [*self.actor_network.in_keys, keys.action] if imitates else []
         nested = [("next", key) for key in following] + [(keys.imitation, key) for key in shown]
         return [*dict.fromkeys(read), *(unravel_key(key) for key in nested)]
 
@@ -296,7 +314,11 @@ class DDPGLoss(LossModule):
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Compute the actor's loss, reduced, and ``"pre_tanh_magnitude"``."""
         data = self.call_network("actor_network", self.current(tensordict))
-        loss = self.reduce(self.actor_objective(data), tensordict)
+        loss = self.mean_per_seed(self.actor_objective(data), tensordict)
+        if self.imitation:
+            loss = loss + self.imitation_weight * self.distance("actor_network", tensordict)
+            self.count_imitated(tensordict)
+        loss = self.reduce_seeds(loss)
         pre_tanh = data.get(self.tensor_keys.pre_tanh_action, None)
         if pre_tanh is None:
             return loss, {}
@@ -323,14 +345,45 @@ class DDPGLoss(LossModule):
 
     def loss_clone(self, tensordict: TensorDictBase) -> Tensor:
         """Compute the clone's squared distance to demonstrated actions, reduced."""
+        return self.reduce_seeds(self.distance("clone_network", tensordict))
+
+    def distance(self, name: str, tensordict: TensorDictBase) -> Tensor:
+        """Return the mean squared distance ``[*S]`` of a policy to demonstrated actions.
+
+        ``name`` is as for `call_network`.
+        """
+        states, shown = self.shown(tensordict)
+        acted = self.call_network(name, states)
+        return self.mean_per_seed(self.squared_distance(acted, shown), shown)
+
+    @property
+    def imitation_weight(self) -> Tensor:
+        """Weight of the imitation of each actor now, ``[*S]``."""
+        halved = self.n_imitated / (self.imitation_half_life or math.inf)
+        return self.imitation * 0.5**halved
+
+    def count_imitated(self, tensordict: TensorDictBase) -> None:
+        """Count an update of the actors that have transitions ``[*S, *B]`` of any weight."""
+        weights = tensordict.get(self.tensor_keys.priority_weight, None)
+        self.n_imitated += 1 if weights is None else (self.flatten_batch(weights) > 0).any(-1)
+
+    def shown(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+        """Return the policies' input in demonstrated states, and all that is shown, ``[*S, *B]``.
+
+        Raises:
+            ValueError: If an entry is missing.
+        """
         keys = self.tensor_keys
         shown = tensordict.get(keys.imitation, None)
         if not isinstance(shown, TensorDictBase) or keys.action not in shown:
             wanted = [(keys.imitation, keys.action)]
             raise missing_key(type(self).__name__, tensordict, wanted)
-        data = self._select(shown, self.clone_network.in_keys, ", under 'imitation',")
-        action = self.call_network("clone_network", data).get(keys.action)
-        return self.reduce((action - shown.get(keys.action)).square().sum(-1), shown)
+        return self._select(shown, self.actor_network.in_keys, ", under 'imitation',"), shown
+
+    def squared_distance(self, acted: TensorDictBase, shown: TensorDictBase) -> Tensor:
+        """Return the squared distance ``[*S, *B]`` of actions to those shown."""
+        key = self.tensor_keys.action
+        return (acted.get(key) - shown.get(key)).square().sum(-1)
 
     def current(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return the networks' input, detached, in the states of transitions ``[*S, *B]``."""
@@ -387,7 +440,10 @@ class DDPGLoss(LossModule):
 
     def reduce(self, loss: Tensor, tensordict: TensorDictBase) -> Tensor:
         """Return the weighted means ``[*S]`` of a loss ``[*S, *B]``, or their sum ``[]``."""
-        mean = self.mean_per_seed(loss, tensordict)
+        return self.reduce_seeds(self.mean_per_seed(loss, tensordict))
+
+    def reduce_seeds(self, mean: Tensor) -> Tensor:
+        """Return means ``[*S]`` as they are, or their sum ``[]``."""
         return mean.sum() if self.reduction == "sum" else mean
 
     def mean_per_seed(self, loss: Tensor, tensordict: TensorDictBase) -> Tensor:

@@ -23,8 +23,7 @@ class MAMLLoss(DDPGLoss):
     """Loss of a policy after its adaptation to each task (Finn et al., 2017, Alg. 3).
 
     With ``L_i(theta) = -mean Q_i(s, pi_theta(s))``, the actor's loss in `DDPGLoss` (with its
-    penalty) for the critics of task i, plus ``imitation`` times the mean squared distance to the
-    task's demonstrated actions, it
+    penalty and the distance to the task's demonstrated actions) for the critics of task i, it
 
     1. adapts the policy to each task, ``theta_i = theta - inner_learning_rate * grad L_i(theta)``,
        on the first half of the task's transitions;
@@ -48,7 +47,6 @@ class MAMLLoss(DDPGLoss):
             it, with the parameters ``actor_network_params``, holds the adapted policies.
         value_network: Q-functions with ``batch_size`` ``[*S, T]``, or ``[*S, T, N]``.
         inner_learning_rate: Step size of the adaptation.
-        imitation: Weight of the distance to the actions of ``"imitation"``, 0 for none.
         **ddpg: Other arguments of `DDPGLoss`.
 
     Raises:
@@ -62,7 +60,6 @@ class MAMLLoss(DDPGLoss):
         value_network: TensorDictModuleBase,
         *,
         inner_learning_rate: float = MAMLConfig.inner_learning_rate,
-        imitation: float = MAMLConfig.imitation,
         **ddpg: Any,
     ) -> None:
         networks: list[Any] = [meta_network, actor_network, value_network]
@@ -81,7 +78,7 @@ class MAMLLoss(DDPGLoss):
                 parameter.copy_(start[name].unsqueeze(len(shapes[0])))
         super().__init__(actor_network, value_network, **ddpg)
         self.meta_network = meta_network
-        self.inner_learning_rate, self.imitation = inner_learning_rate, imitation
+        self.inner_learning_rate = inner_learning_rate
 
     @property
     def out_keys(self) -> list[NestedKey]:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -103,7 +100,8 @@ class MAMLLoss(DDPGLoss):
         adapted = self.adapt(support)
         loss = self.policy_loss(adapted, query)
         self._keep(adapted)
-        return loss.sum() if self.reduction == "sum" else loss, {}
+        self.count_imitated(query)
+        return self.reduce_seeds(loss), {}
 
     def adapt(self, tensordict: TensorDictBase) -> Parameters:
         """Return the policy's parameters ``[*S, T, ...]`` after one gradient step on each task.
@@ -121,11 +119,10 @@ class MAMLLoss(DDPGLoss):
         loss = self.mean_per_seed(self.actor_objective(data), tensordict)
         if not self.imitation:
             return loss
-        shown = tensordict.get(self.tensor_keys.imitation)
-        data = functional_call(self.actor_network, parameters, (self.current(shown),))
-        names = self.tensor_keys
-        distance = (data.get(names.action) - shown.get(names.action)).square().sum(-1)
-        return loss + self.imitation * self.mean_per_seed(distance, shown)
+        states, shown = self.shown(tensordict)
+        acted = functional_call(self.actor_network, parameters, (states,))
+        distance = self.squared_distance(acted, shown)
+        return loss + self.imitation_weight * self.mean_per_seed(distance, shown)
 
     def _each_task(self) -> Parameters:
         n_stacked = len(self.batch_size) - 1

@@ -179,6 +179,37 @@ def test_the_clone_learns_the_distance_to_demonstrated_actions():
         loss(batch.exclude("imitation"))
 
 
+def test_the_actor_imitates_with_its_weight():
+    loss, batch = make_loss("ddpg", imitation=0.7), make_batch(6)
+    shown = batch["imitation"]
+    action = loss.actor_network(shown.select("state"))["action"]
+    distance = (action - shown["action"]).square().sum(-1)
+    alone = make_loss("ddpg")(batch)["loss_actor"]
+    torch.testing.assert_close(loss(batch)["loss_actor"], alone + 0.7 * distance.mean())
+    shown["priority_weight"] = weights = torch.arange(6.0)
+    expected = alone + 0.7 * (distance * weights).mean()
+    torch.testing.assert_close(loss(batch)["loss_actor"], expected)
+    with pytest.raises(ValueError, match="imitation"):
+        loss(batch.exclude("imitation"))
+
+
+def test_the_imitation_of_each_actor_fades_with_its_own_updates():
+    options = {"imitation": 0.7, "imitation_half_life": 2.0, "reduction": "none"}
+    loss = make_loss("ddpg", seeds=(0, 1), stacked=True, **options)
+    batch = make_batch(2, 6)
+    batch["priority_weight"] = torch.tensor([[1.0], [0.0]]).expand(2, 6)
+    shown = batch["imitation"]
+    shown["priority_weight"] = torch.ones(2, 6)
+    action = loss.actor_network(shown.select("state"))["action"]
+    distance = (action - shown["action"]).square().sum(-1).mean(-1)
+    before = loss(batch)["loss_actor"]
+    for _ in range(3):
+        loss(batch)
+    # The first actor has had four updates, the other one, without transitions, none.
+    faded = torch.tensor([0.7 - 0.7 / 4, 0.0]) * distance
+    torch.testing.assert_close(before - loss(batch)["loss_actor"], faded)
+
+
 def test_without_options_it_is_torchrls_loss():
     loss = make_loss("ddpg", pre_tanh_penalty=0.0)
     actor, critic = copy.deepcopy(loss.actor_network), copy.deepcopy(loss.value_network)
