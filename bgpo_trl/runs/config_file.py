@@ -114,6 +114,7 @@ def read_config(path: str | Path, defaults: RunConfig | None = None) -> tuple[Ru
             if not isinstance(found, str | None):
                 raise ValueError(f"{name} is {found!r}")
         values, modules = settings.pop("algorithm"), settings.pop("task_modules", {})
+        settings.pop("scene_version", None)  # `check_settings` compares it
         name, scene = settings.get("name"), settings.get("scene", "nico")
         kind = _algorithm_config(name, settings.pop("algorithm_class", None))
         if kind is None:
@@ -146,18 +147,19 @@ def read_config(path: str | Path, defaults: RunConfig | None = None) -> tuple[Ru
 def settings_of(config: RunConfig, digests: Digests) -> dict[str, Any]:
     """Return the content of ``config.json``.
 
-    In addition to all settings, it names the class of the hyperparameters and the modules of tasks
-    that are not the paper's.
+    In addition to all settings, it names the class of the hyperparameters, the version of the scene
+    and the modules of tasks that are not the paper's.
 
     Args:
         config: The run.
         digests: Digests of its encoders and demonstrations.
     """
-    kind = type(config.algorithm)
+    kind, scene = type(config.algorithm), find_scene(config.scene)
     settings = {
         **asdict(config),
         "algorithm_class": f"{kind.__module__}.{kind.__qualname__}",
-        "task_modules": dict(find_scene(config.scene).modules(config.tasks)),
+        "scene_version": scene.full_version,
+        "task_modules": dict(scene.modules(config.tasks)),
         **digests._asdict(),
     }
     return _as_json(settings)
