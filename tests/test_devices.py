@@ -59,7 +59,7 @@ def test_a_run_is_the_same_on_every_device(device, name, bank, encoders, make_co
         for folder, place in (("here", "cpu"), ("there", device)):
             Trainer(config, tmp_path / folder, device=place, **parts).run()
     finally:
-        encoders.vae.cpu()
+        encoders.frame_network.cpu()
     assert any(float(row["loss_value"]) > 0 for row in rows(tmp_path / "here" / "train.csv"))
     for name in ("train.csv", "eval.csv"):
         here, there = rows(tmp_path / "here" / name), rows(tmp_path / "there" / name)
@@ -89,5 +89,7 @@ def test_encoders_trained_elsewhere_come_back_to_the_cpu(device, tmp_path):
         save_representation(trained, tmp_path / "weights.safetensors")
         found.append(load_representation(tmp_path / "weights.safetensors"))
     here, there = found
-    for ours, theirs in zip(here.vae.parameters(), there.vae.parameters(), strict=True):
+    for ours, theirs in zip(
+        here.frame_network.parameters(), there.frame_network.parameters(), strict=True
+    ):
         torch.testing.assert_close(ours, theirs, rtol=1e-3, atol=1e-4)
