@@ -10,8 +10,8 @@ from pathlib import Path
 def import_plugin(module: str | None) -> None:
     """Import the user's module, from the current folder or installed.
 
-    It may add tasks with `suites.nico.add_task`, and entries to `bgpo_trl.scenes.SCENES` and
-    `bgpo_trl.algorithms.ALGORITHMS`.
+    It may add tasks with `suites.nico.add_task`, and entries to `bgpo_trl.scenes.SCENES`,
+    `bgpo_trl.algorithms.ALGORITHMS` and `bgpo_trl.modules.frame_network.FRAME_NETWORKS`.
 
     Args:
         module: Name of the module; nothing is imported if None.

@@ -242,7 +242,7 @@ class TrainedPolicy:
             array = array[..., top : top + height, left : left + width, :]
         array = array[..., ::-1] if color == "bgr" else array
         several = array if array.ndim == 4 else array[None]
-        resized = resize_frames(several, self.encoders.vae.frame_shape)
+        resized = resize_frames(several, self.encoders.frame_network.frame_shape)
         return resized if array.ndim == 4 else resized[0]
 
     @torch.no_grad()
@@ -267,7 +267,8 @@ class TrainedPolicy:
             raise ValueError(f"{path} is to hold a program of torch.export: end its name in .pt2")
         if self._policy is None:
             raise ValueError("the policy has seen no demonstration: show it one with condition()")
-        shape, noise = (*self.encoders.vae.frame_shape, 3), torch.Generator().manual_seed(0)
+        shape = (*self.encoders.frame_network.frame_shape, 3)
+        noise = torch.Generator().manual_seed(0)
         frames = torch.randint(256, (8, *shape), generator=noise, dtype=torch.uint8)
         # Traced with the weights of today, which may decide what is computed at all.
         traced = make_fx(lambda frame: self._action(frame))(frames[0])
@@ -283,7 +284,7 @@ class TrainedPolicy:
 
     def _frames(self, frames: ArrayLike, wanted: str, ndim: int) -> Tensor:
         array = np.asarray(frames)
-        shape, expected = array.shape, (*self.encoders.vae.frame_shape, 3)
+        shape, expected = array.shape, (*self.encoders.frame_network.frame_shape, 3)
         if (
             array.dtype != np.uint8
             or array.ndim != ndim

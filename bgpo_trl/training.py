@@ -68,10 +68,10 @@ class Trainer:
         progress: Whether to show a progress bar.
 
     Raises:
-        ValueError: If the directory holds a run with other settings, encoders or demonstrations, or
-            any run and ``resume`` is False; if rows, checkpoint or ``config.json`` of a run to
-            resume are missing; if the bank has no demonstration of a task, or is not of the
-            encoders.
+        ValueError: If the directory holds a run with other settings, encoders or demonstrations, of
+            another version of the scene, or any run and ``resume`` is False; if rows, checkpoint or
+            ``config.json`` of a run to resume are missing; if the bank has no demonstration of a
+            task, or is not of the encoders.
         BlockingIOError: If another process works in the directory.
     """
 

@@ -115,7 +115,7 @@ class MinimalBGPO:
 
     Args:
         settings: Settings of the run.
-        encoders: Frozen encoders f_V (``vae``) and f_L (``lae``).
+        encoders: Frozen encoders f_V (``frame_network``) and f_L (``lae``).
         bank: Demonstrations, already embedded by them: phi_d (Alg. 1, line 7).
     """
 
@@ -137,7 +137,8 @@ class MinimalBGPO:
             generator=stream["gwr"],
         )
 
-        n_inputs, hidden = encoders.vae.latent_size + self.gwr.n_features, settings.hidden_sizes
+        n_inputs = encoders.frame_network.latent_size + self.gwr.n_features
+        hidden = settings.hidden_sizes
         actor_sizes = (n_inputs, *hidden, ACTION_SIZE)
         critic_sizes = (n_inputs + ACTION_SIZE, *hidden, 1)
         self.actor = perceptron(actor_sizes, stream["actor 0"], layer_norm=False)
@@ -152,7 +153,7 @@ class MinimalBGPO:
         success = 1.0 + settings.beta
         self.highest_return = max(success, settings.beta + settings.gamma * success)
 
-        encode = FrameEncoder(encoders.vae, del_keys=True)  # pixels -> latent (line 13)
+        encode = FrameEncoder(encoders.frame_network, del_keys=True)  # pixels -> latent (line 13)
         clip = ClipTransform(["latent"], low=-settings.state_limit, high=settings.state_limit)
         schedule = TaskSchedule(settings.task_starts)
         self.env = TransformedEnv(

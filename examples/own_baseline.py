@@ -46,7 +46,7 @@ if __name__ == "__main__":
     out = "runs/own-baseline"
     shown = record_demonstrations(f"{out}/shown", per_task=10, held_out_per_task=1, seed=1)
     encoders, bank = load_pretrained()
-    latent = encode_frames(encoders.vae, shown)
+    latent = encode_frames(encoders.frame_network, shown)
     phi = encoders.lae.encode(latent, shown["length"]).unsqueeze(1).expand(-1, 50, -1)
     taken = valid_steps(shown["length"] - 1, 50)  # one action fewer than frames
     states, actions = torch.cat([latent[:, :-1], phi], -1)[taken], shown["action"][taken]

@@ -36,7 +36,7 @@ if __name__ == "__main__":
     torch.manual_seed(0)
     encoders, bank = load_pretrained()
     behaviors, places = GWRB(32), GWRB(64, GWRBConfig(activity_threshold=0.6), init="data")
-    encode = FrameEncoder(encoders.vae, del_keys=True)  # pixels -> latent
+    encode = FrameEncoder(encoders.frame_network, del_keys=True)  # pixels -> latent
     source = DemonstrationSource(bank.seen(), TaskSchedule(starts=(0, 2, 4)))
     infer = BehaviorLookup(behaviors, learn=True)  # demo_embedding -> behavior
     reward = NoveltyReward(places, weight=0.01)

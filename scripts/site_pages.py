@@ -24,6 +24,7 @@ REFERENCE = {
     ],
     "gwr": ["modules.gwr", "modules.gwr_estimator", "modules.behavior_groups"],
     "encoders": [
+        "modules.frame_network",
         "modules.vae",
         "modules.sequence_autoencoder",
         "modules.inverse_model",

@@ -23,6 +23,7 @@ from bgpo_trl.configs.runs import PAPER_TASKS
 from bgpo_trl.data.bank import DemonstrationBank, DemonstrationSteps
 from bgpo_trl.encoders.representation import Representation
 from bgpo_trl.figures import style
+from bgpo_trl.modules.frame_network import FRAME_NETWORKS
 from bgpo_trl.modules.inverse_model import InverseModel
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
@@ -181,8 +182,8 @@ def easy_world():
 
 @pytest.fixture(autouse=True)
 def restored_registries() -> Iterator[None]:
-    """Remove tasks, scenes and algorithms that a test has added."""
-    registries: list[dict[str, Any]] = [nico._TASKS, ALGORITHMS, SCENES]
+    """Remove tasks, scenes, algorithms and frame networks that a test has added."""
+    registries: list[dict[str, Any]] = [nico._TASKS, ALGORITHMS, SCENES, FRAME_NETWORKS]
     before = [dict(registry) for registry in registries]
     yield
     for registry, entries in zip(registries, before, strict=True):

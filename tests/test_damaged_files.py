@@ -172,7 +172,7 @@ def read_bank(path: Path) -> dict[str, torch.Tensor]:
 
 def read_encoders(path: Path) -> dict[str, torch.Tensor]:
     encoders = load_representation(path, scene=NICO)
-    return {**encoders.vae.state_dict(), **encoders.lae.state_dict(prefix="lae.")}
+    return {**encoders.frame_network.state_dict(), **encoders.lae.state_dict(prefix="lae.")}
 
 
 @examples

@@ -167,7 +167,7 @@ def test_test_episodes_equal_a_plain_loop_over_one_environment(
                 steps, success = 0, False
                 while steps < 6 and not success:
                     if state == "latent":
-                        seen = encoders.vae.latent(now["pixels"])
+                        seen = encoders.frame_network.latent(now["pixels"])
                     else:
                         seen = algorithm.world.env.transform[0].forward(now.clone())["state"]
                     action = policy(seen.clamp(-5, 5))

@@ -11,6 +11,7 @@ import torch
 from PIL import Image
 
 from bgpo_trl.data.dataset import load_demonstrations
+from bgpo_trl.encoders.representation import load_representation
 from suites import nico
 from tests.helpers import rows
 
@@ -90,6 +91,33 @@ def test_own_baseline_succeeds_more_often_than_random_actions(run):
     # Random actions succeed in 2 to 8 % of such episodes.
     assert np.mean([*success.values()]) > 0.15
     assert run("own_baseline.py") == out  # resumed, though there is nothing learned to load
+
+
+def test_own_encoder_is_frozen_and_a_run_learns_from_what_it_sees(run):
+    out = run("own_encoder.py")
+
+    explained, nearest = re.match(r"R2 of .*: (0\.\d+)\nnearest .*: (\d+)%\n", out).groups()
+    assert float(explained) > 0.2
+    assert int(nearest) >= 75  # 50 by chance
+    assert re.search(r"behavior \d+, first action \[.*\]\n$", out)
+    folder = Path("runs/own-encoder")
+    assert [int(row["episode"]) for row in rows(folder / "run/train.csv")] == [1, 2, 3, 4]
+
+    names = runpy.run_path(str(EXAMPLES / "own_encoder.py"))
+    encoders = load_representation(folder / "run/encoders/encoders.safetensors")
+    network = encoders.frame_network
+    assert type(network) is names["RandomPlaces"]
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)  # of the encoders' training
+        untrained = names["RandomPlaces"]((32, 64))
+    for ours, theirs in zip(network.parameters(), untrained.parameters(), strict=True):
+        assert ours.equal(theirs)
+    frame = torch.zeros(1, 32, 64, 3, dtype=torch.uint8)
+    frame[:, 12:16, 24:28] = 255
+    here, across = network.features(torch.cat([frame, frame.roll(8, 2)]))
+    moved = (across - here).view(2, 32)  # along the columns, along the rows
+    assert (moved[0] > 0).all() and moved[1].abs().max() < 1e-3
+    assert run("own_encoder.py") == out
 
 
 def test_gwr_alone_finds_two_clusters(run):

@@ -45,7 +45,7 @@ DEMONSTRATIONS = [noise(seed, length) for seed, length in ((1, 9), (2, 14), (3, 
 
 def embed(encoders, frames):
     """Return phi of frames, by the encoders alone."""
-    latent = encoders.vae.latent(torch.from_numpy(frames))
+    latent = encoders.frame_network.latent(torch.from_numpy(frames))
     with torch.no_grad():
         return encoders.lae.encode(latent, torch.tensor(len(frames)))
 
@@ -107,7 +107,7 @@ def test_a_loaded_policy_acts_as_a_snapshot(trainer_of, load, encoders, name):
             demonstration, task=TASKS[number], generator=torch.Generator().manual_seed(4)
         )
         for frame in noise(6, 3):
-            latent = encoders.vae.latent(torch.from_numpy(frame)).clamp(-5, 5)
+            latent = encoders.frame_network.latent(torch.from_numpy(frame)).clamp(-5, 5)
             expected = snapshot.act(latent.expand(3, 1, 64))[number, 0]
             # Products of stacks of other sizes may round differently.
             torch.testing.assert_close(torch.from_numpy(policy.act(frame)), expected)

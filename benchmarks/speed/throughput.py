@@ -61,7 +61,7 @@ class Arguments:
 def measure_frames(arguments: Arguments, threads: int) -> Table:
     """Time a frame: the bare limit, the layers of this package and stock dm_control."""
     encoders, _ = load_pretrained()
-    each = _time_each(frames.contenders(threads, encoders.vae), arguments.rounds)
+    each = _time_each(frames.contenders(threads, encoders.frame_network), arguments.rounds)
     return {
         name: {
             "frames a second": 1 / Timing.of(taken).median,

@@ -176,7 +176,7 @@ def study(arguments: Arguments) -> str:
     encoders, bank = load_pretrained(tasks=tasks)
     seen = bank.for_tasks(tasks).seen()
     new = record(arguments, tasks)
-    latent, length, task = encode_frames(encoders.vae, new), new["length"], new["task"]
+    latent, length, task = encode_frames(encoders.frame_network, new), new["length"], new["task"]
     embedded = {
         share: encoders.lae.encode(latent, length.mul(share).round().long().clamp(min=1))
         for share in arguments.shares

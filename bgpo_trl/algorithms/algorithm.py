@@ -150,7 +150,7 @@ class Algorithm(ABC):
         self.n_seeds, self.n_tasks = len(seeds), len(bank.tasks)
         self.bank, self.encoders = bank, encoders
         if encoders is not None:
-            encoders.vae.to(self.device)
+            encoders.frame_network.to(self.device)
         if config.state == "state":
             if self.scene.state is None:
                 raise ValueError(
@@ -161,7 +161,7 @@ class Algorithm(ABC):
         elif encoders is None:
             raise ValueError("state='latent' needs trained encoders")
         else:
-            self.state_size = encoders.vae.latent_size
+            self.state_size = encoders.frame_network.latent_size
         if bank.steps is not None and bank.steps.action.shape[-1] != self.scene.action_size:
             raise ValueError(
                 f"actions of the demonstrations have {bank.steps.action.shape[-1]} components, "

@@ -136,7 +136,7 @@ def encode(
     if config.state == "latent":
         if encoders is None:
             raise ValueError("state='latent' needs trained encoders")
-        return FrameEncoder(encoders.vae, del_keys=True)
+        return FrameEncoder(encoders.frame_network, del_keys=True)
     if state is None:
         raise ValueError("state='state' needs a scene with ground truth: learn from frames instead")
     loc, scale = torch.tensor(state.center), torch.tensor(state.scale)

@@ -109,11 +109,14 @@ class RepresentationConfig(Settings):
     """Stage 1: both encoders, and the inverse model."""
 
     vae: VAEConfig = field(default_factory=VAEConfig)
-    """The frame encoder."""
+    """The VAE, if it is the frame encoder."""
     lae: SequenceAutoencoderConfig = field(default_factory=SequenceAutoencoderConfig)
     """The sequence encoder."""
     inverse: InverseModelConfig = field(default_factory=InverseModelConfig)
     """The inverse model."""
+    frame_network: str = "vae"
+    """The frame encoder: vae, or one of FRAME_NETWORKS that the module of --import adds, which is
+    not trained further."""
     seed: int = 0
     """Seed of initial weights, batches and sampling noise. Ours."""
     checkpoint_every: int = 250

@@ -40,6 +40,8 @@ class Fit:
         log: Receives a row every ``config.log_every`` steps.
         progress: Whether to show a progress bar.
         device: Device to train on.
+        frame_network: Identity of the frame network of one's own whose latents it is trained on, or
+            "": a checkpoint of another one is not resumed.
     """
 
     config: RepresentationConfig
@@ -47,6 +49,7 @@ class Fit:
     log: Log | None
     progress: bool
     device: torch.device | str = "cpu"
+    frame_network: str = ""
 
     def __call__(
         self,
@@ -106,13 +109,18 @@ class Fit:
                     self.log({"stage": stage, "step": done, "learning_rate": rate, **parts})
             if path and (done % self.config.checkpoint_every == 0 or done == schedule.steps):
                 state = {
-                    "config": json.dumps(asdict(self.config)),
+                    "config": self._settings,
                     "step": done,
                     "loss": loss.state_dict(),
                     "optimizer": optimizer.state_dict(),
                     "generator": generator.get_state(),
                 }
                 save_checkpoint(path, state)
+
+    @property
+    def _settings(self) -> str:
+        """All that a checkpoint has to have in common with the training that it resumes."""
+        return json.dumps(asdict(self.config)) + self.frame_network
 
     def _resume(
         self,
@@ -126,9 +134,9 @@ class Fit:
         saved = load_checkpoint(path)
         if not saved.keys() >= {"config", "loss", "optimizer", "generator", "step"}:
             raise ValueError(f"{path} holds no checkpoint of encoders: choose another folder")
-        if saved["config"] != json.dumps(asdict(self.config)):
+        if saved["config"] != self._settings:
             raise ValueError(
-                f"{path} was written with another configuration: "
+                f"{path} was written with another configuration or frame network: "
                 "remove it or choose another checkpoint folder"
             )
         loss.load_state_dict(saved["loss"])

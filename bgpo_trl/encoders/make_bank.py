@@ -38,7 +38,7 @@ def make_bank(
         spread: Share of the range of start states that the dataset was recorded over.
     """
     length = dataset["length"]
-    latent = encode_frames(representation.vae, dataset)
+    latent = encode_frames(representation.frame_network, dataset)
     action = dataset.get("action", None)
     if actions == "inferred" or action is None:
         inverse = representation.inverse

@@ -25,6 +25,7 @@ from bgpo_trl.encoders.representation import (
     valid_steps,
 )
 from bgpo_trl.files.writing import write_json, write_whole
+from bgpo_trl.modules.frame_network import FrameNetwork
 from bgpo_trl.modules.inverse_model import InverseModel
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
@@ -49,7 +50,8 @@ def probe(
         dataset: Demonstrations that they were trained on, with their held-out part; reads
             ``pixels``, ``length``, ``train``, ``task`` and, if they are there, ``action`` and
             ``state``.
-        folder: Folder for ``probes.json`` and ``reconstructions.png``; ``None`` writes nothing.
+        folder: Folder for ``probes.json`` and, of the VAE, ``reconstructions.png``; ``None`` writes
+            nothing.
         play: Recorded play in the form of the dataset; adds the errors of joints and objects, as
             ``play_...``, in frames that ``columns.valid`` accepts.
         columns: Meaning of ``state``; without either, joints and objects are left out.
@@ -60,40 +62,42 @@ def probe(
         linear probe's place from the true one, mean over frames), ``inverse_rmse``, ``inverse_r2``
         and ``inverse_r2_<component>`` (actions of the training demonstrations, as they are inferred
         for the bank; components have the names of the joints if there are as many),
-        ``reconstruction`` (squared error per frame), ``mean_frame_reconstruction`` (the same for
-        the mean training frame, the level of an untrained VAE), ``moving_reconstruction`` (share
-        of the squared deviation from the mean frame that is reconstructed, of pixels that deviate
-        by a tenth of the range or more), ``sequence_mse`` (of standardized
-        latents, so 1 is the level of predicting the mean), ``task_accuracy_linear``,
-        ``task_accuracy_nearest``, ``task_accuracy_chance`` and ``active_dimensions``.
+        ``sequence_mse`` (of standardized latents, so 1 is the level of predicting the mean),
+        ``task_accuracy_linear``, ``task_accuracy_nearest``, ``task_accuracy_chance`` and
+        ``active_dimensions``. Of the VAE also ``reconstruction`` (squared error per frame),
+        ``mean_frame_reconstruction`` (the same for the mean training frame, the level of an
+        untrained VAE) and ``moving_reconstruction`` (share of the squared deviation from the mean
+        frame that is reconstructed, of pixels that deviate by a tenth of the range or more).
 
     Raises:
         ValueError: If the dataset has no training or no held-out demonstrations.
     """
-    vae, lae = representation.vae, representation.lae
+    network, lae = representation.frame_network, representation.lae
+    vae = network if isinstance(network, VAE) else None
     train, held_out = split(dataset)
-    latent, latent_held_out = encode_frames(vae, train), encode_frames(vae, held_out)
+    latent, latent_held_out = encode_frames(network, train), encode_frames(network, held_out)
     result = {
         **_probe_state(columns, latent, train, latent_held_out, held_out),
         **_probe_inverse(representation.inverse, latent, train, columns),
-        **_probe_reconstruction(vae, train, held_out),
+        **({} if vae is None else _probe_reconstruction(vae, train, held_out)),
         **_probe_sequences(lae, latent_held_out, held_out),
     }
-    spread = (latent * vae.latent_std)[valid_steps(train.get("length"), latent.shape[1])].std(0)
+    spread = (latent * network.latent_std)[valid_steps(train.get("length"), latent.shape[1])].std(0)
     result["active_dimensions"] = float((spread > 0.1 * spread.max()).sum())
 
     phi = lae.encode(latent, train.get("length"))
     phi_held_out = lae.encode(latent_held_out, held_out.get("length"))
     result |= _probe_tasks(phi, train.get("task"), phi_held_out, held_out.get("task"))
     if play is not None:
-        result |= _probe_play(vae, play, columns)
+        result |= _probe_play(network, play, columns)
     if folder is not None:
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         write_json(folder / "probes.json", result)
-        picture, content = reconstruction_picture(vae, held_out), io.BytesIO()
-        matplotlib.image.imsave(content, picture.numpy(), format="png")
-        write_whole(folder / "reconstructions.png", content.getvalue())
+        if vae is not None:
+            picture, content = reconstruction_picture(vae, held_out), io.BytesIO()
+            matplotlib.image.imsave(content, picture.numpy(), format="png")
+            write_whole(folder / "reconstructions.png", content.getvalue())
     return result
 
 
@@ -114,7 +118,7 @@ def complaints(result: Mapping[str, float]) -> list[str]:
     """
     nearest, chance = result["task_accuracy_nearest"], result["task_accuracy_chance"]
     lines = []
-    if result["moving_reconstruction"] < _GOOD_RECONSTRUCTION:
+    if result.get("moving_reconstruction", 1.0) < _GOOD_RECONSTRUCTION:
         lines.append(
             f"encoders reconstruct {result['moving_reconstruction']:.0%} of what moves in frames: "
             "look for the objects in reconstructions.png; train longer (vae.steps), lower "
@@ -228,11 +232,13 @@ def _probe_state(
     }
 
 
-def _probe_play(vae: VAE, play: TensorDictBase, columns: StateColumns | None) -> dict[str, float]:
+def _probe_play(
+    network: FrameNetwork, play: TensorDictBase, columns: StateColumns | None
+) -> dict[str, float]:
     if columns is None or "state" not in play:
         return {}
     train, held_out = split(play)
-    latent, latent_held_out = encode_frames(vae, train), encode_frames(vae, held_out)
+    latent, latent_held_out = encode_frames(network, train), encode_frames(network, held_out)
     errors = _probe_state(columns, latent, train, latent_held_out, held_out, only=columns.valid)
     return {f"play_{name}": error for name, error in errors.items()}
 

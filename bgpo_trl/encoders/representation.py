@@ -1,8 +1,9 @@
 """Train, save and load the two frozen encoders, and embed demonstrations (Sec. III-A).
 
 `train_representation` first trains the VAE with its inverse model on the frames of
-demonstrations and play, then the LSTM autoencoder on the latents of the demonstrations;
-`bgpo_trl.encoders.probes` evaluates the result.
+demonstrations and play, or takes a frame network of one's own (`FRAME_NETWORKS`). Then it trains
+the LSTM autoencoder and the inverse model on the latents; `bgpo_trl.encoders.probes` evaluates the
+result.
 
 A dataset is a TensorDict ``[N]`` with ``pixels`` uint8 ``[N, T, H, W, 3]``, ``action``
 ``[N, T - 1, A]`` if actions are known, ``length`` int64 ``[N]`` (frames) and ``train`` bool
@@ -11,9 +12,10 @@ A dataset is a TensorDict ``[N]`` with ``pixels`` uint8 ``[N, T, H, W, 3]``, ``a
 
 from __future__ import annotations
 
+import hashlib
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -29,6 +31,11 @@ from bgpo_trl.configs import (
 )
 from bgpo_trl.encoders.fitting import Fit, Log
 from bgpo_trl.files.tensor_file import digest, load_tensors, save_tensors
+from bgpo_trl.modules.frame_network import (
+    FrameNetwork,
+    FrameNetworkError,
+    make_frame_network,
+)
 from bgpo_trl.modules.inverse_model import InverseModel, window
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
@@ -47,28 +54,38 @@ class Representation:
     """The two trained encoders, the inverse model, and the metadata of their training.
 
     Attributes:
-        vae: Frame encoder; ``vae.latent(pixels)`` is the latent used downstream.
+        frame_network: Frame encoder, the `VAE` or one's own; ``frame_network.latent(pixels)`` is
+            the latent used downstream.
         lae: Sequence encoder; ``lae.encode(latent, length)`` is the embedding phi.
         inverse: Inverse model on latents; it infers the actions of demonstrations for a bank. None
             if it was trained on nothing: no recorded actions were known.
         metadata: ``scene`` (`Scene.identity`), ``spread``, ``config`` (JSON), ``seed`` and
-            ``command``.
+            ``command``; of a frame network of one's own also ``frame_network``, its identity, and
+            ``frame_shape`` (JSON).
     """
 
-    vae: VAE
+    frame_network: FrameNetwork
     lae: SequenceAutoencoder
     inverse: InverseModel | None
     metadata: dict[str, str]
 
     def networks(self) -> list[tuple[str, nn.Module]]:
         """Return the networks with the prefixes of their weights in files."""
-        found = {"vae.": self.vae, "lae.": self.lae, "inverse.": self.inverse}
+        prefix = "vae." if self.frame_network.identity == VAE.identity else "frame_network."
+        found = {prefix: self.frame_network, "lae.": self.lae, "inverse.": self.inverse}
         return [(prefix, network) for prefix, network in found.items() if network is not None]
 
     @property
     def identity(self) -> str:
-        """Digest of all weights; it identifies the encoders that made an embedding."""
-        return digest(_tensors(self))
+        """Digest of all weights; it identifies the encoders that made an embedding.
+
+        Of a frame network of one's own, also of its name and version, since another function may
+        have the same weights.
+        """
+        weights, name = digest(_tensors(self)), self.frame_network.identity
+        if name == VAE.identity:
+            return weights
+        return hashlib.sha256(f"{name} {weights}".encode()).hexdigest()
 
     def check_scene(self, scene: Scene, what: object, remedy: str) -> None:
         """Raise ``ValueError`` unless the encoders are of a scene, and of its frames' size.
@@ -79,9 +96,9 @@ class Representation:
             remedy: What to do if they are of another version of the scene.
         """
         scene.check_identity(self.metadata.get("scene"), what, remedy)
-        found, wanted = [*self.vae.frame_shape], [*scene.frame_shape]
+        found, wanted = [*self.frame_network.frame_shape], [*scene.frame_shape]
         if self.inverse is not None:  # else, no actions were known
-            found, wanted = [*found, self.vae.action_size], [*wanted, scene.action_size]
+            found, wanted = [*found, self.inverse.action_size], [*wanted, scene.action_size]
         if found != wanted:
             raise ValueError(
                 f"{what} has frames of {found[:2]} and {found[2:]} actions, the scene {wanted[:2]} "
@@ -104,6 +121,9 @@ def train_representation(
 ) -> Representation:
     """Train both encoders on the training demonstrations.
 
+    A frame network of one's own (``config.frame_network``) is taken as it is, and only the scale of
+    its latents is set.
+
     Args:
         dataset: Demonstrations in the form given by the module; held-out ones are not read.
         config: Hyperparameters; ``RepresentationConfig()`` by default.
@@ -118,16 +138,17 @@ def train_representation(
         checkpoint: Folder for checkpoints, from which an interrupted training is resumed and then
             gives the same weights.
         log: Receives a row every ``config.log_every`` steps.
-        progress: Whether to show a progress bar for each of the two stages.
+        progress: Whether to show a progress bar for each stage.
         device: Device to train on.
 
     Returns:
         The trained encoders, on the CPU, in eval mode, without gradients.
 
     Raises:
-        ValueError: If the dataset or the configuration cannot be trained on, or ``checkpoint``
-            belongs to a training with another configuration; or if ``largest_action`` leaves no
-            action to learn from, or more than a twentieth of those demonstrated out.
+        ValueError: If the dataset or the configuration cannot be trained on, no imported module has
+            the frame network, or ``checkpoint`` belongs to a training with another configuration;
+            or if ``largest_action`` leaves no action to learn from, or more than a twentieth of
+            those demonstrated out.
     """
     config = config or RepresentationConfig()
     train, _ = split(dataset)
@@ -136,13 +157,18 @@ def train_representation(
     _check_actions(train, own, config.inverse)
     folder = Path(checkpoint) if checkpoint else None
     fit = Fit(config, folder, log, progress, device)
-    vae = _train_vae(seen, config.vae, fit, config.seed)
-    latent = encode_frames(vae, train)
+    if config.frame_network == "vae":
+        network = _train_vae(seen, config.vae, fit, config.seed)
+    else:
+        network = _take_frame_network(config.frame_network, seen, fit, config.seed)
+        taken = f"{network.identity} {digest(network.state_dict())}"
+        fit = replace(fit, frame_network=taken)
+    latent = encode_frames(network, train)
     lae = _train_lae(latent, train.get("length"), config.lae, fit, config.seed)
     inverse = None
     if config.inverse.steps and "action" in own:
         if play is not None:
-            latent = encode_frames(vae, own)
+            latent = encode_frames(network, own)
         inverse = _train_inverse(latent, own, config.inverse, fit, config.seed).cpu()
     metadata = {
         "scene": scene,
@@ -151,7 +177,10 @@ def train_representation(
         "seed": str(config.seed),
         "command": command,
     }
-    return Representation(vae.cpu(), lae.cpu(), inverse, metadata)
+    if network.identity != VAE.identity:
+        shape = json.dumps(network.frame_shape)
+        metadata |= {"frame_network": network.identity, "frame_shape": shape}
+    return Representation(network.cpu(), lae.cpu(), inverse, metadata)
 
 
 def retrain_inverse(
@@ -178,19 +207,19 @@ def retrain_inverse(
     if "action" not in own:
         raise ValueError("the inverse model learns from actions, which this play lacks: record it")
     _check_actions(None, own, config.inverse)
-    vae = representation.vae.to(device)
-    latent = encode_frames(vae, own)
+    network = representation.frame_network.to(device)
+    latent = encode_frames(network, own)
     fit = Fit(config, folder, log, progress, device)
     inverse = _train_inverse(latent, own, config.inverse, fit, config.seed)
     metadata = representation.metadata
     kept = {**json.loads(metadata["config"]), "inverse": asdict(config.inverse)}
     commands = "; ".join(part for part in (metadata["command"], command) if part)
     metadata = {**metadata, "config": json.dumps(kept), "command": commands}
-    return Representation(vae.cpu(), representation.lae, inverse.cpu(), metadata)
+    return Representation(network.cpu(), representation.lae, inverse.cpu(), metadata)
 
 
 @torch.no_grad()
-def encode_frames(vae: VAE, dataset: TensorDictBase, batch_size: int = 64) -> Tensor:
+def encode_frames(network: FrameNetwork, dataset: TensorDictBase, batch_size: int = 64) -> Tensor:
     """Encode the valid frames of demonstrations in batches.
 
     Reads ``pixels`` uint8 ``[N, T, H, W, 3]`` and ``length`` ``[N]``.
@@ -199,10 +228,11 @@ def encode_frames(vae: VAE, dataset: TensorDictBase, batch_size: int = 64) -> Te
         Standardized latents, float32 ``[N, T, latent_size]``; zeros at and beyond ``length``.
     """
     pixels, length = dataset.get("pixels"), dataset.get("length")
-    latent = torch.zeros(*pixels.shape[:2], vae.latent_size)
+    latent = torch.zeros(*pixels.shape[:2], network.latent_size)
+    device = network.latent_mean.device
     demonstration, time = valid_steps(length, pixels.shape[1]).nonzero(as_tuple=True)
     for d, t in zip(demonstration.split(batch_size), time.split(batch_size), strict=True):
-        latent[d, t] = vae.latent(pixels[d, t].to(vae.mean_frame.device)).cpu()
+        latent[d, t] = network.latent(pixels[d, t].to(device)).cpu()
     return latent
 
 
@@ -212,7 +242,7 @@ def embed_demonstrations(representation: Representation, dataset: TensorDictBase
 
     Reads ``pixels`` ``[N, T, H, W, 3]`` and ``length`` ``[N]``.
     """
-    latent = encode_frames(representation.vae, dataset)
+    latent = encode_frames(representation.frame_network, dataset)
     return representation.lae.encode(latent, dataset.get("length"))
 
 
@@ -227,11 +257,13 @@ def save_representation(representation: Representation, path: str | Path) -> Non
     save_tensors(path, _tensors(representation), representation.metadata)
 
 
+@torch.no_grad()
 def check_savable(representation: Representation) -> None:
     """Raise ``ValueError`` if `load_representation` would not return the same encoders.
 
-    It makes `VAE`, `SequenceAutoencoder` and `InverseModel` of the sizes in the metadata.
+    It makes a frame network of the name, and the other networks of the sizes, in the metadata.
     """
+    network = representation.frame_network
     try:
         made = _of_tensors(_tensors(representation), representation.metadata)
     except Exception as error:
@@ -241,11 +273,25 @@ def check_savable(representation: Representation) -> None:
         kinds = [[type(network) for _, network in r.networks()] for r in (representation, made)]
         found = next((a.__qualname__ for a, b in zip(*kinds, strict=True) if a is not b), "")
         found = f"{found} is of a class of its own" if found else ""
+        if not found and network.identity != VAE.identity:
+            found = _difference(network, made.frame_network)
     if found:
         raise ValueError(
             f"these encoders could be saved, but not loaded again: {found}; train them with "
-            "bgpo_trl.encoders.train"
+            "bgpo_trl.encoders.train, a frame network of your own by its name in FRAME_NETWORKS"
         )
+
+
+def _difference(network: FrameNetwork, made: FrameNetwork) -> str:
+    """Return why a network of the same class and weights is another one; "" if it is not."""
+    if made.identity != network.identity:
+        return f"{made.identity!r} would be made in place of {network.identity!r}"
+    noise, device = torch.Generator().manual_seed(0), network.latent_mean.device
+    shape = (2, *network.frame_shape, 3)
+    frames = torch.randint(256, shape, generator=noise, dtype=torch.uint8).to(device)
+    if torch.allclose(made.to(device).latent(frames), network.latent(frames), 1e-3, 1e-3):
+        return ""
+    return f"latents of {network.identity!r} depend on more than its parameters and buffers"
 
 
 def load_representation(path: str | Path, *, scene: Scene | None = None) -> Representation:
@@ -254,7 +300,8 @@ def load_representation(path: str | Path, *, scene: Scene | None = None) -> Repr
     By default, those of any scene are accepted.
 
     Raises:
-        ValueError: If the file is missing, damaged, or belongs to another scene.
+        ValueError: If the file is missing, damaged, or belongs to another scene, or no imported
+            module has the version of its frame network.
     """
     path = Path(path)
     remedy = "train new ones with --train-encoders"
@@ -263,6 +310,8 @@ def load_representation(path: str | Path, *, scene: Scene | None = None) -> Repr
         encoders = _of_tensors(tensors, metadata)
     except FileNotFoundError:
         raise ValueError(f"no encoder weights at {path}: {remedy}") from None
+    except FrameNetworkError as error:
+        raise ValueError(f"{path} cannot be loaded: {error}") from None
     except Exception as error:
         raise ValueError(f"{path} is damaged or holds no encoder weights: {remedy}") from error
     if scene is not None:
@@ -274,26 +323,44 @@ def load_representation(path: str | Path, *, scene: Scene | None = None) -> Repr
 
 def _of_tensors(tensors: Mapping[str, Tensor], metadata: dict[str, str]) -> Representation:
     """Return encoders of the tensors and metadata of a file."""
-    if any(value.dtype != torch.float32 for value in tensors.values()):
-        raise ValueError("weights are float32")
     config = json.loads(metadata["config"])
-    vae = VAE(
-        config["vae"]["latent_size"],
-        len(tensors["vae.inverse_head.bias"]),
-        tensors["vae.mean_frame"].shape[:2],
-        config["vae"].get("keypoints", True),
-    )
-    lae = SequenceAutoencoder(vae.latent_size, config["lae"]["embedding_size"])
-    inverse = None
+    action_size = None
     if any(name.startswith("inverse.") for name in tensors):
-        hidden_size = config["inverse"]["hidden_size"]
-        inverse = InverseModel(vae.latent_size, vae.action_size, hidden_size)
-    encoders = Representation(vae, lae, inverse, metadata)
-    for name, module in encoders.networks():
-        module.load_state_dict(
-            {k.removeprefix(name): v for k, v in tensors.items() if k.startswith(name)}
+        action_size = len(tensors["inverse.network.4.bias"])
+    if "frame_network" in metadata:
+        network = _named_frame_network(metadata)
+    else:
+        network = VAE(
+            config["vae"]["latent_size"],
+            len(tensors["vae.inverse_head.bias"]),
+            tensors["vae.mean_frame"].shape[:2],
+            config["vae"].get("keypoints", True),
         )
+    lae = SequenceAutoencoder(network.latent_size, config["lae"]["embedding_size"])
+    inverse = None
+    if action_size is not None:
+        inverse = InverseModel(network.latent_size, action_size, config["inverse"]["hidden_size"])
+    encoders = Representation(network, lae, inverse, metadata)
+    for name, module in encoders.networks():
+        found = {k.removeprefix(name): v for k, v in tensors.items() if k.startswith(name)}
+        # A value of another type would be converted.
+        kinds = {key: value.dtype for key, value in module.state_dict().items()}
+        if any(value.dtype != kinds.get(key) for key, value in found.items()):
+            raise ValueError("weights are of other types than those of the networks")
+        module.load_state_dict(found)
     return encoders
+
+
+def _named_frame_network(metadata: Mapping[str, str]) -> FrameNetwork:
+    """Return the frame network of one's own that metadata name, with other weights."""
+    identity, shape = metadata["frame_network"], json.loads(metadata["frame_shape"])
+    network = _initialized(0, make_frame_network, identity.partition(" ")[0], shape)
+    if network.identity != identity:
+        raise FrameNetworkError(
+            f"it is of the frame network {identity!r}, the imported module has "
+            f"{network.identity!r}: use the version of the module, or train new ones"
+        )
+    return network
 
 
 def _tensors(representation: Representation) -> dict[str, Tensor]:
@@ -334,11 +401,28 @@ def mean_frame(frames: Tensor) -> Tensor:
     return torch.stack(parts).sum(0) / (255 * len(frames))
 
 
-def _initialized(seed: int, network: type[Network], *sizes: Any) -> Network:
+def _initialized(seed: int, make: Callable[..., Network], *arguments: Any) -> Network:
     """Return a network with initial weights drawn from a seed, without use of global state."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        return network(*sizes)
+        return make(*arguments)
+
+
+def _take_frame_network(
+    name: str, datasets: Sequence[TensorDictBase], fit: Fit, seed: int
+) -> FrameNetwork:
+    """Return a frame network of one's own, with the scale of its latents in some datasets."""
+    frames = torch.cat([valid_frames(dataset) for dataset in datasets])
+    network = _initialized(seed, make_frame_network, name, frames.shape[1:3]).to(fit.device)
+    _set_scale(network, frames, fit)
+    return network
+
+
+def _set_scale(network: FrameNetwork, frames: Tensor, fit: Fit) -> None:
+    """Set the scale of latents from frames uint8 ``[F, H, W, 3]``."""
+    chunks = (chunk.to(fit.device) for chunk in frames.split(64))
+    with torch.no_grad():
+        network.set_latent_scale(torch.cat([network.features(chunk) for chunk in chunks]))
 
 
 def _train_vae(datasets: Sequence[TensorDictBase], config: VAEConfig, fit: Fit, seed: int) -> VAE:
@@ -380,8 +464,7 @@ def _train_vae(datasets: Sequence[TensorDictBase], config: VAEConfig, fit: Fit, 
     )
     fit("vae", loss, sample, config, generator, config.bfloat16)
     vae.eval().requires_grad_(False)
-    chunks = (chunk.to(fit.device) for chunk in frames.split(64))
-    vae.set_latent_scale(torch.cat([vae.encode(chunk)[0] for chunk in chunks]))
+    _set_scale(vae, frames, fit)
     return vae
 
 

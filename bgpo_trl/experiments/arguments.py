@@ -19,11 +19,11 @@ SETTINGS: Any = tyro.conf.SuppressFixed[RunConfig]
 
 @dataclass(frozen=True, kw_only=True)
 class ImportArguments:
-    """Own tasks and algorithms in a command."""
+    """Own tasks, algorithms and frame encoders in a command."""
 
     module: Annotated[str | None, tyro.conf.arg(name="import")] = None
-    """Module that adds scenes (SCENES), tasks (nico.add_task) or algorithms (ALGORITHMS), imported
-    first; here or installed."""
+    """Module that adds scenes (SCENES), tasks (nico.add_task), algorithms (ALGORITHMS) or frame
+    encoders (FRAME_NETWORKS), imported first; here or installed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,6 +137,8 @@ class RecordArguments(ImportArguments):
 @dataclass(frozen=True)
 class EncodersArguments(ImportArguments):
     """Train both encoders on recorded demonstrations and play, then probe them.
+
+    With --config.frame-network NAME, the frame encoder is your own and stays as it is.
 
     The same command resumes an interrupted training.
     """

@@ -29,6 +29,7 @@ class InverseModel(nn.Module):
 
     def __init__(self, latent_size: int = 64, action_size: int = 4, hidden_size: int = 512) -> None:
         super().__init__()
+        self.action_size = action_size
         self.network = nn.Sequential(
             nn.Linear((_BEFORE + _AFTER + 1) * latent_size, hidden_size),
             nn.ReLU(),

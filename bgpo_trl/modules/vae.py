@@ -10,6 +10,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from bgpo_trl.modules.frame_network import FrameNetwork
+
 FRAME_SHAPE = (32, 64)
 """Height and width of a frame (Sec. IV-A: "a 64x32 RGB image")."""
 
@@ -22,11 +24,9 @@ _UNIT = 16
 _LARGEST_COORDINATE = 3.0
 # Standard deviation of the blobs that the decoder draws at keypoints: a little more than a cell.
 _BLOB = 0.16
-# On a CPU, activations of more frames do not fit into the cache, and take twice as long.
-_FRAMES_AT_ONCE = 64
 
 
-class VAE(nn.Module):
+class VAE(FrameNetwork):
     """Convolutional VAE over RGB frames, with a one-layer inverse model on its latents.
 
     Encoder (Sec. IV-A): three 3x3 convolutions of 32, 64 and 128 channels, each followed by 2x2
@@ -59,8 +59,6 @@ class VAE(nn.Module):
 
     Attributes:
         mean_frame: Buffer ``[H, W, 3]`` in [0, 1], set before training; grey until then.
-        latent_mean: Buffer ``[latent_size]``, subtracted from mu by `latent`.
-        latent_std: Buffer ``[latent_size]``, by which `latent` divides.
 
     Examples:
         >>> frames = torch.zeros(10, 32, 64, 3, dtype=torch.uint8)
@@ -68,9 +66,8 @@ class VAE(nn.Module):
         torch.Size([10, 64])
     """
 
+    identity = "vae 1"
     mean_frame: Tensor
-    latent_mean: Tensor
-    latent_std: Tensor
     _row: Tensor
     _column: Tensor
 
@@ -86,12 +83,8 @@ class VAE(nn.Module):
                 f"latent_size must be at least 4 and action_size at least 1, got {latent_size} and "
                 f"{action_size}"
             )
-        if len(frame_shape) != 2 or min(frame_shape) < 16:
-            raise ValueError(f"frames must be at least 16 x 16 pixels, got {tuple(frame_shape)}")
-        super().__init__()
-        self.latent_size = latent_size
+        super().__init__(latent_size, frame_shape)
         self.action_size = action_size
-        self.frame_shape = (int(frame_shape[0]), int(frame_shape[1]))
         self._padded = tuple(-(-size // _POOLED) * _POOLED for size in self.frame_shape)
         self._map_shape = (self._padded[0] // 2, self._padded[1] // 2)
         # Half the height and width of the map of keypoints, in the unit of its coordinates.
@@ -122,13 +115,11 @@ class VAE(nn.Module):
         self.register_buffer("_row", torch.linspace(-height, height, rows), persistent=False)
         self.register_buffer("_column", torch.linspace(-width, width, columns), persistent=False)
         self.register_buffer("mean_frame", torch.full((*self.frame_shape, 3), 0.5))
-        self.register_buffer("latent_mean", torch.zeros(latent_size))
-        self.register_buffer("latent_std", torch.ones(latent_size))
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def encode(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and log-variance of the posterior, float32 ``[..., latent_size]`` each."""
-        self._check_frames(pixels)
+        self.check_frames(pixels)
         mu, coarse = self._mean(pixels.reshape(-1, *pixels.shape[-3:]))
         shape = *pixels.shape[:-3], self.latent_size
         return mu.reshape(shape), self.log_variance_head(coarse).float().reshape(shape)
@@ -156,50 +147,13 @@ class VAE(nn.Module):
         self._check_latent(z_next)
         return torch.tanh(self.inverse_head(torch.cat([z, z_next], -1)))
 
-    @torch.no_grad()
-    def latent(self, pixels: Tensor) -> Tensor:
-        """Return the features used downstream: mu, standardized, ``[..., latent_size]``."""
-        self._check_frames(pixels)
-        frames = pixels.reshape(-1, *pixels.shape[-3:])
-        if frames.device.type == "cpu" and len(frames) > _FRAMES_AT_ONCE:
-            mu = torch.cat([self._mean(part)[0] for part in frames.split(_FRAMES_AT_ONCE)])
-        else:
-            mu = self._mean(frames)[0]
-        return self.standardize(mu).reshape(*pixels.shape[:-3], self.latent_size)
-
-    def standardize(self, mu: Tensor) -> Tensor:
-        """Return ``(mu - latent_mean) / latent_std``, ``[..., latent_size]``."""
-        return (mu - self.latent_mean) / self.latent_std
-
-    @torch.no_grad()
-    def set_latent_scale(self, mu: Tensor, floor: float = 0.1) -> None:
-        """Set mean and standard deviation of `latent` from the mu ``[N, latent_size]`` of frames.
-
-        The KL term switches dimensions off: they keep a tiny spread, and dividing by it would turn
-        them into noise as large as the signal. No divisor is below ``floor`` times the largest.
-
-        Raises:
-            ValueError: If ``mu`` has fewer than two rows, or is constant or not finite.
-        """
-        if mu.ndim != 2 or mu.shape[0] < 2:
-            raise ValueError(f"mu must be [N, {self.latent_size}], N >= 2, got {tuple(mu.shape)}")
-        std, mean = torch.std_mean(mu, 0)
-        if not (std.isfinite().all() and std.max() > 0):
-            raise ValueError("mu is constant or not finite: train the VAE (again) before scaling")
-        self.latent_mean.copy_(mean)
-        self.latent_std.copy_(std.clamp_min(floor * std.max()))
+    def features(self, frames: Tensor) -> Tensor:
+        """Return mu of frames ``[N, H, W, 3]``, float32 ``[N, latent_size]``."""
+        return self._mean(frames)[0]
 
     def _check_latent(self, z: Tensor) -> None:
         if z.shape[-1:] != (self.latent_size,):
             raise ValueError(f"a latent must be [..., {self.latent_size}], got {[*z.shape]}")
-
-    def _check_frames(self, pixels: Tensor) -> None:
-        height, width = self.frame_shape
-        if pixels.dtype != torch.uint8 or pixels.shape[-3:] != (height, width, 3):
-            raise ValueError(
-                f"pixels must be uint8 [..., {height}, {width}, 3], got {pixels.dtype} "
-                f"{tuple(pixels.shape)}"
-            )
 
     def _mean(self, frames: Tensor) -> tuple[Tensor, Tensor]:
         """Return mu ``[N, latent_size]`` and the features ``[N, C]`` of frames ``[N, ...]``."""

@@ -13,7 +13,7 @@ import yaml
 
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.configs import AlgorithmConfig, RunConfig
-from bgpo_trl.runs.results import read_json
+from bgpo_trl.runs.results import RepeatedKeyError, parse_json, read_json
 from bgpo_trl.scenes import SCENES, find_scene
 
 _YAML = (".yaml", ".yml")
@@ -32,7 +32,20 @@ class Digests(NamedTuple):
 
 
 class _Loader(yaml.SafeLoader):
-    """PyYAML's safe loader, which also reads 1e-4 as a number, as YAML 1.2 and JSON do."""
+    """PyYAML's safe loader, with two rules of YAML 1.2: 1e-4 is a number, and keys are unique."""
+
+    def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
+        """Return the node of a mapping; raise `RepeatedKeyError` if it gives a key twice."""
+        # Not in construct_mapping, where a mapping also has the keys that it merges (<<).
+        node = super().compose_mapping_node(anchor)
+        found = set[tuple[str, str]]()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode):
+                if (key.tag, key.value) in found:
+                    where = f"{self.name}, line {key.start_mark.line + 1},"
+                    raise RepeatedKeyError(where, key.value)
+                found.add((key.tag, key.value))
+        return node
 
 
 _Loader.add_implicit_resolver(
@@ -49,12 +62,16 @@ def read_settings(path: Path) -> dict[str, Any]:
         path: YAML file if its name ends in ``.yaml`` or ``.yml``, else JSON.
 
     Raises:
-        ValueError: If the file is missing or damaged, or is no mapping of names to values.
+        ValueError: If the file is missing or damaged, gives a key twice, or is no mapping of names
+            to values.
     """
     if path.suffix not in _YAML:
         return read_json(path)
     try:
-        found = yaml.load(path.read_text(), Loader=_Loader)
+        with path.open() as file:
+            found = yaml.load(file, Loader=_Loader)
+    except RepeatedKeyError:
+        raise
     except (yaml.YAMLError, OSError, ValueError, RecursionError) as error:
         mark = getattr(error, "problem_mark", None)
         where = f", line {mark.line + 1}" if mark is not None else ""
@@ -81,13 +98,13 @@ def read_config(path: str | Path, defaults: RunConfig | None = None) -> tuple[Ru
         The settings, and the digests of the encoders and demonstrations.
 
     Raises:
-        ValueError: If the file is missing, was not written by this version, or names a task or
-            hyperparameters that this process does not know.
+        ValueError: If the file is missing, was not written by this version, gives a key twice, or
+            names a task or hyperparameters that this process does not know.
     """
     path = Path(path)
     of_run = path.name == "config.json"
     try:
-        settings = json.loads(path.read_text()) if of_run else read_settings(path)
+        settings = parse_json(path) if of_run else read_settings(path)
         if defaults is not None and isinstance(settings, dict):
             settings = _merged(_as_json(asdict(defaults)), settings)
         if not isinstance(settings, dict) or not isinstance(settings.get("algorithm"), dict):
@@ -97,6 +114,7 @@ def read_config(path: str | Path, defaults: RunConfig | None = None) -> tuple[Ru
             if not isinstance(found, str | None):
                 raise ValueError(f"{name} is {found!r}")
         values, modules = settings.pop("algorithm"), settings.pop("task_modules", {})
+        settings.pop("scene_version", None)  # `check_settings` compares it
         name, scene = settings.get("name"), settings.get("scene", "nico")
         kind = _algorithm_config(name, settings.pop("algorithm_class", None))
         if kind is None:
@@ -119,6 +137,8 @@ def read_config(path: str | Path, defaults: RunConfig | None = None) -> tuple[Ru
             f"{path} {error}: name the module that adds it with --import, or import it first in "
             "Python"
         ) from None
+    except RepeatedKeyError:
+        raise
     except (ValueError, OSError, RecursionError) as error:
         remedy = "use the version of the code that made the run" if of_run else "correct it"
         raise ValueError(f"{path} cannot be read ({error}): {remedy}") from error
@@ -127,18 +147,19 @@ def read_config(path: str | Path, defaults: RunConfig | None = None) -> tuple[Ru
 def settings_of(config: RunConfig, digests: Digests) -> dict[str, Any]:
     """Return the content of ``config.json``.
 
-    In addition to all settings, it names the class of the hyperparameters and the modules of tasks
-    that are not the paper's.
+    In addition to all settings, it names the class of the hyperparameters, the version of the scene
+    and the modules of tasks that are not the paper's.
 
     Args:
         config: The run.
         digests: Digests of its encoders and demonstrations.
     """
-    kind = type(config.algorithm)
+    kind, scene = type(config.algorithm), find_scene(config.scene)
     settings = {
         **asdict(config),
         "algorithm_class": f"{kind.__module__}.{kind.__qualname__}",
-        "task_modules": dict(find_scene(config.scene).modules(config.tasks)),
+        "scene_version": scene.full_version,
+        "task_modules": dict(scene.modules(config.tasks)),
         **digests._asdict(),
     }
     return _as_json(settings)

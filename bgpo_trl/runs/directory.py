@@ -12,6 +12,7 @@ from bgpo_trl.files.checkpoint import has_checkpoint, load_checkpoint
 from bgpo_trl.files.csv_file import CsvFile, check_position, has_rows
 from bgpo_trl.files.writing import make_folder, write_json
 from bgpo_trl.runs.results import read_json
+from bgpo_trl.scenes import find_scene
 
 CSV_FILES = ("train.csv", "eval.csv")
 """Files to which a run appends rows."""
@@ -44,11 +45,17 @@ def check_settings(
         longer: Whether the existing run may have fewer ``episodes``, and lack the last tasks.
 
     Raises:
-        ValueError: If the directory holds a run with other settings.
+        ValueError: If the directory holds a run with other settings, or of another version of the
+            scene.
     """
     path = Path(directory) / "config.json"
     if path.exists():
-        _compare(directory, read_json(path), settings, longer)
+        saved = read_json(path)
+        if "scene_version" in saved and saved.get("scene") == settings.get("scene"):
+            remedy = "use the version that it began in, or begin a new run in another directory"
+            identity = f"{saved['scene']} {saved['scene_version']}"
+            find_scene(settings["scene"]).check_identity(identity, directory, remedy)
+        _compare(directory, saved, settings, longer)
 
 
 def load_last(directory: Path, settings: Mapping[str, Any]) -> dict[str, Any] | None:

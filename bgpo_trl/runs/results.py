@@ -192,6 +192,33 @@ def read_final_tests(path: str | os.PathLike[str]) -> pd.DataFrame:
     return read_table(path, _FINAL, _STEPS, remedy)
 
 
+class RepeatedKeyError(ValueError):
+    """A file of settings gives a key twice; without the error, the last value would count."""
+
+    def __init__(self, where: object, key: str) -> None:
+        super().__init__(f"{where} gives {key!r} twice: keep one of the two")
+
+
+def parse_json(path: Path) -> Any:
+    """Return the content of a JSON file.
+
+    Raises:
+        RepeatedKeyError: If an object of it gives a key twice.
+        ValueError: If it is not JSON.
+        OSError: If it cannot be read.
+    """
+
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        found = dict[str, Any]()
+        for key, value in pairs:
+            if key in found:
+                raise RepeatedKeyError(path, key)
+            found[key] = value
+        return found
+
+    return json.loads(path.read_text(), object_pairs_hook=unique)
+
+
 def read_json(
     path: str | os.PathLike[str], entries: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
@@ -202,13 +229,15 @@ def read_json(
         entries: Types of the required entries; an entry that may be ``None`` may be missing.
 
     Raises:
-        ValueError: If the file is missing or damaged.
+        ValueError: If the file is missing or damaged, or gives a key twice.
     """
     path = Path(path)
     try:
-        found = json.loads(path.read_text())
+        found = parse_json(path)
     except (FileNotFoundError, NotADirectoryError):
         raise _missing(path) from None
+    except RepeatedKeyError:
+        raise
     except (OSError, ValueError, RecursionError):
         found = None
     if not isinstance(found, dict) or not all(

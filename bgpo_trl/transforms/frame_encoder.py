@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from itertools import chain
+
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite
 from torchrl.envs import Transform
 
-from bgpo_trl.modules.vae import VAE
+from bgpo_trl.modules.frame_network import FrameNetwork
 from bgpo_trl.transforms._episode import starting, unbounded
 
 
@@ -26,7 +28,7 @@ class FrameEncoder(Transform):
     ``[*B, H, W, 3]``; writes ``out_key``, float32 ``[*B, 64]``.
 
     Args:
-        vae: The encoder; only its ``latent`` is called.
+        network: The encoder, such as the `VAE`; only its ``latent`` is called.
         in_key: Key of the frames.
         out_key: Key of the latents.
         del_keys: Drop the frames once they are encoded.
@@ -36,6 +38,7 @@ class FrameEncoder(Transform):
 
     Examples:
         >>> from tensordict import TensorDict
+        >>> from bgpo_trl.modules.vae import VAE
         >>> encoder = FrameEncoder(VAE(), del_keys=True)
         >>> frames = torch.zeros(5, 32, 64, 3, dtype=torch.uint8)
         >>> data = encoder(TensorDict({"pixels": frames}, batch_size=[5]))
@@ -45,7 +48,7 @@ class FrameEncoder(Transform):
 
     def __init__(
         self,
-        vae: VAE,
+        network: FrameNetwork,
         in_key: NestedKey = "pixels",
         out_key: NestedKey = "latent",
         *,
@@ -53,15 +56,16 @@ class FrameEncoder(Transform):
     ) -> None:
         super().__init__(in_keys=[in_key], out_keys=[out_key])
         self.in_key, self.out_key = in_key, out_key
-        self.vae = vae
+        self.network = network
         self.del_keys = del_keys
         self._latest: Tensor | None = None
 
     @torch.no_grad()
     def _apply_transform(self, obs: Tensor) -> Tensor:
         # Simulations are on the CPU, even if the encoder is not.
-        device = next((weights.device for weights in self.vae.parameters()), obs.device)
-        return self.vae.latent(obs.to(device)).to(obs.device)
+        stored = chain(self.network.parameters(), self.network.buffers())
+        device = next((values.device for values in stored), obs.device)
+        return self.network.latent(obs.to(device)).to(obs.device)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Encode the frames of any TensorDict."""

@@ -200,14 +200,14 @@ def test_the_bonus_is_for_latents_as_they_are_and_the_policy_sees_them_clipped_i
     make_bgpo, encoders, bank, monkeypatch, limit
 ):
     """Latents much longer than they should be: phi_g is still that of a demonstration."""
-    raw, latent = [], encoders.vae.latent
+    raw, latent = [], encoders.frame_network.latent
 
     def stretched(pixels):
         stretch = 200 * latent(pixels)
         raw.append(stretch.flatten())  # of the only seed
         return stretch
 
-    monkeypatch.setattr(encoders.vae, "latent", stretched)
+    monkeypatch.setattr(encoders.frame_network, "latent", stretched)
     algorithm = make_bgpo("all", seeds=(3,), state_limit=limit)
     assert algorithm.world.env.observation_spec["latent"].shape == (1, 64)
     bound = math.inf if limit is None else limit

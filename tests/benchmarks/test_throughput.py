@@ -43,7 +43,9 @@ def test_ratios_are_against_the_named_contenders(monkeypatch):
     }
     monkeypatch.setattr(frames, "contenders", lambda *a: dict.fromkeys(seconds, (None, 10)))
     monkeypatch.setattr(
-        throughput, "load_pretrained", lambda *_, **__: (type("E", (), {"vae": None}), None)
+        throughput,
+        "load_pretrained",
+        lambda *_, **__: (type("E", (), {"frame_network": None}), None),
     )
     monkeypatch.setattr(throughput, "interleave", lambda contenders, rounds, clock: seconds)
     row = throughput.measure_frames(throughput.Arguments(), threads=2)["ours"]

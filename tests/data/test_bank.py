@@ -180,7 +180,7 @@ def test_a_bank_is_made_of_what_the_encoders_see(encoders):
     assert_same(replace(inferred.steps, action=recorded.steps.action), recorded.steps)
     for row, n in ((0, 5), (1, 3)):
         pixels = dataset["pixels"][row, :n]
-        latent = encoders.vae.latent(pixels)
+        latent = encoders.frame_network.latent(pixels)
         phi = encoders.lae.encode(latent[None], length[row : row + 1])[0]
         torch.testing.assert_close(inferred.embedding[row], phi, rtol=1e-4, atol=1e-5)
         kept = inferred.steps.latents(frames(inferred.steps, row))

@@ -51,10 +51,12 @@ def test_ridge_regression_finds_a_linear_map_at_any_scale() -> None:
 
 def test_picture_shows_frames_over_reconstructions(untrained: Representation) -> None:
     data = demonstrations()
-    picture = reconstruction_picture(untrained.vae, data, columns=5)
+    picture = reconstruction_picture(untrained.frame_network, data, columns=5)
     assert picture.shape == (2 * 32 * 4, 5 * 64 * 4, 3)
     assert torch.equal(picture[:128:4, :256:4], data["pixels"][0, 0])
-    decoded = untrained.vae.decode(untrained.vae.encode(data["pixels"][0, 0])[0])
+    decoded = untrained.frame_network.decode(
+        untrained.frame_network.encode(data["pixels"][0, 0])[0]
+    )
     assert (picture[128::4, :256:4] / 255 - decoded).abs().max() < 0.51 / 255
     last = picture[:128:4, -256::4]
     assert (last == data["pixels"][5, :7]).flatten(1).all(-1).any(), "of a valid step"

@@ -105,7 +105,7 @@ def tiny() -> Representation:
 def same(a: Representation, b: Representation) -> bool:
     return all(
         torch.equal(x, y)
-        for m, n in ((a.vae, b.vae), (a.lae, b.lae), (a.inverse, b.inverse))
+        for m, n in ((a.frame_network, b.frame_network), (a.lae, b.lae), (a.inverse, b.inverse))
         for x, y in zip(m.state_dict().values(), n.state_dict().values(), strict=True)
     )
 
@@ -130,8 +130,8 @@ def test_encoders_as_published_have_constant_rates_no_keypoints_and_no_inverse_m
     read = load_representation(tmp_path / "encoders.safetensors")
     assert read.inverse is None
     assert read.identity == made.identity
-    latent = read.vae.latent(squares(8)["pixels"][:, 0])
-    assert latent.equal(made.vae.latent(squares(8)["pixels"][:, 0]))
+    latent = read.frame_network.latent(squares(8)["pixels"][:, 0])
+    assert latent.equal(made.frame_network.latent(squares(8)["pixels"][:, 0]))
 
 
 def test_encoders_capture_frames_places_actions_and_tasks(
@@ -157,12 +157,12 @@ def test_latents_are_standardized_and_frames_beyond_the_length_ignored(
     trained: Representation, dataset: TensorDict
 ) -> None:
     train, _ = split(dataset)
-    latent = encode_frames(trained.vae, train, batch_size=50)
+    latent = encode_frames(trained.frame_network, train, batch_size=50)
     valid = torch.arange(51) < train["length"].unsqueeze(-1)
     assert (latent[~valid] == 0).all()
     torch.testing.assert_close(latent[valid].mean(0), torch.zeros(64), atol=1e-3, rtol=0)
     assert latent[valid].std(0).max() < 1.001
-    torch.testing.assert_close(latent[3, 2], trained.vae.latent(train["pixels"][3, 2]))
+    torch.testing.assert_close(latent[3, 2], trained.frame_network.latent(train["pixels"][3, 2]))
     part = dataset[:6].clone()
     phi = embed_demonstrations(trained, part)
     assert phi.shape == (6, 32)
@@ -203,9 +203,9 @@ def test_interrupted_training_continues_to_the_same_weights(
 def test_the_frame_encoder_learns_from_the_training_part_of_play(tiny: Representation) -> None:
     play = squares(10)
     trained, held_out_changed = train(squares(8), play=play), play.clone()
-    assert not trained.vae.mean_frame.equal(tiny.vae.mean_frame)
+    assert not trained.frame_network.mean_frame.equal(tiny.frame_network.mean_frame)
     together = torch.cat([valid_frames(d[d["train"]]) for d in (squares(8), play)])
-    torch.testing.assert_close(trained.vae.mean_frame, mean_frame(together))
+    torch.testing.assert_close(trained.frame_network.mean_frame, mean_frame(together))
     held_out_changed["pixels"][~play["train"]] = 0
     assert same(trained, train(squares(8), play=held_out_changed))
 
@@ -331,11 +331,11 @@ def test_encoders_that_could_not_be_loaded_again_are_not_saved(
         """A frame encoder of one's own, of the same tensors."""
 
     mine = Mine()
-    mine.load_state_dict(tiny.vae.state_dict())
+    mine.load_state_dict(tiny.frame_network.state_dict())
     larger = replace(tiny, lae=SequenceAutoencoder(64, 16))
     for encoders, cause in (
-        (replace(tiny, vae=mine), "Mine is of a class of its own"),
-        (replace(tiny, vae=torch.nn.Linear(3, 4)), "could not be made"),
+        (replace(tiny, frame_network=mine), "Mine is of a class of its own"),
+        (replace(tiny, frame_network=torch.nn.Linear(3, 4)), "could not be made"),
         (replace(larger, metadata=tiny.metadata), "could not be made"),
         (replace(tiny, metadata={"scene": "squares 1"}), "could not be made .*config"),
     ):

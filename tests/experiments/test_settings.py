@@ -10,7 +10,7 @@ from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.configs import PRESETS
 from bgpo_trl.experiments.arguments import Arguments
 from bgpo_trl.experiments.settings import at_once, run_config
-from bgpo_trl.runs.config_file import Digests, settings_of
+from bgpo_trl.runs.config_file import Digests, read_config, settings_of
 from suites import nico
 
 ONE, TWO, THREE = nico.PAPER_TASKS
@@ -139,6 +139,38 @@ def test_a_yaml_file_that_is_damaged_or_has_wrong_settings_is_refused(
     path = tmp_path / "mine.yaml"
     path.write_text(content)
     refused(lambda: run_config(Arguments(config=path)), cause, "mine.yaml")
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "where"),
+    [
+        ("mine.yaml", "seeds: [0]\nepisodes: 5\nseeds: [1]", "mine.yaml, line 3, gives 'seeds'"),
+        ("mine.yml", "algorithm:\n  rl: {beta: 1, beta: 2}", "mine.yml, line 2, gives 'beta'"),
+        ("mine.yaml", "seeds: [0]\n'seeds': [0]", "mine.yaml, line 2, gives 'seeds'"),
+        ("mine.json", '{"seeds": [0], "episodes": 5, "seeds": [1]}', "mine.json gives 'seeds'"),
+        ("mine.json", '{"algorithm": {"rl": {"gamma": 1, "gamma": 1}}}', "mine.json gives 'gamma'"),
+        ("config.json", '{"episodes": 5, "episodes": 6}', "config.json gives 'episodes'"),
+    ],
+)
+def test_a_setting_that_stands_twice_is_refused(tmp_path, refused, name, content, where):
+    path = tmp_path / name
+    path.write_text(content)
+    for read in (lambda: run_config(Arguments(config=path)), lambda: read_config(path)):
+        refused(read, f"{path.parent}/{where} twice", "keep one")
+
+
+def test_a_key_may_stand_again_in_another_mapping_and_beside_one_that_is_merged(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text(
+        "name: bgpo-single\n"
+        "algorithm:\n"
+        "  <<: {beta: 0.5, max_steps: 9}\n"
+        "  beta: 0.25\n"
+        "  gwr: {max_age: 7}\n"
+        "  rl: {gamma: 0.9}\n"
+    )
+    algorithm = run_config(Arguments(config=path)).algorithm
+    assert (algorithm.beta, algorithm.max_steps, algorithm.rl.gamma) == (0.25, 9, 0.9)
 
 
 @pytest.mark.parametrize(

@@ -113,7 +113,7 @@ def test_a_floor_limits_the_scale_of_collapsed_latents(vae: VAE) -> None:
     torch.testing.assert_close(vae.latent_mean[0], torch.tensor(3 + 2**0.5))
     before = vae.latent_std.clone(), vae.latent_mean.clone()
     for bad in (torch.ones(5, 64), mu * torch.nan, torch.randn(1, 64), torch.randn(3, 2, 64)):
-        with pytest.raises(ValueError, match="mu"):
+        with pytest.raises(ValueError, match="features"):
             vae.set_latent_scale(bad)
     assert vae.latent_std.equal(before[0]) and vae.latent_mean.equal(before[1])
 

@@ -11,6 +11,7 @@ import torch
 
 from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
 from bgpo_trl.runs.directory import EVAL_COLUMNS, TRAIN_COLUMNS, RunLogger, check_settings
+from bgpo_trl.scenes import SCENES, find_scene
 from tests.algorithms.playing import assert_same
 from tests.helpers import CHECKPOINTS, UNPICKLED, edit, put_checkpoint, rows
 from tests.test_training import at_step
@@ -86,6 +87,24 @@ def test_the_settings_in_the_checkpoint_are_compared(run, begin, make_config, re
     edit(run / "config.json", task_starts=[0, 1, 2])
     resume = partial(begin, run, make_config(task_starts=(0, 1, 2)), resume=True)
     refused(resume, "checkpoint holds a run with other settings (task_starts", "put config.json")
+
+
+def test_a_run_is_resumed_in_the_version_of_its_scene_alone(
+    begin, make_config, tmp_path, refused, monkeypatch
+):
+    """Nothing else would tell: no encoders, and demonstrations of any scene."""
+    run = tmp_path / "run"
+    resume = partial(begin, run, make_config("state", "ddpg"), encoders=None, resume=True)
+    with resume() as trainer:
+        interrupt(trainer, 5)
+    found = find_scene("nico")
+    assert json.loads((run / "config.json").read_text())["scene_version"] == found.version
+    for changed in (replace(found, version="2"), replace(found, setup={"camera": "left"})):
+        with monkeypatch.context() as patch:
+            patch.setitem(SCENES, "nico", changed)
+            cause = f"run is of the scene nico {found.version}, this is {changed.identity}: "
+            refused(resume, cause, "use the version that it began in")
+    resume().close()
 
 
 def test_a_run_is_not_resumed_from_a_checkpoint_of_something_else(run, begin, refused):

@@ -405,11 +405,14 @@ def test_a_run_whose_encoders_could_not_be_loaded_again_does_not_begin(
     monkeypatch.setitem(SCENES, "dot", scene())
     encoders, bank = pretrained
     mine = Mine(64, 1, (16, 24))
-    mine.load_state_dict(encoders.vae.state_dict())
+    mine.load_state_dict(encoders.frame_network.state_dict())
     with pytest.raises(
         ValueError, match=r"could be saved, but not loaded again: [\w.<>]*Mine is of a class of"
     ):
-        train(tmp_path / "run", (replace(encoders, vae=mine), replace(bank, encoder_id=None)))
+        train(
+            tmp_path / "run",
+            (replace(encoders, frame_network=mine), replace(bank, encoder_id=None)),
+        )
     assert not (tmp_path / "run").exists()
 
 

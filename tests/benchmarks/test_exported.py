@@ -1,0 +1,46 @@
+"""A policy and its exported program take turns at the same frames."""
+
+import re
+
+import numpy as np
+import pytest
+
+from benchmarks.speed import exported
+from bgpo_trl.policy import load_run
+
+pytestmark = pytest.mark.usefixtures("easy_world")
+
+
+@pytest.fixture(scope="module")
+def run(easy_world, begin, make_config, tmp_path_factory):
+    directory = tmp_path_factory.mktemp("run") / "run"
+    with begin(directory, make_config(episodes=3, eval_every=3)) as trainer:
+        trainer.run()
+    return directory
+
+
+def test_contenders_act_alike_and_on_every_frame(run, tmp_path):
+    policy = load_run(run)
+    frames = np.random.default_rng(1).integers(0, 256, (3, 32, 64, 3), np.uint8)
+    policy.condition(frames)
+    acts, seen = exported.contenders(policy, tmp_path), {}
+    ours, theirs = (np.stack([act(frame) for frame in frames]) for act in acts.values())
+    assert ours.shape == (3, 4) and not np.allclose(ours[0], ours[1], atol=1e-4)
+    np.testing.assert_allclose(theirs, ours, atol=1e-5)
+
+    def counted(name):
+        return lambda frame: seen.setdefault(name, []).append(frame) or acts[name](frame)
+
+    times = exported.measure({name: counted(name) for name in acts}, list(frames), rounds=2)
+    assert {name: len(found) for name, found in times.items()} == dict.fromkeys(acts, 2)
+    assert all(len(found) == 3 * 4 for found in seen.values())  # two rounds are for warming up
+    assert all(found[4] is not found[3] and found[4] is found[1] for found in seen.values())
+
+
+def test_the_table_has_both(run, capsys, monkeypatch):
+    monkeypatch.setattr(exported, "set_threads", lambda n: None)
+    exported.main(exported.Arguments(run, frames=2, rounds=3))
+    *_, ours, theirs = capsys.readouterr().out.splitlines()
+    number = r"[\d.]+ \([\d.]+-[\d.]+\)"
+    assert re.fullmatch(rf"\| TrainedPolicy.act \| {number} \| 1.00 \(1.00-1.00\) \|", ours)
+    assert re.fullmatch(rf"\| exported program \| {number} \| {number} \|", theirs)

@@ -1,0 +1,305 @@
+"""A frame network of one's own in place of the VAE: other encoders on its vectors, files, runs."""
+
+import json
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+
+from bgpo_trl.algorithms import ALGORITHMS
+from bgpo_trl.configs import RunConfig
+from bgpo_trl.encoders.probes import complaints, probe
+from bgpo_trl.encoders.representation import (
+    encode_frames,
+    load_representation,
+    retrain_inverse,
+    save_representation,
+    split,
+    train_representation,
+    valid_frames,
+    valid_steps,
+)
+from bgpo_trl.encoders.train import make_pretrained, train_encoders
+from bgpo_trl.modules.frame_network import FRAME_NETWORKS, FrameNetwork
+from bgpo_trl.policy import load_run
+from bgpo_trl.scenes import SCENES
+from bgpo_trl.training import Trainer
+from tests.helpers import TINY_ENCODERS, rows
+from tests.scenes.dot import SavedDot, demonstrate, scene
+
+NAME = "columns"
+TINY = replace(TINY_ENCODERS, frame_network=NAME, checkpoint_every=1, log_every=2)
+DOT = scene(SavedDot)
+
+
+class Columns(FrameNetwork):
+    """How bright each column of a frame is, in a random order, after a batch norm that is frozen.
+
+    A batch norm also has a buffer of whole numbers.
+    """
+
+    identity = f"{NAME} 1"
+
+    def __init__(self, frame_shape):
+        super().__init__(frame_shape[1], frame_shape)
+        self.norm = torch.nn.BatchNorm1d(self.latent_size)
+        self.register_buffer("order", torch.randperm(self.latent_size))
+
+    def features(self, frames):
+        return self.norm(frames.float().mean((1, 3))[:, self.order])
+
+
+@pytest.fixture(autouse=True)
+def registered(restored_registries):
+    FRAME_NETWORKS[NAME] = Columns
+
+
+def movies(n=12):
+    """Demonstrations of a column of light that goes to the left or to the right."""
+    random = np.random.default_rng(0)
+    pixels = np.zeros((n, 9, 16, 24, 3), np.uint8)
+    action = np.zeros((n, 8, 1), np.float32)
+    length, task = random.integers(5, 10, n), np.arange(n) % 2
+    for i in range(n):
+        place = random.integers(8, 14)
+        for t in range(length[i]):
+            pixels[i, t, :, place : place + 3] = 255
+            if t < length[i] - 1:
+                move = (1 if task[i] else -1) * random.integers(0, 3)
+                action[i, t], place = move / 2, np.clip(place + move, 0, 21)
+    found = {"pixels": pixels, "action": action, "length": length, "task": task}
+    entries = {key: torch.from_numpy(values) for key, values in found.items()}
+    return TensorDict({**entries, "train": torch.arange(n) < 0.75 * n}, [n])
+
+
+def train(dataset=None, config=TINY, **options):
+    options = {"scene": DOT.identity, "progress": False, **options}
+    return train_representation(movies() if dataset is None else dataset, config, **options)
+
+
+def test_it_stays_as_it_is_and_its_latents_are_standardized():
+    before = torch.get_rng_state()
+    encoders, dataset = train(), movies()
+    assert torch.get_rng_state().equal(before)
+    network = encoders.frame_network
+    assert type(network) is Columns and not network.training
+    assert not any(weights.requires_grad for weights in encoders.frame_network.parameters())
+    assert network.norm.running_mean.eq(0).all() and network.norm.num_batches_tracked == 0
+    shown, _ = split(dataset)
+    features = network.features(valid_frames(shown))
+    latent = encode_frames(network, shown)
+    valid = valid_steps(shown["length"], latent.shape[1])
+    std = features.std(0)
+    expected = (features - features.mean(0)) / std.clamp_min(0.1 * std.max())
+    torch.testing.assert_close(latent[valid], expected)
+    assert not latent[~valid].any()
+
+
+def test_the_other_encoders_learn_from_its_vectors():
+    dataset = movies(60)
+    config = replace(
+        TINY,
+        lae=replace(TINY.lae, steps=100, batch_size=32, learning_rate=1e-2, warmup_steps=10),
+        inverse=replace(TINY.inverse, steps=200, hidden_size=64, batch_size=64, warmup_steps=10),
+        checkpoint_every=1000,
+    )
+    found = probe(train(dataset, config), dataset)
+    assert found["inverse_r2"] > 0.7
+    assert found["task_accuracy_nearest"] > 0.9
+    assert found["sequence_mse"] < 0.9
+    assert not complaints(found)
+
+
+def test_what_is_of_the_vae_alone_is_left_out(tmp_path):
+    options = {"scene": DOT, "progress": False}
+    with pytest.warns(UserWarning) as caught:  # of the other encoders
+        train_encoders(movies(), None, tmp_path / "weights", tmp_path, TINY, **options)
+    assert not any("reconstruct" in str(warning.message) for warning in caught)
+    assert not (tmp_path / "reconstructions.png").exists()
+    assert not any(
+        "reconstruction" in name for name in json.loads((tmp_path / "probes.json").read_text())
+    )
+    assert {row["stage"] for row in rows(tmp_path / "train.csv")} == {"lae", "inverse"}
+
+
+def test_a_file_holds_it_and_its_module_makes_it_again(tmp_path):
+    encoders, path = train(), tmp_path / "weights"
+    save_representation(encoders, path)
+    read = load_representation(path, scene=DOT)
+    assert read.identity == encoders.identity and read.metadata == encoders.metadata
+    frames = movies()["pixels"]
+    assert read.frame_network.latent(frames).equal(encoders.frame_network.latent(frames))
+    assert not read.frame_network.training
+    with pytest.raises(ValueError, match=r"has frames of \[16, 24\] .* the scene \[16, 26\]"):
+        load_representation(path, scene=replace(DOT, frame_shape=(16, 26)))
+
+
+def test_a_file_whose_network_no_module_adds_or_in_another_version_is_refused(tmp_path, refused):
+    path = tmp_path / "weights"
+    save_representation(train(), path)
+    load = partial(load_representation, path)
+    FRAME_NETWORKS[NAME] = type("Columns", (Columns,), {"identity": f"{NAME} 2"})
+    refused(load, f"of the frame network '{NAME} 1', the imported module has '{NAME} 2'", "use the")
+    del FRAME_NETWORKS[NAME]
+    refused(load, f"{path} cannot be loaded: there is no frame network '{NAME}'", "--import")
+
+
+def test_name_version_and_weights_identify_it():
+    encoders = train()
+    newer = type("Columns", (Columns,), {"identity": f"{NAME} 2"})((16, 24))
+    newer.load_state_dict(encoders.frame_network.state_dict())
+    other = replace(encoders, frame_network=train(config=replace(TINY, seed=1)).frame_network)
+    same = replace(encoders, frame_network=train().frame_network)
+    found = {part.identity for part in (encoders, replace(encoders, frame_network=newer), other)}
+    assert len(found) == 3 and same.identity == encoders.identity
+
+
+def test_the_inverse_model_alone_is_trained_on_its_latents():
+    encoders = train()
+    again = retrain_inverse(encoders, movies(), TINY, progress=False)
+    assert again.identity == encoders.identity
+    more = retrain_inverse(encoders, movies(20), TINY, progress=False)
+    assert more.frame_network is encoders.frame_network and more.identity != encoders.identity
+
+
+def test_a_training_on_the_vectors_of_another_network_is_not_resumed(tmp_path):
+    first = train(checkpoint=tmp_path)
+    assert train(checkpoint=tmp_path).identity == first.identity
+    FRAME_NETWORKS[NAME] = type("Columns", (Columns,), {"identity": f"{NAME} 2"})
+    with pytest.raises(ValueError, match="another configuration or frame network: remove it"):
+        train(checkpoint=tmp_path)
+
+
+class Hidden(Columns):
+    """Has a weight that no file would hold."""
+
+    made = 0
+
+    def __init__(self, frame_shape):
+        super().__init__(frame_shape)
+        Hidden.made += 1
+        self.factor = Hidden.made
+
+    def features(self, frames):
+        return self.factor * super().features(frames)
+
+
+class Unlisted(Columns):
+    """Is not the class of its name."""
+
+
+def test_a_network_that_a_file_would_not_bring_back_is_not_saved(tmp_path):
+    FRAME_NETWORKS[NAME] = Hidden
+    hidden = train()
+    FRAME_NETWORKS[NAME] = Columns
+    unlisted = Unlisted((16, 24))
+    unlisted.load_state_dict(hidden.frame_network.state_dict())
+    named = {**hidden.metadata, "frame_network": "rows 1"}
+    for encoders, entry, cause in (
+        (hidden, Hidden, "depend on more than its parameters and buffers"),
+        (replace(hidden, frame_network=unlisted), Columns, "Unlisted is of a class of its own"),
+        (replace(hidden, metadata=named), Hidden, "there is no frame network 'rows'"),
+    ):
+        FRAME_NETWORKS[NAME] = entry
+        with pytest.raises(ValueError, match=f"saved, but not loaded again: .*{cause}"):
+            save_representation(encoders, tmp_path / "weights")
+    assert not (tmp_path / "weights").exists()
+
+
+class Short(Columns):
+    """Leaves a frame out."""
+
+    def features(self, frames):
+        return super().features(frames)[1:]
+
+
+class Narrow(Columns):
+    """Has fewer numbers than it says."""
+
+    def features(self, frames):
+        return super().features(frames)[:, :3]
+
+
+class Constant(Columns):
+    """Sees nothing."""
+
+    def features(self, frames):
+        return torch.ones(len(frames), self.latent_size)
+
+
+@pytest.mark.parametrize(
+    ("entry", "cause"),
+    [
+        (None, "no frame network 'columns', only vae: name the module that adds it with"),
+        (lambda shape: torch.nn.Linear(3, 4), "made a Linear: derive it from FrameNetwork"),
+        (lambda shape: Columns((16, 32)), r"is of frames \[16, 32\], these are \[16, 24\]"),
+        (type("Odd", (Columns,), {"identity": "odd 1"}), "identity of Odd is .* got 'odd 1'"),
+        (type("Odd", (Columns,), {"identity": NAME}), "such as 'columns 1', got 'columns'"),
+        (Constant, "features of frames are constant or not finite"),
+        (Short, r"Short.features\(\) must return \[56, 24\] for 56 frames, got \[55, 24\]"),
+        (Narrow, r"features must be \[N, 24\], N >= 2, got \[56, 3\]"),
+    ],
+)
+def test_what_is_no_frame_network_is_refused_before_training(entry, cause):
+    FRAME_NETWORKS[NAME] = entry
+    if entry is None:
+        del FRAME_NETWORKS[NAME]
+    log = []
+    with pytest.raises(ValueError, match=cause):
+        train(log=log.append)
+    assert not log
+
+
+def test_a_run_learns_from_its_vectors_and_its_policy_is_loaded_and_exported(tmp_path, monkeypatch):
+    """From recordings to a program, in the smallest form."""
+    monkeypatch.setitem(SCENES, "dot", DOT)
+    encoders, bank = make_pretrained(
+        tmp_path / "encoders.safetensors",
+        tmp_path / "demonstrations",
+        folder=tmp_path / "log",
+        scene=DOT,
+        config=TINY,
+        per_task=6,
+        held_out_per_task=2,
+        progress=False,
+    )
+    assert bank.steps is not None and bank.steps.latent.shape[-1] == 24
+    algorithm = replace(ALGORITHMS["bgpo"].config, max_steps=12)
+    config = RunConfig(
+        scene="dot",
+        tasks=DOT.tasks,
+        task_starts=(0, 2),
+        seeds=(3, 5),
+        episodes=4,
+        eval_every=2,
+        algorithm=replace(algorithm, rl=replace(algorithm.rl, warmup_steps=12, batch_size=16)),
+    )
+    parts = {"bank": bank, "encoders": encoders, "progress": False}
+    for folder, lengths in (("whole", (4,)), ("parts", (2, 4))):
+        for episodes in lengths:
+            run = replace(config, episodes=episodes)
+            with Trainer(run, tmp_path / folder, resume=episodes > lengths[0], **parts) as trainer:
+                trainer.run()
+    for name in ("train.csv", "eval.csv"):
+        assert (tmp_path / "whole" / name).read_text() == (tmp_path / "parts" / name).read_text()
+    assert any(float(row["loss_value"]) > 0 for row in rows(tmp_path / "whole" / "train.csv"))
+
+    policy = load_run(tmp_path / "whole")
+    assert type(policy.encoders.frame_network) is Columns
+    robot = SavedDot()
+    robot.reset("left")
+    act, frames = demonstrate(robot, "left", 0), [robot.frame()]
+    while not robot.step(act()).success:
+        frames.append(robot.frame())
+    recognized = policy.condition(np.stack(frames))
+    latent = encoders.frame_network.latent(torch.from_numpy(np.stack(frames)))
+    phi = encoders.lae.encode(latent, torch.tensor(len(frames)))
+    torch.testing.assert_close(recognized.embedding, phi)
+    policy.export(tmp_path / "policy.pt2")
+    program = torch.export.load(tmp_path / "policy.pt2").module()
+    for frame in frames:
+        acted = program(torch.from_numpy(frame)).numpy()
+        np.testing.assert_allclose(acted, policy.act(frame), atol=1e-5)
