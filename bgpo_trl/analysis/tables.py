@@ -8,7 +8,7 @@ from itertools import combinations, product
 import numpy as np
 
 from bgpo_trl.analysis import statistics
-from bgpo_trl.analysis.comparison import NAMES, Run, Setting
+from bgpo_trl.analysis.comparison import NAMES, Setting
 from bgpo_trl.analysis.scores import (
     Values,
     area_scores,
@@ -25,9 +25,8 @@ from bgpo_trl.analysis.scores import (
     success_matrix,
     success_steps,
     times_the_first,
-    trailing_mean,
 )
-from bgpo_trl.runs.cost import Cost, read_costs, total_cost
+from bgpo_trl.runs.results import Run
 
 Table = list[list[str]]
 """Rows of cells; the first row holds the column names."""
@@ -221,7 +220,7 @@ def sequence_table(setting: Setting, reference: Setting | None) -> Table:
     rows = [["", *columns]]
     for name, run in setting.runs.items():
         change = change_since_learned(success_matrix(run))
-        best = forgetting_since_best(trailing_mean(run.curves.success, 3))
+        best = forgetting_since_best(run.success)
         by_noise = "-"
         if run.config.get("eval_episodes"):
             by_noise = f"{100 * since_best_unchanged(run).mean():+.1f}"
@@ -295,24 +294,23 @@ def cost_table(setting: Setting) -> Table:
 
     Empty if no run has a ``cost.csv``.
     """
-    costs = {name: of_run for name, run in setting.runs.items() if (of_run := _costs(run))}
-    numbers = sorted({tasks for of_run in costs.values() for tasks in of_run})
+    costs = {
+        name: run.costs.groupby("tasks").sum()
+        for name, run in setting.runs.items()
+        if run.costs is not None and len(run.costs)
+    }
+    numbers = sorted({tasks for of_run in costs.values() for tasks in of_run.index})
     rows = [["", "hours", *(f"{number} task{'s' * (number > 1)}" for number in numbers)]]
     for name, of_run in costs.items():
-        hours = sum(cost.seconds for cost in of_run.values()) / 3600
-        cells = [_cost_cell(of_run.get(number)) for number in numbers]
-        rows.append([name, f"{hours:.1f}", *cells])
+        seconds, megabytes = of_run["seconds"] / of_run["steps"], of_run["megabytes"]
+        cells = [
+            f"{1000 * seconds[number]:.1f} ms, {megabytes[number]:.0f} MB"
+            if number in of_run.index and of_run["steps"][number]
+            else "-"
+            for number in numbers
+        ]
+        rows.append([name, f"{of_run['seconds'].sum() / 3600:.1f}", *cells])
     return rows if costs else []
-
-
-def _cost_cell(cost: Cost | None) -> str:
-    if cost is None or not cost.steps:
-        return "-"
-    return f"{1000 * cost.seconds / cost.steps:.1f} ms, {cost.megabytes:.0f} MB"
-
-
-def _costs(run: Run) -> dict[int, Cost]:
-    return total_cost([read_costs(path) for path in run.paths("cost.csv")])
 
 
 def task_table(run: Run) -> Table:

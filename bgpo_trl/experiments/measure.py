@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,24 +15,18 @@ from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.evaluation import evaluate_random_policy
 from bgpo_trl.experiments.episodes import evaluator_of, snapshots_of
 from bgpo_trl.figures.frames import file_names, plot_frame_strips, save_gif
-from bgpo_trl.figures.groups import draw_groups
+from bgpo_trl.figures.groups import plot_groups
 from bgpo_trl.figures.gwr import draw_growth, draw_nodes
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.figures.success import plot_step_curves, plot_success_curves
 from bgpo_trl.files.progress import progress_bar
 from bgpo_trl.runs.provenance import command, write_table
-from bgpo_trl.runs.results import read_tests
+from bgpo_trl.runs.results import COLUMNS, read_run
 from bgpo_trl.scenes import find_scene
 from bgpo_trl.training import Trainer
 
 # Number of the evaluation after training; it seeds start states that training never tested.
 _LAST = 2**31
-FINAL_COLUMNS = (
-    *("seed", "demonstrations", "task", "episodes", "success", "steps", "task_inference"),
-)
-"""Columns of ``final.csv``, one row per seed, kind of demonstrations and task. ``steps`` is the
-mean length of the successful tests, empty without one."""
-
 _Row = tuple[int, str, str, int, float, float | str, float | str]
 
 
@@ -53,7 +48,7 @@ def measure(
     """
     algorithm, config = trainer.algorithm, trainer.config
     gwr, rows = algorithm.gwr, _final_tests(trainer, bank, episodes=episodes)
-    tests = pd.DataFrame(rows, columns=pd.Index(FINAL_COLUMNS))
+    tests = pd.DataFrame(rows, columns=pd.Index([*COLUMNS["final.csv"]]))
     write_table(out / "final.csv", tests)
     trainer.dashboard.log_final(tests[tests["demonstrations"] == "held-out"], config.episodes)
     random_success = evaluate_random_policy(
@@ -140,16 +135,10 @@ def draw(
         Lines about GWR-B, its task inference and its groups.
     """
     config, lines = trainer.config, list[str]()
-    presented = dict(zip(config.tasks, config.task_starts, strict=True))
-    figure = plot_success_curves(
-        out / "eval.csv", presented=presented, random_success=summary["random_success"]
-    )
-    save_figure(figure, out / "figures" / "success.png")
-    if (read_tests(out / "eval.csv")["success"] == 1).any():
-        figure = plot_step_curves(
-            out / "eval.csv", presented=presented, demonstrated=summary["demonstrated_steps"]
-        )
-        save_figure(figure, out / "figures" / "steps.png")
+    run = replace(read_run(out), summary=dict(summary))
+    save_figure(plot_success_curves({config.name: run}), out / "figures" / "success.png")
+    if (run.tests["success"] == 1).any():
+        save_figure(plot_step_curves({config.name: run}), out / "figures" / "steps.png")
     episodes = record_episodes(trainer, bank)
     save_figure(plot_frame_strips(episodes), out / "figures" / "episodes.png")
     for name, frames in zip(file_names(config.tasks), episodes.values(), strict=True):
@@ -164,7 +153,7 @@ def draw(
         lines.append(f"GWR-B nodes: {gwr.num_nodes.tolist()}")
         lines.append(f"task inference on held-out demonstrations: {accuracy.mean():.1%}")
     if trainer.algorithm.groups:
-        draw_groups(out, presented, out / "figures" / "groups.png")
+        save_figure(plot_groups(run), out / "figures" / "groups.png")
         numbers = [len(groups.numbers) for groups in trainer.algorithm.groups]
         held_out = bank.held_out(config.held_out)
         purity = np.mean(

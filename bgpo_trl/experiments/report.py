@@ -5,20 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from bgpo_trl.analysis import statistics
 from bgpo_trl.analysis.comparison import (
-    Run,
     Setting,
     differing_conditions,
-    joined,
-    read_run,
     read_settings,
     reference_of,
-    run_directories,
     under_equal_conditions,
 )
 from bgpo_trl.analysis.scores import (
@@ -46,7 +41,7 @@ from bgpo_trl.analysis.tables import (
     task_table,
 )
 from bgpo_trl.experiments.arguments import ReportArguments
-from bgpo_trl.figures.groups import draw_groups, plot_counts, read_counts
+from bgpo_trl.figures.groups import plot_counts, plot_groups
 from bgpo_trl.figures.gwr import plot_gwr_pca
 from bgpo_trl.figures.style import COLORS, save_figure
 from bgpo_trl.figures.success import (
@@ -55,7 +50,15 @@ from bgpo_trl.figures.success import (
     plot_success_matrices,
 )
 from bgpo_trl.files.writing import make_folder, without_folders, write_whole
-from bgpo_trl.runs.results import archive_run, find_table, read_table
+from bgpo_trl.runs.results import (
+    Run,
+    archive_run,
+    find_table,
+    joined,
+    read_run,
+    read_table,
+    run_directories,
+)
 
 # For a screen: figures of results are kept under version control.
 _DPI = 150
@@ -75,33 +78,20 @@ class Section:
     notes: list[str] = field(default_factory=list)
 
 
-def presented(run: Run) -> dict[str, int]:
-    """Return the training episode from which each task of a run is presented."""
-    return dict(zip(run.tasks, run.starts, strict=True))
-
-
 def draw_curves(setting: Setting, out: Path) -> dict[str, Path]:
     """Draw the learning curves of a setting, some runs to a figure; paths by caption."""
     figures: dict[str, Path] = {}
     for start in range(0, len(setting.runs), _CURVES):
         runs = dict(list(setting.runs.items())[start : start + _CURVES])
         part = f"-{1 + start // _CURVES}" if start else ""
-        first, names = next(iter(runs.values())), ", ".join(runs)
-        shown: dict[str, Any] = {
-            "presented": presented(first),
-            "window": 3 * first.eval_every,
-            "last": first.last,
-        }
+        window = 3 * next(iter(runs.values())).eval_every
         path = out / f"{setting.slug}{part}.png"
-        tests = {name: run.paths("eval.csv") for name, run in runs.items()}
-        random = first.summary.get("random_success")
-        save_figure(plot_success_curves(tests, random_success=random, **shown), path, _DPI)
-        figures[f"mean and one standard deviation over seeds: {names}"] = path
-        solving = {n: tests[n] for n, run in runs.items() if np.isfinite(success_steps(run)).any()}
+        save_figure(plot_success_curves(runs, window=window), path, _DPI)
+        figures[f"mean and one standard deviation over seeds: {', '.join(runs)}"] = path
+        solving = {n: run for n, run in runs.items() if np.isfinite(success_steps(run)).any()}
         if solving:
             path = out / f"{setting.slug}-steps{part}.png"
-            steps = first.summary.get("demonstrated_steps")
-            save_figure(plot_step_curves(solving, demonstrated=steps, **shown), path, _DPI)
+            save_figure(plot_step_curves(solving, window=window), path, _DPI)
             figures[f"steps of a success, shown likewise: {', '.join(solving)}"] = path
     return figures
 
@@ -116,19 +106,15 @@ def draw_sequence(setting: Setting, out: Path) -> dict[str, Path]:
 
 def draw_counts(setting: Setting, out: Path) -> dict[str, Path]:
     """Draw the numbers of nodes and groups over training; paths by caption, none without GWR-B."""
-    counts = {}
-    for name, run in setting.runs.items():
-        parts = [read_counts(path, run.last) for path in run.paths("train.csv")]
-        if parts and run.summary.get("nodes") is not None:
-            last = min(part["num_nodes"].shape[1] for part in parts)
-            counts[name] = {
-                column: np.concatenate([part[column][:, :last] for part in parts])
-                for column in parts[0]
-            }
-    if not counts:
+    runs = {
+        name: run
+        for name, run in setting.runs.items()
+        if run.training is not None and run.summary.get("nodes") is not None
+    }
+    if not runs:
         return {}
     path = out / f"{setting.slug}-counts.png"
-    save_figure(plot_counts(counts, presented(setting.first)), path, _DPI)
+    save_figure(plot_counts(runs), path, _DPI)
     return {"nodes and groups: mean over seeds, from the lowest to the highest seed": path}
 
 
@@ -156,7 +142,7 @@ def setting_sections(setting: Setting, reference: Setting | None, out: Path) -> 
         "Tasks: "
         + ", ".join(
             f"{number} {task} (from episode {start})"
-            for number, (task, start) in enumerate(presented(first).items(), 1)
+            for number, (task, start) in enumerate(first.presented.items(), 1)
         )
         + f". {first.last:,} episodes, tests every {first.eval_every}"
         + "".join(f", {name} {value}" for name, value in conditions.items() if value is not None)
@@ -293,7 +279,7 @@ def report(arguments: ReportArguments) -> str:
     for directory in directories if directories == named else ():
         run = runs.get(directory)
         if run is not None and max(run.summary.get("groups") or [0]) > 1:
-            draw_groups(directory, presented(run), out / f"{directory.name}-groups.png")
+            save_figure(plot_groups(run), out / f"{directory.name}-groups.png")
     text = text_of(sections, out)
     write_whole(out / "tables.md", text)
     return text
@@ -334,10 +320,7 @@ def compare(paths: Sequence[Path], *, every: int | None = None, anyway: bool = F
     rows: Table = [["episodes", "task", "first", "second", "second - first", "p", "found"]]
     part = last + 1 if every is None else every
     for end in range(part, last + 1, part):
-        matrices = [
-            evaluation_matrix(run.curves.success, run.curves.episodes, [end], window=part)
-            for run in runs
-        ]
+        matrices = [evaluation_matrix(run, [end], window=part) for run in runs]
         rows += _differences(f"to {end}", first.tasks, *(matrix[:, 0] for matrix in matrices))
     rows += _differences("last 10 %", first.tasks, *map(late_scores, runs))
     return "\n\n".join([*notes, markdown(rows)])

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from bgpo_trl.figures.style import MARKERS, add_legend, save_figure, style_axes, task_markers
 from bgpo_trl.files.writing import write_whole
-from bgpo_trl.runs.results import COUNT, read_table
+from bgpo_trl.runs.results import read_table
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -254,11 +254,12 @@ def draw_growth(
         presented = TaskSchedule(config.task_starts).presented(torch.tensor(episode))
         tasks = majority_task(match_counts(gwr, bank.seen(), n_tasks) * presented)
         graphs[episode] = (gwr.graph().weights, gwr.graph().edges, tasks)
-    path = run / "train.csv"
-    table = read_table(path, {"seed": COUNT, "num_nodes": COUNT})
+    table = read_table(run / "train.csv")
     nodes = {seed: of_seed.tolist() for seed, of_seed in table.groupby("seed")["num_nodes"]}
     if nodes.keys() != set(config.seeds):
-        raise ValueError(f"{path} does not have the seeds of the run: resume it, or name another")
+        raise ValueError(
+            f"{run / 'train.csv'} does not have the seeds of the run: resume it, or name another"
+        )
     figure = plot_gwr_growth(graphs, [nodes[seed] for seed in config.seeds], config.tasks)
     save_figure(figure, (out or run / "figures") / "gwr_growth.png")
     return True

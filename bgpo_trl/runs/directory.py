@@ -11,7 +11,7 @@ from typing import Any, Self
 from bgpo_trl.files.checkpoint import has_checkpoint, load_checkpoint
 from bgpo_trl.files.csv_file import CsvFile, check_position, has_rows
 from bgpo_trl.files.writing import make_folder, write_json
-from bgpo_trl.runs.results import read_json
+from bgpo_trl.runs.results import COLUMNS, read_json
 
 CSV_FILES = ("train.csv", "eval.csv")
 """Files to which a run appends rows."""
@@ -185,30 +185,6 @@ def flatten(settings: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
         yield prefix, settings
 
 
-EVAL_COLUMNS = (
-    "algorithm",
-    "seed",
-    "episode",
-    "env_steps",
-    "task",
-    "success",
-    "return",
-    "steps",
-)
-"""Columns of ``eval.csv``, one row per test episode."""
-
-TRAIN_COLUMNS = (
-    *EVAL_COLUMNS,
-    "intrinsic_return",
-    "num_nodes",
-    "group",
-    "num_groups",
-    "loss_actor",
-    "loss_value",
-)
-"""Columns of ``train.csv``, one row per training episode; those of ``Algorithm.logged`` follow."""
-
-
 class RunLogger:
     """Write the log of a run into its directory.
 
@@ -242,7 +218,7 @@ class RunLogger:
         resume: bool = False,
     ) -> None:
         self.directory = Path(directory)
-        columns = (*TRAIN_COLUMNS, *logged)
+        columns = (*COLUMNS["train.csv"], *logged)
         repeated = {name for name in logged if columns.count(name) > 1}
         if repeated:
             raise ValueError(
@@ -256,13 +232,13 @@ class RunLogger:
         make_folder(self.directory)
         write_json(self.directory / "config.json", config)
         self._train = CsvFile(self.directory / "train.csv", columns)
-        self._eval = CsvFile(self.directory / "eval.csv", EVAL_COLUMNS)
+        self._eval = CsvFile(self.directory / "eval.csv", [*COLUMNS["eval.csv"]])
 
     def log_train(self, row: Mapping[str, Any]) -> None:
         """Write a training episode.
 
         Args:
-            row: Values by column of `TRAIN_COLUMNS` or ``logged``; missing ones stay empty.
+            row: Values by column of `COLUMNS` or ``logged``; missing ones stay empty.
 
         Raises:
             ValueError: If there is no such column.
@@ -274,7 +250,7 @@ class RunLogger:
         """Write a test episode.
 
         Args:
-            row: Values by column of `EVAL_COLUMNS`: names of the algorithm and the task, seed,
+            row: Values by column of `COLUMNS`: names of the algorithm and the task, seed,
                 training episodes and environment steps of that seed so far, and the test episode's
                 success, extrinsic return and length in steps.
 

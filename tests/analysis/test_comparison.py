@@ -2,13 +2,8 @@
 
 import pytest
 
-from bgpo_trl.analysis.comparison import (
-    differing_conditions,
-    read_run,
-    read_settings,
-    reference_of,
-    run_directories,
-)
+from bgpo_trl.analysis.comparison import differing_conditions, read_settings, reference_of
+from bgpo_trl.runs.results import read_run, run_directories
 from tests.analysis.runs import HEAD, TASKS, write_run
 from tests.helpers import edit
 
