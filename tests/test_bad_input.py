@@ -219,7 +219,6 @@ WRONG = {
         "BehaviorMatchingReward"),
     # measures
     "difference of NaN": (lambda: statistics.difference([1.0], [NAN]), "with NaN"),
-    "interval in percent": (lambda: statistics.contrast([[1, 2]], [1]).interval(95), "got 95"),
 }  # fmt: skip
 
 

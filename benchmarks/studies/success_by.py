@@ -19,9 +19,9 @@ from shared import style_success
 from bgpo_trl.analysis import statistics
 from bgpo_trl.analysis.comparison import differing_conditions, title_of
 from bgpo_trl.analysis.scores import late_scores
-from bgpo_trl.analysis.tables import Table
+from bgpo_trl.analysis.tables import Section, Table
 from bgpo_trl.experiments.command_line import command_line
-from bgpo_trl.experiments.report import Section, text_of
+from bgpo_trl.experiments.report import text_of
 from bgpo_trl.figures.style import COLORS, LINES, MARKERS, readable, save_figure
 from bgpo_trl.files.writing import make_folder, write_whole
 from bgpo_trl.runs.results import Run, joined, read_run, run_directories

@@ -8,7 +8,6 @@ the training episodes before each evaluation.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -321,8 +320,9 @@ def forward_transfer(run: Run, reference: Run) -> Estimate | None:
     gained = contrast(
         [(ours / left).mean(-1), (theirs * (1 - area) / left**2).mean(-1)], [1.0, -1.0]
     )
-    value = float(((area - height) / left).mean())
-    return replace(gained, value=value).interval()
+    # Not the difference of the contributions, but it has their interval.
+    shift = float(((area - height) / left).mean()) - gained.value
+    return Estimate(*(bound + shift for bound in gained))
 
 
 def own_areas(run: Run, reference: Run) -> tuple[Values, Values]:

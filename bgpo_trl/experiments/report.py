@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,21 +24,17 @@ from bgpo_trl.analysis.scores import (
     success_steps,
 )
 from bgpo_trl.analysis.tables import (
-    COST_NOTE,
-    DIFFERENCE_NOTES,
-    SEQUENCE_NOTES,
-    SPEED_NOTE,
-    SUCCESS_NOTES,
+    Section,
     Table,
-    claims,
-    cost_table,
-    difference_table,
-    groups_table,
+    claims_section,
+    cost_section,
+    difference_section,
+    groups_section,
     markdown,
-    sequence_table,
-    speed_table,
-    success_table,
-    task_table,
+    run_section,
+    sequence_section,
+    speed_section,
+    success_section,
 )
 from bgpo_trl.experiments.arguments import ReportArguments
 from bgpo_trl.figures.groups import plot_counts, plot_groups
@@ -64,18 +60,6 @@ from bgpo_trl.runs.results import (
 _DPI = 150
 # Curves that can be distinguished in one figure.
 _CURVES = len(COLORS)
-
-
-@dataclass(frozen=True)
-class Section:
-    """Section of the report: title, notes, figures and a table."""
-
-    title: str
-    table: Table = field(default_factory=list)
-    """Rows of cells, the first with the column names; omitted if empty."""
-    figures: dict[str, Path] = field(default_factory=dict)
-    """Paths by caption."""
-    notes: list[str] = field(default_factory=list)
 
 
 def draw_curves(setting: Setting, out: Path) -> dict[str, Path]:
@@ -136,60 +120,32 @@ def draw_nodes(run: Run, path: Path) -> Table:
 
 def setting_sections(setting: Setting, reference: Setting | None, out: Path) -> list[Section]:
     """Return the sections of a setting and draw its figures."""
-    first, title = setting.first, setting.title
-    conditions = {name: first.config.get(name) for name in ("held_out", "eval_episodes")}
-    about = [
-        "Tasks: "
-        + ", ".join(
-            f"{number} {task} (from episode {start})"
-            for number, (task, start) in enumerate(first.presented.items(), 1)
-        )
-        + f". {first.last:,} episodes, tests every {first.eval_every}"
-        + "".join(f", {name} {value}" for name, value in conditions.items() if value is not None)
-        + "."
-    ]
-    sections = [
-        Section(
-            title,
-            success_table(setting),
-            draw_curves(setting, out),
-            [*about, *setting.notes, *SUCCESS_NOTES],
-        )
-    ]
-    table = difference_table(setting)
-    if table:
-        sections.append(
-            Section(f"Differences: {title}", table, notes=[*setting.notes, *DIFFERENCE_NOTES])
-        )
+    sections = _drawn(success_section(setting), lambda: draw_curves(setting, out))
+    sections += difference_section(setting)
     if setting.in_sequence:
-        name = f"Forgetting and transfer: {title}"
         try:
-            table, figures = sequence_table(setting, reference), draw_sequence(setting, out)
-            sections.append(Section(name, table, figures, [*setting.notes, *SEQUENCE_NOTES]))
+            found = sequence_section(setting, reference)
+            sections += _drawn(found, lambda: draw_sequence(setting, out))
         except ValueError as error:  # tested too rarely
-            sections.append(Section(name, notes=[str(error)]))
+            title = f"Forgetting and transfer: {setting.title}"
+            sections.append(Section(title, notes=[str(error)]))
     for share in (0.5, 0.8):
-        table = speed_table(setting, share)
-        if table:
-            name = f"Own episodes to {share:.0%}: {title}".replace("%", " %")
-            sections.append(Section(name, table, notes=[SPEED_NOTE]))
-    table = groups_table(setting)
-    if table:
-        sections.append(Section(f"GWR-B, by seed: {title}", table, draw_counts(setting, out)))
-    for name, run in setting.runs.items():
-        if find_table(run.directory / "gwr.csv"):
-            path = out / f"{setting.slug}-nodes.png"
-            table = draw_nodes(run, path)
-            caption = f"{name}, first seed: first two principal components"
-            sections.append(Section(f"Nodes of GWR-B: {title}", table, {caption: path}))
-            break
-    table = cost_table(setting)
-    if table:
-        sections.append(Section(f"Cost: {title}", table, notes=[COST_NOTE]))
-    for name, run in setting.runs.items():
-        notes = [f"`{run.summary[key]}`" for key in ("commit", "command") if run.summary.get(key)]
-        sections.append(Section(f"{name}: {title}", task_table(run), notes=[", ".join(notes)]))
+        sections += speed_section(setting, share)
+    sections += _drawn(groups_section(setting), lambda: draw_counts(setting, out))
+    with_nodes = [n for n, run in setting.runs.items() if find_table(run.directory / "gwr.csv")]
+    for name in with_nodes[:1]:
+        path = out / f"{setting.slug}-nodes.png"
+        table = draw_nodes(setting.runs[name], path)
+        figures = {f"{name}, first seed: first two principal components": path}
+        sections.append(Section(f"Nodes of GWR-B: {setting.title}", table, figures))
+    sections += cost_section(setting)
+    sections += [run_section(f"{n}: {setting.title}", run) for n, run in setting.runs.items()]
     return sections
+
+
+def _drawn(sections: list[Section], draw: Callable[[], dict[str, Path]]) -> list[Section]:
+    """Return sections with the figures that are drawn for them."""
+    return [replace(section, figures=draw()) for section in sections]
 
 
 def make_report(
@@ -205,7 +161,7 @@ def make_report(
     # All that may be refused comes before the first file.
     for setting in settings:
         for run in setting.runs.values():
-            task_table(run)
+            run_section("", run)
     make_folder(out)
     sections = [Section("Left out", notes=[left_out])] if left_out else []
     for setting, reference in zip(settings, references, strict=True):
@@ -216,14 +172,7 @@ def make_report(
     paired = [reference for _, reference in pairs]
     pairs += [(None, s) for s in settings if s.from_start and s not in paired]
     for continual, concurrent in pairs:
-        table, missing = claims(continual, concurrent)
-        some = continual or concurrent
-        if table and some is not None:
-            number = len(some.first.tasks)
-            about = [note for each in (continual, concurrent) if each for note in each.notes]
-            if missing:
-                about.append(f"{missing} further claims need runs that are not here.")
-            sections.append(Section(f"The paper's claims, {number} tasks", table, notes=about))
+        sections += claims_section(continual, concurrent)
     runs = [run for setting in settings for run in setting.runs.values()]
     return sections, {directory: run for run in runs for directory in run.directories}
 
@@ -246,13 +195,7 @@ def text_of(sections: Sequence[Section], out: Path) -> str:
 
 
 def report(arguments: ReportArguments) -> str:
-    """Write tables and figures of runs: those in a folder, or single ones, of any algorithms.
-
-    Prints and writes tables.md: success, differences between algorithms, forgetting and transfer,
-    learning times, groups of behaviors, cost, each run task by task, and the paper's claims as far
-    as there are runs for them; beside it, figures. The report of a single run is written into its
-    directory. With --archive, first copies what reports read of the runs, compressed, and writes
-    the report beside the copies. docs/benchmark.md defines the measures.
+    """Write the report that `ReportArguments` describes; return its tables.
 
     Raises:
         ValueError: If a run is damaged, none is finished, or conditions differ.

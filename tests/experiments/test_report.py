@@ -11,7 +11,7 @@ from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.analysis import statistics
 from bgpo_trl.analysis.comparison import NAMES, Setting
 from bgpo_trl.analysis.scores import forward_transfer, since_best_unchanged
-from bgpo_trl.analysis.tables import success_table
+from bgpo_trl.analysis.tables import success_section
 from bgpo_trl.experiments.report import ReportArguments, report
 from bgpo_trl.runs.results import read_run
 from tests.analysis.runs import TASKS, write_run, write_training
@@ -87,7 +87,8 @@ def test_what_an_algorithm_knows_of_tasks_is_shown(tmp_path):
         text: replace(run, summary={"needs_label": needs, "needs_boundaries": needs})
         for text, needs in told.items()
     }
-    head, *rows = success_table(Setting({**runs, "?": replace(run, summary={})}))
+    (section,) = success_section(Setting({**runs, "?": replace(run, summary={})}))
+    head, *rows = section.table
     assert [row[head.index("knows of tasks")] for row in rows] == [*runs, "?"]
 
 
