@@ -18,10 +18,8 @@ from eight_tasks import EightTasksArguments
 
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.configs import PRESETS
-from bgpo_trl.experiments import ray_jobs as jobs
 from bgpo_trl.experiments import sweep
-from bgpo_trl.experiments.ray_jobs import Job
-from bgpo_trl.experiments.sweep import SweepArguments
+from bgpo_trl.experiments.sweep import Job, SweepArguments
 from bgpo_trl.runs.config_file import Digests, settings_of
 from bgpo_trl.runs.results import joined, read_run, run_directories
 from suites import nico
@@ -164,7 +162,7 @@ def test_a_sweep_runs_each_job_once(tmp_path, monkeypatch):
         failed = {}
         for job in todo:
             try:
-                jobs.work(job, play, sys.argv)
+                sweep.work(job, play, sys.argv)
             except OSError as error:
                 failed[job] = str(error)
         return failed
