@@ -18,7 +18,7 @@ from bgpo_trl.files.checkpoint import save_checkpoint
 from bgpo_trl.files.csv_file import CsvFile
 from bgpo_trl.runs.dashboard import wandb_logger
 from bgpo_trl.runs.directory import RunLogger
-from bgpo_trl.runs.results import COLUMNS, read_json, read_run, read_table
+from bgpo_trl.runs.results import COLUMNS, read_json, read_run
 from suites import nico
 from tests.scenes.dot import scene
 
@@ -34,10 +34,7 @@ def folder(tmp_path) -> Path:
     for name, content in {
         "unevaluated": HEADER,
         "foreign": "date,temperature\nmonday,21\n",
-        "damaged": HEADER + "bgpo,0,ten,5,grasp_glass,1,1.0,5\n",
-        "cut": HEADER + "bgpo,0,10\n",
         "binary": b"\xff\xfe\x00" * 20,
-        "stranger": HEADER + "bgpo,0,10,5,juggle,1,1.0,5\n",
     }.items():
         (tmp_path / name).mkdir()
         data = content if isinstance(content, bytes) else content.encode()
@@ -90,13 +87,6 @@ CASES = {
     "table of something else": (
         lambda f: read_run(f / "foreign"),
         "lacks the columns algorithm, episode", "name another run"),
-    "row with a word for a number": (
-        lambda f: read_run(f / "damaged"), "line 2 is damaged", "resume the run"),
-    "row cut short": (lambda f: read_run(f / "cut"), "line 2 is damaged", "resume the run"),
-    "binary table": (lambda f: read_run(f / "binary"), "is not a CSV file", "name another run"),
-    "table that is a folder": (lambda f: read_table(f), "is not a CSV file", "name another run"),
-    "test of an unknown task": (
-        lambda f: read_run(f / "stranger"), "'juggle'", "none of grasp_glass"),
     "no settings": (lambda f: read_json(f / "config.json"), "is missing", "let the run in"),
     # encoders and bank
     "no encoders": (

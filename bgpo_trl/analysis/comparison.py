@@ -37,10 +37,11 @@ NAMES = {
 }
 """Names of algorithms and variants in tables and figures, in their order there."""
 
+_USUAL = "practised"  # schedule
 # Entries of config.json that belong to an algorithm or to keeping its run. All others, such as
 # encoders, starts, and the half of the demonstrations to test on, are conditions of a comparison.
-_USUAL = "practised"
 _OF_THE_RUN = ("name", "algorithm", "algorithm_class", *OF_KEEPING)
+_ONLY_EQUAL = "only runs under equal conditions are compared; --anyway compares them"
 _OF_THE_SETTING = ("tasks", "task_starts", "schedule", "episodes")
 
 
@@ -105,20 +106,11 @@ class Setting:
         parts = (kind, number, self.schedule, self.order.replace(" ", "-"))
         return "-".join(filter(None, parts))
 
-    def find(
-        self, algorithm: str, changed: Mapping[str, Any] | None = None
-    ) -> tuple[str, Run] | None:
-        """Return the name and the first run of an algorithm; None without one.
-
-        Args:
-            algorithm: Name of the algorithm.
-            changed: Its changed hyperparameters; none by default.
-        """
+    def find(self, algorithm: str, changed: Mapping[str, Any] | None = None) -> Run | None:
+        """Return the first run of an algorithm with so changed hyperparameters, by default none."""
         wanted = (algorithm, changed or {})
-        for name, run in self.runs.items():
-            if (run.algorithm, run.changed) == wanted:
-                return name, run
-        return None
+        found = (run for run in self.runs.values() if (run.algorithm, run.changed) == wanted)
+        return next(found, None)
 
 
 def read_settings(
@@ -210,7 +202,7 @@ def under_equal_conditions(
     """
     notes = [differing for run in runs[1:] if (differing := differing_conditions(runs[0], run))]
     if notes and not anyway:
-        raise ValueError(_refused(notes[0]))
+        raise ValueError(f"{notes[0]}: {_ONLY_EQUAL}")
     conditions = [_conditions(run) for run in runs]
     for name in dict.fromkeys(name for of_run in conditions for name in of_run):
         silent = sum(name not in of_run for of_run in conditions)
@@ -223,10 +215,6 @@ def under_equal_conditions(
         if run.last > last
     ]
     return [run.until(last) for run in runs], notes
-
-
-def _refused(differing: str) -> str:
-    return f"{differing}: only runs under equal conditions are compared; --anyway compares them"
 
 
 def reference_of(setting: Setting, settings: Iterable[Setting], *, anyway: bool) -> Setting | None:
@@ -247,7 +235,7 @@ def reference_of(setting: Setting, settings: Iterable[Setting], *, anyway: bool)
     ignored = (*_OF_THE_SETTING, "bank") if turned else _OF_THE_SETTING
     differing = differing_conditions(setting.first, found.first, ignored)
     if differing and not anyway:
-        raise ValueError(_refused(differing))
+        raise ValueError(f"{differing}: {_ONLY_EQUAL}")
     setting.notes.extend([differing] if differing else [])
     return found
 

@@ -59,7 +59,7 @@ def contrast(
     """Return the sum of ``weights`` times the means of independent samples, with its t interval.
 
     Weights (1,) make a mean, (1, -1) a difference, (1, -1, -1, 1) a difference of differences. The
-    degrees of freedom are those of Welch and Satterthwaite. Samples are ``[S]`` each.
+    degrees of freedom are by Welch and Satterthwaite. Samples are ``[S]`` each.
 
     Raises:
         ValueError: If a sample is empty, not finite or not a vector.

@@ -217,7 +217,7 @@ def claims_section(continual: Setting | None, concurrent: Setting | None) -> lis
     rows = [["the paper's claim", "tested", "measured", "difference", "found"]]
     for claim, tested, what, runs in tests:
         found = [setting.find(key) if setting else None for setting, key in runs]
-        scores = [_MEASURES[what](run).mean(1) for _, run in filter(None, found)]
+        scores = [_MEASURES[what](run).mean(1) for run in found if run is not None]
         if len(scores) == len(runs):
             difference = statistics.difference(*scores)
             verdict = _CLAIM_VERDICTS.get(difference.verdict, difference.note)
@@ -249,7 +249,7 @@ def sequence_section(setting: Setting, reference: Setting | None) -> list[Sectio
         if run.config.get("eval_episodes"):
             by_noise = f"{100 * since_best_unchanged(run).mean():+.1f}"
         beside = reference.find(run.algorithm, run.changed) if reference is not None else None
-        forward = forward_transfer(run, beside[1]) if beside else None
+        forward = None if beside is None else forward_transfer(run, beside)
         forgetting, since_best, backward = (
             statistics.mean(scores).points()
             for scores in (-change.mean(1), best, change[:, :-1].mean(1))

@@ -9,7 +9,9 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import torch
 
+from bgpo_trl.analysis.scores import final_means
 from bgpo_trl.analysis.task_inference import group_purity, task_inference_accuracy
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.evaluation import evaluate_random_policy
@@ -27,7 +29,6 @@ from bgpo_trl.training import Trainer
 
 # Number of the evaluation after training; it seeds start states that training never tested.
 _LAST = 2**31
-_Row = tuple[int, str, str, int, float, float | str, float | str]
 
 
 def measure(
@@ -47,8 +48,7 @@ def measure(
         Entries of ``summary.json``.
     """
     algorithm, config = trainer.algorithm, trainer.config
-    gwr, rows = algorithm.gwr, _final_tests(trainer, bank, episodes=episodes)
-    tests = pd.DataFrame(rows, columns=pd.Index([*COLUMNS["final.csv"]]))
+    gwr, tests = algorithm.gwr, _final_tests(trainer, bank, episodes=episodes)
     write_table(out / "final.csv", tests)
     trainer.dashboard.log_final(tests[tests["demonstrations"] == "held-out"], config.episodes)
     random_success = evaluate_random_policy(
@@ -90,10 +90,10 @@ def demonstrated_steps(bank: DemonstrationBank) -> dict[str, float]:
     return {name: float(k.double().mean()) - 1 for name, k in kept.items() if len(k)}
 
 
-def _final_tests(trainer: Trainer, bank: DemonstrationBank, *, episodes: int) -> list[_Row]:
+def _final_tests(trainer: Trainer, bank: DemonstrationBank, *, episodes: int) -> pd.DataFrame:
     """Return the rows of ``final.csv``, after as many test episodes of each task and kind."""
     algorithm, config, seen = trainer.algorithm, trainer.config, bank.seen()
-    gwr, rows = algorithm.gwr, list[_Row]()
+    gwr, rows = algorithm.gwr, []
     n_steps = config.algorithm.max_steps + 1
     bar = progress_bar("final tests", shown=trainer.progress, total=2 * n_steps, unit="step")
     for half, (kind, tested) in enumerate(
@@ -107,17 +107,17 @@ def _final_tests(trainer: Trainer, bank: DemonstrationBank, *, episodes: int) ->
         bar.update(half * n_steps - bar.n)  # episodes may all end earlier
         for task, name in enumerate(config.tasks):
             of_task = tested.of_task(task)
-            inferred: list[float | str] = [""] * len(config.seeds)
+            inferred = torch.full((len(config.seeds),), torch.nan)
             if gwr is not None:
-                accuracy = task_inference_accuracy(gwr, seen, of_task, len(config.tasks))
-                inferred = [round(share, 4) for share in accuracy.tolist()]
+                inferred = task_inference_accuracy(gwr, seen, of_task, len(config.tasks))
             for index, seed in enumerate(config.seeds):
                 won = success[index, task]
-                share, of_won = won.float().mean().item(), result.steps[index, task][won].double()
-                steps = round(of_won.mean().item(), 2) if len(of_won) else ""
-                rows.append((seed, kind, name, episodes, round(share, 4), steps, inferred[index]))
+                steps = result.steps[index, task][won].double().mean()  # NaN without a success
+                means = ((won.float().mean(), 4), (steps, 2), (inferred[index], 4))
+                cells = (round(float(mean), digits) for mean, digits in means)
+                rows.append((seed, kind, name, episodes, *cells))
     bar.close()
-    return rows
+    return pd.DataFrame(rows, columns=pd.Index([*COLUMNS["final.csv"]]))
 
 
 def draw(
@@ -143,28 +143,18 @@ def draw(
     save_figure(plot_frame_strips(episodes), out / "figures" / "episodes.png")
     for name, frames in zip(file_names(config.tasks), episodes.values(), strict=True):
         save_gif(frames, out / "figures" / f"{name}.gif", fps=find_scene(config.scene).rate or 5.0)
-    gwr = trainer.algorithm.gwr
-    if gwr is not None:
+    if summary["nodes"] is not None:
         draw_nodes(out, trainer.algorithm, bank, config.tasks)
-        accuracy = task_inference_accuracy(
-            gwr, bank.seen(), bank.held_out(config.held_out), len(config.tasks)
-        )
         draw_growth(out, config, bank)
-        lines.append(f"GWR-B nodes: {gwr.num_nodes.tolist()}")
-        lines.append(f"task inference on held-out demonstrations: {accuracy.mean():.1%}")
-    if trainer.algorithm.groups:
+        inferred = np.asarray(final_means(run, "held-out", "task_inference"))
+        lines.append(f"GWR-B nodes: {summary['nodes']}")
+        lines.append(f"task inference on held-out demonstrations: {inferred.mean():.1%}")
+    if summary["groups"] is not None:
         save_figure(plot_groups(run), out / "figures" / "groups.png")
-        numbers = [len(groups.numbers) for groups in trainer.algorithm.groups]
-        held_out = bank.held_out(config.held_out)
-        purity = np.mean(
-            [
-                group_purity(groups, held_out, len(config.tasks))
-                for groups in trainer.algorithm.groups
-            ]
-        )
+        purity = np.mean(summary["group_purity"])
         lines.append(
-            f"groups of behaviors: {numbers}, {purity:.1%} of held-out demonstrations in a "
-            "group of their task"
+            f"groups of behaviors: {summary['groups']}, {purity:.1%} of held-out demonstrations in "
+            "a group of their task"
         )
     return lines
 

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from bgpo_trl.figures.style import (
     COLORS,
@@ -193,7 +193,7 @@ _MATRICES = 3  # side by side
 _COLOR_MAP, _WHITE_BELOW = "viridis", 0.6
 
 
-def plot_success_matrices(matrices: Mapping[str, ArrayLike], tasks: Sequence[str]) -> Figure:
+def plot_success_matrices(matrices: Mapping[str, NDArray], tasks: Sequence[str]) -> Figure:
     """Plot ``R[i, j]``, success on task j after the phase of task i, in a panel for each run.
 
     Cells give percent; tasks that have not been presented stay white. A task that is forgotten
@@ -202,32 +202,21 @@ def plot_success_matrices(matrices: Mapping[str, ArrayLike], tasks: Sequence[str
     Args:
         matrices: Success in [0, 1] by title, ``[T, T]``; NaN for tasks that were not tested.
         tasks: Names of the tasks, in the order of their presentation.
-
-    Raises:
-        ValueError: If there are no matrices, or one does not have a row and a column per task.
     """
-    n_tasks = len(tasks)
-    found = {title: np.asarray(matrix, float) for title, matrix in matrices.items()}
-    wrong = [list(matrix.shape) for matrix in found.values() if matrix.shape != (n_tasks, n_tasks)]
-    if wrong or not found:
-        raise ValueError(
-            f"matrices must be [{n_tasks}, {n_tasks}], a row and a column per task, "
-            f"not {wrong[0] if wrong else 'none'}"
-        )
-    n_columns = min(_MATRICES, len(found))
-    n_rows = math.ceil(len(found) / n_columns)
-    side = 0.31 * n_tasks  # inches
+    n_columns = min(_MATRICES, len(matrices))
+    n_rows = math.ceil(len(matrices) / n_columns)
+    side = 0.31 * len(tasks)  # inches
     # Titles of panels of few tasks are longer than these; a letter is about 0.08 wide.
-    width = max(side, 0.08 * max(map(len, found)))
+    width = max(side, 0.08 * max(map(len, matrices)))
     figure = Figure(figsize=(width * n_columns + 2.9, (side + 0.45) * n_rows + 0.5))
     figure.set_layout_engine("constrained", w_pad=0.08, h_pad=0.08)
     panels = figure.subplots(n_rows, n_columns, squeeze=False).flat
-    for number, (title, matrix) in enumerate(found.items()):
+    for number, (title, matrix) in enumerate(matrices.items()):
         panel = panels[number]
         image = _draw_matrix(panel, matrix)
         panel.set_title(title, fontsize=9)
         _label_tasks(panel, tasks, names=number % n_columns == 0)
-    for panel in panels[len(found) :]:
+    for panel in panels[len(matrices) :]:
         panel.remove()
     figure.supxlabel("Success on task", fontsize=9)
     figure.supylabel("After the phase of task", fontsize=9)

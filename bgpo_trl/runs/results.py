@@ -187,7 +187,7 @@ OF_KEEPING = ("seeds", "checkpoint_minutes", "task_modules")
 _OF_SEEDS = ("nodes", "groups", "group_purity")  # entries of summary.json, a value per seed
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)  # Tables have no truth value.
 class Run:
     """Settings, summary and tables of a run, or of runs that differ only in their seeds.
 
@@ -367,8 +367,8 @@ def _joined(parts: list[Run]) -> Run:
         values = [run.summary.get(key) for run in parts]
         summary[key] = None if None in values else [v for of_run in values for v in of_run or ()]
     for key in ("commit", "command"):
-        told = dict.fromkeys(run.summary.get(key) or "" for run in parts)
-        summary[key] = "; ".join(filter(None, told))
+        stated = dict.fromkeys(run.summary.get(key) or "" for run in parts)
+        summary[key] = "; ".join(filter(None, stated))
     tables: dict[str, Any] = {}
     for name in ("tests", "training", "final", "costs"):
         of_runs = [getattr(run, name) for run in parts]

@@ -52,7 +52,7 @@ def test_changed_hyperparameters_are_part_of_a_name(tmp_path):
         ("BGPO", plain),
         ("BGPO, beta 0.2, rl.name td3", changed),
     ]
-    assert setting.find("bgpo") == ("BGPO", setting.runs["BGPO"])
+    assert setting.find("bgpo") is setting.runs["BGPO"]
     (alone,) = settings_in(changed)[0].values()
     assert alone.find("bgpo") is None
 

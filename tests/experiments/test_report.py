@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from bgpo_trl.analysis.comparison import NAMES, Setting
 from bgpo_trl.analysis.scores import forward_transfer, since_best_unchanged
 from bgpo_trl.analysis.tables import success_section
 from bgpo_trl.experiments.report import ReportArguments, report
+from bgpo_trl.runs import results
 from bgpo_trl.runs.results import read_run
 from tests.analysis.runs import TASKS, write_run, write_training
 from tests.helpers import cells, contents, edit
@@ -169,6 +171,13 @@ def test_figures_are_beside_the_tables_and_the_report_on_an_archive_is_the_same(
     for name in figures:
         assert f"]({name})" in text_of(reported)
         assert (tmp_path / "again" / name).read_bytes() == (reported / name).read_bytes()
+
+
+def test_each_file_of_a_run_is_read_once(reported, tmp_path, monkeypatch):
+    counts, read = Counter(), results._read_text
+    monkeypatch.setattr(results, "_read_text", lambda path: counts.update([path]) or read(path))
+    report(ReportArguments((reported,), out=tmp_path))
+    assert counts == Counter(reported.glob("*/*.csv"))
 
 
 def split(run, folder):

@@ -192,7 +192,9 @@ FIRST, SECOND = [[0.75, NAN], [0.5, 1.0]], [[0.25, NAN], [0.0, 0.125]]
 
 
 def test_a_panel_shows_the_matrix_as_colors_and_numbers():
-    figure = plot_success_matrices({"one": FIRST, "two": SECOND}, ["grasp_glass", "lift_green"])
+    figure = plot_success_matrices(
+        {"one": np.array(FIRST), "two": np.array(SECOND)}, ["grasp_glass", "lift_green"]
+    )
     one, two = (axes for axes in figure.axes if axes.images)
     assert (one.get_title(), two.get_title()) == ("one", "two")
     for panel, matrix in ((one, FIRST), (two, SECOND)):
@@ -207,8 +209,6 @@ def test_a_panel_shows_the_matrix_as_colors_and_numbers():
 
 REFUSED = {
     "no steps to plot": lambda: plot_step_curves({"none": run_of([(0, 1, "a", 0)], "a")}),
-    "row and a column per task, not [2, 2]": lambda: plot_success_matrices({"one": FIRST}, "abc"),
-    "not none": lambda: plot_success_matrices({}, "ab"),
     "nothing to show": lambda: plot_frame_strips({"none": np.zeros((0, 2, 2, 3), np.uint8)}),
     "uint8 [T, H, W, 3]": lambda: save_gif(np.zeros((1, 2, 3, 3)), "none.gif"),
     "N, d >= 2, not [1, 4]": lambda: plot_gwr_pca(np.zeros((1, 4)), [0], "ab"),
