@@ -11,7 +11,7 @@ from bgpo_trl.configs import RunConfig
 from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.encoders.representation import encode_frames, valid_steps
-from bgpo_trl.runs.results import read_curves
+from bgpo_trl.runs.results import read_run
 from bgpo_trl.training import Trainer
 
 
@@ -54,5 +54,5 @@ if __name__ == "__main__":
     make = partial(NearestNeighbors, states=states, actions=actions)
     with Trainer(config, f"{out}/run", bank=bank, encoders=encoders, make=make, resume=True) as run:
         run.run()
-    success = read_curves(f"{out}/run/eval.csv", config.tasks).success[0, -1]
+    success = read_run(f"{out}/run").success[0, -1]
     print(config.name, dict(zip(config.tasks, success.tolist(), strict=True)))

@@ -22,7 +22,7 @@ from bgpo_trl.configs import (
 )
 from bgpo_trl.encoders.train import make_pretrained
 from bgpo_trl.evaluation import evaluate_random_policy
-from bgpo_trl.runs.results import read_curves
+from bgpo_trl.runs.results import read_run
 from bgpo_trl.scenes import SCENES, Outcome, Scene, Simulation, SimulationEnv
 from bgpo_trl.seeding import random_state, set_random_state
 from bgpo_trl.training import Trainer
@@ -150,6 +150,6 @@ if __name__ == "__main__":
     with Trainer(config, OUT / "run", bank=bank, encoders=encoders, resume=True) as trainer:
         trainer.run()
     by_chance = evaluate_random_policy(tasks=TASKS, episodes=50, max_steps=25, scene=REACHER)
-    learned = read_curves(OUT / "run" / "eval.csv", TASKS).success[0].T  # [tasks, tests]
+    learned = read_run(OUT / "run").success[0].T  # [tasks, tests]
     for task, chance, curve in zip(TASKS, by_chance, learned, strict=True):
         print(f"{task}: random actions {chance:.0%}, tests of BGPO", *map("{:.0%}".format, curve))

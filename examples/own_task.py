@@ -12,7 +12,7 @@ from bgpo_trl.encoders.make_bank import make_bank
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.figures.success import plot_success_curves
-from bgpo_trl.runs.results import TRAIN, read_table
+from bgpo_trl.runs.results import read_run
 from bgpo_trl.training import Trainer
 from suites import nico
 from suites.nico import moves
@@ -44,10 +44,10 @@ if __name__ == "__main__":
     config = RunConfig(seeds=(0,), episodes=8, tasks=tasks, task_starts=starts, eval_every=4)
     with Trainer(config, OUT / "run", bank=bank, encoders=encoders, resume=True) as trainer:
         trainer.run()
-    save_figure(plot_success_curves(OUT / "run" / "eval.csv"), OUT / "success.png")
-    train, test = (read_table(OUT / "run" / file, TRAIN) for file in ("train.csv", "eval.csv"))
+    run = read_run(OUT / "run")
+    save_figure(plot_success_curves({"BGPO": run}), OUT / "success.png")
     for task in tasks:
-        won, passed = (table.loc[table["task"] == task, "success"] for table in (train, test))
+        won, passed = (t.loc[t["task"] == task, "success"] for t in (run.training, run.tests))
         counts = f"{won.sum():.0f} of {len(won)} in training, {passed.sum():.0f} of {len(passed)}"
         print(f"{task}: {counts} tests")
     gwr = trainer.algorithm.gwr

@@ -1,5 +1,6 @@
 """Wrong files: each is refused in one line, and nothing is left half-written."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -16,12 +17,13 @@ from bgpo_trl.figures.style import save_figure
 from bgpo_trl.files.checkpoint import save_checkpoint
 from bgpo_trl.files.csv_file import CsvFile
 from bgpo_trl.runs.dashboard import wandb_logger
-from bgpo_trl.runs.directory import EVAL_COLUMNS, RunLogger
-from bgpo_trl.runs.results import read_curves, read_json, read_table
+from bgpo_trl.runs.directory import RunLogger
+from bgpo_trl.runs.results import COLUMNS, read_json, read_run
 from suites import nico
 from tests.scenes.dot import scene
 
-HEADER = ",".join(EVAL_COLUMNS) + "\n"
+HEADER = ",".join(COLUMNS["eval.csv"]) + "\n"
+CONFIG = {"seeds": [0], "tasks": nico.PAPER_TASKS, "task_starts": [0, 0, 0], "episodes": 10}
 TINY = {"per_task": 2, "held_out_per_task": 1, "progress": False}
 
 
@@ -32,16 +34,12 @@ def folder(tmp_path) -> Path:
     for name, content in {
         "unevaluated": HEADER,
         "foreign": "date,temperature\nmonday,21\n",
-        "damaged": HEADER + "bgpo,0,ten,5,grasp_glass,1,1.0,5\n",
-        "cut": HEADER + "bgpo,0,10\n",
         "binary": b"\xff\xfe\x00" * 20,
-        "stranger": HEADER + "bgpo,0,10,5,juggle,1,1.0,5\n",
     }.items():
         (tmp_path / name).mkdir()
         data = content if isinstance(content, bytes) else content.encode()
         (tmp_path / name / "eval.csv").write_bytes(data)
-        if name != "unevaluated":
-            (tmp_path / name / "config.json").write_text('{"gamma": ')
+        (tmp_path / name / "config.json").write_text(json.dumps(CONFIG))
     bank().save(tmp_path / "bank")
     return tmp_path
 
@@ -53,10 +51,6 @@ def bank() -> DemonstrationBank:
 
 def load_bank(path):
     return DemonstrationBank.load(path, encoder_id="x")
-
-
-def curves(path):
-    return read_curves(path / "eval.csv", nico.PAPER_TASKS)
 
 
 def figure():
@@ -79,7 +73,7 @@ CASES = {
     "csv that is a folder": (lambda f: CsvFile(f, ["a"]), "Is a directory", "choose another run"),
     "csv without columns": (lambda f: CsvFile(f / "a.csv", []), "got ()", "needs columns"),
     "csv of binary data": (
-        lambda f: CsvFile(f / "binary" / "eval.csv", EVAL_COLUMNS),
+        lambda f: CsvFile(f / "binary" / "eval.csv", [*COLUMNS["eval.csv"]]),
         "not with the columns algorithm,seed", "choose another run directory"),
     "figure in a file": (
         lambda f: save_figure(figure(), f / "file" / "a.png"), "cannot make the folder", "another"),
@@ -87,19 +81,12 @@ CASES = {
     "checkpoint in a file": (
         lambda f: save_checkpoint(f / "file", {"a": 1}), "cannot save a checkpoint", "make room"),
     # runs that are read
-    "no run": (lambda f: curves(f / "nowhere"), "there is no run at", "name another"),
+    "no run": (lambda f: read_run(f / "nowhere"), "there is no run at", "name another"),
     "run without a test": (
-        lambda f: curves(f / "unevaluated"), "holds no test episode", "let the run evaluate first"),
+        lambda f: read_run(f / "unevaluated"), "holds no test episode", "let the run evaluate"),
     "table of something else": (
-        lambda f: curves(f / "foreign"),
+        lambda f: read_run(f / "foreign"),
         "lacks the columns algorithm, episode", "name another run"),
-    "row with a word for a number": (
-        lambda f: curves(f / "damaged"), "line 2 is damaged", "resume the run"),
-    "row cut short": (lambda f: curves(f / "cut"), "line 2 is damaged", "resume the run"),
-    "binary table": (lambda f: curves(f / "binary"), "is not a CSV file", "name another run"),
-    "table that is a folder": (lambda f: read_table(f), "is not a CSV file", "name another run"),
-    "test of an unknown task": (
-        lambda f: curves(f / "stranger"), "'juggle'", "none of grasp_glass"),
     "no settings": (lambda f: read_json(f / "config.json"), "is missing", "let the run in"),
     # encoders and bank
     "no encoders": (

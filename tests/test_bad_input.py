@@ -14,7 +14,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv
 
-from bgpo_trl.analysis import scores, statistics
+from bgpo_trl.analysis import statistics
 from bgpo_trl.configs import RunConfig
 from bgpo_trl.files.checkpoint import load_checkpoint
 from bgpo_trl.machine import choose_device, set_threads
@@ -218,19 +218,7 @@ WRONG = {
         lambda: world(source(), RewardSum(), BehaviorMatchingReward(lae)).reset(),
         "BehaviorMatchingReward"),
     # measures
-    "area of nothing": (lambda: scores.area_under_curve([], []), "success [0]"),
-    "area back in time": (lambda: scores.area_under_curve([0.1, 0.2], [2, 1]), "[2.0, 1.0]"),
-    "curves longer than their episodes": (
-        lambda: scores.overall_episodes_to([[[0.1], [0.9]]], [10]), "for episodes [10]"),
-    "matrix of unequal lists": (
-        lambda: scores.evaluation_matrix([[0.1]], [1, 2], [2], window=2), "[1, 2]"),
-    "matrix without a test": (
-        lambda: scores.evaluation_matrix([[0.1]], [1], [9], window=2), "no evaluation"),
-    "mean of no evaluations": (lambda: scores.trailing_mean([[0.1]], 0), "got (1, 1), 0"),
-    "best of a single list": (lambda: scores.forgetting_since_best([0.1, 0.2]), "success [2]"),
-    "transfer without phases": (lambda: scores.change_since_learned([[1, 2]]), "got [1, 2]"),
     "difference of NaN": (lambda: statistics.difference([1.0], [NAN]), "with NaN"),
-    "interval in percent": (lambda: statistics.contrast([[1, 2]], [1]).interval(95), "got 95"),
 }  # fmt: skip
 
 

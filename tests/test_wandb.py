@@ -22,6 +22,7 @@ from bgpo_trl.figures.style import save_figure
 from bgpo_trl.figures.success import plot_success_curves
 from bgpo_trl.runs.dashboard import wandb_logger
 from bgpo_trl.runs.directory import flatten
+from bgpo_trl.runs.results import read_run
 from tests.helpers import interrupt
 
 pytestmark = pytest.mark.usefixtures("easy_world")
@@ -111,7 +112,7 @@ def run(easy_world, begin, make_config, tmp_path_factory):
         final = pd.DataFrame({"task": TASKS, "success": [0.5, 0.25, 0.75]})
         resumed.dashboard.log_final(final, 10)
         figures = directory / "figures"
-        save_figure(plot_success_curves(directory / "eval.csv"), figures / "success.png")
+        save_figure(plot_success_curves({"DDPG": read_run(directory)}), figures / "success.png")
         frames = np.random.default_rng(0).integers(256, size=(6, 32, 64, 3), dtype=np.uint8)
         save_gif(frames, figures / "grasp_glass.gif")
         for path in sorted(figures.iterdir()):

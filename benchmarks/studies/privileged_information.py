@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 from bgpo_trl.algorithms import ALGORITHMS
-from bgpo_trl.analysis.comparison import read_run
 from bgpo_trl.analysis.scores import episodes_to_80, late_scores
 from bgpo_trl.analysis.statistics import mean
 from bgpo_trl.analysis.tables import Table, markdown
@@ -22,6 +21,7 @@ from bgpo_trl.experiments.settings import chosen
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.figures.success import plot_success_curves
 from bgpo_trl.machine import choose_device, set_threads
+from bgpo_trl.runs.results import read_run
 from bgpo_trl.training import Trainer
 
 INPUTS: dict[str, tuple[str, dict[str, Any]]] = {
@@ -99,8 +99,8 @@ def privileged_information(arguments: InformationArguments) -> str:
             resume=arguments.resume,
         ) as trainer:
             trainer.run()
-        save_figure(plot_success_curves(out / "eval.csv"), out / "figures" / "success.png")
         run = read_run(out)
+        save_figure(plot_success_curves({name: run}), out / "figures" / "success.png")
         late, reached = late_scores(run), episodes_to_80(run)
         shares = [f"{100 * share:.1f}" for share in late.mean(0)]
         last = "not reached" if math.isinf(reached) else f"{reached:.0f}"

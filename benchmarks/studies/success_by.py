@@ -17,19 +17,14 @@ from numpy.typing import ArrayLike
 from shared import style_success
 
 from bgpo_trl.analysis import statistics
-from bgpo_trl.analysis.comparison import (
-    Run,
-    differing_conditions,
-    joined,
-    read_run,
-    run_directories,
-)
+from bgpo_trl.analysis.comparison import differing_conditions, title_of
 from bgpo_trl.analysis.scores import late_scores
-from bgpo_trl.analysis.tables import Table
+from bgpo_trl.analysis.tables import Section, Table
 from bgpo_trl.experiments.command_line import command_line
-from bgpo_trl.experiments.report import Section, text_of
+from bgpo_trl.experiments.report import text_of
 from bgpo_trl.figures.style import COLORS, LINES, MARKERS, readable, save_figure
 from bgpo_trl.files.writing import make_folder, write_whole
+from bgpo_trl.runs.results import Run, joined, read_run, run_directories
 
 
 @dataclass(frozen=True)
@@ -59,8 +54,9 @@ def runs_by(directories: Sequence[Path], name: str) -> dict[float, Run]:
             raise ValueError(f"--by {name}: it is {value!r} in {run.directory}, and no number")
         if run.unfinished:
             raise ValueError(f"{run.directory} {run.unfinished}: let the run finish")
-        if run.title != first.title:
-            raise ValueError(f"--by takes runs of one algorithm: {first.title}, {run.title}")
+        if title_of(run) != title_of(first):
+            names = f"{title_of(first)}, {title_of(run)}"
+            raise ValueError(f"--by takes runs of one algorithm: {names}")
         differing = differing_conditions(first, run, (name,))
         if differing:
             raise ValueError(f"{differing}: with --by {name}, they may differ in that alone")
@@ -90,7 +86,7 @@ def section_by(runs: dict[float, Run], name: str, out: Path) -> Section:
         *(f"{value:g}: `{command}`" for value, command in commands.items() if command),
     ]
     caption = f"means over seeds, and each seed, by {name}"
-    return Section(f"Success by {name}: {first.title}", table, {caption: path}, notes)
+    return Section(f"Success by {name}: {title_of(first)}", table, {caption: path}, notes)
 
 
 def plot_by(success: Mapping[float, ArrayLike], tasks: Sequence[str], *, label: str) -> Figure:

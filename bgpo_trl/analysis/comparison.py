@@ -1,19 +1,15 @@
-"""Finished runs, and the conditions under which they are compared."""
+"""Finished runs by setting, and the conditions under which they are compared."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import pandas as pd
-
 from bgpo_trl.files.csv_file import has_rows
-from bgpo_trl.runs.results import Curves, find_table, read_curves, read_json
+from bgpo_trl.runs.results import OF_KEEPING, Run, find_table, joined, read_run
 
 NAMES = {
     "bgpo": "BGPO",
@@ -41,90 +37,18 @@ NAMES = {
 }
 """Names of algorithms and variants in tables and figures, in their order there."""
 
+_USUAL = "practised"  # schedule
 # Entries of config.json that belong to an algorithm or to keeping its run. All others, such as
 # encoders, starts, and the half of the demonstrations to test on, are conditions of a comparison.
-_OF_KEEPING = ("seeds", "checkpoint_minutes", "task_modules")
-_USUAL = "practised"
-_OF_THE_RUN = ("name", "algorithm", "algorithm_class", *_OF_KEEPING)
+_OF_THE_RUN = ("name", "algorithm", "algorithm_class", *OF_KEEPING)
+_ONLY_EQUAL = "only runs under equal conditions are compared; --anyway compares them"
 _OF_THE_SETTING = ("tasks", "task_starts", "schedule", "episodes")
 
 
-@dataclass(frozen=True)
-class Run:
-    """Settings, summary and curves of a run, or of runs that differ in their seeds alone."""
-
-    directories: tuple[Path, ...]
-    config: dict[str, Any]
-    summary: dict[str, Any]
-    curves: Curves
-
-    @property
-    def directory(self) -> Path:
-        """The first directory."""
-        return self.directories[0]
-
-    @property
-    def name(self) -> str:
-        """Name of the directory, or of the folder of several."""
-        return (self.directory if len(self.directories) == 1 else self.directory.parent).name
-
-    def paths(self, name: str) -> list[Path]:
-        """Return the paths of a table in all directories; none unless each has it."""
-        paths = [directory / name for directory in self.directories]
-        return paths if all(map(find_table, paths)) else []
-
-    def table(self, name: str, read: Callable[[Path], pd.DataFrame]) -> pd.DataFrame:
-        """Return the rows of a table in all directories."""
-        paths = [directory / name for directory in self.directories]
-        return pd.concat([read(path) for path in paths], ignore_index=True)
-
-    @property
-    def algorithm(self) -> str:
-        """Name of the algorithm; the directory's where ``config.json`` has none."""
-        return self.config.get("name") or self.name
-
-    @property
-    def changed(self) -> dict[str, Any]:
-        """Hyperparameters that are not the algorithm's usual ones, by name."""
-        return self.summary.get("changed") or {}
-
-    @property
-    def title(self) -> str:
-        """Name in tables, with the changed hyperparameters."""
-        changed = [f"{name} {_short(value)}" for name, value in self.changed.items()]
-        return ", ".join([NAMES.get(self.algorithm, self.algorithm), *changed])
-
-    @property
-    def tasks(self) -> tuple[str, ...]:
-        """Names of the tasks, in the order of their presentation."""
-        return self.curves.tasks
-
-    @property
-    def starts(self) -> list[int]:
-        """Episode from which each task is presented."""
-        return self.config["task_starts"]
-
-    @property
-    def last(self) -> int:
-        """Training episodes before the last test."""
-        return int(self.curves.episodes[-1])
-
-    @property
-    def eval_every(self) -> int:
-        """Training episodes between tests."""
-        tested = [0, *self.curves.episodes.tolist()]
-        steps = min(after - before for before, after in pairwise(tested))
-        return self.config.get("eval_every") or steps
-
-    @property
-    def unfinished(self) -> str:
-        """In what the run is not finished; "" if it is."""
-        episodes = self.config["episodes"]
-        if self.summary.get("episodes", episodes) != episodes:
-            return "is being extended"
-        if episodes - self.last >= self.eval_every:
-            return f"has tests until episode {self.last} of {episodes}"
-        return ""
+def title_of(run: Run) -> str:
+    """Return the name of a run in tables, with the changed hyperparameters."""
+    changed = [f"{name} {_short(value)}" for name, value in run.changed.items()]
+    return ", ".join([NAMES.get(run.algorithm, run.algorithm), *changed])
 
 
 @dataclass(frozen=True)
@@ -182,106 +106,11 @@ class Setting:
         parts = (kind, number, self.schedule, self.order.replace(" ", "-"))
         return "-".join(filter(None, parts))
 
-    def find(
-        self, algorithm: str, changed: Mapping[str, Any] | None = None
-    ) -> tuple[str, Run] | None:
-        """Return the name and the first run of an algorithm; None without one.
-
-        Args:
-            algorithm: Name of the algorithm.
-            changed: Its changed hyperparameters; none by default.
-        """
+    def find(self, algorithm: str, changed: Mapping[str, Any] | None = None) -> Run | None:
+        """Return the first run of an algorithm with so changed hyperparameters, by default none."""
         wanted = (algorithm, changed or {})
-        for name, run in self.runs.items():
-            if (run.algorithm, run.changed) == wanted:
-                return name, run
-        return None
-
-
-def read_run(directory: Path) -> Run:
-    """Read a run.
-
-    Its directory needs ``config.json`` with seeds, tasks, their starts and the number of episodes,
-    and ``eval.csv``.
-
-    Raises:
-        ValueError: If a file is missing or damaged.
-    """
-    entries = {"episodes": int, "seeds": list, "tasks": list, "task_starts": list}
-    config = read_json(directory / "config.json", entries)
-    tasks, starts = config["tasks"], config["task_starts"]
-    named = all(isinstance(task, str) for task in tasks)
-    if not named or len(tasks) != len(starts) or not all(type(start) is int for start in starts):
-        raise ValueError(
-            f"{directory / 'config.json'} does not say when each task starts: put it back as the "
-            "run left it"
-        )
-    path = directory / "summary.json"
-    lists: dict[str, Any] = dict.fromkeys(("nodes", "groups", "group_purity"), list | None)
-    maps: dict[str, Any] = dict.fromkeys(("changed", "demonstrated_steps"), dict | None)
-    summary = read_json(path, lists | maps) if path.exists() else {}
-    return Run((directory,), config, summary, read_curves(directory / "eval.csv", tasks))
-
-
-def joined(runs: Iterable[Run]) -> list[Run]:
-    """Return runs, of which those that differ in their seeds alone are one.
-
-    Runs that share a seed, or were tested at other times, stay apart.
-    """
-    groups: dict[str, list[Run]] = {}
-    for run in runs:
-        alike = {name: run.config[name] for name in run.config if name not in _OF_KEEPING}
-        key = json.dumps([alike, run.changed], sort_keys=True)
-        groups.setdefault(key, []).append(run)
-    found: list[Run] = []
-    for parts in groups.values():
-        seeds = [seed for run in parts for seed in run.config["seeds"]]
-        tests = {tuple(run.curves.episodes.tolist()) for run in parts}
-        found += [_joined(parts)] if len(tests) == 1 and len({*seeds}) == len(seeds) else parts
-    return found
-
-
-def _joined(parts: list[Run]) -> Run:
-    """Return runs of different seeds as one."""
-    if len(parts) == 1:
-        return parts[0]
-    first, summary = parts[0], dict(parts[0].summary)
-    for key in ("nodes", "groups", "group_purity"):  # a value per seed, or None
-        values = [run.summary.get(key) for run in parts]
-        summary[key] = None if None in values else [v for of_run in values for v in of_run or ()]
-    for key in ("commit", "command"):
-        told = dict.fromkeys(run.summary.get(key) or "" for run in parts)
-        summary[key] = "; ".join(filter(None, told))
-    curves = replace(
-        first.curves,
-        seeds=tuple(seed for run in parts for seed in run.curves.seeds),
-        success=np.concatenate([run.curves.success for run in parts]),
-    )
-    config = {**first.config, "seeds": [seed for run in parts for seed in run.config["seeds"]]}
-    return Run(tuple(run.directory for run in parts), config, summary, curves)
-
-
-def run_directories(paths: Iterable[Path]) -> list[Path]:
-    """Return the run directories among some paths and, of other folders, in them.
-
-    Raises:
-        ValueError: If a path is not a directory, or holds no run.
-    """
-    found: list[Path] = []
-    for path in paths:
-        if not path.is_dir():
-            raise ValueError(f"{path} is not a directory: name a run, or a folder of runs")
-        runs = _runs_in(path)
-        if not runs:
-            raise ValueError(f"{path} holds no run: name a run, or a folder of runs")
-        found += runs
-    return found
-
-
-def _runs_in(path: Path) -> list[Path]:
-    if (path / "config.json").exists():
-        return [path]
-    return [run for folder in sorted(path.glob("*/")) for run in _runs_in(folder)]
+        found = (run for run in self.runs.values() if (run.algorithm, run.changed) == wanted)
+        return next(found, None)
 
 
 def read_settings(
@@ -346,7 +175,7 @@ def _setting(runs: list[Run], anyway: bool) -> Setting:
         ),
     )
     runs, notes = under_equal_conditions(runs, anyway=anyway)
-    names = [run.title for run in runs]
+    names = [title_of(run) for run in runs]
     return Setting(
         {
             name if names.count(name) == 1 else f"{name} ({run.name})": run
@@ -373,7 +202,7 @@ def under_equal_conditions(
     """
     notes = [differing for run in runs[1:] if (differing := differing_conditions(runs[0], run))]
     if notes and not anyway:
-        raise ValueError(_refused(notes[0]))
+        raise ValueError(f"{notes[0]}: {_ONLY_EQUAL}")
     conditions = [_conditions(run) for run in runs]
     for name in dict.fromkeys(name for of_run in conditions for name in of_run):
         silent = sum(name not in of_run for of_run in conditions)
@@ -385,11 +214,7 @@ def under_equal_conditions(
         for run in runs
         if run.last > last
     ]
-    return [replace(run, curves=run.curves.until(last)) for run in runs], notes
-
-
-def _refused(differing: str) -> str:
-    return f"{differing}: only runs under equal conditions are compared; --anyway compares them"
+    return [run.until(last) for run in runs], notes
 
 
 def reference_of(setting: Setting, settings: Iterable[Setting], *, anyway: bool) -> Setting | None:
@@ -410,7 +235,7 @@ def reference_of(setting: Setting, settings: Iterable[Setting], *, anyway: bool)
     ignored = (*_OF_THE_SETTING, "bank") if turned else _OF_THE_SETTING
     differing = differing_conditions(setting.first, found.first, ignored)
     if differing and not anyway:
-        raise ValueError(_refused(differing))
+        raise ValueError(f"{differing}: {_ONLY_EQUAL}")
     setting.notes.extend([differing] if differing else [])
     return found
 

@@ -1,93 +1,75 @@
-"""Measures of multi-task and continual learning: of arrays, and of the seeds and tasks of a run.
+"""Measures of multi-task and continual learning, of the ``S`` seeds and ``T`` tasks of a run.
 
-``success`` ``[..., E, T]`` is the share of successes on each of ``T`` tasks at each of ``E``
-evaluations (`bgpo_trl.runs.results.Curves` adds a leading seed dimension). NaN marks tasks that
-were not tested, because they had not been presented yet. ``episodes`` ``[E]`` are the training
-episodes before each evaluation. ``ValueError`` is raised if they do not increase, or shapes do not
-match.
+``success`` ``[..., E, T]`` is the share of successes on each task at each of ``E`` evaluations. NaN
+marks tasks that were not tested, because they had not been presented yet. ``episodes`` ``[E]`` are
+the training episodes before each evaluation.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
-import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from bgpo_trl.analysis.comparison import Run
 from bgpo_trl.analysis.statistics import Estimate, contrast
-from bgpo_trl.runs.results import TRAIN, read_final_tests, read_table, read_tests
+from bgpo_trl.runs.results import Run
 
 Values = NDArray[np.float64]
 
 
-def in_window(episodes: ArrayLike, end: int, window: int) -> NDArray[np.bool_]:
+def _mean(values: Values, axis: int) -> Values:
+    """Return the mean of the values that are not NaN; NaN where all are."""
+    return np.ma.filled(np.ma.masked_invalid(values).mean(axis), np.nan)
+
+
+def _in_window(episodes: ArrayLike, end: int, window: int) -> NDArray[np.bool_]:
     """Return which ``episodes`` ``[E]`` are among the last ``window`` until ``end``, ``[E]``."""
     episodes = np.asarray(episodes)
     return (episodes > end - window) & (episodes <= end)
 
 
-def evaluation_matrix(
-    success: ArrayLike, episodes: ArrayLike, ends: ArrayLike, *, window: int
-) -> Values:
-    """Return ``R[i, j]``, the success on task j at the end of phase i, ``[..., P, T]``.
+def late_window(run: Run) -> int:
+    """Return the length of the last 10 % of training in episodes, at least one test."""
+    return max(run.eval_every, round(0.1 * run.last))
 
-    ``ends`` ``[P]`` are the last episodes of the phases: the starts of the later tasks, and the end
-    of training. Success is the mean over the evaluations in the ``window`` episodes before an end;
-    NaN for tasks without a test among them.
+
+def evaluation_matrix(run: Run, ends: Sequence[int], window: int) -> Values:
+    """Return ``R[i, j]``, the success on task j at the end of phase i, ``[S, P, T]``.
+
+    ``ends`` ``[P]`` are the last episodes of the phases. Success is the mean over the evaluations
+    in the ``window`` episodes before an end; NaN for tasks without a test among them.
 
     Raises:
         ValueError: If a phase has no evaluation in its window.
     """
-    success, episodes = np.asarray(success, float), np.asarray(episodes)
-    _check_episodes(success, episodes, -2)
     phases = []
-    for end in np.asarray(ends).tolist():
-        chosen = in_window(episodes, end, window)
+    for end in ends:
+        chosen = _in_window(run.episodes, end, window)
         if not chosen.any():
             raise ValueError(
                 f"there is no evaluation in the {window} episodes before episode {end}: test "
                 "more often, or for a longer run"
             )
-        phases.append(_mean(success[..., chosen, :], axis=-2))
-    return np.stack(phases, axis=-2)
+        phases.append(_mean(run.success[:, chosen], axis=1))
+    return np.stack(phases, axis=1)
 
 
-def change_since_learned(matrix: ArrayLike) -> Values:
-    """Return each task's change of success since the end of its own phase, ``[..., T]``.
-
-    ``R[T - 1, j] - R[j, j]``, where phase j introduces task j. Its mean over all tasks but the last
-    is the backward transfer of Lopez-Paz & Ranzato (2017, "Gradient Episodic Memory for Continual
-    Learning").
-
-    Args:
-        matrix: Result of `evaluation_matrix` with one phase per task, ``[..., T, T]``.
+def late_scores(run: Run) -> Values:
+    """Return the mean success over the last 10 % of training, ``[S, T]``.
 
     Raises:
-        ValueError: If the numbers of phases and tasks differ.
+        ValueError: If a seed has no test of a task then.
     """
-    matrix = np.asarray(matrix, float)
-    if matrix.shape[-1] != matrix.shape[-2]:
-        raise ValueError(f"matrix must have one phase per task, got {list(matrix.shape[-2:])}")
-    return matrix[..., -1, :] - np.diagonal(matrix, axis1=-2, axis2=-1)
-
-
-def forgetting_since_best(success: ArrayLike) -> Values:
-    """Return the loss of success since each task's best evaluation, ``[...]``.
-
-    The mean over tasks of the highest success at any evaluation minus that at the last one; never
-    negative (Chaudhry et al., 2018, "Riemannian Walk for Incremental Learning", but over all
-    evaluations and tasks). Noise of single evaluations counts as forgetting: average ``success``
-    ``[..., E, T]`` first with `trailing_mean`.
-    """
-    success = np.asarray(success, float)
-    _check_episodes(success, np.arange(success.shape[-2] if success.ndim > 1 else 0), -2)
-    # Unlike np.nanmax, it does not warn of tasks without a test.
-    best = np.fmax.reduce(success, axis=-2)
-    return _mean(best - success[..., -1, :], axis=-1)
+    scores = evaluation_matrix(run, [run.last], late_window(run))[:, 0]
+    lacking = np.flatnonzero(np.isnan(scores).any(1))
+    if len(lacking):
+        raise ValueError(
+            f"{run.directory} has no late test of seed {run.seeds[lacking[0]]}, or not of each "
+            "task: let the run finish"
+        )
+    return scores
 
 
 def area_under_curve(success: ArrayLike, episodes: ArrayLike) -> Values:
@@ -97,21 +79,129 @@ def area_under_curve(success: ArrayLike, episodes: ArrayLike) -> Values:
     episode 0. Curves must not contain NaN.
     """
     success, episodes = np.asarray(success, float), np.asarray(episodes, float)
-    _check_episodes(success, episodes, -1)
-    start = np.zeros((*success.shape[:-1], 1))
-    heights = np.concatenate([start, success], axis=-1)
+    heights = np.concatenate([np.zeros((*success.shape[:-1], 1)), success], axis=-1)
     return np.trapezoid(heights, np.concatenate([[0.0], episodes]), axis=-1) / episodes[-1]
 
 
-def overall_episodes_to(success: ArrayLike, episodes: ArrayLike, threshold: float = 0.8) -> float:
-    """Return the training episodes until overall success first reaches a rate, else infinity.
+def area_scores(run: Run) -> Values:
+    """Return the area under each task's curve since its presentation, ``[S, T]``."""
+    areas = []
+    for task, start in enumerate(run.starts):
+        since = run.episodes > start
+        curve = run.success[:, since, task]
+        areas.append(area_under_curve(curve, run.episodes[since] - start))
+    return np.stack(areas, axis=-1)
+
+
+def best_scores(run: Run) -> Values:
+    """Return each task's highest mean success over seeds in any 10 % of training, ``[T]``."""
+    window, best = late_window(run), np.full(len(run.tasks), -np.inf)
+    for task in range(len(run.tasks)):
+        tested = ~np.isnan(run.success[..., task]).all(0)
+        episodes, success = run.episodes[tested], run.success[:, tested, task]
+        whole = episodes[episodes >= episodes[0] + window - 1]
+        for end in whole if len(whole) else episodes[-1:]:
+            inside = _in_window(episodes, end, window)
+            best[task] = max(best[task], np.nanmean(success[:, inside]))
+    return best
+
+
+def trailing_mean(success: ArrayLike, n: int) -> Values:
+    """Return the mean of each evaluation and up to ``n - 1`` before it, ``[..., E, T]``."""
+    success = np.asarray(success, float)
+    ends = range(1, success.shape[-2] + 1)
+    means = [_mean(success[..., max(0, end - n) : end, :], axis=-2) for end in ends]
+    return np.stack(means, axis=-2)
+
+
+def episodes_to_80(run: Run, threshold: float = 0.8) -> float:
+    """Return the training episodes until overall success first reaches 80 %, else infinity.
 
     Overall success is the mean over seeds and the tasks presented so far, and over the last three
-    evaluations, since a single one has few test episodes. ``success`` is ``[S, E, T]``.
+    evaluations, since a single one has few test episodes.
     """
-    _check_episodes(np.asarray(success, float), np.asarray(episodes), -2)
-    reached = _mean(trailing_mean(success, 3), axis=-1).mean(axis=0) >= threshold
-    return float(np.asarray(episodes)[reached.argmax()]) if reached.any() else float("inf")
+    reached = _mean(trailing_mean(run.success, 3), axis=-1).mean(axis=0) >= threshold
+    return float(run.episodes[reached.argmax()]) if reached.any() else float("inf")
+
+
+def _phases(run: Run) -> tuple[list[int], int]:
+    """Return the last episode of each task's phase, and a fifth of the shortest, in episodes."""
+    ends = [*run.starts[1:], run.last]
+    lengths = [end - start for start, end in zip(run.starts, ends, strict=True)]
+    if min(lengths) <= 0:
+        raise ValueError(
+            f"{run.directory} starts its tasks at {run.starts}: only for tasks one after the other"
+        )
+    return ends, max(run.eval_every, min(lengths) // 5)
+
+
+def success_matrix(run: Run) -> Values:
+    """Return ``R[i, j]``, the success on task j at the end of phase i, ``[S, T, T]``.
+
+    Success is the mean over the last fifth of a phase, at least one evaluation; NaN for tasks that
+    have not been presented.
+
+    Raises:
+        ValueError: If tasks do not start one after the other, or a phase has no test of its task.
+    """
+    ends, window = _phases(run)
+    matrix = evaluation_matrix(run, ends, window)
+    if np.isnan(np.diagonal(matrix, axis1=-2, axis2=-1)).any():
+        raise ValueError(
+            f"{run.directory} has no test of a task in the last {window} episodes of its phase: "
+            "let it be tested more often"
+        )
+    return matrix
+
+
+def change_since_learned(matrix: ArrayLike) -> Values:
+    """Return each task's change of success since the end of its own phase, ``[..., T]``.
+
+    ``R[T - 1, j] - R[j, j]`` of a `success_matrix`. Its mean over all tasks but the last is the
+    backward transfer of Lopez-Paz & Ranzato (2017, "Gradient Episodic Memory for Continual
+    Learning").
+    """
+    matrix = np.asarray(matrix, float)
+    return matrix[..., -1, :] - np.diagonal(matrix, axis1=-2, axis2=-1)
+
+
+def forgetting_since_best(success: ArrayLike) -> Values:
+    """Return the loss of success since each task's best mean of three evaluations, ``[...]``.
+
+    The mean over tasks of the highest `trailing_mean` of ``success`` ``[..., E, T]`` minus the last
+    one; never negative (Chaudhry et al., 2018, "Riemannian Walk for Incremental Learning", but over
+    all evaluations and tasks). Noise of single evaluations would count as forgetting.
+    """
+    means = trailing_mean(success, 3)
+    # Unlike np.nanmax, it does not warn of tasks without a test.
+    best = np.fmax.reduce(means, axis=-2)
+    return _mean(best - means[..., -1, :], axis=-1)
+
+
+def since_best_unchanged(run: Run, draws: int = 400, rng: int = 0) -> Values:
+    """Return the `forgetting_since_best` to expect of policies that do not change, ``[S]``.
+
+    The best of several noisy means is higher than the last one, also where nothing is forgotten.
+    In this simulation, tests after a task's own phase succeed independently, each with the success
+    at the end of the phase, R[j, j] of `success_matrix`. Earlier tests are those of the run.
+
+    Args:
+        run: A run with tasks one after the other, whose ``config.json`` has ``eval_episodes``.
+        draws: Number of simulations, of which the mean is taken.
+        rng: Seed of the simulations.
+
+    Raises:
+        ValueError: As for `success_matrix`.
+    """
+    n_tests = run.config["eval_episodes"]
+    random, learned = np.random.default_rng(rng), success_matrix(run)
+    simulated = np.repeat(run.success[None], draws, 0)
+    for task, end in enumerate(_phases(run)[0]):
+        since = run.episodes > end
+        rate = np.repeat(learned[:, task, task, None], since.sum(), 1)
+        successes = random.binomial(n_tests, rate, (draws, *rate.shape))
+        simulated[:, :, since, task] = successes / n_tests
+    return forgetting_since_best(simulated).mean(0)
 
 
 def trials_to(success: ArrayLike, threshold: float = 0.5, *, window: int = 20) -> float:
@@ -119,15 +209,27 @@ def trials_to(success: ArrayLike, threshold: float = 0.5, *, window: int = 20) -
 
     ``success`` ``[N]`` are the outcomes of these episodes in order. The rate is taken over the
     latest ``window`` of them, and undefined for fewer; infinity if it is never reached.
-
-    Raises:
-        ValueError: If the window is empty.
     """
-    if window < 1:
-        raise ValueError(f"window must be at least 1 episode, not {window}")
     won = np.concatenate([[0.0], np.cumsum(np.asarray(success, float))])
     reached = won[window:] - won[:-window] >= threshold * window
     return float(reached.argmax() + window) if reached.any() else float("inf")
+
+
+def own_episodes(run: Run, threshold: float = 0.5) -> Values | None:
+    """Return the training episodes of each task until a rate of them succeed, ``[S, T]``.
+
+    See `trials_to`; infinite where that was not reached. None if the run has no
+    ``train.csv``.
+    """
+    if run.training is None:
+        return None
+    table = run.training.sort_values(["seed", "episode"])
+    table = table[table["episode"] <= run.last]
+    if table.empty:
+        return None
+    times = table.groupby(["seed", "task"])["success"].agg(trials_to, threshold)
+    found = run.by_seed_and_task(times)
+    return np.where(np.isnan(found), np.inf, found)
 
 
 def times_the_first(episodes: ArrayLike) -> Values:
@@ -144,195 +246,20 @@ def times_the_first(episodes: ArrayLike) -> Values:
     return np.median(learned[:, 1:] / learned[:, :1], axis=0)
 
 
-def trailing_mean(success: ArrayLike, n: int) -> Values:
-    """Return the mean of each evaluation and up to ``n - 1`` before it, ``[..., E, T]``.
-
-    Raises:
-        ValueError: If ``n`` is less than 1.
-    """
-    success = np.asarray(success, float)
-    if n < 1 or success.ndim < 2:
-        raise ValueError(f"success must be [..., E, T] and n at least 1, got {success.shape}, {n}")
-    n_evaluations = success.shape[-2]
-    return np.stack(
-        [
-            _mean(success[..., max(0, end - n) : end, :], axis=-2)
-            for end in range(1, n_evaluations + 1)
-        ],
-        axis=-2,
-    )
-
-
-def _check_episodes(success: Values, episodes: NDArray, axis: int) -> None:
-    """Raise ``ValueError`` unless there is one episode per evaluation, in increasing order."""
-    n_evaluations = success.shape[axis] if success.ndim >= -axis else 0
-    if not n_evaluations or episodes.shape != (n_evaluations,) or (np.diff(episodes) <= 0).any():
-        raise ValueError(
-            "each evaluation needs a training episode, in increasing order: got success "
-            f"{[*success.shape]} for episodes {episodes.tolist()}"
-        )
-
-
-def _mean(values: Values, axis: int) -> Values:
-    """Return the mean of the values that are not NaN; NaN where all are."""
-    return np.ma.filled(np.ma.masked_invalid(values).mean(axis), np.nan)
-
-
-def late_window(run: Run) -> int:
-    """Return the length of the last 10 % of training in episodes, at least one test."""
-    return max(run.eval_every, round(0.1 * run.last))
-
-
-def late_scores(run: Run) -> Values:
-    """Return the mean success over the last 10 % of training, ``[S, T]``.
-
-    Raises:
-        ValueError: If a seed has no test of a task then.
-    """
-    curves = run.curves
-    scores = evaluation_matrix(
-        curves.success, curves.episodes, [run.last], window=late_window(run)
-    )[:, 0]
-    # A seed may also be missing altogether.
-    lacking = [seed for seed in run.config["seeds"] if seed not in curves.seeds]
-    lacking += [curves.seeds[index] for index in np.flatnonzero(np.isnan(scores).any(1))]
-    if lacking:
-        raise ValueError(
-            f"{run.directory} has no late test of seed {lacking[0]}, or not of each task: let the "
-            "run finish"
-        )
-    return scores
-
-
-def area_scores(run: Run) -> Values:
-    """Return the area under each task's curve since its presentation, ``[S, T]``."""
-    episodes, areas = run.curves.episodes, []
-    for task, start in enumerate(run.starts):
-        since = episodes > start
-        curve = run.curves.success[:, since, task]
-        areas.append(area_under_curve(curve, episodes[since] - start))
-    return np.stack(areas, axis=-1)
-
-
-def best_scores(run: Run) -> Values:
-    """Return each task's highest mean success over seeds in any 10 % of training, ``[T]``."""
-    curves, window = run.curves, late_window(run)
-    best = np.full(len(run.tasks), -np.inf)
-    for task in range(len(run.tasks)):
-        tested = ~np.isnan(curves.success[..., task]).all(0)
-        episodes, success = curves.episodes[tested], curves.success[:, tested, task]
-        whole = episodes[episodes >= episodes[0] + window - 1]
-        for end in whole if len(whole) else episodes[-1:]:
-            inside = in_window(episodes, end, window)
-            best[task] = max(best[task], np.nanmean(success[:, inside]))
-    return best
-
-
-def success_matrix(run: Run) -> Values:
-    """Return ``R[i, j]``, the success on task j at the end of phase i, ``[S, T, T]``.
-
-    Success is the mean over the last fifth of a phase, at least one evaluation; NaN for tasks that
-    have not been presented.
-
-    Raises:
-        ValueError: If tasks do not start one after the other, or a phase has no test of its task.
-    """
-    ends, window = _phases(run)
-    matrix = evaluation_matrix(run.curves.success, run.curves.episodes, ends, window=window)
-    if np.isnan(np.diagonal(matrix, axis1=-2, axis2=-1)).any():
-        raise ValueError(
-            f"{run.directory} has no test of a task in the last {window} episodes of its phase: "
-            "let it be tested more often"
-        )
-    return matrix
-
-
-def since_best_unchanged(run: Run, draws: int = 400, rng: int = 0) -> Values:
-    """Return the `forgetting_since_best` to expect of policies that do not change, ``[S]``.
-
-    The best of several noisy means is higher than the last one, also where nothing is forgotten.
-    In this simulation, tests after a task's own phase succeed independently, each with the success
-    at the end of the phase, R[j, j] of `success_matrix`. Earlier tests are those of the run.
-
-    Args:
-        run: A run with tasks one after the other.
-        draws: Number of simulations, of which the mean is taken.
-        rng: Seed of the simulations.
-
-    Raises:
-        ValueError: If the run does not state its ``eval_episodes``, or as for `success_matrix`.
-    """
-    n_tests = run.config.get("eval_episodes")
-    if not isinstance(n_tests, int) or n_tests < 1:
-        raise ValueError(f"{run.directory / 'config.json'} has no eval_episodes")
-    random, learned = np.random.default_rng(rng), success_matrix(run)
-    simulated = np.repeat(run.curves.success[None], draws, 0)
-    for task, end in enumerate(_phases(run)[0]):
-        since = run.curves.episodes > end
-        rate = np.repeat(learned[:, task, task, None], since.sum(), 1)
-        successes = random.binomial(n_tests, rate, (draws, *rate.shape))
-        simulated[:, :, since, task] = successes / n_tests
-    return forgetting_since_best(trailing_mean(simulated, 3)).mean(0)
-
-
-def _phases(run: Run) -> tuple[list[int], int]:
-    """Return the last episode of each task's phase, and a fifth of the shortest, in episodes."""
-    ends = [*run.starts[1:], run.last]
-    lengths = [end - start for start, end in zip(run.starts, ends, strict=True)]
-    if min(lengths) <= 0:
-        raise ValueError(
-            f"{run.directory} starts its tasks at {run.starts}: only for tasks one after the other"
-        )
-    return ends, max(run.eval_every, min(lengths) // 5)
-
-
-def episodes_to_80(run: Run) -> float:
-    """Return the training episodes until overall success reaches 80 %, infinity if never."""
-    return overall_episodes_to(run.curves.success, run.curves.episodes)
-
-
-def own_episodes(run: Run, threshold: float = 0.5) -> Values | None:
-    """Return the training episodes of each task until a rate of them succeed, ``[S, T]``.
-
-    See `trials_to`; infinite where that was not reached. None if the run has no
-    ``train.csv``.
-    """
-    if not run.paths("train.csv"):
-        return None
-    table = run.table("train.csv", lambda path: read_table(path, TRAIN))
-    table = table.sort_values(["seed", "episode"])
-    table = table[table["episode"] <= run.last]
-    if table.empty:
-        return None
-    times = table.groupby(["seed", "task"])["success"].agg(trials_to, threshold)
-    found = _by_seed_and_task(times, run)
-    return np.where(np.isnan(found), np.inf, found)
-
-
 def success_steps(run: Run) -> Values:
     """Return the mean steps of the successful tests in the last 10 % of training, ``[S, T]``.
 
     NaN for tasks without a success, and in runs without the steps of tests.
-
-    Raises:
-        ValueError: If ``eval.csv`` is missing or damaged.
     """
-    tests = run.table("eval.csv", read_tests)
-    late = in_window(tests["episode"], run.last, late_window(run))
-    won = tests[late & (tests["success"] == 1)]
-    return _by_seed_and_task(won.groupby(["seed", "task"])["steps"].mean(), run)
+    late = _in_window(run.tests["episode"], run.last, late_window(run))
+    won = run.tests[late & (run.tests["success"] == 1)]
+    return run.by_seed_and_task(won.groupby(["seed", "task"])["steps"].mean())
 
 
 def demonstrated_steps(run: Run) -> Values:
     """Return the mean steps of the demonstrations of each task, ``[T]``; NaN where unknown."""
     steps = run.summary.get("demonstrated_steps") or {}
     return np.array([steps.get(task, np.nan) for task in run.tasks], float)
-
-
-def _by_seed_and_task(values: pd.Series, run: Run) -> Values:
-    """Return values by seed and task as an array ``[S, T]``; NaN where there are none."""
-    every = pd.MultiIndex.from_product([run.curves.seeds, run.tasks], names=["seed", "task"])
-    return values.reindex(every).to_numpy(float).reshape(len(run.curves.seeds), len(run.tasks))
 
 
 def final_means(run: Run, kind: str, column: str) -> Values | None:
@@ -344,18 +271,17 @@ def final_means(run: Run, kind: str, column: str) -> Values | None:
         column: ``success``, ``steps`` (NaN for tasks without a success) or ``task_inference``.
 
     Raises:
-        ValueError: If the file is damaged, or lacks tests of a seed and task.
+        ValueError: If the file lacks tests of a seed and task.
     """
-    if not run.paths("final.csv"):
+    if run.final is None:
         return None
-    tests = run.table("final.csv", read_final_tests)
-    found = tests[tests["demonstrations"] == kind].groupby(["seed", "task"])
-    if np.isnan(_by_seed_and_task(found.size(), run)).any():
+    found = run.final[run.final["demonstrations"] == kind].groupby(["seed", "task"])
+    if np.isnan(run.by_seed_and_task(found.size())).any():
         raise ValueError(
             f"{run.directory / 'final.csv'} lacks tests with {kind} demonstrations: remove it and "
             "resume the run"
         )
-    values = _by_seed_and_task(found[column].mean(), run)
+    values = run.by_seed_and_task(found[column].mean())
     return None if np.isnan(values).all() else values
 
 
@@ -394,8 +320,9 @@ def forward_transfer(run: Run, reference: Run) -> Estimate | None:
     gained = contrast(
         [(ours / left).mean(-1), (theirs * (1 - area) / left**2).mean(-1)], [1.0, -1.0]
     )
-    value = float(((area - height) / left).mean())
-    return replace(gained, value=value).interval()
+    # Not the difference of the contributions, but it has their interval.
+    shift = float(((area - height) / left).mean()) - gained.value
+    return Estimate(*(bound + shift for bound in gained))
 
 
 def own_areas(run: Run, reference: Run) -> tuple[Values, Values]:
@@ -421,9 +348,9 @@ def own_areas(run: Run, reference: Run) -> tuple[Values, Values]:
 
 def _own_curves(run: Run, task: int) -> tuple[Values, Values]:
     """Return a task's expected own episodes at its tests, ``[E]``, and the curves, ``[S, E]``."""
-    own = _own_episodes(run, task, run.curves.episodes)
+    own = _own_episodes(run, task, run.episodes)
     played = np.diff(own, prepend=0.0) > 0
-    return own[played], run.curves.success[:, played, task]
+    return own[played], run.success[:, played, task]
 
 
 def _own_episodes(run: Run, task: int, episodes: ArrayLike) -> Values:

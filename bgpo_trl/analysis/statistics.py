@@ -53,29 +53,13 @@ class Estimate(NamedTuple):
         return f" [{low:{sign}.0f}, {high:{sign}.0f}]"
 
 
-@dataclass(frozen=True)
-class Contrast:
-    """A weighted sum of the means of independent samples, and its sampling distribution."""
+def contrast(
+    samples: Sequence[ArrayLike], weights: Sequence[float], confidence: float = 0.95
+) -> Estimate:
+    """Return the sum of ``weights`` times the means of independent samples, with its t interval.
 
-    value: float
-    error: float
-    """Standard error; NaN if a sample has a single score."""
-    freedom: float
-    """Degrees of freedom of Welch and Satterthwaite."""
-
-    def interval(self, confidence: float = 0.95) -> Estimate:
-        """Return the value with its t interval."""
-        if not 0 < confidence < 1:
-            raise ValueError(f"confidence must be between 0 and 1, got {confidence}")
-        # Without any spread, the degrees of freedom are 0 / 0 and the interval is a point.
-        half = self.error and self.error * float(stats.t.ppf((1 + confidence) / 2, self.freedom))
-        return Estimate(self.value, self.value - half, self.value + half)
-
-
-def contrast(samples: Sequence[ArrayLike], weights: Sequence[float]) -> Contrast:
-    """Return the sum of ``weights`` times the means of independent samples, each ``[S]``.
-
-    Weights (1,) make a mean, (1, -1) a difference, (1, -1, -1, 1) a difference of differences.
+    Weights (1,) make a mean, (1, -1) a difference, (1, -1, -1, 1) a difference of differences. The
+    degrees of freedom are by Welch and Satterthwaite. Samples are ``[S]`` each.
 
     Raises:
         ValueError: If a sample is empty, not finite or not a vector.
@@ -87,11 +71,13 @@ def contrast(samples: Sequence[ArrayLike], weights: Sequence[float]) -> Contrast
         spread = sample.var(ddof=1) if len(sample) > 1 else math.nan
         variances.append(weight**2 * spread / len(sample))
         freedoms.append(len(sample) - 1)
-    total = sum(variances)
+    error = math.sqrt(sum(variances))
     with np.errstate(divide="ignore", invalid="ignore"):
         shares = np.square(variances) / freedoms
-        freedom = float(np.float64(total) ** 2 / shares.sum())
-    return Contrast(float(value), math.sqrt(total), freedom)
+        freedom = float(np.float64(sum(variances)) ** 2 / shares.sum())
+    # Without any spread, the degrees of freedom are 0 / 0 and the interval is a point.
+    half = error and error * float(stats.t.ppf((1 + confidence) / 2, freedom))
+    return Estimate(float(value), float(value) - half, float(value) + half)
 
 
 def mean(scores: ArrayLike) -> Estimate:
@@ -100,7 +86,7 @@ def mean(scores: ArrayLike) -> Estimate:
     Raises:
         ValueError: As for `contrast`.
     """
-    return contrast([scores], [1.0]).interval()
+    return contrast([scores], [1.0])
 
 
 @dataclass(frozen=True)
@@ -153,9 +139,9 @@ def difference(*samples: ArrayLike) -> Difference:
     """
     if len(samples) not in (2, 4):
         raise ValueError(f"a difference is of two runs or two pairs, not of {len(samples)}")
-    found = contrast(samples, _SIGNS[: len(samples)])
+    wide, narrow = (contrast(samples, _SIGNS[: len(samples)], share) for share in (0.95, 0.9))
     p = permutation_p(samples[0], samples[1]) if len(samples) == 2 else math.nan
-    return Difference(found.interval(), found.interval(0.9), p, seeds_needed(*samples))
+    return Difference(wide, narrow, p, seeds_needed(*samples))
 
 
 def permutation_p(first: ArrayLike, second: ArrayLike, rng: int | np.random.Generator = 0) -> float:

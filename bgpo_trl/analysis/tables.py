@@ -1,14 +1,19 @@
-"""Tables of a comparison: success, differences, forgetting and transfer, learning times, groups."""
+"""Sections of a report: success, differences, forgetting and transfer, learning times, groups.
+
+A function of a section returns a list, which is empty where no run has what the section is about.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
 from itertools import combinations, product
+from pathlib import Path
 
 import numpy as np
 
 from bgpo_trl.analysis import statistics
-from bgpo_trl.analysis.comparison import NAMES, Run, Setting
+from bgpo_trl.analysis.comparison import NAMES, Setting
 from bgpo_trl.analysis.scores import (
     Values,
     area_scores,
@@ -25,46 +30,25 @@ from bgpo_trl.analysis.scores import (
     success_matrix,
     success_steps,
     times_the_first,
-    trailing_mean,
 )
-from bgpo_trl.runs.cost import Cost, read_costs, total_cost
+from bgpo_trl.runs.results import Run
 
 Table = list[list[str]]
 """Rows of cells; the first row holds the column names."""
 
-SUCCESS_NOTES = (
-    "The seed is the unit: its score is the mean over tasks of the success in tests over the last "
-    "10 % of training, its area the mean height of the tasks' curves of test success since they "
-    "were presented. Given are means over seeds and 95 % intervals (Student's t), in percent.",
-    "Worst task: that with the lowest mean. Steps: of the successful tests among these, and of the "
-    "demonstrations; means over the tasks with a success. Episodes to 80 %: until the mean over "
-    "seeds and presented tasks of three tests.",
-)
-DIFFERENCE_NOTES = (
-    "Differences of the seeds' scores in points, with 95 % intervals (Welch's t). Above, below: "
-    "the interval excludes 0. Equivalent: the 90 % interval lies within "
-    f"+-{100 * statistics.MARGIN:.0f} points, a margin set beforehand. Else it is not decided; the "
-    f"number of seeds a run that decides it with a probability of {100 * statistics.POWER:.0f} % "
-    "follows from the difference and the spread of seeds as measured, which are uncertain.",
-    "p: permutation test of seeds, two-sided; the next column adjusts it for the number of rows "
-    "(Holm). Verdicts are not adjusted.",
-)
-SEQUENCE_NOTES = (
-    "Means over seeds and 95 % intervals, in points. R[i, j]: success on task j over the last "
-    "fifth of the phase of task i. Forgetting: mean over tasks of R[j, j] minus R at the end; "
-    "backward transfer: the negative, without the last task; since best: a task's best mean of "
-    "three tests minus its last; if unchanged: what that is on average, by the noise of tests "
-    "alone, for policies whose success stays at R[j, j].",
-    "Forward transfer: (area - reference) / (1 - reference), areas under a task's curve over its "
-    "own episodes, from the first to the last test of its phase; reference: the same algorithm "
-    "with all tasks from the start, whose seeds count in the interval.",
-)
-SPEED_NOTE = (
-    "Training episodes of a task's own until so many of its last 20 succeed: median over seeds, in "
-    "which a seed that never gets there counts as longest; then the same relative to the first "
-    "task, median of the seeds' ratios."
-)
-COST_NOTE = "Of all seeds together, without tests: time of a training step, and memory."
+
+@dataclass(frozen=True)
+class Section:
+    """Section of a report: title, notes, figures and a table."""
+
+    title: str
+    table: Table = field(default_factory=list)
+    """Omitted if empty."""
+    figures: dict[str, Path] = field(default_factory=dict)
+    """Paths by caption."""
+    notes: Sequence[str] = ()
+
+
 _CLAIM_VERDICTS = {"above": "reproduced", "below": "the opposite"}
 _MEASURES = {"success": late_scores, "area": area_scores}
 # Each BGPO with the baselines on the same terms (demonstrations, stabilizers).
@@ -92,8 +76,29 @@ _PAIRS = {
 }
 
 
-def success_table(setting: Setting) -> Table:
-    """Return the table of success of a setting's runs."""
+def success_section(setting: Setting) -> list[Section]:
+    """Return the conditions of a setting, and the success of its runs."""
+    first = setting.first
+    conditions = {name: first.config.get(name) for name in ("held_out", "eval_episodes")}
+    about = (
+        "Tasks: "
+        + ", ".join(
+            f"{number} {task} (from episode {start})"
+            for number, (task, start) in enumerate(first.presented.items(), 1)
+        )
+        + f". {first.last:,} episodes, tests every {first.eval_every}"
+        + "".join(f", {name} {value}" for name, value in conditions.items() if value is not None)
+        + "."
+    )
+    notes = (
+        "The seed is the unit: its score is the mean over tasks of the success in tests over the "
+        "last 10 % of training, its area the mean height of the tasks' curves of test success "
+        "since they were presented. Given are means over seeds and 95 % intervals (Student's t), "
+        "in percent.",
+        "Worst task: that with the lowest mean. Steps: of the successful tests among these, and of "
+        "the demonstrations; means over the tasks with a success. Episodes to 80 %: until the mean "
+        "over seeds and presented tasks of three tests.",
+    )
     numbers = range(1, len(setting.first.tasks) + 1)
     rows = [["", "knows of tasks", "seeds", "success", "worst task"]]
     rows[0] += [*(f"task {number}" for number in numbers), "steps", "demonstrated", "area"]
@@ -112,7 +117,7 @@ def success_table(setting: Setting) -> Table:
             reached = episodes_to_80(run)
             row += [f"{reached:.0f}" if np.isfinite(reached) else "not reached"]
         rows.append(row)
-    return rows
+    return [Section(setting.title, rows, notes=[about, *setting.notes, *notes])]
 
 
 def _task_means(steps: Values) -> Values:
@@ -132,8 +137,8 @@ def _knows(run: Run) -> str:
     return ", ".join(known) or ("nothing" if "needs_label" in run.summary else "?")
 
 
-def difference_table(setting: Setting) -> Table:
-    """Return the table of the differences from BGPO, or from the first run; empty for one run.
+def difference_section(setting: Setting) -> list[Section]:
+    """Return the differences from BGPO, or from the first run.
 
     With it come the pairs that differ in one part, or are on the same terms.
     """
@@ -166,11 +171,22 @@ def difference_table(setting: Setting) -> Table:
                 area.note,
             ]
         )
-    return rows if pairs else []
+    notes = (
+        "Differences of the seeds' scores in points, with 95 % intervals (Welch's t). Above, "
+        "below: the interval excludes 0. Equivalent: the 90 % interval lies within "
+        f"+-{100 * statistics.MARGIN:.0f} points, a margin set beforehand. Else it is not decided; "
+        "the number of seeds a run that decides it with a probability of "
+        f"{100 * statistics.POWER:.0f} % follows from the difference and the spread of seeds as "
+        "measured, which are uncertain.",
+        "p: permutation test of seeds, two-sided; the next column adjusts it for the number of "
+        "rows (Holm). Verdicts are not adjusted.",
+    )
+    title = f"Differences: {setting.title}"
+    return [Section(title, rows, notes=[*setting.notes, *notes])] if pairs else []
 
 
-def claims(continual: Setting | None, concurrent: Setting | None) -> tuple[Table, int]:
-    """Return the table of the paper's claims, and how many lack runs.
+def claims_section(continual: Setting | None, concurrent: Setting | None) -> list[Section]:
+    """Return the paper's claims, as far as there are runs for them.
 
     Args:
         continual: Runs with tasks one after the other, if there are any.
@@ -201,53 +217,77 @@ def claims(continual: Setting | None, concurrent: Setting | None) -> tuple[Table
     rows = [["the paper's claim", "tested", "measured", "difference", "found"]]
     for claim, tested, what, runs in tests:
         found = [setting.find(key) if setting else None for setting, key in runs]
-        scores = [_MEASURES[what](run).mean(1) for _, run in filter(None, found)]
+        scores = [_MEASURES[what](run).mean(1) for run in found if run is not None]
         if len(scores) == len(runs):
             difference = statistics.difference(*scores)
             verdict = _CLAIM_VERDICTS.get(difference.verdict, difference.note)
             rows.append([claim, tested, what, difference.estimate.points(), verdict])
+    there = [setting for setting in settings.values() if setting is not None]
     missing = len(tests) + 1 - len(rows)
-    return (rows if len(rows) > 1 else []), missing
+    notes = [note for setting in there for note in setting.notes]
+    notes += [f"{missing} further claims need runs that are not here."] if missing else []
+    title = f"The paper's claims, {len(there[0].first.tasks)} tasks"
+    return [Section(title, rows, notes=notes)] if len(rows) > 1 else []
 
 
-def sequence_table(setting: Setting, reference: Setting | None) -> Table:
-    """Return the table of forgetting and transfer in a setting with tasks one after the other.
+def sequence_section(setting: Setting, reference: Setting | None) -> list[Section]:
+    """Return forgetting and transfer in a setting with tasks one after the other.
 
     Args:
         setting: The setting.
         reference: That with all tasks from the start, for forward transfer.
+
+    Raises:
+        ValueError: If tasks are tested too rarely.
     """
     columns = ["forgetting", "since best", "if unchanged", "backward transfer", "forward transfer"]
     rows = [["", *columns]]
     for name, run in setting.runs.items():
         change = change_since_learned(success_matrix(run))
-        best = forgetting_since_best(trailing_mean(run.curves.success, 3))
+        best = forgetting_since_best(run.success)
         by_noise = "-"
         if run.config.get("eval_episodes"):
             by_noise = f"{100 * since_best_unchanged(run).mean():+.1f}"
         beside = reference.find(run.algorithm, run.changed) if reference is not None else None
-        forward = forward_transfer(run, beside[1]) if beside else None
+        forward = None if beside is None else forward_transfer(run, beside)
         forgetting, since_best, backward = (
             statistics.mean(scores).points()
             for scores in (-change.mean(1), best, change[:, :-1].mean(1))
         )
         cells = [forgetting, since_best, by_noise, backward, forward.points() if forward else "-"]
         rows.append([name, *cells])
-    return rows
+    notes = (
+        "Means over seeds and 95 % intervals, in points. R[i, j]: success on task j over the last "
+        "fifth of the phase of task i. Forgetting: mean over tasks of R[j, j] minus R at the end; "
+        "backward transfer: the negative, without the last task; since best: a task's best mean of "
+        "three tests minus its last; if unchanged: what that is on average, by the noise of tests "
+        "alone, for policies whose success stays at R[j, j].",
+        "Forward transfer: (area - reference) / (1 - reference), areas under a task's curve over "
+        "its own episodes, from the first to the last test of its phase; reference: the same "
+        "algorithm with all tasks from the start, whose seeds count in the interval.",
+    )
+    title = f"Forgetting and transfer: {setting.title}"
+    return [Section(title, rows, notes=[*setting.notes, *notes])]
 
 
-def speed_table(setting: Setting, share: float) -> Table:
-    """Return the table of learning times: each task's own training episodes to a success rate."""
+def speed_section(setting: Setting, share: float) -> list[Section]:
+    """Return learning times: each task's own training episodes to a success rate."""
+    note = (
+        "Training episodes of a task's own until so many of its last 20 succeed: median over "
+        "seeds, in which a seed that never gets there counts as longest; then the same relative to "
+        "the first task, median of the seeds' ratios."
+    )
     tasks = [f"task {number}" for number, _ in enumerate(setting.first.tasks, 1)]
     rows = [["", *tasks, *(f"{task} : {tasks[0]}" for task in tasks[1:])]]
     for name, run in setting.runs.items():
         episodes = own_episodes(run, share)
         if episodes is not None:
-            rows.append([name, *map(median_cell, episodes.T), *ratio_cells(episodes)])
-    return rows if len(rows) > 1 else []
+            rows.append([name, *map(_median_cell, episodes.T), *_ratio_cells(episodes)])
+    title = f"Own episodes to {100 * share:.0f} %: {setting.title}"
+    return [Section(title, rows, notes=[note])] if len(rows) > 1 else []
 
 
-def median_cell(episodes: Values) -> str:
+def _median_cell(episodes: Values) -> str:
     """Format the median of learning times ``[S]``, and the number of infinite ones."""
     never = int(np.isinf(episodes).sum())
     median = float(np.median(episodes))
@@ -255,7 +295,7 @@ def median_cell(episodes: Values) -> str:
     return f"{cell} ({never} of {len(episodes)} seeds never)" if never else cell
 
 
-def ratio_cells(episodes: Values) -> list[str]:
+def _ratio_cells(episodes: Values) -> list[str]:
     """Format learning times ``[S, T]`` as multiples of the first task's.
 
     Cells give the number of seeds if some never learned the first task.
@@ -268,8 +308,8 @@ def ratio_cells(episodes: Values) -> list[str]:
     ]
 
 
-def groups_table(setting: Setting) -> Table:
-    """Return the table of nodes, groups, purity and task inference; empty without GWR-B."""
+def groups_section(setting: Setting) -> list[Section]:
+    """Return nodes, groups, purity and task inference of the runs with GWR-B."""
     rows = [["", "groups", "purity, %", "tasks inferred, %", "by seed", "nodes of GWR-B"]]
     for name, run in setting.runs.items():
         if run.summary.get("nodes") is None:
@@ -287,36 +327,33 @@ def groups_table(setting: Setting) -> Table:
                 _numbers(run.summary["nodes"]),
             ]
         )
-    return rows if len(rows) > 1 else []
+    return [Section(f"GWR-B, by seed: {setting.title}", rows)] if len(rows) > 1 else []
 
 
-def cost_table(setting: Setting) -> Table:
-    """Return the table of the cost of training by the number of presented tasks, of all seeds.
-
-    Empty if no run has a ``cost.csv``.
-    """
-    costs = {name: of_run for name, run in setting.runs.items() if (of_run := _costs(run))}
-    numbers = sorted({tasks for of_run in costs.values() for tasks in of_run})
+def cost_section(setting: Setting) -> list[Section]:
+    """Return the cost of training by the number of presented tasks, of all seeds."""
+    note = "Of all seeds together, without tests: time of a training step, and memory."
+    costs = {
+        name: run.costs.groupby("tasks").sum()
+        for name, run in setting.runs.items()
+        if run.costs is not None and len(run.costs)
+    }
+    numbers = sorted({tasks for of_run in costs.values() for tasks in of_run.index})
     rows = [["", "hours", *(f"{number} task{'s' * (number > 1)}" for number in numbers)]]
     for name, of_run in costs.items():
-        hours = sum(cost.seconds for cost in of_run.values()) / 3600
-        cells = [_cost_cell(of_run.get(number)) for number in numbers]
-        rows.append([name, f"{hours:.1f}", *cells])
-    return rows if costs else []
+        seconds, megabytes = of_run["seconds"] / of_run["steps"], of_run["megabytes"]
+        cells = [
+            f"{1000 * seconds[number]:.1f} ms, {megabytes[number]:.0f} MB"
+            if number in of_run.index and of_run["steps"][number]
+            else "-"
+            for number in numbers
+        ]
+        rows.append([name, f"{of_run['seconds'].sum() / 3600:.1f}", *cells])
+    return [Section(f"Cost: {setting.title}", rows, notes=[note])] if costs else []
 
 
-def _cost_cell(cost: Cost | None) -> str:
-    if cost is None or not cost.steps:
-        return "-"
-    return f"{1000 * cost.seconds / cost.steps:.1f} ms, {cost.megabytes:.0f} MB"
-
-
-def _costs(run: Run) -> dict[int, Cost]:
-    return total_cost([read_costs(path) for path in run.paths("cost.csv")])
-
-
-def task_table(run: Run) -> Table:
-    """Return the table of a run, task by task."""
+def run_section(title: str, run: Run) -> Section:
+    """Return a run, task by task."""
     late, best, own = late_scores(run), best_scores(run), own_episodes(run)
     seen, held_out = (final_means(run, kind, "success") for kind in ("seen", "held-out"))
     inferred = final_means(run, "held-out", "task_inference")
@@ -338,7 +375,7 @@ def task_table(run: Run) -> Table:
                 statistics.mean(of_seeds).percent(),
                 _numbers((100 * of_seeds).tolist()),
                 "" if task is None else f"{100 * best[index]:.1f}",
-                "" if task is None or own is None else median_cell(own[:, index]),
+                "" if task is None or own is None else _median_cell(own[:, index]),
                 *(
                     "" if shares is None else f"{100 * shares[:, chosen].mean():.{digits}f}"
                     for shares, digits in ((seen, 1), (held_out, 1), (inferred, 2))
@@ -346,7 +383,8 @@ def task_table(run: Run) -> Table:
                 *("" if of_tasks is None else _mean_cell(of_tasks[chosen]) for of_tasks in steps),
             ]
         )
-    return rows
+    known = [f"`{run.summary[key]}`" for key in ("commit", "command") if run.summary.get(key)]
+    return Section(title, rows, notes=[", ".join(known)])
 
 
 def _numbers(values: Iterable[float], digits: int = 0) -> str:

@@ -85,14 +85,7 @@ def form(
 
 
 def groups(arguments: GroupsArguments) -> str:
-    """Measure the groups of behaviors that form from demonstrations, without learning a policy.
-
-    Shows demonstrations in the order of training episodes, in four schedules, and prints by seed:
-    how many groups there are at the end; how pure they are on held-out demonstrations; how many
-    different demonstrations of its own each task needed before it had a group (the most demanding
-    task); how long grouping took; the nodes of GWR-B, and in how many held-out demonstrations it
-    infers the task. Below the table are the tasks that share a group (`sharing`, of held-out
-    demonstrations), with the number of networks in which they do.
+    """Measure the groups of behaviors that form from demonstrations, as `GroupsArguments` says.
 
     Raises:
         ValueError: If there is nothing to draw, or a bank or task does not exist.

@@ -3,36 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+import torch
 
+from bgpo_trl.analysis.scores import final_means
 from bgpo_trl.analysis.task_inference import group_purity, task_inference_accuracy
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.evaluation import evaluate_random_policy
 from bgpo_trl.experiments.episodes import evaluator_of, snapshots_of
 from bgpo_trl.figures.frames import file_names, plot_frame_strips, save_gif
-from bgpo_trl.figures.groups import draw_groups
+from bgpo_trl.figures.groups import plot_groups
 from bgpo_trl.figures.gwr import draw_growth, draw_nodes
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.figures.success import plot_step_curves, plot_success_curves
 from bgpo_trl.files.progress import progress_bar
 from bgpo_trl.runs.provenance import command, write_table
-from bgpo_trl.runs.results import read_tests
+from bgpo_trl.runs.results import COLUMNS, read_run
 from bgpo_trl.scenes import find_scene
 from bgpo_trl.training import Trainer
 
 # Number of the evaluation after training; it seeds start states that training never tested.
 _LAST = 2**31
-FINAL_COLUMNS = (
-    *("seed", "demonstrations", "task", "episodes", "success", "steps", "task_inference"),
-)
-"""Columns of ``final.csv``, one row per seed, kind of demonstrations and task. ``steps`` is the
-mean length of the successful tests, empty without one."""
-
-_Row = tuple[int, str, str, int, float, float | str, float | str]
 
 
 def measure(
@@ -52,8 +48,7 @@ def measure(
         Entries of ``summary.json``.
     """
     algorithm, config = trainer.algorithm, trainer.config
-    gwr, rows = algorithm.gwr, _final_tests(trainer, bank, episodes=episodes)
-    tests = pd.DataFrame(rows, columns=pd.Index(FINAL_COLUMNS))
+    gwr, tests = algorithm.gwr, _final_tests(trainer, bank, episodes=episodes)
     write_table(out / "final.csv", tests)
     trainer.dashboard.log_final(tests[tests["demonstrations"] == "held-out"], config.episodes)
     random_success = evaluate_random_policy(
@@ -95,10 +90,10 @@ def demonstrated_steps(bank: DemonstrationBank) -> dict[str, float]:
     return {name: float(k.double().mean()) - 1 for name, k in kept.items() if len(k)}
 
 
-def _final_tests(trainer: Trainer, bank: DemonstrationBank, *, episodes: int) -> list[_Row]:
+def _final_tests(trainer: Trainer, bank: DemonstrationBank, *, episodes: int) -> pd.DataFrame:
     """Return the rows of ``final.csv``, after as many test episodes of each task and kind."""
     algorithm, config, seen = trainer.algorithm, trainer.config, bank.seen()
-    gwr, rows = algorithm.gwr, list[_Row]()
+    gwr, rows = algorithm.gwr, []
     n_steps = config.algorithm.max_steps + 1
     bar = progress_bar("final tests", shown=trainer.progress, total=2 * n_steps, unit="step")
     for half, (kind, tested) in enumerate(
@@ -112,17 +107,17 @@ def _final_tests(trainer: Trainer, bank: DemonstrationBank, *, episodes: int) ->
         bar.update(half * n_steps - bar.n)  # episodes may all end earlier
         for task, name in enumerate(config.tasks):
             of_task = tested.of_task(task)
-            inferred: list[float | str] = [""] * len(config.seeds)
+            inferred = torch.full((len(config.seeds),), torch.nan)
             if gwr is not None:
-                accuracy = task_inference_accuracy(gwr, seen, of_task, len(config.tasks))
-                inferred = [round(share, 4) for share in accuracy.tolist()]
+                inferred = task_inference_accuracy(gwr, seen, of_task, len(config.tasks))
             for index, seed in enumerate(config.seeds):
                 won = success[index, task]
-                share, of_won = won.float().mean().item(), result.steps[index, task][won].double()
-                steps = round(of_won.mean().item(), 2) if len(of_won) else ""
-                rows.append((seed, kind, name, episodes, round(share, 4), steps, inferred[index]))
+                steps = result.steps[index, task][won].double().mean()  # NaN without a success
+                means = ((won.float().mean(), 4), (steps, 2), (inferred[index], 4))
+                cells = (round(float(mean), digits) for mean, digits in means)
+                rows.append((seed, kind, name, episodes, *cells))
     bar.close()
-    return rows
+    return pd.DataFrame(rows, columns=pd.Index([*COLUMNS["final.csv"]]))
 
 
 def draw(
@@ -140,42 +135,26 @@ def draw(
         Lines about GWR-B, its task inference and its groups.
     """
     config, lines = trainer.config, list[str]()
-    presented = dict(zip(config.tasks, config.task_starts, strict=True))
-    figure = plot_success_curves(
-        out / "eval.csv", presented=presented, random_success=summary["random_success"]
-    )
-    save_figure(figure, out / "figures" / "success.png")
-    if (read_tests(out / "eval.csv")["success"] == 1).any():
-        figure = plot_step_curves(
-            out / "eval.csv", presented=presented, demonstrated=summary["demonstrated_steps"]
-        )
-        save_figure(figure, out / "figures" / "steps.png")
+    run = replace(read_run(out), summary=dict(summary))
+    save_figure(plot_success_curves({config.name: run}), out / "figures" / "success.png")
+    if (run.tests["success"] == 1).any():
+        save_figure(plot_step_curves({config.name: run}), out / "figures" / "steps.png")
     episodes = record_episodes(trainer, bank)
     save_figure(plot_frame_strips(episodes), out / "figures" / "episodes.png")
     for name, frames in zip(file_names(config.tasks), episodes.values(), strict=True):
         save_gif(frames, out / "figures" / f"{name}.gif", fps=find_scene(config.scene).rate or 5.0)
-    gwr = trainer.algorithm.gwr
-    if gwr is not None:
+    if summary["nodes"] is not None:
         draw_nodes(out, trainer.algorithm, bank, config.tasks)
-        accuracy = task_inference_accuracy(
-            gwr, bank.seen(), bank.held_out(config.held_out), len(config.tasks)
-        )
         draw_growth(out, config, bank)
-        lines.append(f"GWR-B nodes: {gwr.num_nodes.tolist()}")
-        lines.append(f"task inference on held-out demonstrations: {accuracy.mean():.1%}")
-    if trainer.algorithm.groups:
-        draw_groups(out, presented, out / "figures" / "groups.png")
-        numbers = [len(groups.numbers) for groups in trainer.algorithm.groups]
-        held_out = bank.held_out(config.held_out)
-        purity = np.mean(
-            [
-                group_purity(groups, held_out, len(config.tasks))
-                for groups in trainer.algorithm.groups
-            ]
-        )
+        inferred = np.asarray(final_means(run, "held-out", "task_inference"))
+        lines.append(f"GWR-B nodes: {summary['nodes']}")
+        lines.append(f"task inference on held-out demonstrations: {inferred.mean():.1%}")
+    if summary["groups"] is not None:
+        save_figure(plot_groups(run), out / "figures" / "groups.png")
+        purity = np.mean(summary["group_purity"])
         lines.append(
-            f"groups of behaviors: {numbers}, {purity:.1%} of held-out demonstrations in a "
-            "group of their task"
+            f"groups of behaviors: {summary['groups']}, {purity:.1%} of held-out demonstrations in "
+            "a group of their task"
         )
     return lines
 

@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from bgpo_trl.analysis import statistics
 from bgpo_trl.analysis.comparison import (
-    Run,
     Setting,
     differing_conditions,
-    joined,
-    read_run,
     read_settings,
     reference_of,
-    run_directories,
     under_equal_conditions,
 )
 from bgpo_trl.analysis.scores import (
@@ -29,24 +24,20 @@ from bgpo_trl.analysis.scores import (
     success_steps,
 )
 from bgpo_trl.analysis.tables import (
-    COST_NOTE,
-    DIFFERENCE_NOTES,
-    SEQUENCE_NOTES,
-    SPEED_NOTE,
-    SUCCESS_NOTES,
+    Section,
     Table,
-    claims,
-    cost_table,
-    difference_table,
-    groups_table,
+    claims_section,
+    cost_section,
+    difference_section,
+    groups_section,
     markdown,
-    sequence_table,
-    speed_table,
-    success_table,
-    task_table,
+    run_section,
+    sequence_section,
+    speed_section,
+    success_section,
 )
 from bgpo_trl.experiments.arguments import ReportArguments
-from bgpo_trl.figures.groups import draw_groups, plot_counts, read_counts
+from bgpo_trl.figures.groups import plot_counts, plot_groups
 from bgpo_trl.figures.gwr import plot_gwr_pca
 from bgpo_trl.figures.style import COLORS, save_figure
 from bgpo_trl.figures.success import (
@@ -55,29 +46,20 @@ from bgpo_trl.figures.success import (
     plot_success_matrices,
 )
 from bgpo_trl.files.writing import make_folder, without_folders, write_whole
-from bgpo_trl.runs.results import archive_run, find_table, read_table
+from bgpo_trl.runs.results import (
+    Run,
+    archive_run,
+    find_table,
+    joined,
+    read_run,
+    read_table,
+    run_directories,
+)
 
 # For a screen: figures of results are kept under version control.
 _DPI = 150
 # Curves that can be distinguished in one figure.
 _CURVES = len(COLORS)
-
-
-@dataclass(frozen=True)
-class Section:
-    """Section of the report: title, notes, figures and a table."""
-
-    title: str
-    table: Table = field(default_factory=list)
-    """Rows of cells, the first with the column names; omitted if empty."""
-    figures: dict[str, Path] = field(default_factory=dict)
-    """Paths by caption."""
-    notes: list[str] = field(default_factory=list)
-
-
-def presented(run: Run) -> dict[str, int]:
-    """Return the training episode from which each task of a run is presented."""
-    return dict(zip(run.tasks, run.starts, strict=True))
 
 
 def draw_curves(setting: Setting, out: Path) -> dict[str, Path]:
@@ -86,22 +68,14 @@ def draw_curves(setting: Setting, out: Path) -> dict[str, Path]:
     for start in range(0, len(setting.runs), _CURVES):
         runs = dict(list(setting.runs.items())[start : start + _CURVES])
         part = f"-{1 + start // _CURVES}" if start else ""
-        first, names = next(iter(runs.values())), ", ".join(runs)
-        shown: dict[str, Any] = {
-            "presented": presented(first),
-            "window": 3 * first.eval_every,
-            "last": first.last,
-        }
+        window = 3 * next(iter(runs.values())).eval_every
         path = out / f"{setting.slug}{part}.png"
-        tests = {name: run.paths("eval.csv") for name, run in runs.items()}
-        random = first.summary.get("random_success")
-        save_figure(plot_success_curves(tests, random_success=random, **shown), path, _DPI)
-        figures[f"mean and one standard deviation over seeds: {names}"] = path
-        solving = {n: tests[n] for n, run in runs.items() if np.isfinite(success_steps(run)).any()}
+        save_figure(plot_success_curves(runs, window=window), path, _DPI)
+        figures[f"mean and one standard deviation over seeds: {', '.join(runs)}"] = path
+        solving = {n: run for n, run in runs.items() if np.isfinite(success_steps(run)).any()}
         if solving:
             path = out / f"{setting.slug}-steps{part}.png"
-            steps = first.summary.get("demonstrated_steps")
-            save_figure(plot_step_curves(solving, demonstrated=steps, **shown), path, _DPI)
+            save_figure(plot_step_curves(solving, window=window), path, _DPI)
             figures[f"steps of a success, shown likewise: {', '.join(solving)}"] = path
     return figures
 
@@ -116,19 +90,15 @@ def draw_sequence(setting: Setting, out: Path) -> dict[str, Path]:
 
 def draw_counts(setting: Setting, out: Path) -> dict[str, Path]:
     """Draw the numbers of nodes and groups over training; paths by caption, none without GWR-B."""
-    counts = {}
-    for name, run in setting.runs.items():
-        parts = [read_counts(path, run.last) for path in run.paths("train.csv")]
-        if parts and run.summary.get("nodes") is not None:
-            last = min(part["num_nodes"].shape[1] for part in parts)
-            counts[name] = {
-                column: np.concatenate([part[column][:, :last] for part in parts])
-                for column in parts[0]
-            }
-    if not counts:
+    runs = {
+        name: run
+        for name, run in setting.runs.items()
+        if run.training is not None and run.summary.get("nodes") is not None
+    }
+    if not runs:
         return {}
     path = out / f"{setting.slug}-counts.png"
-    save_figure(plot_counts(counts, presented(setting.first)), path, _DPI)
+    save_figure(plot_counts(runs), path, _DPI)
     return {"nodes and groups: mean over seeds, from the lowest to the highest seed": path}
 
 
@@ -150,60 +120,32 @@ def draw_nodes(run: Run, path: Path) -> Table:
 
 def setting_sections(setting: Setting, reference: Setting | None, out: Path) -> list[Section]:
     """Return the sections of a setting and draw its figures."""
-    first, title = setting.first, setting.title
-    conditions = {name: first.config.get(name) for name in ("held_out", "eval_episodes")}
-    about = [
-        "Tasks: "
-        + ", ".join(
-            f"{number} {task} (from episode {start})"
-            for number, (task, start) in enumerate(presented(first).items(), 1)
-        )
-        + f". {first.last:,} episodes, tests every {first.eval_every}"
-        + "".join(f", {name} {value}" for name, value in conditions.items() if value is not None)
-        + "."
-    ]
-    sections = [
-        Section(
-            title,
-            success_table(setting),
-            draw_curves(setting, out),
-            [*about, *setting.notes, *SUCCESS_NOTES],
-        )
-    ]
-    table = difference_table(setting)
-    if table:
-        sections.append(
-            Section(f"Differences: {title}", table, notes=[*setting.notes, *DIFFERENCE_NOTES])
-        )
+    sections = _drawn(success_section(setting), lambda: draw_curves(setting, out))
+    sections += difference_section(setting)
     if setting.in_sequence:
-        name = f"Forgetting and transfer: {title}"
         try:
-            table, figures = sequence_table(setting, reference), draw_sequence(setting, out)
-            sections.append(Section(name, table, figures, [*setting.notes, *SEQUENCE_NOTES]))
+            found = sequence_section(setting, reference)
+            sections += _drawn(found, lambda: draw_sequence(setting, out))
         except ValueError as error:  # tested too rarely
-            sections.append(Section(name, notes=[str(error)]))
+            title = f"Forgetting and transfer: {setting.title}"
+            sections.append(Section(title, notes=[str(error)]))
     for share in (0.5, 0.8):
-        table = speed_table(setting, share)
-        if table:
-            name = f"Own episodes to {share:.0%}: {title}".replace("%", " %")
-            sections.append(Section(name, table, notes=[SPEED_NOTE]))
-    table = groups_table(setting)
-    if table:
-        sections.append(Section(f"GWR-B, by seed: {title}", table, draw_counts(setting, out)))
-    for name, run in setting.runs.items():
-        if find_table(run.directory / "gwr.csv"):
-            path = out / f"{setting.slug}-nodes.png"
-            table = draw_nodes(run, path)
-            caption = f"{name}, first seed: first two principal components"
-            sections.append(Section(f"Nodes of GWR-B: {title}", table, {caption: path}))
-            break
-    table = cost_table(setting)
-    if table:
-        sections.append(Section(f"Cost: {title}", table, notes=[COST_NOTE]))
-    for name, run in setting.runs.items():
-        notes = [f"`{run.summary[key]}`" for key in ("commit", "command") if run.summary.get(key)]
-        sections.append(Section(f"{name}: {title}", task_table(run), notes=[", ".join(notes)]))
+        sections += speed_section(setting, share)
+    sections += _drawn(groups_section(setting), lambda: draw_counts(setting, out))
+    with_nodes = [n for n, run in setting.runs.items() if find_table(run.directory / "gwr.csv")]
+    for name in with_nodes[:1]:
+        path = out / f"{setting.slug}-nodes.png"
+        table = draw_nodes(setting.runs[name], path)
+        figures = {f"{name}, first seed: first two principal components": path}
+        sections.append(Section(f"Nodes of GWR-B: {setting.title}", table, figures))
+    sections += cost_section(setting)
+    sections += [run_section(f"{n}: {setting.title}", run) for n, run in setting.runs.items()]
     return sections
+
+
+def _drawn(sections: list[Section], draw: Callable[[], dict[str, Path]]) -> list[Section]:
+    """Return sections with the figures that are drawn for them."""
+    return [replace(section, figures=draw()) for section in sections]
 
 
 def make_report(
@@ -219,7 +161,7 @@ def make_report(
     # All that may be refused comes before the first file.
     for setting in settings:
         for run in setting.runs.values():
-            task_table(run)
+            run_section("", run)
     make_folder(out)
     sections = [Section("Left out", notes=[left_out])] if left_out else []
     for setting, reference in zip(settings, references, strict=True):
@@ -230,14 +172,7 @@ def make_report(
     paired = [reference for _, reference in pairs]
     pairs += [(None, s) for s in settings if s.from_start and s not in paired]
     for continual, concurrent in pairs:
-        table, missing = claims(continual, concurrent)
-        some = continual or concurrent
-        if table and some is not None:
-            number = len(some.first.tasks)
-            about = [note for each in (continual, concurrent) if each for note in each.notes]
-            if missing:
-                about.append(f"{missing} further claims need runs that are not here.")
-            sections.append(Section(f"The paper's claims, {number} tasks", table, notes=about))
+        sections += claims_section(continual, concurrent)
     runs = [run for setting in settings for run in setting.runs.values()]
     return sections, {directory: run for run in runs for directory in run.directories}
 
@@ -260,13 +195,7 @@ def text_of(sections: Sequence[Section], out: Path) -> str:
 
 
 def report(arguments: ReportArguments) -> str:
-    """Write tables and figures of runs: those in a folder, or single ones, of any algorithms.
-
-    Prints and writes tables.md: success, differences between algorithms, forgetting and transfer,
-    learning times, groups of behaviors, cost, each run task by task, and the paper's claims as far
-    as there are runs for them; beside it, figures. The report of a single run is written into its
-    directory. With --archive, first copies what reports read of the runs, compressed, and writes
-    the report beside the copies. docs/benchmark.md defines the measures.
+    """Write the report that `ReportArguments` describes; return its tables.
 
     Raises:
         ValueError: If a run is damaged, none is finished, or conditions differ.
@@ -293,7 +222,7 @@ def report(arguments: ReportArguments) -> str:
     for directory in directories if directories == named else ():
         run = runs.get(directory)
         if run is not None and max(run.summary.get("groups") or [0]) > 1:
-            draw_groups(directory, presented(run), out / f"{directory.name}-groups.png")
+            save_figure(plot_groups(run), out / f"{directory.name}-groups.png")
     text = text_of(sections, out)
     write_whole(out / "tables.md", text)
     return text
@@ -334,10 +263,7 @@ def compare(paths: Sequence[Path], *, every: int | None = None, anyway: bool = F
     rows: Table = [["episodes", "task", "first", "second", "second - first", "p", "found"]]
     part = last + 1 if every is None else every
     for end in range(part, last + 1, part):
-        matrices = [
-            evaluation_matrix(run.curves.success, run.curves.episodes, [end], window=part)
-            for run in runs
-        ]
+        matrices = [evaluation_matrix(run, [end], window=part) for run in runs]
         rows += _differences(f"to {end}", first.tasks, *(matrix[:, 0] for matrix in matrices))
     rows += _differences("last 10 %", first.tasks, *map(late_scores, runs))
     return "\n\n".join([*notes, markdown(rows)])

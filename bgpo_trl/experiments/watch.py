@@ -20,8 +20,6 @@ from bgpo_trl.plugins import import_plugin
 from bgpo_trl.policy import TrainedPolicy, load_run
 from bgpo_trl.scenes import Scene, Simulation, find_scene
 
-__all__ = ["Episode", "WatchArguments", "compose", "demonstrate", "play", "watch"]
-
 _HEIGHT = 128  # (pixels) of each picture
 _BORDER, _CAPTION, _GAP = 4, 18, 8
 _COLORS = {None: "#999999", True: "#009E73", False: "#D55E00"}
@@ -157,12 +155,7 @@ def _draw(
 
 
 def watch(arguments: WatchArguments) -> str:
-    """Film the trained policies of a run beside new demonstrations that they are shown.
-
-    Writes film.gif, and its frames as a strip film.png, into the run's figures/: for each task the
-    demonstration, the policy's observations and a view of the robot, framed green on success and
-    red on timeout. NICO starts from the same scene in every task, so only the demonstration makes
-    the difference. If the run saved graphs, also writes gwr_growth.png, the growth of GWR-B.
+    """Make the film that `WatchArguments` describes; return how the episodes ended.
 
     Raises:
         ValueError: If the directory holds no run that can be loaded, or the run has no such seed.

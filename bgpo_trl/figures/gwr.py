@@ -17,11 +17,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from bgpo_trl.figures.style import MARKERS, add_legend, save_figure, style_axes, task_markers
 from bgpo_trl.files.writing import write_whole
-from bgpo_trl.runs.results import COUNT, read_table
+from bgpo_trl.runs.results import read_table
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from bgpo_trl.algorithms import Algorithm
     from bgpo_trl.configs import RunConfig
     from bgpo_trl.data.bank import DemonstrationBank
@@ -254,11 +252,12 @@ def draw_growth(
         presented = TaskSchedule(config.task_starts).presented(torch.tensor(episode))
         tasks = majority_task(match_counts(gwr, bank.seen(), n_tasks) * presented)
         graphs[episode] = (gwr.graph().weights, gwr.graph().edges, tasks)
-    path = run / "train.csv"
-    table = read_table(path, {"seed": COUNT, "num_nodes": COUNT})
+    table = read_table(run / "train.csv")
     nodes = {seed: of_seed.tolist() for seed, of_seed in table.groupby("seed")["num_nodes"]}
     if nodes.keys() != set(config.seeds):
-        raise ValueError(f"{path} does not have the seeds of the run: resume it, or name another")
+        raise ValueError(
+            f"{run / 'train.csv'} does not have the seeds of the run: resume it, or name another"
+        )
     figure = plot_gwr_growth(graphs, [nodes[seed] for seed in config.seeds], config.tasks)
     save_figure(figure, (out or run / "figures") / "gwr_growth.png")
     return True
@@ -269,7 +268,8 @@ def draw_nodes(
 ) -> None:
     """Write the nodes of the first seed's GWR-B to ``gwr.csv`` and draw them (Fig. 7).
 
-    The bank defines the nodes' majority tasks. Without GWR-B, nothing is written.
+    A row is a node: its majority task (-1 for none), its group, if there are groups, and its
+    weights. The bank defines the nodes' majority tasks. Without GWR-B, nothing is written.
     """
     from bgpo_trl.analysis.task_inference import majority_task, match_counts
 
@@ -280,14 +280,10 @@ def draw_nodes(
     node_tasks = node_tasks[: len(weights)]
     if algorithm.groups:
         groups = algorithm.groups[0].lookup(weights).group
-    write_nodes(run / "gwr.csv", weights, node_tasks, groups)
-    save_figure(plot_gwr_pca(weights, node_tasks, tasks, groups), run / "figures" / "gwr.png")
-
-
-def write_nodes(path: Path, weights: Tensor, tasks: Tensor, groups: Tensor | None = None) -> None:
-    """Write nodes ``[N]`` as CSV: majority task (-1: none), group if given, weights ``[N, d]``."""
     table = pd.DataFrame(weights.numpy()).add_prefix("w")
     if groups is not None:
         table.insert(0, "group", groups.numpy())
-    table.insert(0, "task", tasks.numpy())
-    write_whole(path, table.to_csv(index=False, float_format="%.6g", lineterminator="\r\n"))
+    table.insert(0, "task", node_tasks.numpy())
+    text = table.to_csv(index=False, float_format="%.6g", lineterminator="\r\n")
+    write_whole(run / "gwr.csv", text)
+    save_figure(plot_gwr_pca(weights, node_tasks, tasks, groups), run / "figures" / "gwr.png")

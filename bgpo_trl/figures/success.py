@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -13,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from bgpo_trl.figures.style import (
     COLORS,
@@ -23,23 +22,14 @@ from bgpo_trl.figures.style import (
     readable,
     style_axes,
 )
-from bgpo_trl.runs.results import read_tests
+from bgpo_trl.runs.results import Run
 
 _DOTTED: dict[str, Any] = {"color": "0.35", "linestyle": ":", "linewidth": 1.2}
 _GRID_POINTS = 400
 _OVERALL = "All presented tasks"
 
-_Path = str | os.PathLike[str]
 
-
-def plot_success_curves(
-    eval_csv: _Path | Mapping[str, _Path | Sequence[_Path]],
-    *,
-    presented: Mapping[str, int] | None = None,
-    random_success: Mapping[str, float] | None = None,
-    window: int | None = None,
-    last: int | None = None,
-) -> Figure:
+def plot_success_curves(runs: Mapping[str, Run], *, window: int | None = None) -> Figure:
     """Plot success against training episodes, in one panel for all tasks and one for each.
 
     A seed's curve at episode e is its share of successes among the test episodes after training
@@ -47,27 +37,17 @@ def plot_success_curves(
     means over seeds with a test episode in the window, shaded by one standard deviation
     (``ddof=0``), as in the paper.
 
+    Dashed lines mark the presentation of later tasks. Dotted lines mark the success of random
+    actions, if the summary of the first run has it.
+
     Args:
-        eval_csv: An ``eval.csv`` file, which may hold several algorithms and seeds; or the file or
-            files of each run, by legend name.
-        presented: Training episode from which each task is presented, by task name, in the order of
-            the panels. Starts after the first are marked with dashed lines.
-        random_success: Success rate of a random policy by task, marked with dotted lines.
+        runs: Runs of the same tasks, by legend name.
         window: Length of the trailing mean in training episodes; 5 % of the training if ``None``.
-        last: Training episode at which the curves end; by default that of the longest.
 
     Raises:
-        ValueError: If a file is not an ``eval.csv``, there are no test episodes, or the window is
-            not positive.
+        ValueError: If there are no runs, or the window is not positive.
     """
-    figure, window = _plot_curves(
-        _read_tests(eval_csv),
-        "success",
-        presented or {},
-        (random_success or {}, "random policy"),
-        window,
-        last,
-    )
+    figure, window, _ = _plot_curves(runs, "success", "random_success", "random policy", window)
     figure.supxlabel(f"Training episode (success: mean over the last {window:,})", fontsize=9)
     figure.supylabel("Success rate", fontsize=9)
     for panel in figure.axes:
@@ -76,106 +56,75 @@ def plot_success_curves(
     return figure
 
 
-def plot_step_curves(
-    eval_csv: _Path | Mapping[str, _Path | Sequence[_Path]],
-    *,
-    presented: Mapping[str, int] | None = None,
-    demonstrated: Mapping[str, float] | None = None,
-    window: int | None = None,
-    last: int | None = None,
-) -> Figure:
+def plot_step_curves(runs: Mapping[str, Run], *, window: int | None = None) -> Figure:
     """Plot the steps that a success takes against training episodes, as `plot_success_curves` does.
 
-    Test episodes without success are left out.
+    Test episodes without success are left out. Dotted lines mark the mean steps of demonstrations.
 
     Args:
-        eval_csv: See `plot_success_curves`.
-        presented: See `plot_success_curves`.
-        demonstrated: Mean steps of the demonstrations by task, marked with dotted lines.
+        runs: See `plot_success_curves`.
         window: See `plot_success_curves`.
-        last: See `plot_success_curves`.
 
     Raises:
-        ValueError: If a file is not an ``eval.csv``, the steps of no success are known, or the
-            window is not positive.
+        ValueError: If the steps of no success are known, or the window is not positive.
     """
-    tests = _read_tests(eval_csv)
-    tests["steps"] = tests["steps"].where(tests["success"] == 1)
-    if tests["steps"].isna().all():
-        raise ValueError("there is no success with steps to plot: let the run train longer")
-    demonstrated = demonstrated or {}
-    figure, window = _plot_curves(
-        tests, "steps", presented or {}, (demonstrated, "demonstrations"), window, last
+    figure, window, highest = _plot_curves(
+        runs, "steps", "demonstrated_steps", "demonstrations", window
     )
     figure.supxlabel(f"Training episode (steps: mean over the last {window:,})", fontsize=9)
     figure.supylabel("Steps of a success", fontsize=9)
-    highest = max([tests["steps"].max(), *demonstrated.values()])
     for panel in figure.axes:
         panel.set_ylim(0, 1.1 * highest)
     return figure
 
 
 def _plot_curves(
-    tests: pd.DataFrame,
-    column: str,
-    presented: Mapping[str, int],
-    reference: tuple[Mapping[str, float], str],
-    window: int | None,
-    last: int | None,
-) -> tuple[Figure, int]:
-    """Return a figure of the trailing means of a column, and their window.
+    runs: Mapping[str, Run], column: str, reference: str, reference_name: str, window: int | None
+) -> tuple[Figure, int, float]:
+    """Return a figure of the trailing means of a column of the tests, their window, and the top.
 
-    ``reference`` holds values by task, marked with dotted lines, and their legend name.
+    The summary of the first run has values by task at the entry ``reference``, which are drawn as
+    dotted lines.
     """
-    values, reference_name = reference
-    tasks = [*presented, *sorted(set(tests["task"]) - set(presented))]
-    last = int(tests["episode"].max()) if last is None else last
+    tests = {
+        name: run.tests if column == "success" else run.tests[run.tests["success"] == 1]
+        for name, run in runs.items()
+    }
+    values = [of_run[column] for of_run in tests.values()]
+    if not values or pd.concat(values).isna().all():
+        raise ValueError(f"there is no {column} to plot: let the run train longer")
+    first, top = next(iter(runs.values())), float(pd.concat(values).max())
+    marked = first.summary.get(reference) or {}
+    tasks, presented = first.tasks, first.presented
+    last = max(run.last for run in runs.values())
     window = max(1, round(last / 20)) if window is None else window
     if window < 1:
         raise ValueError(f"window must be at least 1 episode, not {window}.")
 
-    seeds_of = {
-        str(name): of_run.unique() for name, of_run in tests.groupby("name", sort=False)["seed"]
-    }
     figure, panels = _make_panels(len(tasks))
-    grid = _grid(tests["episode"].unique(), last)
+    grid = _grid(np.unique(np.concatenate([run.episodes for run in runs.values()])), last)
     for panel, task in zip(panels.flat, [None, *tasks], strict=False):
-        of_panel = tests if task is None else tests[tests["task"] == task]
-        for index, (name, seeds) in enumerate(seeds_of.items()):
-            of_run = of_panel[of_panel["name"] == name]
+        for index, (name, run) in enumerate(runs.items()):
+            of_run = tests[name]
+            of_panel = of_run if task is None else of_run[of_run["task"] == task]
             curves = [
-                _trailing_mean(of_run[of_run["seed"] == seed], column, grid, window)
-                for seed in seeds
+                _trailing_mean(of_panel[of_panel["seed"] == seed], column, grid, window)
+                for seed in run.seeds
             ]
-            _draw_curve(panel, grid, np.array(curves), name, index, float(tests[column].max()))
+            _draw_curve(panel, grid, np.array(curves), name, index, top)
         starts = {name: episode for name, episode in presented.items() if task in (None, name)}
         mark_starts(panel, starts, tasks, last)
-        if task is not None and task in values:
-            panel.axhline(values[task], **_DOTTED)
+        if task in marked:
+            panel.axhline(marked[task], **_DOTTED)
         title = _OVERALL if task is None else f"Task {tasks.index(task) + 1}: {readable(task)}"
         _style_panel(panel, title, last)
     _tidy_panels(panels, len(tasks))
     handles, labels = figure.axes[0].get_legend_handles_labels()
-    if values:
+    if marked:
         handles += figure.axes[0].plot([], [], **_DOTTED)
         labels += [reference_name]
     add_legend(figure, handles, labels, figure.get_figwidth())
-    return figure, window
-
-
-def _read_tests(files: _Path | Mapping[str, _Path | Sequence[_Path]]) -> pd.DataFrame:
-    """Return the test episodes in files; ``name`` is that of the file or of the algorithm."""
-    if not isinstance(files, Mapping):
-        table = read_tests(files)
-        return table.assign(name=table["algorithm"])
-    if not files:
-        raise ValueError("there are no test episodes to plot: let the run evaluate first.")
-    tables = [
-        read_tests(path).assign(name=name)
-        for name, of_run in files.items()
-        for path in ([of_run] if isinstance(of_run, str | os.PathLike) else of_run)
-    ]
-    return pd.concat(tables, ignore_index=True)
+    return figure, window, max([top, *marked.values()])
 
 
 def _make_panels(n_tasks: int) -> tuple[Figure, NDArray]:
@@ -244,7 +193,7 @@ _MATRICES = 3  # side by side
 _COLOR_MAP, _WHITE_BELOW = "viridis", 0.6
 
 
-def plot_success_matrices(matrices: Mapping[str, ArrayLike], tasks: Sequence[str]) -> Figure:
+def plot_success_matrices(matrices: Mapping[str, NDArray], tasks: Sequence[str]) -> Figure:
     """Plot ``R[i, j]``, success on task j after the phase of task i, in a panel for each run.
 
     Cells give percent; tasks that have not been presented stay white. A task that is forgotten
@@ -253,32 +202,21 @@ def plot_success_matrices(matrices: Mapping[str, ArrayLike], tasks: Sequence[str
     Args:
         matrices: Success in [0, 1] by title, ``[T, T]``; NaN for tasks that were not tested.
         tasks: Names of the tasks, in the order of their presentation.
-
-    Raises:
-        ValueError: If there are no matrices, or one does not have a row and a column per task.
     """
-    n_tasks = len(tasks)
-    found = {title: np.asarray(matrix, float) for title, matrix in matrices.items()}
-    wrong = [list(matrix.shape) for matrix in found.values() if matrix.shape != (n_tasks, n_tasks)]
-    if wrong or not found:
-        raise ValueError(
-            f"matrices must be [{n_tasks}, {n_tasks}], a row and a column per task, "
-            f"not {wrong[0] if wrong else 'none'}"
-        )
-    n_columns = min(_MATRICES, len(found))
-    n_rows = math.ceil(len(found) / n_columns)
-    side = 0.31 * n_tasks  # inches
+    n_columns = min(_MATRICES, len(matrices))
+    n_rows = math.ceil(len(matrices) / n_columns)
+    side = 0.31 * len(tasks)  # inches
     # Titles of panels of few tasks are longer than these; a letter is about 0.08 wide.
-    width = max(side, 0.08 * max(map(len, found)))
+    width = max(side, 0.08 * max(map(len, matrices)))
     figure = Figure(figsize=(width * n_columns + 2.9, (side + 0.45) * n_rows + 0.5))
     figure.set_layout_engine("constrained", w_pad=0.08, h_pad=0.08)
     panels = figure.subplots(n_rows, n_columns, squeeze=False).flat
-    for number, (title, matrix) in enumerate(found.items()):
+    for number, (title, matrix) in enumerate(matrices.items()):
         panel = panels[number]
         image = _draw_matrix(panel, matrix)
         panel.set_title(title, fontsize=9)
         _label_tasks(panel, tasks, names=number % n_columns == 0)
-    for panel in panels[len(found) :]:
+    for panel in panels[len(matrices) :]:
         panel.remove()
     figure.supxlabel("Success on task", fontsize=9)
     figure.supylabel("After the phase of task", fontsize=9)

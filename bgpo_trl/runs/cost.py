@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
-from dataclasses import astuple, dataclass, fields
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from torch import Tensor
 
 from bgpo_trl.files.writing import write_whole
-from bgpo_trl.runs.results import AMOUNT, COUNT, read_table
+from bgpo_trl.runs.results import COLUMNS, read_table
 
 
 @dataclass
@@ -24,10 +24,6 @@ class Cost:
     """Wall time of these steps, without tests and checkpoints."""
     megabytes: float = 0.0
     """Size of networks, replay, GWR-B and groups after the last of these steps, in 10^6 bytes."""
-
-
-COST_COLUMNS = ("tasks", *(field.name for field in fields(Cost)))
-"""Columns of ``cost.csv``, one row for each number of presented tasks."""
 
 
 class CostLog:
@@ -64,7 +60,11 @@ class CostLog:
         Raises:
             OSError: If it cannot be written.
         """
-        write_costs(self.path, self.costs)
+        rows = [
+            f"{tasks},{cost.steps},{cost.seconds:.3f},{cost.megabytes:.6f}"
+            for tasks, cost in sorted(self.costs.items())
+        ]
+        write_whole(self.path, "\n".join([",".join(COLUMNS["cost.csv"]), *rows, ""]))
 
 
 def n_bytes(state: Any) -> int:
@@ -77,34 +77,10 @@ def n_bytes(state: Any) -> int:
 
 
 def read_costs(path: str | os.PathLike[str]) -> dict[int, Cost]:
-    """Read a ``cost.csv``: costs by the number of presented tasks, in increasing order.
+    """Read a ``cost.csv``: costs by the number of presented tasks.
 
     Raises:
         ValueError: If the file is missing or damaged.
     """
-    columns = {"tasks": COUNT, "steps": COUNT, "seconds": AMOUNT, "megabytes": AMOUNT}
-    table = read_table(path, columns, remedy="remove the file, and costs are counted anew")
-    rows = table[list(columns)].sort_values("tasks").itertuples(index=False)
+    rows = read_table(path)[[*COLUMNS["cost.csv"]]].itertuples(index=False)
     return {int(tasks): Cost(int(steps), *amounts) for tasks, steps, *amounts in rows}
-
-
-def write_costs(path: Path, costs: Mapping[int, Cost]) -> None:
-    """Write a ``cost.csv`` atomically.
-
-    Raises:
-        OSError: If it cannot be written.
-    """
-    rows = (
-        f"{tasks},{cost.steps},{cost.seconds:.3f},{cost.megabytes:.6f}"
-        for tasks, cost in sorted(costs.items())
-    )
-    write_whole(path, "\n".join([",".join(COST_COLUMNS), *rows, ""]))
-
-
-def total_cost(costs: Sequence[Mapping[int, Cost]]) -> dict[int, Cost]:
-    """Return the sums of the costs of runs, by the number of presented tasks."""
-    total: dict[int, Cost] = {}
-    for tasks, cost in (row for of_run in costs for row in of_run.items()):
-        sums = zip(astuple(total.get(tasks, Cost())), astuple(cost), strict=True)
-        total[tasks] = Cost(*map(sum, sums))
-    return total

@@ -19,7 +19,7 @@ from torchrl.record.loggers.wandb import WandbLogger
 from bgpo_trl.files.writing import write_whole
 from bgpo_trl.runs.directory import flatten
 from bgpo_trl.runs.provenance import commit_of_code, versions
-from bgpo_trl.runs.results import COUNT, TRAIN, read_table
+from bgpo_trl.runs.results import read_table
 
 # Columns of which there is no mean.
 _NO_MEASURES = ["algorithm", "seed", "episode", "task", "group"]
@@ -219,10 +219,10 @@ def tensorboard_logger(directory: str | os.PathLike[str]) -> TensorboardLogger:
 
 def _untested(directory: Path) -> list[Mapping[Any, Any]]:
     """Return the training episodes of a run after its last evaluation."""
-    tested = read_table(directory / "eval.csv", {"episode": COUNT})["episode"]
-    train = read_table(directory / "train.csv", TRAIN)
+    tested = read_table(directory / "eval.csv")["episode"]
+    train = read_table(directory / "train.csv")
     train = train[train["episode"] > max(tested, default=0)]
-    for name in train.columns.difference([*TRAIN, "algorithm"]):
+    for name in train.columns.difference(["algorithm", "task"]):
         train[name] = pd.to_numeric(train[name], errors="coerce")
     return [*train.to_dict("records")]
 

@@ -11,7 +11,7 @@ from typing import Any, Self
 from bgpo_trl.files.checkpoint import has_checkpoint, load_checkpoint
 from bgpo_trl.files.csv_file import CsvFile, check_position, has_rows
 from bgpo_trl.files.writing import make_folder, write_json
-from bgpo_trl.runs.results import read_json
+from bgpo_trl.runs.results import COLUMNS, read_json
 from bgpo_trl.scenes import find_scene
 
 CSV_FILES = ("train.csv", "eval.csv")
@@ -192,32 +192,8 @@ def flatten(settings: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
         yield prefix, settings
 
 
-EVAL_COLUMNS = (
-    "algorithm",
-    "seed",
-    "episode",
-    "env_steps",
-    "task",
-    "success",
-    "return",
-    "steps",
-)
-"""Columns of ``eval.csv``, one row per test episode."""
-
-TRAIN_COLUMNS = (
-    *EVAL_COLUMNS,
-    "intrinsic_return",
-    "num_nodes",
-    "group",
-    "num_groups",
-    "loss_actor",
-    "loss_value",
-)
-"""Columns of ``train.csv``, one row per training episode; those of ``Algorithm.logged`` follow."""
-
-
 class RunLogger:
-    """Write the log of a run into its directory.
+    """Write the log of a run into its directory; `COLUMNS` says what the tables hold.
 
     Args:
         directory: The run directory; made if missing.
@@ -249,7 +225,7 @@ class RunLogger:
         resume: bool = False,
     ) -> None:
         self.directory = Path(directory)
-        columns = (*TRAIN_COLUMNS, *logged)
+        columns = (*COLUMNS["train.csv"], *logged)
         repeated = {name for name in logged if columns.count(name) > 1}
         if repeated:
             raise ValueError(
@@ -262,38 +238,27 @@ class RunLogger:
             )
         make_folder(self.directory)
         write_json(self.directory / "config.json", config)
-        self._train = CsvFile(self.directory / "train.csv", columns)
-        self._eval = CsvFile(self.directory / "eval.csv", EVAL_COLUMNS)
+        self._files = {
+            name: CsvFile(self.directory / name, columns)
+            for name, columns in (("train.csv", columns), ("eval.csv", [*COLUMNS["eval.csv"]]))
+        }
 
     def log_train(self, row: Mapping[str, Any]) -> None:
-        """Write a training episode.
-
-        Args:
-            row: Values by column of `TRAIN_COLUMNS` or ``logged``; missing ones stay empty.
+        """Write a training episode, values by column; missing ones stay empty.
 
         Raises:
             ValueError: If there is no such column.
             OSError: If the row cannot be written.
         """
-        self._train.write(row)
+        self._files["train.csv"].write(row)
 
     def log_eval(self, row: Mapping[str, Any]) -> None:
-        """Write a test episode.
-
-        Args:
-            row: Values by column of `EVAL_COLUMNS`: names of the algorithm and the task, seed,
-                training episodes and environment steps of that seed so far, and the test episode's
-                success, extrinsic return and length in steps.
-
-        Raises:
-            ValueError: If there is no such column.
-            OSError: If the row cannot be written.
-        """
-        self._eval.write(row)
+        """Write a test episode; see `log_train`."""
+        self._files["eval.csv"].write(row)
 
     def position(self) -> dict[str, int]:
         """Flush the CSV files to disk and return their sizes, for the checkpoint."""
-        return {file.path.name: file.position() for file in (self._train, self._eval)}
+        return {name: file.position() for name, file in self._files.items()}
 
     def truncate_to(self, position: Mapping[str, int]) -> None:
         """Drop the rows that a resumed run will write again.
@@ -305,13 +270,13 @@ class RunLogger:
         Raises:
             ValueError: If a file is shorter.
         """
-        for file in (self._train, self._eval):
-            file.truncate_to(position.get(file.path.name, 0))
+        for name, file in self._files.items():
+            file.truncate_to(position.get(name, 0))
 
     def close(self) -> None:
         """Close the CSV files."""
-        self._train.close()
-        self._eval.close()
+        for file in self._files.values():
+            file.close()
 
     def __enter__(self) -> Self:
         return self

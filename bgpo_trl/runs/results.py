@@ -1,4 +1,4 @@
-"""Results of runs, read from their CSV and JSON files; and compact copies of runs.
+"""Runs read back from their directories, the columns of their tables, and compact copies of runs.
 
 Tables are pandas data frames. A table may be compressed, as `archive_run` writes it: where
 ``eval.csv`` is not there, ``eval.csv.gz`` is read.
@@ -7,13 +7,14 @@ Tables are pandas data frames. A table may be compressed, as `archive_run` write
 from __future__ import annotations
 
 import gzip
-import io
 import json
 import os
 import warnings
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -25,55 +26,65 @@ from bgpo_trl.files.writing import make_folder, write_whole
 
 
 @dataclass(frozen=True)
-class Numbers:
-    """Numbers that the cells of a column may hold."""
+class Cells:
+    """The cells of a column: text, or numbers from 0."""
 
-    high: float = float(np.finfo(float).max)
-    """The largest; the smallest is 0."""
+    high: float | None = None
+    """The largest number; None for text."""
     whole: bool = False
-    """Whether they are integers."""
-    may_be_empty: bool = False
-    """Whether a cell may be empty, which is read as NaN."""
+    """Whether numbers are integers."""
+    optional: bool = False
+    """Whether a cell may be empty, and the column missing; both are read as NaN."""
 
 
-COUNT, SHARE, AMOUNT = Numbers(2**53 - 1, whole=True), Numbers(1), Numbers()
-TEXT = None
-"""Any text, even none."""
-Cells = Numbers | Sequence[str] | None
-"""The cells that a column may hold: numbers, one of some names, or any text."""
+TEXT, COUNT, SHARE = Cells(), Cells(2**53 - 1, whole=True), Cells(1)
+AMOUNT = Cells(float(np.finfo(float).max))
 
-TRAIN = {"seed": COUNT, "episode": COUNT, "task": TEXT, "success": SHARE}
-"""Columns of ``train.csv`` that success is computed from."""
-TRAIN_COUNTS = dict.fromkeys(("num_nodes", "group", "num_groups"), COUNT)
-"""Columns of ``train.csv`` on GWR-B and groups."""
-EVAL = {"algorithm": TEXT, **TRAIN}
-"""Columns of ``eval.csv`` that every run has."""
-_FINAL = {"seed": COUNT, "demonstrations": TEXT, "task": TEXT, "success": SHARE}
-_FINAL["task_inference"] = replace(SHARE, may_be_empty=True)  # of algorithms without GWR-B
-_STEPS = {"steps": replace(AMOUNT, may_be_empty=True)}
+_EPISODE: Mapping[str, Cells | None] = {
+    "algorithm": TEXT,
+    "seed": COUNT,
+    "episode": COUNT,
+    "env_steps": None,
+    "task": TEXT,
+    "success": SHARE,
+    "return": None,
+}
+COLUMNS: Mapping[str, Mapping[str, Cells | None]] = {
+    "train.csv": {
+        **_EPISODE,
+        "algorithm": None,
+        "steps": None,
+        "intrinsic_return": None,
+        "num_nodes": COUNT,
+        "group": COUNT,
+        "num_groups": COUNT,
+        "loss_actor": None,
+        "loss_value": None,
+    },
+    "eval.csv": {**_EPISODE, "steps": replace(AMOUNT, optional=True)},
+    "final.csv": {
+        "seed": COUNT,
+        "demonstrations": TEXT,
+        "task": TEXT,
+        "episodes": None,
+        "success": SHARE,
+        "steps": replace(AMOUNT, optional=True),
+        "task_inference": replace(SHARE, optional=True),
+    },
+    "cost.csv": {"tasks": COUNT, "steps": COUNT, "seconds": AMOUNT, "megabytes": AMOUNT},
+}
+"""Columns of the tables of a run, as they are written, with the cells that reports and figures
+read; None if they do not read the column.
 
+A row is a training episode in ``train.csv``, where the columns of ``Algorithm.logged`` follow, and
+a test episode in ``eval.csv``. It is a seed, a kind of demonstrations and a task in ``final.csv``,
+where ``steps`` is the mean length of the successful tests; ``task_inference`` is empty for
+algorithms without GWR-B. It is a number of presented tasks in ``cost.csv``."""
 
-@dataclass(frozen=True)
-class Curves:
-    """Test success of one run over its training.
-
-    Attributes:
-        seeds: The ``S`` seeds, in increasing order.
-        tasks: The ``T`` task names.
-        episodes: Training episodes before each evaluation, increasing, ``[E]``.
-        success: Share of successes among a seed's test episodes of a task, ``[S, E, T]``; NaN
-            where a task was not tested because it had not been presented yet.
-    """
-
-    seeds: tuple[int, ...]
-    tasks: tuple[str, ...]
-    episodes: NDArray[np.int64]
-    success: NDArray[np.float64]
-
-    def until(self, episode: int) -> Curves:
-        """Return the evaluations after at most ``episode`` training episodes."""
-        kept = self.episodes <= episode
-        return replace(self, episodes=self.episodes[kept], success=self.success[:, kept])
+_REMEDIES = {
+    "final.csv": "remove the file and resume the run, which tests again",
+    "cost.csv": "remove the file, and costs are counted anew",
+}
 
 
 def find_table(path: str | os.PathLike[str]) -> Path | None:
@@ -83,61 +94,52 @@ def find_table(path: str | os.PathLike[str]) -> Path | None:
     return next((candidate for candidate in found if candidate.exists()), None)
 
 
-def read_table(
-    path: str | os.PathLike[str],
-    columns: Mapping[str, Cells] | None = None,
-    optional: Mapping[str, Cells] | None = None,
-    remedy: str = "resume the run, which writes it again, or take the line out",
-) -> pd.DataFrame:
+def read_table(path: str | os.PathLike[str]) -> pd.DataFrame:
     """Return a CSV file of a run, plain or compressed.
+
+    The cells of the columns that `COLUMNS` describes are checked, and numbers converted. All others
+    stay text.
 
     Args:
         path: The CSV file; where it is not there, ``path`` with ``.gz`` is read.
-        columns: Required columns and what their cells may hold. Other columns are kept as text.
-        optional: Further columns; those that the file lacks are NaN.
-        remedy: Advice for a damaged line, the end of the error message.
 
     Raises:
         ValueError: If the file is missing or not CSV, lacks a column or has an invalid cell.
     """
-    path, columns, optional = find_table(path) or Path(path), dict(columns or {}), optional or {}
+    path = find_table(path) or Path(path)
+    name_of_table = path.name.removesuffix(".gz")
+    described = COLUMNS.get(name_of_table, {})
+    columns = {name: cells for name, cells in described.items() if cells is not None}
     table = _read_text(path)
-    missing = sorted(set(columns).difference(table.columns))
-    if len(table.columns) and missing:
-        raise ValueError(f"{path} lacks the columns {', '.join(missing)}: name another run")
-    if missing:
-        return pd.DataFrame(columns=pd.Index([*columns, *optional]))
-    columns |= {name: cells for name, cells in optional.items() if name in table}
+    if not len(table.columns):
+        return pd.DataFrame(columns=pd.Index([*columns]))
+    missing = [name for name in columns if name not in table]
+    if needed := sorted(name for name in missing if not columns[name].optional):
+        raise ValueError(f"{path} lacks the columns {', '.join(needed)}: name another run")
     damaged = pd.Series(False, index=table.index)
     for name, cells in columns.items():
-        if isinstance(cells, Numbers):
-            table[name], valid = _numbers(table[name], cells)
-            damaged |= ~valid
-        elif cells is not None:
-            damaged |= ~table[name].isin(list(cells))
+        if name in missing:
+            table[name] = np.nan
+        elif cells.high is not None:
+            numbers = pd.to_numeric(table[name], errors="coerce").astype(float)
+            valid = numbers.between(0, cells.high)
+            valid &= (numbers % 1 == 0) | (not cells.whole)
+            damaged |= ~(valid | (cells.optional & (table[name] == "")))
+            table[name] = numbers
     if damaged.any():
+        usual = "resume the run, which writes it again, or take the line out"
+        remedy = _REMEDIES.get(name_of_table, usual)
         line = 2 + int(damaged.to_numpy().argmax())
         raise ValueError(f"{path}, line {line} is damaged: {remedy}")
-    whole = [n for n, cells in columns.items() if isinstance(cells, Numbers) and cells.whole]
-    lacking = {name: np.nan for name in optional if name not in table}
-    return table.astype(dict.fromkeys(whole, np.int64)).assign(**lacking)
+    return table.astype({name: np.int64 for name, cells in columns.items() if cells.whole})
 
 
 def _read_text(path: Path) -> pd.DataFrame:
     """Return the cells of a CSV file as text."""
     try:
-        content = path.read_bytes()
-        text = (gzip.decompress(content) if path.suffix == ".gz" else content).decode()
         with warnings.catch_warnings():
             warnings.simplefilter("error", pd.errors.ParserWarning)  # a line that is too long
-            return pd.read_csv(
-                io.StringIO(text),
-                dtype=str,
-                na_values=[],
-                keep_default_na=False,
-                index_col=False,
-                skip_blank_lines=True,
-            )
+            return pd.read_csv(path, dtype=str, keep_default_na=False, index_col=False)
     except (FileNotFoundError, NotADirectoryError):
         raise _missing(path) from None
     except pd.errors.EmptyDataError:
@@ -148,48 +150,10 @@ def _read_text(path: Path) -> pd.DataFrame:
         ) from None
 
 
-def _numbers(cells: pd.Series, kind: Numbers) -> tuple[pd.Series, pd.Series]:
-    """Return the numbers in cells, NaN where there is none, and whether each is valid."""
-    numbers = pd.to_numeric(cells, errors="coerce").astype(float)
-    valid = numbers.between(0, kind.high)
-    if kind.whole:
-        valid &= numbers % 1 == 0
-    if kind.may_be_empty:
-        valid |= cells == ""
-    return numbers, valid
-
-
 def _missing(path: Path) -> ValueError:
     if not path.parent.exists():
         return ValueError(f"there is no run at {path.parent}: name another")
     return ValueError(f"{path} is missing: let the run in {path.parent} finish")
-
-
-def read_tests(path: str | os.PathLike[str]) -> pd.DataFrame:
-    """Return an ``eval.csv``, one row per test episode.
-
-    ``steps`` is NaN if it is not stored.
-
-    Raises:
-        ValueError: If the file is missing or empty, or a row is invalid.
-    """
-    table = read_table(path, EVAL, _STEPS)
-    if table.empty:
-        raise ValueError(f"{path} holds no test episode: let the run evaluate first")
-    return table
-
-
-def read_final_tests(path: str | os.PathLike[str]) -> pd.DataFrame:
-    """Return a ``final.csv``, one row per seed, task and kind of demonstrations.
-
-    ``task_inference`` is NaN for algorithms without GWR-B. ``steps``, those of a success, is NaN
-    without one, and if it is not stored.
-
-    Raises:
-        ValueError: If the file is missing, or a row is invalid.
-    """
-    remedy = "remove the file and resume the run, which tests again"
-    return read_table(path, _FINAL, _STEPS, remedy)
 
 
 class RepeatedKeyError(ValueError):
@@ -247,34 +211,223 @@ def read_json(
     return found
 
 
-def read_curves(path: str | os.PathLike[str], tasks: Sequence[str]) -> Curves:
-    """Read the test success of one run.
+# Entries of config.json that belong to keeping a run, not to what it is.
+OF_KEEPING = ("seeds", "checkpoint_minutes", "task_modules")
+_OF_SEEDS = ("nodes", "groups", "group_purity")  # entries of summary.json, a value per seed
 
-    Args:
-        path: The ``eval.csv`` of the run.
-        tasks: Task names, in the order of the curves.
+
+@dataclass(frozen=True, eq=False)  # Tables have no truth value.
+class Run:
+    """Settings, summary and tables of a run, or of runs that differ only in their seeds.
+
+    Seeds and tasks are in the order of ``config.json``.
+    """
+
+    directories: tuple[Path, ...]
+    config: dict[str, Any]
+    summary: dict[str, Any]
+    tests: pd.DataFrame
+    """Test episodes, ``eval.csv``."""
+    training: pd.DataFrame | None = None
+    """Training episodes, ``train.csv``."""
+    final: pd.DataFrame | None = None
+    """Tests after training, ``final.csv``."""
+    costs: pd.DataFrame | None = None
+    """``cost.csv``."""
+
+    @property
+    def directory(self) -> Path:
+        """The first directory."""
+        return self.directories[0]
+
+    @property
+    def name(self) -> str:
+        """Name of the directory, or of the folder of several."""
+        return (self.directory if len(self.directories) == 1 else self.directory.parent).name
+
+    @property
+    def algorithm(self) -> str:
+        """Name of the algorithm; the directory's where ``config.json`` has none."""
+        return self.config.get("name") or self.name
+
+    @property
+    def changed(self) -> dict[str, Any]:
+        """Hyperparameters that are not the algorithm's usual ones, by name."""
+        return self.summary.get("changed") or {}
+
+    @property
+    def seeds(self) -> tuple[int, ...]:
+        """The ``S`` seeds."""
+        return tuple(self.config["seeds"])
+
+    @property
+    def tasks(self) -> tuple[str, ...]:
+        """Names of the ``T`` tasks, in the order of their presentation."""
+        return tuple(self.config["tasks"])
+
+    @property
+    def starts(self) -> list[int]:
+        """Episode from which each task is presented."""
+        return self.config["task_starts"]
+
+    @property
+    def presented(self) -> dict[str, int]:
+        """Episode from which each task is presented, by task."""
+        return dict(zip(self.tasks, self.starts, strict=True))
+
+    @cached_property
+    def episodes(self) -> NDArray[np.int64]:
+        """Training episodes before each evaluation, increasing, ``[E]``."""
+        return np.unique(self.tests["episode"].to_numpy(np.int64))
+
+    @cached_property
+    def success(self) -> NDArray[np.float64]:
+        """Share of successes among a seed's test episodes of a task, ``[S, E, T]``.
+
+        NaN where a task was not tested, because it had not been presented yet.
+        """
+        means = self.tests.groupby(["seed", "episode", "task"])["success"].mean()
+        axes = (self.seeds, self.episodes, self.tasks)
+        every = pd.MultiIndex.from_product(axes)
+        return means.reindex(every).to_numpy(float).reshape([*map(len, axes)])
+
+    def by_seed_and_task(self, values: pd.Series) -> NDArray[np.float64]:
+        """Return values by seed and task as an array ``[S, T]``; NaN where there are none."""
+        every = pd.MultiIndex.from_product([self.seeds, self.tasks])
+        return values.reindex(every).to_numpy(float).reshape(len(self.seeds), len(self.tasks))
+
+    @property
+    def last(self) -> int:
+        """Training episodes before the last test."""
+        return int(self.episodes[-1])
+
+    @property
+    def eval_every(self) -> int:
+        """Training episodes between tests."""
+        tested = [0, *self.episodes.tolist()]
+        steps = min(after - before for before, after in pairwise(tested))
+        return self.config.get("eval_every") or steps
+
+    @property
+    def unfinished(self) -> str:
+        """In what the run is not finished; "" if it is."""
+        episodes = self.config["episodes"]
+        if self.summary.get("episodes", episodes) != episodes:
+            return "is being extended"
+        if episodes - self.last >= self.eval_every:
+            return f"has tests until episode {self.last} of {episodes}"
+        return ""
+
+    def until(self, episode: int) -> Run:
+        """Return the run with only the tests after at most ``episode`` training episodes."""
+        return replace(self, tests=self.tests[self.tests["episode"] <= episode])
+
+
+def read_run(directory: str | os.PathLike[str]) -> Run:
+    """Read a run; each of its tables once.
+
+    Its directory needs ``config.json`` with seeds, tasks, their starts and the number of episodes,
+    and ``eval.csv``.
 
     Raises:
-        ValueError: If the file is missing or empty, or tests another task.
+        ValueError: If a file is missing or damaged, or there are no tests.
     """
-    tests = read_tests(path)
-    unknown = sorted(set(tests["task"]) - set(tasks))
-    if unknown:
-        raise ValueError(f"{path} tests {unknown[0]!r}, which is none of {', '.join(tasks)}")
-    means = tests.groupby(["seed", "episode", "task"])["success"].mean()
-    seeds, episodes = (sorted(set(tests[name])) for name in ("seed", "episode"))
-    every = pd.MultiIndex.from_product([seeds, episodes, list(tasks)])
-    success = means.reindex(every).to_numpy().reshape(len(seeds), len(episodes), len(tasks))
-    return Curves(tuple(map(int, seeds)), tuple(tasks), np.array(episodes), success)
+    directory = Path(directory)
+    entries = {"episodes": int, "seeds": list, "tasks": list, "task_starts": list}
+    config = read_json(directory / "config.json", entries)
+    tasks, starts = config["tasks"], config["task_starts"]
+    named = all(isinstance(task, str) for task in tasks)
+    if not named or len(tasks) != len(starts) or not all(type(start) is int for start in starts):
+        raise ValueError(
+            f"{directory / 'config.json'} does not say when each task starts: put it back as the "
+            "run left it"
+        )
+    path = directory / "summary.json"
+    lists: dict[str, Any] = dict.fromkeys(_OF_SEEDS, list | None)
+    maps: dict[str, Any] = dict.fromkeys(("changed", "demonstrated_steps"), dict | None)
+    summary = read_json(path, lists | maps) if path.exists() else {}
+    tables = {
+        name: read_table(directory / name)
+        for name in COLUMNS
+        if name == "eval.csv" or find_table(directory / name)
+    }
+    tests, training, final, costs = map(
+        tables.get, ("eval.csv", "train.csv", "final.csv", "cost.csv")
+    )
+    if tests is None or tests.empty:
+        raise ValueError(
+            f"{directory / 'eval.csv'} holds no test episode: let the run evaluate first"
+        )
+    for name, table in tables.items():
+        for column, known in (("seed", config["seeds"]), ("task", tasks)):
+            others = set(table.get(column, ())) - set(known)
+            if others:
+                raise ValueError(
+                    f"{directory / name} has the {column} {min(others)!r}, which is none of "
+                    f"{', '.join(map(str, known))}: put it back as the run left it"
+                )
+    return Run((directory,), config, summary, tests, training, final, costs)
 
 
-_WHOLE = ("summary.json", "final.csv", "cost.csv")
-# Columns that reports and figures read; None for all.
-_TABLES: Mapping[str, tuple[str, ...] | None] = {
-    "train.csv": (*TRAIN, *TRAIN_COUNTS),
-    "eval.csv": (*EVAL, "steps"),
-    "gwr.csv": None,
-}
+def joined(runs: Iterable[Run]) -> list[Run]:
+    """Return runs, of which those that differ only in their seeds are one.
+
+    Runs that share a seed, or were tested at other times, stay apart.
+    """
+    groups: dict[str, list[Run]] = {}
+    for run in runs:
+        alike = {name: run.config[name] for name in run.config if name not in OF_KEEPING}
+        key = json.dumps([alike, run.changed], sort_keys=True)
+        groups.setdefault(key, []).append(run)
+    found: list[Run] = []
+    for parts in groups.values():
+        seeds = [seed for run in parts for seed in run.seeds]
+        tests = {tuple(run.episodes.tolist()) for run in parts}
+        found += [_joined(parts)] if len(tests) == 1 and len({*seeds}) == len(seeds) else parts
+    return found
+
+
+def _joined(parts: list[Run]) -> Run:
+    """Return runs of different seeds as one."""
+    if len(parts) == 1:
+        return parts[0]
+    first, summary = parts[0], dict(parts[0].summary)
+    for key in _OF_SEEDS:
+        values = [run.summary.get(key) for run in parts]
+        summary[key] = None if None in values else [v for of_run in values for v in of_run or ()]
+    for key in ("commit", "command"):
+        stated = dict.fromkeys(run.summary.get(key) or "" for run in parts)
+        summary[key] = "; ".join(filter(None, stated))
+    tables: dict[str, Any] = {}
+    for name in ("tests", "training", "final", "costs"):
+        of_runs = [getattr(run, name) for run in parts]
+        lacking = any(table is None for table in of_runs)
+        tables[name] = None if lacking else pd.concat(of_runs, ignore_index=True)
+    config = {**first.config, "seeds": [seed for run in parts for seed in run.seeds]}
+    return Run(tuple(run.directory for run in parts), config, summary, **tables)
+
+
+def run_directories(paths: Iterable[Path]) -> list[Path]:
+    """Return the run directories among some paths and, of other folders, in them.
+
+    Raises:
+        ValueError: If a path is not a directory, or holds no run.
+    """
+    found: list[Path] = []
+    for path in paths:
+        if not path.is_dir():
+            raise ValueError(f"{path} is not a directory: name a run, or a folder of runs")
+        runs = _runs_in(path)
+        if not runs:
+            raise ValueError(f"{path} holds no run: name a run, or a folder of runs")
+        found += runs
+    return found
+
+
+def _runs_in(path: Path) -> list[Path]:
+    if (path / "config.json").exists():
+        return [path]
+    return [run for folder in sorted(path.glob("*/")) for run in _runs_in(folder)]
 
 
 def archive_run(run: Path, target: Path) -> None:
@@ -298,12 +451,13 @@ def archive_run(run: Path, target: Path) -> None:
     config = read_json(run / "config.json")
     if (target / "config.json").exists() and read_json(target / "config.json") != config:
         raise ValueError(f"{target} holds another run: name another folder for the copy")
-    content = {"config.json": (run / "config.json").read_bytes()}
-    content |= {name: (run / name).read_bytes() for name in _WHOLE if (run / name).exists()}
-    for name, columns in _TABLES.items():
-        if name == "eval.csv" or find_table(run / name):
-            table = read_table(run / name)
-            kept = [column for column in table.columns if columns is None or column in columns]
+    copied = ("config.json", "summary.json", "final.csv", "cost.csv")
+    content = {name: (run / name).read_bytes() for name in copied if (run / name).exists()}
+    for name in ("train.csv", "eval.csv", "gwr.csv"):
+        if path := find_table(run / name):
+            table = _read_text(path)
+            columns = COLUMNS.get(name, dict.fromkeys(table.columns, TEXT))
+            kept = [column for column in table.columns if columns.get(column) is not None]
             text = table[kept].to_csv(index=False, lineterminator="\n")
             content[f"{name}.gz"] = gzip.compress(text.encode(), mtime=0)
     make_folder(target)

@@ -5,9 +5,9 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
-from bgpo_trl.analysis.comparison import Run
-from bgpo_trl.runs.results import Curves
+from bgpo_trl.runs.results import Run
 from suites import nico
 
 NAN = np.nan
@@ -25,13 +25,18 @@ TASKS = nico.PAPER_TASKS
 HEAD = "algorithm,seed,episode,env_steps,task,success,return,steps\n"
 
 
-def make_run(success=SUCCESS, starts=STARTS, tasks="abc", name="bgpo", directory="x", **summary):
-    """Two equal seeds."""
-    episodes = 5 * np.arange(1, len(success) + 1)
-    config = {"name": name, "task_starts": list(starts), "tasks": list(tasks), "eval_every": 5}
-    config |= {"seeds": [0, 1], "episodes": int(episodes[-1])}
-    curves = Curves((0, 1), tuple(tasks), episodes, np.array([success, success]))
-    return Run((Path(directory),), config, summary, curves)
+def make_run(success=SUCCESS, starts=STARTS, tasks="abc", **summary):
+    """Tests every 5 episodes, of success ``[S, E, T]``, or ``[E, T]`` of two equal seeds."""
+    success = np.asarray(success)
+    success = success if success.ndim == 3 else np.stack([success] * 2)
+    seeds, episodes = range(len(success)), 5 * np.arange(1, success.shape[1] + 1)
+    config = {"name": "bgpo", "task_starts": list(starts), "tasks": list(tasks), "eval_every": 5}
+    config |= {"seeds": [*seeds], "episodes": int(episodes[-1])}
+    every = pd.MultiIndex.from_product(
+        [seeds, episodes, list(tasks)], names=["seed", "episode", "task"]
+    )
+    tests = pd.DataFrame({"success": success.ravel()}, every).dropna().reset_index()
+    return Run((Path("x"),), config, summary, tests.assign(steps=NAN))
 
 
 def write_run(

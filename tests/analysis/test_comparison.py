@@ -2,13 +2,8 @@
 
 import pytest
 
-from bgpo_trl.analysis.comparison import (
-    differing_conditions,
-    read_run,
-    read_settings,
-    reference_of,
-    run_directories,
-)
+from bgpo_trl.analysis.comparison import differing_conditions, read_settings, reference_of
+from bgpo_trl.runs.results import read_run, run_directories
 from tests.analysis.runs import HEAD, TASKS, write_run
 from tests.helpers import edit
 
@@ -57,7 +52,7 @@ def test_changed_hyperparameters_are_part_of_a_name(tmp_path):
         ("BGPO", plain),
         ("BGPO, beta 0.2, rl.name td3", changed),
     ]
-    assert setting.find("bgpo") == ("BGPO", setting.runs["BGPO"])
+    assert setting.find("bgpo") is setting.runs["BGPO"]
     (alone,) = settings_in(changed)[0].values()
     assert alone.find("bgpo") is None
 

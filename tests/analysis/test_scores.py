@@ -1,29 +1,30 @@
 """Measures of arrays and of runs, against numbers worked out by hand."""
 
 import itertools
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from bgpo_trl.analysis import scores
-from bgpo_trl.analysis.comparison import read_run
 from bgpo_trl.analysis.scores import expected_own_episodes, forward_transfer, own_areas
+from bgpo_trl.runs.results import read_run
 from tests.analysis.runs import NAN, STARTS, make_run, write_run, write_training
 from tests.analysis.runs import SUCCESS as SUCCESS_OF_RUN
 
-# Two tasks in the order of their presentation, evaluated after 10, 20, 30 and 40 episodes; task 2
-# comes in after 20.
-EPISODES = [10, 20, 30, 40]
+# Two tasks in the order of their presentation, evaluated after 5, 10, 15 and 20 episodes; task 2
+# comes in after 10.
 SUCCESS = np.array([[0.0, NAN], [0.8, NAN], [0.6, 0.0], [0.4, 0.5]])
 INF = np.inf
 
 
 def test_evaluation_matrix_by_hand():
-    last_only = scores.evaluation_matrix(SUCCESS, EPISODES, [20, 40], window=10)
-    np.testing.assert_allclose(last_only, [[0.8, NAN], [0.4, 0.5]])
-    both = scores.evaluation_matrix(SUCCESS, EPISODES, [20, 40], window=20)
-    np.testing.assert_allclose(both, [[0.4, NAN], [0.5, 0.25]])
+    run = make_run(SUCCESS, (0, 10), "ab")
+    last_only = scores.evaluation_matrix(run, [10, 20], window=5)
+    np.testing.assert_allclose(last_only, [[[0.8, NAN], [0.4, 0.5]]] * 2)
+    both = scores.evaluation_matrix(run, [10, 20], window=10)
+    np.testing.assert_allclose(both, [[[0.4, NAN], [0.5, 0.25]]] * 2)
+    with pytest.raises(ValueError, match="there is no evaluation in the 2 episodes before"):
+        scores.evaluation_matrix(run, [9], window=2)
 
 
 def test_changes_since_tasks_were_learned_by_hand():
@@ -33,16 +34,15 @@ def test_changes_since_tasks_were_learned_by_hand():
     assert scores.change_since_learned(matrix) == pytest.approx(expected)
     of_seeds = scores.change_since_learned([matrix, np.multiply(matrix, 0.5)])
     np.testing.assert_allclose(of_seeds, [expected, np.multiply(expected, 0.5)])
-    with pytest.raises(ValueError, match="one phase per task"):
-        scores.change_since_learned(matrix[1:])
 
 
 def test_forgetting_since_the_best_so_far_by_hand():
-    # Task 1 was at 0.8 and is at 0.4; task 2 is at its best.
-    of_seeds = scores.forgetting_since_best([SUCCESS, 0.5 * SUCCESS])
-    np.testing.assert_allclose(of_seeds, [(0.4 + 0) / 2, (0.2 + 0) / 2])
+    # Means of three: task 1 was at 0.7 and is at 0.5; task 2 is at its best.
+    success = np.vstack([[[0.7, NAN]], SUCCESS[1:], [[0.5, 0.4]]])
+    of_seeds = scores.forgetting_since_best([success, 0.5 * success])
+    lost = (0.7 + 0.8) / 2 - 0.5
+    np.testing.assert_allclose(of_seeds, [lost / 2, lost / 4])
     assert scores.forgetting_since_best(SUCCESS[:1]) == 0  # a task never tested is left out
-    assert scores.forgetting_since_best([[0.6], [0.0]]) == 0.6
 
 
 def test_what_noise_alone_leaves_of_the_best_equals_the_sum_over_all_outcomes():
@@ -55,8 +55,7 @@ def test_what_noise_alone_leaves_of_the_best_equals_the_sum_over_all_outcomes():
         for outcome in itertools.product((0, 1), repeat=6 - first):
             won, column = sum(outcome), np.concatenate([success[:first, task], outcome])
             chance = rate**won * (1 - rate) ** (len(outcome) - won)
-            means = scores.trailing_mean(column[:, None], 3)
-            total += chance * scores.forgetting_since_best(means)
+            total += chance * scores.forgetting_since_best(column[:, None])
         expected.append(total)
     found = scores.since_best_unchanged(run, draws=20_000)
     assert found == pytest.approx([np.mean(expected)] * 2, abs=0.01)
@@ -79,11 +78,11 @@ def test_episodes_until_overall_success_reaches_a_rate():
     # the second task comes in at 0 and is done.
     seeds = np.ones((2, 5, 2))
     seeds[:, :3, 1], seeds[:, 3, 1], seeds[0, 0, 0] = NAN, 0, 0
-    episodes = np.array([10, 20, 30, 40, 50])
+    run = make_run(seeds, (0, 15), "ab")
     # Over three evaluations: 1/2, 3/4, 5/6, (1 + 0) / 2, (1 + 1/2) / 2.
-    assert scores.overall_episodes_to(seeds, episodes) == 30
-    assert scores.overall_episodes_to(seeds, episodes, 0.7) == 20
-    assert scores.overall_episodes_to(seeds[:, :2], episodes[:2]) == INF
+    assert scores.episodes_to_80(run) == 15
+    assert scores.episodes_to_80(run, 0.7) == 10
+    assert scores.episodes_to_80(run.until(10)) == INF
 
 
 def test_own_episodes_until_a_rate_of_the_last_succeed():
@@ -97,8 +96,6 @@ def test_own_episodes_until_a_rate_of_the_last_succeed():
     outcomes = [1, 0, 1, 0, 1, 1, 1, 1, 0]
     assert scores.trials_to(outcomes, 0.8, window=5) == 7  # episodes 3 to 7
     assert scores.trials_to(outcomes, window=1) == 1
-    with pytest.raises(ValueError, match="at least 1 episode, not 0"):
-        scores.trials_to(outcomes, window=0)
 
 
 def test_learning_times_relative_to_the_first_task():
@@ -125,13 +122,14 @@ def test_late_scores_average_the_last_tenth_of_training():
     # A tenth of 30 episodes has no test but the last.
     run = make_run()
     np.testing.assert_allclose(scores.late_scores(run), [[0.5, 0.9, 0.4]] * 2)
+    run = make_run()
     run.config["seeds"].append(7)
     with pytest.raises(ValueError, match="no late test of seed 7"):
         scores.late_scores(run)
-    run = make_run()
-    run.curves.success[1, -1, 2] = NAN
+    success = np.stack([SUCCESS_OF_RUN] * 2)
+    success[1, -1, 2] = NAN
     with pytest.raises(ValueError, match="no late test of seed 1"):
-        scores.late_scores(run)
+        scores.late_scores(make_run(success))
 
 
 def test_the_success_matrix_averages_the_last_fifth_of_a_phase():
@@ -154,9 +152,8 @@ def test_best_scores_average_whole_windows_over_all_seeds():
     success[8:12] = 1  # a tenth of 200 episodes is four tests
     assert scores.best_scores(make_run(success, (0,), "a")).tolist() == [1]
     success[10:12] = 0
-    run = make_run(success, (0,), "a")
-    assert scores.best_scores(run).tolist() == [0.5]
-    run.curves.success[1] = 0
+    assert scores.best_scores(make_run(success, (0,), "a")).tolist() == [0.5]
+    run = make_run([success, 0 * success], (0,), "a")
     assert scores.best_scores(run).tolist() == [0.25]
     success[:2] = 1  # half of a window is none
     assert scores.best_scores(make_run(success, (0,), "a")).tolist() == [0.5]
@@ -169,10 +166,10 @@ def test_own_episodes_by_task_and_seed(tmp_path):
 
     never = [0] * 30
     directory = write_run(tmp_path, "bgpo", 9, episodes=120)
-    run = read_run(directory)
-    assert scores.own_episodes(run) is None
+    assert scores.own_episodes(read_run(directory)) is None
     seeds = [[learned(20), learned(30), never], [learned(40), learned(40), learned(30)]]
     write_training(directory, [*seeds, [[], learned(20), [0] * 10 + [1] * 20]])
+    run = read_run(directory)
     assert scores.own_episodes(run).tolist() == [[20, 30, INF], [40, 40, 30], [INF, 20, 20]]
     assert scores.own_episodes(run, 0.8)[2].tolist() == [INF, INF, 26]
 
@@ -190,13 +187,14 @@ def test_steps_of_late_successes_by_seed_and_task(tmp_path):
 
 
 def test_final_tests_by_seed_and_task(tmp_path):
-    run = read_run(write_run(tmp_path, "bgpo", [5, 5], tasks=("b", "a"), starts=(0, 0)))
-    assert scores.final_means(run, "seen", "success") is None
+    path = write_run(tmp_path, "bgpo", [5, 5], tasks=("b", "a"), starts=(0, 0))
+    assert scores.final_means(read_run(path), "seen", "success") is None
     head = "seed,demonstrations,task,episodes,success,steps,task_inference\n"
     cells = {(0, "a"): 0.1, (0, "b"): 0.2, (1, "a"): 0.3, (1, "b"): 0.4}
     steps = {(0, "a"): "", (0, "b"): 12.5, (1, "a"): 9, (1, "b"): 8}
     rows = [f"{s},seen,{task},20,{share},{steps[s, task]},\n" for (s, task), share in cells.items()]
-    (run.directory / "final.csv").write_text(head + "".join(rows))
+    (path / "final.csv").write_text(head + "".join(rows))
+    run = read_run(path)
     assert scores.final_means(run, "seen", "success").tolist() == [[0.2, 0.1], [0.4, 0.3]]
     np.testing.assert_array_equal(scores.final_means(run, "seen", "steps"), [[12.5, NAN], [8, 9]])
     assert scores.final_means(run, "seen", "task_inference") is None
@@ -253,12 +251,12 @@ def test_forward_transfer_is_zero_for_order_independent_learning(curve):
 
 
 def test_seeds_of_run_and_reference_widen_the_interval():
-    run, reference = make_run(), make_run(RISING, (0, 0, 0))
-    for widened, less in ((run, 0.1), (reference, 0.2)):
-        before = forward_transfer(run, reference)
-        widened.curves.success[1] -= less
-        after = forward_transfer(run, reference)
-        assert np.ptp(after[1:]) > np.ptp(before[1:])
+    success, rising = np.array(SUCCESS_OF_RUN), np.array(RISING)
+    runs = [make_run(success), make_run([success, success - 0.1])]
+    references = [make_run(each, (0, 0, 0)) for each in (rising, [rising, rising - 0.2])]
+    pairs = ((runs[0], references[0]), (runs[1], references[0]), (runs[1], references[1]))
+    widths = [np.ptp(forward_transfer(*pair)[1:]) for pair in pairs]
+    assert widths[0] < widths[1] < widths[2]
 
 
 @pytest.mark.slow
@@ -270,9 +268,8 @@ def test_the_interval_of_forward_transfer_has_its_nominal_coverage():
         noisy = []
         for run in exact:
             levels = 0.05 * rng.normal(size=(6, 1, 3))
-            success = run.curves.success[:1] + levels + 0.05 * rng.normal(size=(6, 6, 3))
-            curves = replace(run.curves, seeds=tuple(range(6)), success=success)
-            noisy.append(replace(run, curves=curves))
+            success = run.success[:1] + levels + 0.05 * rng.normal(size=(6, 6, 3))
+            noisy.append(make_run(success, run.starts))
         found = forward_transfer(*noisy)
         covered += found.low <= truth <= found.high
     assert covered / n == pytest.approx(0.95, abs=0.02)

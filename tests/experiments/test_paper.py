@@ -22,7 +22,7 @@ from bgpo_trl.experiments.arguments import Arguments
 from bgpo_trl.experiments.paper import concurrent, continual
 from bgpo_trl.experiments.report import ReportArguments, report
 from bgpo_trl.files.checkpoint import load_checkpoint
-from bgpo_trl.runs.results import read_final_tests, read_table, read_tests
+from bgpo_trl.runs.results import read_table
 from suites import nico
 from tests.helpers import Recorder, cells, contents, rows
 
@@ -44,12 +44,12 @@ def test_an_experiment_writes_curves_figures_and_a_summary(tiny, tmp_path):
     assert "GWR-B nodes: [" in printed and "groups of behaviors: [" in printed
     assert shlex.split(printed)[-3:] == ["bgpo", "report", str(run)]
     figures = {path.name for path in (run / "figures").iterdir()}
-    solved = read_tests(run / "eval.csv")["success"].any()
+    solved = read_table(run / "eval.csv")["success"].any()
     steps = ["steps.png"] if solved else []
     assert figures == {*FIGURES, *steps, *(f"{task}.gif" for task in TASKS)}
     assert json_of(run, "config")["task_starts"] == [0, 0, 0]
 
-    tests = read_final_tests(run / "final.csv")
+    tests = read_table(run / "final.csv")
     keys = tests[["seed", "demonstrations", "task"]].itertuples(index=False, name=None)
     assert sorted(keys) == sorted(
         (seed, kind, task) for seed in (3, 8) for kind in ("seen", "held-out") for task in TASKS
@@ -92,7 +92,7 @@ def test_every_algorithm_runs_and_is_reported_under_its_name(tiniest, tmp_path, 
         assert (run / file).exists() == with_gwr
     assert (run / "figures/groups.png").exists() == with_groups
     assert ("GWR-B" in printed) == with_gwr
-    tests = read_final_tests(run / "final.csv")
+    tests = read_table(run / "final.csv")
     assert (tests["task_inference"].notna() == with_gwr).all()
 
     reported = report(ReportArguments((run,)))
@@ -204,10 +204,10 @@ def test_dashboards_get_evaluations_final_tests_and_figures(tiniest, monkeypatch
     arguments = Arguments(out=run, wandb="offline", tensorboard=True)
     continual(arguments)
     shown = [(f"figures/{path.stem}", path) for path in sorted((run / "figures").iterdir())]
-    trained = read_final_tests(run / "final.csv").query("demonstrations == 'held-out'")
+    trained = read_table(run / "final.csv").query("demonstrations == 'held-out'")
     means = {f"final/success/{task}": s.mean() for task, s in trained.groupby("task")["success"]}
     means["final/success_mean"] = trained["success"].mean()
-    tested = sorted(set(read_tests(run / "eval.csv")["episode"]))
+    tested = sorted(set(read_table(run / "eval.csv")["episode"]))
     assert len(started) == 2
     for recorder in started:
         assert [step for _, step in recorder.metrics] == [*tested, 6]
@@ -287,7 +287,7 @@ def test_a_task_is_added_to_a_finished_run_and_reported(undrawn, tmp_path, encod
     with pytest.warns(match="confuse the new task with push_green_to_white"):
         printed = continual(command)
     assert "lift_green: nearest demonstration of the same task: 0% of the new" in printed
-    tests = read_final_tests(run / "final.csv")
+    tests = read_table(run / "final.csv")
     assert set(tests["task"]) == {*TASKS, "lift_green"}
     assert json_of(run, "config")["tasks"] == [*TASKS, "lift_green"]
     assert json_of(run, "config")["task_starts"][-1] > 6

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -9,11 +10,12 @@ import pytest
 
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.analysis import statistics
-from bgpo_trl.analysis.comparison import NAMES, Setting, read_run
+from bgpo_trl.analysis.comparison import NAMES, Setting
 from bgpo_trl.analysis.scores import forward_transfer, since_best_unchanged
-from bgpo_trl.analysis.tables import success_table
+from bgpo_trl.analysis.tables import success_section
 from bgpo_trl.experiments.report import ReportArguments, report
-from bgpo_trl.runs.cost import Cost, write_costs
+from bgpo_trl.runs import results
+from bgpo_trl.runs.results import read_run
 from tests.analysis.runs import TASKS, write_run, write_training
 from tests.helpers import cells, contents, edit
 
@@ -39,7 +41,7 @@ def complete(run):
     # The mean nodes of tasks 1 and 2 are 5 apart, those of 2 and 3 are 8.
     nodes = "task,group,w0,w1\n0,0,-1,0\n0,1,1,0\n1,0,3,4\n2,1,3,-4\n"
     (run / "gwr.csv").write_text(nodes)
-    write_costs(run / "cost.csv", {1: Cost(10, 0.1, 2.0), 3: Cost(20, 0.3, 9.0)})
+    (run / "cost.csv").write_text("tasks,steps,seconds,megabytes\n1,30,0.3,2\n3,60,0.9,9\n")
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +89,8 @@ def test_what_an_algorithm_knows_of_tasks_is_shown(tmp_path):
         text: replace(run, summary={"needs_label": needs, "needs_boundaries": needs})
         for text, needs in told.items()
     }
-    head, *rows = success_table(Setting({**runs, "?": replace(run, summary={})}))
+    (section,) = success_section(Setting({**runs, "?": replace(run, summary={})}))
+    head, *rows = section.table
     assert [row[head.index("knows of tasks")] for row in rows] == [*runs, "?"]
 
 
@@ -170,6 +173,13 @@ def test_figures_are_beside_the_tables_and_the_report_on_an_archive_is_the_same(
         assert (tmp_path / "again" / name).read_bytes() == (reported / name).read_bytes()
 
 
+def test_each_file_of_a_run_is_read_once(reported, tmp_path, monkeypatch):
+    counts, read = Counter(), results._read_text
+    monkeypatch.setattr(results, "_read_text", lambda path: counts.update([path]) or read(path))
+    report(ReportArguments((reported,), out=tmp_path))
+    assert counts == Counter(reported.glob("*/*.csv"))
+
+
 def split(run, folder):
     """Write a run of three seeds as three runs."""
     for seed in range(3):
@@ -183,7 +193,8 @@ def split(run, folder):
         summary = json.loads((run / "summary.json").read_text())
         lists = {name: [summary[name][seed]] for name in ("nodes", "groups", "group_purity")}
         edit(part / "summary.json", **lists)
-        write_costs(part / "cost.csv", {1: Cost(10, 0.1, 2 / 3), 3: Cost(20, 0.3, 3.0)})
+        costs = "tasks,steps,seconds,megabytes\n1,10,0.1,0.6667\n3,20,0.3,3\n"
+        (part / "cost.csv").write_text(costs)
 
 
 def test_runs_that_differ_in_their_seeds_alone_are_reported_as_one(reported, tmp_path):
@@ -202,7 +213,7 @@ def test_runs_that_differ_in_their_seeds_alone_are_reported_as_one(reported, tmp
     shutil.copytree(parts / "seeds-0", parts / "more")
     with pytest.raises(ValueError, match="holds 4 runs, name one of them"):
         compared(other, parts)
-    edit(parts / "more" / "config.json", seeds=[7], algorithm={"max_steps": 50, "beta": 7})
+    edit(parts / "more" / "config.json", algorithm={"max_steps": 50, "beta": 7})
     with pytest.raises(ValueError, match="holds 2 runs"):
         compared(other, parts)
 

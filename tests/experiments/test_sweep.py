@@ -17,13 +17,11 @@ import pytest
 from eight_tasks import EightTasksArguments
 
 from bgpo_trl.algorithms import ALGORITHMS
-from bgpo_trl.analysis.comparison import joined, read_run, run_directories
 from bgpo_trl.configs import PRESETS
-from bgpo_trl.experiments import ray_jobs as jobs
 from bgpo_trl.experiments import sweep
-from bgpo_trl.experiments.ray_jobs import Job
-from bgpo_trl.experiments.sweep import SweepArguments
+from bgpo_trl.experiments.sweep import Job, SweepArguments
 from bgpo_trl.runs.config_file import Digests, settings_of
+from bgpo_trl.runs.results import joined, read_run, run_directories
 from suites import nico
 from tests.helpers import contents
 
@@ -164,7 +162,7 @@ def test_a_sweep_runs_each_job_once(tmp_path, monkeypatch):
         failed = {}
         for job in todo:
             try:
-                jobs.work(job, play, sys.argv)
+                sweep.work(job, play, sys.argv)
             except OSError as error:
                 failed[job] = str(error)
         return failed
@@ -195,8 +193,8 @@ def test_a_sweep_runs_each_job_once(tmp_path, monkeypatch):
     sweep.sweep(replace(arguments, algorithms=("maml",), seeds=(5, 3)))
     assert played == ["concurrent-maml/seeds-5-3"]
     bgpo, maml = joined(map(read_run, run_directories([tmp_path])))
-    assert sorted(bgpo.curves.seeds) == [0, 2, 4]
-    assert sorted(maml.curves.seeds) == [0, 2, 3, 4, 5]
+    assert sorted(bgpo.seeds) == [0, 2, 4]
+    assert sorted(maml.seeds) == [0, 2, 3, 4, 5]
 
 
 def test_the_documented_slurm_array_requeues_interrupted_jobs_alone(tmp_path):

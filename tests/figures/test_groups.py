@@ -1,32 +1,36 @@
-"""Content of the figures of nodes and groups, from a train.csv written by hand."""
+"""Content of the figures of nodes and groups, from training episodes written by hand."""
+
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from matplotlib.collections import LineCollection
 from matplotlib.colors import to_hex
 
-from bgpo_trl.figures.groups import plot_counts, plot_groups, read_counts, read_groups
+from bgpo_trl.figures.groups import plot_counts, plot_groups
+from bgpo_trl.runs.results import Run
 
 TASKS = ["grasp_glass", "push_green_to_white"]
-PRESENTED = {"grasp_glass": 0, "push_green_to_white": 3}
+CONFIG = {"seeds": [3, 8], "tasks": TASKS, "task_starts": [0, 3], "episodes": 8}
 BLUE, ORANGE = "#0072b2", "#d55e00"
 # Task, group and groups known afterwards, of seeds 3 and 8: task 2 is first played by group 0.
 FIRST = [(0, 0, 1), (0, 0, 1), (0, 0, 1), (1, 0, 2), (1, 1, 2), (0, 0, 2), (1, 1, 2), (0, 0, 2)]
 SECOND = [(0, 0, 1), (0, 0, 1), (0, 0, 1), (1, 0, 1), (1, 0, 1), (0, 0, 1), (1, 0, 3), (0, 2, 3)]
-HEAD = "seed,episode,task,group,num_groups,num_nodes\n"
 
 
 @pytest.fixture
-def path(tmp_path):
+def run():
     """Seeds 8 and 3 with rows in reverse order; seed 8 has played one episode more."""
     rows = [
-        f"{seed},{episode},{TASKS[task]},{group},{num_groups},{2 * episode + seed}"
-        for seed, run in ((8, [*SECOND, (1, 0, 3)]), (3, FIRST))
-        for episode, (task, group, num_groups) in enumerate(run, 1)
+        (seed, episode, TASKS[task], group, num_groups, 2 * episode + seed)
+        for seed, played in ((8, [*SECOND, (1, 0, 3)]), (3, FIRST))
+        for episode, (task, group, num_groups) in enumerate(played, 1)
     ]
-    path = tmp_path / "train.csv"
-    path.write_text(HEAD + "\n".join(rows[::-1]) + "\n")
-    return path
+    columns = ["seed", "episode", "task", "group", "num_groups", "num_nodes"]
+    training = pd.DataFrame(rows[::-1], columns=columns)
+    return Run((Path("x"),), CONFIG, {}, tests=pd.DataFrame({"episode": [4, 9]}), training=training)
 
 
 def marks(axes):
@@ -41,16 +45,9 @@ def marks(axes):
     return found
 
 
-def test_counts_are_read_up_to_the_last_episode_of_the_slowest_seed(path):
-    counts = read_counts(path)
-    nodes = [[2 * episode + seed for episode in range(1, 9)] for seed in (3, 8)]
-    assert counts["num_nodes"].tolist() == nodes
-    assert counts["num_groups"].tolist() == [[row[2] for row in run] for run in (FIRST, SECOND)]
-    assert read_counts(path, last=2)["num_groups"].tolist() == [[1, 1], [1, 1]]
-
-
-def test_counts_are_drawn_as_means_shaded_from_the_lowest_to_the_highest_seed(path):
-    figure = plot_counts({"BGPO": read_counts(path)}, PRESENTED)
+def test_counts_are_means_shaded_from_the_lowest_to_the_highest_seed(run):
+    """Up to the last episode of the slowest seed, or to the last test."""
+    figure = plot_counts({"BGPO": run})
     nodes, groups = figure.axes
     assert nodes.lines[0].get_xdata().tolist() == [*range(1, 9)]
     assert nodes.lines[0].get_ydata().tolist() == [2 * episode + 5.5 for episode in range(1, 9)]
@@ -60,11 +57,13 @@ def test_counts_are_drawn_as_means_shaded_from_the_lowest_to_the_highest_seed(pa
     for panel in figure.axes:
         assert [text.get_text() for text in panel.texts] == ["task 2"]
         assert list(panel.lines[1].get_xdata()) == [3, 3]
+    cut = plot_counts({"BGPO": run.until(4)}).axes[1]
+    assert cut.lines[0].get_ydata().tolist() == [1, 1, 1, 1.5]
 
 
-def test_a_group_has_a_row_with_a_mark_for_each_episode(path):
-    table = read_groups(path, TASKS)
-    numbers, first, second = plot_groups(table[table["episode"] < 9], PRESENTED).axes
+def test_a_group_has_a_row_with_a_mark_for_each_episode(run):
+    training = run.training[run.training["episode"] < 9]
+    numbers, first, second = plot_groups(replace(run, training=training)).axes
     start, of_second, of_first = numbers.lines
     assert set(start.get_xdata()) == {3}
     assert of_first.get_ydata().tolist() == [1, 1, 1, 2, 2, 2, 2, 2]
@@ -83,17 +82,9 @@ def test_a_group_has_a_row_with_a_mark_for_each_episode(path):
     assert [text.get_text() for text in second.get_yticklabels()] == ["0", "2"]
 
 
-def test_runs_without_episodes_or_groups_are_refused(path):
-    with pytest.raises(ValueError, match="is damaged"):
-        read_groups(path, TASKS[:1])
-    path.write_text(HEAD)
-    for call in (
-        lambda: plot_groups(read_groups(path, TASKS), PRESENTED),
-        lambda: plot_counts({}, PRESENTED),
-        lambda: plot_counts({"BGPO": read_counts(path)}, PRESENTED),
-    ):
-        with pytest.raises(ValueError, match="no training episode to show"):
-            call()
-    path.write_text("seed,episode,task\n0,1,grasp_glass\n")
-    with pytest.raises(ValueError, match="lacks the columns group, num_groups"):
-        read_groups(path, TASKS)
+def test_runs_without_training_episodes_are_refused(run):
+    for training in (None, run.training[:0]):
+        empty = replace(run, training=training)
+        for plot in (plot_groups, lambda run: plot_counts({"BGPO": run})):
+            with pytest.raises(ValueError, match="no training episode to show"):
+                plot(empty)

@@ -2,11 +2,12 @@
 
 import itertools
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
+import pandas as pd
 import pytest
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
@@ -22,34 +23,37 @@ from bgpo_trl.figures.success import (
     plot_success_curves,
     plot_success_matrices,
 )
+from bgpo_trl.runs.results import Run
 
 TASKS = ["grasp_glass", "push_green_to_glass", "push_green_to_white"]
 
 
-@pytest.fixture
-def write(tmp_path):
-    """Writes an eval.csv from algorithm, seed, episode, task, success and steps (30) of tests."""
-
-    def write(rows: Iterable[tuple[str, int, int, str, int] | tuple[str, int, int, str, int, int]]):
-        lines = ["algorithm,seed,episode,env_steps,task,success,return,steps"]
-        for algorithm, seed, episode, task, success, *steps in rows:
-            cells = (algorithm, seed, episode, 30 * episode, task, success, 0.0, *(steps or [30]))
-            lines.append(",".join(map(str, cells)))
-        (tmp_path / "eval.csv").write_text("\n".join(lines) + "\n")
-        return tmp_path / "eval.csv"
-
-    return write
+def run_of(rows: Iterable[tuple[int, ...]], tasks: Sequence[str], starts=None, **summary) -> Run:
+    """Make a run from seed, episode, task, success and steps (30) of tests."""
+    rows = [(*row, *[30][len(row) - 4 :]) for row in rows]
+    tests = pd.DataFrame(rows, columns=["seed", "episode", "task", "success", "steps"])
+    seeds = sorted(set(tests["seed"]))
+    config = {"seeds": seeds, "tasks": [*tasks], "task_starts": [*(starts or (0,) * len(tasks))]}
+    return Run((Path("x"),), config, summary, tests)
 
 
 @pytest.fixture
-def run(write) -> Path:
+def runs() -> dict[str, Run]:
     """Three algorithms, two seeds, tasks presented from episodes 0, 35 and 65 of 100."""
-    draws = np.random.default_rng(0)
-    kinds = itertools.product(("BGPO", "MAML", "Dist-NLL"), range(2), range(1, 101))
-    return write(
-        (*kind, TASKS[draws.integers(1 + (kind[2] >= 35) + (kind[2] >= 65))], draws.integers(2))
-        for kind in kinds
-    )
+    draws, starts = np.random.default_rng(0), (0, 35, 65)
+    kinds = [*itertools.product(range(2), range(1, 101))]
+    return {
+        name: run_of(
+            [
+                (*kind, TASKS[draws.integers(1 + sum(kind[1] >= s for s in starts[1:]))], won)
+                for kind, won in zip(kinds, draws.integers(2, size=len(kinds)), strict=True)
+            ],
+            TASKS,
+            starts,
+            random_success={TASKS[1]: 0.05},
+        )
+        for name in ("BGPO", "MAML", "Dist-NLL")
+    }
 
 
 def curve(axes: Axes, index: int = 0) -> dict[int, float]:
@@ -70,10 +74,10 @@ def vertical_lines(axes: Axes) -> list[float]:
     return sorted(float(x[0]) for x in lines if len(x) == 2 and x[0] == x[1])
 
 
-def test_mean_and_spread_over_seeds_by_hand(write):
+def test_mean_and_spread_over_seeds_by_hand():
     outcomes = enumerate([(1, 1, 0), (0, 1, 0)])
-    rows = [("bgpo", seed, e, "push", won) for seed, s in outcomes for e, won in enumerate(s, 1)]
-    overall, push = plot_success_curves(write(rows), window=2).axes
+    rows = [(seed, e, "push", won) for seed, s in outcomes for e, won in enumerate(s, 1)]
+    overall, push = plot_success_curves({"BGPO": run_of(rows, ["push"])}, window=2).axes
     # Seed 0: 1, (1 + 1) / 2, (1 + 0) / 2; seed 1: 0, (0 + 1) / 2, (1 + 0) / 2.
     assert curve(overall) == curve(push) == {1: 0.5, 2: 0.75, 3: 0.5}
     assert band(overall, 1) == (0, 1)
@@ -81,10 +85,9 @@ def test_mean_and_spread_over_seeds_by_hand(write):
     assert band(overall, 3) == (0.5, 0.5)
 
 
-def test_each_panel_shows_its_task_with_a_trailing_window(write):
-    rows = [("bgpo", 0, 1, "a", 1), ("bgpo", 0, 2, "b", 0), ("bgpo", 0, 3, "a", 0)]
-    rows += [("bgpo", 0, 6, "b", 1), ("bgpo", 1, 6, "b", 0)]
-    overall, a, b = plot_success_curves(write(rows), window=3).axes
+def test_each_panel_shows_its_task_with_a_trailing_window():
+    rows = [(0, 1, "a", 1), (0, 2, "b", 0), (0, 3, "a", 0), (0, 6, "b", 1), (1, 6, "b", 0)]
+    overall, a, b = plot_success_curves({"BGPO": run_of(rows, "ab")}, window=3).axes
     assert [axes.get_title() for axes in (a, b)] == ["Task 1: a", "Task 2: b"]
     # A point for each evaluation: nothing is known of episodes 4 and 5.
     assert curve(overall) == pytest.approx({1: 1, 2: 1 / 2, 3: 1 / 3, 6: 1 / 2})
@@ -93,11 +96,10 @@ def test_each_panel_shows_its_task_with_a_trailing_window(write):
     assert curve(b) == {2: 0, 3: 0, 6: 1 / 2}
 
 
-def test_task_starts_and_random_success_are_marked(run):
-    presented = {TASKS[2]: 0, TASKS[0]: 35, TASKS[1]: 65}
-    figure = plot_success_curves(run, presented=presented, random_success={TASKS[0]: 0.05})
+def test_task_starts_and_random_success_are_marked(runs):
+    figure = plot_success_curves(runs)
     assert [vertical_lines(axes) for axes in figure.axes] == [[35, 65], [], [35], [65]]
-    assert figure.axes[2].get_title() == "Task 2: grasp glass"
+    assert figure.axes[2].get_title() == "Task 2: push green to glass"
     by_chance = [
         any(np.array_equal(line.get_ydata(), [0.05, 0.05]) for line in axes.lines)
         for axes in figure.axes
@@ -107,10 +109,11 @@ def test_task_starts_and_random_success_are_marked(run):
     assert labels == ["BGPO (2 seeds)", "MAML (2 seeds)", "Dist-NLL (2 seeds)", "random policy"]
 
 
-def test_steps_are_means_over_successes(write):
-    rows = [("bgpo", 0, 1, "a", 1, 20), ("bgpo", 0, 2, "a", 0, 50), ("bgpo", 0, 3, "a", 1, 10)]
-    rows += [("bgpo", 1, 1, "a", 0, 50), ("bgpo", 1, 3, "a", 1, 30), ("bgpo", 1, 3, "b", 0, 50)]
-    figure = plot_step_curves(write(rows), demonstrated={"a": 28.0}, window=2)
+def test_steps_are_means_over_successes():
+    rows = [(0, 1, "a", 1, 20), (0, 2, "a", 0, 50), (0, 3, "a", 1, 10)]
+    rows += [(1, 1, "a", 0, 50), (1, 3, "a", 1, 30), (1, 3, "b", 0, 50)]
+    run = run_of(rows, "ab", demonstrated_steps={"a": 28.0})
+    figure = plot_step_curves({"BGPO": run}, window=2)
     overall, a, b = figure.axes
     # Seed 0: 20, 20, 10 (the failure has no steps, and episode 1 is out of the window).
     assert curve(overall) == curve(a) == {1: 20, 2: 20, 3: (10 + 30) / 2}
@@ -122,10 +125,10 @@ def test_steps_are_means_over_successes(write):
         assert panel.get_ylim() == pytest.approx((0, 33))
 
 
-def test_the_same_data_gives_the_same_file_without_global_state(run, tmp_path):
+def test_the_same_data_gives_the_same_file_without_global_state(runs, tmp_path):
     before = dict(mpl.rcParams)
     for name in ("first", "second"):
-        save_figure(plot_success_curves(run), tmp_path / "figures" / name)
+        save_figure(plot_success_curves(runs), tmp_path / "figures" / name)
     first, second = ((tmp_path / "figures" / name).read_bytes() for name in ("first", "second"))
     assert first == second
     assert first.startswith(b"\x89PNG")
@@ -168,19 +171,16 @@ def check_labels(figure: Figure, least: int = 1) -> None:
     ("n_tasks", "algorithms"),
     [(1, ["bgpo"]), (3, ["bgpo"]), (8, ["GWR-B + intrinsic reward", "GWR-B", "no", "x"])],
 )
-def test_no_label_is_cut_off_or_overlaps_another(n_tasks, algorithms, write):
+def test_no_label_is_cut_off_or_overlaps_another(n_tasks, algorithms):
     tasks = [f"push_green_to_{number}" for number in range(n_tasks)]
-    rows = [
-        (algorithm, 0, episode, tasks[episode % n_tasks], episode % 2)
-        for algorithm in algorithms
-        for episode in range(0, 20001, 100)
-    ]
-    presented = {task: 20000 * index // n_tasks for index, task in enumerate(tasks)}
+    rows = [(0, episode, tasks[episode % n_tasks], episode % 2) for episode in range(0, 20001, 100)]
+    starts = [20000 * index // n_tasks for index in range(n_tasks)]
+    marked = {"random_success": {tasks[0]: 0.1}, "demonstrated_steps": {tasks[0]: 28.0}}
     check_labels(
-        plot_success_curves(write(rows), presented=presented, random_success={tasks[0]: 0.1})
+        plot_success_curves(dict.fromkeys(algorithms, run_of(rows, tasks, starts, **marked)))
     )
-    won = write((*row[:4], 1) for row in rows)
-    check_labels(plot_step_curves(won, presented=presented, demonstrated={tasks[0]: 28.0}))
+    won = run_of([(*row[:3], 1) for row in rows], tasks, starts, **marked)
+    check_labels(plot_step_curves(dict.fromkeys(algorithms, won)))
     nodes, numbers = np.random.default_rng(0).normal(size=(50, 8)), np.arange(50)
     check_labels(plot_gwr_pca(nodes, numbers % (n_tasks + 1) - 1, tasks, numbers % n_tasks))
     panels = {f"Dist-NLL + demonstrations {number}": np.eye(n_tasks) for number in range(5)}
@@ -192,7 +192,9 @@ FIRST, SECOND = [[0.75, NAN], [0.5, 1.0]], [[0.25, NAN], [0.0, 0.125]]
 
 
 def test_a_panel_shows_the_matrix_as_colors_and_numbers():
-    figure = plot_success_matrices({"one": FIRST, "two": SECOND}, ["grasp_glass", "lift_green"])
+    figure = plot_success_matrices(
+        {"one": np.array(FIRST), "two": np.array(SECOND)}, ["grasp_glass", "lift_green"]
+    )
     one, two = (axes for axes in figure.axes if axes.images)
     assert (one.get_title(), two.get_title()) == ("one", "two")
     for panel, matrix in ((one, FIRST), (two, SECOND)):
@@ -206,9 +208,7 @@ def test_a_panel_shows_the_matrix_as_colors_and_numbers():
 
 
 REFUSED = {
-    "no test episodes": lambda: plot_success_curves({}),
-    "row and a column per task, not [2, 2]": lambda: plot_success_matrices({"one": FIRST}, "abc"),
-    "not none": lambda: plot_success_matrices({}, "ab"),
+    "no steps to plot": lambda: plot_step_curves({"none": run_of([(0, 1, "a", 0)], "a")}),
     "nothing to show": lambda: plot_frame_strips({"none": np.zeros((0, 2, 2, 3), np.uint8)}),
     "uint8 [T, H, W, 3]": lambda: save_gif(np.zeros((1, 2, 3, 3)), "none.gif"),
     "N, d >= 2, not [1, 4]": lambda: plot_gwr_pca(np.zeros((1, 4)), [0], "ab"),

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from bgpo_trl.runs.cost import Cost, CostLog, read_costs, total_cost
+from bgpo_trl.runs.cost import CostLog, read_costs
 
 STATE = {"a": torch.zeros(3), "b": [{"c": torch.zeros(2, dtype=torch.int64)}, 7, None, "x"]}
 
@@ -17,11 +17,6 @@ def test_costs_are_summed_by_the_number_of_tasks(tmp_path):
     lines = (tmp_path / "cost.csv").read_text().splitlines()
     assert lines == ["tasks,steps,seconds,megabytes", "1,2,0.750,0.000028", "2,1,1.000,0.000000"]
     assert read_costs(tmp_path / "cost.csv") == log.costs
-
-
-def test_costs_of_runs_are_added(tmp_path):
-    first, second = {1: Cost(5, 1.5, 2.0), 2: Cost(1, 0.5, 3.0)}, {1: Cost(4, 1.0, 1.0)}
-    assert total_cost([first, second]) == {1: Cost(9, 2.5, 3.0), 2: Cost(1, 0.5, 3.0)}
 
 
 @pytest.mark.parametrize("row", ["1,2,-3,4", "1,2.5,3,4"])

@@ -10,7 +10,8 @@ import torch
 
 from bgpo_trl.runs import dashboard
 from bgpo_trl.runs.dashboard import Dashboard, tensorboard_logger, wandb_logger
-from bgpo_trl.runs.directory import TRAIN_COLUMNS, RunLogger
+from bgpo_trl.runs.directory import RunLogger
+from bgpo_trl.runs.results import COLUMNS
 from tests.helpers import Recorder
 
 SETTINGS = {"gamma": 0.98, "seeds": [3, 8], "network": {"hidden": [64], "rate": None}}
@@ -108,7 +109,7 @@ def test_a_resumed_run_logs_the_means_of_an_uninterrupted_one(make):
     uninterrupted, resumed = Recorder(), Recorder()
     random = np.random.default_rng(0)
     played = [
-        dict.fromkeys(TRAIN_COLUMNS, 2)
+        dict.fromkeys(COLUMNS["train.csv"], 2)
         | episode(seed, number, "push", number % 2, loss_actor=random.normal())
         for number in range(1, 7)
         for seed in (3, 8)

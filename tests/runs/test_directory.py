@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
-from bgpo_trl.runs.directory import EVAL_COLUMNS, TRAIN_COLUMNS, RunLogger, check_settings
+from bgpo_trl.runs.directory import RunLogger, check_settings
+from bgpo_trl.runs.results import COLUMNS
 from bgpo_trl.scenes import SCENES, find_scene
 from tests.algorithms.playing import assert_same
 from tests.helpers import CHECKPOINTS, UNPICKLED, edit, put_checkpoint, rows
@@ -175,7 +176,7 @@ def test_only_the_number_of_episodes_may_grow(begin, make_config, tmp_path):
 
 
 CONFIG = {"gamma": 0.98, "network": {"hidden": [64]}}
-ROW = dict(zip(EVAL_COLUMNS, ("bgpo", 2, 7, 210, "grasp_glass", True, 1.0, 28), strict=True))
+ROW = dict(zip(COLUMNS["eval.csv"], ("bgpo", 2, 7, 210, "grasp_glass", True, 1.0, 28), strict=True))
 
 
 def test_a_run_writes_its_settings_and_two_csv_files(tmp_path):
@@ -190,8 +191,8 @@ def test_a_run_writes_its_settings_and_two_csv_files(tmp_path):
     assert json.loads((directory / "config.json").read_text()) == CONFIG
     cells = "bgpo,2,7,210,grasp_glass,1,1.0,28"
     train, tests = ((directory / name).read_text().splitlines() for name in sizes)
-    assert train == [",".join(TRAIN_COLUMNS), f"{cells},0.25,,,,,"]
-    assert tests == [",".join(EVAL_COLUMNS), cells]
+    assert train == [",".join(COLUMNS["train.csv"]), f"{cells},0.25,,,,,"]
+    assert tests == [",".join(COLUMNS["eval.csv"]), cells]
 
 
 def test_a_column_that_is_there_already_is_refused(tmp_path):

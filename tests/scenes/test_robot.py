@@ -17,7 +17,7 @@ from bgpo_trl.encoders.train import make_pretrained
 from bgpo_trl.experiments.arguments import Arguments
 from bgpo_trl.experiments.run import run_experiment
 from bgpo_trl.policy import load_run
-from bgpo_trl.runs.results import EVAL, read_table
+from bgpo_trl.runs.results import read_table
 from bgpo_trl.scenes import SCENES, Outcome, RobotEnv, SimulationEnv
 from bgpo_trl.training import Trainer
 from tests.helpers import TINY_ENCODERS
@@ -115,7 +115,7 @@ def test_a_run_without_tests_learns_from_what_was_executed(tmp_path, monkeypatch
     expected = torch.cat(asked).clamp(-LIMIT, LIMIT)
     assert torch.cat(asked).abs().max() > LIMIT
     torch.testing.assert_close(held["action"], expected)
-    assert not len(read_table(tmp_path / "run" / "eval.csv", EVAL))
+    assert not len(read_table(tmp_path / "run" / "eval.csv"))
     longer = replace(run, episodes=6)  # the dot, unlike most robots, can be saved
     with Trainer(longer, tmp_path / "run", resume=True, **parts) as trainer:
         trainer.run()

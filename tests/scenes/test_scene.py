@@ -22,7 +22,7 @@ from bgpo_trl.experiments.measure import draw, measure
 from bgpo_trl.experiments.watch import WatchArguments, watch
 from bgpo_trl.modules.vae import VAE
 from bgpo_trl.policy import load_run
-from bgpo_trl.runs.results import TRAIN, read_table
+from bgpo_trl.runs.results import read_table
 from bgpo_trl.scenes import SCENES, Outcome, SimulationEnv, StateColumns, find_scene
 from bgpo_trl.training import Trainer
 from tests.helpers import TINY_ENCODERS
@@ -229,7 +229,7 @@ def test_a_run_of_tasks_named_by_sentences_is_loaded_and_filmed(tmp_path, monkey
 def test_a_run_learns_on_another_robot_and_is_loaded_and_filmed(pretrained, tmp_path, monkeypatch):
     monkeypatch.setitem(SCENES, "dot", scene())
     train(tmp_path / "run", pretrained)
-    table = read_table(tmp_path / "run" / "train.csv", TRAIN)
+    table = read_table(tmp_path / "run" / "train.csv")
     assert len(table) == 8
     assert set(table["task"]) == set(TASKS)
 
@@ -457,7 +457,7 @@ def test_baselines_learn_on_another_robot(pretrained, tmp_path, monkeypatch, nam
     monkeypatch.setitem(SCENES, "dot", scene())
     algorithm = replace(ALGORITHMS[name].config, max_steps=12)
     train(tmp_path, pretrained, name=name, algorithm=algorithm, schedule="sequential")
-    assert len(read_table(tmp_path / "train.csv", TRAIN)) == 8
+    assert len(read_table(tmp_path / "train.csv")) == 8
 
 
 def test_a_run_continues_if_its_simulation_can_be_saved(pretrained, tmp_path, monkeypatch):

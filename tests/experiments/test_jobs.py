@@ -12,10 +12,10 @@ from types import SimpleNamespace
 import pytest
 
 from bgpo_trl.configs import RunConfig
-from bgpo_trl.experiments import ray_jobs as jobs
+from bgpo_trl.experiments import sweep as jobs
 from bgpo_trl.experiments.arguments import Arguments
 from bgpo_trl.experiments.command_line import command_line
-from bgpo_trl.experiments.ray_jobs import Job
+from bgpo_trl.experiments.sweep import Job
 from bgpo_trl.training import Trainer
 from tests.helpers import rows
 
