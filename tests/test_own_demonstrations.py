@@ -61,7 +61,7 @@ def config_of(make_config, share):
     config = make_config(scene="dot", tasks=TASKS, task_starts=(0, 2), episodes=4, seeds=(3,))
     rl = config.algorithm.rl
     if not share:
-        rl = replace(rl, proposals="actor")
+        rl = replace(rl, proposals="actor", imitation=0.0)
     return replace(config, algorithm=replace(config.algorithm, demonstration_share=share, rl=rl))
 
 

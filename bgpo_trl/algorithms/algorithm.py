@@ -171,7 +171,7 @@ class Algorithm(ABC):
         self._noise = generators(seeds, "exploration")
         self.proposals: ProposalTrials | None = None
         if (rl := config.rl).proposals != "actor":
-            self.logged = ("loss_clone",)
+            self.logged = ("loss_clone", *self.logged)
         if rl.proposals == "both":
             self.proposals = ProposalTrials(
                 len(seeds), clone_episodes=rl.clone_episodes, clone_share=rl.clone_share

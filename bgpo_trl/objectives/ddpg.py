@@ -209,7 +209,9 @@ class DDPGLoss(LossModule):
         self._pairs = [*combinations(range(n_critics), 2)] or [(0, 0)]
         self.register_buffer("n_calls", torch.zeros((), dtype=torch.int64))
         # Of each actor, as actors come to new tasks at different times.
-        self.register_buffer("n_imitated", torch.zeros(self.batch_size, dtype=torch.int64))
+        device = next(iter(self.actor_network_params.values(True, True))).device
+        counts = torch.zeros(self.batch_size, dtype=torch.int64, device=device)
+        self.register_buffer("n_imitated", counts)
 
     @property
     def in_keys(self) -> list[NestedKey]:  # pyright: ignore[reportIncompatibleVariableOverride]

@@ -257,7 +257,7 @@ def test_what_an_algorithm_lacks_is_refused(make_config, bank, encoders, in_worl
     with pytest.raises(ValueError, match=r"^the bank has no steps of demonstrations[^\n]*$"):
         BGPO(config, seeds=(0,), bank=without, encoders=encoders)
     with pytest.raises(
-        ValueError, match=r"^demonstration_share must be above 0 for a clone[^\n]*$"
+        ValueError, match=r"^demonstration_share must be above 0 for a policy[^\n]*$"
     ):
         replace(config, demonstration_share=0.0)
 

@@ -33,7 +33,7 @@ def make(make_task_algorithm):
 
 def networks(loss):
     """The tensors of a loss that have a row for each task of each seed, by name."""
-    return {key: value for key, value in loss.state_dict().items() if value.ndim > 1}
+    return {key: value for key, value in loss.state_dict().items() if value.ndim > 2}
 
 
 @both
