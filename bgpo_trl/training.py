@@ -9,13 +9,14 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.record.loggers.common import Logger
 
 from bgpo_trl.algorithms import Algorithm, entry
+from bgpo_trl.algorithms.bgpo import BGPO
 from bgpo_trl.configs import RunConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.encoders.representation import Representation, check_savable
@@ -31,6 +32,7 @@ from bgpo_trl.runs.demonstrations import keep_inputs
 from bgpo_trl.runs.directory import RunLogger, fitting_checkpoint, load_last
 from bgpo_trl.runs.gwr_graphs import growth_moments, save_graph
 from bgpo_trl.scenes import find_scene
+from bgpo_trl.seeding import generators
 from bgpo_trl.transforms import TaskSchedule
 from bgpo_trl.world import World
 
@@ -42,6 +44,10 @@ class Trainer:
     on, unlogged, until the last one finishes; logged values are those of the seed alone. A run
     resumed with more ``config.episodes`` equals a run of that length. A run resumed with further
     tasks at the end (`bgpo_trl.runs.growth.add_task`) keeps all that it has learned.
+
+    With ``config.offline_updates``, each seed first learns from the demonstrations of the tasks
+    that are presented from the start (`BGPO.learn_offline`). A run that is interrupted meanwhile
+    begins again when it is resumed.
 
     Updates, one in ``update_every`` steps, run while the environment steps, and learn from all
     earlier transitions.
@@ -236,6 +242,8 @@ class Trainer:
         """
         algorithm, env, n_episodes = self.algorithm, self.world.env, self.config.episodes
         if self._state is None:
+            if self.config.offline_updates:
+                self._learn_offline()
             self._state = env.reset()
             self.save()  # Rows without a checkpoint could not be resumed.
         state, saved = self._state, time.monotonic()
@@ -284,6 +292,21 @@ class Trainer:
         finally:
             gc.unfreeze()
             bar.close()
+
+    def _learn_offline(self) -> None:
+        """Learn from all demonstrations of the first tasks, in an order of each seed's own."""
+        config, algorithm = self.config, cast(BGPO, self.algorithm)
+        presented = self._schedule.presented(torch.tensor(1))
+        rows = presented[algorithm.bank.task].nonzero().flatten()
+        streams = generators(config.seeds, "offline")
+        orders = [rows[torch.randperm(len(rows), generator=stream)] for stream in streams]
+        bar = progress_bar(
+            "offline", shown=self.progress, total=config.offline_updates, unit="update"
+        )
+        for losses in algorithm.learn_offline(torch.stack(orders, 1), config.offline_updates):
+            self._losses |= losses
+            bar.update()
+        bar.close()
 
     def close(self) -> None:
         """Close files and dashboards, and unlock the directory for other processes."""

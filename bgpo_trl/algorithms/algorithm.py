@@ -333,6 +333,7 @@ class Algorithm(ABC):
         groups: Callable[[int], Tensor],
         n_rows: int,
         *,
+        share: float | None = None,
         generator: Sequence[torch.Generator] | None = None,
     ) -> TensorDictBase:
         """Draw transitions ``[S, E, B]`` to learn from, a share of demonstrated ones last.
@@ -343,14 +344,18 @@ class Algorithm(ABC):
             groups: Returns the group of each of ``n`` transitions, int64 ``[S, E, n]``, given
                 ``n``; -1 for none.
             n_rows: Number of transitions ``B``.
+            share: Share of demonstrated ones, by default ``demonstration_share``. With 1, none have
+                to be in the replay of training episodes.
             generator: Random generators of the seeds, in place of the replays'.
         """
         if self.shown is None:
             return self.replay.sample(groups(n_rows), generator=generator)
-        n_shown = round(self.config.demonstration_share * n_rows)
-        played = self.replay.draw(groups(n_rows - n_shown), generator=generator)
-        shown = self.shown.draw(groups(n_shown), generator=generator)
-        batch = {key: torch.cat([entry, shown[key]], 2) for key, entry in played.items()}
+        share = self.config.demonstration_share if share is None else share
+        n_shown = round(share * n_rows)
+        batch = shown = self.shown.draw(groups(n_shown), generator=generator)
+        if n_shown < n_rows:
+            played = self.replay.draw(groups(n_rows - n_shown), generator=generator)
+            batch = {key: torch.cat([entry, shown[key]], 2) for key, entry in played.items()}
         if self.config.rl.imitates:
             noise = self.config.demonstration_noise
             imitated = self.shown.draw_actions(groups(n_rows), noise, generator=generator)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from typing import Any, cast
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from bgpo_trl.algorithms.algorithm import Algorithm, Policy
@@ -130,13 +131,15 @@ class BGPO(Algorithm):
     def act(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the ``action`` ``[S, A]`` of the episode's ``expert`` with exploration noise."""
         groups = self._number(tensordict, "expert").tolist()
+        return tensordict.set("action", self.act_by(tensordict, groups, self._play(groups)))
+
+    def _play(self, groups: Sequence[int]) -> Tensor:
+        """Activate the group of each seed's episode; return its place in the stack, ``[S]``."""
         if self.experts is not None:
-            expert = self.experts.play(groups)
-        else:
-            expert = torch.zeros(self.n_seeds, dtype=torch.int64)
-            for seed, group in enumerate(groups):
-                self.active.play(seed, group)
-        return tensordict.set("action", self.act_by(tensordict, groups, expert))
+            return self.experts.play(groups)
+        for seed, group in enumerate(groups):
+            self.active.play(seed, group)
+        return torch.zeros(self.n_seeds, dtype=torch.int64)
 
     def store(self, transition: TensorDictBase) -> None:
         """Store a transition of each seed and, at the end of an episode, its demonstration.
@@ -181,14 +184,71 @@ class BGPO(Algorithm):
         """Make one update of each seed."""
         if len(self.replay) < self.config.rl.warmup_steps:
             return {}
+        return self._learn_active()
+
+    def learn_offline(self, rows: Tensor, n_updates: int) -> Iterator[dict[str, Tensor]]:
+        """Learn from demonstrations alone, before the first episode.
+
+        GWR-B and groups first learn all of them, so that they are stored with the behaviors and
+        groups at the end. Then each seed makes its updates, as many for each of its groups, in the
+        order of their numbers.
+
+        Args:
+            rows: Positions in the bank, in the order of each seed, int64 ``[N, S]``.
+            n_updates: Updates of each seed.
+
+        Yields:
+            The losses of each update.
+
+        Raises:
+            ValueError: Without a ``demonstration_share``.
+        """
+        if self.shown is None:
+            raise ValueError("offline updates need a demonstration_share above 0")
+        with torch.no_grad():
+            for row in rows:
+                self._learn_demonstrations(row)
+            for row in rows:
+                episode = self._episode_of(row)
+                self._store_demonstration(self.shown, episode, self._number(episode, "group"))
+        self._revision = [groups.revision for groups in self.groups]
+        numbers = [groups.numbers for groups in self.groups] or [[0]] * self.n_seeds
+        for update in range(n_updates):
+            with torch.no_grad():
+                self._play([of_seed[update * len(of_seed) // n_updates] for of_seed in numbers])
+            yield self._learn_active(share=1.0)
+
+    def _learn_demonstrations(self, rows: Tensor) -> None:
+        """Have GWR-B and groups learn one demonstration of each seed, ``[S]``."""
+        phi = self.bank.embedding[rows]
+        if self.gwr is not None:
+            self.gwr.adapt(phi)
+        for groups, own, row in zip(self.groups, phi, rows.tolist(), strict=False):
+            groups.adapt(own, None if self.starts is None else self.starts[row])
+
+    def _episode_of(self, rows: Tensor) -> TensorDictBase:
+        """Return the end of an episode that showed one demonstration of each seed, ``[S]``."""
+        bank = self.bank
+        shown = {"demo_embedding": bank.embedding[rows], "task": bank.task[rows]}
+        ended = torch.ones(self.n_seeds, 1, dtype=torch.bool)
+        episode: TensorDictBase = TensorDict(
+            {**shown, "demo_index": rows, "next": {"done": ended}}, [self.n_seeds]
+        )
+        for transform in self.conditioning:
+            episode = transform(episode)
+        return episode
+
+    def _learn_active(self, share: float | None = None) -> dict[str, Tensor]:
+        """Make an update of the active groups of each seed; for ``share``, see `sample`."""
         config, active = self.config, self.active
-        if config.experts:
-            return self.learn(
-                self.sample(
-                    lambda n: active.group.unsqueeze(-1).expand(-1, -1, n), config.expert_batch_size
-                )
-            )
-        return self.learn(self.sample(lambda n: active.rows(n).unsqueeze(1), config.rl.batch_size))
+        n_rows = config.expert_batch_size if config.experts else config.rl.batch_size
+
+        def groups(n: int) -> Tensor:
+            if config.experts:
+                return active.group.unsqueeze(-1).expand(-1, -1, n)
+            return active.rows(n).unsqueeze(1)
+
+        return self.learn(self.sample(groups, n_rows, share=share))
 
     @torch.no_grad()
     def snapshot(

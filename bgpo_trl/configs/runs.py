@@ -60,6 +60,9 @@ class RunConfig(Settings):
     demonstrations: int = 0
     """Demonstrations of each task that training episodes show, the first of the bank; 0 for all of
     them. Ours."""
+    offline_updates: int = 0
+    """Updates of each seed from the demonstrations of the first tasks alone, before its first
+    episode. Ours."""
     checkpoint_minutes: float = 10.0
     """Minutes between checkpoints. Ours."""
     name: Fixed[str] = "bgpo"
@@ -72,11 +75,17 @@ class RunConfig(Settings):
         check_seeds(self.seeds)
         at_least(self, 1, "episodes", "eval_every")
         at_least(self, 0, "checkpoint_minutes")
-        at_least(self, 0, "demonstrations", "eval_episodes")
+        at_least(self, 0, "demonstrations", "eval_episodes", "offline_updates")
         distinct = len(set(self.tasks)) == len(self.tasks)
-        starts = self.task_starts
+        starts, learner = self.task_starts, self.algorithm
+        from_shown = isinstance(learner, BGPOConfig) and learner.demonstration_share > 0
         check(
             self,
+            (
+                "offline_updates",
+                from_shown or not self.offline_updates,
+                "0 for MAML, Dist-NLL and algorithms without demonstrations as experience",
+            ),
             ("tasks", distinct, "names of different tasks"),
             ("spread", 0.0 <= self.spread <= 1.0, "from 0 (nominal places) to 1"),
             ("task_starts", len(starts) == len(self.tasks), "one episode for each of the tasks"),

@@ -153,6 +153,8 @@ def _compare(
     longer: bool,
     remedy: str = "choose another run directory, or the same settings.",
 ) -> None:
+    if "offline_updates" in settings:
+        saved = {"offline_updates": 0, **saved}  # which runs before this setting lack
     if longer:
         saved = _as_grown(saved, settings)
     differences = [

@@ -1,0 +1,145 @@
+"""Updates from demonstrations alone, before the first episode."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from bgpo_trl.algorithms import entry
+from bgpo_trl.files.checkpoint import load_checkpoint
+from bgpo_trl.runs.directory import check_settings
+from bgpo_trl.training import Trainer
+from tests.algorithms.playing import assert_same
+from tests.helpers import edit, interrupt, rows
+from tests.test_training import assert_same_run
+
+pytestmark = pytest.mark.usefixtures("easy_world")
+N = 7  # odd, since the actor learns in every other update
+
+
+@pytest.fixture
+def offline_config(make_config):
+    """Settings of a run of two tasks, whose demonstrations form two groups, and a later one."""
+
+    def make(name="bgpo", **changes):
+        config = make_config(name=name, offline_updates=N, task_starts=(0, 0, 4), **changes)
+        algorithm = config.algorithm
+        if algorithm.grouped:
+            algorithm = replace(algorithm, group_evidence=0.5)
+        return replace(config, algorithm=algorithm)
+
+    return make
+
+
+@pytest.fixture
+def first_save(begin):
+    """Play until the first checkpoint; return the algorithm."""
+
+    def play(directory, config) -> Trainer:
+        trainer = begin(directory, config)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(trainer, "_act", lambda state: 1 / 0)
+            with pytest.raises(ZeroDivisionError):
+                trainer.run()
+        trainer.close()
+        return trainer
+
+    return play
+
+
+def test_updates_are_those_made_by_hand(first_save, offline_config, bank, encoders, tmp_path):
+    config = offline_config()
+    ours = first_save(tmp_path, config).algorithm
+    by_hand = entry("bgpo").make(
+        config.algorithm, seeds=config.seeds, bank=bank.seen(), encoders=encoders
+    )
+    seen = bank.seen()
+    orders = [
+        [int((seen.embedding.double() == point).all(1).nonzero()) for point in points]
+        for points in (torch.from_numpy(groups.points) for groups in ours.groups)
+    ]
+    allowed = (seen.task < 2).nonzero().flatten().tolist()
+    assert [sorted(order) for order in orders] == [allowed, allowed]
+    assert orders[0] != orders[1]
+    order = torch.tensor(orders).T
+    for row in order:
+        by_hand.gwr.adapt(seen.embedding[row])
+        for groups, number in zip(by_hand.groups, row.tolist(), strict=True):
+            groups.adapt(seen.embedding[number], by_hand.starts[number])
+    for row in order:
+        given = [by_hand.condition(i, seen.embedding[n], seen.task[n]) for i, n in enumerate(row)]
+        episode = torch.stack(given).set("demo_index", row)
+        paid = (episode["behavior"] - episode["demo_embedding"]).norm(dim=-1).neg().exp()
+        by_hand.shown.add(episode, 1 + config.algorithm.beta * paid, episode["group"])
+    numbers = [groups.numbers for groups in by_hand.groups]
+    n_rows = config.algorithm.expert_batch_size
+    for update in range(N):
+        by_hand.experts.play([of_seed[update * len(of_seed) // N] for of_seed in numbers])
+        group = by_hand.active.group.unsqueeze(-1).expand(-1, -1, n_rows)
+        batch = by_hand.shown.sample(group)
+        noise = config.algorithm.demonstration_noise
+        imitated = by_hand.shown.draw_actions(group, noise)
+        for key, value in imitated.items():
+            batch["imitation", key] = value
+        by_hand.learner.learn(batch)
+    before, after = ours.state_dict(), by_hand.state_dict()
+    assert max(map(len, numbers)) > 1
+    for part in ("learner", "experts", "gwr", "groups", "shown"):
+        assert_same(before[part], after[part])
+
+
+@pytest.mark.parametrize("name", ["bgpo", "demonstrations"])
+def test_seeds_learn_alone_what_they_learn_beside_others(
+    first_save, offline_config, tmp_path, name
+):
+    both = first_save(tmp_path / "both", offline_config(name)).algorithm
+    alone = first_save(tmp_path / "alone", offline_config(name, seeds=(8,))).algorithm
+    fresh = entry(name).make(alone.config, seeds=(8,), bank=alone.bank, encoders=alone.encoders)
+    for group in both.groups[1].numbers if both.groups else [0]:
+        ours, theirs = both.actor_weights(1, group), alone.actor_weights(0, group)
+        first = fresh.actor_weights(0)
+        for key, value in ours.items():
+            torch.testing.assert_close(value, theirs[key], rtol=0, atol=1e-6)
+        assert any((value != first[key]).any() for key, value in ours.items())
+
+
+def test_an_interrupted_run_equals_one_that_is_not(begin, offline_config, tmp_path, monkeypatch):
+    with begin(tmp_path / "straight", offline_config()) as trainer:
+        trainer.run()
+    run = tmp_path / "run"
+    with begin(run, offline_config()) as trainer:
+        learn = trainer.algorithm.learner.learn
+        counts = iter(range(N))
+
+        def stop(batch):
+            if next(counts) == N // 2:
+                raise KeyboardInterrupt
+            return learn(batch)
+
+        monkeypatch.setattr(trainer.algorithm.learner, "learn", stop)
+        with pytest.raises(KeyboardInterrupt):
+            trainer.run()
+    with begin(run, offline_config(), resume=True) as trainer:
+        interrupt(trainer, 5)
+    with begin(run, offline_config(), resume=True) as trainer:
+        trainer.run()
+    assert_same_run(run, tmp_path / "straight")
+    first = rows(run / "train.csv")[0]
+    assert float(first["loss_value"]) > 0
+    assert load_checkpoint(run / "checkpoint")["settings"]["offline_updates"] == N
+
+
+@pytest.mark.parametrize("name", ["bgpo-experts", "maml-demonstrations", "dist-nll"])
+def test_algorithms_without_demonstrations_to_replay_refuse(make_config, name):
+    with pytest.raises(ValueError, match="offline_updates must be 0"):
+        make_config(name=name, offline_updates=1)
+
+
+def test_runs_from_before_the_setting_can_be_resumed(begin, make_config, tmp_path):
+    with begin(tmp_path, make_config(episodes=2)) as trainer:
+        trainer.run()
+        settings = load_checkpoint(tmp_path / "checkpoint")["settings"]
+    edit(tmp_path / "config.json", offline_updates=None)
+    check_settings(tmp_path, settings)
+    with pytest.raises(ValueError, match="offline_updates is 0 there and 5 here"):
+        check_settings(tmp_path, {**settings, "offline_updates": 5})
