@@ -92,6 +92,8 @@ class MetaWorld(Simulation):
         worlds: Worlds by task, shared with other simulations; those missing are made when needed.
     """
 
+    make_world: type[World] = World
+
     def __init__(self, worlds: dict[str, World] | None = None) -> None:
         self.worlds = {} if worlds is None else worlds
         self._data: dict[str, mujoco.MjData] = {}
@@ -104,7 +106,7 @@ class MetaWorld(Simulation):
     def world(self) -> World:
         """World of the current task."""
         if self._task not in self.worlds:
-            self.worlds[self._task] = World(self._task)
+            self.worlds[self._task] = self.make_world(self._task)
         return self.worlds[self._task]
 
     def seed(self, seed: int) -> None:
@@ -181,7 +183,7 @@ def make_env(tasks: Sequence[str], **arguments: Any) -> SimulationEnv:
     return SimulationEnv(partial(MetaWorld, {}), tasks, **sizes, **arguments)
 
 
-SCENES["metaworld"] = Scene(
+METAWORLD = SCENES["metaworld"] = Scene(
     name="metaworld",
     version=f"1-metaworld-{version('metaworld')}",
     tasks=[name.removesuffix("-v3") for name in ENV_POLICY_MAP],

@@ -55,13 +55,12 @@ def main(
         module="examples.meta_world",
         encoders=weights,
         out=folder / "run",
-        seeds=seeds,
         episodes=episodes,
-        eval_every=episodes // 20,
-        eval_episodes=10,
         resume=True,
     )
-    print(run_experiment(arguments, "metaworld", run_config(arguments)))
+    tests = {"eval_every": episodes // 20, "eval_episodes": 10}
+    config = run_config(arguments, changes={"seeds": seeds, **tests})
+    print(run_experiment(arguments, "metaworld", config))
 
 
 if __name__ == "__main__":

@@ -1,0 +1,122 @@
+"""Continual World's ten tasks, one after the other, from pixels: from nothing to a table.
+
+Records demonstrations, trains encoders on them, learns with each algorithm, and writes the report.
+The same command resumes whatever was interrupted. Run it in the folder of the repository:
+
+    python -m benchmarks.continual_world
+    python -m benchmarks.continual_world --small
+
+docs/benchmark.md says what is different from Continual World.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import tyro
+
+from bgpo_trl.configs import (
+    InverseModelConfig,
+    RepresentationConfig,
+    SequenceAutoencoderConfig,
+    VAEConfig,
+)
+from bgpo_trl.data.recording import record_demonstrations
+from bgpo_trl.encoders.pretrained import bank_path
+from bgpo_trl.encoders.train import train_encoders
+from bgpo_trl.experiments.arguments import Arguments, ReportArguments
+from bgpo_trl.experiments.report import report
+from bgpo_trl.experiments.run import run_experiment
+from bgpo_trl.experiments.settings import run_config
+from bgpo_trl.machine import set_threads
+from bgpo_trl.plugins import import_plugin
+from bgpo_trl.scenes import find_scene
+
+MODULE, SCENE = "examples.continual_world", "cw10"
+HELD_OUT = 10  # further demonstrations of each task, which test episodes show
+# Demonstrations come with their actions: no inverse model has to infer them.
+WITHOUT_INVERSE = InverseModelConfig(steps=0)
+ENCODERS = RepresentationConfig(vae=VAEConfig(bfloat16=True), inverse=WITHOUT_INVERSE)
+SMALL_ENCODERS = RepresentationConfig(
+    vae=VAEConfig(steps=400, bfloat16=True),
+    lae=SequenceAutoencoderConfig(steps=400, batch_size=64),
+    inverse=WITHOUT_INVERSE,
+)
+
+
+def make_encoders(folder: Path, demonstrations: int, config: RepresentationConfig) -> Path:
+    """Record demonstrations and train encoders on them, unless they are there; return their file.
+
+    There is no play: encoders see the demonstrations alone.
+    """
+    weights = folder / "encoders.safetensors"
+    if not bank_path(weights).exists():
+        dataset = record_demonstrations(
+            folder / "demonstrations",
+            scene=SCENE,
+            per_task=demonstrations + HELD_OUT,
+            held_out_per_task=HELD_OUT,
+        )
+        train_encoders(dataset, None, weights, folder / "encoders", config, scene=SCENE)
+    return weights
+
+
+def main(
+    folder: Path = Path("runs/cw10"),
+    algorithms: tuple[str, ...] = (
+        "bgpo",
+        "clone",
+        "dist-nll-demonstrations",
+        "oracle",
+        "fine-tuning",
+        "ewc",
+    ),
+    seeds: tuple[int, ...] = (0, 1, 2),
+    demonstrations: int = 30,
+    episodes: int = 300,
+    small: bool = False,
+) -> None:
+    """Learn Continual World's ten tasks, one after the other.
+
+    Args:
+        folder: Folder for demonstrations, encoders, runs and the report.
+        algorithms: Algorithms, as in `bgpo continual`.
+        seeds: Seeds of each run.
+        demonstrations: Demonstrations of each task in training.
+        episodes: Training episodes of each task.
+        small: One seed of bgpo and clone, 20 episodes of each task, and encoders trained a tenth
+            as long. It shows that all parts work, not what can be learned.
+    """
+    import_plugin(MODULE)
+    set_threads(1)
+    if small:
+        algorithms, seeds, episodes = ("bgpo", "clone"), (0,), 20
+    tasks = find_scene(SCENE).default_tasks
+    weights = make_encoders(folder, demonstrations, SMALL_ENCODERS if small else ENCODERS)
+    for algorithm in algorithms:
+        arguments = Arguments(
+            scene=SCENE,
+            module=MODULE,
+            encoders=weights,
+            algorithm=algorithm,
+            episodes=episodes * len(tasks),
+            out=folder / f"run-{algorithm}",
+            resume=True,
+        )
+        changes = {
+            "seeds": seeds,
+            "schedule": "sequential",
+            "task_starts": tuple(range(0, episodes * len(tasks), episodes)),
+            "eval_every": max(1, episodes // 5),
+            "eval_episodes": 2 if small else 10,
+        }
+        print(run_experiment(arguments, "cw10", run_config(arguments, changes=changes)))
+    print(report(ReportArguments(runs=(folder,))))
+
+
+if __name__ == "__main__":
+    try:
+        tyro.cli(main)
+    except (ValueError, OSError, RuntimeError) as error:
+        sys.exit(f"error: {error}")
