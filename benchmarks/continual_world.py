@@ -3,8 +3,8 @@
 Records demonstrations, trains encoders on them, learns with each algorithm, and writes the report.
 The same command resumes whatever was interrupted. Run it in the folder of the repository:
 
-    python -m benchmarks.continual_world
-    python -m benchmarks.continual_world --small
+    python benchmarks/continual_world.py
+    python benchmarks/continual_world.py --small
 
 docs/benchmark.md says what is different from Continual World.
 """
