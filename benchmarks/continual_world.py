@@ -23,7 +23,7 @@ from bgpo_trl.configs import (
     VAEConfig,
 )
 from bgpo_trl.data.recording import record_demonstrations
-from bgpo_trl.encoders.pretrained import bank_path
+from bgpo_trl.encoders.make_bank import make_bank
 from bgpo_trl.encoders.train import train_encoders
 from bgpo_trl.experiments.arguments import Arguments, ReportArguments
 from bgpo_trl.experiments.report import report
@@ -45,21 +45,32 @@ SMALL_ENCODERS = RepresentationConfig(
 )
 
 
-def make_encoders(folder: Path, demonstrations: int, config: RepresentationConfig) -> Path:
-    """Record demonstrations and train encoders on them, unless they are there; return their file.
+def make_encoders(
+    folder: Path, demonstrations: int, encoder_tasks: int, config: RepresentationConfig
+) -> tuple[Path, Path]:
+    """Record demonstrations, train encoders on them and embed them, unless that is done.
 
-    There is no play: encoders see the demonstrations alone.
+    There is no play: encoders see the demonstrations of the first ``encoder_tasks`` alone.
+
+    Returns:
+        The files of the encoders and of the bank of all tasks.
     """
-    weights = folder / "encoders.safetensors"
-    if not bank_path(weights).exists():
-        dataset = record_demonstrations(
-            folder / "demonstrations",
-            scene=SCENE,
-            per_task=demonstrations + HELD_OUT,
-            held_out_per_task=HELD_OUT,
-        )
-        train_encoders(dataset, None, weights, folder / "encoders", config, scene=SCENE)
-    return weights
+    weights, bank = folder / "encoders.safetensors", folder / "bank.safetensors"
+    if bank.exists():
+        return weights, bank
+    tasks = find_scene(SCENE).default_tasks
+    dataset = record_demonstrations(
+        folder / "demonstrations",
+        scene=SCENE,
+        per_task=demonstrations + HELD_OUT,
+        held_out_per_task=HELD_OUT,
+    )
+    seen, known = dataset[dataset["task"] < encoder_tasks], tasks[:encoder_tasks]
+    encoders, _ = train_encoders(
+        seen, None, weights, folder / "encoders", config, tasks=known, scene=SCENE
+    )
+    make_bank(encoders, dataset, tasks=tasks).save(bank)
+    return weights, bank
 
 
 def main(
@@ -75,6 +86,7 @@ def main(
     seeds: tuple[int, ...] = (0, 1, 2),
     demonstrations: int = 30,
     episodes: int = 300,
+    encoder_tasks: int = 10,
     small: bool = False,
 ) -> None:
     """Learn Continual World's ten tasks, one after the other.
@@ -85,6 +97,7 @@ def main(
         seeds: Seeds of each run.
         demonstrations: Demonstrations of each task in training.
         episodes: Training episodes of each task.
+        encoder_tasks: Number of tasks, from the first on, whose demonstrations encoders see.
         small: One seed of bgpo and clone, 20 episodes of each task, and encoders trained a tenth
             as long. It shows that all parts work, not what can be learned.
     """
@@ -93,12 +106,14 @@ def main(
     if small:
         algorithms, seeds, episodes = ("bgpo", "clone"), (0,), 20
     tasks = find_scene(SCENE).default_tasks
-    weights = make_encoders(folder, demonstrations, SMALL_ENCODERS if small else ENCODERS)
+    config = SMALL_ENCODERS if small else ENCODERS
+    weights, bank = make_encoders(folder, demonstrations, encoder_tasks, config)
     for algorithm in algorithms:
         arguments = Arguments(
             scene=SCENE,
             module=MODULE,
             encoders=weights,
+            bank=bank,
             algorithm=algorithm,
             episodes=episodes * len(tasks),
             out=folder / f"run-{algorithm}",
