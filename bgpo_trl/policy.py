@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import importlib
+import importlib.util
 import json
+import logging
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,7 +28,7 @@ from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.dataset import resize_frames
 from bgpo_trl.encoders.representation import Representation, embed_demonstrations
 from bgpo_trl.files.checkpoint import has_checkpoint, load_checkpoint
-from bgpo_trl.files.writing import make_folder
+from bgpo_trl.files.writing import make_folder, write_whole
 from bgpo_trl.runs.config_file import read_config
 from bgpo_trl.runs.demonstrations import load_inputs
 from bgpo_trl.runs.directory import check_checkpoint, fitting_checkpoint
@@ -247,40 +251,56 @@ class TrainedPolicy:
 
     @torch.no_grad()
     def export(self, path: str | Path) -> None:
-        """Write the policy, as conditioned, as a program of ``torch.export``.
+        """Write the policy, as conditioned, as a program of ``torch.export`` or as an ONNX model.
 
-        The program maps a frame uint8 ``[H, W, 3]`` to an action float32 ``[A]`` in [-1, 1], with
-        frame encoder, clipping and context inside: ``torch.export.load(path).module()(frame)``. It
-        needs no part of this package. Before it is written, its actions are compared with those of
-        `act` on frames of noise.
+        It maps a frame uint8 ``[H, W, 3]`` to an action float32 ``[A]`` in [-1, 1], with frame
+        encoder, clipping and context inside: ``torch.export.load(path).module()(frame)``, or
+        ``onnxruntime.InferenceSession(path).run(None, {"frame": frame})``. It needs no part of this
+        package. Before it is written, its actions are compared with those of `act` on frames of
+        noise.
 
         Args:
-            path: File ending in ``.pt2``; an existing one is replaced.
+            path: File ending in ``.pt2``, or in ``.onnx`` with the extra ``onnx``; an existing one
+                is replaced.
 
         Raises:
             ValueError: If no demonstration was given before, or the file has another ending.
+            ImportError: If a package of the extra is missing.
             RuntimeError: If the program acts otherwise; nothing is written.
             OSError: If the file cannot be written.
         """
         path = Path(path)
-        if path.suffix != ".pt2":
-            raise ValueError(f"{path} is to hold a program of torch.export: end its name in .pt2")
+        if path.suffix not in (".pt2", ".onnx"):
+            raise ValueError(
+                f"{path} is to hold a program of torch.export or an ONNX model: end its name in "
+                ".pt2 or .onnx"
+            )
         if self._policy is None:
             raise ValueError("the policy has seen no demonstration: show it one with condition()")
+        if path.suffix == ".onnx":
+            _check_onnx()
         shape = (*self.encoders.frame_network.frame_shape, 3)
         noise = torch.Generator().manual_seed(0)
         frames = torch.randint(256, (8, *shape), generator=noise, dtype=torch.uint8)
         # Traced with the weights of today, which may decide what is computed at all.
         traced = make_fx(lambda frame: self._action(frame))(frames[0])
         program = torch.export.export(traced, (frames[0],))
-        made, scene = program.module(), find_scene(self.config.scene)
+        scene = find_scene(self.config.scene)
+        about = json.dumps({"scene": scene.identity, "rate": scene.rate, "tasks": [*self.tasks]})
+        if path.suffix == ".onnx":
+            content = _onnx_model(program, about)
+            made = _onnx_actions(content)
+        else:
+            content, made = None, program.module()
         for frame in frames:
             expected = torch.from_numpy(self.act(frame))
             if not torch.allclose(made(frame), expected, rtol=0, atol=1e-5):
                 raise RuntimeError("the exported program acts otherwise than the policy")
-        about = {"scene": scene.identity, "rate": scene.rate, "tasks": [*self.tasks]}
         make_folder(path.parent)
-        torch.export.save(program, path, extra_files={"bgpo_trl.json": json.dumps(about)})
+        if content is not None:
+            write_whole(path, content)
+        else:
+            torch.export.save(program, path, extra_files={"bgpo_trl.json": about})
 
     def _frames(self, frames: ArrayLike, wanted: str, ndim: int) -> Tensor:
         array = np.asarray(frames)
@@ -295,6 +315,44 @@ class TrainedPolicy:
             raise ValueError(f"{wanted}, got {array.dtype} {list(shape)}")
         # Copied, since the array may be read-only.
         return torch.tensor(np.ascontiguousarray(array))
+
+
+def _check_onnx() -> None:
+    """Raise ``ImportError`` if a package that ONNX needs is missing."""
+    names = ("onnx", "onnxscript", "onnxruntime")
+    missing = [name for name in names if importlib.util.find_spec(name) is None]
+    if missing:
+        raise ImportError(
+            f"ONNX needs {', '.join(missing)}: pip install 'bgpo_trl[onnx]', or export to a file "
+            "ending in .pt2"
+        )
+
+
+def _onnx_model(program: torch.export.ExportedProgram, about: str) -> bytes:
+    """Return a program as an ONNX model, with ``about`` as its metadata ``bgpo_trl.json``."""
+    logs = [logging.getLogger(name) for name in ("onnxscript", "torch.onnx")]
+    levels = [log.level for log in logs]
+    try:
+        for log in logs:
+            log.setLevel(logging.ERROR)  # They report what they leave as it is.
+        with warnings.catch_warnings(action="ignore", category=FutureWarning):
+            made = torch.onnx.export(
+                program, dynamo=True, verbose=False, input_names=["frame"], output_names=["action"]
+            )
+    finally:
+        for log, level in zip(logs, levels, strict=True):
+            log.setLevel(level)
+    assert made is not None
+    model: Any = made.model_proto
+    model.metadata_props.add(key="bgpo_trl.json", value=about)
+    return model.SerializeToString()
+
+
+def _onnx_actions(model: bytes) -> Callable[[Tensor], Tensor]:
+    """Return what maps a frame to the action of an ONNX model, by onnxruntime."""
+    runtime: Any = importlib.import_module("onnxruntime")
+    session = runtime.InferenceSession(model, providers=["CPUExecutionProvider"])
+    return lambda frame: torch.from_numpy(session.run(None, {"frame": frame.numpy()})[0])
 
 
 def load_run(

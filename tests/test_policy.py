@@ -137,7 +137,7 @@ def test_an_exported_policy_acts_as_before_in_a_process_without_the_package(load
     with pytest.raises(ValueError, match="has seen no demonstration"):
         policy.export(path)
     policy.condition(DEMONSTRATIONS[1], task=TASKS[1])
-    with pytest.raises(ValueError, match=r"end its name in .pt2"):
+    with pytest.raises(ValueError, match=r"end its name in .pt2 or .onnx"):
         policy.export(tmp_path / "policy")
     policy.export(path)
     frames = noise(7, 3)
@@ -159,6 +159,53 @@ def test_an_exported_policy_acts_as_before_in_a_process_without_the_package(load
     expected = [policy.act(frame) for frame in frames]
     np.testing.assert_allclose(np.load(tmp_path / "actions.npy"), expected, rtol=0, atol=1e-5)
     assert np.ptp(expected, axis=0).max() > 1e-4  # the frame matters
+
+
+_RUN_ONNX = """
+import json, sys, numpy as np, onnxruntime
+session = onnxruntime.InferenceSession("policy.onnx")
+frames = np.load("frames.npy")
+np.save("actions.npy", [session.run(None, {"frame": frame})[0] for frame in frames])
+about = json.loads(session.get_modelmeta().custom_metadata_map["bgpo_trl.json"])
+print(json.dumps([about, "torch" in sys.modules]))
+"""
+
+
+@pytest.mark.parametrize("name", ["bgpo", "dist-nll-demonstrations"])
+def test_an_onnx_model_acts_as_the_policy_in_a_process_without_torch(load, tmp_path, name):
+    for package in ("onnx", "onnxscript", "onnxruntime"):
+        pytest.importorskip(package)
+    policy, frames = load(name), noise(7, 3)
+    policy.condition(DEMONSTRATIONS[1], task=TASKS[1])
+    policy.export(tmp_path / "policy.onnx")
+    np.save(tmp_path / "frames.npy", frames)
+    found = subprocess.run(
+        [sys.executable, "-c", _RUN_ONNX], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    about = {"scene": NICO.identity, "rate": 5.0, "tasks": [*TASKS]}
+    assert json.loads(found.stdout) == [about, False]
+    assert sorted(path.name for path in tmp_path.glob("policy*")) == ["policy.onnx"]
+    expected = [policy.act(frame) for frame in frames]
+    np.testing.assert_allclose(np.load(tmp_path / "actions.npy"), expected, rtol=0, atol=1e-5)
+
+
+def test_onnx_without_the_extra_is_refused_in_one_line(load, tmp_path, monkeypatch):
+    policy = load("bgpo")
+    policy.condition(DEMONSTRATIONS[1])
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(ImportError, match=r"needs onnx, onnxscript, onnxruntime: pip install"):
+        policy.export(tmp_path / "policy.onnx")
+
+
+def test_an_onnx_model_that_acts_otherwise_is_not_written(load, tmp_path, monkeypatch):
+    policy = load("bgpo")
+    policy.condition(DEMONSTRATIONS[1])
+    monkeypatch.setattr("bgpo_trl.policy._check_onnx", lambda: None)
+    monkeypatch.setattr("bgpo_trl.policy._onnx_model", lambda program, about: b"")
+    monkeypatch.setattr("bgpo_trl.policy._onnx_actions", lambda model: lambda frame: torch.ones(4))
+    with pytest.raises(RuntimeError, match="acts otherwise"):
+        policy.export(tmp_path / "policy.onnx")
+    assert not [*tmp_path.glob("*.onnx")]
 
 
 def test_frames_of_a_camera_are_cropped_turned_and_resized(load):
