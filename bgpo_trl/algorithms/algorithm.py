@@ -281,13 +281,23 @@ class Algorithm(ABC):
         seen = self.to_device(tensordict.select(*self.learner.policy.in_keys))
         return self.learner.act(seen, self._noise, expert, only_clone)
 
-    def count_episodes(self, transition: TensorDictBase) -> None:
-        """Count the successes of episodes that end, by who played them."""
+    def count_episodes(self, transition: TensorDictBase, group: Tensor) -> None:
+        """Count the successes of episodes that end, by who played them.
+
+        Args:
+            transition: Transitions ``[S]``.
+            group: Group or task of each demonstration, int64 ``[S]``.
+        """
         if self.proposals is None:
             return
         end = transition.get("next")
         for seed in end["done"].flatten().nonzero().flatten().tolist():
-            self.proposals.end(seed, bool(end["success"][seed]))
+            self.proposals.end(
+                seed,
+                bool(end["success"][seed]),
+                group=int(group[seed]),
+                demonstration=int(transition["demo_index"][seed]),
+            )
 
     def replay_keys(self, constant_keys: Sequence[NestedKey] = ()) -> list[NestedKey]:
         """Return the entries of a transition to store, of which some are constant in an episode."""

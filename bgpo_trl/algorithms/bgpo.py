@@ -150,7 +150,7 @@ class BGPO(Algorithm):
         self.replay.add(transition, group)
         if self.shown is not None:
             self._store_demonstration(self.shown, transition, group)
-        self.count_episodes(transition)
+        self.count_episodes(transition, group)
         self._follow_groups()
 
     def _store_demonstration(
@@ -175,7 +175,7 @@ class BGPO(Algorithm):
                 if replay is not None:
                     replay.regroup(seed, group_of)
             if self.proposals is not None:
-                self.proposals.keep(seed, groups.numbers)
+                self.proposals.follow(seed, groups.numbers, group_of.tolist())
             for group in [*self.active.groups[seed]]:
                 if group not in groups.numbers:
                     (self.experts or self.active).rest(seed, group)

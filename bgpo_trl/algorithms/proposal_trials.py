@@ -7,10 +7,15 @@ from copy import deepcopy
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 __all__ = ["ProposalTrials"]
 
 _KEPT = 0.97  # weight of an outcome after a further episode: about the last 33 count
-_ENOUGH = 15.0  # weight of the episodes of the critics' choice before it can be trusted
+_LATEST = 200  # outcomes that are kept; older ones would weigh less than a hundredth
+_ENOUGH = 20  # episodes of the critics' choice before it can be trusted
+
+Outcome = tuple[int, bool]  # demonstration of an episode, and whether the episode succeeded
 
 
 class ProposalTrials:
@@ -26,6 +31,11 @@ class ProposalTrials:
        the clone alone, in the latest training episodes of each, about 33. Else, and before 20
        episodes of theirs, the clone acts.
 
+    Only episodes count whose demonstration is of the group that played, today. The first
+    demonstrations of a new task often belong to the group of another task, whose networks fail;
+    when the new task gets a group of its own, these failures are no longer counted against the
+    networks that failed.
+
     Args:
         n_seeds: Number of seeds ``S``.
         clone_episodes: See 1.
@@ -33,7 +43,7 @@ class ProposalTrials:
 
     Examples:
         >>> trials = ProposalTrials(1, clone_episodes=2, clone_share=0.25)
-        >>> [(trials.begin(0, group=7), trials.end(0, success=True))[0] for _ in range(8)]
+        >>> [(trials.begin(0, group=7), trials.end(0, success=True, group=7))[0] for _ in range(8)]
         [True, True, False, False, False, True, False, False]
         >>> trials.clone_is_better(0, group=7)  # the critics have hardly been tried
         True
@@ -63,24 +73,41 @@ class ProposalTrials:
         due = int((later + 1) * self.clone_share) > int(later * self.clone_share)
         return later < 0 or due
 
-    def end(self, seed: int, success: bool) -> None:
-        """Count the end of a training episode of a seed."""
-        group, alone = self._playing[seed]
-        record = self._groups[seed].setdefault(group, _Record())
+    def end(self, seed: int, success: bool, *, group: int, demonstration: int = 0) -> None:
+        """Count the end of a training episode of a seed.
+
+        Args:
+            seed: Position of the seed.
+            success: Whether the episode succeeded.
+            group: Group of its demonstration; the episode does not count if another group played.
+            demonstration: Position of the demonstration in the bank.
+        """
+        playing, alone = self._playing[seed]
+        record = self._groups[seed].setdefault(playing, _Record())
         record.episodes += 1
-        counts = record.clone if alone else record.choice
-        counts[:] = [_KEPT * counts[0] + success, _KEPT * counts[1] + 1]
+        if group == playing:
+            outcomes = record.clone if alone else record.choice
+            outcomes.append((demonstration, success))
+            del outcomes[:-_LATEST]
 
     def clone_is_better(self, seed: int, group: int) -> bool:
         """Return whether the clone has succeeded more often than what the critics chose."""
         record = self._groups[seed].get(group, _Record())
-        (cloned, of_clone), (chosen, of_choice) = record.clone, record.choice
-        return of_choice < _ENOUGH or chosen * of_clone < cloned * of_choice
+        return len(record.choice) < _ENOUGH or _rate(record.choice) < _rate(record.clone)
 
-    def keep(self, seed: int, groups: Sequence[int]) -> None:
-        """Forget all other groups of a seed."""
+    def follow(self, seed: int, groups: Sequence[int], group_of: Sequence[int]) -> None:
+        """Forget what does not fit the groups of today.
+
+        Args:
+            seed: Position of the seed.
+            groups: Numbers of its groups; all others are forgotten.
+            group_of: Group of each demonstration of the bank.
+        """
         known = {*groups}
         self._groups[seed] = {g: r for g, r in self._groups[seed].items() if g in known}
+        for group, record in self._groups[seed].items():
+            for outcomes in (record.clone, record.choice):
+                outcomes[:] = [outcome for outcome in outcomes if group_of[outcome[0]] == group]
 
     def state_dict(self) -> dict[str, Any]:
         """Return what is counted, and the present episodes."""
@@ -98,8 +125,14 @@ class ProposalTrials:
 
 @dataclass
 class _Record:
-    """Training episodes of a group; weighted successes and episodes of the clone and the choice."""
+    """Training episodes of a group, and the latest outcomes of the clone and the choice."""
 
     episodes: int = 0
-    clone: list[float] = field(default_factory=lambda: [0.0, 0.0])
-    choice: list[float] = field(default_factory=lambda: [0.0, 0.0])
+    clone: list[Outcome] = field(default_factory=list)
+    choice: list[Outcome] = field(default_factory=list)
+
+
+def _rate(outcomes: Sequence[Outcome]) -> float:
+    """Return the share of successes, the latest with the largest weight; 0 of none."""
+    weight = _KEPT ** np.arange(len(outcomes))[::-1]
+    return float(weight @ [success for _, success in outcomes] / weight.sum()) if outcomes else 0.0

@@ -71,7 +71,7 @@ class TaskAlgorithm(Algorithm):
         if self.shown is not None:
             ended = transition.get(("next", "done")).flatten()
             self.shown.add(transition, torch.ones(self.n_seeds), task, ended)
-        self.count_episodes(transition)
+        self.count_episodes(transition, task)
 
     def ready(self) -> bool:
         """Return whether there are enough transitions for an update."""

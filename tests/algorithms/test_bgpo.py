@@ -159,7 +159,8 @@ def test_test_episodes_are_played_by_the_expert_of_their_demonstration(make_bgpo
     if proposals is not None:
         assert all(proposals.clone_is_better(0, group) for group in groups)
         for _ in range(60):  # in one group, what critics choose succeeds, and the clone does not
-            proposals.end(0, not proposals.begin(0, groups[0]))
+            alone = proposals.begin(0, groups[0])
+            proposals.end(0, not alone, group=groups[0])
         worse = {group: proposals.clone_is_better(0, group) for group in groups}
         assert worse == {group: group != groups[0] for group in groups}
     assert all(len(groups.numbers) > 2 for groups in algorithm.groups)

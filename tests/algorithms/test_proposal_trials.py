@@ -15,7 +15,7 @@ def play(trials, outcomes, group=7, seed=0):
     played = []
     for success in outcomes:
         played.append(trials.begin(seed, group))
-        trials.end(seed, success)
+        trials.end(seed, success, group=group)
     return played
 
 
@@ -43,7 +43,7 @@ def test_the_clone_has_its_share_of_training_and_tests_until_the_choice_is_as_go
         later += [alone] if number >= first else []
         assert sum(later) == pytest.approx(share * len(later), abs=1)  # at any time
         outcomes[alone].append(rng.random() < rates[alone])
-        trials.end(1, outcomes[alone][-1])
+        trials.end(1, outcomes[alone][-1], group=7)
         if restored:
             state, trials = trials.state_dict(), make()
             trials.load_state_dict(state)
@@ -64,12 +64,13 @@ def test_the_rules_by_hand():
     play(trials, [True])
     assert not trials.clone_is_better(0, 7)  # 20, and as good
     while trials.begin(0, 7):
-        trials.end(0, True)
-    trials.end(0, False)
+        trials.end(0, True, group=7)
+    trials.end(0, False, group=7)
     assert trials.clone_is_better(0, 7)
     while not trials.begin(0, 7):
-        trials.end(0, True)
-    trials.end(0, False)  # the clone's latest failure weighs more than the choice's older one
+        trials.end(0, True, group=7)
+    # The clone's latest failure weighs more than the choice's older one.
+    trials.end(0, False, group=7)
     assert not trials.clone_is_better(0, 7)
 
 
@@ -78,6 +79,26 @@ def test_a_group_that_is_no_more_is_forgotten():
     for group in (7, 4):
         play(trials, [True, False, True], group)
     kept = copy.deepcopy(trials.state_dict()["groups"][0][7])
-    trials.keep(0, [7, 9])
+    trials.follow(0, [7, 9], [7])
     assert trials.state_dict()["groups"][0] == {7: kept}
     assert play(trials, [True], group=4) == [True]  # a number that returns begins anew
+
+
+def test_episodes_of_demonstrations_that_belong_to_another_group_do_not_count():
+    """A new task's first episodes are played by an old group, and fail; then it has its own."""
+    trials = ProposalTrials(1, clone_episodes=0, clone_share=0.5)
+    for _ in range(60):  # demonstration 0 is of group 7
+        trials.end(0, not trials.begin(0, 7), group=7, demonstration=0)
+    assert not trials.clone_is_better(0, 7)
+    record = copy.deepcopy(trials.state_dict()["groups"][0][7])
+    for _ in range(60):  # of another group, which played: as many episodes, no outcomes
+        trials.begin(0, 7)
+        trials.end(0, False, group=4, demonstration=0)
+    other = trials.state_dict()["groups"][0][7]
+    assert other == {**record, "episodes": 120}
+    for _ in range(60):  # demonstration 1 is thought to be of group 7
+        trials.end(0, trials.begin(0, 7), group=7, demonstration=1)
+    assert trials.clone_is_better(0, 7)
+    trials.follow(0, [7, 8], [7, 8])  # it has got group 8
+    assert not trials.clone_is_better(0, 7)
+    assert trials.state_dict()["groups"][0][7] == {**record, "episodes": 180}
