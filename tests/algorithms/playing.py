@@ -5,7 +5,6 @@ import torch
 from tensordict import TensorDict
 from torch.nn.functional import layer_norm
 
-from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
 from bgpo_trl.transforms import TaskSchedule
 
 # By name: state, meaning of the context, and the algorithm whose settings it has.
@@ -60,16 +59,6 @@ def play(algorithm, n_steps, state=None, hidden=(), watch=lambda chosen: None):
         transitions.append(transition.clone())
         algorithm.store(transition.exclude(*hidden, *(("next", key) for key in hidden)))
     return torch.stack(transitions, dim=1), state
-
-
-def save_and_restore(algorithm, state, other, folder):
-    """Restore `other` from a checkpoint of `algorithm`; return the tensordict in flight."""
-    parts = {"algorithm": algorithm.state_dict(), "world": algorithm.world.state_dict()}
-    save_checkpoint(folder, {**parts, "state": state.to_dict()})
-    saved = load_checkpoint(folder)
-    other.world.load_state_dict(saved["world"])
-    other.load_state_dict(saved["algorithm"])
-    return TensorDict(saved["state"], state.batch_size)
 
 
 def spy_batches(algorithm):

@@ -2,7 +2,6 @@
 
 from copy import deepcopy
 from dataclasses import replace
-from functools import partial
 
 import pytest
 import torch
@@ -221,29 +220,6 @@ def test_the_first_update_comes_after_the_warm_up_and_with_the_step_that_follows
     for value, before in zip(weights(algorithm), start, strict=True):
         assert not value.equal(before)
     assert len(algorithm.replay) == algorithm.config.rl.warmup_steps + 1
-
-
-def test_each_seed_of_a_batch_learns_as_it_would_alone(make_bgpo):
-    """Weights and groups; the rows of whole runs, of all kinds, are in ``test_training.py``."""
-    seeds = (1, 2)  # no pixel of theirs is so near an edge that rounding moves it across
-    close = partial(torch.testing.assert_close, rtol=1e-4, atol=1e-4)
-    batch = make_bgpo("all", seeds=seeds, known=15)
-    together = play(batch, 45)[0]
-    for index, seed in enumerate(seeds):
-        alone = make_bgpo("all", seeds=(seed,), known=15)
-        data = play(alone, 45)[0][0]
-        for key in ("task", "demo_index", "step_count", "group", ("next", "terminated")):
-            assert together[index][key].equal(data[key]), key
-        for key in ("action", *alone.in_keys, ("next", "reward")):
-            close(together[index][key], data[key])
-        for ours, theirs in zip(weights(batch), weights(alone), strict=True):
-            close(ours[index], theirs[0])
-        n_groups, graph = len(alone.groups[0].numbers), alone.gwr.graph(0)
-        torch.testing.assert_close(batch.gwr.graph(index), graph, rtol=1e-5, atol=1e-5)
-        assert len(graph.weights) > 2
-        assert n_groups == len(batch.groups[index].numbers) > 2
-        for group in range(n_groups):
-            close(batch.actor_weights(index, group), alone.actor_weights(0, group))
 
 
 def test_what_an_algorithm_lacks_is_refused(make_config, bank, encoders, in_world):

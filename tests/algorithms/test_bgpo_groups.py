@@ -10,27 +10,9 @@ from bgpo_trl.configs import BGPOConfig
 from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.modules.gwr import GWRB
 from bgpo_trl.transforms import TaskSchedule
-from tests.algorithms.playing import assert_same, perceptron, play, save_and_restore, spy_batches
+from tests.algorithms.playing import assert_same, perceptron, play, spy_batches
 
 pytestmark = pytest.mark.usefixtures("easy_world")
-
-
-def test_a_restored_run_continues_as_the_saved_one(make_bgpo, tmp_path):
-    options = {"schedule": TaskSchedule((0, 0, 0))}
-    algorithm = make_bgpo("all", known=15, **options)
-    _, state = play(algorithm, 60)
-    assert all(len(groups.numbers) > 2 for groups in algorithm.groups)  # more than are active
-    # Of other weights, streams and simulations.
-    other = make_bgpo("all", seeds=(5, 7), **options)
-    play(other, 6)
-    restored_state = save_and_restore(algorithm, state, other, tmp_path)
-    ours, _ = play(algorithm, 15, state)
-    theirs, _ = play(other, 15, restored_state)
-    assert (ours == theirs).all()
-    assert_same(algorithm.learner.state_dict(), other.learner.state_dict())
-    assert_same(algorithm.experts.state_dict(), other.experts.state_dict())
-    for ours, theirs in zip(algorithm.groups, other.groups, strict=True):
-        assert_same(ours.state_dict(), theirs.state_dict())
 
 
 def test_with_one_group_it_is_the_plain_learner_bit_for_bit(make_bgpo):

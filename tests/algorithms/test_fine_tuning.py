@@ -8,7 +8,7 @@ import torch
 from bgpo_trl.algorithms import entry
 from bgpo_trl.configs import FineTuningConfig
 from bgpo_trl.transforms import TaskSchedule
-from tests.algorithms.playing import assert_same, save_and_restore, weights
+from tests.algorithms.playing import assert_same, weights
 from tests.algorithms.playing import play as play_one_task
 
 pytestmark = pytest.mark.usefixtures("easy_world")
@@ -27,10 +27,10 @@ def make(bank, encoders, make_config, in_world):
     return make
 
 
-def play(algorithm, n_steps, state=None, boundaries=(), first=0):
-    """Train for some steps; tasks begin after those numbered in ``boundaries``, from ``first``."""
+def play(algorithm, n_steps, state=None, boundaries=()):
+    """Train for some steps; tasks begin after those numbered in ``boundaries``."""
     boundaries, transitions = dict(boundaries), []
-    for step in range(first, first + n_steps):
+    for step in range(n_steps):
         played, state = play_one_task(algorithm, 1, state)
         transitions.append(played)
         for index, task in boundaries.get(step, ()):
@@ -90,41 +90,6 @@ def test_a_seed_rests_until_its_replay_has_filled_again(make, name):
     assert all(not now.equal(old) for now, old in zip(copies(algorithm, 0), learning, strict=True))
     play(algorithm, 4, state)
     assert all(not now.equal(old) for now, old in zip(copies(algorithm, 1), resting, strict=True))
-
-
-def test_each_seed_of_a_batch_learns_as_it_would_alone(make):
-    batch = make("ewc")
-    together = play(batch, 50, boundaries=BOUNDARIES)[0]
-    for index, seed in enumerate(SEEDS):
-        of_seed = {
-            step: [(0, task) for row, task in of_step if row == index]
-            for step, of_step in BOUNDARIES.items()
-        }
-        alone = make("ewc", seeds=(seed,))
-        data = play(alone, 50, boundaries=of_seed)[0][0]
-        assert together[index]["demo_index"].equal(data["demo_index"])
-        for key in ("action", "latent"):
-            torch.testing.assert_close(together[index][key], data[key], rtol=1e-4, atol=1e-4)
-        for ours, theirs in zip(copies(batch, index), copies(alone, 0), strict=True):
-            torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-4)
-
-
-@pytest.mark.parametrize(
-    ("name", "seeds", "n_steps"),
-    [("fine-tuning-demonstrations", SEEDS, 34), ("ewc", SEEDS, 34), ("ewc", (1,), 21)],
-)
-def test_a_restored_run_continues_as_the_saved_one(make, tmp_path, name, seeds, n_steps):
-    """Also directly after a boundary, when the only seed's replay is empty."""
-    boundaries = BOUNDARIES if len(seeds) == 2 else {5: [(0, 1)], 20: [(0, 2)], 33: [(0, 0)]}
-    algorithm, other = make(name, seeds=seeds), make(name, seeds=seeds)
-    _, state = play(algorithm, n_steps, boundaries=boundaries)
-    play(other, 12, boundaries={9: [(0, 2)]})
-    restored_state = save_and_restore(algorithm, state, other, tmp_path)
-    options = {"boundaries": boundaries, "first": n_steps}
-    ours = play(algorithm, 50 - n_steps, state, **options)[0]
-    theirs = play(other, 50 - n_steps, restored_state, **options)[0]
-    assert (ours == theirs).all()
-    assert_same(algorithm.state_dict(), other.state_dict())
 
 
 def test_ewc_without_weight_is_fine_tuning(make):

@@ -14,7 +14,6 @@ from tests.algorithms.playing import (
     assert_same,
     perceptron,
     play,
-    save_and_restore,
     snapshot,
     spy_batches,
     weights_of,
@@ -185,23 +184,6 @@ def test_demonstrations_are_never_read(make, name):
     for index in range(2):
         nothing = snapshot(blind, index, embedding=float("nan"))
         assert_same(snapshot(seeing, index).parameters, nothing.parameters)
-
-
-@pytest.mark.parametrize(
-    ("name", "changes"),
-    [("maml-demonstrations", {"task_batch_size": 8}), ("dist-nll-demonstrations", {})],
-)
-def test_a_restored_run_continues_as_the_saved_one(make, tmp_path, name, changes):
-    algorithm = make(name, state="latent", **changes)
-    _, state = play(algorithm, 30)
-    # Of other weights, streams and simulations.
-    other = make(name, seeds=(5, 7), state="latent", **changes)
-    restored_state = save_and_restore(algorithm, state, other, tmp_path)
-    ours, _ = play(algorithm, 20, state)
-    theirs, _ = play(other, 20, restored_state)
-    assert (ours == theirs).all()
-    assert_same(algorithm.state_dict(), other.state_dict())
-    assert_same(snapshot(algorithm, 1).parameters, snapshot(other, 1).parameters)
 
 
 def test_a_replay_too_small_to_fill_a_batch_is_refused(make, make_config):

@@ -1,7 +1,5 @@
 """All transforms together, as a training run composes them."""
 
-import copy
-
 import pytest
 import torch
 from torchrl.envs import SerialEnv, check_env_specs
@@ -50,15 +48,6 @@ def test_a_partial_reset_changes_only_its_rows():
     assert not before["lae_h"][1].equal(fresh["lae_h"][1])
 
 
-def test_a_row_of_a_batch_is_that_seed_alone():
-    seeds, lengths = [4, 2, 3], [1, 3, 9]
-    together, _ = play(make_env(seeds, lengths), 30)
-    for row, (seed, length) in enumerate(zip(seeds, lengths, strict=True)):
-        alone, _ = play(make_env([seed], [length]), 30)
-        for key, value in alone[0].items(True, True):
-            torch.testing.assert_close(together[row][key], value)
-
-
 @pytest.mark.parametrize("use_buffers", [True, False])
 def test_each_worker_can_have_a_composition_of_its_own(use_buffers):
     workers = [lambda: make_env(lengths=9), lambda: make_env(lengths=4)]
@@ -79,17 +68,3 @@ def test_collected_data_is_not_overwritten():
         kept.append(step)
         copies.append(step.clone())
     assert (torch.stack(kept) == torch.stack(copies)).all()
-
-
-def test_resumes_from_a_state_dict():
-    env = make_env([0, 1], [2, 3])
-    _, data = play(env, 7)  # in the middle of an episode of both
-    saved, state, base = data.clone(), copy.deepcopy(env.state_dict()), copy.copy(env.base_env)
-    expected, _ = play(env, 12, data)
-    resumed = make_env([8, 9], [2, 3])
-    resumed.base_env.seeds, resumed.base_env.steps = base.seeds, base.steps
-    resumed.base_env.task = base.task
-    resumed.load_state_dict(state)
-    steps, _ = play(resumed, 12, saved)
-    for key, value in expected.items(True, True):
-        torch.testing.assert_close(steps[key], value)
