@@ -76,6 +76,14 @@ def edit(path: Path, **changes: object) -> None:
     path.write_text(json.dumps({k: v for k, v in found.items() if k not in removed}))
 
 
+def through_a_file(state: Any) -> Any:
+    """Return a state as a checkpoint would return it."""
+    file = io.BytesIO()
+    torch.save(state, file)
+    file.seek(0)
+    return torch.load(file, weights_only=True)
+
+
 @contextmanager
 def largest_file(size: int) -> Iterator[None]:
     """Have the kernel refuse to write files beyond a size, as a full disk would."""

@@ -63,7 +63,12 @@ BAD = {
         "demonstration_share": 0.999,
     },
     MAMLConfig: {"inner_learning_rate": NAN, "task_batch_size": 7, "demonstration_share": 0.999},
-    DistNLLConfig: {"learning_rate": NAN, "task_batch_size": 0, "demonstration_share": 0.999},
+    DistNLLConfig: {
+        "learning_rate": NAN,
+        "task_batch_size": 0,
+        "distillation_batch_size": 0,
+        "demonstration_share": 0.999,
+    },
     RunConfig: {
         "seeds": (0.5,),
         "episodes": 1e4,

@@ -150,14 +150,6 @@ def test_a_run_is_resumed_from_the_checkpoint_before_a_damaged_one(uninterrupted
     resumed.run()
     assert_same_run(tmp_path, uninterrupted)
 
-    for path in (tmp_path / "checkpoint").iterdir():
-        path.write_bytes(b"")
-    with (
-        pytest.warns(UserWarning, match="is damaged"),
-        pytest.raises(ValueError, match="no intact checkpoint"),
-    ):
-        make(tmp_path, resume=True)
-
 
 def test_encoder_training_is_resumed_from_the_checkpoint_before_a_damaged_one(
     learned, tmp_path, monkeypatch

@@ -8,7 +8,6 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from bgpo_trl.configs import DistNLLConfig
 from bgpo_trl.modules.multi_head_actor import MultiHeadActor
 from bgpo_trl.seeding import generators
 from bgpo_trl.transforms import TaskSchedule
@@ -230,8 +229,3 @@ def test_the_last_batch_of_a_distillation_has_what_is_left(make):
     play(algorithm, 40)
     assert len(sizes) > 8
     assert sizes == [7, 7, 7, 3] * (len(sizes) // 4)
-
-
-def test_batches_of_nothing_are_refused():
-    with pytest.raises(ValueError, match=r"distillation_batch_size.*\b0\b"):
-        DistNLLConfig(distillation_batch_size=0)

@@ -1,7 +1,6 @@
 """Experts: which groups are active, and that a group's networks are its own for good."""
 
 import copy
-import io
 from dataclasses import replace
 
 import pytest
@@ -13,6 +12,7 @@ from bgpo_trl.algorithms.experts import ActiveGroups, Experts
 from bgpo_trl.algorithms.rl import LearnerSpec, make_learner
 from bgpo_trl.configs import SHOWN, RLConfig
 from tests.algorithms.playing import make_batch
+from tests.helpers import through_a_file
 
 KINDS = {"actor": RLConfig(), "both": SHOWN}  # by their proposals
 every_kind = pytest.mark.parametrize("name", KINDS)
@@ -265,10 +265,8 @@ def test_restored_experts_go_on_bit_for_bit(name):
     experts, restored = make(name), make(name, seeds=(0, 1))
     play(experts, range(13))
     play(restored, range(4))
-    file = io.BytesIO()
-    torch.save({"learner": experts.learner.state_dict(), "experts": experts.state_dict()}, file)
-    file.seek(0)
-    state = torch.load(file, weights_only=True)
+    parts = {"learner": experts.learner.state_dict(), "experts": experts.state_dict()}
+    state = through_a_file(parts)
     restored.load_state_dict(state["experts"])
     restored.learner.load_state_dict(state["learner"])
     for one in (experts, restored):

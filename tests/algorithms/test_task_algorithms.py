@@ -5,9 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tensordict import TensorDict
 
-from bgpo_trl.modules.actor_critic import Actor
 from bgpo_trl.seeding import generators
 from bgpo_trl.transforms import TaskSchedule
 from tests.algorithms.playing import (
@@ -145,32 +143,6 @@ def test_networks_stay_as_they_were_until_there_is_data_of_their_task(make, name
     assert not any(stages[0])
     assert all(stages[-1])
     assert len(set(stages)) > 3
-
-
-@both
-def test_snapshots_are_copies_that_act_as_plain_networks_and_leave_no_trace(make, name):
-    algorithm = make(name)
-    _, state = play(algorithm, 40)
-    before = deepcopy(algorithm.state_dict())
-    gradients = [deepcopy(p.grad) for p in algorithm.learner.loss.parameters()]
-    frozen = [snapshot(algorithm, index) for index in range(2)]
-    assert_same(algorithm.state_dict(), before)
-    assert_same([p.grad for p in algorithm.learner.loss.parameters()], gradients)
-
-    shown = torch.randn(2, N_TASKS, 2, SIZE, generator=torch.Generator().manual_seed(0))
-    for policy, of_seed in zip(frozen, shown, strict=True):
-        alone = Actor(SIZE, in_keys=["state"], hidden_sizes=(64,), batch_size=[N_TASKS])
-        alone.load_state_dict(policy.parameters)
-        expected = alone(TensorDict({"state": of_seed}, [N_TASKS, 2]))["action"]
-        torch.testing.assert_close(policy.act(of_seed), expected)
-
-    parameters = frozen[1].parameters
-    copied = deepcopy(parameters)
-    play(algorithm, 20, state)
-    assert_same(parameters, copied)
-    later = snapshot(algorithm, 1).parameters
-    assert not any(value.requires_grad for value in parameters.values())
-    assert any(not value.equal(later[key]) for key, value in parameters.items())
 
 
 @both

@@ -1,6 +1,5 @@
 """Transitions of shown demonstrations, against the bank's own steps."""
 
-import io
 import itertools
 from dataclasses import replace
 
@@ -9,6 +8,7 @@ import torch
 from tensordict import TensorDict
 
 from bgpo_trl.data.demonstration_replay import DemonstrationReplay
+from tests.helpers import through_a_file
 
 CONSTANT = ["behavior", "label"]
 
@@ -182,11 +182,8 @@ def test_a_seed_of_a_stack_is_that_seed_alone(bank):
 
 def test_a_restored_replay_continues_as_the_saved_one(shown, bank):
     shown.sample(GROUP)
-    file = io.BytesIO()
-    torch.save(shown.state_dict(), file)
-    file.seek(0)
     restored = make(bank.seen(), first=30)
-    restored.load_state_dict(torch.load(file, weights_only=True))
+    restored.load_state_dict(through_a_file(shown.state_dict()))
     for step in range(3):
         assert (restored.sample(GROUP) == shown.sample(GROUP)).all()
         for replay in (restored, shown):

@@ -1,6 +1,5 @@
 """Replay by group against plain lists, and each seed of a stack against itself alone."""
 
-import io
 import resource
 import sys
 
@@ -11,6 +10,7 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 
 from bgpo_trl.data.replay import GroupReplay
+from tests.helpers import through_a_file
 
 KEYS = ["latent", ("next", "terminated")]
 
@@ -37,13 +37,6 @@ def fill(replay, groups):
         replay.add(transition(step, len(of_step)), torch.tensor(of_step))
 
 
-def through_a_file(state):
-    file = io.BytesIO()
-    torch.save(state, file)
-    file.seek(0)
-    return torch.load(file, weights_only=True)
-
-
 @settings(max_examples=60)
 @given(
     capacity=st.integers(1, 9),
@@ -52,21 +45,22 @@ def through_a_file(state):
     ),
     asked=st.lists(st.integers(-1, 5), min_size=1, max_size=12),
     given_generators=st.booleans(),
-    restored=st.booleans(),
+    restored=st.integers(0, 40) | st.integers(0, 3),
 )
 def test_a_row_is_drawn_from_what_is_left_of_its_group(
     capacity, stored, asked, given_generators, restored
 ):
+    """Also of a replay that is saved and restored before or between transitions."""
     replay, kept = make(capacity), [[], []]
     for step, (first, second, both) in enumerate(stored):
         both = both or step == 0  # so that each seed has something
+        if step == restored:
+            state, replay = through_a_file(replay.state_dict()), make(capacity, first=7)
+            replay.load_state_dict(state)
         replay.add(transition(step, 2), torch.tensor([first, second]), torch.tensor([True, both]))
         kept[0] = [*kept[0], (first, step)][-capacity:]
         if both:
             kept[1] = [*kept[1], (second, step + 0.01)][-capacity:]
-    if restored:
-        state, replay = through_a_file(replay.state_dict()), make(capacity, first=7)
-        replay.load_state_dict(state)
     group = torch.tensor([asked, asked[::-1]])
     held = [[[value for g, value in kept[s] if g == n] for n in group[s].tolist()] for s in (0, 1)]
     assert replay.sizes(group).tolist() == [[len(values) for values in rows] for rows in held]
@@ -219,22 +213,6 @@ def test_a_group_is_forgotten_when_overwritten_and_can_return(n_first):
     drawn = replay.sample(torch.zeros(1, 99, dtype=torch.int64))
     assert drawn["latent"].unique().tolist() == [30_000.0, 30_001.0]
     assert (drawn["priority_weight"] == 1).all()
-
-
-@pytest.mark.parametrize("n_steps", [0, 25])
-def test_a_restored_replay_continues_as_the_saved_one(n_steps):
-    replay, restored = make(10), make(10, first=9)
-    fill(replay, [(step % 3, step % 2) for step in range(n_steps)])
-    fill(restored, [(4, 4)] * 3)
-    asked = torch.tensor([[0, 1, 2, 1], [1, 0, 1, -1]])
-    if n_steps:
-        replay.sample(asked)
-    restored.load_state_dict(through_a_file(replay.state_dict()))
-    for step in range(4):
-        for one in (replay, restored):
-            one.add(transition(50 + step, 2), torch.tensor([step % 2, 1]))
-        assert restored.sizes(asked).equal(replay.sizes(asked))
-        assert (restored.sample(asked) == replay.sample(asked)).all()
 
 
 def test_a_seed_is_restored_though_another_has_stored_nothing_yet():

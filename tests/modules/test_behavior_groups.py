@@ -1,7 +1,5 @@
 """Groups of behaviors: which group an input belongs to as demonstrations are shown."""
 
-import io
-
 import numpy as np
 import pytest
 import torch
@@ -10,6 +8,7 @@ from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.transforms import TaskSchedule
 from suites import nico
+from tests.helpers import through_a_file
 
 PLACES = 12.0 * torch.eye(4)
 
@@ -140,10 +139,7 @@ def test_loaded_groups_continue_identically(n_shown):
     groups, restored = BehaviorGroups(4), BehaviorGroups(4)
     inputs = torch.cat([around(place, 40) for place in (0, 1, 2)])
     show(groups, inputs[:n_shown])
-    file = io.BytesIO()
-    torch.save(groups.state_dict(), file)
-    file.seek(0)
-    restored.load_state_dict(torch.load(file, weights_only=True))
+    restored.load_state_dict(through_a_file(groups.state_dict()))
     assert restored.numbers == groups.numbers
     for phi in inputs[n_shown:]:
         ours, theirs = groups.adapt(phi), restored.adapt(phi)

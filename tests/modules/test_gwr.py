@@ -174,14 +174,6 @@ def test_masked_batch_follows_the_plain_reference(config, max_nodes, init):
 # ---- the equations, by hand
 
 
-def test_match_is_the_nearest_node_and_its_activity():
-    gwr = from_data([[0.0, 0.0], [3.0, 4.0]])
-    match = gwr.lookup(torch.tensor([[3.0, 3.5], [0.0, 0.25]]))
-    assert match.node.tolist() == [1, 0]
-    assert match.embedding.tolist() == [[3.0, 4.0], [0.0, 0.0]]
-    assert match.activity.tolist() == pytest.approx([0.6065307, 0.7788008])  # exp(-.5), exp(-.25)
-
-
 @pytest.mark.parametrize("scale", [0.25, 4.0])  # powers of two: nothing is rounded otherwise
 def test_activity_scale_has_the_effect_of_scaled_inputs(scale):
     scaled, plain = (
@@ -236,33 +228,6 @@ def test_best_match_and_neighbor_have_constants_of_their_own():
     assert graph.weights.flatten().tolist() == pytest.approx([0.4 * 0.5 * 0.5, 1 - 0.2 * 0.5 * 0.5])
 
 
-def test_inserted_node_lies_between_and_takes_over_the_edge():
-    gwr = from_data([[0.0, 0.0], [1.0, 0.0]], ALWAYS_INSERT)
-    gwr.adapt(torch.tensor([0.25, 0.5]))
-    graph = gwr.graph()
-    assert graph.weights.tolist() == [[0.0, 0.0], [1.0, 0.0], [0.125, 0.25]]
-    assert graph.habituation.tolist() == [1.0, 1.0, 1.0]
-    assert graph.edges.tolist() == [[0, 2], [1, 2]]
-    assert graph.ages.tolist() == [1, 0]  # only the edge of the best match has aged
-
-
-def test_edges_age_at_the_best_match_and_expire_with_their_nodes():
-    config = replace(ALWAYS_INSERT, max_age=2, lr_neighbor=0.0)
-    gwr = from_data([[0.0], [1.0]], config)
-    gwr.adapt(torch.tensor([4.0]))  # best 1, second 0: node 2 at 2.5; edges 1-2 (1), 0-2 (0)
-    for phi in (1.0, 1.0):  # familiar; best 1, second 0: edge 0-1 renewed, then edge 1-2 ages
-        gwr.adapt(torch.tensor([phi]))
-    graph = gwr.graph()
-    assert graph.edges.tolist() == [[0, 1], [0, 2]]  # 1-2 had age 3
-    assert graph.ages.tolist() == [1, 0]
-    for _ in range(3):  # best 0, second 1: edge 0-2 ages to 3, node 2 has no other
-        assert gwr.num_nodes == 3
-        gwr.adapt(torch.tensor([0.0]))
-    assert gwr.graph().node.tolist() == [0, 1]
-    gwr.adapt(torch.tensor([-4.0]))
-    assert gwr.graph().node.tolist() == [0, 1, 3]  # the identity 2 is not used again
-
-
 def test_ties_go_to_the_older_node():
     ties = from_data([[1.0, 0.0], [-1.0, 0.0]])
     assert ties.adapt(torch.tensor([0.0, 0.5])).node == 0
@@ -272,25 +237,6 @@ def test_ties_go_to_the_older_node():
     copies.adapt(torch.tensor([1.0]))  # nodes 0 and 1 are as near: 0 is best, 1 second
     assert copies.graph().weights.flatten().tolist() == [2.0, 2.0, 3.0, 1.5]
     assert copies.graph().edges.tolist() == [[0, 3], [1, 2], [1, 3]]
-
-
-# ---- starting
-
-
-def test_first_two_inputs_become_the_nodes():
-    gwr = GWRB(2, init="data")
-    assert gwr.num_nodes == 0
-    with pytest.raises(ValueError, match="empty"):
-        gwr.lookup(torch.zeros(2))
-    first, second = torch.tensor([0.5, 0.0]), torch.tensor([0.5, 1.0])
-    match = gwr.adapt(first)
-    assert (match.embedding.tolist(), match.node, match.activity) == ([0.5, 0.0], 0, 1.0)
-    assert gwr.graph().edges.shape == (0, 2)
-    match = gwr.adapt(second)  # matched with the nodes from before
-    assert match.node == 0
-    assert match.activity.item() == pytest.approx(math.exp(-1))
-    assert gwr.graph().weights.tolist() == [[0.5, 0.0], [0.5, 1.0]]
-    assert (gwr.graph().edges.tolist(), gwr.graph().ages.tolist()) == ([[0, 1]], [0])
 
 
 @pytest.mark.parametrize("init", ["random", "data"])
@@ -348,23 +294,6 @@ def test_graph_is_indexed_like_the_batch():
     for wrong in ((2, 0), (), 1, (0, slice(2)), (0, 0, 0), 0.5):
         with pytest.raises(IndexError):
             gwr.graph(wrong)
-
-
-def test_loaded_state_continues_bit_for_bit(tmp_path):
-    inputs = drifting_inputs(900, 2, 3, 4).float()
-    masks = torch.rand(900, 2, 3, generator=torch.Generator().manual_seed(0)) < 0.6
-    gwr = GWRB(4, GROWING, batch_size=[2, 3], init="data")
-    for phi, mask in zip(inputs[:300], masks[:300], strict=True):
-        gwr.adapt(phi, mask)
-    torch.save(gwr.state_dict(), tmp_path / "gwr.pt")
-    resumed = GWRB(4, GROWING, batch_size=[2, 3])
-    resumed.load_state_dict(torch.load(tmp_path / "gwr.pt", weights_only=True))
-    assert_same(resumed.get_extra_state(), gwr.get_extra_state())
-    for phi, mask in zip(inputs[300:], masks[300:], strict=True):
-        assert_same(gwr.adapt(phi, mask), resumed.adapt(phi, mask))
-    assert_same(resumed.get_extra_state(), gwr.get_extra_state())
-    identities = [gwr.graph(i).node for i in itertools.product(range(2), range(3))]
-    assert any(node[-1] >= len(node) for node in identities)  # nodes were removed
 
 
 def test_graphs_states_matches_and_copies_do_not_change_when_the_network_learns():

@@ -1,6 +1,5 @@
 """Properties of GWR-B that hold for any sizes, constants and inputs."""
 
-import io
 import math
 
 import numpy as np
@@ -11,6 +10,7 @@ from hypothesis import strategies as st
 
 from bgpo_trl.configs import GWRBConfig
 from bgpo_trl.modules.gwr import GWRB
+from tests.helpers import through_a_file
 
 
 @st.composite
@@ -91,11 +91,8 @@ def assert_sound(gwr, largest):
 
 
 def saved_and_loaded(gwr):
-    file = io.BytesIO()
-    torch.save(gwr.state_dict(), file)
-    file.seek(0)
     loaded = GWRB(gwr.n_features, gwr.config, batch_size=gwr.batch_size, max_nodes=gwr.max_nodes)
-    loaded.load_state_dict(torch.load(file, weights_only=True))
+    loaded.load_state_dict(through_a_file(gwr.state_dict()))
     return loaded
 
 

@@ -8,7 +8,6 @@ import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
-from torch import Tensor, nn
 from torchrl import objectives
 from torchrl.objectives.value import TD0Estimator
 
@@ -167,28 +166,19 @@ def test_a_stack_of_policies_chooses_for_each_as_one_would():
     assert taken[1] == 1 and (taken[[0, 2, 3]] < 1).all() and (taken > 0).all()
 
 
-def test_the_clone_learns_the_distance_to_demonstrated_actions():
-    loss, batch = make_loss("clone"), make_batch(6)
+@pytest.mark.parametrize(
+    ("name", "part", "weight"), [("clone", "clone", 1), ("ddpg", "actor", 0.7)]
+)
+def test_imitation_is_the_distance_to_demonstrated_actions_with_its_weight(name, part, weight):
+    options = {"imitation": weight} if part == "actor" else {}
+    loss, batch = make_loss(name, **options), make_batch(6)
     shown = batch["imitation"]
-    action = loss.clone_network(shown.select("state"))["action"]
-    distance = (action - shown["action"]).square().sum(-1)
-    torch.testing.assert_close(loss(batch)["loss_clone"], distance.mean())
+    action = getattr(loss, f"{part}_network")(shown.select("state"))["action"]
+    distance = weight * (action - shown["action"]).square().sum(-1)
+    alone = make_loss(name)(batch)["loss_actor"] if part == "actor" else 0
+    torch.testing.assert_close(loss(batch)[f"loss_{part}"], alone + distance.mean())
     shown["priority_weight"] = weights = torch.arange(6.0)
-    torch.testing.assert_close(loss(batch)["loss_clone"], (distance * weights).mean())
-    with pytest.raises(ValueError, match="imitation"):
-        loss(batch.exclude("imitation"))
-
-
-def test_the_actor_imitates_with_its_weight():
-    loss, batch = make_loss("ddpg", imitation=0.7), make_batch(6)
-    shown = batch["imitation"]
-    action = loss.actor_network(shown.select("state"))["action"]
-    distance = (action - shown["action"]).square().sum(-1)
-    alone = make_loss("ddpg")(batch)["loss_actor"]
-    torch.testing.assert_close(loss(batch)["loss_actor"], alone + 0.7 * distance.mean())
-    shown["priority_weight"] = weights = torch.arange(6.0)
-    expected = alone + 0.7 * (distance * weights).mean()
-    torch.testing.assert_close(loss(batch)["loss_actor"], expected)
+    torch.testing.assert_close(loss(batch)[f"loss_{part}"], alone + (distance * weights).mean())
     with pytest.raises(ValueError, match="imitation"):
         loss(batch.exclude("imitation"))
 
@@ -224,80 +214,6 @@ def test_without_options_it_is_torchrls_loss():
     total(theirs).backward()
     for ours, other in zip(loss.parameters(), reference.parameters(), strict=True):
         torch.testing.assert_close(ours.grad, other.grad, rtol=1e-3, atol=1e-5)
-
-
-class PlainDDPG:
-    """DDPG in plain torch, sharing nothing with the code under test but the initial weights."""
-
-    def __init__(self, loss: DDPGLoss):
-        self.actor = self.copy(loss.actor_network, nn.Tanh())
-        self.critic = self.copy(loss.value_network)
-        self.target_actor = copy.deepcopy(self.actor)
-        self.target_critic = copy.deepcopy(self.critic)
-        parameters = [*self.actor.parameters(), *self.critic.parameters()]
-        self.optimizer = torch.optim.Adam(parameters, lr=1e-3)
-
-    @staticmethod
-    def copy(network: nn.Module, *output: nn.Module) -> nn.Sequential:
-        w1, b1, w2, b2 = (parameter.detach() for parameter in network.parameters())
-        plain = nn.Sequential(nn.Linear(*w1.shape), nn.ReLU(), nn.Linear(*w2.shape), *output)
-        for parameter, value in zip(plain.parameters(), (w1.T, b1, w2.T, b2), strict=True):
-            parameter.data = value.clone()
-        return plain
-
-    def losses(self, batch: TensorDict) -> tuple[Tensor, Tensor]:
-        state, action, successor = batch["state"], batch["action"], batch["next"]
-        with torch.no_grad():
-            next_action = self.target_actor(successor["state"])
-            next_q = self.target_critic(torch.cat([successor["state"], next_action], -1))
-            target = successor["reward"] + 0.98 * next_q * (~successor["terminated"]).float()
-            target = target.clip(0.0, 1.1)
-        q = self.critic(torch.cat([state, action], -1))
-        value_loss = ((q - target) ** 2).mean()
-        pre_tanh = self.actor[:-1](state)
-        q = self.critic(torch.cat([state, pre_tanh.tanh()], -1))
-        return -q.mean() + 0.01 * (pre_tanh**2).mean(), value_loss
-
-    def update(self, batch: TensorDict) -> None:
-        actor_loss, value_loss = self.losses(batch)
-        actor, critic = list(self.actor.parameters()), list(self.critic.parameters())
-        actor_grads = torch.autograd.grad(actor_loss, actor)
-        critic_grads = torch.autograd.grad(value_loss, critic)
-        for parameter, grad in zip(actor + critic, actor_grads + critic_grads, strict=True):
-            parameter.grad = grad
-        self.optimizer.step()
-        for network, target in (
-            (self.actor, self.target_actor),
-            (self.critic, self.target_critic),
-        ):
-            for source, slow in zip(network.parameters(), target.parameters(), strict=True):
-                slow.data = 0.995 * slow.data + 0.005 * source.data
-
-
-def test_trains_as_a_plain_ddpg_does():
-    loss = make_loss("ddpg", return_bounds=(0.0, 1.1))
-    update = ForeachSoftUpdate(loss, tau=0.005)
-    plain = PlainDDPG(loss)
-    optimizer = torch.optim.Adam(list(loss.parameters()), lr=1e-3)
-    for step in range(30):
-        batch = make_batch(32, seed=step)
-        result, (actor_loss, value_loss) = loss(batch), plain.losses(batch)
-        torch.testing.assert_close(result["loss_actor"], actor_loss, rtol=1e-4, atol=1e-5)
-        torch.testing.assert_close(result["loss_value"], value_loss, rtol=1e-4, atol=1e-5)
-        optimizer.zero_grad()
-        total(result).backward()
-        optimizer.step()
-        update.step()
-        plain.update(batch)
-    for network, reference in (
-        (loss.actor_network_params, plain.actor),
-        (loss.value_network_params, plain.critic),
-        (loss.target_actor_network_params, plain.target_actor),
-        (loss.target_value_network_params, plain.target_critic),
-    ):
-        for mine, theirs in zip(network.values(True, True), reference.parameters(), strict=True):
-            theirs = theirs.T if theirs.ndim == 2 else theirs
-            torch.testing.assert_close(mine.data, theirs.data, rtol=1e-4, atol=2e-5)
 
 
 @every_loss

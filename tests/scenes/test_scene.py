@@ -134,17 +134,7 @@ def test_what_a_scene_lacks_is_refused_in_a_line(tmp_path):
 
 
 def test_demonstrations_have_the_shapes_of_the_scene(tmp_path):
-    columns = StateColumns(center=(0.0,), scale=(1.0,))
-
-    class Seen(Dot):
-        def state(self):
-            return np.array([self.place])
-
-    seen = scene(Seen, state=columns)
-    shape = {"frame_shape": (16, 24), "action_size": 1, "state_size": 1}
-    seen = replace(seen, make_env=partial(SimulationEnv, Seen, **shape))
-    options = {"per_task": 2, "held_out_per_task": 1, "progress": False}
-    data = record_demonstrations(tmp_path, scene=seen, **options)
+    data = recorded(tmp_path, seen())
     assert data["pixels"].shape == (4, 13, 16, 24, 3)
     assert data["action"].shape == (4, 12, 1)
     assert data["state"].shape == (4, 13, 1)
@@ -170,10 +160,12 @@ def test_encoders_of_another_robot_are_refused_whatever_its_version(pretrained, 
             ValueError, match=r"of the scene dot dot-1, this is cart dot-1.*--scene dot"
         ):
             call()
-    unlabeled = replace(bank, scene=None)
-    with pytest.raises(ValueError, match=r"encoders is of the scene dot dot-1, this is nico"):
-        tasks = {"tasks": ("grasp_glass", "push_green_to_glass"), "scene": "nico"}
-        Trainer(config(**tasks), tmp_path / "run", bank=unlabeled, encoders=encoders)
+    run = config(tasks=("grasp_glass", "push_green_to_glass"), scene="nico")
+    bank = replace(bank, tasks=run.tasks)
+    for given, part in ((bank, "the bank"), (replace(bank, scene=None), "encoders")):
+        with pytest.raises(ValueError, match=rf"{part} is of the scene dot dot-1, this is nico"):
+            Trainer(run, tmp_path / "run", bank=given, encoders=encoders)
+    assert not (tmp_path / "run").exists()
     large = scene(frame_shape=(24, 24))
     with pytest.raises(
         ValueError, match=r"frames of \[16, 24\] and \[1\] actions, the scene \[24, 24\]"
@@ -299,25 +291,35 @@ def test_frames_actions_and_episodes_have_any_size(make, n_actions, n_steps, tmp
     assert policy.act(frames[0]).shape == (n_actions,)
 
 
-@pytest.mark.parametrize(
-    ("frame", "found"),
-    [
-        (np.ones((16, 24, 3), np.float32), r"float32 \[16, 24, 3\]"),
-        (np.ones((24, 16, 3), np.uint8), r"uint8 \[24, 16, 3\]"),
-        (np.ones((16, 24, 1), np.uint8), r"uint8 \[16, 24, 1\]"),
-    ],
-)
-def test_frames_of_another_kind_than_the_scenes_are_refused(frame, found):
-    class Odd(Dot):
-        def frame(self):
-            return frame
+RETURNED = [
+    ("frame", np.ones((16, 24, 3), np.float32), r"float32 \[16, 24, 3\]: return uint8 \[16, 24"),
+    ("frame", np.ones((24, 16, 3), np.uint8), r"uint8 \[24, 16, 3\]: return uint8"),
+    ("frame", np.ones((16, 24, 1), np.uint8), r"uint8 \[16, 24, 1\]: return uint8"),
+    ("step", True, "True: return an Outcome, whose"),  # was an error of unpacking
+    ("step", (np.zeros(1), 0.0, False, False, {}), r"\(array\(\[0"),  # Gym's
+    ("step", (True, False), r"\(True, False\)"),
+    ("step", Outcome(success=0.5), r"Outcome\(succ"),  # paid half a reward
+    ("step", Outcome(success=np.nan), r"Outcome\(succ"),
+    ("step", None, "None"),
+    ("state", None, "nothing: return 1 finite numbers"),  # a forgotten return was NaN
+    ("state", [np.nan], r"\[nan\]"),
+    ("state", [0.0, 1.0], r"float64 \[2\]"),
+    ("state", 0.0, r"float64 \[\]"),
+    ("state", ["far"], r"<U3 \[1\]"),
+]
 
-    with pytest.raises(ValueError, match=rf"Odd.frame\(\) returned {found}: return uint8 \[16, 24"):
-        scene(Odd).simulate(TASKS).reset()
+
+class Seen(Dot):
+    """A dot with ground truth."""
+
+    def state(self):
+        return np.array([self.place])
 
 
-COLUMNS = StateColumns(center=(0.0,), scale=(1.0,))
-STATE_SHAPE = {"frame_shape": (16, 24), "action_size": 1, "state_size": 1}
+def seen(make=Seen):
+    shape = {"frame_shape": (16, 24), "action_size": 1, "state_size": 1}
+    columns = StateColumns(center=(0.0,), scale=(1.0,))
+    return replace(scene(make, state=columns), make_env=partial(SimulationEnv, make, **shape))
 
 
 def recorded(path, robot, **options):
@@ -326,52 +328,15 @@ def recorded(path, robot, **options):
     )
 
 
-@pytest.mark.parametrize(
-    ("outcome", "found"),
-    [
-        (True, "True"),  # is a sequence of nothing, and was an error of unpacking
-        ((np.zeros(1), 0.0, False, False, {}), r"\(array\(\[0"),  # Gym's
-        ((True, False), r"\(True, False\)"),
-        (Outcome(success=0.5), r"Outcome\(succ"),  # paid half a reward
-        (Outcome(success=np.nan), r"Outcome\(succ"),
-        (None, "None"),
-    ],
-)
-def test_outcomes_of_another_kind_are_refused(tmp_path, outcome, found):
-    class Odd(Dot):
-        def step(self, action):
-            return outcome
-
-    message = rf"Odd.step\(\) returned {found}.*: return an Outcome, whose success and failure"
-    env = scene(Odd).simulate(TASKS)
-    with pytest.raises(ValueError, match=message):
-        env.rollout(2)
-    with pytest.raises(ValueError, match=message):
-        recorded(tmp_path, scene(Odd))
-
-
-@pytest.mark.parametrize(
-    ("state", "found"),
-    [
-        (None, "nothing"),  # a forgotten return was NaN
-        ([np.nan], r"\[nan\]"),
-        ([0.0, 1.0], r"float64 \[2\]"),
-        (0.0, r"float64 \[\]"),
-        (["far"], r"<U3 \[1\]"),
-    ],
-)
-def test_a_ground_truth_of_another_kind_is_refused(tmp_path, state, found):
-    class Odd(Dot):
-        def state(self):
-            return state
-
-    odd = scene(Odd, state=COLUMNS)
-    odd = replace(odd, make_env=partial(SimulationEnv, Odd, **STATE_SHAPE))
-    message = rf"Odd.state\(\) returned {found}: return 1 finite numbers"
-    with pytest.raises(ValueError, match=message):
-        odd.simulate(TASKS, observation="state").reset()
-    with pytest.raises(ValueError, match=message):
-        recorded(tmp_path, odd)
+@pytest.mark.parametrize(("method", "value", "message"), RETURNED)
+def test_what_a_simulation_returns_is_checked(tmp_path, method, value, message):
+    odd = seen(type("Odd", (Seen,), {method: lambda *_: value}))
+    for call in (
+        lambda: odd.simulate(TASKS, observation="both").rollout(2),
+        lambda: recorded(tmp_path, odd),
+    ):
+        with pytest.raises(ValueError, match=rf"Odd\.{method}\(\) returned {message}"):
+            call()
 
 
 @pytest.mark.parametrize("column", [(0.0, 0.0), (0.0, np.inf), (np.nan, 1.0), (0.0, -1.0)])
@@ -460,16 +425,6 @@ def test_baselines_learn_on_another_robot(pretrained, tmp_path, monkeypatch, nam
     assert len(read_table(tmp_path / "train.csv")) == 8
 
 
-def test_a_run_continues_if_its_simulation_can_be_saved(pretrained, tmp_path, monkeypatch):
-    monkeypatch.setitem(SCENES, "dot", scene(SavedDot))
-    train(tmp_path / "whole", pretrained)
-    train(tmp_path / "parts", pretrained, episodes=2)
-    train(tmp_path / "parts", pretrained, resume=True)
-    for name in ("train.csv", "eval.csv"):
-        whole, parts = ((tmp_path / run / name).read_text() for run in ("whole", "parts"))
-        assert whole == parts
-
-
 def test_a_run_whose_simulation_cannot_be_saved_is_not_resumed(pretrained, tmp_path, monkeypatch):
     monkeypatch.setitem(SCENES, "dot", scene())
     train(tmp_path, pretrained, episodes=2)
@@ -477,13 +432,3 @@ def test_a_run_whose_simulation_cannot_be_saved_is_not_resumed(pretrained, tmp_p
     with pytest.raises(ValueError, match="'dot' cannot be saved, so this run cannot be resumed"):
         train(tmp_path, pretrained, resume=True)
     assert (tmp_path / "train.csv").read_bytes() == before
-
-
-def test_demonstrations_of_another_robot_are_refused(pretrained, bank, encoders, tmp_path):
-    known = replace(pretrained[1], tasks=("grasp_glass", "push_green_to_glass"))
-    run = config(scene="nico", tasks=known.tasks)
-    with pytest.raises(
-        ValueError, match=r"the bank is of the scene dot dot-1, this is nico .*--scene dot"
-    ):
-        Trainer(run, tmp_path / "run", bank=known, encoders=pretrained[0])
-    assert not (tmp_path / "run").exists()
