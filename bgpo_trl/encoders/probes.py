@@ -237,7 +237,7 @@ def _probe_play(
 ) -> dict[str, float]:
     if columns is None or "state" not in play:
         return {}
-    train, held_out = split(play)
+    train, held_out = split(play, "the recorded play")
     latent, latent_held_out = encode_frames(network, train), encode_frames(network, held_out)
     errors = _probe_state(columns, latent, train, latent_held_out, held_out, only=columns.valid)
     return {f"play_{name}": error for name, error in errors.items()}

@@ -152,7 +152,7 @@ def train_representation(
     """
     config = config or RepresentationConfig()
     train, _ = split(dataset)
-    seen = [train] if play is None else [train, split(play)[0]]
+    seen = [train] if play is None else [train, split(play, "the recorded play")[0]]
     own = seen[-1]
     _check_actions(train, own, config.inverse)
     folder = Path(checkpoint) if checkpoint else None
@@ -203,7 +203,7 @@ def retrain_inverse(
     """
     config = config or RepresentationConfig()
     folder = Path(checkpoint) if checkpoint else None
-    own, _ = split(play)
+    own, _ = split(play, "the recorded play")
     if "action" not in own:
         raise ValueError("the inverse model learns from actions, which this play lacks: record it")
     _check_actions(None, own, config.inverse)
@@ -371,15 +371,20 @@ def _tensors(representation: Representation) -> dict[str, Tensor]:
     }
 
 
-def split(dataset: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
-    """Return the training and the held-out demonstrations, by the key ``train``.
+def split(
+    dataset: TensorDictBase, name: str = "the dataset"
+) -> tuple[TensorDictBase, TensorDictBase]:
+    """Return the training and the held-out episodes, by the key ``train``; ``name`` is for errors.
 
     Raises:
         ValueError: If either set is empty.
     """
     chosen = dataset.get("train").bool()
     if chosen.all() or not chosen.any():
-        raise ValueError("the dataset needs training and held-out demonstrations (key 'train')")
+        raise ValueError(
+            f"{name} needs episodes to train on and held-out ones (key 'train'): record it with "
+            "held_out_per_task of at least 1 and less than per_task"
+        )
     return dataset[chosen], dataset[~chosen]  # pyright: ignore[reportReturnType]
 
 

@@ -200,6 +200,13 @@ def test_interrupted_training_continues_to_the_same_weights(
     assert [row["stage"] for row in rows] == left
 
 
+def test_play_without_held_out_episodes_is_named_in_the_error() -> None:
+    play = squares(10)
+    play["train"] = torch.ones(10, dtype=torch.bool)
+    with pytest.raises(ValueError, match=r"the recorded play needs .* held_out_per_task of at"):
+        train(squares(8), play=play)
+
+
 def test_the_frame_encoder_learns_from_the_training_part_of_play(tiny: Representation) -> None:
     play = squares(10)
     trained, held_out_changed = train(squares(8), play=play), play.clone()
