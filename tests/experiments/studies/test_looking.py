@@ -8,13 +8,13 @@ import looking
 import numpy as np
 import pytest
 import torch
-from looking import Row, plot_bars
+from looking import HidingEnv, Row, plot_bars
 from scipy.spatial.transform import Rotation
 from shared import TrainedArguments, load_blocks
 from tensordict import TensorDict
 
 from bgpo_trl.runs.results import read_table
-from bgpo_trl.scenes.nico import HidingEnv, NicoEnv
+from bgpo_trl.scenes.nico import NicoEnv
 from suites import nico
 from suites.nico.rendering import FrameRenderer
 from tests.helpers import cells
