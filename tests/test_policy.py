@@ -173,8 +173,6 @@ print(json.dumps([about, "torch" in sys.modules]))
 
 @pytest.mark.parametrize("name", ["bgpo", "dist-nll-demonstrations"])
 def test_an_onnx_model_acts_as_the_policy_in_a_process_without_torch(load, tmp_path, name):
-    for package in ("onnx", "onnxscript", "onnxruntime"):
-        pytest.importorskip(package)
     policy, frames = load(name), noise(7, 3)
     policy.condition(DEMONSTRATIONS[1], task=TASKS[1])
     policy.export(tmp_path / "policy.onnx")
