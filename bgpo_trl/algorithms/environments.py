@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Literal
 
 import torch
@@ -70,10 +71,11 @@ def training_env(
         *(transform.clone() for transform in conditioning),  # -> behavior, group, expert, context
     ]
     if beta:
-        transforms.append(match_behavior(beta, encoders))  # reward + beta * exp(-||b - phi_g||)
-    transforms.extend(clip(config))
-    rewards = ["reward", "extrinsic_reward", "intrinsic_reward"] if beta else ["reward"]
-    transforms.append(sum_rewards(*rewards))
+        if encoders is None:
+            raise ValueError("matching behaviors needs trained encoders")
+        # reward + beta * exp(-||b - phi_g||)
+        transforms.append(BehaviorMatchingReward(encoders.lae, beta))
+    transforms += [*clip(config), RewardSum()]  # episode_reward, ...
     return TransformedEnv(base_env, Compose(transforms))
 
 
@@ -95,7 +97,8 @@ def conditioning_on(
         context: What the policy's ``"context"`` is: the behavior b of ``gwr``, the demonstration's
             embedding phi in its place, the task's label one-hot, or nothing.
         n_tasks: Number of labels.
-        behavior_scale: Factor of behavior or embedding in the context.
+        behavior_scale: Factor of behavior or embedding in the context. Beside latents of unit
+            scale, an unscaled behavior slows the first task down.
         gwr: GWR-B.
         groups: Groups of behaviors of each seed; empty for none.
         starts: First latent of each demonstration, for trials of experts; see `GroupLookup`.
@@ -108,10 +111,15 @@ def conditioning_on(
     if groups:
         transforms.append(GroupLookup(groups, learn=True, starts=starts))  # -> group, expert
     if context == "label":
-        transforms.append(label_as_context(n_tasks))  # task -> context
+        label = partial(_label, n_tasks=n_tasks)
+        transforms.append(UnaryTransform(["task"], ["context"], fn=label))
     elif context is not None:
-        transforms.append(behavior_as_context(behavior_scale))  # behavior -> context
+        transforms.append(ObservationNorm(0.0, behavior_scale, ["behavior"], ["context"]))
     return transforms
+
+
+def _label(task: Tensor, n_tasks: int) -> Tensor:
+    return one_hot(task, n_tasks).float()
 
 
 def observation_env(
@@ -143,34 +151,6 @@ def encode(
     return ObservationNorm(loc, scale, in_keys=["state"], standard_normal=True)
 
 
-def match_behavior(beta: float, encoders: Representation | None) -> BehaviorMatchingReward:
-    """Return the transform that adds the intrinsic reward, of weight ``beta``.
-
-    Raises:
-        ValueError: If ``encoders`` is None.
-    """
-    if encoders is None:
-        raise ValueError("matching behaviors needs trained encoders")
-    return BehaviorMatchingReward(encoders.lae, beta=beta)
-
-
-def label_as_context(n_tasks: int) -> UnaryTransform:
-    """Return the transform that makes the one-hot label of the task the context."""
-
-    def label(task: Tensor) -> Tensor:
-        return one_hot(task, n_tasks).float()
-
-    return UnaryTransform(["task"], ["context"], fn=label)
-
-
-def behavior_as_context(scale: float) -> ObservationNorm:
-    """Return the transform that scales the behavior to the context.
-
-    Beside latents of unit scale, an unscaled behavior slows the first task down.
-    """
-    return ObservationNorm(0.0, scale, ["behavior"], ["context"])
-
-
 def clip(config: AlgorithmConfig) -> list[Transform]:
     """Return the transform that bounds the observed state to ``config.state_limit``, or none.
 
@@ -179,8 +159,3 @@ def clip(config: AlgorithmConfig) -> list[Transform]:
     """
     limit = config.state_limit
     return [] if limit is None else [ClipTransform([config.state], low=-limit, high=limit)]
-
-
-def sum_rewards(*keys: str) -> RewardSum:
-    """Return the transform that sums each reward over the episode, as ``episode_...``."""
-    return RewardSum(in_keys=list(keys), out_keys=[f"episode_{key}" for key in keys])

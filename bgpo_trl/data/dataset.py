@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from tensordict import MemoryMappedTensor, TensorDict
+from torch import Tensor
 
 from bgpo_trl.errors import as_shape
 from bgpo_trl.files.writing import make_folder, new_folder, write_json
@@ -84,8 +85,7 @@ def make_dataset(path: Path, meta: Mapping[str, Any]) -> TensorDict:
     """
     make_folder(path)
     dataset = _empty(meta)
-    size = sum(value.numel() * value.element_size() for _, value in dataset.items())
-    free = shutil.disk_usage(path).free
+    size, free = sum(_size(v) for _, v in dataset.items()), shutil.disk_usage(path).free
     if size > free:  # Writing to a memory map on a full disk would kill the process.
         raise OSError(
             f"the dataset takes {size / 1e9:.1f} GB, {path} has {free / 1e9:.1f} GB left: "
@@ -100,21 +100,20 @@ def open_dataset(path: Path, meta: Mapping[str, Any]) -> TensorDict:
     Raises:
         ValueError: If a file is missing or has another size.
     """
-    expected = _empty(meta)
-    for key, value in expected.items():
-        file = path / f"{key}.memmap"
-        size = value.numel() * value.element_size()
-        if not file.exists() or file.stat().st_size != size:
-            raise ValueError(f"{file} is missing or truncated; remove {path} and {_REMEDY}")
     # Not TensorDict.load_memmap, which trusts the dtypes and shapes of its meta.json; the checksum
     # does not cover that file.
-    tensors = {
-        key: MemoryMappedTensor.from_filename(
-            path / f"{key}.memmap", dtype=value.dtype, shape=value.shape
-        )
-        for key, value in expected.items()
-    }
+    expected, tensors = _empty(meta), {}
+    for key, value in expected.items():
+        file = path / f"{key}.memmap"
+        if not file.exists() or file.stat().st_size != _size(value):
+            raise ValueError(f"{file} is missing or truncated; remove {path} and {_REMEDY}")
+        kind = {"dtype": value.dtype, "shape": value.shape}
+        tensors[key] = MemoryMappedTensor.from_filename(file, **kind)
     return TensorDict(tensors, expected.batch_size)
+
+
+def _size(values: Tensor) -> int:
+    return values.numel() * values.element_size()
 
 
 def checksum_of(dataset: TensorDict) -> str:
@@ -331,8 +330,32 @@ def check_episode(scene: Scene, episode: Mapping[str, Any]) -> int:
     Raises:
         ValueError: If an entry has another type, shape or range; the message begins with a verb.
     """
-    length = _check_frames(scene, episode["pixels"])
-    _check_numbers(scene, episode, length)
+    pixels = np.asarray(episode["pixels"])
+    _check_pixels(pixels, least=2)
+    length, *size = pixels.shape[:3]
+    if size != [*scene.frame_shape]:
+        height, width = scene.frame_shape
+        raise ValueError(
+            f"has frames of {size[0]} x {size[1]} pixels, the scene {scene.name!r} of {height} x "
+            f"{width}: resize them first, for example with resize_frames"
+        )
+    if "state" in episode and scene.state is None:
+        raise ValueError(f"has a state, but the scene {scene.name!r} has no ground truth: omit it")
+    shapes = {"action": (length - 1, scene.action_size)}
+    if scene.state is not None:
+        shapes["state"] = (length, scene.state.size)
+    for key in shapes.keys() & episode.keys():
+        values, shape = np.asarray(episode[key]), shapes[key]
+        if values.dtype.kind not in "fiu" or values.shape != shape:
+            raise ValueError(
+                f"has the {key} {values.dtype} {[*values.shape]}: give {[*shape]} numbers for its "
+                f"{length} frames"
+            )
+        if not np.isfinite(values).all():
+            raise ValueError(f"has a {key} that is not finite: mend it, or leave the episode out")
+    largest = np.abs(np.asarray(episode.get("action", 0), np.float32)).max()
+    if largest > 1:
+        raise ValueError(f"has an action of size {largest:.4g}: scale actions to [-1, 1]")
     return length
 
 
@@ -359,40 +382,3 @@ def _check_pixels(pixels: NDArray[Any], least: int) -> None:
             f"has pixels {pixels.dtype} {[*shape]}: give uint8 [T, H, W, 3] (0 to 255), at least "
             f"{least} frames"
         )
-
-
-def _check_frames(scene: Scene, pixels: Any) -> int:
-    """Return the number of frames."""
-    pixels = np.asarray(pixels)
-    _check_pixels(pixels, least=2)
-    shape = pixels.shape
-    if shape[1:3] != tuple(scene.frame_shape):
-        height, width = scene.frame_shape
-        raise ValueError(
-            f"has frames of {shape[1]} x {shape[2]} pixels, the scene {scene.name!r} of {height} x "
-            f"{width}: resize them first, for example with resize_frames"
-        )
-    return len(pixels)
-
-
-def _check_numbers(scene: Scene, episode: Mapping[str, Any], length: int) -> None:
-    """Check the shapes and ranges of actions and states."""
-    if "state" in episode and scene.state is None:
-        raise ValueError(f"has a state, but the scene {scene.name!r} has no ground truth: omit it")
-    shapes = {"action": (length - 1, scene.action_size)}
-    if scene.state is not None:
-        shapes["state"] = (length, scene.state.size)
-    for key, shape in shapes.items():
-        if key not in episode:
-            continue
-        values = np.asarray(episode[key])
-        if values.dtype.kind not in "fiu" or values.shape != shape:
-            raise ValueError(
-                f"has the {key} {values.dtype} {[*values.shape]}: give {[*shape]} numbers for its "
-                f"{length} frames"
-            )
-        if not np.isfinite(values).all():
-            raise ValueError(f"has a {key} that is not finite: mend it, or leave the episode out")
-    largest = np.abs(np.asarray(episode.get("action", 0), np.float32)).max()
-    if largest > 1:
-        raise ValueError(f"has an action of size {largest:.4g}: scale actions to [-1, 1]")

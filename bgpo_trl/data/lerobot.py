@@ -13,7 +13,7 @@ import itertools
 import json
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Self, cast
+from typing import Any, cast
 
 import numpy as np
 import pandas as pd
@@ -380,7 +380,7 @@ def _frames_at(
 
 
 _DATA = "data/chunk-{:03d}/file-{:03d}.parquet"
-_FILE_MB, _FILES_PER_CHUNK = 100, 1000
+_FILE_BYTES, _FILES_PER_CHUNK = 100 * 2**20, 1000
 _INDICES = ("frame_index", "episode_index", "index", "task_index")
 _KEYS = {"action": "action", "state": "observation.environment_state"}
 
@@ -422,138 +422,92 @@ def write_lerobot(
         )
     if int(dataset["task"].max()) >= len(tasks) or len({*tasks}) < len(tasks):
         raise ValueError(f"{', '.join(tasks)}: give a name of its own for each label of the tasks")
-    keys = {key: name for key, name in _KEYS.items() if key in dataset}
-    features = _features(dataset, keys, image_key)
+    pixels, lengths = (cast(Tensor, dataset[key]) for key in ("pixels", "length"))
+    length, task, frame_shape = lengths.numpy(), dataset["task"].tolist(), pixels.shape[-3:]
+    end = length.cumsum()
+    # Files of whole episodes, of about `_FILE_BYTES` before the frames are compressed.
+    files = np.unique((end - length) * frame_shape.numel() // _FILE_BYTES, return_inverse=True)[1]
+    episodes, numbers, colors = [], [], np.zeros((3, 256), np.int64)
     with new_folder(path) as folder:
-        episodes = _write_data(folder, dataset, keys, image_key, fps)
-        stats = _merged([episode.pop("stats") for episode in episodes])
+        for file in range(int(files.max()) + 1):
+            place, tables = divmod(file, _FILES_PER_CHUNK), []
+            for row in np.flatnonzero(files == file).tolist():
+                columns = _columns(cast(TensorDictBase, dataset[row]), row, end[row], fps)
+                frames = pixels[row, : length[row]].numpy()
+                counts = np.stack([np.bincount(c.ravel(), minlength=256) for c in frames.T])
+                stats = {**_stats(columns), image_key: _color_stats(counts, len(frames))}
+                episode = {
+                    "episode_index": row,
+                    "tasks": [tasks[task[row]]],
+                    "length": int(length[row]),
+                    "data/chunk_index": place[0],
+                    "data/file_index": place[1],
+                    "dataset_from_index": int(end[row] - length[row]),
+                    "dataset_to_index": int(end[row]),
+                    "meta/episodes/chunk_index": 0,
+                    "meta/episodes/file_index": 0,
+                }
+                for name, of_feature in stats.items():
+                    episode |= {f"stats/{name}/{kind}": v for kind, v in of_feature.items()}
+                episodes.append(episode)
+                tables.append(_table(columns, image_key, [*map(_png, frames)]))
+                numbers.append(columns)
+                colors += counts
+            _write(folder / _DATA.format(*place), pa.concat_tables(tables))
         meta = folder / "meta"
-        (meta / "episodes" / "chunk-000").mkdir(parents=True)
-        table = pa.Table.from_pylist(
-            [{**episode, "tasks": [tasks[episode["tasks"]]]} for episode in episodes]
-        )
-        pq.write_table(table, meta / "episodes" / "chunk-000" / "file-000.parquet")
+        _write(meta / "episodes/chunk-000/file-000.parquet", pa.Table.from_pylist(episodes))
         index = pd.Index(tasks, name="task")
         pd.DataFrame({"task_index": range(len(tasks))}, index).to_parquet(meta / "tasks.parquet")
+        columns = {name: np.concatenate([one[name] for one in numbers]) for name in numbers[0]}
+        stats = {**_stats(columns), image_key: _color_stats(colors, int(end[-1]))}
         write_json(meta / "stats.json", stats)
-        write_json(
-            meta / "info.json",
-            {
-                "codebase_version": "v3.0",
-                "robot_type": robot_type,
-                "total_episodes": len(episodes),
-                "total_frames": int(dataset["length"].sum()),
-                "total_tasks": len(tasks),
-                "chunks_size": _FILES_PER_CHUNK,
-                "data_files_size_in_mb": _FILE_MB,
-                "video_files_size_in_mb": 2 * _FILE_MB,
-                "fps": fps,
-                "splits": {"train": f"0:{len(episodes)}"},
-                "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
-                "video_path": None,
-                "features": features,
-            },
-        )
+        info = {
+            "codebase_version": "v3.0",
+            "robot_type": robot_type,
+            "total_episodes": len(episodes),
+            "total_frames": int(end[-1]),
+            "total_tasks": len(tasks),
+            "chunks_size": _FILES_PER_CHUNK,
+            "data_files_size_in_mb": _FILE_BYTES // 2**20,
+            "video_files_size_in_mb": 2 * _FILE_BYTES // 2**20,
+            "fps": fps,
+            "splits": {"train": f"0:{len(episodes)}"},
+            "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+            "video_path": None,
+            "features": _features(columns, image_key, [*frame_shape]),
+        }
+        write_json(meta / "info.json", info)
 
 
-def _features(dataset: TensorDictBase, keys: Mapping[str, str], image_key: str) -> dict[str, Any]:
+def _features(
+    columns: Mapping[str, NDArray[Any]], image_key: str, frame_shape: list[int]
+) -> dict[str, Any]:
     """Return the entry ``features`` of ``info.json``."""
     names = ["height", "width", "channels"]
-    shape = [*dataset["pixels"].shape[-3:]]
-    features = {image_key: {"dtype": "image", "shape": shape, "names": names}}
-    for key, name in keys.items():
-        size = dataset[key].shape[-1]
-        names = [f"{key}_{number}" for number in range(size)]
-        features[name] = {"dtype": "float32", "shape": [size], "names": names}
-    for name in ("timestamp", *_INDICES):
-        dtype = "float32" if name == "timestamp" else "int64"
-        features[name] = {"dtype": dtype, "shape": [1], "names": None}
+    features: dict[str, Any] = {image_key: {"dtype": "image", "shape": frame_shape, "names": names}}
+    for name, values in columns.items():
+        size = values[0].size
+        kind = name.removeprefix("observation.environment_")
+        names = None if values.ndim == 1 else [f"{kind}_{n}" for n in range(size)]
+        features[name] = {"dtype": str(values.dtype), "shape": [size], "names": names}
     return features
 
 
-def _write_data(
-    folder: Path, dataset: TensorDictBase, keys: Mapping[str, str], image_key: str, fps: int
-) -> list[dict[str, Any]]:
-    """Write the rows of all frames; return the metadata of each episode, with ``stats``."""
-    episodes, start = [], 0
-    with _DataFiles(folder) as files:
-        for number in range(len(dataset)):
-            row = cast(TensorDictBase, dataset[number])
-            length = int(row["length"])
-            columns = _columns(row, keys)
-            columns |= {
-                "timestamp": np.arange(length, dtype=np.float32) / np.float32(fps),
-                "frame_index": np.arange(length),
-                "episode_index": np.full(length, number),
-                "index": np.arange(start, start + length),
-                "task_index": np.full(length, int(row["task"])),
-            }
-            frames = cast(Tensor, row["pixels"])[:length].numpy()
-            stats = {name: _stats(values) for name, values in columns.items()}
-            stats[image_key] = _stats(frames)
-            chunk_index, file_index = files.write(columns, image_key, [*map(_png, frames)])
-            episodes.append(
-                {
-                    "episode_index": number,
-                    "tasks": int(row["task"]),
-                    "length": length,
-                    "data/chunk_index": chunk_index,
-                    "data/file_index": file_index,
-                    "dataset_from_index": start,
-                    "dataset_to_index": start + length,
-                    "meta/episodes/chunk_index": 0,
-                    "meta/episodes/file_index": 0,
-                    **{f"stats/{f}/{name}": v for f, s in stats.items() for name, v in s.items()},
-                    "stats": stats,
-                }
-            )
-            start += length
-    return episodes
-
-
-def _columns(row: TensorDictBase, keys: Mapping[str, str]) -> dict[str, NDArray[Any]]:
-    """Return actions and states of an episode by the names of their features."""
+def _columns(row: TensorDictBase, number: int, end: int, fps: int) -> dict[str, NDArray[Any]]:
+    """Return the numbers of an episode by the names of their features, a row for each frame."""
     length = int(row["length"])
     columns = {}
-    for key, name in keys.items():
-        n_known = length - (key == "action")
-        values = cast(Tensor, row[key])
-        columns[name] = np.zeros((length, values.shape[-1]), np.float32)
-        columns[name][:n_known] = values[:n_known].numpy()
+    for key, name in _KEYS.items():
+        if key in row:
+            n_known = length - (key == "action")
+            values = cast(Tensor, row[key])
+            columns[name] = np.zeros((length, values.shape[-1]), np.float32)
+            columns[name][:n_known] = values[:n_known].numpy()
+    columns["timestamp"] = np.arange(length, dtype=np.float32) / np.float32(fps)
+    indices = (np.arange(length), number, np.arange(end - length, end), int(row["task"]))
+    for name, values in zip(_INDICES, indices, strict=True):
+        columns[name] = np.broadcast_to(np.asarray(values, np.int64), length)
     return columns
-
-
-class _DataFiles:
-    """Parquet files of the rows, each filled with whole episodes up to about `_FILE_MB`."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder, self._file, self._size = folder, -1, 0
-        self._writer: Any = None
-
-    def write(
-        self, columns: Mapping[str, NDArray[Any]], image_key: str, images: Sequence[bytes]
-    ) -> tuple[int, int]:
-        """Write an episode; return the numbers of its chunk and file."""
-        table = _table(columns, image_key, images)
-        if self._writer is None or self._size > _FILE_MB * 2**20:
-            self.close()
-            self._file, self._size = self._file + 1, 0
-            path = self._folder / _DATA.format(*divmod(self._file, _FILES_PER_CHUNK))
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self._writer = pq.ParquetWriter(path, table.schema)
-        self._writer.write_table(table)
-        self._size += sum(map(len, images))
-        return divmod(self._file, _FILES_PER_CHUNK)
-
-    def close(self) -> None:
-        if self._writer is not None:
-            self._writer.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 def _png(frame: NDArray[np.uint8]) -> bytes:
@@ -575,34 +529,30 @@ def _table(
     return pa.table(arrays)
 
 
-def _stats(values: NDArray[Any]) -> dict[str, Any]:
-    """Return the statistics of a feature, of images by channel ``[3, 1, 1]`` in [0, 1]."""
-    if values.ndim == 4:
-        values = values / 255
-        axes, shape = (0, 1, 2), (3, 1, 1)
-    else:
-        axes, shape = (0,), (values[0].size,)
-    found = {name: getattr(values, name)(axes) for name in ("min", "max", "mean", "std")}
-    return {
-        **{name: np.reshape(value, shape).astype(float).tolist() for name, value in found.items()},
-        "count": [len(values)],
+def _write(path: Path, table: pa.Table) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pq.write_table(table, path)
+
+
+def _stats(columns: Mapping[str, NDArray[Any]]) -> dict[str, dict[str, list[float]]]:
+    """Return the statistics of numbers by the names of their features."""
+    stats = {}
+    for name, values in columns.items():
+        found = {kind: getattr(values, kind)(0) for kind in ("min", "max", "mean", "std")}
+        stats[name] = {kind: np.atleast_1d(v).astype(float).tolist() for kind, v in found.items()}
+        stats[name]["count"] = [len(values)]
+    return stats
+
+
+def _color_stats(counts: NDArray[np.int64], n_frames: int) -> dict[str, Any]:
+    """Return the statistics of frames, by color in [0, 1], from counts of values ``[3, 256]``."""
+    values, share = np.arange(256) / 255, counts / counts.sum(1, keepdims=True)
+    mean = share @ values
+    found = {
+        "min": [values[of_color > 0].min() for of_color in counts],
+        "max": [values[of_color > 0].max() for of_color in counts],
+        "mean": mean,
+        "std": (share * (values - mean[:, None]) ** 2).sum(1) ** 0.5,
     }
-
-
-def _merged(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the statistics of all episodes from those of each."""
-    merged = {}
-    for feature in parts[0]:
-        column = {name: np.array([p[feature][name] for p in parts]) for name in parts[0][feature]}
-        count = column["count"]
-        weight = count.reshape(-1, *[1] * (column["mean"].ndim - 1)) / count.sum()
-        mean = (weight * column["mean"]).sum(0)
-        squares = column["std"] ** 2 + (column["mean"] - mean) ** 2
-        merged[feature] = {
-            "min": column["min"].min(0).tolist(),
-            "max": column["max"].max(0).tolist(),
-            "mean": mean.tolist(),
-            "std": np.sqrt((weight * squares).sum(0)).tolist(),
-            "count": [int(count.sum())],
-        }
-    return merged
+    shaped = {kind: np.reshape(value, (3, 1, 1)).tolist() for kind, value in found.items()}
+    return {**shaped, "count": [n_frames]}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,10 +22,8 @@ from bgpo_trl.data.dataset import (
     write_meta,
 )
 from bgpo_trl.files.progress import progress_bar
-from bgpo_trl.scenes import Scene, find_scene
-
-if TYPE_CHECKING:
-    from bgpo_trl.scenes import Simulation
+from bgpo_trl.scenes import Scene, Simulation, find_scene
+from bgpo_trl.scenes.scene import checked_frame, checked_state, checked_step
 
 _Policy = Callable[[], np.ndarray]
 
@@ -78,11 +76,44 @@ def record_demonstrations(
     """
     scene = find_scene(scene)
     tasks = scene.default_tasks if tasks is None else tasks
-    wanted = _settings(scene, tasks, per_task, held_out_per_task, play, spread, seed, attempts)
+    scene.check_tasks(tasks)
+    scene.check_spread(spread)
+    if scene.demonstrator is None:
+        raise ValueError(
+            f"the scene {scene.name!r} has no demonstrator: write demonstrations that you have, "
+            "with write_demonstrations (docs/extending.md)"
+        )
+    if not tasks:
+        raise ValueError("name at least one of the tasks")
+    if seed < 0 or attempts < 1:
+        raise ValueError(
+            f"seed must be at least 0 and attempts at least 1, got {seed} and {attempts}"
+        )
+    if not 0 <= held_out_per_task < per_task:
+        raise ValueError(
+            f"held_out_per_task is {held_out_per_task}: it must be less than per_task, {per_task}"
+        )
+    wanted = {
+        **layout_of(scene),
+        "tasks": list(tasks),
+        "rows": per_task * len(tasks),
+        "per_task": per_task,
+        "held_out_per_task": held_out_per_task,
+        "spread": float(spread),
+        "seed": seed,
+        **({"play": True} if play else {}),
+    }
     path = Path(path)
     started = is_dataset(path)
-    if started and _is_complete(path, wanted):
-        return load_demonstrations(path)
+    if started:
+        meta = read_meta(path)
+        found = {key: meta.get(key) for key in {**wanted, **meta} if key != "checksum"}
+        if found != wanted:
+            raise ValueError(
+                f"{path} holds another recording ({found}); choose another folder or remove it"
+            )
+        if meta.get("checksum"):
+            return load_demonstrations(path)
     # The renderer comes first, so that a machine without OpenGL fails before writing anything.
     observation = "pixels" if scene.state is None else "both"
     env = scene.simulate(tasks, batch_size=1, spread=spread, observation=observation)
@@ -94,57 +125,6 @@ def record_demonstrations(
     env.close()
     write_meta(path, {**wanted, "checksum": checksum_of(dataset)})
     return dataset
-
-
-def _settings(
-    scene: Scene,
-    tasks: Sequence[str],
-    per_task: int,
-    held_out_per_task: int,
-    play: bool,
-    spread: float,
-    seed: int,
-    attempts: int,
-) -> dict[str, Any]:
-    """Check the arguments and return the settings that identify a recording."""
-    scene.check_tasks(tasks)
-    scene.check_spread(spread)
-    if scene.demonstrator is None:
-        raise ValueError(
-            f"the scene {scene.name!r} has no demonstrator: write demonstrations that you have, "
-            "with write_demonstrations (docs/extending.md)"
-        )
-    if not tasks:
-        raise ValueError("name at least one of the tasks")
-    if seed < 0:
-        raise ValueError(f"seed must be at least 0, got {seed}")
-    if attempts < 1:
-        raise ValueError(f"attempts must be at least 1, got {attempts}")
-    if not 0 <= held_out_per_task < per_task:
-        raise ValueError(
-            f"held_out_per_task is {held_out_per_task}: it must be less than per_task, {per_task}"
-        )
-    return {
-        **layout_of(scene),
-        "tasks": list(tasks),
-        "rows": per_task * len(tasks),
-        "per_task": per_task,
-        "held_out_per_task": held_out_per_task,
-        "spread": float(spread),
-        "seed": seed,
-        **({"play": True} if play else {}),
-    }
-
-
-def _is_complete(path: Path, wanted: Mapping[str, Any]) -> bool:
-    """Return whether a recording was completed; raise ``ValueError`` if it has other settings."""
-    meta = read_meta(path)
-    found = {key: meta.get(key) for key in {**wanted, **meta} if key != "checksum"}
-    if found != wanted:
-        raise ValueError(
-            f"{path} holds another recording ({found}); choose another folder or remove it"
-        )
-    return bool(meta.get("checksum"))
 
 
 class _Recorder:
@@ -196,8 +176,6 @@ class _Recorder:
 
         ``policy_of`` returns the policy that acts, given the demonstrator with that noise.
         """
-        from bgpo_trl.scenes.simulation import checked_executed, checked_frame, checked_outcome
-
         simulation, scene = self.simulation, self.scene
         simulation.seed(start)
         simulation.reset(task)
@@ -207,14 +185,13 @@ class _Recorder:
         frames, states, actions = [checked_frame(simulation, shape)], [self._state()], []
         success = False
         for _ in range(scene.max_steps):
-            actions.append(act())
-            if not np.isfinite(actions[-1]).all():  # what a simulation makes of it is its own
+            action = act()
+            if not np.isfinite(action).all():  # what a simulation makes of it is its own
                 raise ValueError(
                     f"an episode of the demonstrator of {task!r} has an action that is not finite"
                 )
-            outcome = checked_outcome(simulation, simulation.step(actions[-1]))
-            actions[-1] = checked_executed(simulation, actions[-1], outcome)
-            success, failure = outcome[:2]
+            success, failure, executed = checked_step(simulation, action)
+            actions.append(executed)
             frames.append(checked_frame(simulation, shape))
             states.append(self._state())
             if success or failure:
@@ -229,8 +206,6 @@ class _Recorder:
         return episode, success
 
     def _state(self) -> np.ndarray:
-        from bgpo_trl.scenes.simulation import checked_state
-
         columns = self.scene.state
         return np.empty(0) if columns is None else checked_state(self.simulation, columns.size)
 

@@ -75,8 +75,7 @@ class GroupReplay:
         self._n_added = [0] * n_seeds
         # Transition t of seed i is row (t % capacity) * n_seeds + i, so that a step of all seeds is
         # one block and a row has a single index, for which torch has its fastest kernels.
-        self._rows: dict[Any, Tensor] = {}  # by key
-        self._group = self._allocate(torch.Size(), torch.int64)
+        self._rows: dict[Any, Tensor] = {_GROUP: self._allocate(torch.Size(), torch.int64)}
         self._index = [_GroupIndex() for _ in self._generators]
 
     def __len__(self) -> int:
@@ -106,21 +105,16 @@ class GroupReplay:
             ValueError: If an entry is missing, or differs in shape or dtype from those stored; if a
                 group is negative.
         """
-        chosen = None if mask is None else mask.nonzero().flatten()
         numbers = group.tolist()
-        entries = self._checked(transition, numbers, mask)
+        entries = {_GROUP: group, **self._checked(transition, numbers, mask)}
+        n_seeds = len(self._generators)
+        seeds = range(n_seeds) if mask is None else mask.nonzero().flatten().tolist()
+        rows = [self._n_added[seed] % self.capacity * n_seeds + seed for seed in seeds]
+        index = torch.tensor(rows, dtype=torch.int64)
         for key, entry in entries.items():
             if key not in self._rows:
                 self._rows[key] = self._allocate(entry.shape[1:], entry.dtype)
-        n_seeds = len(self._generators)
-        seeds = range(n_seeds) if chosen is None else chosen.tolist()
-        rows = torch.tensor(
-            [self._n_added[seed] % self.capacity * n_seeds + seed for seed in seeds],
-            dtype=torch.int64,
-        )
-        self._group.index_copy_(0, rows, group if chosen is None else group[chosen])
-        for key, entry in entries.items():
-            self._rows[key].index_copy_(0, rows, entry if chosen is None else entry[chosen])
+            self._rows[key].index_copy_(0, index, entry if mask is None else entry[mask])
         for seed in seeds:
             self._index[seed].append(numbers[seed], self._n_added[seed])
             self._n_added[seed] += 1
@@ -173,8 +167,9 @@ class GroupReplay:
         drawn: dict[NestedKey, Tensor] = {}
         if self.n_steps > 1:
             rows, reward, n_taken = self._last_rows(steps, seeds)
+        hidden = {_GROUP} if self._source_key in self._keys else {_GROUP, self._source_key}
         for key, stored in self._rows.items():
-            if (key != self._source_key or key in self._keys) and (keys is None or key in keys):
+            if key not in hidden and (keys is None or key in keys):
                 at = rows if isinstance(key, tuple) and key[0] == "next" else first
                 entry = stored.index_select(0, at).view(*group.shape, *stored.shape[1:])
                 for i in empty:
@@ -231,7 +226,8 @@ class GroupReplay:
             steps[seed] = steps[seed] % self.capacity * len(self._generators) + seed
         rows, counts = torch.from_numpy(steps).flatten(), torch.from_numpy(weight)
         drawn = TensorDict({"priority_weight": counts}, counts.shape)
-        for key, stored in self._rows.items():
+        for key in [key for key in self._rows if key != _GROUP]:
+            stored = self._rows[key]
             entry = stored.index_select(0, rows).view(*counts.shape, *stored.shape[1:])
             entry[counts == 0] = 0  # the NaN of uninitialized memory would outlast a weight of 0
             drawn[key] = entry
@@ -261,7 +257,7 @@ class GroupReplay:
         entries = TensorDict(batch_size=[len(rows)])
         for key, stored in self._rows.items():
             entries.set(key, stored[rows])
-        return entries, self._group[rows]
+        return entries, entries.pop(_GROUP)
 
     def regroup(self, seed: int, group: Tensor) -> None:
         """Assign the transitions of a seed to groups anew.
@@ -277,7 +273,7 @@ class GroupReplay:
             raise ValueError("to regroup what is stored, give the replay a source_key")
         rows = self._held(seed)
         if len(rows):
-            self._group[rows] = group[self._rows[self._source_key][rows]]
+            self._rows[_GROUP][rows] = group[self._rows[self._source_key][rows]]
             self._index[seed] = self._indexed(seed)
 
     def clear(self, seed: int) -> None:
@@ -293,7 +289,7 @@ class GroupReplay:
         # Zeros replace the uninitialized rows of seeds that hold fewer transitions.
         empty = (torch.arange(longest).unsqueeze(-1) >= sizes).view(-1)
         rows = TensorDict({}, [longest * n_seeds])
-        for key, stored in {**self._rows, _GROUP: self._group}.items():
+        for key, stored in self._rows.items():
             filled = stored[: longest * n_seeds].clone()
             filled[empty] = 0
             rows.set(key, filled)
@@ -320,7 +316,6 @@ class GroupReplay:
         for key, saved in TensorDict(state_dict["rows"]).items(True, True):
             self._rows[key] = self._allocate(saved.shape[1:], saved.dtype)
             self._rows[key][: len(saved)] = saved
-        self._group = self._rows.pop(_GROUP)
         self._n_added = n_added.tolist()
         for generator, state in zip(self._generators, state_dict["generators"], strict=True):
             generator.set_state(state.clone())
@@ -339,7 +334,7 @@ class GroupReplay:
     def _indexed(self, seed: int) -> _GroupIndex:
         """Return the index of what the buffer holds of a seed."""
         index = _GroupIndex()
-        index.extend(self._group[self._held(seed)].numpy(), self._oldest()[seed])
+        index.extend(self._rows[_GROUP][self._held(seed)].numpy(), self._oldest()[seed])
         return index
 
     def _checked(
@@ -368,8 +363,8 @@ class GroupReplay:
                 entries |= dict(parts.items(True, True))
             else:
                 entries[key] = entry
-        for key, stored in self._rows.items():
-            entry = entries.get(key)
+        for key in [key for key in self._rows if key != _GROUP]:
+            entry, stored = entries.get(key), self._rows[key]
             if entry is None or entry.shape[1:] != stored.shape[1:] or entry.dtype != stored.dtype:
                 got = "nothing" if entry is None else f"{entry.dtype} {[*entry.shape[1:]]}"
                 raise ValueError(

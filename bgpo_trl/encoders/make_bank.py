@@ -9,10 +9,7 @@ import torch
 from tensordict import TensorDictBase
 
 from bgpo_trl.data.bank import DemonstrationBank, DemonstrationSteps
-from bgpo_trl.encoders.representation import (
-    Representation,
-    encode_frames,
-)
+from bgpo_trl.encoders.representation import Representation, encode_frames
 
 
 @torch.no_grad()

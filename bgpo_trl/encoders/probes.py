@@ -10,6 +10,7 @@ from __future__ import annotations
 import io
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 import matplotlib.image
 import torch
@@ -73,32 +74,49 @@ def probe(
         ValueError: If the dataset has no training or no held-out demonstrations.
     """
     network, lae = representation.frame_network, representation.lae
-    vae = network if isinstance(network, VAE) else None
-    train, held_out = split(dataset)
-    latent, latent_held_out = encode_frames(network, train), encode_frames(network, held_out)
-    result = {
-        **_probe_state(columns, latent, train, latent_held_out, held_out),
-        **_probe_inverse(representation.inverse, latent, train, columns),
-        **({} if vae is None else _probe_reconstruction(vae, train, held_out)),
-        **_probe_sequences(lae, latent_held_out, held_out),
-    }
-    spread = (latent * network.latent_std)[valid_steps(train.get("length"), latent.shape[1])].std(0)
+    train, held_out = _encoded(network, dataset)
+    result = _probe_state(columns, train, held_out)
+    result |= _probe_inverse(representation.inverse, train, columns)
+    if isinstance(network, VAE):
+        result |= _probe_reconstruction(network, train.data, held_out.data)
+    result |= _probe_sequences(lae, held_out)
+    spread = (train.latent * network.latent_std)[train.valid].std(0)
     result["active_dimensions"] = float((spread > 0.1 * spread.max()).sum())
-
-    phi = lae.encode(latent, train.get("length"))
-    phi_held_out = lae.encode(latent_held_out, held_out.get("length"))
-    result |= _probe_tasks(phi, train.get("task"), phi_held_out, held_out.get("task"))
-    if play is not None:
-        result |= _probe_play(network, play, columns)
+    result |= _probe_tasks(lae, train, held_out)
+    if play is not None and columns is not None and "state" in play:
+        parts = _encoded(network, play, "the recorded play")
+        errors = _probe_state(columns, *parts, only=columns.valid)
+        result |= {f"play_{name}": error for name, error in errors.items()}
     if folder is not None:
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         write_json(folder / "probes.json", result)
-        if vae is not None:
-            picture, content = reconstruction_picture(vae, held_out), io.BytesIO()
+        if isinstance(network, VAE):
+            picture, content = reconstruction_picture(network, held_out.data), io.BytesIO()
             matplotlib.image.imsave(content, picture.numpy(), format="png")
             write_whole(folder / "reconstructions.png", content.getvalue())
     return result
+
+
+class _Encoded(NamedTuple):
+    """Episodes with the latents of their frames ``[N, T, F]``, and which of these are valid."""
+
+    data: TensorDictBase
+    latent: Tensor
+    valid: Tensor
+
+    @property
+    def length(self) -> Tensor:
+        return self.data.get("length")
+
+
+def _encoded(network: FrameNetwork, dataset: TensorDictBase, *name: str) -> list[_Encoded]:
+    """Return the training and the held-out episodes of a dataset."""
+    parts = []
+    for data in split(dataset, *name):
+        latent = encode_frames(network, data)
+        parts.append(_Encoded(data, latent, valid_steps(data.get("length"), latent.shape[1])))
+    return parts
 
 
 def complaints(result: Mapping[str, float]) -> list[str]:
@@ -204,78 +222,59 @@ def reconstruction_picture(vae: VAE, demonstrations: TensorDictBase, columns: in
 
 def _probe_state(
     columns: StateColumns | None,
-    latent: Tensor,
-    train: TensorDictBase,
-    latent_held_out: Tensor,
-    held_out: TensorDictBase,
+    train: _Encoded,
+    held_out: _Encoded,
     only: Callable[[Tensor], Tensor] | None = None,
 ) -> dict[str, float]:
-    if columns is None or "state" not in train:
+    """Return the errors of joints and objects, in frames that ``only`` accepts."""
+    if columns is None or "state" not in train.data:
         return {}
-    valid, valid_held_out = (
-        valid_steps(part.get("length"), latent.shape[1]) for part in (train, held_out)
+    (x, state), (x_new, wanted) = (
+        (part.latent[chosen], part.data.get("state")[chosen])
+        for part in (train, held_out)
+        for chosen in [part.valid if only is None else part.valid & only(part.data.get("state"))]
     )
-    if only is not None:
-        valid = valid & only(train.get("state"))
-        valid_held_out = valid_held_out & only(held_out.get("state"))
-    state, wanted = train.get("state")[valid], held_out.get("state")[valid_held_out]
-    error = ridge_predict(latent[valid], state, latent_held_out[valid_held_out]) - wanted
-    read = perceptron_predict(latent[valid], state, latent_held_out[valid_held_out]) - wanted
+    linear = ridge_predict(x, state, x_new) - wanted
+    read = perceptron_predict(x, state, x_new) - wanted
     joints = {
-        f"joint_{name}_rmse_rad": _mean(error[:, i].square()) ** 0.5
+        f"joint_{name}_rmse_rad": _mean(linear[:, i].square()) ** 0.5
         for name, i in columns.angles.items()
     }
     return joints | {
-        f"{name}_{kind}_cm": 100 * _mean(of_kind[:, list(place)].norm(dim=-1))
+        f"{name}_{kind}_cm": 100 * _mean(error[:, list(place)].norm(dim=-1))
         for name, place in columns.places.items()
-        for kind, of_kind in (("error", read), ("linear_error", error))
+        for kind, error in (("error", read), ("linear_error", linear))
     }
 
 
-def _probe_play(
-    network: FrameNetwork, play: TensorDictBase, columns: StateColumns | None
-) -> dict[str, float]:
-    if columns is None or "state" not in play:
-        return {}
-    train, held_out = split(play, "the recorded play")
-    latent, latent_held_out = encode_frames(network, train), encode_frames(network, held_out)
-    errors = _probe_state(columns, latent, train, latent_held_out, held_out, only=columns.valid)
-    return {f"play_{name}": error for name, error in errors.items()}
-
-
-def _probe_tasks(
-    phi: Tensor, task: Tensor, phi_held_out: Tensor, task_held_out: Tensor
-) -> dict[str, float]:
+def _probe_tasks(lae: SequenceAutoencoder, train: _Encoded, held_out: _Encoded) -> dict[str, float]:
     """Return the accuracies of inferring a held-out demonstration's task from its embedding.
 
     Chance is the share of the most frequent task.
     """
-    scores = ridge_predict(phi, torch.nn.functional.one_hot(task).float(), phi_held_out)
-    nearest = torch.cdist(phi_held_out, phi).argmin(-1)
+    phi, phi_new = (lae.encode(part.latent, part.length) for part in (train, held_out))
+    task, wanted = train.data.get("task"), held_out.data.get("task")
+    scores = ridge_predict(phi, torch.nn.functional.one_hot(task).float(), phi_new)
     return {
-        "task_accuracy_linear": _mean(scores.argmax(-1) == task_held_out),
-        "task_accuracy_nearest": _mean(task[nearest] == task_held_out),
-        "task_accuracy_chance": task_held_out.bincount().max().item() / len(task_held_out),
+        "task_accuracy_linear": _mean(scores.argmax(-1) == wanted),
+        "task_accuracy_nearest": _mean(task[torch.cdist(phi_new, phi).argmin(-1)] == wanted),
+        "task_accuracy_chance": wanted.bincount().max().item() / len(wanted),
     }
 
 
 @torch.no_grad()
 def _probe_inverse(
-    inverse: InverseModel | None,
-    latent: Tensor,
-    shown: TensorDictBase,
-    columns: StateColumns | None,
+    inverse: InverseModel | None, shown: _Encoded, columns: StateColumns | None
 ) -> dict[str, float]:
-    if inverse is None or "action" not in shown:
+    """Return the errors of inferred actions."""
+    if inverse is None or "action" not in shown.data:
         return {}
-    action = shown.get("action")
-    valid = valid_steps(shown.get("length") - 1, action.shape[1])
-    action = action[valid]
-    error = inverse(latent, shown.get("length"))[valid] - action
+    action, moves = shown.data.get("action"), shown.valid[:, 1:]
+    action, error = action[moves], (inverse(shown.latent, shown.length) - action)[moves]
     left, all_ = error.square().sum(0), (action - action.mean(0)).square().sum(0)
-    names = list(range(action.shape[-1]))
-    if columns is not None and len(columns.angles) == len(names):
-        names = list(columns.angles)
+    names = [] if columns is None else list(columns.angles)
+    if len(names) != len(left):
+        names = list(range(len(left)))
     by_joint = zip(names, (1 - left / all_).tolist(), strict=True)
     return {
         "inverse_rmse": _mean(error.square()) ** 0.5,
@@ -309,12 +308,9 @@ def _probe_reconstruction(
 
 
 @torch.no_grad()
-def _probe_sequences(
-    lae: SequenceAutoencoder, latent: Tensor, held_out: TensorDictBase
-) -> dict[str, float]:
-    loss = SequenceReconstructionLoss(lae)
-    data = TensorDict({"latent": latent, "length": held_out.get("length")}, [len(latent)])
-    return {"sequence_mse": loss(data)["loss_reconstruction"].item()}
+def _probe_sequences(lae: SequenceAutoencoder, held_out: _Encoded) -> dict[str, float]:
+    data = TensorDict({"latent": held_out.latent, "length": held_out.length}, [len(held_out.data)])
+    return {"sequence_mse": SequenceReconstructionLoss(lae)(data)["loss_reconstruction"].item()}
 
 
 def _mean(values: Tensor) -> float:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -22,20 +23,13 @@ from typing import Any, TypeVar
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
+from torchrl.objectives import LossModule
 
-from bgpo_trl.configs import (
-    InverseModelConfig,
-    RepresentationConfig,
-    SequenceAutoencoderConfig,
-    VAEConfig,
-)
-from bgpo_trl.encoders.fitting import Fit, Log
+from bgpo_trl.configs import InverseModelConfig, RepresentationConfig
+from bgpo_trl.files.checkpoint import has_checkpoint, load_checkpoint, save_checkpoint
+from bgpo_trl.files.progress import progress_bar
 from bgpo_trl.files.tensor_file import digest, load_tensors, save_tensors
-from bgpo_trl.modules.frame_network import (
-    FrameNetwork,
-    FrameNetworkError,
-    make_frame_network,
-)
+from bgpo_trl.modules.frame_network import FrameNetwork, FrameNetworkError, make_frame_network
 from bgpo_trl.modules.inverse_model import InverseModel, window
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
@@ -47,6 +41,8 @@ from bgpo_trl.objectives.supervised import (
 from bgpo_trl.scenes import Scene
 
 Network = TypeVar("Network", bound=nn.Module)
+Log = Callable[[dict[str, Any]], None]
+"""Consumer of a training log's rows: ``stage``, ``step``, ``learning_rate`` and the losses."""
 
 
 @dataclass
@@ -114,10 +110,7 @@ def train_representation(
     scene: str,
     spread: float = 1.0,
     command: str = "",
-    checkpoint: str | Path | None = None,
-    log: Log | None = None,
-    progress: bool = True,
-    device: torch.device | str = "cpu",
+    **how: Any,
 ) -> Representation:
     """Train both encoders on the training demonstrations.
 
@@ -135,11 +128,7 @@ def train_representation(
         scene: Identity of the scene of the frames (`Scene.identity`), stored with the weights.
         spread: Share of the range of start states of the recordings, stored with the weights.
         command: Command line, stored with the weights.
-        checkpoint: Folder for checkpoints, from which an interrupted training is resumed and then
-            gives the same weights.
-        log: Receives a row every ``config.log_every`` steps.
-        progress: Whether to show a progress bar for each stage.
-        device: Device to train on.
+        **how: ``checkpoint``, ``log``, ``progress`` and ``device``, see `Fit`.
 
     Returns:
         The trained encoders, on the CPU, in eval mode, without gradients.
@@ -155,21 +144,17 @@ def train_representation(
     seen = [train] if play is None else [train, split(play, "the recorded play")[0]]
     own = seen[-1]
     _check_actions(train, own, config.inverse)
-    folder = Path(checkpoint) if checkpoint else None
-    fit = Fit(config, folder, log, progress, device)
+    fit = Fit(config, **how)
     if config.frame_network == "vae":
-        network = _train_vae(seen, config.vae, fit, config.seed)
+        network = _train_vae(seen, fit)
     else:
-        network = _take_frame_network(config.frame_network, seen, fit, config.seed)
-        taken = f"{network.identity} {digest(network.state_dict())}"
-        fit = replace(fit, frame_network=taken)
+        network = _take_frame_network(seen, fit)
+        fit = replace(fit, taken=f"{network.identity} {digest(network.state_dict())}")
     latent = encode_frames(network, train)
-    lae = _train_lae(latent, train.get("length"), config.lae, fit, config.seed)
+    lae = _train_lae(latent, train.get("length"), fit)
     inverse = None
     if config.inverse.steps and "action" in own:
-        if play is not None:
-            latent = encode_frames(network, own)
-        inverse = _train_inverse(latent, own, config.inverse, fit, config.seed).cpu()
+        inverse = _train_inverse(latent if play is None else encode_frames(network, own), own, fit)
     metadata = {
         "scene": scene,
         "spread": str(spread),
@@ -180,7 +165,7 @@ def train_representation(
     if network.identity != VAE.identity:
         shape = json.dumps(network.frame_shape)
         metadata |= {"frame_network": network.identity, "frame_shape": shape}
-    return Representation(network.cpu(), lae.cpu(), inverse, metadata)
+    return Representation(network.cpu(), lae, inverse, metadata)
 
 
 def retrain_inverse(
@@ -189,10 +174,7 @@ def retrain_inverse(
     config: RepresentationConfig | None = None,
     *,
     command: str = "",
-    checkpoint: str | Path | None = None,
-    log: Log | None = None,
-    progress: bool = True,
-    device: torch.device | str = "cpu",
+    **how: Any,
 ) -> Representation:
     """Train the inverse model of encoders anew, on the training part of ``play``; keep the rest.
 
@@ -201,21 +183,18 @@ def retrain_inverse(
     the intervals and ``inverse`` are used. Other arguments, the result and errors are as for
     `train_representation`; play without actions is refused, too.
     """
-    config = config or RepresentationConfig()
-    folder = Path(checkpoint) if checkpoint else None
+    fit = Fit(config or RepresentationConfig(), **how)
     own, _ = split(play, "the recorded play")
     if "action" not in own:
         raise ValueError("the inverse model learns from actions, which this play lacks: record it")
-    _check_actions(None, own, config.inverse)
-    network = representation.frame_network.to(device)
-    latent = encode_frames(network, own)
-    fit = Fit(config, folder, log, progress, device)
-    inverse = _train_inverse(latent, own, config.inverse, fit, config.seed)
+    _check_actions(None, own, fit.config.inverse)
+    network = representation.frame_network.to(fit.device)
+    inverse = _train_inverse(encode_frames(network, own), own, fit)
     metadata = representation.metadata
-    kept = {**json.loads(metadata["config"]), "inverse": asdict(config.inverse)}
+    kept = {**json.loads(metadata["config"]), "inverse": asdict(fit.config.inverse)}
     commands = "; ".join(part for part in (metadata["command"], command) if part)
     metadata = {**metadata, "config": json.dumps(kept), "command": commands}
-    return Representation(network.cpu(), representation.lae, inverse.cpu(), metadata)
+    return Representation(network.cpu(), representation.lae, inverse, metadata)
 
 
 @torch.no_grad()
@@ -261,37 +240,31 @@ def save_representation(representation: Representation, path: str | Path) -> Non
 def check_savable(representation: Representation) -> None:
     """Raise ``ValueError`` if `load_representation` would not return the same encoders.
 
-    It makes a frame network of the name, and the other networks of the sizes, in the metadata.
+    It makes a frame network of the name, and the other networks of the sizes, in the metadata, and
+    compares what all of them make of two frames of noise.
     """
-    network = representation.frame_network
+    noise, shape = torch.Generator().manual_seed(0), representation.frame_network.frame_shape
+    frames = torch.randint(256, (1, 2, *shape, 3), generator=noise, dtype=torch.uint8)
+    data = TensorDict({"pixels": frames, "length": torch.tensor([2])}, [1])
     try:
         made = _of_tensors(_tensors(representation), representation.metadata)
+        pairs = zip(_outputs(representation, data), _outputs(made, data), strict=True)
+        same = all(torch.allclose(*pair, 1e-3, 1e-3) for pair in pairs)
+        found = "" if same else "what they return depends on more than parameters and buffers"
     except Exception as error:
-        cause = " ".join(f"{type(error).__name__}: {error}".split())
-        made, found = None, f"others could not be made of their tensors and metadata ({cause})"
-    else:
-        kinds = [[type(network) for _, network in r.networks()] for r in (representation, made)]
-        found = next((a.__qualname__ for a, b in zip(*kinds, strict=True) if a is not b), "")
-        found = f"{found} is of a class of its own" if found else ""
-        if not found and network.identity != VAE.identity:
-            found = _difference(network, made.frame_network)
+        found = " ".join(f"{type(error).__name__}: {error}".split())
     if found:
         raise ValueError(
-            f"these encoders could be saved, but not loaded again: {found}; train them with "
+            f"these encoders could be saved, but not loaded again ({found}): train them with "
             "bgpo_trl.encoders.train, a frame network of your own by its name in FRAME_NETWORKS"
         )
 
 
-def _difference(network: FrameNetwork, made: FrameNetwork) -> str:
-    """Return why a network of the same class and weights is another one; "" if it is not."""
-    if made.identity != network.identity:
-        return f"{made.identity!r} would be made in place of {network.identity!r}"
-    noise, device = torch.Generator().manual_seed(0), network.latent_mean.device
-    shape = (2, *network.frame_shape, 3)
-    frames = torch.randint(256, shape, generator=noise, dtype=torch.uint8).to(device)
-    if torch.allclose(made.to(device).latent(frames), network.latent(frames), 1e-3, 1e-3):
-        return ""
-    return f"latents of {network.identity!r} depend on more than its parameters and buffers"
+def _outputs(encoders: Representation, data: TensorDictBase) -> list[Tensor]:
+    """Return latents, embeddings and, if they can be inferred, actions of episodes."""
+    latent, length = encode_frames(encoders.frame_network, data), data.get("length")
+    found = [latent, encoders.lae.encode(latent, length)]
+    return found if encoders.inverse is None else [*found, encoders.inverse(latent, length)]
 
 
 def load_representation(path: str | Path, *, scene: Scene | None = None) -> Representation:
@@ -324,9 +297,6 @@ def load_representation(path: str | Path, *, scene: Scene | None = None) -> Repr
 def _of_tensors(tensors: Mapping[str, Tensor], metadata: dict[str, str]) -> Representation:
     """Return encoders of the tensors and metadata of a file."""
     config = json.loads(metadata["config"])
-    action_size = None
-    if any(name.startswith("inverse.") for name in tensors):
-        action_size = len(tensors["inverse.network.4.bias"])
     if "frame_network" in metadata:
         network = _named_frame_network(metadata)
     else:
@@ -338,8 +308,8 @@ def _of_tensors(tensors: Mapping[str, Tensor], metadata: dict[str, str]) -> Repr
         )
     lae = SequenceAutoencoder(network.latent_size, config["lae"]["embedding_size"])
     inverse = None
-    if action_size is not None:
-        inverse = InverseModel(network.latent_size, action_size, config["inverse"]["hidden_size"])
+    if (last := tensors.get("inverse.network.4.bias")) is not None:
+        inverse = InverseModel(network.latent_size, len(last), config["inverse"]["hidden_size"])
     encoders = Representation(network, lae, inverse, metadata)
     for name, module in encoders.networks():
         found = {k.removeprefix(name): v for k, v in tensors.items() if k.startswith(name)}
@@ -413,14 +383,135 @@ def _initialized(seed: int, make: Callable[..., Network], *arguments: Any) -> Ne
         return make(*arguments)
 
 
-def _take_frame_network(
-    name: str, datasets: Sequence[TensorDictBase], fit: Fit, seed: int
-) -> FrameNetwork:
+@dataclass(frozen=True)
+class Fit:
+    """Training loop of both encoders: Adam, by default with warm-up and cosine decay.
+
+    Attributes:
+        config: Hyperparameters; the seed and the intervals apply to every stage.
+        checkpoint: Folder for checkpoints, from which an interrupted training is resumed and then
+            gives the same weights; None for none.
+        log: Receives a row every ``config.log_every`` steps.
+        progress: Whether to show a progress bar for each stage.
+        device: Device to train on.
+        taken: Identity of the frame network of one's own whose latents it is trained on, or "": a
+            checkpoint of another one is not resumed.
+    """
+
+    config: RepresentationConfig
+    checkpoint: str | Path | None = None
+    log: Log | None = None
+    progress: bool = True
+    device: torch.device | str = "cpu"
+    taken: str = ""
+
+    def generator(self) -> torch.Generator:
+        """Return the random numbers of a stage."""
+        return torch.Generator().manual_seed(self.config.seed)
+
+    def __call__(
+        self,
+        stage: str,
+        loss: LossModule,
+        sample: Callable[[torch.Generator], TensorDict],
+        generator: torch.Generator,
+        bfloat16: bool = False,
+    ) -> None:
+        """Train ``loss.parameters()`` on the device, from the last checkpoint if there is one.
+
+        Args:
+            stage: Name of its settings, the progress bar, the log rows and the checkpoint.
+            loss: Maps a batch to a TensorDict whose ``loss_*`` entries are summed.
+            sample: Draws a batch, on the CPU.
+            generator: The only source of randomness of ``sample`` and ``loss``; saved in the
+                checkpoint, so that a resumed training gives the same weights.
+            bfloat16: Whether to compute the loss in bfloat16 where that is precise enough.
+
+        Raises:
+            ValueError: If the loss is no longer finite, or the checkpoints are damaged or belong to
+                another configuration.
+            OSError: If a checkpoint cannot be written.
+        """
+        loss.to(self.device)
+        schedule = getattr(self.config, stage)
+        steps, device = schedule.steps, torch.device(self.device)
+        optimizer = torch.optim.Adam(loss.parameters(), lr=schedule.learning_rate)
+        path = Path(self.checkpoint) / stage if self.checkpoint else None
+        start = self._resume(path, loss, optimizer, generator)
+        rows = range(start, steps)
+        shown = {"shown": self.progress, "initial": start, "total": steps}
+        bar = progress_bar(f"train {stage}", rows, **shown)
+        for step in bar:
+            rate = schedule.learning_rate * min(1.0, (step + 1) / schedule.warmup_steps)
+            if schedule.decay:
+                rate *= (1 + math.cos(math.pi * step / steps)) / 2
+            for group in optimizer.param_groups:
+                group["lr"] = rate
+            batch = sample(generator).to(self.device)
+            with torch.autocast(device.type, torch.bfloat16, enabled=bfloat16):
+                losses = loss(batch)
+            objective = [value for key, value in losses.items() if key.startswith("loss_")]
+            optimizer.zero_grad()
+            torch.stack(objective).sum().backward()
+            optimizer.step()
+            done = step + 1
+            if done % self.config.log_every == 0 or done == steps:
+                parts = {key: value.item() for key, value in losses.items()}
+                if not all(math.isfinite(value) for value in parts.values()):
+                    raise ValueError(f"{stage} diverged at step {done}: lower its learning_rate")
+                texts = {k.removeprefix("loss_"): f"{v:.3g}" for k, v in parts.items()}
+                bar.set_postfix(texts, refresh=False)
+                if self.log:
+                    self.log({"stage": stage, "step": done, "learning_rate": rate, **parts})
+            if path and (done % self.config.checkpoint_every == 0 or done == steps):
+                state = {
+                    "config": self._settings,
+                    "step": done,
+                    "loss": loss.state_dict(),
+                    "optimizer": optimizer.state_dict(),
+                    "generator": generator.get_state(),
+                }
+                save_checkpoint(path, state)
+
+    @property
+    def _settings(self) -> str:
+        """All that a checkpoint has to have in common with the training that it resumes."""
+        return json.dumps(asdict(self.config)) + self.taken
+
+    def _resume(
+        self,
+        path: Path | None,
+        loss: LossModule,
+        optimizer: torch.optim.Optimizer,
+        generator: torch.Generator,
+    ) -> int:
+        """Restore the last checkpoint if there is one; return the number of steps made."""
+        if not path or not has_checkpoint(path):
+            return 0
+        saved = load_checkpoint(path)
+        if not saved.keys() >= {"config", "loss", "optimizer", "generator", "step"}:
+            raise ValueError(f"{path} holds no checkpoint of encoders: choose another folder")
+        if saved["config"] != self._settings:
+            raise ValueError(
+                f"{path} was written with another configuration or frame network: "
+                "remove it or choose another checkpoint folder"
+            )
+        loss.load_state_dict(saved["loss"])
+        optimizer.load_state_dict(saved["optimizer"])
+        generator.set_state(saved["generator"])
+        return saved["step"]
+
+
+def _take_frame_network(datasets: Sequence[TensorDictBase], fit: Fit) -> FrameNetwork:
     """Return a frame network of one's own, with the scale of its latents in some datasets."""
-    frames = torch.cat([valid_frames(dataset) for dataset in datasets])
+    frames, (name, seed) = _frames_of(datasets), (fit.config.frame_network, fit.config.seed)
     network = _initialized(seed, make_frame_network, name, frames.shape[1:3]).to(fit.device)
     _set_scale(network, frames, fit)
     return network
+
+
+def _frames_of(datasets: Sequence[TensorDictBase]) -> Tensor:
+    return torch.cat([valid_frames(dataset) for dataset in datasets])
 
 
 def _set_scale(network: FrameNetwork, frames: Tensor, fit: Fit) -> None:
@@ -430,16 +521,22 @@ def _set_scale(network: FrameNetwork, frames: Tensor, fit: Fit) -> None:
         network.set_latent_scale(torch.cat([network.features(chunk) for chunk in chunks]))
 
 
-def _train_vae(datasets: Sequence[TensorDictBase], config: VAEConfig, fit: Fit, seed: int) -> VAE:
+def _train_vae(datasets: Sequence[TensorDictBase], fit: Fit) -> VAE:
+    """Train the VAE on frames of datasets, and its inverse model on actions of the last one."""
+    config, own = fit.config.vae, datasets[-1]
     length = torch.cat([dataset.get("length") for dataset in datasets])
     if length.max() < config.window:
         raise ValueError(f"the dataset has no training demonstration of {config.window} frames")
-    frames = torch.cat([valid_frames(dataset) for dataset in datasets])
-    own = datasets[-1]
-    action = torch.cat([_actions_of_frames(dataset, own) for dataset in datasets])
+    frames = _frames_of(datasets)
     # Actions of demonstrations are unknown, unless there is no play to learn from.
     n_known = int(own.get("length").sum()) if "action" in own else 0
     n_unknown = len(frames) - n_known
+    action = torch.zeros(n_unknown, 1)
+    if n_known:
+        # The padding after the last frame of a demonstration is never read.
+        padded = torch.nn.functional.pad(own.get("action"), (0, 0, 0, 1))
+        known = padded[valid_steps(own.get("length"), padded.shape[1])]
+        action = torch.cat([known.new_zeros(n_unknown, known.shape[-1]), known])
     first = length.cumsum(0) - length
     starts = torch.cat(
         [
@@ -455,11 +552,10 @@ def _train_vae(datasets: Sequence[TensorDictBase], config: VAEConfig, fit: Fit, 
         windows = {"pixels": frames[index], "action": action[index]}
         return TensorDict({**windows, "action_known": drawn >= n_unknown}, [n_windows])
 
-    generator = torch.Generator().manual_seed(seed)
-    frame_shape = frames.shape[1:3]
-    sizes = (config.latent_size, action.shape[-1], frame_shape, config.keypoints)
-    vae = _initialized(seed, VAE, *sizes)
+    sizes = (config.latent_size, action.shape[-1], frames.shape[1:3], config.keypoints)
+    vae = _initialized(fit.config.seed, VAE, *sizes)
     vae.mean_frame.copy_(mean_frame(frames))
+    generator = fit.generator()
     loss = VAEInverseLoss(
         vae,
         reconstruction_weight=config.reconstruction_weight,
@@ -467,20 +563,10 @@ def _train_vae(datasets: Sequence[TensorDictBase], config: VAEConfig, fit: Fit, 
         inverse_weight=config.inverse_weight,
         generator=generator,
     )
-    fit("vae", loss, sample, config, generator, config.bfloat16)
+    fit("vae", loss, sample, generator, config.bfloat16)
     vae.eval().requires_grad_(False)
     _set_scale(vae, frames, fit)
     return vae
-
-
-def _actions_of_frames(dataset: TensorDictBase, own: TensorDictBase) -> Tensor:
-    """Return the action after each valid frame, ``[sum(length), A]``; 0 if not of ``own``."""
-    length, n_frames = dataset.get("length"), dataset.get("pixels").shape[1]
-    action = own.get("action", torch.zeros(1, 1, 1))
-    if dataset is not own or "action" not in own:
-        action = torch.zeros(()).expand(len(length), n_frames - 1, action.shape[-1])
-    # The padding after the last frame of a demonstration is never read.
-    return torch.nn.functional.pad(action, (0, 0, 0, 1))[valid_steps(length, n_frames)]
 
 
 def _steps_to_infer(episodes: TensorDictBase, config: InverseModelConfig) -> tuple[Tensor, Tensor]:
@@ -518,15 +604,9 @@ def _check_actions(
             )
 
 
-def _train_inverse(
-    latent: Tensor,
-    episodes: TensorDictBase,
-    config: InverseModelConfig,
-    fit: Fit,
-    seed: int,
-) -> InverseModel:
+def _train_inverse(latent: Tensor, episodes: TensorDictBase, fit: Fit) -> InverseModel:
     """Train the inverse model on the latents ``[N, T, 64]`` and actions of episodes."""
-    length, action = episodes.get("length"), episodes.get("action")
+    config, length, action = fit.config.inverse, episodes.get("length"), episodes.get("action")
     valid, slow = _steps_to_infer(episodes, config)
     chosen = (slow & valid).nonzero()
 
@@ -537,21 +617,21 @@ def _train_inverse(
         windows = windows + config.noise * torch.randn(windows.shape, generator=generator)
         return TensorDict({"window": windows, "action": action[episode, step]}, [len(drawn)])
 
-    generator = torch.Generator().manual_seed(seed)
     sizes = (latent.shape[-1], action.shape[-1], config.hidden_size)
-    inverse = _initialized(seed, InverseModel, *sizes)
-    fit("inverse", ActionInferenceLoss(inverse), sample, config, generator)
-    return inverse.eval().requires_grad_(False)
+    inverse = _initialized(fit.config.seed, InverseModel, *sizes)
+    fit("inverse", ActionInferenceLoss(inverse), sample, fit.generator())
+    return inverse.eval().requires_grad_(False).cpu()
 
 
-def _train_lae(
-    latent: Tensor, length: Tensor, config: SequenceAutoencoderConfig, fit: Fit, seed: int
-) -> SequenceAutoencoder:
+def _train_lae(latent: Tensor, length: Tensor, fit: Fit) -> SequenceAutoencoder:
+    """Train the sequence encoder on the latents ``[N, T, 64]`` of episodes."""
+    config = fit.config.lae
+
     def sample(generator: torch.Generator) -> TensorDict:
         index = torch.randint(len(latent), (config.batch_size,), generator=generator)
         return TensorDict({"latent": latent[index], "length": length[index]}, [config.batch_size])
 
-    generator = torch.Generator().manual_seed(seed)
-    lae = _initialized(seed, SequenceAutoencoder, latent.shape[-1], config.embedding_size)
-    fit("lae", SequenceReconstructionLoss(lae), sample, config, generator)
-    return lae.eval().requires_grad_(False)
+    sizes = (latent.shape[-1], config.embedding_size)
+    lae = _initialized(fit.config.seed, SequenceAutoencoder, *sizes)
+    fit("lae", SequenceReconstructionLoss(lae), sample, fit.generator())
+    return lae.eval().requires_grad_(False).cpu()

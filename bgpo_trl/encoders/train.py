@@ -15,11 +15,11 @@ from tensordict import TensorDictBase
 from bgpo_trl.configs import RepresentationConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.recording import record_demonstrations
-from bgpo_trl.encoders.fitting import Log
 from bgpo_trl.encoders.make_bank import make_bank
 from bgpo_trl.encoders.pretrained import bank_path
 from bgpo_trl.encoders.probes import complaints, probe
 from bgpo_trl.encoders.representation import (
+    Log,
     Representation,
     retrain_inverse,
     save_representation,
@@ -29,17 +29,8 @@ from bgpo_trl.files.csv_file import CsvFile
 from bgpo_trl.files.writing import check_folder, make_folder
 from bgpo_trl.scenes import Scene, find_scene
 
-_COLUMNS = (
-    "stage",
-    "step",
-    "learning_rate",
-    "loss_reconstruction",
-    "loss_kl",
-    "loss_inverse",
-    "reconstruction",
-    "kl",
-    "inverse",
-)
+_TERMS = ("reconstruction", "kl", "inverse")
+_COLUMNS = ("stage", "step", "learning_rate", *(f"loss_{term}" for term in _TERMS), *_TERMS)
 
 
 def train_encoders(
@@ -90,19 +81,13 @@ def train_encoders(
     make_folder(folder)
     check_folder(weights.parent)  # before hours of training
     with CsvFile(folder / "train.csv", _COLUMNS) as file:
-        fit = {
-            "command": command,
-            "checkpoint": folder / "checkpoint",
-            "log": _log_of(file),
-            "progress": progress,
-            "device": device,
-        }
+        how: dict[str, Any] = {"command": command, "checkpoint": folder / "checkpoint"}
+        how |= {"log": _log_of(file), "progress": progress, "device": device}
         if keep is not None and play is not None:
-            representation = retrain_inverse(keep, play, config, **fit)
+            representation = retrain_inverse(keep, play, config, **how)
         else:
-            representation = train_representation(
-                dataset, config, play=play, scene=scene.identity, spread=spread, **fit
-            )
+            how |= {"scene": scene.identity, "spread": spread}
+            representation = train_representation(dataset, config, play=play, **how)
     save_representation(representation, weights)
     actions = scene.bank_actions
     bank = make_bank(representation, dataset, tasks=tasks, actions=actions, spread=spread)
@@ -123,11 +108,9 @@ def make_pretrained(
     per_task: int = 1_200,
     held_out_per_task: int = 200,
     seed: int = 0,
-    progress: bool = True,
-    tasks: Sequence[str] | None = None,
-    spread: float = 1.0,
-    scene: Scene | str = "nico",
-    **options: Any,
+    command: str = "",
+    device: torch.device | str = "cpu",
+    **shared: Any,
 ) -> tuple[Representation, DemonstrationBank]:
     """Record demonstrations and play, train both encoders, and embed the demonstrations.
 
@@ -142,21 +125,14 @@ def make_pretrained(
         per_task: Demonstrations of each task.
         held_out_per_task: How many of those are held out.
         seed: Seed of the recording.
-        progress: Whether to show progress bars.
-        tasks: Tasks to demonstrate; by default the scene's.
-        spread: Share of the whole range of start states.
-        scene: The robot, or its name.
-        **options: Further arguments of `train_encoders`.
+        command: Command line, stored with the weights.
+        device: Device to train on.
+        **shared: ``scene``, ``tasks``, ``spread`` and ``progress``, as for `record_demonstrations`
+            and `train_encoders`.
 
     Raises:
         ValueError: If the dataset is damaged or was recorded in another scene.
     """
-    shared: dict[str, Any] = {
-        "scene": scene,
-        "tasks": tasks,
-        "spread": spread,
-        "progress": progress,
-    }
     record = partial(record_demonstrations, seed=seed, **shared)
     demonstrations = record(dataset, per_task=per_task, held_out_per_task=held_out_per_task)
     play = record(
@@ -165,15 +141,9 @@ def make_pretrained(
         held_out_per_task=max(1, held_out_per_task // 4),
         play=True,
     )
-    return train_encoders(
-        demonstrations,
-        play,
-        Path(weights),
-        Path(folder),
-        config or RepresentationConfig(),
-        **shared,
-        **options,
-    )
+    config, folder = config or RepresentationConfig(), Path(folder)
+    options = {"command": command, "device": device, **shared}
+    return train_encoders(demonstrations, play, Path(weights), folder, config, **options)
 
 
 def _log_of(file: CsvFile) -> Log:

@@ -19,6 +19,7 @@ from bgpo_trl.files.writing import check_folder
 from bgpo_trl.plugins import import_plugin
 from bgpo_trl.policy import TrainedPolicy, load_run
 from bgpo_trl.scenes import Scene, Simulation, find_scene
+from bgpo_trl.scenes.scene import checked_frame, checked_step
 
 _HEIGHT = 128  # (pixels) of each picture
 _BORDER, _CAPTION, _GAP = 4, 18, 8
@@ -72,8 +73,6 @@ def demonstrate(
 
 def play(policy: TrainedPolicy, task: str, demonstration: NDArray, seed: int) -> Episode:
     """Show the policy a demonstration, and return its episode from the start with that seed."""
-    from bgpo_trl.scenes.simulation import checked_frame, checked_outcome
-
     policy.condition(demonstration, task=task)
     config = policy.config
     scene = find_scene(config.scene)
@@ -84,7 +83,7 @@ def play(policy: TrainedPolicy, task: str, demonstration: NDArray, seed: int) ->
     seen, views, success = [checked_frame(simulation, shape)], [_view(simulation)], False
     for _ in range(config.algorithm.max_steps):
         action = policy.act(seen[-1]).astype(np.float64)
-        success, failure = checked_outcome(simulation, simulation.step(action))[:2]
+        success, failure, _ = checked_step(simulation, action)
         seen.append(checked_frame(simulation, shape))
         views.append(_view(simulation))
         if success or failure:

@@ -2,10 +2,19 @@
 
 from typing import TYPE_CHECKING
 
-from bgpo_trl.scenes.scene import SCENES, Scene, StateColumns, Weights, find_scene
+from bgpo_trl.scenes.scene import (
+    SCENES,
+    Observation,
+    Outcome,
+    Scene,
+    Simulation,
+    StateColumns,
+    Weights,
+    find_scene,
+)
 
 if TYPE_CHECKING:
-    from bgpo_trl.scenes.simulation import Observation, Outcome, RobotEnv, Simulation, SimulationEnv
+    from bgpo_trl.scenes.simulation import RobotEnv, SimulationEnv
 else:
 
     def __getattr__(name):

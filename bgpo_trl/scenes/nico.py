@@ -15,8 +15,8 @@ import torch
 from dm_env import TimeStep
 from numpy.typing import NDArray
 
-from bgpo_trl.scenes.scene import Scene, StateColumns, Weights
-from bgpo_trl.scenes.simulation import Observation, Outcome, Simulation, SimulationEnv
+from bgpo_trl.scenes.scene import Observation, Outcome, Scene, Simulation, StateColumns, Weights
+from bgpo_trl.scenes.simulation import SimulationEnv
 from bgpo_trl.seeding import random_state, set_random_state
 from suites import nico
 from suites.nico.base import STATE_CENTER, STATE_SCALE, STATE_SIZE, Environment, check_spread

@@ -4,17 +4,161 @@ from __future__ import annotations
 
 import importlib
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from reprlib import repr as short_repr
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
+import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from bgpo_trl.scenes.simulation import Observation, Simulation, SimulationEnv
+    from bgpo_trl.scenes.simulation import SimulationEnv
 
-__all__ = ["SCENES", "Scene", "StateColumns", "Weights", "find_scene"]
+__all__ = [
+    "SCENES",
+    "Observation",
+    "Outcome",
+    "Scene",
+    "Simulation",
+    "StateColumns",
+    "Weights",
+    "checked_frame",
+    "checked_state",
+    "checked_step",
+    "find_scene",
+]
+
+Observation = Literal["pixels", "state", "both"]
+
+
+class Outcome(NamedTuple):
+    """Outcome of a step.
+
+    Attributes:
+        success: Whether the task is solved, which ends the episode with reward 1.
+        failure: Whether the episode ends without success, for example by a fall.
+        executed: Action ``[A]`` in [-1, 1] that a physical robot executed, where its limits
+            allowed less than was asked for; None for the action itself. See `RobotEnv`.
+    """
+
+    success: bool
+    failure: bool = False
+    executed: NDArray[Any] | None = None
+
+
+class Simulation(ABC):
+    """One simulated robot, of which `SimulationEnv` steps several side by side.
+
+    A subclass for a robot of your own defines `seed`, `reset`, `step` and `frame`. With `state`,
+    policies can learn from the ground truth; with `save` and `load`, runs can be resumed; with
+    `view`, films show the robot.
+    """
+
+    @abstractmethod
+    def seed(self, seed: int) -> None:
+        """Seed the draws of all following starts, for all tasks alike; below 2**32."""
+
+    @abstractmethod
+    def reset(self, task: str) -> None:
+        """Begin an episode of the task with that name, from a start drawn at random."""
+
+    @abstractmethod
+    def step(self, action: NDArray[np.float64]) -> Outcome:
+        """Perform an action ``[A]`` in [-1, 1]; it may run beside the steps of others, in a thread.
+
+        It is not called after the end of an episode.
+        """
+
+    @abstractmethod
+    def frame(self) -> NDArray[np.uint8]:
+        """Return the camera's frame, ``[H, W, 3]``; it is called in one thread only."""
+
+    def state(self) -> NDArray[Any]:
+        """Return the ground truth, ``[N]``."""
+        raise self._lacks("state()")
+
+    def view(self) -> NDArray[np.uint8]:
+        """Return an onlooker's view of the robot for films, ``[H', W', 3]``."""
+        raise self._lacks("view()")
+
+    def save(self) -> dict[str, Any]:
+        """Return all that the future depends on, as tensors, numbers, strings, lists and dicts."""
+        raise self._lacks("save()")
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Continue from what `save` returned."""
+        raise self._lacks("load()")
+
+    def close(self) -> None:  # noqa: B027 - most have nothing to free
+        """Free what the simulation holds."""
+
+    def _lacks(self, method: str) -> NotImplementedError:
+        return NotImplementedError(f"{type(self).__name__} does not define {method}")
+
+
+def checked_frame(simulation: Simulation, frame_shape: Sequence[int]) -> NDArray[np.uint8]:
+    """Return a simulation's frame; NumPy would convert others, and fractions would become black.
+
+    Raises:
+        ValueError: If it is not uint8 ``[H, W, 3]`` of the height and width given.
+    """
+    frame, shape = np.asarray(simulation.frame()), (*frame_shape, 3)
+    if frame.dtype != np.uint8 or frame.shape != shape:
+        wanted = f"uint8 {[*shape]}, as the scene's frame_shape says"
+        raise _refusal(simulation, "frame", f"{frame.dtype} {[*frame.shape]}", wanted)
+    return frame
+
+
+def checked_state(simulation: Simulation, size: int) -> NDArray[np.float32]:
+    """Return a simulation's ground truth, float32 ``[size]``.
+
+    Raises:
+        ValueError: If it is something else than so many finite numbers.
+    """
+    found = simulation.state()
+    state = np.asarray(found)
+    if state.dtype.kind not in "fiu" or state.shape != (size,) or not np.isfinite(state).all():
+        wanted = f"{size} finite numbers, as the scene's StateColumns say"
+        raise _refusal(simulation, "state", short_repr(found), wanted)
+    return state.astype(np.float32)
+
+
+def checked_step(simulation: Simulation, action: NDArray[np.float64]) -> Outcome:
+    """Step a simulation; return the outcome with the action that was executed.
+
+    It is the action asked for, unless the simulation says otherwise.
+
+    Raises:
+        ValueError: If the outcome is no `Outcome` of two bools (a tuple of Gym would succeed at
+            each step), or the executed action something else than finite numbers in [-1, 1], as
+            many as asked for.
+    """
+    outcome = simulation.step(action)
+    flags = outcome[:2] if isinstance(outcome, Outcome) else (None,)
+    if not all(type(flag) in (bool, np.bool_) for flag in flags):
+        wanted = "an Outcome, whose success and failure are True or False"
+        raise _refusal(simulation, "step", short_repr(outcome), wanted)
+    if outcome.executed is None:
+        return outcome._replace(executed=action)
+    executed, shape = np.asarray(outcome.executed), action.shape
+    # Comparisons with NaN are false.
+    if (
+        executed.dtype.kind not in "fiu"
+        or executed.shape != shape
+        or not (np.abs(executed) <= 1).all()
+    ):
+        found = f"the executed action {short_repr(executed.tolist())}"
+        wanted = f"{len(action)} numbers in [-1, 1], or None"
+        raise _refusal(simulation, "step", found, wanted)
+    return outcome._replace(executed=executed.astype(np.float64))
+
+
+def _refusal(simulation: Simulation, method: str, found: str, wanted: str) -> ValueError:
+    found = " ".join(found.split())
+    return ValueError(f"{type(simulation).__name__}.{method}() returned {found}: return {wanted}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
-from reprlib import repr as short_repr
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, get_args
 
 import numpy as np
 import torch
@@ -16,158 +14,17 @@ from torchrl.envs import EnvBase
 
 from bgpo_trl.errors import as_shape, missing_key
 from bgpo_trl.machine import RowPool, usable_cores
+from bgpo_trl.scenes.scene import (
+    Observation,
+    Outcome,
+    Simulation,
+    checked_frame,
+    checked_state,
+    checked_step,
+)
 from bgpo_trl.seeding import Seeding, row_seeds
 
-__all__ = [
-    "Observation",
-    "Outcome",
-    "RobotEnv",
-    "Simulation",
-    "SimulationEnv",
-    "checked_executed",
-    "checked_frame",
-    "checked_outcome",
-    "checked_state",
-]
-
-Observation = Literal["pixels", "state", "both"]
-
-
-class Outcome(NamedTuple):
-    """Outcome of a step.
-
-    Attributes:
-        success: Whether the task is solved, which ends the episode with reward 1.
-        failure: Whether the episode ends without success, for example by a fall.
-        executed: Action ``[A]`` in [-1, 1] that a physical robot executed, where its limits
-            allowed less than was asked for; None for the action itself. See `RobotEnv`.
-    """
-
-    success: bool
-    failure: bool = False
-    executed: NDArray[Any] | None = None
-
-
-class Simulation(ABC):
-    """One simulated robot, of which `SimulationEnv` steps several side by side.
-
-    A subclass for a robot of your own defines `seed`, `reset`, `step` and `frame`. With `state`,
-    policies can learn from the ground truth; with `save` and `load`, runs can be resumed; with
-    `view`, films show the robot.
-    """
-
-    @abstractmethod
-    def seed(self, seed: int) -> None:
-        """Seed the draws of all following starts, for all tasks alike; below 2**32."""
-
-    @abstractmethod
-    def reset(self, task: str) -> None:
-        """Begin an episode of the task with that name, from a start drawn at random."""
-
-    @abstractmethod
-    def step(self, action: NDArray[np.float64]) -> Outcome:
-        """Perform an action ``[A]`` in [-1, 1]; it may run beside the steps of others, in a thread.
-
-        It is not called after the end of an episode.
-        """
-
-    @abstractmethod
-    def frame(self) -> NDArray[np.uint8]:
-        """Return the camera's frame, ``[H, W, 3]``; it is called in one thread only."""
-
-    def state(self) -> NDArray[Any]:
-        """Return the ground truth, ``[N]``."""
-        raise self._lacks("state()")
-
-    def view(self) -> NDArray[np.uint8]:
-        """Return an onlooker's view of the robot for films, ``[H', W', 3]``."""
-        raise self._lacks("view()")
-
-    def save(self) -> dict[str, Any]:
-        """Return all that the future depends on, as tensors, numbers, strings, lists and dicts."""
-        raise self._lacks("save()")
-
-    def load(self, state: dict[str, Any]) -> None:
-        """Continue from what `save` returned."""
-        raise self._lacks("load()")
-
-    def close(self) -> None:  # noqa: B027 - most have nothing to free
-        """Free what the simulation holds."""
-
-    def _lacks(self, method: str) -> NotImplementedError:
-        return NotImplementedError(f"{type(self).__name__} does not define {method}")
-
-
-def checked_frame(simulation: Simulation, frame_shape: Sequence[int]) -> NDArray[np.uint8]:
-    """Return a simulation's frame; NumPy would convert others, and fractions would become black.
-
-    Raises:
-        ValueError: If it is not uint8 ``[H, W, 3]`` of the height and width given.
-    """
-    frame, shape = np.asarray(simulation.frame()), (*frame_shape, 3)
-    if frame.dtype != np.uint8 or frame.shape != shape:
-        raise ValueError(
-            f"{type(simulation).__name__}.frame() returned {frame.dtype} {[*frame.shape]}: return "
-            f"uint8 {[*shape]}, as the scene's frame_shape says"
-        )
-    return frame
-
-
-def checked_state(simulation: Simulation, size: int) -> NDArray[np.float32]:
-    """Return a simulation's ground truth, float32 ``[size]``.
-
-    Raises:
-        ValueError: If it is something else than so many finite numbers.
-    """
-    found = simulation.state()
-    state = np.asarray(found)
-    if state.dtype.kind not in "fiu" or state.shape != (size,) or not np.isfinite(state).all():
-        what = "nothing" if found is None else f"{state.dtype} {[*state.shape]}"
-        if state.dtype.kind == "f" and state.shape == (size,):
-            what = f"{state.tolist()}"
-        raise ValueError(
-            f"{type(simulation).__name__}.state() returned {what}: return {size} finite numbers, "
-            "as the scene's StateColumns say"
-        )
-    return state.astype(np.float32)
-
-
-def checked_outcome(simulation: Simulation, outcome: object) -> Outcome:
-    """Return what a simulation's ``step`` returned.
-
-    Raises:
-        ValueError: If it is no `Outcome` of two bools; a tuple of Gym would succeed at each step.
-    """
-    if not isinstance(outcome, Outcome) or not all(
-        type(o) in (bool, np.bool_) for o in outcome[:2]
-    ):
-        found = " ".join(short_repr(outcome).split())
-        raise ValueError(
-            f"{type(simulation).__name__}.step() returned {found}: return an Outcome, "
-            "whose success and failure are True or False"
-        )
-    return outcome
-
-
-def checked_executed(
-    simulation: Simulation, action: NDArray[np.float64], outcome: Outcome
-) -> NDArray[np.float64]:
-    """Return the action that was executed in a step: the one asked for, unless it says otherwise.
-
-    Raises:
-        ValueError: If it is something else than finite numbers in [-1, 1], as many as asked for.
-    """
-    if outcome.executed is None:
-        return action
-    executed = np.asarray(outcome.executed)
-    kind, wanted = executed.dtype.kind, action.shape
-    # Comparisons with NaN are false.
-    if kind not in "fiu" or executed.shape != wanted or not (np.abs(executed) <= 1).all():
-        raise ValueError(
-            f"{type(simulation).__name__}.step() returned the executed action "
-            f"{short_repr(executed.tolist())}: return {len(action)} numbers in [-1, 1], or None"
-        )
-    return executed.astype(np.float64)
+__all__ = ["RobotEnv", "SimulationEnv"]
 
 
 class SimulationEnv(EnvBase):
@@ -283,32 +140,23 @@ class SimulationEnv(EnvBase):
         )
 
     def _observe(self) -> dict[str, torch.Tensor]:
-        # Fresh memory each time: what was handed out before must not change.
-        out = {
-            key: torch.from_numpy(value.copy()).unflatten(0, self.batch_size)
-            if self.batch_size
-            else torch.from_numpy(value[0].copy())
-            for key, value in self._current.items()
-        }
-        batch = self.batch_size
-        out["task"] = torch.from_numpy(self._task.copy()).reshape(batch)
-        out["success"] = torch.from_numpy(self._success.copy()).reshape(*batch, 1)
-        done = torch.from_numpy(self._success | self._failure).reshape(*batch, 1)
+        done = self._success | self._failure
+        flags = {"success": self._success, "done": done, "terminated": done}
+        flags |= {"truncated": np.zeros_like(done)}
+        found = {**self._current, "task": self._task}
+        found |= {key: flag[:, None] for key, flag in flags.items()}
+        # Copies: what was handed out before must not change.
         return {
-            **out,
-            "done": done,
-            "terminated": done.clone(),
-            "truncated": torch.zeros_like(done),
+            key: torch.from_numpy(value.copy()).reshape((*self.batch_size, *value.shape[1:]))
+            for key, value in found.items()
         }
 
     def _record(self, row: int) -> None:
-        simulation = self.simulations[row]
-        if "pixels" in self._current:
-            shape = self._current["pixels"].shape[1:3]
-            self._current["pixels"][row] = checked_frame(simulation, shape)
-        if "state" in self._current:
-            size = self._current["state"].shape[1]
-            self._current["state"][row] = checked_state(simulation, size)
+        simulation, current = self.simulations[row], self._current
+        if "pixels" in current:
+            current["pixels"][row] = checked_frame(simulation, current["pixels"].shape[1:3])
+        if "state" in current:
+            current["state"][row] = checked_state(simulation, current["state"].shape[1])
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         del kwargs
@@ -367,23 +215,23 @@ class SimulationEnv(EnvBase):
         self, rows: Iterable[int], actions: NDArray[np.float64], rewards: NDArray[np.float32]
     ) -> None:
         """Step simulations in all threads and draw their frames in this one."""
+        asked = {row: actions[row] for row in rows}
 
         def step(row: int) -> Outcome:
-            simulation = self.simulations[row]
-            return checked_outcome(simulation, simulation.step(actions[row]))
+            return checked_step(self.simulations[row], asked[row])
 
         def record(row: int, outcome: Outcome) -> None:
             self._record(row)
             rewards[row] = outcome.success
             self._success[row], self._failure[row] = outcome[:2]
-            self._record_executed(row, actions[row], outcome)
+            if "executed_action" in self._current:
+                self._current["executed_action"][row] = outcome.executed
+            elif outcome.executed is not asked[row]:
+                raise ValueError(
+                    "only a RobotEnv takes the executed action: make the environment one"
+                )
 
-        self._threads.each(rows, step, record)
-
-    def _record_executed(self, row: int, action: NDArray[np.float64], outcome: Outcome) -> None:
-        del row, action
-        if outcome.executed is not None:
-            raise ValueError("only a RobotEnv takes the executed action: make the environment one")
+        self._threads.each(asked, step, record)
 
     def frames(self) -> np.ndarray:
         """Return a copy of the frames that were drawn last, uint8 ``[*B, H, W, 3]``.
@@ -414,6 +262,11 @@ class SimulationEnv(EnvBase):
         for simulation, seed in zip(self.simulations, seeds, strict=True):
             simulation.seed(seed)
 
+    def _arrays(self) -> dict[str, np.ndarray]:
+        """Return what checkpoints hold besides the simulations, by name."""
+        flags = {"begun": self._begun, "success": self._success, "failure": self._failure}
+        return {"task": self._task, **flags}
+
     def simulation_state(self) -> dict[str, Any]:
         """Return all that the future depends on, for checkpoints.
 
@@ -422,11 +275,8 @@ class SimulationEnv(EnvBase):
         """
         return {
             "simulations": [simulation.save() for simulation in self.simulations],
-            "task": torch.from_numpy(self._task.copy()),
-            "begun": torch.from_numpy(self._begun.copy()),
-            "success": torch.from_numpy(self._success.copy()),
-            "failure": torch.from_numpy(self._failure.copy()),
             "current": {key: torch.from_numpy(v.copy()) for key, v in self._current.items()},
+            **{key: torch.from_numpy(v.copy()) for key, v in self._arrays().items()},
         }
 
     def load_simulation_state(self, state: dict[str, Any]) -> None:
@@ -452,10 +302,8 @@ class SimulationEnv(EnvBase):
             )
         for simulation, saved in zip(self.simulations, state["simulations"], strict=True):
             simulation.load(saved)
-        self._task[:] = state["task"].numpy()
-        self._begun[:] = state["begun"].numpy()
-        self._success[:] = state["success"].numpy()
-        self._failure[:] = state["failure"].numpy()
+        for key, value in self._arrays().items():
+            value[:] = state[key].numpy()
         for key, value in self._current.items():
             value[:] = state["current"][key].numpy()
 
@@ -498,7 +346,3 @@ class RobotEnv(SimulationEnv):
         super()._make_specs(frame_shape, state_size, action_size)
         self.observation_spec["executed_action"] = self.action_spec.clone()
         self._current["executed_action"] = np.zeros((1, action_size), np.float32)
-
-    def _record_executed(self, row: int, action: NDArray[np.float64], outcome: Outcome) -> None:
-        executed = checked_executed(self.simulations[row], action, outcome)
-        self._current["executed_action"][row] = executed

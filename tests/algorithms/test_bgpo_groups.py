@@ -1,14 +1,10 @@
 """BGPO with groups of behaviors: experts, balanced replay, and demonstrations as experience."""
 
-import math
 from dataclasses import replace
 
 import pytest
 import torch
 
-from bgpo_trl.configs import BGPOConfig
-from bgpo_trl.encoders.pretrained import load_pretrained
-from bgpo_trl.modules.gwr import GWRB
 from bgpo_trl.transforms import TaskSchedule
 from tests.algorithms.playing import assert_same, perceptron, play, spy_batches
 
@@ -175,54 +171,3 @@ def test_nothing_is_known_of_tasks_that_have_not_been_presented(make_bgpo, bank)
     for index in range(2):
         policies = [one.snapshot(index, shown, task, torch.Generator()) for one in both]
         assert_same(*(policy.state_dict() for policy in policies))
-
-
-@pytest.mark.parametrize("limit", [5.0, None])
-def test_the_bonus_is_for_latents_as_they_are_and_the_policy_sees_them_clipped_if_there_is_a_limit(
-    make_bgpo, encoders, bank, monkeypatch, limit
-):
-    """Latents much longer than they should be: phi_g is still that of a demonstration."""
-    raw, latent = [], encoders.frame_network.latent
-
-    def stretched(pixels):
-        stretch = 200 * latent(pixels)
-        raw.append(stretch.flatten())  # of the only seed
-        return stretch
-
-    monkeypatch.setattr(encoders.frame_network, "latent", stretched)
-    algorithm = make_bgpo("all", seeds=(3,), state_limit=limit)
-    assert algorithm.world.env.observation_spec["latent"].shape == (1, 64)
-    bound = math.inf if limit is None else limit
-    raw.clear()  # what was seen to make the specs
-    data = play(algorithm, 25)[0][0]
-    frames, trajectory, n_ended, n_clipped = iter(raw), [], 0, 0
-    trajectory.append(next(frames))
-    for step in data:
-        assert step["latent"].equal(trajectory[-1].clamp(-bound, bound))
-        n_clipped += int((trajectory[-1].abs() > 5).sum())
-        trajectory.append(next(frames))
-        assert step["next", "latent"].equal(trajectory[-1].clamp(-bound, bound))
-        if step["next", "done"]:
-            length = torch.tensor([len(trajectory)])
-            phi_g = encoders.lae.encode(torch.stack(trajectory)[None], length)[0]
-            bonus = torch.exp(-(step["behavior"] - phi_g).norm())
-            torch.testing.assert_close(step["next", "intrinsic_reward"][0], bonus)
-            trajectory, n_ended = [next(frames)], n_ended + 1
-    assert n_ended > 3
-    assert n_clipped > 100
-
-
-def test_the_bonus_tells_right_from_wrong_on_the_shipped_bank():
-    """For a trajectory just like a demonstration, by what GWR-B says of another one."""
-    bank = load_pretrained()[1]
-    seen, held_out = bank.seen(), bank.held_out()
-    gwr = GWRB(32, BGPOConfig().gwr, generator=torch.Generator().manual_seed(0))
-    order = torch.randperm(len(seen.task), generator=torch.Generator().manual_seed(1))[:300]
-    for phi in seen.embedding[order]:
-        gwr.adapt(phi)
-    behavior = gwr.lookup(held_out.embedding).embedding
-    bonus = torch.exp(-torch.cdist(behavior, held_out.embedding))
-    same = held_out.task.unsqueeze(1) == held_out.task
-    # Half of the demonstrations of a task are from the other side of the table.
-    assert bonus[same].median() > 0.1
-    assert bonus[~same].median() < 0.05

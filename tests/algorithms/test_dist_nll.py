@@ -15,7 +15,6 @@ from tests.algorithms.playing import (
     SCHEDULE,
     assert_same,
     choice,
-    make_batch,
     perceptron,
     play,
     snapshot,
@@ -39,28 +38,6 @@ def teachers_action(algorithm, seed, task, state):
     return perceptron(
         weights_of(algorithm.learner.loss.actor_network_params, seed, task), state
     ).tanh()
-
-
-def test_a_teacher_learns_from_the_transitions_of_its_own_task_only(make):
-    """All that happens in task 1 is changed in one of two runs."""
-    first, second = make(), make()
-    for step in range(40):
-        transition = make_batch(2, n_state=SIZE, seed=step)
-        transition["task"] = torch.tensor([step % 3, step % 2])
-        changed = transition.clone()
-        for key in ("state", "action", ("next", "state"), ("next", "reward")):
-            others = transition["task"].unsqueeze(-1) != 1
-            changed[key] = transition[key].where(others, -transition[key])
-        for algorithm, data in ((first, transition), (second, changed)):
-            algorithm.update()
-            algorithm.store(data)
-    compared = 0
-    for key, value in first.learner.loss.state_dict().items():
-        if value.ndim > 2:  # weights
-            differs = (value != second.learner.loss.state_dict()[key]).flatten(2).any(-1)
-            assert differs.tolist() == 2 * [[False, True, False]], key
-            compared += 1
-    assert compared == 16
 
 
 def test_teachers_learn_from_demonstrations_too_and_students_do_not(make, bank):
@@ -220,12 +197,3 @@ def test_a_task_of_which_nothing_is_known_has_a_head_that_does_nothing(make):
     for task in range(N_TASKS):
         assert not start["mlp.layers.1.weight"][task].any()
         assert bool(frozen["mlp.layers.1.weight"][task].any()) == (task == 0)
-
-
-def test_the_last_batch_of_a_distillation_has_what_is_left(make):
-    algorithm, sizes = make(samples=24, distillation_batch_size=7), []
-    for loss in algorithm._distillation:
-        loss.register_forward_pre_hook(lambda _, inputs: sizes.append(inputs[0].shape[-1]))
-    play(algorithm, 40)
-    assert len(sizes) > 8
-    assert sizes == [7, 7, 7, 3] * (len(sizes) // 4)

@@ -12,7 +12,6 @@ from bgpo_trl.algorithms.experts import ActiveGroups, Experts
 from bgpo_trl.algorithms.rl import LearnerSpec, make_learner
 from bgpo_trl.configs import SHOWN, RLConfig
 from tests.algorithms.playing import make_batch
-from tests.helpers import through_a_file
 
 KINDS = {"actor": RLConfig(), "both": SHOWN}  # by their proposals
 every_kind = pytest.mark.parametrize("name", KINDS)
@@ -230,65 +229,3 @@ def test_a_group_that_ends_is_put_aside_and_comes_back_as_it_was(name):
     experts.play([1, 0])
     for group, tensors in kept.items():
         assert not differing(tensors_of(experts, 0, slot_of(experts, 0, group)), tensors)
-
-
-@every_kind
-def test_a_seed_of_a_batch_is_that_seed_alone(name):
-    """Also where the other has more active groups, or its groups rest."""
-    together = make(name, most=3, rest_after=7)
-    alone = make(name, most=3, rest_after=7, seeds=SEEDS[1:])
-    generator = torch.Generator().manual_seed(2)
-    widths = set()
-    for step in range(40):
-        first, second = torch.randint(6, (2,), generator=generator).tolist() if step else (0, 0)
-        if step % 16 > 8:
-            second = 2
-        slots = together.play([first, second])
-        assert alone.play([second]).tolist() == slots[1:].tolist()
-        widths.add((width_of(together), width_of(alone)))
-        learn(together, step)
-        learn(alone, step, slice(1, 2))
-    assert len(widths) > 3
-    for group in range(6):
-        ours = policy_of(together, 1, group)
-        for key, value in policy_of(alone, 0, group).items():
-            torch.testing.assert_close(ours[key], value, rtol=1e-4, atol=1e-5)
-
-
-@every_kind
-def test_restored_experts_go_on_bit_for_bit(name):
-    def play(experts, steps):
-        for step in steps:
-            experts.play([step % 5, step % 3])
-            learn(experts, step)
-
-    experts, restored = make(name), make(name, seeds=(0, 1))
-    play(experts, range(13))
-    play(restored, range(4))
-    parts = {"learner": experts.learner.state_dict(), "experts": experts.state_dict()}
-    state = through_a_file(parts)
-    restored.load_state_dict(state["experts"])
-    restored.learner.load_state_dict(state["learner"])
-    for one in (experts, restored):
-        play(one, range(13, 25))
-    assert restored.active.group.equal(experts.active.group)
-    for seed in range(2):
-        for slot in range(len(experts.active.groups[seed])):
-            ours, theirs = (tensors_of(one, seed, slot) for one in (experts, restored))
-            assert not differing(ours, theirs)
-        for group in range(6):
-            ours, theirs = (policy_of(one, seed, group) for one in (experts, restored))
-            assert not differing(ours, theirs)
-
-
-def test_an_expert_that_rests_is_left_as_it_is_and_one_that_does_not_is_not():
-    experts, seen = make("both", most=3, rest_after=5), {}
-    # Group 0 rests from the fifth step after its own until it is played again.
-    for step, group in enumerate([0, 1, 1, 1, 1, *[1] * 7, 0, 0]):
-        experts.play([group, 0])
-        learn(experts, step)
-        seen[step] = policy_of(experts, 0, 0)
-        assert (experts.active.groups[0] == [1]) == (5 <= step < 12)
-    assert differing(seen[2], seen[4])
-    assert not any(differing(seen[step], seen[4]) for step in range(5, 12))
-    assert differing(seen[13], seen[4])

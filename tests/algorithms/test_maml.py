@@ -74,23 +74,3 @@ def test_each_half_of_a_tasks_batch_has_its_share_of_demonstrations(make_task_al
             assert (of_frame[shown[[3, 7]].long().argmax(-1)] == task).all()
             n_batches += 1
     assert n_batches > 50
-
-
-def test_testing_adapts_to_as_many_demonstrations_of_the_task_as_training(
-    make_task_algorithm, bank
-):
-    options = {"state": "latent", "task_batch_size": 8, "adaptation_size": 20}
-    algorithm = make_task_algorithm("maml-demonstrations", **options)
-    play(algorithm, 45)
-    adapted_to, adapt = [], algorithm.loss.adapt
-    algorithm.loss.adapt = lambda data: (adapted_to.append(data), adapt(data))[1]
-    for _ in range(2):
-        snapshot(algorithm, 0, seed=5)
-    first, second = adapted_to
-    assert (first == second).all()
-    assert first.shape == (2, N_TASKS, 20)
-    assert first["priority_weight"].all()
-    steps = bank.seen().steps
-    latents = steps.latents(torch.arange(len(steps.latent)))
-    is_shown = (first["latent"].unsqueeze(-2) == latents).all(-1).any(-1)
-    assert (is_shown.sum(-1) == 5).all()  # a share of .25

@@ -12,7 +12,6 @@ from tests.algorithms.playing import (
     assert_same,
     perceptron,
     play,
-    snapshot,
     spy_batches,
     weights_of,
 )
@@ -73,23 +72,6 @@ def test_the_first_update_comes_after_the_warm_up_when_some_task_fills_a_batch_f
 
 
 @both
-def test_tasks_that_are_never_presented_make_no_difference(make, name):
-    ddpg = replace(make(name).config.rl, warmup_steps=10)  # as many as three tasks need
-    three, one = (make(name, schedule=TaskSchedule(s), rl=ddpg) for s in ((0, 99, 99), (0,)))
-    start = deepcopy(networks(three.learner.loss))
-    ours, theirs = play(three, 30)[0], play(one, 30)[0]
-    torch.testing.assert_close(ours["action"], theirs["action"], rtol=1e-4, atol=1e-5)
-    alone = networks(one.learner.loss)
-    for key, value in networks(three.learner.loss).items():
-        if value.shape[1] != N_TASKS:  # MAML's own policy, which all tasks share
-            torch.testing.assert_close(value, alone[key], rtol=1e-4, atol=1e-5)
-            continue
-        torch.testing.assert_close(value[:, 0], alone[key][:, 0], rtol=1e-4, atol=1e-5)
-        if "value" in key:
-            assert value[:, 1:].equal(start[key][:, 1:])
-
-
-@both
 def test_tasks_can_share_a_batch_in_equal_parts(make, name):
     """By hand: 24 transitions are 24 of one task, 12 of each of two, 8 of each of three."""
     schedule = TaskSchedule((0, 3, 6))
@@ -143,19 +125,6 @@ def test_networks_stay_as_they_were_until_there_is_data_of_their_task(make, name
     assert not any(stages[0])
     assert all(stages[-1])
     assert len(set(stages)) > 3
-
-
-@both
-def test_demonstrations_are_never_read(make, name):
-    seeing, blind = make(name), make(name)
-    ours, _ = play(seeing, 40)
-    theirs, _ = play(blind, 40, hidden=["demo_embedding"])
-    for key in ("action", "state", "demo_index", ("next", "reward")):
-        assert ours[key].equal(theirs[key]), key
-    assert_same(dict(seeing.learner.loss.state_dict()), dict(blind.learner.loss.state_dict()))
-    for index in range(2):
-        nothing = snapshot(blind, index, embedding=float("nan"))
-        assert_same(snapshot(seeing, index).parameters, nothing.parameters)
 
 
 def test_a_replay_too_small_to_fill_a_batch_is_refused(make, make_config):

@@ -46,18 +46,6 @@ def test_what_is_not_whole_is_refused_in_one_line(copy, damage, message):
         assert "record it again with `bgpo record PATH`" in str(error.value)
 
 
-def test_a_flipped_byte_is_noticed(copy):
-    for key in sorted(KEYS):
-        values = np.memmap(copy / f"{key}.memmap", np.uint8, "r+")
-        values[len(values) // 2] ^= 1
-        values.flush()
-        with pytest.raises(ValueError, match=r"is damaged \(checksum differs\)"):
-            load_demonstrations(copy)
-        values[len(values) // 2] ^= 1
-        values.flush()
-    assert len(load_demonstrations(copy)) == 9
-
-
 TASKS = ("grasp_glass", "push_green_to_white")
 
 

@@ -8,7 +8,6 @@ import torch
 from tensordict import TensorDict
 
 from bgpo_trl.data.demonstration_replay import DemonstrationReplay
-from tests.helpers import through_a_file
 
 CONSTANT = ["behavior", "label"]
 
@@ -155,39 +154,6 @@ def test_demonstrations_and_their_steps_are_drawn_equally_often(bank):
     for rows, n_steps in ((is_long, 5), (~is_long, 2)):
         ends = drawn["next", "terminated"][rows].float().mean()
         assert float(ends) == pytest.approx(1 / n_steps, abs=0.03)
-
-
-def test_a_seed_of_a_stack_is_that_seed_alone(bank):
-    together = make(bank.seen(), n_seeds=3)
-    alone = [
-        DemonstrationReplay(bank.seen(), generator=[stream], constant_keys=["behavior"])
-        for stream in generators(3)
-    ]
-    asked = torch.tensor([[0, 1, 0, -1]])
-    for step in range(8):
-        data, group = episode(step, 2 * step, step + 3), torch.tensor([step % 2, 0, 1])
-        reward, mask = torch.full([3], 1.0 + step / 100), torch.tensor([True, step % 3 == 0, True])
-        together.add(data, reward, group, mask)
-        for seed, replay in enumerate(alone):
-            rows = slice(seed, seed + 1)
-            replay.add(data[rows], reward[rows], group[rows], mask[rows])
-        assert len(together) == min(len(replay) for replay in alone)
-        drawn = together.sample(asked.expand(3, -1))
-        for seed, replay in enumerate(alone):
-            other, has = replay.sample(asked)[0], drawn["priority_weight"][seed] > 0
-            assert other["priority_weight"].equal(drawn["priority_weight"][seed])
-            for key in ("latent", "action", ("next", "latent"), ("next", "reward")):
-                assert other[key][has].equal(drawn[seed][key][has])
-
-
-def test_a_restored_replay_continues_as_the_saved_one(shown, bank):
-    shown.sample(GROUP)
-    restored = make(bank.seen(), first=30)
-    restored.load_state_dict(through_a_file(shown.state_dict()))
-    for step in range(3):
-        assert (restored.sample(GROUP) == shown.sample(GROUP)).all()
-        for replay in (restored, shown):
-            show(replay, [(step, 1.0, 1), (2 + step, 1.0, 1)])
 
 
 def test_a_bank_without_steps_is_refused(bank):

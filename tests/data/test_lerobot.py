@@ -118,7 +118,7 @@ def test_statistics_are_those_of_all_frames(written):
 
 
 def test_long_datasets_are_spread_over_several_files(tmp_path, monkeypatch):
-    monkeypatch.setattr(lerobot, "_FILE_MB", 0)
+    monkeypatch.setattr(lerobot, "_FILE_BYTES", 1)
     monkeypatch.setattr(lerobot, "_FILES_PER_CHUNK", 2)
     path = tmp_path / "many"
     write_lerobot(path, dataset_of(), tasks=TASKS, fps=5)

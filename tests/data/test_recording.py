@@ -1,17 +1,13 @@
 import re
-import shutil
 
-import numpy as np
 import pytest
 import torch
 
 from bgpo_trl.data import recording as demonstrations
 from bgpo_trl.data.dataset import load_demonstrations, open_dataset, read_meta
 from bgpo_trl.data.recording import record_demonstrations
-from bgpo_trl.scenes import nico as nico_scene
 from suites import nico
-from suites.nico.demonstrator import Demonstrator
-from tests.helpers import contents, edit
+from tests.helpers import contents
 
 TINY = {"per_task": 3, "held_out_per_task": 1, "progress": False}
 KEYS = {"pixels", "state", "action", "length", "task", "train", "seed"}
@@ -26,26 +22,13 @@ def test_recording_returns_what_loading_does(recorded):
         assert dataset[key].shape == (9, *shapes.get(key, ()))
     assert dataset["pixels"].dtype == torch.uint8
     assert dataset["length"].dtype == dataset["task"].dtype == torch.int64
-    again = record_demonstrations(recorded, **TINY)  # complete: only opened
-    for key in KEYS:
-        torch.testing.assert_close(again[key], dataset[key], rtol=0, atol=0)
-
-
-def test_tasks_and_held_out_ones_are_marked(recorded):
-    dataset = load_demonstrations(recorded)
-
     assert dataset["task"].tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 2]
     assert dataset["train"].tolist() == [True, True, False] * 3
     assert dataset["seed"].tolist() == [0] * 9
-
-
-def test_demonstrations_differ_from_each_other_and_between_seeds(recorded, tmp_path):
-    starts = load_demonstrations(recorded)["state"][:, 0]
-    other = record_demonstrations(
-        tmp_path, tasks=["grasp_glass"], per_task=1, held_out_per_task=0, seed=1, progress=False
-    )
-
-    assert len(torch.cat([starts, other["state"][:, 0]]).unique(dim=0)) == 10
+    assert len(dataset["state"][:, 0].unique(dim=0)) == 9
+    again = record_demonstrations(recorded, **TINY)  # complete: only opened
+    for key in KEYS:
+        torch.testing.assert_close(again[key], dataset[key], rtol=0, atol=0)
 
 
 def test_padding_is_zero_and_the_rest_is_not(recorded):
@@ -98,26 +81,6 @@ def test_play_follows_a_demonstration_and_then_moves_at_random(tmp_path):
     again = record_demonstrations(tmp_path / "again", play=True, **options)
     for key in KEYS:
         assert again[key].equal(play[key])
-
-
-def test_a_demonstration_that_fails_is_tried_again(tmp_path, monkeypatch):
-    attempts = []
-
-    class ClumsyAtFirst(Demonstrator):
-        def reset(self):
-            super().reset()
-            attempts.append(self)
-
-        def __call__(self, timestep):
-            return super().__call__(timestep) if len(attempts) > 2 else np.zeros(4)
-
-    monkeypatch.setattr(nico_scene, "Demonstrator", ClumsyAtFirst)
-    dataset = record_demonstrations(
-        tmp_path, tasks=["grasp_glass"], per_task=1, held_out_per_task=0, progress=False
-    )
-
-    assert len(attempts) >= 3
-    assert dataset["action"].abs().sum() > 1
 
 
 class Fickle(nico.TASKS["push_green_to_white"]):
@@ -174,30 +137,6 @@ def test_an_interrupted_recording_ends_as_an_uninterrupted_one(recorded, tmp_pat
     assert contents(tmp_path) == contents(recorded)
 
 
-def test_missing_rows_are_recorded_again(recorded, copy):
-    length = np.memmap(copy / "length.memmap", np.int64, "r+")
-    length[[1, 8]] = 0
-    length.flush()
-    pixels = np.memmap(copy / "pixels.memmap", np.uint8, "r+").reshape(9, -1)
-    pixels[8, :1000] = 7  # as after a kill in the middle of a row
-    pixels.flush()
-    edit(copy / "dataset.json", checksum=None)
-
-    record_demonstrations(copy, **TINY)
-
-    assert contents(copy) == contents(recorded)
-
-
-@pytest.mark.parametrize("wrong", [{"seed": 1}, {"tasks": ["grasp_glass"]}])
-def test_another_recording_is_not_continued(copy, wrong):
-    before = contents(copy)
-
-    with pytest.raises(ValueError, match=r"holds another recording .*; choose another folder or"):
-        record_demonstrations(copy, **{**TINY, **wrong})
-
-    assert contents(copy) == before
-
-
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
@@ -211,13 +150,3 @@ def test_wrong_arguments_are_refused_before_anything_is_written(tmp_path, wrong,
         record_demonstrations(tmp_path / "new", **{**TINY, **wrong})
 
     assert not (tmp_path / "new").exists()
-
-
-def test_a_full_disk_is_noticed_before_recording(tmp_path, monkeypatch):
-    usage = shutil.disk_usage(tmp_path)._replace(free=10**6)
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
-
-    with pytest.raises(OSError, match=r"^the dataset takes 0\.0 GB, .* has 0\.0 GB left: make ro"):
-        record_demonstrations(tmp_path, **TINY)
-
-    assert not list(tmp_path.iterdir())

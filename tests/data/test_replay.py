@@ -134,19 +134,6 @@ def test_a_transition_of_several_steps_is_a_plain_walk(capacity, n_steps, played
             assert row["next", "done"].item() == last[5]
 
 
-def test_entries_are_drawn_as_they_are_sampled_also_some_of_them():
-    groups, asked = [(0, 1), (1, 1), (0, 0), (2, 1)], torch.tensor([[0, 1, 0, -1], [1, 1, 0, 7]])
-    first, second, third = make(), make(), make()
-    for replay in (first, second, third):
-        fill(replay, groups)
-    sampled, drawn, some = first.sample(asked), second.draw(asked), third.draw(asked, keys=KEYS[1:])
-    assert drawn.keys() == {*sampled.keys(True, True)} - {"next"}
-    assert some.keys() == {KEYS[1], "priority_weight"}
-    filled = drawn["priority_weight"] > 0
-    for entries in (drawn, some):
-        assert all(entry[filled].equal(sampled[key][filled]) for key, entry in entries.items())
-
-
 def test_the_latest_transitions_of_a_group_and_their_weights_by_hand():
     replay = make(capacity=5)
     fill(replay, [(0, 1), (0, 1), (1, 1), (0, 0), (0, 1), (1, 1), (0, 0)])  # the last five are left

@@ -8,7 +8,6 @@ from bgpo_trl.encoders.pretrained import load_pretrained
 from bgpo_trl.modules.behavior_groups import BehaviorGroups
 from bgpo_trl.transforms import TaskSchedule
 from suites import nico
-from tests.helpers import through_a_file
 
 PLACES = 12.0 * torch.eye(4)
 
@@ -134,22 +133,6 @@ def test_behaviors_that_differ_in_a_small_feature_have_their_groups():
     assert len({*zip(which[300:].tolist(), found.group.tolist(), strict=True)}) == 2
 
 
-@pytest.mark.parametrize("n_shown", [0, 55])
-def test_loaded_groups_continue_identically(n_shown):
-    groups, restored = BehaviorGroups(4), BehaviorGroups(4)
-    inputs = torch.cat([around(place, 40) for place in (0, 1, 2)])
-    show(groups, inputs[:n_shown])
-    restored.load_state_dict(through_a_file(groups.state_dict()))
-    assert restored.numbers == groups.numbers
-    for phi in inputs[n_shown:]:
-        ours, theirs = groups.adapt(phi), restored.adapt(phi)
-        assert ours.group.equal(theirs.group)
-        assert ours.novelty.equal(theirs.novelty)
-    assert restored.numbers == groups.numbers == [0, 1, 2]
-    assert restored.revision == groups.revision
-    assert restored.parent == groups.parent
-
-
 @pytest.mark.parametrize(
     "phi", [torch.zeros(5), torch.full((4,), torch.nan), torch.zeros(2, 5)], ids=str
 )
@@ -244,14 +227,3 @@ def test_vectors_embedded_twice_are_one_demonstration_whatever_their_rounding():
         twice.adapt(point + 1e-6 * point.norm() * torch.randn(4, generator=noise))
     assert len(twice.numbers) == len(once.numbers) == 2
     assert twice.state_dict()["shown"].tolist() == [2] * len(points)
-
-
-def test_inputs_may_be_lists_and_arrays():
-    of_tensors, of_others = BehaviorGroups(4), BehaviorGroups(4)
-    for number, point in enumerate(torch.cat([around(0, 30), around(1, 30, seed=1)])):
-        of_tensors.adapt(point)
-        of_others.adapt(point.numpy() if number % 2 else point.tolist())
-    for place in PLACES[:2]:
-        assert of_others.lookup(place.tolist()).group == of_tensors.lookup(place).group
-    with pytest.raises(ValueError, match="phi must be a tensor, an array, or lists"):
-        of_others.adapt([[1.0], [2.0, 3.0]])

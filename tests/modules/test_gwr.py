@@ -198,21 +198,6 @@ def test_activity_scale_has_the_effect_of_scaled_inputs(scale):
     assert not torch.equal(unscaled.num_nodes, plain.num_nodes)
 
 
-def test_best_match_and_neighbor_learn_and_habituate():
-    gwr = from_data([[0.0, 0.0], [1.0, 0.0]])
-    match = gwr.adapt(torch.tensor([0.25, 0.5]))
-    assert match.embedding.tolist() == [0.0, 0.0]  # from before learning
-    graph = gwr.graph()
-    assert graph.weights.tolist() == [
-        pytest.approx([0.1 * 0.25, 0.1 * 0.5]),
-        pytest.approx([1 - 0.01 * 0.75, 0.01 * 0.5]),
-    ]
-    assert graph.habituation.tolist() == pytest.approx([0.7404474, 0.9325757])
-    gwr.adapt(torch.tensor([0.25, 0.5]))
-    step = 0.1 * 0.7404474 * (0.25 - 0.025)
-    assert gwr.graph().weights[0, 0].item() == pytest.approx(0.025 + step)
-
-
 def test_best_match_and_neighbor_have_constants_of_their_own():
     config = GWRBConfig(
         initial_habituation=0.5, alpha_best=2.0, alpha_neighbor=4.0, tau_best=2.0, tau_neighbor=4.0,
@@ -345,12 +330,6 @@ def test_damaged_state_is_rejected(damage):
         with pytest.raises(ValueError, match="damaged"):
             gwr.set_extra_state(state)
     assert_same(gwr.get_extra_state(), [before])
-
-
-def test_removed_nodes_cost_no_memory():
-    gwr = grown(3, n=2000, config=replace(GROWING, max_age=1), max_nodes=12)
-    assert gwr.graph().node[-1] > 200  # so many nodes there were
-    assert sum(buffer.numel() for buffer in gwr.buffers()) <= 50 * 4
 
 
 def test_network_that_grew_in_inference_mode_learns_outside():

@@ -8,8 +8,6 @@ import pytest
 import torch
 from sklearn.base import clone
 from sklearn.datasets import make_blobs
-from sklearn.model_selection import GridSearchCV
-from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.utils.estimator_checks import check_estimator
 
@@ -63,23 +61,6 @@ def test_estimator_equals_the_network_that_adapts_to_the_rows(rows):
     whole = clone(model).fit(rows)
     assert whole.labels_.tolist() == match.node.tolist()
     assert whole.fit(rows[:2]).gwr_.num_nodes == 2  # a new network
-
-
-def test_pipelines_and_grid_searches_take_the_estimator(rows):
-    model = GWRBEstimator(GWRBConfig(activity_scale=4.0))
-    pipeline = make_pipeline(StandardScaler(), model)
-    labels = pipeline.fit_predict(100 * rows + 7)
-    assert pipeline.transform(100 * rows + 7).shape == rows.shape
-    assert pipeline.get_feature_names_out(["x", "y"]).tolist() == ["x", "y"]
-    assert labels.tolist() == model.fit_predict(rows).tolist()
-    grid = {"config": [GWRBConfig(activity_scale=scale) for scale in (0.01, 4.0)]}
-
-    def score(model, X, y=None):
-        return -np.abs(model.transform(X) - X).mean()
-
-    assert GridSearchCV(model, grid, scoring=score).fit(rows).best_params_ == {
-        "config": GWRBConfig(activity_scale=4.0)
-    }
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, 1e200])

@@ -220,34 +220,6 @@ def test_a_task_of_weight_zero_changes_nothing_and_is_not_adapted_to():
     torch.testing.assert_close(result.detach(), expected)
 
 
-def test_each_seed_of_a_stack_has_the_gradient_that_it_has_alone():
-    together = stack_loss(3, inner_learning_rate=0.5)
-    # Targets that are no copies of what is learned, and a task that is known to one seed only.
-    for params in (together.target_actor_network_params, together.target_value_network_params):
-        for w in params.parameters():
-            w.data.mul_(1.5)
-    batch = weighted(transitions(3, TASKS, 8), 1.0, 1.0, 1.0)
-    batch["priority_weight"][1:, 2] = 0
-    whole = total(together(batch))
-    whole.backward()
-    values = 0.0
-    for seed in range(3):
-        alone = stack_loss(None, inner_learning_rate=0.5)
-        mine, theirs = dict(alone.named_parameters()), dict(together.named_parameters())
-        mine |= dict(alone.named_buffers())
-        theirs |= dict(together.named_buffers())
-        for name, w in mine.items():
-            if w.ndim:  # not the discount
-                w.data.copy_(theirs[name].data[seed])
-        value = total(alone(batch[seed].clone()))
-        value.backward()
-        values = values + value.detach()
-        for ours, of_all in zip(gradients(alone), gradients(together), strict=True):
-            torch.testing.assert_close(of_all[seed], ours)
-            assert ours.abs().sum() > 0
-    torch.testing.assert_close(whole.detach(), values)
-
-
 def test_what_does_not_fit_is_refused():
     for meta, adapted, value in (
         ([2], [3, 2], [3, 2]), ([2], [2], [2]), ([], [3], [2]), ([], [], []),

@@ -14,7 +14,6 @@ from torchrl.envs import (
     step_mdp,
 )
 
-from bgpo_trl.files.checkpoint import load_checkpoint, save_checkpoint
 from bgpo_trl.scenes.nico import NicoEnv
 from suites import nico
 from suites.nico.demonstrator import Demonstrator
@@ -194,29 +193,6 @@ def test_episodes_have_no_time_limit_without_a_step_counter():
     last = limited.rollout(60, policy=lambda td: td.set("action", torch.zeros(4)))[-1]["next"]
     assert (last["truncated"].item(), last["terminated"].item()) == (True, False)
     assert last["step_count"] == 50
-
-
-@pytest.mark.parametrize("batch_size", [(), (2, 2)])
-def test_it_continues_bit_for_bit_from_a_saved_state(tmp_path, batch_size):
-    env = NicoEnv(batch_size=batch_size, observation="both")
-    steps = actions(env, 9)
-    task = torch.arange(env.batch_size.numel()).reshape(batch_size) % 3
-    td = run(env, env.reset(TensorDict({"task": task}, batch_size)), steps[:4])[-1]
-    save_checkpoint(tmp_path, env.simulation_state())
-
-    def go_on(env: NicoEnv) -> list[TensorDictBase]:
-        first = run(env, td.exclude("reward"), steps[4:])
-        start = env.reset()  # draws random numbers
-        return [first, start.clone(), run(env, start, steps[:3])]
-
-    expected = go_on(env)
-    env.load_simulation_state(load_checkpoint(tmp_path))
-    fresh = NicoEnv(batch_size=batch_size, seed=99, observation="both")
-    fresh.load_simulation_state(load_checkpoint(tmp_path))
-
-    for actual in (go_on(env), go_on(fresh)):
-        for first, second in zip(actual, expected, strict=True):
-            assert_equal(first, second)
 
 
 def test_observations_and_saved_states_share_no_memory_with_the_environment():

@@ -6,7 +6,6 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from tensordict import TensorDict
 from torchrl.envs import check_env_specs
 
 from bgpo_trl.algorithms import ALGORITHMS
@@ -131,12 +130,6 @@ def test_several_robots_are_refused_in_one_line(refused):
         "there is one robot, and 2 are asked for",
         "train one seed (seeds=(0,)), without tests (eval_episodes=0)",
     )
-
-
-def test_a_start_of_a_task_is_asked_for_by_its_name():
-    env = robot_scene().simulate(["right", "left"], batch_size=[1])
-    env.reset(TensorDict({"task": torch.tensor([1])}, [1]))
-    assert env.simulations[0].task == "left"
 
 
 @pytest.mark.parametrize(

@@ -189,7 +189,8 @@ class Told(SavedDot):
         super().reset({name: short for short, name in SENTENCES.items()}[task])
 
 
-def test_a_run_of_tasks_named_by_sentences_is_loaded_and_filmed(tmp_path, monkeypatch):
+def test_a_run_learns_on_another_robot_and_is_loaded_and_filmed(tmp_path, monkeypatch):
+    """Its tasks have names that commas and slashes could tear apart."""
     names = tuple(SENTENCES.values())
     short = {name: task for task, name in SENTENCES.items()}
     told = replace(
@@ -198,7 +199,7 @@ def test_a_run_of_tasks_named_by_sentences_is_loaded_and_filmed(tmp_path, monkey
         default_tasks=names,
     )
     monkeypatch.setitem(SCENES, "dot", told)
-    made = make_pretrained(
+    encoders, bank = make_pretrained(
         tmp_path / "encoders.safetensors",
         tmp_path / "demonstrations",
         folder=tmp_path / "log",
@@ -208,35 +209,29 @@ def test_a_run_of_tasks_named_by_sentences_is_loaded_and_filmed(tmp_path, monkey
         held_out_per_task=2,
         progress=False,
     )
-    options = {"bank": made[1], "encoders": made[0], "progress": False}
+    options = {"bank": bank, "encoders": encoders, "progress": False}
     with Trainer(config(tasks=names), tmp_path / "run", **options) as trainer:
         trainer.run()
-        summary = measure(trainer, made[1], tmp_path / "run")
-        draw(trainer, made[1], tmp_path / "run", summary)
-    assert load_run(tmp_path / "run").bank.tasks == names
+        summary = measure(trainer, bank, tmp_path / "run")
+        draw(trainer, bank, tmp_path / "run", summary)
+    table = read_table(tmp_path / "run" / "train.csv")
+    assert (len(table), {*table["task"]}) == (8, {*names})
     films = [*(tmp_path / "run" / "figures").glob("move*.gif")]
     assert len(films) == 2
 
-
-def test_a_run_learns_on_another_robot_and_is_loaded_and_filmed(pretrained, tmp_path, monkeypatch):
-    monkeypatch.setitem(SCENES, "dot", scene())
-    train(tmp_path / "run", pretrained)
-    table = read_table(tmp_path / "run" / "train.csv")
-    assert len(table) == 8
-    assert set(table["task"]) == set(TASKS)
-
     # The encoders do not come with the scene: the run keeps them.
     policy = load_run(tmp_path / "run")
-    assert policy.encoders.identity == pretrained[0].identity
-    policy.condition(np.zeros((3, 16, 24, 3), np.uint8), task="left")
+    assert policy.encoders.identity == encoders.identity
+    assert policy.bank.tasks == names
+    policy.condition(np.zeros((3, 16, 24, 3), np.uint8), task=names[0])
     assert policy.act(np.zeros((16, 24, 3), np.uint8)).shape == (1,)
     with pytest.raises(ValueError, match=r"a frame is uint8 \[16, 24, 3\], got .*\[32, 64, 3\]"):
         policy.act(np.zeros((32, 64, 3), np.uint8))
     outcomes = watch(WatchArguments(run=tmp_path / "run"))
-    assert "left: " in outcomes
+    assert f"{names[0]}: " in outcomes
     assert (tmp_path / "run" / "figures" / "film.gif").exists()
     one_shot(OneShotArguments(run=tmp_path / "run", shares=(1.0,), episodes=2))
-    assert {*read_table(tmp_path / "run" / "one_shot.csv")["task"]} == {*TASKS}
+    assert {*read_table(tmp_path / "run" / "one_shot.csv")["task"]} == {*names}
 
 
 class Walker(Dot):
@@ -301,11 +296,11 @@ RETURNED = [
     ("step", Outcome(success=0.5), r"Outcome\(succ"),  # paid half a reward
     ("step", Outcome(success=np.nan), r"Outcome\(succ"),
     ("step", None, "None"),
-    ("state", None, "nothing: return 1 finite numbers"),  # a forgotten return was NaN
+    ("state", None, "None: return 1 finite numbers"),  # a forgotten return was NaN
     ("state", [np.nan], r"\[nan\]"),
-    ("state", [0.0, 1.0], r"float64 \[2\]"),
-    ("state", 0.0, r"float64 \[\]"),
-    ("state", ["far"], r"<U3 \[1\]"),
+    ("state", [0.0, 1.0], r"\[0.0, 1.0\]"),
+    ("state", 0.0, "0.0"),
+    ("state", ["far"], r"\['far'\]"),
 ]
 
 
@@ -365,14 +360,17 @@ def test_a_run_whose_encoders_could_not_be_loaded_again_does_not_begin(
     pretrained, tmp_path, monkeypatch
 ):
     class Mine(VAE):
-        """A frame encoder of one's own."""
+        """A frame encoder that sees something else than its weights say."""
+
+        def features(self, frames):
+            return super().features(255 - frames)
 
     monkeypatch.setitem(SCENES, "dot", scene())
     encoders, bank = pretrained
     mine = Mine(64, 1, (16, 24))
     mine.load_state_dict(encoders.frame_network.state_dict())
     with pytest.raises(
-        ValueError, match=r"could be saved, but not loaded again: [\w.<>]*Mine is of a class of"
+        ValueError, match=r"could be saved, but not loaded again .*depends on more than"
     ):
         train(
             tmp_path / "run",

@@ -6,13 +6,11 @@ One task alone is tested for behavior that the base class gives to every task.
 import itertools
 import re
 
-import mujoco
 import numpy as np
 import pytest
 
 from suites import nico
 from suites.nico import base, kinematics
-from suites.nico.demonstrator import Demonstrator
 from suites.nico.physics import OBJECT_HALF_HEIGHT, OBJECTS, TABLE_HEIGHT, Physics
 
 
@@ -230,80 +228,6 @@ def test_a_smaller_spread_scales_the_draws(load):
     assert 0.40 < whole_side.mean() < 0.60
     assert 0.16 < half_side.mean() < 0.34
     assert not (half_side & ~whole_side).any()
-
-
-def test_starts_are_at_rest(load):
-    env = load("grasp_glass", seed=3, observation="state")
-    for _ in range(5):
-        start = env.reset().observation["privileged_state"]
-        for _ in range(5):
-            end = env.step(np.zeros(4)).observation["privileged_state"]
-        np.testing.assert_allclose(end[:4], start[:4], atol=0.02)  # (rad)
-        np.testing.assert_allclose(end[4:], start[4:], atol=0.002)  # (m)
-
-
-def test_objects_are_within_reach(load):
-    env = load("grasp_glass", seed=0, observation="state")
-    physics = env.physics
-    limits = np.radians([100, 100, 85])
-    for _ in range(10):
-        env.reset()
-        for name in OBJECTS:
-            target = physics.object_position(name) + np.array([0.0, 0.0, 0.02])
-            arm = kinematics.inverse(target)
-            assert (np.abs(arm) < limits).all()
-            set_arm(physics, arm)
-            np.testing.assert_allclose(physics.grip_position(), target, atol=1e-3)
-
-
-def set_arm(physics: Physics, arm: np.ndarray) -> None:
-    physics.data.qpos[:3] = arm
-    physics.forward()
-
-
-@pytest.fixture(scope="module")
-def segmentation(physics):
-    """Simulation -> name of the body that each pixel of the frame shows, or None."""
-    renderer = mujoco.Renderer(physics.model.ptr, 32, 64)
-    renderer.enable_segmentation_rendering()
-    names = np.array([physics.model.id2name(b, "body") for b in physics.model.geom_bodyid] + [""])
-
-    def segment() -> np.ndarray:
-        renderer.update_scene(physics.data.ptr, "eyes")
-        ids, types = np.moveaxis(renderer.render(), -1, 0)
-        return names[np.where(types == mujoco.mjtObj.mjOBJ_GEOM, ids, -1)]
-
-    yield segment
-    renderer.render()  # Makes its context current, or closing would free buffers of another one.
-    renderer.close()
-
-
-def test_the_hand_stays_in_view_in_demonstrations(load, segmentation):
-    digits = ("thumb", "upper_finger", "lower_finger")
-    hand = ["hand", *(f"{digit}_{segment}" for digit in digits for segment in (1, 2, 3))]
-    in_view = []
-    for task in nico.ALL_TASKS:
-        env = load(task, seed=0, observation="state")
-        demonstrator = Demonstrator(env, seed=0)
-        for _ in range(2):
-            timestep = env.reset()
-            demonstrator.reset()
-            in_view.append(np.isin(segmentation(), hand).sum() >= 4)
-            while not timestep.last():
-                timestep = env.step(demonstrator(timestep))
-                in_view.append(np.isin(segmentation(), hand).sum() >= 4)
-    assert len(in_view) > 200
-    assert np.mean(in_view) >= 0.98
-
-
-def test_objects_are_at_least_4_pixels_wide(load, segmentation):
-    env = load("grasp_glass", seed=0, observation="state")
-    for _ in range(20):
-        env.reset()
-        set_arm(env.physics, np.array([0.0, -1.5, 0.0]))  # out of the way
-        shown = segmentation()
-        for name in OBJECTS:
-            assert (shown == name).any(axis=0).sum() >= 4
 
 
 def test_bad_arguments_are_refused():
