@@ -217,34 +217,6 @@ def test_a_seed_is_restored_though_another_has_stored_nothing_yet():
     assert drawn["latent"][0].item() == 4
 
 
-@pytest.mark.parametrize("restored", [False, True])
-def test_a_cleared_seed_draws_nothing_and_then_only_what_it_stores_anew(restored):
-    replay, untouched = make(10), make(10)
-    for one in (replay, untouched):
-        fill(one, [(0, 0)] * 13)
-    replay.clear(1)
-    if restored:
-        state, replay = through_a_file(replay.state_dict()), make(10, first=9)
-        replay.load_state_dict(state)
-    assert replay.sizes(torch.zeros(2, 1).long()).tolist() == [[10], [0]]
-    with pytest.raises(ValueError, match="every seed needs a transition"):
-        replay.sample(torch.zeros(2, 5).long())
-    asked = torch.tensor([[0] * 5, [-1] * 5])
-    drawn = replay.sample(asked)
-    assert (drawn[0] == untouched.sample(asked)[0]).all()
-    assert not any(value.any() for value in drawn[1].values(True, True))
-    for one in (replay, untouched):
-        fill(one, [(1, 0)] * 2)
-    kept, group = replay.contents(1)
-    assert kept["latent"].flatten().tolist() == pytest.approx([0.01, 1.01])
-    assert group.tolist() == [0, 0]
-    asked = torch.tensor([[0, 1, 0, 1], [0, 0, 0, 1]])
-    drawn = replay.sample(asked)
-    assert (drawn[0] == untouched.sample(asked)[0]).all()
-    assert set(drawn["latent"][1, :3].flatten().tolist()) <= set(kept["latent"].flatten().tolist())
-    assert drawn["priority_weight"][1].tolist() == [1, 1, 1, 0]
-
-
 @pytest.mark.parametrize("n_steps", [1, 3])
 def test_rows_of_the_only_seed_are_zeros_where_memory_is_not(monkeypatch, n_steps):
     keys = ["latent", ("next", "reward"), ("next", "done")]

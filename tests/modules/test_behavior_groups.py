@@ -70,16 +70,6 @@ def test_novelty_is_relative_to_the_extent_of_the_group():
     assert (along.diff() > 0).all()
 
 
-def test_groups_do_not_depend_on_the_scale_of_inputs():
-    inputs = torch.cat([around(place, 30) for place in range(3)]).double()
-    found = []
-    for scale in (0.1, 1, 10):
-        groups = BehaviorGroups(4)
-        found.append((show(groups, scale * inputs), groups.lookup(scale * inputs).group.tolist()))
-    assert all(result == found[0] for result in found)
-    assert len(set(found[0][1])) == 3
-
-
 @pytest.mark.parametrize("sizes", [(45, 75), (75, 45)])
 def test_larger_part_of_a_split_group_keeps_the_number(sizes):
     inputs = torch.cat([around(place, size) for place, size in enumerate(sizes)])

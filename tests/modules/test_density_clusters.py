@@ -66,19 +66,6 @@ def test_chance_splits_no_points_with_a_single_mode(n_points, d):
         assert not density_clusters(points @ local_whitening(points)).any()
 
 
-@pytest.mark.parametrize("d", [2, 8, 32])
-@pytest.mark.parametrize("sizes", [(25, 25), (20, 300)])
-def test_sizes_and_spreads_may_differ(sizes, d):
-    rng = np.random.default_rng(d)
-    labels = np.repeat([0, 1], sizes)
-    points = rng.normal(size=(len(labels), d)) * np.array([2.0, 1.0])[labels, None]
-    points[labels == 1, 0] += 8 * np.sqrt(d)
-    found = density_clusters(points)
-    assert found.max() == 1
-    inside = found >= 0
-    assert (found[inside] == labels[inside]).all() and inside.mean() > 0.9
-
-
 def test_cluster_needs_the_least_number_of_points_and_the_evidence():
     points, _ = blobs([90, 14])
     assert density_clusters(points).max() == 1
@@ -93,13 +80,6 @@ def test_far_points_are_outliers_only_beside_several_clusters():
     far = points.mean(0) + 30 * np.eye(6)[[4, 5]]
     assert density_clusters(np.vstack([points, far])).tolist() == [*labels, -1, -1]
     assert not density_clusters(np.vstack([points[:40], far])).any()
-
-
-def test_clusters_do_not_depend_on_the_order_of_points():
-    points, _ = blobs([30, 50, 20])
-    order = np.random.default_rng(1).permutation(len(points))
-    ours, theirs = density_clusters(points)[order], density_clusters(points[order])
-    assert len({*zip(ours.tolist(), theirs.tolist(), strict=True)}) == ours.max() + 1 == 3
 
 
 @pytest.mark.parametrize("d", [1, 2, 5])

@@ -70,18 +70,6 @@ def test_keypoints_are_expected_places_and_decode_to_blobs_there(vae: VAE) -> No
         torch.testing.assert_close(blob.max(), torch.tensor(1.0))
 
 
-@pytest.mark.parametrize("batch", [(), (0,), (2, 1, 3)])
-def test_leading_dimensions(vae: VAE, batch: tuple[int, ...]) -> None:
-    pixels = frames(*batch)
-    mu, log_variance = vae.encode(pixels)
-    assert mu.shape == log_variance.shape == vae.latent(pixels).shape == (*batch, 64)
-    decoded, action = vae.decode(mu), vae.inverse(mu, mu)
-    assert decoded.shape == pixels.shape
-    assert ((decoded >= 0) & (decoded <= 1)).all()
-    assert action.shape == (*batch, 4)
-    assert (action.abs() <= 1).all()
-
-
 def test_a_zero_last_layer_decodes_the_mean_frame_within_limits(vae: VAE) -> None:
     vae.mean_frame[:8], vae.mean_frame[8:16], vae.mean_frame[16:] = 0.3, 0.0, 1.0
     vae.decoder[-1].weight.data.zero_()
@@ -90,17 +78,6 @@ def test_a_zero_last_layer_decodes_the_mean_frame_within_limits(vae: VAE) -> Non
     torch.testing.assert_close(shown[:8], torch.full((8, 64, 3), 0.3))
     torch.testing.assert_close(shown[8:16], torch.full((8, 64, 3), 0.02))
     torch.testing.assert_close(shown[16:], torch.full((16, 64, 3), 0.98))
-
-
-def test_latent_is_standardized_mu_without_gradient(vae: VAE) -> None:
-    pixels = frames(40)
-    mu, _ = vae.encode(pixels)
-    torch.testing.assert_close(vae.latent(pixels), mu, msg="unscaled before training")
-    vae.set_latent_scale(mu, floor=0.0)
-    latent = vae.latent(pixels)
-    assert not latent.requires_grad
-    torch.testing.assert_close(latent.mean(0), torch.zeros(64), atol=1e-4, rtol=0)
-    torch.testing.assert_close(latent.std(0), torch.ones(64), atol=1e-4, rtol=0)
 
 
 def test_a_floor_limits_the_scale_of_collapsed_latents(vae: VAE) -> None:
@@ -162,25 +139,6 @@ def test_phi_is_the_hidden_state_after_the_last_valid_latent(lae: SequenceAutoen
     assert phi.shape == (5, 32)
     torch.testing.assert_close(phi, states[torch.arange(5), LENGTH - 1])
     assert (phi.abs() < 1).all()
-
-
-def test_streaming_equals_batch(lae: SequenceAutoencoder) -> None:
-    z = sequences(2, 5)
-    length = LENGTH.expand(2, 5)
-    h = c = torch.zeros(2, 5, 32)
-    phi = torch.zeros(2, 5, 32)
-    for t in range(51):
-        h, c = lae.step(z[:, :, t], h, c)
-        phi = torch.where((length == t + 1).unsqueeze(-1), h, phi)
-    torch.testing.assert_close(phi, lae.encode(z, length))
-
-
-def test_latents_beyond_the_length_have_no_influence(lae: SequenceAutoencoder) -> None:
-    z = sequences(5)
-    beyond = (torch.arange(51) >= LENGTH.unsqueeze(-1)).unsqueeze(-1)
-    for filler in (7.0, torch.nan):
-        padded = z.masked_fill(beyond, filler)
-        torch.testing.assert_close(lae.encode(padded, LENGTH), lae.encode(z, LENGTH))
 
 
 def test_decoder_is_fed_phi_at_every_step(lae: SequenceAutoencoder) -> None:

@@ -2,6 +2,7 @@
 
 import copy
 import math
+from functools import partial
 
 import pytest
 import torch
@@ -143,6 +144,28 @@ def test_the_policy_takes_the_proposal_whose_lowest_value_is_higher(weights, onl
         torch.testing.assert_close(action[..., 0], torch.full(shape, chosen))
 
 
+def test_a_stack_of_policies_chooses_for_each_as_one_would():
+    source = torch.Generator().manual_seed(0)
+
+    def network(kind, *ensemble):
+        shape = {"hidden_sizes": (16,), "batch_size": (4, *ensemble)}
+        return kind(STATE, ACTION, in_keys=["state"], generator=source, **shape)
+
+    stack = ProposalPolicy(network(Actor), network(Actor), network(Critic, 3))
+    stack.only_clone[1] = True
+    state = torch.randn(4, 200, STATE, generator=source)
+    together = stack(TensorDict({"state": state}, (4, 200)))["action"]
+    names = [*stack.state_dict()]
+    for row in range(4):
+        weights = {name: stack.state_dict()[name][row] for name in names}
+        data = TensorDict({"state": state[row]}, 200)
+        alone = torch.func.functional_call(stack, weights, (data,))["action"]
+        torch.testing.assert_close(together[row], alone)
+    cloned = stack.clone(TensorDict({"state": state}, (4, 200)))["action"]
+    taken = (together == cloned).all(-1).float().mean(-1)
+    assert taken[1] == 1 and (taken[[0, 2, 3]] < 1).all() and (taken > 0).all()
+
+
 @pytest.mark.parametrize(
     ("name", "part", "weight"), [("clone", "clone", 1), ("ddpg", "actor", 0.7)]
 )
@@ -191,6 +214,35 @@ def test_without_options_it_is_torchrls_loss():
     total(theirs).backward()
     for ours, other in zip(loss.parameters(), reference.parameters(), strict=True):
         torch.testing.assert_close(ours.grad, other.grad, rtol=1e-3, atol=1e-5)
+
+
+@every_loss
+def test_each_seed_of_a_stack_learns_as_it_does_alone(name):
+    close = partial(torch.testing.assert_close, rtol=1e-4, atol=1e-4)
+    seeds = (0, 1, 2)
+    stacked, *alone = losses = [
+        make_loss(name, seeds, stacked=True),
+        *(make_loss(name, (seed,)) for seed in seeds),
+    ]
+    optimizers = [torch.optim.Adam(list(loss.parameters()), lr=1e-3) for loss in losses]
+    updates = [ForeachSoftUpdate(loss, tau=0.005) for loss in losses]
+    for step in range(10):
+        batch = make_batch(len(seeds), 32, seed=step)
+        results = [loss(data) for loss, data in zip(losses, [batch, *batch.unbind(0)], strict=True)]
+        for loss, result in zip(losses, results, strict=True):
+            loss.zero_grad()
+            total(result).backward()
+        for key, together in results[0].items():
+            apart = torch.stack([result[key] for result in results[1:]])
+            close(together, apart.sum(0) if key.startswith("loss_") else apart)
+        for index, one in enumerate(alone):
+            for ours, theirs in zip(stacked.parameters(), one.parameters(), strict=True):
+                if step == 0:
+                    torch.testing.assert_close(ours.grad[index], theirs.grad)
+                close(ours[index], theirs)
+        for optimizer, update in zip(optimizers, updates, strict=True):
+            optimizer.step()
+            update.step()
 
 
 @every_loss

@@ -169,57 +169,6 @@ def test_the_actors_loss_stores_the_adapted_policies_and_trains_the_meta_policy_
     assert all(w.grad is None for w in loss.meta_network.parameters())
 
 
-def total(losses):
-    return losses["loss_actor"] + losses["loss_value"]
-
-
-def gradients(loss):
-    return [w.grad.clone() for w in loss.parameters() if w.requires_grad]
-
-
-def weighted(batch, *weights):
-    """Return the batch with one weight for each task of all seeds."""
-    weight = torch.tensor(weights).double().view(len(weights), 1)
-    return batch.clone().set("priority_weight", weight.expand(batch.batch_size).contiguous())
-
-
-def test_a_task_of_weight_zero_changes_nothing_and_is_not_adapted_to():
-    loss = stack_loss(inner_learning_rate=0.5)
-    batch = weighted(transitions(2, TASKS, 8), 1.0, 0.0, 1.0)
-    result = total(loss(batch))
-    result.backward()
-    first = gradients(loss)
-    for adapted, meta in zip(
-        ordered(loss.actor_network_params), loss.meta_network.parameters(), strict=True
-    ):
-        assert adapted[:, 1].equal(meta)
-        assert not torch.isclose(adapted[:, [0, 2]], meta.unsqueeze(1), rtol=1e-3).all()
-    for w in loss.value_network_params.parameters():
-        assert not w.grad[:, 1].any()
-        assert w.grad[:, 0].any()
-        assert w.grad[:, 2].any()
-
-    # The result is independent of the content of the task: other transitions, another Q-function.
-    batch[:, 1] = weighted(transitions(2, TASKS, 8, seed=5), 1.0, 0.0, 1.0)[:, 1]
-    with torch.no_grad():
-        for w in loss.value_network_params.parameters():
-            w[:, 1] += 1
-    loss.zero_grad()
-    again = total(loss(batch))
-    again.backward()
-    assert again.equal(result)
-    for ours, theirs in zip(gradients(loss), first, strict=True):
-        assert ours.equal(theirs)
-
-    # The rest is the contribution of the other tasks.
-    expected = 0.0
-    for task in (0, 2):
-        loss.zero_grad()
-        alone = total(loss(weighted(batch, *(float(i == task) for i in range(3)))))
-        expected = expected + alone.detach()
-    torch.testing.assert_close(result.detach(), expected)
-
-
 def test_what_does_not_fit_is_refused():
     for meta, adapted, value in (
         ([2], [3, 2], [3, 2]), ([2], [2], [2]), ([], [3], [2]), ([], [], []),

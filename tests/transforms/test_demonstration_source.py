@@ -107,16 +107,6 @@ def test_an_unfinished_episode_starts_again():
     collector.shutdown(close_env=False)
 
 
-def test_an_episode_ends_once():
-    env, source = make([0, 1], [2, 4])
-    env.rollout(4, break_when_any_done=False, break_when_all_done=True)  # row 0 waits for row 1
-    assert source.episode.tolist() == [1, 1]
-    data = env.reset()
-    for _ in range(6):  # stepping on without a reset
-        data = env.step_mdp(env.step(data.set("action", torch.zeros(2, 4))))
-    assert source.episode.tolist() == [2, 2]
-
-
 def test_reaches_environments_inside_a_serial_env():
     def single(length):
         return TransformedEnv(MockEnv(None, length), RewardSum())

@@ -51,22 +51,6 @@ def unchanged(gwr, before):
     ]
 
 
-@pytest.mark.parametrize("seeds", [None, [4, 2, 3]])
-@pytest.mark.parametrize("learn", [True, False])
-def test_the_behavior_is_set_at_reset_and_constant_in_the_episode(seeds, learn):
-    env, gwr = make(seeds, learn=learn)
-    check_env_specs(env)
-    start = env.reset()
-    expected = gwr.lookup(start["demo_embedding"])
-    assert start["behavior"].equal(expected.embedding)
-    assert start["behavior_node"].equal(expected.node)
-    steps, _ = play(env, 3, start)  # one episode
-    for key in ("behavior", "behavior_node"):
-        for data in (steps, steps["next"]):
-            dim = len(env.batch_size)
-            assert data[key].equal(start[key].unsqueeze(dim).expand_as(data[key]))
-
-
 def test_behaviors_are_those_of_algorithm_1():
     seeds, lengths, n_steps = [4, 2, 3], [1, 2, 5], 120
     env, gwr = make(seeds, lengths)

@@ -17,46 +17,35 @@ from suites.opengl import choose_backend, explain
 
 @pytest.fixture
 def on_linux(monkeypatch):
-    monkeypatch.delenv("MUJOCO_GL", raising=False)
     monkeypatch.setattr(platform, "system", lambda: "Linux")
 
 
 @pytest.mark.parametrize(
-    ("libraries", "backend"), [({"EGL", "OSMesa"}, "egl"), ({"OSMesa"}, "osmesa")]
-)
-def test_backend_is_the_first_that_can_be_loaded(on_linux, libraries, backend):
-    assert choose_backend(libraries.__contains__) == backend
-
-
-@pytest.mark.parametrize("chosen", ["osmesa", "glfw"])
-def test_a_backend_chosen_by_the_user_is_kept(on_linux, monkeypatch, chosen):
-    monkeypatch.setenv("MUJOCO_GL", chosen)
-    monkeypatch.setenv("DISPLAY", ":0")
-    assert choose_backend(lambda _: True) == chosen
-
-
-@pytest.mark.parametrize(
-    ("chosen", "remedy"),
+    ("chosen", "screen", "libraries", "expected"),
     [
-        ("", "apt-get install libegl1"),
-        ("osmesa", "no library OSMesa: unset it"),
-        ("EGL", "set it to egl"),
-        ("glfw", "needs a screen"),
-        ("off", "disables rendering"),
+        ("", "", {"EGL", "OSMesa"}, "egl"),
+        ("", "", {"OSMesa"}, "osmesa"),
+        ("", "", set(), "apt-get install libegl1"),
+        ("osmesa", "", {"EGL", "OSMesa"}, "osmesa"),
+        ("osmesa", "", {"EGL"}, "no library OSMesa: unset it"),
+        ("glfw", ":0", set(), "glfw"),
+        ("glfw", "", {"EGL"}, "needs a screen"),
+        ("EGL", "", {"EGL"}, "set it to egl"),
+        ("off", "", {"EGL"}, "disables rendering"),
     ],
 )
-def test_missing_and_unknown_backends_are_reported(on_linux, monkeypatch, chosen, remedy):
-    for screen in ("DISPLAY", "WAYLAND_DISPLAY"):
-        monkeypatch.delenv(screen, raising=False)
-    if chosen:
-        monkeypatch.setenv("MUJOCO_GL", chosen)
-    with pytest.raises(RuntimeError, match=remedy):
-        choose_backend(lambda _: False)
-
-
-def test_other_systems_have_their_own_backend(on_linux, monkeypatch):
-    monkeypatch.setattr(platform, "system", lambda: "Darwin")
-    assert choose_backend(lambda _: False) is None
+def test_the_backend_is_that_of_the_user_or_the_first_that_can_be_loaded(
+    on_linux, monkeypatch, chosen, screen, libraries, expected
+):
+    for name, value in (("MUJOCO_GL", chosen), ("DISPLAY", screen), ("WAYLAND_DISPLAY", "")):
+        monkeypatch.setenv(name, value)
+    if " " not in expected:
+        assert choose_backend(libraries.__contains__) == expected
+        monkeypatch.setattr(platform, "system", lambda: "Darwin")
+        assert choose_backend(lambda _: False) == (chosen or None)
+        return
+    with pytest.raises(RuntimeError, match=expected):
+        choose_backend(libraries.__contains__)
 
 
 @pytest.mark.parametrize(
@@ -173,17 +162,6 @@ def test_a_renderer_of_another_thread_changes_no_frames(physics, renderer, ended
             elsewhere.close()
         here.close()
     np.testing.assert_array_equal(renderer.render(physics.data.ptr), before)
-
-
-def test_threads_may_render_at_the_same_time(physics, renderer):
-    before = renderer.render(physics.data.ptr)
-
-    def draw(number: int) -> bool:
-        own = renderer if number % 2 else FrameRenderer(physics.model.ptr)
-        return all((own.render(physics.data.ptr) == before).all() for _ in range(20))
-
-    with ThreadPoolExecutor(4) as pool:
-        assert all(pool.map(draw, range(8)))
 
 
 def test_the_driver_has_the_same_name_in_any_thread(renderer):
