@@ -57,6 +57,25 @@ def row_seeds(seed: int | Iterable[int] | None, count: int) -> list[int]:
     return [(seeds[0] + row) % 2**32 for row in range(count)] if counted else seeds
 
 
+def one_each(
+    generator: torch.Generator | Sequence[torch.Generator] | None, count: int
+) -> Sequence[torch.Generator | None]:
+    """Return a source of random numbers for each of ``count`` things.
+
+    Args:
+        generator: One for all, one for each, or None for torch's default generator.
+        count: Number of things.
+
+    Raises:
+        ValueError: If there are not as many, or they are something else.
+    """
+    sources = generator if isinstance(generator, Sequence) else [generator] * count
+    kinds = (torch.Generator, type(None))
+    if len(sources) != count or not all(isinstance(source, kinds) for source in sources):
+        raise ValueError(f"generator must be a torch.Generator, or a sequence of {count}, one each")
+    return sources
+
+
 @dataclass(frozen=True, eq=False)
 class Seeding:
     """Mark of one call of ``set_seed``; two calls with the same seed are distinct.

@@ -164,9 +164,7 @@ class DemonstrationBank:
                 f"the bank has fewer than {most} demonstrations of {self.tasks[few[0]]!r} for "
                 "training: choose fewer"
             )
-        task = seen.task.unsqueeze(-1)
-        place = (task == torch.arange(len(self.tasks))).cumsum(0).gather(-1, task).flatten()
-        return seen._select(place <= most)
+        return seen._select(_place(seen.task) < most)
 
     def held_out(self, part: Literal["validation", "test"] | None = None) -> DemonstrationBank:
         """Return the demonstrations for test episodes, or a part of them.
@@ -182,9 +180,7 @@ class DemonstrationBank:
         rows = torch.nonzero(~self.train).flatten()
         if part is None:
             return self._select(rows)
-        task = self.task[rows].unsqueeze(-1)
-        place = (task == torch.arange(len(self.tasks))).cumsum(0).gather(-1, task).flatten() - 1
-        return self._select(rows[place % 2 == (part == "test")])
+        return self._select(rows[_place(self.task[rows]) % 2 == (part == "test")])
 
     def of_task(self, task: int) -> DemonstrationBank:
         """Return the demonstrations of one task."""
@@ -283,15 +279,12 @@ class DemonstrationBank:
             if not isinstance(tasks, list) or not all(isinstance(name, str) for name in tasks):
                 raise ValueError("its tasks are no list of names")
             columns = {k.removeprefix("steps."): t for k, t in tensors.items() if "." in k}
-            rows = {key: tensor for key, tensor in tensors.items() if "." not in key}
-            steps = DemonstrationSteps(**columns) if columns else None
-            spread = float(meta["spread"])
             bank = cls(
-                **rows,
+                **{key: tensor for key, tensor in tensors.items() if "." not in key},
                 tasks=tuple(tasks),
-                steps=steps,
+                steps=DemonstrationSteps(**columns) if columns else None,
                 encoder_id=encoder_id,
-                spread=spread,
+                spread=float(meta["spread"]),
                 scene=meta.get("scene"),
             )
         except FileNotFoundError:
@@ -313,3 +306,10 @@ class DemonstrationBank:
                 f"{encoder_id}; {remedy}"
             )
         return bank
+
+
+def _place(task: Tensor) -> Tensor:
+    """Return the position of each demonstration among those of its task, from 0."""
+    labels = task.unsqueeze(-1)
+    same = labels == torch.arange(int(task.max()) + 1 if len(task) else 1)
+    return same.cumsum(0).gather(-1, labels).flatten() - 1

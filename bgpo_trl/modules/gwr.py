@@ -20,6 +20,7 @@ from torch import Tensor, nn
 
 from bgpo_trl.configs import GWRBConfig
 from bgpo_trl.errors import as_shape
+from bgpo_trl.seeding import one_each
 
 if TYPE_CHECKING:
     import networkx as nx
@@ -171,7 +172,7 @@ class GWRB(nn.Module):
             raise ValueError(f"init must be 'random' or 'data'; got {init!r}")
         self.max_nodes, self.init = max_nodes, init
         n_networks = self.batch_size.numel()
-        generators = _as_generators(generator, n_networks)
+        generators = one_each(generator, n_networks)
         self._topologies = [_Topology(self.config.initial_habituation) for _ in range(n_networks)]
         weights = torch.full((n_networks, 16, self.n_features), torch.inf)
         self.register_buffer("_weights", weights, persistent=False)
@@ -186,7 +187,7 @@ class GWRB(nn.Module):
     def redraw(self, generator: torch.Generator | Sequence[torch.Generator] | None = None) -> None:
         """Draw random weights as on construction, in networks that have not learned yet."""
         start = [self.config.initial_habituation] * 2
-        for network, source in enumerate(_as_generators(generator, len(self._topologies))):
+        for network, source in enumerate(one_each(generator, len(self._topologies))):
             topology = self._topologies[network]
             is_new = topology.next_identity == 2 and topology.habituation == start
             if self.init == "random" and is_new:
@@ -601,20 +602,6 @@ def _random_nodes(n_features: int, generator: torch.Generator | None) -> Tensor:
     """Draw the weights of a network's first two nodes uniformly from (-1, 1), ``[2, d]``."""
     device = None if generator is None else generator.device
     return 2 * torch.rand(2, n_features, generator=generator, device=device) - 1
-
-
-def _as_generators(
-    value: torch.Generator | Sequence[torch.Generator] | None, count: int
-) -> Sequence[torch.Generator | None]:
-    """Return one generator (or None) per network; raise ``ValueError`` if there are others."""
-    generators = value if isinstance(value, Sequence) else [value] * count
-    if len(generators) != count or not all(
-        generator is None or isinstance(generator, torch.Generator) for generator in generators
-    ):
-        raise ValueError(
-            f"generator must be a torch.Generator, or a sequence of {count}, one a network"
-        )
-    return generators
 
 
 def as_tensor(value: Numbers, name: str) -> Tensor:

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from bgpo_trl.configs import RLConfig
 from bgpo_trl.errors import as_shape
+from bgpo_trl.seeding import one_each
 
 __all__ = ["StackedLinear", "StackedMLP"]
 
@@ -83,14 +84,10 @@ class StackedLinear(nn.Module):
             self.bias.uniform_(-bound, bound, generator=generator)
             return
         n_layers = self.batch_size.numel()
-        if len(generator) != n_layers:
-            raise ValueError(
-                f"pass one generator per layer: batch_size {tuple(self.batch_size)} needs "
-                f"{n_layers}, got {len(generator)}"
-            )
+        streams = one_each(generator, n_layers)
         weights = self.weight.view(n_layers, self.in_features, self.out_features)
         biases = self.bias.view(n_layers, self.out_features)
-        for weight, bias, stream in zip(weights, biases, generator, strict=True):
+        for weight, bias, stream in zip(weights, biases, streams, strict=True):
             weight.uniform_(-bound, bound, generator=stream)
             bias.uniform_(-bound, bound, generator=stream)
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 
 from bgpo_trl.errors import as_shape
-from bgpo_trl.seeding import generators, row_seeds
+from bgpo_trl.seeding import generators, one_each, row_seeds
 from bgpo_trl.transforms._episode import EpisodeTransform, ending, starting, unbounded
 
 
@@ -173,9 +173,7 @@ class DemonstrationSource(EpisodeTransform):
                 f"the bank has no demonstration of task {missing[0]} of the schedule: record some, "
                 f"or use a schedule of fewer than {schedule.n_tasks} tasks"
             )
-        sources = generator if isinstance(generator, Sequence) else [generator] * n_rows
-        if len(sources) != n_rows:
-            raise ValueError(f"generator must be one or {n_rows}, one a row; got {len(sources)}")
+        sources = one_each(generator, n_rows)
         self.schedule = schedule
         self.register_buffer("_stream", _streams(sources).view(batch_size))
         self.register_buffer("episode", torch.zeros(batch_size, dtype=torch.int64))

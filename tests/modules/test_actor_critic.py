@@ -41,7 +41,7 @@ def test_initial_weights_are_those_of_each_generator_alone():
         alone = StackedMLP(6, 2, hidden_sizes=(8, 4), generator=generator)
         for mine, theirs in zip(stacked.parameters(), alone.parameters(), strict=True):
             assert torch.equal(mine[i], theirs)
-    with pytest.raises(ValueError, match="needs 3, got 2"):
+    with pytest.raises(ValueError, match="a sequence of 3, one each"):
         StackedLinear(2, 2, (3,), generators(2))
 
 

@@ -137,7 +137,7 @@ def test_bad_arguments_and_wrong_orders_are_refused():
     for call, message in (
         (lambda: DemonstrationSource(bank, CONCURRENT), "no demonstration of task 2"),
         (lambda: DemonstrationSource(one_missing, both), "shapes"),
-        (lambda: DemonstrationSource(bank, both, **options), "one or 3"),
+        (lambda: DemonstrationSource(bank, both, **options), "a sequence of 3, one each"),
         (lambda: make([0, 1], base=MockEnv([0, 1, 2]))[0].reset(), "batch_size"),
         (lambda: source.seed_rows([1]), "1 seeds for 2 simulations"),
     ):
