@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from tensordict import TensorDict
 
 from bgpo_trl.algorithms import entry
 from bgpo_trl.files.checkpoint import load_checkpoint
@@ -76,7 +77,7 @@ def test_updates_are_those_made_by_hand(first_save, offline_config, bank, encode
     for update in range(N):
         by_hand.experts.play([of_seed[update * len(of_seed) // N] for of_seed in numbers])
         group = by_hand.active.group.unsqueeze(-1).expand(-1, -1, n_rows)
-        batch = by_hand.shown.sample(group)
+        batch = TensorDict(by_hand.shown.draw(group), group.shape)
         noise = config.algorithm.demonstration_noise
         imitated = by_hand.shown.draw_actions(group, noise)
         for key, value in imitated.items():

@@ -331,7 +331,6 @@ class Algorithm(ABC):
         return DemonstrationReplay(
             self.bank,
             generator=generators(self.seeds, "demonstration replay"),
-            state_key=self.config.state,
             constant_keys=constant_keys,
             own_constants=own_constants,
             n_steps=self.config.rl.n_steps,

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from bgpo_trl.data.bank import DemonstrationBank
@@ -25,7 +25,6 @@ class DemonstrationReplay:
     Args:
         bank: Demonstrations that episodes are drawn from, with their steps.
         generator: Random generators for sampling, one for each of ``S`` seeds.
-        state_key: Name of the latent.
         constant_keys: Entries that are constant within an episode, stored with each demonstration.
         own_constants: Whether a transition comes with the constant entries of its own
             demonstration, or else with those of any one of its group.
@@ -42,7 +41,6 @@ class DemonstrationReplay:
         bank: DemonstrationBank,
         *,
         generator: Sequence[torch.Generator],
-        state_key: NestedKey = "latent",
         constant_keys: Sequence[NestedKey] = (),
         own_constants: bool = True,
         n_steps: int = 1,
@@ -65,7 +63,7 @@ class DemonstrationReplay:
         self._generators = list(generator)
         self._n_steps, self._gamma = n_steps, gamma
         self._own_constants = own_constants
-        self._state_key, self._constant_keys = state_key, list(constant_keys)
+        self._constant_keys = list(constant_keys)
         self._shown = GroupReplay(
             capacity,
             generator=generator,
@@ -90,24 +88,19 @@ class DemonstrationReplay:
         """
         self._shown.add(episode.copy().set("reward", reward), group, mask)
 
-    def sample(self, group: Tensor) -> TensorDict:
-        """Draw, for each row, a demonstration of the row's group and one of its transitions.
-
-        Returns:
-            Batch size ``[S, *R]`` as in `GroupReplay.sample`, with the state, the constant entries,
-            ``"action"``, ``"priority_weight"`` and, under ``"next"``, the state, ``"reward"``,
-            ``"terminated"`` and ``"done"``.
-        """
-        return TensorDict(self.draw(group), group.shape)
-
     def draw(
         self, group: Tensor, *, generator: Sequence[torch.Generator] | None = None
     ) -> dict[NestedKey, Tensor]:
-        """Return the entries of `sample` by key, without a TensorDict.
+        """Draw, for each row, a demonstration of the row's group and one of its transitions.
 
         Args:
-            group: Group of each row, int64 ``[S, *R]``.
+            group: Group of each row, int64 ``[S, *R]``; -1 as for `GroupReplay.sample`.
             generator: Random generators of the seeds, in place of the replay's.
+
+        Returns:
+            By key, ``[S, *R, ...]``: ``"latent"``, the constant entries, ``"action"``,
+            ``"priority_weight"`` and, under ``"next"``, ``"latent"``, ``"reward"``,
+            ``"terminated"`` and ``"done"``.
         """
         sources = self._generators if generator is None else generator
         entries, reward, frame, left = self._draw_frames(group, sources)
@@ -118,8 +111,8 @@ class DemonstrationReplay:
         return {
             **entries,
             **several,
-            self._state_key: self._steps.latents(frame),
-            ("next", self._state_key): self._steps.latents(frame + n_taken),
+            "latent": self._steps.latents(frame),
+            ("next", "latent"): self._steps.latents(frame + n_taken),
             ("next", "reward"): reward.unsqueeze(-1) * ends,
             ("next", "terminated"): ends,
             ("next", "done"): ends,
@@ -132,21 +125,21 @@ class DemonstrationReplay:
         *,
         generator: Sequence[torch.Generator] | None = None,
     ) -> dict[NestedKey, Tensor]:
-        """Draw states and actions to imitate, as `draw` does.
+        """Draw latents and actions to imitate, as `draw` does.
 
         Args:
             group: Group of each row, int64 ``[S, *R]``.
-            noise: Standard deviation of Gaussian noise added to the states.
+            noise: Standard deviation of Gaussian noise added to the latents.
             generator: Random generators of the seeds, in place of the replay's.
 
         Returns:
-            By key: the state, the constant entries, ``"action"``, ``"priority_weight"``.
+            By key: ``"latent"``, the constant entries, ``"action"``, ``"priority_weight"``.
         """
         sources = self._generators if generator is None else generator
         entries, _, frame, _ = self._draw_frames(group, sources)
-        state = self._steps.latents(frame)
-        drawn = draw_for_rows(torch.randn, group, sources, state.shape[-1])
-        return {**entries, self._state_key: state + noise * drawn}
+        latent = self._steps.latents(frame)
+        drawn = draw_for_rows(torch.randn, group, sources, latent.shape[-1])
+        return {**entries, "latent": latent + noise * drawn}
 
     def _draw_frames(
         self, group: Tensor, sources: Sequence[torch.Generator]

@@ -19,7 +19,7 @@ from bgpo_trl.scenes.scene import Observation, Outcome, Scene, Simulation, State
 from bgpo_trl.scenes.simulation import SimulationEnv
 from bgpo_trl.seeding import random_state, set_random_state
 from suites import nico
-from suites.nico.base import STATE_CENTER, STATE_SCALE, STATE_SIZE, Environment, check_spread
+from suites.nico.base import STATE_CENTER, STATE_SCALE, STATE_SIZE, Environment
 from suites.nico.demonstrator import Demonstrator
 from suites.nico.rendering import FRAME_HEIGHT, FRAME_WIDTH, FrameRenderer
 
@@ -158,9 +158,6 @@ class NicoEnv(SimulationEnv):
         observation: Observation = "pixels",
         **options: Any,
     ) -> None:
-        check_spread(spread)
-        if not isinstance(tasks, str):
-            nico.check_tasks(tasks)
         self._spread = spread
         self._renderer: FrameRenderer | None = None
         super().__init__(

@@ -63,7 +63,8 @@ class SimulationEnv(EnvBase):
 
     Raises:
         ValueError: If there are not as many seeds as simulations, a seed is out of range, or there
-            is to be no task, simulation or thread, or ground truth that the simulation lacks.
+            is to be no task, one task twice, no simulation or thread, or ground truth that the
+            simulation lacks.
     """
 
     def __init__(
@@ -85,8 +86,8 @@ class SimulationEnv(EnvBase):
             raise ValueError(f"observation is {observation!r}; choose one of {choices}")
         if threads is not None and threads < 1:
             raise ValueError(f"threads must be at least 1, or None for all cores, got {threads}")
-        if not tasks or isinstance(tasks, str):
-            raise ValueError(f"tasks must be a sequence of names, got {tasks!r}")
+        if not tasks or isinstance(tasks, str) or len({*tasks}) < len(tasks):
+            raise ValueError(f"tasks must be a sequence of names, all different, got {tasks!r}")
         if observation != "pixels" and state_size is None:
             raise ValueError("the simulation has no ground truth: observe pixels")
         self.tasks = tuple(tasks)

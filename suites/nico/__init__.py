@@ -2,8 +2,8 @@
 
 # First, since importing it chooses the OpenGL backend, which must precede MuJoCo's import.
 from suites.nico import rendering  # isort: skip
-from suites.nico.base import NicoTask, check_spread, nominal_places, scene_version
-from suites.nico.nico import ALL_TASKS, PAPER_TASKS, TASKS, add_task, check_tasks, load, register
+from suites.nico.base import NicoTask, nominal_places, scene_version
+from suites.nico.nico import ALL_TASKS, PAPER_TASKS, TASKS, add_task, load, register
 from suites.nico.physics import OBJECTS, Physics, scene_xml
 
 __all__ = [
@@ -14,8 +14,6 @@ __all__ = [
     "NicoTask",
     "Physics",
     "add_task",
-    "check_spread",
-    "check_tasks",
     "load",
     "nominal_places",
     "register",

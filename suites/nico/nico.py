@@ -74,18 +74,6 @@ def add_task(name: str, task: type[NicoTask]) -> None:
     _TASKS[name] = task
 
 
-def check_tasks(names: Sequence[str]) -> None:
-    """Raise ``ValueError`` if a task does not exist or is named twice."""
-    for position, name in enumerate(names):
-        if name not in TASKS:
-            raise ValueError(
-                f"no NICO task {name!r}; choose one of {', '.join(TASKS)}, or add it with "
-                "nico.add_task"
-            )
-        if name in names[:position]:
-            raise ValueError(f"the task {name!r} is named twice: name each once")
-
-
 def load(
     task: str,
     *,
@@ -125,7 +113,10 @@ def load(
         >>> env.reset().observation["pixels"].shape
         (32, 64, 3)
     """
-    check_tasks([task])
+    if task not in TASKS:
+        raise ValueError(
+            f"no NICO task {task!r}; choose one of {', '.join(TASKS)}, or add it with nico.add_task"
+        )
     if not time_limit > 0:
         raise ValueError(f"time_limit must be above 0 s, got {time_limit}: a step takes 0.2 s")
     physics = physics or Physics.from_xml_string(scene_xml())

@@ -79,7 +79,7 @@ def test_transitions_are_the_steps_of_what_was_shown_in_the_rows_group(make_show
     }
     found = {key: set() for key in told}
     for _ in range(60):
-        drawn = shown.sample(GROUP)
+        drawn = TensorDict(shown.draw(GROUP), GROUP.shape)
         assert drawn["priority_weight"].tolist() == [[1, 1, 1, 0, 0], [1, 1, 1, 1, 0]]
         for seed, row in itertools.product(range(2), range(5)):
             key = seed, int(GROUP[seed, row])
@@ -129,7 +129,7 @@ def test_constants_are_of_any_demonstration_of_the_group_if_not_its_own(bank):
     replay = make(bank.seen(), own_constants=False)
     show(replay, [(3, 1.0, 0), (5, 1.0, 0)], [(4, 1.0, 0), (6, 1.0, 0)], [(7, 1.0, 1), (8, 1.0, 1)])
     steps = bank.seen().steps
-    drawn = replay.sample(torch.tensor([[0, 1]]).expand(2, 2).repeat_interleave(300, 1))
+    drawn = replay.draw(torch.tensor([[0, 1]]).expand(2, 2).repeat_interleave(300, 1))
     frames = torch.stack([steps.latents(steps.first), steps.latents(steps.first + 1)], 1)
     for seed, members in enumerate(((3, 4), (5, 6))):
         told = drawn["behavior"][seed, :300, 0].long()
@@ -148,7 +148,8 @@ def test_demonstrations_and_their_steps_are_drawn_equally_often(bank):
     short, long = int(lengths.argmin()), int(lengths.argmax())
     assert (int(lengths[short]), int(lengths[long])) == (3, 6)
     show(replay, [(short, 1.0, 0)], [(long, 1.0, 0)])
-    drawn = replay.sample(torch.zeros(1, 20_000, dtype=torch.int64))[0]
+    group = torch.zeros(1, 20_000, dtype=torch.int64)
+    drawn = TensorDict(replay.draw(group), group.shape)[0]
     is_long = drawn["behavior"][:, 0] == long
     assert abs(int(is_long.sum()) - 10_000) < 5 * 5_000**0.5
     for rows, n_steps in ((is_long, 5), (~is_long, 2)):

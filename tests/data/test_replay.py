@@ -171,6 +171,7 @@ def test_samples_share_nothing_with_the_buffer():
     data["action"].data.zero_()
     rows = torch.zeros(1, 4, dtype=torch.int64)
     replay.sample(rows)["action"].zero_()
+    assert {*replay.draw(rows, keys=[])} == {"priority_weight"}
     drawn = replay.sample(rows)["action"]
     assert (drawn == 1).all()
     assert not drawn.requires_grad

@@ -21,8 +21,6 @@ from bgpo_trl.encoders.make_bank import make_bank
 from bgpo_trl.encoders.probes import _probe_reconstruction, probe
 from bgpo_trl.encoders.representation import (
     Representation,
-    embed_demonstrations,
-    encode_frames,
     load_representation,
     mean_frame,
     retrain_inverse,
@@ -149,23 +147,6 @@ def test_encoders_capture_frames_places_actions_and_tasks(
     assert probed["task_accuracy_linear"] > 0.8
     assert probed["task_accuracy_nearest"] > 0.8
     assert probed["sequence_mse"] < 0.6
-
-
-def test_latents_are_standardized_and_frames_beyond_the_length_ignored(
-    trained: Representation, dataset: TensorDict
-) -> None:
-    train, _ = split(dataset)
-    latent = encode_frames(trained.frame_network, train, batch_size=50)
-    valid = torch.arange(51) < train["length"].unsqueeze(-1)
-    assert (latent[~valid] == 0).all()
-    torch.testing.assert_close(latent[valid].mean(0), torch.zeros(64), atol=1e-3, rtol=0)
-    assert latent[valid].std(0).max() < 1.001
-    torch.testing.assert_close(latent[3, 2], trained.frame_network.latent(train["pixels"][3, 2]))
-    part = dataset[:6].clone()
-    phi = embed_demonstrations(trained, part)
-    assert phi.shape == (6, 32)
-    part["pixels"][:, 12:] = 255
-    assert torch.equal(embed_demonstrations(trained, part), phi)
 
 
 def test_weights_depend_on_seed_and_training_part_and_not_on_global_state(
