@@ -292,4 +292,4 @@ def make_learner(config: RLConfig, spec: LearnerSpec) -> Learner:
         "clone": "clone_network_params",
         "critic": "target_value_network_params",
     }
-    return Learner(ProposalPolicy(actor, clone, critic), sources, loss, config)
+    return Learner(ProposalPolicy(actor, clone, critic, config.caution), sources, loss, config)

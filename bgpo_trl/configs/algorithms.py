@@ -77,6 +77,9 @@ class RLConfig(Settings):
     """Environment steps of each seed per update (1 in Alg. 1)."""
     policy_delay: int = 1
     """Updates of the critics per update of actor and clone."""
+    caution: float = 1.0
+    """With both proposals, standard deviations of the critics' gains by which their mean must be
+    above 0 for the actor's proposal to be taken (`ProposalPolicy`)."""
     clone_episodes: int = 20
     """With both proposals, episodes of a group that its clone plays alone before the critics
     choose."""
@@ -89,7 +92,7 @@ class RLConfig(Settings):
         positive(self, "learning_rate")
         if self.imitation_half_life is not None:
             positive(self, "imitation_half_life")
-        at_least(self, 0, "noise", "pre_tanh_penalty", "imitation")
+        at_least(self, 0, "noise", "pre_tanh_penalty", "imitation", "caution")
         at_least(self, 1, "batch_size", "warmup_steps", "replay_size", "update_every")
         at_least(self, 1, "critics", "n_steps", "policy_delay")
         at_least(self, 0, "clone_episodes")
@@ -120,7 +123,7 @@ SHOWN = RLConfig(
     imitation_half_life=5_000.0,
     hidden_sizes=(128, 128),
     learning_rate=3e-4,
-    gamma=0.97,
+    gamma=0.98,
     noise=0.1,
     update_every=2,
     policy_delay=2,

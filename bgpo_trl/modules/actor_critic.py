@@ -129,19 +129,21 @@ class Critic(StackedNetwork):
 
 
 class ProposalPolicy(TensorDictModuleBase):
-    """Policy that takes the better of two proposals, as critics value them.
+    """Policy that takes the better of two proposals, if critics are sure which is better.
 
-    At each step, an actor and a clone of demonstrations propose an action. The policy takes that of
-    the actor if the lowest value of all critics is higher for it, else that of the clone (Hu et
-    al., 2024, "Imitation Bootstrapped Reinforcement Learning"). `DDPGLoss` bootstraps from the same
-    choice.
+    At each step, an actor and a clone of demonstrations propose an action (Hu et al., 2024,
+    "Imitation Bootstrapped Reinforcement Learning"). Each critic says how much more the actor's
+    action is worth. The policy takes the actor's action if the mean of these gains is above
+    ``caution`` times their standard deviation, else the clone's. Where critics disagree, as they do
+    before they have seen much, the clone acts. `DDPGLoss` bootstraps from the better proposal.
 
     Reads the ``in_keys`` of the actor; writes ``"action"`` ``[*S, *B, A]``.
 
     Args:
         actor: Policy that writes ``"action"``, with ``batch_size`` ``[*S]``.
         clone: Policy with the same keys and ``batch_size``.
-        critic: Q-functions of ``batch_size`` ``[*S, N]``.
+        critic: Q-functions of ``batch_size`` ``[*S, N]``, at least two of them.
+        caution: See above; 0 compares the means.
 
     Attributes:
         only_clone: Where the policy takes the action of the clone whatever the critics say, bool
@@ -159,8 +161,9 @@ class ProposalPolicy(TensorDictModuleBase):
     in_keys: list[NestedKey]
     only_clone: Tensor
 
-    def __init__(self, actor: Actor, clone: Actor, critic: Critic) -> None:
+    def __init__(self, actor: Actor, clone: Actor, critic: Critic, caution: float = 1.0) -> None:
         super().__init__()
+        self.caution = caution
         self.in_keys, self.out_keys = actor.in_keys, ["action"]
         self.actor, self.clone, self.critic = actor, clone, critic
         self.register_buffer("only_clone", torch.zeros(actor.batch_size, dtype=torch.bool))
@@ -180,8 +183,8 @@ class ProposalPolicy(TensorDictModuleBase):
         both.set("action", torch.stack([cloned, own], dim))
         of_each = both.unsqueeze(dim)
         of_each = of_each.expand(*self.critic.batch_size, *both.shape[dim:])
-        value = self.critic(of_each)["state_action_value"].amin(dim)
-        value_of_clone, value_of_actor = value.unbind(dim)
+        value_of_clone, value_of_actor = self.critic(of_each)["state_action_value"].unbind(dim + 1)
+        gain = value_of_actor - value_of_clone
         only_clone = self.only_clone.reshape(*self.batch_size, *[1] * (own.ndim - dim))
-        takes_actor = (value_of_actor > value_of_clone) & ~only_clone
+        takes_actor = (gain.mean(dim) > self.caution * gain.std(dim)) & ~only_clone
         return tensordict.set("action", torch.where(takes_actor, own, cloned))

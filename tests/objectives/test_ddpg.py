@@ -121,23 +121,29 @@ def test_targets_are_of_the_proposal_that_the_pair_prefers(weights, best):
 
 
 @pytest.mark.parametrize(
-    ("weights", "only_clone", "chosen"),
+    ("weights", "caution", "only_clone", "chosen"),
     [
-        ((1.0, 2.0, 3.0), False, 0.6),
-        ((-1.0, -2.0, -3.0), False, 0.2),
-        # The lowest value of the three decides: -0.6 for the actor, -1.8 for the clone.
-        ((1.0, 2.0, -3.0), False, 0.2),
-        ((-1.0, -2.0, -3.0), True, 0.6),
+        ((1.0, 2.0, 3.0), 1.0, False, 0.6),
+        # The actor's gains are 0.4, 0.8 and 1.2: mean 0.8, standard deviation 0.4.
+        ((-1.0, -2.0, -3.0), 1.0, False, 0.2),
+        ((-1.0, -2.0, -3.0), 1.9, False, 0.2),
+        ((-1.0, -2.0, -3.0), 2.1, False, 0.6),
+        ((-1.0, -2.0, -3.0), 1.0, True, 0.6),
+        # 0.4, -0.8 and 1.2: mean 0.27, standard deviation 1.01.
+        ((-1.0, 2.0, -3.0), 0.0, False, 0.2),
+        ((-1.0, 2.0, -3.0), 1.0, False, 0.6),
     ],
 )
-def test_the_policy_takes_the_proposal_whose_lowest_value_is_higher(weights, only_clone, chosen):
+def test_the_policy_takes_the_actors_proposal_if_critics_agree_that_it_gains(
+    weights, caution, only_clone, chosen
+):
     loss = flat_networks((0.2, 0.6), weights)
     parts = {"actor": "actor_network", "clone": "clone_network", "critic": "value_network"}
     networks = {}
     for name, attribute in parts.items():
         networks[name] = copy.deepcopy(getattr(loss, attribute))
         getattr(loss, f"{attribute}_params").data.to_module(networks[name])
-    policy = ProposalPolicy(**networks)
+    policy = ProposalPolicy(**networks, caution=caution)
     policy.only_clone.fill_(only_clone)
     for shape in ((3,), ()):
         action = policy(TensorDict({"state": torch.randn(*shape, STATE)}, shape))["action"]
