@@ -66,6 +66,19 @@ def test_chance_splits_no_points_with_a_single_mode(n_points, d):
         assert not density_clusters(points @ local_whitening(points)).any()
 
 
+@pytest.mark.parametrize("seed", [0, 18, 45, 54, 72])
+def test_a_sparse_cluster_is_told_from_a_dense_one_beside_it(seed):
+    """The valley counts from both sides: it hardly lies below the sparse cluster."""
+    rng = np.random.default_rng(seed)
+    labels = np.repeat([0, 1], [60, 30])
+    points = rng.normal(size=(90, 3)) * np.array([1.0, 2.5])[labels, None]
+    points[labels == 1, 0] += 9
+    found = density_clusters(points)
+    inside = found >= 0
+    assert found.max() == 1
+    assert (found[inside] == labels[inside]).all() and inside.mean() > 0.8
+
+
 def test_cluster_needs_the_least_number_of_points_and_the_evidence():
     points, _ = blobs([90, 14])
     assert density_clusters(points).max() == 1
