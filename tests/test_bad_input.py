@@ -25,9 +25,9 @@ from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
 from bgpo_trl.objectives.ddpg import DDPGLoss, ForeachSoftUpdate
 from bgpo_trl.objectives.supervised import (
-    DistillationLoss,
-    SequenceReconstructionLoss,
-    VAEInverseLoss,
+    distillation_loss,
+    sequence_reconstruction_loss,
+    vae_inverse_loss,
 )
 from bgpo_trl.scenes.nico import NicoEnv
 from bgpo_trl.training import Trainer
@@ -125,17 +125,17 @@ WRONG = {
     "ddpg flat reward": (lambda: loss()(transitions(reward=(8,))), "got [8]"),
     "targets that never move": (lambda: ForeachSoftUpdate(loss(), tau=0.0), "got 0.0"),
     "distillation without teacher": (
-        lambda: DistillationLoss(actor())(transitions()), "no 'teacher_action'"),
+        lambda: distillation_loss(actor(), transitions()), "no 'teacher_action'"),
     "distillation without spread": (
-        lambda: DistillationLoss(actor())(transitions().set("teacher_action", torch.zeros(8, 4))),
+        lambda: distillation_loss(actor(), transitions().set("teacher_action", torch.zeros(8, 4))),
         "from its actor, found no 'loc', 'scale'"),
-    "windows of one frame": (lambda: VAEInverseLoss(VAE())(windows(2, 1)), "(2, 1, 32"),
+    "windows of one frame": (lambda: vae_inverse_loss(VAE(), windows(2, 1)), "(2, 1, 32"),
     "windows without actions": (
-        lambda: VAEInverseLoss(VAE())(windows(2, 2).exclude("action")), "no 'action'"),
+        lambda: vae_inverse_loss(VAE(), windows(2, 2).exclude("action")), "no 'action'"),
     "actions of another robot": (
-        lambda: VAEInverseLoss(VAE())(windows(2, 2, action=7)), "got [2, 2, 7]"),
+        lambda: vae_inverse_loss(VAE(), windows(2, 2, action=7)), "got [2, 2, 7]"),
     "sequences without lengths": (
-        lambda: SequenceReconstructionLoss(lae)(TensorDict({"latent": z}, [2])), "no 'length'"),
+        lambda: sequence_reconstruction_loss(lae, TensorDict({"latent": z}, [2])), "no 'length'"),
     # the world
     "a run of no seed": (lambda: RunConfig(seeds=()), "seeds must be one or more"),
     "a run of a seed twice": (lambda: RunConfig(seeds=(1, 1)), "all different"),

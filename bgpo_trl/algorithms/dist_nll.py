@@ -16,7 +16,7 @@ from bgpo_trl.algorithms.task_algorithm import TaskAlgorithm
 from bgpo_trl.configs import DistNLLConfig
 from bgpo_trl.modules.actor_critic import Actor
 from bgpo_trl.modules.multi_head_actor import MultiHeadActor
-from bgpo_trl.objectives.supervised import DistillationLoss
+from bgpo_trl.objectives.supervised import distillation_loss
 from bgpo_trl.seeding import generators
 
 
@@ -56,7 +56,6 @@ class DistNLL(TaskAlgorithm):
         # By seed: the task of each head, in order of appearance.
         self._head_tasks: list[list[int]] = [[] for _ in self.seeds]
         self._heads = generators(self.seeds, "heads")
-        self._distillation = [DistillationLoss(student) for student in self.students]
         self._student_optimizers = [
             torch.optim.Adam(student.parameters(), lr=self.config.learning_rate, fused=True)
             for student in self.students
@@ -107,7 +106,7 @@ class DistNLL(TaskAlgorithm):
             shown = functional_call(self.learner.policy, teachers, (batch.copy(),))
         batch.set("teacher_action", shown["action"])
         for part in batch.split(self.config.distillation_batch_size, dim=1):
-            loss = self._distillation[index](part)["loss_distillation"]
+            loss = distillation_loss(student, part)
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()

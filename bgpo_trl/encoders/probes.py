@@ -30,7 +30,7 @@ from bgpo_trl.modules.frame_network import FrameNetwork
 from bgpo_trl.modules.inverse_model import InverseModel
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
-from bgpo_trl.objectives.supervised import SequenceReconstructionLoss
+from bgpo_trl.objectives.supervised import sequence_reconstruction_loss
 from bgpo_trl.scenes import StateColumns
 
 _GOOD_RECONSTRUCTION, _GOOD_NEAREST, _GOOD_INVERSE = 0.5, 0.9, 0.5
@@ -310,7 +310,7 @@ def _probe_reconstruction(
 @torch.no_grad()
 def _probe_sequences(lae: SequenceAutoencoder, held_out: _Encoded) -> dict[str, float]:
     data = TensorDict({"latent": held_out.latent, "length": held_out.length}, [len(held_out.data)])
-    return {"sequence_mse": SequenceReconstructionLoss(lae)(data)["loss_reconstruction"].item()}
+    return {"sequence_mse": sequence_reconstruction_loss(lae, data)["loss_reconstruction"].item()}
 
 
 def _mean(values: Tensor) -> float:

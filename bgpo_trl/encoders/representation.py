@@ -17,13 +17,13 @@ import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
-from torchrl.objectives import LossModule
 
 from bgpo_trl.configs import InverseModelConfig, RepresentationConfig
 from bgpo_trl.files.checkpoint import has_checkpoint, load_checkpoint, save_checkpoint
@@ -34,9 +34,9 @@ from bgpo_trl.modules.inverse_model import InverseModel, window
 from bgpo_trl.modules.sequence_autoencoder import SequenceAutoencoder
 from bgpo_trl.modules.vae import VAE
 from bgpo_trl.objectives.supervised import (
-    ActionInferenceLoss,
-    SequenceReconstructionLoss,
-    VAEInverseLoss,
+    action_inference_loss,
+    sequence_reconstruction_loss,
+    vae_inverse_loss,
 )
 from bgpo_trl.scenes import Scene
 
@@ -412,18 +412,20 @@ class Fit:
     def __call__(
         self,
         stage: str,
-        loss: LossModule,
+        network: nn.Module,
+        loss_of: Callable[..., TensorDict],
         sample: Callable[[torch.Generator], TensorDict],
         generator: torch.Generator,
         bfloat16: bool = False,
     ) -> None:
-        """Train ``loss.parameters()`` on the device, from the last checkpoint if there is one.
+        """Train a network on the device, from the last checkpoint if there is one.
 
         Args:
             stage: Name of its settings, the progress bar, the log rows and the checkpoint.
-            loss: Maps a batch to a TensorDict whose ``loss_*`` entries are summed.
+            network: Network to train.
+            loss_of: Maps network and batch to a TensorDict whose ``loss_*`` entries are summed.
             sample: Draws a batch, on the CPU.
-            generator: The only source of randomness of ``sample`` and ``loss``; saved in the
+            generator: The only source of randomness of ``sample`` and ``loss_of``; saved in the
                 checkpoint, so that a resumed training gives the same weights.
             bfloat16: Whether to compute the loss in bfloat16 where that is precise enough.
 
@@ -432,12 +434,12 @@ class Fit:
                 another configuration.
             OSError: If a checkpoint cannot be written.
         """
-        loss.to(self.device)
+        network.to(self.device)
         schedule = getattr(self.config, stage)
         steps, device = schedule.steps, torch.device(self.device)
-        optimizer = torch.optim.Adam(loss.parameters(), lr=schedule.learning_rate)
+        optimizer = torch.optim.Adam(network.parameters(), lr=schedule.learning_rate)
         path = Path(self.checkpoint) / stage if self.checkpoint else None
-        start = self._resume(path, loss, optimizer, generator)
+        start = self._resume(path, network, optimizer, generator)
         rows = range(start, steps)
         shown = {"shown": self.progress, "initial": start, "total": steps}
         bar = progress_bar(f"train {stage}", rows, **shown)
@@ -449,7 +451,7 @@ class Fit:
                 group["lr"] = rate
             batch = sample(generator).to(self.device)
             with torch.autocast(device.type, torch.bfloat16, enabled=bfloat16):
-                losses = loss(batch)
+                losses = loss_of(network, batch)
             objective = [value for key, value in losses.items() if key.startswith("loss_")]
             optimizer.zero_grad()
             torch.stack(objective).sum().backward()
@@ -467,7 +469,7 @@ class Fit:
                 state = {
                     "config": self._settings,
                     "step": done,
-                    "loss": loss.state_dict(),
+                    "network": network.state_dict(),
                     "optimizer": optimizer.state_dict(),
                     "generator": generator.get_state(),
                 }
@@ -481,7 +483,7 @@ class Fit:
     def _resume(
         self,
         path: Path | None,
-        loss: LossModule,
+        network: nn.Module,
         optimizer: torch.optim.Optimizer,
         generator: torch.Generator,
     ) -> int:
@@ -489,14 +491,14 @@ class Fit:
         if not path or not has_checkpoint(path):
             return 0
         saved = load_checkpoint(path)
-        if not saved.keys() >= {"config", "loss", "optimizer", "generator", "step"}:
+        if not saved.keys() >= {"config", "network", "optimizer", "generator", "step"}:
             raise ValueError(f"{path} holds no checkpoint of encoders: choose another folder")
         if saved["config"] != self._settings:
             raise ValueError(
                 f"{path} was written with another configuration or frame network: "
                 "remove it or choose another checkpoint folder"
             )
-        loss.load_state_dict(saved["loss"])
+        network.load_state_dict(saved["network"])
         optimizer.load_state_dict(saved["optimizer"])
         generator.set_state(saved["generator"])
         return saved["step"]
@@ -556,14 +558,14 @@ def _train_vae(datasets: Sequence[TensorDictBase], fit: Fit) -> VAE:
     vae = _initialized(fit.config.seed, VAE, *sizes)
     vae.mean_frame.copy_(mean_frame(frames))
     generator = fit.generator()
-    loss = VAEInverseLoss(
-        vae,
+    loss_of = partial(
+        vae_inverse_loss,
         reconstruction_weight=config.reconstruction_weight,
         kl_weight=config.kl_weight,
         inverse_weight=config.inverse_weight,
         generator=generator,
     )
-    fit("vae", loss, sample, generator, config.bfloat16)
+    fit("vae", vae, loss_of, sample, generator, config.bfloat16)
     vae.eval().requires_grad_(False)
     _set_scale(vae, frames, fit)
     return vae
@@ -619,7 +621,7 @@ def _train_inverse(latent: Tensor, episodes: TensorDictBase, fit: Fit) -> Invers
 
     sizes = (latent.shape[-1], action.shape[-1], config.hidden_size)
     inverse = _initialized(fit.config.seed, InverseModel, *sizes)
-    fit("inverse", ActionInferenceLoss(inverse), sample, fit.generator())
+    fit("inverse", inverse, action_inference_loss, sample, fit.generator())
     return inverse.eval().requires_grad_(False).cpu()
 
 
@@ -633,5 +635,5 @@ def _train_lae(latent: Tensor, length: Tensor, fit: Fit) -> SequenceAutoencoder:
 
     sizes = (latent.shape[-1], config.embedding_size)
     lae = _initialized(fit.config.seed, SequenceAutoencoder, *sizes)
-    fit("lae", SequenceReconstructionLoss(lae), sample, fit.generator())
+    fit("lae", lae, sequence_reconstruction_loss, sample, fit.generator())
     return lae.eval().requires_grad_(False).cpu()

@@ -8,6 +8,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from bgpo_trl.algorithms import dist_nll
 from bgpo_trl.modules.multi_head_actor import MultiHeadActor
 from bgpo_trl.seeding import generators
 from bgpo_trl.transforms import TaskSchedule
@@ -146,13 +147,18 @@ def test_students_learn_from_their_teachers_at_the_end_of_each_episode(make, sch
                 torch.testing.assert_close(expected, value, rtol=1e-4, atol=1e-5)
 
 
-def test_students_learn_what_their_teachers_do_in_tests(make):
+def test_students_learn_what_their_teachers_do_in_tests(make, monkeypatch):
     """The clone of one task, and what the critics choose in the others."""
     algorithm, taught = make("dist-nll-demonstrations", state="latent"), []
     play(algorithm, 60)
     algorithm.proposals.clone_is_better = lambda seed, task: task == 0
-    learn = algorithm._distillation[1]
-    algorithm._distillation[1] = lambda part: taught.append(part.clone()) or learn(part)
+    learn = dist_nll.distillation_loss
+
+    def spy(student, part):
+        taught.append(part.clone())
+        return learn(student, part)
+
+    monkeypatch.setattr(dist_nll, "distillation_loss", spy)
     algorithm._distill(1)
     loss, chosen = algorithm.learner.loss, set()
     assert len(algorithm._head_tasks[1]) == N_TASKS
