@@ -191,7 +191,7 @@ WRONG = {
     "NaN bonus": (lambda: BehaviorMatchingReward(lae, beta=NAN), "got nan"),
     "time limit too late": (lambda: world(source(), StepCounter(5)).reset(), "DemonstrationSource"),
     # measures
-    "difference of NaN": (lambda: statistics.difference([1.0], [NAN]), "with NaN"),
+    "difference of NaN": (lambda: statistics.difference([1.0], [NAN]), "must be finite"),
 }  # fmt: skip
 
 

@@ -20,17 +20,23 @@ import numpy as np
 import pandas as pd
 import tyro
 from numpy.typing import NDArray
-from shared import Episode, TrainedArguments, load_blocks_of_nico, play, random_actions
+from shared import (
+    Episode,
+    TrainedArguments,
+    load_blocks_of_nico,
+    play,
+    random_actions,
+    write_measurement,
+)
 
 from bgpo_trl.analysis.tables import Table, markdown
-from bgpo_trl.evaluation import start_seeds
+from bgpo_trl.evaluation import evaluator_of, snapshots_of, start_seeds
 from bgpo_trl.experiments.command_line import command_line
-from bgpo_trl.experiments.episodes import evaluator_of, snapshots_of
 from bgpo_trl.files.writing import check_folder
 from bgpo_trl.machine import set_threads
 from bgpo_trl.plugins import import_plugin
 from bgpo_trl.policy import LoadedRun
-from bgpo_trl.runs.provenance import commit_of_code, write_measurement
+from bgpo_trl.runs.provenance import commit_of_code
 from bgpo_trl.scenes.nico import NicoSimulation
 from suites import nico
 from suites.nico import kinematics

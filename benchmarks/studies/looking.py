@@ -27,20 +27,20 @@ from shared import (
     play,
     random_actions,
     style_success,
+    write_measurement,
 )
 
 from bgpo_trl.analysis import statistics
 from bgpo_trl.analysis.tables import Table, markdown
-from bgpo_trl.evaluation import start_seeds
+from bgpo_trl.evaluation import evaluator_of, snapshots_of, start_seeds
 from bgpo_trl.experiments.command_line import command_line
-from bgpo_trl.experiments.episodes import evaluator_of, snapshots_of
 from bgpo_trl.figures.style import COLORS, readable, save_figure
 from bgpo_trl.files.progress import progress_bar
 from bgpo_trl.files.writing import check_folder
 from bgpo_trl.machine import set_threads
 from bgpo_trl.plugins import import_plugin
 from bgpo_trl.policy import LoadedRun
-from bgpo_trl.runs.provenance import commit_of_code, write_measurement
+from bgpo_trl.runs.provenance import commit_of_code
 from bgpo_trl.scenes.nico import NICO, NicoEnv, NicoSimulation
 from suites import nico, opengl
 

@@ -14,22 +14,21 @@ import pandas as pd
 import torch
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
-from shared import TrainedArguments
+from shared import TrainedArguments, write_measurement
 
 from bgpo_trl.analysis.tables import Table, markdown
 from bgpo_trl.analysis.task_inference import task_inference_accuracy
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.encoders.representation import embed_demonstrations
-from bgpo_trl.evaluation import Evaluator, Snapshot
+from bgpo_trl.evaluation import Evaluator, Snapshot, evaluator_of
 from bgpo_trl.experiments.command_line import command_line
-from bgpo_trl.experiments.episodes import evaluator_of
 from bgpo_trl.figures.style import COLORS, add_legend, readable, save_figure, style_axes
 from bgpo_trl.files.writing import check_folder
 from bgpo_trl.machine import set_threads
 from bgpo_trl.plugins import import_plugin
 from bgpo_trl.policy import TrainedPolicy, load_run
-from bgpo_trl.runs.provenance import commit_of_code, write_measurement
+from bgpo_trl.runs.provenance import commit_of_code
 from bgpo_trl.seeding import stream_seed
 
 # Number of the evaluation; it seeds start states that neither training nor final tests used.

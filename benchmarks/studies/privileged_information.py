@@ -5,13 +5,12 @@ python benchmarks/studies/privileged_information.py
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from bgpo_trl.algorithms import ALGORITHMS
-from bgpo_trl.analysis.scores import episodes_to_80, late_scores
+from bgpo_trl.analysis.scores import late_scores
 from bgpo_trl.analysis.statistics import mean
 from bgpo_trl.analysis.tables import Table, markdown
 from bgpo_trl.configs import PRESETS, RLConfig
@@ -85,7 +84,7 @@ def privileged_information(arguments: InformationArguments) -> str:
         eval_episodes=5,
     )
     chosen_inputs = {name: chosen(INPUTS, name, "--inputs") for name in names}
-    table: Table = [["policy observes", *base.tasks, "all", "episodes to 80 %"]]
+    table: Table = [["policy observes", *base.tasks, "all"]]
     for name, (algorithm, changes) in chosen_inputs.items():
         settings: Any = {**changes, "rl": arguments.rl}
         config = replace(ALGORITHMS[algorithm].config, **settings)
@@ -101,10 +100,9 @@ def privileged_information(arguments: InformationArguments) -> str:
             trainer.run()
         run = read_run(out)
         save_figure(plot_success_curves({name: run}), out / "figures" / "success.png")
-        late, reached = late_scores(run), episodes_to_80(run)
+        late = late_scores(run)
         shares = [f"{100 * share:.1f}" for share in late.mean(0)]
-        last = "not reached" if math.isinf(reached) else f"{reached:.0f}"
-        table.append([name, *shares, mean(late.mean(1)).percent(), last])
+        table.append([name, *shares, mean(late.mean(1)).percent()])
     return markdown(table)
 
 

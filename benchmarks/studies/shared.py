@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import tyro
 from dm_env import TimeStep
 from matplotlib.axes import Axes
@@ -17,7 +18,9 @@ from numpy.typing import NDArray
 from bgpo_trl.experiments.arguments import ImportArguments
 from bgpo_trl.figures.style import add_legend, style_axes
 from bgpo_trl.files.checkpoint import has_checkpoint
+from bgpo_trl.files.writing import make_folder, write_json
 from bgpo_trl.policy import LoadedRun, load_all_seeds
+from bgpo_trl.runs.provenance import command, write_table
 from suites import nico
 from suites.nico.base import Environment
 
@@ -127,6 +130,16 @@ def random_actions(env: Environment, seed: int) -> Actor:
     del env
     random = np.random.default_rng(seed)
     return lambda _: random.uniform(-1.0, 1.0, 4)
+
+
+def write_measurement(folder: Path, name: str, table: pd.DataFrame, commit: str) -> None:
+    """Write a table to ``NAME.csv``, and the commit and command that made it to ``NAME.json``.
+
+    The folder is made if missing; ``commit`` is that of the code when the measurement began.
+    """
+    make_folder(folder)
+    write_table(folder / f"{name}.csv", table)
+    write_json(folder / f"{name}.json", {"commit": commit, "command": command()})
 
 
 def style_success(figure: Figure, axes: Axes) -> None:

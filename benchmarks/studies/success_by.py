@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from shared import style_success
 
 from bgpo_trl.analysis import statistics
-from bgpo_trl.analysis.comparison import differing_conditions, title_of
+from bgpo_trl.analysis.comparison import check_conditions, title_of
 from bgpo_trl.analysis.scores import late_scores
 from bgpo_trl.analysis.tables import Section, Table
 from bgpo_trl.experiments.command_line import command_line
@@ -57,9 +57,7 @@ def runs_by(directories: Sequence[Path], name: str) -> dict[float, Run]:
         if title_of(run) != title_of(first):
             names = f"{title_of(first)}, {title_of(run)}"
             raise ValueError(f"--by takes runs of one algorithm: {names}")
-        differing = differing_conditions(first, run, (name,))
-        if differing:
-            raise ValueError(f"{differing}: with --by {name}, they may differ in that alone")
+        check_conditions(first, run, (name,))
         if value in found:
             raise ValueError(f"--by {name}: {found[value].directory}, {run.directory} have {value}")
         found[value] = run

@@ -16,19 +16,18 @@ import numpy as np
 import pandas as pd
 import torch
 from numpy.typing import NDArray
-from shared import TrainedArguments, load_blocks
+from shared import TrainedArguments, load_blocks, write_measurement
 from torch import Tensor
 
 from bgpo_trl.analysis.tables import markdown
-from bgpo_trl.evaluation import Snapshot
+from bgpo_trl.evaluation import Snapshot, evaluator_of, snapshots_of
 from bgpo_trl.experiments.command_line import command_line
-from bgpo_trl.experiments.episodes import evaluator_of, snapshots_of
 from bgpo_trl.files.progress import progress_bar
 from bgpo_trl.files.writing import check_folder
 from bgpo_trl.machine import set_threads
 from bgpo_trl.plugins import import_plugin
 from bgpo_trl.policy import LoadedRun
-from bgpo_trl.runs.provenance import commit_of_code, write_measurement
+from bgpo_trl.runs.provenance import commit_of_code
 
 # Number of the evaluation; it seeds start states that no other test uses.
 _NUMBER = 2**31 + 4

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from bgpo_trl.files.csv_file import has_rows
 from bgpo_trl.runs.results import OF_KEEPING, Run, find_table, joined, read_run
 
 NAMES = {
@@ -41,7 +40,6 @@ _USUAL = "practised"  # schedule
 # Entries of config.json that belong to an algorithm or to keeping its run. All others, such as
 # encoders, starts, and the half of the demonstrations to test on, are conditions of a comparison.
 _OF_THE_RUN = ("name", "algorithm", "algorithm_class", *OF_KEEPING)
-_ONLY_EQUAL = "only runs under equal conditions are compared; --anyway compares them"
 _OF_THE_SETTING = ("tasks", "task_starts", "schedule", "episodes")
 
 
@@ -57,8 +55,6 @@ class Setting:
 
     runs: dict[str, Run]
     """By their names in tables."""
-    notes: list[str] = field(default_factory=list)
-    """Runs that were cut, and differences that were let pass."""
     order: str = ""
     """Name of its order of tasks, where another setting has the same tasks in another order."""
 
@@ -71,7 +67,7 @@ class Setting:
     def in_sequence(self) -> bool:
         """Whether tasks are presented one after the other."""
         starts = self.first.starts
-        return len(starts) > 1 and all(start < end for start, end in pairwise(starts))
+        return len(starts) > 1 and _rising(starts)
 
     @property
     def from_start(self) -> bool:
@@ -79,32 +75,27 @@ class Setting:
         return not any(self.first.starts)
 
     @property
-    def schedule(self) -> str:
-        """Name of the schedule by which presented tasks are drawn, if it is not the usual one."""
-        schedule = self.first.config.get("schedule", _USUAL)
-        return "" if schedule == _USUAL else str(schedule)
+    def _more(self) -> list[str]:
+        """The schedule by which presented tasks are drawn, if not the usual one, and the order."""
+        schedule = _schedule(self.first)
+        return [what for what in (schedule * (schedule != _USUAL), self.order) if what]
 
     @property
     def title(self) -> str:
         """Title of its tables."""
         number = len(self.first.tasks)
-        how = (
-            "all from the start"
-            if self.from_start
-            else "one after the other"
-            if self.in_sequence
-            else f"from episodes {', '.join(map(str, self.first.starts))}"
-        )
-        more = "".join(f", {what}" for what in (self.schedule, self.order) if what)
-        return f"{number} task{'s' * (number > 1)}, {how}{more}"
+        how = f"from episodes {', '.join(map(str, self.first.starts))}"
+        if self.from_start:
+            how = "all from the start"
+        elif self.in_sequence:
+            how = "one after the other"
+        return ", ".join([f"{number} task{'s' * (number > 1)}", how, *self._more])
 
     @property
     def slug(self) -> str:
         """Beginning of its figures' file names."""
         kind = "concurrent" if self.from_start else "continual" if self.in_sequence else "staggered"
-        number = str(len(self.first.tasks))
-        parts = (kind, number, self.schedule, self.order.replace(" ", "-"))
-        return "-".join(filter(None, parts))
+        return "-".join([kind, str(len(self.first.tasks)), *self._more]).replace(" ", "-")
 
     def find(self, algorithm: str, changed: Mapping[str, Any] | None = None) -> Run | None:
         """Return the first run of an algorithm with so changed hyperparameters, by default none."""
@@ -113,18 +104,10 @@ class Setting:
         return next(found, None)
 
 
-def read_settings(
-    directories: Sequence[Path], *, anyway: bool = False
-) -> tuple[list[Setting], str]:
+def read_settings(directories: Sequence[Path]) -> tuple[list[Setting], str]:
     """Read runs and sort them by setting: their tasks, and how these are presented.
 
-    Runs that differ in their seeds alone are joined. Runs that are not finished, or not begun, are
-    left out.
-
-    Args:
-        directories: Run directories.
-        anyway: Compare runs under different conditions all the same; longer runs are then cut to
-            the length of the shortest.
+    Runs that differ in their seeds alone are joined. Runs that are not finished are left out.
 
     Returns:
         The settings that have runs, and a line about the runs that were left out, or "".
@@ -136,22 +119,19 @@ def read_settings(
     groups: dict[tuple, list[Run]] = {}
     waiting: list[str] = []
     for directory in directories:
-        path = find_table(directory / "eval.csv")
-        if path is None or (path.suffix == ".csv" and not has_rows(path)):
+        if find_table(directory / "eval.csv") is None:
             waiting.append(f"{directory} holds no test episode")
             continue
         run = read_run(directory)
         if run.unfinished:
-            waiting.append(f"{run.directory} {run.unfinished}")
+            waiting.append(f"{directory} {run.unfinished}")
         else:
-            starts, schedule = run.starts, run.config.get("schedule", _USUAL)
-            rising = all(start < end for start, end in pairwise(starts))
-            kind = (run.tasks, not any(starts), rising, schedule)
+            kind = (run.tasks, not any(run.starts), _rising(run.starts), _schedule(run))
             groups.setdefault(kind, []).append(run)
-    left_out = "; ".join(waiting) + f": let the run{'s' * (len(waiting) > 1)} finish"
+    left_out = f"{'; '.join(waiting)}: let them finish" if waiting else ""
     if not groups:
-        raise ValueError(left_out if waiting else "there are no runs: name a run")
-    found = [_setting(joined(runs), anyway) for runs in groups.values()]
+        raise ValueError(left_out or "there are no runs: name a run")
+    found = [_setting(joined(runs)) for runs in groups.values()]
     found.sort(key=lambda setting: (len(setting.first.tasks), setting.from_start))
     settings: list[Setting] = []
     for setting in found:
@@ -161,66 +141,39 @@ def read_settings(
             order = "in reverse" if turned else f"order {len(alike) + 1}"
             setting = replace(setting, order=order)
         settings.append(setting)
-    return settings, left_out if waiting else ""
+    return settings, left_out
 
 
-def _setting(runs: list[Run], anyway: bool) -> Setting:
+def _rising(starts: Sequence[int]) -> bool:
+    return all(start < end for start, end in pairwise(starts))
+
+
+def _schedule(run: Run) -> str:
+    return run.config.get("schedule", _USUAL)
+
+
+def _setting(runs: list[Run]) -> Setting:
+    """Return runs of the same tasks as a setting; raise ``ValueError`` if conditions differ."""
     order = {name: place for place, name in enumerate(NAMES)}
     runs = sorted(
         runs,
-        key=lambda run: (
-            order.get(run.algorithm, len(order)),
-            bool(run.changed),
-            run.directory,
-        ),
+        key=lambda run: (order.get(run.algorithm, len(order)), bool(run.changed), run.directory),
     )
-    runs, notes = under_equal_conditions(runs, anyway=anyway)
+    for run in runs[1:]:
+        check_conditions(runs[0], run)
     names = [title_of(run) for run in runs]
     return Setting(
         {
             name if names.count(name) == 1 else f"{name} ({run.name})": run
             for name, run in zip(names, runs, strict=True)
-        },
-        notes,
+        }
     )
 
 
-def under_equal_conditions(
-    runs: Sequence[Run], *, anyway: bool = False
-) -> tuple[list[Run], list[str]]:
-    """Check that runs are comparable, and cut longer ones to the length of the shortest.
-
-    Args:
-        runs: Runs of the same tasks.
-        anyway: Whether to note differing conditions instead of refusing them.
-
-    Returns:
-        The runs, and notes: differing conditions, those that not all runs state, and what is cut.
-
-    Raises:
-        ValueError: If conditions differ.
-    """
-    notes = [differing for run in runs[1:] if (differing := differing_conditions(runs[0], run))]
-    if notes and not anyway:
-        raise ValueError(f"{notes[0]}: {_ONLY_EQUAL}")
-    conditions = [_conditions(run) for run in runs]
-    for name in dict.fromkeys(name for of_run in conditions for name in of_run):
-        silent = sum(name not in of_run for of_run in conditions)
-        if silent:
-            notes.append(f"{name}: not stated by {silent} of {len(runs)} runs, taken as equal")
-    last = min(run.last for run in runs)
-    notes += [
-        f"{run.directory} is cut at {last} of {run.last} episodes"
-        for run in runs
-        if run.last > last
-    ]
-    return [run.until(last) for run in runs], notes
-
-
-def reference_of(setting: Setting, settings: Iterable[Setting], *, anyway: bool) -> Setting | None:
+def reference_of(setting: Setting, settings: Iterable[Setting]) -> Setting | None:
     """Return the setting with the same tasks from the start, for tasks one after the other.
 
-    None without one. With ``anyway``, differing conditions are noted in the setting.
+    None without one.
 
     Raises:
         ValueError: If its runs have other conditions, beside the order and starts of tasks.
@@ -232,27 +185,30 @@ def reference_of(setting: Setting, settings: Iterable[Setting], *, anyway: bool)
         return None
     # The digest of a bank depends on the order of its tasks.
     turned = setting.first.tasks != found.first.tasks
-    ignored = (*_OF_THE_SETTING, "bank") if turned else _OF_THE_SETTING
-    differing = differing_conditions(setting.first, found.first, ignored)
-    if differing and not anyway:
-        raise ValueError(f"{differing}: {_ONLY_EQUAL}")
-    setting.notes.extend([differing] if differing else [])
+    check_conditions(setting.first, found.first, (*_OF_THE_SETTING, *["bank"] * turned))
     return found
 
 
-def differing_conditions(run: Run, other: Run, ignored: Sequence[str] = ()) -> str:
-    """Return in which conditions two runs differ, in one line; "" if in none.
+def check_conditions(run: Run, other: Run, ignored: Sequence[str] = ()) -> None:
+    """Check that two runs were made under equal conditions.
 
     Conditions are all entries of ``config.json`` but those of the algorithm, and the time limit of
     an episode. Entries that only one of them has are passed over.
+
+    Raises:
+        ValueError: If conditions differ that are not ``ignored``.
     """
     ours, theirs = _conditions(run), _conditions(other)
-    found = [
+    differing = [
         f"{name} ({_short(ours[name])} and {_short(theirs[name])})"
         for name in ours
         if name in theirs and name not in ignored and ours[name] != theirs[name]
     ]
-    return f"{run.directory} and {other.directory} differ in {', '.join(found)}" if found else ""
+    if differing:
+        raise ValueError(
+            f"{run.directory} and {other.directory} differ in {', '.join(differing)}: only runs "
+            "under equal conditions are compared, name the others apart"
+        )
 
 
 def _conditions(run: Run) -> dict[str, Any]:

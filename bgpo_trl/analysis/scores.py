@@ -93,37 +93,6 @@ def area_scores(run: Run) -> Values:
     return np.stack(areas, axis=-1)
 
 
-def best_scores(run: Run) -> Values:
-    """Return each task's highest mean success over seeds in any 10 % of training, ``[T]``."""
-    window, best = late_window(run), np.full(len(run.tasks), -np.inf)
-    for task in range(len(run.tasks)):
-        tested = ~np.isnan(run.success[..., task]).all(0)
-        episodes, success = run.episodes[tested], run.success[:, tested, task]
-        whole = episodes[episodes >= episodes[0] + window - 1]
-        for end in whole if len(whole) else episodes[-1:]:
-            inside = _in_window(episodes, end, window)
-            best[task] = max(best[task], np.nanmean(success[:, inside]))
-    return best
-
-
-def trailing_mean(success: ArrayLike, n: int) -> Values:
-    """Return the mean of each evaluation and up to ``n - 1`` before it, ``[..., E, T]``."""
-    success = np.asarray(success, float)
-    ends = range(1, success.shape[-2] + 1)
-    means = [_mean(success[..., max(0, end - n) : end, :], axis=-2) for end in ends]
-    return np.stack(means, axis=-2)
-
-
-def episodes_to_80(run: Run, threshold: float = 0.8) -> float:
-    """Return the training episodes until overall success first reaches 80 %, else infinity.
-
-    Overall success is the mean over seeds and the tasks presented so far, and over the last three
-    evaluations, since a single one has few test episodes.
-    """
-    reached = _mean(trailing_mean(run.success, 3), axis=-1).mean(axis=0) >= threshold
-    return float(run.episodes[reached.argmax()]) if reached.any() else float("inf")
-
-
 def _phases(run: Run) -> tuple[list[int], int]:
     """Return the last episode of each task's phase, and a fifth of the shortest, in episodes."""
     ends = [*run.starts[1:], run.last]
@@ -154,54 +123,12 @@ def success_matrix(run: Run) -> Values:
     return matrix
 
 
-def change_since_learned(matrix: ArrayLike) -> Values:
-    """Return each task's change of success since the end of its own phase, ``[..., T]``.
+def forgetting(matrix: Values) -> Values:
+    """Return the loss of success since the end of a task's own phase, ``[..., T]``.
 
-    ``R[T - 1, j] - R[j, j]`` of a `success_matrix`. Its mean over all tasks but the last is the
-    backward transfer of Lopez-Paz & Ranzato (2017, "Gradient Episodic Memory for Continual
-    Learning").
+    ``R[j, j] - R[T - 1, j]`` of a `success_matrix`; 0 for the last task.
     """
-    matrix = np.asarray(matrix, float)
-    return matrix[..., -1, :] - np.diagonal(matrix, axis1=-2, axis2=-1)
-
-
-def forgetting_since_best(success: ArrayLike) -> Values:
-    """Return the loss of success since each task's best mean of three evaluations, ``[...]``.
-
-    The mean over tasks of the highest `trailing_mean` of ``success`` ``[..., E, T]`` minus the last
-    one; never negative (Chaudhry et al., 2018, "Riemannian Walk for Incremental Learning", but over
-    all evaluations and tasks). Noise of single evaluations would count as forgetting.
-    """
-    means = trailing_mean(success, 3)
-    # Unlike np.nanmax, it does not warn of tasks without a test.
-    best = np.fmax.reduce(means, axis=-2)
-    return _mean(best - means[..., -1, :], axis=-1)
-
-
-def since_best_unchanged(run: Run, draws: int = 400, rng: int = 0) -> Values:
-    """Return the `forgetting_since_best` to expect of policies that do not change, ``[S]``.
-
-    The best of several noisy means is higher than the last one, also where nothing is forgotten.
-    In this simulation, tests after a task's own phase succeed independently, each with the success
-    at the end of the phase, R[j, j] of `success_matrix`. Earlier tests are those of the run.
-
-    Args:
-        run: A run with tasks one after the other, whose ``config.json`` has ``eval_episodes``.
-        draws: Number of simulations, of which the mean is taken.
-        rng: Seed of the simulations.
-
-    Raises:
-        ValueError: As for `success_matrix`.
-    """
-    n_tests = run.config["eval_episodes"]
-    random, learned = np.random.default_rng(rng), success_matrix(run)
-    simulated = np.repeat(run.success[None], draws, 0)
-    for task, end in enumerate(_phases(run)[0]):
-        since = run.episodes > end
-        rate = np.repeat(learned[:, task, task, None], since.sum(), 1)
-        successes = random.binomial(n_tests, rate, (draws, *rate.shape))
-        simulated[:, :, since, task] = successes / n_tests
-    return forgetting_since_best(simulated).mean(0)
+    return np.diagonal(matrix, axis1=-2, axis2=-1) - matrix[..., -1, :]
 
 
 def trials_to(success: ArrayLike, threshold: float = 0.5, *, window: int = 20) -> float:
@@ -230,20 +157,6 @@ def own_episodes(run: Run, threshold: float = 0.5) -> Values | None:
     times = table.groupby(["seed", "task"])["success"].agg(trials_to, threshold)
     found = run.by_seed_and_task(times)
     return np.where(np.isnan(found), np.inf, found)
-
-
-def times_the_first(episodes: ArrayLike) -> Values:
-    """Return the learning times of the later tasks as multiples of the first task's, ``[T - 1]``.
-
-    The median over seeds of `trials_to` ``[S, T]``, with tasks in order of presentation. A task
-    that a seed never learns counts as infinitely long. Seeds that never learn the first task are
-    left out; NaN if none is left.
-    """
-    episodes = np.asarray(episodes, float)
-    learned = episodes[np.isfinite(episodes[:, 0])]
-    if not len(learned):
-        return np.full(episodes.shape[1] - 1, np.nan)
-    return np.median(learned[:, 1:] / learned[:, :1], axis=0)
 
 
 def success_steps(run: Run) -> Values:

@@ -19,14 +19,9 @@ from scipy import stats
 
 MARGIN = 0.05
 """Two runs count as equivalent if their difference is within this margin, stated beforehand."""
-POWER = 0.8
-"""Probability of a decision for which `seeds_needed` counts seeds."""
-_MANY = 1_000
 # More assignments of seeds to two runs than this are sampled. Eight against eight are 12,870.
 _PERMUTATIONS = 20_000
 _SIGNS = (1.0, -1.0, -1.0, 1.0)
-
-Array = NDArray[np.float64]
 
 
 class Estimate(NamedTuple):
@@ -81,29 +76,18 @@ def contrast(
 
 
 def mean(scores: ArrayLike) -> Estimate:
-    """Return the mean of the seeds' scores ``[S]`` with its 95 % interval.
-
-    Raises:
-        ValueError: As for `contrast`.
-    """
+    """Return the mean of the seeds' scores ``[S]`` with its 95 % interval."""
     return contrast([scores], [1.0])
 
 
 @dataclass(frozen=True)
 class Difference:
-    """The difference between two runs, what can be said of it, and what it would take to say more.
-
-    For two pairs of runs, it is the difference of the pairs' differences.
-    """
+    """The difference between two runs, or between the differences of two pairs of runs."""
 
     estimate: Estimate
     """With its 95 % interval."""
     narrow: Estimate
     """With its 90 % interval, that of two one-sided tests of equivalence at 5 %."""
-    p: float
-    """Of the permutation test; NaN for two pairs, or a single seed."""
-    seeds: int | None
-    """Seeds a run that a decision would take, see `seeds_needed`; None if that is unknown."""
 
     @property
     def verdict(self) -> str:
@@ -117,46 +101,21 @@ class Difference:
             return f"equivalent ({side})" if side else "equivalent"
         return side or "not decided"
 
-    @property
-    def note(self) -> str:
-        """The verdict and, where nothing is decided, how many seeds a run it would take."""
-        if self.verdict != "not decided" or self.seeds is None:
-            return self.verdict
-        count = f"more than {_MANY:,}" if self.seeds > _MANY else f"about {self.seeds}"
-        return f"not decided ({count} seeds would)"
-
 
 def difference(*samples: ArrayLike) -> Difference:
-    """Return the difference of the mean scores of two runs, first minus second.
+    """Return the difference of the mean scores ``[S]`` of two runs, first minus second.
 
     Of four runs: the difference between the first two minus that between the last two.
-
-    Args:
-        samples: Scores of each run's seeds, ``[S]``; numbers of seeds may differ.
-
-    Raises:
-        ValueError: As for `contrast`; or if there are not two or four samples.
     """
-    if len(samples) not in (2, 4):
-        raise ValueError(f"a difference is of two runs or two pairs, not of {len(samples)}")
-    wide, narrow = (contrast(samples, _SIGNS[: len(samples)], share) for share in (0.95, 0.9))
-    p = permutation_p(samples[0], samples[1]) if len(samples) == 2 else math.nan
-    return Difference(wide, narrow, p, seeds_needed(*samples))
+    signs = _SIGNS[: len(samples)]
+    return Difference(contrast(samples, signs), contrast(samples, signs, 0.9))
 
 
-def permutation_p(first: ArrayLike, second: ArrayLike, rng: int | np.random.Generator = 0) -> float:
+def permutation_p(first: ArrayLike, second: ArrayLike) -> float:
     """Return the two-sided p value of a permutation test of the difference of two means.
 
     It is exact for up to 20,000 assignments of the seeds to the two runs, such as eight against
     eight; of more, as many are drawn. NaN if a run has a single seed.
-
-    Args:
-        first: Scores of the first run's seeds, ``[S]``.
-        second: Scores of the second run's seeds; their number may differ.
-        rng: Generator of the draws, or its seed.
-
-    Raises:
-        ValueError: If scores are missing or not finite.
     """
     samples = _checked(first), _checked(second)
     if min(map(len, samples)) < 2:
@@ -166,68 +125,13 @@ def permutation_p(first: ArrayLike, second: ArrayLike, rng: int | np.random.Gene
         lambda a, b, axis: a.mean(axis) - b.mean(axis),
         vectorized=True,
         n_resamples=_PERMUTATIONS,
-        rng=np.random.default_rng(rng),
+        rng=np.random.default_rng(0),
     )
     return float(test.pvalue)
 
 
-def seeds_needed(*samples: ArrayLike) -> int | None:
-    """Return the number of seeds a run at which a decision is likely, a power calculation.
-
-    If the difference and the spread of seeds are as measured, so many seeds find the runs
-    equivalent, or different, with a probability of at least `POWER`. Both are uncertain with few
-    seeds, and so is the result.
-
-    Args:
-        samples: Scores of the seeds of two runs or two pairs of runs, ``[S]`` each.
-
-    Returns:
-        At least 2; more than 1,000 is given as 1,001; None if a run has a single seed.
-
-    Raises:
-        ValueError: As for `contrast`.
-    """
-    scores = [_checked(sample) for sample in samples]
-    if min(map(len, scores)) < 2:
-        return None
-    spreads = np.array([sample.var(ddof=1) for sample in scores])
-    if not spreads.any():
-        return 2
-    gap = abs(contrast(scores, _SIGNS[: len(scores)]).value)
-    n = np.arange(2, _MANY + 1)
-    # Of runs with n seeds each, whose difference has this standard error.
-    freedom = (n - 1) * spreads.sum() ** 2 / (spreads**2).sum()
-    error = np.sqrt(spreads.sum() / n)
-    # Two one-sided tests (Schuirmann, 1987): each bound of the margin is excluded.
-    upper, lower = (
-        _power(0.95, freedom, distance / error) for distance in (MARGIN - gap, MARGIN + gap)
-    )
-    different = _power(0.975, freedom, gap / error)
-    enough = np.maximum(upper + lower - 1, different) >= POWER
-    return int(n[enough.argmax()]) if enough.any() else _MANY + 1
-
-
-def _power(confidence: float, freedom: Array, distance: Array) -> Array:
-    """Return the power of one-sided t tests at distances from the bound in standard errors."""
-    # Beyond this distance the power is 1, and SciPy's becomes NaN.
-    distance = np.clip(distance, -1e3, 1e3)
-    return stats.nct.sf(stats.t.ppf(confidence, freedom), freedom, distance)
-
-
-def holm(p: Sequence[float]) -> list[float]:
-    """Return p values adjusted for their number (Holm, 1979), in the given order; NaN stay."""
-    values = np.asarray(p, float)
-    order = [index for index in np.argsort(values) if not math.isnan(values[index])]
-    factors = np.arange(len(order), 0, -1)
-    values[order] = np.minimum(1, np.maximum.accumulate(factors * values[order]))
-    return values.tolist()
-
-
-def _checked(scores: ArrayLike) -> Array:
+def _checked(scores: ArrayLike) -> NDArray[np.float64]:
     scores = np.asarray(scores, float)
     if scores.ndim != 1 or not scores.size or not np.isfinite(scores).all():
-        raise ValueError(
-            "scores must be finite, one for each of one or more seeds: got shape "
-            f"{list(scores.shape)}{'' if np.isfinite(scores).all() else ' with NaN or Inf'}"
-        )
+        raise ValueError(f"scores must be finite, one for each of one or more seeds: got {scores}")
     return scores

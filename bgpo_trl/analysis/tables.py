@@ -7,29 +7,24 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from itertools import combinations, product
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 
 from bgpo_trl.analysis import statistics
-from bgpo_trl.analysis.comparison import NAMES, Setting
+from bgpo_trl.analysis.comparison import Setting
 from bgpo_trl.analysis.scores import (
     Values,
     area_scores,
-    best_scores,
-    change_since_learned,
     demonstrated_steps,
-    episodes_to_80,
     final_means,
-    forgetting_since_best,
+    forgetting,
     forward_transfer,
     late_scores,
     own_episodes,
-    since_best_unchanged,
     success_matrix,
     success_steps,
-    times_the_first,
 )
 from bgpo_trl.runs.results import Run
 
@@ -39,7 +34,7 @@ Table = list[list[str]]
 
 @dataclass(frozen=True)
 class Section:
-    """Section of a report: title, notes, figures and a table."""
+    """Section of a report: title, table, figures and notes."""
 
     title: str
     table: Table = field(default_factory=list)
@@ -49,26 +44,11 @@ class Section:
     notes: Sequence[str] = ()
 
 
-_CLAIM_VERDICTS = {"above": "reproduced", "below": "the opposite"}
-_MEASURES = {"success": late_scores, "area": area_scores}
-# Each BGPO with the baselines on the same terms (demonstrations, stabilizers).
-_BASELINES = {
-    "bgpo": ("maml-demonstrations", "dist-nll-demonstrations"),
-    "bgpo-experts": ("maml", "dist-nll"),
-    "bgpo-single": ("maml", "dist-nll"),
-    "bgpo-paper": ("maml-paper", "dist-nll-paper"),
-}
-_BASELINE_NAMES = ("MAML", "Dist-NLL")
-# Fig. 9, from the best to the worst.
-_ABLATION = (
-    ("bgpo-single", "without-bonus"),
-    ("without-bonus", "without-gwr"),
-    ("without-gwr", "without-both"),
-    ("bgpo-single", "without-both"),
-)
 # Beside BGPO: its versions and the baselines on the same terms; with and without an addition.
 _PAIRS = {
-    *((ours, rival) for ours in list(_BASELINES)[1:] for rival in _BASELINES[ours]),
+    *(("bgpo-experts", rival) for rival in ("maml", "dist-nll")),
+    *(("bgpo-single", rival) for rival in ("maml", "dist-nll")),
+    *(("bgpo-paper", rival) for rival in ("maml-paper", "dist-nll-paper")),
     *(("bgpo-single", fewer) for fewer in ("without-bonus", "without-gwr", "without-both")),
     *(("without-bonus", "without-both"), ("without-gwr", "without-both")),
     *(("group-balanced-replay", "bgpo-single"), ("demonstrations", "bgpo-single")),
@@ -80,29 +60,25 @@ def success_section(setting: Setting) -> list[Section]:
     """Return the conditions of a setting, and the success of its runs."""
     first = setting.first
     conditions = {name: first.config.get(name) for name in ("held_out", "eval_episodes")}
-    about = (
-        "Tasks: "
-        + ", ".join(
-            f"{number} {task} (from episode {start})"
-            for number, (task, start) in enumerate(first.presented.items(), 1)
-        )
-        + f". {first.last:,} episodes, tests every {first.eval_every}"
-        + "".join(f", {name} {value}" for name, value in conditions.items() if value is not None)
-        + "."
+    tasks = ", ".join(
+        f"{number} {task} (from episode {start})"
+        for number, (task, start) in enumerate(first.presented.items(), 1)
     )
+    tests = [f"{name} {value}" for name, value in conditions.items() if value is not None]
     notes = (
+        f"Tasks: {tasks}. {first.last:,} episodes, "
+        + ", ".join([f"tests every {first.eval_every}", *tests])
+        + ".",
         "The seed is the unit: its score is the mean over tasks of the success in tests over the "
         "last 10 % of training, its area the mean height of the tasks' curves of test success "
         "since they were presented. Given are means over seeds and 95 % intervals (Student's t), "
         "in percent.",
         "Worst task: that with the lowest mean. Steps: of the successful tests among these, and of "
-        "the demonstrations; means over the tasks with a success. Episodes to 80 %: until the mean "
-        "over seeds and presented tasks of three tests.",
+        "the demonstrations; means over the tasks with a success.",
     )
     numbers = range(1, len(setting.first.tasks) + 1)
     rows = [["", "knows of tasks", "seeds", "success", "worst task"]]
     rows[0] += [*(f"task {number}" for number in numbers), "steps", "demonstrated", "area"]
-    rows[0] += ["episodes to 80 %"] if setting.from_start else []
     for name, run in setting.runs.items():
         late, area = late_scores(run), area_scores(run)
         worst = int(late.mean(0).argmin())
@@ -112,12 +88,8 @@ def success_section(setting: Setting) -> list[Section]:
         steps, demonstrated = _task_means(success_steps(run)), demonstrated_steps(run)
         solved = ~np.isnan(steps)
         row += [_mean_cell(steps[solved]), _mean_cell(demonstrated[solved])]
-        row += [statistics.mean(area.mean(1)).percent()]
-        if setting.from_start:
-            reached = episodes_to_80(run)
-            row += [f"{reached:.0f}" if np.isfinite(reached) else "not reached"]
-        rows.append(row)
-    return [Section(setting.title, rows, notes=[about, *setting.notes, *notes])]
+        rows.append([*row, statistics.mean(area.mean(1)).percent()])
+    return [Section(setting.title, rows, notes=notes)]
 
 
 def _task_means(steps: Values) -> Values:
@@ -151,138 +123,57 @@ def difference_section(setting: Setting) -> list[Section]:
         for pair in (both, both[::-1])
         if (named[pair[0]], named[pair[1]]) in _PAIRS and pair not in pairs
     ]
-    found = [
-        [
-            statistics.difference(*(score(setting.runs[name]).mean(1) for name in pair))
-            for pair in pairs
+    rows = [["", "success", "found", "p", "area", "found"]]
+    for pair in pairs:
+        runs = [setting.runs[name] for name in pair]
+        late, area = ([score(run).mean(1) for run in runs] for score in (late_scores, area_scores))
+        p = statistics.permutation_p(*late)
+        cells = [
+            cell
+            for found in (statistics.difference(*late), statistics.difference(*area))
+            for cell in (found.estimate.points(), found.verdict)
         ]
-        for score in (late_scores, area_scores)
-    ]
-    adjusted = statistics.holm([late.p for late in found[0]])
-    rows = [["", "success", "found", "p", "p, Holm", "area", "found"]]
-    for (ours, other), late, area, p in zip(pairs, *found, adjusted, strict=True):
-        rows.append(
-            [
-                f"{ours} against {other}",
-                late.estimate.points(),
-                late.note,
-                *("-" if np.isnan(value) else f"{value:.3f}" for value in (late.p, p)),
-                area.estimate.points(),
-                area.note,
-            ]
-        )
+        cells.insert(2, "-" if np.isnan(p) else f"{p:.3f}")
+        rows.append([" against ".join(pair), *cells])
     notes = (
         "Differences of the seeds' scores in points, with 95 % intervals (Welch's t). Above, "
         "below: the interval excludes 0. Equivalent: the 90 % interval lies within "
-        f"+-{100 * statistics.MARGIN:.0f} points, a margin set beforehand. Else it is not decided; "
-        "the number of seeds a run that decides it with a probability of "
-        f"{100 * statistics.POWER:.0f} % follows from the difference and the spread of seeds as "
-        "measured, which are uncertain.",
-        "p: permutation test of seeds, two-sided; the next column adjusts it for the number of "
-        "rows (Holm). Verdicts are not adjusted.",
+        f"+-{100 * statistics.MARGIN:.0f} points, a margin set beforehand. Else it is not decided. "
+        "p: permutation test of seeds, two-sided. Nothing is adjusted for the number of rows.",
     )
-    title = f"Differences: {setting.title}"
-    return [Section(title, rows, notes=[*setting.notes, *notes])] if pairs else []
-
-
-def claims_section(continual: Setting | None, concurrent: Setting | None) -> list[Section]:
-    """Return the paper's claims, as far as there are runs for them.
-
-    Args:
-        continual: Runs with tasks one after the other, if there are any.
-        concurrent: Runs of the same tasks from the start.
-    """
-    settings = {"one after the other": continual, "from the start": concurrent}
-    against = [
-        (name, ours, rival)
-        for ours, rivals in _BASELINES.items()
-        for name, rival in zip(_BASELINE_NAMES, rivals, strict=True)
-    ]
-    # Claim, compared runs, measure, and the two or four runs whose scores are subtracted.
-    tests: list[tuple[str, str, str, list[tuple[Setting | None, str]]]] = []
-    for how, setting in settings.items():
-        for (name, ours, rival), what in product(against, _MEASURES):
-            tested = f"{NAMES[ours]} against {NAMES[rival]}"
-            runs = [(setting, ours), (setting, rival)]
-            tests.append((f"BGPO above {name}, {how}", tested, what, runs))
-    for name, ours, rival in against:
-        runs = [(setting, key) for setting in settings.values() for key in (ours, rival)]
-        claim = f"the lead over {name} is larger one after the other"
-        tests.append((claim, f"{NAMES[ours]} against {NAMES[rival]}", "success", runs))
-    for better, worse in _ABLATION:
-        claim = f"{NAMES[better]} converges faster than {NAMES[worse]}"
-        runs = [(concurrent, better), (concurrent, worse)]
-        tests.append((claim, "from the start", "area", runs))
-
-    rows = [["the paper's claim", "tested", "measured", "difference", "found"]]
-    for claim, tested, what, runs in tests:
-        found = [setting.find(key) if setting else None for setting, key in runs]
-        scores = [_MEASURES[what](run).mean(1) for run in found if run is not None]
-        if len(scores) == len(runs):
-            difference = statistics.difference(*scores)
-            verdict = _CLAIM_VERDICTS.get(difference.verdict, difference.note)
-            rows.append([claim, tested, what, difference.estimate.points(), verdict])
-    there = [setting for setting in settings.values() if setting is not None]
-    missing = len(tests) + 1 - len(rows)
-    notes = [note for setting in there for note in setting.notes]
-    notes += [f"{missing} further claims need runs that are not here."] if missing else []
-    title = f"The paper's claims, {len(there[0].first.tasks)} tasks"
-    return [Section(title, rows, notes=notes)] if len(rows) > 1 else []
+    return [Section(f"Differences: {setting.title}", rows, notes=notes)] if pairs else []
 
 
 def sequence_section(setting: Setting, reference: Setting | None) -> list[Section]:
-    """Return forgetting and transfer in a setting with tasks one after the other.
-
-    Args:
-        setting: The setting.
-        reference: That with all tasks from the start, for forward transfer.
-
-    Raises:
-        ValueError: If tasks are tested too rarely.
-    """
-    columns = ["forgetting", "since best", "if unchanged", "backward transfer", "forward transfer"]
-    rows = [["", *columns]]
+    """Return forgetting and transfer in a setting with tasks one after the other."""
+    rows = [["", "forgetting", "forward transfer"]]
     for name, run in setting.runs.items():
-        change = change_since_learned(success_matrix(run))
-        best = forgetting_since_best(run.success)
-        by_noise = "-"
-        if run.config.get("eval_episodes"):
-            by_noise = f"{100 * since_best_unchanged(run).mean():+.1f}"
         beside = reference.find(run.algorithm, run.changed) if reference is not None else None
         forward = None if beside is None else forward_transfer(run, beside)
-        forgetting, since_best, backward = (
-            statistics.mean(scores).points()
-            for scores in (-change.mean(1), best, change[:, :-1].mean(1))
-        )
-        cells = [forgetting, since_best, by_noise, backward, forward.points() if forward else "-"]
-        rows.append([name, *cells])
+        forgotten = statistics.mean(forgetting(success_matrix(run)).mean(1)).points()
+        rows.append([name, forgotten, forward.points() if forward else "-"])
     notes = (
-        "Means over seeds and 95 % intervals, in points. R[i, j]: success on task j over the last "
-        "fifth of the phase of task i. Forgetting: mean over tasks of R[j, j] minus R at the end; "
-        "backward transfer: the negative, without the last task; since best: a task's best mean of "
-        "three tests minus its last; if unchanged: what that is on average, by the noise of tests "
-        "alone, for policies whose success stays at R[j, j].",
+        "Means over seeds and 95 % intervals, in points. Forgetting: mean over tasks of R[j, j] "
+        "minus R at the end. R[i, j] is the success on task j over the last fifth of the phase of "
+        "task i.",
         "Forward transfer: (area - reference) / (1 - reference), areas under a task's curve over "
         "its own episodes, from the first to the last test of its phase; reference: the same "
         "algorithm with all tasks from the start, whose seeds count in the interval.",
     )
-    title = f"Forgetting and transfer: {setting.title}"
-    return [Section(title, rows, notes=[*setting.notes, *notes])]
+    return [Section(f"Forgetting and transfer: {setting.title}", rows, notes=notes)]
 
 
 def speed_section(setting: Setting, share: float) -> list[Section]:
     """Return learning times: each task's own training episodes to a success rate."""
     note = (
         "Training episodes of a task's own until so many of its last 20 succeed: median over "
-        "seeds, in which a seed that never gets there counts as longest; then the same relative to "
-        "the first task, median of the seeds' ratios."
+        "seeds, in which a seed that never gets there counts as longest."
     )
-    tasks = [f"task {number}" for number, _ in enumerate(setting.first.tasks, 1)]
-    rows = [["", *tasks, *(f"{task} : {tasks[0]}" for task in tasks[1:])]]
+    rows = [["", *(f"task {number}" for number, _ in enumerate(setting.first.tasks, 1))]]
     for name, run in setting.runs.items():
         episodes = own_episodes(run, share)
         if episodes is not None:
-            rows.append([name, *map(_median_cell, episodes.T), *_ratio_cells(episodes)])
+            rows.append([name, *map(_median_cell, episodes.T)])
     title = f"Own episodes to {100 * share:.0f} %: {setting.title}"
     return [Section(title, rows, notes=[note])] if len(rows) > 1 else []
 
@@ -293,19 +184,6 @@ def _median_cell(episodes: Values) -> str:
     median = float(np.median(episodes))
     cell = f"{median:.0f}" if np.isfinite(median) else "not reached"
     return f"{cell} ({never} of {len(episodes)} seeds never)" if never else cell
-
-
-def _ratio_cells(episodes: Values) -> list[str]:
-    """Format learning times ``[S, T]`` as multiples of the first task's.
-
-    Cells give the number of seeds if some never learned the first task.
-    """
-    learned = int(np.isfinite(episodes[:, 0]).sum())
-    note = "" if learned == len(episodes) else f" ({learned} of {len(episodes)} seeds)"
-    return [
-        "-" if np.isnan(times) else ("not reached" if np.isinf(times) else f"{times:.2f}") + note
-        for times in times_the_first(episodes).tolist()
-    ]
 
 
 def groups_section(setting: Setting) -> list[Section]:
@@ -354,7 +232,7 @@ def cost_section(setting: Setting) -> list[Section]:
 
 def run_section(title: str, run: Run) -> Section:
     """Return a run, task by task."""
-    late, best, own = late_scores(run), best_scores(run), own_episodes(run)
+    late = late_scores(run)
     seen, held_out = (final_means(run, kind, "success") for kind in ("seen", "held-out"))
     inferred = final_means(run, "held-out", "task_inference")
     trained = final_means(run, "held-out", "steps")
@@ -362,8 +240,7 @@ def run_section(title: str, run: Run) -> Section:
         *(None if found is None else _task_means(found) for found in (success_steps(run), trained)),
         demonstrated_steps(run),
     ]
-    rows = [["task", "last 10 %", "by seed", "best 10 %", "own episodes to 50 %"]]
-    rows[0] += ["trained, seen", "trained, held-out", "inferred"]
+    rows = [["task", "last 10 %", "by seed", "trained, seen", "trained, held-out", "inferred"]]
     rows[0] += ["steps", "steps, trained", "steps, demonstrated"]
     # The last row is the mean over tasks.
     for index, task in enumerate([*run.tasks, None]):
@@ -374,8 +251,6 @@ def run_section(title: str, run: Run) -> Section:
                 task or "all",
                 statistics.mean(of_seeds).percent(),
                 _numbers((100 * of_seeds).tolist()),
-                "" if task is None else f"{100 * best[index]:.1f}",
-                "" if task is None or own is None else _median_cell(own[:, index]),
                 *(
                     "" if shares is None else f"{100 * shares[:, chosen].mean():.{digits}f}"
                     for shares, digits in ((seen, 1), (held_out, 1), (inferred, 2))

@@ -14,11 +14,10 @@ import torch
 from bgpo_trl.analysis.scores import final_means
 from bgpo_trl.analysis.task_inference import group_purity, task_inference_accuracy
 from bgpo_trl.data.bank import DemonstrationBank
-from bgpo_trl.evaluation import evaluate_random_policy
-from bgpo_trl.experiments.episodes import evaluator_of, snapshots_of
+from bgpo_trl.evaluation import evaluate_random_policy, evaluator_of, snapshots_of
 from bgpo_trl.figures.frames import file_names, plot_frame_strips, save_gif
 from bgpo_trl.figures.groups import plot_groups
-from bgpo_trl.figures.gwr import draw_growth, draw_nodes
+from bgpo_trl.figures.gwr import draw_nodes
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.figures.success import plot_step_curves, plot_success_curves
 from bgpo_trl.files.progress import progress_bar
@@ -37,15 +36,6 @@ def measure(
     """Test the trained policies with seen and with held-out demonstrations.
 
     Dashboards get the success with held-out ones.
-
-    Args:
-        trainer: The trainer after training.
-        bank: Training and held-out demonstrations.
-        out: Folder for ``final.csv``.
-        episodes: Test episodes per seed, task and kind of demonstrations.
-
-    Returns:
-        Entries of ``summary.json``.
     """
     algorithm, config = trainer.algorithm, trainer.config
     gwr, tests = algorithm.gwr, _final_tests(trainer, bank, episodes=episodes)
@@ -125,12 +115,6 @@ def draw(
 ) -> list[str]:
     """Draw the figures of the run, and describe its GWR-B.
 
-    Args:
-        trainer: The trainer after training.
-        bank: Training and held-out demonstrations.
-        out: Folder for ``figures/`` and ``gwr.csv``.
-        summary: Result of `measure`.
-
     Returns:
         Lines about GWR-B, its task inference and its groups.
     """
@@ -144,8 +128,7 @@ def draw(
     for name, frames in zip(file_names(config.tasks), episodes.values(), strict=True):
         save_gif(frames, out / "figures" / f"{name}.gif", fps=find_scene(config.scene).rate or 5.0)
     if summary["nodes"] is not None:
-        draw_nodes(out, trainer.algorithm, bank, config.tasks)
-        draw_growth(out, config, bank)
+        draw_nodes(out / "figures" / "gwr.png", trainer.algorithm, bank, config.tasks)
         inferred = np.asarray(final_means(run, "held-out", "task_inference"))
         lines.append(f"GWR-B nodes: {summary['nodes']}")
         lines.append(f"task inference on held-out demonstrations: {inferred.mean():.1%}")
@@ -161,10 +144,6 @@ def draw(
 
 def record_episodes(trainer: Trainer, bank: DemonstrationBank) -> dict[str, np.ndarray]:
     """Return the frames of a test episode of each task with the first seed's trained policy.
-
-    Args:
-        trainer: The trainer after training.
-        bank: Training and held-out demonstrations; held-out ones are shown.
 
     Returns:
         Frames uint8 ``[N, H, W, 3]``, by task and outcome.

@@ -13,7 +13,6 @@ from PIL import Image, ImageDraw, ImageFont, ImageOps
 from bgpo_trl.data.recording import record_demonstrations
 from bgpo_trl.experiments.arguments import WatchArguments
 from bgpo_trl.figures.frames import plot_frame_strips, save_gif
-from bgpo_trl.figures.gwr import draw_growth
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.files.writing import check_folder
 from bgpo_trl.plugins import import_plugin
@@ -109,17 +108,10 @@ def compose(episodes: Sequence[Episode], fps: float = 10.0) -> NDArray:
     The frames continue to the end of the longest episode, and the last one is held for two seconds.
     """
     steps = max(max(len(e.demonstration), len(e.seen)) for e in episodes)
-    height = _CAPTION + _HEIGHT + 2 * _BORDER + _GAP
-    shape = episodes[0].seen.shape[1:3]
-    widths = 2 * [round(shape[1] * _HEIGHT / shape[0])]
-    widths += [] if episodes[0].view is None else [episodes[0].view.shape[2]]
-    width = sum(width + 2 * _BORDER for width in widths) + (len(widths) + 1) * _GAP
-    pictures = []
-    for step in range(steps):
-        picture = Image.new("RGB", (width, height * len(episodes) + _GAP), "white")
-        for row, episode in enumerate(episodes):
-            _draw(picture, episode, step, row * height + _GAP // 2, widths)
-        pictures.append(picture)
+    pictures = [
+        Image.fromarray(np.concatenate([_row(episode, step) for episode in episodes]))
+        for step in range(steps)
+    ]
     # A palette shared by all frames keeps static pixels identical: a quarter of the file size.
     sample = [np.asarray(picture) for picture in pictures[:: max(1, steps // 4)] + pictures[-1:]]
     palette = Image.fromarray(np.concatenate(sample)).quantize(128)
@@ -128,38 +120,36 @@ def compose(episodes: Sequence[Episode], fps: float = 10.0) -> NDArray:
     return np.stack([np.asarray(frame.convert("RGB")) for frame in frames])
 
 
-def _draw(
-    picture: Image.Image, episode: Episode, step: int, top: int, widths: Sequence[int]
-) -> None:
-    draw, font = ImageDraw.Draw(picture), ImageFont.load_default(13)
+def _row(episode: Episode, step: int) -> NDArray:
+    """Return the demonstration, what the policy sees and an onlooker's view, side by side."""
     now = min(step, len(episode.seen) - 1)
-    outcome = episode.success if now == len(episode.seen) - 1 else None
+    ended = now == len(episode.seen) - 1
+    color = _COLORS[episode.success if ended else None]
+    progress = episode.outcome if ended else f"step {now}"
     shown = episode.demonstration[min(step, len(episode.demonstration) - 1)]
-    color = _COLORS[outcome]
-    progress = f"step {now}" if outcome is None else episode.outcome
-    panels = [(shown, f"shown: {episode.task.replace('_', ' ')}", _COLORS[None])]
+    panels = [_panel(shown, f"shown: {episode.task.replace('_', ' ')}", _COLORS[None])]
     if episode.view is None:
-        panels.append((episode.seen[now], progress, color))
+        panels.append(_panel(episode.seen[now], progress, color))
     else:
-        panels.append((episode.seen[now], "the robot's view", color))
-        panels.append((episode.view[now], progress, color))
-    left = _GAP
-    for (frame, caption, border), width in zip(panels, widths, strict=True):
-        size = (width, _HEIGHT)
-        image = Image.fromarray(frame).resize(size, Image.Resampling.NEAREST)
-        picture.paste(ImageOps.expand(image, _BORDER, border), (left, top + _CAPTION))
-        fill = "black" if border == _COLORS[None] else border
-        draw.text((left + _BORDER, top), caption, fill=fill, font=font)
-        left += width + 2 * _BORDER + _GAP
+        panels.append(_panel(episode.seen[now], "the robot's view", color))
+        panels.append(_panel(episode.view[now], progress, color))
+    return np.concatenate(panels, axis=1)
+
+
+def _panel(frame: NDArray, caption: str, color: str) -> NDArray:
+    """Return a frame with a border of that color below its caption."""
+    size = (round(frame.shape[1] * _HEIGHT / frame.shape[0]), _HEIGHT)
+    image = Image.fromarray(frame).resize(size, Image.Resampling.NEAREST)
+    image = ImageOps.expand(image, _BORDER, color)
+    image = ImageOps.expand(image, (_GAP // 2, _CAPTION, _GAP // 2, _GAP), "white")
+    fill = "black" if color == _COLORS[None] else color
+    place = (_GAP // 2 + _BORDER, 0)
+    ImageDraw.Draw(image).text(place, caption, fill=fill, font=ImageFont.load_default(13))
+    return np.asarray(image)
 
 
 def watch(arguments: WatchArguments) -> str:
-    """Make the film that `WatchArguments` describes; return how the episodes ended.
-
-    Raises:
-        ValueError: If the directory holds no run that can be loaded, or the run has no such seed.
-        OSError: If the pictures cannot be written.
-    """
+    """Make the film that `WatchArguments` describes; return how the episodes ended."""
     run, out = arguments.run, arguments.out or arguments.run / "figures"
     import_plugin(arguments.module)
     policy = load_run(run, seed=arguments.run_seed)
@@ -174,7 +164,6 @@ def watch(arguments: WatchArguments) -> str:
         strips[f"{episode.task}: the demonstration"] = episode.demonstration
         strips[f"{episode.task}: the robot's view, {episode.outcome}"] = episode.seen
     save_figure(plot_frame_strips(strips), out / "film.png")
-    draw_growth(run, config, policy.bank, out)
     outcomes = [f"{episode.task}: {episode.outcome}" for episode in episodes]
     learned = f"seed {policy.seed} after {policy.episodes:,} training episodes"
     return "\n".join([learned, *outcomes, f"pictures: {out}"])

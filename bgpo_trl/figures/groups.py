@@ -1,91 +1,18 @@
-"""Figures of the groups of behaviors: their number, the number of nodes, and their episodes."""
+"""Figure of the groups of behaviors: their number, and the episodes of each."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
-import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import NDArray
 
-from bgpo_trl.figures.style import (
-    COLORS,
-    LINES,
-    add_legend,
-    mark_starts,
-    style_axes,
-    task_markers,
-)
+from bgpo_trl.figures.style import add_legend, mark_starts, style_axes, task_markers
 from bgpo_trl.runs.results import Run
-
-_PANELS = {"num_nodes": "Nodes of GWR-B", "num_groups": "Groups of behaviors"}
-
-
-def plot_counts(runs: Mapping[str, Run]) -> Figure:
-    """Plot the numbers of nodes and groups against training episodes.
-
-    Lines are means over seeds, shaded from the lowest to the highest seed. They end at the last
-    test, or at the last episode of the slowest seed.
-
-    Args:
-        runs: Runs of the same tasks, by legend name, with training episodes.
-
-    Raises:
-        ValueError: If there are no training episodes.
-    """
-    counts = {name: _counts(run) for name, run in runs.items()}
-    last = max((of_run["num_nodes"].shape[1] for of_run in counts.values()), default=0)
-    if not last:
-        raise ValueError("there is no training episode to show: let the run train first.")
-    presented, width = next(iter(runs.values())).presented, 7.0
-    figure = Figure(figsize=(width, 4.6), layout="constrained")
-    panels = figure.subplots(len(_PANELS), sharex=True)
-    for panel, (column, title) in zip(panels, _PANELS.items(), strict=True):
-        style_axes(panel)
-        for index, (name, of_run) in enumerate(counts.items()):
-            _draw_count(panel, of_run[column], name, index)
-        mark_starts(panel, presented, list(presented), last)
-        highest = max(int(of_run[column].max()) for of_run in counts.values())
-        panel.set(xlim=(0, last), ylim=(0, 1.2 * highest))  # room for the labels of dashed lines
-        panel.yaxis.set_major_locator(MaxNLocator(5, integer=True))
-        panel.set_ylabel(title, fontsize=9)
-    panels[-1].set_xlabel("Training episode", fontsize=9)
-    panels[-1].xaxis.set_major_formatter("{x:,.0f}")
-    handles, labels = panels[0].get_legend_handles_labels()
-    add_legend(figure, handles, labels, width)
-    return figure
-
-
-def _counts(run: Run) -> dict[str, NDArray[np.int64]]:
-    """Return the numbers after each training episode, ``[S, E]``, by column."""
-    table = _training(run)
-    table = table[table["episode"] <= run.last]
-    return {
-        column: table.pivot(index="seed", columns="episode", values=column)
-        .dropna(axis="columns")
-        .to_numpy(np.int64)
-        for column in _PANELS
-    }
-
-
-def _training(run: Run) -> pd.DataFrame:
-    """Return the training episodes; raise ``ValueError`` without one."""
-    if run.training is None or run.training.empty:
-        raise ValueError("there is no training episode to show: let the run train first.")
-    return run.training
-
-
-def _draw_count(panel: Axes, counts: NDArray[np.int64], name: str, index: int) -> None:
-    """Draw the counts of a run, ``[S, E]``."""
-    episodes = np.arange(1, counts.shape[1] + 1)
-    color, line = COLORS[index % len(COLORS)], LINES[index % len(LINES)]
-    panel.plot(episodes, counts.mean(0), color=color, linestyle=line, linewidth=1.6, label=name)
-    panel.fill_between(episodes, counts.min(0), counts.max(0), color=color, alpha=0.18, linewidth=0)
 
 
 def plot_groups(run: Run) -> Figure:
@@ -98,7 +25,9 @@ def plot_groups(run: Run) -> Figure:
     Raises:
         ValueError: If there are no training episodes.
     """
-    episodes, tasks = _training(run).sort_values(["seed", "episode"]), run.tasks
+    if run.training is None or run.training.empty:
+        raise ValueError("there is no training episode to show: let the run train first.")
+    episodes, tasks = run.training.sort_values(["seed", "episode"]), run.tasks
     last = int(episodes["episode"].max())
     seeds = dict(iter(episodes.groupby("seed")))
     heights = [of_seed["group"].nunique() for of_seed in seeds.values()]

@@ -45,7 +45,7 @@ def plot_success_curves(runs: Mapping[str, Run], *, window: int | None = None) -
         window: Length of the trailing mean in training episodes; 5 % of the training if ``None``.
 
     Raises:
-        ValueError: If there are no runs, or the window is not positive.
+        ValueError: If there are no tests.
     """
     figure, window, _ = _plot_curves(runs, "success", "random_success", "random policy", window)
     figure.supxlabel(f"Training episode (success: mean over the last {window:,})", fontsize=9)
@@ -57,16 +57,12 @@ def plot_success_curves(runs: Mapping[str, Run], *, window: int | None = None) -
 
 
 def plot_step_curves(runs: Mapping[str, Run], *, window: int | None = None) -> Figure:
-    """Plot the steps that a success takes against training episodes, as `plot_success_curves` does.
+    """Plot the steps that a success takes, as `plot_success_curves` plots success.
 
     Test episodes without success are left out. Dotted lines mark the mean steps of demonstrations.
 
-    Args:
-        runs: See `plot_success_curves`.
-        window: See `plot_success_curves`.
-
     Raises:
-        ValueError: If the steps of no success are known, or the window is not positive.
+        ValueError: If the steps of no success are known.
     """
     figure, window, highest = _plot_curves(
         runs, "steps", "demonstrated_steps", "demonstrations", window
@@ -98,8 +94,6 @@ def _plot_curves(
     tasks, presented = first.tasks, first.presented
     last = max(run.last for run in runs.values())
     window = max(1, round(last / 20)) if window is None else window
-    if window < 1:
-        raise ValueError(f"window must be at least 1 episode, not {window}.")
 
     figure, panels = _make_panels(len(tasks))
     grid = _grid(np.unique(np.concatenate([run.episodes for run in runs.values()])), last)

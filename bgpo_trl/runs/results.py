@@ -12,7 +12,7 @@ import os
 import warnings
 import zlib
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -24,67 +24,33 @@ from numpy.typing import NDArray
 
 from bgpo_trl.files.writing import make_folder, write_whole
 
-
-@dataclass(frozen=True)
-class Cells:
-    """The cells of a column: text, or numbers from 0."""
-
-    high: float | None = None
-    """The largest number; None for text."""
-    whole: bool = False
-    """Whether numbers are integers."""
-    optional: bool = False
-    """Whether a cell may be empty, and the column missing; both are read as NaN."""
-
-
-TEXT, COUNT, SHARE = Cells(), Cells(2**53 - 1, whole=True), Cells(1)
-AMOUNT = Cells(float(np.finfo(float).max))
-
-_EPISODE: Mapping[str, Cells | None] = {
-    "algorithm": TEXT,
-    "seed": COUNT,
-    "episode": COUNT,
-    "env_steps": None,
-    "task": TEXT,
-    "success": SHARE,
-    "return": None,
+_EPISODE = ("algorithm", "seed", "episode", "env_steps", "task", "success", "return", "steps")
+_OF_TRAINING = ("intrinsic_return", "num_nodes", "group", "num_groups", "loss_actor", "loss_value")
+COLUMNS: Mapping[str, tuple[str, ...]] = {
+    "train.csv": (*_EPISODE, *_OF_TRAINING),
+    "eval.csv": _EPISODE,
+    "final.csv": (
+        *("seed", "demonstrations", "task", "episodes", "success", "steps", "task_inference"),
+    ),
+    "cost.csv": ("tasks", "steps", "seconds", "megabytes"),
 }
-COLUMNS: Mapping[str, Mapping[str, Cells | None]] = {
-    "train.csv": {
-        **_EPISODE,
-        "algorithm": None,
-        "steps": None,
-        "intrinsic_return": None,
-        "num_nodes": COUNT,
-        "group": COUNT,
-        "num_groups": COUNT,
-        "loss_actor": None,
-        "loss_value": None,
-    },
-    "eval.csv": {**_EPISODE, "steps": replace(AMOUNT, optional=True)},
-    "final.csv": {
-        "seed": COUNT,
-        "demonstrations": TEXT,
-        "task": TEXT,
-        "episodes": None,
-        "success": SHARE,
-        "steps": replace(AMOUNT, optional=True),
-        "task_inference": replace(SHARE, optional=True),
-    },
-    "cost.csv": {"tasks": COUNT, "steps": COUNT, "seconds": AMOUNT, "megabytes": AMOUNT},
-}
-"""Columns of the tables of a run, as they are written, with the cells that reports and figures
-read; None if they do not read the column.
+"""Columns of the tables of a run, as they are written.
 
 A row is a training episode in ``train.csv``, where the columns of ``Algorithm.logged`` follow, and
 a test episode in ``eval.csv``. It is a seed, a kind of demonstrations and a task in ``final.csv``,
 where ``steps`` is the mean length of the successful tests; ``task_inference`` is empty for
 algorithms without GWR-B. It is a number of presented tasks in ``cost.csv``."""
-
-_REMEDIES = {
-    "final.csv": "remove the file and resume the run, which tests again",
-    "cost.csv": "remove the file, and costs are counted anew",
+_READ: Mapping[str, tuple[str, ...]] = {
+    "train.csv": ("seed", "episode", "task", "success", "num_nodes", "group", "num_groups"),
+    "eval.csv": ("algorithm", "seed", "episode", "task", "success", "steps"),
+    "final.csv": ("seed", "demonstrations", "task", "success", "steps", "task_inference"),
+    "cost.csv": COLUMNS["cost.csv"],
 }
+"""Columns that reports and figures read; those of ``_OPTIONAL`` may be missing or empty."""
+_OPTIONAL = ("steps", "task_inference", "num_nodes", "group", "num_groups")
+_TEXT = ("algorithm", "task", "demonstrations")
+_WHOLE = ("seed", "episode", "tasks", "num_nodes", "group", "num_groups")
+_SHARES = ("success", "task_inference")
 
 
 def find_table(path: str | os.PathLike[str]) -> Path | None:
@@ -97,57 +63,52 @@ def find_table(path: str | os.PathLike[str]) -> Path | None:
 def read_table(path: str | os.PathLike[str]) -> pd.DataFrame:
     """Return a CSV file of a run, plain or compressed.
 
-    The cells of the columns that `COLUMNS` describes are checked, and numbers converted. All others
-    stay text.
-
-    Args:
-        path: The CSV file; where it is not there, ``path`` with ``.gz`` is read.
-
     Raises:
-        ValueError: If the file is missing or not CSV, lacks a column or has an invalid cell.
+        ValueError: If the file is missing or not CSV, lacks a column that reports read, or has an
+            invalid cell in one.
     """
     path = find_table(path) or Path(path)
-    name_of_table = path.name.removesuffix(".gz")
-    described = COLUMNS.get(name_of_table, {})
-    columns = {name: cells for name, cells in described.items() if cells is not None}
-    table = _read_text(path)
-    if not len(table.columns):
-        return pd.DataFrame(columns=pd.Index([*columns]))
-    missing = [name for name in columns if name not in table]
-    if needed := sorted(name for name in missing if not columns[name].optional):
-        raise ValueError(f"{path} lacks the columns {', '.join(needed)}: name another run")
-    damaged = pd.Series(False, index=table.index)
-    for name, cells in columns.items():
-        if name in missing:
-            table[name] = np.nan
-        elif cells.high is not None:
-            numbers = pd.to_numeric(table[name], errors="coerce").astype(float)
-            valid = numbers.between(0, cells.high)
-            valid &= (numbers % 1 == 0) | (not cells.whole)
-            damaged |= ~(valid | (cells.optional & (table[name] == "")))
-            table[name] = numbers
-    if damaged.any():
-        usual = "resume the run, which writes it again, or take the line out"
-        remedy = _REMEDIES.get(name_of_table, usual)
-        line = 2 + int(damaged.to_numpy().argmax())
-        raise ValueError(f"{path}, line {line} is damaged: {remedy}")
-    return table.astype({name: np.int64 for name, cells in columns.items() if cells.whole})
-
-
-def _read_text(path: Path) -> pd.DataFrame:
-    """Return the cells of a CSV file as text."""
+    read = _READ.get(path.name.removesuffix(".gz"), ())
+    numbers = [name for name in read if name not in _TEXT]
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", pd.errors.ParserWarning)  # a line that is too long
-            return pd.read_csv(path, dtype=str, keep_default_na=False, index_col=False)
-    except (FileNotFoundError, NotADirectoryError):
+            table = pd.read_csv(
+                path,
+                dtype=dict.fromkeys(_TEXT, str),
+                # Names of tasks such as "NA" stay text.
+                keep_default_na=False,
+                na_values={name: [""] for name in numbers},
+                index_col=False,
+            )
+        if lacking := [name for name in read if name not in table and name not in _OPTIONAL]:
+            raise ValueError(f"it lacks the columns {', '.join(lacking)}")
+        table = table.reindex(columns=[*table, *(name for name in read if name not in table)])
+        for name in numbers:
+            _check_numbers(table[name].astype(float), name)
+        whole = [name for name in numbers if name in _WHOLE and table[name].notna().all()]
+        return table.astype(dict.fromkeys(whole, np.int64))
+    except FileNotFoundError:
         raise _missing(path) from None
     except pd.errors.EmptyDataError:
-        return pd.DataFrame()
+        return pd.DataFrame(columns=pd.Index(read))
     except (OSError, EOFError, zlib.error, ValueError, pd.errors.ParserWarning) as error:
+        reason = str(error).splitlines()[0]
         raise ValueError(
-            f"{path} is not a CSV file of a run ({str(error).splitlines()[0]}): name another run"
+            f"{path} is damaged, or no table of a run ({reason}): resume the run, which writes it "
+            "again, or name another run"
         ) from None
+
+
+def _check_numbers(column: pd.Series, name: str) -> None:
+    """Raise ``ValueError`` for a number that no run writes."""
+    valid = column.between(0, 1 if name in _SHARES else np.finfo(float).max)
+    if name in _WHOLE:
+        valid &= column % 1 == 0
+    if name in _OPTIONAL:
+        valid |= column.isna()
+    if not valid.all():
+        raise ValueError(f"{name} is {column[~valid].iloc[0]:g}")
 
 
 def _missing(path: Path) -> ValueError:
@@ -156,53 +117,22 @@ def _missing(path: Path) -> ValueError:
     return ValueError(f"{path} is missing: let the run in {path.parent} finish")
 
 
-class RepeatedKeyError(ValueError):
-    """A file of settings gives a key twice; without the error, the last value would count."""
-
-    def __init__(self, where: object, key: str) -> None:
-        super().__init__(f"{where} gives {key!r} twice: keep one of the two")
-
-
-def parse_json(path: Path) -> Any:
-    """Return the content of a JSON file.
-
-    Raises:
-        RepeatedKeyError: If an object of it gives a key twice.
-        ValueError: If it is not JSON.
-        OSError: If it cannot be read.
-    """
-
-    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        found = dict[str, Any]()
-        for key, value in pairs:
-            if key in found:
-                raise RepeatedKeyError(path, key)
-            found[key] = value
-        return found
-
-    return json.loads(path.read_text(), object_pairs_hook=unique)
-
-
 def read_json(
     path: str | os.PathLike[str], entries: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
     """Return the content of a run's ``config.json`` or ``summary.json``.
 
-    Args:
-        path: The JSON file.
-        entries: Types of the required entries; an entry that may be ``None`` may be missing.
+    ``entries`` are types of required entries; an entry that may be ``None`` may be missing.
 
     Raises:
-        ValueError: If the file is missing or damaged, or gives a key twice.
+        ValueError: If the file is missing or damaged.
     """
     path = Path(path)
     try:
-        found = parse_json(path)
-    except (FileNotFoundError, NotADirectoryError):
+        found = json.loads(path.read_text())
+    except FileNotFoundError:
         raise _missing(path) from None
-    except RepeatedKeyError:
-        raise
-    except (OSError, ValueError, RecursionError):
+    except (OSError, ValueError):
         found = None
     if not isinstance(found, dict) or not all(
         isinstance(found.get(name), kind) for name, kind in (entries or {}).items()
@@ -312,25 +242,22 @@ class Run:
     def unfinished(self) -> str:
         """In what the run is not finished; "" if it is."""
         episodes = self.config["episodes"]
+        if self.tests.empty:
+            return "holds no test episode"
         if self.summary.get("episodes", episodes) != episodes:
             return "is being extended"
         if episodes - self.last >= self.eval_every:
             return f"has tests until episode {self.last} of {episodes}"
         return ""
 
-    def until(self, episode: int) -> Run:
-        """Return the run with only the tests after at most ``episode`` training episodes."""
-        return replace(self, tests=self.tests[self.tests["episode"] <= episode])
-
 
 def read_run(directory: str | os.PathLike[str]) -> Run:
     """Read a run; each of its tables once.
 
-    Its directory needs ``config.json`` with seeds, tasks, their starts and the number of episodes,
-    and ``eval.csv``.
+    Its directory needs ``config.json`` with seeds, tasks, their starts and the number of episodes.
 
     Raises:
-        ValueError: If a file is missing or damaged, or there are no tests.
+        ValueError: If a file is missing or damaged.
     """
     directory = Path(directory)
     entries = {"episodes": int, "seeds": list, "tasks": list, "task_starts": list}
@@ -347,17 +274,8 @@ def read_run(directory: str | os.PathLike[str]) -> Run:
     maps: dict[str, Any] = dict.fromkeys(("changed", "demonstrated_steps"), dict | None)
     summary = read_json(path, lists | maps) if path.exists() else {}
     tables = {
-        name: read_table(directory / name)
-        for name in COLUMNS
-        if name == "eval.csv" or find_table(directory / name)
+        name: read_table(directory / name) for name in COLUMNS if find_table(directory / name)
     }
-    tests, training, final, costs = map(
-        tables.get, ("eval.csv", "train.csv", "final.csv", "cost.csv")
-    )
-    if tests is None or tests.empty:
-        raise ValueError(
-            f"{directory / 'eval.csv'} holds no test episode: let the run evaluate first"
-        )
     for name, table in tables.items():
         for column, known in (("seed", config["seeds"]), ("task", tasks)):
             others = set(table.get(column, ())) - set(known)
@@ -366,7 +284,9 @@ def read_run(directory: str | os.PathLike[str]) -> Run:
                     f"{directory / name} has the {column} {min(others)!r}, which is none of "
                     f"{', '.join(map(str, known))}: put it back as the run left it"
                 )
-    return Run((directory,), config, summary, tests, training, final, costs)
+    tests = tables.get("eval.csv", pd.DataFrame(columns=pd.Index(_READ["eval.csv"])))
+    others = (tables.get(name) for name in ("train.csv", "final.csv", "cost.csv"))
+    return Run((directory,), config, summary, tests, *others)
 
 
 def joined(runs: Iterable[Run]) -> list[Run]:
@@ -433,32 +353,26 @@ def _runs_in(path: Path) -> list[Path]:
 def archive_run(run: Path, target: Path) -> None:
     """Copy what reports and figures read of a finished run.
 
-    Settings, summary, final tests and cost are copied as they are. Of ``train.csv``, ``eval.csv``
-    and ``gwr.csv``, the columns that are read are written as gzip. The same run always gives the
-    same bytes, and an archived run can be archived again.
-
-    Args:
-        run: The run directory.
-        target: Directory of the copy; made if missing.
+    Settings, summary, final tests and cost are copied as they are. Of ``train.csv`` and
+    ``eval.csv``, the columns that are read are written as gzip. The same run always gives the same
+    bytes, and an archived run can be archived again.
 
     Raises:
         ValueError: If a file of the run is missing or damaged, or ``target`` is the run, or holds
             another one.
         OSError: If the copy cannot be written.
     """
-    if run.resolve() == target.resolve():
-        raise ValueError(f"{target} is the run itself: name another folder for the copy")
     config = read_json(run / "config.json")
-    if (target / "config.json").exists() and read_json(target / "config.json") != config:
-        raise ValueError(f"{target} holds another run: name another folder for the copy")
+    if (target / "config.json").exists() and (
+        run.samefile(target) or read_json(target / "config.json") != config
+    ):
+        raise ValueError(f"{target} is the run, or holds another: name another folder for the copy")
     copied = ("config.json", "summary.json", "final.csv", "cost.csv")
     content = {name: (run / name).read_bytes() for name in copied if (run / name).exists()}
-    for name in ("train.csv", "eval.csv", "gwr.csv"):
+    for name in ("train.csv", "eval.csv"):
         if path := find_table(run / name):
-            table = _read_text(path)
-            columns = COLUMNS.get(name, dict.fromkeys(table.columns, TEXT))
-            kept = [column for column in table.columns if columns.get(column) is not None]
-            text = table[kept].to_csv(index=False, lineterminator="\n")
+            table = pd.read_csv(path, dtype=str, keep_default_na=False)
+            text = table[[c for c in table if c in _READ[name]]].to_csv(index=False)
             content[f"{name}.gz"] = gzip.compress(text.encode(), mtime=0)
     make_folder(target)
     for name, data in content.items():

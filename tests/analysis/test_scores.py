@@ -1,7 +1,5 @@
 """Measures of arrays and of runs, against numbers worked out by hand."""
 
-import itertools
-
 import numpy as np
 import pytest
 
@@ -30,35 +28,9 @@ def test_evaluation_matrix_by_hand():
 def test_changes_since_tasks_were_learned_by_hand():
     matrix = [[0.8, NAN, NAN], [0.7, 0.9, NAN], [0.0, 1.0, 0.3]]
     # Task 1 has lost 0.8, task 2 has gained 0.1; of task 3 nothing can be said.
-    expected = [-0.8, 0.1, 0]
-    assert scores.change_since_learned(matrix) == pytest.approx(expected)
-    of_seeds = scores.change_since_learned([matrix, np.multiply(matrix, 0.5)])
+    expected = [0.8, -0.1, 0]
+    of_seeds = scores.forgetting(np.array([matrix, np.multiply(matrix, 0.5)]))
     np.testing.assert_allclose(of_seeds, [expected, np.multiply(expected, 0.5)])
-
-
-def test_forgetting_since_the_best_so_far_by_hand():
-    # Means of three: task 1 was at 0.7 and is at 0.5; task 2 is at its best.
-    success = np.vstack([[[0.7, NAN]], SUCCESS[1:], [[0.5, 0.4]]])
-    of_seeds = scores.forgetting_since_best([success, 0.5 * success])
-    lost = (0.7 + 0.8) / 2 - 0.5
-    np.testing.assert_allclose(of_seeds, [lost / 2, lost / 4])
-    assert scores.forgetting_since_best(SUCCESS[:1]) == 0  # a task never tested is left out
-
-
-def test_what_noise_alone_leaves_of_the_best_equals_the_sum_over_all_outcomes():
-    # With one test an evaluation, the tests after a phase have 16, 4 and 1 outcomes.
-    run = make_run()
-    run.config["eval_episodes"] = 1
-    success, expected = np.array(SUCCESS_OF_RUN), []
-    for task, first in enumerate((2, 4, 6)):
-        rate, total = success[first - 1, task], 0.0  # the test at the end of the phase
-        for outcome in itertools.product((0, 1), repeat=6 - first):
-            won, column = sum(outcome), np.concatenate([success[:first, task], outcome])
-            chance = rate**won * (1 - rate) ** (len(outcome) - won)
-            total += chance * scores.forgetting_since_best(column[:, None])
-        expected.append(total)
-    found = scores.since_best_unchanged(run, draws=20_000)
-    assert found == pytest.approx([np.mean(expected)] * 2, abs=0.01)
 
 
 def test_area_under_curve_by_hand():
@@ -73,18 +45,6 @@ def test_area_under_curve_by_hand():
     np.testing.assert_allclose(scores.area_scores(make_run())[0, 1:], [b, c])
 
 
-def test_episodes_until_overall_success_reaches_a_rate():
-    # By evaluation and task, of two seeds. Means over seeds and presented tasks: 1/2, 1, 1, then
-    # the second task comes in at 0 and is done.
-    seeds = np.ones((2, 5, 2))
-    seeds[:, :3, 1], seeds[:, 3, 1], seeds[0, 0, 0] = NAN, 0, 0
-    run = make_run(seeds, (0, 15), "ab")
-    # Over three evaluations: 1/2, 3/4, 5/6, (1 + 0) / 2, (1 + 1/2) / 2.
-    assert scores.episodes_to_80(run) == 15
-    assert scores.episodes_to_80(run, 0.7) == 10
-    assert scores.episodes_to_80(run.until(10)) == INF
-
-
 def test_own_episodes_until_a_rate_of_the_last_succeed():
     # The tenth success is the thirteenth episode, but twenty are needed for a rate.
     assert scores.trials_to([0, 0, 0] + [1] * 10 + [0] * 7) == 20
@@ -96,21 +56,6 @@ def test_own_episodes_until_a_rate_of_the_last_succeed():
     outcomes = [1, 0, 1, 0, 1, 1, 1, 1, 0]
     assert scores.trials_to(outcomes, 0.8, window=5) == 7  # episodes 3 to 7
     assert scores.trials_to(outcomes, window=1) == 1
-
-
-def test_learning_times_relative_to_the_first_task():
-    seeds = [[100, 50, 300], [40, 40, INF], [50, 100, 100]]
-    # By seed 0.5, 1 and 2; 3, never and 2.
-    assert scores.times_the_first(seeds).tolist() == [1, 3]
-    # A seed without the first task says nothing; half of the others never learn the third.
-    assert scores.times_the_first([*seeds[:2], [INF, 20, 20]]).tolist() == [0.75, INF]
-    np.testing.assert_array_equal(scores.times_the_first([[INF, 20, INF]]), [NAN, NAN])
-
-
-def test_trailing_mean_by_hand():
-    expected = [[0, NAN], [0.4, NAN], [1.4 / 3, 0], [0.6, 0.25]]
-    np.testing.assert_allclose(scores.trailing_mean(SUCCESS, 3), expected)
-    np.testing.assert_array_equal(scores.trailing_mean(SUCCESS, 1), SUCCESS)
 
 
 def test_late_scores_average_the_last_tenth_of_training():
@@ -145,19 +90,6 @@ def test_the_success_matrix_averages_the_last_fifth_of_a_phase():
         scores.success_matrix(make_run(starts=(0, 0, 10)))
     with pytest.raises(ValueError, match=r"no test .* more often"):
         scores.success_matrix(make_run(starts=(0, 6, 8)))
-
-
-def test_best_scores_average_whole_windows_over_all_seeds():
-    success = np.zeros((40, 1))
-    success[8:12] = 1  # a tenth of 200 episodes is four tests
-    assert scores.best_scores(make_run(success, (0,), "a")).tolist() == [1]
-    success[10:12] = 0
-    assert scores.best_scores(make_run(success, (0,), "a")).tolist() == [0.5]
-    run = make_run([success, 0 * success], (0,), "a")
-    assert scores.best_scores(run).tolist() == [0.25]
-    success[:2] = 1  # half of a window is none
-    assert scores.best_scores(make_run(success, (0,), "a")).tolist() == [0.5]
-    np.testing.assert_allclose(scores.best_scores(make_run()), [0.8, 0.9, 0.4])
 
 
 def test_own_episodes_by_task_and_seed(tmp_path):

@@ -7,9 +7,6 @@ import numpy as np
 import pytest
 
 from bgpo_trl.experiments import watch
-from bgpo_trl.figures import gwr as growth
-from bgpo_trl.runs.config_file import read_config
-from bgpo_trl.runs.gwr_graphs import load_graphs
 from suites import nico
 from suites.nico.demonstrator import Demonstrator
 from tests.helpers import contents
@@ -33,7 +30,7 @@ def test_a_film_has_its_files_and_leaves_the_run_unchanged(run_of, undemonstrate
     assert not out.exists()
     printed = watch.watch(watch.WatchArguments(run, run_seed=8, out=out))
     assert contents(run) == before
-    expected = {"film.gif", "film.png"} | ({"gwr_growth.png"} if name == "bgpo" else set())
+    expected = {"film.gif", "film.png"}
     assert {path.name for path in out.iterdir()} == expected
     first, *outcomes, last = printed.splitlines()
     assert re.fullmatch(r"seed 8 after \d+ training episodes", first)
@@ -81,27 +78,3 @@ def test_the_frame_of_an_episode_has_the_color_of_its_outcome_from_its_end_on(su
     framed = [int((np.abs(p - np.array(color)) < 9).all(-1).sum()) for p in pictures.astype(int)]
     assert framed[0] == 0
     assert min(framed[1:]) > 2 * 4 * 2 * (128 + 192)  # two pictures with borders of 4 pixels
-
-
-def test_the_growth_figure_labels_nodes_by_the_tasks_presented_so_far(run_of, bank, monkeypatch):
-    run, drawn = run_of("bgpo"), []
-    config = read_config(run / "config.json")[0]
-    monkeypatch.setattr(growth, "plot_gwr_growth", lambda *given: drawn.append(given))
-    monkeypatch.setattr(growth, "save_figure", lambda figure, path: drawn.append(path))
-    assert growth.draw_growth(run, config, bank)
-    (graphs, counts, names), path = drawn
-    assert path == run / "figures" / "gwr_growth.png"
-    assert names == nico.PAPER_TASKS
-    assert list(graphs) == list(load_graphs(run / "gwr"))
-    seen = bank.seen()
-    for episode, (weights, edges, tasks) in graphs.items():
-        presented = [t for t, start in enumerate(config.task_starts) if start < episode]
-        matches = [[] for _ in weights]
-        for phi, task in zip(seen.embedding, seen.task.tolist(), strict=True):
-            if task in presented:
-                matches[int((weights - phi).norm(dim=-1).argmin())].append(task)
-        for matched, task in zip(matches, tasks.tolist(), strict=True):
-            assert task == (max(range(3), key=matched.count) if matched else -1)
-        assert edges.max() < len(weights) == counts[0][episode - 1]
-    assert [len(count) for count in counts] == [config.episodes] * 2
-    assert not growth.draw_growth(run_of("oracle"), config, bank)

@@ -1,4 +1,4 @@
-"""Content of the figures of nodes and groups, from training episodes written by hand."""
+"""Content of the figure of groups, from training episodes written by hand."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +9,7 @@ import pytest
 from matplotlib.collections import LineCollection
 from matplotlib.colors import to_hex
 
-from bgpo_trl.figures.groups import plot_counts, plot_groups
+from bgpo_trl.figures.groups import plot_groups
 from bgpo_trl.runs.results import Run
 
 TASKS = ["grasp_glass", "push_green_to_white"]
@@ -45,22 +45,6 @@ def marks(axes):
     return found
 
 
-def test_counts_are_means_shaded_from_the_lowest_to_the_highest_seed(run):
-    """Up to the last episode of the slowest seed, or to the last test."""
-    figure = plot_counts({"BGPO": run})
-    nodes, groups = figure.axes
-    assert nodes.lines[0].get_xdata().tolist() == [*range(1, 9)]
-    assert nodes.lines[0].get_ydata().tolist() == [2 * episode + 5.5 for episode in range(1, 9)]
-    assert groups.lines[0].get_ydata().tolist() == [1, 1, 1, 1.5, 1.5, 1.5, 2.5, 2.5]
-    edges = np.concatenate([part.vertices for part in nodes.collections[0].get_paths()])
-    assert set(edges[edges[:, 0] == 3, 1]) == {9, 14}
-    for panel in figure.axes:
-        assert [text.get_text() for text in panel.texts] == ["task 2"]
-        assert list(panel.lines[1].get_xdata()) == [3, 3]
-    cut = plot_counts({"BGPO": run.until(4)}).axes[1]
-    assert cut.lines[0].get_ydata().tolist() == [1, 1, 1, 1.5]
-
-
 def test_a_group_has_a_row_with_a_mark_for_each_episode(run):
     training = run.training[run.training["episode"] < 9]
     numbers, first, second = plot_groups(replace(run, training=training)).axes
@@ -85,6 +69,5 @@ def test_a_group_has_a_row_with_a_mark_for_each_episode(run):
 def test_runs_without_training_episodes_are_refused(run):
     for training in (None, run.training[:0]):
         empty = replace(run, training=training)
-        for plot in (plot_groups, lambda run: plot_counts({"BGPO": run})):
-            with pytest.raises(ValueError, match="no training episode to show"):
-                plot(empty)
+        with pytest.raises(ValueError, match="no training episode to show"):
+            plot_groups(empty)

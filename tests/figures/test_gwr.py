@@ -1,4 +1,4 @@
-"""Content of the figures of GWR-B's nodes and growth."""
+"""Content of the figures of GWR-B's nodes."""
 
 import itertools
 
@@ -8,7 +8,7 @@ import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
 
-from bgpo_trl.figures.gwr import plot_gwr_growth, plot_gwr_pca
+from bgpo_trl.figures.gwr import plot_gwr_pca
 
 TASKS = ["grasp_glass", "push_green_to_white"]
 
@@ -62,25 +62,3 @@ def test_nodes_are_colored_by_task_and_in_a_second_panel_by_group():
     by_task, by_group = figure.axes
     assert by_task.get_position().height == pytest.approx(by_group.get_position().height)
     assert by_task.get_xlim() == by_group.get_xlim()
-
-
-# In a plane of four dimensions: the last graph's spread is largest along the second axis.
-LAST = np.array([[0, 0, 0, 0], [0, 4, 0, 0], [1, 0, 0, 0], [1, 4, 0, 0], [0.5, 90, 0, 0]])
-GRAPHS = {
-    20: (LAST, [[0, 1], [2, 3], [0, 4]], [0, 1, 0, 1, -1]),
-    10: (LAST[:2] + np.array([0.5, 1, 0, 0]), [[0, 1]], [0, -1]),
-}
-
-
-def test_growth_panels_share_the_components_of_the_last_graph():
-    early, late, _ = plot_gwr_growth(GRAPHS, [[1, 2]], TASKS).axes
-    # Of the four that match, the mean is (0.5, 2); components are the second and the first axis.
-    shown = [(-2, -0.5), (-2, 0.5), (2, -0.5), (2, 0.5), (88, 0)]
-    for axes, expected in ((late, shown), (early, [(-1, 0), (3, 0)])):
-        # The edges, then the nodes of one kind after those of another.
-        nodes = np.concatenate([np.asarray(c.get_offsets()) for c in axes.collections[1:]])
-        assert nodes == pytest.approx(np.array(expected))
-    assert (early.get_xlim(), early.get_ylim()) == (late.get_xlim(), late.get_ylim())
-    assert late.get_xlabel() == "component 1 (94% of variance)"  # 16 of 17
-    assert early.get_title() == "episode 10: 2 nodes, 1 outside"
-    assert late.get_title() == "episode 20: 5 nodes, 1 outside"

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from bgpo_trl.figures.frames import plot_frame_strips, save_gif
-from bgpo_trl.figures.gwr import plot_gwr_growth, plot_gwr_pca
+from bgpo_trl.figures.gwr import plot_gwr_pca
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.figures.success import (
     plot_step_curves,
@@ -211,11 +211,6 @@ REFUSED = {
     "no steps to plot": lambda: plot_step_curves({"none": run_of([(0, 1, "a", 0)], "a")}),
     "nothing to show": lambda: plot_frame_strips({"none": np.zeros((0, 2, 2, 3), np.uint8)}),
     "uint8 [T, H, W, 3]": lambda: save_gif(np.zeros((1, 2, 3, 3)), "none.gif"),
-    "N, d >= 2, not [1, 4]": lambda: plot_gwr_pca(np.zeros((1, 4)), [0], "ab"),
-    "must be finite": lambda: plot_gwr_pca(np.full((3, 4), NAN), [0] * 3, "ab"),
-    "one task for each of the 3 nodes": lambda: plot_gwr_pca(np.zeros((3, 4)), [0] * 2, "ab"),
-    "2 task_names, not 0 to 2": lambda: plot_gwr_pca(np.zeros((3, 4)), [0, 1, 2], "ab"),
-    "no graph to show": lambda: plot_gwr_growth({}, [], "ab"),
 }
 
 
