@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -236,6 +236,52 @@ class Evaluator:
                 policy[name] = padded(policy[name])
         presented = torch.cat([saved["presented"], torch.zeros(n_more, dtype=torch.bool)])
         return Snapshot(**{**saved, "presented": presented, "policy": algorithm.policy(**policy)})
+
+
+class _Run(Protocol):
+    """A `Trainer`, a `LoadedRun` or a `TrainedPolicy`."""
+
+    config: Any
+    encoders: Any
+    algorithm: Any
+
+
+def evaluator_of(
+    run: _Run,
+    bank: DemonstrationBank,
+    episodes: int,
+    *,
+    starts: tuple[int, ...] | None = None,
+    scene: Scene | None = None,
+) -> Evaluator:
+    """Return an evaluator of the tasks of a run.
+
+    Args:
+        run: The run.
+        bank: Demonstrations to show.
+        episodes: Test episodes of each task and seed.
+        starts: Episode from which each task is presented; by default all are.
+        scene: Robot to test, that of the run if None.
+    """
+    config = run.config
+    return Evaluator(
+        config.algorithm,
+        seeds=config.seeds,
+        schedule=TaskSchedule((0,) * len(config.tasks) if starts is None else starts),
+        episodes=episodes,
+        bank=bank,
+        encoders=run.encoders,
+        spread=config.spread,
+        scene=config.scene if scene is None else scene,
+    )
+
+
+def snapshots_of(run: _Run, evaluator: Evaluator, number: int) -> list[Snapshot]:
+    """Return the trained policy of each seed, conditioned for evaluation ``number``."""
+    return [
+        evaluator.snapshot(run.algorithm, index, number, episode=run.config.episodes)
+        for index in range(len(run.config.seeds))
+    ]
 
 
 def start_seeds(seed: int, number: int, shape: Sequence[int]) -> NDArray[np.int64]:

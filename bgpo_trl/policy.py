@@ -27,11 +27,11 @@ from bgpo_trl.configs import RunConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.data.dataset import resize_frames
 from bgpo_trl.encoders.representation import Representation, embed_demonstrations
-from bgpo_trl.files.checkpoint import has_checkpoint, load_checkpoint
+from bgpo_trl.files.checkpoint import has_checkpoint
 from bgpo_trl.files.writing import make_folder, write_whole
 from bgpo_trl.runs.config_file import read_config
 from bgpo_trl.runs.demonstrations import load_inputs
-from bgpo_trl.runs.directory import check_checkpoint, fitting_checkpoint
+from bgpo_trl.runs.directory import fitting_checkpoint, read_checkpoint
 from bgpo_trl.runs.results import read_json
 from bgpo_trl.scenes import find_scene
 from bgpo_trl.seeding import stream_seed
@@ -379,15 +379,13 @@ def load_run(
         ...
         ValueError: no-run holds no run: there is no config.json
     """
-    path = Path(path)
-    config, digests = read_config(path / "config.json")
-    if seed is not None and seed not in config.seeds:
-        seeds = ", ".join(map(str, config.seeds))
-        raise ValueError(f"{path} has no seed {seed!r}: choose one of {seeds}")
-    if config.algorithm.state != "latent" or digests.encoders is None:
-        raise ValueError(f"{path} learned from the ground truth: only runs from frames can watch")
     run = load_all_seeds(path, make=make)
-    return TrainedPolicy(run, config.seeds[0] if seed is None else seed)
+    seeds = run.config.seeds
+    if run.config.algorithm.state != "latent":
+        raise ValueError(f"{path} learned from the ground truth: only runs from frames can watch")
+    if seed is not None and seed not in seeds:
+        raise ValueError(f"{path} has no seed {seed!r}: choose one of {', '.join(map(str, seeds))}")
+    return TrainedPolicy(run, seeds[0] if seed is None else seed)
 
 
 def load_all_seeds(path: str | Path, *, make: Callable[..., Algorithm] | None = None) -> LoadedRun:
@@ -422,9 +420,8 @@ def load_all_seeds(path: str | Path, *, make: Callable[..., Algorithm] | None = 
     if not has_checkpoint(path / "checkpoint"):
         raise ValueError(f"{path} has no checkpoint: let the run reach its first one, or keep it")
     encoders, bank = load_inputs(path, config.tasks, digests, config.scene)
-    saved = load_checkpoint(path / "checkpoint", mmap=True, newest=True)
-    # Before anything is made of the sizes in the settings, which may not be the run's.
-    check_checkpoint(path / "checkpoint", saved, read_json(path / "config.json"))
+    # Compared before anything is made of the sizes in the settings, which may not be the run's.
+    saved = read_checkpoint(path, read_json(path / "config.json"), mmap=True, newest=True)
     with fitting_checkpoint(path):
         state, episodes = saved["algorithm"], saved["world"]["source"]["episode"].tolist()
         return LoadedRun.restore(make, config, state, encoders, bank, episodes)

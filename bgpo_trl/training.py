@@ -20,7 +20,7 @@ from bgpo_trl.algorithms.bgpo import BGPO
 from bgpo_trl.configs import RunConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.encoders.representation import Representation, check_savable
-from bgpo_trl.evaluation import Evaluator
+from bgpo_trl.evaluation import Evaluator, evaluator_of
 from bgpo_trl.files.checkpoint import save_checkpoint
 from bgpo_trl.files.progress import progress_bar
 from bgpo_trl.files.writing import lock_directory
@@ -30,7 +30,6 @@ from bgpo_trl.runs.cost import CostLog
 from bgpo_trl.runs.dashboard import Dashboard
 from bgpo_trl.runs.demonstrations import keep_inputs
 from bgpo_trl.runs.directory import RunLogger, fitting_checkpoint, load_last
-from bgpo_trl.runs.gwr_graphs import growth_moments, save_graph
 from bgpo_trl.scenes import find_scene
 from bgpo_trl.seeding import generators
 from bgpo_trl.transforms import TaskSchedule
@@ -61,8 +60,8 @@ class Trainer:
     Args:
         config: The run.
         directory: The run's directory: ``config.json``, ``train.csv``, ``eval.csv``, ``cost.csv``,
-            ``checkpoint/``, in ``gwr/`` graphs of the first seed's GWR-B during training, and
-            ``bank.safetensors`` and ``encoders/`` if these do not come with the scene.
+            ``checkpoint/``, and ``bank.safetensors`` and ``encoders/`` if these do not come with
+            the scene.
         bank: Embedded demonstrations, seen and held out, of at least ``config.tasks``.
         encoders: Trained encoders, or None if unused.
         make: Constructor of the algorithm; by default that of the entry ``config.name``.
@@ -70,7 +69,6 @@ class Trainer:
         resume: Continue from the last checkpoint in the directory, if there is one.
         loggers: TorchRL's loggers, or functions without arguments that make one, called once the
             directory is accepted. They get the means that `Dashboard` lists.
-        per_seed_curves: Whether they also get the test success of each seed.
         progress: Whether to show a progress bar.
 
     Raises:
@@ -92,7 +90,6 @@ class Trainer:
         device: torch.device | str = "cpu",
         resume: bool = False,
         loggers: Iterable[Logger | Callable[[], Logger]] = (),
-        per_seed_curves: bool = False,
         progress: bool = True,
     ) -> None:
         self.config = config
@@ -129,7 +126,6 @@ class Trainer:
         # For the progress bar: the latest training episodes, and the latest evaluation.
         self._successes: deque[int] = deque(maxlen=100)
         self._tested = ""
-        self._growth_moments = growth_moments(config.episodes)
         # Rows of seeds that finished early, kept for a resumed run with more episodes.
         self._later: list[dict[str, Any]] = []
         self._settings = settings_of(config, Digests(used, bank.identity))
@@ -151,17 +147,13 @@ class Trainer:
                 self.directory,
                 config=self._settings,
                 logged=self.algorithm.logged,
-                resume=resume,
+                position=saved["position"] if saved is not None else {} if resume else None,
             )
             opened.enter_context(self.logger)
-            if saved is not None:
-                self.logger.truncate_to(saved["position"])
             # Runs without encoders cannot be loaded to watch demonstrations.
             if saved is None and encoders is not None:
                 keep_inputs(self.directory, bank, encoders, self._scene)
-            self.dashboard = Dashboard(
-                self.directory, loggers, settings=self._settings, per_seed=per_seed_curves
-            )
+            self.dashboard = Dashboard(self.directory, loggers, settings=self._settings)
             opened.enter_context(self.dashboard)
             for row in () if saved is None else saved["later"]:
                 self._log(row)
@@ -192,20 +184,12 @@ class Trainer:
             bank=seen,
             spread=config.spread,
         )
-        self.evaluator = self._make_evaluator(bank) if config.eval_episodes else None
-
-    def _make_evaluator(self, bank: DemonstrationBank) -> Evaluator:
-        config = self.config
-        return Evaluator(
-            config.algorithm,
-            seeds=config.seeds,
-            schedule=self._schedule,
-            episodes=config.eval_episodes,
-            bank=bank.held_out(config.held_out),
-            encoders=self.encoders,
-            spread=config.spread,
-            scene=self._scene,
-        )
+        self.evaluator: Evaluator | None = None
+        if config.eval_episodes:
+            tested = bank.held_out(config.held_out)
+            self.evaluator = evaluator_of(
+                self, tested, config.eval_episodes, starts=config.task_starts
+            )
 
     def _check_added_tasks(self, saved: dict[str, Any], bank: DemonstrationBank) -> None:
         """Raise ``ValueError`` if tasks that a checkpoint lacks would change what was learned."""
@@ -362,8 +346,6 @@ class Trainer:
             loss = self._losses.get(name, torch.zeros(()))
             row[name] = float(loss[index] if loss.ndim else loss)
         self._log(row)
-        if index == 0 and algorithm.gwr is not None and episode in self._growth_moments:
-            save_graph(self.directory / "gwr", episode, algorithm.gwr)
         if self.evaluator is not None and episode % self.config.eval_every == 0:
             self.evaluator.take(algorithm, index, episode, self.env_steps)
 

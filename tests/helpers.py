@@ -1,7 +1,6 @@
 """Files of runs, damage done to them, and stand-ins, for tests of several packages."""
 
 import csv
-import hashlib
 import io
 import itertools
 import json
@@ -123,11 +122,10 @@ CHECKPOINTS = {
 
 
 def put_checkpoint(run: Path, content: bytes) -> None:
-    """Replace the checkpoints of a run by one of this content, with its digest."""
+    """Replace the checkpoints of a run by one of this content."""
     shutil.rmtree(run / "checkpoint")
     (run / "checkpoint").mkdir()
-    digest = hashlib.sha256(content).hexdigest()[:16]
-    (run / "checkpoint" / f"checkpoint-000007-{digest}.pt").write_bytes(content)
+    (run / "checkpoint" / "checkpoint-000007.pt").write_bytes(content)
 
 
 def at_step(trainer: Trainer, n: int, do: Callable[[], object]) -> None:
@@ -155,13 +153,12 @@ class Recorder(Logger):
     Attributes:
         metrics: Pairs of metrics and step.
         settings: Hyperparameters.
-        media: Pairs of name and path.
         closed: Whether it was shut down.
     """
 
     def __init__(self):
         super().__init__("run", "")
-        self.metrics, self.settings, self.media, self.closed = [], [], [], False
+        self.metrics, self.settings, self.closed = [], [], False
 
     def _create_experiment(self):
         return None
@@ -173,10 +170,6 @@ class Recorder(Logger):
 
     def log_hparams(self, cfg):
         self.settings.append(cfg)
-
-    def log_media(self, name, path):
-        assert not self.closed
-        self.media.append((name, path))
 
     def shutdown(self, timeout=None):
         self.closed = True

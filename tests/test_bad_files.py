@@ -16,7 +16,6 @@ from bgpo_trl.figures.frames import plot_frame_strips
 from bgpo_trl.figures.style import save_figure
 from bgpo_trl.files.checkpoint import save_checkpoint
 from bgpo_trl.files.csv_file import CsvFile
-from bgpo_trl.runs.dashboard import wandb_logger
 from bgpo_trl.runs.directory import RunLogger
 from bgpo_trl.runs.results import COLUMNS, read_json, read_run
 from suites import nico
@@ -67,11 +66,7 @@ CASES = {
         lambda f: log(f / "file"), "cannot make the folder", "File exists): choose another"),
     "run that has only tests": (
         lambda f: log(f / "unevaluated"), "already holds a run", "resume it, or choose another"),
-    "unknown wandb mode": (
-        lambda f: wandb_logger(f / "new", "yes"),  # pyright: ignore
-        "not 'yes'", '"online" or "offline"'),
     "csv that is a folder": (lambda f: CsvFile(f, ["a"]), "Is a directory", "choose another run"),
-    "csv without columns": (lambda f: CsvFile(f / "a.csv", []), "got ()", "needs columns"),
     "csv of binary data": (
         lambda f: CsvFile(f / "binary" / "eval.csv", [*COLUMNS["eval.csv"]]),
         "not with the columns algorithm,seed", "choose another run directory"),
@@ -82,11 +77,9 @@ CASES = {
         lambda f: save_checkpoint(f / "file", {"a": 1}), "cannot save a checkpoint", "make room"),
     # runs that are read
     "no run": (lambda f: read_run(f / "nowhere"), "there is no run at", "name another"),
-    "run without a test": (
-        lambda f: read_run(f / "unevaluated"), "holds no test episode", "let the run evaluate"),
     "table of something else": (
         lambda f: read_run(f / "foreign"),
-        "lacks the columns algorithm, episode", "name another run"),
+        "lacks the columns algorithm, seed, episode", "name another run"),
     "no settings": (lambda f: read_json(f / "config.json"), "is missing", "let the run in"),
     # encoders and bank
     "no encoders": (

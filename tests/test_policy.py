@@ -317,8 +317,8 @@ def cut_checkpoints(run):
         (lambda run: shutil.rmtree(run / "encoders"), "trained with the encoders"),
         (lambda run: rewrite(run, encoders="0" * 64), "trained with the encoders 000000000000"),
         (lambda run: rewrite(run, bank="0" * 64), "with the demonstrations 000000000000"),
-        (lambda run: rewrite(run, encoders=None), "ground truth"),
-        (lambda run: rewrite_algorithm(run, state="state"), "ground truth"),
+        (lambda run: rewrite(run, encoders=None), "trained without encoders"),
+        (lambda run: rewrite_algorithm(run, state="state"), "state is latent there and state here"),
         (lambda run: rewrite_algorithm(run, {"hidden_sizes": [2_000_000_000]}), "hidden_sizes is"),
         (lambda run: rewrite(run, name="mine"), "'mine'"),
     ],
@@ -330,6 +330,17 @@ def test_a_run_that_cannot_be_loaded_is_refused_in_one_line(trainer_of, tmp_path
     with pytest.raises(ValueError, match=cause) as error:
         bgpo_trl.load_run(run)
     assert "\n" not in str(error.value)
+
+
+def test_a_run_on_the_ground_truth_watches_nothing(
+    begin, make_config, encoders, tmp_path, monkeypatch
+):
+    place = "bgpo_trl.runs.demonstrations.load_representation"
+    monkeypatch.setattr(place, lambda path: encoders)
+    with begin(tmp_path / "run", make_config("state", "ddpg", episodes=1)) as trainer:
+        trainer.run()
+    with pytest.raises(ValueError, match="learned from the ground truth"):
+        bgpo_trl.load_run(tmp_path / "run")
 
 
 @pytest.mark.parametrize("seed", [4, "3"])

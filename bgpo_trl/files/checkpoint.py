@@ -1,26 +1,22 @@
 """Checkpoints that survive crashes: written atomically, verified on loading, never fewer than one.
 
-A checkpoint is a file ``checkpoint-{number}-{digest}.pt``. As in ``torch.hub``'s file names,
-``digest`` is the start of its SHA-256, since ``torch.load`` does not detect damaged bytes.
+A checkpoint is a file ``checkpoint-{number}.pt``, a ZIP archive. ``torch.load`` does not compare
+the checksums in it, hence they are compared before.
 """
 
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import os
-import pickle
-import re
 import warnings
+import zipfile
 from collections import OrderedDict
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-_NAME = re.compile(r"checkpoint-\d+-[0-9a-f]{16}\.pt")
-_REMEDY = "put it back as the run left it, or begin a new run in another directory"
 _PLAIN_TYPES = (bool, int, float, str, type(None), Tensor, nn.Parameter)
 
 
@@ -58,22 +54,17 @@ def save_checkpoint(directory: str | os.PathLike[str], state: dict[str, Any]) ->
     number = _number(earlier[0]) + 1 if earlier else 1
     try:
         directory.mkdir(parents=True, exist_ok=True)
-        with temporary.open("wb") as file:
-            digest = _write(state, file)
-        path = directory / f"checkpoint-{number:06d}-{digest}.pt"
+        torch.save(state, temporary)
+        _flush(temporary)
+        path = directory / f"checkpoint-{number:06d}.pt"
         temporary.replace(path)
-        descriptor = os.open(directory, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
-    except OSError as error:
+        _flush(directory)
+    except (OSError, RuntimeError) as error:  # RuntimeError: torch.save, on a full disk.
         with contextlib.suppress(OSError):  # The directory may be missing or a file.
             temporary.unlink()
         raise OSError(
-            error.errno,
-            f"cannot save a checkpoint in {directory} ({error.strerror}), earlier ones are kept: "
-            "make room, then resume the run",
+            f"cannot save a checkpoint in {directory} ({str(error).splitlines()[0]}), earlier ones "
+            "are kept: make room, then resume the run"
         ) from error
     for old in earlier[1:]:
         old.unlink()
@@ -93,13 +84,13 @@ def load_checkpoint(
     ``newest``, only the newest one is read, for what is to be used as it is, not resumed.
 
     Raises:
-        ValueError: If there is no intact checkpoint, or, with ``newest``, it is not the newest; or
-            if the file is not a checkpoint of this package.
+        ValueError: If there is no intact checkpoint, or, with ``newest``, it is not the newest.
     """
     directory = Path(directory)
     for path in _checkpoints(directory):
-        if _is_intact(path):
-            return _read(path, map_location, mmap)
+        state = _read(path, map_location, mmap)
+        if state is not None:
+            return state
         if newest:
             raise ValueError(
                 f"{path} is damaged, and older checkpoints have learned less: resume the run, "
@@ -107,21 +98,21 @@ def load_checkpoint(
             )
         warnings.warn(f"{path} is damaged: resuming from the checkpoint before it.", stacklevel=2)
     raise ValueError(
-        f"{directory} holds no intact checkpoint to resume from: start a new run in another "
-        "directory."
+        f"{directory} holds no intact checkpoint to resume from: put it back as the run left it, "
+        "or start a new run in another directory"
     )
 
 
-def _read(path: Path, map_location: str | torch.device, mmap: bool) -> dict[str, Any]:
+def _read(path: Path, map_location: str | torch.device, mmap: bool) -> dict[str, Any] | None:
+    """Return the content of a checkpoint; None if it is damaged, or not one."""
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # of pickles that torch has not written
-            state = torch.load(path, map_location=map_location, weights_only=True, mmap=mmap)
-    except (pickle.UnpicklingError, RuntimeError, ValueError, EOFError) as error:
-        raise ValueError(f"{path} is not a checkpoint: {_REMEDY}") from error
-    if not isinstance(state, dict):
-        raise ValueError(f"{path} holds a {type(state).__name__}, not a checkpoint: {_REMEDY}")
-    return state
+        with zipfile.ZipFile(path) as file:
+            if file.testzip() is not None:
+                return None
+        state = torch.load(path, map_location=map_location, weights_only=True, mmap=mmap)
+    except Exception:  # Damage raises errors of many kinds.
+        return None
+    return state if isinstance(state, dict) else None
 
 
 def has_checkpoint(directory: str | os.PathLike[str]) -> bool:
@@ -129,38 +120,13 @@ def has_checkpoint(directory: str | os.PathLike[str]) -> bool:
     return bool(_checkpoints(Path(directory)))
 
 
-class _HashingFile:
-    """Hash the bytes written, and keep the ``OSError`` that ``torch.save`` would hide."""
-
-    def __init__(self, file: BinaryIO) -> None:
-        self._file = file
-        self.sha256 = hashlib.sha256()
-        self.error: OSError | None = None
-
-    def write(self, data: Any) -> int:
-        try:
-            written = self._file.write(data)
-        except OSError as error:
-            self.error = error
-            raise
-        self.sha256.update(data)
-        return written
-
-    def flush(self) -> None:
-        self._file.flush()
-
-
-def _write(state: dict[str, Any], file: BinaryIO) -> str:
-    hashing_file = _HashingFile(file)
+def _flush(path: Path) -> None:
+    """Have a file or folder written to the disk."""
+    descriptor = os.open(path, os.O_RDONLY)
     try:
-        torch.save(state, hashing_file)  # pyright: ignore[reportArgumentType]
-    except RuntimeError:
-        if hashing_file.error is not None:
-            raise hashing_file.error from None
-        raise
-    file.flush()
-    os.fsync(file.fileno())
-    return hashing_file.sha256.hexdigest()[:16]
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def _number(path: Path) -> int:
@@ -169,14 +135,7 @@ def _number(path: Path) -> int:
 
 def _checkpoints(directory: Path) -> list[Path]:
     """Return the checkpoints in a directory, newest first."""
-    found = [path for path in directory.glob("checkpoint-*.pt") if _NAME.fullmatch(path.name)]
-    return sorted(found, key=_number, reverse=True)
-
-
-def _is_intact(path: Path) -> bool:
-    with open(path, "rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
-    return digest.startswith(path.stem.split("-")[2])
+    return sorted(directory.glob("checkpoint-[0-9]*.pt"), key=_number, reverse=True)
 
 
 def _check_state(value: Any, where: str) -> None:

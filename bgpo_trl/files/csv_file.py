@@ -20,7 +20,7 @@ class CsvFile:
     booleans as 0 and 1, and floats with enough digits to be read back exactly.
 
     Raises:
-        ValueError: If the file exists with other columns, or two columns have the same name.
+        ValueError: If the file exists with other columns.
         OSError: If the file cannot be written.
 
     Examples:
@@ -36,10 +36,7 @@ class CsvFile:
     """
 
     def __init__(self, path: str | os.PathLike[str], columns: Sequence[str]) -> None:
-        self.path = Path(path)
-        self.columns = tuple(columns)
-        if not self.columns or len(set(self.columns)) < len(self.columns):
-            raise ValueError(f"{self.path.name} needs columns, all different: got {self.columns}")
+        self.path, self.columns = Path(path), tuple(columns)
         header = _csv_line(self.columns)
         self._header_size = len(header)
         try:
@@ -48,21 +45,18 @@ class CsvFile:
             raise OSError(
                 f"cannot write {self.path} ({error.strerror}): choose another run directory"
             ) from None
-        try:
-            self._file.seek(0)
-            content = self._file.read()
-            if not header.startswith(content[: len(header)]):
-                found = content[:300].partition(b"\n")[0].decode(errors="replace").strip()
-                raise ValueError(
-                    f"{self.path} begins with {found!r}, not with the columns "
-                    f"{','.join(self.columns)} of this run: choose another run directory."
-                )
-            self._file.truncate(content.rfind(b"\n") + 1)
-            if len(content) < len(header):
-                self._append(header)
-        except BaseException:
+        self._file.seek(0)
+        content = self._file.read()
+        if not header.startswith(content[: len(header)]):
             self._file.close()
-            raise
+            found = content[:300].partition(b"\n")[0].decode(errors="replace").strip()
+            raise ValueError(
+                f"{self.path} begins with {found!r}, not with the columns "
+                f"{','.join(self.columns)} of this run: choose another run directory."
+            )
+        self._file.truncate(content.rfind(b"\n") + 1)
+        if len(content) < len(header):
+            self._append(header)
 
     def write(self, row: Mapping[str, Any]) -> None:
         """Append a row of values by column; columns without a value stay empty.
@@ -91,7 +85,12 @@ class CsvFile:
             ValueError: If the file is shorter, or the position is not the end of a row.
         """
         position = max(position, self._header_size)
-        check_position(self.path, position)
+        self._file.seek(position - 1)
+        if self._file.read(1) != b"\n":
+            raise ValueError(
+                f"{self.path} has no row that ends at byte {position}, where the checkpoint was "
+                "taken: put the file back as the run left it, or start a new run."
+            )
         self._file.truncate(position)
 
     def close(self) -> None:
@@ -116,34 +115,6 @@ class CsvFile:
                 error.errno,
                 f"cannot write to {self.path} ({error.strerror}): make room, then resume the run",
             ) from error
-
-
-def has_rows(path: str | os.PathLike[str]) -> bool:
-    """Return whether a CSV file exists and holds more than its header."""
-    try:
-        with open(path, "rb") as file:
-            return bool(file.readline() and file.read(1))
-    except OSError:
-        return False
-
-
-def check_position(path: str | os.PathLike[str], position: int) -> None:
-    """Check that a row of the file, which may be missing, ends at a position in bytes.
-
-    Raises:
-        ValueError: If no row ends there.
-    """
-    path = Path(path)
-    size = path.stat().st_size if path.exists() else 0
-    if position <= size:
-        with path.open("rb") as file:
-            file.seek(position - 1)
-            if file.read(1) == b"\n":
-                return
-    raise ValueError(
-        f"{path} has {size} bytes and no row that ends at byte {position}, where the checkpoint "
-        "was taken: put the file back as the run left it, or start a new run."
-    )
 
 
 def plain_value(value: Any) -> Any:

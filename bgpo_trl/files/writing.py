@@ -17,11 +17,7 @@ _ABSOLUTE = re.compile(r"(?<![^\s'\"`=(])/[^\s'\"`,;:)]+")  # path, from the beg
 
 
 def make_folder(path: str | os.PathLike[str]) -> Path:
-    """Make a folder and its parents unless they exist.
-
-    Raises:
-        OSError: If it cannot be made, for example because a file has that name, or is read-only.
-    """
+    """Make a folder and its parents unless they exist."""
     path = Path(path)
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -118,10 +114,6 @@ def lock_directory(directory: str | os.PathLike[str], *, wait: bool = False) -> 
         directory: The directory, made if missing; what was made is removed if it stays empty.
         wait: Whether to wait for another process instead of raising.
 
-    Raises:
-        BlockingIOError: If another process holds the lock.
-        OSError: If the directory cannot be made, written or locked.
-
     Examples:
         >>> import tempfile
         >>> run = Path(tempfile.mkdtemp()) / "run"
@@ -133,23 +125,19 @@ def lock_directory(directory: str | os.PathLike[str], *, wait: bool = False) -> 
     """
     absolute = Path(directory).resolve()
     made = [folder for folder in (absolute, *absolute.parents) if not folder.exists()]
+    make_folder(directory)
     # One instance per path and process, which counts how often it is held.
     lock = FileLock(absolute / "lock", thread_local=False, is_singleton=True)
-    while True:
-        make_folder(directory)
-        try:
-            lock.acquire(timeout=-1 if wait else 0, poll_interval=0.5)
-            break
-        except FileNotFoundError:  # The last holder has just removed the folder.
-            continue
-        except Timeout:
-            raise BlockingIOError(
-                f"{directory} is in use by another process: let it finish, or stop it"
-            ) from None
-        except OSError as error:
-            raise OSError(
-                f"cannot lock {directory} ({error.strerror}): choose another directory"
-            ) from None
+    try:
+        lock.acquire(timeout=-1 if wait else 0, poll_interval=0.5)
+    except Timeout:
+        raise BlockingIOError(
+            f"{directory} is in use by another process: let it finish, or stop it"
+        ) from None
+    except OSError as error:
+        raise OSError(
+            f"cannot lock {directory} ({error.strerror}): choose another directory"
+        ) from None
     try:
         yield
     finally:

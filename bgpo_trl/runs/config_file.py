@@ -13,10 +13,7 @@ import yaml
 
 from bgpo_trl.algorithms import ALGORITHMS
 from bgpo_trl.configs import AlgorithmConfig, RunConfig
-from bgpo_trl.runs.results import RepeatedKeyError, parse_json, read_json
 from bgpo_trl.scenes import SCENES, find_scene
-
-_YAML = (".yaml", ".yml")
 
 
 class Digests(NamedTuple):
@@ -35,16 +32,13 @@ class _Loader(yaml.SafeLoader):
     """PyYAML's safe loader, with two rules of YAML 1.2: 1e-4 is a number, and keys are unique."""
 
     def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
-        """Return the node of a mapping; raise `RepeatedKeyError` if it gives a key twice."""
         # Not in construct_mapping, where a mapping also has the keys that it merges (<<).
         node = super().compose_mapping_node(anchor)
-        found = set[tuple[str, str]]()
-        for key, _ in node.value:
-            if isinstance(key, yaml.ScalarNode):
-                if (key.tag, key.value) in found:
-                    where = f"{self.name}, line {key.start_mark.line + 1},"
-                    raise RepeatedKeyError(where, key.value)
-                found.add((key.tag, key.value))
+        keys = [key.value for key, _ in node.value]
+        for place, (key, _) in enumerate(node.value):
+            if key.value in keys[:place]:
+                given = f"{key.value!r} is given twice"
+                raise yaml.MarkedYAMLError(problem=given, problem_mark=key.start_mark)
         return node
 
 
@@ -56,27 +50,21 @@ _Loader.add_implicit_resolver(
 
 
 def read_settings(path: Path) -> dict[str, Any]:
-    """Return the entries of a file of settings.
-
-    Args:
-        path: YAML file if its name ends in ``.yaml`` or ``.yml``, else JSON.
+    """Return the entries of a file of settings, YAML or JSON, which is YAML too.
 
     Raises:
         ValueError: If the file is missing or damaged, gives a key twice, or is no mapping of names
             to values.
     """
-    if path.suffix not in _YAML:
-        return read_json(path)
     try:
-        with path.open() as file:
-            found = yaml.load(file, Loader=_Loader)
-    except RepeatedKeyError:
-        raise
+        found = yaml.load(path.read_text(), Loader=_Loader)
+    except FileNotFoundError:
+        raise ValueError(f"{path.parent} holds no run: there is no {path.name}") from None
     except (yaml.YAMLError, OSError, ValueError, RecursionError) as error:
         mark = getattr(error, "problem_mark", None)
         where = f", line {mark.line + 1}" if mark is not None else ""
         reason = getattr(error, "problem", None) or next(iter(str(error).splitlines()), "")
-        raise ValueError(f"{path}{where} is not YAML ({reason}): correct it") from None
+        raise ValueError(f"{path}{where} cannot be read ({reason}): correct it") from None
     if not isinstance(found, dict) or not all(isinstance(name, str) for name in found):
         raise ValueError(
             f"{path} must hold settings, one `name: value` a line, as config.json does"
@@ -86,8 +74,6 @@ def read_settings(path: Path) -> dict[str, Any]:
 
 def read_config(path: str | Path, defaults: RunConfig | None = None) -> tuple[RunConfig, Digests]:
     """Read the settings that `Trainer` wrote: the inverse of ``dataclasses.asdict``.
-
-    Settings that the file lacks get their defaults.
 
     Args:
         path: The ``config.json`` of a run, or another file that `read_settings` reads.
@@ -102,46 +88,34 @@ def read_config(path: str | Path, defaults: RunConfig | None = None) -> tuple[Ru
             names a task or hyperparameters that this process does not know.
     """
     path = Path(path)
-    of_run = path.name == "config.json"
+    settings = read_settings(path)
+    if defaults is not None:
+        settings = _merged(_as_json(asdict(defaults)), settings)
     try:
-        settings = parse_json(path) if of_run else read_settings(path)
-        if defaults is not None and isinstance(settings, dict):
-            settings = _merged(_as_json(asdict(defaults)), settings)
-        if not isinstance(settings, dict) or not isinstance(settings.get("algorithm"), dict):
-            raise ValueError("it holds no settings of a run")
         digests = Digests(*(settings.pop(name, None) for name in Digests._fields))
-        for name, found in digests._asdict().items():
-            if not isinstance(found, str | None):
-                raise ValueError(f"{name} is {found!r}")
-        values, modules = settings.pop("algorithm"), settings.pop("task_modules", {})
+        modules = settings.pop("task_modules", {})
         settings.pop("scene_version", None)  # `check_settings` compares it
-        name, scene = settings.get("name"), settings.get("scene", "nico")
-        kind = _algorithm_config(name, settings.pop("algorithm_class", None))
-        if kind is None:
-            raise LookupError(f"is a run of {name!r}, whose hyperparameters no imported module has")
+        kind = _algorithm_config(settings.get("name"), settings.pop("algorithm_class", None))
+        scene = settings.get("scene", "nico")
         if scene not in SCENES:
             raise LookupError(f"is a run in the scene {scene!r}, which no imported module adds")
-        unknown = _unknown_task(scene, settings.get("tasks"))
-        if unknown is not None:
-            # The module is not imported, since a file should not decide what is imported.
-            module = modules.get(unknown) if isinstance(modules, dict) else None
-            known = isinstance(module, str) and module != "__main__"
-            where = f"the module {module!r}" if known else "a script or notebook"
-            raise LookupError(f"has the task {unknown!r}, added by {where}")
-        algorithm = _built(kind, values, "algorithm")
+        for task in settings.get("tasks", ()):
+            if task not in find_scene(scene).tasks:
+                # The module is not imported, since a file should not decide what is imported.
+                module = modules.get(task, "a script or notebook")
+                raise LookupError(f"has the task {task!r}, added by {module!r}")
+        algorithm = _built(kind, settings.get("algorithm"), "algorithm")
         return _built(RunConfig, {**settings, "algorithm": algorithm}), digests
-    except (FileNotFoundError, NotADirectoryError):
-        raise ValueError(f"{path.parent} holds no run: there is no {path.name}") from None
     except LookupError as error:
         raise ValueError(
-            f"{path} {error}: name the module that adds it with --import, or import it first in "
-            "Python"
+            f"{path} {error.args[0]}: name the module that adds it with --import, or import it "
+            "first in Python"
         ) from None
-    except RepeatedKeyError:
-        raise
-    except (ValueError, OSError, RecursionError) as error:
-        remedy = "use the version of the code that made the run" if of_run else "correct it"
-        raise ValueError(f"{path} cannot be read ({error}): {remedy}") from error
+    except (ValueError, TypeError, AttributeError) as error:
+        raise ValueError(
+            f"{path} cannot be read ({error}): correct it or, for a run, use the version of the "
+            "code that made it"
+        ) from error
 
 
 def settings_of(config: RunConfig, digests: Digests) -> dict[str, Any]:
@@ -149,10 +123,6 @@ def settings_of(config: RunConfig, digests: Digests) -> dict[str, Any]:
 
     In addition to all settings, it names the class of the hyperparameters, the version of the scene
     and the modules of tasks that are not the paper's.
-
-    Args:
-        config: The run.
-        digests: Digests of its encoders and demonstrations.
     """
     kind, scene = type(config.algorithm), find_scene(config.scene)
     settings = {
@@ -181,35 +151,31 @@ def _merged(defaults: dict[str, Any], settings: dict[str, Any]) -> dict[str, Any
     return merged
 
 
-def _unknown_task(scene: object, tasks: object) -> str | None:
-    """Return the first task that is not in a scene; None if there is none, or no list."""
-    if not (isinstance(scene, str) and scene in SCENES and isinstance(tasks, list)):
-        return None
-    known = find_scene(scene).tasks
-    return next((name for name in tasks if isinstance(name, str) and name not in known), None)
-
-
-def _algorithm_config(name: object, stored: object) -> type[AlgorithmConfig] | None:
-    """Return the class of an algorithm's hyperparameters; None if it is unknown.
+def _algorithm_config(name: Any, stored: Any) -> type[AlgorithmConfig]:
+    """Return the class of an algorithm's hyperparameters.
 
     Args:
         name: Of the algorithm.
         stored: Its name in the file; None in files without it. Only classes of modules that this
             process has imported are found, since a file should not decide what is imported.
+
+    Raises:
+        LookupError: If it is unknown.
     """
-    if isinstance(stored, str):
-        module, _, attribute = stored.rpartition(".")
-        kind = getattr(sys.modules.get(module), attribute, None)
-        if isinstance(kind, type) and issubclass(kind, AlgorithmConfig):
-            return kind
-    if not isinstance(name, str) or name not in ALGORITHMS:
-        return None
+    module, _, attribute = str(stored).rpartition(".")
+    kind = getattr(sys.modules.get(module), attribute, None)
+    if isinstance(kind, type) and issubclass(kind, AlgorithmConfig):
+        return kind
+    if name not in ALGORITHMS:
+        raise LookupError(f"is a run of {name!r}, whose hyperparameters no imported module has")
     return type(ALGORITHMS[name].config)
 
 
-def _built(kind: type, values: dict[str, Any], where: str = "") -> Any:
+def _built(kind: type, values: Any, where: str = "") -> Any:
     """Return settings of a class from a file; ``where`` names them in errors."""
     hints, prefix = get_type_hints(kind), f"{where}." if where else ""
+    if not isinstance(values, dict):
+        raise ValueError(f"{where} holds no settings")
     unknown = sorted(values.keys() - hints.keys(), key=str)
     if unknown:
         raise ValueError(f"unknown setting {prefix}{unknown[0]}")

@@ -4,26 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 from torch import Tensor
 
 from bgpo_trl.files.writing import write_whole
 from bgpo_trl.runs.results import COLUMNS, read_table
-
-
-@dataclass
-class Cost:
-    """Cost of the training steps with one number of presented tasks, of all seeds together."""
-
-    steps: int = 0
-    """Training steps; in each, every seed takes one step."""
-    seconds: float = 0.0
-    """Wall time of these steps, without tests and checkpoints."""
-    megabytes: float = 0.0
-    """Size of networks, replay, GWR-B and groups after the last of these steps, in 10^6 bytes."""
 
 
 class CostLog:
@@ -41,30 +29,29 @@ class CostLog:
     """
 
     def __init__(self, path: str | os.PathLike[str], *, resume: bool = False) -> None:
-        self.path = Path(path)
-        self.costs = read_costs(self.path) if resume and self.path.exists() else {}
+        self._path = Path(path)
+        table = read_table(self._path) if resume and self._path.exists() else pd.DataFrame()
+        # Training steps of all seeds, their seconds, and megabytes after the last of them.
+        self._costs = {int(tasks): costs for tasks, *costs in table.itertuples(index=False)}
 
     def add_step(self, tasks: int, seconds: float) -> None:
         """Count a training step of ``seconds`` with so many presented ``tasks``."""
-        cost = self.costs.setdefault(tasks, Cost())
-        cost.steps += 1
-        cost.seconds += seconds
+        costs = self._costs.setdefault(tasks, [0, 0.0, 0.0])
+        costs[0] += 1
+        costs[1] += seconds
 
     def measure(self, tasks: int, state: Mapping[str, Any]) -> None:
         """Note the size of the algorithm's ``state_dict`` with so many presented ``tasks``."""
-        self.costs.setdefault(tasks, Cost()).megabytes = n_bytes(state) / 1e6
+        self._costs.setdefault(tasks, [0, 0.0, 0.0])[2] = n_bytes(state) / 1e6
 
     def write(self) -> None:
-        """Replace the file.
-
-        Raises:
-            OSError: If it cannot be written.
-        """
+        """Replace the file; raise ``OSError`` if it cannot be written."""
         rows = [
-            f"{tasks},{cost.steps},{cost.seconds:.3f},{cost.megabytes:.6f}"
-            for tasks, cost in sorted(self.costs.items())
+            (tasks, steps, f"{seconds:.3f}", f"{megabytes:.6f}")
+            for tasks, (steps, seconds, megabytes) in sorted(self._costs.items())
         ]
-        write_whole(self.path, "\n".join([",".join(COLUMNS["cost.csv"]), *rows, ""]))
+        table = pd.DataFrame(rows, columns=pd.Index(COLUMNS["cost.csv"]))
+        write_whole(self._path, table.to_csv(index=False))
 
 
 def n_bytes(state: Any) -> int:
@@ -74,13 +61,3 @@ def n_bytes(state: Any) -> int:
     if isinstance(state, Mapping):
         return sum(map(n_bytes, state.values()))
     return sum(map(n_bytes, state)) if isinstance(state, list | tuple) else 0
-
-
-def read_costs(path: str | os.PathLike[str]) -> dict[int, Cost]:
-    """Read a ``cost.csv``: costs by the number of presented tasks.
-
-    Raises:
-        ValueError: If the file is missing or damaged.
-    """
-    rows = read_table(path)[[*COLUMNS["cost.csv"]]].itertuples(index=False)
-    return {int(tasks): Cost(int(steps), *amounts) for tasks, steps, *amounts in rows}

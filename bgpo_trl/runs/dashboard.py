@@ -8,7 +8,6 @@ import uuid
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from shlex import quote
 from typing import Any, Literal, Self
 
 import pandas as pd
@@ -36,17 +35,14 @@ class Dashboard:
     | ``train/COLUMN``, such as ``train/loss_actor`` | the same, of each number in ``train.csv`` |
     | ``final/success/TASK``, ``final/success_mean`` | seeds and tests after training |
 
-    ``eval/success_sd`` is the standard deviation over seeds (``ddof=0``, as in the figures) of
-    their means. With ``per_seed``, each seed has a curve ``eval/success/TASK/seed_SEED`` too. The
-    settings, the commit and the versions of packages are logged as hyperparameters once, by names
-    such as ``algorithm.beta``. A logger that raises is dropped with one warning.
+    The settings, the commit and the versions of packages are logged as hyperparameters once, by
+    names such as ``algorithm.beta``. A logger that raises is dropped with one warning.
 
     Args:
         directory: The run directory. Training episodes in its ``train.csv`` that no evaluation
             follows belong to the next one, so that a resumed run logs the same means.
         loggers: Loggers, or functions without arguments that make one.
         settings: Settings of the run, as JSON stores them.
-        per_seed: Whether to log the test success of each seed.
 
     Raises:
         ValueError: If there are loggers and ``train.csv`` or ``eval.csv`` is missing or damaged.
@@ -58,9 +54,8 @@ class Dashboard:
         loggers: Iterable[Logger | Callable[[], Logger]] = (),
         *,
         settings: Mapping[str, Any],
-        per_seed: bool = False,
     ) -> None:
-        self._per_seed, loggers = per_seed, [*loggers]
+        loggers = [*loggers]
         # Training episodes since the last evaluation.
         self._episodes = _untested(Path(directory)) if loggers else []
         self._loggers: list[Logger] = []
@@ -69,14 +64,13 @@ class Dashboard:
                 self._loggers.append(logger() if callable(logger) else logger)
             except Exception as error:
                 _warn("A logger", error)
-        if self._loggers:
-            settings = {**settings, "commit": commit_of_code(), "versions": versions()}
-            # TensorBoard takes no lists.
-            plain = {
-                name: json.dumps(value) if isinstance(value, list) else value
-                for name, value in flatten(settings)
-            }
-            self._each(lambda logger: logger.log_hparams(dict(plain)))
+        settings = {**settings, "commit": commit_of_code(), "versions": versions()}
+        # TensorBoard takes no lists.
+        plain = {
+            name: json.dumps(value) if isinstance(value, list) else value
+            for name, value in flatten(settings)
+        }
+        self._each(lambda logger: logger.log_hparams(dict(plain)))
 
     def log_train(self, row: Mapping[str, Any]) -> None:
         """Add a training episode, a row of ``train.csv``, to the means of the next evaluation."""
@@ -90,19 +84,10 @@ class Dashboard:
             rows: Test episodes of all seeds after the same number of training episodes, as rows of
                 ``eval.csv``.
         """
-        if not self._loggers:
-            return
         tests, episode = pd.DataFrame([*rows]), int(rows[0]["episode"])
         played = [row for row in self._episodes if row["episode"] <= episode]
         self._episodes = [row for row in self._episodes if row["episode"] > episode]
-        of_seeds = tests.groupby("seed")["success"].mean()
-        metrics = {**_success("eval", tests), **_training(played)}
-        if len(of_seeds) > 1:
-            metrics["eval/success_sd"] = float(of_seeds.std(ddof=0))
-        if self._per_seed:
-            for (task, seed), success in tests.groupby(["task", "seed"])["success"]:
-                metrics[f"eval/success/{task}/seed_{seed}"] = float(success.mean())
-        self._log(metrics, episode)
+        self._log({**_success("eval", tests), **_training(played)}, episode)
 
     def log_final(self, tests: pd.DataFrame, episode: int) -> None:
         """Log the tests after training.
@@ -112,15 +97,6 @@ class Dashboard:
             episode: Training episodes of a seed.
         """
         self._log(_success("final", tests), episode)
-
-    def log_media(self, name: str, path: str | os.PathLike[str]) -> None:
-        """Send a finished figure or video to Weights & Biases and loggers with a ``log_media``.
-
-        Args:
-            name: Name on the dashboard.
-            path: A picture, or a video as GIF or MP4.
-        """
-        self._each(lambda logger: _send(logger, name, Path(path)))
 
     def close(self) -> None:
         """Shut the loggers down."""
@@ -146,32 +122,23 @@ class Dashboard:
 
 
 def wandb_logger(
-    directory: str | os.PathLike[str],
-    mode: Literal["online", "offline"],
-    *,
-    group: str | None = None,
-    tags: Sequence[str] | None = None,
+    directory: str | os.PathLike[str], mode: Literal["online", "offline"], group: str | None = None
 ) -> WandbLogger:
-    """Start a run on Weights & Biases, offline if it does not answer, or continue that of a run.
+    """Start a run on Weights & Biases, or continue that of a run.
 
     Args:
         directory: The run directory; its ``wandb/`` gets the files, and the id of the run, by which
             a resumed run continues its curves.
         mode: ``"online"``, or ``"offline"`` for a later ``wandb sync``.
         group: Group of the run.
-        tags: Tags of the run; those of a continued run stay if None.
 
     Raises:
-        ValueError: If there is no such mode.
         ImportError: If wandb is not installed.
-        RuntimeError: If neither mode works.
     """
-    if mode not in ("online", "offline"):
-        raise ValueError(f'the mode must be "online" or "offline", not {mode!r}')
     directory = Path(directory)
     identity = directory / "wandb" / "run_id"
     identity.parent.mkdir(parents=True, exist_ok=True)
-    if not identity.exists() or not identity.read_text():  # killed before it was written
+    if not identity.exists():
         write_whole(identity, uuid.uuid4().hex)
     try:
         return WandbLogger(
@@ -182,7 +149,6 @@ def wandb_logger(
             log_env_packages=False,  # would reveal paths of this machine
             mode=mode,  # not `offline=`, which changes os.environ for good
             group=group,
-            tags=None if tags is None else [*tags],
             settings={
                 "init_timeout": 30,
                 "finish_timeout": 60,
@@ -192,15 +158,6 @@ def wandb_logger(
         )
     except ImportError:
         raise ImportError("wandb is not installed: pip install 'bgpo_trl[wandb]'") from None
-    except Exception as error:
-        if mode == "offline":
-            raise RuntimeError(f"wandb cannot write its files: {_reason(error)}") from error
-        warnings.warn(
-            f"wandb does not answer ({_reason(error)}): logging offline, upload it with "
-            f"`wandb sync {quote(str(identity.parent))}/offline-run-*`",
-            stacklevel=2,
-        )
-    return wandb_logger(directory, "offline", group=group, tags=tags)
 
 
 def tensorboard_logger(directory: str | os.PathLike[str]) -> TensorboardLogger:
@@ -247,24 +204,9 @@ def _training(episodes: Sequence[Mapping[Any, Any]]) -> dict[str, float]:
     return {**_success("train", table), **metrics}
 
 
-def _send(logger: Logger, name: str, path: Path) -> None:
-    if isinstance(logger, WandbLogger):
-        import wandb  # an optional extra, installed if there is a WandbLogger
-
-        # The path rather than the frames, for which wandb (and TorchRL's log_video) needs moviepy.
-        media = wandb.Video if path.suffix in (".gif", ".mp4") else wandb.Image
-        logger.experiment.log({name: media(str(path))})
-    elif log_media := getattr(logger, "log_media", None):
-        log_media(name, path)
-
-
 def _warn(name: str, error: Exception) -> None:
+    reason = (str(error) or type(error).__name__).splitlines()[0]
     warnings.warn(
-        f"{name} failed ({_reason(error)}) and gets nothing more of this run: the CSV files are "
-        "complete.",
+        f"{name} failed ({reason}) and gets nothing more of this run: the CSV files are complete.",
         stacklevel=4,
     )
-
-
-def _reason(error: Exception) -> str:
-    return (str(error) or type(error).__name__).splitlines()[0]

@@ -30,12 +30,6 @@ def keep_inputs(
     Copies, of some megabytes, move with the directory to other machines. Runs with the shipped
     encoders and demonstrations store none, since digests in ``config.json`` identify them.
 
-    Args:
-        directory: The run directory.
-        bank: Demonstrations of the run's tasks.
-        encoders: Encoders of the run.
-        scene: The robot, or its name.
-
     Raises:
         OSError: If a file cannot be written.
     """
@@ -59,12 +53,6 @@ def load_inputs(
     directory: Path, tasks: tuple[str, ...], digests: Digests, scene: Scene | str = "nico"
 ) -> tuple[Representation, DemonstrationBank]:
     """Load the encoders and demonstrations that a run was trained with.
-
-    Args:
-        directory: The run directory.
-        tasks: Tasks of the run.
-        digests: Digests in its ``config.json``.
-        scene: The robot, or its name.
 
     Raises:
         ValueError: If one of the files is missing, damaged or another one.

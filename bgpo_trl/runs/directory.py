@@ -9,61 +9,37 @@ from pathlib import Path
 from typing import Any, Self
 
 from bgpo_trl.files.checkpoint import has_checkpoint, load_checkpoint
-from bgpo_trl.files.csv_file import CsvFile, check_position, has_rows
+from bgpo_trl.files.csv_file import CsvFile
 from bgpo_trl.files.writing import make_folder, write_json
 from bgpo_trl.runs.results import COLUMNS, read_json
-from bgpo_trl.scenes import find_scene
 
-CSV_FILES = ("train.csv", "eval.csv")
-"""Files to which a run appends rows."""
-_OF_A_CHECKPOINT: Mapping[str, type] = {
-    "settings": dict,
-    "position": dict,
-    "algorithm": dict,
-    "world": dict,
-    "evaluator": dict,
-    "state": dict,
-    "env_steps": int,
-    "later": list,
-}
+_CSV_FILES = ("train.csv", "eval.csv")  # to which a run appends rows
+_REMEDY = "put it back as the run left it, or begin a new run in another directory"
 
 
 def holds_run(directory: str | os.PathLike[str]) -> bool:
     """Return whether a directory holds any file of a run."""
-    names = ("config.json", *CSV_FILES, "checkpoint")
+    names = ("config.json", *_CSV_FILES, "checkpoint")
     return any((Path(directory) / name).exists() for name in names)
 
 
 def check_settings(
     directory: str | os.PathLike[str], settings: Mapping[str, Any], *, longer: bool = False
 ) -> None:
-    """Check that a directory holds no run, or one with the given settings.
+    """Check that a directory holds no run, or one with the given settings, as JSON stores them.
 
-    Args:
-        directory: A run directory, which may be missing.
-        settings: Settings of a run, as JSON stores them.
-        longer: Whether the existing run may have fewer ``episodes``, and lack the last tasks.
+    With ``longer``, the existing run may have fewer ``episodes``, and lack the last tasks.
 
     Raises:
-        ValueError: If the directory holds a run with other settings, or of another version of the
-            scene.
+        ValueError: If the directory holds a run with other settings.
     """
     path = Path(directory) / "config.json"
     if path.exists():
-        saved = read_json(path)
-        if "scene_version" in saved and saved.get("scene") == settings.get("scene"):
-            remedy = "use the version that it began in, or begin a new run in another directory"
-            identity = f"{saved['scene']} {saved['scene_version']}"
-            find_scene(settings["scene"]).check_identity(identity, directory, remedy)
-        _compare(directory, saved, settings, longer)
+        _compare(directory, read_json(path), settings, longer)
 
 
 def load_last(directory: Path, settings: Mapping[str, Any]) -> dict[str, Any] | None:
     """Read the checkpoint that a run resumes from, without changing any file.
-
-    Args:
-        directory: The run directory.
-        settings: Settings of the run, as JSON stores them; ``episodes`` and tasks may have grown.
 
     Returns:
         The state saved by `Trainer`; ``None`` if nothing has been logged yet.
@@ -72,51 +48,37 @@ def load_last(directory: Path, settings: Mapping[str, Any]) -> dict[str, Any] | 
         ValueError: If settings, rows or checkpoint are missing, damaged or of another run.
     """
     check_settings(directory, settings, longer=True)
-    folder = directory / "checkpoint"
-    remedy = "put it back as the run left it, or begin a new run in another directory"
-    if not has_checkpoint(folder):
-        if any(has_rows(directory / name) for name in CSV_FILES):
-            raise ValueError(f"{directory} has rows of a run, but no checkpoint: {remedy}")
+    tables = {name: directory / name for name in _CSV_FILES}
+    if not has_checkpoint(directory / "checkpoint"):
+        if any(path.exists() and path.read_bytes().count(b"\n") > 1 for path in tables.values()):
+            raise ValueError(f"{directory} has rows of a run, but no checkpoint: {_REMEDY}")
         return None
-    if not (directory / "config.json").exists():
-        raise ValueError(f"{directory} has a checkpoint, but no config.json: {remedy}")
-    state = load_checkpoint(folder)
-    check_checkpoint(folder, state, settings)
-    for name, position in state["position"].items():
-        check_position(directory / name, position)
+    state = read_checkpoint(directory, settings)
+    for name, path in tables.items():
+        if not path.exists() or path.stat().st_size < state["position"][name]:
+            raise ValueError(f"{path} lacks rows from before the checkpoint: {_REMEDY}")
     return state
 
 
-def check_checkpoint(folder: Path, state: Mapping[str, Any], settings: Mapping[str, Any]) -> None:
-    """Check that a checkpoint is `Trainer`'s, of these settings or fewer episodes or tasks.
-
-    Args:
-        folder: Folder of the checkpoint.
-        state: Its content.
-        settings: Settings of the run, as JSON stores them.
+def read_checkpoint(
+    directory: Path, settings: Mapping[str, Any], *, mmap: bool = False, newest: bool = False
+) -> dict[str, Any]:
+    """Read the last checkpoint of a run with these settings, or with fewer episodes or tasks.
 
     Raises:
-        ValueError: If entries are missing, or settings differ.
+        ValueError: If there is no intact checkpoint, or it is not of a run with these settings.
     """
-    missing = [
-        name for name, kind in _OF_A_CHECKPOINT.items() if not isinstance(state.get(name), kind)
-    ]
-    if missing:
-        raise ValueError(
-            f"{folder} holds no checkpoint of a run, it lacks {', '.join(missing)}: put it back as "
-            "the run left it, or begin a new run in another directory"
-        )
-    remedy = "put config.json back as the run left it, or choose another run directory"
-    _compare(folder, state["settings"], settings, longer=True, remedy=remedy)
+    folder = directory / "checkpoint"
+    state = load_checkpoint(folder, mmap=mmap, newest=newest)
+    if not isinstance(state.get("settings"), dict):
+        raise ValueError(f"{folder} holds no checkpoint of a run: {_REMEDY}")
+    _compare(folder, state["settings"], settings, longer=True)
+    return state
 
 
 @contextlib.contextmanager
 def fitting_checkpoint(directory: Path) -> Iterator[None]:
-    """Turn errors of loading a checkpoint's state, in the block, into one line.
-
-    Raises:
-        ValueError: If the state does not fit what it is loaded into.
-    """
+    """Turn errors of loading a checkpoint's state, in the block, into one line."""
     try:
         yield
     except (AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
@@ -151,8 +113,8 @@ def _compare(
     saved: Mapping[str, Any],
     settings: Mapping[str, Any],
     longer: bool,
-    remedy: str = "choose another run directory, or the same settings.",
 ) -> None:
+    """Raise ``ValueError`` if settings differ, beside length and further tasks if ``longer``."""
     if "offline_updates" in settings:
         saved = {"offline_updates": 0, **saved}  # which runs before this setting lack
     if longer:
@@ -163,7 +125,8 @@ def _compare(
     ]
     if differences:
         raise ValueError(
-            f"{where} holds a run with other settings ({'; '.join(differences)}): {remedy}"
+            f"{where} holds a run with other settings ({'; '.join(differences)}): choose another "
+            "run directory, or the settings and the version of the run"
         )
 
 
@@ -201,12 +164,12 @@ class RunLogger:
         directory: The run directory; made if missing.
         config: Settings of the run, as JSON stores them, written to ``config.json``.
         logged: Further columns of ``train.csv``; see `Algorithm`.
-        resume: Continue the run in the directory, which may have had fewer ``episodes``; call
-            `truncate_to` next.
+        position: To continue a run, the result of `position` in its checkpoint: later rows are
+            dropped; empty to start over, for a run that ended before its first checkpoint.
 
     Raises:
-        ValueError: If the directory holds a run with other settings or columns, or any run without
-            ``resume``; if a name in ``logged`` is that of another column.
+        ValueError: If the directory holds any run without ``position``; if its tables have other
+            columns, or are shorter; if a name in ``logged`` is that of another column.
         OSError: If the directory cannot be written.
 
     Examples:
@@ -224,61 +187,42 @@ class RunLogger:
         *,
         config: Mapping[str, Any],
         logged: Sequence[str] = (),
-        resume: bool = False,
+        position: Mapping[str, int] | None = None,
     ) -> None:
-        self.directory = Path(directory)
-        columns = (*COLUMNS["train.csv"], *logged)
+        directory, columns = Path(directory), (*COLUMNS["train.csv"], *logged)
         repeated = {name for name in logged if columns.count(name) > 1}
         if repeated:
             raise ValueError(
                 f"train.csv has the column {', '.join(sorted(repeated))} already: choose other "
                 "names for what the algorithm logs"
             )
-        if not resume and holds_run(self.directory):
+        if position is None and holds_run(directory):
             raise ValueError(
-                f"{self.directory} already holds a run: resume it, or choose another run directory."
+                f"{directory} already holds a run: resume it, or choose another run directory."
             )
-        make_folder(self.directory)
-        write_json(self.directory / "config.json", config)
-        self._files = {
-            name: CsvFile(self.directory / name, columns)
-            for name, columns in (("train.csv", columns), ("eval.csv", [*COLUMNS["eval.csv"]]))
-        }
+        make_folder(directory)
+        self._train = CsvFile(directory / "train.csv", columns)
+        self._eval = CsvFile(directory / "eval.csv", COLUMNS["eval.csv"])
+        for file in (self._train, self._eval):
+            file.truncate_to((position or {}).get(file.path.name, 0))
+        write_json(directory / "config.json", config)
 
     def log_train(self, row: Mapping[str, Any]) -> None:
-        """Write a training episode, values by column; missing ones stay empty.
-
-        Raises:
-            ValueError: If there is no such column.
-            OSError: If the row cannot be written.
-        """
-        self._files["train.csv"].write(row)
+        """Write a training episode; see `CsvFile.write`."""
+        self._train.write(row)
 
     def log_eval(self, row: Mapping[str, Any]) -> None:
-        """Write a test episode; see `log_train`."""
-        self._files["eval.csv"].write(row)
+        """Write a test episode; see `CsvFile.write`."""
+        self._eval.write(row)
 
     def position(self) -> dict[str, int]:
         """Flush the CSV files to disk and return their sizes, for the checkpoint."""
-        return {name: file.position() for name, file in self._files.items()}
-
-    def truncate_to(self, position: Mapping[str, int]) -> None:
-        """Drop the rows that a resumed run will write again.
-
-        Args:
-            position: Result of `position` saved in the checkpoint; empty to start over, for a run
-                that ended before its first checkpoint.
-
-        Raises:
-            ValueError: If a file is shorter.
-        """
-        for name, file in self._files.items():
-            file.truncate_to(position.get(name, 0))
+        return {file.path.name: file.position() for file in (self._train, self._eval)}
 
     def close(self) -> None:
         """Close the CSV files."""
-        for file in self._files.values():
-            file.close()
+        self._train.close()
+        self._eval.close()
 
     def __enter__(self) -> Self:
         return self

@@ -12,10 +12,10 @@ from bgpo_trl.configs import RunConfig
 from bgpo_trl.data.bank import DemonstrationBank
 from bgpo_trl.encoders.pretrained import bank_path
 from bgpo_trl.encoders.representation import Representation
-from bgpo_trl.files.checkpoint import has_checkpoint, load_checkpoint
+from bgpo_trl.files.checkpoint import has_checkpoint
 from bgpo_trl.runs.config_file import read_config, settings_of
 from bgpo_trl.runs.demonstrations import load_inputs, weights_of_run
-from bgpo_trl.runs.directory import check_checkpoint
+from bgpo_trl.runs.directory import read_checkpoint
 from bgpo_trl.scenes import find_scene
 
 _MOST = 300  # demonstrations of a task that are compared
@@ -61,8 +61,7 @@ def add_task(
     if task in saved.tasks:
         raise ValueError(f"{directory} has the task {task!r} already: resume it without adding one")
     scene.check_tasks((task,))
-    folder = directory / "checkpoint"
-    if not has_checkpoint(folder):
+    if not has_checkpoint(directory / "checkpoint"):
         raise ValueError(f"{directory} has no checkpoint: begin a new run with all of the tasks")
     encoders, shown = load_inputs(directory, saved.tasks, digests, scene)
     weights = weights_of_run(directory, scene, encoders.identity)
@@ -70,8 +69,7 @@ def add_task(
     path = bank_path(weights) if bank is None else bank
     found = DemonstrationBank.load(path, encoder_id=encoders.identity)
     shown += found.for_tasks((task,))
-    state = load_checkpoint(folder, mmap=True)
-    check_checkpoint(folder, state, settings_of(saved, digests))
+    state = read_checkpoint(directory, settings_of(saved, digests), mmap=True)
     start = int(state["world"]["source"]["episode"].max()) + 1
     if start >= config.episodes:
         raise ValueError(
@@ -88,17 +86,12 @@ class Distinctness(NamedTuple):
     Attributes:
         new: Share of its demonstrations whose nearest other demonstration is of the same task.
         old: The same of the other tasks, before it was added.
-        own_distance: Median distances to the nearest other demonstration of the same task, for the
-            last task and the others.
-        other_distance: Median distances to the nearest demonstration of another task, likewise.
         confused: The task that most of the mistaken demonstrations are nearest to; None without
             such ones.
     """
 
     new: float
     old: float
-    own_distance: tuple[float, float]
-    other_distance: tuple[float, float]
     confused: str | None
 
     @property
@@ -116,9 +109,7 @@ class Distinctness(NamedTuple):
         )
         return (
             f"nearest demonstration of the same task: {self.new:.0%} of the new demonstrations, "
-            f"{self.old:.0%} of the old; distance to it {self.own_distance[0]:.2f} and "
-            f"{self.own_distance[1]:.2f}, to another task {self.other_distance[0]:.2f} and "
-            f"{self.other_distance[1]:.2f}; {verdict}"
+            f"{self.old:.0%} of the old; {verdict}"
         )
 
 
@@ -132,17 +123,13 @@ def distinctness(bank: DemonstrationBank) -> Distinctness:
     rows = torch.cat([torch.nonzero(bank.task == t).flatten()[:_MOST] for t in range(last + 1)])
     phi, task = bank.embedding[rows], bank.task[rows]
     distance = torch.cdist(phi, phi).fill_diagonal_(torch.inf)
-    same, is_new = task.unsqueeze(1) == task, task == last
-    own = distance.masked_fill(~same, torch.inf).amin(1)
-    other = distance.masked_fill(same, torch.inf).amin(1)
-    before = distance.masked_fill(same | is_new, torch.inf).amin(1)
-    mistaken = is_new & (other < own)
-    nearest = task[distance.masked_fill(same, torch.inf).argmin(1)][mistaken]
+    is_new = task == last
+    nearest = task[distance.argmin(1)]
+    nearest_old = task[distance.masked_fill(is_new, torch.inf).argmin(1)]
+    mistaken = nearest[is_new & (nearest != task)]
     # With one old task, no old demonstration could have been mistaken.
     return Distinctness(
-        new=float((own <= other)[is_new].float().mean()),
-        old=float((own <= before)[~is_new].float().mean()),
-        own_distance=(float(own[is_new].median()), float(own[~is_new].median())),
-        other_distance=(float(other[is_new].median()), float(other[~is_new].median())),
-        confused=bank.tasks[int(nearest.mode().values)] if len(nearest) else None,
+        new=float((nearest == task)[is_new].float().mean()),
+        old=float((nearest_old == task)[~is_new].float().mean()),
+        confused=bank.tasks[int(mistaken.mode().values)] if len(mistaken) else None,
     )

@@ -1,4 +1,4 @@
-"""Where results come from: code, versions and command; and files of measurements with these."""
+"""Where results come from: code, versions and command; and tables."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from bgpo_trl.files.writing import make_folder, without_folders, write_json, write_whole
+from bgpo_trl.files.writing import without_folders, write_whole
 
 
 def commit_of_code() -> str:
@@ -35,16 +35,6 @@ def versions() -> dict[str, str]:
 def command() -> str:
     """Return the command line of this process, `without_folders` of this machine."""
     return without_folders(shlex.join(["python", *sys.argv]))
-
-
-def write_measurement(folder: Path, name: str, table: pd.DataFrame, commit: str) -> None:
-    """Write a table to ``NAME.csv``, and the commit and command that made it to ``NAME.json``.
-
-    The folder is made if missing; ``commit`` is that of the code when the measurement began.
-    """
-    make_folder(folder)
-    write_table(folder / f"{name}.csv", table)
-    write_json(folder / f"{name}.json", {"commit": commit, "command": command()})
 
 
 def write_table(path: Path, table: pd.DataFrame) -> None:

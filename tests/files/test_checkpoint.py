@@ -1,6 +1,5 @@
 """Checkpoints: what is saved is loaded, and no crash or full disk loses the one before."""
 
-import errno
 import warnings
 from collections import OrderedDict
 from pathlib import Path
@@ -75,9 +74,11 @@ def test_the_newest_is_loaded_the_one_before_kept_and_leftovers_of_a_kill_ignore
     assert files(directory) == [paths[-1], newest, directory / "checkpoint-notes.pt"]
 
 
-@settings(max_examples=25)
+@settings(max_examples=200)
 @given(where=st.floats(0, 1, exclude_max=True), bit=st.integers(-1, 7))
-def test_a_damaged_checkpoint_is_skipped_with_a_warning(where, bit, tmp_path_factory):
+def test_a_damaged_checkpoint_is_skipped_with_a_warning_or_read_as_it_was(
+    where, bit, tmp_path_factory
+):
     directory = tmp_path_factory.mktemp("checkpoint")
     save_checkpoint(directory, {"weight": torch.arange(100.0), "episode": 1})
     newer = save_checkpoint(directory, {"weight": torch.arange(100.0), "episode": 2})
@@ -89,9 +90,12 @@ def test_a_damaged_checkpoint_is_skipped_with_a_warning(where, bit, tmp_path_fac
         content[position] ^= 1 << bit
     newer.write_bytes(content)
 
-    with pytest.warns(UserWarning, match=f"{newer.name} is damaged"):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
         state = load_checkpoint(directory)
-    assert state["episode"] == 1
+    # Some bytes, such as padding, mean nothing.
+    skipped = [f"{newer.name} is damaged" in str(warning.message) for warning in caught]
+    assert (state["episode"], skipped) in ((1, [True]), (2, []))
     assert torch.equal(state["weight"], torch.arange(100.0))
 
     newest = save_checkpoint(directory, {"weight": torch.arange(100.0), "episode": 3})
@@ -117,9 +121,8 @@ def test_a_full_disk_keeps_earlier_checkpoints(room, tmp_path_factory):
     first, second, third = ({"weight": torch.ones(5000), "episode": n} for n in (1, 2, 3))
     kept = [save_checkpoint(directory, state) for state in (first, second)]
     size = int(room * kept[-1].stat().st_size)
-    with largest_file(size), pytest.raises(OSError, match="earlier ones are kept") as error:
+    with largest_file(size), pytest.raises(OSError, match="earlier ones are kept: make room"):
         save_checkpoint(directory, third)
-    assert error.value.errno == errno.EFBIG
     assert files(directory) == kept
     assert load_checkpoint(directory)["episode"] == 2
     save_checkpoint(directory, third)

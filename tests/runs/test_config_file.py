@@ -76,8 +76,11 @@ def nested(**rl):
         ({"color": 1}, "unknown setting color"),
         (nested(momentum=0.9), "unknown setting algorithm.rl.momentum"),
         (nested(gamma="0.9"), "algorithm.rl: gamma must be a number, got 0.9"),
-        (nested(hidden_sizes=[5, 0.5]), "algorithm.rl: hidden_sizes must be a tuple, each a whole"),
-        ({"algorithm": 3}, "no settings of a run"),
+        (
+            nested(hidden_sizes=[5, 0.5]),
+            "algorithm.rl: hidden_sizes must be tuple[int, ...], got [5, 0.5]",
+        ),
+        ({"algorithm": 3}, "algorithm holds no settings"),
         ({"name": "mine", "algorithm_class": "os.path"}, "of 'mine', whose hyperparameters no im"),
     ],
 )
@@ -92,7 +95,7 @@ class Juggle(nico.NicoTask):
 
 @pytest.mark.parametrize(
     ("modules", "where"),
-    [(None, f"the module {Juggle.__module__!r}"), ([], "a script or notebook")],
+    [(None, repr(Juggle.__module__)), ({}, "'a script or notebook'")],
 )
 def test_the_module_of_an_unknown_task_is_reported_not_imported(tmp_path, modules, where):
     nico.add_task("juggle", Juggle)

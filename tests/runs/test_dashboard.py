@@ -54,42 +54,32 @@ def evaluation(number, seeds=(3, 8)):
 def make(tmp_path):
     """Make a dashboard of a run that has the rows of its CSV files, none by default."""
 
-    def make(*loggers, played=(), tested=(), **options):
-        with RunLogger(tmp_path, config=SETTINGS, resume=True) as log:
-            log.truncate_to({})
+    def make(*loggers, played=(), tested=()):
+        with RunLogger(tmp_path, config=SETTINGS, position={}) as log:
             for row in played:
                 log.log_train(row)
             for row in tested:
                 log.log_eval({name: row[name] for name in ("seed", "episode", "task", "success")})
-        return Dashboard(tmp_path, loggers, settings=SETTINGS, **options)
+        return Dashboard(tmp_path, loggers, settings=SETTINGS)
 
     return make
 
 
-@pytest.mark.parametrize("per_seed", [False, True])
-def test_an_evaluation_logs_means_over_seeds_of_tests_and_training(make, per_seed):
+def test_means_over_seeds_and_plain_settings_are_logged(make, monkeypatch):
+    monkeypatch.setattr(dashboard, "commit_of_code", lambda: "c0ffee")
     recorder = Recorder()
-    with make(recorder, per_seed=per_seed) as board:
+    with make(recorder) as board:
         for row in PLAYED:
             board.log_train(row)
         board.log_eval(evaluation(2))
-        diverged = episode(8, 3, "push", 1, loss_actor=float("nan"), num_nodes=2)
-        board.log_train(diverged)
+        board.log_train(episode(8, 3, "push", 1, loss_actor=float("nan"), num_nodes=2))
         board.log_eval(evaluation(4, seeds=(8,)))
+        board.log_final(pd.DataFrame({"task": ["grasp"] * 2, "success": [0.5, 0.75]}), 6)
     assert recorder.closed
-    (first, first_step), (second, second_step) = recorder.metrics
-    assert (first_step, second_step) == (2, 4)
-    expected = {
-        "eval/success/grasp": 1 / 4,
-        "eval/success/push": 3 / 4,
-        "eval/success_mean": 1 / 2,
-        "eval/success_sd": 1 / 4,  # of 3/4 and 1/4
-        **MEANS,
-    }
-    for (seed, task), successes in TESTED.items():
-        if per_seed:
-            expected[f"eval/success/{task}/seed_{seed}"] = np.mean(successes)
-    assert first == pytest.approx(expected)
+    (first, second, final), steps = zip(*recorder.metrics, strict=True)
+    assert steps == (2, 4, 6)
+    of_tests = {"eval/success/grasp": 1 / 4, "eval/success/push": 3 / 4, "eval/success_mean": 1 / 2}
+    assert first == pytest.approx({**of_tests, **MEANS})
     expected = {
         "eval/success/grasp": 0.0,
         "eval/success/push": 1 / 2,
@@ -100,8 +90,17 @@ def test_an_evaluation_logs_means_over_seeds_of_tests_and_training(make, per_see
         "train/loss_actor": float("nan"),  # is seen
         "train/num_nodes": 4.0,
     }
-    found = {name: value for name, value in second.items() if "/seed_" not in name}
-    assert found == pytest.approx(expected, nan_ok=True)
+    assert second == pytest.approx(expected, nan_ok=True)
+    assert final == {"final/success/grasp": 0.625, "final/success_mean": 0.625}
+    (found,) = recorder.settings
+    assert found.pop("versions.torch") == torch.__version__
+    assert {name: value for name, value in found.items() if "versions." not in name} == {
+        "gamma": 0.98,
+        "seeds": "[3, 8]",
+        "network.hidden": "[64]",
+        "network.rate": None,
+        "commit": "c0ffee",
+    }
 
 
 def test_a_resumed_run_logs_the_means_of_an_uninterrupted_one(make):
@@ -126,30 +125,8 @@ def test_a_resumed_run_logs_the_means_of_an_uninterrupted_one(make):
     assert resumed.metrics == uninterrupted.metrics[1:]
 
 
-def test_final_tests_media_and_settings_are_logged_as_plain_values(make, tmp_path, monkeypatch):
-    monkeypatch.setattr(dashboard, "commit_of_code", lambda: "c0ffee")
-    recorder = Recorder()
-    with make(recorder) as board:
-        final = [{"task": "grasp", "success": 0.5}, {"task": "grasp", "success": 0.75}]
-        final.append({"task": "push", "success": 0.25})
-        board.log_final(pd.DataFrame(final), 6)
-        board.log_media("figures/success", tmp_path / "success.png")
-    means = {"final/success/grasp": 0.625, "final/success/push": 0.25, "final/success_mean": 0.5}
-    assert recorder.metrics == [(means, 6)]
-    assert recorder.media == [("figures/success", tmp_path / "success.png")]
-    (found,) = recorder.settings
-    assert found.pop("versions.torch") == torch.__version__
-    assert {name: value for name, value in found.items() if "versions." not in name} == {
-        "gamma": 0.98,
-        "seeds": "[3, 8]",
-        "network.hidden": "[64]",
-        "network.rate": None,
-        "commit": "c0ffee",
-    }
-
-
-@pytest.mark.parametrize("method", ["log_hparams", "log_metrics", "log_media", "shutdown"])
-def test_a_logger_that_fails_is_dropped_with_one_warning(make, method, monkeypatch, tmp_path):
+@pytest.mark.parametrize("method", ["log_hparams", "log_metrics", "shutdown"])
+def test_a_logger_that_fails_is_dropped_with_one_warning(make, method, monkeypatch):
     broken, intact = Recorder(), Recorder()
     calls = []
 
@@ -165,39 +142,8 @@ def test_a_logger_that_fails_is_dropped_with_one_warning(make, method, monkeypat
         for number in (2, 4):
             board.log_train(episode(3, number, "grasp", 1))
             board.log_eval(evaluation(number))
-            board.log_media("figures/success", tmp_path / "success.png")
     assert len(caught) == len(calls) == 1
-    assert (len(intact.metrics), len(intact.media), intact.closed) == (2, 2, True)
-
-
-@pytest.fixture
-def unreachable(monkeypatch):
-    """Have `WandbLogger` fail in modes, as without a network; returns these and what is made."""
-    modes, made = [], []
-
-    def logger(name, *, mode, group, **options):
-        if mode in modes:
-            raise ConnectionError("no route\nto host")
-        made.append((mode, group))
-
-    monkeypatch.setattr(dashboard, "WandbLogger", logger)
-    return modes, made
-
-
-def test_wandb_logs_offline_when_it_does_not_answer(unreachable, make, tmp_path):
-    modes, made = unreachable
-    modes.append("online")
-    with pytest.warns(UserWarning, match=r"\(no route\): logging offline") as caught:
-        wandb_logger(tmp_path, "online", group="mine")
-    assert len(caught) == 1
-    assert made == [("offline", "mine")]
-
-    modes.append("offline")
-    with pytest.warns(UserWarning) as caught:
-        board = make(lambda: wandb_logger(tmp_path, "online"))
-    messages = [str(warning.message).partition(" (")[0] for warning in caught]
-    assert messages == ["wandb does not answer", "A logger failed"]
-    board.log_eval(evaluation(2))  # the run goes on without it
+    assert (len(intact.metrics), intact.closed) == (2, True)
 
 
 @pytest.mark.parametrize(
@@ -208,8 +154,9 @@ def test_a_missing_package_is_one_warning(package, make_logger, make, monkeypatc
     attribute = {"wandb": "_has_wandb", "tensorboard": "_has_tb"}[package]
     monkeypatch.setattr(f"torchrl.record.loggers.{package}.{attribute}", False)
     with pytest.warns(UserWarning, match=rf"pip install 'bgpo_trl\[{package}\]'") as caught:
-        make(lambda: make_logger(tmp_path)).close()
+        board = make(lambda: make_logger(tmp_path))
     assert len(caught) == 1
+    board.log_eval(evaluation(2))  # the run goes on without it
 
 
 def test_tensorboard_gets_the_means_as_scalars_in_the_run_directory(make, monkeypatch, tmp_path):
@@ -239,7 +186,6 @@ def test_tensorboard_gets_the_means_as_scalars_in_the_run_directory(make, monkey
         for row in PLAYED:
             board.log_train(row)
         board.log_eval(evaluation(2))
-        board.log_media("figures/success", tmp_path / "success.png")
     assert closed == [str(tmp_path / "tensorboard")]
     assert {name: value for name, value, _ in written if name in MEANS} == pytest.approx(MEANS)
     assert {step for *_, step in written} == {2}
